@@ -49,7 +49,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 
 def __getattr__(name: str) -> object:
-    """Return a name of the Python interface, which is imported now."""
+    """Return a name of the Python interface, importing it on first use."""
     if name not in _MODULES:
         raise AttributeError(f"module 'fdhil' has no attribute {name!r}")
     from importlib import import_module

@@ -1,8 +1,8 @@
-"""Ends tasks for certain, whatever they raise or swallow while they are cancelled.
+"""Ends tasks reliably, whatever they raise or swallow while they are cancelled.
 
-A cancellation can get lost: a context manager raises an error of its own while it is closed, ``except*`` and the
-``wait_for`` of Python 3.11 drop it when a failure comes at the same moment, and a task group leaves ``cancelling()``
-counted up. So a loop that catches failures and tries again never awaits what may fail in its own task.
+A cancellation can get lost: a context manager raises its own error while closing, ``except*`` and the ``wait_for`` of
+Python 3.11 drop it when a failure comes at the same moment, and a task group leaves ``cancelling()`` incremented. So a
+loop that catches failures and retries never awaits what may fail in its own task.
 """
 
 import asyncio
@@ -19,14 +19,14 @@ Result = TypeVar("Result")
 
 
 class GivenUp(DeviceError):
-    """A library cancelled what it was asked to do, which nobody else did."""
+    """A library cancelled its own task, without any request to do so."""
 
 
 async def run_attempt(device: str, work: Coroutine[Any, Any, Result], end_s: float = END_S) -> Result:
-    """Return what ``work`` returns or raise what it raises; CancelledError for certain when the caller is cancelled.
+    """Return the result of ``work`` or raise its error; always raises CancelledError when the caller is cancelled.
 
-    ``work`` runs in a task of its own, which has ``end_s`` to end. GivenUp when ``work`` was cancelled by somebody else
-    than the caller.
+    ``work`` runs in its own task, which has ``end_s`` to end. GivenUp when something other than the caller cancelled
+    it.
     """
     attempt = asyncio.create_task(work, name=f"attempt at {device}")
     try:
@@ -35,8 +35,13 @@ async def run_attempt(device: str, work: Coroutine[Any, Any, Result], end_s: flo
         await end_tasks([attempt], end_s)
         raise
     if attempt.cancelled():
-        raise GivenUp(device, "the connection was given up by its library; look at the peer's log")
+        raise GivenUp(device, "the library closed the connection; see the peer's log")
     return attempt.result()
+
+
+def find_first_error(error: BaseException) -> BaseException:
+    """Return the first error inside nested exception groups."""
+    return find_first_error(error.exceptions[0]) if isinstance(error, BaseExceptionGroup) else error
 
 
 async def end_tasks(
@@ -44,7 +49,7 @@ async def end_tasks(
 ) -> set[asyncio.Task[Any]]:
     """Cancel tasks every ``again_s`` until they have ended; return those that still run after ``within_s``.
 
-    What they raise is not looked at. A cancellation of the caller is raised afterwards.
+    Their exceptions are ignored. A cancellation of the caller is raised afterwards.
     """
     given = left = set(tasks)
     cancelled = False

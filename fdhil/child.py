@@ -1,8 +1,8 @@
-"""Starts child processes that end with the process that started them, also when that one is killed.
+"""Starts child processes that end with the process that started them, even when that one is killed.
 
 As a script (``python child.py PARENT SIGNAL COMMAND...``) it has the kernel send it a signal at its parent's death and
-becomes the command. That signal comes when the thread that started the child ends: start children from a thread that
-lives as long as they do. What changes its user (setpriv, sudo) loses it.
+becomes the command. The signal comes when the thread that started the child ends: start children from a thread that
+lives as long as they do. A command that changes its user (setpriv, sudo) loses it.
 """
 
 import ctypes
@@ -17,15 +17,15 @@ ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def ending_with_parent(command: Sequence[str], number: signal.Signals = signal.SIGTERM) -> list[str]:
-    """Return the command that runs ``command`` and gets the signal when this process ends, however it ends."""
+    """Return a command that runs ``command`` and receives the signal whenever this process ends."""
     return [sys.executable, "-I", "-S", __file__, str(os.getpid()), str(int(number)), *command]
 
 
 @contextmanager
 def stopping_in_order() -> Iterator[None]:
-    """Raise KeyboardInterrupt once for SIGTERM, SIGHUP or Ctrl-C, so that with blocks end the children in their order.
+    """Raise KeyboardInterrupt once for SIGTERM, SIGHUP or Ctrl-C, so that with blocks end children in order.
 
-    A second signal does not disturb that; what is ignored (nohup) stays so. Of the main thread alone.
+    Further signals are ignored; ignored signals (nohup) stay ignored. For the main thread only.
     """
     caught = [number for number in ENDING_SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
 
@@ -43,14 +43,14 @@ def stopping_in_order() -> Iterator[None]:
 
 
 def end_with(parent: int, number: int = signal.SIGTERM) -> None:
-    """Have the kernel send this process a signal when its parent ends; exit where it has ended already."""
+    """Have the kernel send this process a signal when its parent ends; exit if it has already ended."""
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number, 0, 0, 0)
     if os.getppid() != parent:
         sys.exit(1)
 
 
 def main(parent: str, number: str, *command: str) -> None:
-    """Become the command, unless the parent has ended already."""
+    """Become the command, unless the parent has already ended."""
     for each in (int(number), signal.SIGPIPE, signal.SIGXFSZ):  # Python ignores the last two; the command must not
         signal.signal(each, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [int(number)])

@@ -98,7 +98,7 @@ class Object(IntEnum):
 
 
 LOGICAL_AXIS_STEP = 0x800
-"""The objects of the next axis of one device lie so much higher (CiA 402-2; 0x6000 to 0x67FF are the first axis')."""
+"""Index distance of the objects of two axes of one device (CiA 402-2; 0x6000 to 0x67FF are the first axis')."""
 LOGICAL_AXES = range(1, 9)
 
 
@@ -177,7 +177,7 @@ def controlword_toward_enabled(state: State) -> int | None:
 
 @dataclass(frozen=True, slots=True)
 class PdoEntry:
-    """One mapped object of a PDO: index, sub-index, length in bits, signed or not, and its place in the frame."""
+    """One mapped object of a PDO: index, sub-index, length in bits, signed or not, and its position in the frame."""
 
     index: int
     sub: int
@@ -260,7 +260,7 @@ class Scaling:
     def to_increments(self, position_mm: float) -> int:
         """Round a position or offset in mm to drive increments; ValueError for NaN and infinities."""
         if not math.isfinite(position_mm):
-            raise ValueError(f"{position_mm} mm is no position")
+            raise ValueError(f"{position_mm} mm is not a valid position")
         return round(self.sign * position_mm * self.increments_per_mm)
 
     def to_mm(self, increments: float) -> float:

@@ -1,7 +1,7 @@
-"""Keeps the connections from being taken by who only holds them, so that no stranger locks anybody out of disarming.
+"""Limits connections, so that clients that only hold them cannot keep an operator from disarming.
 
-One that does nothing is ended; and where there are too many, the longest idle of whoever has the most makes room. How
-many may be there is the server's ``limit_concurrency``: beyond it, it would refuse whoever comes.
+An idle connection is closed; when there are too many, the longest idle one of the address with the most makes room. The
+number is the server's ``limit_concurrency``: beyond it, the server would refuse new clients.
 """
 
 import asyncio
@@ -14,11 +14,11 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 
 MOST_CONNECTIONS = 256
 QUIET_S = 20.0
-"""For so long, at most twice as long, no request need be whole, and nothing of an answer be read."""
+"""Time, at most twice as long, in which a request must be complete and an answer be read."""
 
 
 class BoundedHttp(H11Protocol):
-    """A connection of HTTP."""
+    """An HTTP connection that is closed when idle."""
 
     _look: asyncio.TimerHandle
     _seen = (-1, 0)
@@ -26,7 +26,7 @@ class BoundedHttp(H11Protocol):
     since_s = 0.0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Take a connection, and end another one where there are too many."""
+        """Accept a connection, and close another one when there are too many."""
         super().connection_made(transport)
         self.since_s = self.loop.time()
         self._look = self.loop.call_later(QUIET_S, self._end_if_quiet)
@@ -35,7 +35,7 @@ class BoundedHttp(H11Protocol):
 
     @property
     def idle(self) -> bool:
-        """Whether no request of it is being answered."""
+        """Whether it has no request in progress."""
         return self.cycle is None or self.cycle.response_complete  # type: ignore[redundant-expr]  # none came yet
 
     def _end_if_quiet(self) -> None:
@@ -53,38 +53,38 @@ class BoundedHttp(H11Protocol):
         super().on_response_complete()
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        """Hand the connection on to the protocol of sockets, which has its own pings."""
+        """Pass the connection on to the WebSocket protocol, which has its own pings."""
         self._look.cancel()
         super().handle_websocket_upgrade(event)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The connection has ended."""
+        """Stop watching a closed connection."""
         self._look.cancel()
         super().connection_lost(exc)
 
 
 class BoundedSocket(WebSocketsSansIOProtocol):
-    """A browser's socket that is not listened to while it does not read: what answers its pings takes no memory."""
+    """A WebSocket that is not read while its client does not read: answers to its pings take no memory."""
 
     since_s = 0.0
 
     @property
     def idle(self) -> bool:
-        """Whether it has been told that it is over."""
+        """Whether it is being closed."""
         return self.close_sent
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The connection has ended."""
-        self.connections.add(self)  # where it made room it is out already, which it would stumble over
+        """Take leave of a closed connection."""
+        self.connections.add(self)  # the base class removes it again, also after it made room
         super().connection_lost(exc)
 
     def pause_writing(self) -> None:
-        """What it is told waits to be read."""
+        """Stop reading while output waits."""
         super().pause_writing()
         self.transport.pause_reading()
 
     def resume_writing(self) -> None:
-        """It is read on."""
+        """Read again."""
         super().resume_writing()
         if not (self.read_paused or self.transport.is_closing()):
             self.transport.resume_reading()
@@ -94,7 +94,7 @@ Bounded = BoundedHttp | BoundedSocket
 
 
 def _make_room(others: Sequence[Bounded]) -> None:
-    """End the connection that is idle for longest, of the address that has the most; none where sockets are told."""
+    """Close the longest idle connection of the address with the most; never a WebSocket in use."""
     count = Counter(each.client and each.client[0] for each in others)
     may_go = [each for each in others if each.idle or isinstance(each, BoundedHttp)]
     order = sorted(may_go, key=lambda each: (-count[each.client and each.client[0]], not each.idle, each.since_s))

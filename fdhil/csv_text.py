@@ -1,4 +1,4 @@
-"""The text of a CSV file, read whole within a limit: what a file declares or repeats can never take more memory."""
+"""Reads the text of a CSV file within a limit, so that no declared or repeated content exhausts memory."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,12 +13,12 @@ LINE_ENDS = "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"  # of str.splitlines
 
 
 def read_csv_text(path: Path) -> str:
-    """Return a file's text; RecordingError when it cannot be read, is no text, or is larger than a recording may be."""
+    """Return a file's text; RecordingError when it is unreadable, not text, or exceeds the size of a recording."""
     return text_of(read_content(path), str(path))
 
 
 def read_content(path: Path) -> bytes:
-    """Return a file's bytes; RecordingError when it cannot be read or is larger than a recording may be."""
+    """Return a file's bytes; RecordingError when it is unreadable or exceeds the size of a recording."""
     try:
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1)
@@ -30,13 +30,13 @@ def read_content(path: Path) -> bytes:
 
 
 def text_of(raw: bytes, source: str, encoding: str = "utf-8-sig") -> str:
-    """Return the text of a file's bytes; RecordingError when it is none, or has more rows than a recording may have."""
+    """Decode a file's bytes; RecordingError when they are not text, or have too many rows for a recording."""
     if any(raw.count(end.encode()) > MAX_ROWS for end in LINE_ENDS):
         raise _too_large(source)
     try:
         return raw.decode(encoding)
     except UnicodeDecodeError:
-        raise RecordingError(f"{source} is no text file: export it as CSV in UTF-8") from None
+        raise RecordingError(f"{source} is not a text file: export it as CSV in UTF-8") from None
 
 
 def _too_large(source: str) -> RecordingError:
@@ -44,14 +44,14 @@ def _too_large(source: str) -> RecordingError:
 
 
 def check_lengths(lines: Sequence[str], first: int, source: str) -> None:
-    """Refuse a line that is too long for columns before it is taken apart; ``first`` is its 1-based number."""
+    """Refuse a line that is too long before it is split; ``first`` is its 1-based number."""
     for number, line in enumerate(lines, first):
         if len(line) > MAX_LINE_CHARS:
             raise RecordingError(
-                f"{source} line {number} has {len(line)} characters, which no row has: export it again"
+                f"{source} line {number} has {len(line)} characters, which no valid row has: export it again"
             )
 
 
 def shown(text: str) -> str:
-    """Return a cell or header as an error shows it; no file can make it long."""
+    """Return a cell or header for an error message, shortened."""
     return repr(text if len(text) <= SHOWN_CHARS else f"{text[:SHOWN_CHARS]}...")

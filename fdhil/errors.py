@@ -1,7 +1,7 @@
-"""The error tree. Every message is one sentence that names the cause and the next action.
+"""The tree of errors. Every message names the cause and the next action in one sentence.
 
 Expected outcomes (a refused window, a correction that would not help) are values, not exceptions: see
-:mod:`fdhil.records`. What is raised here is the unexpected, and ``exit_code`` is what the command line returns for it.
+:mod:`fdhil.records`. Errors here are unexpected; ``exit_code`` is what the command line returns for them.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import errno
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-MOST_TOLD, MOST_CHARACTERS = 51, 2000  # no file makes a message without end
-LONGEST_WORD = 60  # of a program, as it is shown
+MOST_FAULTS, MOST_CHARACTERS = 51, 2000  # bounds of a message, whatever the file
+LONGEST_WORD = 60  # of a program, in a message
 
 
 class FdhilError(Exception):
@@ -34,21 +34,21 @@ class ConfigFault:
 
 
 class ConfigError(FdhilError):
-    """The configuration (or an option) cannot be used; carries all faults at once, not only the first."""
+    """The configuration (or an option) is invalid; reports all faults at once."""
 
     exit_code = 2
 
     def __init__(self, source: str, faults: Sequence[ConfigFault]) -> None:
         self.source = source
         self.faults = tuple(faults)
-        told = [str(fault)[:MOST_CHARACTERS] for fault in self.faults[:MOST_TOLD]]
-        if len(self.faults) > MOST_TOLD:
-            told.append(f"and {len(self.faults) - MOST_TOLD} more faults; mend these first")
-        super().__init__(f"{source}: " + "; ".join(told))
+        shown_faults = [str(fault)[:MOST_CHARACTERS] for fault in self.faults[:MOST_FAULTS]]
+        if len(self.faults) > MOST_FAULTS:
+            shown_faults.append(f"and {len(self.faults) - MOST_FAULTS} more faults; fix these first")
+        super().__init__(f"{source}: " + "; ".join(shown_faults))
 
 
 class DeviceError(FdhilError):
-    """A drive, sensor, bus or port does not do what it must; ``device`` names it."""
+    """A drive, sensor, bus or port fails; ``device`` names it."""
 
     def __init__(self, device: str, message: str) -> None:
         self.device = device
@@ -60,13 +60,13 @@ class ConnectError(DeviceError):
 
     @classmethod
     def of_socket(cls, device: str, error: OSError, absent: str) -> ConnectError:
-        """Return why ``device`` was not heard at its UNIX socket; ``absent`` says it where nothing listens there."""
+        """Return why ``device`` did not answer at its UNIX socket; ``absent`` is the text when nothing listens."""
         text, cause = absent, error.strerror or error
         if error.errno in (errno.EACCES, errno.EPERM):
-            text = f"may not be asked by this user ({cause}), so that whether it runs is not known"
-            text += "; ask as a user of its group, or with sudo"
+            text = f"does not accept this user ({cause}), so that it is unknown whether it runs"
+            text += "; run the command as a user of its group, or with sudo"
         elif error.errno in (errno.EMFILE, errno.ENFILE):
-            text = f"was not asked ({cause}); close other connections or files, then try again"
+            text = f"could not be reached ({cause}); close other connections or files, then try again"
         return cls(device, text)
 
 
@@ -75,23 +75,23 @@ class DeviceTimeout(DeviceError):
 
 
 class SdoTimeout(DeviceTimeout):
-    """A drive did not answer an SDO request in time; its late answer is not taken for another one's."""
+    """A drive did not answer an SDO request in time; its late answer must not be taken for another request's."""
 
 
 class ProtocolError(DeviceError):
-    """A device answered something that its protocol does not allow."""
+    """A device sent an answer that its protocol does not allow."""
 
 
 class ForeignMaster(ProtocolError):
-    """Another master was heard on a bus on which fdhil was about to send, or sent; it sends no more there."""
+    """Another master is active on a bus on which fdhil was about to send, or sent; fdhil stops sending there."""
 
 
 class SdoToggle(ProtocolError):
-    """A drive's segments of an SDO transfer do not alternate: one was lost, or two masters ask."""
+    """The segments of a drive's SDO transfer do not alternate: one was lost, or two masters send requests."""
 
 
 class SdoTooLarge(ProtocolError):
-    """An object is longer than a healthy drive's, or takes longer than it may."""
+    """An object is longer than a healthy drive's, or its transfer takes too long."""
 
 
 class SdoAbort(ProtocolError):
@@ -103,15 +103,15 @@ class SdoAbort(ProtocolError):
 
 
 class DriveFault(DeviceError):
-    """A drive is in, or fell into, a state in which it must not be used."""
+    """A drive is in a state in which it must not be used."""
 
 
 class EdsError(DeviceError):
-    """An EDS or DCF file cannot be read."""
+    """An EDS or DCF file is invalid or unreadable."""
 
 
 class StoreError(FdhilError):
-    """The store (recordings, history, journal) cannot be read or written; ``code`` is the class the operator sees."""
+    """The store (recordings, history, journal) cannot be read or written; ``code`` is the class for the operator."""
 
     def __init__(self, message: str, code: str = "StoreFault") -> None:
         self.code = code
@@ -119,16 +119,15 @@ class StoreError(FdhilError):
 
 
 class RecordingError(FdhilError):
-    """A recording or demand cannot be read: truncated, empty, without a column, or with text where a number belongs."""
+    """A recording or demand is invalid: truncated, empty, without a column, or with text instead of a number."""
 
 
 class OutputError(FdhilError):
-    """A file that a command was asked to write cannot be written; what stood there before is kept."""
+    """An output file cannot be written; its earlier content is kept."""
 
 
 class ProgramError(FdhilError):
-    """An NC program cannot be interpreted; ``line`` is the 1-based source line (0: the
-    whole file), ``word`` the word at fault."""
+    """An NC program cannot be interpreted; ``line`` is the 1-based line (0: the whole file), ``word`` the word."""
 
     def __init__(self, line: int, word: str, message: str) -> None:
         self.line = line
@@ -139,4 +138,4 @@ class ProgramError(FdhilError):
 
 
 class GcodeBudget(ProgramError):
-    """An NC program asks for more than one may: blocks, repetitions, depth, names, motions or characters of a line."""
+    """An NC program exceeds a limit: blocks, repetitions, depth, names, motions or characters of a line."""

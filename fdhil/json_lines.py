@@ -1,4 +1,4 @@
-"""JSON lines: one object a line, as the daemon, its clients and child processes exchange them."""
+"""Encodes and decodes JSON lines, one object per line: the format of daemon, clients and child processes."""
 
 import json
 from collections.abc import Mapping
@@ -6,12 +6,12 @@ from typing import Any
 
 
 def encode_line(document: Mapping[str, Any]) -> bytes:
-    """Return an object as one line."""
+    """Encode an object as one line."""
     return json.dumps(document).encode() + b"\n"
 
 
 def decode_line(line: bytes | str) -> dict[str, Any] | None:
-    """Return the object of a line, None where it is none: cut off, no JSON, nested too deeply, or another value.
+    """Decode the object of a line; None when it is truncated, invalid, nested too deeply, or not an object.
 
     >>> decode_line(encode_line({"ok": True})), decode_line(b'{"ok"'), decode_line(b"[1]")
     ({'ok': True}, None, None)

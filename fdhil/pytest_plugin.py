@@ -43,12 +43,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.fixture
 def feed_drive_bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Callable[..., FeedDriveBench]]:
-    """Return :func:`start`, which starts a simulated machine; whatever was started ends with the test."""
+    """Return :func:`start`, which starts a simulated machine; it ends with the test."""
     bus = str(request.config.getoption("--feed-drive-bus"))
     with contextlib.ExitStack() as benches:
 
         def start(axes: str = "XY", **options: Any) -> FeedDriveBench:
-            """Start a machine with these ``axes``; ``options`` as of :class:`FeedDriveBench`."""
             folder = tmp_path / f"bench{next(_channel)}"
             folder.mkdir()
             return benches.enter_context(FeedDriveBench(folder, **{"axes": axes, "bus": bus} | options))
@@ -57,11 +56,11 @@ def feed_drive_bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator
 
 
 class FeedDriveBench:
-    """A running machine: drives that speak CiA 402, voltage sensors that speak Modbus, and an NC that is off at first.
+    """A running machine: drives that speak CiA 402, voltage sensors that speak Modbus, and an NC, initially off.
 
-    ``changes`` are put into its configuration (as of ``configs/machine-template.toml``), ``pace`` is ``realtime`` or
-    ``lockstep``: then the next SYNC of its NC waits for the set-points of whoever takes part. ``ready`` is what
-    ``fdhil sim --json`` says first: buses, node-IDs, PDO mappings, EDS files, Modbus ports.
+    ``changes`` are merged into its configuration (as of ``configs/machine-template.toml``), ``pace`` is ``realtime`` or
+    ``lockstep``: then the next SYNC of its NC waits for the set-points of all participants. ``ready`` is the first
+    event of ``fdhil sim --json``: buses, node-IDs, PDO mappings, EDS files, Modbus ports.
     """
 
     def __init__(
@@ -109,7 +108,7 @@ class FeedDriveBench:
             self._service.stop()
             self._thread.join()
 
-    # -- joining it
+    # -- the bus
 
     @property
     def bus_arguments(self) -> dict[str, Any]:
@@ -117,10 +116,10 @@ class FeedDriveBench:
         return {key: value for key, value in self.ready["buses"]["can0"].items() if value is not None}
 
     def join(self, plan: Sequence[FrameFault] = (), seed: int = 0) -> can.BusABC:
-        """Join the bus as a party of its own; it is shut down with the bench.
+        """Join the bus as a participant of its own, until the bench ends.
 
-        With a ``plan`` of faults it is a :class:`fdhil.sim.wire.fault_bus.FaultBus`: they meet what this party sends
-        and receives, and nobody else.
+        With a ``plan`` of faults it is a :class:`fdhil.sim.wire.fault_bus.FaultBus`: the faults affect only the frames
+        that this participant sends and receives.
         """
         import can
 
@@ -131,12 +130,12 @@ class FeedDriveBench:
         return self._joined[-1]
 
     def drive(self, axis: str = "X") -> Mapping[str, Any]:
-        """Return what the machine says of a drive: ``node_id``, ``eds``, ``increments_per_mm``, ``tpdo``, ``rpdo``."""
-        told: Mapping[str, Any] = self.ready["drives"][axis]
-        return told
+        """Return the data of a drive: ``node_id``, ``eds``, ``increments_per_mm``, ``tpdo``, ``rpdo``."""
+        drive: Mapping[str, Any] = self.ready["drives"][axis]
+        return drive
 
     def write_config(self, path: Path | None = None) -> Path:
-        """Write the configuration with which fdhil's own commands join this machine; return where it is."""
+        """Write the configuration with which fdhil's own commands join this machine; return its path."""
         from fdhil.cli.demo.toml import to_toml
 
         document = copy.deepcopy(self._document)
@@ -147,28 +146,28 @@ class FeedDriveBench:
         path.write_text(to_toml(document), "utf-8")
         return path
 
-    # -- what it is and does
+    # -- state and commands
 
     def position_mm(self, axis: str = "X") -> float:
-        """Return where the table truly is, whatever the drive says of it."""
+        """Return the true position of the table, whatever the drive reports."""
         assert self._service is not None
         return float(self._service.machine.units[axis].drive.table_mm)
 
     def command(self, command: str, **more: Any) -> None:
-        """Give a command of the operator's panel, as of ``fdhil sim --help``: ``command("override", percent=50)``.
+        """Send a command of the operator's panel, as of ``fdhil sim --help``: ``command("override", percent=50)``.
 
-        One that the machine refuses fails the test.
+        A command that the machine refuses fails the test.
         """
         assert self._service is not None
         if wrong := self._service.command(json.dumps({"command": command, **more})):
-            pytest.fail(f"the feed drive bench cannot: {wrong}")
+            pytest.fail(f"the feed drive bench failed: {wrong}")
 
     def fault(self, name: str, axis: str | None = "X", **more: Any) -> None:
-        """Let a fault happen, as of docs/reference/faults.md: ``fault("load_torque", value=5.0, duration_s=0.3)``."""
+        """Inject a fault of docs/reference/faults.md: ``fault("load_torque", value=5.0, duration_s=0.3)``."""
         self.command("fault", fault=name, **({} if axis is None else {"axis": axis}), **more)
 
     def play(self, program: str | Path, trace: Path | None = None) -> None:
-        """Switch the machine's own NC on and let it play a program: its text, or an NC or demand file."""
+        """Switch the machine's own NC on and run a program: its text, or an NC or demand file."""
         if isinstance(program, str):
             path = self.folder / f"program{next(_channel)}.ngc"
             path.write_text(program, "utf-8")
@@ -179,23 +178,22 @@ class FeedDriveBench:
         self.command("play", file=str(program))
 
     def wait_for(self, event: str) -> dict[str, Any]:
-        """Wait for an event (``ready``, ``nc``, ``playing``, ``finished``) and return it; those before it are gone.
+        """Wait for an event (``ready``, ``nc``, ``playing``, ``finished``) and return it; drop earlier ones.
 
-        Fails the test when the machine cannot do what it was told, or says nothing for ``patience_s``.
+        Fails the test when the machine cannot do what was commanded, or reports nothing for ``patience_s``.
         """
         while True:
             try:
-                told = self._events.get(timeout=self._patience_s)
+                received = self._events.get(timeout=self._patience_s)
             except queue.Empty:
-                pytest.fail(f"the feed drive bench said no {event!r} within {self._patience_s:g} s")
-            if told["event"] == "error":
-                pytest.fail(f"the feed drive bench cannot: {told['text']}")
-            if told["event"] == event:
-                return told
+                pytest.fail(f"the feed drive bench did not report {event!r} within {self._patience_s:g} s")
+            if received["event"] == "error":
+                pytest.fail(f"the feed drive bench failed: {received['text']}")
+            if received["event"] == event:
+                return received
 
 
 def _document(axes: str, bus: str) -> dict[str, Any]:
-    """Return the configuration of a machine whose axes are all those of the demonstration."""
     from fdhil.cli.demo.machines import machine_document
 
     document = machine_document()

@@ -1,9 +1,7 @@
 """Reads this computer's clocks and waits by them; a class that takes a ``Clock`` also runs on simulated time.
 
-Coroutines need none: the time of their event loop is the same monotonic clock.
+Coroutines do not need it: the time of their event loop is the same monotonic clock.
 """
-
-from __future__ import annotations
 
 import select
 import socket
@@ -12,7 +10,7 @@ from pathlib import Path
 
 
 class Clock:
-    """The clocks of this computer, and the two ways in which a thread waits."""
+    """This computer's clocks, and a thread's two ways to wait."""
 
     def now_s(self) -> float:
         """Return the monotonic time, s."""
@@ -23,22 +21,22 @@ class Clock:
         return time.time()
 
     def since_boot_ns(self) -> int:
-        """Return the time since the computer was started; the time in which it was suspended counts, a machine ages."""
+        """Return the time since the computer was started, including suspended time: a machine ages meanwhile."""
         return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
     def boot_id(self) -> str:
-        """Return the kernel's identifier of this boot; times since the boot compare only within one."""
+        """Return the kernel's identifier of this boot; times since boot compare only within one boot."""
         try:
             return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
         except OSError:
             return ""
 
     def sleep(self, seconds: float) -> None:
-        """Block this thread for so long."""
+        """Block this thread."""
         time.sleep(seconds)
 
     def wait_readable(self, connection: socket.socket, seconds: float) -> bool:
-        """Block until ``connection`` can be read, at most for so long; return whether it can."""
+        """Wait until ``connection`` is readable, at most ``seconds``; return whether it is."""
         poll = select.poll()
         poll.register(connection, select.POLLIN)
         return bool(poll.poll(seconds * 1000))

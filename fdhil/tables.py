@@ -1,4 +1,4 @@
-"""The literal registries: name -> "module:factory" (a profile: "package:file"). Being listed is being tested.
+"""Literal registries: name -> "module:factory" (a profile: "package:file"). A listed entry is tested.
 
 Nothing registers itself. Config checks names against these tables without importing the rooms behind them.
 """
@@ -81,6 +81,6 @@ PUBLISHERS: Mapping[str, str] = {
 
 
 def load(table: Mapping[str, str], name: str) -> Any:
-    """Import and return the factory or module that ``table`` lists under ``name``; KeyError when it lists none."""
+    """Import and return the factory or module that ``table`` lists under ``name``; KeyError for an unknown name."""
     module, _, attribute = table[name].partition(":")
     return getattr(import_module(module), attribute) if attribute else import_module(module)

@@ -87,7 +87,7 @@ async def test_attempt_that_its_library_cancels_is_a_failure_to_be_tried_again()
     async def given_up() -> None:
         raise asyncio.CancelledError
 
-    with pytest.raises(GivenUp, match="given up by its library"):
+    with pytest.raises(GivenUp, match="library closed the connection"):
         await run_attempt("can0", given_up())
 
 

@@ -106,5 +106,5 @@ def test_increments_and_millimetres_agree(increments: int, sign: int) -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_no_position_is_refused(value: float) -> None:
-    with pytest.raises(ValueError, match="no position"):
+    with pytest.raises(ValueError, match="not a valid position"):
         Scaling(65536, 20.0).to_increments(value)

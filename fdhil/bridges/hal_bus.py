@@ -1,14 +1,14 @@
 #!/usr/bin/python3
 """Presents LinuxCNC's HAL pins as a CANopen bus, and feeds offsets into HAL's streamer.
 
-LinuxCNC's own Python runs it, loaded by a line at the end of its HAL files (``fdhil init --from-linuxcnc`` writes it):
+LinuxCNC's own Python runs it, loaded by a line at the end of the HAL files (``fdhil init --from-linuxcnc`` writes it):
 
     loadusr -Wn fdhil-hal /usr/bin/python3 /path/to/hal_bus.py machine.toml
 
 HAL's ``sampler`` records the pins of ``[axis.X.drive.hal]`` in every servo cycle, all axes in one channel. A cycle
-becomes a SYNC and the PDOs of profile ``hal`` for each axis, in the text protocol of a socketcand hub. So everything
-that listens to a CANopen bus works with HAL as it is. Samples that the sampler had no room for are SYNCs that are
-missing from the count: holes, never interpolated.
+becomes a SYNC and the PDOs of profile ``hal`` for each axis, in the text protocol of a socketcand hub. So every
+CANopen client works with HAL unchanged. Samples that the sampler dropped are missing in the SYNC count: they are holes,
+never interpolated.
 
 Where the HAL file has loaded ``streamer`` for fdhil, offsets (0x60B0) that a client sends go there. Each offset names
 the SYNC that it answers, and takes effect ``offset_lead_cycles`` + 1 cycles after it. What reaches the axis is limited
@@ -36,7 +36,7 @@ CHANNEL = "hal"
 LOOK_S = 0.001
 DEPTH = 8192  # of the sampler, in cycles
 MOST_PINS = 20  # of one channel of the sampler
-MOST_WAITING = 8 << 20  # bytes that a client may be behind
+MOST_WAITING = 8 << 20  # unsent bytes per client
 MOST_COMMAND = 4096
 SYNC_RANGE = 240  # of the SYNC counter, 1 to 240
 GUARD_SILENT_S = 0.05  # beyond the lead
@@ -49,11 +49,11 @@ SHARED = ("fdhil-row", "fdhil-on")  # signals of the generated HAL file: the str
 
 
 class PinError(Exception):
-    """A pin cannot be sampled; ``str`` names the pin, the reason and what to do."""
+    """A pin cannot be sampled; ``str`` names the pin, the reason and the next action."""
 
 
 class Axis(NamedTuple):
-    """One axis: its node-ID, its pins by their key in ``[axis.X.drive.hal]``, and scales."""
+    """One axis: its node-ID, its pins by their key in ``[axis.X.drive.hal]``, and its scales."""
 
     name: str
     node_id: int
@@ -61,8 +61,8 @@ class Axis(NamedTuple):
     scales: Mapping[str, float]
     per_mm: float  # increments, with the axis' sign
     period_s: float
-    commanded: bool  # the voltage is a command, which acts in the cycle that begins
-    corrected: bool  # offsets may be added: the HAL file has its limit3
+    commanded: bool  # whether the voltage is a command for the coming cycle
+    corrected: bool  # whether offsets may be added: the HAL file has the axis' limit3
 
 
 class Sample(NamedTuple):
@@ -104,7 +104,7 @@ def read_axes(document: Mapping[str, Any]) -> list[Axis]:
 
 
 class AxisReader:
-    """Turns the values of an axis' pins into its sample, cycle by cycle. Pure."""
+    """Converts the values of an axis' pins to its sample, cycle by cycle. Pure."""
 
     def __init__(self, axis: Axis) -> None:
         self.axis = axis
@@ -136,7 +136,7 @@ class AxisReader:
 
 
 def _whole(value: float, bits: int) -> int:
-    """Round to a signed integer of so many bits and a sign; NaN and what is beyond become the lowest."""
+    """Round to a signed integer with ``bits`` magnitude bits; NaN and overflow become the lowest value."""
     most = (1 << bits) - 1
     return round(value) if -most <= value <= most else -most - 1
 
@@ -165,11 +165,11 @@ def counter_of(cycle: int) -> int:
 
 
 class OffsetQueue:
-    """Places offsets on servo cycles: which rows go into the streamer now. Pure.
+    """Assigns offsets to servo cycles: returns the rows to be written to the streamer now. Pure.
 
-    The streamer hands one row to HAL in each cycle. A row's number comes back through the sampler, so that the cycle of
-    every later row is known. ``rows`` are (number, offsets in HAL's unit of each axis); before the first answer the
-    queue is primed with zeros. A cycle whose offset did not come keeps the one before; what comes too late is dropped.
+    The streamer passes one row to HAL in each cycle. A row's number comes back through the sampler, so that the cycle
+    of every later row is known. ``rows`` are (number, offsets in HAL's unit of each axis); before the first answer the
+    queue is filled with zeros. A cycle without an offset keeps the one before; a late offset is dropped.
     """
 
     def __init__(self, axes: Sequence[Axis], lead: int) -> None:
@@ -188,11 +188,11 @@ class OffsetQueue:
 
     @property
     def running(self) -> bool:
-        """Whether rows are in the streamer, or were."""
+        """Whether rows were written to the streamer."""
         return self._next > 1
 
     def applied(self, cycle: int, row: int, empty: bool) -> None:
-        """Take what the sampler saw in a cycle: the row in effect. A streamer that ran empty starts again."""
+        """Take the row that the sampler saw in effect in a cycle. An empty streamer restarts the queue."""
         self._newest = cycle
         if not self.running or not row:
             return
@@ -223,15 +223,15 @@ class OffsetQueue:
             return
         for target in sorted(self._answers):
             if len(self._answers[target]) < len(self._per_unit) and target == max(self._answers):
-                return  # the rest is on its way
+                return  # the rest is still to come
             number = target - self._zero
-            told = self._answers.pop(target)
+            offsets = self._answers.pop(target)
             if number < self._next:
                 self.dropped += 1
                 continue
             while self._next < number:
                 yield self._row()
-            for place, offset in told.items():
+            for place, offset in offsets.items():
                 self._held[place] = offset
             yield self._row()
 
@@ -241,7 +241,7 @@ class OffsetQueue:
 
 
 class Client:
-    """One connection, as a socketcand hub has it."""
+    """One connection of a socketcand client."""
 
     def __init__(self, wire: socket.socket) -> None:
         wire.setblocking(False)
@@ -252,7 +252,7 @@ class Client:
         self._in = b""
 
     def commands(self) -> Iterator[list[bytes]]:
-        """Yield the words of each command that has come."""
+        """Yield the words of each received command."""
         try:
             came = self.wire.recv(1 << 16)
         except BlockingIOError:
@@ -266,7 +266,7 @@ class Client:
             yield command.split()
 
     def flush(self) -> None:
-        """Send what waits as far as it goes; a client that reads nothing is let go."""
+        """Send as much as the client takes; drop a client that reads nothing."""
         try:
             while self.out:
                 del self.out[: self.wire.send(self.out[: 1 << 16])]
@@ -277,20 +277,20 @@ class Client:
 
 
 class Hub:
-    """The bus on a TCP port: what is sampled goes to all clients; what a client sends goes to the others, offsets not.
+    """The bus on a TCP port: samples go to all clients; a client's frames go to the others, except offsets.
 
     Offsets are for HAL alone: their effect is read back from there.
     """
 
     def __init__(self, host: str, port: int) -> None:
-        self._door = socket.create_server((host, port))
-        self._door.setblocking(False)
+        self._listener = socket.create_server((host, port))
+        self._listener.setblocking(False)
         self._clients: list[Client] = []
 
     def received(self) -> list[tuple[int, bytes]]:
-        """Admit clients and return the frames that they sent."""
-        with contextlib.suppress(OSError):  # nobody waits
-            self._clients.append(Client(self._door.accept()[0]))
+        """Accept clients and return the frames that they sent."""
+        with contextlib.suppress(OSError):  # no client is waiting
+            self._clients.append(Client(self._listener.accept()[0]))
         frames = []
         for client in self._clients:
             for words in client.commands():
@@ -385,11 +385,11 @@ class HalSampler:
                 return
             values = [{key: row[place] for key, place in places.items()} for places in self._places]
             applied, empty = (row[k] for k in self._shared) if self.corrected else (0, True)
-            yield self._stream.sampleno + row[-1], values, applied, empty  # what was lost has no number of its own
+            yield self._stream.sampleno + row[-1], values, applied, empty  # lost samples count, too
 
 
 class Pin:
-    """A line of ``halcmd -s show pin``: owner, type, direction, value, name, and the signal it is linked to."""
+    """A line of ``halcmd -s show pin``: owner, type, direction, value, name, and linked signal."""
 
     def __init__(self, line: str) -> None:
         words = line.split()
@@ -400,7 +400,7 @@ class Pin:
 
 
 def _require(pin: str, pins: Mapping[str, Pin], functions: Sequence[Sequence[str]], key: str, kind: str) -> None:
-    """Raise PinError unless HAL has the pin, of this type, and a thread computes it.
+    """Raise PinError unless HAL has the pin, with this type, and a thread computes it.
 
     ``functions`` are the words of ``halcmd -s show funct``: owner, two addresses, floating point, users, name.
     """
@@ -420,7 +420,6 @@ def _require(pin: str, pins: Mapping[str, Pin], functions: Sequence[Sequence[str
 
 
 def _halcmd(*words: str) -> str:
-    """Run halcmd; PinError with what it printed."""
     done = subprocess.run(["halcmd", *words], capture_output=True, text=True, check=False)
     if done.returncode:
         raise PinError(f"halcmd {' '.join(words)}: {done.stderr.strip() or done.stdout.strip()}")
@@ -428,7 +427,7 @@ def _halcmd(*words: str) -> str:
 
 
 class Bridge:
-    """Moves samples to the bus and offsets to the streamer, in one loop."""
+    """Carries samples to the bus and offsets to the streamer, in one loop."""
 
     def __init__(self, hal: Any, component: Any, options: argparse.Namespace) -> None:
         document = tomllib.loads(Path(options.config).read_text("utf-8"))
@@ -452,7 +451,7 @@ class Bridge:
         self._started_s = time.time()
 
     def turn(self) -> None:
-        """Run once: what was sampled, what clients sent, what the streamer needs."""
+        """Run one turn: send samples, receive frames, feed the streamer."""
         text = bytearray()
         for cycle, values, row, empty in self._sampler.cycles():
             if self._queue is not None:
@@ -494,7 +493,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--thread", default="servo-thread", help="the thread of the motion controller")
     options = parser.parse_args(arguments)
     here = Path(__file__).resolve().parent
-    sys.path[:] = [folder for folder in sys.path if Path(folder).resolve() != here]  # linuxcnc.py stands there
+    sys.path[:] = [folder for folder in sys.path if Path(folder).resolve() != here]  # it contains linuxcnc.py
     import hal  # type: ignore[import-not-found]  # LinuxCNC's own
 
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
@@ -506,10 +505,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         serve(hal, component, options)
     except KeyboardInterrupt:
         return 0
-    except Exception as error:  # noqa: BLE001 - what went wrong here must not end LinuxCNC
-        sys.stderr.write(
-            f"{NAME}: fdhil receives nothing and corrects nothing ({error}); LinuxCNC goes on without it\n"
-        )
+    except Exception as error:  # noqa: BLE001 - an error here must not end LinuxCNC
+        sys.stderr.write(f"{NAME}: fdhil receives and corrects nothing ({error}); LinuxCNC starts without it\n")
         component.ready()
         time.sleep(1.0)  # halcmd must see that the component was ready
         return 0

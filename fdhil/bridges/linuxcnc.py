@@ -1,14 +1,14 @@
 #!/usr/bin/python3
-"""Tells fdhil what LinuxCNC does, exact to a servo cycle: JSON lines over TCP. It changes nothing in LinuxCNC.
+"""Publishes LinuxCNC's state, exact to a servo cycle, as JSON lines over TCP. It changes nothing in LinuxCNC.
 
 LinuxCNC's own Python runs it, loaded by the last line of the HAL file that has the joints and the motion controller
-(``python -m fdhil.bridges`` prints it):
+(``python -m fdhil.bridges`` prints the line):
 
     loadusr -Wn fdhil-bridge /usr/bin/python3 /path/to/linuxcnc.py
 
-It loads HAL's ``sampler`` behind the motion controller and taps the joints' set-points, the kind of the motion, its
-line and speed. Overrides, pause, tool and program come from LinuxCNC's status. Where it cannot work it says so, and
-LinuxCNC starts all the same. Standard library and LinuxCNC's own modules only.
+It loads HAL's ``sampler`` after the motion controller and samples the joints' set-points, the kind of the motion, its
+line and speed. Overrides, pause, tool and program come from LinuxCNC's status. Where it cannot work it reports the
+reason, and LinuxCNC starts without it. Standard library and LinuxCNC's own modules only.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ LOOK_S = 0.005
 STATUS_S = 0.02
 MOVING_CYCLES, RESTING_CYCLES = 10, 200  # between states while nothing changes
 STAMP_ERROR_NS = 2_000_000
-FORGET = 0.02  # share by which a cycle that was late is forgotten in every look: two clocks drift apart
+FORGET = 0.02  # share of a late cycle forgotten per poll: two clocks drift apart
 DEPTH = 8192
-SEEN_READY_S = 1.0  # until halcmd has seen that the bridge was ready: it would end LinuxCNC else
-MOST_WAITING = 1 << 20  # bytes that a listener may be behind
+SEEN_READY_S = 1.0  # until halcmd has seen the bridge ready; it would end LinuxCNC otherwise
+MOST_WAITING = 1 << 20  # unsent bytes per listener
 MOST_LISTENERS = 32
 VALUES = (
     ("motion.motion-type", "s"),
@@ -43,11 +43,11 @@ VALUES = (
     ("motion.current-vel", "f"),
     ("motion.requested-vel", "f"),
 )
-HOLDS = ("motion.feed-hold", "motion.feed-inhibit")  # tapped where HAL has linked them
+HOLDS = ("motion.feed-hold", "motion.feed-inhibit")  # sampled where HAL has linked them
 
 
 class Status(NamedTuple):
-    """What LinuxCNC's status tells; None is what it does not."""
+    """LinuxCNC's status; None is what it does not report."""
 
     feed_override: float | None = None
     rapid_override: float | None = None
@@ -57,7 +57,7 @@ class Status(NamedTuple):
 
 
 class Cycle(NamedTuple):
-    """One servo cycle: the joints' set-points (machine units), and what the motion controller says."""
+    """One servo cycle: the joints' set-points (machine units), and the motion controller's outputs."""
 
     number: int
     joints: tuple[float, ...]
@@ -69,20 +69,20 @@ class Cycle(NamedTuple):
 
 
 class Teller:
-    """Turns cycles into the states that are told: each change with the cycle before it, and a few between. Pure."""
+    """Selects the states to publish: each change with the cycle before it, and a few in between. Pure."""
 
     def __init__(self, axes: Sequence[str], mm_per_unit: float, period_ns: int) -> None:
         self._axes = axes
         self._mm = mm_per_unit
         self._period_ns = period_ns
-        self._zero_ns: float | None = None  # when cycle 0 was
+        self._zero_ns: float | None = None  # time of cycle 0
         self._last: dict[str, Any] | None = None
         self._mark: Any = None
-        self._told = -RESTING_CYCLES
+        self._published = -RESTING_CYCLES
         self._joints: tuple[float, ...] = ()
 
     def clock(self, number: int, now_ns: int) -> None:
-        """Cycle ``number`` was the newest now: no cycle was later than it was seen."""
+        """Update the clock: cycle ``number`` was the newest at ``now_ns``; no cycle is later than its reception."""
         zero_ns = float(now_ns - number * self._period_ns)
         if self._zero_ns is None or zero_ns < self._zero_ns:
             self._zero_ns = zero_ns
@@ -90,7 +90,7 @@ class Teller:
             self._zero_ns += FORGET * min(zero_ns - self._zero_ns, STAMP_ERROR_NS)
 
     def tell(self, cycle: Cycle, status: Status) -> list[dict[str, Any]]:
-        """Return the states that this cycle tells, the oldest first."""
+        """Return the states to publish at this cycle, the oldest first."""
         still = cycle.joints == self._joints
         self._joints = cycle.joints
         held = cycle.held or status.paused
@@ -98,22 +98,22 @@ class Teller:
         mark = (motion, cycle.line, held, *status)
         state = self._state(cycle, motion, held, status)
         before, self._last = self._last, state
-        told: list[dict[str, Any]] = []
+        states: list[dict[str, Any]] = []
         if mark != self._mark:
-            if before is not None and self._told < cycle.number - 1:
-                told.append(before)
-            told.append(state)
-        elif cycle.number - self._told >= (RESTING_CYCLES if still else MOVING_CYCLES):
-            told.append(state)
-        if told:
-            self._told, self._mark = cycle.number, mark
-        return told
+            if before is not None and self._published < cycle.number - 1:
+                states.append(before)
+            states.append(state)
+        elif cycle.number - self._published >= (RESTING_CYCLES if still else MOVING_CYCLES):
+            states.append(state)
+        if states:
+            self._published, self._mark = cycle.number, mark
+        return states
 
     def _state(self, cycle: Cycle, motion: str, held: bool, status: Status) -> dict[str, Any]:
         assert self._zero_ns is not None
         places: dict[str, float] = {}
         for joint, axis in enumerate(self._axes):
-            # of two joints of an axis the first; degrees of A, B and C
+            # the first of two joints of an axis; degrees for A, B and C
             places.setdefault(axis, cycle.joints[joint] * (1.0 if axis in "ABC" else self._mm))
         return {
             "cycle": cycle.number,
@@ -133,7 +133,7 @@ class Teller:
 
 
 class Listeners:
-    """Whoever listens: lines go to all; one that does not keep up is let go. What they say is not heard."""
+    """Sends lines to all TCP clients; drops one that does not keep up. Their input is ignored."""
 
     def __init__(self, host: str, port: int, greeting: bytes) -> None:
         self._socket = socket.create_server((host, port))
@@ -143,7 +143,7 @@ class Listeners:
         self._waiting: dict[socket.socket, bytearray] = {}
 
     def send(self, lines: bytes) -> None:
-        """Let in who knocks, and send the lines to all, as far as they take them."""
+        """Accept new clients, and send the lines to all as far as they take them."""
         self._admit()
         for listener, waiting in list(self._waiting.items()):
             waiting += lines
@@ -158,7 +158,7 @@ class Listeners:
                 self._let_go(listener)
 
     def close(self) -> None:
-        """Let everybody go."""
+        """Close all connections."""
         for listener in list(self._waiting):
             self._let_go(listener)
         self._socket.close()
@@ -167,10 +167,10 @@ class Listeners:
         while True:
             try:
                 listener, _ = self._socket.accept()
-            except OSError:  # nobody knocks
+            except OSError:  # no client is waiting
                 return
             listener.setblocking(False)
-            if len(self._waiting) >= MOST_LISTENERS:  # the one farthest behind makes room, or the oldest
+            if len(self._waiting) >= MOST_LISTENERS:  # the slowest makes room, or the oldest
                 self._let_go(max(self._waiting, key=lambda each: len(self._waiting[each])))
             self._waiting[listener] = bytearray(self._greeting)
 
@@ -180,23 +180,23 @@ class Listeners:
 
 
 class Tap:
-    """HAL's sampler behind the motion controller: every servo cycle, none twice."""
+    """HAL's sampler after the motion controller: every servo cycle once."""
 
     def __init__(self, hal: Any, component: Any, joints: int, channel: int, thread: str) -> None:
-        taps = [(f"joint.{joint}.motor-pos-cmd", "f") for joint in range(joints)] + list(VALUES)
-        taps += [(pin, "b") for pin in HOLDS if _signal_of(pin)]
+        pins = [(f"joint.{joint}.motor-pos-cmd", "f") for joint in range(joints)] + list(VALUES)
+        pins += [(pin, "b") for pin in HOLDS if _signal_of(pin)]
         self._joints = joints
-        kinds = "".join(kind for _, kind in taps)
+        kinds = "".join(kind for _, kind in pins)
         if not hal.component_exists("sampler"):
             _halcmd("loadrt", "sampler", f"depth={DEPTH}", f"cfg={kinds}")
-        for k, (pin, _) in enumerate(taps):
+        for k, (pin, _) in enumerate(pins):
             signal_name = _signal_of(pin) or f"fdhil-{pin.replace('.', '-')}"
             _halcmd("net", signal_name, pin, "=>", f"sampler.{channel}.pin.{k}")
         _halcmd("addf", f"sampler.{channel}", thread)
         self._stream = hal.stream(component, hal.sampler_base + channel, kinds)
 
     def cycles(self) -> Iterator[Cycle]:
-        """Yield the cycles that have come since the last call."""
+        """Yield the cycles since the last call."""
         while self._stream.readable:
             row = self._stream.read()
             if row is None:
@@ -206,7 +206,6 @@ class Tap:
 
 
 def _halcmd(*words: str) -> str:
-    """Run halcmd; RuntimeError with what it said."""
     done = subprocess.run(["halcmd", *words], capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"halcmd {' '.join(words)}: {done.stderr.strip() or done.stdout.strip()}")
@@ -214,14 +213,13 @@ def _halcmd(*words: str) -> str:
 
 
 def _signal_of(pin: str) -> str:
-    """Return the signal that a pin is linked to, empty without one."""
     words = _halcmd("-s", "show", "pin", pin).split()
     arrows = [k for k, word in enumerate(words) if word in ("==>", "<==", "<=>")]
     return words[arrows[0] + 1] if arrows else ""
 
 
 class StatusReader:
-    """LinuxCNC's status, asked now and then; it comes up after the bridge."""
+    """LinuxCNC's status, polled periodically; it starts later than the bridge."""
 
     def __init__(self, linuxcnc: Any) -> None:
         self._linuxcnc = linuxcnc
@@ -230,7 +228,7 @@ class StatusReader:
         self.now = Status()
 
     def poll(self) -> None:
-        """Ask if it is time."""
+        """Poll when it is due."""
         if time.monotonic() < self._due_s:
             return
         self._due_s = time.monotonic() + STATUS_S
@@ -242,7 +240,7 @@ class StatusReader:
             self._stat, self.now = None, Status()
             return
         s = self._stat
-        if not s.task_state:  # nobody has written there yet
+        if not s.task_state:  # nothing was written there yet
             return
         self.now = Status(
             round(s.feedrate, 4), round(s.rapidrate, 4), bool(s.paused), s.tool_in_spindle, s.file or None
@@ -250,12 +248,12 @@ class StatusReader:
 
 
 def machine_of(linuxcnc: Any, path: str) -> tuple[list[str], float, int]:
-    """Return the axis of each joint, millimetres per unit and the servo period (ns), as LinuxCNC's INI file says."""
+    """Return the axis of each joint, millimetres per unit and the servo period (ns) from LinuxCNC's INI file."""
     ini = linuxcnc.ini(path)
     letters = [c for c in (ini.find("TRAJ", "COORDINATES") or "XYZ").upper() if c.isalpha()]
     kinematics = (ini.find("KINS", "KINEMATICS") or "").split()
-    told = [word.split("=")[1].upper() for word in kinematics if word.lower().startswith("coordinates=")]
-    axes = [c for c in told[0] if c.isalpha()] if told else letters
+    named = [word.split("=")[1].upper() for word in kinematics if word.lower().startswith("coordinates=")]
+    axes = [c for c in named[0] if c.isalpha()] if named else letters
     joints = int(ini.find("KINS", "JOINTS") or len(axes))
     units = (ini.find("TRAJ", "LINEAR_UNITS") or "mm").lower()
     mm = 25.4 if units in ("in", "inch", "imperial") else 1.0
@@ -263,7 +261,7 @@ def machine_of(linuxcnc: Any, path: str) -> tuple[list[str], float, int]:
 
 
 def serve(options: argparse.Namespace, hal: Any, linuxcnc: Any, component: Any) -> NoReturn:
-    """Set up and tell for ever."""
+    """Set up and publish until the process ends."""
     axes, mm, period_ns = machine_of(linuxcnc, options.ini)
     axes = list(options.axes.upper()) if options.axes else axes
     greeting = {"schema": SCHEMA, "axes": axes, "servo_period_s": period_ns * 1e-9}
@@ -271,7 +269,7 @@ def serve(options: argparse.Namespace, hal: Any, linuxcnc: Any, component: Any) 
     tap = Tap(hal, component, len(axes), options.channel, options.thread)
     teller, status = Teller(axes, mm, period_ns), StatusReader(linuxcnc)
     component.ready()
-    _say(f"tells what LinuxCNC does at {options.host}:{listeners.port}")
+    _say(f"publishes LinuxCNC's state at {options.host}:{listeners.port}")
     while True:
         status.poll()
         cycles = list(tap.cycles())
@@ -285,12 +283,12 @@ def _say(text: str) -> None:
     sys.stderr.write(f"{NAME}: {text}\n")
 
 
-def _line(told: Mapping[str, Any]) -> bytes:
-    return json.dumps(told, separators=(",", ":")).encode() + b"\n"
+def _line(document: Mapping[str, Any]) -> bytes:
+    return json.dumps(document, separators=(",", ":")).encode() + b"\n"
 
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Tells fdhil what LinuxCNC does; loaded by LinuxCNC's HAL file.")
+    parser = argparse.ArgumentParser(description="Publishes LinuxCNC's state to fdhil; loaded by LinuxCNC's HAL file.")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at; 0.0.0.0: also for other computers")
     parser.add_argument("--port", type=int, default=5571, help="TCP port, as in [nc_source.linuxcnc]")
     parser.add_argument("--axes", help="the axis of each joint, as XYYZ; left out: as the INI file says")
@@ -301,11 +299,11 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run until LinuxCNC ends; what is wrong is said, and never keeps LinuxCNC from starting."""
+    """Run until LinuxCNC ends; report errors without keeping LinuxCNC from starting."""
     options = _options(arguments)
     here = Path(__file__).resolve().parent
-    sys.path[:] = [folder for folder in sys.path if Path(folder).resolve() != here]  # this file is called as its own
-    # LinuxCNC's own; the rest of the file is tried without them
+    sys.path[:] = [folder for folder in sys.path if Path(folder).resolve() != here]  # it has a linuxcnc.py
+    # LinuxCNC's own modules, absent in tests
     import hal  # type: ignore[import-not-found]
     import linuxcnc  # type: ignore[import-not-found]
 
@@ -315,8 +313,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         serve(options, hal, linuxcnc, component)
     except KeyboardInterrupt:
         return 0
-    except Exception as error:  # noqa: BLE001 - what went wrong here must not end LinuxCNC
-        _say(f"fdhil is told nothing ({error}); LinuxCNC goes on without")
+    except Exception as error:  # noqa: BLE001 - an error here must not end LinuxCNC
+        _say(f"fdhil receives nothing ({error}); LinuxCNC starts without it")
         component.ready()
         time.sleep(SEEN_READY_S)
         return 0

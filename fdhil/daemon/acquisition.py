@@ -1,6 +1,4 @@
-"""Reads the machine's records until it is told to stop; a source that fails is opened again, later and later."""
-
-from __future__ import annotations
+"""Reads the machine's records until it is cancelled; a failed source is opened again with increasing delay."""
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
@@ -21,13 +19,13 @@ Take = Callable[[Record | NcState | Notice], None]
 
 
 class Source(Protocol):
-    """A machine as the daemon needs it: its records in blocks, and counts of what was received and lost."""
+    """The daemon's view of a machine: its records in blocks, and counts of received and lost frames."""
 
     async def run(self, take: Take) -> None:
-        """Hand records over as they come, until the source ends; DeviceError when a device fails for good."""
+        """Pass records to ``take`` until the source ends; DeviceError when a device fails permanently."""
 
     def counters(self) -> Mapping[str, Any]:
-        """Return frames received, lost and the like."""
+        """Return counts of frames received, lost and the like."""
 
     def black_box(self) -> Mapping[str, str]:
         """Return the frames of the last seconds of each bus, as the lines of a log."""
@@ -37,7 +35,7 @@ OpenSource = Callable[[MachineConfig], AbstractAsyncContextManager[Source]]
 
 
 class Acquisition:
-    """One machine's source, over one opening after another; ``source`` is None while none is open."""
+    """A machine's source across reconnections; ``source`` is None while none is open."""
 
     def __init__(
         self, config: MachineConfig, open_source: OpenSource, hearing: Hearing, tell: Callable[[Sequence[Notice]], None]
@@ -49,9 +47,9 @@ class Acquisition:
         self._delay_s = FIRST_RETRY_S
 
     async def run(self, take: Take, end_s: float) -> None:
-        """Hand records over until this is cancelled; closing the source then has ``end_s``.
+        """Pass records to ``take`` until cancelled; closing the source then has ``end_s``.
 
-        What cannot be opened at the start ends the daemon with the reason: it is a fault of the set-up.
+        A source that cannot be opened at the start ends the daemon with the reason: it is a fault of the setup.
         """
         while True:
             try:
@@ -63,7 +61,7 @@ class Acquisition:
                 cause = str(error)
             self.source = None
             self._hearing.source_lost(asyncio.get_running_loop().time())
-            text = f"{cause}; it is opened again in {self._delay_s:.1f} s, what was learnt is kept."
+            text = f"{cause}; it is opened again in {self._delay_s:.1f} s; identified parameters are kept."
             self._tell([Notice("SourceLost", "MAJOR", text)])
             await asyncio.sleep(self._delay_s)
             self._delay_s = min(LAST_RETRY_S, 2 * self._delay_s)
@@ -78,5 +76,5 @@ class Acquisition:
             await source.run(take)
 
     def received(self) -> None:
-        """Note that records came: a source that fails now is opened again soon."""
+        """Reset the retry delay: records arrive."""
         self._delay_s = FIRST_RETRY_S

@@ -1,10 +1,8 @@
-"""Derives alarms from the notices of a machine: active, gone and acknowledged, the states of ISA-18.2. Pure.
+"""Derives alarms from a machine's notices: active, gone and acknowledged, the states of ISA-18.2. Pure.
 
-A condition is a class of notice that lasts: the notice of severity info of the same class ends it. Every other class is
-an event that is over when it is reported.
+A condition is a class of notice that lasts until a notice of severity info of the same class ends it. Every other class
+is an event that is over when it is reported.
 """
-
-from __future__ import annotations
 
 import re
 from collections import deque
@@ -29,7 +27,7 @@ ENDED_BY: Mapping[str, tuple[str, ...]] = {
     "GuardFound": ("GuardLost",),
 }
 KEPT_OVER_RESTART = frozenset({"MaintenanceDue"})
-"""Conditions of the history: a new daemon goes on with them, and watches the others from the beginning."""
+"""Conditions of the history, which a new daemon continues; it starts without the others."""
 ENDS = 500
 MOST_TOGETHER = 1000
 _BUS, _PARAMETER = re.compile(r"[Bb]us ([\w.-]+)"), re.compile(r"(\w+)")
@@ -51,27 +49,27 @@ class Alarm:
 
     @property
     def state(self) -> Literal["active", "gone"]:
-        """Whether the cause is still there."""
+        """Whether the cause persists."""
         return "active" if self.until is None else "gone"
 
     @property
     def is_shown(self) -> bool:
-        """Return whether somebody has to know of it: it is active, or waits to be acknowledged."""
+        """Whether it needs attention: it is active, or waits to be acknowledged."""
         return self.until is None or bool(self.waiting)
 
     @property
     def rank(self) -> tuple[bool, bool, int]:
-        """Order alarms: active before gone, MAJOR before minor, newest first."""
+        """Sort key: active before gone, MAJOR before minor, newest first."""
         return self.until is not None, self.newest.notice.severity != "MAJOR", -self.newest.number
 
 
 class AlarmTable:
-    """The alarms of a machine, from its notices in their order."""
+    """A machine's alarms, built from its notices in order."""
 
     def __init__(self, notices: Iterable[StoredNotice] = ()) -> None:
         self._alarms: dict[Key, Alarm] = {}
         self.ended: dict[int, Stamp] = {}
-        """By the number of the notice that raised an alarm last, and of the one that ended it, when it ended."""
+        """End of each ended alarm, by the number of the notice that raised it last and of the one that ended it."""
         for stored in notices:
             self.take(stored)
 
@@ -115,7 +113,7 @@ class AlarmTable:
                 self._settle(key)
 
     def acknowledge(self, given: Acknowledgement) -> None:
-        """Note that notices were acknowledged."""
+        """Record that notices were acknowledged."""
         for key, alarm in list(self._alarms.items()):
             if alarm.waiting.intersection(given.notices):
                 alarm.waiting.difference_update(given.notices)
@@ -131,21 +129,21 @@ class AlarmTable:
         return sorted(self._alarms.values(), key=lambda alarm: alarm.rank)
 
     def left_active(self) -> list[Notice]:
-        """Return the ends of conditions that a daemon before this one left: what is still so is reported again."""
+        """Return notices that end the conditions of an earlier daemon; what persists is reported again."""
         left = [key for key, alarm in self._alarms.items() if alarm.until is None and key[0] not in KEPT_OVER_RESTART]
-        text = "The daemon was restarted; it is reported again if it persists."
+        text = "The daemon was restarted; the condition is reported again if it persists."
         return [Notice(code, "info", f"Bus {about}: {text}" if about else text, axis) for code, axis, about in left]
 
 
 def key_of(notice: Notice) -> Key:
-    """Return class, axis and, where an axis may have several of the class, the bus or parameter that it names."""
+    """Return class, axis and, where an axis may have several alarms of the class, the bus or parameter it names."""
     pattern = _SUBJECTS.get(notice.code)
     named = pattern.search(notice.text) if pattern else None
     return notice.code, notice.axis, named[1] if named else ""
 
 
 def alarm_document(alarm: Alarm) -> dict[str, Any]:
-    """Return an alarm as JSON has it; the time it began (``since``) is that of the newest time it was raised."""
+    """Return an alarm as a JSON document; ``since`` is the last time that it was raised."""
     notice = alarm.newest.notice
     return {
         "code": notice.code,
@@ -163,7 +161,7 @@ def alarm_document(alarm: Alarm) -> dict[str, Any]:
 
 
 def alarms_status(alarms: Sequence[Alarm], most: int) -> dict[str, Any]:
-    """Return how many alarms are active or wait to be acknowledged, and the first ones, as JSON has them."""
+    """Return how many alarms are active or unacknowledged, and the first ``most``, as a JSON document."""
     active = sum(alarm.until is None for alarm in alarms)
     waiting = sum(bool(alarm.waiting) for alarm in alarms)
     first = [alarm_document(alarm) for alarm in alarms[:most]]

@@ -1,11 +1,9 @@
-"""Has every request that changes something in the audit, with who asked for it and what he was answered.
+"""Records every request that changes something in the audit log, with its client and the answer.
 
-What makes the machine do more (arm, acknowledge) is written before it is done, and refused where it cannot be written.
-What makes it do less (disarm, stop) is done and answered first: no disk delays it. A flood becomes a few
-lines; the last of those that were held back is written a moment later, with how many there were.
+A request that makes the machine do more (arm, acknowledge) is recorded before it is executed, and refused where it
+cannot be recorded. One that makes it do less (disarm, stop) is executed and answered first: no disk delays it. A flood
+becomes a few lines; the last suppressed line follows a moment later with the number of suppressed ones.
 """
-
-from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
@@ -26,11 +24,11 @@ DONE_FIRST = ("disarm", "stop")
 TOLD = ("program", "method", "whole", "notices", "up_to", "note", "by")
 MOST_CHARACTERS = 500
 HELD_S = 1.0 / journal.REFILL_PER_S
-REFUSED_S = 60.0  # one line for all that a user may not ask for in that time: he may not fill the disk
+REFUSED_S = 60.0  # one line for all refused requests of a user in that time: they cannot fill the disk
 
 
 class _Held(NamedTuple):
-    """The last line of a kind that was held back, of how many, and whether they were allowed to ask."""
+    """The last suppressed line of a kind, the number of suppressed lines, and whether they were allowed."""
 
     entry: dict[str, Any]
     lines: int
@@ -38,7 +36,7 @@ class _Held(NamedTuple):
 
 
 class Audited:
-    """Hands requests on to ``handle``, those that change something by way of the audit of ``folder``."""
+    """Passes requests to ``handle``; those that change something are recorded in the audit of ``folder``."""
 
     def __init__(
         self, handle: Callable[[Mapping[str, Any]], Awaitable[Answer]], folder: Path, clock: Clock = SYSTEM_CLOCK
@@ -51,7 +49,7 @@ class Audited:
         self._disk = asyncio.Lock()
 
     async def of(self, request: Mapping[str, Any], peer: Peer) -> Answer:
-        """Return the answer to a request; AuthRequired where the peer may not ask for that."""
+        """Return the answer to a request; AuthRequired where the peer lacks the right."""
         what = str(request["request"])
         if not peer.may(what):
             answer = _not_allowed(what, peer)
@@ -61,7 +59,7 @@ class Audited:
             return await self._handle(request)
         if what not in DONE_FIRST and (trouble := await self._write(what, request, peer, None)) is not None:
             return trouble
-        answer = refusal("Stopped", "the daemon ended before it was answered", "start it, then ask again")
+        answer = refusal("Stopped", "the daemon ended before the answer", "start it, then repeat the request")
         try:
             answer = await self._handle(request)
         except Exception as error:
@@ -80,22 +78,22 @@ class Audited:
         return writing
 
     async def written(self) -> None:
-        """Wait until what was answered already is in the audit too, also what was held back."""
+        """Wait until all answered requests are in the audit, including suppressed lines."""
         await asyncio.gather(*self._writing)
         for key in [*self._held]:
             self._release(key)
         await asyncio.gather(*self._writing)
 
     async def _write(self, what: str, request: Mapping[str, Any], peer: Peer, answer: Answer | None) -> Answer | None:
-        """Write one line, before the answer is known with None; return why it could not be."""
+        """Write one line, with answer None before the request is executed; return a refusal when that fails."""
         allowed = peer.may(what)
-        kind = what if what in (*NEEDS, *DONE_FIRST) else "what there is not"
+        kind = what if what in (*NEEDS, *DONE_FIRST) else "unknown"
         key = f"{peer.uid} {kind} {answer is None}" if allowed else f"{peer.uid}"
         if self._admits(key, allowed):
             held = self._held.pop(key, None)
             return await self._append(_entry(what, request, peer, answer), held.lines if held else 0)
-        text = f"{peer.user} asks for {what} too often to be written down"
-        busy = refusal("Busy", text, "ask again in a second") if answer is None else None
+        text = f"{peer.user} sends {what} requests too often for the audit log"
+        busy = refusal("Busy", text, "try again in a second") if answer is None else None
         if key not in self._held:
             asyncio.get_running_loop().call_later(HELD_S if allowed else REFUSED_S, self._release, key)
         count = self._held[key].lines if key in self._held else 0
@@ -112,25 +110,25 @@ class Audited:
         return True
 
     def _release(self, key: str) -> None:
-        """Write the last line that was held back, unless a later one has told of it."""
+        """Write the last suppressed line, unless a later line has reported it."""
         if (held := self._held.pop(key, None)) is not None:
-            self._admits(key, held.allowed)  # it is one more of its kind
+            self._admits(key, held.allowed)  # counts as one more line of its kind
             self._begin(self._append(held.entry, held.lines - 1))
 
     async def _append(self, entry: dict[str, Any], held: int) -> Answer | None:
-        """Write one line, and how many were ``held`` back before it; return why it could not be."""
+        """Append one line with the number of lines ``held`` back before it; return a refusal when that fails."""
         if held:
             entry["not_written"] = held
         what = entry.get("asked") or entry["answered"]
         if "answered" in entry:
-            journal.write_line(f"{_asker(entry)} asked to {what}: {entry['result']}")
+            journal.write_line(f"{_asker(entry)} requested {what}: {entry['result']}")
         try:
-            async with self._disk:  # in the order of what was asked
+            async with self._disk:  # keeps the order of the requests
                 await in_own_thread(audit.append, self._folder, entry, self._clock)
         except StoreError as error:
-            text = f"{what} of {entry['who']['user']} is not in the audit: {error}"
+            text = f"{what} of {entry['who']['user']} could not be recorded in the audit log: {error}"
             journal.write_line(text, "MAJOR")
-            return refusal(error.code, text, "nothing was done; mend the store, then ask again")
+            return refusal(error.code, text, "nothing was done; repair the store, then try again")
         return None
 
 
@@ -140,13 +138,13 @@ def _asker(entry: Mapping[str, Any]) -> str:
 
 
 def _entry(what: str, request: Mapping[str, Any], peer: Peer, answer: Answer | None) -> dict[str, Any]:
-    told = {key: _short(request[key]) for key in TOLD if request.get(key) is not None and peer.may(what)}
+    fields = {key: _short(request[key]) for key in TOLD if request.get(key) is not None and peer.may(what)}
     what = _short(what)
     who = {"user": peer.user, "uid": peer.uid, "pid": peer.pid}
     if answer is None:
-        return {"who": who, "asked": what, **told}
+        return {"who": who, "asked": what, **fields}
     result = "done" if answer["ok"] else str(answer["code"])
-    return {"who": who, "answered": what, **told, "result": result, "text": _short(answer.get("text", ""))}
+    return {"who": who, "answered": what, **fields, "result": result, "text": _short(answer.get("text", ""))}
 
 
 def _short(value: Any) -> Any:
@@ -155,10 +153,10 @@ def _short(value: Any) -> Any:
 
 def _not_allowed(what: str, peer: Peer) -> Answer:
     if peer.role is Role.NOBODY:
-        text = f"user {peer.user} may not talk to the daemon"
-        return refusal("AuthRequired", text, "[access] of the configuration says who may")
+        text = f"user {peer.user} has no access to the daemon"
+        return refusal("AuthRequired", text, "[access] of the configuration assigns the rights")
     needs = NEEDS.get(what, Role.COMMISSION)
     whom = "the daemon's own user or root" if needs is Role.COMMISSION else "[access] operate"
     return refusal(
-        "AuthRequired", f"user {peer.user} may look and disarm, but not {_short(what)}", f"{whom} may do that"
+        "AuthRequired", f"user {peer.user} may watch and disarm, but not request {_short(what)}", f"this needs {whom}"
     )

@@ -1,9 +1,7 @@
-"""Keeps the frames that were on the buses before and after the guard stopped a correction, one file per trip.
+"""Keeps the frames on the buses before and after the guard stopped a correction, one file per trip.
 
-Files are numbered: which one is the newest does not hang on the wall clock.
+Files are numbered, so that their order does not depend on the wall clock.
 """
-
-from __future__ import annotations
 
 import heapq
 import io
@@ -26,7 +24,7 @@ _NAME = re.compile(r"(?:(\d{6})-)?(\d{8}T\d{6}\.\d{6}Z)-([A-Za-z0-9_]{1,40})\.lo
 
 @dataclass(frozen=True, slots=True)
 class BlackBox:
-    """One file: its running ``number`` (0 in those of before there were numbers), when it was written, the class."""
+    """One file: its running ``number`` (0 in files of older versions), its date and its class."""
 
     path: Path
     number: int
@@ -35,7 +33,7 @@ class BlackBox:
 
 
 def kept(store: Path) -> list[BlackBox]:
-    """Return the black boxes of a store, oldest first; a file of another name is none."""
+    """Return the black boxes of a store, oldest first; files with other names are ignored."""
     found = []
     for path in sorted((store / FOLDER).glob("*.log")):
         match = _NAME.fullmatch(path.name)
@@ -50,9 +48,9 @@ def kept(store: Path) -> list[BlackBox]:
 
 
 def dump(store: Path, code: str, frames: Callable[[], Mapping[str, str]], clock: Clock = SYSTEM_CLOCK) -> Notice:
-    """Write what ``frames`` gives, each bus' candump log, to ``blackbox/`` in the store; the oldest files go.
+    """Write ``frames``, each bus' candump log, to ``blackbox/`` in the store; delete the oldest files.
 
-    Returns what is to be told, also when the disk refuses: the correction is off already.
+    Returns a notice even when the disk refuses: the correction is already off.
     """
     folder, logs = store / FOLDER, frames()
     try:
@@ -65,13 +63,13 @@ def dump(store: Path, code: str, frames: Callable[[], Mapping[str, str]], clock:
             old.path.unlink()
     except (OSError, StoreError) as error:
         trouble = store_error(folder, error) if isinstance(error, OSError) else error
-        return Notice(trouble.code, "minor", f"the frames around the trip are not kept: {trouble}")
+        return Notice(trouble.code, "minor", f"the frames around the trip could not be stored: {trouble}")
     lines = sum(log.count("\n") for log in logs.values())
     return Notice("BlackBox", "info", f"the last {lines} frames are in {file}")
 
 
 def _in_order(logs: Iterable[str]) -> str:
-    """Return the lines of several buses as ``candump -l`` writes them: in one order of time."""
+    """Merge the lines of several buses by time, as ``candump -l`` writes them."""
     merged = io.StringIO()  # not a list: a flood has hundreds of thousands of lines
     merged.writelines(heapq.merge(*map(io.StringIO, logs), key=lambda line: float(line[1 : line.index(")")])))
     return merged.getvalue()

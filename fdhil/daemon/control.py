@@ -1,19 +1,15 @@
-"""Serves the control socket: one JSON object per line and request, one per answer, over a UNIX socket.
+"""Serves the control socket: one JSON object per line for each request and answer, over a UNIX socket.
 
-A request is {"request": "status" | "live" | "arm" | "disarm" | "stop", ...}; an answer is {"ok": true, ...} or
-{"ok": false, "code", "text", "advice"}. With "progress": true lines {"progress": {...}} come before an answer that
-takes its time; who asks to arm and closes the connection meanwhile abandons what is checked for him. Who is at the
-other end is what the kernel says, and what he may ask for what the config says (``peers``); arming needs the operator's
-token besides. After the answer to ``live`` the connection tells the samples as they pass (``fdhil.daemon.live``). Of
-sixteen connections the one that has been idle for longest makes room for one more; where all wait for their answers,
-four more may ask for ``status`` and ``disarm``.
+A request is {"request": "status" | "live" | "arm" | "disarm" | "stop", ...}; an answer is {"ok": true, ...} or {"ok":
+false, "code", "text", "advice"}. With "progress": true, lines {"progress": {...}} precede an answer that takes time;
+closing the connection meanwhile abandons the check of an arm request. The kernel identifies the client, and the config
+assigns its rights (``peers``); arming also needs the operator's token. After the answer to ``live`` the connection
+streams samples (``fdhil.daemon.live``). When all sixteen connections are in use, the longest idle one makes room; where
+all wait for answers, four more clients may send ``status`` and ``disarm``.
 """
-
-from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import select
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
@@ -33,10 +29,10 @@ from fdhil.json_lines import decode_line, encode_line
 SOCKET_NAME = "daemon.sock"
 MAX_LINE = 64 * 1024
 MAX_CLIENTS = 16
-RESERVE = 4  # more, for who must be heard while all others wait for their answers
+RESERVE = 4  # extra clients, for ALWAYS_HEARD while all others wait for answers
 ALWAYS_HEARD = ("disarm", "status")
 IDLE_S = 60.0
-LOOK_S = 1.0  # for the name of the socket
+LOOK_S = 1.0  # period of the check of the socket's file
 PROGRESS_S = 0.5
 
 Handler = Callable[[Mapping[str, Any], Peer], Awaitable[Answer]]
@@ -47,7 +43,7 @@ Done = TypeVar("Done")
 
 
 class ControlServer:
-    """Serves requests to ``handle``; each client has its own task, a slow or dead one delays nobody else."""
+    """Passes requests to ``handle``; each client has its own task, so that a slow or dead one delays no other."""
 
     def __init__(
         self,
@@ -58,27 +54,26 @@ class ControlServer:
         live: Stream | None = None,
         lost: Callable[[str], Awaitable[object]] | None = None,
     ) -> None:
-        """``progress`` tells how far what takes long is, ``abandon`` ends it; ``access`` says who may come.
+        """Serve users with ``access``; ``progress`` describes a long check, ``abandon`` ends it.
 
-        ``lost`` is called when the socket's name has gone: with "" where it was made again, else with why it cannot be.
-
+        ``lost`` is called when the socket's file has gone: with "" once it was created again, else with the reason.
         ``live`` serves a connection after the answer that opens it as a stream.
         """
         self._handle, self._progress, self._abandon, self._access = handle, progress, abandon, access
         self._live, self._lost = live, lost
-        # the clients in the order of their last answers, the longest idle first, and those that wait for one
+        # all clients, the longest idle first, and those that wait for an answer
         self._clients: dict[asyncio.Task[None], None] = {}
         self._busy: set[asyncio.Task[None]] = set()
-        self._arming: list[asyncio.StreamWriter] = []  # who waits for an arming: what is checked is for the first
+        self._arming: list[asyncio.StreamWriter] = []  # clients that wait to arm; the check is for the first
 
     @property
     def hung_up(self) -> bool:
-        """Whether who has something checked and armed has left by now; may be asked from any thread."""
+        """Whether the client whose arm request is checked has disconnected; safe in any thread."""
         return any(map(_hung_up, self._arming[:1]))
 
     @asynccontextmanager
     async def serving(self, path: Path) -> AsyncIterator[None]:
-        """Listen at ``path`` until the block is left; a socket file left by a crash is replaced. ConnectError."""
+        """Listen at ``path`` until the block ends; replaces a socket file left by a crash. ConnectError."""
         try:
             listener = listen(path, self._access)
         except OSError as error:
@@ -94,14 +89,14 @@ class ControlServer:
             for task in list(self._clients):
                 task.cancel()
             await asyncio.gather(*self._clients, return_exceptions=True)
-            with contextlib.suppress(OSError):  # the next daemon takes the place of one that stays
+            with contextlib.suppress(OSError):  # the next daemon replaces a file that stays
                 path.unlink()
 
     async def _served(self, listener: socket.socket) -> asyncio.Server:
         return await asyncio.start_unix_server(self._accept, sock=listener, limit=MAX_LINE)
 
     async def _keep_name(self, path: Path, name: FileId | None) -> None:
-        """Make the socket again where its name leads elsewhere, as in a run directory that was cleaned."""
+        """Create the socket again when its file is gone or replaced, as in a cleaned run directory."""
         while True:
             listener = await self._renewed(path, name)
             before, self._server = self._server, await self._served(listener)
@@ -110,7 +105,7 @@ class ControlServer:
             await self._tell_lost("")
 
     async def _renewed(self, path: Path, name: FileId | None) -> socket.socket:
-        """Wait until the name is gone, and return the listener that takes its place as soon as there can be one."""
+        """Wait until the file is gone; return the listener that replaces it as soon as one can be created."""
         trouble = ""
         while True:
             await asyncio.sleep(LOOK_S)
@@ -138,16 +133,16 @@ class ControlServer:
         try:
             await self._converse(task, reader, writer)
         except (OSError, asyncio.LimitOverrunError, ValueError, TimeoutError):
-            pass  # a client that left, talks too much or never reads loses its connection, nothing else
+            pass  # a client that left, sends too much or never reads loses only its connection
         except asyncio.CancelledError:
-            pass  # the daemon stops, or another has this place; the stream's own callback must not see it
+            pass  # the daemon stops, or made room; the stream's own callback must not see it
         finally:
             self._clients.pop(task, None)
             self._busy.discard(task)
             writer.close()
 
     def _has_room(self) -> bool:
-        """Whether one more may come; the connection that has been idle for longest is closed for it."""
+        """Return whether one more client may connect; close the longest idle connection for it."""
         if len(self._clients) < MAX_CLIENTS:
             return True
         idle = next((client for client in self._clients if client not in self._busy), None)
@@ -168,22 +163,21 @@ class ControlServer:
             writer.write(encode_line(answer))
             await _in_time(writer.drain())
             if self._live is not None and "live" in answer:
-                self._busy.add(task)  # it is never idle: nobody takes its place
+                self._busy.add(task)  # a stream is never idle: it is not closed for others
                 await self._live(reader, writer)
                 return
             if peer.role is Role.NOBODY:
                 return
 
     async def _attended(self, line: bytes, peer: Peer, writer: asyncio.StreamWriter) -> Answer:
-        """Answer a request; of one to arm tell the progress meanwhile, and see whether somebody waits for it."""
-        try:
-            request = json.loads(line)
-        except (ValueError, RecursionError):
-            return refusal("BadRequest", "the request is no JSON", "send one JSON object per line")
-        if not isinstance(request, dict) or request.get("request") != "arm" or not peer.may("arm"):
+        """Answer a request; during an arm request report progress and check that the client still waits."""
+        request = decode_line(line)
+        if request is None:
+            return refusal("BadRequest", "the request is not a JSON object", "send one JSON object per line")
+        if request.get("request") != "arm" or not peer.may("arm"):
             return await self._answer(request, peer)
         if _hung_up(writer):
-            return ABANDONED  # it waited while this process slept: nobody is there who wants it by now
+            return ABANDONED  # the client left while this process was suspended
         answering = asyncio.ensure_future(self._answer(request, peer))
         self._arming.append(writer)
         try:
@@ -196,17 +190,19 @@ class ControlServer:
             self._arming.remove(writer)
 
     def _attend(self, writer: asyncio.StreamWriter, wanted: bool) -> None:
-        """Tell how far what is checked is where that is wanted; abandon it where nobody waits for it."""
+        """Report the progress of a check to the client; abandon the check when the client has gone."""
         if _hung_up(writer):
             self._abandon()
-        elif wanted and (told := self._progress()):
-            writer.write(encode_line({"progress": told}))
+        elif wanted and (progress := self._progress()):
+            writer.write(encode_line({"progress": progress}))
 
-    async def _answer(self, request: Any, peer: Peer) -> Answer:
-        if not isinstance(request, dict) or not isinstance(request.get("request"), str):
-            return refusal("BadRequest", "the request has no text under 'request'", "status, arm, disarm or stop")
+    async def _answer(self, request: Mapping[str, Any], peer: Peer) -> Answer:
+        if not isinstance(request.get("request"), str):
+            return refusal(
+                "BadRequest", "the request has no text under the key 'request'", "status, arm, disarm or stop"
+            )
         if len(self._busy) > MAX_CLIENTS and request["request"] not in ALWAYS_HEARD:
-            return refusal("Busy", f"{MAX_CLIENTS} others wait for their answers", "wait for one of them to end")
+            return refusal("Busy", f"{MAX_CLIENTS} other requests are pending", "wait for one of them to end")
         try:
             return await self._handle(request, peer)
         except FdhilError as error:
@@ -215,7 +211,6 @@ class ControlServer:
 
 
 def _name_of(path: Path) -> FileId | None:
-    """Return what identifies the file at a path, None where there is none."""
     try:
         found = path.lstat()
     except OSError:
@@ -224,17 +219,17 @@ def _name_of(path: Path) -> FileId | None:
 
 
 def _hung_up(writer: asyncio.StreamWriter) -> bool:
-    """Whether the other end is closed altogether, unlike one that only sends no more."""
+    """Return whether the other end is fully closed, not only its sending side."""
     poll = select.poll()
     try:
         poll.register(writer.get_extra_info("socket"), 0)
-    except ValueError:  # it left while it was told something, and is closed here too
+    except ValueError:  # the client left during an answer, and is closed here too
         return True
     return bool(poll.poll(0))
 
 
 async def _in_time(doing: Awaitable[Done]) -> Done:
-    """Wait for a client no longer than it may idle; TimeoutError. A cancellation is kept, as wait_for may not."""
+    """Wait for a client, at most its idle time; TimeoutError. Keeps a cancellation, which wait_for may lose."""
     async with asyncio.timeout(IDLE_S):
         return await doing
 
@@ -247,9 +242,8 @@ def ask(
 ) -> dict[str, Any]:
     """Send one request to a running daemon and return its answer (blocking; for the command line).
 
-    With ``progress`` the daemon is asked to tell how far it is, and each of its tellings goes there.
-
-    ConnectError when no daemon listens, DeviceTimeout when it does not answer.
+    With ``progress`` the daemon reports its progress, and each report is passed to it. ConnectError when no daemon
+    listens, DeviceTimeout when it does not answer.
     """
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
@@ -259,8 +253,8 @@ def ask(
             client.sendall(encode_line({**request, **wanted}))
             with client.makefile("rb") as lines:
                 line = lines.readline()
-                while progress and line.startswith(b'{"progress"'):
-                    progress(json.loads(line)["progress"])
+                while progress and line.startswith(b'{"progress"') and (report := decode_line(line)):
+                    progress(report["progress"])
                     line = lines.readline()
     except TimeoutError:
         text = f"did not answer within {timeout_s:.0f} s; see its log"
@@ -272,5 +266,5 @@ def ask(
         raise ConnectError("daemon", "closed the connection without an answer; see its log")
     answer = decode_line(line)
     if answer is None:
-        raise ConnectError("daemon", f"gave no answer of a daemon; see what listens at {path}")
+        raise ConnectError("daemon", f"sent an invalid answer; see what listens at {path}")
     return answer

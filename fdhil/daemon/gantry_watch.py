@@ -1,6 +1,4 @@
-"""Watches how far the two drives of a gantry axis are apart: the beam between them must not be skewed."""
-
-from __future__ import annotations
+"""Monitors the difference between the two drives of a gantry axis: the beam between them must not be skewed."""
 
 from collections.abc import Sequence
 
@@ -9,12 +7,12 @@ import numpy as np
 from fdhil.config import MachineConfig, is_second_drive
 from fdhil.records import AxisSamples, Float, Int, Notice
 
-MOST_SAMPLES = 20_000  # that wait for the other drive's
+MOST_SAMPLES = 20_000  # waiting for the other drive's
 Rows = tuple[Int, Float]
 
 
 class GantryWatch:
-    """Compares the following errors of both drives at the same SYNC: their zeros need not be the same."""
+    """Compares the following errors of both drives at the same SYNC: their zeros may differ."""
 
     def __init__(self, config: MachineConfig) -> None:
         seconds = [name for name in config.axis if is_second_drive(name)]
@@ -50,7 +48,7 @@ class GantryWatch:
                     del self._waiting[name]
 
     def look(self) -> tuple[bool, Sequence[Notice]]:
-        """Return whether any axis was skewed since the last look, and a notice for each whose skew begins or ends."""
+        """Return whether any axis was skewed since the last call, and a notice for each skew that begins or ends."""
         found = {axis: um for axis, um in self._largest_um.items() if um > self._limit_um[axis]}
         new = [axis for axis in found if axis not in self._skewed]
         over = [Notice("GantrySkew", "info", "the drives agree again", axis) for axis in self._skewed - set(found)]

@@ -1,20 +1,18 @@
-"""Keeps the heap of a process that runs for months small: freed memory goes back to the computer (glibc; else nothing).
+"""Keeps the heap of a long-running process small: freed memory is returned to the system (glibc only).
 
-By itself glibc takes each large block that was freed as a reason to lay the next ones of that size among the small
-ones, where a small one that stays holds all before it, and gives each thread a heap of its own.
+By default glibc reacts to each freed large block by placing the next ones of that size among the small ones, where one
+remaining small block pins all memory before it, and gives each thread a heap of its own.
 """
-
-from __future__ import annotations
 
 import ctypes
 from contextlib import suppress
 
-# what mallopt(3) calls them; the sizes are those that a process of glibc begins with
+# numbers of mallopt(3), and glibc's initial sizes
 MALLOPT = {"M_TRIM_THRESHOLD": (-1, 128 << 10), "M_MMAP_THRESHOLD": (-3, 128 << 10), "M_ARENA_MAX": (-8, 2)}
 
 
 def keep_small() -> None:
-    """Lay large blocks apart, and all threads' blocks in two heaps; to be called before there are threads."""
+    """Allocate large blocks separately, and limit all threads to two heaps; call before threads start."""
     with suppress(OSError, AttributeError):
         mallopt = ctypes.CDLL(None).mallopt
         for name, value in MALLOPT.values():
@@ -22,6 +20,6 @@ def keep_small() -> None:
 
 
 def give_back() -> None:
-    """Give back each page that lies free between blocks that are used; some milliseconds, without Python's lock."""
+    """Return every free page between used blocks; takes some milliseconds, without Python's lock."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -1,9 +1,7 @@
-"""Hears the machine: frames, SYNC and samples with their ages, and what is not as the config says.
+"""Monitors reception: frames, SYNC and samples with their ages, and deviations from the config.
 
-Pure but for the times it is given. What was not heard within the last second is silent, whatever came before.
+Pure; times are inputs. A bus without a frame in the last second is silent.
 """
-
-from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Mapping
@@ -18,15 +16,15 @@ from fdhil.pipeline import Record
 from fdhil.records import AxisSamples, Notice, TickTimes
 
 LIVE_S = 1.0
-LOAD_S = 1.0  # over which the load of a bus is told
+LOAD_S = 1.0  # averaging time of the bus load
 SYNC_INTERVALS = 500
-RATE_NS = 1_000_000_000  # of the newest SYNCs, over which their rate is told
+RATE_NS = 1_000_000_000  # averaging time of the SYNC rate
 FEW_SYNCS = 32
 PERIOD_TOLERANCE = 0.02
-PERIOD_S = 60.0  # a period is judged by the median of the rates of so long
-STEADY = 0.01  # by which nearly all of them agree, or they tell no period
-PATIENCE_S = 3.0  # until what is wrong, or missing, is told
-START_S = 10.0  # until a drive samples when SYNC runs
+PERIOD_S = 60.0  # time whose median rate determines the period
+STEADY = 0.01  # spread of 90 % of the rates, above which they determine no period
+PATIENCE_S = 3.0  # until a problem is reported
+START_S = 10.0  # until a drive must send samples when SYNC runs
 FRAME_BITS = 121  # 8 data bytes, 11 bit identifier, stuffing between none and the worst case
 SILENCES = {"BusSilent", "BusDown", "SyncLost"}
 
@@ -34,7 +32,7 @@ Trouble = tuple[str, str]
 
 
 class Hearing:
-    """Listens to the listeners: fed with every record and, a few times a second, with the source's counters."""
+    """State of all reception: takes every record and, a few times per second, the source's counters."""
 
     def __init__(self, config: MachineConfig, now_s: float) -> None:
         self._config = config
@@ -49,9 +47,9 @@ class Hearing:
         self._forget(now_s)
 
     def _forget(self, now_s: float) -> None:
-        """Begin anew: what was counted before belongs to another source."""
+        """Reset everything: earlier counts belong to another source."""
         self._frames: dict[str, int] = {}
-        self._heard_s = dict.fromkeys(("", *self._buses), now_s)
+        self._received_s = dict.fromkeys(("", *self._buses), now_s)
         self._counters: Mapping[str, Any] = {}
         self._loads: tuple[float, dict[str, int]] = (now_s, {})
         self.load_percent: dict[str, float] = {}
@@ -64,29 +62,29 @@ class Hearing:
         self._silent.clear()
 
     def source_opened(self, now_s: float) -> None:
-        """The machine can be listened to."""
+        """Note that the source is open."""
         self.open, self.opened_s = True, now_s
         self._forget(now_s)
 
     def source_lost(self, now_s: float) -> None:
-        """The machine cannot be listened to until the source is opened again."""
+        """Note that the source is lost until it is opened again."""
         self.open, self.opened_s = False, now_s
         self.lost_times += 1
         self._forget(now_s)
 
     def alive(self, now_s: float, silence_s: float) -> bool:
-        """Whether records arrive, or it is known why they cannot (the source is lost, the bus is silent)."""
+        """Return whether records arrive, or the reason for their absence is known (source lost, bus silent)."""
         latest = max(self.opened_s, self._last_record_s or self.opened_s)
         return not self.open or bool(self._silent) or now_s - latest <= silence_s
 
     def record_came(self, record: Record | Notice, now_s: float) -> None:
-        """Note when SYNC and samples came, and what the source itself says is silent."""
+        """Note the arrival of SYNC and samples, and silence that the source itself reports."""
         self._last_record_s = now_s
         if isinstance(record, TickTimes):
             self._sync.extend(zip(record.tick.tolist(), record.t_ns.tolist(), strict=True))
             self._sync_s = now_s
         elif isinstance(record, AxisSamples) and record.axis in self.moves:
-            if record.tick.size:  # else none is whole: a TPDO of the mapping does not come
+            if record.tick.size:  # an empty block: a mapped TPDO is missing
                 self._samples_s[record.axis] = now_s
                 self._statuswords[record.axis] = int(record.statusword[-1])
             self.moves[record.axis].feed(record, now_s)
@@ -97,12 +95,12 @@ class Hearing:
                 self._silent.add(record.code)
 
     def counted(self, counters: Mapping[str, Any], now_s: float) -> None:
-        """Take the source's counters: where they grow, something is heard."""
+        """Take the source's counters: a growing one shows reception."""
         self._counters = counters
-        frames = {bus: int(counters.get(f"{bus}.frames" if bus else "frames", 0)) for bus in self._heard_s}
+        frames = {bus: int(counters.get(f"{bus}.frames" if bus else "frames", 0)) for bus in self._received_s}
         for bus, count in frames.items():
             if count != self._frames.get(bus, 0):
-                self._heard_s[bus] = now_s
+                self._received_s[bus] = now_s
         self._frames = frames
         then_s, before = self._loads
         if before and now_s - then_s < LOAD_S:
@@ -113,20 +111,20 @@ class Hearing:
         self._loads = now_s, frames
 
     def sync_rate_hz(self, now_s: float) -> float | None:
-        """Return the SYNC rate over the newest arrivals; None while too few came, or none within the last second."""
+        """Return the SYNC rate of the newest arrivals; None with too few, or none within the last second."""
         if self._sync_s is None or now_s - self._sync_s > LIVE_S:
             return None
         newest_tick, newest_ns = self._sync[-1]
         recent = [(tick, t_ns) for tick, t_ns in self._sync if newest_ns - t_ns <= RATE_NS and tick <= newest_tick]
         ticks, span_s = newest_tick - recent[0][0], (newest_ns - recent[0][1]) * 1e-9
-        # two buses that are drained one after the other may show nothing but the same ticks twice
+        # two buses that are read one after the other may show the same ticks twice
         return ticks / span_s if len(recent) >= FEW_SYNCS and ticks > 0 and span_s > 0 else None
 
     def status(self, now_s: float) -> dict[str, Any]:
-        """Return the part of the status document that says what is heard, with ages."""
+        """Return the reception part of the status document, with ages."""
         rate = self.sync_rate_hz(now_s)
-        heard = {bus: round(now_s - at_s, 3) for bus, at_s in self._heard_s.items()}
-        heard_s_ago = heard.pop("")
+        ages = {bus: round(now_s - at_s, 3) for bus, at_s in self._received_s.items()}
+        heard_s_ago = ages.pop("")
         state = "reconnecting" if not self.open else "listening" if heard_s_ago <= LIVE_S else "silent"
         return {
             "source": {
@@ -134,7 +132,7 @@ class Hearing:
                 "since_s": round(now_s - self.opened_s, 3),
                 "lost_times": self.lost_times,
                 "heard_s_ago": heard_s_ago,
-                "buses": heard if self.open else {},
+                "buses": ages if self.open else {},
                 "last_record_age_s": None if self._last_record_s is None else round(now_s - self._last_record_s, 3),
             },
             "sync": {
@@ -147,19 +145,19 @@ class Hearing:
         }
 
     def samples_s_ago(self, axis: str, now_s: float) -> float | None:
-        """Return how long ago the last samples of an axis came; None when none did."""
+        """Return the age of an axis' last samples, s; None when there were none."""
         at_s = self._samples_s.get(axis)
         return None if at_s is None else round(now_s - at_s, 3)
 
     def drive_state(self, axis: str) -> str | None:
-        """Return the state of CiA 402 that a drive told last; None when it told none."""
+        """Return the last reported CiA 402 state of a drive; None when there was none."""
         word = self._statuswords.get(axis)
         return None if word is None else state_of(word).value
 
-    # what is not as the config says ----------------------------------------------------------------------------
+    # deviations from the config --------------------------------------------------------------------------------
 
     def troubles(self, windows: Mapping[str, int], now_s: float) -> dict[Trouble, str]:
-        """Return what has been wrong for a while: (class, axis) -> cause and next action. ``windows``: found so far."""
+        """Return lasting problems: (class, axis) -> cause and next action. ``windows``: number found per axis."""
         found = dict(self._found(windows, now_s)) if self.open else {}
         self._since_s = {trouble: self._since_s.get(trouble, now_s) for trouble in found}
         patience = {"NoSamples": START_S, "MovesNotUsed": 0.0, "ScaleSuspect": 0.0, "PitchSuspect": 0.0}
@@ -178,7 +176,7 @@ class Hearing:
                 yield (unused[0], axis), unused[1]
 
     def _suspect_period(self, rate: float | None, now_s: float) -> str | None:
-        """Return what is wrong with the period of SYNC by the rates of the last minute; None where nothing is."""
+        """Return what is wrong with the SYNC period, by the rates of the last minute; None: nothing."""
         if not self._realtime or rate is None:
             self._rates.clear()
             return None
@@ -192,24 +190,24 @@ class Hearing:
         if abs(typical / expected - 1) <= PERIOD_TOLERANCE:
             return None
         if most - least > STEADY * typical:
-            text = f"SYNC comes unevenly, at {least:.0f} to {most:.0f} Hz where the config says {expected:.4g}"
-            return f"{text}: no period can be determined; take load off this PC and off whoever sends SYNC"
-        text = f"SYNC comes at {typical:.4g} Hz where the config says {expected:.4g}: what is identified is wrong"
+            text = f"SYNC is uneven, {least:.0f} to {most:.0f} Hz instead of the configured {expected:.4g} Hz"
+            return f"{text}: no period can be determined; reduce the load of this PC and of the SYNC producer"
+        text = f"SYNC runs at {typical:.4g} Hz instead of {expected:.4g} Hz as configured: all parameters are wrong"
         return f"{text}; set sync_period_s = {1 / typical:.4g}, or correct the NC's"
 
     def _missing(self, axis: str, bus: str, synced: bool, now_s: float) -> tuple[str, str] | None:
-        """Return what is not heard of a drive while its bus is."""
-        if now_s - self._heard_s[bus] > LIVE_S:
+        """Return the problem of a drive from which no data arrive while its bus is active."""
+        if now_s - self._received_s[bus] > LIVE_S:
             return None
         node = f"node {self._config.node_id(axis)} on {bus}"
         if self._counters.get(f"{bus}.{axis}.heard") == 0:
-            text = f"the drive ({node}) was never heard, nothing is known of its axis"
+            text = f"the drive ({node}) has never sent a frame; its axis is not monitored"
             if not synced:
-                text += "; without SYNC that is so where it sends no heartbeat (0x1017), else"
+                text += "; without SYNC this is normal for a drive that sends no heartbeat (0x1017), else"
                 return "NodeNeverHeard", f"{text} check node_id in the config, its supply and its wiring"
             return "NodeNeverHeard", f"{text}; check node_id in the config, its supply and its wiring"
         age_s = self.samples_s_ago(axis, now_s)
         if synced and (age_s is None or age_s > LIVE_S):
-            text = f"the drive ({node}) sends no samples though SYNC runs"
-            return "NoSamples", f"{text}; check that it is Operational, and its TPDO mapping with fdhil check"
+            text = f"the drive ({node}) sends no samples although SYNC runs"
+            return "NoSamples", f"{text}; check its NMT state (Operational), and its TPDO mapping with fdhil check"
         return None

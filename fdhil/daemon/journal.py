@@ -1,8 +1,5 @@
-"""Writes one log line per outcome, for a person; under systemd with the priority that the journal understands."""
+"""Writes one readable log line per outcome; under systemd with the priority that the journal understands."""
 
-from __future__ import annotations
-
-import json
 import os
 import select
 import sys
@@ -12,38 +9,29 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import Literal, TextIO
 
-from fdhil.records import (
-    PARAMETERS,
-    UNITS,
-    LoopEstimate,
-    Notice,
-    Outcome,
-    ParameterSet,
-    Skill,
-    WindowOutcome,
-    unit_of,
-)
+from fdhil.json_lines import encode_line
+from fdhil.records import PARAMETERS, UNITS, LoopEstimate, Notice, Outcome, ParameterSet, Skill, WindowOutcome, unit_of
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 Severity = Literal["info", "minor", "MAJOR"]
 # syslog priorities, see sd-daemon(3)
 _PRIORITY = {"info": 6, "minor": 4, "MAJOR": 3}
-BURST = 20  # lines of one class that are written before a flood of it is only counted
+BURST = 20  # lines of one class that are written before a flood is only counted
 REFILL_PER_S = 1.0
 
 _for_programs = threading.Event()  # whether lines are JSON
 _clocks = [SYSTEM_CLOCK]  # the last one dates the lines
-_dropped = {"lines": 0}  # that nobody took, since the last that somebody did
+_dropped = {"lines": 0}  # since the last line that was written
 
 
 def printable(text: str) -> str:
-    """Escape what could steer a terminal or forge a line: names, EMCY texts and file names come from outside."""
+    """Escape what could control a terminal or forge a line: names, EMCY texts and file names come from outside."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 @contextmanager
 def lines_as_json(wanted: bool) -> Iterator[None]:
-    """Write each line as a JSON object to stdout meanwhile, for programs, where that is wanted."""
+    """Write each line as a JSON object to stdout meanwhile, when ``wanted``."""
     if wanted:
         _for_programs.set()
     try:
@@ -63,10 +51,10 @@ def lines_dated_by(clock: Clock) -> Iterator[None]:
 
 
 def write_line(text: str, severity: Severity = "info") -> None:
-    """Write one line to stderr with its time in UTC; to the journal, which has the time, with its priority.
+    """Write one line to stderr with its time in UTC; to the journal, which adds the time, with its priority.
 
-    Nobody waits for who reads it: where nothing is taken now, or a disk is full, the line is dropped, and it is told
-    later how many were.
+    Never waits for the reader: when the pipe or the disk is full, the line is dropped and counted, and the count is
+    reported later.
     """
     lost = _dropped["lines"]
     if lost and _written(*_line(f"{lost} lines could not be written before this one", "minor")):
@@ -76,18 +64,17 @@ def write_line(text: str, severity: Severity = "info") -> None:
 
 
 def _line(text: str, severity: Severity) -> tuple[TextIO, str]:
-    """Where a line goes, and how it reads there."""
     now = datetime.fromtimestamp(_clocks[-1].wall_s(), UTC)
     if _for_programs.is_set():
         line = {"time": now.isoformat(timespec="milliseconds"), "severity": severity, "text": text}
-        return sys.stdout, json.dumps(line) + "\n"
+        return sys.stdout, encode_line(line).decode()
     stamp = f"{now:%Y-%m-%d %H:%M:%S}.{now.microsecond // 1000:03d} UTC "
     prefix = f"<{_PRIORITY[severity]}>" if os.environ.get("JOURNAL_STREAM") else stamp
     return sys.stderr, f"{prefix}{printable(text)}\n"
 
 
 def _written(stream: TextIO, line: str) -> bool:
-    """Write a line as far as it is taken at once: a full pipe, or a terminal that was halted, would hold all up."""
+    """Write a line as far as possible without blocking: a full pipe or a stopped terminal must not delay the daemon."""
     try:
         descriptor = stream.fileno()
     except (OSError, ValueError):  # a text in memory
@@ -105,7 +92,7 @@ def _written(stream: TextIO, line: str) -> bool:
 
 
 def line_of(outcome: Outcome) -> tuple[str, Severity]:
-    """Return an outcome as one line an operator understands, and how much it matters."""
+    """Format an outcome as one line for the operator, with its severity."""
     if isinstance(outcome, Notice):
         axis = f"{outcome.axis}: " if outcome.axis else ""
         return f"{axis}{outcome.code}: {outcome.text}", outcome.severity
@@ -134,15 +121,15 @@ def _set_line(published: ParameterSet) -> str:
     values = (f"{name} {getattr(published.parameters, name):.5g} {UNITS[name]}" for name in PARAMETERS)
     windows = f"{published.windows} window" + ("" if published.windows == 1 else "s")
     terms = (f"{name} {value:.5g} {unit_of(name)}" for name, value in published.parameters.terms)
-    told = ", ".join((*values, *terms))
-    return f"{published.axis}: parameters, revision {published.revision} from {windows}: {told}"
+    shown = ", ".join((*values, *terms))
+    return f"{published.axis}: parameters, revision {published.revision} from {windows}: {shown}"
 
 
 def _loops_line(found: LoopEstimate) -> str:
     gains = ", ".join(f"{name} {value:.5g}" for name, value in zip(found.names, found.values, strict=True))
     verdict = found.verdict
-    told = "believed" if verdict.accepted else "not believed: " + "; ".join(str(reason) for reason in verdict.reasons)
-    return f"{found.axis}: loops of structure {found.structure}, {gains}; {told}"
+    result = "accepted" if verdict.accepted else "refused: " + "; ".join(str(reason) for reason in verdict.reasons)
+    return f"{found.axis}: loops of structure {found.structure}, {gains}; {result}"
 
 
 def _skill_line(skill: Skill) -> str:
@@ -159,7 +146,7 @@ class FloodGate:
         self._buckets: dict[str, tuple[float, float, int]] = {}
 
     def admit(self, code: str, now_s: float) -> int | None:
-        """Return how many lines of this class were held back before this one, or None to hold this one back too."""
+        """Return how many lines of this class were suppressed before this one, or None to suppress it too."""
         tokens, held = self._tokens(code, now_s)
         if tokens < 1.0:
             self._buckets[code] = (tokens, now_s, held + 1)

@@ -1,6 +1,4 @@
-"""Compiles the kernels before the daemon says READY: a compile under way holds the interpreter for seconds."""
-
-from __future__ import annotations
+"""Compiles the kernels before the daemon is READY: a compilation blocks the interpreter for seconds."""
 
 import math
 
@@ -17,7 +15,7 @@ from fdhil.records import Float, Parameters, Stages, Trajectory, Window, frozen,
 
 
 def warm(config: MachineConfig, method: str | None = None) -> None:
-    """Send made-up rapids of the nominal drives through the pipelines and plan a correction: every kernel compiles."""
+    """Run simulated rapids of the nominal drives through pipelines and a correction, so that every kernel compiles."""
     dt_s = config.machine.sync_period_s
     windows = {}
     for name, axis in config.axis.items():
@@ -38,9 +36,9 @@ def warm(config: MachineConfig, method: str | None = None) -> None:
 
 
 def _warm_what_is_rare() -> None:
-    """Call what a sound drive seldom needs: offsets at their limits, a sensor told by the others, coloured innovations.
+    """Call what a healthy drive rarely needs: clipped offsets, a reconstructed sensor, coloured innovations.
 
-    The last compiles nothing: it has a library's code and buffers, of over a megabyte, in memory from the beginning.
+    The last one compiles nothing, but loads a library's code and buffers, over a megabyte, into memory from the start.
     """
     project(np.linspace(0.0, 2.0, 8), np.ones(3), np.zeros(2))
     theta, rows = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 5.0, 0.0]), np.ones((4, 3))
@@ -50,7 +48,7 @@ def _warm_what_is_rare() -> None:
 
 
 def nominal_rapid(name: str, axis: Axis, dt_s: float, direction: int = 1, seed: int = 1) -> Window:
-    """Return a rapid that the nominal drive makes under its regulators, with noise; the voltage follows from [1]."""
+    """Return a simulated rapid of the nominal drive with its regulators and noise; the voltage follows from [1]."""
     top = axis.rapid_speed_rad_s
     nominal = Parameters(**axis.nominal.model_dump())
     ramp_s = axis.rapid_speed_mm_s / axis.max_acceleration_mm_s2

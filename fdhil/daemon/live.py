@@ -1,18 +1,17 @@
-"""Tells the samples of the axes to whoever looks on: one JSON object per line over the control socket.
+"""Streams samples of the axes to viewers: one JSON object per line over the control socket.
 
-A viewer costs the daemon a line per block of samples, made once for all of them, and nothing that it could lose: each
-viewer has room for so many lines, and what finds none is skipped and told. Nothing waits for a viewer.
+A viewer costs one encoded line per block of samples, shared by all viewers, and can never delay the daemon: each viewer
+has a bounded queue, and lines that do not fit are skipped and counted.
 
-The lines: ``begin`` says the period, the axes and the order of the signals; ``samples`` has the first ``tick`` of a
-block, ``ticks`` after it where some are missing, and ``values``, float32 (7, n), NaN where a drive tells no voltage;
-``voltage`` is that of a sensor of its own, by the host's clock, to which ``times`` lays the ticks; ``temperature`` is
-one reading; ``skipped`` counts the lines that this viewer lost; ``alive`` is said when there is nothing else to say.
+The lines: ``begin`` has the period, the axes and the order of the signals; ``samples`` has the first ``tick`` of a
+block, ``ticks`` after it where some are missing, and ``values``, float32 (7, n), NaN where a drive has no voltage;
+``voltage`` is that of a separate sensor, by the host's clock, to which ``times`` maps the ticks; ``temperature`` is one
+reading; ``skipped`` counts the lines that this viewer lost; ``alive`` is sent when there is nothing else.
 """
-
-from __future__ import annotations
 
 import asyncio
 import base64
+import contextlib
 from collections import deque
 from typing import Any
 
@@ -25,22 +24,20 @@ from fdhil.records import AxisSamples, Temperature, TickTimes, VoltageSamples
 
 SIGNALS = ("voltage_v", "current_a", "speed_rad_s", "following_error_um", "offset_um", "position_mm", "demand_mm")
 MAX_VIEWERS = 4
-MAX_WAITING = 400  # lines of one viewer: five seconds of four axes
+MAX_WAITING = 400  # lines per viewer: five seconds of four axes
 ALIVE_S = 1.0
-DEAD_S = 60.0  # who reads nothing for so long has gone
-BUFFER = 64 * 1024  # bytes of one viewer in the socket's own buffer
+DEAD_S = 60.0  # a viewer that reads nothing for so long has gone
+BUFFER = 64 * 1024  # bytes per viewer in the socket's own buffer
 
 
 class _Viewer:
-    """The lines that one viewer has yet to get."""
-
     def __init__(self) -> None:
         self._lines: deque[bytes] = deque()
         self._skipped = 0
         self.waiting = asyncio.Event()
 
     def put(self, line: bytes) -> None:
-        """Take a line in, or skip it and count that."""
+        """Queue a line, or skip and count it."""
         if len(self._lines) >= MAX_WAITING:
             self._skipped += 1
         else:
@@ -48,7 +45,7 @@ class _Viewer:
             self.waiting.set()
 
     def taken(self) -> bytes:
-        """Return all that waits, and behind it how much was skipped; a word of life when there is nothing."""
+        """Return all queued lines and the count of skipped ones; a keep-alive when there are none."""
         lines = list(self._lines)
         if self._skipped:
             lines.append(encode_line({"live": "skipped", "lines": self._skipped}))
@@ -59,7 +56,7 @@ class _Viewer:
 
 
 class LiveStream:
-    """What passes, for viewers that come and go."""
+    """Distributes the machine's records to viewers."""
 
     def __init__(self, config: MachineConfig) -> None:
         self._begin = {"sync_period_s": config.machine.sync_period_s, "axes": list(config.axis), "signals": SIGNALS}
@@ -68,13 +65,15 @@ class LiveStream:
         self._viewers: set[_Viewer] = set()
 
     def begin(self) -> Answer:
-        """Return the answer that opens a stream, or why there is none."""
+        """Return the answer that opens a stream, or a refusal."""
         if len(self._viewers) >= MAX_VIEWERS:
-            return refusal("Busy", f"{MAX_VIEWERS} others look on", "close one of them; `fdhil web` needs a single one")
+            return refusal(
+                "Busy", f"{MAX_VIEWERS} other viewers are connected", "close one of them; `fdhil web` needs only one"
+            )
         return {"ok": True, "live": "begin", **self._begin}
 
     def take(self, record: object) -> None:
-        """Hand a record on to all who look; what cannot be drawn against time is not told."""
+        """Pass a record to all viewers; records that cannot be drawn against time are ignored."""
         if isinstance(record, Temperature):
             self._temperatures[record.axis] = encode_line(
                 {"live": "temperature", "axis": record.axis, "place": record.place, "celsius": record.celsius}
@@ -85,22 +84,23 @@ class LiveStream:
                 viewer.put(line)
 
     def _line_of(self, record: object) -> bytes | None:
-        """Return what is told of a record; a block may be empty, where no sample of it is whole."""
+        """Encode a record; None for an empty block (no complete sample) and other records."""
         if isinstance(record, Temperature):
             return self._temperatures[record.axis]
         if isinstance(record, AxisSamples) and record.tick.size:
             return encode_line(_samples(record))
         if isinstance(record, VoltageSamples) and record.t_ns.size:
-            return encode_line(_voltage(record))
+            values = {"t_ns": packed(record.t_ns, "<i8"), "values": packed(record.voltage_v, "<f4")}
+            return encode_line({"live": "voltage", "axis": record.axis, **values})
         if isinstance(record, TickTimes) and record.tick.size and self._by_the_clock:
             ends = {"tick": record.tick[[0, -1]].tolist(), "t_ns": record.t_ns[[0, -1]].tolist()}
             return encode_line({"live": "times", **ends})
         return None
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Tell one viewer what passes until it leaves; TimeoutError when it reads nothing for a minute."""
+        """Stream to one viewer until it disconnects; TimeoutError when it reads nothing for a minute."""
         if len(self._viewers) >= MAX_VIEWERS:
-            return  # others who came at the same time have the places
+            return  # others connected at the same time
         writer.transport.set_write_buffer_limits(BUFFER)
         viewer = _Viewer()
         for line in self._temperatures.values():
@@ -112,18 +112,11 @@ class LiveStream:
                 async with asyncio.timeout(DEAD_S):
                     await writer.drain()
                 if not viewer.waiting.is_set():
-                    await _set_within(viewer.waiting, ALIVE_S)
+                    with contextlib.suppress(TimeoutError):
+                        async with asyncio.timeout(ALIVE_S):
+                            await viewer.waiting.wait()
         finally:
             self._viewers.discard(viewer)
-
-
-async def _set_within(event: asyncio.Event, limit_s: float) -> None:
-    """Wait until an event is set, at most so long."""
-    try:
-        async with asyncio.timeout(limit_s):
-            await event.wait()
-    except TimeoutError:
-        pass
 
 
 def _samples(block: AxisSamples) -> dict[str, Any]:
@@ -143,16 +136,11 @@ def _samples(block: AxisSamples) -> dict[str, Any]:
     }
 
 
-def _voltage(block: VoltageSamples) -> dict[str, Any]:
-    values = {"t_ns": packed(block.t_ns, "<i8"), "values": packed(block.voltage_v, "<f4")}
-    return {"live": "voltage", "axis": block.axis, **values}
-
-
 def packed(values: np.ndarray[Any, Any], kind: str) -> str:
-    """Return numbers as base64 of their bytes in the type ``kind``."""
+    """Encode numbers as base64 of their bytes in the type ``kind``."""
     return base64.b64encode(np.ascontiguousarray(values, kind).tobytes()).decode()
 
 
 def unpacked(text: str, kind: str) -> np.ndarray[Any, Any]:
-    """Return the numbers (n,) of base64 of their bytes in the type ``kind``; ValueError for what is none."""
+    """Decode numbers (n,) from base64 of their bytes in the type ``kind``; ValueError when it is invalid."""
     return np.frombuffer(base64.b64decode(text, validate=True), kind)

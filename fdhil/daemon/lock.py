@@ -1,6 +1,4 @@
-"""Locks a machine for one daemon; the kernel releases the lock with the process, however that ends."""
-
-from __future__ import annotations
+"""Locks a machine for one daemon; the kernel releases the lock with the process, however it ends."""
 
 import fcntl
 import os
@@ -19,10 +17,10 @@ class BusLocked(DeviceError):
 
 @contextmanager
 def sole_owner(run_directory: Path, store_directory: Path) -> Iterator[None]:
-    """Hold the locks of a run directory (made with mode 0700 where it is missing) and of a store.
+    """Hold the locks of a run directory (created with mode 0700 if missing) and of a store.
 
-    BusLocked when another holds one of them. The store has a lock of its own: who removes the run directory of a
-    daemon has not ended it. A store that is not there or cannot be read is told of by who opens it.
+    BusLocked when another process holds one of them. The store has its own lock, because removing the run directory of
+    a daemon does not end it. A missing or unreadable store is reported when it is opened.
     """
     with ExitStack() as held:
         try:
@@ -33,27 +31,26 @@ def sole_owner(run_directory: Path, store_directory: Path) -> Iterator[None]:
             held.callback(os.close, descriptor)
             free = _locked(descriptor)
         except OSError as error:
-            text = f"cannot be used: {error.strerror}; check [store] run_directory and its rights"
+            text = f"cannot be used: {error.strerror}; check [store] run_directory and its permissions"
             raise DeviceError(str(run_directory), text) from None
         if not free:
             owner = os.pread(descriptor, 32, 0).decode("ascii", "replace").strip() or "unknown"
-            text = f"BusLocked: a daemon already serves it (process {owner}); stop that one first, nothing was sent"
+            text = f"BusLocked: a daemon already serves it (process {owner}), nothing was sent; stop that daemon first"
             raise BusLocked(str(run_directory), text)
         with suppress(OSError):
             store_directory.mkdir(parents=True, exist_ok=True)
             store = os.open(store_directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
             held.callback(os.close, store)
             if not _locked(store):
-                text = "BusLocked: another daemon writes to this store; stop that one first, nothing was sent"
+                text = "BusLocked: another daemon writes to this store, nothing was sent; stop that daemon first"
                 raise BusLocked(str(store_directory), text)
-        with suppress(OSError):  # it is only told to another one; the lock holds without it
+        with suppress(OSError):  # only for the message of a second daemon; the lock holds without it
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         yield
 
 
 def _locked(descriptor: int) -> bool:
-    """Lock an open file or folder for this process; False where another has locked it."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -1,9 +1,7 @@
-"""Follows the moves of an axis on the bus: are they of use to identification, and do the scales agree?
+"""Monitors the moves of an axis on the bus: whether identification can use them, and whether the scales agree.
 
-Nothing is identified here: it is counted what never becomes a window, so that silence has a reason. Pure.
+It identifies nothing, but counts moves that never become a window, so that silence has a reason. Pure.
 """
-
-from __future__ import annotations
 
 import math
 from typing import Any
@@ -15,13 +13,13 @@ from fdhil.drivers.moves import load_event_source
 from fdhil.identification.windows import PLATEAU_BAND, PLATEAU_S, RAPID_SHARE, RUN_SHARE
 from fdhil.records import AxisSamples, Float, Int
 
-REST_S = 0.1  # a demand that stands for so long has ended the move
-FEW = 3  # moves that say something about all
-TOO_FAST = 1.05  # of the rapid speed: no override goes there unseen
+REST_S = 0.1  # standstill of the demand that completes a move
+FEW = 3  # moves that are representative
+TOO_FAST = 1.05  # of the rapid speed: no override explains more
 SCALE_TOLERANCE = 0.02
 SCALE_TRAVEL_MM = 50.0  # by which position and the integral of speed are compared
-LEAST_MM, LONGEST_GAP_S = 0.2, 0.1  # of a block that is compared
-PATIENCE_S = 5.0  # until a move that is over has become a window
+LEAST_MM, LONGEST_GAP_S = 0.2, 0.1  # of a compared block
+PATIENCE_S = 5.0  # until a completed move must be a window
 
 
 def _columns(samples: AxisSamples) -> tuple[Int, Float, Float, Float]:
@@ -51,7 +49,7 @@ class Moves:
         self.usable_s = -math.inf
 
     def feed(self, samples: AxisSamples, now_s: float) -> None:
-        """Take a block of samples that came now."""
+        """Take a block of samples that arrived now."""
         if samples.tick.size == 0:
             return
         last = self._last
@@ -68,10 +66,10 @@ class Moves:
         self._compare(float(position[-1] - position[0]), speed, seconds)
 
     def _follow(self, speed_mm_s: Float, now_s: float) -> None:
-        """Follow the demand's speed (n,): a move is over when it has stood for a while."""
+        """Follow the demand's speed (n,): a move is complete once it has stood still for a while."""
         after = np.append(self._speed_mm_s, speed_mm_s)
         self._speed_mm_s = float(after[-1])
-        for mm_s in np.fmin(after[1:], after[:-1]).tolist():  # a jump, as drives are enabled, is no speed
+        for mm_s in np.fmin(after[1:], after[:-1]).tolist():  # a jump, as drives are enabled, is not a speed
             if not mm_s > self._still_mm_s:
                 self._still += 1
                 if self._still == self._rest_rows and self._peak_mm_s > 0.0:
@@ -95,7 +93,7 @@ class Moves:
         self._peak_mm_s, self._level_mm_s, self._level_rows = 0.0, 0.0, 0
 
     def _compare(self, moved_mm: float, speed_rad_s: Float, seconds: Float) -> None:
-        """Regress the position's way on the speed's, block by block; what hardly moves, or has a gap, tells nothing."""
+        """Regress the position's travel on that of the speed; ignore blocks with a gap or little travel."""
         turned_mm = float(np.sum((speed_rad_s[1:] + speed_rad_s[:-1]) / 2 * seconds)) * self._mm_per_rad
         far = max(abs(turned_mm), abs(moved_mm))
         if LEAST_MM < far < math.inf and seconds.max() <= LONGEST_GAP_S:
@@ -105,12 +103,12 @@ class Moves:
 
     @property
     def scale(self) -> float | None:
-        """How far the position goes by what the speed says; None until the axis has gone far enough."""
+        """Ratio of the position's travel to the integral of speed; None until the axis has travelled far enough."""
         across, own, travel_mm = self._agreement
         return across / own if travel_mm >= SCALE_TRAVEL_MM and own > 0.0 else None
 
     def status(self) -> dict[str, Any]:
-        """Return the counts, and how fast the fastest move was."""
+        """Return the counts and the speed of the fastest move."""
         return {
             "seen": self.seen,
             "too_slow": self.slow,
@@ -122,12 +120,12 @@ class Moves:
     def trouble(self, windows: int, now_s: float) -> tuple[str, str] | None:
         """Return class and sentence of what keeps the moves from being used; None when nothing does.
 
-        ``windows`` is how many of them became one.
+        ``windows`` is the number of moves that became a window.
         """
         scale, fastest = self.scale, self.fastest_mm_s
         pitch, rapid = map(self._axis.shown_key, ("screw_pitch_mm", "rapid_speed_mm_s"))
         if scale is not None and abs(scale - 1.0) > SCALE_TOLERANCE:
-            text = f"the position goes {scale:.3g} times as far as the speed says"
+            text = f"the position travels {scale:.3g} times the integral of the speed"
             return "ScaleSuspect", f"{text}; correct increments_per_rev, the drive's profile or its sign"
         if self.seen >= FEW and fastest > TOO_FAST * self._rapid_mm_s:
             return "PitchSuspect", (
@@ -142,18 +140,18 @@ class Moves:
         pitch, rapid = map(self._axis.shown_key, ("screw_pitch_mm", "rapid_speed_mm_s"))
         if self.slow:
             return "MovesNotUsed", (
-                f"{self.seen} moves seen, none used: {self.slow} stay below {self._needed:.0%} of the rapid speed of"
-                f" {self._axis.shown(self._rapid_mm_s, '/s', 'g')}, the fastest at"
-                f" {self._axis.shown(self.fastest_mm_s, '/s')}; make rapids at full override, or correct {rapid} or"
+                f"{self.seen} moves recorded, none used: {self.slow} stay below {self._needed:.0%} of the rapid speed"
+                f" of {self._axis.shown(self._rapid_mm_s, '/s', 'g')}, the fastest at"
+                f" {self._axis.shown(self.fastest_mm_s, '/s')}; run rapids at full override, or correct {rapid} or"
                 f" {pitch}"
             )
         if self.usable >= FEW and now_s - self.usable_s > PATIENCE_S:
             return "MovesNotUsed", (
-                f"{self.usable} fast moves seen, none used: no event of the G0 source {self._source} came; correct"
+                f"{self.usable} fast moves recorded, none used: no event of the G0 source {self._source} came; correct"
                 ' [g0] or use source = "inferred"'
             )
         if self.short >= FEW and not self.usable:
             return "MovesNotUsed", (
-                f"{self.short} fast moves seen, none used: no plateau of {PLATEAU_S:g} s; make longer rapids"
+                f"{self.short} fast moves recorded, none used: no plateau of {PLATEAU_S:g} s; run longer rapids"
             )
         return None

@@ -1,9 +1,7 @@
-"""Remembers what the NC says of itself: for the status, for notices, and for where a notice was. Pure.
+"""Tracks the NC's state: for the status, for notices, and for the program line of a notice. Pure.
 
-Times are given.
+Times are inputs.
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,12 +11,12 @@ from fdhil.daemon.journal import printable
 from fdhil.records import MoveKind, NcState, Notice
 
 FRESH_S = 1.0
-FULL = 0.005  # by which an override of 100 % may be off
+FULL = 0.005  # tolerance of an override of 100 %
 WORKING = (MoveKind.RAPID, MoveKind.FEED, MoveKind.ARC, MoveKind.HOLD)
-HELD = "a rapid that is held teaches nothing, and a correction waits"
+HELD = "held rapids are not identified, and a correction waits"
 ADVICE = {
-    "rapid override": "rapids teach nothing until it is 100 %",
-    "feed override": "a program is not corrected at another speed than it was planned for",
+    "rapid override": "rapids are not identified until it is 100 %",
+    "feed override": "a program is corrected only at the speed it was planned for",
 }
 
 
@@ -27,12 +25,12 @@ class NcWatch:
 
     def __init__(self) -> None:
         self._state: NcState | None = None
-        self._heard_s = 0.0
+        self._received_s = 0.0
         self._unusual: dict[str, str] = {}
 
     def note(self, state: NcState, now_s: float) -> list[Notice]:
-        """Take a state; return what begins to be unusual, and what no longer is."""
-        self._state, self._heard_s = state, now_s
+        """Take a state; return notices for what becomes unusual, and for what is normal again."""
+        self._state, self._received_s = state, now_s
         if state.motion is MoveKind.UNKNOWN:
             return []
         found = dict(_unusual(state))
@@ -42,20 +40,20 @@ class NcWatch:
         return begun + over
 
     def placed(self, notice: Notice, now_s: float) -> Notice:
-        """Return a notice as it is told: printable, and unless it is mere news with the line that the NC works at."""
+        """Return a notice as reported: printable, and unless it is info with the current line of the NC."""
         return replace(notice, text=printable(notice.text + self._place(notice, now_s)))
 
     def _place(self, notice: Notice, now_s: float) -> str:
         state = self._state
         if state is None or notice.severity == "info" or state.line is None or state.motion not in WORKING:
             return ""
-        if now_s - self._heard_s > FRESH_S:
+        if now_s - self._received_s > FRESH_S:
             return ""
         program = "" if state.program is None else f" of {state.program.rpartition('/')[2]}"
         return f" (the NC is at line {state.line}{program})"
 
     def status(self, now_s: float) -> dict[str, Any] | None:
-        """Return what the NC said last, with its age; None when it never said anything."""
+        """Return the NC's last reported state with its age; None when there was none."""
         state = self._state
         if state is None:
             return None
@@ -69,7 +67,7 @@ class NcWatch:
             "rapid_override": state.rapid_override,
             "feed_hold": state.feed_hold,
             "tool": state.tool,
-            "heard_s_ago": round(now_s - self._heard_s, 3),
+            "heard_s_ago": round(now_s - self._received_s, 3),
         }
 
 
@@ -82,7 +80,7 @@ def _unusual(state: NcState) -> Iterator[tuple[str, str]]:
 
 
 def _usual(what: str) -> str:
-    return "the NC's feed goes on" if what == "feed hold" else f"the NC's {what} is 100 % again"
+    return "the NC's feed continues" if what == "feed hold" else f"the NC's {what} is 100 % again"
 
 
 def _notice(what: str, severity: Any, text: str) -> Notice:

@@ -1,6 +1,4 @@
-"""Keeps which notices wait for somebody to acknowledge them, and who acknowledged the others."""
-
-from __future__ import annotations
+"""Tracks which notices are unacknowledged, and who acknowledged the others."""
 
 import threading
 from collections import deque
@@ -17,13 +15,13 @@ from fdhil.store.notice_document import acknowledgement_document, notice_documen
 from fdhil.store.rows import Acknowledgement, Stamp, StoredNotice
 
 NEWEST = RECENT_NOTICES
-TOLD_OPEN = 20  # in the status
-LAST_STORED = 100  # notices whose numbers the status can name
+TOLD_OPEN = 20  # open notices in the status
+LAST_STORED = 100  # notices whose numbers the status can show
 MOST_WHO, MOST_NOTE = 64, 200  # characters
 
 
 class NotAcknowledged(FdhilError):
-    """A request to acknowledge that cannot be met; ``answer`` says why."""
+    """An acknowledgement that is refused; ``answer`` gives the reason."""
 
     def __init__(self, code: str, text: str, advice: str) -> None:
         super().__init__(text)
@@ -31,68 +29,68 @@ class NotAcknowledged(FdhilError):
 
 
 class NoticeBook:
-    """The newest notices of the history: each while it is open, then only who acknowledged it. For several threads."""
+    """The newest notices of the history: each while it is open, then only its acknowledgement. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._known: dict[int, StoredNotice | Acknowledgement] = {}
+        self._by_number: dict[int, StoredNotice | Acknowledgement] = {}
         self._last: deque[tuple[Notice, int]] = deque(maxlen=LAST_STORED)
         self._alarms = AlarmTable()
 
     def begin(self, notices: Sequence[StoredNotice]) -> None:
-        """Start from what the history has, oldest first."""
+        """Load the history, oldest first."""
         with self._lock:
             self._last.clear()
             self._alarms = AlarmTable(notices)
             asking = [notice for notice in notices if notice.notice.severity != "info"]
-            self._known = {notice.number: notice.acknowledged or notice for notice in asking}
+            self._by_number = {notice.number: notice.acknowledged or notice for notice in asking}
 
     def stored(self, notice: Notice, number: int, stamp: Stamp) -> None:
-        """Note that a notice was stored."""
+        """Add a stored notice."""
         with self._lock:
             self._last.append((notice, number))
             kept = StoredNotice(number, notice, stamp)
             self._alarms.take(kept)
             if notice.severity != "info":
-                self._known[number] = kept
-                for old in list(self._known)[:-NEWEST]:
-                    del self._known[old]
+                self._by_number[number] = kept
+                for old in list(self._by_number)[:-NEWEST]:
+                    del self._by_number[old]
                     self._alarms.forget(old)
 
     def chosen(self, request: Mapping[str, Any]) -> list[int]:
-        """Return the open notices that a request names; NotAcknowledged where it names none that there is."""
+        """Return the open notices that a request names; NotAcknowledged where it names none or unknown ones."""
         numbers, up_to = request.get("notices"), request.get("up_to")
         with self._lock:
             waiting = [notice.number for notice in self._open()]
             if isinstance(up_to, int) and _is_number(up_to) and numbers is None:
                 return [number for number in waiting if number <= up_to]
             if not (isinstance(numbers, list) and numbers and all(map(_is_number, numbers)) and up_to is None):
-                text = "the request names no notices"
+                text = "the request selects no notices"
                 raise NotAcknowledged("BadRequest", text, "give 'notices' (a list of numbers) or 'up_to' (a number)")
-            if unknown := [number for number in numbers if number not in self._known]:
-                text = f"there is no notice {', '.join(map(str, unknown[:5]))} that asks to be acknowledged"
-                raise NotAcknowledged("NoSuchNotice", text, "fdhil status shows the numbers of those that do")
+            if unknown := [number for number in numbers if number not in self._by_number]:
+                text = f"there is no notice {', '.join(map(str, unknown[:5]))} that can be acknowledged"
+                raise NotAcknowledged("NoSuchNotice", text, "fdhil status shows the numbers of open notices")
         named = set(numbers)
         return [number for number in waiting if number in named]
 
     def acknowledged(self, given: Acknowledgement) -> None:
-        """Note that notices were acknowledged."""
+        """Record that notices were acknowledged."""
         with self._lock:
             self._alarms.acknowledge(given)
             for number in given.notices:
-                if number in self._known:
-                    self._known[number] = given
+                if number in self._by_number:
+                    self._by_number[number] = given
 
     def told(self, notice: Notice) -> dict[str, Any]:
-        """Return the number of a notice in the history (None: not stored, yet) and its acknowledgement."""
+        """Return the number of a notice in the history (None: not stored yet) and its acknowledgement."""
         with self._lock:
-            number = next((number for known, number in reversed(self._last) if known is notice), None)
-            known = self._known.get(number) if number is not None else None
-        given = known if isinstance(known, Acknowledgement) else None
+            number = next((number for stored, number in reversed(self._last) if stored is notice), None)
+            entry = self._by_number.get(number) if number is not None else None
+        given = entry if isinstance(entry, Acknowledgement) else None
         return {"number": number, "acknowledged": acknowledgement_document(given)}
 
     def status(self) -> dict[str, Any]:
-        """Return what waits to be acknowledged: how many, how many of them MAJOR, and the newest, oldest first."""
+        """Return how many notices are unacknowledged, how many of them MAJOR, and the newest, oldest first."""
         with self._lock:
             waiting = self._open()
         major = sum(notice.notice.severity == "MAJOR" for notice in waiting)
@@ -108,12 +106,12 @@ class NoticeBook:
             return alarms_status(self._alarms.shown(), TOLD_OPEN)
 
     def left_active(self) -> list[Notice]:
-        """Return the ends of the conditions that the daemon before this one left."""
+        """Return notices that end the conditions of an earlier daemon."""
         with self._lock:
             return self._alarms.left_active()
 
     def _open(self) -> list[StoredNotice]:
-        return [known for known in self._known.values() if isinstance(known, StoredNotice)]
+        return [each for each in self._by_number.values() if isinstance(each, StoredNotice)]
 
 
 def _is_number(value: object) -> bool:
@@ -123,19 +121,19 @@ def _is_number(value: object) -> bool:
 def acknowledgement_of(
     request: Mapping[str, Any], numbers: Sequence[int], stamp: Stamp | None = None
 ) -> Acknowledgement:
-    """Return who acknowledges what, now; NotAcknowledged where nobody answers for it."""
+    """Parse an acknowledgement made now; NotAcknowledged where the request is invalid."""
     who, note = request.get("by"), request.get("note", "")
     if not isinstance(who, str) or not who.strip() or len(who) > MOST_WHO:
-        text = "nobody answers for the acknowledgement"
+        text = "the acknowledgement has no name"
         raise NotAcknowledged("BadRequest", text, f"give a name of at most {MOST_WHO} characters as 'by'")
     if not isinstance(note, str) or len(note) > MOST_NOTE:
-        text = "the note is no text, or too long"
+        text = "the note is not a text, or too long"
         raise NotAcknowledged("BadRequest", text, f"give a text of at most {MOST_NOTE} characters as 'note'")
     return Acknowledgement(tuple(numbers), printable(who.strip()), printable(note.strip()), stamp or Stamp.now())
 
 
 def counted(numbers: Sequence[int]) -> str:
-    """Return how many notices these are, and which in few words."""
+    """Return a short text for these notices, such as ``3 notices (number 4 to 9)``."""
     if len(numbers) == 1:
         return f"notice {numbers[0]}"
     return f"{len(numbers)} notices" + (f" (number {min(numbers)} to {max(numbers)})" if numbers else "")

@@ -1,6 +1,4 @@
-"""Tells systemd how the service is (sd_notify), without a library."""
-
-from __future__ import annotations
+"""Notifies systemd of the service's state (sd_notify), without a library."""
 
 import contextlib
 import os
@@ -8,9 +6,9 @@ import socket
 
 
 def notify(state: str) -> bool:
-    """Send one state such as ``READY=1`` or ``WATCHDOG=1``; False when no service manager listens.
+    """Send one state such as ``READY=1`` or ``WATCHDOG=1``; return False when no service manager listens.
 
-    The protocol is one datagram to the socket that NOTIFY_SOCKET names; a leading @ is the abstract namespace.
+    The protocol is one datagram to the socket named by NOTIFY_SOCKET; a leading @ is the abstract namespace.
     """
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:

@@ -1,6 +1,4 @@
-"""Outcomes and parameters as JSON documents, values to full precision. Imports nothing heavy."""
-
-from __future__ import annotations
+"""Encodes outcomes and parameters as JSON documents, values to full precision. Imports nothing heavy."""
 
 import math
 from dataclasses import asdict
@@ -8,21 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.records import (
-    LoopEstimate,
-    Notice,
-    Outcome,
-    ParameterSet,
-    Skill,
-    WindowOutcome,
-    unit_of,
-)
+from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, WindowOutcome, unit_of
 from fdhil.store.history import described, friction_of
 from fdhil.store.set_document import set_document
 
 
 def as_document(outcome: Outcome) -> dict[str, Any]:
-    """Return an outcome as JSON has it; ``kind`` is window, parameters, skill, notice or loops."""
+    """Return an outcome as a JSON document; ``kind`` is window, parameters, skill, notice or loops."""
     if isinstance(outcome, WindowOutcome):
         return _window(outcome)
     if isinstance(outcome, ParameterSet):
@@ -34,7 +24,7 @@ def as_document(outcome: Outcome) -> dict[str, Any]:
 
 
 def loops_document(found: LoopEstimate) -> dict[str, Any]:
-    """Return what rapids show of the drive's own loops as JSON has it."""
+    """Return the identified control loops of a drive as a JSON document."""
     stds = np.sqrt(np.diag(found.covariance)).tolist()
     gains = zip(found.names, found.values.tolist(), stds, strict=True)
     return {
@@ -52,7 +42,7 @@ def loops_document(found: LoopEstimate) -> dict[str, Any]:
 
 def _window(outcome: WindowOutcome) -> dict[str, Any]:
     window, verdict = outcome.window, outcome.verdict
-    told = {name: figures | {"unit": unit_of(name)} for name, figures in described(outcome).items()}
+    all_figures = {name: figures | {"unit": unit_of(name)} for name, figures in described(outcome).items()}
     terms = outcome.estimate.terms if outcome.estimate else ()
     return {
         "kind": "window",
@@ -67,8 +57,8 @@ def _window(outcome: WindowOutcome) -> dict[str, Any]:
         "method": outcome.estimate and outcome.estimate.method,
         "unexplained_um": verdict.unexplained_um,
         "warnings": [str(warning) for warning in verdict.warnings],
-        "parameters": {name: figures for name, figures in told.items() if name not in terms},
-        "terms": {name: figures for name, figures in told.items() if name in terms},
+        "parameters": {name: figures for name, figures in all_figures.items() if name not in terms},
+        "terms": {name: figures for name, figures in all_figures.items() if name in terms},
         "friction_at_rapid": friction_of(outcome),
         "delay_s": _delay(outcome),
         "at_table": None if outcome.at_table is None else asdict(outcome.at_table),
@@ -77,7 +67,7 @@ def _window(outcome: WindowOutcome) -> dict[str, Any]:
 
 
 def _delay(outcome: WindowOutcome) -> dict[str, Any] | None:
-    """Return by how much the voltage is late against current and speed; None where that was not estimated."""
+    """Return the delay of the voltage against current and speed; None where it was not estimated."""
     estimate = outcome.estimate
     if estimate is None or estimate.delay_s is None or not math.isfinite(estimate.delay_s):
         return None

@@ -1,6 +1,4 @@
-"""Stores each outcome of the daemon; when the disk refuses it says so, and the daemon goes on in shadow."""
-
-from __future__ import annotations
+"""Stores each outcome of the daemon; when the disk refuses, it reports that and the daemon continues in shadow."""
 
 import math
 import threading
@@ -40,12 +38,12 @@ from fdhil.store.windows import RawScale, Scales, WindowStore
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 SKILLS = 3
-# of the history: its newest rows may be in the log alone, which goes aside first; beside no file SQLite removes it
+# the log first: it may hold the newest rows, and SQLite removes a log without its file
 SUFFIXES = ("-wal", "-shm", "")
 
 
 def raw_scales(config: MachineConfig, axis: str) -> Scales:
-    """Return how the drive's integers of each column become values: the drivers' own scales, in their own order."""
+    """Return the scales from the drive's integers to the values of each column, as the drivers apply them."""
     settings = config.axis[axis]
     profile = load_profile(settings.drive)
     position = (RawScale(settings.scaling.sign / settings.scaling.increments_per_mm),)
@@ -59,33 +57,26 @@ def raw_scales(config: MachineConfig, axis: str) -> Scales:
     }
 
 
-def _point(window: StoredWindow) -> Point:
-    """Return a stored window's estimate as the drift tracker has it."""
-    values, stds = (_numbers(window, key) for key in ("value", "std"))
-    return Point(values, stds, window.start_tick, window.direction)
-
-
 def _numbers(window: StoredWindow, key: str) -> Float:
-    """Return a figure (6,) of each parameter of a stored window, NaN where there is none."""
-    told = window.parameters or {}
-    return frozen([math.nan if (number := told.get(name, {}).get(key)) is None else number for name in PARAMETERS])
+    """Return a figure (6,) of each parameter of a stored window, NaN where it is missing."""
+    figures = window.parameters or {}
+    return frozen([math.nan if (number := figures.get(name, {}).get(key)) is None else number for name in PARAMETERS])
 
 
 def _members(windows: Sequence[StoredWindow]) -> tuple[Member, ...]:
-    """Return what stored windows, given in order, tell a pool."""
     members = []
     for place, window in enumerate(windows, start=1 - len(windows)):
-        if (told := window.told) is not None:
-            values, own, shared = (frozen(told[key]) for key in ("values", "own", "shared"))
-            members.append(Member(tuple(told["names"]), values, own, shared, place, window.direction))
+        if (pooled := window.told) is not None:
+            values, own, shared = (frozen(pooled[key]) for key in ("values", "own", "shared"))
+            members.append(Member(tuple(pooled["names"]), values, own, shared, place, window.direction))
     return tuple(members)
 
 
 class OutcomeStore:
-    """Writes outcomes to the windows' folder and to the history. Safe to call from several worker threads.
+    """Writes outcomes to the folder of windows and to the history. Safe to call from several worker threads.
 
-    A store that refuses never stops the daemon: ``fault`` is the class of the refusal (None while all is well), the
-    outcome stays in memory only, and each next one is tried again (a window always as a new file).
+    A failing store never stops the daemon: ``fault`` is the class of the refusal (None while all is well), the outcome
+    stays in memory only, and each next one is tried again (a window always as a new file).
     """
 
     def __init__(self, config: MachineConfig, clock: Clock = SYSTEM_CLOCK) -> None:
@@ -99,11 +90,11 @@ class OutcomeStore:
         self._accepted = {axis: deque[tuple[int, int]](maxlen=HISTORY) for axis in config.axis}  # start tick and row
         self.notices = NoticeBook()
         self.fault: str | None = None
-        self._told_left = False
+        self._file_reported = False
         self.strays: tuple[str, ...] = ()
 
     def open(self) -> list[Notice]:
-        """Open or create the store; a damaged history is put aside, never deleted. Return what must be told."""
+        """Open or create the store; a damaged history is moved aside, never deleted. Return notices."""
         notices = []
         try:
             notices += self._open()
@@ -116,12 +107,11 @@ class OutcomeStore:
         if self.strays:
             names = ", ".join(self.strays[:5])
             folder = self._directory / WINDOWS_FOLDER
-            text = f"{len(self.strays)} files in {folder} are no windows and are ignored: {names}."
+            text = f"{len(self.strays)} files in {folder} are not windows and are ignored: {names}."
             notices.append(Notice("StrayFiles", "minor", text))
         return notices
 
     def _open(self) -> list[Notice]:
-        """Open what is not open; return the notice of damaged rows that were put aside."""
         new = self._history is None
         if self._history is None:
             outbox = self._outbox
@@ -135,23 +125,21 @@ class OutcomeStore:
         places = self._history.put_damaged_aside()
         self.notices.begin(self._history.notices(limit=NEWEST))
         self._history.checkpoint()
-        text = f"Damaged rows of the history were put aside, older ones are used: {places}; check the disk."
+        text = f"Damaged rows of the history were moved aside, older ones are used: {places}; check the disk."
         return [Notice("CorruptFile", "MAJOR", text)] if places else []
 
     def _leave_replaced(self) -> list[Notice]:
-        """Close a history whose file was replaced, removed or overwritten; what stands there is opened next."""
+        """Close a history whose file was replaced, removed or overwritten; the new file is opened next."""
         if self._history is None or self._history.is_in_place():
             return []
         with suppress(OSError):
             self._history.abandon()
         self._history = None
         for rows in self._accepted.values():
-            rows.clear()  # numbers of rows in the file that was
+            rows.clear()  # row numbers of the old file
         path = self._directory / FILE_NAME
-        text = f"{path} was replaced, removed or overwritten while the daemon ran: what was recorded since that file"
-        return [
-            Notice("StoreReplaced", "MAJOR", f"{text} was written is not in it; new records go to what stands there.")
-        ]
+        text = f"{path} was replaced, removed or overwritten while the daemon ran: records made since that file"
+        return [Notice("StoreReplaced", "MAJOR", f"{text} was written are not in it; new records go to the new file.")]
 
     def _put_aside(self, error: StoreError) -> list[Notice]:
         path = self._directory / FILE_NAME
@@ -167,7 +155,7 @@ class OutcomeStore:
             notices = self._open()
         except (OSError, StoreError):
             return self._refused(error)
-        text = f"The history was damaged, it is kept as {aside.name} and a new one was begun; check the disk."
+        text = f"The history was damaged; it is kept as {aside.name}, and a new one was started; check the disk."
         return [Notice("CorruptFile", "MAJOR", text), *notices]
 
     def close(self) -> None:
@@ -178,7 +166,7 @@ class OutcomeStore:
                 self._history = None
 
     def newest(self) -> dict[str, Revision]:
-        """Return the newest revision of each axis that the history has."""
+        """Return the newest revision of each axis in the history."""
         return {} if self._history is None else newest_sets(self._history, self._config.axis)
 
     def skills(self) -> list[Skill]:
@@ -188,7 +176,7 @@ class OutcomeStore:
         return [skill for axis in self._config.axis for skill in self._history.skills(axis, limit=SKILLS)]
 
     def known(self, axis: str) -> Known:
-        """Return where an earlier run left off: first values, newest set, the newest accepted windows' estimates."""
+        """Return what an earlier run left: first values, newest set, estimates of the newest accepted windows."""
         if self._history is None:
             return Known()
         newest = self._history.revisions(axis, limit=1)
@@ -197,7 +185,10 @@ class OutcomeStore:
             for direction, window in self._history.first_windows(axis).items()
         }
         windows = [window for window in self._history.windows(axis, limit=2 * HISTORY) if window.accepted][-HISTORY:]
-        points = tuple(map(_point, windows[-4 * POOL_WINDOWS :]))
+        points = tuple(
+            Point(_numbers(window, "value"), _numbers(window, "std"), window.start_tick, window.direction)
+            for window in windows[-4 * POOL_WINDOWS :]
+        )
         published = newest[0].set if newest else None
         loops = newest_loops(self._history, axis, self._config.digest)
         return Known(first, published, points, _members(windows), loops)
@@ -207,41 +198,40 @@ class OutcomeStore:
         return (0, 0) if self._history is None else self._history.counts(axis)
 
     def keep(self, outcomes: Sequence[Outcome]) -> list[Notice]:
-        """Store outcomes durably in their order; return a notice when that fails, and one when it works again."""
+        """Store outcomes durably in order; return a notice when that fails, and one when it works again."""
         with self._lock:
-            told = []
+            notices = []
             try:
-                told += self._leave_replaced()
-                told += self._write(outcomes)
-                if replaced := self._leave_replaced():  # while it was written
-                    told += [*replaced, *self._write(outcomes)]
+                notices += self._leave_replaced()
+                notices += self._write(outcomes)
+                if replaced := self._leave_replaced():  # replaced during the write
+                    notices += [*replaced, *self._write(outcomes)]
             except StoreError as error:
-                return told + self._refused(error)
-            told += self._left_files()
+                return notices + self._refused(error)
+            notices += self._left_files()
             if self.fault is not None and any(isinstance(outcome, WindowOutcome) for outcome in outcomes):
                 self.fault = None
-                text = "The store can be written again; what came in between was not kept, arm again when needed."
-                told.append(Notice("StoreRecovered", "info", text))
-        return told
+                text = "The store can be written again; records in between were not stored, arm again when needed."
+                notices.append(Notice("StoreRecovered", "info", text))
+        return notices
 
     def _write(self, outcomes: Sequence[Outcome]) -> list[Notice]:
-        told = self._open() if self._history is None or self._windows is None else []
+        notices = self._open() if self._history is None or self._windows is None else []
         assert self._history is not None
         for outcome in outcomes:
             self._keep(outcome)
         self._history.checkpoint()
-        return told
+        return notices
 
     def _left_files(self) -> list[Notice]:
-        """Tell once that a window's file is there that should have gone."""
         left = self._windows.left if self._windows is not None else None
-        if left is None or self._told_left:
+        if left is None or self._file_reported:
             return []
-        self._told_left = True
+        self._file_reported = True
         return [Notice("StrayFiles", "minor", str(left))]
 
     def acknowledge(self, request: Mapping[str, Any]) -> Answer:
-        """Store who has seen which notices, so that they are open no more; StoreError when the disk refuses."""
+        """Store an acknowledgement of notices; StoreError when the disk refuses."""
         with self._lock:
             try:
                 given = acknowledgement_of(request, self.notices.chosen(request), Stamp.now(self._clock))
@@ -256,13 +246,13 @@ class OutcomeStore:
                 self._require_in_place(self._history)
                 self._history.checkpoint()
                 self.notices.acknowledged(given)
-        text = f"{counted(given.notices)} acknowledged by {given.who}; {self.notices.status()['count']} more wait"
+        text = f"{counted(given.notices)} acknowledged by {given.who}; {self.notices.status()['count']} more are open"
         journal.write_line(text)
         return {"ok": True, "text": text, "acknowledged": list(given.notices)}
 
     def _require_in_place(self, history: History) -> None:
         if not history.is_in_place():
-            text = f"{self._directory / FILE_NAME} was replaced; nothing is acknowledged; look at the notices again"
+            text = f"{self._directory / FILE_NAME} was replaced; nothing is acknowledged; check the notices again"
             raise StoreError(text, "StoreReplaced")
 
     def _keep(self, outcome: Outcome) -> None:
@@ -291,4 +281,4 @@ class OutcomeStore:
         self._windows = None  # its folder may be gone
         if again:
             return []
-        return [Notice(error.code, "MAJOR", f"{error}; the daemon goes on in shadow and cannot be armed.")]
+        return [Notice(error.code, "MAJOR", f"{error}; the daemon continues in shadow and cannot be armed.")]

@@ -1,6 +1,4 @@
-"""Says who is at the other end of a UNIX socket, by the kernel's word (SO_PEERCRED), and what he may ask for."""
-
-from __future__ import annotations
+"""Identifies the process at the other end of a UNIX socket (SO_PEERCRED) and its rights."""
 
 import contextlib
 import os
@@ -13,11 +11,11 @@ from pathlib import Path
 from fdhil.config import Access
 from fdhil.guard.peers import Role, credentials
 
-# what each request needs; what is not listed needs the most
+# rights that each request needs; any other needs the highest
 NEEDS: Mapping[str, Role] = {
     "status": Role.WATCH,
     "live": Role.WATCH,
-    "disarm": Role.WATCH,  # standing still is never refused to one who may look
+    "disarm": Role.WATCH,  # never refused to a user who may watch
     "arm": Role.OPERATE,
     "acknowledge": Role.OPERATE,
 }
@@ -25,7 +23,7 @@ NEEDS: Mapping[str, Role] = {
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """A process that talks to the daemon: its user, its number, what it may do."""
+    """A client process of the daemon: its user, its process ID, its rights."""
 
     user: str
     uid: int
@@ -33,12 +31,12 @@ class Peer:
     role: Role
 
     def may(self, request: str) -> bool:
-        """Whether it may ask for that."""
+        """Return whether it may make this request."""
         return self.role >= NEEDS.get(request, Role.COMMISSION)
 
 
 def peer_of(connection: socket.socket, access: Access) -> Peer:
-    """Return who is at the other end: the daemon's own user and root may do all, others what the config says."""
+    """Return the client at the other end: the daemon's user and root have all rights, others those of the config."""
     pid, uid = credentials(connection)
     try:
         user = pwd.getpwuid(uid).pw_name
@@ -48,7 +46,7 @@ def peer_of(connection: socket.socket, access: Access) -> Peer:
 
 
 def role_of(user: str, uid: int, access: Access) -> Role:
-    """Return what a user of this computer may do; the daemon's own and root may do all."""
+    """Return the rights of a user of this computer; the daemon's user and root have all."""
     if uid in (0, os.getuid()):
         return Role.COMMISSION
     if user in access.operate:
@@ -57,10 +55,10 @@ def role_of(user: str, uid: int, access: Access) -> Role:
 
 
 def listen(path: Path, access: Access) -> socket.socket:
-    """Return a listening socket at ``path``: the owner's alone (0600), its group's too where ``access`` names users.
+    """Open a listening socket at ``path``: for its owner (0600), and its group (0660) where ``access`` names users.
 
-    Then the group may also enter the folder, but not list it: the token there stays the owner's. A socket file left by
-    a crash is replaced. OSError when it cannot be made.
+    Then the group may also enter the folder, but not list it: the token in it stays the owner's. A socket file left by
+    a crash is replaced. OSError when it cannot be created.
     """
     with contextlib.suppress(FileNotFoundError):
         if path.is_socket():
@@ -71,7 +69,7 @@ def listen(path: Path, access: Access) -> socket.socket:
         shared = bool(access.watch or access.operate)
         path.chmod(0o660 if shared else 0o600)
         if shared:
-            with contextlib.suppress(PermissionError):  # a folder of another owner is as that one wants it
+            with contextlib.suppress(PermissionError):  # another owner's folder stays as it is
                 path.parent.chmod(path.parent.stat().st_mode & 0o7777 | 0o010)
     except OSError:
         listener.close()

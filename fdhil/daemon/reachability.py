@@ -1,6 +1,4 @@
-"""Restores what a cleaned run directory took away from a running daemon, or has the correction ramped to zero."""
-
-from __future__ import annotations
+"""Restores the socket and token of a running daemon whose run directory was cleaned, or ramps to zero."""
 
 import asyncio
 
@@ -11,15 +9,15 @@ from fdhil.records import Notice
 CODE = "SocketLost"
 
 
-async def reach_again(desk: ArmingDesk, trouble: str) -> Notice:
-    """Write the token again beside the socket that was made again; ramp to zero where ``trouble`` prevented that."""
+async def reach_again(arming: ArmingDesk, trouble: str) -> Notice:
+    """Write the token again after the socket; ramp to zero where ``trouble`` or an error prevents either."""
     try:
-        await asyncio.to_thread(desk.restore_token)
+        await asyncio.to_thread(arming.restore_token)
     except DeviceError as error:
         trouble = trouble or str(error)
     if trouble:
-        await desk.disarm()
-        text = f"The control socket or the token is gone and cannot be made again ({trouble}): disarmed."
+        await arming.disarm()
+        text = f"The control socket or the token is gone and cannot be created again ({trouble}): disarmed."
         return Notice(CODE, "MAJOR", text)
-    text = "The run directory was cleaned away: the control socket and the token were made again, all goes on."
+    text = "The run directory was removed: the control socket and the token were created again; operation continues."
     return Notice(CODE, "minor", text)

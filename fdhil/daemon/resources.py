@@ -1,9 +1,7 @@
-"""Says what this process uses of its computer: memory, descriptors, threads, each beside what it may use (Linux).
+"""Measures this process' memory, descriptors and threads against their limits (Linux).
 
-The bound is the tightest of what systemd set (MemoryMax, TasksMax) and the process' own limit (LimitNOFILE).
+The limit is the tightest of systemd's (MemoryMax, TasksMax) and the process' own (LimitNOFILE).
 """
-
-from __future__ import annotations
 
 import errno
 import os
@@ -13,13 +11,13 @@ from pathlib import Path
 
 from fdhil.records import Notice
 
-HIGH, LOW = 0.8, 0.7  # share of what is allowed at which it is told, and below which it is over
+HIGH, LOW = 0.8, 0.7  # used share above which a notice is raised, and below which it ends
 CGROUPS = Path("/sys/fs/cgroup")
 
 
 @dataclass(frozen=True, slots=True)
 class Use:
-    """One thing that is used: how much, and how much may be, None without a bound."""
+    """Use of one resource and its limit, None where there is none."""
 
     name: str
     used: int
@@ -27,14 +25,14 @@ class Use:
 
     @property
     def share(self) -> float:
-        """The part of what is allowed; 0 without a bound."""
+        """Used share of the limit; 0 without a limit."""
         return self.used / self.allowed if self.allowed else 0.0
 
 
 def uses(process: Path = Path("/proc/self"), cgroups: Path = CGROUPS) -> tuple[Use, ...]:
-    """Return memory in bytes, descriptors and threads of this process; of what cannot be looked at, nothing.
+    """Return memory in bytes, descriptors and threads of this process; empty where they cannot be read.
 
-    To look takes a descriptor: where there is none left, just that is returned.
+    Reading needs a descriptor: when none is left, only that is returned.
     """
     try:
         return _uses(process, cgroups)
@@ -57,7 +55,6 @@ def _uses(process: Path, cgroups: Path) -> tuple[Use, ...]:
 
 
 def _group_of(process: Path) -> str:
-    """The process' control group, by the unified hierarchy; that of all where it is in none."""
     for line in (process / "cgroup").read_text("utf-8").splitlines():
         if line.startswith("0::/"):
             return line[4:]
@@ -73,22 +70,22 @@ def _bound(file: Path) -> int | None:
 
 
 class ResourceWatch:
-    """Tells once that something is nearly used up, and once that it is no longer."""
+    """Reports once that a resource is nearly exhausted, and once that it no longer is."""
 
     def __init__(self) -> None:
         self._high: set[str] = set()
 
     def look(self, found: tuple[Use, ...]) -> list[Notice]:
-        """Return what there is to say of what is used now."""
-        told: list[Notice] = []
+        """Return notices about the measured use."""
+        notices: list[Notice] = []
         for use in found:
             if use.share >= HIGH and use.name not in self._high:
                 self._high.add(use.name)
-                told.append(Notice("ResourceHigh", "minor", f"the daemon uses {_said(use)}"))
+                notices.append(Notice("ResourceHigh", "minor", f"the daemon uses {_said(use)}"))
             elif use.share < LOW and use.name in self._high:
                 self._high.discard(use.name)
-                told.append(Notice("ResourceHigh", "info", f"the daemon uses {_said(use)} again"))
-        return told
+                notices.append(Notice("ResourceHigh", "info", f"the daemon uses {_said(use)} again"))
+        return notices
 
 
 def _said(use: Use) -> str:

@@ -1,10 +1,8 @@
 """Runs the daemon: one task group that carries records from the machine to the pipelines, and outcomes to the store.
 
-Sources restart with back-off; a pipeline never does. An unexpected exception in any task ramps the correction down
-(the guard is told to disarm) and ends the process: there is no half-alive daemon. Nothing is ever sent from here.
+Sources restart with increasing delay; a pipeline never does. An unexpected exception in any task ramps the correction
+to zero (the guard is disarmed) and ends the process: a daemon is never half alive. It sends nothing to the machine.
 """
-
-from __future__ import annotations
 
 import asyncio
 import os
@@ -17,6 +15,7 @@ from fdhil.arming.answers import Answer, refusal
 from fdhil.arming.desk import ArmingDesk
 from fdhil.arming.guard_link import TRIPPED, VOIDING
 from fdhil.arming.standing import ADOPT, START_AND_ADOPT, Standing
+from fdhil.cancellation import find_first_error
 from fdhil.commissioning.void import void_record
 from fdhil.config import MachineConfig, unlikely
 from fdhil.daemon import alarms, blackbox, heap, journal
@@ -50,7 +49,7 @@ STUCK_S = 60.0  # a batch that is digested for so long hangs
 
 
 class InternalError(FdhilError):
-    """A fault of fdhil itself ended the daemon."""
+    """An internal error of fdhil ended the daemon."""
 
 
 class Service:
@@ -69,7 +68,7 @@ class Service:
         self._method = method
         self._run_directory = config.run_directory
         self._store = OutcomeStore(config, clock)
-        self._desk = ArmingDesk(config, self._store, self._run_directory, clock)
+        self._arming = ArmingDesk(config, self._store, self._run_directory, clock)
         self._watch = Watch(config, self._clock.now_s())
         self._live = LiveStream(config)
         self._gantry = GantryWatch(config)
@@ -77,14 +76,14 @@ class Service:
         self._queues = {axis: RecordQueue() for axis in config.axis}
         self._busy_since_s: dict[str, float] = {}
         self._notices = asyncio.Queue[Notice](NOTICE_QUEUE)
-        self._void_axes = asyncio.Queue[str]()  # each once at most: ``_void_by`` has the newest that speaks against it
+        self._void_axes = asyncio.Queue[str]()  # each once at most; ``_void_by`` has the newest reason
         self._void_by: dict[str, str] = {}
         self._gate = journal.FloodGate()
-        self._held: dict[alarms.Key, Notice] = {}  # by condition the newest notice, while a flood holds it back
+        self._held: dict[alarms.Key, Notice] = {}  # newest suppressed notice of each condition
         self._audit = Audited(self._handle, config.store.directory, clock)
-        desk, access = self._desk, config.access
+        arming, access = self._arming, config.access
         self._control = ControlServer(
-            self._audit.of, lambda: desk.checking, desk.abandon, access, self._live.serve, self._socket_lost
+            self._audit.of, lambda: arming.checking, arming.abandon, access, self._live.serve, self._socket_lost
         )
         self._acquisition = Acquisition(config, open_source, self._watch.hearing, self._tell)
         self._stop = asyncio.Event()
@@ -94,7 +93,7 @@ class Service:
         self._frames_seen = -1
 
     async def run(self) -> Standing:
-        """Serve until a signal asks to stop; return what may still be applied. BusLocked when another one serves it."""
+        """Serve until a signal requests a stop; return what may still be applied. BusLocked: another serves it."""
         loop = asyncio.get_running_loop()
         with sole_owner(self._run_directory, self._config.store.directory), journal.lines_dated_by(self._clock):
             stopping = [number for number in STOPPING if signal.getsignal(number) is not signal.SIG_IGN]  # as by nohup
@@ -106,7 +105,7 @@ class Service:
                 notify("STOPPING=1")
                 self.shutdown.begin()
                 await self._ramp_to_zero()
-                stop, budgets, stands = self.shutdown, self._budgets, self._desk.guard.standing
+                stop, budgets, stands = self.shutdown, self._budgets, self._arming.guard.standing
                 await stop.step("the audit log", self._audit.written(), budgets.audit_s, "its last lines are lost")
                 closing = asyncio.to_thread(self._store.close)
                 await stop.step("closing the store", closing, budgets.store_s, "its last records may be lost")
@@ -114,7 +113,7 @@ class Service:
                     loop.remove_signal_handler(number)
                 if (
                     self._acquisition.opened.is_set() or not stands.nothing
-                ):  # else it never ran, and the error alone is told
+                ):  # else it never ran, and only the error is reported
                     self._say_stopped(stands)
         return stands
 
@@ -122,13 +121,13 @@ class Service:
         if stands.nothing:
             journal.write_line(f"stopped, {stands}")
         else:
-            advice = START_AND_ADOPT if self._desk.guard.state == "lost" else ADOPT
+            advice = START_AND_ADOPT if self._arming.guard.state == "lost" else ADOPT
             journal.write_line(f"stopped, {stands}; {advice}", "MAJOR")
 
     @property
     def standing(self) -> Standing:
-        """What may still be applied, as far as the daemon knows."""
-        return self._desk.guard.standing
+        """The offset that may still be applied, as far as the daemon knows."""
+        return self._arming.guard.standing
 
     async def _serve(self) -> None:
         clock = ClockWatch(await asyncio.to_thread(newest_record_s, self._config.store.directory))
@@ -137,13 +136,13 @@ class Service:
         await asyncio.to_thread(self._prepare)
         async with self._control.serving(self._run_directory / SOCKET_NAME), asyncio.TaskGroup() as tasks:
             stop, budgets = self.shutdown, self._budgets
-            closing_s = budgets.source_s + 1.0  # reported before it is given up
+            closing_s = budgets.source_s + 1.0  # reported before it is abandoned
             acquiring = tasks.create_task(self._acquisition.run(self._take, closing_s), name="acquire")
             others = [tasks.create_task(self._work(axis), name=f"axis {axis}") for axis in self._config.axis]
             others.append(tasks.create_task(self._keep_notices(), name="notices"))
             others.append(tasks.create_task(self._void_records(), name="void"))
-            others.append(tasks.create_task(self._desk.attend(self._tell), name="guard"))
-            others.append(tasks.create_task(self._desk.stream(self._tell), name="stream"))
+            others.append(tasks.create_task(self._arming.attend(self._tell), name="guard"))
+            others.append(tasks.create_task(self._arming.stream(self._tell), name="stream"))
             others.append(tasks.create_task(self._feed_watchdog(), name="watchdog"))
             others.append(tasks.create_task(self._listen(), name="listen"))
             others.append(tasks.create_task(self._watch_resources(clock), name="resources"))
@@ -165,19 +164,19 @@ class Service:
 
     async def _ramp_to_zero(self) -> None:
         effect = "the guard ramps to zero when this process has ended; see fdhil-guard's journal"
-        await self.shutdown.step("the ramp to zero", self._desk.stand_down(), self._budgets.zero_s, effect)
+        await self.shutdown.step("the ramp to zero", self._arming.stand_down(), self._budgets.zero_s, effect)
 
     async def _analysed(self) -> None:
         axes = (queue.join() for queue in self._queues.values())
         await asyncio.gather(*axes, self._notices.join(), self._void_axes.join())
 
     def _prepare(self) -> None:
-        """Begin each axis with what the history knows, and compile the kernels."""
-        self._desk.begin(self._store.newest(), self._store.skills())
+        """Load each axis from the history, and compile the kernels."""
+        self._arming.begin(self._store.newest(), self._store.skills())
         for axis in self._config.axis:
-            known = self._store.known(axis)
-            self._pipelines[axis] = AxisPipeline(axis, self._config, self._method, known)
-            self._watch.begin(axis, known.newest, self._store.counts(axis), known.loops)
+            history = self._store.known(axis)
+            self._pipelines[axis] = AxisPipeline(axis, self._config, self._method, history)
+            self._watch.begin(axis, history.newest, self._store.counts(axis), history.loops)
         warm(self._config, self._method)
 
     async def _say_ready(self) -> None:
@@ -191,7 +190,7 @@ class Service:
     def _take(self, record: Record | NcState | Notice) -> None:
         self._acquisition.received()
         if isinstance(record, NcState):
-            self._desk.hear_nc(record)
+            self._arming.hear_nc(record)
             self._tell(self._watch.nc.note(record, self._clock.now_s()))
             return
         self._watch.hearing.record_came(record, self._clock.now_s())
@@ -200,37 +199,36 @@ class Service:
             return
         self._live.take(record)
         if isinstance(record, Temperature):
-            self._desk.knowledge.note_temperature(record)
+            self._arming.knowledge.note_temperature(record)
         elif isinstance(record, AxisSamples):
             self._gantry.feed(record)
-            self._desk.hear(record)
+            self._arming.hear(record)
         for axis in self._config.axis if isinstance(record, TickTimes) else (record.axis,):
             if axis in self._queues:
                 self._queues[axis].put(record)
 
     async def _work(self, axis: str) -> None:
-        """Feed one axis' pipeline, in order, in a worker thread; a batch takes all that waits."""
+        """Feed one axis' pipeline in order, in a worker thread; a batch takes all waiting records."""
         queue = self._queues[axis]
         while True:
             batch = await queue.batch()
             self._busy_since_s[axis] = self._clock.now_s()
             outcomes, notices = await asyncio.to_thread(self._digest, axis, batch)
             del self._busy_since_s[axis]
-            self._desk.knowledge.note(outcomes)
+            self._arming.knowledge.note(outcomes)
             self._say([*outcomes, *notices])
             queue.digested(len(batch))
 
     def _digest(self, axis: str, batch: Sequence[Record]) -> tuple[list[Outcome], list[Notice]]:
-        """In the worker thread: records through the pipeline, outcomes into the store."""
         outcomes = [outcome for record in batch for outcome in self._pipelines[axis].feed(record)]
         return outcomes, self._store.keep(outcomes) if outcomes else []
 
-    # what is said and kept -------------------------------------------------------------------------------------
+    # logging and storing ----------------------------------------------------------------------------------------
 
     def _tell(self, notices: Sequence[Notice]) -> None:
-        """Show notices and have them stored; what a flood held back is not stored either.
+        """Log notices and queue them for the store; those that a flood suppressed are not stored either.
 
-        What voids a record does so whatever a flood holds back.
+        A notice that voids a commissioning record does so even when suppressed.
         """
         now_s = self._clock.now_s()
         for notice in notices:
@@ -257,7 +255,7 @@ class Service:
             self._notices.task_done()
 
     async def _void_records(self) -> None:
-        """Mark commissioning records that are void: the guard that is started next must know of it."""
+        """Mark void commissioning records in the store, for the next guard that starts."""
         while True:
             axis = await self._void_axes.get()
             try:
@@ -267,7 +265,7 @@ class Service:
             self._void_axes.task_done()
 
     def _say(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
-        """Show outcomes: one log line each (a flood becomes a count), the newest in the status. Return those shown."""
+        """Log outcomes, one line each (a flood becomes a count), update the status; return those that were logged."""
         now_s, shown = self._clock.now_s(), []
         for outcome in outcomes:
             text, severity = journal.line_of(outcome)
@@ -280,7 +278,7 @@ class Service:
         return shown
 
     async def _feed_watchdog(self) -> None:
-        """Feed systemd's watchdog while blocks arrive, or it is known why none can: a restart mends neither."""
+        """Feed systemd's watchdog while blocks arrive or their absence is explained: a restart fixes neither."""
         period_s = int(os.environ.get("WATCHDOG_USEC", WATCHDOG_S * 2e6)) / 1e6 / 2
         while True:
             if self._alive(period_s):
@@ -297,7 +295,7 @@ class Service:
         return moved or self._watch.hearing.alive(now_s, period_s)
 
     async def _listen(self) -> None:
-        """Look a few times a second whether the machine is heard, and tell what is not as the config says."""
+        """Check reception a few times per second and report deviations from the config."""
         while True:
             await asyncio.sleep(LISTEN_S)
             now_s = self._clock.now_s()
@@ -308,17 +306,17 @@ class Service:
             skewed, notices = self._gantry.look()
             self._tell(notices)
             if skewed:
-                await self._desk.disarm()
+                await self._arming.disarm()
 
     async def _watch_resources(self, clock: ClockWatch) -> None:
-        """Look now and then: is memory, are descriptors nearly used up, was the clock set, does an offer wait."""
+        """Check memory, descriptors, the clock, waiting proposals and the store periodically."""
         watch, offers = ResourceWatch(), OfferWatch(self._config)
         while True:
             await asyncio.to_thread(heap.give_back)
             self._resources = uses()
             self._tell([*watch.look(self._resources), *clock.look(self._clock.wall_s(), self._clock.now_s())])
             self._tell(await asyncio.to_thread(offers.look))
-            self._tell(await asyncio.to_thread(self._store.keep, ()))  # tells whether the history still stands there
+            self._tell(await asyncio.to_thread(self._store.keep, ()))  # reports a replaced history
             await asyncio.sleep(RESOURCES_S)
 
     # control ---------------------------------------------------------------------------------------------------
@@ -329,12 +327,12 @@ class Service:
         if request["request"] == "live":
             return self._live.begin()
         if request["request"] == "arm":
-            answer = await self._desk.arm(request, lambda: self._control.hung_up)
-            self._tell([*await asyncio.to_thread(self._desk.guard.take_changes), _told(answer)])
+            answer = await self._arming.arm(request, lambda: self._control.hung_up)
+            self._tell([*await asyncio.to_thread(self._arming.guard.take_changes), _told(answer)])
             difference = self._watch.config_difference(request.get("config_digest", self._config.digest))
             return {**answer, "config_difference": difference} if difference else answer
         if request["request"] == "disarm":
-            return await self._desk.disarm()
+            return await self._arming.disarm()
         if request["request"] == "acknowledge":
             return await asyncio.to_thread(self._store.acknowledge, request)
         if request["request"] == "stop":
@@ -344,7 +342,7 @@ class Service:
         return refusal("BadRequest", text, "send status, live, arm, disarm, acknowledge or stop")
 
     async def _socket_lost(self, trouble: str) -> None:
-        self._tell([await reach_again(self._desk, trouble)])
+        self._tell([await reach_again(self._arming, trouble)])
 
     def _status(self) -> Answer:
         counters = dict(self._acquisition.source.counters()) if self._acquisition.source is not None else {}
@@ -356,8 +354,8 @@ class Service:
             "strays": list(self._store.strays),
         }
         status = self._watch.status(self._clock.now_s(), self._store.notices.told)
-        guard = self._desk.guard
-        for axis, celsius in self._desk.knowledge.temperatures.items():
+        guard = self._arming.guard
+        for axis, celsius in self._arming.knowledge.temperatures.items():
             status["axes"][axis]["slideway_c"] = celsius
         return {
             "ok": True,
@@ -369,9 +367,9 @@ class Service:
             "resources": {use.name: {"used": use.used, "allowed": use.allowed} for use in self._resources},
             "guard": dict(guard.status),
             "may_stand": {"nothing": guard.standing.nothing, "text": str(guard.standing)},
-            "armed": self._desk.armed,
-            "checking": self._desk.checking,
-            "passes": self._desk.passes,
+            "armed": self._arming.armed,
+            "checking": self._arming.checking,
+            "passes": self._arming.passes,
             "store": store,
             "unacknowledged": self._store.notices.status(),
             "alarms": self._store.notices.alarms(),
@@ -379,23 +377,23 @@ class Service:
 
 
 def _told(answer: Answer) -> Notice:
-    """Return what the log and the history say of a request to arm: an audit needs the refused ones too."""
+    """Return the notice of an arm request for log and history, refused ones included."""
     if answer["ok"]:
         return Notice("Armed", "info", str(answer["text"]))
     return Notice("ArmRefused", "minor", f"{answer['code']}: {answer['text']}")
 
 
 def run(config: MachineConfig, open_source: OpenSource, method: str | None = None) -> Standing:
-    """Run the daemon until it is told to stop; return what may still be applied.
+    """Run the daemon until it is stopped; return the offset that may still be applied.
 
-    FdhilError when it cannot start or meets what it must not survive.
+    FdhilError when it cannot start or meets a fatal error.
     """
     heap.keep_small()
     service = Service(config, open_source, method, leave=os._exit)
     try:
         return asyncio.run(_served(service))
     except ExceptionGroup as group:
-        first = _first(group)
+        first = find_first_error(group)
         if isinstance(first, FdhilError):
             raise first from None
         for line in "".join(traceback.format_exception(group)).splitlines():
@@ -410,7 +408,3 @@ async def _served(service: Service) -> Standing:
     stands = await service.run()
     service.shutdown.leave_overrun()
     return stands
-
-
-def _first(error: BaseException) -> BaseException:
-    return _first(error.exceptions[0]) if isinstance(error, BaseExceptionGroup) else error

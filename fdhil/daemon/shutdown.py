@@ -1,10 +1,8 @@
-"""Ends a process step by step: each step has its time, what takes longer is reported and left, the whole is bounded.
+"""Ends a process step by step: each step has a time limit, an overdue one is reported and abandoned.
 
-Nothing waits for ever: a device that does not let go, a disk that does not answer or a library that swallows its
-cancellation delay the end, and do not prevent it. What the guard then has applied it ramps to zero by itself.
+Nothing waits for ever: a device that does not close, a disk that does not answer or a library that swallows its
+cancellation delays the end but cannot prevent it. The guard then ramps any applied offset to zero by itself.
 """
-
-from __future__ import annotations
 
 import asyncio
 import contextlib
@@ -21,7 +19,7 @@ TEARDOWN_S = 2.0  # of the event loop, after the last step
 
 @dataclass(frozen=True, slots=True)
 class Budgets:
-    """How long each step may take, in s; systemd's TimeoutStopSec is above ``total_s``."""
+    """Time limit of each step, s; systemd's TimeoutStopSec is above ``total_s``."""
 
     zero_s: float = 20.0  # the guard answers at a SYNC, or when it has missed it for 10 s; then it ramps
     source_s: float = 6.0
@@ -31,14 +29,14 @@ class Budgets:
 
     @property
     def total_s(self) -> float:
-        """After how long the process ends, whatever has not."""
+        """Time after which the process ends in any case."""
         return float(sum(astuple(self))) + TEARDOWN_S
 
 
 class Shutdown:
     """The end of one process, after ``total_s`` at the latest.
 
-    ``leave`` ends it at once (``os._exit``); without it, what takes longer is only reported.
+    ``leave`` ends it at once (``os._exit``); without it, an overdue step is only reported.
     """
 
     def __init__(self, total_s: float, leave: Callable[[int], object] | None = None) -> None:
@@ -49,14 +47,14 @@ class Shutdown:
         self._limit: threading.Timer | None = None
 
     def begin(self) -> None:
-        """Have the process end after ``total_s``, whatever still runs then."""
+        """End the process after ``total_s``, whatever is still running."""
         if self._limit is None and self._leave is not None:
             self._limit = threading.Timer(self.total_s, self._give_up)
             self._limit.daemon = True
             self._limit.start()
 
     async def step(self, what: str, work: Coroutine[Any, Any, Any], within_s: float, effect: str) -> None:
-        """Do one step within its time, which counts from its first begin; else report it with its ``effect``."""
+        """Run one step within its time, counted from its first start; else report it with its ``effect``."""
         now_s = asyncio.get_running_loop().time()
         deadline_s = self._deadlines_s.setdefault(what, now_s + within_s)
         task = asyncio.create_task(work, name=what)
@@ -68,20 +66,22 @@ class Shutdown:
             task.result()
         elif what not in self.overrun:
             self.overrun.append(what)
-            journal.write_line(f"stopping: {what} is not done after {within_s:g} s and is left; {effect}", "MAJOR")
+            journal.write_line(
+                f"stopping: {what} is not finished after {within_s:g} s and is abandoned; {effect}", "MAJOR"
+            )
 
     def leave_overrun(self) -> None:
-        """End the process now where a step was left: its thread or task would hold the end of the event loop."""
+        """End the process now if a step was abandoned: its thread or task would block the event loop's end."""
         if self.overrun and self._leave is not None:
             self._leave(EXIT_CODE)
 
     def end(self) -> None:
-        """Forget the limit: all has ended."""
+        """Cancel the limit."""
         if self._limit is not None:
             self._limit.cancel()
 
     def _give_up(self) -> None:
-        with contextlib.suppress(Exception):  # nothing may keep it from leaving
+        with contextlib.suppress(Exception):  # nothing may prevent the exit
             journal.write_line(f"not stopped after {self.total_s:g} s: the process ends now", "MAJOR")
         assert self._leave is not None
         self._leave(EXIT_CODE)

@@ -1,6 +1,4 @@
-"""Gathers the status document from the outcomes that pass. Pure but for the times it is given."""
-
-from __future__ import annotations
+"""Builds the status document from outcomes. Pure; times are inputs."""
 
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
@@ -32,7 +30,7 @@ class _AxisWatch:
 
 
 class Watch:
-    """Remembers the newest of everything that passes, and notices what is wrong with it."""
+    """Tracks the newest outcome of each kind, and what is wrong."""
 
     def __init__(self, config: MachineConfig, now_s: float) -> None:
         self._config = config
@@ -46,13 +44,13 @@ class Watch:
     def begin(
         self, axis: str, published: ParameterSet | None, counts: tuple[int, int], loops: LoopEstimate | None = None
     ) -> None:
-        """Start from what the history knows of an axis."""
+        """Load an axis from the history."""
         watch = self._axes[axis]
         watch.loops = loops
         watch.published, (watch.accepted, watch.refused) = published, counts
 
     def outcome_came(self, outcome: Outcome, now_s: float) -> None:
-        """Note an outcome."""
+        """Take an outcome."""
         if isinstance(outcome, Notice):
             self._notices.append((now_s, outcome))
             return
@@ -72,11 +70,11 @@ class Watch:
             self._axes[outcome.axis].skill = outcome
 
     def config_difference(self, digest: object) -> str:
-        """Return that a client has another configuration than this daemon; empty: the same."""
+        """Return a text when a client has another configuration than this daemon; empty: the same."""
         return config_difference({"config_digest": self._config.digest, "limits": _limits(self._config)}, digest)
 
     def troubles(self, now_s: float) -> list[Notice]:
-        """Return what became wrong since the last call, and what is no longer."""
+        """Return notices for new problems since the last call, and for those that are over."""
         before = self._troubles
         self._troubles = self.hearing.troubles({axis: watch.windows for axis, watch in self._axes.items()}, now_s)
         begun = [
@@ -85,12 +83,12 @@ class Watch:
             if (code, axis) not in before
         ]
         over = [(code, axis) for code, axis in before if (code, axis) not in self._troubles]
-        return begun + [Notice(code, "info", "this is no longer so", axis) for code, axis in over]
+        return begun + [Notice(code, "info", "the condition has ended", axis) for code, axis in over]
 
     def status(self, now_s: float, stored: Callable[[Notice], Mapping[str, Any]] = lambda _: {}) -> dict[str, Any]:
-        """Return the status document (without what others know: counters, store, guard).
+        """Return the status document (without counters, store and guard).
 
-        ``stored`` tells what is known of a notice since it was stored.
+        ``stored`` returns what is known of a notice since it was stored.
         """
         return {
             "schema": SCHEMA,
@@ -135,7 +133,7 @@ class Watch:
 
 
 def _limits(config: MachineConfig) -> dict[str, dict[str, float | None]]:
-    """Return what may be sent to each axis that may be corrected; null where nothing of that kind is."""
+    """Return the limits of each axis that may be corrected; null where there is none of that kind."""
     return {
         name: {
             "max_offset_um": axis.correction.max_offset_um,
@@ -150,16 +148,16 @@ def _limits(config: MachineConfig) -> dict[str, dict[str, float | None]]:
 
 
 def config_difference(status: Mapping[str, Any], digest: object) -> str:
-    """Return that the daemon of a status document runs with another configuration than the file's; empty: the same."""
+    """Return a text when the daemon of a status runs with another configuration; empty: the same."""
     if status.get("config_digest") == digest:
         return ""
-    offsets = ", ".join(f"{axis} {told['max_offset_um']:g} um" for axis, told in status.get("limits", {}).items())
-    text = "the daemon runs with another configuration than the file, which was changed since: its own limits hold"
+    offsets = ", ".join(f"{axis} {limits['max_offset_um']:g} um" for axis, limits in status.get("limits", {}).items())
+    text = "the configuration file has changed since the daemon started; the daemon keeps its own limits"
     return f"{text} ({offsets or 'nothing is sent'}); restart daemon and guard to use the file"
 
 
 def severity_of(code: str) -> Literal["minor", "MAJOR"]:
-    """Return how severe a trouble of a class is."""
+    """Return the severity of a class of problem."""
     return "minor" if code in MINOR else "MAJOR"
 
 

@@ -1,9 +1,7 @@
-"""``python -m fdhil.guard --settings FILE --descriptor N``: the guard on an open transmit descriptor.
+"""Runs the guard on an open transmit descriptor: ``python -m fdhil.guard --settings FILE --descriptor N``.
 
-``fdhil-guard`` starts it; on its own it opens nothing but its settings and its control socket.
+``fdhil-guard`` starts it. It opens only its settings file and its control socket.
 """
-
-from __future__ import annotations
 
 import argparse
 import gc
@@ -22,7 +20,7 @@ from fdhil.guard.settings import load
 
 
 def main() -> int:
-    """Run the guard; the exit code is 0 when it stopped with nothing applied, 3 otherwise."""
+    """Run the guard; return 0 when it stopped with no offset applied, 3 otherwise."""
     parser = argparse.ArgumentParser(prog="fdhil.guard", description=__doc__)
     parser.add_argument("--settings", type=Path, required=True, help="the settings file that fdhil-guard wrote")
     parser.add_argument("--descriptor", type=int, required=True, help="the open CAN_RAW or socketcand descriptor")

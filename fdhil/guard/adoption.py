@@ -1,11 +1,9 @@
-"""Judges what a drive holds of our offset, and brings to zero what may be believed. Pure, part of the core.
+"""Assesses the offset that a drive still holds and ramps it to zero once it is trustworthy. Pure, part of the core.
 
-A value is known when three TPDOs in a row showed it, each at its own time. It is believed, and only then sent, when it
-is also within the compiled ceiling, agrees with the drive's own demand (0x6062), and the drive is as it was
+A value is confirmed when three TPDOs in a row showed it, each in its own cycle. It is trusted, and only then sent, when
+it also lies within the compiled ceiling, agrees with the drive's own demand (0x6062), and the drive is as it was
 commissioned.
 """
-
-from __future__ import annotations
 
 from fdhil.guard import feedforward
 from fdhil.guard.conditions import AGREEING, ARMING_INTERLOCKS, View, Views, known, views_of
@@ -19,22 +17,22 @@ from fdhil.guard.state import AxisState, Inputs, Request, State
 from fdhil.guard.transitions import Event
 
 PERIODS_AWAITED = 2 * AGREEING
-"""TPDOs in which a value must have become known: three in a row, and as many that were in doubt."""
-EMPTIED_S = 0.25  # in which what is behind a queue (HAL's limit3) has brought any offset to zero
+"""TPDOs within which a value must be confirmed: three in a row, after as many doubtful ones."""
+EMPTIED_S = 0.25  # until HAL's limit3, behind the queue, has brought any offset to zero
 DISTURBED_CYCLES = 1000
-"""SYNC after another node wrote an offset, in which nothing is adopted."""
+"""SYNC cycles after another node wrote an offset, in which nothing is adopted."""
 IMPLAUSIBLE = frozenset({"StaleData", "TargetLost", "FollowingError", "Implausible", "PdoLength"})
 OF_THE_RECORD = frozenset({"NotCommissioned", "RecordVoid", "PdoMapping"})
 
 
 def patience(settings: Settings) -> int:
-    """Return how many SYNC to wait for a value to become known; a queue that ran empty is first taken to zero."""
+    """Return the number of SYNC cycles to wait for a confirmed value; a queue (HAL) needs time to run empty first."""
     emptied = settings.lead + settings.cycles(EMPTIED_S) if settings.lead else 0
     return PERIODS_AWAITED * max([axis.read_back_every for axis in settings.axes]) + emptied
 
 
 def doubts(views: Views, alarms: Alarms) -> Alarms:
-    """Return all that forbids believing what the drives hold; empty: it may be ramped to zero from there."""
+    """Return every reason not to trust what the drives show; empty: the ramp to zero may start from there."""
     found = [alarm for alarm in alarms if alarm.code in IMPLAUSIBLE]
     for view in views:
         found += [
@@ -50,11 +48,11 @@ def _doubt(view: View) -> str:
     own, _seen, axis = view
     held = known(axis)
     if held is None:
-        return "three TPDOs in a row do not agree on it"
+        return "no three TPDOs in a row agree on it"
     if not abs(held) <= ceiling(own.increments_per_mm):
         return f"{_um(own, held)}: beyond the ceiling of {CEILING_OFFSET_UM:.0f} um"
     if not axis.off_demand <= EPS:
-        return f"{_um(own, held)}: its demand (0x6062) says otherwise"
+        return f"{_um(own, held)}: its demand (0x6062) contradicts it"
     return ""
 
 
@@ -63,16 +61,16 @@ def _um(own: AxisSettings, held: int) -> str:
 
 
 def in_doubt(views: Views, doubtful: Alarms) -> Alarm:
-    """Return the cause of freezing: the axis that shows an offset, how much, and the first thing that is wrong."""
+    """Return the cause of freezing: the axis that shows an offset, its size, and the first thing that is wrong."""
     own, _, axis = next((view for view in views if view[2].read_back), views[0])
-    told = next((a for a in doubtful if a.axis == own.name and a.code == "OffsetDoubtful"), None)
-    if told is not None:
-        return told
+    doubt = next((a for a in doubtful if a.axis == own.name and a.code == "OffsetDoubtful"), None)
+    if doubt is not None:
+        return doubt
     return Alarm("OffsetDoubtful", own.name, f"{_um(own, axis.read_back or 0)}: {doubtful[0].cause}")
 
 
 def may_stand(state: State) -> tuple[int | None, ...]:
-    """Return what may still be applied in each drive, in increments; 0: it is known that nothing is, None: unknown."""
+    """Return the offset that may still be applied in each drive, increments; 0: certainly none, None: unknown."""
     return tuple([_may_stand(state, axis) for axis in state.axes])
 
 
@@ -83,16 +81,17 @@ def _may_stand(state: State, axis: AxisState) -> int | None:
     if held is None and state.adopt_checked and is_zero(axis):
         return 0
     if held is None and state.mode is Mode.FROZEN:
-        return axis.sent[0] or None  # the last that was sent; zeros that were not read back say nothing
+        return axis.sent[0] or None  # the last one sent; zeros that were not read back prove nothing
     return held
 
 
 def is_zero(axis: AxisState) -> bool:
-    """Whether nothing but zeros was sent, and the drive has shown one since, and nothing else last."""
+    """Return whether only zeros were sent, and the drive has shown zero since then and in its last TPDO."""
     return not any(axis.sent) and not axis.read_back and (axis.zero_shown or known(axis) == 0)
 
 
 def adopt_refusals(state: State, request: Request, alarms: Alarms, views: Views) -> Alarms:
+    """Return every reason to refuse an adopt request; empty: granted."""
     refused = [alarm for alarm in alarms if alarm.reaction is Reaction.FREEZE]
     if state.undisturbed_for < DISTURBED_CYCLES:
         refused.append(Alarm("OffsetHijack", detail=f"{state.undisturbed_for} SYNC ago"))
@@ -106,17 +105,15 @@ def adopt_refusals(state: State, request: Request, alarms: Alarms, views: Views)
 
 
 def _nothing_held(state: State) -> bool:
-    """Whether all drives are known to hold nothing: then there is nothing to send either."""
     return not _fed(state) and all(known(axis) == 0 for axis in state.axes)
 
 
 def _fed(state: State) -> bool:
-    """Whether a drive holds, or may hold, a speed or torque offset."""
     return is_fed(state) or state.feed.unconfirmed
 
 
 def adopting(state: State, settings: Settings) -> State:
-    """Take over what the drives hold: the ramp starts from the value read; speed and torque get zeros."""
+    """Start the ramp to zero from the values read back; speed and torque offsets get zeros at once."""
     cause = Alarm("StaleOffset")
     if _nothing_held(state):
         return state.after(Event.NOTHING_HELD, axes=tuple(map(at_zero, state.axes)), cause=None)
@@ -130,9 +127,9 @@ def _from_measured(state: State) -> State:
 
 
 def compared(state: State, request: Request, settings: Settings) -> tuple[State, Alarms]:
-    """A record holds again where the drive was found to be the one signed off; where it is another, it is void.
+    """Validate the record of each drive that matches the one signed off; void it where the drive differs.
 
-    So it is where the drive was touched since it was compared, as far as that is known.
+    A record is void, too, where the drive was written to or rebooted after the comparison.
     """
     refused = [] if request.token_valid is True else [Alarm("AuthRequired")]
     if state.sending:
@@ -150,28 +147,29 @@ def compared(state: State, request: Request, settings: Settings) -> tuple[State,
 
 
 def _why_void(record: str, found: str, touched: bool) -> str:
-    """Return why a record is void after its drive was compared; empty: it holds."""
+    """Return why a record is void after its drive was compared; empty: it is valid."""
     if not record or found != record:
-        return "it differs from the record that this guard knows"
-    return "that was after it was compared" if touched else ""
+        return "it differs from the guard's record"
+    return "after it was compared" if touched else ""
 
 
 def at_rest(axis: AxisState, offset: int) -> AxisState:
+    """Return the axis with ``offset`` applied and no motion."""
     return axis._replace(offset=offset, rate=0, sent=(offset,) * len(axis.sent), echo_misses=0, zero_shown=False)
 
 
 def at_zero(axis: AxisState) -> AxisState:
-    """The drive has shown that it holds 0, and nothing but that is sent."""
+    """Return the axis as its drive has shown it: 0 is applied, and only 0 is sent."""
     return at_rest(axis, 0)._replace(readings=AGREEING, zero_shown=True)
 
 
 def unread(state: State) -> State:
-    """Return the state with what the drives hold to be read anew."""
+    """Return the state without the read-backs, so that they have to be confirmed again."""
     return state._replace(axes=tuple([axis._replace(read_back=None, zero_shown=False) for axis in state.axes]))
 
 
 def frozen(state: State, cause: Alarm) -> State:
-    """Stop sending: what the drive holds is unknown, unless only zeros were sent and shown."""
+    """Stop sending: the applied offset becomes unknown, unless only zeros were sent and read back."""
     if not state.measuring and all(map(is_zero, state.axes)):
         return state.after(Event.BLOCKED_AT_ZERO, cause=cause, places=())
     axes = tuple([axis._replace(read_back=None) for axis in state.axes])
@@ -179,7 +177,7 @@ def frozen(state: State, cause: Alarm) -> State:
 
 
 def adopt_at_start(state: State, inputs: Inputs, alarms: Alarms, views: Views, settings: Settings) -> State:
-    """Once after the start: an offset that a drive holds is ramped to zero from its value, or frozen if in doubt."""
+    """Once after the start, ramp an applied offset to zero from its value; freeze when it is in doubt."""
     if state.adopt_checked or state.mode is not Mode.OFF or not inputs.sync:
         return state
     unsafe = any(a.code in ("SyncJitter", "OffsetHijack", "BusLocked") or a.reaction is Reaction.FREEZE for a in alarms)
@@ -189,7 +187,7 @@ def adopt_at_start(state: State, inputs: Inputs, alarms: Alarms, views: Views, s
         return state._replace(adopt_checked=True)
     if not is_fed(state) and not any(axis.read_back for axis in state.axes):
         return state._replace(unknown_for=0)
-    if state.undisturbed_for < DISTURBED_CYCLES:  # it is that node's: brought to zero, it would write it again
+    if state.undisturbed_for < DISTURBED_CYCLES:  # that node would write its offset again
         shows = next(axis for axis, held in zip(settings.axes, state.axes, strict=True) if held.read_back)
         return state.after(Event.DOUBTFUL, cause=Alarm("OffsetHijack", shows.name), adopt_checked=True)
     doubtful = doubts(views, alarms)
@@ -200,7 +198,7 @@ def adopt_at_start(state: State, inputs: Inputs, alarms: Alarms, views: Views, s
 
 
 def measure(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> State:
-    """After another node's offset frame nothing is sent until the drives show what they hold; then from there to 0."""
+    """After another node wrote an offset, send nothing until the drives show confirmed values; then ramp to zero."""
     if not state.measuring:
         return state
     views = views_of(settings, inputs, state)

@@ -1,9 +1,7 @@
-"""Sends and receives on a descriptor that somebody else opened: CAN_RAW or the socketcand text protocol.
+"""Sends and receives on a descriptor opened by the starter: CAN_RAW or the socketcand text protocol.
 
 What may leave is checked here, where the bytes leave: our heartbeat and the configured offset RPDOs, nothing else.
 """
-
-from __future__ import annotations
 
 import errno
 import fcntl
@@ -32,20 +30,20 @@ CAN_SFF_ONLY = 0xC00007FF
 RETRY = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EINTR)
 FULL = (errno.ENOBUFS, errno.EAGAIN, errno.EWOULDBLOCK)
 MAX_PENDING_BYTES = 1 << 16
-MOST_FRAMES = 256  # of one call: a flood must not keep the loop from sending
+MOST_FRAMES = 256  # per call: a flood must not keep the loop from sending
 MOST_TURNS = 16  # more than a socket holds
 
 
 class BusDown(Exception):
-    """The bus is gone; ``str`` says why."""
+    """The bus is gone; ``str`` gives the reason."""
 
 
 class ForbiddenFrame(Exception):
-    """Something tried to send a frame that the guard must never send."""
+    """A frame was to be sent whose COB-ID the guard must never use."""
 
 
 class CanSocket(ABC):
-    """What both transports share: the descriptor and the filter of what may be sent."""
+    """A transport: the descriptor and the filter of COB-IDs that may be sent."""
 
     def __init__(self, descriptor: socket.socket, allowed: Iterable[int]) -> None:
         self._socket = descriptor
@@ -54,21 +52,21 @@ class CanSocket(ABC):
         descriptor.setblocking(False)
 
     def fileno(self) -> int:
-        """The descriptor, for poll."""
+        """Return the descriptor, for poll."""
         return self._socket.fileno()
 
     @abstractmethod
     def receive(self) -> list[Frame]:
-        """Return the frames that wait, a few hundred at most, without waiting; BusDown when the bus is gone."""
+        """Return the waiting frames, a few hundred at most, without blocking; BusDown when the bus is gone."""
 
     def restored(self) -> bool:
-        """Whether a bus that was gone is back, what came before forgotten; a hub that hung up never is."""
+        """Return whether a lost bus is back, with old frames discarded; a closed hub connection never is."""
         return False
 
     def send(self, cob_id: int, data: bytes) -> bool:
-        """Send one frame now; False when the queue is full. BusDown, ForbiddenFrame."""
+        """Send one frame now; return False when the queue is full. BusDown, ForbiddenFrame."""
         if cob_id not in self._allowed:
-            raise ForbiddenFrame(f"{cob_id:03X} is none of the COB-IDs that this process may send")
+            raise ForbiddenFrame(f"{cob_id:03X} is not a COB-ID that this process may send")
         try:
             return self._send(cob_id, data)
         except OSError as error:
@@ -78,7 +76,7 @@ class CanSocket(ABC):
 
     @abstractmethod
     def _send(self, cob_id: int, data: bytes) -> bool:
-        """Send one frame that may be sent; OSError."""
+        """Send one frame whose COB-ID is allowed; OSError."""
 
     def close(self) -> None:
         """Close the descriptor."""
@@ -86,7 +84,7 @@ class CanSocket(ABC):
 
 
 class RawCan(CanSocket):
-    """SocketCAN's CAN_RAW; ``lost_frames`` counts what the kernel dropped because it was not read."""
+    """SocketCAN's CAN_RAW; ``lost_frames`` counts frames that the kernel dropped because they were read too late."""
 
     def __init__(self, descriptor: socket.socket, allowed: Iterable[int], wanted: Iterable[int]) -> None:
         super().__init__(descriptor, allowed)
@@ -99,20 +97,20 @@ class RawCan(CanSocket):
         self._channel = descriptor.getsockname()[0]
 
     def restored(self) -> bool:
-        """Bind again, as after an adapter was plugged in again, and see whether the interface is up."""
+        """Bind again, as after an adapter was plugged in again; return whether the interface is up."""
         try:
             self._socket.bind((self._channel,))
             # an interface that was removed has taken the filters with it
             self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, self._filters)
-            asked = _IFREQ.pack(self._channel.encode(), 0)
-            up = _IFREQ.unpack(fcntl.ioctl(self._socket.fileno(), SIOCGIFFLAGS, asked))[1] & IFF_UP
-            self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)  # that it was down is known
+            query = _IFREQ.pack(self._channel.encode(), 0)
+            up = _IFREQ.unpack(fcntl.ioctl(self._socket.fileno(), SIOCGIFFLAGS, query))[1] & IFF_UP
+            self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)  # clears the old error
             return bool(up) and any(not self.receive() for _ in range(MOST_TURNS))
         except (OSError, BusDown):
             return False
 
     def receive(self) -> list[Frame]:
-        """Return the frames that wait, error frames as controller states."""
+        """Return the waiting frames, error frames as controller states."""
         frames: list[Frame] = []
         for _ in range(MOST_FRAMES):
             try:
@@ -147,7 +145,7 @@ class RawCan(CanSocket):
 
 
 def controller_states(can_id: int, data: bytes) -> list[str]:
-    """Return what an error frame says about the controller (linux/can/error.h): off, restarted, passive, active."""
+    """Decode the controller state of an error frame (linux/can/error.h): off, restarted, passive, active."""
     states = []
     if can_id & 0x40:
         states.append("off")
@@ -164,7 +162,7 @@ def controller_states(can_id: int, data: bytes) -> list[str]:
 
 
 class SocketcandText(CanSocket):
-    """The socketcand protocol in raw mode, the greeting already done: ``< frame 123 23.424242 11 22 >``."""
+    """The socketcand protocol in raw mode after the greeting: ``< frame 123 23.424242 11 22 >``."""
 
     def __init__(self, descriptor: socket.socket, allowed: Iterable[int], wanted: Iterable[int]) -> None:
         super().__init__(descriptor, allowed)
@@ -174,7 +172,7 @@ class SocketcandText(CanSocket):
         self._rest = b""
 
     def receive(self) -> list[Frame]:
-        """Return the wanted frames of what waits."""
+        """Return the waiting frames whose COB-ID is wanted."""
         try:
             chunk = self._socket.recv(MOST_FRAMES * 64)
         except OSError as error:
@@ -222,7 +220,7 @@ class SocketcandText(CanSocket):
 def adopt_descriptor(
     transport: Literal["can_raw", "socketcand"], descriptor: int, allowed: Iterable[int], wanted: Iterable[int]
 ) -> CanSocket:
-    """Take over an open descriptor; OSError when it is none of that kind."""
+    """Take over an open descriptor; OSError when it is of another kind."""
     kind = RawCan if transport == "can_raw" else SocketcandText
     taken = socket.socket(fileno=descriptor)
     try:

@@ -1,9 +1,7 @@
-"""Judges the bus and each axis by the interlocks: predicates that must hold before and while an offset is sent.
+"""Checks the bus and each axis against the interlocks: predicates that must hold before and while offsets are sent.
 
-Every comparison says what is good: what is unknown (None, NaN) is never good.
+Every comparison states the good case, so that an unknown value (None, NaN) never passes.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
@@ -21,25 +19,25 @@ from fdhil.guard.settings import AxisSettings, Settings
 from fdhil.guard.state import AxisInput, AxisState, BusView, Inputs, State
 
 View = tuple[AxisSettings, AxisInput, AxisState]
-"""One axis: what it is set to, what it showed, and what is remembered of it."""
+"""One axis: its settings, its inputs and its state."""
 Views = tuple[View, ...]
 Good = Callable[[AxisSettings, AxisInput, AxisState], bool]
 AGREEING = 3
-"""TPDOs in a row that must show the same offset before it is known."""
+"""TPDOs in a row that must show the same offset before it is confirmed."""
 
 
 def views_of(settings: Settings, inputs: Inputs, state: State) -> Views:
-    """Put together what belongs to each axis."""
+    """Combine settings, inputs and state of each axis."""
     return tuple(zip(settings.axes, inputs.axes, state.axes, strict=True))
 
 
 def _shows(seen: AxisInput, bit: int) -> bool | None:
-    """Return whether the statusword has a bit, None when it is unknown."""
+    """Return whether a statusword bit is set, None when the statusword is unknown."""
     return None if seen.statusword is None else bool(seen.statusword & bit)
 
 
 def known(axis: AxisState) -> int | None:
-    """Return the offset that the drive holds, None as long as it is not shown or not shown alike."""
+    """Return the offset that the drive holds, None until enough TPDOs in a row show the same value."""
     return axis.read_back if axis.readings >= AGREEING else None
 
 
@@ -57,7 +55,7 @@ def _heartbeat(own: AxisSettings, seen: AxisInput, _axis: AxisState) -> bool:
 
 # (class, what must be true): evaluated per axis and SYNC, in this order
 AXIS_INTERLOCKS: tuple[tuple[str, Good], ...] = (
-    ("PdoLength", lambda _own, seen, _axis: seen.short_frames < 3),  # before what follows from it
+    ("PdoLength", lambda _own, seen, _axis: seen.short_frames < 3),  # first: others follow from it
     ("StaleData", lambda _own, seen, _axis: seen.feedback_age <= 3),
     ("HeartbeatLost", _heartbeat),
     ("NmtStateWrong", lambda _own, seen, _axis: seen.nmt is None or seen.nmt == Nmt.OPERATIONAL),
@@ -93,22 +91,21 @@ ARMING_INTERLOCKS: tuple[tuple[str, Good], ...] = (
 
 
 def failing(bus: BusView, views: Views) -> Alarms:
-    """Return an alarm for every interlock that is not good at this SYNC."""
+    """Return an alarm for every interlock that fails at this SYNC."""
     of_bus = [Alarm(code) for code, good in BUS_INTERLOCKS if not good(bus)]
     return (*of_bus, *[Alarm(code, v[0].name) for v in views for code, good in AXIS_INTERLOCKS if not good(*v)])
 
 
 def not_ready(views: Views) -> Alarms:
-    """Return an alarm for everything about the drives that forbids arming beyond ``failing``."""
+    """Return an alarm for every condition of the drives, beyond ``failing``, that forbids arming."""
     return tuple([_told(code, v) for v in views for code, good in ARMING_INTERLOCKS if not good(*v)])
 
 
 def _told(code: str, view: View) -> Alarm:
-    """An alarm; of a record that was void before the start with its reason."""
     own, _seen, axis = view
     return Alarm(code, own.name, own.void_reason if code == "RecordVoid" and not axis.touched else "")
 
 
 def withheld(facts: Mapping[str, object], needed: Mapping[str, str]) -> Alarms:
-    """Return an alarm for every needed fact that the daemon does not vouch for; only a true ``True`` counts."""
+    """Return an alarm for every required fact that the daemon does not attest; only a literal ``True`` counts."""
     return tuple(Alarm(code) for fact, code in needed.items() if facts.get(fact) is not True)

@@ -1,9 +1,7 @@
-"""Serves JSON lines of a few clients on a UNIX socket; none of them can block the loop or fill its memory.
+"""Serves JSON lines to a few clients on a UNIX socket; none of them can block the loop or exhaust its memory.
 
-Each turn of the loop serves one client at most, by one request at most. A client whose answers wait is not read.
+Each turn of the loop serves at most one request of one client. A client that does not read its answers is not served.
 """
-
-from __future__ import annotations
 
 import contextlib
 import json
@@ -29,24 +27,24 @@ MAX_LINE_BYTES = 1 << 15
 MOST_DESCRIPTORS = 253  # the kernel's limit: what does not fit the buffer would be closed in this thread
 ANCILLARY_BYTES = socket.CMSG_SPACE(MOST_DESCRIPTORS * 4)
 
-LOOK_S = 1.0  # for the name of the socket
+LOOK_S = 1.0  # period of the check of the socket's file
 AT_ONCE = struct.pack("ii", 1, 0)
 
 
 class Closer:
-    """Closes what clients sent or left, in a thread: closing a hung server's file may wait. No socket lingers.
+    """Closes descriptors in a thread, because closing a file on a hung server may block. Sockets do not linger.
 
-    ``look`` is called in that thread whenever nothing was left for LOOK_S.
+    ``look`` is called in that thread whenever the queue was empty for LOOK_S.
     """
 
     def __init__(self, look: Callable[[], None] = lambda: None) -> None:
         self._look = look
         self._left: queue.SimpleQueue[int | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="closer", daemon=True)
-        self._thread.start()  # now: later there may be no room for a thread
+        self._thread.start()  # now: later no thread may be available
 
     def take(self, descriptor: int) -> None:
-        """Close a descriptor some time."""
+        """Queue a descriptor to be closed."""
         self._left.put(descriptor)
 
     def _run(self) -> None:
@@ -58,7 +56,7 @@ class Closer:
                 continue
             if descriptor is None:
                 return
-            with contextlib.suppress(OSError):  # it is no socket
+            with contextlib.suppress(OSError):  # not a socket
                 sent = socket.socket(fileno=descriptor)
                 try:
                     sent.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, AT_ONCE)
@@ -68,16 +66,16 @@ class Closer:
                 os.close(descriptor)
 
     def end(self) -> None:
-        """Wait a moment for what is left; what still waits then is closed by the process' end."""
+        """Wait briefly for the queue to drain; the end of the process closes the rest."""
         self._left.put(None)
         self._thread.join(0.5)
 
 
 @dataclass(slots=True, eq=False)
 class Client:
-    """One connection; ``heard_s`` is when its last request came (monotonic), ``armed`` whether it is the one in charge.
+    """One connection; ``heard_s``: time of its last request (monotonic), ``armed``: whether it armed the correction.
 
-    ``descriptor`` came with the requests that are read now; only a request that asks for it takes it.
+    ``descriptor`` came with the requests that are read now; only a request that needs it takes it.
     """
 
     socket: socket.socket
@@ -91,11 +89,11 @@ class Client:
     gone: bool = False
 
     def fileno(self) -> int:
-        """The descriptor, for poll."""
+        """Return the descriptor, for poll."""
         return self.socket.fileno()
 
     def read(self, now_s: float) -> Document | None:
-        """Return the next complete request, None when there is none; a line that is no request is answered at once."""
+        """Return the next complete request, None when there is none; an invalid line is answered at once."""
         if b"\n" not in self.inbox:
             self._receive()
         line, newline, rest = self.inbox.partition(b"\n")
@@ -106,7 +104,7 @@ class Client:
         document = parse_line(line)
         if document is None:
             self.reply(
-                {}, ok=False, code="BadRequest", text="the line is no valid request", advice="send a JSON object"
+                {}, ok=False, code="BadRequest", text="the line is not a valid request", advice="send a JSON object"
             )
         return document
 
@@ -121,16 +119,16 @@ class Client:
             for descriptor in array("i", data):
                 self.release()
                 self.descriptor = descriptor
-        self.gone = self.gone or not chunk  # one that has to make room for another has gone, whatever it says
+        self.gone = self.gone or not chunk  # a client that made room stays gone
         self.inbox += chunk
 
     def settle(self) -> None:
-        """After a request was handled: a descriptor that none of the requests read so far asked for is closed."""
+        """After a request, close a descriptor that none of the requests read so far has claimed."""
         if not self.inbox:
             self.release()
 
     def release(self) -> None:
-        """Let the descriptor go."""
+        """Close the descriptor later."""
         if self.descriptor is not None:
             self.closer.take(self.descriptor)
             self.descriptor = None
@@ -143,7 +141,7 @@ class Client:
         self.flush()
 
     def flush(self) -> None:
-        """Send what is queued as far as it goes."""
+        """Send as much of the queued answers as the socket takes."""
         try:
             sent = self.socket.send(self.outbox) if self.outbox else 0
             del self.outbox[:sent]
@@ -153,15 +151,15 @@ class Client:
             self.gone = True
 
     def close(self) -> None:
-        """Close the connection, and with it what was sent over it and never read."""
+        """Close the connection, including descriptors that were never claimed."""
         self.release()
         self.closer.take(self.socket.detach())
 
 
 class Listener:
-    """A listening socket at ``path``; where its name has gone (a cleaned run directory) it is made again.
+    """A listening socket at ``path``, created again when its file is gone (a cleaned run directory).
 
-    ``lost`` says why that cannot be done, empty while nothing is lost. OSError when it cannot be made at all.
+    ``lost`` gives the reason when that fails, else it is empty. OSError when the socket cannot be created at all.
     """
 
     def __init__(self, path: Path, shared: bool) -> None:
@@ -188,17 +186,17 @@ class Listener:
         return made
 
     def look(self) -> None:
-        """Make the socket again where its name leads elsewhere; what disks have to do with it may wait."""
+        """Create the socket again when its file is gone or replaced; runs in a thread, disk access may block."""
         if self._renewed is not None or self._is_there():
             self.lost = ""
             return
         folder = self._path.parent
         try:
-            with contextlib.suppress(FileExistsError):  # the daemon may be quicker
+            with contextlib.suppress(FileExistsError):  # the daemon may create it first
                 folder.mkdir(parents=True)
                 folder.chmod(0o710 if self._mode == 0o660 else 0o700)
             if folder.stat().st_mode & 0o002:
-                raise PermissionError(0, "anybody may write to its folder")
+                raise PermissionError(0, "its folder is writable for every user")
             self._renewed, self.lost = self._made(), ""
         except OSError as error:
             self.lost = error.strerror or str(error)
@@ -211,17 +209,17 @@ class Listener:
         return (found.st_dev, found.st_ino) == self._name
 
     def renew(self) -> None:
-        """Take the socket that was made again, if there is one."""
+        """Switch to the socket that was created again, if there is one."""
         if self._renewed is not None:
             self.socket.close()
             self.socket, self._renewed = self._renewed, None
 
 
 class Control:
-    """The listening socket ``guard.sock`` and its clients; DeviceError when it cannot be made.
+    """The listening socket ``guard.sock`` and its clients; DeviceError when it cannot be created.
 
-    The file is the guard's alone (0600), or its group's too (0660) where ``access`` names others. Whom it does not name
-    is told so and let go, and ``turned_away`` is called.
+    Only the guard's user may open the file (0600), or its group too (0660) where ``access`` names other users. Users
+    that it does not name get a refusal and are disconnected, and ``turned_away`` is called.
     """
 
     def __init__(self, run_directory: Path, access: Access, turned_away: Callable[[Peer, object], None]) -> None:
@@ -231,33 +229,33 @@ class Control:
         try:
             self._listener = Listener(self.path, access.shared)
         except OSError as error:
-            text = f"the control socket cannot be made ({error.strerror or error}), and nothing is sent"
+            text = f"the control socket cannot be created ({error.strerror or error}), and nothing is sent"
             raise DeviceError(str(self.path), f"{text}; check the run directory") from None
         self._closer = Closer(self._listener.look)
 
     def fileno(self) -> int:
-        """The listener's descriptor, for poll."""
+        """Return the listener's descriptor, for poll."""
         return self._listener.socket.fileno()
 
     @property
     def lost(self) -> str:
-        """Why nobody can connect any more, empty while anybody can."""
+        """The reason why no client can connect any more; empty while clients can."""
         return self._listener.lost
 
     @property
     def pending(self) -> bool:
-        """Whether requests wait that were read already."""
+        """Whether requests are waiting that were already read."""
         return any(b"\n" in client.inbox and not client.outbox for client in self.clients)
 
     def register(self, poll: select.poll) -> None:
-        """Have ``poll`` look at the listener and at every client: what it sends, or whether it takes its answer."""
+        """Have ``poll`` watch the listener and every client: for input, or for room while answers wait."""
         self._listener.renew()
         poll.register(self, select.POLLIN)
         for client in self.clients:
             poll.register(client, select.POLLOUT if client.outbox else select.POLLIN)
 
     def serve(self, ready: set[int], now_s: float) -> tuple[Client, Document] | None:
-        """Take one connection, and one request of the client that has waited longest."""
+        """Accept one connection, and return one request of the client that has waited longest."""
         if self.fileno() in ready:
             self._accept(now_s)
         for client in [client for client in self.clients if not client.gone]:
@@ -273,7 +271,7 @@ class Control:
         return None
 
     def _accept(self, now_s: float) -> None:
-        """Take one connection of who may talk; when there are too many, the one that was silent longest ends."""
+        """Accept one connection of an authorised user; when there are too many, the longest silent one is closed."""
         try:
             connection, _ = self._listener.socket.accept()
         except OSError:
@@ -292,7 +290,7 @@ class Control:
         self.clients.append(client)
 
     def drop_gone(self) -> None:
-        """Close and forget the clients that have gone."""
+        """Close and forget the clients that have disconnected."""
         for client in self.clients:
             if client.gone:
                 client.close()

@@ -1,11 +1,9 @@
 """Decides what leaves the guard: ``step(state, inputs, settings) -> (state, output)``, pure, once per SYNC.
 
-No clock, no I/O: time is the SYNC count in the state. Every way out of a state leads toward OFF, but for the operator's
-arm and adopt. The order within a step: what the drives and the bus say, the interlocks, the request, the place on the
-path, the motion of the offset, and a check of the frame by other formulas than those that made it.
+No clock, no I/O: time is the SYNC count in the state. Every way out of a state leads toward OFF, except the operator's
+arm and adopt. The order within a step: what the drives and the bus show, the interlocks, the request, the position on
+the path, the motion of the offset, and a check of the frame by formulas other than those that computed it.
 """
-
-from __future__ import annotations
 
 from fdhil.guard import feedforward
 from fdhil.guard.adoption import (
@@ -38,7 +36,7 @@ FAILED_SENDS = 3
 
 
 def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Output]:
-    """Decide what leaves the guard now. ``inputs.sync`` False is the local timer's step, taken when SYNC is silent."""
+    """Decide what leaves the guard now. ``inputs.sync`` False is a step of the local timer, while SYNC is missing."""
     before, fed_before = state.mode, state.feed.mode
     state = observe(state, inputs, settings)
     views = views_of(settings, inputs, state)
@@ -62,11 +60,10 @@ def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outpu
     return state, output._replace(refused=refused, transition=moved, feed_transition=fed)
 
 
-# --- what the drives and the bus say ---
+# --- what the drives and the bus show ---
 
 
 def _alarms(state: State, inputs: Inputs, views: Views) -> Alarms:
-    """Everything that is not good at this step, events first."""
     own = []
     if state.missed_run > MISSED_CYCLES:
         own.append(Alarm("LoopOverrun"))
@@ -76,7 +73,7 @@ def _alarms(state: State, inputs: Inputs, views: Views) -> Alarms:
 
 
 def standing(state: State, inputs: Inputs, settings: Settings) -> Alarms:
-    """Return what was not good at the step that took ``inputs``, what forbids arming included; for the status."""
+    """Return every alarm of the step that took ``inputs``, including what forbids arming; for the status."""
     views = views_of(settings, inputs, state)
     return (*_alarms(state, inputs, views), *not_ready(views))
 
@@ -87,7 +84,7 @@ def standing(state: State, inputs: Inputs, settings: Settings) -> Alarms:
 def _request(
     state: State, inputs: Inputs, alarms: Alarms, views: Views, settings: Settings
 ) -> tuple[State, Alarms | None]:
-    """Answer the request: the new state and the refusals (empty: granted), None when nothing was asked."""
+    """Decide the request: the new state and the refusals (empty: granted), None when there was no request."""
     request = inputs.request
     if request is None:
         return state, None
@@ -111,7 +108,7 @@ def _request(
 def _refusals(
     state: State, inputs: Inputs, request: Request, alarms: Alarms, views: Views, settings: Settings
 ) -> Alarms:
-    """All that forbids arming; an empty answer is the only way from OFF to ARMED, or to the on-line feed-forward."""
+    """Return every reason not to arm; only an empty answer leads from OFF to ARMED or to the on-line feed-forward."""
     refused: list[Alarm] = []
     if state.mode is not Mode.OFF or state.feed.mode is not FeedMode.OFF:
         refused.append(Alarm("NotOff", detail=state.mode.value))
@@ -155,7 +152,7 @@ def _ramp_down(state: State, cause: Alarm, event: Event = Event.END) -> State:
 
 
 def _react(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> State:
-    """Freeze or ramp down, whichever the worst alarm asks for; a lost daemon is one."""
+    """Freeze or ramp down, as the worst alarm requires; a lost daemon ramps down."""
     hijack = next((alarm for alarm in alarms if alarm.code == "OffsetHijack"), None)
     if hijack is not None or any(alarm.code == "NodeRebooted" for alarm in inputs.alarms):
         state = unread(state)
@@ -168,7 +165,7 @@ def _react(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> 
     if state.failed_run >= 2 * FAILED_SENDS:
         return frozen(state, Alarm("TxQueueFull"))
     if hijack is not None and _was_ramped_before(state):
-        return frozen(state, hijack)  # two masters that write one offset step the table
+        return frozen(state, hijack)  # two masters that write the same offset make the table jump
     if hijack is not None:
         return _ramp_down(state, hijack, Event.HIJACK)._replace(measuring=max(1, state.measuring))
     if state.mode not in IN_CHARGE:
@@ -181,7 +178,7 @@ def _react(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> 
 
 
 def _was_ramped_before(state: State) -> bool:
-    """Whether this is a ramp from what another node wrote: one that writes again would do so for ever."""
+    """Return whether an offset of another node is being ramped already: ramping again could go on for ever."""
     return (
         state.mode in LANDING
         and not state.measuring
@@ -191,17 +188,17 @@ def _was_ramped_before(state: State) -> bool:
 
 
 def _reaction(alarm: Alarm, settings: Settings) -> Reaction:
-    """Without SYNC an event-driven RPDO can still be ramped, a synchronous one is not applied."""
+    """Return the reaction; without SYNC only an event-driven RPDO can be ramped, a synchronous one is not applied."""
     if alarm.code == "SyncLost" and not settings.offset_synchronous:
         return Reaction.RAMP_DOWN
     return alarm.reaction
 
 
-# --- the place on the path ---
+# --- the position on the path ---
 
 
 def _follow_path(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> State:
-    """Find the row that this SYNC latched; hold when it cannot be told, ramp down when that lasts or the path ends."""
+    """Locate the latched row; hold when it is ambiguous, ramp down when that persists or the path ends."""
     if state.mode not in IN_CHARGE:
         return state
     path = inputs.path
@@ -211,8 +208,8 @@ def _follow_path(state: State, inputs: Inputs, alarms: Alarms, settings: Setting
     if state.mode is Mode.ARMED:
         if hold:
             return _held(state, hold, settings)
-        state, astray = await_start(state._replace(held_for=0), path)
-        return state if astray is None else _ramp_down(state, astray)
+        state, misaligned = await_start(state._replace(held_for=0), path)
+        return state if misaligned is None else _ramp_down(state, misaligned)
     state, lost = track(state, path)
     hold = hold or lost
     if path.final and state.places[0].row >= path.end - 1:
@@ -227,7 +224,7 @@ def _follow_path(state: State, inputs: Inputs, alarms: Alarms, settings: Setting
 
 
 def _held(state: State, alarm: Alarm, settings: Settings) -> State:
-    """Hold the offset, or when that has lasted too long ramp it down; before the start there is nothing to hold."""
+    """Hold the offset; ramp it down when that has lasted too long. Before the start there is nothing to hold."""
     allowed = settings.cycles(FEED_HOLD_S) if alarm.code == "FeedHold" else HOLD_CYCLES
     if state.held_for >= allowed:
         return _ramp_down(state, alarm)
@@ -238,7 +235,7 @@ def _held(state: State, alarm: Alarm, settings: Settings) -> State:
 
 
 def _move(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Output]:
-    """Compute, check and hand out the next offsets; a step that is too late sends nothing and stands still."""
+    """Compute, check and output the next offsets; a step that is too late sends nothing and holds the value."""
     if state.mode not in SENDING or state.measuring:
         return state, Output()
     if not inputs.sync and (settings.offset_synchronous or not inputs.bus.silent):
@@ -259,7 +256,7 @@ def _move(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outp
 
 
 def _next_offsets(state: State, path: CorrectedPath | None, settings: Settings) -> tuple[tuple[int, ...], Alarm | None]:
-    """Return the next offset of each axis, and the alarm when the table itself asks for more than is allowed."""
+    """Return the next offset of each axis, and an alarm when the table itself exceeds a limit."""
     if state.mode is Mode.ARMED:
         return (0,) * len(state.axes), None
     if state.mode is Mode.HOLD:
@@ -282,7 +279,7 @@ def _next_offsets(state: State, path: CorrectedPath | None, settings: Settings) 
 
 
 def _wrong_frame(state: State, offsets: tuple[int, ...], settings: Settings) -> Alarm | None:
-    """Check the frames by the limits alone, whatever made them; they are wrong only if this program is."""
+    """Check the offsets against the limits alone; a violation can only be a fault of this program."""
     for s, axis, offset in zip(settings.axes, state.axes, offsets, strict=True):
         broken = type(offset) is not int or violation(s.limits, axis.offset, axis.rate, offset) is not None
         if broken or not abs(offset) <= ceiling(s.increments_per_mm):
@@ -302,12 +299,11 @@ def _sent(axis: AxisState, offset: int, setting: AxisSettings) -> AxisState:
 
 
 def _stands(axis: AxisState) -> AxisState:
-    """Nothing was sent in this cycle: the drive keeps the value."""
     return axis._replace(rate=0, sent=(axis.sent[0], *axis.sent[:-1]))
 
 
 def _arrived(state: State, path: CorrectedPath | None, lead: int) -> State:
-    """Leave RAMPING when on the table, and a landing when the drives show 0."""
+    """Leave RAMPING once on the table; leave a ramp-down once the drives show 0."""
     if state.mode is Mode.RAMPING and path is not None and len(state.places) == 1:
         on_table = tuple([axis.offset for axis in state.axes]) == path.offsets_at(state.places[0].row + lead + 1)
         return state.after(Event.ON_TABLE) if on_table else state

@@ -1,8 +1,8 @@
 """Computes speed and torque offsets (0x60B1, 0x60B2) on line from the targets that the NC sends. Pure.
 
-The law is a few whole weights per axis, found by the daemon from the identified drive; here it is integer arithmetic on
-the last targets, with limits of its own. It has a state beside the position offset's and is never on together with it.
-Zero is always the safer value: whatever freezes a position offset sets these offsets to zero at once.
+The law is a few integer weights per axis, which the daemon derives from the identified drive; here it is integer
+arithmetic on the last targets, with limits of its own. Its state is separate from that of the position offset, and both
+are never on together. Zero is always the safer value: whatever freezes a position offset sets these to zero at once.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from fdhil.guard.transitions import NEXT_FEED, ZEROS, ZEROS_UNCONFIRMED, Event
 SHIFT = 24
 FADE_S = 0.1
 KEPT = 4
-"""Cycles of what was sent, to compare with what the drives show: one late frame is no mismatch."""
+"""Cycles of sent offsets that are kept to compare with what the drives show."""
 
 Targets = tuple[int, ...]
 Pair = tuple[int, int]
 
 
 class FeedforwardLimits(NamedTuple):
-    """Largest speed offset (increments/s) and torque offset (0.1 % of the rated torque), and each per SYNC cycle."""
+    """Largest speed offset (increments/s), torque offset (0.1 % of the rated torque), and their change per cycle."""
 
     speed: int
     speed_rate: int
@@ -34,9 +34,10 @@ class FeedforwardLimits(NamedTuple):
 
 
 class Law(NamedTuple):
-    """One axis' weights, times 2^24, on how far the last targets lie from the newest one, newest first.
+    """One axis' weights, times 2^24, on the distances of the last targets from the newest one, newest first.
 
-    ``pace`` gives the speed as a share of that from which dry friction acts in full, ``dry`` that friction's torque.
+    ``pace`` yields the speed as a share of the speed at which dry friction acts in full; ``dry`` is that friction's
+    torque.
     """
 
     speed: tuple[int, ...]
@@ -46,7 +47,7 @@ class Law(NamedTuple):
 
     @property
     def depth(self) -> int:
-        """How many targets it looks at."""
+        """The number of targets that the law needs."""
         return 1 + max(len(self.speed), len(self.torque), len(self.pace))
 
     def offsets(self, targets: Sequence[int]) -> Pair:
@@ -62,16 +63,16 @@ def _sum(weights: Sequence[int], ways: Sequence[int]) -> int:
 
 
 def _whole(value: int) -> int:
-    """Divide by 2^24, to the nearest."""
+    """Divide by 2^24, rounding to the nearest."""
     return (value + (1 << SHIFT - 1)) >> SHIFT
 
 
 class Feed(NamedTuple):
-    """The feed-forward's memory: ``share`` of ``FADE_S`` faded in (cycles), the last targets per axis, newest first.
+    """State of the feed-forward: ``share`` of ``FADE_S`` faded in (cycles), the last targets per axis, newest first.
 
-    ``sent`` are the last offsets of all axes, newest first; ``held`` counts cycles in which something was not as it
-    should be, ``limited`` those in which a limit took something away, ``unsent`` those in a row whose frames did not
-    leave. ``unconfirmed``: it went OFF with no zero shown, or none sent: something may still be applied.
+    ``sent``: the last offsets of all axes, newest first; ``held``: cycles in which an interlock failed; ``limited``:
+    cycles in which a limit acted; ``unsent``: consecutive cycles whose frames did not leave. ``unconfirmed``: it went
+    OFF although no zero was read back, or none was sent: an offset may still be applied.
     """
 
     mode: FeedMode = FeedMode.OFF
@@ -97,16 +98,16 @@ class Feed(NamedTuple):
         return self.sent[0]
 
     def after(self, event: Event, cause: Alarm | None) -> Feed:
-        """Return the state that ``event`` leads to; KeyError where the table has no such way."""
+        """Return the state that ``event`` leads to; KeyError where the table has no such transition."""
         unconfirmed = event is Event.ZERO_NOT_SHOWN
         return self._replace(mode=NEXT_FEED[self.mode, event], cause=cause, unconfirmed=unconfirmed)
 
     def send(self, pairs: tuple[Pair, ...]) -> Feed:
-        """Note what is sent now."""
+        """Record the offsets that are sent now."""
         return self._replace(sent=(pairs, *self.sent)[:KEPT])
 
     def not_sent(self, axes: Sequence[int]) -> Feed:
-        """The last frames of some axes did not leave: the offsets before them are still in force, no zero counts."""
+        """Note that the last frames of some axes did not leave: the offsets before them still act, no zero counts."""
         if not axes:
             return self._replace(unsent=0)
         newest, before = (*self.sent, *self.sent)[:2]
@@ -115,23 +116,23 @@ class Feed(NamedTuple):
 
 
 def armed(laws: tuple[Law, ...]) -> Feed:
-    """Return the state behind an arming: nothing is sent but zeros until enough targets were heard."""
+    """Return the state after arming: zeros are sent until enough targets were received."""
     off = Feed(laws=laws, targets=((),) * len(laws), sent=(((0, 0),) * len(laws),) * KEPT)
     return off.after(Event.ARM, None)
 
 
 def zeroing(axes: int, cause: Alarm) -> Feed:
-    """Return the state that sends zeros to drives that hold something else."""
+    """Return the state that sends zeros to drives that hold other values."""
     return Feed(sent=(((0, 0),) * axes,)).after(Event.ADOPT, cause)
 
 
 def end(feed: Feed, cause: Alarm) -> Feed:
-    """Fade out."""
+    """Begin to fade out."""
     return feed.after(Event.END, cause) if feed.mode is FeedMode.ON else feed
 
 
 def react(feed: Feed, alarms: Sequence[Alarm]) -> Feed:
-    """Zero at once on what stops a drive or the bus, fade out on the rest; a short gap is bridged."""
+    """Zero at once on what stops a drive or the bus, fade out on other alarms; bridge a short gap."""
     if feed.mode is FeedMode.OFF:
         return feed
     worst = max(alarms, key=lambda alarm: alarm.reaction, default=None)
@@ -145,29 +146,29 @@ def react(feed: Feed, alarms: Sequence[Alarm]) -> Feed:
 
 
 def hear(feed: Feed, targets: Sequence[int | None]) -> Feed:
-    """Take the targets that a SYNC latched; one that did not come goes on as the two before it."""
-    heard = []
+    """Take the targets that a SYNC latched; extrapolate a missing one from the two before it."""
+    latched = []
     for law, past, target in zip(feed.laws, feed.targets, targets, strict=True):
         newest = target
         if newest is None:
             newest = 2 * past[0] - past[1] if len(past) > 1 else None
-        heard.append(past if newest is None else (newest, *past)[: law.depth])
-    return feed._replace(targets=tuple(heard))
+        latched.append(past if newest is None else (newest, *past)[: law.depth])
+    return feed._replace(targets=tuple(latched))
 
 
 def move(feed: Feed, limits: Sequence[FeedforwardLimits], fade_cycles: int, confirmed: bool = True) -> Feed:
-    """Go one cycle on: the next offsets are ``applied``, inside their limits; OFF once zeros were sent.
+    """Advance one cycle: ``applied`` becomes the next offsets within their limits; OFF once enough zeros were sent.
 
-    ``confirmed``: no drive shows anything but 0; zeros are sent for longer when one does.
+    ``confirmed``: no drive shows anything but 0; while one does, zeros are sent for longer.
     """
     if feed.mode is FeedMode.ZEROING:
         return zeroed(feed, confirmed)
-    known = all(len(past) == law.depth for law, past in zip(feed.laws, feed.targets, strict=True))
+    complete = all(len(past) == law.depth for law, past in zip(feed.laws, feed.targets, strict=True))
     share = feed.share + 1 if feed.mode is FeedMode.ON else feed.share - 1
-    feed = feed._replace(share=clamp(share, 0, fade_cycles) if known else 0)
+    feed = feed._replace(share=clamp(share, 0, fade_cycles) if complete else 0)
     applied, limited = [], False
     for k, (law, past, own) in enumerate(zip(feed.laws, feed.targets, limits, strict=True)):
-        speed, torque = law.offsets(past) if known else (0, 0)
+        speed, torque = law.offsets(past) if complete else (0, 0)
         limited = limited or abs(speed) > own.speed or abs(torque) > own.torque
         applied.append(_inside(feed.applied[k], (speed, torque), feed.share, fade_cycles, own))
     feed = feed.send(tuple(applied))._replace(limited=feed.limited + limited)
@@ -176,12 +177,12 @@ def move(feed: Feed, limits: Sequence[FeedforwardLimits], fade_cycles: int, conf
 
 
 def zeroed(feed: Feed, confirmed: bool = True) -> Feed:
-    """Go one cycle on with zeros."""
+    """Advance one cycle with zeros."""
     return _landed(feed.send(((0, 0),) * len(feed.applied))._replace(zeros=feed.zeros + 1), confirmed)
 
 
 def _landed(feed: Feed, confirmed: bool) -> Feed:
-    """OFF after enough zeros that the drives show; or after far more that one does not show, or that do not leave."""
+    """Go OFF after enough zeros that the drives show; or after many more that are not shown or do not leave."""
     if confirmed and feed.zeros > ZEROS:
         return feed.after(Event.ZERO_SHOWN, feed.cause)
     if feed.mode is FeedMode.ON or max(feed.zeros, feed.unsent) <= ZEROS_UNCONFIRMED:
@@ -190,7 +191,7 @@ def _landed(feed: Feed, confirmed: bool) -> Feed:
 
 
 def _inside(before: Pair, wanted: Pair, share: int, fade_cycles: int, limits: FeedforwardLimits) -> Pair:
-    """Fade, then keep amplitude and rate."""
+    """Fade, then limit amplitude and rate."""
     bounds = ((limits.speed, limits.speed_rate), (limits.torque, limits.torque_rate))
     values = []
     for last, goal, (largest, rate) in zip(before, wanted, bounds, strict=True):
@@ -200,7 +201,7 @@ def _inside(before: Pair, wanted: Pair, share: int, fade_cycles: int, limits: Fe
 
 
 def violates(limits: FeedforwardLimits, before: Pair, after: Pair) -> bool:
-    """Check what is to be sent by the limits alone; zero may always be sent."""
+    """Check what is about to be sent against the limits alone; zero is always allowed."""
     for last, value, largest, rate in zip(before, after, limits[::2], limits[1::2], strict=True):
         if type(value) is not int or not -largest <= value <= largest:
             return True

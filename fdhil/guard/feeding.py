@@ -1,6 +1,4 @@
-"""Steps the on-line feed-forward: what stops it, what it sends, and the check of that. Pure."""
-
-from __future__ import annotations
+"""Runs one step of the on-line feed-forward: its alarms, its output, and the check of that output. Pure."""
 
 from fdhil.guard import feedforward
 from fdhil.guard.feedforward import FADE_S
@@ -11,12 +9,12 @@ from fdhil.guard.state import Inputs, Output, State
 
 
 def is_fed(state: State) -> bool:
-    """Whether a drive shows a speed or torque offset."""
+    """Return whether a drive shows a speed or torque offset."""
     return any(any(axis.fed_back) for axis in state.axes)
 
 
 def go_on(state: State, inputs: Inputs, alarms: Alarms, settings: Settings, output: Output) -> tuple[State, Output]:
-    """Go on with the feed-forward; on a lost SYNC its zeros are sent all the same."""
+    """Run one step of the feed-forward; its zeros are sent even without SYNC."""
     before = state.feed.not_sent(inputs.unfed)
     if before.mode is FeedMode.OFF:
         return state, output

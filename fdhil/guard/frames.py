@@ -1,10 +1,8 @@
-"""Gathers frames into what the core may know at a SYNC: pure bookkeeping, no socket and no clock of its own.
+"""Gathers CAN frames into the inputs of the core at a SYNC: pure bookkeeping, no socket, no clock.
 
 A TPDO is sampled at a SYNC and arrives after it, so that at the next SYNC it is one cycle old. The target that a SYNC
-latches is the last one that came before it.
+latches is the last one that arrived before it.
 """
-
-from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
@@ -36,16 +34,16 @@ FOREIGN_CYCLES = 3
 FED = frozenset({Object.VELOCITY_OFFSET, Object.TORQUE_OFFSET})
 _NEEDED = frozenset({Object.STATUSWORD, Object.POSITION_ACTUAL, Object.MODE_DISPLAY})
 PDO_SET_UP = range(0x1400, 0x1C00)
-# what a commissioning record relies on besides: its options, the scale, the cycle, and "restore the defaults"
+# other objects that a commissioning record relies on: options, scale, cycle, "restore the defaults"
 SET_UP = frozenset((0x1005, 0x1011, 0x1016, 0x1017, 0x6007, 0x605A, 0x605E, 0x6065, 0x6066, 0x6075, 0x607D, 0x607E))
 SET_UP |= {0x6085, 0x608F, 0x6091, 0x6092, 0x60C2}
 
 
 class _PdoState:
-    """One PDO that is listened to: its last content and age in SYNC cycles, and what is wrong with it.
+    """A received PDO: its last content, its age in SYNC cycles, and what is wrong with it.
 
-    ``early``: it came again long before it was due, ``twice``: with another content; ``sure_age`` is that of the last
-    that came when it was due.
+    ``early``: it came again long before it was due, ``twice``: with different content; ``sure_age``: age of the last
+    one that came when due.
     """
 
     def __init__(self, pdo: Pdo) -> None:
@@ -61,7 +59,7 @@ class _PdoState:
         self.twice_run = self.short = self.long = 0
 
     def take(self, data: bytes) -> None:
-        """Take one frame: short ones are dropped and counted, of long ones the mapped bytes are used."""
+        """Take one frame: drop and count a short one; of a long one use the mapped bytes."""
         if len(data) < self.length:
             self.short += 1
             return
@@ -74,7 +72,7 @@ class _PdoState:
             self.twice = self.twice or data != self.data
         self.fresh, self.age = True, 0
         if data != self.data:
-            self.data, self.values = data, unpack(self.entries, data)  # now: at the SYNC there is no time
+            self.data, self.values = data, unpack(self.entries, data)  # decoded now: at the SYNC there is no time
 
     def at_sync(self) -> None:
         """Age by one cycle."""
@@ -85,8 +83,8 @@ class _PdoState:
 
 
 _Place = tuple[_PdoState, int]
-_ABSENT: _Place = _PdoState(Pdo(0, ())), 0  # of an object that no PDO carries
-# what a drive shows, in the order in which ``_axis_input`` takes it
+_ABSENT: _Place = _PdoState(Pdo(0, ())), 0  # for an object that no PDO carries
+# the signals of a drive, in the order in which they are unpacked below
 _SIGNALS = (
     Object.POSITION_ACTUAL, Object.POSITION_OFFSET, Object.FOLLOWING_ERROR, Object.STATUSWORD, Object.MODE_DISPLAY,
     Object.VELOCITY_OFFSET, Object.TORQUE_OFFSET, Object.VELOCITY_ACTUAL, Object.POSITION_DEMAND,
@@ -101,9 +99,9 @@ class _Node:
 
 
 class Listener:
-    """Gathers frames (``take``) and gives the axes' inputs and the bus' view at a SYNC (``at_sync``).
+    """Gathers frames (``take``) and returns the axes' inputs and the bus state at a SYNC (``at_sync``).
 
-    The bus does not give back what we send ourselves: a frame with one of our COB-IDs is another node's.
+    The bus does not return what we send ourselves: a frame with one of our COB-IDs comes from another node.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -129,12 +127,12 @@ class Listener:
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
 
     def wanted_ids(self) -> tuple[int, ...]:
-        """All COB-IDs that the guard must hear, for a receive filter."""
+        """Return all COB-IDs that the guard needs, for a receive filter."""
         ids = {base + node for node in self._axes_of for base in (COB_EMCY, COB_HEARTBEAT, COB_SDO_REQUEST)}
         return tuple(sorted(ids | {COB_NMT, COB_SYNC, *self._pdos, *self._sent_ids, *self._writers}))
 
     def take(self, cob_id: int, data: bytes, now_s: float) -> None:
-        """Take any frame but SYNC; ``now_s`` is monotonic time."""
+        """Take any frame except SYNC; ``now_s`` is monotonic time."""
         pdo = self._pdos.get(cob_id)
         if pdo is not None:
             pdo.take(data)
@@ -158,7 +156,7 @@ class Listener:
             self._emergency(axis, data)
 
     def error(self, state: str) -> None:
-        """The controller reported its error state: active, warning, passive, off, down or restarted."""
+        """Set the controller's state: active, warning, passive, off, down or restarted."""
         if state == "restarted":
             self._alarm(Alarm("BusRestarted"))
             state = "active"
@@ -184,7 +182,7 @@ class Listener:
             self._alarm(Alarm("NodeRebooted", self.settings.axes[axis].name))
 
     def _sdo_request(self, axis: int, data: bytes) -> None:
-        """Any master's write to the drive (CiA 301 7.2.4, initiate download, plain or block): it may be another now."""
+        """Detect a write to the drive by any master (CiA 301 7.2.4, initiate download, plain or block)."""
         if len(data) < 4 or not (data[0] >> 5 == 1 or data[0] & 0xE1 == 0xC0):
             return
         index, of = first_axis_index(int.from_bytes(data[1:3], "little")), self.settings.axes[axis]
@@ -203,7 +201,7 @@ class Listener:
         )
 
     def at_sync(self, data: bytes, stamp_s: float, now_s: float) -> tuple[tuple[AxisInput, ...], BusView]:
-        """Close the cycle at a SYNC with its frame time ``stamp_s``; the view of the bus and of the axes."""
+        """Close the cycle at a SYNC with its frame time ``stamp_s``; return the inputs of the axes and of the bus."""
         self._count(data)
         regular = self._interval(stamp_s, now_s)
         axes = tuple([self._axis_at_sync(k, axis, now_s) for k, axis in enumerate(self.settings.axes)])
@@ -211,7 +209,7 @@ class Listener:
         return axes, BusView(self.bus_state, regular, silent=False, lost_frames=lost)
 
     def in_silence(self, now_s: float, silent: bool) -> tuple[tuple[AxisInput, ...], BusView]:
-        """The same between two SYNC: nothing is closed."""
+        """Return the same between two SYNC, without closing a cycle."""
         axes = [self._axis_input(k, axis, now_s, None) for k, axis in enumerate(self.settings.axes)]
         return tuple(axes), BusView(self.bus_state, sync_regular=False, silent=silent)
 
@@ -226,7 +224,7 @@ class Listener:
         return self._counter or 0
 
     def forget_sync(self) -> None:
-        """After a silence the next SYNC starts a new series."""
+        """Start a new series of SYNC after a silence."""
         self._counter = self._last_sync_s = None
         self._intervals.clear()
 
@@ -243,10 +241,10 @@ class Listener:
             self._alarm(Alarm("SyncCollision", detail=f"SYNC {before} to {data[0]}"))
 
     def _interval(self, stamp_s: float, now_s: float) -> bool:
-        """Whether SYNC is regular: the interval not above three periods, the median of the last within 2 %.
+        """Return whether SYNC is regular: no interval above three periods, the median of the last within 2 %.
 
-        The frame's stamp and its arrival are both looked at and the better one counts: a late reader spoils the
-        arrival, a wall clock that is set spoils the stamp, and neither is the bus' fault.
+        Both the frame's stamp and its arrival are evaluated and the better one counts: a late reader corrupts the
+        arrival, a wall clock that is set corrupts the stamp, and neither is a fault of the bus.
         """
         last, self._last_sync_s = self._last_sync_s, (stamp_s, now_s)
         if last is None:
@@ -296,7 +294,7 @@ class Listener:
 
 
 def _places(pdos: Sequence[_PdoState]) -> dict[int, _Place]:
-    """Return the place of each object, in the most frequent PDO that carries it."""
+    """Return each object's entry in the most frequent PDO that carries it."""
     rarest_first = sorted(pdos, key=lambda pdo: -pdo.every_sync)
     return {index: (pdo, place) for pdo in rarest_first for index, place in pdo.where.items()}
 
@@ -310,5 +308,5 @@ def _last(pdo: _PdoState, place: int) -> int | None:
 
 
 def _age(pdos: Sequence[_PdoState]) -> float:
-    """Age of the oldest TPDO that carries a signal of the guard, in units of its own rate, rounded up."""
+    """Return the age of the oldest TPDO that carries a signal of the guard, in units of its own period, rounded up."""
     return max([-(-pdo.age // pdo.every_sync) for pdo in pdos if pdo.needed], default=NEVER)

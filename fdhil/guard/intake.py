@@ -1,6 +1,4 @@
-"""Takes a table from its descriptor and checks it a few rows a turn, so that no SYNC waits for it."""
-
-from __future__ import annotations
+"""Takes a table from its descriptor and checks a few rows per turn, so that no SYNC waits for it."""
 
 from typing import Any, Literal
 
@@ -21,7 +19,7 @@ Kind = Literal["whole", "piece", "renewal"]
 
 
 class Intake:
-    """``path`` is the table in force; one more at a time is on its way in."""
+    """Holds the table in force, ``path``, and at most one more that is being checked."""
 
     def __init__(self, settings: Settings, journal: Journal) -> None:
         self.path: CorrectedPath | None = None
@@ -34,13 +32,13 @@ class Intake:
 
     @property
     def busy(self) -> bool:
-        """Whether a table is on its way in."""
+        """Whether a table is being checked."""
         return self._loading is not None
 
     def begin(self, client: Client, document: Document, state: State) -> None:
-        """Take the table that came with a request; the answer follows when its rows are checked.
+        """Take the table that came with a request; the answer follows once its rows are checked.
 
-        A request that says ``renew`` puts other offsets into the first rows, while nothing has begun.
+        A request with ``renew`` replaces the offsets of the first rows, as long as the machine has not started.
         """
         running = state.sending or state.mode is not Mode.OFF
         renews = state.mode is Mode.ARMED and document.get("renew") is True
@@ -68,12 +66,12 @@ class Intake:
         return table.begin(body, self._taken + 1, names, limits, self.path, keep, travel)
 
     def check(self, state: State) -> None:
-        """Check the next rows of the table on its way in; a few at a time while frames have to leave in time."""
+        """Check the next rows of the new table; only a few at a time while frames have to leave in time."""
         if self._loading is None:
             return
         loading, client, document = self._loading
         try:
-            _require(self._kind, state)  # it may have been armed since the table came
+            _require(self._kind, state)  # the guard may have been armed since the table came
             loading.check(ROWS_PER_TURN if state.sending else ROWS_PER_IDLE_TURN)
         except table.TableRefused as refusal:
             self._loading = None
@@ -85,7 +83,7 @@ class Intake:
             client.reply(document, ok=True, sequence=loading.joined.sequence, rows=rows)
 
     def _refuse(self, client: Client, document: dict[str, Any], refusal: table.TableRefused) -> None:
-        if str(refusal) != self._refused:  # the same again and again is told once
+        if str(refusal) != self._refused:  # a repeated refusal is journaled once
             self._journal.write("table_refused", code=refusal.code, text=str(refusal))
         self._refused = str(refusal)
         advice = Alarm(refusal.code).action
@@ -93,14 +91,13 @@ class Intake:
 
 
 def _kind(loading: table.Loading, renews: bool) -> Kind:
-    """Return what a table is that has just begun."""
     if renews:
         return "renewal"
     return "whole" if loading.joined.first == 0 and loading.next_row == 0 else "piece"
 
 
 def _require(kind: Kind, state: State) -> None:
-    """TableRefused where such a table may not take force: what is armed is replaced by its own renewal alone."""
+    """Raise TableRefused where such a table must not take force: an armed table is replaced only by its own renewal."""
     standing = state.mode is Mode.OFF and not state.sending
     if not {"piece": True, "renewal": state.mode is Mode.ARMED, "whole": standing}[kind]:
         raise table.TableRefused("TableBusy", Alarm("TableBusy").cause)

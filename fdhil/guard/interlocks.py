@@ -1,6 +1,4 @@
-"""Lists the interlocks: the reaction, cause and next action of each class, and what the daemon must vouch for."""
-
-from __future__ import annotations
+"""Lists the interlocks: the reaction, cause and next action of each class, and the facts the daemon must attest."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,7 +6,7 @@ from enum import IntEnum
 
 
 class Reaction(IntEnum):
-    """What the guard does; a higher one wins."""
+    """The guard's reaction; a higher one takes precedence."""
 
     REFUSE = 0
     HOLD = 1
@@ -26,9 +24,9 @@ EFFECT: Mapping[Reaction, str] = {
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """Something that stops or refuses a correction: its class, the axis it is about, and a detail.
+    """A condition that stops or refuses a correction: its class, its axis and a detail.
 
-    ``late`` says how late this computer was just before, where that explains what a drive shows.
+    ``late`` describes how late this computer was just before, where that explains what a drive shows.
     """
 
     code: str
@@ -38,7 +36,7 @@ class Alarm:
 
     @property
     def reaction(self) -> Reaction:
-        """What the guard does about it while it sends."""
+        """The guard's reaction to it while it sends."""
         return CATALOGUE[self.code][0]
 
     @property
@@ -46,11 +44,11 @@ class Alarm:
         """The cause as a clause."""
         where = f"axis {self.axis}: " if self.axis else ""
         shown = f"{where}{CATALOGUE[self.code][1]}" + (f" ({self.detail})" if self.detail else "")
-        return f"{self.late}: that is why {shown}" if self.late else shown
+        return f"{self.late}, therefore {shown}" if self.late else shown
 
     @property
     def action(self) -> str:
-        """What the operator does next."""
+        """The operator's next action."""
         if self.code == "NotOff" and self.detail == "FROZEN":
             return "hold the feed, then run fdhil adopt"
         if self.late and self.reaction is not Reaction.FREEZE:
@@ -58,7 +56,7 @@ class Alarm:
         return CATALOGUE[self.code][2]
 
     def sentence(self, off: bool = False) -> str:
-        """Return cause, effect on the machine (``off``: nothing is applied any more) and next action as a sentence."""
+        """Return cause, effect on the machine (``off``: nothing is applied any more) and next action."""
         effect = "the correction is off and nothing is applied" if off else EFFECT[self.reaction]
         return f"{self.cause}; {effect}; {self.action}"
 
@@ -72,43 +70,39 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "BusOff": (_F, "the CAN controller is bus-off", "hold the feed, check cable and termination, then adopt"),
     "ErrorPassive": (_R, "the CAN controller is error-passive", "check cable, termination and bit rate"),
     "BusRestarted": (_F, "the CAN controller restarted by itself", "hold the feed, then adopt"),
-    "BusDown": (_F, "the CAN bus is gone", "hold the feed, restore the interface (a hub: restart the guard), adopt"),
+    "BusDown": (_F, "the CAN bus is down", "hold the feed, restore the interface (a hub: restart the guard), adopt"),
     "TxQueueFull": (_R, "frames do not leave the transmit queue", "check that another node acknowledges"),
     "RxOverflow": (_R, "frames were lost before they were read", "give the guard a real-time priority"),
     "LoopOverrun": (_R, "the guard's loop was late for more than ten cycles", "give the guard a real-time priority"),
-    "SyncLost": (_F, "no SYNC is heard", "hold the feed, restore the NC's SYNC, then adopt"),
-    "SyncJitter": (_H, "SYNC does not come at its period", "check sync_period_s and the NC's SYNC producer"),
+    "SyncLost": (_F, "no SYNC is received", "hold the feed, restore the NC's SYNC, then adopt"),
+    "SyncJitter": (_H, "SYNC does not keep its period", "check sync_period_s and the NC's SYNC producer"),
     "SyncCollision": (_R, "the SYNC counter jumps: there is a second producer", "remove the second SYNC producer"),
     # the drive
     "StaleData": (_R, "the drive's feedback is older than three SYNC", "check the drive and its TPDO mapping"),
     "FeedbackGap": (_H, "a feedback frame was lost", "check the bus load and the cable"),
     "TargetLost": (_H, "no new target (0x607A) came with this SYNC", "check that the NC streams its targets"),
-    "HeartbeatLost": (_R, "the drive's heartbeat is missing", "check the drive, or its 0x1017"),
+    "HeartbeatLost": (_R, "the drive's heartbeat is missing", "check the drive and its heartbeat time (0x1017)"),
     "NmtStateWrong": (_F, "the drive is not Operational", "hold the feed, find the NMT master, then adopt"),
     "NodeRebooted": (_F, "the drive has rebooted", "hold the feed, run fdhil check with the NC off, then fdhil adopt"),
     "DriveNotEnabled": (_R, "the drive is not in Operation enabled", "clear its fault and enable it"),
     "NotFollowing": (_R, "the drive does not follow its demand (statusword bit 12)", "check the drive's limits"),
     "LimitActive": (_R, "an internal limit is active (statusword bit 11)", "leave the limit"),
     "FollowingError": (_R, "the following error exceeds half its window", "check load, gains and 0x6065"),
-    "NotCsp": (_R, "the drive does not show cyclic synchronous position mode", "set 0x6060 to 8"),
+    "NotCsp": (_R, "the drive is not in cyclic synchronous position mode", "set 0x6060 to 8"),
     "ReadBackStale": (
         _R,
-        "the drive's offset (0x60B0) is not shown, so that it is unknown",
+        "the drive does not report its offset (0x60B0), so that it is unknown",
         "check the drive and that one of its TPDOs maps 0x60B0",
     ),
     "EchoMismatch": (_R, "the drive's offset is not the one that was sent", "check the PDO mapping and the scaling"),
-    "Implausible": (
-        _R,
-        "position and speed contradict each other",
-        "check the drive's mapping, look for a second sender",
-    ),
-    "DriveEmergency": (_R, "the drive sent an emergency", "read its error code and clear it"),
+    "Implausible": (_R, "position and speed contradict each other", "check the mapping, find a second sender"),
+    "DriveEmergency": (_R, "the drive sent an emergency message (EMCY)", "read its error code and clear it"),
     "PdoLength": (_R, "a PDO is shorter than its mapping", "compare the drive's mapping with the profile"),
     "PdoMapping": (_N, "a PDO is longer than its mapping", "compare the drive's mapping with the profile"),
     "StaleOffset": (_N, "the drive already holds an offset", "adopt it, so that it is ramped to zero"),
     "OffsetDoubtful": (
         _F,
-        "what the drive holds as offset may not be believed",
+        "the offset that the drive reports cannot be trusted",
         "hold the feed, switch the drive off and on, run fdhil check with the NC off, then fdhil adopt",
     ),
     # other nodes
@@ -127,46 +121,46 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "OffsetLimit": (_R, "an offset is beyond the limit, braking included", "plan the correction inside the limits"),
     "OffsetRate": (_R, "an offset changes too fast", "plan the correction inside the limits"),
     "OffsetEnergy": (_R, "the offsets travel more than allowed in one second", "plan a smoother correction"),
-    "SoftwareLimit": (_N, "the path is too near to a software limit", "lower max_offset_um, or move the work"),
-    "PositionRange": (_N, "the path is too near to the end of 32 bits", "move the work, or coarsen the increments"),
+    "SoftwareLimit": (_N, "the path is too near to a software limit", "lower max_offset_um, or move the workpiece"),
+    "PositionRange": (_N, "the path is too near to the 32-bit limit", "move the workpiece, or use coarser increments"),
     "CorruptFile": (_N, "the correction table cannot be read", "plan it again"),
     "TableBusy": (_N, "a whole table cannot be changed while a correction runs", "disarm, or adopt first"),
     "ProgramMismatch": (_N, "no table of this program is loaded", "plan and load the correction of this program"),
-    # what the daemon vouches for
+    # facts that the daemon attests
     "NotCommissioned": (_N, "there is no valid commissioning record", "run fdhil commission"),
     "RecordVoid": (
         _N,
-        "the drive has rebooted or was set up anew since it was commissioned",
+        "the drive has rebooted or its settings have changed since it was commissioned",
         "switch the NC off and run fdhil check, which compares it again",
     ),
     "FeedforwardUnknown": (_N, "it is unknown whether the offset enters the feed-forward", "run fdhil commission"),
     "FeedforwardOff": (_N, "this drive is not set up for speed and torque offsets", "run fdhil commission"),
     "ModelNotValidated": (_N, "the model was not validated", "record a rapid move of each axis"),
-    "ModelStale": (_R, "the model is too old or of another state of the machine", "record a rapid move of each axis"),
+    "ModelStale": (_R, "the model is too old, or the machine has changed since", "record a rapid move of each axis"),
     "PoorSkill": (_R, "predictions of the last moves were not good enough", "check load and gains, identify again"),
     "HarmPredicted": (_N, "the correction is not predicted to help", "leave it off, or plan another method"),
     "ReadOnlyStore": (_R, "the journal cannot be written", "make the store's disk writable"),
-    "WatchdogNotArmed": (_N, "the drive's watchdog on us is not proven", "run fdhil commission"),
+    "WatchdogNotArmed": (_N, "the drive's monitoring of the guard's heartbeat is not verified", "run fdhil commission"),
     "LimitBeyondWindow": (_N, "the largest offset exceeds a quarter of the window", "lower max_offset_um"),
     "AuthRequired": (_N, "the operator's token is missing or wrong", "use the token of the run directory"),
     # the guard itself
-    "NotOff": (_N, "what was armed before has not ended", "disarm it first"),
-    "NotSettled": (_N, "the interlocks were not all good for 100 SYNC", "wait a moment and arm again"),
+    "NotOff": (_N, "the previous correction has not ended", "disarm it first"),
+    "NotSettled": (_N, "not all interlocks have been good for 100 SYNC cycles", "wait a moment and arm again"),
     "PcLate": (
         _N,
-        "this PC is too late for a correction",
+        "this PC reacts too late for a correction",
         "take load off this PC, give the guard a real-time priority, measure with fdhil doctor --latency 60, arm again",
     ),
-    "GuardBusy": (_N, "a request of this connection still waits", "wait for its answer, then ask again"),
-    "DisarmedSince": (_N, "it was disarmed after this was asked for", "ask again when it is wanted"),
+    "GuardBusy": (_N, "a request of this connection is still pending", "wait for its answer, then ask again"),
+    "DisarmedSince": (_N, "the correction was disarmed after this request was made", "repeat the request if needed"),
     "MainLost": (_R, "the daemon is gone or does not answer", "restart the daemon, then arm again"),
-    "Disarmed": (_R, "disarmed", "arm when it is wanted again"),
-    "Stopped": (_R, "the guard was told to stop", "start it again when it is wanted"),
+    "Disarmed": (_R, "disarmed", "arm again when needed"),
+    "Stopped": (_R, "the guard was stopped", "start it again when needed"),
     "Finished": (_R, "the path is finished", "arm the next program"),
-    "InternalError": (_F, "the guard contradicts itself", "report it with the journal"),
+    "InternalError": (_F, "the guard has found an internal error", "report it with the journal"),
 }
 
-# what the daemon must vouch for to arm, and the class of the refusal
+# facts that the daemon must attest for arming, and the class of the refusal
 FACTS: Mapping[str, str] = {
     "commissioned": "NotCommissioned",
     "offset_in_feedforward_known": "FeedforwardUnknown",

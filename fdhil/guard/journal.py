@@ -1,6 +1,4 @@
-"""Writes events as JSON lines on stdout (the journal pipe), and notifies systemd. It writes no file."""
-
-from __future__ import annotations
+"""Writes events as JSON lines to stdout (the journal pipe) and notifies systemd. It writes no file."""
 
 import json
 import os
@@ -13,11 +11,11 @@ from typing import Any, NamedTuple
 
 KEPT_EVENTS = 32
 WATCHDOG = "WATCHDOG=1"
-MOST_CHARACTERS = 500  # of a text, so that a line is never longer than the pipe takes at once
+MOST_CHARACTERS = 500  # per text, so that the pipe takes a line at once
 
 
 class Clock(NamedTuple):
-    """The monotonic and the wall clock of the guard, and what it waits with."""
+    """The guard's monotonic and wall clock, and the poll object that it waits with."""
 
     now_s: Callable[[], float] = time.monotonic
     wall_s: Callable[[], float] = time.time
@@ -28,7 +26,7 @@ SYSTEM = Clock()
 
 
 class Journal:
-    """One JSON line per event, dated by ``clock``; a slow reader costs lines, never time: ``dropped`` counts them."""
+    """Writes one JSON line per event, dated by ``clock``; a slow reader loses lines (``dropped``), never delays us."""
 
     def __init__(self, descriptor: int = 1, clock: Clock = SYSTEM) -> None:
         self._descriptor, self.clock = descriptor, clock
@@ -59,31 +57,31 @@ class Notifier:
     def __init__(self, address: str | None) -> None:
         self._address = None if address is None else "\0" + address[1:] if address.startswith("@") else address
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
-        self._untold: deque[str] = deque(maxlen=4)
+        self._pending: deque[str] = deque(maxlen=4)
         self._watchdog_s = 0.0
 
     def tell(self, text: str) -> None:
         """Send one notification, such as READY=1."""
         if self._address is not None:
-            self._untold.append(text)
+            self._pending.append(text)
             self._send()
 
     def alive(self, now_s: float) -> None:
         """Feed the unit's watchdog, twice a second."""
         if now_s - self._watchdog_s >= 0.5:
             self._watchdog_s = now_s
-            self._untold = deque([text for text in self._untold if text != WATCHDOG], maxlen=4)
+            self._pending = deque([text for text in self._pending if text != WATCHDOG], maxlen=4)
             self.tell(WATCHDOG)
 
     def close(self) -> None:
-        """Nothing more is told."""
+        """Close the socket."""
         self._address = None
         self._socket.close()
 
     def _send(self) -> None:
         try:
-            while self._untold:
-                self._socket.sendto(self._untold[0].encode("utf-8", "replace"), str(self._address))
-                self._untold.popleft()
-        except OSError:  # its queue is full, or systemd begins anew: what is left waits
+            while self._pending:
+                self._socket.sendto(self._pending[0].encode("utf-8", "replace"), str(self._address))
+                self._pending.popleft()
+        except OSError:  # its queue is full, or systemd restarts: the rest waits
             return

@@ -1,6 +1,4 @@
-"""Ramps to zero when the loop itself has failed: from what was sent last, by the limits alone, at each SYNC."""
-
-from __future__ import annotations
+"""Ramps to zero when the loop itself has failed: from the last sent offset, by the limits alone, at each SYNC."""
 
 import select
 from collections.abc import Sequence
@@ -17,10 +15,10 @@ ZEROS = 5
 
 
 def land(state: State, unsent: Sequence[int], settings: Settings, can: CanSocket, clock: Clock) -> tuple[int, ...]:
-    """Ramp the offsets to zero and return what was sent last, in increments per axis; it stops when SYNC or bus stop.
+    """Ramp the offsets to zero; return what was sent last, increments per axis. Ends when SYNC or the bus stops.
 
-    ``unsent`` are the axes whose last offset did not leave. Speed and torque offsets are set to zero at once. Nothing
-    is judged and nothing is read back.
+    ``unsent``: axes whose last offset did not leave. Speed and torque offsets are set to zero at once. No interlock is
+    checked and nothing is read back.
     """
     moving = [(axis.sent[1], 0) if k in unsent else (axis.offset, axis.rate) for k, axis in enumerate(state.axes)]
     feeds = () if state.feed.mode is FeedMode.OFF else settings.feeds
@@ -38,7 +36,7 @@ def land(state: State, unsent: Sequence[int], settings: Settings, can: CanSocket
 
 
 def _step(settings: Settings, can: CanSocket, moving: list[tuple[int, int]], counter: int) -> list[tuple[int, int]]:
-    """Send the next offsets; return them with their rates. What does not leave stands."""
+    """Send the next offsets; return them with their rates. An axis whose frame does not leave keeps its offset."""
     stepped = []
     for axis, (offset, rate) in zip(settings.axes, moving, strict=True):
         following, entries = follow(axis.limits, offset, rate, 0, 0), axis.offset.entries
@@ -48,7 +46,7 @@ def _step(settings: Settings, can: CanSocket, moving: list[tuple[int, int]], cou
 
 
 def _sync(can: CanSocket, silence_s: float, clock: Clock) -> int | None:
-    """Wait for the next SYNC and return its counter, 0 where it has none; None when none comes for too long."""
+    """Wait for the next SYNC; return its counter (0 where it has none), None when none comes within ``silence_s``."""
     poll = clock.new_poll()
     poll.register(can, select.POLLIN)
     end_s = clock.now_s() + silence_s

@@ -1,7 +1,7 @@
-"""Bounds an offset, in whole drive increments per SYNC cycle, and moves it inside these limits.
+"""Limits an offset, in whole drive increments per SYNC cycle, and moves it within these limits.
 
-Everything here is integer arithmetic: there is no NaN, no rounding, and every start can be enumerated by a test.
-The check of a frame (``violation``) shares no formula with the motion (``follow``), so that one guards the other.
+All of it is integer arithmetic: no NaN, no rounding, and a test can enumerate every start. The check of a frame
+(``violation``) shares no formula with the motion (``follow``), so that each guards the other.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import floor, isqrt
 
-# the ceilings: what no settings file can raise
+# ceilings that no settings file can raise
 CEILING_OFFSET_UM = 250.0
 CEILING_SPEED_MM_S = 20.0
 CEILING_ACCELERATION_MM_S2 = 2000.0
@@ -23,10 +23,10 @@ ROUNDING_ACCELERATION = 2
 
 @dataclass(frozen=True, slots=True)
 class OffsetLimits:
-    """``offset`` increments, ``rate`` per cycle, ``acceleration`` per cycle^2, ``variation`` total per ``window``.
+    """``offset`` in increments, ``rate`` per cycle, ``acceleration`` per cycle^2, ``variation`` per ``window``.
 
-    ``window`` is one second in SYNC cycles: within it the offset may travel ``variation`` increments in all, which
-    bounds what an oscillating table can do.
+    ``window`` is one second in SYNC cycles: within it the offset may travel ``variation`` increments in total, which
+    bounds an oscillating table.
     """
 
     offset: int
@@ -47,14 +47,14 @@ class OffsetLimits:
 
 
 def ceiling(increments_per_mm: float) -> int:
-    """Return the largest offset, in increments, that may ever be sent, whatever was read or configured."""
+    """Return the largest offset, in increments, that may ever be sent, whatever is read or configured."""
     return floor(CEILING_OFFSET_UM * 1e-3 * increments_per_mm + 1e-9)
 
 
 def ceilings(
     increments_per_mm: float, sync_period_s: float, max_speed_mm_s: float, max_acceleration_mm_s2: float
 ) -> OffsetLimits:
-    """Return the most that settings may allow an axis of that speed and acceleration, rounded down; 0: too coarse."""
+    """Return the largest limits that settings may give such an axis, rounded down; 0: its increments are too coarse."""
     speed = min(CEILING_SPEED_MM_S, SPEED_SHARE * max_speed_mm_s)
     acceleration = min(CEILING_ACCELERATION_MM_S2, ACCELERATION_SHARE * max_acceleration_mm_s2)
     return OffsetLimits(
@@ -67,12 +67,12 @@ def ceilings(
 
 
 def _whole(increments: float) -> int:
-    """Round down but to one, the least that can be sent; 0 where that is more than twice as much."""
+    """Round down, but to at least 1, the smallest step; 0 where 1 is more than twice the value."""
     return max(1, floor(increments + 1e-9)) if increments >= LEAST_INCREMENTS else 0
 
 
 def stopping(rate: int, acceleration: int) -> int:
-    """Return how far an offset still travels that moves at ``rate`` >= 0 and brakes by ``acceleration`` each cycle."""
+    """Return the distance that an offset at ``rate`` >= 0 still travels, braking by ``acceleration`` each cycle."""
     steps = rate // acceleration
     return steps * rate - acceleration * steps * (steps + 1) // 2
 
@@ -89,10 +89,10 @@ def clamp(value: int, low: int, high: int) -> int:
 
 
 def follow(limits: OffsetLimits, offset: int, rate: int, wanted: int, wanted_rate: int) -> int:
-    """Return the next offset on the way to a moving goal: ``wanted`` next cycle, moving at ``wanted_rate``.
+    """Return the next offset toward a moving goal: ``wanted`` next cycle, moving at ``wanted_rate``.
 
-    What is missing is made up without overshoot and inside the acceleration; on the goal the goal is met exactly. A
-    goal at rest at 0 is the ramp to zero.
+    The difference is closed without overshoot and within the acceleration; once on the goal it is met exactly. A goal
+    that stands at 0 is the ramp to zero.
     """
     missing = wanted - offset - wanted_rate
     closing = approach(abs(missing), limits.acceleration)
@@ -104,13 +104,13 @@ def follow(limits: OffsetLimits, offset: int, rate: int, wanted: int, wanted_rat
 
 
 def brake(limits: OffsetLimits, offset: int, rate: int) -> int:
-    """Return the next offset when it is to come to rest wherever that is."""
+    """Return the next offset of one that brakes to a stop."""
     speed = rate - clamp(rate, -limits.acceleration, limits.acceleration)
     return _inside(limits, offset, rate, clamp(speed, -limits.hard_rate, limits.hard_rate))
 
 
 def _inside(limits: OffsetLimits, offset: int, rate: int, speed: int) -> int:
-    """Brake an outward speed in time for the largest offset, harder than usual where rounding leaves no other way."""
+    """Brake an outward speed in time for the largest offset, harder than usual where rounding requires it."""
     outward = 1 if speed > 0 else -1
     room = max(0, limits.offset - outward * offset)
     allowed = approach(room, limits.hard_acceleration)
@@ -120,12 +120,12 @@ def _inside(limits: OffsetLimits, offset: int, rate: int, speed: int) -> int:
 
 
 def violation(limits: OffsetLimits, before: int, rate: int, offset: int) -> str | None:
-    """Check one frame against the one before it and that one's rate; return the class of what it breaks, or None.
+    """Check one frame against the one before it and its rate; return the class of the broken limit, or None.
 
-    Braking-aware: an offset moving outward must still be able to stop at the limit.
+    Braking-aware: an offset that moves outward must still be able to stop at the limit.
     """
     speed = offset - before
-    if not abs(offset) <= max(limits.offset, abs(before)):  # an adopted offset may come from outside
+    if not abs(offset) <= max(limits.offset, abs(before)):  # an adopted offset may start beyond the limit
         return "OffsetLimit"
     if not abs(speed) <= limits.hard_rate or not abs(speed - rate) <= limits.hard_acceleration:
         return "OffsetRate"
@@ -137,14 +137,14 @@ def violation(limits: OffsetLimits, before: int, rate: int, offset: int) -> str 
 
 @dataclass(frozen=True, slots=True)
 class Travel:
-    """How far an offset travelled within the last second, in tenths of it, so that it costs nothing to carry."""
+    """Distance that an offset travelled within the last second, in tenths of a second to keep it cheap."""
 
     current: int = 0
     filled: int = 0
     past: tuple[int, ...] = ()
 
     def add(self, move: int, window: int) -> Travel:
-        """Return the record with one more cycle; ``window`` is the second in cycles."""
+        """Return the record with one more cycle; ``window`` is one second in cycles."""
         share = max(1, window // 10)
         if self.filled + 1 < share:
             return Travel(self.current + abs(move), self.filled + 1, self.past)
@@ -152,5 +152,5 @@ class Travel:
 
     @property
     def total(self) -> int:
-        """Increments travelled within at least the last 0.9 and at most the last 1.0 second of them."""
+        """Increments travelled within the last 0.9 to 1.0 second."""
         return self.current + sum(self.past)

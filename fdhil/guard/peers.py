@@ -1,6 +1,4 @@
-"""Says who is at the other end of a UNIX socket, by the kernel (SO_PEERCRED), and what he may ask the guard for."""
-
-from __future__ import annotations
+"""Identifies the process at the other end of a UNIX socket (SO_PEERCRED) and what it may request from the guard."""
 
 import os
 import socket
@@ -13,7 +11,7 @@ SO_PEERCRED = getattr(socket, "SO_PEERCRED", 17)
 
 
 class Role(IntEnum):
-    """What a user may do; each may do what those before it may."""
+    """Rights of a user; each includes those before it."""
 
     NOBODY = 0
     WATCH = 1
@@ -21,10 +19,10 @@ class Role(IntEnum):
     COMMISSION = 3
 
 
-# what each request needs; what is not listed needs the most, and so does to vouch for a drive (compared)
+# rights that each request needs; any other, such as compared, needs the highest
 NEEDS: Mapping[object, Role] = {
     "status": Role.WATCH,
-    "disarm": Role.WATCH,  # standing still is never refused to one who may look
+    "disarm": Role.WATCH,  # never refused to a user who may watch
     "alive": Role.OPERATE,
     "table": Role.OPERATE,
     "arm": Role.OPERATE,
@@ -35,18 +33,18 @@ NEEDS: Mapping[object, Role] = {
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """The users that may talk to the guard besides root and its own: the daemon's, and those that may watch."""
+    """Users that may use the guard besides root and its own: the daemon's, and those that may watch."""
 
     daemon_uid: int | None = None
     watching: tuple[int, ...] = ()
 
     @property
     def shared(self) -> bool:
-        """Whether anybody else may."""
+        """Whether other users have access."""
         return self.daemon_uid is not None or bool(self.watching)
 
     def role_of(self, uid: int) -> Role:
-        """Return what a user may do: who arms must be the daemon, which vouches for the model."""
+        """Return the rights of a user: only the daemon, which attests the model, may arm."""
         if uid in (0, os.getuid()):
             return Role.COMMISSION
         if uid == self.daemon_uid:
@@ -56,25 +54,25 @@ class Access:
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """A process that talks to the guard: its user, its number, what it may do."""
+    """A client process of the guard: its user, its process ID, its rights."""
 
     uid: int
     pid: int
     role: Role
 
     def may(self, request: object) -> bool:
-        """Whether it may ask for that."""
+        """Return whether it may make this request."""
         return self.role >= (NEEDS.get(request, Role.COMMISSION) if isinstance(request, str) else Role.COMMISSION)
 
     def refused(self, request: object) -> dict[str, str]:
-        """Return why not: class, cause and next action."""
-        what = repr(request[:40]) if isinstance(request, str) else "that"
-        may = f"may not ask the guard for {what}" if self.role else "may not talk to the guard"
-        advice = "ask the daemon for it; [access] of the configuration says who may what"
+        """Return the refusal: class, cause and next action."""
+        what = repr(request[:40]) if isinstance(request, str) else "this"
+        may = f"may not request {what} from the guard" if self.role else "has no access to the guard"
+        advice = "use the daemon instead; [access] of the configuration assigns the rights"
         return {"code": "AuthRequired", "text": f"user {self.uid} {may}", "advice": advice}
 
 
 def credentials(connection: socket.socket) -> tuple[int, int]:
-    """Return process and user at the other end."""
+    """Return process ID and user ID of the other end."""
     pid, uid, _ = struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, SO_PEERCRED, 12))
     return pid, uid

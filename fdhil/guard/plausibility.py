@@ -1,6 +1,4 @@
-"""Compares at each SYNC what was in force with what the drives showed. Pure, part of the core."""
-
-from __future__ import annotations
+"""Compares at each SYNC the offsets in force with what the drives showed. Pure, part of the core."""
 
 from collections.abc import Sequence
 from math import inf
@@ -11,19 +9,19 @@ from fdhil.guard.settings import AxisSettings, Settings
 from fdhil.guard.state import NOT_SHOWN, AxisInput, AxisState, Inputs, Shown, State
 from fdhil.guard.transitions import Event
 
-STRAY = 50  # readings: a second one within so many that is not what was sent was written by another node
+STRAY = 50  # readings; a second wrong one within as many was written by another node
 
 
 def observe(state: State, inputs: Inputs, settings: Settings) -> State:
-    """Take in what was sampled: failed frames, read-backs, following errors, the targets just latched."""
+    """Take the samples of a cycle: unsent frames, read-backs, following errors, the targets just latched."""
     axes, failed = tuple(map(_touched, state.axes, inputs.axes)), 0
     if inputs.unsent or inputs.unfed:
         axes = tuple([_not_sent(axis) if k in inputs.unsent else axis for k, axis in enumerate(axes)])
         state, failed = behind(state), state.failed_run + 1
     if not inputs.sync:
         return state._replace(axes=axes, failed_run=failed, tick=state.tick + (not settings.offset_synchronous))
-    heard = [axis.target for axis in inputs.axes]
-    targets = None if None in heard else tuple([target for target in heard if target is not None])
+    received = [axis.target for axis in inputs.axes]
+    targets = None if None in received else tuple([target for target in received if target is not None])
     depth = max([axis.setpoint_delay_cycles for axis in settings.axes]) + 2
     history = (targets, *state.targets)[:depth]
     sampled = [
@@ -50,17 +48,16 @@ def observe(state: State, inputs: Inputs, settings: Settings) -> State:
 
 
 def _touched(axis: AxisState, seen: AxisInput) -> AxisState:
-    """A drive that has rebooted, or that another master wrote to, may not be as it was commissioned."""
+    """Void the record of a drive that rebooted or was written to: it may differ from the commissioned one."""
     return axis if seen.touched == axis.touched else axis._replace(touched=seen.touched, record_void=True)
 
 
 def _counts(state: State, settings: Settings) -> bool:
-    """Whether a late step is the loop's fault: a simulated machine runs ahead until offsets come, then it waits."""
+    """Return whether a late step is the loop's fault: a simulated machine waits only while offsets are sent."""
     return settings.clock == "monotonic" or state.mode in ON_PATH
 
 
 def _not_sent(axis: AxisState) -> AxisState:
-    """The last frame did not leave: the value before it is still in force, at rest."""
     return axis._replace(offset=axis.sent[1], rate=0, sent=(axis.sent[1], *axis.sent[1:]))
 
 
@@ -73,13 +70,12 @@ def _sampled(
     sending: bool,
     lead: int,
 ) -> AxisState:
-    """Compare what the drive showed at the SYNC before with what was in force then.
+    """Compare what the drive showed at the previous SYNC with what was in force then.
 
     ``axis.sent[0]`` left after that SYNC, ``sent[1]`` after the one before it and was latched at it. The set-point
     followed then was latched ``setpoint_delay_cycles`` earlier, together with its offset. With a ``lead`` the offset in
-    force left so many cycles earlier.
-    What changes while nothing is ``sending``, but to one of the last that were sent (a drive may be late), was written
-    by another node; so was what is shown between readings that are what was sent.
+    force left that many cycles earlier. Another node wrote the offset where it changes while nothing is ``sending``,
+    except to one of the last sent values (a drive may be late), or where wrong values appear between correct ones.
     """
     axis = axis._replace(foreign=False) if axis.foreign else axis
     error: float = axis.following_error
@@ -112,7 +108,7 @@ def _sampled(
 
 
 def _off_demand(seen: AxisInput, k: int, history: tuple[tuple[int, ...] | None, ...]) -> float:
-    """Return how far the read-back is from what the drive adds to its last targets, told by 0x6062 if that came too."""
+    """Return how far the read-back is from 0x6062 minus the last targets; 0 where 0x6062 is not mapped."""
     if seen.demand is None or seen.read_back is None:
         return 0.0
     targets = [latched[k] for latched in history[1:] if latched is not None]
@@ -121,10 +117,10 @@ def _off_demand(seen: AxisInput, k: int, history: tuple[tuple[int, ...] | None, 
 
 
 def _believed(axis: AxisState, seen: AxisInput, setting: AxisSettings, tick: int) -> AxisState:
-    """Compare position and speed with the last that were believed: what the motor's power allows, and each other.
+    """Check position and speed against the last plausible ones: by the motor's power, and against each other.
 
-    The table may part from its motor by the largest offset: with more lost motion no correction makes sense. A sample
-    that is not believed is no reference for the next, which has more time to have got there.
+    Table and motor may differ by the largest offset: with more lost motion a correction makes no sense. An implausible
+    sample is no reference for the next one, which has had more time to get there.
     """
     if not setting.speed_step or seen.position is None or seen.speed is None:
         return axis
@@ -139,7 +135,7 @@ def _believed(axis: AxisState, seen: AxisInput, setting: AxisSettings, tick: int
 
 
 def _fed(axis: AxisState, shown: Shown, sent: Sequence[Pair]) -> AxisState:
-    """Compare speed and torque offset in the same way; a frame that was late by a cycle or two is no mismatch."""
+    """Compare the speed and torque offset in the same way; a frame late by a cycle or two is no mismatch."""
     if shown == NOT_SHOWN:
         return axis
     right = len(sent) < 2 or any(all(s in (None, v) for s, v in zip(shown, pair, strict=True)) for pair in sent[1:])
@@ -147,5 +143,5 @@ def _fed(axis: AxisState, shown: Shown, sent: Sequence[Pair]) -> AxisState:
 
 
 def behind(state: State) -> State:
-    """A frame did not leave in time: the offset is no longer on the table and has to catch up."""
+    """Note that a frame did not leave in time: the offset is off the table and has to catch up."""
     return state.after(Event.LATE) if state.mode is Mode.ACTIVE else state

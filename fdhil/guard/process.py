@@ -1,10 +1,8 @@
-"""Runs the guard's one loop over the bus, the daemon's socket and the signals; all decisions are the core's.
+"""Runs the guard's one loop over the bus, the daemon's socket and the signals; the core makes all decisions.
 
-At a SYNC the offset frames leave in the same turn and before anything else is done. Nothing here waits for a client:
-after each request that was served the clients rest, so that however many they send, every SYNC finds the loop waiting.
+At a SYNC the offset frames leave in the same turn, before anything else. Nothing here waits for a client: after each
+request the clients pause, so that however many requests they send, every SYNC finds the loop waiting.
 """
-
-from __future__ import annotations
 
 import select
 import socket
@@ -34,14 +32,14 @@ from fdhil.guard.turn_times import TurnTimes
 IDLE_S = 0.05
 REST_S = 0.001
 RESTORE_S = 0.5
-REFUSED_S = 1.0  # one line of the journal for all who are refused in that time: they may not fill it
+REFUSED_S = 1.0  # one journal line for all refusals in that time: they cannot fill it
 DECIDED = ("arm", "feedforward", "disarm", "adopt", "compared")
 
 
 class Guard:
-    """The process; ``run`` returns its exit code: 0 when it is known that nothing is applied, 3 otherwise.
+    """The process; ``run`` returns its exit code: 0 when certainly no offset is applied, 3 otherwise.
 
-    ``wake`` becomes readable when a signal asks to stop. The journal's clock is that of the loop, too.
+    ``wake`` becomes readable when a signal requests a stop. The journal's clock is also the clock of the loop.
     """
 
     def __init__(
@@ -81,14 +79,14 @@ class Guard:
     # --- the loop ---
 
     def run(self) -> int:
-        """Serve until a signal asks to stop and the offset is at zero, or cannot be brought there."""
+        """Serve until a signal requests a stop and the offset is zero or cannot be ramped to zero."""
         self.begin()
         while (code := self.turn()) is None:
             pass
         return code
 
     def begin(self) -> None:
-        """Report that the loop is about to turn."""
+        """Report that the loop is ready."""
         self._notifier.tell("READY=1")
         self._journal.write("ready", bus=self.settings.bus, axes=[axis.name for axis in self.settings.axes])
 
@@ -98,7 +96,7 @@ class Guard:
             if self.state.sending or self._requests or not self._stopping:
                 self._turn()
                 return None
-        except Exception as error:  # noqa: BLE001 - the guard's supervisor: whatever has failed, the offset is taken away
+        except Exception as error:  # noqa: BLE001 - the guard's supervisor: whatever failed, the offset goes to zero
             self._failed(error)
             return 3
         standing_um = status.may_stand_um(self.state, self.settings)
@@ -106,7 +104,7 @@ class Guard:
         return 3 if self.state.feed.may_stand or any(um != 0 for um in standing_um.values()) else 0
 
     def _failed(self, error: Exception) -> None:
-        """Ramp to zero from what was sent last, without serving anybody any more, and say what was the matter."""
+        """Ramp to zero from the last sent offset without serving any client; journal the error."""
         cause = Alarm("InternalError", detail=f"{type(error).__name__}: {error}"[:200])
         effect = "the offset is ramped to zero from what was sent last, and the guard ends"
         text = f"{cause.cause}; {effect}; {cause.action}"
@@ -115,15 +113,15 @@ class Guard:
         sending, clock = self.state.sending, self._journal.clock
         sent = land(self.state, self._unsent, self.settings, self._can, clock)
         standing_um = status.may_stand_um(self.state, self.settings)
-        if sending:  # nothing was read back on the way
+        if sending:  # nothing was read back during the ramp
             standing_um = dict.fromkeys(standing_um)
         self._stopped(standing_um, status.in_um(sent, self.settings))
 
     def _stopped(self, standing_um: Mapping[str, float | None], sent_um: Mapping[str, float | None]) -> None:
         left = status.sentence(standing_um, self.state.feed)
-        told = {"text": f"the guard has stopped; {left}; hold the feed, start it again and adopt"} if left else {}
+        text = {"text": f"the guard has stopped; {left}; hold the feed, start it again and adopt"} if left else {}
         state = self.state.mode.value
-        self._journal.write("stopped", state=state, offset_um=sent_um, may_stand_um=standing_um, **told)
+        self._journal.write("stopped", state=state, offset_um=sent_um, may_stand_um=standing_um, **text)
         self.control.close()
         self._notifier.close()
         self._can.close()
@@ -146,15 +144,17 @@ class Guard:
             self._serve(ready - {self._can.fileno(), self._wake.fileno()})
 
     def _unreachable(self) -> None:
-        """Nobody can ask for zero where the control socket has no name: ramp to it now."""
+        """Ramp to zero when the control socket has no file: no client could request it any more."""
         self._lost = self.control.lost
         if self._lost:
-            text = f"the control socket is gone and cannot be made again ({self._lost}): what is on is ramped to zero"
-            self._journal.write("unreachable", text=f"{text}; make the run directory again")
+            text = (
+                f"the control socket is gone and cannot be created again ({self._lost}): the offset is ramped to zero"
+            )
+            self._journal.write("unreachable", text=f"{text}; restore the run directory")
             self._requests.append((None, {}, Request("disarm")))
 
     def _wait(self, rest_s: float) -> set[int]:
-        """Wait for the bus and for signals; for the clients too, unless they rest."""
+        """Wait for the bus and for signals; for the clients too, unless they pause."""
         poll = self._journal.clock.new_poll()
         poll.register(self._wake, select.POLLIN)
         if self._listener.bus_state != "down":
@@ -207,14 +207,16 @@ class Guard:
         self._journal.write("bus_down", text=str(error))
 
     def _restore(self, now_s: float) -> None:
-        """See now and then whether a bus that was gone is back; what the drives hold by then is not known."""
+        """Check periodically whether a lost bus is back; what the drives hold by then is unknown."""
         if now_s < self._restore_s:
             return
         self._restore_s = now_s + RESTORE_S
         if self._can.restored():
             self._listener.error("restarted")
             self._listener.forget_sync()
-            self._journal.write("bus_restored", text="the CAN bus is back; hold the feed, then adopt what is applied")
+            self._journal.write(
+                "bus_restored", text="the CAN bus is back; an offset may be applied; hold the feed, then adopt"
+            )
 
     def _sync(self, data: bytes, stamp_s: float, now_s: float, late: bool) -> None:
         self._last_sync_s, self._silent, self._put_off = now_s, False, False
@@ -224,12 +226,12 @@ class Guard:
         self._turns.add(clock.wall_s() - stamp_s if stamped else clock.now_s() - now_s, late, now_s)
 
     def _local_timer(self) -> None:
-        """Without SYNC for too long the core steps on the wall clock: it freezes, or ramps an event-driven RPDO."""
+        """Without SYNC for too long, step on the wall clock: freeze, or ramp an event-driven RPDO."""
         now_s = self._now_s()
         if now_s - self._last_sync_s <= self.settings.silence_s:
             return
         if not self._put_off and self._frames_wait():
-            self._put_off = True  # once: whoever babbles does not hide that no SYNC was among what had waited
+            self._put_off = True  # once: a babbling node cannot hide that SYNC is missing
             return
         if not self._silent:
             self._silent = True
@@ -239,7 +241,7 @@ class Guard:
             self._in_silence(now_s)
 
     def _frames_wait(self) -> bool:
-        """Whether it was this process that slept, and not the bus: then its frames are waiting."""
+        """Return whether frames are waiting: then this process was suspended, the bus was not silent."""
         if self._listener.bus_state == "down":
             return False
         poll = self._journal.clock.new_poll()
@@ -247,19 +249,18 @@ class Guard:
         return bool(poll.poll(0))
 
     def _in_silence(self, now_s: float) -> None:
-        """A step without SYNC."""
         axes, bus = self._listener.in_silence(now_s, silent=True)
         self._advance(Inputs(False, axes, bus), late=False, now_s=now_s)
 
     def _advance(self, seen: Inputs, late: bool, now_s: float) -> None:
-        """Run one step of the core and send what it says; answer and journal after that."""
+        """Run one step of the core and send its output; then answer and journal."""
         client, document, request = self._requests.popleft() if self._requests and not late else (None, {}, None)
         arming = request is not None and request.kind in ("arm", "feedforward")
         taking_over = arming and not self.state.sending
         in_charge, withdrawn = (client, ()) if taking_over else (self._owner, self._withdrawn)
         alive, alarms = self._alive(in_charge, now_s), self._listener.alarms()
-        heard = (late, self._unsent, self._unfed, alive, alarms, withdrawn, self.intake.path, request)
-        inputs = Inputs(seen.sync, seen.axes, seen.bus, *heard)
+        events = (late, self._unsent, self._unfed, alive, alarms, withdrawn, self.intake.path, request)
+        inputs = Inputs(seen.sync, seen.axes, seen.bus, *events)
         before = self.state.axes
         self.state, output = core.step(self.state, inputs, self.settings)
         self._send(output)
@@ -271,8 +272,8 @@ class Guard:
             self._turns.begin()
         if output.refused is not None and client is not None:
             self._answer(client, document, output.refused)
-        asked = client.peer if client is not None and request is not None and request.kind == "disarm" else None
-        by = {"uid": asked.uid, "pid": asked.pid} if asked is not None else {}
+        disarmed_by = client.peer if client is not None and request is not None and request.kind == "disarm" else None
+        by = {"uid": disarmed_by.uid, "pid": disarmed_by.pid} if disarmed_by is not None else {}
         if output.transition is not None and not {*output.transition[:2]} <= {Mode.RAMPING, Mode.ACTIVE}:
             self._explain(now_s)
             self._tell(*output.transition[:2], self.state.cause, by)
@@ -283,13 +284,11 @@ class Guard:
                 self._journal.write("record_void", axis=own.name, text=Alarm("RecordVoid", own.name).sentence())
 
     def _explain(self, now_s: float) -> None:
-        """Note in the cause of a transition that this computer was late, where that explains it."""
         cause = self.state.cause
         if cause is not None and not cause.late and (late := self._turns.blame(cause.code, now_s)):
             self.state = self.state._replace(cause=replace(cause, late=late))
 
     def _alive(self, owner: Client | None, now_s: float) -> bool:
-        """Whether the daemon that armed is connected and says so often enough."""
         return owner is not None and not owner.gone and now_s - owner.heard_s <= self.settings.daemon_lost_s
 
     def _own(self, client: Client | None) -> None:
@@ -298,7 +297,6 @@ class Guard:
         self._owner, self._withdrawn = client, ()
 
     def _send(self, output: Output) -> None:
-        """Send what a step says, and note which axes' frames did not leave."""
         axes = zip(self.settings.axes, self._entries, output.offsets or (), strict=output.offsets is not None)
         counter = self._listener.counter
         frames = [(axis.offset.cob_id, pack(e, (offset, counter)[: len(e)])) for axis, e, offset in axes]
@@ -309,7 +307,7 @@ class Guard:
             self._sent([(COB_HEARTBEAT + self.settings.node_id, bytes([Nmt.OPERATIONAL]))])
 
     def _sent(self, frames: Sequence[tuple[int, bytes]]) -> tuple[int, ...]:
-        """Send frames; return the places of those that did not leave. On a dead bus none is tried."""
+        """Send frames; return the indices of those that did not leave. On a dead bus none is tried."""
         unsent = []
         for k, (cob_id, data) in enumerate(frames):
             try:
@@ -322,10 +320,10 @@ class Guard:
         return tuple(unsent)
 
     def _tell(self, before: Mode, mode: Mode, cause: Alarm | None, by: Mapping[str, int]) -> None:
-        """Write down a change of state; ``by`` is whose disarm led to it."""
+        """Journal a change of state; ``by`` names the client whose disarm caused it."""
         standing_um = status.may_stand_um(self.state, self.settings)
         off = mode is Mode.OFF and not status.sentence(standing_um)
-        told = {"code": cause.code, "axis": cause.axis, "text": cause.sentence(off)} if cause else {}
+        described = {"code": cause.code, "axis": cause.axis, "text": cause.sentence(off)} if cause else {}
         self._journal.write(
             "state",
             before=before.value,
@@ -334,26 +332,26 @@ class Guard:
             offset_um=status.offset_um(self.state, self.settings),
             may_stand_um=standing_um,
             missed=self.state.missed,
-            **told,
+            **described,
             **by,
         )
         self._notifier.tell(f"STATUS={mode.value}" + (f": {cause.cause}" if cause else ""))
 
     def _tell_feed(self, before: FeedMode, mode: FeedMode, by: Mapping[str, int]) -> None:
         feed, cause = self.state.feed, self.state.feed.cause
-        told = {"code": cause.code, "axis": cause.axis, "text": cause.sentence(mode is FeedMode.OFF)} if cause else {}
+        entry = {"code": cause.code, "axis": cause.axis, "text": cause.sentence(mode is FeedMode.OFF)} if cause else {}
         if feed.unconfirmed:
-            told["text"] = f"{status.FED}; hold the feed, then run fdhil adopt"
-        self._journal.write("feedforward", before=before.value, state=mode.value, tick=self.state.tick, **told, **by)
+            entry["text"] = f"{status.FED}; hold the feed, then run fdhil adopt"
+        self._journal.write("feedforward", before=before.value, state=mode.value, tick=self.state.tick, **entry, **by)
         self._notifier.tell(f"STATUS=feed-forward {mode.value}" + (f": {cause.cause}" if cause else ""))
 
     # --- the clients ---
 
-    def _serve(self, asked: set[int]) -> None:
-        """Serve one client and check some rows of a table; then both rest, and the loop waits for the bus alone."""
-        if not (asked or self.control.pending or self.intake.busy):
+    def _serve(self, ready: set[int]) -> None:
+        """Serve one client and check some rows of a table; then pause both, and wait for the bus alone."""
+        if not (ready or self.control.pending or self.intake.busy):
             return
-        served = self.control.serve(asked, self._now_s())
+        served = self.control.serve(ready, self._now_s())
         if served is not None:
             self._request(*served)
             served[0].settle()
@@ -375,14 +373,14 @@ class Guard:
         elif kind in DECIDED:
             self._queue(client, document, parse_request(kind, document, self.settings))
         else:
-            told = f"{kind[:40]!r} is an unknown request" if isinstance(kind, str) else "the request has no name"
-            client.reply(document, ok=False, code="BadRequest", text=told, advice=f"use one of {', '.join(DECIDED)}")
+            text = f"{kind[:40]!r} is an unknown request" if isinstance(kind, str) else "the request has no name"
+            client.reply(document, ok=False, code="BadRequest", text=text, advice=f"use one of {', '.join(DECIDED)}")
 
     def _queue(self, client: Client, document: Document, request: Request) -> None:
-        """Have a step decide; one request of a client waits at a time, but a disarm takes the place of all others.
+        """Queue a request for the next step; each client has one waiting at most, but a disarm replaces all others.
 
-        A request that names another number of ``disarms`` was made before the last of them, and slept since. Of clients
-        that have gone one disarm waits, however many said it.
+        A request with another count of ``disarms`` was made before the last disarm and is refused. Of clients that have
+        disconnected one disarm is kept, however many sent one.
         """
         disarms = request.kind == "disarm"
         if disarms:
@@ -411,7 +409,7 @@ class Guard:
             self._requests.append((client, document, request))
 
     def _withdraw(self, client: Client, document: Document) -> None:
-        """The daemon's keep-alive; what it no longer vouches for ends the correction."""
+        """Take the daemon's keep-alive; a fact that it no longer attests ends the correction."""
         facts = document.get("facts")
         if client is self._owner and isinstance(facts, dict):
             self._withdrawn = tuple(Alarm(FACTS[f]) for f in WITHDRAWABLE if f in facts and facts[f] is not True)
@@ -424,21 +422,21 @@ class Guard:
             return
         if Alarm("AuthRequired") in refused:
             self._tell_refused(client.peer, document["request"])
-        told = list(map(status.told, refused))
-        client.reply(document, ok=False, state=self.state.mode.value, **told[0], refused=told)
+        alarms = list(map(status.told, refused))
+        client.reply(document, ok=False, state=self.state.mode.value, **alarms[0], refused=alarms)
 
     def _tell_refused(self, peer: Peer, kind: object) -> None:
-        """Write down who asked for what he may not; ``times`` counts all that were refused since the line before."""
+        """Journal who requested what they may not; ``times`` counts all refusals since the line before."""
         self._refused, now_s = self._refused + 1, self._now_s()
         if now_s - self._refused_s >= REFUSED_S:
-            told = str(kind)[:40] if kind else "to talk"
+            requested = str(kind)[:40] if kind else "to talk"
             self._journal.write(
-                "refused", code="AuthRequired", request=told, uid=peer.uid, pid=peer.pid, times=self._refused
+                "refused", code="AuthRequired", request=requested, uid=peer.uid, pid=peer.pid, times=self._refused
             )
             self._refused_s, self._refused = now_s, 0
 
     def status(self) -> dict[str, Any]:
-        """Return what the guard knows, for the daemon's status."""
+        """Return the guard's status, for the daemon."""
         shadow = self._shadow.offsets()
         not_good: tuple[Alarm, ...] = (Alarm("SyncLost"),)
         if self._inputs is not None and not self._silent:

@@ -1,6 +1,4 @@
-"""Names the states, files and times that the guard and its clients share, each once."""
-
-from __future__ import annotations
+"""Names the states, files and times that the guard shares with its clients."""
 
 from enum import StrEnum
 
@@ -8,13 +6,13 @@ SOCKET_NAME = "guard.sock"
 SETTINGS_NAME = "guard.json"
 TABLE_NAME = "fdhil-table"
 HOLD_CYCLES = 10
-"""SYNC for which a gap is held before it ends what was armed."""
+"""SYNC cycles for which a gap is bridged before the correction ends."""
 RESERVE_S = 1.0
-"""With so much left of a streamed table the guard ramps to zero."""
+"""Remaining time of a streamed table at which the guard ramps to zero."""
 
 
 class Mode(StrEnum):
-    """The guard's state; :mod:`fdhil.guard.transitions` says what leads from one to another."""
+    """The guard's state; :mod:`fdhil.guard.transitions` lists the transitions."""
 
     OFF = "OFF"
     ADOPT = "ADOPT"
@@ -27,7 +25,7 @@ class Mode(StrEnum):
 
 
 class FeedMode(StrEnum):
-    """Whether the on-line feed-forward acts: ENDING fades out, ZEROING sends zeros at once."""
+    """State of the on-line feed-forward: ENDING fades out, ZEROING sends zeros at once."""
 
     OFF = "OFF"
     ON = "ON"
@@ -36,7 +34,7 @@ class FeedMode(StrEnum):
 
 
 FEEDFORWARD = "FEEDFORWARD"
-"""What a client is told as the state while the feed-forward is not OFF."""
+"""The state that clients receive while the feed-forward is not OFF."""
 ON_PATH = frozenset({Mode.RAMPING, Mode.ACTIVE, Mode.HOLD})
 IN_CHARGE = ON_PATH | {Mode.ARMED}
 LANDING = frozenset({Mode.ADOPT, Mode.RAMP_DOWN})

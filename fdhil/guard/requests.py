@@ -1,9 +1,7 @@
-"""Parses the bytes of a request into the record that the core decides on; what is none becomes one that is refused.
+"""Parses a request into the record that the core decides on; an invalid one becomes a record that is refused.
 
-Whatever the bytes are, nothing is raised here.
+No input raises an exception here.
 """
-
-from __future__ import annotations
 
 import hashlib
 import hmac
@@ -22,7 +20,7 @@ MOST_CHARACTERS = 200
 
 
 def parse_line(line: bytes) -> Document | None:
-    """Return the JSON object of a line, None when it is none; its ``id`` stays only where it can be given back."""
+    """Return the JSON object of a line, None when it is invalid; ``id`` is kept only where it can be returned."""
     try:
         document = json.loads(line, parse_constant=refuse_constant)
     except (ValueError, RecursionError):
@@ -47,31 +45,29 @@ def parse_request(kind: Any, document: Mapping[str, Any], settings: Settings) ->
 
 
 def _text(document: Mapping[str, Any], key: str) -> str:
-    """The text of a key, empty when it holds none of a sensible length."""
+    """Return the text of a key, empty when it is missing, not a text or too long."""
     value = document.get(key)
     return value if isinstance(value, str) and len(value) <= MOST_CHARACTERS else ""
 
 
 def _compared(given: object, settings: Settings) -> dict[str, str]:
-    """The fingerprints of the drives that were compared; what is no text is no drive's."""
     found = given if isinstance(given, dict) else {}
     return {axis.name: _text(found, axis.name) for axis in settings.axes if axis.name in found}
 
 
 def _touched(given: object, settings: Settings) -> dict[str, int]:
-    """How often each drive was touched before it was compared; what is no number is of none."""
     found = given if isinstance(given, dict) else {}
     return {axis.name: found[axis.name] for axis in settings.axes if type(found.get(axis.name)) is int}
 
 
 def _laws(given: object, settings: Settings) -> tuple[Law, ...]:
-    """The feed-forward's law of every axis, in the guard's order; empty when one is missing or none."""
+    """Return the feed-forward law of every axis, in the guard's order; empty when one is missing or invalid."""
     laws = [parse_law(given.get(axis.name)) for axis in settings.axes] if isinstance(given, dict) else []
     return tuple([law for law in laws if law is not None]) if None not in laws else ()
 
 
 def parse_law(document: object) -> Law | None:
-    """Return the law that a request carries, None when it is none."""
+    """Return the law of a request, None when it is invalid."""
     if not isinstance(document, Mapping):
         return None
     parts: list[tuple[int, ...]] = []

@@ -1,9 +1,7 @@
 """Writes, reads and checks the guard's settings: a frozen record in one JSON file of the run directory.
 
-The file is written by ``fdhil-guard`` from the machine's config and profile; the guard reads nothing else.
+``fdhil-guard`` writes the file from the machine's config and profile; the guard reads nothing else.
 """
-
-from __future__ import annotations
 
 import hashlib
 import json
@@ -27,14 +25,14 @@ Layout = tuple[tuple[int, int, int, bool], ...]
 """Entries (index, sub-index, bits, signed) of a PDO, one behind the other."""
 OFFSET_LAYOUT: Layout = ((Object.POSITION_OFFSET, 0, 32, True),)
 LEAD_LAYOUT: Layout = (*OFFSET_LAYOUT, (0x0005, 0, 8, False))
-"""With a lead: behind the offset, in a dummy entry (CiA 301), the counter of the SYNC that it answers."""
+"""With a lead: after the offset, in a dummy entry (CiA 301), the counter of the SYNC that it answers."""
 MOST_LEAD = 200
 FEED_LAYOUT: Layout = ((Object.VELOCITY_OFFSET, 0, 32, True), (Object.TORQUE_OFFSET, 0, 16, True))
 
 
 @dataclass(frozen=True, slots=True)
 class Pdo:
-    """One PDO: its COB-ID, its layout and with every how many SYNC it comes."""
+    """One PDO: its COB-ID, its layout, and its period in SYNC cycles."""
 
     cob_id: int
     layout: Layout
@@ -42,13 +40,13 @@ class Pdo:
 
     @property
     def entries(self) -> tuple[PdoEntry, ...]:
-        """The placed entries."""
+        """The entries with their bit offsets."""
         return lay_out(self.layout)
 
 
 @dataclass(frozen=True, slots=True)
 class Feedforward:
-    """What the on-line feed-forward may send: ``pdo`` maps 0x60B1 and 0x60B2, ``limits`` in the drive's counts."""
+    """The on-line feed-forward's PDO, which maps 0x60B1 and 0x60B2, and its ``limits`` in the drive's counts."""
 
     pdo: Pdo
     limits: feedforward.FeedforwardLimits
@@ -58,15 +56,13 @@ class Feedforward:
 class AxisSettings:
     """One axis: ``target`` is the NC's RPDO with 0x607A, ``offset`` our own RPDO with 0x60B0 alone.
 
-    ``window`` is the drive's following error window (0x6065) in increments; ``limits`` in increments per SYNC cycle,
-    which the axis' own ``max_speed_mm_s`` and ``max_acceleration_mm_s2`` bound as well.
-    ``speed_count`` is one count of 0x606C in increments per SYNC cycle, ``speed_step`` by how much of that the motor's
-    speed can change in one cycle; 0: not judged.
-    ``travel`` are the drive's software limits (0x607D), None: it has none.
-    ``heartbeat_timeout_s`` 0: the drive has no heartbeat, and its PDOs alone show that it is Operational.
-    ``writers`` are COB-IDs, not ours, whose frames may change an offset of the drive.
-    ``record`` is the fingerprint of the drive as it was commissioned, empty: it was not; ``record_void`` says that
-    something against it was seen since, ``void_reason`` what.
+    ``window`` is the drive's following error window (0x6065) in increments; ``limits`` are in increments per SYNC cycle
+    and bounded by the axis' ``max_speed_mm_s`` and ``max_acceleration_mm_s2``, too. ``speed_count`` is one count of
+    0x606C in increments per SYNC cycle, ``speed_step`` the largest change of the motor's speed in one cycle in that
+    unit; 0: not checked. ``travel`` are the drive's software limits (0x607D), None: it has none.
+    ``heartbeat_timeout_s`` 0: the drive has no heartbeat, only its PDOs show that it is Operational. ``writers`` are
+    foreign COB-IDs whose frames may change an offset of the drive. ``record`` is the fingerprint of the commissioned
+    drive, empty: not commissioned; ``record_void``: an event since then voids it, ``void_reason`` names the event.
     """
 
     name: str
@@ -93,7 +89,7 @@ class AxisSettings:
 
     @property
     def read_back_every(self) -> int:
-        """With every how many SYNC a TPDO shows the offset in force; 0: none does."""
+        """Period, in SYNC cycles, of the TPDO that shows the offset in force; 0: there is none."""
         shown = [pdo.every_sync for pdo in self.tpdos if any(e[:2] == OFFSET_LAYOUT[0][:2] for e in pdo.layout)]
         return max(1, min(shown)) if shown else 0
 
@@ -103,10 +99,10 @@ class Settings:
     """The machine as the guard sees it.
 
     ``clock`` "sync": time is SYNC count x period (a simulated machine need not run in real time). ``token_sha256`` is
-    the hash of the operator's token, empty: nothing can be armed. ``offset_synchronous``: the drive applies our RPDO
-    at the next SYNC, so that without SYNC nothing can be ramped. ``daemon_uid`` is the user of the daemon where it is
-    another than the guard's, ``watching`` are the users who may look and disarm besides. ``lead``: an offset takes
-    effect so many cycles later than at the next SYNC, because it waits in a queue (HAL's streamer).
+    the hash of the operator's token, empty: nothing can be armed. ``offset_synchronous``: the drive applies our RPDO at
+    the next SYNC, so that without SYNC nothing can be ramped. ``daemon_uid`` is the daemon's user where it differs from
+    the guard's, ``watching`` are users who may also watch and disarm. ``lead``: an offset takes effect that many cycles
+    later than at the next SYNC, because it waits in a queue (HAL's streamer).
     """
 
     bus: str
@@ -125,29 +121,29 @@ class Settings:
 
     @property
     def silence_s(self) -> float:
-        """How long the bus may be without SYNC: four periods and the lead; 10 s where time is the SYNC count.
+        """Longest time without SYNC: four periods and the lead; 10 s where time is the SYNC count.
 
-        A simulated machine stands still between two SYNCs, and its slowest listener may hold it up.
+        A simulated machine stands still between two SYNCs, and its slowest participant may delay it.
         """
         return 10.0 if self.clock == "sync" else (4 + self.lead) * self.sync_period_s
 
     @property
     def daemon_lost_s(self) -> float:
-        """How long the daemon may say nothing while it has something armed."""
+        """Longest silence of the daemon while it has something armed."""
         return 10.0 if self.clock == "sync" else 0.5
 
     @property
     def heartbeat_cycles(self) -> int:
-        """Our heartbeat comes with every so many SYNC."""
+        """Period of our heartbeat in SYNC cycles."""
         return self.cycles(self.heartbeat_s)
 
     def cycles(self, seconds: float) -> int:
-        """Return a duration in whole SYNC cycles, at least one."""
+        """Convert a duration to whole SYNC cycles, at least one."""
         return max(1, round(seconds / self.sync_period_s))
 
     @property
     def sent_ids(self) -> frozenset[int]:
-        """The only COB-IDs that may ever leave: our heartbeat and the configured offset RPDOs."""
+        """The only COB-IDs that may be sent: our heartbeat and the configured offset RPDOs."""
         fed = [axis.feedforward.pdo.cob_id for axis in self.axes if axis.feedforward is not None]
         return frozenset([0x700 + self.node_id, *(axis.offset.cob_id for axis in self.axes), *fed])
 
@@ -159,14 +155,14 @@ class Settings:
 
 
 def to_json(settings: Settings) -> str:
-    """Return the settings as the text of their file, which ends with a digest over them."""
+    """Return the settings as the text of their file, which ends with a digest of them."""
     document = {"schema": SCHEMA, **asdict(settings)}
     digest = hashlib.sha256(json.dumps(document).encode()).hexdigest()
     return json.dumps({**document, "digest": digest}, indent=1)
 
 
 def from_json(text: str, source: str = "settings") -> Settings:
-    """Read settings back; ConfigError when the text is not what ``to_json`` writes, or asks for more than a ceiling."""
+    """Parse settings; ConfigError when the text is not what ``to_json`` writes, or exceeds a ceiling."""
     try:
         document = json.loads(text, parse_constant=refuse_constant)
         if document.pop("schema") != SCHEMA:
@@ -182,15 +178,15 @@ def from_json(text: str, source: str = "settings") -> Settings:
 
 
 def load(path: Path) -> Settings:
-    """Read the settings file; ConfigError when it cannot be read or used, or is not as it was written.
+    """Read the settings file; ConfigError when it is unreadable, invalid or modified since it was written.
 
-    What is no plain file is not waited for.
+    A file that is not a regular one is refused without blocking.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
         with os.fdopen(descriptor, "rb") as file:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                raise OSError("it is no plain file")
+                raise OSError("it is not a regular file")
             text = file.read(MAX_BYTES).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(str(path), [ConfigFault("file", f"cannot be read: {error}", "run fdhil-guard")]) from None
@@ -202,24 +198,24 @@ def load(path: Path) -> Settings:
 
 
 def refuse_constant(constant: str) -> None:
-    """Raise ValueError: NaN and Infinity are no JSON."""
-    raise ValueError(f"{constant} is no number")
+    """Raise ValueError: NaN and Infinity are invalid JSON."""
+    raise ValueError(f"{constant} is not a number")
 
 
 def _whole(value: object, low: int, high: int, what: str) -> int:
     if type(value) is not int or not low <= value <= high:
-        raise ValueError(f"{what} is no whole number from {low} to {high}")
+        raise ValueError(f"{what} is not an integer from {low} to {high}")
     return value
 
 
 def _number(value: object, low: float, high: float, what: str) -> None:
     if type(value) not in (int, float) or not low <= value <= high:  # type: ignore[operator] # it is a number
-        raise ValueError(f"{what} is no number from {low:g} to {high:g}")
+        raise ValueError(f"{what} is not a number from {low:g} to {high:g}")
 
 
 def _word(value: object, pattern: str, what: str) -> None:
     if not isinstance(value, str) or not re.fullmatch(pattern, value):
-        raise ValueError(f"{what} is none")
+        raise ValueError(f"{what} is invalid")
 
 
 def _pdo(document: Mapping[str, Any]) -> Pdo:
@@ -248,9 +244,9 @@ def _axis(document: dict[str, Any]) -> AxisSettings:
 
 
 def _check(settings: Settings) -> None:
-    """Refuse what would make the guard's own arithmetic wrong; ValueError names it."""
+    """Refuse settings that would make the guard's own arithmetic wrong; ValueError names the value."""
     if not settings.axes:
-        raise ValueError("no axis may be corrected (an [axis.NAME.correction] section switches writing on)")
+        raise ValueError("no axis may be corrected; an [axis.NAME.correction] section enables it")
     _number(settings.sync_period_s, 1e-5, 1.0, "sync_period_s")
     _number(settings.heartbeat_s, 1e-3, 10.0, "heartbeat_s")
     _whole(settings.node_id, 1, 127, "node_id")
@@ -270,14 +266,14 @@ def _check(settings: Settings) -> None:
         _check_axis(axis, LEAD_LAYOUT if settings.lead else OFFSET_LAYOUT)
         _check_limits(axis, settings.sync_period_s)
     if len(settings.sent_ids) != 1 + len(settings.axes) + sum(a.feedforward is not None for a in settings.axes):
-        raise ValueError("two of our PDOs share one COB-ID")
-    heard = [pdo.cob_id for axis in settings.axes for pdo in (axis.target, *axis.tpdos)]
-    if len({axis.name for axis in settings.axes}) < len(settings.axes) or len(set(heard)) < len(heard):
-        raise ValueError("two axes are one")
-    if {*settings.sent_ids, *heard} & {cob_id for axis in settings.axes for cob_id in axis.writers}:
-        raise ValueError("a COB-ID that is ours, the NC's or a drive's counts as a foreign writer's")
-    if settings.sent_ids & {*heard, *(COB_HEARTBEAT + axis.node_id for axis in settings.axes)}:
-        raise ValueError("a COB-ID that is ours is another sender's: of the NC's set-points or a drive")
+        raise ValueError("two PDOs of the guard share one COB-ID")
+    received = [pdo.cob_id for axis in settings.axes for pdo in (axis.target, *axis.tpdos)]
+    if len({axis.name for axis in settings.axes}) < len(settings.axes) or len(set(received)) < len(received):
+        raise ValueError("two axes share a name or a COB-ID")
+    if {*settings.sent_ids, *received} & {cob_id for axis in settings.axes for cob_id in axis.writers}:
+        raise ValueError("a COB-ID of the guard, the NC or a drive is listed as a foreign writer's")
+    if settings.sent_ids & {*received, *(COB_HEARTBEAT + axis.node_id for axis in settings.axes)}:
+        raise ValueError("a COB-ID of the guard is also used by the NC's set-points or a drive")
 
 
 def _check_axis(axis: AxisSettings, layout: Layout) -> None:
@@ -308,7 +304,7 @@ def _check_sent(pdo: Pdo, layout: Layout, text: str) -> None:
 
 
 def _check_limits(axis: AxisSettings, sync_period_s: float) -> None:
-    """The ceilings are this program's: the file can only lower them, and not below one increment."""
+    """Refuse limits above this program's ceilings or below one increment."""
     _number(axis.increments_per_mm, 1.0, MOST_INCREMENTS_PER_MM, f"axis {axis.name}: increments_per_mm")
     for value in (axis.max_speed_mm_s, axis.max_acceleration_mm_s2):
         _number(value, 1e-3, 1e9, f"axis {axis.name}: max_speed_mm_s or max_acceleration_mm_s2")

@@ -1,9 +1,7 @@
 """Follows a loaded table while the guard is off, to show what would be sent.
 
-Nothing here leaves the process: it works on a copy of the core's state and is shown in the status alone.
+It works on a copy of the core's state and appears in the status only; nothing of it is sent.
 """
-
-from __future__ import annotations
 
 from fdhil.guard.path import CorrectedPath
 from fdhil.guard.protocol import Mode
@@ -12,7 +10,7 @@ from fdhil.guard.tracking import await_start, track
 
 
 class Shadow:
-    """Follows one table as an armed guard would, without an interlock; begins anew where the path is lost or ends."""
+    """Follows one table as an armed guard would, without interlocks; restarts where the path is lost or ends."""
 
     def __init__(self) -> None:
         self._path: CorrectedPath | None = None
@@ -21,7 +19,7 @@ class Shadow:
         self._before: State | None = None
 
     def follow(self, state: State, path: CorrectedPath | None) -> None:
-        """Take the SYNC that ``state`` has seen."""
+        """Take the SYNC that ``state`` has processed."""
         rested, self._before = self._before or state, state
         if state.mode is not Mode.OFF or path is None:
             self._path = self._state = None
@@ -39,7 +37,7 @@ class Shadow:
         self._state = None if ended or (lost is not None and lost.code != "FeedHold") else found
 
     def offsets(self) -> tuple[int, ...] | None:
-        """Return what would be sent now, in increments per axis; None while the machine is not on the path."""
+        """Return what would be sent now, increments per axis; None while the machine is off the path."""
         if self._state is None or self._path is None:
             return None
         return self._path.offsets_at(self._state.places[0].row + 1)

@@ -1,6 +1,4 @@
-"""Catches every signal that can be: those that ask the guard to stop have it ramp to zero, others do nothing."""
-
-from __future__ import annotations
+"""Catches every signal: those that request a stop ramp the offset to zero, all others are ignored."""
 
 import ctypes
 import os
@@ -10,13 +8,13 @@ import socket
 # SIGXCPU comes from the kernel half a second before it would kill a real-time process that never waits
 STOP = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGXCPU})
 KEPT = frozenset({signal.SIGKILL, signal.SIGSTOP, signal.SIGCONT, signal.SIGCHLD})
-RESERVED = 32, 33  # of the C library, which lets nobody handle them; sent from outside they would end the process
+RESERVED = 32, 33  # of the C library, which allows no handler; sent from outside they would end the process
 SIGACTION = {"x86_64": 13, "aarch64": 134, "riscv64": 134}
 MASK_BYTES = 8
 
 
 def catch() -> socket.socket:
-    """Take every signal; return the socket that becomes readable when one asks to stop."""
+    """Install the handlers; return the socket that becomes readable when a signal requests a stop."""
     wake, signalled = socket.socketpair()
     wake.setblocking(False)
     signalled.setblocking(False)
@@ -28,7 +26,7 @@ def catch() -> socket.socket:
 
 
 def _note(*_: object) -> None:
-    """The signal's number is on the wake socket already."""
+    """Do nothing: the signal's number is on the wake socket already."""
 
 
 def _ignore_reserved() -> None:

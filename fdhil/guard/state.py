@@ -1,4 +1,4 @@
-"""Records what goes in and out of the guard's core, and what it remembers."""
+"""Records of the guard's core: its inputs, its outputs and its state."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ UNDISTURBED = 1 << 30
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What the operator or the daemon asks for; all but a disarm and a stop need the operator's token.
+    """A request of the operator or the daemon; all but a disarm and a stop need the operator's token.
 
-    ``compared`` are the fingerprints, per axis, of drives that were found to be as they were commissioned, ``touched``
-    how often each had been touched by what the status said before they were read.
+    ``compared`` are the fingerprints, per axis, of drives that match their commissioning record; ``touched`` is how
+    often each had been written to or rebooted, by the status read before the comparison.
     """
 
     kind: Literal["arm", "feedforward", "disarm", "adopt", "compared", "stop"]
@@ -38,13 +38,13 @@ class Request:
 
 
 class AxisInput(NamedTuple):
-    """One axis at a SYNC: what its frames said since the SYNC before.
+    """One axis at a SYNC: the content of its frames since the SYNC before.
 
     ``target`` is the 0x607A that this SYNC latched, ``position`` and ``read_back`` what was sampled at the SYNC before
-    (None when no frame came). Ages are infinite when never heard;
-    ``feedback_age`` is that of the older of statusword and position, ``read_back_age`` that of 0x60B0, each in units of
-    its own rate; ``read_back_crowded``: its TPDO came when it was not due, so that one of the last two may be another
-    node's. ``demand`` is 0x6062; ``touched`` counts boot-ups, and writes to what the commissioning relies on.
+    (None when no frame came). Ages are infinite when nothing was ever received; ``feedback_age`` is that of the older
+    of statusword and position, ``read_back_age`` that of 0x60B0, each in units of its own period;
+    ``read_back_crowded``: its TPDO came when it was not due, so that one of the last two may be another node's.
+    ``demand`` is 0x6062; ``touched`` counts boot-ups, and writes to objects that the commissioning relies on.
     """
 
     target: int | None = None
@@ -67,7 +67,7 @@ class AxisInput(NamedTuple):
 
 
 class BusView(NamedTuple):
-    """What is known of the bus at a SYNC."""
+    """State of the bus at a SYNC."""
 
     state: str = "active"
     sync_regular: bool = False
@@ -76,10 +76,10 @@ class BusView(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """All that one step may know. ``sync`` False: the local timer, because no SYNC came.
+    """All inputs of one step. ``sync`` False: a step of the local timer, because no SYNC came.
 
-    ``late``: the next SYNC is already there, so that nothing sent now would be in time. ``unsent`` are the axes whose
-    offset of the step before did not leave, ``unfed`` those whose speed and torque offset did not. ``alarms`` are
+    ``late``: the next SYNC has already arrived, so that nothing sent now would be in time. ``unsent`` are the axes
+    whose offset of the step before did not leave, ``unfed`` those whose speed and torque offset did not. ``alarms`` are
     events since the last step (emergency, foreign frame).
     """
 
@@ -97,14 +97,13 @@ class Inputs(NamedTuple):
 
 
 class AxisState(NamedTuple):
-    """One axis' offset: ``offset`` in force or about to be, moving at ``rate``; ``sent`` the last values, newest first.
+    """One axis' offset: ``offset`` in force or about to be, moving at ``rate``; ``sent``: last values, newest first.
 
-    ``read_back`` is what the drive last showed (None: never), in ``readings`` TPDOs in a row, by ``off_demand`` away
-    from what 0x6062 says; ``zero_shown``: it showed 0 since we send 0. ``record_void``: it may not be as commissioned.
-    ``strays`` grows with readings that were not what was sent, between others that were; ``foreign``: another node
-    wrote what was shown last.
-    ``fed_back`` is the same of speed and torque offset. ``believed`` are the last position, speed (increments per
-    cycle) and tick that agreed with those before, ``implausible`` the samples since then that did not.
+    ``read_back`` is what the drive last showed (None: never), in ``readings`` TPDOs in a row, ``off_demand`` away from
+    what 0x6062 shows; ``zero_shown``: it showed 0 since we send 0. ``record_void``: it may differ from the commissioned
+    drive. ``strays`` grows with wrong readings between correct ones; ``foreign``: another node wrote the value shown
+    last. ``fed_back`` is the read-back of the speed and torque offset. ``believed`` are the last plausible position,
+    speed (increments per cycle) and tick, ``implausible`` counts the implausible samples since then.
     """
 
     offset: int = 0
@@ -129,14 +128,14 @@ class AxisState(NamedTuple):
 
 
 class State(NamedTuple):
-    """The guard's whole memory.
+    """The guard's whole state.
 
-    ``places`` are the rows of the path that the machine may be at, best first; ``anchor`` the last row that the
-    targets agreed with. ``rest`` are the last targets heard, ``rested_for`` the cycles since they came to stand there.
-    ``cause`` is why the correction went off, kept until the next arming. ``measuring`` counts the cycles in which
-    nothing is sent because another node changed the offset: the ramp starts from what the drives show.
-    ``unknown_for`` counts those after the start in which a drive showed an offset that could not be believed yet,
-    ``undisturbed_for`` those since another node wrote an offset.
+    ``places`` are the rows of the path that the machine may be at, best first; ``anchor`` the last row that matched the
+    targets. ``rest`` are the last targets received, ``rested_for`` the cycles since they last changed. ``cause`` is why
+    the correction went off, kept until the next arming. ``measuring`` counts the cycles in which nothing is sent
+    because another node changed the offset: the ramp starts from what the drives show. ``unknown_for`` counts the
+    cycles after the start in which a drive showed an offset that was not trusted yet, ``undisturbed_for`` those since
+    another node wrote an offset.
     """
 
     mode: Mode
@@ -165,16 +164,16 @@ class State(NamedTuple):
 
     @property
     def sending(self) -> bool:
-        """Whether frames of ours leave."""
+        """Whether the guard sends frames."""
         return self.mode in SENDING or self.feed.mode is not FeedMode.OFF
 
     def after(self, event: Event, **changes: Any) -> State:
-        """Return the state that ``event`` leads to, with ``changes``; KeyError where the table has no such way."""
+        """Return the state after ``event``, with ``changes``; KeyError where the table has no such transition."""
         return self._replace(mode=NEXT[self.mode, event], **changes)
 
 
 class Output(NamedTuple):
-    """What to do now: the offset of each axis in increments (None: send nothing), our heartbeat, what to journal.
+    """The output of a step: the offset of each axis in increments (None: send nothing), our heartbeat, journal entries.
 
     ``refused`` answers a request: None when there was none, empty when it was granted. ``feed`` are speed and torque
     offset of each axis in the drive's counts.

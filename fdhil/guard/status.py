@@ -1,6 +1,4 @@
-"""Makes the guard's status document, with offsets in the units and the direction of the axis."""
-
-from __future__ import annotations
+"""Builds the guard's status document, with offsets in the unit and direction of the axis."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -17,29 +15,29 @@ FED = "speed and torque offsets may still be applied"
 
 
 def told(alarm: Alarm) -> dict[str, str]:
-    """Return an alarm as it is given to clients."""
+    """Return an alarm as clients receive it."""
     late = {"late": alarm.late} if alarm.late else {}
     return {"code": alarm.code, "axis": alarm.axis, "text": alarm.cause, "advice": alarm.action, **late}
 
 
 def in_um(offsets: Sequence[int | None], settings: Settings) -> dict[str, float | None]:
-    """Return increments per axis as um in the axis' direction; None stays."""
+    """Convert increments per axis to um in the axis' direction; None stays."""
     pairs = zip(settings.axes, offsets, strict=True)
     return {s.name: None if o is None else round(s.sign * o / s.increments_per_mm * 1e3, 3) for s, o in pairs}
 
 
 def offset_um(state: State, settings: Settings) -> dict[str, float | None]:
-    """Return what was sent last."""
+    """Return the offsets sent last."""
     return in_um([axis.offset for axis in state.axes], settings)
 
 
 def may_stand_um(state: State, settings: Settings) -> dict[str, float | None]:
-    """Return what may still be applied in each drive: 0.0 when it is known that nothing is, None when it is unknown."""
+    """Return the offset that may still be applied in each drive: 0.0: certainly none, None: unknown."""
     return in_um(may_stand(state), settings)
 
 
 def sentence(standing_um: Mapping[str, float | None], feed: Feed | None = None) -> str:
-    """Say what may still be applied; empty when it is known that nothing is."""
+    """Describe what may still be applied; empty when certainly nothing is."""
     left = [
         f"{'an unknown offset' if um is None else f'{um:.1f} um'} on {x}" for x, um in standing_um.items() if um != 0
     ]
@@ -49,7 +47,7 @@ def sentence(standing_um: Mapping[str, float | None], feed: Feed | None = None) 
 
 
 def document(state: State, settings: Settings, path: CorrectedPath | None, not_good: Sequence[Alarm]) -> dict[str, Any]:
-    """Return what state and table say; the loop adds what it alone knows."""
+    """Return the status of state and table; the loop adds what only it knows."""
     cause, feed = state.cause or state.feed.cause, state.feed
     return {
         "state": state.mode.value if feed.mode is FeedMode.OFF else FEEDFORWARD,

@@ -1,9 +1,7 @@
-"""Hands a correction table to the guard as an open descriptor of sealed memory, and checks it row by row.
+"""Passes a correction table to the guard as a descriptor of sealed memory, and checks it row by row.
 
-Memory that is sealed cannot change, shrink or block while it is read, whoever still holds it.
+Sealed memory cannot change, shrink or block while it is read, whoever else still has it open.
 """
-
-from __future__ import annotations
 
 import fcntl
 import json
@@ -25,8 +23,8 @@ MAX_HEAD_BYTES = 4096
 SEALED = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE
 _LENGTH = struct.Struct("<I")
 _TOO_NEAR = {
-    "SoftwareLimit": "a software limit of the drive than twice the largest offset; lower max_offset_um, or move work",
-    "PositionRange": "the end of 32 bits than the largest offset; move the work, or coarsen the drive's increments",
+    "SoftwareLimit": "a software limit of the drive than twice the largest offset; lower max_offset_um",
+    "PositionRange": "the end of the 32-bit range than the largest offset; move the workpiece, or use coarser steps",
 }
 
 
@@ -52,10 +50,10 @@ def encode(
     first: int = 0,
     final: bool = True,
 ) -> bytes:
-    """Return the body of a table: a JSON header, then demand and offset of each axis as little-endian int32.
+    """Return the bytes of a table: a JSON header, then demand and offset of each axis as little-endian int32.
 
-    ``first`` is the number of the first row; a table that is streamed is sent in pieces with ``final`` False but in
-    the last. ValueError when a value is no integer of 32 bits.
+    ``first`` is the number of the first row; a streamed table is sent in pieces with ``final`` False in all but the
+    last. ValueError when a value is not a 32-bit integer.
     """
     rows = len(demand[axes[0]])
     head = {"axes": list(axes), "first": first, "rows": rows, "final": final, "program": program_digest}
@@ -80,7 +78,7 @@ def _to_int32(values: Column) -> bytes:
 
 
 def decode(body: bytes, sequence: int = 0) -> tuple[tuple[str, ...], CorrectedPath]:
-    """Return the axes and the rows of a body; TableRefused (``CorruptFile``) when it is not what ``encode`` writes."""
+    """Return the axes and rows of a table; TableRefused (``CorruptFile``) when it is not what ``encode`` writes."""
     try:
         (length,) = _LENGTH.unpack_from(body)
         if length > MAX_HEAD_BYTES:
@@ -112,7 +110,7 @@ def _columns(data: bytes, rows: int, count: int) -> tuple[Sequence[int], ...]:
 
 
 def seal(body: bytes) -> int:
-    """Return a descriptor of sealed memory that holds a body; StoreError when it is too long or there is no memory."""
+    """Return a descriptor of sealed memory with the table; StoreError when it is too long or memory is exhausted."""
     if len(body) > MAX_TABLE_BYTES:
         raise StoreError(f"a correction table of {len(body)} bytes is too long for the guard; stream it in pieces")
     try:
@@ -132,9 +130,9 @@ def seal(body: bytes) -> int:
 
 
 def read_sealed(descriptor: int | None, most_bytes: int = MAX_TABLE_BYTES) -> bytes:
-    """Return what sealed memory holds; TableRefused (``CorruptFile``, ``TableBusy`` above ``most_bytes``).
+    """Return the content of sealed memory; TableRefused (``CorruptFile``, ``TableBusy`` above ``most_bytes``).
 
-    The seals are asked for first: only memory has any, so that whatever else came (a FIFO, a socket) is not touched.
+    The seals are checked first: only memory has any, so that anything else (a FIFO, a socket) is not read.
     """
     try:
         sealed = descriptor is not None and fcntl.fcntl(descriptor, fcntl.F_GET_SEALS) & SEALED == SEALED
@@ -152,9 +150,9 @@ def read_sealed(descriptor: int | None, most_bytes: int = MAX_TABLE_BYTES) -> by
 
 
 def check_rows(limits: OffsetLimits, offsets: Sequence[int], start: int, stop: int) -> str | None:
-    """Check rows [start, stop) of a table's offsets, with what lies before ``start``; return the class or None.
+    """Check rows [start, stop) of a table's offsets, with those before ``start``; return the class or None.
 
-    The row before the first is taken to be at rest at the first row's value: the fade-in brings the offset there.
+    The row before the first counts as standing at the first row's value: the fade-in brings the offset there.
     """
     for row in range(start, stop):
         before = offsets[max(row - 1, 0)]
@@ -180,7 +178,7 @@ def _variation_fits(limits: OffsetLimits, offsets: Sequence[int], start: int, st
 def check_demand(travel: Travel, limits: OffsetLimits, demand: Sequence[int]) -> None:
     """Raise TableRefused unless these rows keep away from both ends of the axis.
 
-    The largest offset from the ends of 32 bits (``PositionRange``), twice that from the software limits
+    They keep the largest offset from the ends of 32 bits (``PositionRange``), twice that from the software limits
     (``SoftwareLimit``).
     """
     ends = [("SoftwareLimit", travel[0] + 2 * limits.offset, travel[1] - 2 * limits.offset)] if travel else []
@@ -191,10 +189,10 @@ def check_demand(travel: Travel, limits: OffsetLimits, demand: Sequence[int]) ->
 
 @dataclass(slots=True)
 class Loading:
-    """A table on its way in: its rows are checked a piece at a time, so that no SYNC waits for it.
+    """A new table whose rows are checked a piece at a time, so that no SYNC waits for it.
 
-    ``joined`` is the path with the new rows behind the old ones, or in their place; ``done`` once all have passed, or
-    those before ``stop``: the others are as they were.
+    ``joined`` is the path with the new rows appended or replaced; ``done`` once all have passed, or those before
+    ``stop``: the others are unchanged.
     """
 
     joined: CorrectedPath
@@ -214,7 +212,7 @@ class Loading:
         return self.next_row >= self.last
 
     def check(self, rows: int) -> None:
-        """Check the next rows of all axes; TableRefused with the class of the first limit that is broken."""
+        """Check the next rows of all axes; TableRefused with the class of the first broken limit."""
         first = self.joined.first
         stop = min(self.next_row + rows, self.last)
         travels = self.travel or (None,) * len(self.limits)
@@ -236,9 +234,9 @@ def begin(
     keep_from: int,
     travel: tuple[Travel, ...] = (),
 ) -> Loading:
-    """Decode a new body and join it to what is loaded; rows before ``keep_from`` are let go.
+    """Decode a new table and append it to the loaded one; rows before ``keep_from`` are dropped.
 
-    TableRefused when it belongs to other axes or does not continue the loaded rows of the same program.
+    TableRefused when it is for other axes or does not continue the loaded rows of the same program.
     """
     names, path = decode(body, sequence)
     if names != tuple(axes):
@@ -248,7 +246,7 @@ def begin(
             raise TableRefused("ProgramMismatch", "a streamed table must begin with row 0; plan it again")
         return Loading(path, limits, travel)
     if path.first != loaded.end or path.program_digest != loaded.program_digest or loaded.final:
-        raise TableRefused("ProgramMismatch", f"row {path.first} does not continue the loaded table; load it anew")
+        raise TableRefused("ProgramMismatch", f"row {path.first} does not continue the loaded table; load it again")
     cut = max(0, min(keep_from, loaded.end - limits[0].window - 3) - loaded.first)
     if 8 * len(names) * (path.end - loaded.first - cut) > MAX_TABLE_BYTES:
         raise TableRefused(
@@ -273,16 +271,16 @@ def renew(
     loaded: CorrectedPath | None,
     travel: tuple[Travel, ...] = (),
 ) -> Loading:
-    """Put other offsets into the first rows of what is loaded, for a machine that has not begun.
+    """Replace the offsets of the first loaded rows, for a machine that has not started.
 
-    TableRefused when they are not those rows: of another program, more than there are, or of another demand.
+    TableRefused when they do not match: another program, more rows than loaded, or another demand.
     """
     names, path = decode(body)
     same = loaded is not None and names == tuple(axes) and path.first == loaded.first == 0 and path.end <= loaded.end
     if loaded is None or not same or path.program_digest != loaded.program_digest:
-        raise TableRefused("ProgramMismatch", "the rows are not the first ones of the loaded table; load it anew")
+        raise TableRefused("ProgramMismatch", "the rows are not the first ones of the loaded table; load it again")
     if any(list(new) != list(old[: path.end]) for new, old in zip(path.demand, loaded.demand, strict=True)):
-        raise TableRefused("ProgramMismatch", "the rows are those of another path than the loaded one; load it anew")
+        raise TableRefused("ProgramMismatch", "the rows are those of another path than the loaded one; load it again")
     offset = tuple(
         [array("i", new) + array("i", old[path.end :]) for new, old in zip(path.offset, loaded.offset, strict=True)]
     )

@@ -1,6 +1,4 @@
-"""Finds the machine on the path by the NC's targets alone. Pure, part of the core's step."""
-
-from __future__ import annotations
+"""Locates the machine on the path by the NC's targets alone. Pure, part of the core's step."""
 
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.path import EPS, CorrectedPath, Place, advance, around, onward, rate_between
@@ -8,14 +6,14 @@ from fdhil.guard.state import State
 from fdhil.guard.transitions import Event
 
 STILL_CYCLES = 10
-"""How long the targets must stand at the path's begin before a move can be its start."""
+"""SYNC cycles for which the targets must stand at the path's start before a move can begin it."""
 RATE_TOLERANCE = 0.02
 HIGHEST_RATE = 1.6
-"""Of what an NC's override gives; a larger step along the path is a jump."""
+"""The highest rate of an NC's override; a larger step along the path is a jump."""
 
 
 def rest(state: State) -> State:
-    """Count for how long the targets have stood, armed or not; a target that did not come says nothing."""
+    """Count how long the targets have stood still, armed or not; a missing target changes nothing."""
     now = state.targets[0]
     if now is None:
         return state
@@ -23,7 +21,7 @@ def rest(state: State) -> State:
 
 
 def await_start(state: State, path: CorrectedPath) -> tuple[State, Alarm | None]:
-    """Armed: once the targets have stood at the path's begin, the first that leaves it says where the path is."""
+    """While ARMED: once the targets have stood at the path's start, the first to leave it locates the path."""
     now, stood = state.targets[0], state.rest
     if now is None or stood is None or now == stood or state.rested_for < STILL_CYCLES:
         return state, None
@@ -37,7 +35,7 @@ def await_start(state: State, path: CorrectedPath) -> tuple[State, Alarm | None]
 
 
 def track(state: State, path: CorrectedPath) -> tuple[State, Alarm | None]:
-    """Move along the path by what the targets say; an alarm when they say something else."""
+    """Advance along the path with the targets; return an alarm when they do not match."""
     targets = state.targets[0]
     places = advance(path, state.places, targets)
     if places:
@@ -54,7 +52,7 @@ def track(state: State, path: CorrectedPath) -> tuple[State, Alarm | None]:
 
 
 def _lost(state: State, path: CorrectedPath, targets: tuple[int, ...]) -> Alarm:
-    """The targets are at no row: either the path is run at another rate, or it is another path."""
+    """Return the alarm for targets that match no row: the path runs at another rate, or it is another path."""
     last = state.targets[1]
     rate = rate_between(path, state.places[0].row, last, targets) if last is not None else None
     if rate is None or not 0 <= rate <= HIGHEST_RATE or abs(rate - 1) <= RATE_TOLERANCE:

@@ -1,9 +1,7 @@
-"""Tables the guard's states: what is sent in each, and which event leads from one to which. The core has no other way.
+"""Tables of the guard's states: what is sent in each, and which event leads where. The core has no other transition.
 
 ``docs/reference/guard.md`` is generated from here.
 """
-
-from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from enum import Enum
@@ -12,27 +10,25 @@ from fdhil.guard.protocol import AT_REST, IN_CHARGE, LANDING, ON_PATH, SENDING, 
 
 ZEROS = 3
 ZEROS_UNCONFIRMED = 50
-"""Cycles of zeros before the end, where the drives show them and where one does not."""
+"""Cycles of zeros that end a ramp: when the drives show them, and when one does not."""
 
 
 class Event(Enum):
-    """What leads to another state; the value says it."""
+    """What leads to another state; the value describes it."""
 
     ARM = "the operator arms, and nothing forbids it"
-    ADOPT = "a drive holds what may be believed, at the start or when the operator adopts"
-    NOTHING_HELD = "the operator adopts, and all drives are known to hold 0"
-    DOUBTFUL = "at the start a drive holds an offset that may not be believed"
-    START = "the targets leave the path's begin"
+    ADOPT = "a drive holds a trusted offset, at the start or when the operator adopts"
+    NOTHING_HELD = "the operator adopts, and all drives certainly hold 0"
+    DOUBTFUL = "at the start a drive holds an offset that cannot be trusted"
+    START = "the targets leave the path's start"
     ON_TABLE = "the offset is the table's"
     LATE = "a frame did not leave in time"
     GAP = "an interlock that holds fails"
-    FOUND = "the interlock is good again, and the place on the path is known"
-    END = (
-        "disarmed, told to stop, the path's end, a lost daemon, a hold that was too long, an interlock that ramps down"
-    )
+    FOUND = "the interlock is good again, and the position on the path is known"
+    END = "disarmed, stopped, the path ends, the daemon is lost, a hold is too long, an interlock that ramps down fails"
     HIJACK = "another node changed the offset"
-    BLOCKED = "an interlock that freezes fails, or frames do not leave, or what the drives hold may not be believed"
-    BLOCKED_AT_ZERO = "the same where nothing but zeros was sent, and they were shown"
+    BLOCKED = "an interlock that freezes fails, or frames do not leave, or a drive's offset cannot be trusted"
+    BLOCKED_AT_ZERO = "the same, but only zeros were sent and read back"
     ZERO_SHOWN = f"more than {ZEROS} cycles of zeros were sent, and the drives show them"
     ZERO_NOT_SHOWN = f"more than {ZEROS_UNCONFIRMED} cycles of zeros were sent, and a drive does not show them"
 

@@ -1,6 +1,4 @@
-"""Opens the descriptor on which the guard's process sends: CAN_RAW, or a hub that speaks socketcand."""
-
-from __future__ import annotations
+"""Opens the descriptor on which the guard sends: CAN_RAW, or a hub that speaks socketcand."""
 
 import socket
 import time
@@ -12,11 +10,11 @@ CONNECT_S = 5.0
 
 
 class BusPlace(Protocol):
-    """A bus: the network interface ``channel``, or the channel of a hub."""
+    """Address of a bus: the network interface ``channel``, or the channel of a hub."""
 
     @property
     def interface(self) -> str:
-        """``socketcan`` or ``socketcand``; there are others, on which nothing can be sent."""
+        """``socketcan`` or ``socketcand``; on other interfaces nothing can be sent."""
 
     @property
     def channel(self) -> str:
@@ -32,7 +30,7 @@ class BusPlace(Protocol):
 
 
 def connect_bus(name: str, bus: BusPlace) -> socket.socket:
-    """Open the transmit descriptor; a hub still has to be greeted. ConnectError when the bus cannot be had."""
+    """Open the transmit descriptor; a hub needs ``greet`` after it. ConnectError when the bus is unavailable."""
     if bus.interface == "socketcan":
         return _open_raw(name, bus.channel)
     if bus.interface == "socketcand":
@@ -41,7 +39,7 @@ def connect_bus(name: str, bus: BusPlace) -> socket.socket:
         except OSError as error:
             text = f"no hub answers at {bus.host} port {bus.port} ({error.strerror or error}); start the hub first"
             raise ConnectError(f"bus {name}", text) from None
-    why = "lives inside one process" if bus.interface == "virtual" else "is for listening only"
+    why = "exists inside one process only" if bus.interface == "virtual" else "is for listening only"
     text = f"the interface {bus.interface!r} {why}; set socketcan or socketcand"
     raise ConnectError(f"bus {name}", text)
 
@@ -50,7 +48,7 @@ def _open_raw(name: str, channel: str) -> socket.socket:
     raw = None
     try:
         raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-        raw.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")  # what comes before the guard listens is old
+        raw.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")  # earlier frames are outdated
         raw.bind((channel,))
     except OSError as error:
         if raw is not None:
@@ -61,7 +59,7 @@ def _open_raw(name: str, channel: str) -> socket.socket:
 
 
 def greet(name: str, bus: BusPlace, hub: socket.socket) -> None:
-    """Go through the greeting of a hub, byte by byte, so that no frame is swallowed."""
+    """Perform the greeting of a hub, byte by byte, so that no frame is lost."""
     if bus.interface != "socketcand":
         return
     deadline_s = time.monotonic() + CONNECT_S
@@ -73,7 +71,7 @@ def greet(name: str, bus: BusPlace, hub: socket.socket) -> None:
             _expect(hub, "ok", deadline_s)
     except OSError as error:
         hub.close()
-        text = f"the hub at {bus.host} port {bus.port} broke off its greeting ({error}); check that it is a socketcand"
+        text = f"the hub at {bus.host} port {bus.port} ended the greeting ({error}); check that it is a socketcand"
         raise ConnectError(f"bus {name}", text) from None
 
 

@@ -1,10 +1,8 @@
-"""Measures how late the guard's offsets leave: from the time stamp of a SYNC until they were handed to the kernel.
+"""Measures how late the guard's offsets leave: from the time stamp of a SYNC until they are handed to the kernel.
 
-A late turn is this computer's: what the drives show then (an internal limit, a following error, a missed heartbeat) is
-its consequence and no fault of the machine.
+A late turn is this computer's fault: what the drives show then (an internal limit, a following error, a missed
+heartbeat) is its consequence, not a fault of the machine.
 """
-
-from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
@@ -18,8 +16,8 @@ BINS_US = (20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, 20_000, 50_000)
 MINUTE_S = 60.0
 MOST_LATE = 0.001  # share of the turns of the last minute: arming is refused above it
 LEAST_TURNS = 1_000
-MOST_S = 1.0  # more is a wall clock that was set
-RECENT_S = 1.0  # what a drive shows so long after a late offset may come from it
+MOST_S = 1.0  # longer: the wall clock was set
+RECENT_S = 1.0  # for so long a late offset may explain what a drive shows
 CONSEQUENCES = {
     "LimitActive", "NotFollowing", "FollowingError", "EchoMismatch", "DriveEmergency", "LoopOverrun", "StaleData",
     "FeedbackGap", "TargetLost", "SyncJitter", "HeartbeatLost", "Implausible",
@@ -34,10 +32,10 @@ class _Minute(NamedTuple):
 
 
 class TurnTimes:
-    """A histogram of all turns, the turns of the last minute or two, and the late offsets of the running correction."""
+    """A histogram of all turns, counts of the last one or two minutes, and late offsets of the running correction."""
 
     def __init__(self, settings: Settings) -> None:
-        # a simulated machine waits for its offsets, or runs ahead: its time stamps say nothing of this computer
+        # a simulated machine waits for its offsets, or runs ahead: its time stamps do not measure this computer
         self._limit_s = settings.sync_period_s * (1 + settings.lead) if settings.clock == "monotonic" else inf
         self._counts = [0] * (len(BINS_US) + 1)
         self._worst_s = 0.0
@@ -45,11 +43,11 @@ class TurnTimes:
         self.begin()
 
     def begin(self) -> None:
-        """Forget the late offsets of the correction before."""
+        """Reset the count of late offsets for a new correction."""
         self._late, self._latest_s, self._late_worst_s = 0, -inf, 0.0
 
     def add(self, turn_s: float, missed: bool, now_s: float) -> None:
-        """Count a turn; ``missed``: the next SYNC was there before its offsets could leave."""
+        """Count a turn; ``missed``: the next SYNC arrived before its offsets could leave."""
         turn_s = turn_s if 0.0 <= turn_s <= MOST_S else 0.0
         self._counts[bisect_left(BINS_US, turn_s * 1e6)] += 1
         self._worst_s = max(self._worst_s, turn_s)
@@ -70,7 +68,7 @@ class TurnTimes:
         return f"{LATE} ({offsets}, worst {self._late_worst_s * 1e3:.1f} ms)"
 
     def refusal(self) -> str:
-        """Return why nothing may be armed on this computer now; empty where it may."""
+        """Return why nothing may be armed on this computer now; empty: it may."""
         turns, late = (sum(values) for values in zip(*(m[1:3] for m in self._minutes), strict=True))
         if self._limit_s == inf or turns < LEAST_TURNS or late <= MOST_LATE * turns:
             return ""
@@ -78,7 +76,7 @@ class TurnTimes:
         return f"{late} of the last {turns} offsets would have left late, the worst after {worst_ms:.1f} ms"
 
     def document(self) -> dict[str, Any]:
-        """Return what was counted; the last class of the histogram has no upper bound."""
+        """Return the counts; the last class of the histogram has no upper bound."""
         recent = self._minutes
         return {
             "turns": sum(self._counts),

@@ -1,10 +1,8 @@
-"""The immutable records that cross rooms. Arrays are read-only float64 unless said; the unit is in the name.
+"""Immutable records that the rooms exchange. Arrays are read-only float64 unless stated; the unit is in the name.
 
-Physics is SI (V, A, rad/s, N.m, kg.m2, s), path geometry is millimetres, path errors are micrometres where the
-name says ``_um``. Drive increments appear in none of them.
+Physics is SI (V, A, rad/s, N.m, kg.m2, s), path geometry is in millimetres, path errors are in micrometres where the
+name ends in ``_um``. None of them contains drive increments.
 """
-
-from __future__ import annotations
 
 from fdhil.records.nc import NcState
 from fdhil.records.paths import Correction, HeldOut, Prediction, Skill, Trajectory, Zone, table_path

@@ -1,6 +1,4 @@
-"""What a numerical controller says of itself."""
-
-from __future__ import annotations
+"""State of a numerical controller, as it reports it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,13 +8,13 @@ from fdhil.records.signals import MoveKind
 
 @dataclass(frozen=True, slots=True)
 class NcState:
-    """What an NC does at one instant; what its source cannot tell is None.
+    """State of an NC at one instant; None is what its source does not report.
 
-    ``stamp_ns`` is CLOCK_MONOTONIC of this computer, and the instant lies within ``error_ns`` of it, to either side:
-    how old an answer may be is in it. ``motion`` is UNKNOWN while the NC is not heard, HOLD while a feed hold keeps it
-    still. ``line`` is the 1-based source line of ``program`` that moves now. Overrides are 1.0 at 100 %. ``demand_mm``
-    are the NC's own set-points by axis, true at ``nc_tick``, its own cycle counter, which counts ``nc_period_s``:
-    where an NC tells them, they are laid on the set-points of the bus, and clocks do not matter.
+    ``stamp_ns`` is CLOCK_MONOTONIC of this computer; the instant lies within ``error_ns`` of it on either side, which
+    covers the age of the answer. ``motion`` is UNKNOWN while nothing is received from the NC, HOLD during a feed hold.
+    ``line`` is the 1-based source line of ``program`` that is being executed. Overrides are 1.0 at 100 %. ``demand_mm``
+    are the NC's own set-points by axis, valid at ``nc_tick``, its cycle counter with period ``nc_period_s``: they are
+    aligned with the set-points on the bus, so that clocks do not matter.
     """
 
     stamp_ns: int
@@ -35,11 +33,11 @@ class NcState:
     nc_period_s: float | None = None
 
     def __post_init__(self) -> None:
-        """Escape what is no Unicode in the program's name, as of a Latin-1 file: nothing that tells or keeps it can."""
+        """Escape non-Unicode bytes in the program's name (a Latin-1 file), which nothing could encode."""
         if self.program is not None:
             object.__setattr__(self, "program", self.program.encode("utf-8", "backslashreplace").decode())
 
     @property
     def held(self) -> bool:
-        """Whether a feed hold is known to keep the NC still."""
+        """Whether a feed hold certainly stops the NC."""
         return self.motion is MoveKind.HOLD or bool(self.feed_hold)

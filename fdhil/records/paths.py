@@ -1,6 +1,4 @@
-"""Paths: reference, prediction and correction."""
-
-from __future__ import annotations
+"""Records of paths: reference, prediction and correction."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,10 +11,10 @@ from fdhil.records.verdicts import Reason
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """A reference on the SYNC grid: ``time_s`` (n,) and ``position_mm`` per axis (n,); ``rapid`` (n,) marks G0 rows.
+    """A reference on the SYNC grid: ``time_s`` (n,), ``position_mm`` per axis (n,); ``rapid`` (n,) marks G0 samples.
 
-    ``line`` (n,) is the source line of the program that ordered the row, 0 where there is none. ``notes`` question the
-    program. The mm of a rotary axis are lengths of arc at its radius, where it has ``mm_per_degree``.
+    ``line`` (n,) is the source line of the program for each sample, 0 where there is none. ``notes`` are doubts about
+    the program. For a rotary axis with ``mm_per_degree``, mm are arc lengths at its radius.
     """
 
     dt_s: float
@@ -29,25 +27,25 @@ class Trajectory:
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """The axes in the order of the machine, both drives of a gantry axis."""
+        """The axes in the machine's order, both drives of a gantry axis."""
         return tuple(self.position_mm)
 
     @property
     def table_axes(self) -> tuple[str, ...]:
-        """The axes of the path, a gantry axis once."""
+        """The axes of the path; a gantry axis appears once."""
         return table_axes(self.axes)
 
     @property
     def path_mm(self) -> Float:
-        """The path (n, d), a column for each of ``table_axes``."""
+        """The path (n, d), one column for each of ``table_axes``."""
         return self.table_mm(self.position_mm)
 
     def table_mm(self, position_mm: Mapping[str, Float]) -> Float:
-        """Return the path (n, d) of the table whose drives are at positions (n,) per axis."""
+        """Return the path (n, d) of the table for drive positions (n,) per axis."""
         return table_path(self.axes, np.column_stack([position_mm[axis] for axis in self.axes]))
 
     def place(self, row: int) -> str:
-        """Return where a row is: ``X 1.0 Y 2.0``, a rotary axis in degrees."""
+        """Return the position of a row as text: ``X 1.0 Y 2.0``, a rotary axis in degrees."""
         at = {axis: self.position_mm[axis][row] / self.mm_per_degree.get(axis, 1.0) for axis in self.table_axes}
         return " ".join(f"{axis} {position:.1f}" for axis, position in at.items())
 
@@ -58,7 +56,7 @@ def table_axes(axes: Sequence[str]) -> tuple[str, ...]:
 
 
 def table_path(axes: Sequence[str], position_mm: Float) -> Float:
-    """Return the path (n, d) of a table whose drives are at (n, k): a gantry axis is at the mean of both its drives."""
+    """Return the path (n, d) of a table from its drives' positions (n, k); a gantry axis is the mean of its drives."""
     found = table_axes(axes)
     if len(found) == len(axes):
         return position_mm
@@ -67,7 +65,7 @@ def table_path(axes: Sequence[str], position_mm: Float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class Zone:
-    """A stretch of the path whose contour error stands out: where it is, how much, and why."""
+    """A section of the path with a prominent contour error: its position, size and cause."""
 
     start_s: float
     end_s: float
@@ -78,10 +76,10 @@ class Zone:
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Predicted against reference: per axis arrays (n,), contour error (n,) in um, and zones.
+    """Predicted against reference: arrays (n,) per axis, contour error (n,) in um, and zones.
 
-    ``current_a`` per axis (n,) is the model's at the SYNC instants; ``limited_s`` is the time each axis spent with a
-    limit acting.
+    ``current_a`` per axis (n,) is the model's at the SYNC instants; ``limited_s`` is the time that each axis spent in a
+    limit.
     """
 
     reference: Trajectory
@@ -94,7 +92,7 @@ class Prediction:
 
     @property
     def rms_um(self) -> float:
-        """The RMS of the contour error."""
+        """RMS of the contour error, um."""
         return rms(self.contour_um)
 
     def rows(self, zone: Zone) -> slice:
@@ -122,7 +120,7 @@ class Skill:
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """What models leave of the following error of moves that they were not identified on, um: of the worst move.
+    """Residual following error of moves that the models were not identified from, um, for the worst move.
 
     ``max_um`` is the largest of any move, ``following_um`` the RMS following error of the move with ``rms_um``.
     """
@@ -135,11 +133,11 @@ class HeldOut:
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """What a correction method plans for a reference: offsets per axis (n,), the path error without and with them.
+    """Result of a correction method for a reference: offsets per axis (n,), path error without and with them.
 
-    ``offset_um`` is added to the reference; ``refused`` is empty when the gate lets the correction through, else the
-    offsets are all 0. ``warnings`` do not refuse. ``delay_s`` is the delay tau of r(t - tau) that was aimed at. Speed
-    and torque offsets (n,) per axis are empty unless the method is an on-line feed-forward.
+    ``offset_um`` is added to the reference; ``refused`` is empty when the correction may be used, else all offsets are
+    0. ``warnings`` do not refuse it. ``delay_s`` is the delay tau of the target r(t - tau). Speed and torque offsets
+    (n,) per axis are empty unless the method is an on-line feed-forward.
     """
 
     method: str

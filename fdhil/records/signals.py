@@ -1,6 +1,4 @@
-"""Signals: samples, windows and recordings of an axis."""
-
-from __future__ import annotations
+"""Records of signals: samples, windows and recordings of an axis."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,9 +15,10 @@ VoltageSampling = Literal["interval_mean", "instant"]
 class AxisSamples:
     """A block of one axis' samples on the SYNC grid, all arrays (n,).
 
-    ``tick`` counts SYNC cycles and rises strictly; a hole in it is a lost sample, and ``lost`` counts the frames that
-    were lost while the block was gathered. ``demand_mm`` is r[k], what the drive follows at that tick, without offset.
-    ``offset_mm`` is the position offset (0x60B0) in force. ``voltage_v`` is None when no drive object gives it.
+    ``tick`` counts SYNC cycles and increases strictly; a hole in it is a lost sample, and ``lost`` counts the frames
+    lost while the block was gathered. ``demand_mm`` is r[k], the set-point that the drive follows at that tick, without
+    offset. ``offset_mm`` is the position offset (0x60B0) in force. ``voltage_v`` is None when no drive object provides
+    it.
     """
 
     axis: str
@@ -36,10 +35,10 @@ class AxisSamples:
 
 @dataclass(frozen=True, slots=True)
 class VoltageSamples:
-    """Samples of a separate voltage sensor: ``t_ns`` (n,) host-monotonic instants of the sensor's own grid,
-    with their uncertainty ``t_error_ns`` (n,), and ``voltage_v`` (n,). ``counter`` (n,) is the sensor's own count.
+    """Samples of a separate voltage sensor on its own grid, arrays (n,).
 
-    ``on_grid`` is False where a sensor was asked near its instants: ``t_ns`` is then when each value was true.
+    ``t_ns`` are host-monotonic instants with the uncertainty ``t_error_ns``; ``counter`` is the sensor's own count.
+    ``on_grid`` is False where a sensor is polled near its instants: then ``t_ns`` is when each value was valid.
     """
 
     sensor: str
@@ -54,12 +53,11 @@ class VoltageSamples:
 
 @dataclass(frozen=True, slots=True)
 class SlowVoltage:
-    """Voltage of a sensor slower than the drive, on its own grid beside a window: ``voltage_v`` (m,), lost samples NaN.
+    """Voltage of a sensor slower than the drive, on its own grid: ``voltage_v`` (m,), lost samples NaN.
 
-    Sample j covers ``begin_s`` + j ``period_s`` after row 0 of the window and one period from there (or is the value at
-    its begin, as the window's ``voltage_sampling`` says). ``error_s`` is how far off ``begin_s`` may be.
-    ``late_s`` (m,), of a sensor that was asked near its instants, is by how much later each value was true, less than
-    half a period.
+    Sample j covers one period from ``begin_s`` + j ``period_s`` after sample 0 of the window (or is the value at its
+    start, by the window's ``voltage_sampling``). ``error_s`` is the uncertainty of ``begin_s``. ``late_s`` (m,), for a
+    polled sensor, is the delay of each value, less than half a period.
     """
 
     begin_s: float
@@ -71,10 +69,10 @@ class SlowVoltage:
 
 @dataclass(frozen=True, slots=True)
 class TableSamples:
-    """Samples of a sensor at an axis' table: ``values`` (n,) in the unit of ``signal`` at ``tick`` (n,), which rises.
+    """Samples of a sensor at an axis' table: ``values`` (n,) in the unit of ``signal`` at ``tick`` (n,), increasing.
 
-    A tick between two SYNCs has a fraction; ``tick_error`` is how far off all of them may be, 0 where they were sampled
-    at the SYNC. Samples of an acceleration come ``rate_per_tick``; a longer step is a lost one.
+    A tick between two SYNCs has a fraction; ``tick_error`` is the uncertainty of all ticks, 0 where sampled at the
+    SYNC. Acceleration samples come ``rate_per_tick``; a longer step is a lost one.
     """
 
     axis: str
@@ -94,7 +92,7 @@ class TickTimes:
 
 
 class MoveKind(Enum):
-    """What the NC ordered; UNKNOWN is what it did not tell."""
+    """Kind of the move that the NC executes; UNKNOWN where it does not report it."""
 
     RAPID = "rapid"
     FEED = "feed"
@@ -106,9 +104,9 @@ class MoveKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class NcMove:
-    """What an NC said of itself while an axis moved; None is what it did not tell.
+    """What an NC reported while an axis moved; None where it did not report it.
 
-    ``override`` is the least and the greatest that was in force, 1.0 at 100 %; ``held`` whether a feed hold was on.
+    ``override`` is the lowest and the highest in force, 1.0 at 100 %; ``held`` whether a feed hold was active.
     """
 
     line: int | None = None
@@ -119,9 +117,9 @@ class NcMove:
 
 @dataclass(frozen=True, slots=True)
 class MoveEvent:
-    """From ``tick`` on the axis makes a move of this kind, as ``source`` (a G0 event source) says.
+    """From ``tick`` on the axis makes a move of this kind, according to ``source`` (a G0 event source).
 
-    ``nc`` is what the NC said of it, None where the source is no NC.
+    ``nc`` is the NC's report of it, None where the source is not an NC.
     """
 
     axis: str
@@ -133,7 +131,7 @@ class MoveEvent:
 
 @dataclass(frozen=True, slots=True)
 class Temperature:
-    """A temperature reading at a place of an axis (``slideway``, ``screw``, ``motor``)."""
+    """A temperature reading at one location of an axis (``slideway``, ``screw``, ``motor``)."""
 
     axis: str
     tick: int
@@ -143,7 +141,7 @@ class Temperature:
 
 @dataclass(frozen=True, slots=True)
 class Stages:
-    """Half-open sample ranges of a rapid inside its window; an absent stage is None."""
+    """Half-open sample ranges of a rapid within its window; a missing stage is None."""
 
     accelerate: tuple[int, int] | None
     cruise: tuple[int, int] | None
@@ -155,17 +153,17 @@ class Window:
     """One G0 of one axis on a uniform grid of ``dt_s``, from rest to rest, with its stages and gaps.
 
     Arrays are (n,); a lost sample is NaN in every signal, and ``gaps`` lists the half-open ranges that were lost.
-    ``voltage_v`` of row k is the mean over [t_k, t_k + dt) when ``voltage_sampling`` is ``interval_mean``, else the
-    value at t_k; ``voltage_delay_s`` (what is left after alignment by counters, None when not known) has not been
-    taken out. ``slow_voltage`` stands in its place where a sensor samples more slowly than the drive.
-    ``speed_late_s`` is how late the recorded speed was, which has been taken out (None: nothing was), with its standard
-    deviation. ``table_mm`` is the place and ``table_m_s2`` the acceleration that sensors at the table tell, NaN in rows
-    that they do not, None without them. ``start_s`` is the time of row 0 in its recording or since the first tick.
-    ``offset_mm`` is the position offset in force, None where it was 0 throughout or is not known.
-    ``torque_constant_nm_per_a`` is the K that the recording itself tells. ``nc`` is what the NC said of the move,
-    None where it was not heard. Of a move that is no rapid (``is_rapid``), a whole laboratory recording, ``stages`` and
-    ``direction`` mean little. ``current_off_a`` is one standard deviation (n,) of how far readings of the current may
-    be from its means, None where nothing determines it. Two windows are equal when they are the same one.
+    ``voltage_v`` of sample k is the mean over [t_k, t_k + dt) when ``voltage_sampling`` is ``interval_mean``, else the
+    value at t_k; ``voltage_delay_s`` (the residual delay after alignment by counters, None when unknown) is not
+    compensated. ``slow_voltage`` replaces it where a sensor samples more slowly than the drive. ``speed_late_s`` is the
+    delay of the recorded speed, already compensated (None: no compensation), with its standard deviation. ``table_mm``
+    is the position and ``table_m_s2`` the acceleration of sensors at the table, NaN in samples without a value, None
+    without sensors. ``start_s`` is the time of sample 0 in its recording or since the first tick. ``offset_mm`` is the
+    position offset in force, None where it was 0 throughout or is unknown. ``torque_constant_nm_per_a`` is the K that
+    the recording itself states. ``nc`` is the NC's report of the move, None without one. For a move that is not a rapid
+    (``is_rapid``), a whole laboratory recording, ``stages`` and ``direction`` mean little. ``current_off_a`` (n,) is
+    one standard deviation of current readings from their means, None where nothing determines it. Windows are equal
+    only when identical.
     """
 
     axis: str
@@ -199,16 +197,16 @@ class Window:
 
     @property
     def n(self) -> int:
-        """Number of rows."""
+        """Number of samples."""
         return int(self.speed_rad_s.size)
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A stretch of one axis before windows are cut, a whole file or the newest samples: arrays (n,), lost samples NaN.
+    """Samples of one axis before windows are cut, a whole file or the newest ones: arrays (n,), lost samples NaN.
 
-    ``gaps`` are half-open. ``slow_voltage``, counted from row 0, stands in the place of ``voltage_v`` where a sensor is
-    slower than the rows; both are None without a source. Row 0 is ``start_tick``. The rest is as in :class:`Window`.
+    ``gaps`` are half-open. ``slow_voltage``, counted from sample 0, replaces ``voltage_v`` where a sensor is slower;
+    both are None without a source. Sample 0 is at ``start_tick``. The rest is as in :class:`Window`.
     """
 
     axis: str

@@ -1,6 +1,4 @@
-"""Arrays and physical parameters, with their names and units."""
-
-from __future__ import annotations
+"""Array types and the physical parameters, with their names and units."""
 
 import re
 from collections.abc import Mapping
@@ -15,7 +13,7 @@ Int = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 PARAMETERS = ("R", "L", "K", "Jt", "ft", "Cd")
-RATIOS = ("Jt/K", "ft/K", "Cd/K")  # what current and speed alone tell
+RATIOS = ("Jt/K", "ft/K", "Cd/K")  # identifiable from current and speed alone
 INTERVAL_95 = 1.959963984540054
 """Half the width of a 95 % interval, in standard deviations of a normal distribution."""
 UNITS: Mapping[str, str] = {
@@ -31,7 +29,7 @@ UNITS: Mapping[str, str] = {
     "friction_at_rapid": "N.m",  # Cd + ft w at the rapid speed
 }
 
-# what may join the six; of a ripple's name the number is its periods in a turn of the motor
+# optional terms; the number in a ripple's name is its periods per motor revolution
 _TERMS: Mapping[str, str] = {
     r"load": "N.m",
     r"coulomb_(positive|negative)": "N.m",
@@ -50,21 +48,21 @@ _TERMS: Mapping[str, str] = {
 
 
 def unit_of(name: str) -> str | None:
-    """Return the unit of a parameter, a ratio or a term; None for a name that is none."""
+    """Return the unit of a parameter, a ratio or a term; None for an unknown name."""
     if name in UNITS:
         return UNITS[name]
     return next((unit for pattern, unit in _TERMS.items() if re.fullmatch(pattern, name)), None)
 
 
 def frozen(values: npt.ArrayLike) -> Float:
-    """Return ``values`` as a read-only float64 array (a copy, so that no caller can reach into a record)."""
+    """Return ``values`` as a read-only float64 array: a copy, so that no caller can change a record."""
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array
 
 
 def read_only(values: Float) -> Float:
-    """Return a read-only view, not a copy: a kernel that only reads is compiled for this one kind of array."""
+    """Return a read-only view without copying: kernels are compiled for this one array type."""
     view = values.view()
     view.setflags(write=False)
     return view
@@ -84,19 +82,18 @@ def rms(values: Float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """The six physical parameters of equations [1] and [2] (ohm, H, N.m/A, kg.m2, N.m.s, N.m), and ``terms``.
+    """The six parameters of equations [1] and [2] (ohm, H, N.m/A, kg.m2, N.m.s, N.m), and ``terms``.
 
-    The torque against the positive direction of a shaft that turns at w, at the angle a = 2 pi x / pitch of its place
-    x, is that of [2] with what has joined it, side = sign(w):
+    The torque against the positive direction of a shaft with speed w, at the angle a = 2 pi x / pitch of its position
+    x, is that of [2] with the added terms, side = sign(w):
 
         load + side (C + stribeck exp(-(w / stribeck_speed)^2)) + f w + sum of ripple_k sin(k a + ripple_k_phase)
 
-    C is ``coulomb_positive`` or ``coulomb_negative`` where there are such, else Cd; f the same with ``viscous_...`` and
-    ft. The shaft sticks while |K i - load - ripples| <= C + stribeck. ``terms`` are pairs of name and value.
-
-    ``dead_time`` is the voltage that the inverter takes against the current's direction from what is asked of it.
-    ``resonance`` is that of motor and table against each other, the motor free, as seen from its torque to its speed;
-    the table is ``resonance_share`` of Jt (left out: half), and what rubs is the table.
+    C is ``coulomb_positive`` or ``coulomb_negative`` where these exist, else Cd; f likewise ``viscous_...`` or ft. The
+    shaft sticks while |K i - load - ripples| <= C + stribeck. ``terms`` are pairs of name and value. ``dead_time`` is
+    the voltage that the inverter loses, against the current's direction. ``resonance`` is that of motor and table
+    against each other, the motor free, from motor torque to motor speed; the table has ``resonance_share`` of Jt
+    (default: half), and the friction acts on the table.
     """
 
     R: float
@@ -109,12 +106,12 @@ class Parameters:
 
     @classmethod
     def of(cls, values: Mapping[str, float]) -> Self:
-        """Return the parameters whose names and values these are, the six and perhaps terms; KeyError for fewer."""
+        """Build parameters from values by name, the six and any terms; KeyError when one of the six is missing."""
         R, L, K, Jt, ft, Cd = (float(values[name]) for name in PARAMETERS)
         return cls(R, L, K, Jt, ft, Cd, tuple((n, float(v)) for n, v in values.items() if n not in PARAMETERS))
 
     def changed(self, **values: float) -> Self:
-        """Return the parameters with some values, of terms too, changed or added."""
+        """Return the parameters with some values, including terms, replaced or added."""
         return type(self).of({**self.as_dict(), **dict(self.terms), **values})
 
     def as_dict(self) -> dict[str, float]:
@@ -122,5 +119,5 @@ class Parameters:
         return {name: float(getattr(self, name)) for name in PARAMETERS}
 
     def term(self, name: str, default: float = 0.0) -> float:
-        """Return the value of a term, ``default`` where it has not joined."""
+        """Return the value of a term, ``default`` where there is none."""
         return dict(self.terms).get(name, default)

@@ -1,6 +1,4 @@
-"""Verdicts on a drive: estimates, and whether they are believed."""
-
-from __future__ import annotations
+"""Records of estimates, verdicts and notices."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,7 +12,7 @@ from fdhil.records.values import PARAMETERS, RATIOS, Float, Parameters
 
 
 class Result(Enum):
-    """How an estimation ended."""
+    """Outcome of an estimation."""
 
     OK = "OK"
     UNDER_EXCITED = "UNDER_EXCITED"
@@ -26,7 +24,7 @@ class Result(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """Why something was refused or is not known: the class name of FAULTS, the figure that caused it, what to do."""
+    """Why something was refused or is unknown: the class name of FAULTS, the figure behind it, the next action."""
 
     code: str
     text: str
@@ -38,14 +36,14 @@ class Reason:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """An estimator's answer: ``values`` (k,) and ``covariance`` (k, k) of ``names``; NaN where the data cannot tell.
+    """Result of an estimator: ``values`` (k,) and ``covariance`` (k, k) of ``names``; NaN where not identifiable.
 
     ``residuals`` maps "electrical" (V) and "mechanical" (A) to their residuals (m,), in standard deviations where the
-    method is maximum likelihood. ``missing`` maps the names that are NaN to the reason. ``delay_s`` is the voltage
-    delay that the data show, None when not estimated, and ``delay_std_s`` its standard deviation. ``systematic`` (k, q)
-    is that part of the covariance, one standard deviation a column, which is the same in every window of a drive, None
-    when not told. ``names`` are ``PARAMETERS``, then the terms that joined; what is ``given`` was not estimated: the
-    data sheet or the recording tells it.
+    method is maximum likelihood. ``missing`` maps names that are NaN to the reason. ``delay_s`` is the voltage delay
+    that the data show, None when not estimated, and ``delay_std_s`` its standard deviation. ``systematic`` (k, q) is
+    the part of the covariance that all windows of a drive share, one standard deviation a column, None when
+    unavailable. ``names`` are ``PARAMETERS``, then the added terms; ``given`` names were not estimated but taken from
+    the data sheet or the recording.
     """
 
     method: str
@@ -61,7 +59,7 @@ class Estimate:
     given: tuple[str, ...] = ()
 
     def value(self, name: str) -> float:
-        """Return one parameter's value (NaN when the data cannot tell it)."""
+        """Return one parameter's value, NaN when it is not identifiable."""
         return float(self.values[self.names.index(name)])
 
     def std(self, name: str) -> float:
@@ -70,22 +68,22 @@ class Estimate:
         return float(np.sqrt(self.covariance[k, k]))
 
     def parameters(self) -> Parameters:
-        """Return the six parameters and the terms that joined; NaN stays NaN."""
+        """Return the six parameters and the added terms; NaN stays NaN."""
         return Parameters.of({name: self.value(name) for name in (*PARAMETERS, *self.terms)})
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """The names of the terms that joined the six."""
+        """The names of the terms beyond the six parameters."""
         return tuple(name for name in self.names if name not in PARAMETERS and name not in RATIOS)
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The validation's answer for one window or pool.
+    """Result of the validation of one window or pool.
 
-    ``reasons`` refuse; ``warnings`` name what the model does not have, what that costs, and what to do.
-    ``unexplained_um`` is the RMS at the table, through the closed loop, of what is left unexplained of the rapid's
-    following error; None where the regulators are not known.
+    ``reasons`` refuse; ``warnings`` name what the model lacks, what that costs, and what to do. ``unexplained_um`` is
+    the RMS at the table, through the closed loop, of the unexplained part of the rapid's following error; None where
+    the regulators are unknown.
     """
 
     accepted: bool
@@ -97,10 +95,10 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class AtTable:
-    """What an encoder at the table tells of a move, um: its error against the demand, RMS and at most.
+    """What an encoder at the table measures of a move, um: its error against the demand, RMS and maximum.
 
-    ``unseen`` is the part of it that the drive's encoder does not see. ``left_rms_um`` is what is left of the error
-    beside that which the window's own model predicts at the table, None where the regulators are not known.
+    ``unseen`` is the part that the drive's encoder does not see. ``left_rms_um`` is the residual after subtracting what
+    the window's own model predicts at the table, None where the regulators are unknown.
     """
 
     error_rms_um: float
@@ -112,7 +110,7 @@ class AtTable:
 
 @dataclass(frozen=True, slots=True)
 class WindowOutcome:
-    """One window that was analysed: what was estimated, and whether it is believed; what the table's encoder tells."""
+    """One analysed window: its estimate, its verdict, and the error measured at the table."""
 
     window: Window
     estimate: Estimate | None
@@ -122,11 +120,11 @@ class WindowOutcome:
 
 @dataclass(frozen=True, slots=True)
 class ParameterSet:
-    """A published revision of one axis' parameters: pooled from ``windows`` accepted windows.
+    """A published revision of one axis' parameters, pooled from ``windows`` accepted windows.
 
-    ``window_ticks`` are where they start, where that is known. ``unexplained_um`` and ``warnings`` are the verdict's.
-    ``loops`` are the keys of ``[axis.X.regulators]`` by which the loops that it was validated with differ from the
-    configured ones; None where that was not recorded.
+    ``window_ticks`` are their start ticks, where known. ``unexplained_um`` and ``warnings`` are the verdict's.
+    ``loops`` are the keys of ``[axis.X.regulators]`` in which the loops used for validation differ from the configured
+    ones; None where that was not recorded.
     """
 
     axis: str
@@ -145,11 +143,11 @@ class ParameterSet:
 
 @dataclass(frozen=True, slots=True)
 class LoopEstimate:
-    """The drive's own loops as rapids show them: ``values`` (k,) and ``covariance`` (k, k) of ``names``.
+    """The drive's own control loops as identified from rapids: ``values`` (k,) and ``covariance`` (k, k) of ``names``.
 
-    ``names`` are keys of ``[axis.X.regulators]``, and ``structure`` is the one of the table that fits best. What the
-    loops leave of the following error is the ``unexplained_um`` of the verdict; ``configured_um`` is what the
-    configured ones leave, None where there are none.
+    ``names`` are keys of ``[axis.X.regulators]``; ``structure`` is the best-fitting one. The residual following error
+    with these loops is the verdict's ``unexplained_um``; ``configured_um`` is that with the configured loops, None
+    where there are none.
     """
 
     axis: str
@@ -163,7 +161,7 @@ class LoopEstimate:
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """Something an operator should know: a FAULTS class, its severity, cause, effect and next action."""
+    """Information for the operator: a FAULTS class, its severity, cause, effect and next action."""
 
     code: str
     severity: Literal["info", "minor", "MAJOR"]

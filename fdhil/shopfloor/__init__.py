@@ -1,5 +1,5 @@
-"""Tells the shop floor's networks what the daemon knows: OPC UA, MQTT, MTConnect, Prometheus; each by its own process.
+"""Publishes the daemon's status on shop-floor networks: OPC UA, MQTT, MTConnect, Prometheus, one process each.
 
-They are clients of the daemon's socket that only ask for its status. Nothing here sends anything to a machine, and
-nothing that comes over such a network reaches the daemon.
+They are clients of the daemon's socket that only request its status. Nothing here sends anything to a machine, and
+nothing received from such a network reaches the daemon.
 """

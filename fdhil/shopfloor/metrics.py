@@ -1,7 +1,7 @@
-"""Makes Prometheus metrics of what is published: base units, and names by the conventions of Prometheus. Pure.
+"""Makes Prometheus metrics of the published items: base units, and names by Prometheus' conventions. Pure.
 
-https://prometheus.io/docs/practices/naming/. What is not known is absent; texts are no metrics, but for the two that
-say what runs. All names begin with ``fdhil_``.
+https://prometheus.io/docs/practices/naming/. Unknown values are absent; texts are not metrics, except those that name
+what is running. All names begin with ``fdhil_``.
 """
 
 from collections import Counter
@@ -14,7 +14,7 @@ from prometheus_client.registry import Collector
 from fdhil.shopfloor.news import News
 from fdhil.shopfloor.published import Item, Value
 
-VERSION = version("fdhil")  # once: it is read from files
+VERSION = version("fdhil")  # read once, from files
 UNITS: Mapping[str, tuple[str, float]] = {
     "": ("", 1.0),
     "1": ("ratio", 1.0),
@@ -54,7 +54,7 @@ def name_of(item: Item) -> str:
 
 
 class Metrics(Collector):
-    """The metrics of the newest news; none but ``fdhil_up`` while there is none."""
+    """The metrics of the newest update; only ``fdhil_up`` while there is none."""
 
     def __init__(self) -> None:
         self._news: News | None = None
@@ -62,7 +62,7 @@ class Metrics(Collector):
         self._notices: Counter[tuple[str, str]] = Counter()
 
     def take(self, news: News) -> None:
-        """Take the newest news."""
+        """Take the newest update."""
         self._news = news
         self._heard_ms = self._heard_ms if news.silent else news.stamp_ms
         self._notices.update((event.code, event.severity) for event in news.events)
@@ -73,7 +73,7 @@ class Metrics(Collector):
         up = news is not None and not news.silent
         yield GaugeMetricFamily("fdhil_up", "whether the daemon answers", float(up))
         if self._heard_ms is not None:
-            words = "when the daemon answered last"
+            words = "time of the daemon's last answer"
             yield GaugeMetricFamily("fdhil_answered_timestamp_seconds", words, self._heard_ms * 1e-3)
         if news is None or news.silent:
             return
@@ -87,7 +87,7 @@ class Metrics(Collector):
         yield self._counted()
 
     def _counted(self) -> Metric:
-        words = "notices of the daemon since this process began"
+        words = "notices of the daemon since this process started"
         family = CounterMetricFamily("fdhil_notices", words, labels=["code", "severity"])
         for (code, severity), count in sorted(self._notices.items()):
             family.add_metric([code, severity], count)
@@ -96,7 +96,7 @@ class Metrics(Collector):
 
 def _add(families: dict[str, Metric], value: Value) -> None:
     item, name = value.item, name_of(value.item)
-    labels = {key: told for key, told in (("axis", value.axis), ("bus", value.bus)) if told}
+    labels = {key: name for key, name in (("axis", value.axis), ("bus", value.bus)) if name}
     if item.kind == "count":
         family = families.setdefault(name, CounterMetricFamily(name, item.description, labels=list(labels)))
         family.add_sample(f"{name}_total", labels, float(value.value or 0))
@@ -110,19 +110,19 @@ def _add(families: dict[str, Metric], value: Value) -> None:
 
 
 def _infos(news: News) -> Iterator[Metric]:
-    told: dict[str, dict[str, str]] = {"fdhil": {"version": VERSION}}
+    infos: dict[str, dict[str, str]] = {"fdhil": {"version": VERSION}}
     for value in news.values:
         if value.item.name in TEXTS and value.value:
             metric, label = TEXTS[value.item.name]
-            told.setdefault(metric, {})[label] = str(value.value)
-    words = {"fdhil": "version and configuration that run", "fdhil_armed": "what is armed"}
-    for metric, labels in told.items():
+            infos.setdefault(metric, {})[label] = str(value.value)
+    words = {"fdhil": "running version and configuration", "fdhil_armed": "armed correction"}
+    for metric, labels in infos.items():
         yield InfoMetricFamily(metric, words[metric], labels)
 
 
 def _alarms(news: News) -> Metric:
     labels = ["code", "severity", "axis"]
-    family = GaugeMetricFamily("fdhil_alarm", "something that is wrong now; absent while it is not", labels=labels)
+    family = GaugeMetricFamily("fdhil_alarm", "an active problem; absent otherwise", labels=labels)
     for code, severity, axis in sorted({(each.code, each.severity, each.axis) for each in news.alarms}):
         family.add_metric([code, severity, axis], 1.0)
     return family

@@ -1,8 +1,8 @@
-"""Tells an MQTT broker what the daemon knows, as an edge node of Sparkplug B.
+"""Publishes the daemon's status to an MQTT broker, as an edge node of Sparkplug B.
 
-The broker is told when the node is born and when it dies, and in between only what changes. Of all commands the one
-that asks for the births is obeyed, and no other. Nothing is stored: what happens while the broker is away is not told
-later, and a broker that takes less than comes is told the newest values and the newest notices.
+The broker receives the node's birth and death, and only changes in between. The only command obeyed is the request for
+births. Nothing is stored: events during a broker's absence are not sent later, and a slow broker receives the newest
+values and notices.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import NoReturn
 import aiomqtt
 from aiomqtt.exceptions import MqttConnectError
 
-from fdhil.cancellation import GivenUp, end_tasks, run_attempt
+from fdhil.cancellation import GivenUp, end_tasks, find_first_error, run_attempt
 from fdhil.config import MachineConfig
 from fdhil.config.credentials import password_of, tls_of
 from fdhil.config.publish import MqttBroker
@@ -43,33 +43,33 @@ from fdhil.shopfloor.sparkplug import (
 
 FIRST_RETRY_S, LAST_RETRY_S = 1.0, 60.0
 END_S = 10.0
-DEATH_S = 2.0  # a broker that does not take our death certificate sends the one it has
-REBIRTH_S = 1.0  # births are sent no more often
-WAITING = 32  # messages of the broker that wait to be looked at
-HOST_AHEAD_MS = 60_000  # by which the clock of a host application may be ahead of this computer's
-MOST_EVENTS = 256  # notices that wait to be told
+DEATH_S = 2.0  # to send the death certificate; else the broker sends the will
+REBIRTH_S = 1.0  # shortest time between births
+WAITING = 32  # queued messages of the broker
+HOST_AHEAD_MS = 60_000  # tolerance of a host application's clock
+MOST_EVENTS = 256  # queued notices
 NOTICE = "the newest notice"
 BROKER = ("MQTT broker", "publish.mqtt")  # as errors name it
 DATATYPES: Mapping[str, int] = {"measure": DOUBLE, "count": INT64, "flag": BOOLEAN, "state": STRING, "text": STRING}
 
 
 class HostGone(Exception):
-    """The primary host application says that it is not there."""
+    """The primary host application reports that it is offline."""
 
 
 async def publish(config: MachineConfig) -> None:
-    """Publish until it is cancelled; a broker that is not there is tried again, later and later.
+    """Publish until cancelled; an unavailable broker is retried with increasing delay.
 
     ConnectError when the files of its credentials cannot be used.
     """
     settings = config.publish.mqtt
     session = Session(settings, settings.node_name(config.machine.name))
-    tls_of(settings, *BROKER)  # what is wrong with the files ends the command
+    tls_of(settings, *BROKER)  # faulty files end the command
     password_of(settings, *BROKER)
     where = f"{settings.host}:{settings.port}"
     say_ready(f"Sparkplug B of {config.machine.name}: {session.node.topic('NBIRTH')}, for the broker at {where}")
     tasks = [asyncio.create_task(_hear(config, session)), asyncio.create_task(_stay_connected(session, settings))]
-    try:  # neither goes on without the other: what is told would be old
+    try:  # if one ends, so does the other: values would be outdated
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         done.pop().result()
     finally:
@@ -82,39 +82,35 @@ async def _hear(config: MachineConfig, session: Session) -> None:
 
 
 async def _stay_connected(session: Session, settings: MqttBroker) -> NoReturn:
-    delay_s, told = FIRST_RETRY_S, ""
+    delay_s, logged = FIRST_RETRY_S, ""
     where = f"{settings.host}:{settings.port}"
     while True:
         began_s = time.monotonic()
         try:
             await run_attempt(f"broker {where}", _serve_connection(session, settings, where))
         except* (aiomqtt.MqttError, GivenUp) as errors:
-            cause = _cause(_first(errors))
-            if cause != told:
-                journal.write_line(f"the broker {where} is not told anything: {cause}; it is tried again", "minor")
-            told = cause
+            cause = _cause(find_first_error(errors))
+            if cause != logged:
+                journal.write_line(f"nothing is published to the broker {where}: {cause}; retrying", "minor")
+            logged = cause
         except* HostGone:
-            journal.write_line(f"the primary host {settings.primary_host} is gone; it is waited for", "minor")
-        if time.monotonic() - began_s > LAST_RETRY_S:  # it was there, and not for a moment only
-            delay_s, told = FIRST_RETRY_S, ""
+            journal.write_line(f"the primary host {settings.primary_host} is offline; waiting for it", "minor")
+        if time.monotonic() - began_s > LAST_RETRY_S:  # the connection lasted
+            delay_s, logged = FIRST_RETRY_S, ""
         await asyncio.sleep(delay_s)
         delay_s = min(LAST_RETRY_S, 2 * delay_s)
 
 
 async def _serve_connection(session: Session, settings: MqttBroker, where: str) -> None:
     async with _client(settings, session) as broker:
-        journal.write_line(f"the broker {where} is there")
+        journal.write_line(f"connected to the broker {where}")
         await session.run(broker)
 
 
-def _first(error: BaseException) -> BaseException:
-    return _first(error.exceptions[0]) if isinstance(error, BaseExceptionGroup) else error
-
-
 def _cause(error: BaseException) -> str:
-    """Return why a broker cannot be told, and what to look at."""
+    """Return why publishing fails, and what to check."""
     if isinstance(error, MqttConnectError):
-        return f"it refuses ({error}); check user and password_file, and whom it lets in"
+        return f"it refuses ({error}); check user, password_file and the broker's access rules"
     if "SSL" in str(error):
         return f"{error}; check tls_ca_file and the name in its certificate"
     return f"{error}; check host and port, and whether it runs"
@@ -127,7 +123,7 @@ def _client(settings: MqttBroker, session: Session) -> aiomqtt.Client:
     return aiomqtt.Client(
         settings.host,
         settings.port,
-        identifier=f"fdhil-{identity}",  # the broker ends what is left of our own connection before
+        identifier=f"fdhil-{identity}",  # the broker then closes our previous connection
         username=settings.user,
         password=password_of(settings, *BROKER),
         tls_context=tls_of(settings, *BROKER),
@@ -140,7 +136,7 @@ def _client(settings: MqttBroker, session: Session) -> aiomqtt.Client:
 
 
 def _silent_log() -> logging.Logger:
-    """Return a log that says nothing: what matters of the library's words comes as an exception."""
+    """Return a muted logger: the library's relevant messages come as exceptions."""
     log = logging.getLogger("fdhil.mqtt")
     log.propagate = False
     log.handlers = [logging.NullHandler()]
@@ -148,7 +144,7 @@ def _silent_log() -> logging.Logger:
 
 
 class Session:
-    """What is said over one connection after another."""
+    """Publishing over successive connections."""
 
     def __init__(self, settings: MqttBroker, node: str) -> None:
         self.node = EdgeNode(settings.group, node)
@@ -156,40 +152,40 @@ class Session:
         self._news: News | None = None
         self._notices: dict[str, Metric] = {}
         self._events = deque[Event]()
-        self._untold = 0  # notices that made room for newer ones
-        self._fresh = False  # whether the news has not been told yet
+        self._dropped = 0  # notices dropped for newer ones
+        self._fresh = False  # whether the update has not been sent yet
         self._stir = asyncio.Event()
         self._rebirth = self._born = False
         self._host_state: HostState | None = None
 
     def hear(self, news: News) -> None:
-        """Take what the daemon says now; it is told where a broker is there."""
+        """Take the newest update; it is sent while a broker is connected."""
         self._news = news
         if self._born:
             self._fresh = True
             self._wait(news.events)
-        else:  # the births tell the newest notice, too
+        else:  # the births include the newest notice
             for event in news.events:
                 self._note(event)
         self._stir.set()
 
     def _wait(self, events: Iterable[Event]) -> None:
-        """Have notices told one after another; where the broker is too slow, the oldest make room."""
+        """Queue notices to be sent one after another; when the broker is too slow, drop the oldest."""
         self._events.extend(events)
         while len(self._events) > MOST_EVENTS:
             self._note(self._events.popleft())
-            if not self._untold:
-                text = f"the broker takes less than there is to tell: the oldest of {MOST_EVENTS} notices make room"
+            if not self._dropped:
+                text = f"the broker is too slow: the oldest of {MOST_EVENTS} queued notices are dropped"
                 journal.write_line(f"{text} for newer ones", "minor")
-            self._untold += 1
+            self._dropped += 1
 
     def _waited(self) -> None:
-        if self._untold:
-            journal.write_line(f"{self._untold} notices were not told one by one: the broker was too slow", "minor")
-        self._untold = 0
+        if self._dropped:
+            journal.write_line(f"{self._dropped} notices were not sent one by one: the broker was too slow", "minor")
+        self._dropped = 0
 
     async def run(self, broker: aiomqtt.Client) -> None:
-        """Serve one connection until it breaks (an ExceptionGroup with MqttError or HostGone), or all is cancelled."""
+        """Serve one connection until it breaks (an ExceptionGroup with MqttError or HostGone), or it is cancelled."""
         self._rebirth, self._born, self._host_state = False, False, None
         await broker.subscribe(self.node.topic("NCMD"), qos=1)
         if self._host:
@@ -202,14 +198,14 @@ class Session:
             await self._die(broker)
 
     async def _die(self, broker: aiomqtt.Client) -> None:
-        """Say so before leaving; the broker only tells of a connection that broke."""
+        """Send the death certificate: the broker itself reports broken connections only."""
         if not self._born:
             return
         self._born = False
-        while self._events:  # the next births tell the newest
+        while self._events:  # the next births include the newest
             self._note(self._events.popleft())
         self._waited()
-        with contextlib.suppress(aiomqtt.MqttError):  # it broke: the broker has the will
+        with contextlib.suppress(aiomqtt.MqttError):  # broken: the broker publishes the will
             await _send(broker, [self.node.death(_now_ms())], DEATH_S)
 
     async def _obey(self, broker: aiomqtt.Client) -> None:
@@ -223,7 +219,7 @@ class Session:
     def _note_host(self, state: HostState | None) -> None:
         """Accept the newest state of the host: an older death belongs to an earlier connection.
 
-        A time stamp ahead of this computer's clock orders nothing: later states would be ignored until that time.
+        A time stamp ahead of this computer's clock sets no order: it would make later states be ignored until then.
         """
         known = self._host_state
         if state is None or (known is not None and state.stamp_ms < known.stamp_ms):
@@ -253,7 +249,7 @@ class Session:
         self._stir.clear()
 
     def _changes(self, news: News) -> list[Message]:
-        """Return what is new, of several notices the oldest one: each is told by itself."""
+        """Return the changes, with only the oldest of several notices: each is sent by itself."""
         self._fresh = False
         if self._events:
             self._note(self._events.popleft())
@@ -266,7 +262,7 @@ class Session:
         self._notices[event.axis] = Metric("notice", STRING, text, event.stamp_ms, description=NOTICE, event=True)
 
     def _metrics(self, news: News) -> tuple[list[Metric], dict[str, list[Metric]]]:
-        """Return the metrics of the node, and of each axis; while the daemon is silent, no axis is there."""
+        """Return the metrics of the node, and of each axis; no axis while the daemon is silent."""
         up = Metric("up", BOOLEAN, not news.silent, news.stamp_ms, description="whether the daemon answers")
         node = [up, *self._of("", news)]
         axes = dict.fromkeys(value.axis for value in news.values if value.axis)
@@ -274,9 +270,9 @@ class Session:
 
     def _of(self, axis: str, news: News) -> list[Metric]:
         known = [metric_of(value) for value in news.values if value.axis == axis]
-        told = [f"{alarm.code}: {alarm.text}" for alarm in news.alarms if alarm.axis == axis]
-        text = None if news.silent else "; ".join(told)
-        alarms = Metric("alarms", STRING, text, news.stamp_ms, description="what is wrong now, with the next action")
+        active = [f"{alarm.code}: {alarm.text}" for alarm in news.alarms if alarm.axis == axis]
+        text = None if news.silent else "; ".join(active)
+        alarms = Metric("alarms", STRING, text, news.stamp_ms, description="active problems, with the next action")
         none_yet = Metric("notice", STRING, None, news.stamp_ms, description=NOTICE)
         return [*known, alarms, self._notices.get(axis, none_yet)]
 

@@ -1,7 +1,7 @@
-"""An MTConnect adapter: agents connect to it over TCP and are told in SHDR, line by line, what changes.
+"""An MTConnect adapter: agents connect over TCP and receive changes in SHDR, line by line.
 
-It answers an agent's pings and reads nothing else. An agent that does not read what it is sent loses its connection,
-and one that goes silent too; it comes again, and is told everything.
+It answers an agent's pings and ignores other input. An agent that does not read, or stops pinging, loses its
+connection; when it connects again it receives everything.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from fdhil.shopfloor.process import say_ready
 from fdhil.shopfloor.published import published
 from fdhil.shopfloor.shdr import PING, Picture, devices_xml, lines, notice, picture
 
-HEARTBEAT_S = 10.0  # an agent pings as often; twice as long without a ping it is gone
+HEARTBEAT_S = 10.0  # period of an agent's pings; after two without one it is gone
 MAX_AGENTS = 8
 MAX_LINE = 1024
-MAX_UNREAD = 256 * 1024  # bytes that wait for an agent
+MAX_UNREAD = 256 * 1024  # unsent bytes per agent
 
 
 async def publish(config: MachineConfig) -> None:
-    """Serve agents, until it is cancelled. ConnectError when it cannot listen."""
+    """Serve agents until cancelled. ConnectError when it cannot listen."""
     settings = config.publish.mtconnect
     adapter = Adapter()
     server = await _listening(adapter, settings)
@@ -58,7 +58,7 @@ async def _listening(adapter: Adapter, settings: MtConnectAdapter) -> asyncio.Se
 
 
 class Adapter:
-    """Says the same to every agent: all that is known when it comes, then what changes."""
+    """Sends the same to every agent: all known values when it connects, then changes."""
 
     def __init__(self) -> None:
         self._agents: dict[asyncio.StreamWriter, asyncio.Task[None] | None] = {}
@@ -67,30 +67,30 @@ class Adapter:
         self._notices: dict[str, str] = {}  # the newest of each axis
 
     def tell(self, news: News) -> None:
-        """Tell every agent what is new."""
+        """Send every agent what has changed."""
         now = picture(news)
         new = [notice(event) for event in news.events]
         self._notices |= {event.axis: line for event, line in zip(news.events, new, strict=True)}
-        told, self._picture = self._picture, now
+        before, self._picture = self._picture, now
         for agent in list(self._agents):
-            self._write(agent, [*lines(told, now), *new])
+            self._write(agent, [*lines(before, now), *new])
 
     @property
     def agents(self) -> int:
-        """How many are connected."""
+        """Number of connected agents."""
         return len(self._agents)
 
     def close(self) -> None:
-        """End all connections; an agent then holds everything for unavailable."""
+        """Close all connections; an agent then considers everything unavailable."""
         for agent, task in list(self._agents.items()):
             agent.close()
             if task is not None:
                 task.cancel()
 
     async def attend(self, reader: asyncio.StreamReader, agent: asyncio.StreamWriter) -> None:
-        """Attend to one agent until it leaves."""
+        """Serve one agent until it disconnects."""
         if not self._has_room(agent):
-            journal.write_line(f"{MAX_AGENTS} agents are connected, another one is sent away", "minor")
+            journal.write_line(f"{MAX_AGENTS} agents are connected, another one is refused", "minor")
             agent.close()
             return
         self._agents[agent] = asyncio.current_task()
@@ -98,7 +98,7 @@ class Adapter:
         try:
             await self._answer_pings(reader, agent)
         except (OSError, ValueError, TimeoutError):
-            pass  # it left, sent a line without an end, or is no longer there: it may come again
+            pass  # it left, sent a line without an end, or stopped pinging: it may connect again
         except asyncio.CancelledError:
             pass  # the process stops; the stream's own callback must not see it
         finally:
@@ -107,7 +107,7 @@ class Adapter:
             agent.close()
 
     def _has_room(self, new: asyncio.StreamWriter) -> bool:
-        """Whether one more may come; for it goes the first that never pinged, or that of the address with two more."""
+        """Return whether one more fits; closes one that never pinged, or one of an address with two more."""
         if len(self._agents) < MAX_AGENTS:
             return True
         count = Counter(map(_address, self._agents))
@@ -125,7 +125,7 @@ class Adapter:
         self._write(agent, ["* adapterVersion: fdhil", *everything, *self._notices.values()])
 
     async def _answer_pings(self, reader: asyncio.StreamReader, agent: asyncio.StreamWriter) -> None:
-        patience_s: float | None = None  # who never pings, as a person with a terminal, may listen
+        patience_s: float | None = None  # a client that never pings, such as a terminal, may stay
         while True:
             async with asyncio.timeout(patience_s):
                 line = await reader.readline()
@@ -136,12 +136,12 @@ class Adapter:
                 self._pinging.add(agent)
                 self._write(agent, [f"* PONG {round(1000 * HEARTBEAT_S)}"])
 
-    def _write(self, agent: asyncio.StreamWriter, said: list[str]) -> None:
+    def _write(self, agent: asyncio.StreamWriter, text_lines: list[str]) -> None:
         if agent.transport.get_write_buffer_size() > MAX_UNREAD:
             agent.transport.abort()
             return
         with contextlib.suppress(OSError):
-            agent.write("".join(f"{line}\n" for line in said).encode())
+            agent.write("".join(f"{line}\n" for line in text_lines).encode())
 
 
 def _address(agent: asyncio.StreamWriter) -> str:

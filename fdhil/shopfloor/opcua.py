@@ -1,4 +1,4 @@
-"""Serves what the daemon knows over OPC UA, for reading."""
+"""Serves the daemon's status over OPC UA, read-only."""
 
 import logging
 from collections.abc import AsyncIterator
@@ -15,30 +15,30 @@ from fdhil.shopfloor.opcua_nodes import Nodes
 from fdhil.shopfloor.opcua_security import NAME, ReadServer, secure
 from fdhil.shopfloor.process import say_ready
 
-MOST_BYTES, MOST_CHUNKS = 1 << 20, 32  # of a request
+MOST_BYTES, MOST_CHUNKS = 1 << 20, 32  # per request
 logging.getLogger("asyncua").setLevel(logging.CRITICAL)
 
 
 class Served:
-    """A server that runs, and what it shows."""
+    """A running server and its nodes."""
 
     def __init__(self, server: Server, nodes: Nodes, messages: Messages) -> None:
         self._server, self._nodes, self._messages = server, nodes, messages
 
     @property
     def port(self) -> int:
-        """The TCP port that it listens at."""
+        """The TCP port on which it listens."""
         return int(self._server.bserver._server.sockets[0].getsockname()[1])  # type: ignore[union-attr]
 
     async def tell(self, news: News) -> None:
-        """Show the newest values and tell what began and ended."""
+        """Show the newest values and publish what began and ended."""
         await self._nodes.show(news)
         await self._messages.tell(news)
 
 
 @asynccontextmanager
 async def serving(config: MachineConfig) -> AsyncIterator[Served]:
-    """Serve until the block is left; ConnectError where it cannot listen or a file cannot be used."""
+    """Serve until the block ends; ConnectError where it cannot listen or a file cannot be used."""
     settings = config.publish.opcua
     server = Server(iserver=ReadServer(settings))
     server.limits = TransportLimits(65535, 65535, MOST_CHUNKS, MOST_BYTES)
@@ -55,7 +55,7 @@ async def serving(config: MachineConfig) -> AsyncIterator[Served]:
     try:
         await server.start()
     except OSError as error:
-        text = f"{settings.host}:{settings.port} cannot be opened: {error.strerror or error}"
+        text = f"cannot listen at {settings.host}:{settings.port}: {error.strerror or error}"
         raise ConnectError(NAME, f"{text}; set another [publish.opcua] host or port") from None
     try:
         yield Served(server, nodes, messages)

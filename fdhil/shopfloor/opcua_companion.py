@@ -1,6 +1,6 @@
-"""Fills what the companion specification has a place for: who the machine is, and the program that runs.
+"""Fills the nodes of the companion specification: the machine's identification, and the running program.
 
-What fdhil does not know has a bad quality there, and no default that would be taken for a fact: 0 is a mode, too.
+Values unknown to fdhil have a bad quality there, and no default that could be mistaken for a fact: 0 is a mode, too.
 """
 
 from collections.abc import AsyncIterator, Mapping
@@ -18,7 +18,7 @@ DOES: Mapping[str, str] = {"rapid": "Running", "feed": "Running", "arc": "Runnin
 
 
 class Companion:
-    """The standard parts of one MachineTool."""
+    """The standard nodes of one MachineTool."""
 
     def __init__(self, server: Server, machine: Node, machine_tool: int) -> None:
         self._server, self._machine, self._space = server, machine, machine_tool
@@ -27,7 +27,7 @@ class Companion:
         self._states: dict[str, tuple[ua.NodeId, int]] = {}
 
     async def build(self, settings: OpcUaServer) -> None:
-        """Say who the machine is, and that nothing is known yet of what it does."""
+        """Write the identification, and mark all activity as unknown."""
         await self._identify(settings)
         at = self._space
         for part in ("Monitoring", "Production"):
@@ -45,16 +45,16 @@ class Companion:
     async def _identify(self, settings: OpcUaServer) -> None:
         di = await self._server.get_namespace_index(DI)
         place = await self._machine.get_child(f"{di}:Identification")
-        told = {
+        values = {
             "Manufacturer": ua.Variant(ua.LocalizedText(settings.manufacturer)),
             "SerialNumber": ua.Variant(settings.serial_number, ua.VariantType.String),
             "ProductInstanceUri": ua.Variant(settings.product_instance_uri, ua.VariantType.String),
         }
-        for name, variant in told.items():
+        for name, variant in values.items():
             await (await place.get_child(f"{di}:{name}")).write_value(variant)
 
     async def show(self, value: Value, why: int) -> None:
-        """Show a value where the companion specification has a place for it, too; ``why`` it may not be known."""
+        """Write a value to its node of the companion specification, if it has one; ``why`` it may be unknown."""
         if value.item.name == "nc_program":
             await self._server.write_attribute_value(self._program.nodeid, shown(value, why))
         elif value.item.name == "nc_motion":
@@ -62,7 +62,7 @@ class Companion:
 
     async def _show_state(self, value: Value, why: int) -> None:
         name = DOES.get(str(value.value))
-        told = [unknown(why, value.stamp_ms)] * 3
+        data_values = [unknown(why, value.stamp_ms)] * 3
         if name is not None:
             kind, number = self._states[name]
             variants: list[Any] = [
@@ -70,9 +70,9 @@ class Companion:
                 ua.Variant(kind, ua.VariantType.NodeId),
                 ua.Variant(number, ua.VariantType.UInt32),
             ]
-            stamp = told[0].SourceTimestamp
-            told = [ua.DataValue(variant, SourceTimestamp=stamp) for variant in variants]
-        for node, data in zip(self._state, told, strict=True):
+            stamp = data_values[0].SourceTimestamp
+            data_values = [ua.DataValue(variant, SourceTimestamp=stamp) for variant in variants]
+        for node, data in zip(self._state, data_values, strict=True):
             await self._server.write_attribute_value(node.nodeid, data)
 
 

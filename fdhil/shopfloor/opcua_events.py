@@ -1,4 +1,4 @@
-"""Tells alarms as conditions and notices as events, under the machine's Notification.Messages (OPC 40501-1)."""
+"""Publishes alarms as conditions and notices as events, under the machine's Notification.Messages (OPC 40501-1)."""
 
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -18,7 +18,7 @@ SILENT = "DaemonSilent"
 
 
 class Messages:
-    """The conditions that are on, and the events as they come."""
+    """The active conditions, and the events as they come."""
 
     def __init__(self, server: Server, nodes: Nodes) -> None:
         self._server, self._nodes = server, nodes
@@ -27,7 +27,7 @@ class Messages:
         self._notices: EventGenerator
 
     async def build(self) -> None:
-        """Make the type of fdhil's notices, and the way by which they reach the server's own node."""
+        """Create the type of fdhil's notices, and the reference to the server's own node."""
         everything = self._server.nodes.server
         await everything.set_event_notifier([ua.EventNotifier.SubscribeToEvents])
         await everything.add_reference(self._nodes.messages, ua.ObjectIds.HasNotifier)
@@ -36,10 +36,10 @@ class Messages:
         self._notices = await self._generator(kind.nodeid, "Identifier")
 
     async def tell(self, news: News) -> None:
-        """Tell what began, what ended, and what is new. A silent daemon ends no alarm: it is not known."""
+        """Publish what began, what ended, and new events. A silent daemon ends no alarm: its state is unknown."""
         now = {(alarm.code, alarm.axis): alarm for alarm in news.alarms}
         if news.silent:
-            silent = Alarm(SILENT, "MAJOR", f"{news.silent}; no value is known")
+            silent = Alarm(SILENT, "MAJOR", f"{news.silent}; no values are known")
             now = self._on | {(SILENT, ""): silent}
         for key in self._on.keys() - now.keys():
             await self._condition(self._on[key], False)
@@ -51,7 +51,7 @@ class Messages:
             await self._notice(event)
 
     async def _generator(self, kind: ua.NodeId, code: str) -> EventGenerator:
-        """Return what triggers events of a type; ``code`` is a field that the type declares without a value."""
+        """Return a generator for events of a type; ``code`` is a field that the type declares without a value."""
         generator = await self._server.get_event_generator(kind, self._nodes.messages.nodeid)
         generator.event.add_property(code, "", ua.VariantType.String)
         return generator
@@ -61,34 +61,34 @@ class Messages:
         if key not in self._conditions:
             self._conditions[key] = await self._generator(node_id(ALERT_TYPE, self._nodes.machine_tool), "ErrorCode")
         generator = self._conditions[key]
-        told: Any = generator.event
-        told.NodeId = node_id(".".join(filter(None, ["alarm", alarm.code, alarm.axis])), self._nodes.own)
-        told.ConditionName = told.ErrorCode = alarm.code
-        told.SourceName = alarm.axis or "machine"
-        told.Severity = SEVERITY[alarm.severity]
-        told.Retain = active
-        _set_state(told, "EnabledState", "Enabled", True)
-        _set_state(told, "ActiveState", "Active" if active else "Inactive", active)
-        _set_state(told, "AckedState", "Acknowledged", True)  # fdhil acknowledges at the daemon, by name
-        await self._trigger(generator, alarm.text if active else f"{alarm.code}: this is no longer so", None)
+        event: Any = generator.event
+        event.NodeId = node_id(".".join(filter(None, ["alarm", alarm.code, alarm.axis])), self._nodes.own)
+        event.ConditionName = event.ErrorCode = alarm.code
+        event.SourceName = alarm.axis or "machine"
+        event.Severity = SEVERITY[alarm.severity]
+        event.Retain = active
+        _set_state(event, "EnabledState", "Enabled", True)
+        _set_state(event, "ActiveState", "Active" if active else "Inactive", active)
+        _set_state(event, "AckedState", "Acknowledged", True)  # operators acknowledge at the daemon
+        await self._trigger(generator, alarm.text if active else f"{alarm.code}: the condition has ended", None)
 
     async def _notice(self, event: Event) -> None:
-        told: Any = self._notices.event
-        told.Identifier = event.code
-        told.SourceName = event.axis or "machine"
-        told.Severity = SEVERITY[event.severity]
+        fields: Any = self._notices.event
+        fields.Identifier = event.code
+        fields.SourceName = event.axis or "machine"
+        fields.Severity = SEVERITY[event.severity]
         stamp = datetime.fromtimestamp(event.stamp_ms * 1e-3, UTC)
         await self._trigger(self._notices, f"{event.code}: {event.text}", stamp)
 
     async def _trigger(self, generator: EventGenerator, message: str, stamp: datetime | None) -> None:
-        """Tell who listens to the machine's messages, and who listens to all of the server."""
-        told = generator.event
-        told.emitting_node = self._nodes.messages.nodeid
+        """Trigger an event for clients of the machine's messages, and for clients of the whole server."""
+        event = generator.event
+        event.emitting_node = self._nodes.messages.nodeid
         await generator.trigger(time_attr=stamp, message=message)
-        told.emitting_node = self._server.nodes.server.nodeid  # and there a ConditionRefresh finds it
-        await self._server.iserver.subscription_service.trigger_event(told)
+        event.emitting_node = self._server.nodes.server.nodeid  # where ConditionRefresh finds it
+        await self._server.iserver.subscription_service.trigger_event(event)
 
 
-def _set_state(told: Any, name: str, words: str, value: bool) -> None:
-    setattr(told, name, ua.LocalizedText(words, "en"))
-    setattr(told, f"{name}/Id", value)
+def _set_state(event: Any, name: str, words: str, value: bool) -> None:
+    setattr(event, name, ua.LocalizedText(words, "en"))
+    setattr(event, f"{name}/Id", value)

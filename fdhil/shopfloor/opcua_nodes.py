@@ -1,6 +1,6 @@
-"""Lays out the address space: a MachineTool (OPC 40501-1) with fdhil's own values in it, each with its unit.
+"""Builds the address space: a MachineTool (OPC 40501-1) with fdhil's own values in it, each with its unit.
 
-Node IDs are made of what is published (``s=X.R_low``, ``s=state``, ``s=can0.bus_load``) and stay the same.
+Node IDs are derived from the published items (``s=X.R_low``, ``s=state``, ``s=can0.bus_load``) and stay the same.
 """
 
 from pathlib import Path
@@ -34,7 +34,7 @@ class Nodes:
         self.machine_tool = 0
 
     async def build(self) -> None:
-        """Load the companion specifications and make the machine."""
+        """Load the companion specifications and create the machine."""
         for name in ("Di", "Machinery", "IA", "MachineTool"):
             await self._server.import_xml(str(NODESETS / f"Opc.Ua.{name}.NodeSet2.xml"))
         self.machine_tool = await self._server.get_namespace_index(MACHINE_TOOL)
@@ -86,7 +86,7 @@ class Nodes:
         return node
 
     async def show(self, news: News) -> None:
-        """Write every value with its time; what is not known has a bad quality that says why."""
+        """Write every value with its time; an unknown one has a bad quality with the reason."""
         why = ua.StatusCodes.BadNoCommunication if news.silent else ua.StatusCodes.BadNoDataAvailable
         for value in news.values:
             await self._server.write_attribute_value(self._values[value.key].nodeid, shown(value, why))

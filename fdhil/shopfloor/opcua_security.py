@@ -1,6 +1,6 @@
-"""Says who may connect to the OPC UA server, and what they may ask: to read, to browse, to subscribe.
+"""Limits who may connect to the OPC UA server, and to what: reading, browsing, subscribing.
 
-Without a certificate the server is for this computer alone and asks for no name. With one, everything is signed and
+Without a certificate the server accepts local clients only, without a login. With one, everything is signed and
 encrypted. No client can write, call more than ConditionRefresh, or add a node.
 """
 
@@ -28,14 +28,11 @@ from fdhil.shopfloor.opcua_subscriptions import ReportedValues
 
 NAME = "OPC UA server"
 ANYONE = User(role=UserRole.Anonymous)
-MOST_CONNECTIONS, MOST_AT_ONCE = 16, 64  # of which those beyond sixteen are being ended
+MOST_CONNECTIONS, MOST_AT_ONCE = 16, 64  # those beyond sixteen are being closed
 ACTIVATION_S = 10.0  # for a client to log in
 MOST_SUBSCRIPTIONS = 64
 MOST_FAILURES, FAILURES_S = 10, 60.0
-REFUSED = {
-    ua.ObjectIds.WriteRequest_Encoding_DefaultBinary,
-    ua.ObjectIds.HistoryReadRequest_Encoding_DefaultBinary,
-}
+REFUSED = {ua.ObjectIds.WriteRequest_Encoding_DefaultBinary, ua.ObjectIds.HistoryReadRequest_Encoding_DefaultBinary}
 POLICIES = [
     ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
     ua.SecurityPolicyType.Aes128Sha256RsaOaep_SignAndEncrypt,
@@ -51,42 +48,42 @@ CHECKED = (
 
 @dataclass
 class Reader(User):
-    """A user who has logged in, as the users file had him then."""
+    """A logged-in user, with the users file's entry at that time."""
 
     known: KnownUser | None = None
 
 
 class ForReading(SimpleRoleRuleset):
-    """Every user may read, browse and subscribe, until he is removed or changed in the file; nobody may do more."""
+    """Lets every user read, browse and subscribe, until the file removes or changes the user; nothing more."""
 
     def __init__(self, users: UsersFile | None = None) -> None:
         self._users = users
         self._permitted = {ua.NodeId(ua.Int32(kind)) for kind in USER_TYPES if kind not in REFUSED}
 
     def check_validity(self, user: User, action_type_id: ua.NodeId, body: Any) -> bool:
-        """Whether a request of that type is served."""
+        """Return whether a request of that type is served."""
         if self._users is not None and isinstance(user, Reader) and self._users.user(user.name or "") != user.known:
             return False
         return action_type_id in self._permitted
 
 
 class Doorkeeper(UserManager):
-    """Lets in who knows a user's password; without a users file anyone, for then only this computer is served.
+    """Checks passwords; without a users file everybody is accepted, because then only local clients can connect.
 
-    After ten wrong passwords in a minute from one address none is taken from there for the rest of it: guessing is
-    slow, cheap to refuse, and locks nobody else out.
+    After ten wrong passwords in a minute from one address all logins from there are refused for the rest of it:
+    guessing is slow, cheap to refuse, and locks out no other user.
     """
 
     def __init__(self, users: UsersFile | None) -> None:
         self.users = users
-        self._failures: list[tuple[str, float]] = []  # from where, and when
+        self._failures: list[tuple[str, float]] = []  # address and time
         self.address = ""
-        """Where who asks next is."""
+        """Address of the client that logs in next."""
 
     def get_user(
         self, iserver: Any, username: str | None = None, password: str | None = None, certificate: Any = None
     ) -> User | None:
-        """Return the user of a session; None: it is not let in."""
+        """Return the user of a session; None: refused."""
         if self.users is None:
             return User(role=UserRole.User)
         now_s = time.monotonic()
@@ -102,29 +99,29 @@ class Doorkeeper(UserManager):
 
 
 class Visit(InternalSession):
-    """A client's session, which tells the doorkeeper where its client is, and its client each change."""
+    """A client's session, which passes its address to the user manager, and each change to its client."""
 
     async def create_subscription(self, *given: Any, **named: Any) -> ua.CreateSubscriptionResult:
-        """Make a subscription without items yet."""
+        """Create a subscription without items."""
         made = await super().create_subscription(*given, **named)
         subscription = self.subscription_service.subscriptions[made.SubscriptionId]
         subscription.monitored_item_srv = ReportedValues(subscription, self.aspace)
         return made
 
     def activate_session(self, *given: Any) -> Any:
-        """Ask the doorkeeper whether it is let in; nothing else is done meanwhile."""
-        peer: Any = self.name  # of a client its address and port
-        door = self.iserver.user_manager
-        assert isinstance(door, Doorkeeper)
-        door.address = str(peer[0]) if isinstance(peer, tuple) else ""
+        """Log the client in; no other session can interfere meanwhile."""
+        peer: Any = self.name  # a client's address and port
+        users = self.iserver.user_manager
+        assert isinstance(users, Doorkeeper)
+        users.address = str(peer[0]) if isinstance(peer, tuple) else ""
         return super().activate_session(*given)
 
 
 class Connections(list[Any]):
-    """The transports of all clients: for one too many goes the oldest of an address with two more, or else itself."""
+    """The transports of all clients; above the limit the oldest of an address with more is closed, or the new one."""
 
     def append(self, new: Any) -> None:
-        """Take a connection."""
+        """Add a connection."""
         super().append(new)
         there = [each for each in self if not each.is_closing()]
         if len(there) > MOST_CONNECTIONS:
@@ -138,7 +135,7 @@ def _address(transport: Any) -> str:
 
 
 class ReadServer(InternalServer):
-    """An address space that remembers no other servers: who is not let in could fill its memory with them."""
+    """An address space that registers no other servers: unauthenticated clients could fill its memory with them."""
 
     def __init__(self, settings: OpcUaServer) -> None:
         users = None if settings.users_file is None else UsersFile(settings.users_file)
@@ -156,25 +153,25 @@ class ReadServer(InternalServer):
         return Visit(self, self.aspace, self.subscription_service, name, user=user, external=external)
 
     def register_server(self, server: Any, conf: Any = None) -> None:
-        """Refuse to be a discovery server."""
+        """Refuse to act as a discovery server."""
         raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
 
 
 async def secure(server: Server, settings: OpcUaServer, uri: str) -> None:
-    """Give the server its certificate and its URI; ConnectError with the file that cannot be used."""
+    """Configure the server's certificate and URI; ConnectError with the file that cannot be used."""
     if settings.certificate_file is None or settings.private_key_file is None:
         server.set_security_policy([ua.SecurityPolicyType.NoSecurity], ForReading())
         await server.set_application_uri(uri)
         return
-    door = server.iserver.user_manager
-    assert isinstance(door, Doorkeeper)
-    server.set_security_policy(POLICIES, ForReading(door.users))
+    users = server.iserver.user_manager
+    assert isinstance(users, Doorkeeper)
+    server.set_security_policy(POLICIES, ForReading(users.users))
     for key, load in (("certificate_file", server.load_certificate), ("private_key_file", server.load_private_key)):
         content = _read(key, getattr(settings, key))
         try:
             await load(content, format="pem" if b"-----BEGIN" in content else "der")
         except (ValueError, TypeError):
-            raise _fault(key, f"{getattr(settings, key)} cannot be used: it is none, or has a password") from None
+            raise _fault(key, f"{getattr(settings, key)} cannot be used: it is invalid, or has a password") from None
     _check_pair(server, settings)
     await server.set_application_uri(_application_uri(server.iserver.certificate) or uri)
     if settings.trusted_clients is not None:
@@ -198,20 +195,20 @@ async def _validator(folder: Path) -> CertificateValidator:
 
 
 class Validator(CertificateValidator):
-    """Trusts the certificates that are in the folder when a client comes."""
+    """Trusts the certificates that are in the folder when a client connects."""
 
     async def validate(self, cert: Any, app_description: Any) -> None:
         """Check a client's certificate; ServiceError."""
         assert self._trust_store is not None
         try:
             await self._trust_store.load()
-        except (OSError, ValueError):  # none is left, or a file is being written
+        except (OSError, ValueError):  # no file is left, or one is being written
             raise ServiceError(ua.StatusCodes.BadCertificateUntrusted) from None
         await super().validate(cert, app_description)
 
 
 def _application_uri(certificate: Any) -> str | None:
-    """Return the URI that the certificate is for: a client compares it with what the server calls itself."""
+    """Return the URI in the certificate: a client compares it with the server's own."""
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
@@ -228,4 +225,4 @@ def _read(key: str, path: Path) -> bytes:
 
 
 def _fault(key: str, what: str) -> ConnectError:
-    return ConnectError(NAME, f"[publish.opcua] {key}: {what}; nothing is served; correct the file or its rights")
+    return ConnectError(NAME, f"[publish.opcua] {key}: {what}; nothing is served; correct the file or its permissions")

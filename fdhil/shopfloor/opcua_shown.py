@@ -1,4 +1,4 @@
-"""Makes OPC UA's data of what is published: a value with its kind, quality and time, a unit, the ID of a node. Pure."""
+"""Makes OPC UA data of published items: values with type, quality and time, units, node IDs. Pure."""
 
 from collections.abc import Mapping
 from datetime import UTC
@@ -40,7 +40,7 @@ UNITS: Mapping[str, tuple[str, str, str]] = {
 
 
 def shown(value: Value, why: int) -> ua.DataValue:
-    """Return a value with its quality and time; one that is not known says by its status ``why``."""
+    """Return a value with its quality and time; an unknown one has the status ``why``."""
     if value.value is None:
         return unknown(why, value.stamp_ms)
     kind = TYPES[value.item.kind]
@@ -49,7 +49,7 @@ def shown(value: Value, why: int) -> ua.DataValue:
 
 
 def unknown(why: int, stamp_ms: int) -> ua.DataValue:
-    """Return no value, with the status that says ``why``."""
+    """Return an empty value with the status ``why``."""
     status = ua.StatusCode(ua.UInt32(why))
     return ua.DataValue(ua.Variant(), StatusCode=status, SourceTimestamp=_time(stamp_ms))
 
@@ -59,13 +59,13 @@ def _time(stamp_ms: int) -> ua.DateTime:
 
 
 def node_id(identifier: int | str, namespace: int = 0) -> ua.NodeId:
-    """Return the ID of a node by its number or its name."""
+    """Return a node ID from its number or name."""
     known = ua.Int32(identifier) if isinstance(identifier, int) else ua.String(identifier)
     return ua.NodeId(known, ua.Int16(namespace))
 
 
 def unit_of(unit: str) -> ua.EUInformation:
-    """Return a unit as OPC UA has it: the letters of its common code, one byte each, are its number."""
+    """Return a unit in OPC UA's form: the letters of its common code, one byte each, are its number."""
     code, symbol, name = UNITS[unit]
     return ua.EUInformation(
         NamespaceUri="http://www.opcfoundation.org/UA/units/un/cefact",

@@ -1,7 +1,8 @@
-"""Decides what a subscribed client is told of a value: each change of what was reported to it last.
+"""Decides which values a subscribed client receives: each change against the value it received last.
 
-asyncua compares with the value before, which may not have been reported: what creeps by less than a client's deadband
-is never told, and with a deadband no status is told whose value is none, so that an old number stays Good.
+asyncua compares with the previous value, which may not have been reported: a drift in steps below a client's deadband
+is never reported, and with a deadband no status is reported for a value without a number, so that an old one stays
+Good.
 """
 
 from numbers import Real
@@ -12,10 +13,10 @@ from asyncua.server.monitored_item_service import MonitoredItemService
 
 
 class ReportedValues(MonitoredItemService):
-    """The monitored items of one subscription; ``mvalue`` of each has what was reported last."""
+    """The monitored items of one subscription; ``mvalue`` of each is the value reported last."""
 
     async def datachange_callback(self, handle: int, value: ua.DataValue, error: ua.StatusCode | None = None) -> None:
-        """Report a value that was written, where it differs from the one reported last."""
+        """Report a written value where it differs from the one reported last."""
         if error:
             await super().datachange_callback(handle, value, error)
             return
@@ -24,15 +25,16 @@ class ReportedValues(MonitoredItemService):
         if item.mode == ua.MonitoringMode.Disabled or not is_news(item.mvalue.current_dvalue, value, item.filter):
             return
         item.mvalue.set_current_datavalue(value)
-        told = ua.MonitoredItemNotification()
-        told.ClientHandle, told.Value = item.client_handle, value
-        await self.isub.enqueue_datachange_event(number, told, item.queue_size)
+        notification = ua.MonitoredItemNotification()
+        notification.ClientHandle, notification.Value = item.client_handle, value
+        await self.isub.enqueue_datachange_event(number, notification, item.queue_size)
 
 
 def is_news(reported: ua.DataValue | None, value: ua.DataValue, wanted: Any = None) -> bool:
-    """Whether a client with the filter ``wanted`` is told a value after the one reported last (OPC 10000-4, 7.22.2).
+    """Return whether a client with the filter ``wanted`` receives a value after the one reported last.
 
-    A change of the status always is. A deadband is one of numbers; one in percent, for which there is no range, is 0.
+    See OPC 10000-4, 7.22.2. A change of status is always reported. A deadband applies to numbers; one in percent, for
+    which there is no range, counts as 0.
     """
     if reported is None or _status(reported) != _status(value):
         return True
@@ -44,7 +46,7 @@ def is_news(reported: ua.DataValue | None, value: ua.DataValue, wanted: Any = No
         return True
     before, now = _plain(reported), _plain(value)
     if band is not None and all(isinstance(each, Real) and not isinstance(each, bool) for each in (before, now)):
-        return not abs(now - before) <= band  # nor where one is NaN
+        return not abs(now - before) <= band  # NaN always differs
     return bool(before != now)
 
 

@@ -1,4 +1,4 @@
-"""Runs one process of a network: until SIGTERM or Ctrl-C, with a line and a word to systemd when it is ready."""
+"""Runs one publisher process until SIGTERM or Ctrl-C, and reports readiness to the log and systemd."""
 
 import asyncio
 import os
@@ -12,12 +12,12 @@ from fdhil.daemon.notify import notify
 from fdhil.daemon.shutdown import Shutdown
 
 C = TypeVar("C")
-PUBLISHER_S = 12.0  # a broker, server or database that takes no farewell
+PUBLISHER_S = 12.0  # to close connections to peers that do not answer
 STOP_S = 18.0  # below the TimeoutStopSec of the units
 
 
 def run(publisher: Callable[[C], Coroutine[Any, Any, None]], config: C) -> None:
-    """Publish until it is told to stop. FdhilError when it cannot start."""
+    """Publish until stopped. FdhilError when it cannot start."""
     heap.keep_small()
     shutdown = Shutdown(STOP_S, os._exit)
     try:
@@ -30,17 +30,17 @@ async def _until_told_to_stop(publisher: Coroutine[Any, Any, None], shutdown: Sh
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    publishing, told = asyncio.create_task(publisher), asyncio.create_task(stop.wait())
-    await asyncio.wait([publishing, told], return_when=asyncio.FIRST_COMPLETED)
+    publishing, stopping = asyncio.create_task(publisher), asyncio.create_task(stop.wait())
+    await asyncio.wait([publishing, stopping], return_when=asyncio.FIRST_COMPLETED)
     shutdown.begin()
     if publishing.done():
-        told.cancel()
+        stopping.cancel()
         publishing.result()
     elif await end_tasks([publishing], PUBLISHER_S):
-        journal.write_line(f"stopping: the connection is not closed after {PUBLISHER_S:g} s; it is left", "minor")
+        journal.write_line(f"stopping: the connection is not closed after {PUBLISHER_S:g} s and is abandoned", "minor")
 
 
 def say_ready(text: str) -> None:
-    """Tell the log and systemd that it serves; ``text`` says what and where, the address last."""
+    """Report to the log and systemd that it serves; ``text`` names what and where, the address last."""
     journal.write_line(text)
     notify(f"READY=1\nSTATUS={text}")

@@ -1,4 +1,4 @@
-"""Serves the metrics to Prometheus over HTTP: GET /metrics and nothing else, for the hosts that the config allows."""
+"""Serves metrics to Prometheus over HTTP: GET /metrics only, for the hosts that the config allows."""
 
 import asyncio
 import contextlib
@@ -25,7 +25,7 @@ Send = Callable[[Mapping[str, Any]], Awaitable[None]]
 
 
 class Page:
-    """The one page, as an ASGI application."""
+    """The metrics page, an ASGI application."""
 
     def __init__(self, metrics: Metrics, hosts: tuple[str, ...]) -> None:
         self._registry = CollectorRegistry(auto_describe=False)
@@ -42,11 +42,11 @@ class Page:
     def _answer(self, scope: Mapping[str, Any]) -> tuple[int, str, bytes]:
         headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
         if _name_of(headers.get("host", "")) not in self._hosts:
-            return 421, "text/plain", b"this host is not among [publish.prometheus] allowed_hosts\n"
+            return 421, "text/plain", b"this host is not in [publish.prometheus] allowed_hosts\n"
         if scope["path"] != "/metrics":
             return 404, "text/plain", b"the metrics are at /metrics\n"
         if scope["method"] not in ("GET", "HEAD"):
-            return 405, "text/plain", b"the metrics are for reading\n"
+            return 405, "text/plain", b"the metrics are read-only\n"
         encode, kind = choose_encoder(headers.get("accept", ""))
         return 200, kind, encode(self._registry)
 
@@ -58,7 +58,7 @@ def _name_of(host: str) -> str:
 
 
 class _Server(uvicorn.Server):
-    """Leaves the signals to the process that it is a part of."""
+    """Leaves signals to the process around it."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -78,7 +78,7 @@ async def publish(config: MachineConfig) -> None:
             async for news in listen(config, settings.period_s):
                 metrics.take(news)
                 if serving.done():
-                    raise ConnectError("metrics", "the server ended by itself; start it again")
+                    raise ConnectError("metrics", "the server stopped unexpectedly; start it again")
         finally:
             server.should_exit = True
             await serving
@@ -86,7 +86,7 @@ async def publish(config: MachineConfig) -> None:
 
 def _configured(settings: PrometheusMetrics, page: Page) -> uvicorn.Config:
     """Return the server's settings; ConnectError with the TLS file that cannot be used."""
-    asked = settings.tls_client_ca_file
+    client_ca = settings.tls_client_ca_file
     configured = uvicorn.Config(
         page,
         lifespan="off",
@@ -97,17 +97,17 @@ def _configured(settings: PrometheusMetrics, page: Page) -> uvicorn.Config:
         access_log=False,
         server_header=False,
         limit_concurrency=MOST_CONNECTIONS,
-        backlog=MOST_CONNECTIONS,  # as many are taken at once: each is a descriptor
+        backlog=MOST_CONNECTIONS,  # bounds descriptors, too
         timeout_graceful_shutdown=2,
         ssl_certfile=settings.tls_certificate_file,
         ssl_keyfile=settings.tls_key_file,
-        ssl_ca_certs=str(asked) if asked else None,
-        ssl_cert_reqs=ssl.CERT_REQUIRED if asked else ssl.CERT_NONE,
+        ssl_ca_certs=str(client_ca) if client_ca else None,
+        ssl_cert_reqs=ssl.CERT_REQUIRED if client_ca else ssl.CERT_NONE,
     )
     try:
         configured.load()
-    except OSError as error:  # an SSLError is one, too
-        text = f"the TLS files cannot be used ({error.strerror or error}); compare [publish.prometheus] tls_..._file"
+    except OSError as error:  # also SSLError
+        text = f"the TLS files cannot be used ({error.strerror or error}); check [publish.prometheus] tls_..._file"
         raise ConnectError("metrics", f"{text}, which this user must be able to read") from None
     return configured
 
@@ -117,5 +117,5 @@ def _listening(settings: PrometheusMetrics) -> socket.socket:
         family = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM)[0][0]
         return socket.create_server((settings.host, settings.port), family=family)
     except OSError as error:
-        text = f"{settings.host}:{settings.port} cannot be opened: {error.strerror or error}"
+        text = f"cannot listen at {settings.host}:{settings.port}: {error.strerror or error}"
         raise ConnectError("metrics", f"{text}; set another [publish.prometheus] host or port") from None

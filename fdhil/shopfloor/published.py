@@ -1,7 +1,7 @@
-"""Says what is published, once for all protocols: a flat list of named values, made of the daemon's status. Pure.
+"""Lists the published items, once for all protocols: named values derived from the daemon's status. Pure.
 
-A value that is not known is None, and so is every one while the daemon is silent: each protocol tells that in its own
-way (a bad quality, UNAVAILABLE, nothing at all), and never by an old number.
+An unknown value is None, and so is every value while the daemon is silent: each protocol reports that in its own way (a
+bad quality, UNAVAILABLE, no value at all), and never with an old number.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,7 +13,7 @@ from fdhil.records import PARAMETERS, UNITS, MoveKind
 
 Kind = Literal["measure", "count", "flag", "state", "text"]
 Plain = float | int | bool | str | None
-GUARD_LIVE_S = 2.0  # the daemon asks it twice a second; what it said before is not what is applied now
+GUARD_LIVE_S = 2.0  # the daemon polls the guard twice a second
 NC_LIVE_S = 2.0
 MEANING: Mapping[str, str] = {
     "R": "resistance of the motor's winding",
@@ -30,10 +30,10 @@ MOTIONS = tuple(kind.value for kind in MoveKind)
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """What is published under a name; ``path`` leads to it in the status, {axis} and {bus} stand for their names.
+    """A published item; ``path`` leads to it in the status, {axis} and {bus} stand for their names.
 
-    ``age`` leads to how long ago it was heard: beyond ``live_s`` it is not known any more. ``choices`` are all that a
-    state can be. A ``count`` only grows, until the daemon starts anew.
+    ``age`` leads to its age: beyond ``live_s`` it is unknown. ``choices`` are all values of a state. A ``count`` only
+    grows, until the daemon restarts.
     """
 
     name: str
@@ -49,9 +49,9 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """One published value. ``axis`` and ``bus`` are empty for what is the whole machine's; ``value`` None: not known.
+    """One published value. ``axis`` and ``bus`` are empty for values of the whole machine; ``value`` None: unknown.
 
-    ``stamp_ms`` is when it was last so, Unix time in ms: when the daemon was asked, less the age where that is told.
+    ``stamp_ms`` is its time, Unix time in ms: that of the status, less the age where there is one.
     """
 
     item: Item
@@ -62,13 +62,13 @@ class Value:
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """What it is, apart from how it is: name, axis and bus."""
+        """Its identity: name, axis and bus."""
         return self.item.name, self.axis, self.bus
 
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """Something that is wrong now: a class of errors, the axis it is about, cause and next action."""
+    """An active problem: class, axis, cause and next action."""
 
     code: str
     severity: Literal["minor", "MAJOR"]
@@ -78,7 +78,7 @@ class Alarm:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """A notice of the daemon, when it came (Unix time in ms), and after how much of the daemon's own time."""
+    """A notice of the daemon, its time (Unix time in ms), and the daemon's uptime at that time."""
 
     code: str
     severity: Literal["info", "minor", "MAJOR"]
@@ -97,7 +97,7 @@ def _joined(sentences: Any) -> Plain:
 
 
 def _armed_program(status: Any) -> Plain:
-    """Return the file's name; empty while nothing is armed, or what is armed is no program."""
+    """Return the file's name; empty while nothing is armed, or a correction without a program."""
     return _base_name(_at(status, "armed.program") or "") if status else None
 
 
@@ -139,29 +139,29 @@ def _parameter(name: str) -> Iterator[Item]:
 MACHINE: tuple[Item, ...] = (
     _state("state", STATES, "state", "state of the correction"),
     _flag("offset_stands", "may_stand.nothing", "whether an offset may be applied in a drive", shown=lambda no: not no),
-    _state("hearing", SOURCE_STATES, "source.state", "whether the machine's buses are heard"),
-    _count("source_lost", "source.lost_times", "how often the buses could not be listened to any more"),
+    _state("hearing", SOURCE_STATES, "source.state", "whether frames are received from the machine's buses"),
+    _count("source_lost", "source.lost_times", "how often the connection to the buses was lost"),
     _measure("uptime", "s", "uptime_s", "how long the daemon has been running"),
     _measure("sync_rate", "Hz", "sync.rate_hz", "rate of the SYNC messages"),
     _measure("sync_expected", "Hz", "sync.expected_hz", "rate of SYNC by the configuration"),
     _count("frames_received", "frames.received", "CAN frames received"),
     _count("frames_lost", "frames.lost", "CAN frames that were lost"),
     _count("records_dropped", "counters.records_dropped", "records that were dropped unread"),
-    _measure("troubles", "", "troubles", "how many things are not as the configuration says", shown=len),
-    _measure("unacknowledged", "", "unacknowledged.count", "notices that wait to be acknowledged"),
+    _measure("troubles", "", "troubles", "number of deviations from the configuration", shown=len),
+    _measure("unacknowledged", "", "unacknowledged.count", "number of unacknowledged notices"),
     _measure("unacknowledged_major", "", "unacknowledged.MAJOR", "how many of them are MAJOR"),
     _text("store_fault", "store", "why nothing is stored, empty while all is well", shown=lambda s: s["fault"] or ""),
     _text("config_digest", "config_digest", "digest of the configuration"),
-    _text("armed_program", "", "the program that is armed, empty without one", shown=_armed_program),
-    _text("armed_method", "armed.method", "method of the correction that is armed"),
+    _text("armed_program", "", "the armed program, empty without one", shown=_armed_program),
+    _text("armed_method", "armed.method", "method of the armed correction"),
     _measure("predicted_before", "um", "armed.before.rms_um", "contour error (RMS) predicted without correction"),
     _measure("predicted_after", "um", "armed.after.rms_um", "contour error (RMS) predicted with the correction"),
     _measure("pass_number", "", "passes", "number of the program's last pass", shown=_newest_pass("pass")),
     _measure("pass_rms", "um", "passes", "contour error (RMS) measured in it", shown=_newest_pass("measured.rms_um")),
-    _measure("pass_max", "um", "passes", "largest contour error in it", shown=_newest_pass("measured.max_um")),
-    _state("nc_motion", MOTIONS, "nc.motion", "what the NC does", **_NC),
+    _measure("pass_max", "um", "passes", "largest contour error measured in it", shown=_newest_pass("measured.max_um")),
+    _state("nc_motion", MOTIONS, "nc.motion", "motion of the NC", **_NC),
     _text("nc_program", "nc.program", "the NC's program", shown=_base_name, **_NC),
-    _measure("nc_line", "", "nc.line", "line of the NC's program that moves", **_NC),
+    _measure("nc_line", "", "nc.line", "line of the NC's program being executed", **_NC),
     _measure("nc_feed", "mm/min", "nc.feed_mm_min", "feed along the path", **_NC),
     _measure("nc_feed_override", "1", "nc.feed_override", "feed override, 1 is 100 %", **_NC),
     _measure("nc_rapid_override", "1", "nc.rapid_override", "rapid override, 1 is 100 %", **_NC),
@@ -175,28 +175,28 @@ AXIS: tuple[Item, ...] = (
     _count("windows_accepted", "axes.{axis}.accepted", "rapids that passed all checks"),
     _count("windows_refused", "axes.{axis}.refused", "rapids that were refused"),
     _flag("last_rapid_accepted", f"{_LAST}.accepted", "whether the last rapid passed all checks"),
-    _measure("last_rapid_fit", "%", f"{_LAST}.fit_percent", "how much of the last rapid's speed the model explains"),
+    _measure("last_rapid_fit", "%", f"{_LAST}.fit_percent", "share of the last rapid's speed that the model explains"),
     _text("last_rapid_reasons", f"{_LAST}.reasons", "why the last rapid was refused", shown=_joined),
-    _measure("unexplained", "um", "axes.{axis}.unexplained_um", "what the model leaves of a rapid at the table (RMS)"),
-    _text("warnings", "axes.{axis}.warnings", "what the model does not have", shown=_joined),
+    _measure("unexplained", "um", "axes.{axis}.unexplained_um", "residual error of a rapid at the table (RMS)"),
+    _text("warnings", "axes.{axis}.warnings", "deficiencies of the model", shown=_joined),
     _measure("following_error", "um", f"{_SKILL}.measured_rms_um", "following error (RMS) in the last recorded move"),
-    _measure("prediction_error", "um", f"{_SKILL}.rms_um", "how far its prediction was off (RMS)"),
-    _measure("identified_at", "degC", "axes.{axis}.temperature_c", "temperature that the parameters belong to"),
+    _measure("prediction_error", "um", f"{_SKILL}.rms_um", "error of its prediction (RMS)"),
+    _measure("identified_at", "degC", "axes.{axis}.temperature_c", "temperature at the identification"),
     _measure("slideway", "degC", "axes.{axis}.slideway_c", "temperature of the slideway"),
-    _measure("samples_age", "s", "axes.{axis}.samples_s_ago", "how long ago the last samples came"),
-    _measure("offset", "um", "guard.offset_um.{axis}", "correction offset that was sent last", **_GUARD),
+    _measure("samples_age", "s", "axes.{axis}.samples_s_ago", "age of the last samples"),
+    _measure("offset", "um", "guard.offset_um.{axis}", "correction offset sent last", **_GUARD),
     _measure("may_stand", "um", "guard.may_stand_um.{axis}", "offset that may be applied in the drive", **_GUARD),
 )
 
-BUS: tuple[Item, ...] = (_measure("bus_load", "%", "bus_load_percent.{bus}", "how loaded the bus is"),)
+BUS: tuple[Item, ...] = (_measure("bus_load", "%", "bus_load_percent.{bus}", "load of the bus"),)
 
 
 def published(
     axes: Sequence[str], buses: Sequence[str], status: Mapping[str, Any] | None, now_ms: int
 ) -> tuple[Value, ...]:
-    """Return every published value by a status of the daemon, ``now_ms`` old; None: the daemon is silent."""
-    told: Mapping[str, Any] = {} if status is None else status
-    return tuple(_value(item, told, now_ms, axis, bus) for items, axis, bus in _places(axes, buses) for item in items)
+    """Return every published value of a status; None: the daemon is silent."""
+    known: Mapping[str, Any] = {} if status is None else status
+    return tuple(_value(item, known, now_ms, axis, bus) for items, axis, bus in _places(axes, buses) for item in items)
 
 
 def _places(axes: Sequence[str], buses: Sequence[str]) -> Iterator[tuple[tuple[Item, ...], str, str]]:
@@ -225,16 +225,16 @@ def _plain(value: Any) -> Plain:
 
 
 def alarms(status: Mapping[str, Any] | None) -> tuple[Alarm, ...]:
-    """Return what is wrong now, by the daemon; that it is silent itself is not among it."""
-    told: Mapping[str, Any] = {} if status is None else status
-    found = [Alarm(each["code"], each["severity"], each["text"], each["axis"]) for each in told.get("troubles", [])]
-    # a guard that moves an offset on purpose has something applied, too
-    if told.get("state") in ("OFF", "FROZEN", "lost") and _at(told, "may_stand.nothing") is False:
-        found.append(Alarm("OffsetStands", "MAJOR", f"{_at(told, 'may_stand.text')}; hold the feed, run fdhil adopt"))
-    if _at(told, "source.state") == "reconnecting":
-        found.append(Alarm("SourceLost", "MAJOR", "the machine's buses cannot be listened to; look at fdhil status"))
-    if fault := _at(told, "store.fault"):
-        found.append(Alarm("StoreFault", "MAJOR", f"{fault}: nothing is stored; look at fdhil status"))
+    """Return the active problems that the daemon reports; its own silence is not among them."""
+    known: Mapping[str, Any] = {} if status is None else status
+    found = [Alarm(each["code"], each["severity"], each["text"], each["axis"]) for each in known.get("troubles", [])]
+    # not while the guard itself moves an offset
+    if known.get("state") in ("OFF", "FROZEN", "lost") and _at(known, "may_stand.nothing") is False:
+        found.append(Alarm("OffsetStands", "MAJOR", f"{_at(known, 'may_stand.text')}; hold the feed, run fdhil adopt"))
+    if _at(known, "source.state") == "reconnecting":
+        found.append(Alarm("SourceLost", "MAJOR", "the machine's buses cannot be read; see fdhil status"))
+    if fault := _at(known, "store.fault"):
+        found.append(Alarm("StoreFault", "MAJOR", f"{fault}: nothing is stored; see fdhil status"))
     return tuple(found)
 
 
@@ -242,12 +242,12 @@ def events(status: Mapping[str, Any], now_ms: int) -> tuple[Event, ...]:
     """Return the newest notices of the daemon, oldest first."""
     return tuple(
         Event(
-            told["code"],
-            told["severity"],
-            told["text"],
-            told["axis"],
-            now_ms - round(1000 * told["age_s"]),
-            status["uptime_s"] - told["age_s"],
+            notice["code"],
+            notice["severity"],
+            notice["text"],
+            notice["axis"],
+            now_ms - round(1000 * notice["age_s"]),
+            status["uptime_s"] - notice["age_s"],
         )
-        for told in status.get("notices", [])
+        for notice in status.get("notices", [])
     )

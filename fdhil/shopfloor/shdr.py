@@ -1,7 +1,7 @@
-"""Says published values as lines of MTConnect's adapter protocol (SHDR), and what an agent must know of them. Pure.
+"""Formats published values as lines of MTConnect's adapter protocol (SHDR), and the agent's Devices.xml. Pure.
 
-Lines and levels: MTConnect part 5 and the adapter's guide of the reference agent. Names, units and the form of
-Devices.xml: MTConnect 2.0, part 2; a type or unit that the standard does not know has the prefix ``x:``.
+Lines and levels: MTConnect part 5 and the adapter guide of the reference agent. Names, units and the form of
+Devices.xml: MTConnect 2.0, part 2; types and units outside the standard have the prefix ``x:``.
 """
 
 import re
@@ -38,7 +38,7 @@ UNITS: Mapping[str, tuple[str, float]] = {
     "kg.m2": ("x:KILOGRAM_METER_SQUARED", 1.0),
     "N.m.s": ("x:NEWTON_METER_SECOND", 1.0),
 }
-# what the standard has a type for, or the world a word: type and sub-type
+# items with a type of the standard, or a common name: type and sub-type
 TYPES: Mapping[str, tuple[str, str]] = {
     "R": ("RESISTANCE", ""),
     "L": ("x:INDUCTANCE", ""),
@@ -59,7 +59,7 @@ IN_PERCENT = {"nc_feed_override", "nc_rapid_override"}
 
 @cache
 def key_of(name: str, axis: str = "", bus: str = "") -> str:
-    """Return the id of a data item: of letters, digits and underscores."""
+    """Return the id of a data item: letters, digits and underscores."""
     return re.sub(r"\W", "_", "_".join(filter(None, (axis or bus or "machine", name))), flags=re.ASCII)
 
 
@@ -69,30 +69,27 @@ def stamp(ms: int) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return text at which no line ends, and no field, and that an agent can write as XML."""
+    """Return text without line and field separators that an agent can write as XML."""
     return printable(" ".join(text.replace("|", "/").split()))
 
 
 def shown(item: Item, value: Plain) -> str:
-    """Return a value as a data item shows it, in its unit."""
+    """Format a value of a data item in its unit."""
     if value is None:
         return UNAVAILABLE
     if isinstance(value, bool):
         return str(value).upper()
     if isinstance(value, str):
         return _plain(value)
-    return f"{value * _factor(item):.12g}"
-
-
-def _factor(item: Item) -> float:
-    return 100.0 if item.name in IN_PERCENT else UNITS.get(item.unit, ("", 1.0))[1]
+    factor = 100.0 if item.name in IN_PERCENT else UNITS.get(item.unit, ("", 1.0))[1]
+    return f"{value * factor:.12g}"
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """All that the adapter says at one time: the text of each data item, and when it was so (Unix time in ms).
+    """Full state of the adapter: the text of each data item, and its time (Unix time in ms).
 
-    ``conditions`` has the active alarms of each condition by their code; None: nothing is known of it.
+    ``conditions`` has the active alarms of each condition by their code; None: unknown.
     """
 
     items: Mapping[str, str]
@@ -102,7 +99,7 @@ class Picture:
 
 
 def picture(news: News) -> Picture:
-    """Return what is to be said of an answer of the daemon, or of its silence."""
+    """Return the adapter state for an update, or for a silent daemon."""
     items = {AVAILABLE: UNAVAILABLE if news.silent else "AVAILABLE"}
     items |= {key_of(*value.key): shown(value.item, value.value) for value in news.values}
     stamps = {key_of(*value.key): value.stamp_ms for value in news.values}
@@ -119,14 +116,15 @@ def _level(alarm: Alarm) -> str:
 
 
 def lines(before: Picture | None, now: Picture) -> list[str]:
-    """Return the lines that lead an agent from ``before`` (None: it knows nothing) to ``now``."""
-    told = {} if before is None else before.items
-    changed = [(key, text) for key, text in now.items.items() if told.get(key) != text]
-    said = [f"{stamp(now.stamps.get(key, now.now_ms))}|{key}|{text}" for key, text in changed]
+    """Return the lines that bring an agent from ``before`` (None: it has nothing) to ``now``."""
+    sent = {} if before is None else before.items
+    changed = [(key, text) for key, text in now.items.items() if sent.get(key) != text]
+    result = [f"{stamp(now.stamps.get(key, now.now_ms))}|{key}|{text}" for key, text in changed]
     for key, active in now.conditions.items():
-        texts = _condition(None, active) if before is None else _changed(before.conditions[key], active)
-        said += [f"{stamp(now.now_ms)}|{key}|{text}" for text in texts]
-    return said
+        past = None if before is None else before.conditions[key]
+        texts = [] if before is not None and past == active else _condition(past, active)
+        result += [f"{stamp(now.now_ms)}|{key}|{text}" for text in texts]
+    return result
 
 
 def notice(event: Event) -> str:
@@ -134,12 +132,8 @@ def notice(event: Event) -> str:
     return f"{stamp(event.stamp_ms)}|{key_of(NOTICE, event.axis)}|{event.code}|{_plain(event.text)}"
 
 
-def _changed(past: Mapping[str, str] | None, active: Mapping[str, str] | None) -> list[str]:
-    return [] if past == active else _condition(past, active)
-
-
 def _condition(past: Mapping[str, str] | None, active: Mapping[str, str] | None) -> list[str]:
-    """Return what is said of a condition: that which is over by its code, or that all is well."""
+    """Return the lines of a condition: cleared codes and new alarms, or NORMAL for all."""
     if active is None:
         return [f"{UNAVAILABLE}||||"]
     if not active:
@@ -150,7 +144,7 @@ def _condition(past: Mapping[str, str] | None, active: Mapping[str, str] | None)
 
 
 def devices_xml(machine: str, uid: str, values: Iterable[Value], created_ms: int) -> str:
-    """Return the Devices.xml of an agent that listens to this adapter: every data item that it will ever name."""
+    """Return the Devices.xml of an agent of this adapter, with every data item that it may send."""
     listed = list(values)
     axes = dict.fromkeys(value.axis for value in listed if value.axis)
     root = Element("MTConnectDevices", {"xmlns": SCHEMA, "xmlns:x": OWN_SCHEMA})
@@ -166,7 +160,7 @@ def devices_xml(machine: str, uid: str, values: Iterable[Value], created_ms: int
     name = re.sub(r"\W", "_", machine, flags=re.ASCII)
     identity = {"id": "fdhil", "name": name, "uuid": uid or default_uuid(machine)}
     device = SubElement(SubElement(root, "Devices"), "Device", identity)
-    SubElement(device, "Description").text = f"feed drives of {machine}, as fdhil knows them"
+    SubElement(device, "Description").text = f"feed drives of {machine}, as monitored by fdhil"
     own = SubElement(device, "DataItems")
     SubElement(own, "DataItem", {"category": "EVENT", "id": AVAILABLE, "type": "AVAILABILITY"})
     _listed(own, [value for value in listed if not value.axis], "")
@@ -180,7 +174,7 @@ def devices_xml(machine: str, uid: str, values: Iterable[Value], created_ms: int
 
 
 def default_uuid(machine: str) -> str:
-    """Return the UUID of a machine that was given none: the same for the same name, always."""
+    """Return the UUID of a machine without a configured one: always the same for the same name."""
     return str(uuid.uuid5(uuid.NAMESPACE_URL, f"urn:fdhil:{machine}"))
 
 
@@ -192,17 +186,17 @@ def _listed(parent: Element, values: Iterable[Value], axis: str) -> None:
 
 
 def _described(value: Value) -> dict[str, str]:
-    """Return the attributes of a data item; what has a unit that is none of a share or a count is a sample."""
+    """Return the attributes of a data item; it is a SAMPLE when it has a unit other than a share or a count."""
     item = value.item
     name, _, end = item.name.partition("_")
     interval = name in TYPES and end in ("low", "high")
     kind, sub = TYPES[name] if interval else TYPES.get(item.name, (f"x:{item.name.upper()}", ""))
     sub = f"x:INTERVAL_{end.upper()}" if interval else sub
     unit = UNITS[item.unit][0] if item.kind == "measure" and item.unit in UNITS else ""
-    told = {
+    attributes = {
         "category": "SAMPLE" if unit else "EVENT",
         "id": key_of(*value.key),
         "name": key_of(*value.key),
         "type": kind,
     }
-    return told | ({"subType": sub} if sub else {}) | ({"units": unit} if unit else {})
+    return attributes | ({"subType": sub} if sub else {}) | ({"units": unit} if unit else {})

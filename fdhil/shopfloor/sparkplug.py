@@ -1,7 +1,7 @@
-"""Speaks Sparkplug B as an edge node: topics, payloads, birth and death certificates, sequence numbers. Pure.
+"""Implements a Sparkplug B edge node: topics, payloads, birth and death certificates, sequence numbers. Pure.
 
-The field numbers of the payload, the data types and the order of the messages are those of the Eclipse Sparkplug
-specification 3.0, chapters 4 to 6. An edge node is a machine, its devices are the axes.
+Field numbers, data types and the order of messages follow the Eclipse Sparkplug specification 3.0, chapters 4 to 6. An
+edge node is a machine, its devices are the axes.
 """
 
 import json
@@ -17,7 +17,7 @@ from google.protobuf.message import DecodeError
 NAMESPACE = "spBv1.0"
 REBIRTH = "Node Control/Rebirth"
 BIRTH_DEATH = "bdSeq"
-WRAP = 256  # seq and bdSeq go from 0 to 255
+WRAP = 256  # range of seq and bdSeq, 0 to 255
 INT64, DOUBLE, BOOLEAN, STRING = 4, 10, 11, 12
 UNIT = "engUnit"
 DESCRIPTION = "Documentation"
@@ -40,9 +40,9 @@ _FIELDS: Mapping[str, tuple[tuple[int, str, str], ...]] = {
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """One value of the node or of a device: ``datatype`` as Sparkplug numbers it, ``stamp_ms`` since 1970 in UTC.
+    """One value of the node or of a device: ``datatype`` as numbered by Sparkplug, ``stamp_ms`` since 1970 in UTC.
 
-    An ``event`` is told again where its value is the one before and its stamp is not.
+    An ``event`` is sent again where its value is unchanged but its stamp is not.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Metric:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """What is published on the broker; nothing of an edge node is retained."""
+    """An MQTT message; nothing of an edge node is retained."""
 
     topic: str
     payload: bytes
@@ -64,16 +64,16 @@ class Message:
 
 
 class EdgeNode:
-    """The session of one edge node with a broker, over as many connections as it takes.
+    """The session of one edge node with a broker, across connections.
 
-    It is asked in the order of the specification: ``will`` before each connection, ``births`` after it (and when a
-    host asks for them again), then ``news`` as often as wanted, ``death`` before the connection is closed on purpose.
+    The order of calls is that of the specification: ``will`` before each connection, ``births`` after it (and when a
+    host requests them), then ``news`` repeatedly, ``death`` before the connection is closed on purpose.
     """
 
     def __init__(self, group: str, node: str) -> None:
         self._group, self._node = group, node
         self._aliases: dict[tuple[str, str], int] = {}
-        self._told: dict[str, dict[str, Metric]] = {}  # of the node ("") and of each device that was born
+        self._sent: dict[str, dict[str, Metric]] = {}  # by device that was born, "" the node
         self._seq = 0
         self._bd_seq = -1
 
@@ -82,7 +82,7 @@ class EdgeNode:
         return "/".join((NAMESPACE, self._group, verb, self._node, *([device] if device else [])))
 
     def will(self, now_ms: int) -> Message:
-        """Begin a new connection: return the death certificate that the broker publishes where we cannot."""
+        """Begin a new connection: return the death certificate that the broker publishes when the connection breaks."""
         self._bd_seq = (self._bd_seq + 1) % WRAP
         return self.death(now_ms)
 
@@ -91,52 +91,52 @@ class EdgeNode:
         return Message(self.topic("NDEATH"), _payload(now_ms, None, [_fields(self._birth_death(now_ms))]), qos=1)
 
     def births(self, node: Iterable[Metric], devices: Mapping[str, Iterable[Metric]], now_ms: int) -> list[Message]:
-        """Return the birth certificates of the node and of its devices, with everything that is known."""
-        self._told, self._seq = {}, -1
+        """Return the birth certificates of the node and its devices, with all known metrics."""
+        self._sent, self._seq = {}, -1
         rebirth = Metric(REBIRTH, BOOLEAN, False, now_ms, description="write true to have all births sent again")
         own = [_fields(self._birth_death(now_ms)), _fields(rebirth)]
         born = [self._born("", list(node), now_ms, own)]
         return born + [self._born(device, list(metrics), now_ms, []) for device, metrics in devices.items()]
 
     def news(self, node: Iterable[Metric], devices: Mapping[str, Iterable[Metric]], now_ms: int) -> list[Message]:
-        """Return what has changed since the last call: values, devices that went silent, and those that are back.
+        """Return the changes since the last call: values, devices that became silent, and returning ones.
 
-        A device that is not listed is silent. What gains a value that its birth did not name is born again.
+        A device that is not listed is silent. One with a metric that its birth did not name is born again.
         """
         now = {device: list(metrics) for device, metrics in devices.items()}
         if self._outgrown("", own := list(node)):
             return self.births(own, now, now_ms)
-        silent = [device for device in self._told if device and device not in now]
+        silent = [device for device in self._sent if device and device not in now]
         messages = [message for message in [self._changed("", own, now_ms)] if message is not None]
         for device in silent:
-            del self._told[device]
+            del self._sent[device]
             messages.append(Message(self.topic("DDEATH", device), _payload(now_ms, self._next(), [])))
         for device, metrics in now.items():
-            if device not in self._told or self._outgrown(device, metrics):
+            if device not in self._sent or self._outgrown(device, metrics):
                 messages.append(self._born(device, metrics, now_ms, []))
             elif (changed := self._changed(device, metrics, now_ms)) is not None:
                 messages.append(changed)
         return messages
 
     def _outgrown(self, device: str, metrics: list[Metric]) -> bool:
-        told = self._told.get(device, {})
-        return any(m.name not in told or told[m.name].datatype != m.datatype for m in metrics)
+        sent = self._sent.get(device, {})
+        return any(m.name not in sent or sent[m.name].datatype != m.datatype for m in metrics)
 
     def _born(self, device: str, metrics: list[Metric], now_ms: int, own: Sequence[Mapping[str, Any]]) -> Message:
         seq = self._next()
-        self._told[device] = {metric.name: metric for metric in metrics}
+        self._sent[device] = {metric.name: metric for metric in metrics}
         named = [{**_fields(metric), "alias": self._alias(device, metric.name)} for metric in metrics]
         return Message(self.topic("DBIRTH" if device else "NBIRTH", device), _payload(now_ms, seq, [*own, *named]))
 
     def _changed(self, device: str, metrics: list[Metric], now_ms: int) -> Message | None:
-        """Return what is new by alias alone; None where nothing is. A value that is no longer told is null."""
-        told = self._told[device]
+        """Return changed metrics by alias; None where nothing changed. A metric that is gone becomes null."""
+        sent = self._sent[device]
         still = {metric.name for metric in metrics}
-        gone = [replace(old, value=None, stamp_ms=now_ms) for name, old in told.items() if name not in still]
-        new = [metric for metric in (*metrics, *gone) if _is_new(metric, told[metric.name])]
+        gone = [replace(old, value=None, stamp_ms=now_ms) for name, old in sent.items() if name not in still]
+        new = [metric for metric in (*metrics, *gone) if _is_new(metric, sent[metric.name])]
         if not new:
             return None
-        told.update({metric.name: metric for metric in new})
+        sent.update({metric.name: metric for metric in new})
         by_alias = [{**_value_of(m), "alias": self._alias(device, m.name), "timestamp": m.stamp_ms} for m in new]
         return Message(self.topic("DDATA" if device else "NDATA", device), _payload(now_ms, self._next(), by_alias))
 
@@ -152,7 +152,7 @@ class EdgeNode:
 
 
 def wants_rebirth(payload: bytes) -> bool:
-    """Whether a command asks for the births; every other command is none that is honoured here."""
+    """Return whether a command requests the births; every other command is ignored."""
     command = _classes()["Payload"]()
     try:
         command.ParseFromString(payload)
@@ -163,41 +163,41 @@ def wants_rebirth(payload: bytes) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class HostState:
-    """What a primary host application says of itself, and when (ms since 1970)."""
+    """State of a primary host application, and its time (ms since 1970)."""
 
     online: bool
     stamp_ms: int
 
 
 def host_topic(host: str) -> str:
-    """Return the topic on which a primary host application says that it is there."""
+    """Return the topic on which a primary host application publishes its state."""
     return f"{NAMESPACE}/STATE/{host}"
 
 
 def host_state(payload: bytes) -> HostState | None:
-    """Read the state of a host application; None for what is none."""
+    """Parse the state of a host application; None when it is invalid."""
     try:
-        told = json.loads(payload)
-        online, stamp_ms = told["online"], told["timestamp"]
+        document = json.loads(payload)
+        online, stamp_ms = document["online"], document["timestamp"]
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
     whole = isinstance(online, bool) and isinstance(stamp_ms, int)
     return HostState(online, stamp_ms) if whole else None
 
 
-def _is_new(metric: Metric, told: Metric) -> bool:
-    return _value_of(metric) != _value_of(told) or (metric.event and metric.stamp_ms != told.stamp_ms)
+def _is_new(metric: Metric, sent: Metric) -> bool:
+    return _value_of(metric) != _value_of(sent) or (metric.event and metric.stamp_ms != sent.stamp_ms)
 
 
 def _fields(metric: Metric) -> dict[str, Any]:
     pairs = [(UNIT, metric.unit), (DESCRIPTION, metric.description)]
     properties = [(key, text) for key, text in pairs if text]
-    told = {
+    property_set = {
         "keys": [key for key, _ in properties],
         "values": [{"type": STRING, "string_value": text} for _, text in properties],
     }
     named = {"name": metric.name, "timestamp": metric.stamp_ms, "datatype": metric.datatype, **_value_of(metric)}
-    return {**named, "properties": told} if properties else named
+    return {**named, "properties": property_set} if properties else named
 
 
 def _value_of(metric: Metric) -> dict[str, Any]:
@@ -206,11 +206,11 @@ def _value_of(metric: Metric) -> dict[str, Any]:
         return {"is_null": True}
     if metric.datatype == BOOLEAN:
         return {"boolean_value": bool(value)}
-    if metric.datatype == INT64:  # the bits of a signed number, as a number without a sign
+    if metric.datatype == INT64:  # two's complement as an unsigned number
         return {"long_value": int(value) % 2**64}
     if metric.datatype == DOUBLE:
         return {"double_value": float(value)}
-    # half a character, as of a file name that is no UTF-8, cannot be sent
+    # surrogates, as in file names that are not UTF-8, cannot be sent
     return {"string_value": str(value).encode("utf-8", "replace").decode()}
 
 

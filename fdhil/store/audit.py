@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.errors import StoreError
+from fdhil.json_lines import decode_line, encode_line
 from fdhil.store.atomic import store_error, sync_folder, write_all
 from fdhil.store.rows import Stamp
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
@@ -41,7 +42,7 @@ def append(folder: Path, entry: Mapping[str, Any], clock: Clock = SYSTEM_CLOCK) 
             stamp = Stamp.now(clock)
             time_utc = datetime.fromtimestamp(stamp.wall_s, UTC).isoformat(timespec="milliseconds")
             body = {"time": time_utc, "boot": stamp.boot, "monotonic_ns": stamp.monotonic_ns, **entry}
-            line = json.dumps({**body, "seal": _seal(before, body)}).encode() + b"\n"
+            line = encode_line({**body, "seal": _seal(before, body)})
             write_all(descriptor, line if whole else b"\n" + line)
             os.fsync(descriptor)
             if before == BEGIN:
@@ -89,10 +90,7 @@ def _last_seal(descriptor: int) -> tuple[str, bool]:
 
 def _seal_of(line: bytes) -> str:
     """Return a line's own seal; without one its SHA-256, so that the chain continues and shows the damage."""
-    try:
-        seal = json.loads(line)["seal"]
-    except (ValueError, KeyError, TypeError, RecursionError):
-        seal = None
+    seal = (decode_line(line) or {}).get("seal")
     return seal if isinstance(seal, str) else hashlib.sha256(line).hexdigest()
 
 
@@ -117,11 +115,8 @@ def entries(folder: Path) -> Iterator[tuple[dict[str, Any], str | None]]:
 
 
 def _read(line: bytes, before: str) -> tuple[dict[str, Any], str | None]:
-    try:
-        body = json.loads(line)
-    except (ValueError, RecursionError):
-        body = None
-    if not isinstance(body, dict):
+    body = decode_line(line)
+    if body is None:
         return {"line": line[:200].decode("utf-8", "replace")}, BROKEN
     seal = body.pop("seal", None)
     return body, None if seal == _seal(before, body) else BROKEN

@@ -1,4 +1,4 @@
-"""The bridge between HAL pins and a CANopen bus: samples, frames, and which cycle an offset takes effect in."""
+"""The bridge from HAL pins to a CANopen bus: samples, frames, and the cycle in which an offset takes effect."""
 
 from __future__ import annotations
 
@@ -76,7 +76,6 @@ def test_a_value_that_is_no_number_is_far_out_of_range() -> None:
 
 
 def test_frames_are_those_of_profile_hal() -> None:
-    """What the bridge packs is what the drivers unpack: lengths by the profile, SYNC behind the set-points."""
     axes = read_axes(document())
     frames = list(frames_of(10, axes, [AxisReader(axis).sample(VALUE) for axis in axes]))
     profile = load_profile(Drive.model_validate({"source": "hal", "hal": PINS}))
@@ -87,8 +86,6 @@ def test_frames_are_those_of_profile_hal() -> None:
 
 
 class Streamer:
-    """HAL's streamer and sampler, one cycle at a time, with two axes that are always answered alike."""
-
     def __init__(self) -> None:
         self.queue = OffsetQueue(read_axes(document()), LEAD)
         self.waiting: list[tuple[int, list[float]]] = []
@@ -96,7 +93,6 @@ class Streamer:
         self.seen: dict[int, float] = {}
 
     def run(self, cycles: int, offset: Mapping[int, int] | None = None, late: int = 3) -> None:
-        """Run cycles; the SYNC of each is answered ``late`` cycles later, by the increments for when it acts."""
         for _ in range(cycles):
             self.cycle += 1
             empty = not self.waiting

@@ -1,4 +1,4 @@
-"""The bridge without LinuxCNC: which cycles it tells, at what time, and that no listener can hold it up."""
+"""The bridge without LinuxCNC: published cycles, their time, and listeners that cannot delay it."""
 
 from __future__ import annotations
 

@@ -213,7 +213,7 @@ def test_a_daemon_that_may_not_be_asked_is_not_told_to_be_away(machine: Path) ->
         command = [*HEEDING_MODES, sys.executable, "-m", "fdhil", "status", str(machine)]
         done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (3, "")
-    assert "daemon: may not be asked by this user (Permission denied), so that whether it runs is not" in done.stderr
+    assert "daemon: does not accept this user (Permission denied), so that it is unknown whether it runs" in done.stderr
     assert "start it" not in done.stderr
 
 
@@ -281,9 +281,9 @@ NOTICE = {"number": 41, "time": "2026-11-22T13:47:00+00:00", "axis": "X", "code"
 
 
 def test_notices_are_acknowledged_by_their_numbers(machine: Path, capsys: Any) -> None:
-    with answering(machine, {"ok": True, "text": "notice 41 acknowledged by me; 0 more wait"}) as asked:
+    with answering(machine, {"ok": True, "text": "notice 41 acknowledged by me; 0 more are open"}) as asked:
         code, out, _ = fdhil("acknowledge", machine, "41", "--note", "seen", capsys=capsys)
-    assert (code, out) == (0, "notice 41 acknowledged by me; 0 more wait\n")
+    assert (code, out) == (0, "notice 41 acknowledged by me; 0 more are open\n")
     (request,) = asked
     assert (request["request"], request["notices"], request["note"]) == ("acknowledge", [41], "seen")
     assert request["by"]

@@ -1,1 +1,1 @@
-"""Crash consistency: what was acknowledged is there, whatever call of the system failed or ended the process."""
+"""Crash consistency: acknowledged records survive any system call that fails or is the last one."""

@@ -1,6 +1,6 @@
-"""The guard ramps down while the wall clock of its process is wrong, or is set; its frames are compared.
+"""Compares the guard's ramp-down frames while the wall clock of its process is wrong, or is set.
 
-The clock is that of Debian's libfaketime, for the guard's process alone; its monotonic clock is left alone.
+The clock is that of Debian's libfaketime, for the guard's process alone; its monotonic clock is unchanged.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ CLOCKS: Mapping[str, tuple[str, str, str]] = {
 
 
 def ramp(folder: Path, clock: tuple[str, str, str]) -> list[tuple[int, ...]]:
-    """Return the offsets that the guard sends from a row of the path on, until they are 0, through a fault on it."""
     folder.mkdir(parents=True)
     shown = folder / "clock"
     shown.write_text(clock[0])
@@ -60,7 +59,6 @@ def ramp(folder: Path, clock: tuple[str, str, str]) -> list[tuple[int, ...]]:
 
 @contextmanager
 def _environment(**names: str) -> Iterator[None]:
-    """Give the processes that are started in the block these names."""
     names |= {"FAKETIME_DONT_FAKE_MONOTONIC": "1", "DONT_FAKE_MONOTONIC": "1"}
     os.environ.update(names)
     try:

@@ -1,4 +1,4 @@
-"""The daemon itself as a kind of record: it hears rapids, and what its store took without a fault is acknowledged."""
+"""The daemon as a kind of record: it receives rapids; those its store took without a fault are acknowledged."""
 
 from __future__ import annotations
 
@@ -23,19 +23,15 @@ SETS = 100_000  # what a revision is numbered from, so that it is no rapid
 
 
 class Daemon:
-    """What a daemon left in its store."""
-
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.said: list[str] = []
 
     def keep(self, number: int) -> None:
-        """Run a daemon until it has heard its rapids; ``number`` is not the daemon's."""
         del number
         _run(self.folder, lambda **_: None)
 
     def found(self) -> set[int]:
-        """Return the rapids, whole with their files, and the published sets."""
         if not (self.folder / FILE_NAME).exists():
             return set()
         with History.read(self.folder) as history:
@@ -45,14 +41,17 @@ class Daemon:
             if (window := believed(self.folder / WINDOWS_FOLDER / row.file)) is not None:
                 assert window.start_tick == row.start_tick
                 whole.append(row.start_tick)
-        return {*whole, *(row.start_tick for row in windows[:-RAPIDS]), *(SETS + told.set.revision for told in sets)}
+        return {
+            *whole,
+            *(row.start_tick for row in windows[:-RAPIDS]),
+            *(SETS + result.set.revision for result in sets),
+        }
 
     def close(self) -> None:
         """Nothing is open."""
 
 
 def run_daemon(folder: Path, tell: Callable[..., None]) -> None:
-    """Run a daemon in this process; what it refuses, its start included, is told."""
     try:
         _run(folder, tell)
     except InternalError as error:
@@ -66,12 +65,11 @@ def _run(folder: Path, tell: Callable[..., None]) -> None:
 
 
 async def _served(config: MachineConfig, tell: Callable[..., None]) -> None:
-    """Run a daemon until it has heard its rapids; no signal stops it, whose byte to the loop would be a write too."""
-    daemon, loop, heard = Service(config, Machine(rapids(config, count=RAPIDS)).open), asyncio.get_running_loop(), 0
+    daemon, loop, received = Service(config, Machine(rapids(config, count=RAPIDS)).open), asyncio.get_running_loop(), 0
     before = OutcomeStore.keep
 
     def keep(self: OutcomeStore, outcomes: Sequence[Outcome]) -> list[Notice]:
-        nonlocal heard
+        nonlocal received
         notices = before(self, outcomes)
         for number in map(_number, outcomes) if self.fault is None else ():
             if number is not None:
@@ -79,8 +77,8 @@ async def _served(config: MachineConfig, tell: Callable[..., None]) -> None:
         for notice in notices:
             if notice.severity == "MAJOR":
                 tell(refused=notice.text)
-        heard += sum(isinstance(outcome, WindowOutcome) for outcome in outcomes)
-        if heard >= RAPIDS:
+        received += sum(isinstance(outcome, WindowOutcome) for outcome in outcomes)
+        if received >= RAPIDS:
             loop.call_soon_threadsafe(daemon._stop.set)
         return notices
 

@@ -1,6 +1,6 @@
-"""A process that keeps records on a disk of its own, which becomes full or read-only; and the start after that.
+"""Keeps records on a private disk that becomes full or read-only, and starts again after that.
 
-The disk is in memory and in a name space of the process: nobody else sees it, and it is gone with the process.
+The disk is in memory, in a name space of the process: it is invisible to others and ends with the process.
 """
 
 from __future__ import annotations
@@ -23,8 +23,6 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def filled(make: Make, folder: Path, free_bytes: int) -> Told:
-    """Keep a record, some more with so many bytes left, one more start on the full disk, and the next with room."""
-
     def work(tell: Callable[..., None]) -> None:
         disk = _mounted(folder)
         _keep(make, disk, 1, tell)
@@ -39,8 +37,6 @@ def filled(make: Make, folder: Path, free_bytes: int) -> Told:
 
 
 def read_only(make: Make, folder: Path) -> Told:
-    """Keep records, start and keep on while the disk is read-only, and start again when it is not."""
-
     def work(tell: Callable[..., None]) -> None:
         disk = _mounted(folder)
         for number in (1, 2):
@@ -54,7 +50,6 @@ def read_only(make: Make, folder: Path) -> Told:
 
 
 def _keep(make: Make, disk: Path, number: int, tell: Callable[..., None]) -> None:
-    """Start, keep a record, and end."""
     try:
         keeper = make(disk)
         try:
@@ -68,7 +63,6 @@ def _keep(make: Make, disk: Path, number: int, tell: Callable[..., None]) -> Non
 
 
 def _mounted(folder: Path) -> Path:
-    """Mount a disk of this process' own; return the folder of a store on it. OSError."""
     uid, gid = os.getuid(), os.getgid()
     _called(_libc.unshare(NEW_SPACE | (NEW_USER if uid else 0)))
     if uid:
@@ -92,7 +86,6 @@ def _called(result: int) -> None:
 
 
 def _fill(ballast: Path, free_bytes: int) -> None:
-    """Write until the disk is full, but for so many bytes."""
     with ballast.open("wb", buffering=0) as file, contextlib.suppress(OSError):
         while file.write(bytes(1 << 14)):
             pass

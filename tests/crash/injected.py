@@ -1,7 +1,7 @@
-"""A process that keeps records while strace has one of its calls fail, lie or end it; and the start after that.
+"""Keeps records while strace makes one system call fail, return short or end the process; then starts again.
 
-The process is forked from this one, where all is loaded already, so that one run takes a tenth of a second. Its calls
-are counted from the moment it is told to go on. What it acknowledges goes out by a socket, whose calls are left alone.
+The process is forked from this one, where everything is loaded, so that one run takes a tenth of a second. Its calls
+are counted from the start command on. Acknowledgements leave by a socket, whose calls are not affected.
 """
 
 from __future__ import annotations
@@ -45,8 +45,6 @@ Work = Callable[[Path, Callable[..., None]], None]
 
 @dataclass
 class Told:
-    """What a process said before it ended: the numbers it acknowledged, what it refused, what nobody foresaw."""
-
     kept: list[int] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     found: list[int] = field(default_factory=list)
@@ -56,38 +54,32 @@ class Told:
 
 
 def injection(call: str, nth: int, fault: str) -> str:
-    """Return strace's option for a fault at the nth such call."""
     return f"inject={call}:{FAULTS[fault]}:when={nth}{'+' if fault == 'full from then on' else ''}"
 
 
 def faults_of(call: str) -> Sequence[str]:
-    """Return the faults that a call can have: only a write can be short, and a disk is full where it grows."""
     grows = call in (*WRITES, "openat", "mkdir", "rename", "link")
     left_out = {*(() if call in WRITES else ("wrote nothing", "lied of 3 bytes")), "" if grows else "full from then on"}
     return [fault for fault in FAULTS if fault not in left_out]
 
 
 def kept_under(work: Work, folder: Path, inject: str | None, trace: Path) -> Told:
-    """Have a process do the work of keeping some records with a fault in it; the trace has its calls."""
     with _forked(lambda tell: work(folder, tell)) as (pid, ours), _traced(pid, inject, trace):
         ours.send(b"go")
         return _heard(ours)
 
 
 def looked_at(make: Make, folder: Path, number: int) -> Told:
-    """Start anew, say what is there, and keep one more."""
     return done_by(lambda tell: look(make, folder, number, tell))
 
 
 def done_by(work: Callable[[Callable[..., None]], None]) -> Told:
-    """Have a process do something and tell of it."""
     with _forked(work) as (_, ours):
         ours.send(b"go")
         return _heard(ours)
 
 
 def calls_of(trace: Path) -> Sequence[Counter[str]]:
-    """Return how often each thread of a trace made each call: strace counts a thread's calls by themselves."""
     threads: dict[str, Counter[str]] = {}
     for thread, call in re.findall(r"^(\d+) +(\w+)\(", trace.read_text("utf-8", "replace"), re.MULTILINE):
         threads.setdefault(thread, Counter())[call] += 1
@@ -95,13 +87,11 @@ def calls_of(trace: Path) -> Sequence[Counter[str]]:
 
 
 def was_injected(trace: Path) -> bool:
-    """Whether the fault came to pass."""
     text = trace.read_text("utf-8", "replace")
     return "(INJECTED)" in text or "killed by SIGKILL" in text
 
 
 def keep_some(make: Make, folder: Path, tell: Callable[..., None]) -> None:
-    """Keep some records; what is refused is told, and the next one is tried."""
     keeper = None
     for number in range(1, RECORDS + 1):
         try:
@@ -116,7 +106,6 @@ def keep_some(make: Make, folder: Path, tell: Callable[..., None]) -> None:
 
 
 def look(make: Make, folder: Path, number: int, tell: Callable[..., None]) -> None:
-    """Start anew in this process, tell what is there, and keep one more."""
     keeper = make(folder)
     if folder.exists():
         for one in _numbers(keeper):
@@ -136,7 +125,6 @@ def _numbers(keeper: Keeper) -> list[int]:
 
 @contextlib.contextmanager
 def _forked(work: Callable[[Callable[..., None]], None]) -> Iterator[tuple[int, socket.socket]]:
-    """Fork a process that does ``work`` when it is told to; kill it when the block is left."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     pid = os.fork()
     if pid == 0:
@@ -154,8 +142,6 @@ def _forked(work: Callable[[Callable[..., None]], None]) -> Iterator[tuple[int, 
 
 
 def _child(work: Callable[[Callable[..., None]], None], theirs: socket.socket) -> None:
-    """Do the work and tell what nobody foresaw; never returns."""
-
     def tell(**what: Any) -> None:
         theirs.send(json.dumps(what).encode())
 
@@ -173,7 +159,6 @@ def _child(work: Callable[[Callable[..., None]], None], theirs: socket.socket) -
 
 @contextlib.contextmanager
 def _traced(pid: int, inject: str | None, trace: Path) -> Iterator[None]:
-    """Have strace follow a process from now on."""
     options = ["-f", "-o", str(trace), "-e", f"trace={','.join(CALLS)}", *(("-e", inject) if inject else ())]
     tracer = subprocess.Popen(["strace", *options, "-p", str(pid)], stderr=subprocess.PIPE, text=True)
     assert tracer.stderr is not None
@@ -188,15 +173,14 @@ def _traced(pid: int, inject: str | None, trace: Path) -> Iterator[None]:
 
 
 def _heard(ours: socket.socket) -> Told:
-    """Hear a process until it ends."""
-    told = Told()
-    while not told.wrong and (message := _message(ours)):
+    result = Told()
+    while not result.wrong and (message := _message(ours)):
         for key, value in json.loads(message).items():
             if key == "ended":
-                told.ended = True
+                result.ended = True
             else:
-                getattr(told, key).append(value)
-    return told
+                getattr(result, key).append(value)
+    return result
 
 
 def _message(ours: socket.socket) -> bytes:

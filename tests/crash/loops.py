@@ -1,7 +1,7 @@
-"""Every call of a process that keeps records fails, lies or ends it, one after the other; what is there then is judged.
+"""Makes every system call of a process that keeps records fail, return short or end it, and checks the result.
 
-A record that was acknowledged and is not there is lost. One that is there and is another one was believed half. The
-start that follows must do, or say plainly what to do.
+An acknowledged record that is missing is lost. One with other content was accepted half-written. The following start
+must succeed, or report clearly what to do.
 """
 
 from __future__ import annotations
@@ -36,8 +36,6 @@ MOST_TOLD = 20
 
 @dataclass
 class Found:
-    """What the runs of one kind of record found; ``wrong`` names what must not be."""
-
     calls: Counter[str] = field(default_factory=Counter)
     faults: int = 0  # that there are; ``tried`` of them
     tried: int = 0
@@ -51,8 +49,6 @@ class Found:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of record: how its store is opened, what a process does that keeps some, and what is kept afterwards."""
-
     make: Callable[[Path], Keeper]
     work: Work
     later: int = 9
@@ -63,21 +59,19 @@ KINDS["the daemon"] = Kind(Daemon, run_daemon, FIRST_RAPID)
 
 
 def tried(name: str, folder: Path, most: int | None = None) -> Found:
-    """Try a kind of record with each fault at each call, or at ``most`` of them by chance."""
     kind = KINDS[name]
     found, begun = Found(), _begun(kind, folder, name in BEGUN_BEFORE)
     for fault_at in _faults(begun, kind, folder, found, most):
         store, trace = folder / "store", folder / "trace"
         shutil.rmtree(store, ignore_errors=True)
         shutil.copytree(begun, store)
-        told = kept_under(kind.work, store, injection(*fault_at), trace)
+        result = kept_under(kind.work, store, injection(*fault_at), trace)
         if was_injected(trace):
-            _judged(fault_at, told, looked_at(kind.make, store, kind.later), found)
+            _judged(fault_at, result, looked_at(kind.make, store, kind.later), found)
     return found
 
 
 def _begun(kind: Kind, folder: Path, before: bool) -> Path:
-    """Return an empty store, or one that was begun ``before``; all that the work takes is loaded then."""
     used, begun = folder / "used", folder / "begun"
     for place in (used, begun):
         place.mkdir(parents=True)
@@ -91,12 +85,11 @@ def _begun(kind: Kind, folder: Path, before: bool) -> Path:
 
 
 def _faults(begun: Path, kind: Kind, folder: Path, found: Found, most: int | None) -> Iterator[tuple[str, int, str]]:
-    """Yield call, number and fault, for each call that a run makes without one."""
     store, trace = folder / "first", folder / "first.trace"
     shutil.copytree(begun, store)
-    told = kept_under(kind.work, store, None, trace)
-    assert told.ended, told
-    assert not told.refused, told
+    result = kept_under(kind.work, store, None, trace)
+    assert result.ended, result
+    assert not result.refused, result
     threads = calls_of(trace)
     found.calls = sum(threads, Counter())
     every = [
@@ -111,7 +104,6 @@ def _faults(begun: Path, kind: Kind, folder: Path, found: Found, most: int | Non
 
 
 def _judged(at: tuple[str, int, str], told: Told, after: Told, found: Found) -> None:
-    """Judge one run, and the start after it."""
     call, nth, fault = at
     found.runs[fault] += 1
     found.acknowledged += len(told.kept)
@@ -133,5 +125,4 @@ def _judged(at: tuple[str, int, str], told: Told, after: Told, found: Found) -> 
 
 
 def _is_plain(after: Told) -> bool:
-    """Whether a start that did not do said what to do: of what lied nobody can begin as if nothing had been."""
     return all(text.startswith("StoreError: ") and "; " in text for text in after.wrong)

@@ -1,4 +1,4 @@
-"""What was acknowledged is there after any call failed or was the last, and on full and read-only disks."""
+"""Acknowledged records are there after any failing or final call, and on full and read-only disks."""
 
 from __future__ import annotations
 
@@ -34,15 +34,11 @@ def test_what_was_acknowledged_outlives_any_call_that_fails_or_is_the_last(name:
 
 
 class Careless(Plain):
-    """Numbers in a file that is emptied before it is written anew."""
-
     def keep(self, number: int) -> None:
-        """Write all numbers so far."""
         numbers = {*self.found(), number}
         (self.folder / "numbers").write_text(" ".join(map(str, sorted(numbers))))
 
     def found(self) -> set[int]:
-        """Return the numbers."""
         file = self.folder / "numbers"
         return set(map(int, file.read_text().split())) if file.exists() else set()
 
@@ -63,22 +59,24 @@ def test_a_store_that_empties_a_file_before_it_writes_it_is_found_out(
 @pytest.mark.fault("F3")
 def test_a_full_disk_takes_nothing_back(name: str, tmp_path: Path) -> None:
     make = KEEPERS[name]
-    told = disks.filled(make, tmp_path, free_bytes=0)
-    assert (told.wrong, told.ended) == ([], True)
-    assert set(told.kept) - {9} <= set(told.found)
-    assert 1 in told.found
-    assert all("the disk is full" in text or "No space left" in text or "told before" in text for text in told.refused)
-    assert told.refused or name == "audit"  # a line may still fit into the page that the file has
+    result = disks.filled(make, tmp_path, free_bytes=0)
+    assert (result.wrong, result.ended) == ([], True)
+    assert set(result.kept) - {9} <= set(result.found)
+    assert 1 in result.found
+    assert all(
+        "the disk is full" in text or "No space left" in text or "told before" in text for text in result.refused
+    )
+    assert result.refused or name == "audit"  # a line may still fit into the page that the file has
 
 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("name", KEEPERS)
 @pytest.mark.fault("F5")
 def test_a_read_only_disk_takes_nothing_and_loses_nothing(name: str, tmp_path: Path) -> None:
-    told = disks.read_only(KEEPERS[name], tmp_path)
-    assert (told.wrong, told.ended) == ([], True)
-    assert (told.kept, {1, 2} <= set(told.found)) == ([1, 2, 9], True)
-    (text,) = told.refused
+    result = disks.read_only(KEEPERS[name], tmp_path)
+    assert (result.wrong, result.ended) == ([], True)
+    assert (result.kept, {1, 2} <= set(result.found)) == ([1, 2, 9], True)
+    (text,) = result.refused
     assert any(words in text for words in ("it is read-only", "Read-only file system", "told before"))
 
 
@@ -98,12 +96,9 @@ def test_steps_that_cannot_be_read_now_are_not_written_over(tmp_path: Path, monk
 @pytest.mark.fault("F9")
 def test_the_newest_black_box_stays_whatever_the_clock_shows(tmp_path: Path) -> None:
     class BackwardClock(Clock):
-        """A clock that goes back a day each time."""
-
         shown_s = datetime(2026, 11, 23, tzinfo=UTC).timestamp()
 
         def wall_s(self) -> float:
-            """Return what it shows."""
             self.shown_s -= timedelta(days=1).total_seconds()
             return self.shown_s
 

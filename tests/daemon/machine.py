@@ -1,4 +1,4 @@
-"""A machine for the daemon's tests: its drive really is the nominal one, and it shuttles at rapid speed."""
+"""A simulated machine for daemon tests: its drive is the nominal one, moving back and forth at rapid speed."""
 
 from __future__ import annotations
 
@@ -22,13 +22,12 @@ NOMINAL = AXIS["nominal"]
 
 
 def config_of(folder: Path, axes: Sequence[str] = ("X",), **sections: Any) -> MachineConfig:
-    """Return the bench's configuration with its store in ``folder``."""
     document = {"machine": {"name": "bench"}, "axis": dict.fromkeys(axes, bench_axis()), **sections}
     return machine_config.parse(document, "test", folder)
 
 
 def rapids(config: MachineConfig, axis: str = "X", count: int = 2, first_tick: int = 0) -> list[Record]:
-    """Return the records of ``count`` rapids, to and fro, in blocks of 40 samples with 0.4 s of rest between them."""
+    """Return the records of ``count`` rapids, back and forth, in blocks of 40 samples, with 0.4 s of standstill."""
     dt_s = config.machine.sync_period_s
     windows = [nominal_rapid(axis, config.axis[axis], dt_s, 1 if k % 2 == 0 else -1) for k in range(count)]
     rest = round(0.4 / dt_s)
@@ -73,7 +72,7 @@ def _blocks(axis: str, signals: dict[str, Any], events: list[MoveEvent], first_t
 
 
 class Machine:
-    """A source that yields what it is given, and more when ``give`` is called; ``fail`` makes it fail."""
+    """A source that yields given records, and more when ``give`` is called; ``fail`` makes it fail."""
 
     def __init__(self, records: Sequence[Record | NcState | Notice] = ()) -> None:
         self.queue: asyncio.Queue[Record | NcState | Notice | Exception] = asyncio.Queue()
@@ -83,13 +82,11 @@ class Machine:
         self.give(*records)
 
     def give(self, *records: Record | NcState | Notice | Exception) -> None:
-        """Let the source yield these next; an exception is raised in it."""
         for record in records:
             self.queue.put_nowait(record)
 
     @asynccontextmanager
     async def open(self, config: MachineConfig) -> AsyncIterator[Machine]:
-        """Open, unless it is ``unreachable`` for so many times."""
         if self.unreachable > 0:
             self.unreachable -= 1
             raise ConnectError("can0", "cannot be reached; check the wiring")
@@ -97,7 +94,6 @@ class Machine:
         yield self
 
     async def run(self, take: Callable[[Record | NcState | Notice], None]) -> None:
-        """Hand over what was given."""
         while True:
             record = await self.queue.get()
             if isinstance(record, Exception):
@@ -106,9 +102,7 @@ class Machine:
             take(record)
 
     def black_box(self) -> dict[str, str]:
-        """Return what was on the bus."""
         return {"can0": "(1.000000) can0 080#\n"}
 
     def counters(self) -> dict[str, int]:
-        """Return frames received and lost."""
         return {"frames": self.taken, "lost": 0}

@@ -1,4 +1,4 @@
-"""The real machine of the daemon's tests: the twin as a process, the daemon and the guard beside it."""
+"""The real processes for daemon tests: the simulator, the daemon and the guard."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ WAITS = {
 
 @contextmanager
 def patient() -> Iterator[None]:
-    """Wait long for a drive's answer by SDO, but not for a simulated drive to settle as a real one does."""
+    """Allow long SDO timeouts, but no settling time as of a real drive."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in WAITS.items():
             patch.setattr(f"fdhil.{name}", value)
@@ -57,8 +57,6 @@ def patient() -> Iterator[None]:
 
 @dataclass
 class Shop:
-    """A twin that runs, and the configuration of the machine that it is."""
-
     folder: Path
     twin: Twin
     path: Path
@@ -66,31 +64,26 @@ class Shop:
 
     @property
     def run_directory(self) -> Path:
-        """The folder of sockets and token."""
         assert self.config.store.run_directory is not None
         return self.config.store.run_directory
 
     def commission(self) -> None:
-        """Commission both axes; a twin on a busy host may take seconds for an answer."""
         with patient():
             for axis in self.config.axis:
                 save_record(commission(self.config, axis), self.config.store.directory)
 
     def daemon(self) -> Process:
-        """Start a daemon and wait until it listens."""
         daemon = Process("daemon", ["fdhil", "run", str(self.path)], self.folder / "daemon.log")
         self.wait(lambda: self.status() is not None, daemon)
         self.status_when(lambda s: s["source"]["state"] == "listening")
         return daemon
 
     def guard(self) -> Process:
-        """Start a guard and wait until it answers."""
         guard = Process("guard", ["fdhil.cli.guard", str(self.path)], self.folder / "guard.log")
         self.wait((self.run_directory / "guard.sock").exists, guard)
         return guard
 
     def wait(self, done: Any, process: Process | None = None) -> None:
-        """Wait until ``done()``, or a process has ended."""
         while not done():
             self.twin.check()
             if process is not None:
@@ -98,14 +91,12 @@ class Shop:
             time.sleep(0.05)
 
     def status(self) -> dict[str, Any] | None:
-        """Return the daemon's status, None while none runs."""
         try:
             return ask(self.run_directory / "daemon.sock", {"request": "status"}, timeout_s=500.0)
         except ConnectError:
             return None
 
     def status_when(self, ready: Any) -> dict[str, Any]:
-        """Return the first status for which ``ready`` holds."""
         found: dict[str, Any] = {}
 
         def done() -> bool:
@@ -116,18 +107,15 @@ class Shop:
         return found
 
     def told(self, words: str, times: int = 1) -> None:
-        """Wait until the daemon's log has said so for the n-th time, and what it told of is over."""
         log = self.folder / "daemon.log"
         self.wait(lambda: log.read_text().count(words) >= times)
         self.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
 
     def nc(self, on: bool) -> None:
-        """Switch the NC: with it come SYNC, NMT and enabled drives."""
         self.twin.command("nc", on=on)
         self.twin.event("nc")
 
     def play(self, name: str, program: str, **options: Any) -> dict[str, Any]:
-        """Write a program and let the NC play it."""
         path = self.folder / name
         path.write_text(program)
         return self.twin.play(path, **options)
@@ -135,7 +123,6 @@ class Shop:
 
 @contextmanager
 def opened(folder: Path, bench: str = BENCH) -> Iterator[Shop]:
-    """Start a twin whose tables are heavier than the data sheet says; ``bench`` is the text of its configuration."""
     (folder / "twin.toml").write_text(f'{bench}[bus.can0]\ninterface = "socketcand"\n')
     with Twin(folder / "twin.toml", folder / "twin.log") as twin:
         bus = twin.ready["buses"]["can0"]
@@ -146,10 +133,9 @@ def opened(folder: Path, bench: str = BENCH) -> Iterator[Shop]:
 
 
 def fdhil(*arguments: str | Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
-    """Run the command line as its entry point does, in this process; return exit code, stdout and stderr."""
     capsys.readouterr()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["fdhil", *map(str, arguments)])
         code = run_safely(cli)
-    said = capsys.readouterr()
-    return code, said.out, said.err
+    output = capsys.readouterr()
+    return code, output.out, output.err

@@ -1,4 +1,4 @@
-"""Who may ask the daemon for what, by the kernel's word, and what of it is in the audit."""
+"""Rights of the daemon's clients, as identified by the kernel, and the audit of their requests."""
 
 from __future__ import annotations
 
@@ -57,8 +57,6 @@ def test_what_is_not_listed_needs_the_most_and_whoever_may_look_may_disarm() -> 
 
 
 class Desk:
-    """Counts what reaches it."""
-
     def __init__(self) -> None:
         self.done: list[str] = []
 
@@ -80,10 +78,10 @@ async def test_every_request_without_the_role_is_refused_has_no_effect_and_is_in
         assert answer["ok"] == peer.may(what) == (what in desk.done)
         assert answer["ok"] or answer["code"] == "AuthRequired"
         await audited.written()
-    told = [(entry.get("asked") or entry["answered"], entry.get("result")) for entry, _ in audit.entries(tmp_path)]
-    refused = [what for what, result in told if result == "AuthRequired"]
+    reported = [(entry.get("asked") or entry["answered"], entry.get("result")) for entry, _ in audit.entries(tmp_path)]
+    refused = [what for what, result in reported if result == "AuthRequired"]
     assert refused == [what for what in (*NEEDS, "stop") if not peer.may(what)]
-    assert {what for what, result in told if result == "done"} == set(desk.done) - {"status", "live"}
+    assert {what for what, result in reported if result == "done"} == set(desk.done) - {"status", "live"}
     assert b"SECRET" not in b"".join(path.read_bytes() for path in tmp_path.iterdir())
 
 
@@ -103,7 +101,7 @@ async def test_who_acts_for_whom_is_written_before_it_is_done_and_the_answer_is_
     ]
     last = list(audit.entries(tmp_path))[-1][0]
     assert (last["answered"], last["result"], last["program"]) == ("arm", "ModelStale", "/p/part.ngc")
-    assert "fdhil-web (process 99) for anna asked to arm: ModelStale" in capsys.readouterr().err
+    assert "fdhil-web (process 99) for anna requested arm: ModelStale" in capsys.readouterr().err
 
 
 @pytest.mark.fault("F5")
@@ -117,7 +115,7 @@ async def test_what_cannot_be_written_down_is_not_done_but_disarming_is(
         assert answer["ok"] == (what in ("disarm", "stop"))
     await audited.written()
     assert desk.done == ["disarm", "stop"]
-    assert capsys.readouterr().err.count("is not in the audit") == 4
+    assert capsys.readouterr().err.count("could not be recorded in the audit log") == 4
 
 
 @pytest.mark.fault("F12")
@@ -165,8 +163,8 @@ async def test_of_who_may_not_ask_there_is_a_short_line_a_minute_whatever_he_ask
         for what in (*NEEDS, "stop", "anything"):
             for _ in range(10):
                 assert (await audited.of({**long, "request": what}, stranger))["code"] == "AuthRequired"
-    told = [entry.get("not_written", 0) for entry, _ in audit.entries(tmp_path)]
-    assert told == [0, 69, 69]
+    result = [entry.get("not_written", 0) for entry, _ in audit.entries(tmp_path)]
+    assert result == [0, 69, 69]
     await audited.written()
     assert sum(1 + entry.get("not_written", 0) for entry, _ in audit.entries(tmp_path)) == 210
     assert (tmp_path / audit.FILE_NAME).stat().st_size < 4000
@@ -181,8 +179,8 @@ async def test_what_ends_in_an_error_is_in_the_audit_too(tmp_path: Path) -> None
         with pytest.raises(ZeroDivisionError):
             await audited.of({"request": what}, owner)
     await audited.written()
-    told = [(entry["answered"], entry["result"]) for entry, _ in audit.entries(tmp_path) if "answered" in entry]
-    assert told == [("arm", "ZeroDivisionError"), ("disarm", "ZeroDivisionError")]
+    result = [(entry["answered"], entry["result"]) for entry, _ in audit.entries(tmp_path) if "answered" in entry]
+    assert result == [("arm", "ZeroDivisionError"), ("disarm", "ZeroDivisionError")]
 
 
 @pytest.mark.fault("F12")
@@ -198,7 +196,6 @@ async def test_requests_of_ever_new_and_long_names_fill_neither_the_disk_nor_the
 
 @pytest.fixture
 def open_folder() -> Iterator[Path]:
-    """A folder that every user may enter."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         folder.chmod(0o755)

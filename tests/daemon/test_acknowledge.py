@@ -1,4 +1,4 @@
-"""What an operator should know waits until somebody answers for it; who did, and when, is kept and told everywhere."""
+"""Notices stay open until an operator acknowledges them; name and time are stored and reported everywhere."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ async def test_a_notice_waits_until_somebody_answers_for_it_also_over_a_restart(
 ) -> None:
     config = config_of(tmp_path)
     async with serving(config, Machine([DOWN, BACK, DUE])) as path:
-        told = await status_when(path, lambda s: s["unacknowledged"]["count"] == 2)
-        assert told["unacknowledged"]["MAJOR"] == 1
-        assert [n["code"] for n in told["unacknowledged"]["newest"]] == ["BusDown", "MaintenanceDue"]
-        number = told["unacknowledged"]["newest"][0]["number"]
+        status = await status_when(path, lambda s: s["unacknowledged"]["count"] == 2)
+        assert status["unacknowledged"]["MAJOR"] == 1
+        assert [n["code"] for n in status["unacknowledged"]["newest"]] == ["BusDown", "MaintenanceDue"]
+        number = status["unacknowledged"]["newest"][0]["number"]
         answer = await _acknowledged(path, notices=[number], by="anna", note="plug was out")
         assert (answer["ok"], answer["acknowledged"]) == (True, [number])
-        told = await status_when(path, lambda s: True)
-        by_text = {notice["text"]: notice for notice in told["notices"]}
+        status = await status_when(path, lambda s: True)
+        by_text = {notice["text"]: notice for notice in status["notices"]}
         assert by_text[DOWN.text]["acknowledged"]["who"] == "anna"
         assert by_text[DUE.text]["acknowledged"] is None
         again = await _acknowledged(path, notices=[number], by="ben")
         assert (again["ok"], again["acknowledged"]) == (True, [])
     assert "notice 1 acknowledged by anna" in capsys.readouterr().err
     async with serving(config, Machine()) as path:
-        told = await status_when(path, lambda s: True)
-        assert [n["code"] for n in told["unacknowledged"]["newest"]] == ["MaintenanceDue"]
-        answer = await _acknowledged(path, up_to=told["unacknowledged"]["newest"][-1]["number"], by="ben")
+        status = await status_when(path, lambda s: True)
+        assert [n["code"] for n in status["unacknowledged"]["newest"]] == ["MaintenanceDue"]
+        answer = await _acknowledged(path, up_to=status["unacknowledged"]["newest"][-1]["number"], by="ben")
         assert answer["ok"]
     with History.read(config.store.directory) as history:
         known = {n.notice.text: n.acknowledged for n in history.notices() if n.notice.severity != "info"}
@@ -93,7 +93,7 @@ def test_only_the_newest_notices_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     book = NoticeBook()
     for number in range(1, 6):
         book.stored(DOWN, number, STAMP)
-    assert [told["number"] for told in book.status()["newest"]] == [3, 4, 5]
+    assert [result["number"] for result in book.status()["newest"]] == [3, 4, 5]
 
 
 def test_a_long_list_of_numbers_is_gone_through_a_few_times_however_many_wait() -> None:

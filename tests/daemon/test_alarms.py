@@ -1,4 +1,4 @@
-"""Alarms begin, end, chatter and are acknowledged as ISA-18.2 has it; they are made of notices alone."""
+"""Alarms begin, end, chatter and are acknowledged as in ISA-18.2; they derive from notices alone."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ def at(second: int) -> Stamp:
 
 
 def table(*notices: Notice) -> AlarmTable:
-    """Return the alarms of notices one second apart, numbered from 1."""
     return AlarmTable(StoredNotice(k, notice, at(k)) for k, notice in enumerate(notices, 1))
 
 
@@ -109,11 +108,11 @@ def test_store_that_works_again_ends_the_alarm_of_the_full_disk() -> None:
 async def test_alarm_of_a_daemon_that_ended_is_over_when_the_next_one_starts(tmp_path: Path) -> None:
     config = config_of(tmp_path)
     async with serving(config, Machine([LOST])) as path:
-        told = await status_when(path, lambda s: s["alarms"]["active"])
-        assert (told["alarms"]["first"][0]["code"], told["unacknowledged"]["count"]) == ("HeartbeatLost", 1)
+        status = await status_when(path, lambda s: s["alarms"]["active"])
+        assert (status["alarms"]["first"][0]["code"], status["unacknowledged"]["count"]) == ("HeartbeatLost", 1)
     async with serving(config, Machine()) as path:
-        told = await status_when(path, lambda s: s["alarms"]["first"][0]["until"])
-        assert (told["alarms"]["active"], told["alarms"]["unacknowledged"]) == (0, 1)
+        status = await status_when(path, lambda s: s["alarms"]["first"][0]["until"])
+        assert (status["alarms"]["active"], status["alarms"]["unacknowledged"]) == (0, 1)
 
 
 async def test_end_that_a_flood_held_back_is_stored_when_the_flood_is_over(
@@ -122,8 +121,8 @@ async def test_end_that_a_flood_held_back_is_stored_when_the_flood_is_over(
     monkeypatch.setattr(journal, "REFILL_PER_S", 20.0)
     config = config_of(tmp_path)
     async with serving(config, Machine([LOST, BACK] * 40)) as path:
-        told = await status_when(path, lambda s: s["alarms"]["first"] and not s["alarms"]["active"])
-        assert told["alarms"]["first"][0]["count"] < 40
+        status = await status_when(path, lambda s: s["alarms"]["first"] and not s["alarms"]["active"])
+        assert status["alarms"]["first"][0]["count"] < 40
         await status_when(path, lambda s: s["notices"][-1]["text"] == BACK.text)
     with History.read(config.store.directory) as history:
         assert history.notices()[-1].notice.severity == "info"

@@ -1,4 +1,4 @@
-"""The black box: the frames before a trip are kept, in a form that other tools read, and never in the way."""
+"""The black box: frames before a trip are stored in a standard format, without delaying anything."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def status(state: str, code: str = "") -> dict[str, Any]:
 @pytest.mark.parametrize("before", ["ARMED", "RAMPING", "ACTIVE", "HOLD", "FEEDFORWARD"])
 @pytest.mark.parametrize("after", ["RAMP_DOWN", "OFF", "FROZEN"])
 def test_what_ends_a_correction_is_a_trip(before: str, after: str) -> None:
-    told = _changes(status(before), status(after, "EchoMismatch"))
-    assert [notice.code for notice in told] == ["GuardState", TRIPPED]
-    assert (told[1].severity, told[1].axis, told[1].text) == ("MAJOR", "X", "EchoMismatch: why")
+    shown_status = _changes(status(before), status(after, "EchoMismatch"))
+    assert [notice.code for notice in shown_status] == ["GuardState", TRIPPED]
+    assert (shown_status[1].severity, shown_status[1].axis, shown_status[1].text) == ("MAJOR", "X", "EchoMismatch: why")
 
 
 @pytest.mark.parametrize(
@@ -97,19 +97,19 @@ def test_black_box_has_the_frames_of_all_buses_in_order_of_time(tmp_path: Path) 
 
 def test_a_dump_is_one_file_and_the_oldest_go(tmp_path: Path) -> None:
     for _ in range(11):
-        told = blackbox.dump(tmp_path, "SyncLost", lambda: {"can0": "(1.000000) can0 080#\n", "can1": ""})
-    assert told.code == "BlackBox"
+        result = blackbox.dump(tmp_path, "SyncLost", lambda: {"can0": "(1.000000) can0 080#\n", "can1": ""})
+    assert result.code == "BlackBox"
     files = sorted((tmp_path / "blackbox").glob("*.log"))
     assert len(files) == blackbox.KEPT_FILES
     assert files[-1].read_text() == "(1.000000) can0 080#\n"
     assert files[-1].name.endswith("-SyncLost.log")
-    assert str(files[-1]) in told.text
+    assert str(files[-1]) in result.text
 
 
 def test_a_disk_that_refuses_is_told(tmp_path: Path) -> None:
     (tmp_path / "blackbox").write_text("in the way")
-    told = blackbox.dump(tmp_path, "SyncLost", dict)
-    assert (told.code, told.severity) == ("StoreFault", "minor")
+    result = blackbox.dump(tmp_path, "SyncLost", dict)
+    assert (result.code, result.severity) == ("StoreFault", "minor")
 
 
 def test_a_file_of_an_impossible_date_is_none(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A clock that is set or behind is told once, and the daemon says so at its start and while it runs."""
+"""A clock that is set or behind is reported once, at start and while running."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ NOW_S = 1_800_000_000.0
 def test_a_clock_that_is_set_is_told_once(jump_s: float) -> None:
     watch = ClockWatch(None)
     assert [watch.look(NOW_S + k, 5.0 + k) for k in (0, 10, 20)] == [[], [], []]
-    (told,) = watch.look(NOW_S + 30 + jump_s, 35.0)
+    (result,) = watch.look(NOW_S + 30 + jump_s, 35.0)
     way = "forward" if jump_s > 0 else "back"
-    assert (told.code, f"{way} by {abs(jump_s):.0f} s" in told.text) == ("ClockJump", True)
+    assert (result.code, f"{way} by {abs(jump_s):.0f} s" in result.text) == ("ClockJump", True)
     assert watch.look(NOW_S + 40 + jump_s, 45.0) == []
 
 
@@ -40,6 +40,6 @@ async def test_a_clock_that_is_behind_the_history_is_told_at_the_start(tmp_path:
     with History.open(config.store.directory) as history:
         history.add_notice(Notice("Armed", "info", "in two hours"), Stamp(time.time() + 7200.0, "boot", 1))
     async with serving(config, Machine()) as path:
-        status = await status_when(path, lambda told: told["unacknowledged"]["newest"])
-    told = {notice["code"]: notice["text"] for notice in status["unacknowledged"]["newest"]}
-    assert "the newest record is from 2.0 h later" in told["ClockJump"]
+        status = await status_when(path, lambda shown_status: shown_status["unacknowledged"]["newest"])
+    shown_status = {notice["code"]: notice["text"] for notice in status["unacknowledged"]["newest"]}
+    assert "the newest record is 2.0 h later" in shown_status["ClockJump"]

@@ -1,4 +1,4 @@
-"""The small parts: the socket's client, the notify protocol, the log's lines, the lock, the token."""
+"""Small parts: the socket's client, the notify protocol, log lines, the lock, the token."""
 
 from __future__ import annotations
 
@@ -33,7 +33,6 @@ from tests.store.made import outcome, published
 
 @pytest.fixture
 def listener(tmp_path: Path) -> Iterator[socket.socket]:
-    """A UNIX stream socket that accepts but says nothing by itself."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as server:
         server.bind(str(tmp_path / "s"))
         server.listen()
@@ -47,16 +46,16 @@ def test_no_daemon_is_one_sentence_with_the_next_action(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("code", [errno.EACCES, errno.EPERM])
 def test_a_socket_that_may_not_be_used_is_no_daemon_that_is_away(code: int) -> None:
-    """Who was told to start it would start a second one."""
+    """The advice to start a daemon would start a second one."""
     denied = OSError(code, os.strerror(code))
-    told = str(ConnectError.of_socket("daemon", denied, "is not running; start it"))
-    assert told.startswith(f"daemon: may not be asked by this user ({os.strerror(code)}), so that whether it runs")
-    assert "start it" not in told
+    result = str(ConnectError.of_socket("daemon", denied, "is not running; start it"))
+    assert result.startswith(
+        f"daemon: does not accept this user ({os.strerror(code)}), so that it is unknown whether it runs"
+    )
+    assert "start it" not in result
 
 
 async def test_what_could_not_be_read_is_told_with_its_exit_code(tmp_path: Path) -> None:
-    """It is no refusal: a program that is none is trouble."""
-
     async def handle(request: Mapping[str, Any], peer: Peer) -> Mapping[str, Any]:
         raise ProgramError(3, "G77", "is no G code; correct the program")
 
@@ -82,14 +81,13 @@ def test_a_daemon_that_hangs_up_or_talks_nonsense_is_told(tmp_path: Path, listen
 
         thread = threading.Thread(target=serve)
         thread.start()
-        with pytest.raises(ConnectError, match=r"without an answer|no answer of a daemon"):
+        with pytest.raises(ConnectError, match=r"without an answer|an invalid answer"):
             ask(tmp_path / "s", {"request": "status"})
         thread.join()
 
 
 @pytest.mark.usefixtures("real_time")
 async def test_what_takes_its_time_tells_its_progress_and_ends_when_nobody_waits(tmp_path: Path) -> None:
-    """The daemon's side and the command line's: two tellings, then the answer; who hangs up abandons it."""
     turn = {"count": 0}
     free, abandoned = asyncio.Event(), asyncio.Event()
 
@@ -103,18 +101,17 @@ async def test_what_takes_its_time_tells_its_progress_and_ends_when_nobody_waits
             free.set()
         return {"checked_s": turn["count"]}
 
-    told: list[Mapping[str, Any]] = []
+    result: list[Mapping[str, Any]] = []
     async with ControlServer(handle, progress, abandoned.set, Access()).serving(tmp_path / "c"):
-        answer = await asyncio.to_thread(ask, tmp_path / "c", {"request": "arm"}, 10.0, told.append)
+        answer = await asyncio.to_thread(ask, tmp_path / "c", {"request": "arm"}, 10.0, result.append)
         assert answer == {"ok": True}
-        assert told == [{"checked_s": 1}, {"checked_s": 2}]
+        assert result == [{"checked_s": 1}, {"checked_s": 2}]
         with pytest.raises(DeviceTimeout):
             await asyncio.to_thread(ask, tmp_path / "c", {"request": "arm", "of": "one who leaves"}, 0.01)
         await asyncio.wait_for(abandoned.wait(), 30.0)  # also where no progress was asked for
 
 
 async def asking(path: Path, *requests: Mapping[str, Any]) -> asyncio.StreamWriter:
-    """Connect and ask; the answer is not waited for."""
     _, writer = await asyncio.open_unix_connection(str(path))
     writer.writelines(json.dumps(request).encode() + b"\n" for request in requests)
     return writer
@@ -125,24 +122,23 @@ async def asking(path: Path, *requests: Mapping[str, Any]) -> asyncio.StreamWrit
 async def test_a_check_is_told_to_and_abandoned_by_whom_it_is_for_alone(
     role: Role, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An operator's check goes on while another asks to arm, who may not, or comes second, and then leaves."""
     monkeypatch.setattr("fdhil.daemon.control.PROGRESS_S", 0.01)
     roles = iter([Role.OPERATE, role])
     monkeypatch.setattr("fdhil.daemon.control.peer_of", lambda *_: Peer("somebody", 4711, 1, next(roles)))
-    heard, free, abandoned = asyncio.Semaphore(0), asyncio.Event(), asyncio.Event()
+    received, free, abandoned = asyncio.Semaphore(0), asyncio.Event(), asyncio.Event()
 
     async def handle(request: Mapping[str, Any], peer: Peer) -> Mapping[str, Any]:
-        heard.release()
+        received.release()
         await free.wait()
         return {"ok": True}
 
     server = ControlServer(handle, lambda: {"program": "secret.ngc"}, abandoned.set, Access())
     async with server.serving(tmp_path / "c"):
         operator = await asking(tmp_path / "c", {"request": "arm"})
-        await heard.acquire()
+        await received.acquire()
         reader, other = await asyncio.open_unix_connection(str(tmp_path / "c"))
         other.write(b'{"request": "arm", "progress": true}\n')
-        await heard.acquire()
+        await received.acquire()
         with pytest.raises(TimeoutError):
             await asyncio.wait_for(reader.readline(), 0.3)
         other.close()
@@ -159,18 +155,17 @@ def test_who_has_no_descriptor_left_is_told_so(tmp_path: Path, listener: socket.
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (1, hard))
     try:
-        with pytest.raises(ConnectError, match=r"was not asked \(Too many open files\); close"):
+        with pytest.raises(ConnectError, match=r"could not be reached \(Too many open files\); close"):
             ask(tmp_path / "s", {"request": "status"})
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 async def test_who_left_before_the_daemon_came_to_it_arms_nothing(tmp_path: Path) -> None:
-    """As when the daemon's computer was asleep: what stops is done all the same, and who sends no more still waits."""
-    heard: list[str] = []
+    received: list[str] = []
 
     async def handle(request: Mapping[str, Any], peer: Peer) -> Mapping[str, Any]:
-        heard.append(f"{request['request']} {request['of']}")
+        received.append(f"{request['request']} {request['of']}")
         return {"ok": True}
 
     async with ControlServer(handle, dict, lambda: None, Access()).serving(tmp_path / "c"):
@@ -183,11 +178,10 @@ async def test_who_left_before_the_daemon_came_to_it_arms_nothing(tmp_path: Path
         writer.write_eof()
         assert json.loads(await reader.readline()) == {"ok": True}
         writer.close()
-    assert heard == ["disarm one who left", "stop one who left", "arm one who stays"]
+    assert received == ["disarm one who left", "stop one who left", "arm one who stays"]
 
 
 async def test_idle_connections_make_room_and_those_that_wait_leave_some_for_disarm(tmp_path: Path) -> None:
-    """Three times as many connections as there are places, idle ones and such that wait for an answer."""
     free, waiting = asyncio.Event(), asyncio.Semaphore(0)
 
     async def handle(request: Mapping[str, Any], peer: Peer) -> Mapping[str, Any]:
@@ -269,17 +263,16 @@ def test_lines_carry_priorities_in_the_journal_and_no_escapes_anywhere(
 @pytest.mark.fault("F11")
 @pytest.mark.timeout(60)
 def test_a_log_that_nobody_reads_holds_nothing_up_and_what_it_lacks_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A pager, or a terminal that was halted with Ctrl-S, and then a reader that has gone."""
     monkeypatch.setattr(journal, "_dropped", {"lines": 0})
     reader, writer = os.pipe()
     with os.fdopen(reader, "rb", 0) as read, os.fdopen(writer, "w") as stream:
         monkeypatch.setattr(sys, "stderr", stream)
         for _ in range(2_000):
             journal.write_line("x" * 100)
-        told = read.read(1 << 20).count(b"\n")
+        result = read.read(1 << 20).count(b"\n")
         journal.write_line("last")
         lines = read.read(1 << 20).decode().splitlines()
-        assert lines[0].endswith(f" {2_000 - told} lines could not be written before this one")
+        assert lines[0].endswith(f" {2_000 - result} lines could not be written before this one")
         assert lines[1].endswith(" last")
         read.close()
         journal.write_line("said to nobody")
@@ -321,7 +314,6 @@ def test_a_run_directory_that_cannot_be_is_told(tmp_path: Path) -> None:
 
 
 def test_a_store_that_cannot_be_does_not_end_the_daemon(tmp_path: Path) -> None:
-    """It records nothing then, which the store itself tells; the machine is watched all the same."""
     (tmp_path / "file").write_text("")
     with sole_owner(tmp_path / "run", tmp_path / "file"):
         pass

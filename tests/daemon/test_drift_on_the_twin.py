@@ -1,4 +1,4 @@
-"""From the twin's bus to the history: warm slide-ways have their slopes, a loaded table is seen at its first rapid."""
+"""From the simulated bus to the history: slopes of warm slide-ways, and a loaded table at its first rapid."""
 
 from __future__ import annotations
 
@@ -33,15 +33,14 @@ time_constant_s = 1e9
 
 @pytest.fixture
 def shop(tmp_path: Path) -> Iterator[Shop]:
-    """A twin of one axis whose friction falls with the temperature, which its sensor tells."""
     bench = HEAD + AXIS + TWIN
     (tmp_path / "twin.toml").write_text(f'{bench}[bus.can0]\ninterface = "socketcand"\n')
     with Twin(tmp_path / "twin.toml", tmp_path / "twin.log") as twin:
         bus, sensor = twin.ready["buses"]["can0"], twin.ready["modbus"]["X"]
-        told = "\n".join(f"{key} = {json.dumps(value)}" for key, value in {**sensor, "period_s": 0.05}.items())
+        expected = "\n".join(f"{key} = {json.dumps(value)}" for key, value in {**sensor, "period_s": 0.05}.items())
         place = "\n".join(f"{key} = {json.dumps(bus[key])}" for key in ("channel", "host", "port"))
         machine = tmp_path / "machine.toml"
-        machine.write_text(f'{bench}[axis.X.temperature]\n{told}\n[bus.can0]\ninterface = "socketcand"\n{place}\n')
+        machine.write_text(f'{bench}[axis.X.temperature]\n{expected}\n[bus.can0]\ninterface = "socketcand"\n{place}\n')
         yield Shop(tmp_path, twin, machine, machine_config.load(machine))
 
 
@@ -70,12 +69,10 @@ def test_warming_and_load(shop: Shop, capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def _is_read(celsius: float, status: dict[str, Any]) -> bool:
-    """Whether the daemon has read the temperature."""
     return bool(abs(status["axes"]["X"].get("slideway_c", math.nan) - celsius) < 0.01)
 
 
 def _shuttle(shop: Shop) -> None:
-    """Play the shuttle and wait until its rapids are analysed."""
     before = _analysed(shop.status() or {})
     shop.play("shuttle.ngc", SHUTTLE)
     shop.status_when(lambda status: _analysed(status) >= before + 2)

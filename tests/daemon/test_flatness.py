@@ -1,6 +1,6 @@
-"""Flatness feed-forward by the real processes: identified from the bus, armed without a program, measured by the twin.
+"""Flatness feed-forward with the real processes: identified from the bus, armed without a program, measured.
 
-The axes are heavier than their data sheet says, so that only identified parameters help.
+The axes are heavier than in their data sheet, so that only identified parameters help.
 """
 
 from __future__ import annotations
@@ -27,14 +27,12 @@ error has to shrink."""
 
 
 def bench_of(axis: str, speed_feedforward: float) -> str:
-    """The configuration of an axis with [axis.NAME.feedforward]."""
     regulators = {**AXIS["regulators"], "speed_feedforward": speed_feedforward}
     return axis_toml(axis, regulators=regulators, feedforward=LIMITS) + f"[sim.axis.{axis}]\nJt = 0.085\n"
 
 
 @pytest.fixture
 def shop(tmp_path: Path) -> Iterator[Shop]:
-    """The twin, commissioned: the RPDO of speed and torque offset is made valid and read back."""
     with opened(tmp_path, HEAD + "".join(bench_of(axis, own) for axis, (own, _) in CASES.items())) as shop:
         shop.commission()
         yield shop
@@ -52,8 +50,8 @@ def test_an_identified_machine_follows_without_a_program(shop: Shop, capsys: Cap
         for axis, (_, smaller) in CASES.items():
             assert before[axis] / after[axis] >= smaller, (before, after)
         assert fdhil("disarm", shop.path, capsys=capsys)[0] == 0
-        told = shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
-        assert feed_of(told)["applied"] == {"X": [0, 0], "Y": [0, 0]}
+        status = shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
+        assert feed_of(status)["applied"] == {"X": [0, 0], "Y": [0, 0]}
         assert largest_errors_um(shop, "again") == pytest.approx(before, rel=0.1)
         fades_out_on_an_emergency(shop, capsys)
         assert daemon.stop() == 0
@@ -61,7 +59,6 @@ def test_an_identified_machine_follows_without_a_program(shop: Shop, capsys: Cap
 
 
 def switch_on(shop: Shop, capsys: Capture) -> None:
-    """Arm, once the guard has seen enough good SYNC: on a busy host a lockstep second takes many."""
     shop.status_when(lambda s: s["guard"].get("good_for", 0) > SETTLED_CYCLES)
     code, out, err = fdhil("arm", shop.path, "--method", "flatness", "--json", capsys=capsys)
     assert code == 0, (out, err)
@@ -69,36 +66,33 @@ def switch_on(shop: Shop, capsys: Capture) -> None:
 
 
 def fed_forward(shop: Shop, capsys: Capture) -> dict[str, float]:
-    """The largest errors with the feed-forward on, which is on still at the path's end."""
     switch_on(shop, capsys)
     shop.status_when(lambda s: s["state"] == "FEEDFORWARD")
     errors_um = largest_errors_um(shop, "after")
-    told = shop.status_when(lambda s: s["guard"])
-    assert told["state"] == "FEEDFORWARD", told["guard"]
+    status = shop.status_when(lambda s: s["guard"])
+    assert status["state"] == "FEEDFORWARD", status["guard"]
     return errors_um
 
 
 def fades_out_on_an_emergency(shop: Shop, capsys: Capture) -> None:
-    """A drive's emergency ends it by itself, with its class; nothing is armed again."""
     switch_on(shop, capsys)
     shop.status_when(lambda s: s["state"] == "FEEDFORWARD")
     shop.twin.command("fault", fault="frame", can_id=0x081, data="1043080000000000")
-    told = shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
-    assert feed_of(told)["cause"]["code"] == "DriveEmergency"
+    status = shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
+    assert feed_of(status)["cause"]["code"] == "DriveEmergency"
     boxes = shop.config.store.directory / "blackbox"
     shop.wait(lambda: any(boxes.glob("*-DriveEmergency.log")))
     (box,) = boxes.glob("*-DriveEmergency.log")
     shop.wait(lambda: "can0 081#1043080000000000" in box.read_text())
-    assert feed_of(told)["applied"] == {"X": [0, 0], "Y": [0, 0]}
+    assert feed_of(status)["applied"] == {"X": [0, 0], "Y": [0, 0]}
 
 
 def feed_of(status: dict[str, Any]) -> dict[str, Any]:
-    """What the guard says of the feed-forward."""
     return dict(status["guard"]["feedforward"])
 
 
 def largest_errors_um(shop: Shop, name: str) -> dict[str, float]:
-    """Let the NC play the bench's path; return the largest tracking error of each axis, by the twin's own trace."""
+    """Run the bench's path by the NC; return each axis' largest tracking error, um, by the simulator."""
     demand, trace = shop.folder / "path.csv", shop.folder / f"{name}.csv"
     path = bench_demand(10, hold_s=0.2)
     lines = [f"{k * 0.001:.3f},{x:.9f},{y:.9f}" for k, (x, y) in enumerate(path)]

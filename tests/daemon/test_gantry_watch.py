@@ -1,4 +1,4 @@
-"""The watch over the two drives of a gantry axis."""
+"""The monitor of the two drives of a gantry axis."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from tests.bench import rotary_and_gantry_document
 
 
 def samples(axis: str, first: int, error_um: float, zero_mm: float = 0.0, rows: int = 50) -> AxisSamples:
-    """A block of one drive in motion, behind its demand by ``error_um``."""
     tick = first + np.arange(rows)
     demand = zero_mm + 0.01 * tick
     still = frozen(np.zeros(rows))

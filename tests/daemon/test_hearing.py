@@ -1,4 +1,4 @@
-"""What is heard now, and what is not as the config says: told with its reason, in the status and as a notice."""
+"""Reception and deviations from the config: reported with the reason, in the status and as a notice."""
 
 from __future__ import annotations
 
@@ -34,8 +34,6 @@ WIRED = 2400  # SYNCs, again and again: a busy host's daemon hears them whenever
 
 
 class Line:
-    """A hub that sends what a wire shows: SYNC every 2 ms and the frames of node 1, until it is cut."""
-
     def __init__(self) -> None:
         self._cut = threading.Event()
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -71,18 +69,15 @@ class Line:
             time.sleep(0.05)
 
     def cut(self) -> None:
-        """Send nothing more."""
         self._cut.set()
 
     def close(self) -> None:
-        """End the connection."""
         self.cut()
         self._listener.close()
 
 
 @pytest.fixture
 def line() -> Iterator[Line]:
-    """A bus with SYNC and one drive."""
     made = Line()
     yield made
     made.close()
@@ -94,15 +89,12 @@ def _quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def shown(status: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> str:
-    """Return the status as a person sees it."""
     capsys.readouterr()
     show(status, open_console())
     return " ".join(capsys.readouterr().out.split())
 
 
 class Opens:
-    """The real drivers, as ``serving`` wants a machine."""
-
     open = staticmethod(open_machine)
 
 
@@ -110,29 +102,26 @@ class Opens:
 async def test_a_wrong_period_a_node_never_heard_and_a_dead_bus_are_told(
     line: Line, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Over the hub: SYNC at half the rate of the config, one drive of two; then nothing more."""
     monkeypatch.setattr("fdhil.daemon.hearing.PERIOD_S", 3.0)
     bus = {"can0": {"interface": "socketcand", "port": line.port}}
     config = config_of(tmp_path, ("X", "Y"), bus=bus)
     async with serving(config, Opens()) as path:  # type: ignore[arg-type]
-        told = await status_when(path, lambda s: {t["code"] for t in s["troubles"]} >= WRONG)
-        assert told["source"]["state"] == "listening"
-        assert told["sync"]["rate_hz"] == pytest.approx(500.0, rel=0.01)
-        troubles = {(each["code"], each["axis"]): each["text"] for each in told["troubles"]}
-        expected = (
-            r"SYNC comes at (499\.\d|500(\.\d)?) Hz where the config says 1000: .* set sync_period_s = 0\.00(2|1999)"
-        )
+        status = await status_when(path, lambda s: {t["code"] for t in s["troubles"]} >= WRONG)
+        assert status["source"]["state"] == "listening"
+        assert status["sync"]["rate_hz"] == pytest.approx(500.0, rel=0.01)
+        troubles = {(each["code"], each["axis"]): each["text"] for each in status["troubles"]}
+        expected = r"SYNC runs at (499\.\d|500(\.\d)?) Hz instead of 1000 Hz .* set sync_period_s = 0\.00(2|1999)"
         assert re.search(expected, troubles["SyncPeriodSuspect", ""])
-        assert "the drive (node 2 on can0) was never heard" in troubles["NodeNeverHeard", "Y"]
-        assert {notice["code"] for notice in told["notices"]} >= WRONG
-        text = shown(told, capsys)
+        assert "the drive (node 2 on can0) has never sent a frame" in troubles["NodeNeverHeard", "Y"]
+        assert {notice["code"] for notice in status["notices"]} >= WRONG
+        text = shown(status, capsys)
         assert re.search(r"listening, SYNC (499|500)\.\d Hz of 1000", text)
-        assert "Y: NodeNeverHeard: the drive (node 2 on can0) was never heard" in text
+        assert "Y: NodeNeverHeard: the drive (node 2 on can0) has never sent a frame" in text
         line.cut()
-        told = await status_when(path, lambda s: s["source"]["state"] == "silent" and s["sync"]["rate_hz"] is None)
-        assert told["source"]["heard_s_ago"] > 1.0
-        assert told["sync"]["heard_s_ago"] >= 1.0  # told in whole milliseconds
-        text = shown(told, capsys)
+        status = await status_when(path, lambda s: s["source"]["state"] == "silent" and s["sync"]["rate_hz"] is None)
+        assert status["source"]["heard_s_ago"] > 1.0
+        assert status["sync"]["heard_s_ago"] >= 1.0  # told in whole milliseconds
+        text = shown(status, capsys)
         assert "silent for" in text
         assert "no SYNC for" in text
         assert "Hz of" not in text
@@ -156,18 +145,18 @@ def test_the_rate_is_of_what_is_heard_now(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("periods_us", "told"),
+    ("periods_us", "expected"),
     [
         ((1000,), None),
         ((1200,), "set sync_period_s = 0.0012"),
         (
             (1059, 1307, 1509),
-            "comes unevenly, at 663 to 944 Hz where the config says 1000: no period can be determined",
+            "is uneven, 663 to 944 Hz instead of the configured 1000 Hz: no period can be determined",
         ),
     ],
 )
 def test_period_is_judged_by_a_minute_and_gets_a_number_only_where_it_is_steady(
-    periods_us: tuple[int, ...], told: str | None, tmp_path: Path
+    periods_us: tuple[int, ...], expected: str | None, tmp_path: Path
 ) -> None:
     hearing = Hearing(config_of(tmp_path), 0.0)
     hearing.source_opened(0.0)
@@ -180,15 +169,15 @@ def test_period_is_judged_by_a_minute_and_gets_a_number_only_where_it_is_steady(
         found = {code: text for (code, _), text in hearing.troubles({}, now_s).items()}
         if "SyncPeriodSuspect" in found and first_s is None:
             first_s = now_s
-    assert (first_s is None) is (told is None)
-    if told is not None:
-        assert told in found["SyncPeriodSuspect"]
+    assert (first_s is None) is (expected is None)
+    if expected is not None:
+        assert expected in found["SyncPeriodSuspect"]
         assert first_s is not None
         assert first_s > 59.0
 
 
 def test_two_buses_that_show_the_same_ticks_twice_are_no_rate(tmp_path: Path) -> None:
-    """On a busy host a bus was drained long after another: the newest tick was the oldest one known, too."""
+    """On a busy host a bus was read long after another: its newest tick was also the oldest."""
     hearing = Hearing(config_of(tmp_path), 0.0)
     hearing.source_opened(0.0)
     for late_ns in (0, 300_000_000):
@@ -201,7 +190,7 @@ def test_two_buses_that_show_the_same_ticks_twice_are_no_rate(tmp_path: Path) ->
 def test_a_drive_that_answers_but_does_not_sample_is_told_once_and_its_end_too(tmp_path: Path) -> None:
     watch = Watch(config_of(tmp_path), 0.0)
     watch.hearing.source_opened(0.0)
-    told: list[tuple[float, Notice]] = []
+    result: list[tuple[float, Notice]] = []
     for k in range(1, 120):
         now_s, ticks = k * 0.25, np.arange(k * 250, k * 250 + 250)
         watch.hearing.record_came(TickTimes(frozen_ints(ticks), frozen_ints(ticks * 1_000_000)), now_s)
@@ -211,13 +200,16 @@ def test_a_drive_that_answers_but_does_not_sample_is_told_once_and_its_end_too(t
             still, tick = frozen(np.zeros(whole)), frozen_ints(ticks[:whole])
             samples = AxisSamples("X", tick, still, still, still, still, None, still, tick)
             watch.hearing.record_came(samples, now_s)
-        told += [(now_s, notice) for notice in watch.troubles(now_s)]
-    assert [(n.code, n.severity, n.axis) for _, n in told] == [("NoSamples", "MAJOR", "X"), ("NoSamples", "info", "X")]
-    assert 10.0 <= told[0][0] <= 11.0
+        result += [(now_s, notice) for notice in watch.troubles(now_s)]
+    assert [(n.code, n.severity, n.axis) for _, n in result] == [
+        ("NoSamples", "MAJOR", "X"),
+        ("NoSamples", "info", "X"),
+    ]
+    assert 10.0 <= result[0][0] <= 11.0
 
 
 @pytest.mark.parametrize(
-    ("synced", "words"), [(True, "axis; check node_id"), (False, "no heartbeat (0x1017), else check")]
+    ("synced", "words"), [(True, "monitored; check node_id"), (False, "no heartbeat (0x1017), else check")]
 )
 def test_a_drive_that_is_never_heard_may_be_one_without_a_heartbeat(synced: bool, words: str, tmp_path: Path) -> None:
     hearing = Hearing(config_of(tmp_path), 0.0)
@@ -227,12 +219,11 @@ def test_a_drive_that_is_never_heard_may_be_one_without_a_heartbeat(synced: bool
         if synced:
             hearing.record_came(TickTimes(frozen_ints(ticks), frozen_ints(ticks * 1_000_000)), k * 0.25)
         hearing.counted({"frames": k, "can0.frames": k, "can0.X.heard": 0}, k * 0.25)
-        told = hearing.troubles({}, k * 0.25)
-    assert words in told["NodeNeverHeard", "X"]
+        result = hearing.troubles({}, k * 0.25)
+    assert words in result["NodeNeverHeard", "X"]
 
 
 def fed(config: MachineConfig, records: list[Record], windows: int = 0) -> dict[tuple[str, str], str]:
-    """Return the troubles that a machine of ``config`` sees in the records of another."""
     hearing = Hearing(config, 0.0)
     hearing.source_opened(0.0)
     now_s = 0.0
@@ -244,7 +235,6 @@ def fed(config: MachineConfig, records: list[Record], windows: int = 0) -> dict[
 
 
 def other(folder: Path, **axis: Any) -> MachineConfig:
-    """Return the bench's config but for the keys of axis X."""
     document = {"machine": {"name": "bench"}, "axis": {"X": bench_axis(**axis)}}
     return machine_config.parse(document, "test", folder)
 
@@ -255,7 +245,7 @@ def test_moves_that_are_seen_and_not_used_have_their_reason(tmp_path: Path) -> N
     assert fed(true, records, windows=4) == {}
     ((key, text),) = fed(other(tmp_path, rapid_speed_mm_s=1000.0), records).items()
     assert key == ("MovesNotUsed", "X")
-    assert "4 moves seen, none used: 4 stay below 90% of the rapid speed of 1000 mm/s, the fastest at 5" in text
+    assert "4 moves recorded, none used: 4 stay below 90% of the rapid speed of 1000 mm/s, the fastest at 5" in text
     assert "correct rapid_speed_mm_s or screw_pitch_mm" in text
     ((key, text),) = fed(true, records).items()
     assert key == ("MovesNotUsed", "X")
@@ -265,7 +255,7 @@ def test_moves_that_are_seen_and_not_used_have_their_reason(tmp_path: Path) -> N
     assert "times the rapid speed" in text
     ((key, text),) = fed(other(tmp_path, screw_pitch_mm=10.0), records, windows=4).items()
     assert key == ("ScaleSuspect", "X")
-    assert "the position goes 2 times as far as the speed says" in text
+    assert "the position travels 2 times the integral of the speed" in text
 
 
 def test_moves_without_a_plateau_are_told_as_such(tmp_path: Path) -> None:
@@ -286,7 +276,7 @@ def test_moves_without_a_plateau_are_told_as_such(tmp_path: Path) -> None:
         moves.append(AxisSamples("X", tick, position, position, turning, zeros, None, zeros, frozen_ints(zeros)))
     ((key, text),) = fed(config, moves).items()
     assert key == ("MovesNotUsed", "X")
-    assert "no plateau of 0.1 s; make longer rapids" in text
+    assert "no plateau of 0.1 s; run longer rapids" in text
 
 
 async def test_the_daemon_tells_moves_it_cannot_use_instead_of_0_accepted_0_refused(
@@ -294,11 +284,11 @@ async def test_the_daemon_tells_moves_it_cannot_use_instead_of_0_accepted_0_refu
 ) -> None:
     records = rapids(config_of(tmp_path), count=3)
     async with serving(other(tmp_path, rapid_speed_mm_s=1000.0), Machine(records)) as path:
-        told = await status_when(path, lambda s: s["troubles"] and s["axes"]["X"]["moves"]["seen"] == 3)
-        text = shown(told, capsys)
-    assert [notice["code"] for notice in told["notices"]].count("MovesNotUsed") == 1
+        status = await status_when(path, lambda s: s["troubles"] and s["axes"]["X"]["moves"]["seen"] == 3)
+        text = shown(status, capsys)
+    assert [notice["code"] for notice in status["notices"]].count("MovesNotUsed") == 1
     assert "X 0/0" in text
-    assert "X: MovesNotUsed: 3 moves seen, none used" in text
+    assert "X: MovesNotUsed: 3 moves recorded, none used" in text
     assert "X: 3 moves detected; not used: 3 slower than a rapid (the fastest of all reached 5" in text
 
 

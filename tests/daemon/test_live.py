@@ -1,4 +1,4 @@
-"""The daemon's stream of samples: what passes is told to who looks, and nobody who looks can hold the daemon up."""
+"""The daemon's stream of samples: viewers receive records, and none can delay the daemon."""
 
 from __future__ import annotations
 
@@ -42,8 +42,6 @@ def block(tick: Any, axis: str = "X", voltage: bool = True) -> AxisSamples:
 
 @asynccontextmanager
 async def streaming(stream: LiveStream, folder: Path) -> AsyncIterator[Path]:
-    """Serve a stream alone on a control socket."""
-
     async def handle(_request: Any, _peer: Any) -> Any:
         return stream.begin()
 
@@ -52,14 +50,12 @@ async def streaming(stream: LiveStream, folder: Path) -> AsyncIterator[Path]:
 
 
 async def ask_live(path: Path) -> tuple[Line, asyncio.StreamReader, asyncio.StreamWriter]:
-    """Ask for the stream; return the answer and the connection."""
     reader, writer = await asyncio.open_unix_connection(str(path), limit=2**22)
     writer.write(b'{"request": "live"}\n')
     return json.loads(await reader.readline()), reader, writer
 
 
 async def line_of(reader: asyncio.StreamReader, kind: str) -> Line:
-    """Return the next line of a kind."""
     while True:
         line: Line = json.loads(await asyncio.wait_for(reader.readline(), 60.0))
         if line["live"] == kind:
@@ -67,7 +63,6 @@ async def line_of(reader: asyncio.StreamReader, kind: str) -> Line:
 
 
 def values_of(line: Line) -> Any:
-    """Return the signals (7, n) of a block."""
     return unpacked(line["values"], "<f4").reshape(len(SIGNALS), -1)
 
 
@@ -83,10 +78,10 @@ async def test_a_running_daemon_tells_its_samples_as_they_pass(tmp_path: Path, m
         records = rapids(config, count=1)
         machine.give(*records)
         sent = [record for record in records if isinstance(record, AxisSamples)]
-        told = [await line_of(reader, "samples") for _ in sent]
+        result = [await line_of(reader, "samples") for _ in sent]
         writer.close()
-    assert [line["tick"] for line in told] == [int(record.tick[0]) for record in sent]
-    current = np.concatenate([values_of(line)[SIGNALS.index("current_a")] for line in told])
+    assert [line["tick"] for line in result] == [int(record.tick[0]) for record in sent]
+    current = np.concatenate([values_of(line)[SIGNALS.index("current_a")] for line in result])
     np.testing.assert_allclose(current, np.concatenate([record.current_a for record in sent]), atol=1e-4)
 
 
@@ -172,7 +167,7 @@ async def test_viewers_are_few_and_who_leaves_makes_room(tmp_path: Path) -> None
 
 
 def test_nobody_looks_nothing_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fdhil.daemon.live.encode_line", lambda told: pytest.fail("a line was made for nobody"))
+    monkeypatch.setattr("fdhil.daemon.live.encode_line", lambda result: pytest.fail("a line was made for nobody"))
     LiveStream(config_of(tmp_path)).take(block([1, 2, 3]))
 
 

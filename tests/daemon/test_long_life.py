@@ -1,4 +1,4 @@
-"""The daemon works for long: once its rings are full, a rapid more, or a client more, takes no memory more."""
+"""Long operation of the daemon: once its buffers are full, further rapids and clients use no more memory."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ EMERGENCY = 0x081
 
 
 def later(records: Sequence[Record], ticks: int, period_s: float) -> list[Record]:
-    """Return the same rapids so many SYNC later."""
     shifted: list[Record] = []
     for record in records:
         if isinstance(record, AxisSamples):
@@ -44,12 +43,11 @@ def later(records: Sequence[Record], ticks: int, period_s: float) -> list[Record
 
 
 def look_on_and_leave(path: Path) -> None:
-    """Ask for the live stream and be gone in the middle of a line; say half a request and be gone."""
-    for said in (b'{"request": "live"}\n', b'{"request": "sta'):
+    for output in (b'{"request": "live"}\n', b'{"request": "sta'):
         with socket.socket(socket.AF_UNIX) as client:
             client.connect(str(path))
-            client.sendall(said)
-            if said.endswith(b"\n"):
+            client.sendall(output)
+            if output.endswith(b"\n"):
                 client.recv(10)
 
 
@@ -89,13 +87,13 @@ async def test_a_rapid_more_and_a_client_more_take_no_memory_more(
 def test_a_flood_of_emergencies_is_counted_and_takes_no_memory() -> None:
     watch = NodeWatch("X", 1)
     rng = np.random.default_rng(1)
-    told, blocks = [], []
+    result, blocks = [], []
     for start in range(0, EMERGENCIES, 1000):
         codes = rng.integers(0x0100, 0xFFFF, 1000).tolist()
         flood = [(start * 1000, EMERGENCY, code.to_bytes(2, "little") + bytes(6)) for code in codes]
-        told += watch.feed(frames_of(flood), start)
+        result += watch.feed(frames_of(flood), start)
         del flood, codes
         blocks.append(sys.getallocatedblocks())
     assert watch.emcy_count == EMERGENCIES
-    assert len(told) <= 32
+    assert len(result) <= 32
     assert blocks[-1] - blocks[len(blocks) // 2] < 100, blocks

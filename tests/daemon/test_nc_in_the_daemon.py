@@ -1,4 +1,4 @@
-"""The daemon beside an NC that tells its moves: what it says of a rapid goes with the window to history and status."""
+"""An NC that reports its moves: its report of a rapid reaches history and status with the window."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from tests.daemon.test_service import serving, status_when
 
 
 def said(records: Sequence[Record], moves: Sequence[NcMove]) -> list[Record]:
-    """The records, with what the NC said of each rapid."""
-    told = iter(moves)
+    result = iter(moves)
     return [
-        replace(record, nc=next(told)) if isinstance(record, MoveEvent) and record.kind is MoveKind.RAPID else record
+        replace(record, nc=next(result)) if isinstance(record, MoveEvent) and record.kind is MoveKind.RAPID else record
         for record in records
     ]
 

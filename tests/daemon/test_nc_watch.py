@@ -1,4 +1,4 @@
-"""What the NC says of itself is shown, and what is unusual about it is told once, and once that it is over."""
+"""The NC's state is shown; unusual states are reported once, and once when they end."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TROUBLE = Notice("DriveFault", "MAJOR", "the drive has a fault", "X")
 
 
 def test_an_override_and_a_hold_are_told_once_and_when_they_are_over() -> None:
-    watch, told = NcWatch(), []
+    watch, result = NcWatch(), []
     for state in (
         WORKING,
         replace(WORKING, rapid_override=0.5),
@@ -24,8 +24,8 @@ def test_an_override_and_a_hold_are_told_once_and_when_they_are_over() -> None:
         replace(WORKING, motion=MoveKind.UNKNOWN, rapid_override=None),
         WORKING,
     ):
-        told += [(notice.code, notice.severity) for notice in watch.note(state, 1.0)]
-    assert told == [
+        result += [(notice.code, notice.severity) for notice in watch.note(state, 1.0)]
+    assert result == [
         ("OverrideChanged", "minor"), ("FeedHold", "minor"), ("FeedHold", "info"), ("OverrideChanged", "info"),
     ]  # fmt: skip
 

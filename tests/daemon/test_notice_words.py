@@ -1,4 +1,4 @@
-"""Every class of notice has its effect and its next action, each said in one place."""
+"""Every class of notice has its effect and next action in exactly one table."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ CALLED = re.compile(r'\b(?:Notice|_notice|_tell)\(\s*"([^"]*)"')
 
 
 def codes() -> set[str]:
-    """Return the classes that the code gives notices, as far as its text names them."""
     found = {"BusOff", "BusRestarted", "TransceiverFault", "NotAcknowledged", "ErrorPassive", "NcSilent", "LoadChanged"}
     for path in Path(fdhil.__file__).parent.rglob("*.py"):
         found.update(CALLED.findall(path.read_text("utf-8")))
@@ -36,8 +35,8 @@ def test_a_class_of_notice_has_effect_and_action(code: str) -> None:
 
 def test_what_the_guard_stopped_has_the_guards_own_words() -> None:
     alarm = Alarm("EchoMismatch", "X")
-    told = words_of(Notice("GuardTripped", "MAJOR", f"EchoMismatch: {alarm.sentence()}", "X"))
-    assert told == (EFFECT[Reaction.RAMP_DOWN], CATALOGUE["EchoMismatch"][2])
+    notices = words_of(Notice("GuardTripped", "MAJOR", f"EchoMismatch: {alarm.sentence()}", "X"))
+    assert notices == (EFFECT[Reaction.RAMP_DOWN], CATALOGUE["EchoMismatch"][2])
 
 
 def test_what_a_late_pc_caused_has_the_action_against_a_late_pc() -> None:

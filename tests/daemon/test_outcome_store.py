@@ -1,4 +1,4 @@
-"""The store under the daemon: full, read-only, damaged or foreign, the daemon goes on in shadow and says so."""
+"""The daemon's store when full, read-only, damaged or foreign: the daemon continues in shadow and reports it."""
 
 from __future__ import annotations
 
@@ -30,16 +30,21 @@ from tests.store.made import BENCH, outcome, published, window
 
 
 def opened(folder: Path) -> tuple[OutcomeStore, list[Notice]]:
-    """Return an open store of a store in ``folder``, and what it said."""
     store = OutcomeStore(config_of(folder))
     return store, store.open()
 
 
 def test_outcomes_are_kept_in_their_order_and_known_again(tmp_path: Path) -> None:
-    store, said = opened(tmp_path)
-    told: list[Outcome] = [outcome(), outcome(accepted=False), outcome(), published(1), Notice("A", "info", "b", "X")]
-    assert said == []
-    assert store.keep(told) == []
+    store, output = opened(tmp_path)
+    notices: list[Outcome] = [
+        outcome(),
+        outcome(accepted=False),
+        outcome(),
+        published(1),
+        Notice("A", "info", "b", "X"),
+    ]
+    assert output == []
+    assert store.keep(notices) == []
     store.close()
     again, _ = opened(tmp_path)
     known = again.known("X")
@@ -73,9 +78,9 @@ def test_a_disk_that_refuses_is_told_once_and_recovers(
 
     with monkeypatch.context() as patch:
         patch.setattr("fdhil.store.atomic.os.write", refuse)
-        said = store.keep([outcome()])
-        assert [notice.code for notice in said] == [code]
-        assert "goes on in shadow" in said[0].text
+        output = store.keep([outcome()])
+        assert [notice.code for notice in output] == [code]
+        assert "continues in shadow" in output[0].text
         assert store.fault == code
         assert store.keep([outcome()]) == []
     assert [notice.code for notice in store.keep([outcome()])] == ["StoreRecovered"]
@@ -90,8 +95,8 @@ def test_a_damaged_history_is_put_aside_and_a_new_one_begun(tmp_path: Path) -> N
     directory.mkdir()
     for k in (1, 2):
         (directory / FILE_NAME).write_bytes(b"garbage" * 1000)
-        store, said = opened(tmp_path)
-        assert [notice.code for notice in said] == ["CorruptFile"]
+        store, output = opened(tmp_path)
+        assert [notice.code for notice in output] == ["CorruptFile"]
         assert store.fault is None
         assert store.keep([published(k)]) == []
         store.close()
@@ -105,8 +110,8 @@ def test_a_newer_schema_is_left_alone_in_shadow(tmp_path: Path) -> None:
     db = sqlite3.connect(directory / FILE_NAME)
     db.execute("PRAGMA user_version = 99")
     db.close()
-    store, said = opened(tmp_path)
-    assert [notice.code for notice in said] == ["SchemaVersion"]
+    store, output = opened(tmp_path)
+    assert [notice.code for notice in output] == ["SchemaVersion"]
     assert store.fault == "SchemaVersion"
     assert store.keep([outcome()]) == []
     assert store.known("X").newest is None
@@ -115,8 +120,8 @@ def test_a_newer_schema_is_left_alone_in_shadow(tmp_path: Path) -> None:
 
 def test_a_store_that_cannot_be_made_is_told(tmp_path: Path) -> None:
     (tmp_path / "fdhil-data").write_text("in the way")
-    store, said = opened(tmp_path)
-    assert [notice.severity for notice in said] == ["MAJOR"]
+    store, output = opened(tmp_path)
+    assert [notice.severity for notice in output] == ["MAJOR"]
     assert store.keep([outcome()]) == []
 
 
@@ -125,9 +130,9 @@ def test_strays_are_named(tmp_path: Path) -> None:
     folder = tmp_path / "fdhil-data" / "windows"
     folder.mkdir(parents=True)
     (folder / "notes.txt").write_text("")
-    store, said = opened(tmp_path)
-    assert [notice.code for notice in said] == ["StrayFiles"]
-    assert "notes.txt" in said[0].text
+    store, output = opened(tmp_path)
+    assert [notice.code for notice in output] == ["StrayFiles"]
+    assert "notes.txt" in output[0].text
     store.close()
 
 
@@ -140,8 +145,8 @@ def test_what_windows_tell_a_pool_is_known_again(tmp_path: Path) -> None:
     known = again.known("X")
     again.close()
     assert set(known.first) == {1, -1}
-    assert [told.direction for told in known.members] == list(ways)
-    assert [told.place for told in known.members] == [-2, -1, 0]
+    assert [result.direction for result in known.members] == list(ways)
+    assert [result.place for result in known.members] == [-2, -1, 0]
     made = outcome(of=window())
     assert made.estimate is not None
     fresh = member(made.window, made.estimate)
@@ -169,9 +174,9 @@ def test_a_load_is_part_of_what_is_told_in_json() -> None:
     assert document["terms"]["load"]["unit"] == "N.m"
     assert document["terms"]["load"]["high"] == pytest.approx(2.5 + 1.96, abs=0.01)
     assert (document["unexplained_um"], document["warnings"]) == (0.5, [])
-    told = as_document(outcome())
-    assert (told["terms"], told["warnings"], told["unexplained_um"]) == ({}, [], None)
-    assert told["friction_at_rapid"]["value"] == pytest.approx(5.0 + 0.05 * 157.08, abs=0.01)
+    result = as_document(outcome())
+    assert (result["terms"], result["warnings"], result["unexplained_um"]) == ({}, [], None)
+    assert result["friction_at_rapid"]["value"] == pytest.approx(5.0 + 0.05 * 157.08, abs=0.01)
 
 
 @pytest.mark.fault("F17")
@@ -191,8 +196,8 @@ def test_the_log_of_a_damaged_history_is_kept_beside_it(tmp_path: Path) -> None:
     with path.open("r+b") as file:
         file.seek(14 * 4096)
         file.write(b"\xff" * 4096)
-    store, said = opened(tmp_path)
-    assert [notice.code for notice in said] == ["CorruptFile"]
+    store, output = opened(tmp_path)
+    assert [notice.code for notice in output] == ["CorruptFile"]
     store.close()
     reader.close()
     assert path.with_name(f"{FILE_NAME}.corrupt-1-wal").read_bytes() == log
@@ -207,9 +212,9 @@ def test_an_old_window_that_cannot_be_removed_is_told_once(tmp_path: Path, monke
             raise OSError(errno.EPERM, os.strerror(errno.EPERM))
 
     monkeypatch.setattr(Path, "unlink", refuse)
-    said = [notice for _ in range(6) for notice in store.keep([outcome()])]
-    assert [(notice.code, notice.severity) for notice in said] == [("StrayFiles", "minor")]
-    assert "w00000001-X.parquet cannot be removed" in said[0].text
+    notices = [notice for _ in range(6) for notice in store.keep([outcome()])]
+    assert [(notice.code, notice.severity) for notice in notices] == [("StrayFiles", "minor")]
+    assert "w00000001-X.parquet cannot be removed" in notices[0].text
     assert (store.counts("X"), store.fault) == ((6, 0), None)
     store.close()
 
@@ -271,8 +276,8 @@ def test_a_history_that_is_replaced_is_reported_and_what_follows_is_in_the_file_
         reader.execute("SELECT count(*) FROM notices").fetchone()
     change(history, backup)
     whole = outcome()
-    said = [notice.code for k in range(8) for notice in store.keep([whole, Notice("C", "MAJOR", f"after {k}")])]
-    assert (said, store.fault) == (["StoreReplaced"], None)
+    notices = [notice.code for k in range(8) for notice in store.keep([whole, Notice("C", "MAJOR", f"after {k}")])]
+    assert (notices, store.fault) == (["StoreReplaced"], None)
     last = store.notices.status()["newest"][-1]["number"]
     assert store.acknowledge({"notices": [last], "by": "anna"})["ok"]
     with History.read(tmp_path / "fdhil-data") as found:
@@ -289,8 +294,8 @@ def test_a_folder_of_windows_that_is_removed_is_made_again(tmp_path: Path) -> No
     store, _ = opened(tmp_path)
     assert store.keep([outcome()]) == []
     shutil.rmtree(tmp_path / "fdhil-data" / "windows")
-    said = [notice.code for _ in range(3) for notice in store.keep([outcome()])]
-    assert (said, store.fault) == (["StoreFault", "StoreRecovered"], None)
+    notices = [notice.code for _ in range(3) for notice in store.keep([outcome()])]
+    assert (notices, store.fault) == (["StoreFault", "StoreRecovered"], None)
     assert len(list_windows(tmp_path / "fdhil-data" / "windows").windows) == 2
     store.close()
 

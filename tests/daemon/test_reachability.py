@@ -1,4 +1,4 @@
-"""The daemon can be asked although its run directory was cleaned away, or it disarms."""
+"""After its run directory was cleaned the daemon stays reachable, or disarms."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ def _looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @asynccontextmanager
 async def served(path: Path) -> AsyncIterator[asyncio.Queue[str]]:
-    """Have a control socket; yield what becomes of its name."""
     lost = asyncio.Queue[str]()
 
     async def handle(request: Mapping[str, Any], peer: Peer) -> Mapping[str, Any]:

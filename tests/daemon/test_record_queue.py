@@ -1,4 +1,4 @@
-"""The queue between the machine and a pipeline: bounded, in order, and honest about what it refused."""
+"""The queue between machine and pipeline: bounded, in order, with a count of dropped records."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the daemon uses of its computer is known, and told before it is used up."""
+"""The daemon measures its resources and reports them before they are exhausted."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ print(uses()[0].used - before)
 
 @pytest.mark.usefixtures("processes")
 def test_a_large_block_that_is_freed_is_given_back() -> None:
-    said = subprocess.run([sys.executable, "-c", FREED], capture_output=True, text=True, check=True)
-    assert int(said.stdout) < 5e6  # of 42 MB
+    output = subprocess.run([sys.executable, "-c", FREED], capture_output=True, text=True, check=True)
+    assert int(output.stdout) < 5e6  # of 42 MB
 
 
 BETWEEN = """
@@ -58,8 +58,8 @@ print(before - uses()[0].used)
 
 @pytest.mark.usefixtures("processes")
 def test_what_lies_free_between_used_blocks_is_given_back() -> None:
-    said = subprocess.run([sys.executable, "-c", BETWEEN], capture_output=True, text=True, check=True)
-    assert int(said.stdout) > 30e6  # of 40 MB
+    output = subprocess.run([sys.executable, "-c", BETWEEN], capture_output=True, text=True, check=True)
+    assert int(output.stdout) > 30e6  # of 40 MB
 
 
 GROW = """
@@ -78,15 +78,17 @@ print(*(b - a for a, b in zip(before, after)))
 @pytest.mark.usefixtures("processes")
 @pytest.mark.fault("F10")
 def test_what_grows_is_seen_to_grow() -> None:
-    """In a process of its own: what other tests left behind may end just then."""
-    told = subprocess.run([sys.executable, "-c", GROW], capture_output=True, text=True, check=True)
-    memory, descriptors, threads = map(int, told.stdout.split())
+    """Runs in its own process: what other tests left behind may end at that moment."""
+    result = subprocess.run([sys.executable, "-c", GROW], capture_output=True, text=True, check=True)
+    memory, descriptors, threads = map(int, result.stdout.split())
     assert 15e6 < memory < 40e6
     assert (descriptors, threads) == (2, 1)
 
 
-@pytest.mark.parametrize(("group", "told"), [("0::/system.slice/fdhil.service\n", (1 << 30, 64)), ("", (None, None))])
-def test_the_bounds_are_those_of_the_unit(group: str, told: tuple[int | None, int | None], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("group", "expected"), [("0::/system.slice/fdhil.service\n", (1 << 30, 64)), ("", (None, None))]
+)
+def test_the_bounds_are_those_of_the_unit(group: str, expected: tuple[int | None, int | None], tmp_path: Path) -> None:
     process, groups = tmp_path / "self", tmp_path / "cgroup"
     mine = groups / "system.slice" / "fdhil.service"
     for folder in (process / "fd", process / "task" / "1", mine):
@@ -96,7 +98,7 @@ def test_the_bounds_are_those_of_the_unit(group: str, told: tuple[int | None, in
     (mine / "memory.max").write_text(f"{1 << 30}\n")
     (mine / "pids.max").write_text("64\n")
     memory, _, threads = uses(process, groups)
-    assert (memory.allowed, threads.allowed) == told
+    assert (memory.allowed, threads.allowed) == expected
     assert (memory.used, threads.used) == (100 * os.sysconf("SC_PAGE_SIZE"), 1)
     (mine / "memory.max").write_text("max\n")
     assert uses(process, groups)[0].allowed is None
@@ -105,9 +107,9 @@ def test_the_bounds_are_those_of_the_unit(group: str, told: tuple[int | None, in
 @pytest.mark.fault("F10")
 def test_it_is_told_once_when_it_is_high_and_once_when_it_is_over() -> None:
     watch = ResourceWatch()
-    told = [watch.look((Use("memory_bytes", used, 1000), Use("threads", used, None))) for used in range(700, 950, 50)]
-    told += [watch.look((Use("memory_bytes", used, 1000),)) for used in (750, 690, 500)]
-    assert [[(notice.code, notice.severity) for notice in notices] for notices in told if notices] == [
+    result = [watch.look((Use("memory_bytes", used, 1000), Use("threads", used, None))) for used in range(700, 950, 50)]
+    result += [watch.look((Use("memory_bytes", used, 1000),)) for used in (750, 690, 500)]
+    assert [[(notice.code, notice.severity) for notice in notices] for notices in result if notices] == [
         [("ResourceHigh", "minor")],
         [("ResourceHigh", "info")],
     ]
@@ -115,12 +117,11 @@ def test_it_is_told_once_when_it_is_high_and_once_when_it_is_over() -> None:
 
 async def test_the_status_says_what_is_used(tmp_path: Path) -> None:
     async with serving(config_of(tmp_path), Machine()) as path:
-        status = await status_when(path, lambda told: told["resources"])
-    assert {name: told["used"] > 0 for name, told in status["resources"].items()} == dict.fromkeys(used(), True)
+        status = await status_when(path, lambda result: result["resources"])
+    assert {name: result["used"] > 0 for name, result in status["resources"].items()} == dict.fromkeys(used(), True)
 
 
 async def fill_the_pool() -> None:
-    """Have the event loop's pool start all its threads: how many it has by itself depends on how fast they are."""
     most = min(32, (os.cpu_count() or 1) + 4)  # as of ThreadPoolExecutor
     met = threading.Barrier(most)
     await asyncio.gather(*(asyncio.to_thread(met.wait, 60.0) for _ in range(most)))
@@ -129,11 +130,10 @@ async def fill_the_pool() -> None:
 @pytest.mark.usefixtures("real_time")
 @pytest.mark.fault("F10")
 async def test_clients_that_come_and_go_leave_descriptors_and_threads_as_they_were(tmp_path: Path) -> None:
-    """Two hundred clients, of which half leave without a word."""
     config = config_of(tmp_path)
     machine = Machine(rapids(config, count=2))
     async with serving(config, machine) as path:
-        await status_when(path, lambda told: told["axes"]["X"]["accepted"] == 2)
+        await status_when(path, lambda result: result["axes"]["X"]["accepted"] == 2)
         await fill_the_pool()
         before = used()
         for _ in range(100):
@@ -151,13 +151,15 @@ async def test_clients_that_come_and_go_leave_descriptors_and_threads_as_they_we
     assert after["threads"] <= before["threads"]
 
 
-@pytest.mark.parametrize(("number", "told"), [(errno.EMFILE, ["descriptors"]), (errno.EIO, [])])
+@pytest.mark.parametrize(("number", "expected"), [(errno.EMFILE, ["descriptors"]), (errno.EIO, [])])
 @pytest.mark.fault("F10")
-def test_what_cannot_be_looked_at_ends_nothing(number: int, told: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_looked_at_ends_nothing(
+    number: int, expected: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuses(*_: object) -> None:
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(Path, "iterdir", refuses)
     found = uses()
-    assert [use.name for use in found] == told
+    assert [use.name for use in found] == expected
     assert all(use.share == 1.0 for use in found)

@@ -1,4 +1,4 @@
-"""A machine with a rotary axis and one with a gantry, whole: record, identify, predict, correct, measure again."""
+"""Machines with a rotary and a gantry axis: record, identify, predict, correct, measure again."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("long_computation")
 
 @dataclass(frozen=True)
 class Whole:
-    """What came of a machine: identified and true parameters, contour error predicted and measured (um RMS)."""
+    """Results of a machine: identified and true parameters, contour error predicted and measured (um RMS)."""
 
     found: Mapping[str, Parameters]
     true: Mapping[str, Parameters]
@@ -41,13 +41,11 @@ class Whole:
 
 
 def program_of(lines: str) -> str:
-    """Return a program of these lines."""
     return lines.replace("|", "\n") + "\nM2\n"
 
 
 @contextmanager
 def shuttled(folder: Path, document: dict[str, Any], shuttle: str) -> Iterator[Machine]:
-    """Have a machine on virtual time that has made the rapids of ``shuttle``."""
     with Machine(config=document | on_a_bus("memory"), folder=folder) as machine:
         machine.start("guard")
         machine.start("daemon")
@@ -58,12 +56,10 @@ def shuttled(folder: Path, document: dict[str, Any], shuttle: str) -> Iterator[M
 
 
 def on_a_bus(channel: str) -> dict[str, Any]:
-    """Return the part of a configuration that names the bus."""
     return {"bus": {"can0": {"interface": "virtual", "channel": channel}}}
 
 
 def run(folder: Path, document: dict[str, Any], path: str, shuttle: str) -> Whole:
-    """Identify, predict, cut, correct and cut again."""
     with shuttled(folder, document, shuttle) as machine:
         config, program = machine.config, machine.write(program_of(path), "path.ngc")
         with History.read(config.store.directory) as history:
@@ -82,7 +78,6 @@ def run(folder: Path, document: dict[str, Any], path: str, shuttle: str) -> Whol
 
 
 def cut(machine: Machine, path: str) -> float:
-    """Let the NC cut the path; return the RMS of the contour error at the table, um."""
     trace = machine.folder / "trace.csv"
     machine.plant.trace(trace)
     machine.play(program_of(path), "path.ngc")
@@ -92,7 +87,6 @@ def cut(machine: Machine, path: str) -> float:
 
 
 def machine(*axes: str) -> dict[str, Any]:
-    """Return the demonstration's machine with these of its axes."""
     document = machine_document()
     for table in (document["axis"], document["sim"]["axis"]):
         for axis in [*table]:
@@ -102,7 +96,6 @@ def machine(*axes: str) -> dict[str, Any]:
 
 
 def check(whole: Whole) -> None:
-    """What must come of any machine: true parameters, a prediction that is measured, a smaller error."""
     for axis, found in whole.found.items():
         for name in ("R", "L", "K", "Jt", "ft", "Cd"):
             assert getattr(found, name) == pytest.approx(getattr(whole.true[axis], name), rel=0.02), (axis, name)
@@ -112,7 +105,6 @@ def check(whole: Whole) -> None:
 
 
 def rotary() -> dict[str, Any]:
-    """Return the machine with a rotary table."""
     document = machine("X")
     document["axis"]["A"] = rotary_axis()
     document["sim"]["axis"]["A"] = {"Jt": 0.082, "Cd": 5.5, "start_deg": 0.0}
@@ -129,7 +121,6 @@ GANTRY_SHUTTLE = "|G4 P0.25|".join(["G0 X400 Y400", "G0 X0 Y0", "G0 X250 Y250", 
 
 
 def gantry(**second: Any) -> dict[str, Any]:
-    """Return the machine with a gantry axis whose second motor is another one, mounted the other way round."""
     document = machine("X", "Y")
     document["axis"]["Y2"] = {"drive": {"sign": -1}, **second}
     document["sim"]["axis"]["Y2"] = {"Jt": 0.085, "R": 0.52}
@@ -143,7 +134,6 @@ def test_both_drives_of_a_gantry_are_identified_and_corrected_each_by_its_own_mo
 
 
 def test_skewed_gantry_ends_the_correction(tmp_path: Path) -> None:
-    """A correction makes both drives alike until the slide-way of one of them warms: then 2 um are too few."""
     with shuttled(tmp_path, gantry(max_difference_um=2.0), GANTRY_SHUTTLE) as machine:
         assert any("the drives Y and Y2 are" in notice["text"] for notice in machine.ask("status")["notices"])
         answer = machine.arm(machine.write(program_of(GANTRY), "path.ngc"), method="inverse")

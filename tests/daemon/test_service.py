@@ -1,4 +1,4 @@
-"""The daemon on a made-up machine: what comes in is identified, kept, told; what goes wrong is told and survived."""
+"""The daemon on a simulated machine: records are identified, stored and reported; faults are reported and survived."""
 
 from __future__ import annotations
 
@@ -34,7 +34,6 @@ from tests.daemon.shop import fdhil
 
 @pytest.fixture(autouse=True)
 def _quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave the compiling to the first rapid: most of these tests never see one."""
     monkeypatch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
 
 
@@ -48,7 +47,6 @@ async def _exists(path: Path) -> None:
 
 @asynccontextmanager
 async def serving(config: MachineConfig, machine: Machine) -> AsyncIterator[Path]:
-    """Run a daemon in this process until the block is left; yield its control socket."""
     task = asyncio.create_task(Service(config, machine.open).run())
     assert config.store.run_directory is not None
     path = config.store.run_directory / "daemon.sock"
@@ -62,7 +60,6 @@ async def serving(config: MachineConfig, machine: Machine) -> AsyncIterator[Path
 
 
 async def status_when(path: Path, ready: Any) -> dict[str, Any]:
-    """Ask for the status until ``ready(status)``."""
     while True:
         status = await asyncio.to_thread(ask, path, {"request": "status"})
         if ready(status):
@@ -80,9 +77,9 @@ async def test_rapids_become_parameters_with_intervals_in_status_and_history(tmp
     assert status["sync"]["expected_hz"] == 1000.0
     assert (axis["refused"], axis["revision"]) == (0, 2)
     for name, true in NOMINAL.items():
-        told = axis["parameters"][name]
-        assert told["low"] < told["value"] < told["high"]
-        assert told["value"] == pytest.approx(true, rel=0.1), name
+        result = axis["parameters"][name]
+        assert result["low"] < result["value"] < result["high"]
+        assert result["value"] == pytest.approx(true, rel=0.1), name
     with History.read(config.store.directory) as history:
         assert [r.set.revision for r in history.revisions("X")] == [1, 2]
         assert history.revisions("X")[1].window_ids == (1, 2)
@@ -106,8 +103,8 @@ async def test_a_configuration_that_was_edited_while_the_daemon_runs_is_reported
         answers = [await asyncio.to_thread(fdhil, command, file, *more, capsys=capsys) for command, *more in asked]
         (trouble,) = await asyncio.to_thread(lambda: list(examine_daemon(load(file))))
     assert trouble.code == "ConfigDiffers"
-    said = [" ".join((out + err).split()) for _, out, err in answers]
-    assert [("another configuration than the file" in text, "X 250 um" in text) for text in said] == [(True, True)] * 4
+    output = [" ".join((out + err).split()) for _, out, err in answers]
+    assert [("configuration file has changed" in text, "X 250 um" in text) for text in output] == [(True, True)] * 4
     assert json.loads(answers[1][1])["limits"]["X"]["max_offset_um"] == 250.0
 
 
@@ -210,13 +207,13 @@ async def test_systemd_hears_ready_the_watchdog_and_the_end(tmp_path: Path, monk
         monkeypatch.setenv("WATCHDOG_USEC", "100000")
         machine = Machine()
         async with serving(config_of(tmp_path), machine):
-            heard = [await asyncio.get_running_loop().sock_recv(manager, 200) for _ in range(2)]
+            received = [await asyncio.get_running_loop().sock_recv(manager, 200) for _ in range(2)]
         with contextlib.suppress(BlockingIOError):
             while True:
-                heard.append(manager.recv(200))
-    assert any(message.startswith(b"READY=1") for message in heard)
-    assert b"WATCHDOG=1" in heard
-    assert b"STOPPING=1" in heard
+                received.append(manager.recv(200))
+    assert any(message.startswith(b"READY=1") for message in received)
+    assert b"WATCHDOG=1" in received
+    assert b"STOPPING=1" in received
 
 
 async def test_a_drive_that_boots_voids_its_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -234,7 +231,6 @@ async def test_a_drive_that_boots_voids_its_record(tmp_path: Path, capsys: pytes
 
 @pytest.mark.fault("A23", "F12")
 async def test_a_boot_that_a_flood_or_a_full_queue_holds_back_voids_its_record_all_the_same(tmp_path: Path) -> None:
-    """X boots again and again, Y once; and no notice can be stored, as where the disk hangs."""
     config = config_of(tmp_path, ("X", "Y"))
     service = Service(config, Machine().open)
     for k in range(300):

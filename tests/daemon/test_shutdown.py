@@ -1,4 +1,4 @@
-"""The daemon ends when it is told to, whatever its devices, its disk and its libraries do meanwhile."""
+"""The daemon stops on request, whatever its devices, its disk and its libraries do."""
 
 from __future__ import annotations
 
@@ -29,8 +29,6 @@ def _quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class ClosingMachine(Machine):
-    """A machine whose devices fail, or hang until ``released``, while they are closed."""
-
     def __init__(self, error: Exception | None = None) -> None:
         super().__init__()
         self.error = error
@@ -38,7 +36,6 @@ class ClosingMachine(Machine):
 
     @asynccontextmanager
     async def open(self, config: MachineConfig) -> AsyncIterator[Machine]:
-        """Open; closing raises the error, or waits whoever cancels it."""
         self.opened += 1
         self.running.set()
         try:
@@ -54,7 +51,6 @@ class ClosingMachine(Machine):
 
 
 async def stopped(service: Service, running: asyncio.Event) -> None:
-    """Run the daemon, tell it to stop when its source is open, and wait for its end."""
     task = asyncio.create_task(service.run())
     await asyncio.wait([task, asyncio.create_task(running.wait())], return_when=asyncio.FIRST_COMPLETED)
     os.kill(os.getpid(), signal.SIGTERM)
@@ -92,7 +88,7 @@ async def test_device_that_does_not_close_is_reported_and_left(
     await stopped(service, machine.running)
     service.shutdown.leave_overrun()
     service.shutdown.end()
-    assert "closing buses and sensors is not done after 0.01 s and is left" in capsys.readouterr().err
+    assert "closing buses and sensors is not finished after 0.01 s and is abandoned" in capsys.readouterr().err
     assert left == [3]
     machine.released.set()
 
@@ -106,7 +102,7 @@ async def test_disk_that_does_not_answer_is_reported_and_left(
     monkeypatch.setattr(service._store, "close", lambda: (disk_answers.wait(), close()))
     try:
         await stopped(service, machine.running)
-        assert "closing the store is not done after 0.01 s and is left" in capsys.readouterr().err
+        assert "closing the store is not finished after 0.01 s and is abandoned" in capsys.readouterr().err
     finally:
         disk_answers.set()
 

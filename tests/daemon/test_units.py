@@ -1,4 +1,4 @@
-"""The units are what systemd understands, and as confined as promised."""
+"""The systemd units are valid, and as confined as documented."""
 
 from __future__ import annotations
 
@@ -57,7 +57,6 @@ def test_systemd_agrees(name: str, tmp_path: Path) -> None:
 def test_every_service_is_verified_and_as_confined_as_promised(
     tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:
-    """All that run on: what only sets something up as root and is over at once (the mirror) is not meant."""
     exposed = {name: exposure(name, tmp_path) for name in SERVICES}
     record_property("goal", ", ".join(f"{name} {figure:g}" for name, figure in exposed.items()))
     assert max(exposed.values()) <= LARGEST_EXPOSURE, exposed
@@ -65,13 +64,12 @@ def test_every_service_is_verified_and_as_confined_as_promised(
 
 
 def exposure(name: str, folder: Path) -> float:
-    """Verify a unit and return how exposed systemd finds it, from 0 to 10."""
     unit = folder / name.replace("@", "@one")
     unit.write_text(re.sub(r"^(Exec\w+)=\S+", rf"\1={sys.executable}", (UNITS / name).read_text(), flags=re.MULTILINE))
     verified = subprocess.run(["systemd-analyze", "verify", str(unit)], capture_output=True, text=True)
     assert (verified.returncode, verified.stderr.strip()) == (0, ""), name
     judged = ["systemd-analyze", "security", "--offline=yes", str(unit)]
-    said = subprocess.run(judged, capture_output=True, text=True).stdout
-    found = re.search(r"exposure level for \S+: ([0-9.]+) ", said)
-    assert found, said
+    output = subprocess.run(judged, capture_output=True, text=True).stdout
+    found = re.search(r"exposure level for \S+: ([0-9.]+) ", output)
+    assert found, output
     return float(found[1])

@@ -1,4 +1,4 @@
-"""The real processes: the twin with its NC on a bus of its own, guard and daemon beside it, the command line on top."""
+"""The real processes: the simulator with its NC on its own bus, guard, daemon and command line."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ pytestmark = [pytest.mark.timeout(1500), pytest.mark.usefixtures("processes")]
 
 @pytest.fixture
 def shop(tmp_path: Path) -> Iterator[Shop]:
-    """A twin whose tables are heavier than the data sheet says, commissioned."""
     with opened(tmp_path) as shop:
         shop.commission()
         yield shop
@@ -35,12 +34,12 @@ def test_from_the_bus_to_the_history_to_a_corrected_cut_and_back(shop: Shop, cap
         _refuses_what_is_not_known(shop, capsys)
         shop.nc(on=True)
         shop.play("shuttle.ngc", SHUTTLE)
-        told = shop.status_when(
+        refused = shop.status_when(
             lambda s: (
                 s["sync"]["rate_hz"] and all(s["axes"][a]["accepted"] + s["axes"][a]["refused"] >= 4 for a in "XY")
             )
         )
-        _knows_the_drives(told)
+        _knows_the_drives(refused)
         _refuses_a_second_daemon(shop)
         _cuts_corrected(shop, capsys)
         _refuses_a_drive_that_was_written_to_until_it_is_compared(shop, capsys)
@@ -78,9 +77,9 @@ def _knows_the_drives(status: dict[str, object]) -> None:
         assert (axis["accepted"], axis["refused"]) == (4, 0), axis
         assert axis["skill"]["rms_um"] < 0.1 * axis["skill"]["measured_rms_um"]
         for name, true in REAL.items():
-            told = axis["parameters"][name]
-            assert told["value"] == pytest.approx(true, rel=0.1 if name in {"ft", "Cd"} else 0.02), name
-            assert told["low"] < told["high"]
+            result = axis["parameters"][name]
+            assert result["value"] == pytest.approx(true, rel=0.1 if name in {"ft", "Cd"} else 0.02), name
+            assert result["low"] < result["high"]
 
 
 def _refuses_a_second_daemon(shop: Shop) -> None:
@@ -105,7 +104,6 @@ def _cuts_corrected(shop: Shop, capsys: Capture) -> None:
 
 
 def _refuses_a_drive_that_was_written_to_until_it_is_compared(shop: Shop, capsys: Capture) -> None:
-    """Another master writes the following error window, to what it was: nobody knows that until it is compared."""
     place = shop.config.bus["can0"]
     with can.Bus(interface="socketcand", channel=place.channel, host=place.host, port=place.port) as bus:
         written = struct.pack("<BHBI", 0x23, 0x6065, 0, 32768)
@@ -123,7 +121,6 @@ def _refuses_a_drive_that_was_written_to_until_it_is_compared(shop: Shop, capsys
 
 
 def _cut(shop: Shop, name: str, program: str = "corner.ngc", text: str = CORNER) -> float:
-    """Let the NC cut the program; return the RMS of the contour error in um."""
     trace = shop.folder / f"{name}.csv"
     shop.play(program, text, trace=trace)
     rows = np.genfromtxt(trace, delimiter=",", names=True)
@@ -144,12 +141,12 @@ def _replays_bit_by_bit(shop: Shop, capsys: Capture) -> None:
     for file, window, revision, skill in zip(document["files"], stored, revisions, skills, strict=True):
         of = {outcome["kind"]: outcome for outcome in file["outcomes"]}
         unitless = {
-            name: {key: value for key, value in told.items() if key != "unit"}
-            for name, told in of["window"]["parameters"].items()
+            name: {key: value for key, value in result.items() if key != "unit"}
+            for name, result in of["window"]["parameters"].items()
         }
         assert unitless == window.parameters
         assert of["window"]["fit_percent"] == window.fit_percent
-        values = {name: told["value"] for name, told in of["parameters"]["parameters"].items()}
+        values = {name: result["value"] for name, result in of["parameters"]["parameters"].items()}
         assert values == revision.set.parameters.as_dict()
         assert of["skill"]["rms_um"] == skill.rms_um
 

@@ -155,10 +155,10 @@ def test_the_daemon_tells_of_an_offer_once_until_it_is_answered(works: Works, fi
     watch = OfferWatch(config)
     (notice,) = watch.look()
     assert (notice.code, notice.severity) == ("OfferWaits", "minor")
-    assert notice.text == "the works offers a change: friction version 3"
+    assert notice.text == "a configuration change is proposed: friction version 3"
     assert watch.look() == []
     lay(works, file, version=4)
-    assert [each.text for each in watch.look()] == ["the works offers a change: friction version 4"]
+    assert [each.text for each in watch.look()] == ["a configuration change is proposed: friction version 4"]
     fdhil("offers", "reject", file, "friction", "--by", "Bert", "--reason", "another oil", capsys=capsys)
     assert [each.text[-1] for each in OfferWatch(config).look()] == ["3"]
     (config.store.directory / ANSWERS_FILE).write_text("{")
@@ -190,5 +190,5 @@ def test_the_daemon_remembers_of_the_offers_those_alone_that_lie_there(works: Wo
         for old in config.offers_directory.glob("*.offer"):
             old.unlink()
         (config.offers_directory / f"other-{number}.offer").touch()
-        assert [each.text for each in watch.look()] == [f"the works offers a change: other version {number}"]
+        assert [each.text for each in watch.look()] == [f"a configuration change is proposed: other version {number}"]
     assert len(watch._told) == 1

@@ -132,7 +132,7 @@ def test_a_change_goes_out_stage_by_stage(collected: Shop) -> None:
     machine = Machine(shop.files["mill-1"])  # the daemon, started anew
     digest = shop.config("mill-1").digest
     noticed = Notice("MaintenanceDue", "minor", "Friction rises; look at the lubrication.", "X", 1000)
-    lies = Notice("OfferWaits", "minor", "the works offers a change: friction version 4")
+    lies = Notice("OfferWaits", "minor", "a configuration change is proposed: friction version 4")
     assert machine.store.keep([replace(published(), config_digest=digest), noticed, lies]) == []
     machine.close()
     shop.uplink("mill-1")

@@ -1,4 +1,4 @@
-"""The machine of the feed-forward's tests: a law, its limits, and drives that take speed and torque offset."""
+"""Test machine of the feed-forward: a law, its limits, and drives with speed and torque offsets."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ FACTS = dict.fromkeys(FEEDFORWARD_FACTS, True)
 
 
 def fed_settings(shown: bool = False) -> Settings:
-    """The bench's settings with an RPDO for both offsets, ``shown`` with a TPDO for them as well."""
     made = machine.settings()
     layout = ((0x60B1, 0, 32, True), (0x60B2, 0, 16, True))
     axes = [
@@ -34,7 +33,6 @@ def fed_settings(shown: bool = False) -> Settings:
 
 
 def fed_bench(shown: bool = False) -> Bench:
-    """The machine with a moving demand, the guard knowing of no program."""
     bench = machine.bench()
     for drive in bench.drives:
         drive.shows_fed = shown
@@ -42,12 +40,10 @@ def fed_bench(shown: bool = False) -> Bench:
 
 
 def request(**changes: Any) -> Request:
-    """A granted request, or one with something changed."""
     return replace(Request("feedforward", True, "", FACTS, (LAW, LAW)), **changes)
 
 
 def switched_on(shown: bool = False) -> Bench:
-    """The feed-forward on, faded in, the path running."""
     bench = fed_bench(shown)
     bench.settle()
     assert bench.sync(request()).refused == ()

@@ -1,6 +1,6 @@
-"""The guard whose patience a test ends: a file in its run directory stands for ten seconds of silence.
+"""Runs a guard whose timeouts a test can shorten: a file in its run directory stands for ten seconds of silence.
 
-``python -m tests.guard.impatient CONFIG`` starts it as fdhil-guard does, with ``--settings`` it is the guard itself.
+``python -m tests.guard.impatient CONFIG`` starts it as fdhil-guard does; with ``--settings`` it is the guard itself.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ BUS, DAEMON = "bus_silent_for_long", "daemon_silent_for_long"
 
 
 def shorten(name: str, file: str) -> None:
-    """Make this time-out of the settings short while the file is there."""
     usual = getattr(Settings, name).fget
     setattr(
         Settings,
@@ -28,12 +27,10 @@ _execv = os.execv
 
 
 def execute(program: str, arguments: list[str]) -> None:
-    """Become this module where fdhil-guard becomes the guard."""
     _execv(program, [__spec__.name if word == "fdhil.guard" else word for word in arguments])
 
 
 def main() -> int:
-    """Start what the arguments are of."""
     if "--settings" in sys.argv:
         from fdhil.guard.__main__ import main as guard
 

@@ -1,4 +1,4 @@
-"""A machine at the level of its frames: NC and drives as the guard sees them, one SYNC at a time, no physics."""
+"""Simulates a machine at frame level: NC and drives as the guard sees them, one SYNC at a time, no physics."""
 
 from __future__ import annotations
 
@@ -25,12 +25,11 @@ LIMITS = OffsetLimits(offset=819, rate=65, acceleration=6, variation=9830, windo
 
 
 def ramp_cycles(limits: OffsetLimits, offset: int) -> int:
-    """The bound on the cycles from ``offset`` at any rate to rest at 0: 1 + |o|/S + 3 S/A."""
+    """Return the bound on the cycles from ``offset`` at any rate to standstill at 0: 1 + |o|/S + 3 S/A."""
     return 1 + -(-abs(offset) // limits.rate) + 3 * -(-limits.rate // limits.acceleration)
 
 
 def axis_settings(name: str, node_id: int, limits: OffsetLimits = LIMITS) -> AxisSettings:
-    """The default mapping of the simulated drive."""
     return AxisSettings(
         name=name,
         node_id=node_id,
@@ -54,7 +53,6 @@ def axis_settings(name: str, node_id: int, limits: OffsetLimits = LIMITS) -> Axi
 
 
 def settings(axes: Sequence[str] = ("X", "Y"), limits: OffsetLimits = LIMITS, **changes: object) -> Settings:
-    """Settings of the bench in SYNC time."""
     made = Settings(
         bus="can0",
         transport="socketcand",
@@ -70,16 +68,16 @@ def settings(axes: Sequence[str] = ("X", "Y"), limits: OffsetLimits = LIMITS, **
 
 
 def commissioned(made: Settings) -> Settings:
-    """The same settings, every drive signed off."""
     return replace(made, axes=tuple(replace(axis, record=RECORD) for axis in made.axes))
 
 
 @dataclass
 class Drive:
-    """What a drive holds and shows; ``answers`` False: it is silent; ``scale`` 0: it ignores its offset.
+    """State of a drive; ``answers`` False: it is silent; ``scale`` 0: it ignores its offset.
 
-    ``remapped``: TPDO 380 carries its two objects the other way round; ``shows_offset`` False: it does not come.
-    ``fed`` are speed and torque offset in force, in TPDO 1A0 when ``shows_fed``; ``takes_fed``: what it makes of them.
+    ``remapped``: TPDO 380 carries its two objects in reverse order; ``shows_offset`` False: it is not sent. ``fed`` are
+    the speed and torque offset in force, sent in TPDO 1A0 when ``shows_fed``; ``takes_fed`` maps a received pair to
+    them.
     """
 
     node_id: int
@@ -102,12 +100,10 @@ class Drive:
     queue: list[tuple[int, int]] = field(default_factory=list)
 
     def hold(self, offset: int) -> None:
-        """Hold an offset that somebody wrote some time ago."""
         self.offset = self.received_offset = offset
         self.queue = [(target, offset) for target, _ in self.queue]
 
     def at_sync(self, tick: int) -> list[Frame]:
-        """Latch what was received, then sample all TPDOs."""
         self.target = self.received_target
         if self.received_offset is not None:
             self.offset, self.received_offset = round(self.received_offset * self.scale), None
@@ -136,11 +132,10 @@ class Drive:
 
 @dataclass
 class Bench:
-    """Drives, the NC's stream of targets, and the guard's core behind its listener; ``frames`` is the bus trace.
+    """Drives, the NC's stream of targets, and the guard's core with its frame monitor; ``frames`` is the bus trace.
 
-    ``held`` is what the drives held at each SYNC, whatever the guard thinks of it.
-
-    ``row`` of the demand that the NC sends next; before ``playing`` it stands at row 0.
+    ``held`` are the drives' true offsets at each SYNC. ``row`` is the next demand row of the NC; before ``playing`` it
+    stays at row 0.
     """
 
     settings: Settings
@@ -179,14 +174,12 @@ class Bench:
         return tuple(axis.offset for axis in self.state.axes)
 
     def targets(self) -> list[int]:
-        """What the NC sends next."""
         if self.rest is not None:
             return self.rest
         last = len(self.demand[0]) - 1
         return [column[min(self.row, last)] for column in self.demand]
 
     def stream(self) -> None:
-        """The NC's RPDOs for the next SYNC; the guard hears them, the drives receive them."""
         for drive, target in zip(self.drives, self.targets(), strict=True):
             drive.received_target = target
             self.hear(0x200 + drive.node_id, struct.pack("<Hi", 0x0F, target))
@@ -197,11 +190,10 @@ class Bench:
         self.listener.take(cob_id, data, self.tick * 1e-3)
 
     def to_zero(self, since_tick: int) -> int:
-        """How many SYNC after ``since_tick`` the first frames with zero on every axis left, by the bus trace alone."""
+        """Return how many SYNC after ``since_tick`` the first zero frames of every axis left, by the bus trace."""
         return next(tick for tick, offsets in self.frames if tick > since_tick and not any(offsets)) - since_tick
 
     def inject(self, cob_id: int, data: bytes) -> None:
-        """Another node's frame on the bus, an offset by PDO or SDO included: the drives take it as the guard's."""
         self.hear(cob_id, data)
         for drive in self.drives:
             if cob_id == 0x300 + drive.node_id and len(data) >= 4:
@@ -210,7 +202,6 @@ class Bench:
                 drive.received_offset = int.from_bytes(data[4:], "little", signed=True)
 
     def reboot(self, number: int) -> None:
-        """A drive boots: its power-on values, and the frame that says so."""
         drive = self.drives[number]
         drive.hold(0)
         drive.received_offset = None
@@ -225,9 +216,9 @@ class Bench:
         nc: bool = True,
         drop: Sequence[int] = (),
     ) -> Output:
-        """One SYNC: drives latch and sample, the guard steps and sends, then the NC streams.
+        """Run one SYNC: drives latch and sample, the guard steps and sends, then the NC streams.
 
-        ``unsent``: the axes whose frames of the step before did not leave.
+        ``unsent``: axes whose frames of the previous step did not leave.
         """
         if unsent and self.outputs and self.outputs[-1].offsets is not None:
             tick, offsets = self.frames.pop()
@@ -278,7 +269,6 @@ class Bench:
         return output
 
     def silence(self) -> Output:
-        """The local timer while no SYNC comes."""
         axes, bus = self.listener.in_silence(self.tick * 1e-3, True)
         return self.step(Inputs(False, axes, bus, main_alive=self.main_alive, path=self.path))
 
@@ -299,7 +289,7 @@ class Bench:
         self.playing = True
 
     def until(self, mode: Mode, limit: int = 2000) -> int:
-        """Step until the guard is in ``mode``; the number of SYNC it took."""
+        """Step until the guard is in ``mode``; return the number of SYNC."""
         for taken in range(limit):
             if self.mode is mode:
                 return taken
@@ -314,7 +304,6 @@ def arm_request(**changes: object) -> Request:
 def smooth_path(
     rows: int = 600, rest: int = 40, amplitude: int = 300, axes: int = 2
 ) -> tuple[list[list[int]], list[list[int]]]:
-    """Demand and offset columns: a start from rest into steady speed and back, and a slow bump of the offset."""
     demand: list[list[int]] = []
     offset: list[list[int]] = []
     for axis in range(axes):
@@ -333,7 +322,6 @@ def smooth_path(
 
 
 def _bump(k: int, begin: int, end: int, amplitude: int) -> int:
-    """A smooth rise and fall: the cosine of a full turn."""
     import math
 
     if not begin <= k < end:
@@ -342,7 +330,6 @@ def _bump(k: int, begin: int, end: int, amplitude: int) -> int:
 
 
 def bench(amplitude: int = 300, **changes: object) -> Bench:
-    """A bench with a table loaded, its drives at rest at the begin of the path."""
     made = settings(**changes)  # type: ignore[arg-type] # fields of Settings
     demand, offset = smooth_path(amplitude=amplitude, axes=len(made.axes))
     path = CorrectedPath(0, tuple(demand), tuple(offset), True, DIGEST, 1)

@@ -1,4 +1,4 @@
-"""A socketcand hub with the machine behind it, in a thread: it paces SYNC and waits for nobody unless told to."""
+"""A socketcand hub with a machine behind it, in a thread; it paces SYNC and waits for clients only in lockstep."""
 
 from __future__ import annotations
 
@@ -21,25 +21,23 @@ SLOW_S = 0.02
 
 
 def open_bus(name: str, bus: CanBus) -> socket.socket:
-    """A descriptor on which a guard can send, as fdhil-guard opens it."""
     transmit = connect_bus(name, bus)
     greet(name, bus, transmit)
     return transmit
 
 
 def encode(frames: list[Frame]) -> bytes:
-    """Frames as a socketcand server sends them."""
     return b"".join(f"< frame {i:03X} {time.time():.6f} {d.hex()} >".encode() for i, d in frames)
 
 
 class Peer(threading.Thread):
-    """One client is the guard; ``sent`` lists (SYNC count, COB-ID, data) of everything it put on the bus.
+    """One client is the guard; ``sent`` lists (SYNC count, COB-ID, data) of everything that it sent.
 
-    Each cycle: SYNC, the drives' TPDOs, then the NC's targets; while ``lockstep`` the next SYNC waits for the offset
-    frames of a guard that sent some in the cycle before, and no longer once a test says that they are not ``expected``.
-    ``turns`` counts the turns of the thread. ``row`` runs over ``demand`` while ``playing``, slowly from
-    ``slow_from``, so that a test on a busy host still meets the path where it wants to. ``at_row`` are frames of
-    another node that come once, with the TPDOs of that row; ``rows_at`` tells the row of each SYNC.
+    Each cycle: SYNC, the drives' TPDOs, then the NC's targets. While ``lockstep`` the next SYNC waits for the offset
+    frames of a guard that sent some in the cycle before, until a test clears ``expected``. ``turns`` counts the turns
+    of the thread. ``row`` runs over ``demand`` while ``playing``, slowly from ``slow_from``, so that a test on a busy
+    host still meets the intended part of the path. ``at_row`` are frames of another node sent once with the TPDOs of
+    that row; ``rows_at`` is the row of each SYNC.
     """
 
     def __init__(self, demand: list[list[int]], period_s: float = 0.001) -> None:
@@ -81,7 +79,6 @@ class Peer(threading.Thread):
 
     @property
     def hung_up(self) -> bool:
-        """Whether no guard is there any more, and what it had sent is read."""
         return self._client is None
 
     def _accept(self) -> None:
@@ -111,7 +108,6 @@ class Peer(threading.Thread):
             client.sendall(b"< ok >")
 
     def inject(self, *frames: Frame) -> None:
-        """Put frames of another node on the bus."""
         with self._lock:
             assert self._client is not None
             self._client.sendall(encode(list(frames)))
@@ -174,12 +170,10 @@ class Peer(threading.Thread):
                     drive.received_offset = int.from_bytes(data, "little", signed=True)
 
     def stand(self) -> None:
-        """Send no SYNC any more, from the return on."""
         self.syncing = False
         self.wait(lambda: self.standing, "a standstill")
 
     def read_out(self) -> None:
-        """Return when all that the guard has sent by now is in ``sent``."""
         client = self._client
         assert client is not None
         self.wait(lambda: not select.select([client], [], [], 0)[0], "an empty socket")
@@ -187,11 +181,10 @@ class Peer(threading.Thread):
         self.wait(lambda: self.turns > turns + 1, "the end of the turn that emptied it")
 
     def offsets_sent(self, node: int = 1) -> list[tuple[int, int]]:
-        """(SYNC count, increments) of the offset frames to one node."""
+        """Return (SYNC count, increments) of the offset frames to one node."""
         return [(k, int.from_bytes(d, "little", signed=True)) for k, i, d in list(self.sent) if i == 0x300 + node]
 
     def wait(self, condition: Callable[[], bool], what: str, limit_s: float = 100.0) -> None:
-        """Wait until something has come about."""
         deadline_s = time.monotonic() + limit_s
         while not condition():
             assert time.monotonic() < deadline_s, f"{what} did not come about"
@@ -200,7 +193,6 @@ class Peer(threading.Thread):
 
 @contextmanager
 def at_rest() -> Iterator[Peer]:
-    """Let a machine that stands be there until the block is left."""
     peer = Peer(DEMAND_AT_REST)
     peer.start()
     yield peer
@@ -209,7 +201,6 @@ def at_rest() -> Iterator[Peer]:
 
 
 def write_config(folder: Path, port: int, clock: str = "sync", axes: str = "XY", corrected: bool = True) -> Path:
-    """A machine config of the bench whose bus is on ``port``."""
     bus = f'[bus.can0]\ninterface = "socketcand"\nhost = "127.0.0.1"\nport = {port}\n[guard]\nclock = "{clock}"\n'
     file = folder / "machine.toml"
     file.write_text(bench_toml(axes, corrected) + bus, "utf-8")

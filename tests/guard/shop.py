@@ -1,4 +1,4 @@
-"""The guard's shell in this process, one turn at a time: a bus of lists, drives, and clients over its real socket."""
+"""Runs the guard's loop in this process, one turn at a time: a bus of lists, drives, and clients on its real socket."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ DEMAND, OFFSET = smooth_path()
 
 
 class Wire(CanSocket):
-    """``sent`` are (COB-ID, data); ``down``: the bus is gone, ``full``: nothing leaves the queue.
+    """A bus; ``sent`` are (COB-ID, data); ``down``: the bus is down, ``full``: the transmit queue is full.
 
-    Frames of the COB-IDs in ``kept_back`` do not leave; at the first of those in ``ends_at`` the bus goes down.
+    Frames of the COB-IDs in ``kept_back`` do not leave; the first of those in ``ends_at`` takes the bus down.
     """
 
     def __init__(self, allowed: frozenset[int]) -> None:
@@ -71,8 +71,6 @@ class Wire(CanSocket):
 
 
 class Shop:
-    """A guard, its drives at the begin of the path, and an NC that plays it while ``playing``."""
-
     def __init__(self, folder: Path, made: Settings | None = None, notify: str | None = None, **changes: Any) -> None:
         made = made or commissioned(settings(**changes))
         digest = hashlib.sha256(TOKEN.encode()).hexdigest()
@@ -94,7 +92,6 @@ class Shop:
         self._clients: list[socket.socket] = []
 
     def cycle(self) -> None:
-        """One SYNC with all frames of its cycle; the guard takes a turn."""
         self.tick += 1
         sampled = [frame for drive in self.drives for frame in drive.at_sync(self.tick)]
         targets = [column[min(self.row, len(column) - 1)] for column in DEMAND]
@@ -115,7 +112,6 @@ class Shop:
         self.taken = len(self.wire.sent)
 
     def serve(self) -> None:
-        """Let the guard look after its clients without a SYNC."""
         for _ in range(3):
             self.guard._rested_s = 0.0
             self.turn()
@@ -132,7 +128,6 @@ class Shop:
         return client
 
     def ask(self, client: socket.socket, request: Mapping[str, Any] | bytes, *descriptors: int) -> dict[str, Any]:
-        """Send a request and let SYNC go on until it is answered."""
         line = request if isinstance(request, bytes) else json.dumps(request).encode()
         socket.send_fds(client, [line + b"\n"], descriptors)
         return self.answer(client)
@@ -162,7 +157,6 @@ class Shop:
         assert answer["ok"], answer
 
     def arm(self) -> socket.socket:
-        """Table loaded, interlocks settled, armed; the client must go on being heard."""
         client = self.connect()
         self.load(client)
         self.run(150)

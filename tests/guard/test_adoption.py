@@ -1,4 +1,4 @@
-"""The guard takes over from a drive only what it may believe; nothing read may become a step."""
+"""The guard adopts only a trusted offset of a drive; no reading may become a step."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import pytest
 from fdhil.guard import core
 from fdhil.guard.adoption import may_stand
 from fdhil.guard.interlocks import Alarm
+from fdhil.guard.limits import follow
 from fdhil.guard.protocol import Mode
 from fdhil.guard.state import Request
 from tests.guard.machine import RECORD, Bench, arm_request, bench
@@ -20,7 +21,6 @@ ADOPT = Request("adopt", token_valid=True)
 
 
 def holding(*offsets: int, **changes: object) -> Bench:
-    """A machine whose drives hold these offsets when the guard starts; ``changes`` are made in its axes' settings."""
     machine = bench()
     axes = tuple(replace(axis, **changes) for axis in machine.settings.axes)  # type: ignore[arg-type]
     machine = Bench(replace(machine.settings, axes=axes), machine.path, machine.demand, machine.drives)
@@ -43,7 +43,6 @@ def active(offset: int = 600) -> Bench:
 
 
 def largest_step(machine: Bench, since: int) -> int:
-    """Increments between two cycles in what the drives really held."""
     held = machine.held[since:]
     return max(abs(b - a) for before, after in itertools.pairwise(held) for a, b in zip(before, after, strict=True))
 
@@ -69,7 +68,7 @@ def test_a_believed_offset_is_ramped_from_its_value() -> None:
 
 
 @pytest.mark.parametrize(
-    ("machine", "told"),
+    ("machine", "expected"),
     [
         (holding(820, 0), "250.2 um may still be applied: beyond the ceiling"),
         (holding(0, -327680), "-100000.0 um may still be applied: beyond the ceiling"),
@@ -77,14 +76,14 @@ def test_a_believed_offset_is_ramped_from_its_value() -> None:
         (holding(500, 0, record_void=True), "152.6 um may still be applied: axis X: the drive has rebooted"),
     ],
 )
-def test_what_may_not_be_believed_is_frozen_and_told(machine: Bench, told: str) -> None:
+def test_what_may_not_be_believed_is_frozen_and_told(machine: Bench, expected: str) -> None:
     machine.run(150)
     assert machine.mode is Mode.FROZEN
     assert machine.frames == []
     assert machine.heartbeats == []
     assert machine.state.cause is not None
     assert machine.state.cause.code == "OffsetDoubtful"
-    assert told in machine.state.cause.sentence()
+    assert expected in machine.state.cause.sentence()
     assert may_stand(machine.state) == tuple(drive.offset for drive in machine.drives)
     assert codes(machine.sync(ADOPT).refused) & {"OffsetDoubtful", "NotCommissioned", "RecordVoid"}
     assert "NotOff" in codes(machine.sync(arm_request()).refused)
@@ -93,7 +92,7 @@ def test_what_may_not_be_believed_is_frozen_and_told(machine: Bench, told: str) 
 @pytest.mark.parametrize("target", [327680, 800])
 @pytest.mark.fault("A17")
 def test_a_remapped_read_back_is_not_believed(target: int) -> None:
-    """0x60B0 and 0x6062 at each other's place: within the ceiling or not, nothing is sent."""
+    """0x60B0 and 0x6062 are swapped: nothing is sent, within the ceiling or not."""
     machine = bench()
     machine.rest = [target, 0]
     machine.drives[0].remapped = True
@@ -119,7 +118,6 @@ def test_forged_frames_beside_the_drives_own_move_nothing(at: int, times: int) -
 
 @pytest.mark.parametrize("phase", range(1, 10))
 def test_another_node_in_step_with_the_drive_is_not_believed(phase: int) -> None:
-    """It sends TPDO3 as often as the drive does, consistent, at a time of its own: neither of the two is known."""
     machine = bench()
     for _ in range(200):
         machine.sync()
@@ -139,7 +137,6 @@ def test_an_offset_that_is_never_shown_alike_is_frozen() -> None:
 
 
 def test_a_drive_that_boots_at_rest_is_read_anew() -> None:
-    """What it held before says nothing: it is known again after three readings, and until then nothing is armed."""
     machine = bench()
     machine.settle()
     while machine.tick % 10 != 3:
@@ -153,7 +150,7 @@ def test_a_drive_that_boots_at_rest_is_read_anew() -> None:
 
 
 def test_nothing_is_armed_while_the_read_back_is_silent() -> None:
-    """A restart with -91.6 um in the drive and its TPDO3 gone: unknown refuses."""
+    """A restart with -91.6 um in the drive and its TPDO3 missing: the unknown offset refuses arming."""
     machine = holding(-300, 0)
     for _ in range(300):
         machine.sync(drop=(0x381,))
@@ -296,14 +293,14 @@ def test_a_flood_of_other_events_does_not_hide_a_foreign_offset() -> None:
 
 
 def test_no_frame_is_beyond_the_compiled_ceiling(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever the settings and the state say: what is sent is bounded by 250 um."""
+    """Frames are bounded by 250 um, whatever settings and state contain."""
     machine = active()
     limits = replace(machine.settings.axes[0].limits, offset=32768, rate=3000, acceleration=3000)
     machine.settings = replace(
         machine.settings, axes=tuple(replace(axis, limits=limits) for axis in machine.settings.axes)
     )
     count = len(machine.frames)
-    monkeypatch.setattr(core, "follow", lambda *_: 820)
+    monkeypatch.setattr(core, follow.__name__, lambda *_: 820)
     machine.sync(Request("disarm"))
     assert machine.mode is Mode.FROZEN
     assert machine.alarms[-1].code == "InternalError"
@@ -316,12 +313,11 @@ def test_what_may_stand_while_it_sends_is_what_was_sent_or_shown() -> None:
     machine.drives[0].scale = 0.5
     while not machine.state.axes[0].echo_misses:
         machine.sync()
-    told = may_stand(machine.state)
-    assert told[0] == machine.state.axes[0].read_back != machine.frames[-1][1][0]
+    result = may_stand(machine.state)
+    assert result[0] == machine.state.axes[0].read_back != machine.frames[-1][1][0]
 
 
 def test_a_zero_that_was_shown_at_the_end_stays_known() -> None:
-    """Switched off after the job, the drives say nothing any more: nothing has been sent since."""
     machine = active()
     machine.sync(Request("disarm"))
     machine.until(Mode.OFF)
@@ -354,7 +350,7 @@ def test_adopt_leads_out_of_frozen_once_the_drives_were_read() -> None:
 
 
 def test_adopt_of_nothing_is_off_without_a_frame() -> None:
-    """Beyond the ceiling there is one way out: the drive is switched off and on, and shows zero."""
+    """Beyond the ceiling the only way out is to switch the drive off and on: it then shows zero."""
     machine = holding(5000, 0, record="")
     machine.run(150)
     assert machine.mode is Mode.FROZEN
@@ -413,11 +409,11 @@ def test_a_drive_that_was_touched_after_it_was_compared_stays_void(touched: Mapp
     restart(machine)
     machine.settle()
     asked = Request("compared", True, compared={"X": RECORD}, touched=touched)
-    told = Alarm("RecordVoid", "X", "that was after it was compared")
-    assert machine.sync(asked).refused == (told,)
+    expected = Alarm("RecordVoid", "X", "after it was compared")
+    assert machine.sync(asked).refused == (expected,)
     assert codes(machine.arm()) == {"RecordVoid"}
     restart(machine)  # in the very cycle in which the guard is told
-    assert machine.sync(replace(asked, touched={"X": 2})).refused == (told,)
+    assert machine.sync(replace(asked, touched={"X": 2})).refused == (expected,)
     assert machine.sync(replace(asked, touched={"X": 3})).refused == ()
 
 

@@ -1,4 +1,4 @@
-"""OFF to ARMED: impossible unless every interlock, every fact, the token, the table and the time agree."""
+"""OFF to ARMED is impossible unless every interlock, every fact, the token, the table and the time agree."""
 
 from __future__ import annotations
 
@@ -43,7 +43,6 @@ BUS_CHANGES: dict[str, dict[str, Any]] = {
 
 
 def test_the_daemon_must_vouch_for_each_of_these() -> None:
-    """Named here once more: what is no longer asked for would be missed by nobody."""
     machine, fed = bench(), fed_bench()
     machine.settle()
     fed.settle()
@@ -61,7 +60,6 @@ def test_the_daemon_must_vouch_for_each_of_these() -> None:
 
 @pytest.fixture(scope="module")
 def settled() -> tuple[Bench, Inputs]:
-    """A machine with everything good, and the inputs of its next SYNC."""
     machine = bench(axes=("X",))
     axes = tuple(replace(axis, heartbeat_timeout_s=0.5) for axis in machine.settings.axes)
     machine.settings = replace(machine.settings, axes=axes)
@@ -75,7 +73,6 @@ def settled() -> tuple[Bench, Inputs]:
 
 
 def refusals(machine: Bench, inputs: Inputs) -> set[str]:
-    """The classes of the refusal; empty when it was armed."""
     state, output = core.step(machine.state, inputs, machine.settings)
     assert output.refused is not None
     assert (state.mode is Mode.ARMED) is (output.refused == ())
@@ -112,9 +109,9 @@ def test_every_vector_of_the_interlocks(settled: tuple[Bench, Inputs]) -> None:
             axis = AXIS_CHANGES[code](axis)
         for code in broken & BUS_CHANGES.keys():
             bus = bus._replace(**BUS_CHANGES[code])
-        told = refusals(machine, inputs._replace(axes=(axis,), bus=bus, request=arm_request()))
-        assert broken <= told
-        assert bool(told) is bool(broken)
+        answer = refusals(machine, inputs._replace(axes=(axis,), bus=bus, request=arm_request()))
+        assert broken <= answer
+        assert bool(answer) is bool(broken)
 
 
 @pytest.mark.parametrize("value", [None, 1, "true", 0, [], {"commissioned": True}])
@@ -168,7 +165,6 @@ GOOD: View = (
 
 
 def changed(change: dict[str, Any]) -> View:
-    """The good view with one field of any of its three records changed."""
     own, seen, axis = GOOD
     ((name, value),) = change.items()
     if name in AxisState._fields:
@@ -211,7 +207,6 @@ def test_unknown_is_never_good(change: dict[str, Any], code: str) -> None:
 
 
 def test_every_vector_of_an_axis_is_told_exactly() -> None:
-    """All interlocks of an axis, each good or not: what is told is what is not good, and nothing else."""
     own, seen, axis = GOOD
     bus = BusView(sync_regular=True, silent=False)
     bits = {"DriveNotEnabled": -0x0004, "NotFollowing": -0x1000, "LimitActive": 0x0800, "FollowingError": 0x2000}
@@ -242,13 +237,13 @@ def test_every_vector_of_an_axis_is_told_exactly() -> None:
 
 def test_every_vector_of_the_bus_is_told_exactly() -> None:
     states = {"active": "", "warning": "", "passive": "ErrorPassive", "off": "BusOff", "down": "BusDown"}
-    told = set()
+    result = set()
     for state, regular, silent, lost in itertools.product(states, (True, False), (True, False), (0, 1)):
         expected = {states[state]} - {""} | ({"SyncLost"} if silent else set()) | ({"RxOverflow"} if lost else set())
         expected |= set() if regular else {"SyncJitter"}
         assert {alarm.code for alarm in failing(BusView(state, regular, silent, lost), (GOOD,))} == expected
-        told |= expected
-    assert told == {code for code, _ in BUS_INTERLOCKS}
+        result |= expected
+    assert result == {code for code, _ in BUS_INTERLOCKS}
 
 
 @pytest.mark.parametrize(
@@ -278,20 +273,19 @@ REFUSES |= {"NotOff", "NotSettled", "GuardBusy", "DisarmedSince", "PcLate"}
 
 
 def test_what_cannot_be_ramped_freezes_what_may_pass_is_held_and_all_else_that_goes_wrong_ramps_down() -> None:
-    """The reactions of the safety concept; what only a request can meet refuses it and touches nothing that runs."""
     for reaction, codes in ((Reaction.FREEZE, FREEZES), (Reaction.HOLD, HOLDS), (Reaction.REFUSE, REFUSES)):
         assert {code for code in CATALOGUE if Alarm(code).reaction is reaction} == codes
 
 
 def test_an_alarm_says_axis_cause_detail_effect_and_next_action() -> None:
     bare, full = Alarm("SyncLost"), Alarm("SyncLost", "X", "for 4 ms")
-    assert bare.cause == "no SYNC is heard"
-    assert full.cause == "axis X: no SYNC is heard (for 4 ms)"
+    assert bare.cause == "no SYNC is received"
+    assert full.cause == "axis X: no SYNC is received (for 4 ms)"
     action = "hold the feed, restore the NC's SYNC, then adopt"
     frozen = "nothing can be sent: the last offset may still be applied"
-    assert bare.sentence() == f"no SYNC is heard; {frozen}; {action}"
+    assert bare.sentence() == f"no SYNC is received; {frozen}; {action}"
     off = "the correction is off and nothing is applied"
-    assert bare.sentence(off=True) == f"no SYNC is heard; {off}; {action}"
+    assert bare.sentence(off=True) == f"no SYNC is received; {off}; {action}"
     assert Alarm("NotOff", detail="FROZEN").action == "hold the feed, then run fdhil adopt"
     assert Alarm("NotOff", detail="ACTIVE").action == "disarm it first"
     assert Alarm("SyncLost", detail="FROZEN").action == action
@@ -326,7 +320,6 @@ def test_each_class_has_cause_effect_and_action(code: str) -> None:
     ],
 )
 def test_the_last_good_value_is_good(change: dict[str, Any]) -> None:
-    """One step before each bound nothing is refused and nothing stops."""
     bus = BusView(sync_regular=True, silent=False)
     assert failing(bus, (changed(change),)) == ()
     assert not_ready((changed(change),)) == ()
@@ -356,5 +349,5 @@ def test_feedback_that_is_three_old_is_a_gap_four_is_stale() -> None:
 
 
 def test_the_client_waits_longer_than_the_guard_for_a_sync() -> None:
-    """Else an arming without SYNC would look like a guard that is gone, and not be refused as SyncLost."""
+    """Otherwise arming without SYNC would look like a lost guard instead of a SyncLost refusal."""
     assert machine_settings(clock="sync").silence_s + 1 < ANSWER_S

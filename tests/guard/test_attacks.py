@@ -1,4 +1,4 @@
-"""Garbage, floods and signals beside a running correction neither end the guard nor cost it a SYNC."""
+"""Garbage, floods and signals during a correction neither end the guard nor cost it a SYNC."""
 
 from __future__ import annotations
 
@@ -30,7 +30,6 @@ LAW = '{"speed": %s, "torque": %s, "pace": %s, "dry": %s}'
 
 
 def garbage() -> Iterator[bytes]:
-    """Lines of which none is a request that may be granted, and none a disarm."""
     yield from (b"", b"\xff\xfe", b"NaN", b"[" * 20_000, b'{"a":' * 5_000, b"{", b'{"request": }', b"\0" * 100)
     for value in VALUES:
         yield value.encode()
@@ -56,7 +55,6 @@ def connection(rig: Rig) -> socket.socket:
 
 
 def flood(rig: Rig, send: Callable[[socket.socket], object], ended: threading.Event) -> None:
-    """Send as much as goes, over a connection that is made again whenever it ends, and read nothing."""
     client = connection(rig)
     while not ended.wait(0.001):
         try:
@@ -84,14 +82,13 @@ def many(text: str) -> Callable[[socket.socket], object]:
 
 
 def descriptors(folder: Path) -> list[int]:
-    """What a table may come as that is none: not one of them may be read, nor be waited for."""
     os.mkfifo(folder / "fifo")
     near, far = socket.socketpair()
     return [os.open(folder / "fifo", os.O_RDWR), near.detach(), far.detach(), os.memfd_create("unsealed"), *os.pipe()]
 
 
 def memory_kb(rig: Rig) -> int:
-    """The most that the process ever held."""
+    """Return the peak memory of the process, KB."""
     text = Path(f"/proc/{rig.process.pid}/status").read_text()
     return int(text.split("VmHWM:")[1].split()[0])
 
@@ -150,9 +147,9 @@ def test_neither_garbage_nor_floods_nor_signals_cost_a_running_correction_one_sy
             thread.join()
         for descriptor in (*wrong, piece, whole):
             os.close(descriptor)
-    told = rig.events()
-    assert not any(event["event"] == "failed" for event in told)
-    assert [event["missed"] for event in told if event.get("state") == "OFF"] == [missed]
+    events = rig.events()
+    assert not any(event["event"] == "failed" for event in events)
+    assert [event["missed"] for event in events if event.get("state") == "OFF"] == [missed]
     ticks = [tick for tick, _ in rig.peer.offsets_sent() if tick > armed_at]
     assert ticks == list(range(ticks[0], ticks[0] + len(ticks)))
     rows = {target: k for k, target in enumerate(DEMAND[0])}
@@ -166,7 +163,6 @@ def test_neither_garbage_nor_floods_nor_signals_cost_a_running_correction_one_sy
 
 @pytest.mark.fault("F13")
 def test_what_asks_it_to_stop_has_it_ramp_first(rig: Rig) -> None:
-    """A closed terminal, an interrupt, the kernel's warning before its limit: any of them, and all at once."""
     rig.into_the_cut()
     assert abs(rig.peer.offsets_sent()[-1][1]) > 100
     for number in STOPPING:
@@ -216,21 +212,20 @@ def wait_for_ready(rig: Rig) -> bool:
 
 
 def test_a_second_request_waits_for_the_answer_to_the_first(rig: Rig) -> None:
-    """But a disarm takes the place of what waits, and idle connections make room for new ones."""
     guard = rig.connect()
     rig.peer.stand()
     rig.peer.wait(lambda: guard.status()["tick"] == rig.peer.tick, "the last SYNC")
     idle = [connection(rig) for _ in range(2 * MAX_CLIENTS)]
     with connection(rig) as client:
         client.send(b'{"request": "arm", "id": 1}\n{"request": "arm", "id": 2}\n')
-        told = answer(client)
-        assert (told["id"], told["code"]) == (2, "GuardBusy")
+        reply = answer(client)
+        assert (reply["id"], reply["code"]) == (2, "GuardBusy")
         client.send(b'{"request": "disarm", "id": 3}\n')
-        told = answer(client)
-        assert (told["id"], told["code"]) == (1, "DisarmedSince")
+        reply = answer(client)
+        assert (reply["id"], reply["code"]) == (1, "DisarmedSince")
         rig.peer.syncing = True
-        told = answer(client)
-        assert (told["id"], told["ok"]) == (3, True)
+        reply = answer(client)
+        assert (reply["id"], reply["ok"]) == (3, True)
         client.send(b'{"request": "sing", "id": "4"}\n{"request": ["status"], "id": 5.5}\n')
         assert [answer(client)["code"] for _ in range(1)] == ["BadRequest"]
     for each in idle:

@@ -1,4 +1,4 @@
-"""What is believed of a drive, and what is taken over from it: each rule for itself, without a machine."""
+"""Rules for trusting and adopting a drive's offset, each by itself, without a machine."""
 
 from __future__ import annotations
 
@@ -42,7 +42,6 @@ DOUBTS = {"StaleData", "TargetLost", "FollowingError", "Implausible", "PdoLength
 
 
 def held(*shown: int | None, mode: Mode = Mode.OFF, **changes: Any) -> State:
-    """Drives that have shown these offsets three times; ``changes`` are made in what is remembered of each axis."""
     state = initial(MADE)
     axes = [a._replace(read_back=s, readings=3, **changes) for a, s in zip(state.axes, shown, strict=True)]
     return state._replace(mode=mode, axes=tuple(axes))
@@ -53,7 +52,6 @@ def views(state: State, made: Settings = MADE, inputs: Inputs = GOOD) -> Views:
 
 
 def started(state: State, *alarms: str, inputs: Inputs = GOOD) -> State:
-    """The state behind one step of the check that is made after a start."""
     return adopt_at_start(state, inputs, tuple(map(Alarm, alarms)), views(state, inputs=inputs), MADE)
 
 
@@ -62,7 +60,6 @@ def started(state: State, *alarms: str, inputs: Inputs = GOOD) -> State:
 
 @pytest.mark.parametrize("code", CATALOGUE)
 def test_at_the_start_the_bus_must_be_ours_and_what_is_read_plausible(code: str) -> None:
-    """What makes sending unsafe puts it off, what makes reading doubtful counts against it, the rest is no reason."""
     before = held(500, 0)
     after = started(before, code)
     if code in WAITS:
@@ -91,9 +88,9 @@ def test_doubt_lasts_six_readings_in_a_row_and_then_freezes_for_good() -> None:
     assert started(unheard, "StaleData").unknown_for == 0
     state = started(state, "StaleData")
     assert (state.mode, state.adopt_checked) == (Mode.FROZEN, True)
-    told = "axis X: what the drive holds as offset may not be believed (152.6 um may still be applied: the drive's"
+    expected = "axis X: the offset that the drive reports cannot be trusted (152.6 um may still be applied: the drive's"
     assert state.cause is not None
-    assert state.cause.sentence().startswith(told)
+    assert state.cause.sentence().startswith(expected)
 
 
 def test_after_a_foreign_offset_the_drives_have_six_readings_to_agree() -> None:
@@ -112,23 +109,23 @@ def test_after_a_foreign_offset_the_drives_have_six_readings_to_agree() -> None:
 
 
 @pytest.mark.parametrize(
-    ("axis", "told"),
+    ("axis", "expected"),
     [
         ({"off_demand": 2.0}, ""),
-        ({"off_demand": 2.5}, "152.6 um may still be applied: its demand (0x6062) says otherwise"),
-        ({"off_demand": float("nan")}, "152.6 um may still be applied: its demand (0x6062) says otherwise"),
-        ({"readings": 2}, "three TPDOs in a row do not agree on it"),
-        ({"read_back": None}, "three TPDOs in a row do not agree on it"),
+        ({"off_demand": 2.5}, "152.6 um may still be applied: its demand (0x6062) contradicts it"),
+        ({"off_demand": float("nan")}, "152.6 um may still be applied: its demand (0x6062) contradicts it"),
+        ({"readings": 2}, "no three TPDOs in a row agree on it"),
+        ({"read_back": None}, "no three TPDOs in a row agree on it"),
         ({"read_back": 819}, ""),
         ({"read_back": -820}, "-250.2 um may still be applied: beyond the ceiling of 250 um"),
     ],
 )
 def test_a_value_is_believed_that_was_shown_three_times_and_fits_ceiling_and_demand(
-    axis: Mapping[str, Any], told: str
+    axis: Mapping[str, Any], expected: str
 ) -> None:
     state = held(500, 0)
     state = state._replace(axes=(state.axes[0]._replace(**axis), state.axes[1]))
-    assert doubts(views(state), ()) == ((Alarm("OffsetDoubtful", "X", told),) if told else ())
+    assert doubts(views(state), ()) == ((Alarm("OffsetDoubtful", "X", expected),) if expected else ())
 
 
 def test_a_value_is_believed_of_a_drive_that_is_as_it_was_commissioned() -> None:
@@ -142,12 +139,11 @@ def test_a_value_is_believed_of_a_drive_that_is_as_it_was_commissioned() -> None
 
 
 def test_who_is_told_of_a_doubt_is_told_the_axis_the_offset_and_the_reason() -> None:
-    """The axis that shows an offset; where none does (a torque is held), the first."""
     doubtful: Alarms = (Alarm("RecordVoid", "Y"),)
-    reason = "axis Y: the drive has rebooted or was set up anew since it was commissioned"
+    reason = "axis Y: the drive has rebooted or its settings have changed since it was commissioned"
     for shown, axis, um in (((500, 0), "X", "152.6"), ((0, -500), "Y", "-152.6"), ((0, 0), "X", "0.0")):
-        told = Alarm("OffsetDoubtful", axis, f"{um} um may still be applied: {reason}")
-        assert in_doubt(views(held(*shown)), doubtful) == told
+        expected = Alarm("OffsetDoubtful", axis, f"{um} um may still be applied: {reason}")
+        assert in_doubt(views(held(*shown)), doubtful) == expected
     own = Alarm("OffsetDoubtful", "X", "its own")
     assert in_doubt(views(held(None, 0)), (*doubtful, Alarm("OffsetDoubtful", "Y", "another's"), own)) == own
 
@@ -156,13 +152,11 @@ def test_who_is_told_of_a_doubt_is_told_the_axis_the_offset_and_the_reason() -> 
 
 
 def moving(**changes: Any) -> AxisState:
-    """An axis in motion, with misses counted, that had shown 0 before."""
     made = AxisState(offset=600, rate=30, sent=(600, 570, 540, 510), read_back=540, readings=1, echo_misses=1)
     return made._replace(zero_shown=True, **changes)
 
 
 def test_what_is_taken_over_is_at_rest_there_as_if_it_had_been_sent_for_ever() -> None:
-    """Misses and zeros count from there: what was shown before says nothing of it."""
     assert at_rest(moving(), 500) == AxisState(offset=500, sent=(500,) * 4, read_back=540, readings=1)
     assert at_zero(moving(read_back=0)) == AxisState(read_back=0, readings=3, zero_shown=True)
 
@@ -173,7 +167,6 @@ def test_what_is_to_be_read_anew_is_unknown() -> None:
 
 
 def test_adopting_begins_where_each_drive_is() -> None:
-    """From its value, at rest, told why, with zeros of its own; a drive that holds nothing is sent nothing but 0."""
     before = held(500, 0, mode=Mode.FROZEN, offset=7, rate=3)._replace(zeros_sent=50, measuring=4)
     after = adopting(before, MADE)
     assert (after.mode, after.cause) == (Mode.ADOPT, Alarm("StaleOffset"))
@@ -230,8 +223,8 @@ def test_adopting_and_comparing_are_refused_while_it_sends(mode: Mode) -> None:
 
 
 def test_a_drive_that_is_another_is_told_by_its_axis() -> None:
-    told = Alarm("RecordVoid", "Y", "it differs from the record that this guard knows")
-    for found, refused in (({"X": RECORD, "Y": "another"}, (told,)), ({"X": RECORD}, ())):
+    expected = Alarm("RecordVoid", "Y", "it differs from the guard's record")
+    for found, refused in (({"X": RECORD, "Y": "another"}, (expected,)), ({"X": RECORD}, ())):
         state, answer = compared(
             held(0, 0), Request("compared", True, compared=found, touched=dict.fromkeys("XY", 0)), MADE
         )

@@ -1,4 +1,4 @@
-"""One derivation of the limits for planner and guard, and ceilings that no file can raise."""
+"""Planner and guard derive the same limits, and no file can raise a ceiling."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.guard.machine import settings as made_settings
 
 
 def test_config_and_guard_have_the_same_ceilings() -> None:
-    """The guard has them of its own: it does not import the config."""
+    """The guard does not import the config, so that both define the ceilings."""
     ours = (CEILING_OFFSET_UM, CEILING_SPEED_MM_S, CEILING_ACCELERATION_MM_S2, VARIATION_MM)
     assert ours == (
         guard_limits.CEILING_OFFSET_UM,
@@ -69,7 +69,6 @@ def documents() -> st.SearchStrategy[dict[str, Any]]:
 def test_planner_and_guard_agree_on_every_axis_and_nothing_exceeds_a_ceiling(
     document: dict[str, Any], seed: int
 ) -> None:
-    """Whatever is wanted: what the planner makes of it, the guard takes; what it holds to is within the ceilings."""
     machine = parsed(document)
     if isinstance(machine, str):
         assert any(words in machine for words in ("too coarse", "from the largest offset to zero", "feed drives have"))
@@ -102,7 +101,6 @@ def test_planner_and_guard_agree_on_every_axis_and_nothing_exceeds_a_ceiling(
 
 
 def parsed(document: dict[str, Any]) -> machine_config.MachineConfig | str:
-    """The config, or why it is refused."""
     try:
         return machine_config.parse(document)
     except ConfigError as error:
@@ -110,7 +108,6 @@ def parsed(document: dict[str, Any]) -> machine_config.MachineConfig | str:
 
 
 def altered(**changes: object) -> str:
-    """A settings file in which somebody has changed a limit of the first axis, or another value of it."""
     document = json.loads(to_json(made_settings()))
     axis = document["axes"][0]
     for key, value in changes.items():
@@ -153,7 +150,6 @@ def test_the_travel_of_an_axis_is_read_as_it_was_written(travel: list[int] | Non
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.fault("G11")
 def test_no_value_of_any_kind_in_any_field_is_anything_but_a_refusal() -> None:
-    """Every key of the file, at every depth, given what does not belong there."""
     clean = json.loads(to_json(made_settings()))
     paths = list(_paths(clean))
     assert len(paths) > 100

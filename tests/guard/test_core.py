@@ -1,4 +1,4 @@
-"""The guard's life of one correction, on the frames that leave."""
+"""One correction through the guard's core, checked on the frames that leave."""
 
 from __future__ import annotations
 
@@ -68,7 +68,6 @@ def test_path_end_ramps_to_zero_and_off(armed: Bench) -> None:
 
 
 def test_the_last_row_is_sent_and_the_ramp_begins_behind_it(armed: Bench) -> None:
-    """A table that ends while its offset rises: the last row leaves, at its own cycle, then the way to zero begins."""
     path = armed.path
     assert path is not None
     demand, offset = (tuple(column[:200] for column in columns) for columns in (path.demand, path.offset))
@@ -84,11 +83,10 @@ def test_the_last_row_is_sent_and_the_ramp_begins_behind_it(armed: Bench) -> Non
 
 
 def test_what_ended_it_is_told_once_and_by_its_own_name(armed: Bench) -> None:
-    """A change of the state is told in the cycle in which it happens, with its cause; otherwise nothing is."""
     for kind, code in (("stop", "Stopped"), ("disarm", "Disarmed")):
         machine = copy.deepcopy(armed)
-        told = [machine.sync().transition for _ in range(5)]
-        assert told == [None] * 5
+        result = [machine.sync().transition for _ in range(5)]
+        assert result == [None] * 5
         assert machine.sync(Request("stop" if kind == "stop" else "disarm")).transition == (
             *(Mode.ARMED, Mode.RAMP_DOWN),
             Alarm(code),
@@ -101,7 +99,6 @@ def test_what_ended_it_is_told_once_and_by_its_own_name(armed: Bench) -> None:
 
 
 def test_each_landing_sends_its_own_zeros(armed: Bench) -> None:
-    """What the landing before sent does not count: whoever is armed again and disarmed lands anew."""
     for _ in range(2):
         armed.run(25)
         before = len(armed.frames)

@@ -1,10 +1,10 @@
-"""Corners of the core that no single fault leads to."""
+"""Details of the core that no single fault reaches."""
 
 from __future__ import annotations
 
 import pytest
 
-from fdhil.guard import core
+from fdhil.guard import core, limits
 from fdhil.guard.conditions import known
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.path import CorrectedPath, rate_between
@@ -26,7 +26,6 @@ def active() -> Bench:
 
 
 def inputs_of(machine: Bench, withdrawn: tuple[Alarm, ...] = ()) -> Inputs:
-    """The inputs of the next SYNC."""
     machine.counter = machine.counter % 240 + 1
     seen, bus = machine.listener.at_sync(bytes([machine.counter]), 0.0, 0.0)
     return Inputs(True, seen, bus, path=machine.path, withdrawn=withdrawn)
@@ -45,8 +44,8 @@ def test_status_tells_what_is_not_good() -> None:
     assert core.standing(machine.state, inputs_of(machine), machine.settings) == ()
     machine.drives[0].mode = 1
     machine.settle(20)
-    told = core.standing(machine.state, inputs_of(machine), machine.settings)
-    assert ("NotCsp", "X") in {(alarm.code, alarm.axis) for alarm in told}
+    result = core.standing(machine.state, inputs_of(machine), machine.settings)
+    assert ("NotCsp", "X") in {(alarm.code, alarm.axis) for alarm in result}
 
 
 def test_adopting_is_for_off_and_frozen_alone() -> None:
@@ -61,9 +60,9 @@ def test_who_arms_in_frozen_is_told_to_adopt_and_not_to_disarm() -> None:
     machine = active()
     machine.listener.error("off")
     machine.until(Mode.FROZEN)
-    told = next(alarm for alarm in machine.arm() if alarm.code == "NotOff")
-    assert "adopt" in told.action
-    assert "armed or ramping" not in told.cause
+    result = next(alarm for alarm in machine.arm() if alarm.code == "NotOff")
+    assert "adopt" in result.action
+    assert "armed or ramping" not in result.cause
 
 
 def test_adopting_waits_for_the_drives_own_word() -> None:
@@ -153,7 +152,7 @@ def test_a_wrong_frame_is_caught_whatever_made_it(monkeypatch: pytest.MonkeyPatc
     machine = active()
     machine.sync(Request("disarm"))
     count = len(machine.frames)
-    monkeypatch.setattr(core, "follow", lambda *_: wrong)
+    monkeypatch.setattr(core, limits.follow.__name__, lambda *_: wrong)
     machine.sync()
     assert machine.state.mode is Mode.FROZEN
     assert machine.alarms[-1].code == "InternalError"
@@ -229,7 +228,7 @@ def test_a_hold_lasts_ten_cycles_each_time_anew() -> None:
 
 
 def test_one_good_cycle_between_two_gaps_is_enough() -> None:
-    """What was found again may be lost again for as long: the gaps do not add up."""
+    """Gaps do not add up: each may last as long as a single one."""
     machine = active()
     for _ in range(4):
         for _ in range(10):  # the first of them latches what was streamed before: it is the good one

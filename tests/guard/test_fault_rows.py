@@ -1,4 +1,4 @@
-"""Faults of the matrix that the guard's other tests show without their class or without the whole reaction."""
+"""Faults of the fault matrix whose class or full reaction no other guard test shows."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from tests.guard.test_faults import Tell
 
 
 def cutting(machine: Bench) -> Bench:
-    """Return the machine in the cut, with an offset that is well away from zero."""
     machine.settle()
     assert machine.arm() == ()
     machine.run(30)
@@ -31,7 +30,6 @@ def cutting(machine: Bench) -> Bench:
 
 
 def ends_at_zero_by(machine: Bench, code: str, since_tick: int, tell: Tell) -> None:
-    """Check the class of what ended it, and that it went to zero by ramp and stays off."""
     assert machine.alarms[-1].code == code
     machine.until(Mode.OFF)
     tell("sync_to_zero", machine.to_zero(since_tick))
@@ -113,12 +111,9 @@ def test_a_pdo_longer_than_its_mapping_arms_nothing() -> None:
 
 
 class LateSync(Bench):
-    """A machine of the host's clock, whose SYNC comes ``late_s`` after its time."""
-
     late_s = 0.0
 
     def delay(self) -> None:
-        """Put the delay between the SYNC and the listener."""
         hear = self.listener.at_sync
         self.listener.at_sync = lambda data, stamp_s, now_s: hear(  # type: ignore[method-assign]
             data, stamp_s + self.late_s, now_s + self.late_s
@@ -147,7 +142,6 @@ def test_a_sync_that_is_late_once_is_held_and_another_period_ends_it(record_prop
 @pytest.mark.fault("G10")
 @pytest.mark.goal("R16")
 def test_the_operators_token_is_in_nothing_that_is_written(tmp_path: Path) -> None:
-    """Neither in the settings, the journal, the status, nor in any answer, right or wrong."""
     shop = Shop(tmp_path)
     try:
         client = shop.into_the_cut()

@@ -1,4 +1,4 @@
-"""Each fault in the cut: its class once, the reaction that the matrix asks for, zero within the time to safe."""
+"""Each fault during a cut: its class once, the reaction of the fault matrix, zero within the time to safe."""
 
 from __future__ import annotations
 
@@ -100,7 +100,6 @@ FROZEN: dict[str, tuple[Fault, str]] = {
 
 @pytest.fixture(scope="module")
 def prepared() -> Bench:
-    """Active, the offset of X near its largest and rising."""
     machine = bench(amplitude=800)
     machine.settle()
     assert machine.arm() == ()
@@ -115,7 +114,6 @@ def prepared() -> Bench:
 
 @pytest.fixture
 def cutting(prepared: Bench) -> Bench:
-    """A machine of one's own in that state."""
     return copy.deepcopy(prepared)
 
 
@@ -171,7 +169,6 @@ def test_fault_freezes_at_once_and_only_the_operator_leads_out(cutting: Bench, r
 
 @pytest.mark.fault("A23")
 def test_a_reboot_freezes_until_the_drive_was_compared_and_adopted(cutting: Bench) -> None:
-    """A23: what the drive holds and how it is set up is unknown; nothing is sent until both are known again."""
     count = len(cutting.frames)
     cutting.reboot(0)
     cutting.run(30)
@@ -294,7 +291,6 @@ def test_many_missed_cycles_ramp_down(cutting: Bench) -> None:
 
 
 def test_a_simulated_machine_that_runs_ahead_of_a_guard_without_offsets_is_no_overrun() -> None:
-    """By the host's clock the guard may sleep: the machine waits for its frames as soon as it sends offsets."""
     machine = bench()
     machine.settle()
     for _ in range(300):

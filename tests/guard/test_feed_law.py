@@ -1,4 +1,4 @@
-"""The feed-forward's law, its limits, its fades and its gaps, cycle by cycle, without a machine."""
+"""The feed-forward's law, limits, fades and gaps, cycle by cycle, without a machine."""
 
 from __future__ import annotations
 
@@ -32,10 +32,9 @@ from tests.guard.fed import LAW, LIMITS, ONE
 @given(
     st.lists(st.tuples(st.integers(-(2**31), 2**31 - 1), st.booleans()), min_size=5, max_size=80), st.integers(1, 50)
 )
-def test_limits_hold_for_any_targets(heard: list[tuple[int, bool]], ending: int) -> None:
-    """Amplitude and rate of both offsets, whatever the targets jump to or lack; at the end they are zero."""
+def test_limits_hold_for_any_targets(expected: list[tuple[int, bool]], ending: int) -> None:
     feed: Feed = armed((LAW,))
-    for k, (target, lost) in enumerate(heard):
+    for k, (target, lost) in enumerate(expected):
         if k == ending:
             feed = end(feed, Alarm("Disarmed"))
         before = feed.applied
@@ -49,7 +48,7 @@ def test_limits_hold_for_any_targets(heard: list[tuple[int, bool]], ending: int)
 
 
 def test_at_rest_the_law_says_zero() -> None:
-    """Weights count from the newest target: rounding of the weights cannot leave an offset on an axis at rest."""
+    """Weights count from the newest target, so that their rounding leaves no offset at standstill."""
     assert LAW.offsets([123_456] * 3) == (0, 0)
     assert LAW.offsets([10, 0, -10]) == (2000, -20 + 20 + 30)
     assert LAW.offsets([-10, 0, 10]) == (-2000, 20 - 20 - 30)  # and dry friction acts in full, not more, either way
@@ -77,19 +76,17 @@ GOOD = {"speed": [1], "torque": [1], "pace": [1], "dry": 1}
     ],
 )
 def test_only_a_whole_law_is_taken(change: dict[str, object]) -> None:
-    """Integers of a bounded size, a bounded number of them."""
     assert parse_law(GOOD) == Law((1,), (1,), (1,), 1)
     assert parse_law(GOOD | change) is None
     assert parse_law([GOOD]) is None
 
 
 def fed(**changes: Any) -> Feed:
-    """A feed-forward of one axis that is on, with all targets it needs."""
     return armed((LAW,))._replace(targets=((30, 20, 10),), **changes)
 
 
 def test_it_fades_in_cycle_by_cycle_and_out_the_same_way() -> None:
-    """Of 10 cycles each adds a tenth of what the law says, rounded down; ending takes it back."""
+    """Each of 10 cycles adds a tenth of the law's value, rounded down; fading out reverses it."""
     wide, feed = FeedforwardLimits(10**6, 10**6, 10**4, 10**4), fed()
     assert LAW.offsets((30, 20, 10)) == (2000, 30)
     seen = []
@@ -111,7 +108,6 @@ def test_it_fades_in_cycle_by_cycle_and_out_the_same_way() -> None:
 
 
 def test_before_it_acts_zeros_are_in_force() -> None:
-    """Of each axis: armed, as many cycles of them as are kept to compare with; and where a drive holds something."""
     none = ((0, 0), (0, 0))
     assert armed((LAW, LAW)).sent == (none,) * 4
     assert zeroing(2, Alarm("StaleOffset")) == Feed(FeedMode.ZEROING, sent=(none,), cause=Alarm("StaleOffset"))
@@ -147,7 +143,6 @@ def test_zeros_end_it_after_more_than_three_that_are_shown_or_fifty_that_are_not
 
 
 def test_a_limit_that_takes_something_away_is_counted() -> None:
-    """What is just at the limit is not limited, and before all targets were heard nothing is."""
     assert LAW.offsets((30, 20, 10)) == (2000, 30)
     for speed, torque, counted in ((2000, 30, 0), (1999, 30, 1), (2000, 29, 1)):
         assert move(fed(), [FeedforwardLimits(speed, speed, torque, torque)], 10).limited == counted
@@ -156,8 +151,8 @@ def test_a_limit_that_takes_something_away_is_counted() -> None:
 
 def test_nothing_but_zeros_until_every_target_was_heard() -> None:
     feed = armed((LAW,))
-    for heard in (5, 1005):
-        feed = move(hear(feed, [heard]), [LIMITS], 10)
+    for received in (5, 1005):
+        feed = move(hear(feed, [received]), [LIMITS], 10)
         assert (feed.applied, feed.share) == (((0, 0),), 0)
     feed = move(hear(feed, [2005]), [LIMITS], 10)
     assert feed.share == 1
@@ -193,7 +188,6 @@ def test_the_largest_values_are_the_last_that_pass() -> None:
 
 
 def test_a_gap_is_bridged_for_ten_cycles_in_a_row() -> None:
-    """The eleventh ends it; one good cycle in between starts the count anew."""
     hold, feed = (Alarm("TargetLost"),), fed()
     for k in range(HOLD_CYCLES):
         feed = react(feed, hold)

@@ -1,4 +1,4 @@
-"""Speed and torque offsets that did not leave are not gone on from: what the drive holds is."""
+"""After unsent speed and torque offsets the feed-forward continues from what the drive holds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The guard's on-line feed-forward on the machine: mute until armed, zero on whatever is wrong, read back."""
+"""The guard's on-line feed-forward on the machine: mute until armed, zero on any fault, read back."""
 
 from __future__ import annotations
 
@@ -31,7 +31,6 @@ from tests.guard.shop import OWNER, TOKEN, Shop
 
 
 def test_it_is_mute_until_it_is_asked_for() -> None:
-    """No frame leaves, whatever moves; on, both objects leave every SYNC with the heartbeat beside."""
     bench = fed_bench()
     bench.play()
     bench.settle(300)
@@ -53,7 +52,6 @@ def test_it_is_mute_until_it_is_asked_for() -> None:
     ],
 )
 def test_what_forbids_it(changes: dict[str, Any], code: str) -> None:
-    """Token, law of every axis, and each fact that the daemon must vouch for."""
     bench = fed_bench()
     bench.settle()
     refused = bench.sync(request(**changes)).refused
@@ -63,7 +61,6 @@ def test_what_forbids_it(changes: dict[str, Any], code: str) -> None:
 
 
 def test_never_together_with_a_position_offset() -> None:
-    """One is refused while the other is on."""
     bench = switched_on()
     refused = bench.sync(arm_request()).refused
     assert refused is not None
@@ -78,7 +75,6 @@ def test_never_together_with_a_position_offset() -> None:
 
 
 def test_without_the_section_it_cannot_be_switched_on() -> None:
-    """A drive that was not set up for it has no RPDO in the settings."""
     bench = machine.bench()
     bench.settle()
     refused = bench.sync(request()).refused
@@ -87,7 +83,6 @@ def test_without_the_section_it_cannot_be_switched_on() -> None:
 
 
 def test_disarmed_it_fades_to_zero_and_stops() -> None:
-    """Within the fade both offsets are 0, zeros follow, then nothing is sent."""
     bench = switched_on()
     bench.sync(Request("disarm"))
     bench.run(120)
@@ -101,7 +96,6 @@ def test_disarmed_it_fades_to_zero_and_stops() -> None:
 
 
 def test_a_lost_sync_zeroes_at_once() -> None:
-    """The first step of the local timer sends zeros, without any ramp."""
     bench = switched_on()
     assert bench.silence().feed == ((0, 0), (0, 0))
     for _ in range(5):
@@ -112,7 +106,6 @@ def test_a_lost_sync_zeroes_at_once() -> None:
 
 @pytest.mark.parametrize("what", ["fault", "daemon", "target"])
 def test_a_fault_fades_it_out(what: str) -> None:
-    """A drive's fault, a daemon that is gone, targets that stay away: each with its cause."""
     bench = switched_on()
     if what == "fault":
         bench.drives[0].statusword = 0x0218
@@ -129,7 +122,6 @@ def test_a_fault_fades_it_out(what: str) -> None:
 @pytest.mark.fault("A19")
 @pytest.mark.parametrize("index", [0x60B1, 0x60B2])
 def test_another_masters_write_fades_it_out(index: int) -> None:
-    """By SDO, to an object that the guard sends; in a drive that is not fed it is of no concern here."""
     write = struct.pack("<BHBi", 0x23, index, 0, 300)
     bench = switched_on()
     bench.inject(0x601, write)
@@ -146,7 +138,6 @@ def test_another_masters_write_fades_it_out(index: int) -> None:
 
 
 def test_a_lost_target_is_bridged() -> None:
-    """One target that does not come is taken to go on as those before it."""
     bench = switched_on()
     bench.sync(nc=False)
     bench.run(30)
@@ -154,7 +145,6 @@ def test_a_lost_target_is_bridged() -> None:
 
 
 def test_settings_keep_it() -> None:
-    """Through the settings file, and its COB-IDs are among those that may leave."""
     made = fed_settings()
     assert from_json(to_json(made)) == made
     assert {0x401, 0x402} <= made.sent_ids
@@ -162,18 +152,15 @@ def test_settings_keep_it() -> None:
 
 
 def mode_of(bench: Bench) -> FeedMode:
-    """Whether the feed-forward acts."""
     return bench.state.feed.mode
 
 
 def code_of(bench: Bench) -> str | None:
-    """Why the feed-forward went off."""
     cause = bench.state.feed.cause
     return None if cause is None else cause.code
 
 
 def test_what_the_drives_show_is_what_was_sent() -> None:
-    """Every value comes back a cycle later; frames that were late or did not leave are no mismatch."""
     bench = switched_on(shown=True)
     for k in range(200):
         bench.sync(late=k % 20 == 5)
@@ -194,7 +181,6 @@ def test_what_the_drives_show_is_what_was_sent() -> None:
     ids=["no torque", "no speed", "swapped", "sign", "scale"],
 )
 def test_a_drive_that_makes_something_else_of_them_ends_it(takes: Callable[[Pair], Pair]) -> None:
-    """Two readings that are none of the last values sent fade both offsets out, as for a position offset."""
     bench = switched_on(shown=True)
     bench.drives[1].takes_fed = takes
     bench.run(4)
@@ -214,7 +200,6 @@ def test_one_wrong_reading_is_none() -> None:
 
 
 def test_a_drive_that_keeps_its_torque_is_told() -> None:
-    """Zeros go on for as long as they may help; then the guard gives up and says so, and refuses the next arming."""
     bench = switched_on(shown=True)
     bench.drives[0].takes_fed = lambda _pair: (0, 40)
     bench.run(140)
@@ -235,7 +220,6 @@ def test_a_drive_that_keeps_its_torque_is_told() -> None:
 
 
 def test_zeros_that_do_not_leave_are_none() -> None:
-    """Where a queue stays full the guard gives up, says what may stand, and arms nothing until it was adopted."""
     bench = switched_on()
     bench.sync(Request("disarm"))
     before = bench.state.feed.applied
@@ -243,9 +227,9 @@ def test_zeros_that_do_not_leave_are_none() -> None:
     for _ in range(100):
         bench.sync(unsent=(0, 1))
     assert mode_of(bench) is FeedMode.OFF
-    told = status.document(bench.state, bench.settings, None, ())["feedforward"]
-    assert told["confirmed"] is False
-    assert told["cause"]["text"].endswith("(no zero was read back)")
+    shown_status = status.document(bench.state, bench.settings, None, ())["feedforward"]
+    assert shown_status["confirmed"] is False
+    assert shown_status["cause"]["text"].endswith("(no zero was read back)")
     assert bench.state.feed.applied[0][0] > before[0][0] // 2
     bench.run(150)
     for wanted in (request(), arm_request()):
@@ -273,7 +257,6 @@ def test_an_axis_whose_zeros_stay_behind_is_waited_for() -> None:
 
 
 def test_a_mismatch_that_ended_at_zero_is_over() -> None:
-    """What was told against a drive is why it went off; what it shows since then is that nothing stands."""
     bench = switched_on(shown=True)
     bench.drives[1].takes_fed = lambda pair: (pair[0], -pair[1])
     bench.run(200)
@@ -283,7 +266,6 @@ def test_a_mismatch_that_ended_at_zero_is_over() -> None:
 
 @pytest.mark.usefixtures("real_time")
 def test_a_guard_that_ends_over_a_torque_says_so(tmp_path: Path) -> None:
-    """The bus is gone while it acts: exit code, the last line and the journal say what may still be applied."""
     with closing(Shop(tmp_path, commissioned(fed_settings()))) as shop:
         client = shop.connect()
         shop.run(150)
@@ -301,13 +283,14 @@ def test_a_guard_that_ends_over_a_torque_says_so(tmp_path: Path) -> None:
         assert shop.guard.status()["feedforward"]["confirmed"] is False
         shop.stop.send(b"x")
         assert shop.guard.run() == 3
-        told = [event for event in shop.events() if event["event"] in ("feedforward", "stopped")][-2:]
-        assert told[0]["text"].startswith("speed and torque offsets may still be applied; hold the feed")
-        assert told[1]["text"].startswith("the guard has stopped; speed and torque offsets may still be applied; hold")
+        events = [event for event in shop.events() if event["event"] in ("feedforward", "stopped")][-2:]
+        assert events[0]["text"].startswith("speed and torque offsets may still be applied; hold the feed")
+        assert events[1]["text"].startswith(
+            "the guard has stopped; speed and torque offsets may still be applied; hold"
+        )
 
 
 def test_a_drive_that_holds_a_torque_at_start_gets_zeros() -> None:
-    """A guard that comes back finds what another left behind; nothing else is sent."""
     bench = fed_bench(shown=True)
     bench.drives[1].fed = (0, -25)
     bench.settle()
@@ -318,7 +301,6 @@ def test_a_drive_that_holds_a_torque_at_start_gets_zeros() -> None:
 
 
 def test_one_mapped_object_is_enough_to_compare() -> None:
-    """A TPDO with the torque alone: the speed says nothing."""
     bench = fed_bench(shown=True)
     layout = ((0x2000, 0, 32, True), (0x60B2, 0, 16, True))
     axes = [replace(a, tpdos=(*a.tpdos[:-1], Pdo(0x1A0 + a.node_id, layout))) for a in bench.settings.axes]
@@ -334,7 +316,6 @@ def test_one_mapped_object_is_enough_to_compare() -> None:
 
 
 def test_a_feed_hold_takes_them_to_zero() -> None:
-    """Targets that stand leave neither speed nor torque: the offsets go to zero within the limits, and stay there."""
     bench = switched_on()
     bench.rest = bench.targets()
     bench.run(60)
@@ -347,7 +328,6 @@ def test_a_feed_hold_takes_them_to_zero() -> None:
 
 @pytest.mark.parametrize("what", ["bus off", "reboot", "not operational"])
 def test_what_stops_the_bus_or_a_drive_zeroes_at_once(what: str) -> None:
-    """No fade: the very next frames are zeros, and nothing follows them."""
     bench = switched_on()
     if what == "bus off":
         bench.listener.error("off")
@@ -363,7 +343,6 @@ def test_what_stops_the_bus_or_a_drive_zeroes_at_once(what: str) -> None:
 
 
 def test_beyond_its_limits_it_is_limited_and_counted() -> None:
-    """A demand faster than the largest speed offset: what is sent stays at the limit, and the count says so."""
     bench = fed_bench()
     bench.settle()
     assert bench.sync(request()).refused == ()
@@ -377,7 +356,7 @@ def test_beyond_its_limits_it_is_limited_and_counted() -> None:
 
 
 def test_a_corrupt_state_sends_zeros() -> None:
-    """Whatever breaks the limits is checked by other formulas than made it: InternalError, zeros, off."""
+    """The check uses other formulas than the computation: InternalError, zeros, off."""
     bench = switched_on()
     broken = bench.state.feed._replace(sent=(((LIMITS.speed + 5_000, 0), (0, 0)), *bench.state.feed.sent[1:]))
     bench.state = bench.state._replace(feed=broken)
@@ -393,8 +372,8 @@ def test_a_change_is_told_in_the_cycle_in_which_it_happens() -> None:
     bench = switched_on()
     bench.sync(Request("disarm"))
     bench.run(120)
-    told = [output.feed_transition for output in bench.outputs if output.feed_transition is not None]
-    assert told == [(FeedMode.OFF, FeedMode.ON), (FeedMode.ON, FeedMode.ENDING), (FeedMode.ENDING, FeedMode.OFF)]
+    result = [output.feed_transition for output in bench.outputs if output.feed_transition is not None]
+    assert result == [(FeedMode.OFF, FeedMode.ON), (FeedMode.ON, FeedMode.ENDING), (FeedMode.ENDING, FeedMode.OFF)]
     bench = switched_on()
     bench.silence()
     assert bench.outputs[-1].feed_transition == (FeedMode.ON, FeedMode.ZEROING)
@@ -402,7 +381,6 @@ def test_a_change_is_told_in_the_cycle_in_which_it_happens() -> None:
 
 @pytest.mark.parametrize("sync", [True, False])
 def test_where_nothing_can_be_sent_what_was_sent_last_stays_in_force(sync: bool) -> None:
-    """A late step counts as one more cycle of it, the local timer's as none."""
     bench = switched_on()
     before = bench.state.feed._replace(sent=tuple([((k, 0), (0, k)) for k in range(4)]))
     bench.state = bench.state._replace(feed=before)
@@ -413,7 +391,6 @@ def test_where_nothing_can_be_sent_what_was_sent_last_stays_in_force(sync: bool)
 
 
 def test_what_acts_cannot_be_adopted() -> None:
-    """Adopting sends position offsets: while the feed-forward acts, fades or lands it is refused, and goes on."""
     bench = switched_on(shown=True)
     for mode in (FeedMode.ON, FeedMode.ENDING):
         refused = bench.sync(Request("adopt", True)).refused
@@ -424,7 +401,7 @@ def test_what_acts_cannot_be_adopted() -> None:
 
 
 def test_a_whole_table_waits_while_it_sends(tmp_path: Path) -> None:
-    """Checking a table of many rows would make its frames late."""
+    """Checking a long table would delay its frames."""
     allowed = {mode: _answer_to_a_table(tmp_path / mode.value, mode)["ok"] for mode in FeedMode}
     assert allowed == {mode: mode is FeedMode.OFF for mode in FeedMode}
 

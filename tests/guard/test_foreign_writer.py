@@ -1,4 +1,4 @@
-"""A second master that writes the offset of a drive, by whatever COB-ID: nothing is adopted, nothing is fought over."""
+"""A second master that writes a drive's offset by any COB-ID: nothing is adopted and nothing overwritten repeatedly."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ ADOPT = Request("adopt", token_valid=True)
 
 
 def written_by(*cob_ids: int, amplitude: int = 800) -> Bench:
-    """A machine whose drive X has RPDOs with these COB-IDs that write its offset."""
     machine = bench(amplitude=amplitude)
     axes = machine.settings.axes
     settings = replace(machine.settings, axes=(replace(axes[0], writers=cob_ids), *axes[1:]))
@@ -28,7 +27,6 @@ def written_by(*cob_ids: int, amplitude: int = 800) -> Bench:
 
 
 def write(machine: Bench, value: int = PITCH_ERROR, cob_id: int = WRITER) -> None:
-    """The other master's frame, behind ours: it is what the next SYNC latches."""
     machine.hear(cob_id, struct.pack("<i", value))
     machine.drives[0].received_offset = value
 
@@ -80,7 +78,7 @@ def test_offset_of_another_master_can_be_adopted_once_that_is_silent() -> None:
 
 
 def test_offset_that_changes_by_itself_is_not_adopted() -> None:
-    """The other master uses a COB-ID that nobody knows; what it writes varies along the axis."""
+    """The other master uses an unknown COB-ID; its offset varies along the axis."""
     machine = written_by()
     machine.drives[0].hold(PITCH_ERROR)
     for _ in range(8):
@@ -95,8 +93,6 @@ def test_offset_that_changes_by_itself_is_not_adopted() -> None:
 
 @dataclass
 class LateDrive(Drive):
-    """Applies an offset a SYNC later, and shows it with every SYNC."""
-
     waits: list[int | None] = field(default_factory=lambda: [None])
 
     def at_sync(self, tick: int) -> list[Frame]:
@@ -108,7 +104,6 @@ class LateDrive(Drive):
 
 
 def test_last_offsets_of_a_drive_that_is_late_are_no_other_masters() -> None:
-    """The guard freezes: the drive goes on to what was sent last, and that is not adopted later than it must be."""
     plain = bench(amplitude=800)
     axes = [
         replace(
@@ -155,7 +150,7 @@ def test_master_that_writes_again_and_again_is_not_fought(period: int, mode: Mod
 
 @pytest.mark.fault("A19")
 def test_offset_that_was_not_sent_is_found_by_the_read_back() -> None:
-    """By a COB-ID that nobody knows: every other time that it is written, the drive shows it."""
+    """By an unknown COB-ID; the drive shows every second of its values."""
     machine = cutting(written_by(), 100)
     for _ in range(120):
         machine.sync()
@@ -203,5 +198,5 @@ def test_writers_are_heard_and_none_of_ours() -> None:
     assert from_json(to_json(made)) == made
     for ours in (0x301, 0x201, 0x181):
         axes = (replace(made.axes[0], writers=(ours,)), *made.axes[1:])
-        with pytest.raises(ConfigError, match="counts as a foreign writer's"):
+        with pytest.raises(ConfigError, match="is listed as a foreign writer's"):
             from_json(to_json(replace(made, axes=axes)))

@@ -1,4 +1,4 @@
-"""How the core makes one frame and checks it, and how long it waits: rules at their exact bounds."""
+"""How the core computes and checks one frame, and how long it waits: rules at their exact limits."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ CEILING = 819
 
 
 def one(mode: Mode = Mode.ACTIVE, **changes: Any) -> State:
-    """One axis in a state, ``changes`` in what is remembered of it; on the path it is at row 1."""
     state = initial(MADE)._replace(mode=mode, places=(Place(1),))
     return state._replace(axes=(state.axes[0]._replace(**changes),))
 
@@ -41,18 +40,17 @@ def test_at_the_start_nothing_is_known_and_zeros_are_remembered_for_as_long_as_a
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_frame_may_be_at_the_ceiling_and_no_increment_beyond(sign: int) -> None:
-    """Whatever the settings allow; what is beyond is told by axis, offset, rate and frame."""
     assert ceiling(MADE.axes[0].increments_per_mm) == CEILING
     wide = replace(MADE.axes[0].limits, offset=CEILING + 5)
     settings = replace(MADE, axes=(replace(MADE.axes[0], limits=wide),))
     state = one(offset=sign * (CEILING - 1), rate=sign)
     assert core._wrong_frame(state, (sign * CEILING,), settings) is None
-    told = f"{sign * (CEILING - 1)} + {sign} -> {sign * (CEILING + 1)}"
-    assert core._wrong_frame(state, (sign * (CEILING + 1),), settings) == Alarm("InternalError", "X", told)
+    expected = f"{sign * (CEILING - 1)} + {sign} -> {sign * (CEILING + 1)}"
+    assert core._wrong_frame(state, (sign * (CEILING + 1),), settings) == Alarm("InternalError", "X", expected)
 
 
 def test_a_table_that_asks_for_more_than_the_motion_gives_is_told_by_what_it_breaks() -> None:
-    """A step that a check would let pass (its acceleration counts the rounding) and the motion does not reach."""
+    """A step that passes the check (its acceleration includes rounding) but exceeds the motion."""
     for goal, code in ((8, "OffsetRate"), (9, "OffsetRate"), (100, "OffsetRate"), (CEILING + 1, "OffsetLimit")):
         assert core._next_offsets(one(), table(0, goal, goal), MADE) == ((), Alarm(code, "X"))
     assert core._next_offsets(one(Mode.RAMPING), table(0, 8, 8), MADE)[1] is None
@@ -66,7 +64,6 @@ def test_a_second_of_travel_may_be_all_that_is_allowed() -> None:
 
 
 def test_where_nothing_is_sent_in_time_the_offset_stands() -> None:
-    """The value stays in force for another cycle, at rest."""
     state = one(Mode.RAMP_DOWN, offset=300, rate=-20, sent=(300, 320, 340, 360))
     state, output = core._move(state, Inputs(True, (), BusView(), late=True), MADE)
     axis = state.axes[0]
@@ -74,7 +71,6 @@ def test_where_nothing_is_sent_in_time_the_offset_stands() -> None:
 
 
 def test_arming_begins_at_rest_at_zero_whatever_is_remembered() -> None:
-    """A zero that was shown before says nothing of the frames that follow."""
     rubbish = one(Mode.OFF, offset=5, rate=5, sent=(5, 5, 5, 5), echo_misses=1, zero_shown=True)
     armed = core._armed(rubbish, Inputs(True, (), BusView(), path=table(0, 0, 0)))
     assert (armed.mode, armed.axes) == (Mode.ARMED, (AxisState(),))

@@ -1,4 +1,4 @@
-"""The guard hears order, age, length and origin of frames, and the regularity of SYNC."""
+"""The frame monitor tracks order, age, length and origin of frames, and the regularity of SYNC."""
 
 from __future__ import annotations
 
@@ -22,52 +22,52 @@ def target(value: int) -> bytes:
 
 
 def test_the_target_latched_is_the_last_before_the_sync() -> None:
-    heard = listener()
-    heard.take(0x201, target(5), 0.0)
-    heard.take(0x201, target(6), 0.0)
-    axes, _ = heard.at_sync(b"\x01", 0.0, 0.0)
+    monitor = listener()
+    monitor.take(0x201, target(5), 0.0)
+    monitor.take(0x201, target(6), 0.0)
+    axes, _ = monitor.at_sync(b"\x01", 0.0, 0.0)
     assert axes[0].target == 6
-    axes, _ = heard.at_sync(b"\x02", 0.001, 0.001)
+    axes, _ = monitor.at_sync(b"\x02", 0.001, 0.001)
     assert axes[0].target is None
 
 
 def test_ages_count_in_units_of_each_pdo() -> None:
-    heard = listener()
+    monitor = listener()
     ages = []
     for k in range(1, 40):
-        axes, _ = heard.at_sync(bytes([k]), k * 1e-3, k * 1e-3)
+        axes, _ = monitor.at_sync(bytes([k]), k * 1e-3, k * 1e-3)
         ages.append(axes[0].feedback_age)
         if k < 20:
-            heard.take(0x181, bytes(8), 0.0)
-            heard.take(0x281, bytes(6), 0.0)
+            monitor.take(0x181, bytes(8), 0.0)
+            monitor.take(0x281, bytes(6), 0.0)
         if k % 10 == 0 and k < 35:
-            heard.take(0x481, bytes(7), 0.0)
+            monitor.take(0x481, bytes(7), 0.0)
     assert ages[9] > 1e6
     assert set(ages[10:20]) == {1}
     assert ages[20:24] == [2, 3, 4, 5]
 
 
 def test_read_back_is_told_once() -> None:
-    heard = listener()
-    heard.take(0x381, struct.pack("<ii", 0, -77), 0.0)
-    assert heard.at_sync(b"\x01", 0.0, 0.0)[0][0].read_back == -77
-    assert heard.at_sync(b"\x02", 0.0, 0.0)[0][0].read_back is None
+    monitor = listener()
+    monitor.take(0x381, struct.pack("<ii", 0, -77), 0.0)
+    assert monitor.at_sync(b"\x01", 0.0, 0.0)[0][0].read_back == -77
+    assert monitor.at_sync(b"\x02", 0.0, 0.0)[0][0].read_back is None
 
 
 def test_a_frame_that_was_not_due_spoils_the_read_back_beside_it() -> None:
-    """TPDO3 is due every tenth SYNC: what comes within half of that, or twice in one, shows nothing for sure."""
-    heard = listener()
+    """TPDO3 is due every tenth SYNC: one within half of that, or two in one, prove nothing."""
+    monitor = listener()
     shown, ages = [], []
     for k in range(1, 60):
-        axes, _ = heard.at_sync(bytes([k]), k * 1e-3, k * 1e-3)
+        axes, _ = monitor.at_sync(bytes([k]), k * 1e-3, k * 1e-3)
         shown.append(axes[0].read_back)
         ages.append(axes[0].read_back_age)
         if k % 10 == 0:
-            heard.take(0x381, struct.pack("<ii", 7, 7), 0.0)
+            monitor.take(0x381, struct.pack("<ii", 7, 7), 0.0)
         if k == 20:
-            heard.take(0x381, struct.pack("<ii", 7, 7), 0.0)  # the very same frame again
+            monitor.take(0x381, struct.pack("<ii", 7, 7), 0.0)  # the very same frame again
         if k in (30, 44):
-            heard.take(0x381, struct.pack("<ii", 7, 500), 0.0)
+            monitor.take(0x381, struct.pack("<ii", 7, 500), 0.0)
     assert [k + 1 for k, value in enumerate(shown) if value is not None] == [11, 21, 41, 51]
     assert 500 not in shown
     assert ages[20] == 1
@@ -81,23 +81,23 @@ def test_what_is_heard_is_all_that_is_needed() -> None:
 
 
 def test_after_a_silence_the_counter_starts_anew() -> None:
-    heard = listener()
-    heard.at_sync(b"\x05", 0.0, 0.0)
-    heard.forget_sync()
-    _, bus = heard.at_sync(b"\x99", 9.0, 9.0)
+    monitor = listener()
+    monitor.at_sync(b"\x05", 0.0, 0.0)
+    monitor.forget_sync()
+    _, bus = monitor.at_sync(b"\x99", 9.0, 9.0)
     assert not bus.sync_regular
-    assert heard.alarms() == ()
+    assert monitor.alarms() == ()
 
 
 def test_wrong_lengths() -> None:
-    heard = listener()
-    heard.take(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)
+    monitor = listener()
+    monitor.take(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)
     for _ in range(3):
-        heard.take(0x281, b"\0", 0.0)
-    axes, _ = heard.at_sync(b"\x01", 0.0, 0.0)
+        monitor.take(0x281, b"\0", 0.0)
+    axes, _ = monitor.at_sync(b"\x01", 0.0, 0.0)
     assert (axes[0].statusword, axes[0].short_frames, axes[0].long_frames) == (0x1237, 3, 0)
-    heard.take(0x281, struct.pack("<Hi", 0x0237, 0) + b"\0", 0.0)
-    axes, _ = heard.at_sync(b"\x02", 0.0, 0.0)
+    monitor.take(0x281, struct.pack("<Hi", 0x0237, 0) + b"\0", 0.0)
+    axes, _ = monitor.at_sync(b"\x02", 0.0, 0.0)
     assert (axes[0].statusword, axes[0].short_frames, axes[0].long_frames) == (0x0237, 0, 1)
 
 
@@ -122,19 +122,19 @@ def test_wrong_lengths() -> None:
     ],
 )
 def test_events(cob_id: int, data: bytes, code: str | None) -> None:
-    heard = listener()
-    heard.take(cob_id, data, 0.0)
-    assert [alarm.code for alarm in heard.alarms()] == ([code] if code else [])
-    assert heard.alarms() == ()
+    monitor = listener()
+    monitor.take(cob_id, data, 0.0)
+    assert [alarm.code for alarm in monitor.alarms()] == ([code] if code else [])
+    assert monitor.alarms() == ()
 
 
 @pytest.mark.fault("A21")
 def test_a_flood_stays_small() -> None:
-    heard = listener()
+    monitor = listener()
     for _ in range(10_000):
-        heard.take(0x081, b"\x10\x23", 0.0)
-    assert heard.emergencies == 10_000
-    assert len(heard.alarms()) == 1
+        monitor.take(0x081, b"\x10\x23", 0.0)
+    assert monitor.emergencies == 10_000
+    assert len(monitor.alarms()) == 1
 
 
 @pytest.mark.parametrize(
@@ -150,28 +150,28 @@ def test_a_flood_stays_small() -> None:
     ],
 )
 def test_sync_counter(counters: list[int], codes: list[str]) -> None:
-    heard = listener()
+    monitor = listener()
     for counter in counters:
-        heard.at_sync(bytes([counter]), 0.0, 0.0)
-    assert [alarm.code for alarm in heard.alarms()] == codes
+        monitor.at_sync(bytes([counter]), 0.0, 0.0)
+    assert [alarm.code for alarm in monitor.alarms()] == codes
 
 
 def test_sync_without_counter_is_not_judged() -> None:
-    heard = listener()
+    monitor = listener()
     for data in (b"", b"\x05", b"", b"\x09", b"\x00\x01"):
-        heard.at_sync(data, 0.0, 0.0)
-    assert heard.alarms() == ()
+        monitor.at_sync(data, 0.0, 0.0)
+    assert monitor.alarms() == ()
 
 
 def regular(intervals: list[tuple[float, float]], period_s: float = 0.001) -> list[bool]:
-    """Whether each SYNC was regular, for (stamp, arrival) intervals in monotonic time."""
-    heard = listener(clock="monotonic", sync_period_s=period_s)
+    """Return whether each SYNC was regular, for (stamp, arrival) intervals in monotonic time."""
+    monitor = listener(clock="monotonic", sync_period_s=period_s)
     stamp = arrival = 100.0
-    told = [heard.at_sync(b"", stamp, arrival)[1].sync_regular]
+    result = [monitor.at_sync(b"", stamp, arrival)[1].sync_regular]
     for by_stamp, by_arrival in intervals:
         stamp, arrival = stamp + by_stamp, arrival + by_arrival
-        told.append(heard.at_sync(b"", stamp, arrival)[1].sync_regular)
-    return told
+        result.append(monitor.at_sync(b"", stamp, arrival)[1].sync_regular)
+    return result
 
 
 def test_regular_sync() -> None:
@@ -185,32 +185,32 @@ def test_a_late_reader_is_not_the_bus_fault_and_a_set_clock_neither() -> None:
 
 
 def test_jitter_and_a_wrong_period_are_told() -> None:
-    told = regular([(0.001, 0.001)] * 10 + [(0.0031, 0.0031)] + [(0.001, 0.001)] * 3)
-    assert told[11] is False
-    assert told[12] is True
+    result = regular([(0.001, 0.001)] * 10 + [(0.0031, 0.0031)] + [(0.001, 0.001)] * 3)
+    assert result[11] is False
+    assert result[12] is True
     assert not any(regular([(0.00103, 0.00103)] * 40))
 
 
 def test_two_senders_of_one_id_are_told_after_three_cycles() -> None:
-    heard = listener()
+    monitor = listener()
     for k in range(1, 5):
-        heard.take(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)
-        heard.take(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)  # a duplicate says nothing new
-        heard.at_sync(bytes([k]), 0.0, 0.0)
-    assert heard.alarms() == ()
+        monitor.take(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)
+        monitor.take(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)  # a duplicate says nothing new
+        monitor.at_sync(bytes([k]), 0.0, 0.0)
+    assert monitor.alarms() == ()
     for k in range(5, 8):
-        heard.take(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)
-        heard.take(0x281, struct.pack("<Hi", 0x1237, 1), 0.0)
-        heard.at_sync(bytes([k]), 0.0, 0.0)
-    assert [alarm.code for alarm in heard.alarms()] == ["ForeignProducer"]
+        monitor.take(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)
+        monitor.take(0x281, struct.pack("<Hi", 0x1237, 1), 0.0)
+        monitor.at_sync(bytes([k]), 0.0, 0.0)
+    assert [alarm.code for alarm in monitor.alarms()] == ["ForeignProducer"]
 
 
 @given(st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8))))
 def test_any_traffic_is_taken(frames: list[tuple[int, bytes]]) -> None:
-    heard = listener()
+    monitor = listener()
     for cob_id, data in frames:
-        heard.take(cob_id, data, 0.0)
-        heard.at_sync(data[:1], 0.0, 0.0)
-    axes, _ = heard.in_silence(0.0, True)
-    assert len(axes) == len(heard.settings.axes)
-    assert {alarm.code for alarm in heard.alarms()} <= CATALOGUE.keys()
+        monitor.take(cob_id, data, 0.0)
+        monitor.at_sync(data[:1], 0.0, 0.0)
+    axes, _ = monitor.in_silence(0.0, True)
+    assert len(axes) == len(monitor.settings.axes)
+    assert {alarm.code for alarm in monitor.alarms()} <= CATALOGUE.keys()

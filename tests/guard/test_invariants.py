@@ -31,7 +31,7 @@ for _mode in ON_PATH:
 
 
 def test_random_walks_break_no_limit() -> None:
-    """Some of the study's; ``python -m studies.guard_invariants`` goes on for as long as wanted."""
+    """A sample of the study ``python -m studies.guard_invariants``."""
     frames = 0
     for seed in range(4):
         seen, wrong = episode(f"suite:{seed}")
@@ -41,8 +41,6 @@ def test_random_walks_break_no_limit() -> None:
 
 
 class Faults(RuleBasedStateMachine):
-    """Any sequence of cycles, requests and faults; ``steady`` cycles in between let the guard get somewhere."""
-
     def __init__(self) -> None:
         super().__init__()
         self.machine: Bench = bench()
@@ -55,7 +53,6 @@ class Faults(RuleBasedStateMachine):
             drive.hold(value)
 
     def cycle(self, request: Request | None = None, unsent: Sequence[int] = (), **how: object) -> None:
-        """One SYNC, its frames judged by the wire."""
         machine, before = self.machine, self.machine.mode
         if machine.outputs and machine.outputs[-1].offsets is not None:
             for k in unsent:
@@ -82,7 +79,6 @@ class Faults(RuleBasedStateMachine):
 
     @rule()
     def settle_and_arm(self) -> None:
-        """Everything good again, then armed and into the path where that is allowed."""
         for drive in self.machine.drives:
             drive.statusword, drive.mode, drive.answers, drive.scale, drive.position_error = ENABLED, 8, True, 1.0, 0
             drive.remapped = False
@@ -221,7 +217,6 @@ class Faults(RuleBasedStateMachine):
         self.cycle(self.comparison(valid, digest))
 
     def comparison(self, valid: bool, digest: str) -> Request:
-        """The drives were compared now, X with this finding."""
         touched = {name: axis.touched for name, axis in zip("XY", self.machine.state.axes, strict=True)}
         return Request("compared", valid, compared={"X": digest, "Y": RECORD}, touched=touched)
 

@@ -1,4 +1,4 @@
-"""The last way to zero, when the loop itself has failed: each of its frames, and that it ends."""
+"""The emergency ramp after a failure of the loop: each of its frames, and its end."""
 
 from __future__ import annotations
 
@@ -25,8 +25,6 @@ LAST_ZEROS = 5
 
 
 class Ticking(Wire):
-    """A bus on which a SYNC waits whenever somebody listens; at those numbered in ``fulls`` nothing leaves."""
-
     def __init__(self, made: Settings, fulls: Sequence[int] = ()) -> None:
         super().__init__(made.sent_ids)
         self.syncs, self._fulls = 0, fulls
@@ -50,7 +48,6 @@ def sending(made: Settings, *offsets: int, rate: int = 0, mode: Mode = Mode.ACTI
 
 
 def ramp(offset: int, rate: int, fulls: Sequence[int] = ()) -> Iterator[int]:
-    """What the limits alone make of it; where nothing leaves it stands."""
     syncs = 0
     while True:
         syncs += 1
@@ -64,7 +61,6 @@ def ramp(offset: int, rate: int, fulls: Sequence[int] = ()) -> Iterator[int]:
 
 @pytest.mark.parametrize(("rate", "fulls"), [(0, ()), (40, ()), (-40, (3, 4)), (0, (1, 20))])
 def test_each_axis_goes_to_zero_by_its_limits_and_five_zeros_end_it(rate: int, fulls: Sequence[int]) -> None:
-    """From what was sent last and its rate; what does not leave stands for a cycle."""
     made = machine.settings()
     wire = Ticking(made, fulls)
     try:
@@ -115,7 +111,6 @@ def test_where_nothing_was_sent_nothing_is_and_no_sync_is_awaited() -> None:
 
 @pytest.mark.parametrize(("mode", "fed"), [(Mode.ACTIVE, False), (Mode.OFF, True), (Mode.ACTIVE, True)])
 def test_only_what_was_sent_gets_zeros(mode: Mode, fed: bool) -> None:
-    """Offsets of the place, or speed and torque, each by its own frame."""
     made = fed_settings()
     state = sending(made, 0, 0, mode=mode)
     wire = Ticking(made)

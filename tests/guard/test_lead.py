@@ -1,4 +1,4 @@
-"""Offsets that wait in a queue (HAL's streamer): sent ahead, in force with their own row, read back as late as that."""
+"""Offsets that wait in a queue (HAL's streamer): sent ahead, in force at their own row, read back with that delay."""
 
 from __future__ import annotations
 
@@ -20,8 +20,6 @@ LEAD = 20
 
 @dataclass
 class QueuedDrive(Drive):
-    """A drive behind a queue: the offset that is received takes effect ``LEAD`` SYNC later than at the next."""
-
     waiting: deque[int] = field(default_factory=lambda: deque([0] * LEAD))
     empty: bool = False
 
@@ -35,7 +33,6 @@ class QueuedDrive(Drive):
 
 
 def ahead(axis: AxisSettings) -> AxisSettings:
-    """An axis as the bridge presents it: no set-point delay, everything shown at each SYNC."""
     tpdos = tuple(replace(pdo, every_sync=1) if pdo.cob_id & 0x780 == 0x380 else pdo for pdo in axis.tpdos)
     offset = Pdo(axis.offset.cob_id, LEAD_LAYOUT)
     return replace(axis, offset=offset, tpdos=tpdos)

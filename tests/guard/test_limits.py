@@ -1,4 +1,4 @@
-"""Limits and motion: enumerated where they are small, drawn where they are large."""
+"""Limits and motion of offsets: enumerated where small, sampled where large."""
 
 from __future__ import annotations
 
@@ -38,7 +38,6 @@ def test_approach_is_the_fastest_rate_that_still_stops(distance: int, accelerati
 
 
 def starts(limits: OffsetLimits) -> list[tuple[int, int]]:
-    """All (offset, rate) that a frame within the limits may leave behind."""
     return [
         (offset, rate)
         for offset in range(-limits.offset, limits.offset + 1)
@@ -175,7 +174,6 @@ def test_travel_lies_between_nine_tenths_of_a_second_and_a_whole_one(window: int
 
 
 def test_standing_still_or_moving_inward_is_allowed_outside_the_limit() -> None:
-    """An adopted offset may lie beyond it: it must not grow, and may stand."""
     assert violation(SMALL, SMALL.offset + 5, 0, SMALL.offset + 5) is None
     assert violation(SMALL, SMALL.offset + 5, 0, SMALL.offset + 4) is None
     assert violation(SMALL, -SMALL.offset - 5, 0, -SMALL.offset - 5) is None
@@ -186,7 +184,6 @@ def test_standing_still_or_moving_inward_is_allowed_outside_the_limit() -> None:
 def test_a_table_that_is_met_is_followed_up_to_the_rounding_and_what_is_not_met_is_approached_within_the_limit() -> (
     None
 ):
-    """On the goal the second difference may be that of a rounded curve; on the way to it, no more than configured."""
     assert follow(SMALL, 0, 3, 3 + SMALL.hard_acceleration, 3 + SMALL.hard_acceleration) == 3 + SMALL.hard_acceleration
     assert follow(SMALL, 0, 3, 20, 3 + SMALL.hard_acceleration) == 3 + SMALL.acceleration
     assert follow(SMALL, 0, -3, 4, 4) == -3 + SMALL.acceleration  # met, but by more than rounding explains
@@ -203,7 +200,6 @@ def test_a_coarse_drive_may_move_one_increment_where_that_is_at_most_twice_the_c
 
 
 def test_a_ceiling_that_is_a_whole_number_of_increments_is_reached() -> None:
-    """Rounded down, but not by what the arithmetic of floats loses."""
     assert ceiling(4.0) == 1
     assert ceiling(1000.0) == 250
     assert ceilings(1000.0, 0.001, 500.0, 4000.0).variation == 3000

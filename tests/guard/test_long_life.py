@@ -1,4 +1,4 @@
-"""The guard runs for months without a collector: nothing that it does may leave a cycle, or memory, behind."""
+"""The guard runs for months without a garbage collector: it must create neither cycles nor growing memory."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ BLOCKS_A_LIFE = 40  # that a life may leave: the rings are not full yet; one obj
 
 @contextmanager
 def without_a_collector() -> Iterator[None]:
-    """Collect once, then not any more, as the guard's process does."""
     gc.collect()
     gc.disable()
     try:
@@ -30,7 +29,6 @@ def without_a_collector() -> Iterator[None]:
 
 
 def life(shop: Shop) -> None:
-    """Armed, into the cut, hurt, down; and clients that ask nonsense, leave in mid-line, or are refused."""
     shop.playing, shop.row = False, 0
     client = shop.arm()
     shop.playing = True
@@ -50,7 +48,6 @@ def life(shop: Shop) -> None:
 
 
 def forget(shop: Shop) -> None:
-    """Let go of what the shop itself has noted, and of the newest events, of which the guard keeps so many."""
     shop.guard._journal.recent.clear()
     shop.wire.sent.clear()
     shop.taken = 0
@@ -76,16 +73,15 @@ def test_the_guard_leaves_nothing_behind_that_only_a_collector_would_find(tmp_pa
 @pytest.mark.usefixtures("processes")
 @pytest.mark.fault("F10")
 def test_a_life_more_takes_no_memory_and_no_descriptor_more(tmp_path: Path) -> None:
-    """In a process of its own, where nothing else comes and goes."""
-    told = subprocess.run([sys.executable, "-m", __name__, tmp_path], stdout=subprocess.PIPE, check=True).stdout
-    blocks, containers, descriptors = zip(*json.loads(told), strict=True)
+    """Runs in its own process, where nothing else allocates."""
+    output = subprocess.run([sys.executable, "-m", __name__, tmp_path], stdout=subprocess.PIPE, check=True).stdout
+    blocks, containers, descriptors = zip(*json.loads(output), strict=True)
     assert blocks[-1] - blocks[0] < BLOCKS_A_LIFE * LIVES, blocks
     assert containers[-1] - containers[0] < LIVES, containers
     assert descriptors[-1] - descriptors[0] < LIVES - 2, descriptors  # a thread closes them, a moment later
 
 
 def lives(folder: Path) -> list[list[int]]:
-    """Return what is in use after each of the last lives: blocks of memory, objects that hold others, descriptors."""
     shop = Shop(folder)
     used: list[int] = []  # plain numbers: to note them makes no object that holds others
     try:

@@ -1,4 +1,4 @@
-"""What one SYNC's frames say of each axis, by numbers: which target and which offset belong to what was sampled."""
+"""Read-back checks of one SYNC: which target and which offset belong to each sample."""
 
 from __future__ import annotations
 
@@ -20,13 +20,11 @@ SENT = (7, 60, 500, 4000, 30_000, 200_000)
 
 
 def made(delay: int = 2, **changes: Any) -> Settings:
-    """One axis that follows a set-point so many SYNC after it was latched."""
     own = replace(machine.axis_settings("X", 1), setpoint_delay_cycles=delay)
     return replace(machine.settings("X"), axes=(own,), **changes)
 
 
 def begin(**changes: Any) -> State:
-    """One axis of which nothing is known, with ``changes`` in what is remembered."""
     state = initial(made())
     return state._replace(axes=(state.axes[0]._replace(**changes),))
 
@@ -34,7 +32,6 @@ def begin(**changes: Any) -> State:
 def after(
     state: State, settings: Settings | None = None, *, sync: bool = True, left: bool = True, **seen: Any
 ) -> State:
-    """The state behind a step that was shown this by its one drive."""
     given = AxisInput(**{"target": 9, "read_back_age": 0.0, **seen})
     return observe(state, Inputs(sync, (given,), BusView(), unsent=() if left else (0,)), settings or made())
 
@@ -44,7 +41,6 @@ def after(
 def test_the_following_error_is_from_the_target_and_the_offset_that_were_followed(
     delay: int, shown: int | None
 ) -> None:
-    """Both as many SYNC before the sampling as the drive takes, whether the offset is read back in that SYNC or not."""
     state = begin(sent=SENT)._replace(targets=TARGETS[: delay + 1])
     seen = after(state, made(delay), position=1_000_000, read_back=shown)
     assert seen.axes[0].following_error == TARGETS[delay][0] + SENT[1 + delay] - 1_000_000
@@ -78,7 +74,6 @@ def test_no_more_targets_are_kept_than_the_slowest_drive_needs() -> None:
 def test_the_demand_less_the_offset_is_one_of_the_last_targets_but_the_newest(
     targets: tuple[tuple[int] | None, ...], demand: int | None, off: float
 ) -> None:
-    """By how far it is off them; a drive that tells no demand is off by nothing."""
     state = begin()._replace(targets=targets)
     shown = after(state, target=10_000, read_back=40, demand=None if demand is None else demand + 40)
     assert shown.axes[0].off_demand == off
@@ -127,7 +122,6 @@ def test_what_is_read_back_is_what_was_in_force_or_a_cycle_or_two_late_or_wrong(
 
 @pytest.mark.parametrize(("synchronous", "ticks"), [(True, 0), (False, 1)])
 def test_between_two_syncs_it_counts_what_did_not_leave_and_who_touched_a_drive(synchronous: bool, ticks: int) -> None:
-    """The local timer's step: nothing is compared, nothing is forgotten."""
     settings, state = made(offset_synchronous=synchronous), begin(sent=SENT, offset=7, rate=-53)
     state = after(state._replace(failed_run=1, tick=5), settings, sync=False, left=False, touched=1, read_back=0)
     axis = state.axes[0]
@@ -167,7 +161,6 @@ def test_speed_and_torque_that_are_shown_are_those_of_a_cycle_or_more_before(
 
 
 def test_what_is_not_shown_says_nothing() -> None:
-    """What was shown of speed and torque stays, and what was wrong with it."""
     state = begin(fed_back=(5, 6), feed_misses=1)
     state = state._replace(feed=state.feed._replace(sent=(((1, 2),),) * 3))
     assert (after(state).axes[0].fed_back, after(state).axes[0].feed_misses) == ((5, 6), 1)
@@ -175,7 +168,7 @@ def test_what_is_not_shown_says_nothing() -> None:
 
 @pytest.mark.parametrize("mode", Mode)
 def test_a_late_step_is_counted_while_it_sends_and_against_the_loop_where_time_runs_on(mode: Mode) -> None:
-    """A simulated machine runs ahead until it is on the path: only there is a late step the loop's fault."""
+    """A simulated machine runs ahead until it is on the path: only there a late step counts."""
     for clock, counts in (("monotonic", True), ("sync", mode in ON_PATH)):
         settings = made(clock=clock)
         state = begin()._replace(mode=mode, missed=5, missed_run=2)

@@ -1,4 +1,4 @@
-"""The place on the path has exact bounds: what is still this row, this place, this rate."""
+"""Positions on the path at their exact limits: matching rows, searched rows, rates."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ END = FIRST + len(X)
 
 
 def at(row: int, dx: int = 0, dy: int = 0) -> tuple[int, int]:
-    """The targets of a row, off it by so much."""
     return X[row - FIRST] + dx, Y[row - FIRST] + dy
 
 
@@ -110,12 +109,11 @@ def test_off_the_path_there_is_no_rate() -> None:
 
 @pytest.mark.parametrize(("row", "known"), [(138, True), (139, False), (115, True), (114, False)])
 def test_a_rate_is_looked_for_near_the_place_alone(row: int, known: bool) -> None:
-    """Fifteen rows before and eight behind: farther away it is another place."""
+    """Fifteen rows before and eight after; farther away it is another position."""
     assert (rate_between(PATH, 130, _between(row + 0.5), _between(row + 0.5)) is not None) is known
 
 
 def test_a_rate_is_found_from_the_first_straight_to_the_last() -> None:
-    """Half a row of the last one; a target at the ninth row ahead belongs to the straight behind it."""
     assert rate_between(PATH, END - 3, _between(END - 2.0), _between(END - 1.5)) == pytest.approx(0.5)
     assert rate_between(PATH, FIRST + 3, _between(FIRST + 2.0), _between(FIRST + 2.5)) == pytest.approx(0.5)
     assert rate_between(PATH, 130, _between(138.5), at(139)) is None
@@ -124,7 +122,6 @@ def test_a_rate_is_found_from_the_first_straight_to_the_last() -> None:
 
 
 def test_the_rate_is_that_of_the_axis_that_moves_most_wherever_the_others_stand() -> None:
-    """Whichever axis it is, and however far from zero another one stands."""
     moving = [*range(0, 500, 50)]
     for still in (10_000, -10_000):
         for axes in ((moving, [still] * 10), ([still] * 10, moving)):
@@ -143,7 +140,6 @@ def _between(place: float) -> tuple[int, int]:
 
 
 def state_at(row: int, *targets: tuple[int, int] | None, **changes: object) -> State:
-    """An active state whose last targets were these, newest first."""
     made = initial(machine.settings())
     made = made._replace(mode=Mode.ACTIVE, places=(Place(row),), anchor=row, targets=targets)
     return made._replace(**changes)  # type: ignore[arg-type] # fields of State
@@ -198,9 +194,8 @@ def test_another_rate_is_told_from_another_path(rate: float, code: str) -> None:
 
 
 def test_another_rate_is_told_in_percent_of_the_planned_from_none_to_the_highest() -> None:
-    """160 % is the most that an override gives; who stands between two rows runs at 0 %."""
     path = CorrectedPath(0, tuple([axis[2:] for axis in (X, Y)]), ([0] * 61,) * 2, True, "p")
-    for targets, told in (
+    for targets, result in (
         (((80, -48), (0, 0)), Alarm("OverrideChanged", detail="160 % of the planned rate")),
         (((85, -51), (0, 0)), Alarm("Misaligned")),
         (((25, -15), (25, -15)), Alarm("OverrideChanged", detail="0 % of the planned rate")),
@@ -208,7 +203,7 @@ def test_another_rate_is_told_in_percent_of_the_planned_from_none_to_the_highest
         (((80, -48), None), Alarm("Misaligned")),
         (((75, -45), (25, -15)), Alarm("Misaligned")),  # at the planned rate, half a row beside
     ):
-        assert track(state_at(0, *targets), path)[1] == told, targets
+        assert track(state_at(0, *targets), path)[1] == result, targets
 
 
 def test_targets_that_stand_at_the_last_row_are_a_feed_hold() -> None:

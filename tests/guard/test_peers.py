@@ -1,4 +1,4 @@
-"""Who may ask the guard for what, by the kernel's word: a watcher may look and disarm, only the daemon may arm."""
+"""Rights of the guard's clients, as identified by the kernel: watchers may disarm, only the daemon may arm."""
 
 from __future__ import annotations
 
@@ -40,7 +40,6 @@ def shop(tmp_path: Path) -> Iterator[Shop]:
 
 
 def become(monkeypatch: pytest.MonkeyPatch, uid: int) -> None:
-    """Have who connects from now on be another user, as far as the kernel says."""
     monkeypatch.setattr("fdhil.guard.control.credentials", lambda _: (99, uid))
 
 
@@ -108,8 +107,8 @@ def test_the_daemon_arms_but_vouches_for_no_drive(shop: Shop, monkeypatch: pytes
 def test_a_stranger_is_told_and_let_go_and_takes_nobodys_place(shop: Shop, monkeypatch: pytest.MonkeyPatch) -> None:
     become(monkeypatch, STRANGER)
     client = shop.connect()
-    told = shop.answer(client)
-    assert (told["code"], "may not talk to the guard" in told["text"]) == ("AuthRequired", True)
+    answer = shop.answer(client)
+    assert (answer["code"], "has no access to the guard" in answer["text"]) == ("AuthRequired", True)
     assert shop.guard.control.clients == []
     assert [(e["request"], e["uid"]) for e in shop.events() if e["event"] == "refused"] == [("to talk", STRANGER)]
 
@@ -132,9 +131,9 @@ def test_who_is_refused_often_is_counted_and_fills_no_journal(shop: Shop, monkey
 def test_a_wrong_token_is_written_down_too(shop: Shop) -> None:
     client = shop.connect()
     assert "AuthRequired" in str(shop.ask(client, {"request": "adopt", "token": "guessed"}))
-    told = [event for event in shop.events() if event["event"] == "refused"]
-    assert [(event["request"], event["uid"]) for event in told] == [("adopt", os.getuid())]
-    assert "guessed" not in json.dumps(told)
+    events = [event for event in shop.events() if event["event"] == "refused"]
+    assert [(event["request"], event["uid"]) for event in events] == [("adopt", os.getuid())]
+    assert "guessed" not in json.dumps(events)
 
 
 ASK = """
@@ -169,4 +168,4 @@ def test_another_user_of_this_computer_is_known_by_the_kernel() -> None:
         asked.stdout.close()
         shop.close()
     assert [answer["ok"] for answer in answers] == [True, True, False]
-    assert answers[2]["text"] == "user 65534 may not ask the guard for 'adopt'"
+    assert answers[2]["text"] == "user 65534 may not request 'adopt' from the guard"

@@ -1,4 +1,4 @@
-"""Position and speed that cannot both be true: two in a row end a correction, what a machine can do never does."""
+"""Position and speed that contradict each other: two samples in a row end a correction, feasible motion never does."""
 
 from __future__ import annotations
 
@@ -25,13 +25,11 @@ COUNT = 1e-3
 
 
 def judged() -> Settings:
-    """Settings of one axis whose speed is judged."""
     made = machine.settings("X")
     return replace(made, axes=(replace(made.axes[0], speed_count=COUNT, speed_step=STEP),))
 
 
 def bench() -> Bench:
-    """The machine, its speed judged, the path running and corrected."""
     made = machine.bench()
     axes = tuple(replace(axis, speed_count=COUNT, speed_step=STEP) for axis in made.settings.axes)
     made = Bench(replace(made.settings, axes=axes), made.path, made.demand, made.drives)
@@ -44,7 +42,6 @@ def bench() -> Bench:
 
 
 def mutate(made: Bench, position: int, speed: int) -> None:
-    """One SYNC whose TPDO1 of drive 1 says something else by so much."""
     drive = made.drives[0]
     made.sync(drop=(0x181,))
     assert drive.followed is not None
@@ -52,7 +49,7 @@ def mutate(made: Bench, position: int, speed: int) -> None:
 
 
 def test_the_config_tells_what_a_motor_can_do(tmp_path: Path) -> None:
-    """200 A make 160 N.m on 0.075 kg.m2: 22 increments per cycle and cycle; twice that is believed."""
+    """200 A make 160 N.m on 0.075 kg.m2: 22 increments per cycle squared; twice that is plausible."""
     made = settings_of(bench_config("X"), "can0", tmp_path, "")
     assert made.axes[0].speed_count == pytest.approx(1e-3)
     assert made.axes[0].speed_step == pytest.approx(2 * 200 * 0.8 / 0.075 * 65536 / (2 * math.pi) * 1e-6)
@@ -81,7 +78,6 @@ def test_one_wrong_frame_is_passed_over_two_are_not(position: int, speed: int) -
 
 
 def test_a_speed_that_is_stuck_is_noticed() -> None:
-    """The drive moves on and shows one speed for ever: the way does not fit."""
     made = bench()
     for k in range(400):
         if made.mode is not Mode.ACTIVE:
@@ -104,7 +100,6 @@ def observed(state: State, position: int | None, speed: int | None) -> State:
 @settings(max_examples=80, deadline=None)
 @given(st.lists(st.tuples(st.integers(-22, 22), st.booleans()), min_size=3, max_size=120))
 def test_whatever_the_motor_can_do_is_believed(course: list[tuple[int, bool]]) -> None:
-    """Any acceleration up to its power, with frames lost in between: not one sample is doubted."""
     state, place, speed = initial(judged()), 0.0, 0.0
     for push, lost in course:
         place += speed + 0.5 * push
@@ -114,7 +109,6 @@ def test_whatever_the_motor_can_do_is_believed(course: list[tuple[int, bool]]) -
 
 
 def test_the_bounds_are_what_the_settings_say() -> None:
-    """A change of speed by one step, and a way that is off by a step and the largest offset, are the last believed."""
     limit = machine.LIMITS.offset
     start = observed(initial(judged()), 0, 0)
     for position, speed, good in (
@@ -129,7 +123,7 @@ def test_the_bounds_are_what_the_settings_say() -> None:
 
 
 def test_a_place_that_was_set_anew_is_believed_again() -> None:
-    """Homing moves the zero: the longer ago the last sample, the farther the axis may have come."""
+    """Homing moves the zero: the longer ago the last sample, the larger the allowed distance."""
     state = observed(initial(judged()), 0, 0)
     for _ in range(400):
         state = observed(state, 1_000_000, 0)
@@ -145,7 +139,6 @@ def test_it_is_not_judged_without_a_speed() -> None:
 
 
 def test_one_wrong_read_back_is_forgiven_two_in_a_row_are_not() -> None:
-    """A good reading in between starts the count anew; a value of a cycle or two before is late, not wrong."""
     state = initial(machine.settings("X"))
     axis = state.axes[0]._replace(sent=(40, 30, 20, 10, 0, 0))
     counts = []

@@ -1,4 +1,4 @@
-"""The guard as a process, on a hub of the socketcand protocol with a machine behind it."""
+"""The guard as a process, on a socketcand hub with a machine behind it."""
 
 from __future__ import annotations
 
@@ -35,8 +35,6 @@ ENDS_S = 100.0  # a process that ends or answers does so at once, on a host that
 
 
 class Rig:
-    """Peer, guard process and a daemon's client that says it is alive."""
-
     def __init__(self, folder: Path, clock: str = "sync", program: Sequence[str] = ("-m", impatient.__name__)) -> None:
         self.peer = Peer(DEMAND)
         self.peer.start()
@@ -54,7 +52,6 @@ class Rig:
         self._keeper = threading.Thread(target=self._keep_alive, daemon=True)
 
     def adopt(self) -> int:
-        """Run the operator's command in this process; return its exit code."""
         token = self.run_directory / "token"
         token.touch(0o600)
         token.write_text(TOKEN)
@@ -65,7 +62,6 @@ class Rig:
             return run_safely(cli)
 
     def start(self) -> subprocess.Popen[bytes]:
-        """Start a guard on a descriptor of its own, as fdhil-guard does by exec."""
         with open_bus("can0", self.config.bus["can0"]) as bus:
             arguments = ["--settings", str(self.settings), "--descriptor", str(bus.fileno())]
             return subprocess.Popen(
@@ -103,7 +99,6 @@ class Rig:
         self.peer.wait(lambda: len(self.peer.offsets_sent()) > 30, "zeros")
 
     def settle(self) -> None:
-        """Stand until the guard has answered all SYNC: they ran ahead of it until its first offsets came."""
         client = self.client
         assert client is not None
         self.peer.stand()
@@ -116,12 +111,10 @@ class Rig:
         return str(self.client.status()["state"])
 
     def into_the_cut(self) -> None:
-        """Armed, playing in lockstep, well into the bump of the offset."""
         self.arm()
         self.play_into_the_cut()
 
     def into_the_cut_blindly(self) -> None:
-        """The same of a guard that cannot be asked for its status."""
         client = self.connect()
         columns = [dict(zip("XY", rows, strict=True)) for rows in (DEMAND, OFFSET)]
         assert client.load("XY", columns[0], columns[1], DIGEST)["ok"]
@@ -160,7 +153,6 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
 
 
 def check_limits(rig: Rig) -> None:
-    """No frame breaks a limit against the one before it; a cycle that the guard missed stops the offset at once."""
     missed = max([int(str(event["missed"])) for event in rig.events() if event["event"] == "state"], default=0)
     for node in (1, 2):
         values = [0, 0, *[offset for _, offset in rig.peer.offsets_sent(node)]]
@@ -235,7 +227,6 @@ def test_lost_daemon_ramps_down(rig: Rig, how: str) -> None:
 
 @pytest.mark.fault("A7", "E8")
 def test_lost_sync_freezes_and_adopting_brings_it_to_zero(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
-    """Out of FROZEN as the operator goes: ``fdhil adopt``, and 0 only when zero was read back."""
     rig.into_the_cut()
     assert rig.client is not None
     rig.peer.playing = rig.peer.expected = False
@@ -307,7 +298,6 @@ def test_killed_guard_leaves_a_value_that_the_next_one_adopts(rig: Rig) -> None:
 @pytest.mark.fault("G9", "A19", "F16")
 @pytest.mark.parametrize("cob_id", [0x301, 0x501], ids=["our COB-ID", "another RPDO of the drive"])
 def test_what_is_forged_foreign_or_silent_makes_no_step(rig: Rig, cob_id: int) -> None:
-    """Over the hub, as another node would do it: forged and missing read-backs, a foreign offset, a blind restart."""
     client, peer, drive = rig.connect(), rig.peer, rig.peer.drives[0]
     for value in (300, 300, 983_040, -983_040):
         peer.inject((0x381, value.to_bytes(4, "little", signed=True) * 2))
@@ -346,7 +336,7 @@ def test_what_is_forged_foreign_or_silent_makes_no_step(rig: Rig, cob_id: int) -
         peer.wait(lambda: peer.tick > tick + 300, "SYNC")
         with GuardClient(rig.run_directory, timeout_s=ENDS_S) as other:
             refused = other.arm(TOKEN, DIGEST, FACTS_GIVEN)["refused"]
-            assert "ReadBackStale" in {told["code"] for told in refused}
+            assert "ReadBackStale" in {result["code"] for result in refused}
             assert not other.adopt(TOKEN)["ok"]
         assert len(peer.sent) == count
     finally:

@@ -1,4 +1,4 @@
-"""The guard can be asked for zero although its run directory was cleaned away, or it ramps to zero by itself."""
+"""After its run directory was cleaned the guard stays reachable, or ramps to zero."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_folder_that_anybody_may_write_to_gets_no_socket(folder: Path, shop: Sho
     folder.mkdir()
     folder.chmod(0o777)
     shop.guard.control._listener.look()
-    assert shop.guard.control.lost == "anybody may write to its folder"
+    assert shop.guard.control.lost == "its folder is writable for every user"
     assert not [*folder.iterdir()]
 
 

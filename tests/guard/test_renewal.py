@@ -1,4 +1,4 @@
-"""First rows in the place of others: what is armed and has not begun takes them, whole and checked, or not at all."""
+"""New first rows for an armed table before its start: accepted complete and checked, or not at all."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ __all__ = ["make"]
 
 
 def renewing(height: int, rows: int = 200, **changes: Any) -> int:
-    """Sealed first rows of the loaded table: its demand, and on X up to ``height`` increments more than its offset."""
     demand, offset = ([list(column[:rows]) for column in columns] for columns in (DEMAND, OFFSET))
     offset[0] = [value + min(height, k // 20, (rows - k) // 20) for k, value in enumerate(offset[0])]
     values = {"demand": dict(zip("XY", demand, strict=True)), "offset": dict(zip("XY", offset, strict=True))} | changes
@@ -29,7 +28,6 @@ def renewing(height: int, rows: int = 200, **changes: Any) -> int:
 
 
 def test_what_is_armed_and_has_not_begun_takes_other_first_rows(make: Make) -> None:
-    """They are in force at the start; the rows behind them are those of before."""
     shop = make()
     client = shop.arm()
     assert shop.guard.intake.path is not None
@@ -65,7 +63,6 @@ def test_what_is_armed_and_has_not_begun_takes_other_first_rows(make: Make) -> N
 def test_first_rows_of_something_else_or_beyond_a_limit_are_refused(
     make: Make, changes: dict[str, Any], code: str
 ) -> None:
-    """What was checked when it was armed stays in force."""
     shop = make()
     client = shop.arm()
     before = shop.guard.intake.path
@@ -79,7 +76,6 @@ def test_first_rows_of_something_else_or_beyond_a_limit_are_refused(
 
 
 def test_a_machine_that_begins_meanwhile_goes_on_with_what_it_has(make: Make) -> None:
-    """The rows are refused when the first target leaves the start before they are checked, and ever after."""
     shop = make()
     client = shop.arm()
     before = shop.guard.intake.path

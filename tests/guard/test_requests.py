@@ -1,4 +1,4 @@
-"""What clients send, as bytes: a request, or nothing that harms."""
+"""Any bytes of clients parse into a request, or into a harmless refusal."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def test_an_id_is_given_back_only_where_it_is_short(mark: object, kept: bool) ->
 
 
 def test_how_often_a_drive_was_touched_is_a_number_or_unknown() -> None:
-    for said, touched in (({"X": 2, "Y": 0}, {"X": 2, "Y": 0}), ({"X": True, "Y": "0", "Z": 1}, {}), ([1], {})):
-        assert parse_request("compared", {"touched": said}, settings()).touched == touched
+    for output, touched in (({"X": 2, "Y": 0}, {"X": 2, "Y": 0}), ({"X": True, "Y": "0", "Z": 1}, {}), ([1], {})):
+        assert parse_request("compared", {"touched": output}, settings()).touched == touched
 
 
 @given(st.binary(max_size=200) | st.from_type(dict).map(lambda found: json.dumps(found, default=str).encode()))

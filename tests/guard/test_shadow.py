@@ -1,4 +1,4 @@
-"""Off, the guard shows what it would send; it sends nothing."""
+"""While off, the guard shows what it would send, and sends nothing."""
 
 from __future__ import annotations
 
@@ -12,26 +12,24 @@ from tests.guard.machine import DIGEST
 
 
 def followed(made: machine.Bench, shadow: Shadow, cycles: int) -> list[tuple[int, ...] | None]:
-    """Run so many SYNC and return what the shadow says after each."""
-    said = []
+    output = []
     for _ in range(cycles):
         made.sync()
         shadow.follow(made.state, made.path)
-        said.append(shadow.offsets())
-    return said
+        output.append(shadow.offsets())
+    return output
 
 
 def test_it_says_what_an_armed_guard_sends() -> None:
-    """Row by row from the path's first move on, to its end; no frame leaves."""
     watched, armed, shadow = machine.bench(), machine.bench(), Shadow()
     assert set(followed(watched, shadow, 130)) == {None}
     armed.settle()
     assert armed.arm() == ()
     watched.play()
     armed.play()
-    said = followed(watched, shadow, 500)
+    log = followed(watched, shadow, 500)
     active = 0
-    for shown in said:
+    for shown in log:
         was, output = armed.mode, armed.sync()
         if was is armed.mode is Mode.ACTIVE:
             active += 1
@@ -39,7 +37,7 @@ def test_it_says_what_an_armed_guard_sends() -> None:
     assert active > 300
     assert watched.frames == []
     assert all(output.offsets is None and output.feed is None for output in watched.outputs)
-    assert said[-1] is None or armed.mode is Mode.ACTIVE
+    assert log[-1] is None or armed.mode is Mode.ACTIVE
 
 
 def test_another_path_shows_nothing_and_the_next_start_is_found_again() -> None:

@@ -1,4 +1,4 @@
-"""The guard's shell, turn by turn: what it does with bus, clients, signals and systemd; no clock decides anything."""
+"""The guard's loop, turn by turn: bus, clients, signals and systemd, independent of real clocks."""
 
 from __future__ import annotations
 
@@ -47,7 +47,6 @@ def make(tmp_path: Path) -> Iterator[Make]:
 
 
 def inside(offsets: list[int]) -> None:
-    """No frame breaks a limit against those before it."""
     values = [0, 0, *offsets]
     rates = [b - a for a, b in itertools.pairwise(values)]
     assert max(map(abs, values)) <= LIMITS.offset
@@ -56,7 +55,6 @@ def inside(offsets: list[int]) -> None:
 
 
 def arm_line() -> bytes:
-    """The operator's request to arm."""
     return json.dumps({"request": "arm", "token": TOKEN, "program_digest": DIGEST, "facts": dict(FACTS_GIVEN)}).encode()
 
 
@@ -73,9 +71,9 @@ def test_told_to_stop_it_ramps_reads_zero_back_and_ends_with_0(make: Make) -> No
         shop.cycle()
     assert shop.guard.run() == 0
     inside(shop.offsets())
-    told = shop.events()[-1]
-    assert (told["event"], told["may_stand_um"]) == ("stopped", {"X": 0.0, "Y": 0.0})
-    assert "text" not in told
+    event = shop.events()[-1]
+    assert (event["event"], event["may_stand_um"]) == ("stopped", {"X": 0.0, "Y": 0.0})
+    assert "text" not in event
 
 
 def test_frozen_it_ends_with_3_and_says_what_stands(make: Make) -> None:
@@ -88,11 +86,11 @@ def test_frozen_it_ends_with_3_and_says_what_stands(make: Make) -> None:
     shop.stop.send(b"\x0f")
     shop.guard._last_sync_s -= 10.0
     assert shop.guard.run() == 3
-    told = shop.events()[-1]
-    assert told["may_stand_um"]["X"] != 0.0
-    assert "um on X" in told["text"]
-    assert "may still be applied" in told["text"]
-    assert "Network" not in told["text"]
+    result = shop.events()[-1]
+    assert result["may_stand_um"]["X"] != 0.0
+    assert "um on X" in result["text"]
+    assert "may still be applied" in result["text"]
+    assert "Network" not in result["text"]
     assert [event["text"] for event in shop.events() if event["event"] == "bus_down"] == ["the cable is cut"]
 
 
@@ -214,7 +212,6 @@ def test_a_bus_that_breaks_while_it_sends_is_down(make: Make) -> None:
 
 
 def test_a_bus_that_is_back_is_heard_again_and_what_stands_is_adopted(make: Make) -> None:
-    """The guard needs no restart; nothing is sent before the operator says so."""
     shop = make()
     client = shop.into_the_cut()
     shop.wire.down = True
@@ -247,7 +244,6 @@ def test_frames_that_do_not_leave_are_no_frames(make: Make) -> None:
 
 
 def steep(rows: int) -> list[int]:
-    """An offset (rows,) that rises to some hundred increments and falls again, nearly as steeply as is allowed."""
     rise = [6] * 10 + [0] * 2 + [-6] * 10
     rates = list(itertools.accumulate([0] * 200 + rise + [0] * 10 + [-change for change in rise] + [0] * rows))
     return list(itertools.accumulate(rates))[:rows]
@@ -255,7 +251,6 @@ def steep(rows: int) -> list[int]:
 
 @pytest.fixture
 def steep_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both axes' offsets are steep."""
     monkeypatch.setattr(shop_module, "OFFSET", [steep(len(column)) for column in shop_module.DEMAND])
 
 
@@ -298,10 +293,10 @@ def test_an_offset_that_left_before_the_bus_went_down_stands(make: Make, ends_at
         shop.turn()
     shop.stop.send(b"\x0f")
     assert shop.guard.run() == 3
-    told = shop.events()[-1]["may_stand_um"]
+    event = shop.events()[-1]["may_stand_um"]
     per_um = shop.settings.axes[0].increments_per_mm / 1000
-    assert told["X"] == pytest.approx(shop.offsets(1)[-1] / per_um, abs=0.06)
-    assert told["X"] != 0.0
+    assert event["X"] == pytest.approx(shop.offsets(1)[-1] / per_um, abs=0.06)
+    assert event["X"] != 0.0
 
 
 def test_a_fault_of_the_program_ramps_from_what_left(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -350,13 +345,12 @@ def test_without_sync_it_steps_by_the_local_timer_and_hears_frames_first(make: M
 
 
 def test_a_node_that_babbles_does_not_hide_that_no_sync_comes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    """There is another frame of it whenever the guard looks whether some wait; before, that put the step off."""
     shop = make()
     shop.into_the_cut()
-    heard = shop.wire.receive
+    received = shop.wire.receive
 
     def babbling() -> list[Frame]:
-        frames = heard()
+        frames = received()
         shop.wire.feed([(0x701, b"\x05", 0.0)])
         return frames
 
@@ -445,11 +439,11 @@ def test_one_decision_of_a_client_waits_but_a_disarm_takes_its_place(make: Make)
     shop.run(5)
     client.send(b"".join(b'{"request": "%s", "id": %d}\n' % (kind, k) for k, kind in enumerate(
         [b"arm", b"adopt", b"disarm", b"disarm"])))  # fmt: skip
-    told = [shop.answer(client, syncing=False)]
-    while len(told) < 3:
-        told.append(shop.answer(client, syncing=False))
+    reply = [shop.answer(client, syncing=False)]
+    while len(reply) < 3:
+        reply.append(shop.answer(client, syncing=False))
     codes = [(1, "GuardBusy"), (0, "DisarmedSince"), (3, "GuardBusy")]
-    assert [(answer["id"], answer["code"]) for answer in told] == codes
+    assert [(answer["id"], answer["code"]) for answer in reply] == codes
     assert shop.answer(client)["ok"]
 
 
@@ -465,7 +459,6 @@ def test_a_disarm_takes_the_place_of_what_others_ask_for(make: Make) -> None:
 
 
 def test_what_those_ask_for_who_have_gone_does_not_pile_up(make: Make) -> None:
-    """Nor do those that make room for others come back by talking on."""
     shop = make()
     shop.run(130)
     for kind in [b"adopt"] * 20 + [b"disarm"] * 20:
@@ -489,7 +482,7 @@ def test_what_those_ask_for_who_have_gone_does_not_pile_up(make: Make) -> None:
 
 
 def test_a_request_that_was_made_before_the_last_disarm_arms_nothing(make: Make) -> None:
-    """As of a daemon that slept between loading and arming, while somebody else disarmed."""
+    """As of a daemon that was suspended between loading and arming, while another client disarmed."""
     shop = make()
     client, other = shop.connect(), shop.connect()
     shop.run(10)
@@ -532,7 +525,6 @@ def test_a_table_waits_for_the_one_before_and_a_long_one_for_the_end(make: Make)
 def test_a_table_that_came_before_the_arming_takes_no_force_behind_it(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of the same program, but with other offsets, and so long that it is checked while another client arms."""
     monkeypatch.setattr(intake, "ROWS_PER_IDLE_TURN", 8)
     shop = make()
     client, other = shop.connect(), shop.connect()
@@ -651,7 +643,6 @@ def connected(desk: Control, now_s: float = 0.0) -> socket.socket:
 
 
 def serve(desk: Control, now_s: float = 1.0) -> list[dict[str, Any]]:
-    """Serve until nobody has anything left to say."""
     served = []
     for _ in range(50):
         found = desk.serve({client.fileno() for client in desk.clients}, now_s)
@@ -764,7 +755,6 @@ def test_an_answer_to_who_has_gone_is_dropped() -> None:
 
 
 def test_a_socket_that_would_linger_is_closed_at_once() -> None:
-    """A peer that passes it holds up none of what others left."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         near = socket.create_connection(server.getsockname())
         near.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 30_000))
@@ -784,14 +774,13 @@ def test_a_socket_that_would_linger_is_closed_at_once() -> None:
 
 
 def test_one_full_queue_does_not_silence_the_watchdog(tmp_path: Path) -> None:
-    """Systemd does not read for a while: what was to be said is said with the next watchdog, and no more often."""
     address = str(tmp_path / "notify")
     systemd = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     systemd.bind(address)
     systemd.setblocking(False)
     notifier = Notifier(address)
     sent = 0
-    while not notifier._untold:
+    while not notifier._pending:
         notifier.tell(f"STATUS={sent}")
         sent += 1
     notifier.tell("READY=1")

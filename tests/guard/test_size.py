@@ -1,4 +1,4 @@
-"""The guard is small enough to be read: the safety page names each part's modules and how many lines it may have."""
+"""The guard stays small enough to read: the safety page limits the lines of each part."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PARTS = {name: (re.findall(r"\w+", modules), int(most)) for name, modules, most 
 
 
 def code_lines(file: Path) -> int:
-    """Lines that are neither blank nor comment nor docstring."""
+    """Return the number of lines that are neither blank nor comment nor docstring."""
     source = file.read_text("utf-8")
     lines: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):

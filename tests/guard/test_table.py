@@ -1,4 +1,4 @@
-"""The table that is handed over: what is not as it must be is no table, and one class says so."""
+"""Correction tables: every invalid one is refused with its class."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_a_table_is_handed_over_in_sealed_memory() -> None:
 
 
 def test_what_is_no_sealed_memory_is_not_read(tmp_path: Path) -> None:
-    """Neither opened, nor waited for, nor read: a FIFO, a socket, a file, memory that can still change, nothing."""
+    """A FIFO, a socket, a file, writable memory, nothing: neither opened nor read, and nothing waits."""
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "file").write_bytes(body())
     near, far = socket.socketpair()
@@ -91,10 +91,10 @@ def test_what_is_no_sealed_memory_is_not_read(tmp_path: Path) -> None:
     os.truncate(long, table.MAX_TABLE_BYTES + 1)
     fcntl.fcntl(long, fcntl.F_ADD_SEALS, table.SEALED)
     for descriptor in [*wrong, long]:
-        told = "did not come as a descriptor of sealed memory, and it was not read; load it again$"
+        expected = "did not come as a descriptor of sealed memory, and it was not read; load it again$"
         if descriptor == long:
-            told = f"^a correction table of {table.MAX_TABLE_BYTES + 1} bytes is too long; stream it in pieces$"
-        with pytest.raises(TableRefused, match=told) as refusal:
+            expected = f"^a correction table of {table.MAX_TABLE_BYTES + 1} bytes is too long; stream it in pieces$"
+        with pytest.raises(TableRefused, match=expected) as refusal:
             table.read_sealed(descriptor)
         assert refusal.value.code == "CorruptFile"
         if descriptor not in (None, 1 << 20):
@@ -155,7 +155,7 @@ def test_whatever_the_header_holds_it_is_one_class(head: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "expected"),
     [
         ({"rows": 1.5}, "its header counts no rows, or names no program"),
         ({"first": -1}, "its header counts no rows, or names no program"),
@@ -172,14 +172,14 @@ def test_whatever_the_header_holds_it_is_one_class(head: str) -> None:
         ({"program": "p" * 4096}, "its header is too long"),
     ],
 )
-def test_what_is_wrong_with_a_body_is_told_and_what_to_do(changes: dict[str, object], told: str) -> None:
+def test_what_is_wrong_with_a_body_is_told_and_what_to_do(changes: dict[str, object], expected: str) -> None:
     head = {**HEAD, **changes}
     raw = json.dumps(head).encode()
     whole = struct.pack("<I", len(raw)) + raw + bytes(16 if head["rows"] else 0)
-    if told:
+    if expected:
         with pytest.raises(TableRefused) as refusal:
             table.decode(whole)
-        assert str(refusal.value) == f"the correction table cannot be read ({told}); plan it again"
+        assert str(refusal.value) == f"the correction table cannot be read ({expected}); plan it again"
     else:
         assert table.decode(whole)[1].first == head["first"]
 
@@ -193,7 +193,6 @@ def test_a_header_may_have_4096_bytes() -> None:
 
 
 def decoded(whole: bytes) -> object:
-    """The class that refuses it, or axes and rows."""
     try:
         names, path = table.decode(whole)
     except TableRefused as refusal:
@@ -202,7 +201,7 @@ def decoded(whole: bytes) -> object:
 
 
 def test_a_program_named_by_no_text_is_told_in_plain_letters() -> None:
-    """A lone surrogate is text to JSON: it is carried along, and what is told of it can be encoded."""
+    """JSON accepts a lone surrogate: messages that contain it must still be encodable."""
     raw = json.dumps({**HEAD, "program": "\ud800"}).encode()
     _, path = table.decode(struct.pack("<I", len(raw)) + raw + bytes(16))
     assert json.dumps(path.program_digest) == '"\\ud800"'
@@ -253,7 +252,6 @@ def test_a_table_has_the_number_under_which_it_came() -> None:
 
 
 def test_rows_are_let_go_that_no_check_and_no_machine_needs_any_more() -> None:
-    """Behind the machine, and a second and three rows before what is added, whatever the axes' windows."""
     limits = (OffsetLimits(819, 65, 6, 9830, 5), OffsetLimits(819, 65, 6, 9830, 2))
     rows = {"X": [0] * 40, "Y": [0] * 40}
     whole = table.begin(table.encode("XY", rows, rows, "p", 0, False), 1, "XY", limits, None, 0).joined
@@ -272,10 +270,10 @@ def test_a_piece_that_does_not_belong_is_refused(changed: dict[str, object], axe
     limits = (LIMITS,) * 2
     path = table.begin(body(final=False), 1, "XY", limits, None, 0).joined
     piece = table.encode("XY", ROWS, OFFSETS, str(changed.get("program", "p")), int(str(changed.get("first", 0))))
-    told = f"^row {changed.get('first')} does not continue the loaded table; load it anew$"
+    expected = f"^row {changed.get('first')} does not continue the loaded table; load it again$"
     if not changed:
-        told = f"^the table is for axes X, Y, not {', '.join(axes)}$"
-    with pytest.raises(TableRefused, match=told) as refusal:
+        expected = f"^the table is for axes X, Y, not {', '.join(axes)}$"
+    with pytest.raises(TableRefused, match=expected) as refusal:
         table.begin(piece, 2, axes, limits, path, 0)
     assert refusal.value.code == "ProgramMismatch"
 
@@ -290,14 +288,13 @@ def test_a_stream_begins_with_row_0() -> None:
     "what", [{"axes": "YX"}, {"axes": "X"}, {"first": 1}, {"program": "other"}, {"loaded": None}, {"rows": 5}]
 )
 def test_first_rows_take_the_place_of_those_of_the_same_table_alone(what: dict[str, object]) -> None:
-    """Of the same axes, from row 0, no more than are loaded."""
     limits = (LIMITS,) * 2
     loaded = None if "loaded" in what else table.begin(body(), 1, "XY", limits, None, 0).joined
     rows = {axis: [*values, *values[:1]][: int(str(what.get("rows", 4)))] for axis, values in ROWS.items()}
     zeros = {axis: [0] * len(rows["X"]) for axis in "XY"}
     piece = table.encode("XY", rows, zeros, str(what.get("program", "p")), int(str(what.get("first", 0))))
-    told = "^the rows are not the first ones of the loaded table; load it anew$"
-    with pytest.raises(TableRefused, match=told) as refusal:
+    expected = "^the rows are not the first ones of the loaded table; load it again$"
+    with pytest.raises(TableRefused, match=expected) as refusal:
         table.renew(piece, 2, str(what.get("axes", "XY")), limits, loaded)
     assert refusal.value.code == "ProgramMismatch"
 
@@ -305,8 +302,8 @@ def test_first_rows_take_the_place_of_those_of_the_same_table_alone(what: dict[s
 def test_first_rows_of_another_way_are_those_of_another_path() -> None:
     loaded = table.begin(body(), 1, "XY", (LIMITS,) * 2, None, 0).joined
     other = table.encode("XY", ROWS | {"Y": [5, 5, 5, 6]}, OFFSETS, "p")
-    told = "^the rows are those of another path than the loaded one; load it anew$"
-    with pytest.raises(TableRefused, match=told) as refusal:
+    expected = "^the rows are those of another path than the loaded one; load it again$"
+    with pytest.raises(TableRefused, match=expected) as refusal:
         table.renew(other, 2, "XY", (LIMITS,) * 2, loaded)
     assert refusal.value.code == "ProgramMismatch"
 
@@ -345,7 +342,6 @@ def test_of_a_renewed_table_the_rows_are_checked_that_may_differ_and_a_second_be
 
 
 def test_a_second_of_travel_may_be_all_that_is_allowed_wherever_it_begins() -> None:
-    """Any five moves in a row, however many rows are checked at a time, and from one piece to the next."""
     limits = OffsetLimits(819, 65, 60, variation=100, window=5)
     swinging = [20 * (row % 2) for row in range(30)]
     assert table.check_rows(limits, swinging, 0, 30) is None
@@ -367,7 +363,6 @@ def test_a_second_of_travel_may_be_all_that_is_allowed_wherever_it_begins() -> N
 
 
 def test_rows_that_were_checked_are_not_checked_again() -> None:
-    """Only what is new, and what it moves away from, is judged."""
     jump = [0, 0, 0, 800, 800, 800, 800]
     assert table.check_rows(LIMITS, jump, 0, 7) == "OffsetRate"
     assert table.check_rows(LIMITS, jump, 3, 7) == "OffsetRate"
@@ -391,7 +386,6 @@ TINY = OffsetLimits(offset=10, rate=5, acceleration=2, variation=1000, window=10
 
 
 def loaded_within(travel: tuple[int, int] | None, demand: list[int]) -> CorrectedPath:
-    """Load a resting table of one axis with these software limits."""
     body = table.encode("X", {"X": demand}, {"X": [0] * len(demand)}, "p")
     loading = table.begin(body, 1, ["X"], (TINY,), None, 0, (travel,))
     while not loading.done:
@@ -407,16 +401,20 @@ def test_a_path_keeps_twice_the_largest_offset_from_the_software_limits(demand: 
 
 @pytest.mark.parametrize("demand", [[0, 0, 0, 0, 81], [-81, 0], [0] * 50 + [120], [-(2**31)]])
 def test_a_path_that_comes_nearer_is_no_table(demand: list[int]) -> None:
-    told = "^the path comes nearer to a software limit of the drive than twice the largest offset; lower max_offset_um"
-    with pytest.raises(TableRefused, match=told) as caught:
+    expected = (
+        "^the path comes nearer to a software limit of the drive than twice the largest offset; lower max_offset_um"
+    )
+    with pytest.raises(TableRefused, match=expected) as caught:
         loaded_within((-100, 100), demand)
     assert caught.value.code == "SoftwareLimit"
 
 
 @pytest.mark.parametrize("end", [2**31 - 1 - 9, 2**31 - 1, -(2**31) + 9, -(2**31)])
 def test_no_offset_on_a_path_leaves_32_bits(end: int) -> None:
-    """The largest offset is 10 here: one increment nearer to the end and the drive would wrap around."""
-    with pytest.raises(TableRefused, match="path comes nearer to the end of 32 bits than the largest") as caught:
+    """The largest offset is 10 here: one increment nearer to the end the drive would wrap around."""
+    with pytest.raises(
+        TableRefused, match="path comes nearer to the end of the 32-bit range than the largest"
+    ) as caught:
         loaded_within(None, [0] * 5 + [end])
     assert caught.value.code == "PositionRange"
 
@@ -427,7 +425,6 @@ def test_a_path_up_to_the_largest_offset_from_the_end_of_32_bits_is_a_table(end:
 
 
 def test_a_piece_that_comes_nearer_is_no_part_of_a_table() -> None:
-    """Of the rows behind those that were let go, each at its own place."""
     limits = (OffsetLimits(10, 5, 2, 1000, 2),)
     for row in (0, 1, 2, 3):
         demand = [0] * 4
@@ -465,7 +462,6 @@ def test_rows_are_little_endian_wherever_they_are_made(monkeypatch: pytest.Monke
 
 
 def test_a_streamed_table_does_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Piece after piece, while nothing runs that would let the first ones go."""
     monkeypatch.setattr(table, "MAX_TABLE_BYTES", 8 * 2 * 10)
     loaded = table.begin(body("p", 0, False), 1, "XY", (TINY, TINY), None, 0).joined
     loaded = table.begin(body("p", 4, False), 2, "XY", (TINY, TINY), loaded, 0).joined

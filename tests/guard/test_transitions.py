@@ -1,4 +1,4 @@
-"""The table of transitions: what it must never hold, and that there is no way beside it."""
+"""The table of transitions: forbidden contents, and no transition outside it."""
 
 from __future__ import annotations
 
@@ -84,7 +84,6 @@ def test_the_feed_forward_begins_by_arming_and_zeroing_never_turns_on() -> None:
 
 @pytest.mark.parametrize("mode", Mode)
 def test_from_every_state_two_events_lead_to_rest_and_none_but_the_operators_leads_away(mode: Mode) -> None:
-    """What is in charge ends, what lands is at rest next, and whoever is at rest stays there until he is asked."""
     if mode in IN_CHARGE:
         assert WAYS[mode, Event.END] is Mode.RAMP_DOWN
     landed = WAYS.get((mode, Event.END), mode)
@@ -96,7 +95,6 @@ def test_from_every_state_two_events_lead_to_rest_and_none_but_the_operators_lea
 
 
 def in_mode(mode: Mode) -> Bench:
-    """A machine whose guard is in a state, all drives but those of ADOPT and FROZEN as they should be."""
     if mode is Mode.ADOPT:
         held = machine.bench()
         held.drives[0].hold(300)
@@ -129,7 +127,6 @@ def in_mode(mode: Mode) -> Bench:
 @pytest.mark.parametrize("end", ["daemon lost", "disarm", "stop"])
 @pytest.mark.parametrize("mode", Mode)
 def test_from_every_state_the_drives_come_to_zero_and_nothing_is_sent_any_more(mode: Mode, end: str) -> None:
-    """The core takes the ways of the table: whatever it was doing, all drives hold 0 in time, and the bus is silent."""
     made = in_mode(mode)
     assert made.mode is mode
     if end == "daemon lost":

@@ -1,4 +1,4 @@
-"""A bus that cannot be opened, and a peer that is no hub, are told in one sentence."""
+"""An unusable bus and a peer that is not a hub are reported in one sentence."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_hub_that_is_not_there() -> None:
 
 
 class RawSocket:
-    """Stands for CAN_RAW where the kernel has none; tests/socketcan has the real one."""
+    """Replaces CAN_RAW where the kernel has none; tests/socketcan uses the real one."""
 
     def __init__(self, *family: int, up: bool) -> None:
         self.calls: list[Any] = [family]
@@ -93,7 +93,6 @@ def test_a_raw_socket_hears_nothing_before_the_guard_listens_and_is_closed_when_
 
 
 def run_main(monkeypatch: pytest.MonkeyPatch, settings: Path, descriptor: int) -> int:
-    """Run the guard's program in this process with these arguments."""
     monkeypatch.setattr("sys.argv", ["fdhil.guard", "--settings", str(settings), "--descriptor", str(descriptor)])
     return guard_main.main()
 
@@ -117,6 +116,6 @@ def test_a_descriptor_that_is_no_socket_is_one_sentence(
     (tmp_path / "guard.json").write_text(to_json(replace(settings, run_directory=str(tmp_path))))
     with (tmp_path / "a file").open("wb") as file:
         assert run_main(monkeypatch, tmp_path / "guard.json", file.fileno()) == 3
-    told = capsys.readouterr().err
-    assert "cannot be used" in told
-    assert "nothing was sent; start the guard with fdhil-guard" in told
+    output = capsys.readouterr().err
+    assert "cannot be used" in output
+    assert "nothing was sent; start the guard with fdhil-guard" in output

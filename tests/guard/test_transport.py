@@ -1,4 +1,4 @@
-"""Sockets and settings: what may leave, what is understood, and that the settings survive their file."""
+"""Sockets and settings: allowed frames, parsing, and settings that survive their file."""
 
 from __future__ import annotations
 
@@ -53,8 +53,6 @@ def frames_of(can: SocketcandText, far: socket.socket, text: bytes) -> list[tupl
 
 
 class Narrow(socket.socket):
-    """A connection whose buffer has room for five bytes more."""
-
     def send(self, data: object, flags: int = 0) -> int:
         return super().send(bytes(data)[:5], flags)  # type: ignore[call-overload] # bytes are given
 
@@ -105,7 +103,6 @@ def test_torn_frames_are_joined(wire: tuple[SocketcandText, socket.socket]) -> N
 
 
 def babble(can: SocketcandText, far: socket.socket) -> None:
-    """The hub sends what has no frame in it, for ever."""
     far.setblocking(False)
     while True:
         with contextlib.suppress(BlockingIOError):
@@ -114,13 +111,11 @@ def babble(can: SocketcandText, far: socket.socket) -> None:
 
 
 def listen(can: SocketcandText) -> None:
-    """Receive for ever: that the other end has gone may come later."""
     while True:
         can.receive()
 
 
 def pour(can: SocketcandText, frames: int) -> None:
-    """Send frames that nobody reads, until the queue is full or torn."""
     for _ in range(frames):
         if not can.send(0x301, b"\0\0\0\0"):
             raise BusDown("full")
@@ -146,8 +141,6 @@ def test_a_full_queue_is_told(wire: tuple[SocketcandText, socket.socket]) -> Non
 
 
 class Raw:
-    """A CAN_RAW socket as far as RawCan uses it."""
-
     def __init__(self) -> None:
         self.options: list[tuple[int, int]] = []
         self.waiting: list[tuple[bytes, list[tuple[int, int, bytes]]]] = []
@@ -323,26 +316,26 @@ def test_two_axes_on_one_offset_are_refused() -> None:
 
 @pytest.mark.parametrize("taken", [("axes", 1, "target"), ("axes", 0, "target"), ("axes", 1, "tpdos", 0)])
 def test_an_offset_under_another_senders_id_is_refused(taken: tuple[str | int, ...]) -> None:
-    """It would reach the drive as half a set-point, or the NC as what a drive says."""
+    """It would reach the drive as half a set-point, or the NC as a drive's data."""
     document = inner = json.loads(to_json(settings()))
     for key in taken:
         inner = inner[key]
     document["axes"][0]["offset"]["cob_id"] = inner["cob_id"]
-    with pytest.raises(ConfigError, match="is another sender's"):
+    with pytest.raises(ConfigError, match="is also used by"):
         from_json(json.dumps(document))
 
 
 def test_a_heartbeat_of_ours_in_a_drives_name_is_refused() -> None:
     document = json.loads(to_json(settings()))
     document["node_id"] = document["axes"][1]["node_id"]
-    with pytest.raises(ConfigError, match="is another sender's"):
+    with pytest.raises(ConfigError, match="is also used by"):
         from_json(json.dumps(document))
 
 
 def test_two_axes_that_are_one_are_refused() -> None:
     document = json.loads(to_json(settings()))
     document["axes"][1]["tpdos"] = document["axes"][0]["tpdos"]
-    with pytest.raises(ConfigError, match="two axes are one"):
+    with pytest.raises(ConfigError, match="two axes share a name"):
         from_json(json.dumps(document))
 
 

@@ -1,4 +1,4 @@
-"""How late the guard is: counted, named where it explains what a drive shows, refused above a stated share."""
+"""Lateness of the guard: counted, reported as a cause, and refused above a stated share."""
 
 from __future__ import annotations
 
@@ -47,16 +47,16 @@ def test_late_offsets_explain_what_a_drive_shows_soon_after_them_and_nothing_els
     assert turns.blame("LimitActive", 0.0) == ""
     turns.add(0.009, False, 5.0)
     turns.add(0.0002, True, 5.001)
-    told = "this PC was late (2 offsets, worst 9.0 ms)"
-    assert turns.blame("LimitActive", 5.5) == told
+    expected = "this PC was late (2 offsets, worst 9.0 ms)"
+    assert turns.blame("LimitActive", 5.5) == expected
     assert turns.blame("SoftwareLimit", 5.5) == ""
     assert turns.blame("LimitActive", 5.001 + RECENT_S + 0.1) == ""
     turns.begin()
     assert turns.blame("LimitActive", 5.5) == ""
-    alarm = Alarm("LimitActive", "X", late=told)
-    assert alarm.cause == f"{told}: that is why axis X: an internal limit is active (statusword bit 11)"
+    alarm = Alarm("LimitActive", "X", late=expected)
+    assert alarm.cause == f"{expected}, therefore axis X: an internal limit is active (statusword bit 11)"
     assert "take load off this PC" in alarm.action
-    assert "adopt" in Alarm("SyncLost", late=told).action  # what was frozen needs what it always needs
+    assert "adopt" in Alarm("SyncLost", late=expected).action  # what was frozen needs what it always needs
 
 
 @pytest.mark.parametrize(("clock", "refused"), [("monotonic", True), ("sync", False)])
@@ -111,6 +111,6 @@ def test_guard_says_that_the_pc_was_late_where_that_ended_the_correction(make: C
     cause = shop.ask(client, {"request": "status"})["cause"]
     assert cause["code"] == "LimitActive"
     assert cause["late"] == "this PC was late (1 offset, worst 9.0 ms)"
-    assert cause["text"].startswith("this PC was late (1 offset, worst 9.0 ms): that is why axis X: an internal limit")
+    assert cause["text"].startswith("this PC was late (1 offset, worst 9.0 ms), therefore axis X: an internal limit")
     assert "take load off this PC" in cause["advice"]
     assert any("this PC was late" in event.get("text", "") for event in shop.events())

@@ -1,4 +1,4 @@
-"""The guard on the simulated machine: what the drives followed is the table, row by row."""
+"""The guard on the simulated machine: the drives follow the table row by row."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ main()
 
 
 def demand_mm() -> list[tuple[float, float]]:
-    """A smooth move of both axes, at rest at both ends."""
+    """Return a smooth move of both axes, at standstill at both ends."""
     parts = [min(max((k - 50) / (ROWS - 100), 0.0), 1.0) for k in range(ROWS)]
     ways = [10 * t**3 - 15 * t**4 + 6 * t**5 for t in parts]
     return [(40.0 * way, -15.0 * way) for way in ways]
 
 
 def offset_increments() -> list[int]:
-    """A bump of 61 um over the middle of the move."""
+    """Return a bump of 61 um over the middle of the move."""
     return [
         round(100 * (1 - math.cos(2 * math.pi * (k - 100) / (ROWS - 200)))) if 100 <= k < ROWS - 100 else 0
         for k in range(ROWS)
@@ -50,8 +50,6 @@ def offset_increments() -> list[int]:
 
 
 class Twin:
-    """The simulated machine in lockstep, its NC on."""
-
     def __init__(self, folder: Path) -> None:
         self.config = write_config(folder, 0)
         with self.config.open("a") as file:
@@ -81,7 +79,6 @@ class Twin:
 
 
 def play(twin: Twin, guard: GuardClient, folder: Path) -> dict[str, Any]:
-    """Load, arm and play; the twin's finished event."""
     rows = demand_mm()
     columns = [[round(row[k] * 3276.8) for row in rows] for k in (0, 1)]
     bump = offset_increments()

@@ -1,4 +1,4 @@
-"""One entry for each axis: where a list is shorter than it must be, the step is an error, never a shorter frame."""
+"""One entry per axis: a list that is too short is an error, never a shorter frame."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ FED = feed.armed((LAW, LAW))._replace(targets=((0,) * 3,) * 2)
 
 
 def sending(mode: Mode) -> State:
-    """A state of fewer axes than the settings have."""
     return FEWER._replace(mode=mode, places=(Place(0),))
 
 
@@ -78,8 +77,6 @@ CASES |= {
 
 
 class _Taking:
-    """A bus that takes every frame."""
-
     def send(self, cob_id: int, data: bytes) -> bool:
         return bool(cob_id and data)
 

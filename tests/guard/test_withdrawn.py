@@ -1,4 +1,4 @@
-"""What a daemon no longer vouched for ends its own correction, and is no reproach to whoever arms next."""
+"""A withdrawn fact ends the daemon's own correction and does not affect the next client that arms."""
 
 from __future__ import annotations
 

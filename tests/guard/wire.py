@@ -1,4 +1,4 @@
-"""Judges the offset frames to one drive by the wire and what the drive held; knows nothing of the guard's state."""
+"""Checks the offset frames to one drive by the bus and the drive's offset, independent of the guard's state."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ CEILING = 819
 
 
 class Wire:
-    """``ours`` says what is wrong with a frame of the guard, None when nothing is.
+    """``ours`` returns what is wrong with a frame of the guard, None when nothing is.
 
-    A frame may continue the last one on the wire, whoever sent it, or what the drive holds: whatever else it is, is a
-    step. A cycle without a frame of ours brings the offset to rest.
+    A frame may continue the last one on the bus, whoever sent it, or the drive's offset: anything else is a step. A
+    cycle without our frame stops the offset.
     """
 
     def __init__(self, limits: OffsetLimits, held: int) -> None:
@@ -25,20 +25,16 @@ class Wire:
         self._travelled = 0
 
     def foreign(self, value: int) -> None:
-        """Another node's frame, or its SDO write."""
         self._last = self._before = value
         self._rate = 0
 
     def lost(self) -> None:
-        """The last frame of ours did not leave."""
         self._last, self._rate = self._before, 0
 
     def stood(self, before: int) -> None:
-        """In front of the last frame of ours a cycle was missed: it went on from ``before``, at rest."""
         self._before, self._rate = before, self._last - before
 
     def nothing(self) -> None:
-        """No frame of ours in this cycle."""
         self._rate = 0
         self._travel(0)
 
@@ -49,7 +45,6 @@ class Wire:
         self._travelled += move
 
     def ours(self, value: object, held: int) -> str | None:
-        """A frame of ours, sent while the drive holds ``held``."""
         if type(value) is not int:
             return f"{value!r} is no integer"
         wrong = [self._judge(value, self._last, self._rate)]

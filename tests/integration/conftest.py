@@ -30,15 +30,12 @@ _channel = itertools.count()
 
 @dataclass
 class Bench:
-    """The twin in a thread on one transport, and the configuration with which anyone joins it."""
-
     config: MachineConfig
     service: SimService
     events: queue.Queue[dict[str, Any]]
     ready: Mapping[str, Any] = field(default_factory=dict)
 
     def event(self, kind: str) -> dict[str, Any]:
-        """Return the next event of this kind."""
         while True:
             event = self.events.get(timeout=PATIENCE_S)
             assert event["event"] != "error", event
@@ -46,17 +43,14 @@ class Bench:
                 return event
 
     def command(self, line: str) -> None:
-        """Give one command of the operator's panel (JSON)."""
         self.service.command(line)
 
     def join(self) -> can.BusABC:
-        """Join the bus with the arguments that the ready event gives to any python-can program."""
         place = {k: v for k, v in self.ready["buses"]["can0"].items() if v is not None}
         return can.Bus(**place)
 
 
 def sign_off(config: MachineConfig) -> None:
-    """Give every axis the record that a commissioning would leave, from what its drive says by SDO; nothing moves."""
     for axis in config.axis:
         with Master(config, axis) as master:
             found = survey(master)
@@ -77,7 +71,6 @@ def sign_off(config: MachineConfig) -> None:
 
 
 def take_voltage_from_sensors(bench: Bench) -> Bench:
-    """Tell the drivers to take the voltage from the Modbus sensors."""
     for axis, settings in bench.config.axis.items():
         voltage = settings.voltage.model_copy(update={"source": "modbus"})
         bench.config.axis[axis].__dict__["voltage"] = voltage
@@ -85,7 +78,6 @@ def take_voltage_from_sensors(bench: Bench) -> Bench:
 
 
 def digested(pipeline: AxisPipeline, records: Sequence[Any]) -> list[Outcome]:
-    """Feed a pipeline as the daemon does: what an operator should know is for the operator."""
     return [o for record in records if not isinstance(record, Notice) for o in pipeline.feed(record)]
 
 
@@ -110,13 +102,11 @@ TRANSPORTS: Mapping[str, Callable[[dict[str, Any]], None]] = {
 
 @pytest.fixture(params=["virtual", "hub", pytest.param("socketcan", marks=pytest.mark.socketcan)])
 def transport(request: pytest.FixtureRequest) -> str:
-    """The transport of this run of the suite."""
     return str(request.param)
 
 
 @pytest.fixture
 def settling_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorter waits of the commissioning than on a real machine; the simulated drive settles sooner."""
     monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.3)
     monkeypatch.setattr("fdhil.commissioning.transmit.LOOK_S", 0.05)
     monkeypatch.setattr("fdhil.commissioning.steps.SETTLE_CYCLES", 150)
@@ -127,13 +117,11 @@ def settling_soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def sections() -> dict[str, Any]:
-    """Sections that a test module adds to the bench's configuration."""
     return {"sim": {"pace": "lockstep", "modbus": False}}
 
 
 @pytest.fixture
 def bench(transport: str, sections: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    """Serve the bench's twin on the transport; it waits for a guard that is held up with a zero, too."""
     monkeypatch.setattr("fdhil.sim.service.LOCKSTEP_WAIT_S", LOCKSTEP_HOLDING_WAIT_S)
     document = bench_document() | sections
     TRANSPORTS[transport](document)

@@ -1,6 +1,6 @@
-"""Runs in the machine whose power is cut: looks what is there, tells it, then keeps records of all kinds for ever.
+"""Runs in the machine whose power is cut: reports the stored records, then keeps storing records of all kinds.
 
-Its clock is set anew before each round of records: their order must not hang on it.
+Its clock is set before each round of records: their order must not depend on it.
 """
 
 from __future__ import annotations
@@ -19,13 +19,11 @@ JUMPS_S = (0.0, 3600.0, -3600.0, -1.7e9, 3.0e8)  # an hour either way, back to a
 
 
 def say(line: str) -> None:
-    """Tell the other side of the console."""
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 
 
 def main() -> None:
-    """Look, then write; each line that is printed is of what is on the disk by then."""
     folder, begun_s = Path(sys.argv[1]), time.time()
     if sys.argv[2] == "careless":
         os.fsync = lambda fd: None

@@ -1,8 +1,7 @@
-"""Cuts the power of a machine while it keeps records of every kind, boots it again, and looks what is left.
+"""Cuts the power of a machine while it stores records of every kind, boots it again, and checks the records.
 
-The machine is a Linux of its own (user mode) with an ext4 on a disk image. A cut is SIGKILL for all of it: what its
-kernel had not written is gone, as with a real machine. ``python -m tests.integration.power_cuts CUTS PICTURES`` prints
-a table.
+The machine is a user-mode Linux with an ext4 disk image. A cut is SIGKILL for all of it: unwritten data are lost as on
+a real machine. ``python -m tests.integration.power_cuts CUTS PICTURES`` prints a table.
 """
 
 from __future__ import annotations
@@ -51,12 +50,6 @@ Numbers = dict[str, set[int]]
 
 @dataclass
 class Findings:
-    """What was found after the cuts: ``lost`` and ``damage`` name what must not be.
-
-    A machine that is cut is booted again on its disk. The disk of one that is stopped for a moment is that of a machine
-    that is cut there: of such ``pictures`` the journal is played, and the product starts upon what is there.
-    """
-
     cuts: int = 0
     pictures: int = 0
     acknowledged: Counter[str] = field(default_factory=Counter)
@@ -66,12 +59,10 @@ class Findings:
 
 
 def prepare() -> None:
-    """Fetch what the machine needs; CalledProcessError when that fails."""
     subprocess.run(["bash", ROOT / "tests/integration/vcan-vm.sh", "-q", "-m", "uml", "-p"], check=True)
 
 
 def make_disk(folder: Path) -> Path:
-    """Make an empty ext4 in a file."""
     disk = folder / "disk"
     with disk.open("wb") as file:
         file.truncate(DISK_BYTES)
@@ -81,7 +72,6 @@ def make_disk(folder: Path) -> Path:
 
 @contextmanager
 def booted(folder: Path, disk: Path, how: str) -> Iterator[subprocess.Popen[str]]:
-    """Boot; yield the machine, whose console is its standard output. Left, its power is cut."""
     init = folder / "init"
     init.write_text(INIT.format(cache=CACHE, root=ROOT, python=sys.executable, how=how))
     init.chmod(0o755)
@@ -106,16 +96,10 @@ def booted(folder: Path, disk: Path, how: str) -> Iterator[subprocess.Popen[str]
 
 
 def cut(machine: subprocess.Popen[str]) -> None:
-    """Cut the power: what the machine's kernel had not written is gone."""
     os.killpg(machine.pid, signal.SIGKILL)
 
 
 def cut_power(cuts: int, folder: Path, how: str = "careful", seed: int = 1, pictures: int = 0) -> Findings:
-    """Cut the power ``cuts`` times, each time after a random number of acknowledged records, and look each time.
-
-    Before each cut so many ``pictures`` are taken and looked at. ``how`` "careless" waits for no disk, to show that
-    such a machine loses what it acknowledged.
-    """
     found, chance = Findings(), random.Random(seed)
     disk, kept = make_disk(folder), {name: set[int]() for name in KEEPERS}
     for number in range(cuts + 1):
@@ -135,7 +119,6 @@ def cut_power(cuts: int, folder: Path, how: str = "careful", seed: int = 1, pict
 
 
 def _looked(console: Iterable[str], kept: Numbers, found: Findings) -> bool:
-    """Compare what a boot finds with what was acknowledged before the cut; whether it told."""
     for line in console:
         what, _, rest = line.strip().partition(" ")
         if what == "found":
@@ -148,7 +131,6 @@ def _looked(console: Iterable[str], kept: Numbers, found: Findings) -> bool:
 
 
 def _compare(there: Mapping[str, set[int]], kept: Numbers, found: Findings) -> None:
-    """Compare what is there with what was acknowledged."""
     where = f"cut {found.cuts}, picture {found.pictures}"
     for name, numbers in kept.items():
         found.checked += len(numbers)
@@ -156,7 +138,6 @@ def _compare(there: Mapping[str, set[int]], kept: Numbers, found: Findings) -> N
 
 
 def _heard(console: Iterable[str], records: int, kept: Numbers, found: Findings) -> None:
-    """Note what the machine acknowledges, until it is so many ``records``, or to its end."""
     for line in console:
         what, _, rest = line.rstrip("\n").partition(" ")
         if what == "kept" and line.endswith("\n"):
@@ -170,14 +151,12 @@ def _heard(console: Iterable[str], records: int, kept: Numbers, found: Findings)
 
 
 def _said(line: str, console: Iterable[str]) -> str:
-    """Return what a line of trouble says; of a traceback its last line."""
     if line.startswith("Traceback"):
         line = next((end for end in console if end.strip() and not end.startswith((" ", "\t"))), line)
     return line.strip()[:300]
 
 
 def _pictured(machine: subprocess.Popen[str], disk: Path, folder: Path, kept: Numbers, found: Findings) -> None:
-    """Take a picture of the disk, and look what a machine that was cut there would find."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     picture = folder / "disk"
@@ -189,14 +168,13 @@ def _pictured(machine: subprocess.Popen[str], disk: Path, folder: Path, kept: Nu
     subprocess.run(["debugfs", "-R", f"rdump /store {folder}", picture], check=True, capture_output=True)
     there = {}
     for name, make in KEEPERS.items():
-        told = looked_at(make, folder / "store" / place_of(name), MUCH_LATER)
-        there[name] = set(told.found)
-        found.damage += [f"picture {found.pictures}: {name}: {text}" for text in (*told.wrong, *told.said)]
+        result = looked_at(make, folder / "store" / place_of(name), MUCH_LATER)
+        there[name] = set(result.found)
+        found.damage += [f"picture {found.pictures}: {name}: {text}" for text in (*result.wrong, *result.said)]
     _compare(there, kept, found)
 
 
 def _take(machine: subprocess.Popen[str], disk: Path, picture: Path) -> None:
-    """Copy the disk of a machine that is stopped for a moment, with the processes that write for its kernel."""
     processes = [machine.pid, *_writers(machine.pid)]
     for pid in processes:
         os.kill(pid, signal.SIGSTOP)
@@ -208,7 +186,6 @@ def _take(machine: subprocess.Popen[str], disk: Path, picture: Path) -> None:
 
 
 def _copy(disk: Path, picture: Path) -> None:
-    """Copy what is read of a disk, with holes where it is zero."""
     with disk.open("rb") as source, picture.open("wb") as copy:
         while chunk := source.read(COPIED_BYTES):
             if chunk.strip(b"\0"):
@@ -218,19 +195,16 @@ def _copy(disk: Path, picture: Path) -> None:
 
 
 def _writers(pid: int) -> list[int]:
-    """Return the machine's processes that are none of its users': those it does not trace."""
     tasks = Path(f"/proc/{pid}/task").glob("*/children")
     children = [int(child) for task in tasks for child in task.read_text("ascii").split()]
     return [child for child in children if "TracerPid:\t0\n" in Path(f"/proc/{child}/status").read_text("ascii")]
 
 
 def _state(pid: int) -> str:
-    """Return what a process does: T is stopped."""
     return Path(f"/proc/{pid}/stat").read_text("ascii").rpartition(")")[2].split()[0]
 
 
 def main() -> int:
-    """Cut, and print what was found; 1 when anything that was acknowledged is gone or damaged."""
     cuts, pictures = (int(number) for number in sys.argv[1:])
     prepare()
     with tempfile.TemporaryDirectory(prefix="power-cuts-") as name:

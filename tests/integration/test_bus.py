@@ -1,4 +1,4 @@
-"""What any CANopen master sees of the drives, on every transport."""
+"""The drives as any CANopen master sees them, on every transport."""
 
 from __future__ import annotations
 
@@ -20,14 +20,12 @@ PATIENCE_S = 100.0
 
 @pytest.fixture
 def bus(bench: Bench) -> Iterator[can.BusABC]:
-    """A stock python-can bus that has joined."""
     joined = bench.join()
     yield joined
     joined.shutdown()
 
 
 def next_of(bus: can.BusABC, can_ids: Collection[int]) -> tuple[int, bytes]:
-    """Return the next frame with one of these identifiers."""
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
         message = bus.recv(0.1)
@@ -37,7 +35,6 @@ def next_of(bus: can.BusABC, can_ids: Collection[int]) -> tuple[int, bytes]:
 
 
 def received(bus: can.BusABC, can_id: int) -> bytes:
-    """Return the data of the next frame with this identifier."""
     return next_of(bus, (can_id,))[1]
 
 
@@ -85,7 +82,6 @@ def test_a_reset_node_boots_and_can_be_started(bus: can.BusABC) -> None:
 def test_the_nc_s_takeover_is_whole_when_another_thread_orders_it(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The machine goes on while the order is given: half a takeover would leave the drives without their mode."""
     of_axis = bench.service.machine.nc._wiring
 
     def slow(axis: str) -> Wiring:

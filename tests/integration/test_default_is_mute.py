@@ -1,4 +1,4 @@
-"""A default installation on a bus that is alive: the daemon's real process, heard by the bus and by the kernel."""
+"""A default installation on an active bus: the daemon's real process, observed on the bus and by the kernel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The on-line feed-forward on the simulated machine: no program is known, the targets on the bus are enough."""
+"""The on-line feed-forward on the simulated machine: without a program, from the targets on the bus."""
 
 from __future__ import annotations
 
@@ -32,7 +32,6 @@ LIMITS = {"max_torque_nm": 100.0, "max_speed_rad_s": 30.0}
 
 @pytest.fixture
 def transport() -> str:
-    """The transport that joins processes."""
     return "hub"
 
 
@@ -42,7 +41,6 @@ CASES = {"X": (1.0, 3.0), "Y": (0.5, 50.0)}
 
 @pytest.fixture
 def sections() -> dict[str, Any]:
-    """Both axes may be fed forward; quantisation stays, sensor noise is none of the table's."""
     document = bench_document()
     for name, axis in document["axis"].items():
         axis["feedforward"] = LIMITS
@@ -52,7 +50,6 @@ def sections() -> dict[str, Any]:
 
 @pytest.fixture
 def client(bench: Bench, settling_soon: None, tmp_path: Path) -> Iterator[GuardClient]:
-    """A guard on the bench's bus, the drives commissioned before."""
     for axis in "XY":
         record = commission(bench.config, axis)
         save_record(record, bench.config.store.directory)
@@ -69,7 +66,6 @@ def client(bench: Bench, settling_soon: None, tmp_path: Path) -> Iterator[GuardC
 
 
 def switch_on(client: GuardClient, bench: Bench) -> None:
-    """Switch the feed-forward on as soon as the interlocks have been good for long enough."""
     models = nominal_models(bench.config)
     laws = {axis: law(models[axis], bench.config.axis[axis], 0.001) for axis in "XY"}
     run = bench.config.store.run_directory
@@ -85,7 +81,6 @@ def switch_on(client: GuardClient, bench: Bench) -> None:
 
 
 def largest_errors_um(bench: Bench, client: GuardClient, demand: Path, trace: Path, rows: int) -> dict[str, float]:
-    """Play the demand and return the largest tracking error of each axis."""
     bench.command(json.dumps({"command": "trace", "file": str(trace)}))
     bench.command(json.dumps({"command": "play", "file": str(demand)}))
     while bench.events.empty() or not any(e["event"] == "finished" for e in list(bench.events.queue)):
@@ -98,7 +93,6 @@ def largest_errors_um(bench: Bench, client: GuardClient, demand: Path, trace: Pa
 
 
 def test_the_largest_tracking_error_shrinks(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
-    """At least 3 times on the bench, 50 times on a drive that lags; off again, nothing stays applied."""
     demand = tmp_path / "demand.csv"
     path = bench_demand(10)
     lines = [f"{k * 0.001:.3f},{x:.9f},{y:.9f}" for k, (x, y) in enumerate(path)]
@@ -114,7 +108,7 @@ def test_the_largest_tracking_error_shrinks(bench: Bench, client: GuardClient, t
     deadline = time.monotonic() + PATIENCE_S
     while client.status()["feedforward"]["state"] != "OFF" and time.monotonic() < deadline:
         time.sleep(0.02)
-    told = client.status()["feedforward"]
-    assert told["state"] == "OFF"
-    assert told["cause"]["code"] == "Disarmed"
-    assert told["applied"] == {"X": [0, 0], "Y": [0, 0]}
+    status = client.status()["feedforward"]
+    assert status["state"] == "OFF"
+    assert status["cause"]["code"] == "Disarmed"
+    assert status["applied"] == {"X": [0, 0], "Y": [0, 0]}

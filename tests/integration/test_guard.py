@@ -25,26 +25,22 @@ DIGEST = "0" * 64
 
 @pytest.fixture(params=["hub", pytest.param("socketcan", marks=pytest.mark.socketcan)])
 def transport(request: pytest.FixtureRequest) -> str:
-    """The transports that join processes; ``virtual`` does not."""
     return str(request.param)
 
 
 @pytest.fixture
 def sections() -> dict[str, Any]:
-    """The guard counts time in SYNCs, as the twin does."""
     return {"sim": {"pace": "lockstep", "modbus": False}, "guard": {"clock": "sync"}}
 
 
 @pytest.fixture
 def client(bench: Bench, tmp_path: Path) -> Iterator[GuardClient]:
-    """A guard that runs on the bench's bus."""
     with guarded(bench, tmp_path) as guard_client:
         yield guard_client
 
 
 @contextmanager
 def guarded(bench: Bench, tmp_path: Path) -> Iterator[GuardClient]:
-    """Run a guard on the bench's bus for the time of a with block."""
     document = json.loads(bench.config.model_dump_json(exclude_none=True))
     path = tmp_path / "machine.toml"
     path.write_text(toml(document), "utf-8")
@@ -67,7 +63,6 @@ def toml(document: dict[str, Any], path: str = "") -> str:
 
 
 def arm(client: GuardClient, token: str) -> dict[str, Any]:
-    """Arm as soon as the interlocks have been good for long enough."""
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
         client.alive()
@@ -79,7 +74,6 @@ def arm(client: GuardClient, token: str) -> dict[str, Any]:
 
 
 def missed_until_it_is_waited_for(client: GuardClient) -> int:
-    """Return the SYNCs that the guard had missed when it has caught up with those from before its first zero."""
     first = client.status()["tick"]
     while (status := client.status())["tick"] < first + 50:
         client.alive()
@@ -92,7 +86,6 @@ def test_every_offset_is_applied_in_its_own_cycle(bench: Bench, client: GuardCli
 
 
 def every_offset_is_applied_in_its_own_cycle(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
-    """Arm a bump on a way that the NC plays, and compare what the drives applied."""
     way = np.concatenate([np.zeros(20), 2.5 * (1 - np.cos(np.linspace(0, np.pi, 500))), np.full(100, 5.0)])
     demand = tmp_path / "demand.csv"
     rows = [f"{k * 0.001:.3f},{x:.6f},{x:.6f}" for k, x in enumerate(way)]

@@ -1,4 +1,4 @@
-"""The guard's process beside drives of other makes: what it listens to and sends is as their profiles have it."""
+"""The guard's process with drives of other makes: it receives and sends as their profiles define."""
 
 from __future__ import annotations
 
@@ -19,13 +19,11 @@ pytestmark = pytest.mark.usefixtures("processes")
 
 @pytest.fixture(params=["hub", pytest.param("socketcan", marks=pytest.mark.socketcan)])
 def transport(request: pytest.FixtureRequest) -> str:
-    """The transports that join processes; ``virtual`` does not."""
     return str(request.param)
 
 
 @pytest.fixture
 def sections(tmp_path: Path) -> dict[str, Any]:
-    """Two drives of one make, in their dress."""
     eds = str(write_eds("epos4", tmp_path))
     axis = bench_axis(drive={"profile": "epos4", "dc_link_v": 300.0})
     sim = {"pace": "lockstep", "modbus": False, "axis": {name: {"eds": eds} for name in "XY"}}

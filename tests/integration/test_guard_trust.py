@@ -1,4 +1,4 @@
-"""What the guard believes of a drive on the bus: a foreign set-up, a reboot, a read-back at another place."""
+"""The guard's trust in a drive on the bus: a foreign configuration, a reboot, a remapped read-back."""
 
 from __future__ import annotations
 
@@ -31,19 +31,15 @@ WINDOW = 0x6065
 
 @pytest.fixture
 def transport() -> str:
-    """Processes are joined."""
     return "hub"
 
 
 @pytest.fixture
 def sections() -> dict[str, Any]:
-    """One axis; the guard counts time in SYNCs, as the twin does."""
     return {"sim": {"pace": "lockstep", "modbus": False}, "guard": {"clock": "sync"}}
 
 
 class Shop:
-    """The twin, its config as a file, and a guard that can be started again."""
-
     def __init__(self, bench: Bench, folder: Path) -> None:
         self.bench, self.folder, self.config = bench, folder, folder / "machine.toml"
         self.config.write_text(toml(json.loads(bench.config.model_dump_json(exclude_none=True))), "utf-8")
@@ -60,7 +56,6 @@ class Shop:
                 yield client
 
     def nc(self, on: bool) -> None:
-        """Switch the NC; that it stops because a drive is gone is no error here. What it stops is SYNC."""
         if on:
             (self.run / impatient.BUS).unlink(missing_ok=True)
         self.bench.command(json.dumps({"command": "nc", "on": on}))
@@ -73,7 +68,6 @@ class Shop:
         self.bench.command(json.dumps({"command": "fault", **fault}))
 
     def write(self, bus: can.BusABC, index: int, value: int, specifier: int = 0x23) -> None:
-        """Another master's SDO download to drive X, of four bytes or (2B) of two."""
         bus.send(
             can.Message(
                 arbitration_id=0x601, data=struct.pack("<BHBI", specifier, index, 0, value), is_extended_id=False
@@ -81,15 +75,13 @@ class Shop:
         )
 
     def refused(self, client: GuardClient) -> set[tuple[str, str]]:
-        """What forbids arming, by class and axis; that nothing is loaded is none of it."""
         answer = client.arm(read_token(self.run), "0" * 64, dict.fromkeys(FACTS, True))
-        return {(told["code"], told["axis"]) for told in answer["refused"]} - {
+        return {(result["code"], result["axis"]) for result in answer["refused"]} - {
             ("ProgramMismatch", ""),
             ("MainLost", ""),
         }
 
     def until(self, client: GuardClient, wanted: set[tuple[str, str]]) -> None:
-        """Wait until arming is refused for these reasons, and maybe others; with none wanted for none."""
         deadline = time.monotonic() + PATIENCE_S
         while not (found := self.refused(client)) >= wanted or (found and not wanted):
             assert time.monotonic() < deadline, found
@@ -146,7 +138,6 @@ def test_a_void_record_outlives_the_guard_beside_a_running_nc(shop: Shop) -> Non
 
 
 def test_a_remapped_read_back_at_100_mm_moves_nothing(shop: Shop, tmp_path: Path) -> None:
-    """0x60B0 and 0x6062 in each other's place: a guard that starts reads the axis' position as its offset."""
     rows = 450
     demand = tmp_path / "demand.csv"
     way = [100 * (10 * t**3 - 15 * t**4 + 6 * t**5) for t in (min(k / (rows - 10), 1.0) for k in range(rows))]

@@ -1,4 +1,4 @@
-"""A sample of the study of kills, hangs, restarts and faults at random times, and that its judges see what is wrong."""
+"""A sample of the study of kills, hangs, restarts and faults, and a check that its judges detect errors."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fdhil.guard import core
+from fdhil.guard import conditions, core, limits
 from fdhil.guard.limits import OffsetLimits
 from studies import kills
 from studies.fault_rows import RAMPED, Descent, descent
@@ -68,11 +68,11 @@ def test_a_descent_is_judged_by_its_bounds() -> None:
 
 
 def test_a_guard_that_does_not_see_a_fault_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(core, "failing", lambda _bus, _views: ())
+    monkeypatch.setattr(core, conditions.failing.__name__, lambda _bus, _views: ())
     assert kills.frame_part("E11", 1, 7).wrong
 
 
 def test_a_guard_that_ramps_by_a_step_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(core, "follow", lambda _limits, _offset, _rate, wanted, _rate_wanted: wanted)
-    monkeypatch.setattr(core, "violation", lambda _limits, _before, _rate, _offset: None)
+    monkeypatch.setattr(core, limits.follow.__name__, lambda _limits, _offset, _rate, wanted, _rate_wanted: wanted)
+    monkeypatch.setattr(core, limits.violation.__name__, lambda _limits, _before, _rate, _offset: None)
     assert any("a step" in each for each in kills.frame_part("F15", 20, 7).wrong)

@@ -27,7 +27,6 @@ SETTLED_ROWS = 500  # after the last rapid: it becomes a window when its axis ha
 
 
 def settled(records: list[Any], axis: str, rapids: int, rows: int = SETTLED_ROWS) -> bool:
-    """Whether all rapids of an axis are over, and it has stood for a while: records come later than the NC tells."""
     rests = [r.tick for r in records if isinstance(r, MoveEvent) and r.axis == axis and r.kind is MoveKind.REST]
     blocks = (r for r in reversed(records) if isinstance(r, AxisSamples) and r.axis == axis and r.tick.size)
     newest = next((int(block.tick[-1]) for block in blocks), 0)
@@ -35,11 +34,6 @@ def settled(records: list[Any], axis: str, rapids: int, rows: int = SETTLED_ROWS
 
 
 async def recorded(bench: Bench, program: Path) -> tuple[list[Any], dict[str, int]]:
-    """Let the NC play a program, and return all records that the drivers made of it with their counters.
-
-    A machine in real time does not wait for a host that is held up: what lost frames, or a sensor's samples,
-    is recorded again, twice.
-    """
     for _ in range(3 if bench.config.sim.pace == "realtime" else 1):
         records, counters = await _recorded(bench, program)
         if not any(n for name, n in counters.items() if name.rpartition(".")[2] == "lost"):
@@ -79,7 +73,6 @@ def shuttle(folder: Path, rounds: int = 2) -> Path:
 
 
 def test_nothing_is_lost_and_the_drives_are_identified(bench: Bench, tmp_path: Path) -> None:
-    """Demand and position lie on the same tick: one cycle of misalignment would show as 0.5 mm at rapid speed."""
     records, counters = asyncio.run(recorded(bench, shuttle(tmp_path)))
     assert counters["lost"] == 0, counters
     demand_and_position_are_aligned([r for r in records if isinstance(r, AxisSamples) and r.axis == "X"])

@@ -1,4 +1,4 @@
-"""The daemon's copy of the bus goes one way: it hears everything, and nothing that it sends comes back.
+"""The daemon's copy of the bus is one-way: it receives everything, and its frames reach no drive.
 
 The commands are those of ``fdhil-mirror@.service`` (`make test-vcan`; needs Debian's can-utils).
 """
@@ -31,7 +31,6 @@ with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw:
 
 
 def commands(key: str) -> list[list[str]]:
-    """What the unit runs, for this bus; what it may fail at (a leading -) is left out."""
     lines = [line.partition("=")[2] for line in UNIT.read_text().splitlines() if line.startswith(f"{key}=/")]
     return [[shutil.which(Path(word).name) or word if k == 0 else word.replace("%i", BUS)
              for k, word in enumerate(line.split())] for line in lines]  # fmt: skip

@@ -1,7 +1,7 @@
-"""Drives that do not tell their voltage: it comes from Modbus sensors.
+"""Drives without a voltage object: the voltage comes from Modbus sensors.
 
-How well the sensor's counter can be tied to the SYNC depends on the host that stamps both. What must hold on any host:
-a voltage that is off by more than a sample is refused for its timing, and what is accepted is right.
+How well the sensor's counter is aligned with SYNC depends on the host that stamps both. On any host, a voltage that is
+off by more than a sample is refused for its timing, and accepted results are right.
 """
 
 from __future__ import annotations
@@ -22,19 +22,16 @@ pytestmark = pytest.mark.usefixtures("long_computation")
 
 @pytest.fixture(params=["hub", pytest.param("socketcan", marks=pytest.mark.socketcan)])
 def transport(request: pytest.FixtureRequest) -> str:
-    """The buses whose frames are stamped on their way; the slow sensor is tried on ``virtual``."""
     return str(request.param)
 
 
 @pytest.fixture
 def sections() -> dict[str, Any]:
-    """A sensor answers in wall time, so the machine runs in it too."""
     return {"machine": {"name": "bench", "sync_period_s": 0.002}, "sim": {"pace": "realtime", "modbus": True}}
 
 
 @pytest.fixture
 def bench(bench: Bench) -> Bench:
-    """The drivers are told to take the voltage from the sensors."""
     return take_voltage_from_sensors(bench)
 
 

@@ -1,4 +1,4 @@
-"""fdhil play in the place of the NC, and a guard that corrects what it plays."""
+"""fdhil play instead of the NC, with a guard that corrects the played program."""
 
 from __future__ import annotations
 
@@ -30,13 +30,11 @@ main()
 
 @pytest.fixture
 def transport() -> str:
-    """Three processes of fdhil and the twin: on an interface of the kernel."""
     return "socketcan"
 
 
 @pytest.fixture
 def sections() -> dict[str, Any]:
-    """All count time in SYNCs, as the twin does, whose computer they share."""
     limits = {"setpoints": {"travel_mm": [-1.0, 20.0]}}
     axes = {name: axis | limits for name, axis in bench_document()["axis"].items()}
     return {
@@ -64,13 +62,13 @@ def test_a_correction_works_beside_it(bench: Bench, tmp_path: Path) -> None:
             text=True,
         ) as play:
             assert play.stderr is not None
-            told = []
+            result = []
             for line in play.stderr:
-                told.append(line)
+                result.append(line)
                 if "press Enter" in line:
                     break
             else:
-                pytest.fail("".join(told))
+                pytest.fail("".join(result))
             loaded = guard.load(("X", "Y"), {"X": increments, "Y": increments}, {"X": bump, "Y": bump}, DIGEST)
             assert loaded["ok"], loaded
             run = bench.config.store.run_directory
@@ -89,8 +87,8 @@ def test_a_correction_works_beside_it(bench: Bench, tmp_path: Path) -> None:
                     while (frame := bus.recv(0)) is not None:
                         if frame.arbitration_id == 0x301:
                             offsets.append(struct.unpack("<i", frame.data)[0])
-            said, err = play.communicate()
-        assert play.returncode == 0, said + err
+            output, err = play.communicate()
+        assert play.returncode == 0, output + err
         assert max(offsets) == 100, guard.status()
         assert offsets[-1] == 0
         assert guard.status()["state"] == "OFF"

@@ -1,4 +1,4 @@
-"""What was acknowledged is there after the power was cut, and a store that waits for no disk would be found out."""
+"""Acknowledged records survive a power cut, and a store without fsync would be detected."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The predictor and the twin's physics are independent code; on the bench path they must say the same.
+"""The predictor and the simulator's physics are independent code; on the bench path they must agree.
 
-The twin runs behind its own NC and its own CiA 402, two cycles late and in whole increments; the predictor knows none
-of that.
+The simulator runs behind its own NC and CiA 402 drive, two cycles late and in whole increments; the predictor has
+neither.
 """
 
 from __future__ import annotations
@@ -38,7 +38,6 @@ def machine(feedforward: float, plant: dict[str, dict[str, float]]) -> MachineCo
 
 
 def table(config: MachineConfig, program: Path, folder: Path) -> Float:
-    """Let the twin's NC play the program, and return its true table positions (n, 2) in mm."""
     reference = load_trajectory(program, config)
     twin = TwinInHand(config)
     twin.switch_on()

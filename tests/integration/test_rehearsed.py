@@ -1,4 +1,4 @@
-"""Faults of the bus rehearsed in the cut, by script: the guard's process on the twin's bus takes the offset back."""
+"""Bus faults rehearsed during a cut: the guard's process on the simulated bus ramps the offset to zero."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Four axes on one bus: rows of 2 to 10 ms, every one of them recorded, every rapid of every axis found."""
+"""Four axes on one bus: cycles of 2 to 10 ms, every sample recorded, every rapid of every axis found."""
 
 from __future__ import annotations
 
@@ -30,7 +30,6 @@ SETTLED_S = 0.6
 
 
 def rapid_mm(period_s: float, length_mm: float = 300.0, speed: float = 500.0, acceleration: float = 4000.0) -> Float:
-    """Return one rapid's way (n,) from 0 to its end."""
     ramp_s, cruise_s = speed / acceleration, length_mm / speed - speed / acceleration
     t = np.arange(0.0, 2 * ramp_s + cruise_s + period_s, period_s)
     up, down = np.clip(t, 0, ramp_s), np.clip(t - ramp_s - cruise_s, 0, ramp_s)
@@ -39,7 +38,6 @@ def rapid_mm(period_s: float, length_mm: float = 300.0, speed: float = 500.0, ac
 
 
 def there_and_back(_: Path, config: MachineConfig) -> Trajectory:
-    """Return two rapids of all axes together, with rests between."""
     period_s = config.machine.sync_period_s
     way, rest = rapid_mm(period_s), round(REST_S / period_s)
     places = np.concatenate([np.zeros(rest), way, np.full(rest, 300.0), 300.0 - way, np.zeros(rest)])
@@ -54,7 +52,6 @@ def there_and_back(_: Path, config: MachineConfig) -> Trajectory:
 
 
 async def recorded(bench: Bench) -> tuple[list[Any], dict[str, int]]:
-    """Let the NC play, and return all records that the drivers made of it with their counters."""
     records: list[Any] = []
     rows = round(SETTLED_S / bench.config.machine.sync_period_s)
     async with open_machine(bench.config) as source:

@@ -20,24 +20,20 @@ pytestmark = pytest.mark.usefixtures("long_computation")
 
 @pytest.fixture
 def transport() -> str:
-    """The bus is not what is tried here."""
     return "virtual"
 
 
 @pytest.fixture
 def sections() -> dict[str, Any]:
-    """A sensor answers in wall time, so the machine runs in it too; its samples are means over 5 ms."""
     return {"sim": {"pace": "realtime", "modbus": True, "modbus_cycles": 5}}
 
 
 @pytest.fixture
 def bench(bench: Bench) -> Bench:
-    """The drivers are told to take the voltage from the sensors."""
     return take_voltage_from_sensors(bench)
 
 
 def outcomes_of(bench: Bench, folder: Path, rounds: int = 2) -> dict[str, list[Outcome]]:
-    """Return what each axis' pipeline makes of a shuttle."""
     records, counters = asyncio.run(recorded(bench, shuttle(folder, rounds)))
     assert counters["lost"] == 0, counters
     assert not any(counters[f"modbus.{axis}.lost"] for axis in bench.config.axis)

@@ -1,4 +1,4 @@
-"""A check that goes on while the machine runs: what has passed is sent, nothing of what follows a refused place."""
+"""A check that continues while the machine runs: checked rows are sent, none after a refused position."""
 
 from __future__ import annotations
 
@@ -35,13 +35,11 @@ __all__ = ["client", "sections"]
 
 @pytest.fixture
 def transport() -> str:
-    """The transport that joins processes."""
     return "hub"
 
 
 @contextlib.contextmanager
 def kept_alive(client: GuardClient) -> Iterator[None]:
-    """Tell the guard that this process lives, whatever it is busy with."""
     ended = threading.Event()
 
     def tell() -> None:
@@ -58,7 +56,6 @@ def kept_alive(client: GuardClient) -> Iterator[None]:
 
 
 def written(folder: Path, path: Float) -> Path:
-    """A demand on disk."""
     demand = folder / "demand.csv"
     np.savetxt(
         demand,
@@ -72,7 +69,6 @@ def written(folder: Path, path: Float) -> Path:
 
 
 def play(bench: Bench, client: GuardClient, demand: Path, stream: RowStream) -> None:
-    """Arm a stream and let the NC play its demand, handing on what the guard lacks."""
     bench.command('{"command": "nc", "on": true}')
     bench.event("nc")
     piece = stream.take(FIRST_S)
@@ -98,7 +94,6 @@ def play(bench: Bench, client: GuardClient, demand: Path, stream: RowStream) -> 
 
 
 def test_rows_end_before_a_place_that_is_refused(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
-    """Armed while the check goes on: corrected until a second before the block with the place, none beyond, no jump."""
     there, hard = bench_demand(10), bench_demand(20, (0.030, 0.015))
     path = np.concatenate([np.repeat(there[:1], 300, axis=0), *[there, there[::-1]] * 2, hard])
     place = len(path) - len(hard)
@@ -126,14 +121,12 @@ def test_rows_end_before_a_place_that_is_refused(bench: Bench, client: GuardClie
 
 
 def grow(checked: CheckedProgram, demand: Path, rows: Path, config: MachineConfig) -> None:
-    """Check a demand as the process does; what it tells is known at once."""
-
-    def hear(told: Mapping[str, Any]) -> None:
-        if "block" in told:
-            end, sha256 = told["block"]
-            checked.take(Block(end, sha256, told["last"]), told["errors"])
-        elif "refused" in told:
-            checked.refused += (Reason(**told["refused"]),)
+    def hear(result: Mapping[str, Any]) -> None:
+        if "block" in result:
+            end, sha256 = result["block"]
+            checked.take(Block(end, sha256, result["last"]), result["errors"])
+        elif "refused" in result:
+            checked.refused += (Reason(**result["refused"]),)
 
     with rows.open("r+b") as body:
         check(demand, program_digest(demand), nominal_models(config), config, body, hear)

@@ -1,7 +1,7 @@
-"""What a motor's encoder cannot see: an encoder and an accelerometer at the table tell how it swings on its screw.
+"""What a motor encoder cannot see: table encoder and accelerometer show the resonance on the screw.
 
-The twin is moved by hand, and all that it sends goes through the drivers and the pipeline with made-up times of
-arrival: the same bits each time.
+The simulator is stepped directly, and its frames pass drivers and pipeline with given arrival times: the same bits each
+time.
 """
 
 from __future__ import annotations
@@ -34,7 +34,6 @@ DRAIN_CYCLES, LATE_NS = 50, 400_000  # how often what came is taken, and how lat
 
 
 def config() -> MachineConfig:
-    """Return a machine of which both screws give, with an encoder at one table and an accelerometer at the other."""
     document: dict[str, Any] = bench_document()
     document["axis"]["X"]["table"] = {"source": "canopen", "cob_id": 0x2A0, "byte": 2, "scale": 1e-4}
     document["axis"]["Y"]["accelerometer"] = {"device": "/dev/none", "rate_hz": 800.0}
@@ -44,7 +43,6 @@ def config() -> MachineConfig:
 
 
 def to_and_fro() -> np.ndarray[Any, Any]:
-    """Return the rows of a rapid of both axes by 300 mm, a rest and the way back, smoothed as by a quick NC."""
     t = np.arange(0.0, 1.2, PERIOD_S)
     way = np.cumsum(np.clip(np.minimum(t * 4000, (0.725 - t) * 4000), 0, 500)) * PERIOD_S
     both = np.concatenate([np.zeros(200), way, way[-1] - way])
@@ -52,7 +50,6 @@ def to_and_fro() -> np.ndarray[Any, Any]:
 
 
 def cycles(hand: TwinInHand) -> Iterator[list[Frame]]:
-    """Yield the frames of each cycle until what is played has finished."""
     while not any(event["event"] == "finished" for event in hand.events):
         known = len(hand.wire)
         hand.run(1)
@@ -61,7 +58,6 @@ def cycles(hand: TwinInHand) -> Iterator[list[Frame]]:
 
 @cache
 def recorded() -> dict[str, list[WindowOutcome]]:
-    """Return the analysed rapids by axis."""
     machine, begun = config(), 0
     decoder, ticks = BusDecoder("can0", machine), TickClock(PERIOD_S)
     settings = machine.axis["Y"].accelerometer
@@ -112,11 +108,11 @@ def test_the_resonance_is_found_in_each_rapid_and_the_rapid_believed(axis: str) 
 
 @pytest.mark.usefixtures("long_computation")
 def test_the_model_with_it_knows_what_the_motors_encoder_does_not_see() -> None:
-    for told in (o.at_table for o in recorded()["X"]):
-        assert told is not None
-        assert told.unseen_rms_um > 15.0
-        assert told.left_rms_um is not None
-        assert told.left_rms_um < told.unseen_rms_um / 4
+    for result in (o.at_table for o in recorded()["X"]):
+        assert result is not None
+        assert result.unseen_rms_um > 15.0
+        assert result.left_rms_um is not None
+        assert result.left_rms_um < result.unseen_rms_um / 4
     assert all(o.at_table is None for o in recorded()["Y"])  # it has no encoder
 
 

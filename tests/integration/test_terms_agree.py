@@ -1,4 +1,4 @@
-"""What real axes have, by the twin and by the model's terms: independent code that must say the same on the path."""
+"""Effects of real axes in the simulator and in the model's terms: independent code that must agree on the path."""
 
 from __future__ import annotations
 
@@ -40,7 +40,6 @@ PLANT = {"compliance": {"ft": 0.0}}  # behind the spring in the twin, before it 
 
 
 def machine(case: str, *, told: bool) -> MachineConfig:
-    """Return the machine; ``told``: the configuration knows the drive's true loops."""
     document = bench_document()
     for axis in document["axis"].values():
         axis["regulators"] |= LOOPS.get(case, {}) if told else {}

@@ -261,7 +261,7 @@ class Machine:
         loop, kept = self._loop, Path(tempfile.mkdtemp(dir=self.folder))
         store, left = self.config.store.directory, self.config.run_directory / SOCKET_NAME
         shutil.copytree(store, kept / "store", symlinks=True, ignore=self._not_of_daemon)
-        self.service._desk.guard.close()
+        self.service._arming.guard.close()
         loop.dead = True
         service, serving, self.service, self._loop, self._serving = self.service, self._serving, None, None, None
         loop.clock = VirtualClock()

@@ -1,6 +1,6 @@
-"""What :func:`stopping` and :func:`approach` promise, put in the place of their code, whose products z3 is slow with.
+"""Contracts of :func:`stopping` and :func:`approach`, used instead of their code, whose products are slow in z3.
 
-``test_limits`` proves each promise from the code itself.
+``test_limits`` proves each contract from the code itself.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class _Approach(NamedTuple):
 
 
 class Contracts:
-    """Answers each call by an unknown integer and states all that is promised of it and of those before."""
+    """Answers each call by an unknown integer and states everything guaranteed about it and earlier ones."""
 
     def __init__(self) -> None:
         self._stopping: list[_Stopping] = []
@@ -55,7 +55,7 @@ class Contracts:
         return made.rate
 
     def one_step(self, rate: Integer, acceleration: Integer) -> Integer:
-        """Return what is travelled from ``rate`` on; what is left of it after one cycle of braking is known as well."""
+        """Return the distance travelled from ``rate``; the rest after one cycle of braking is stated, too."""
         way = self.stopping(rate, acceleration)
         left = rate - acceleration
         assume((rate >= acceleration).implies(way == left + self.stopping(left, acceleration)))
@@ -63,12 +63,12 @@ class Contracts:
 
 
 def _travels_as_far(one: _Stopping, other: _Stopping) -> Claim:
-    """Faster or braked less, it travels at least as far."""
+    """State: faster or braked less, it travels at least as far."""
     faster = (one.rate >= other.rate) & (other.rate >= 0) & (one.acceleration <= other.acceleration)
     return faster.implies(one.way >= other.way)
 
 
 def _is_fastest(approach: _Approach, stopping: _Stopping) -> Claim:
-    """No rate that still stops in the distance is larger than the one of the approach."""
+    """State: no larger rate than the approach rate still stops within the distance."""
     stops = (stopping.rate >= 0) & (stopping.acceleration == approach.acceleration)
     return (stops & (stopping.rate + stopping.way <= approach.distance)).implies(stopping.rate <= approach.rate)

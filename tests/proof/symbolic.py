@@ -1,7 +1,7 @@
-"""Runs Python code on unknown integers along every path through it, so that z3 can prove what holds on each.
+"""Runs Python code on unknown integers along every path, so that z3 can prove what holds on each.
 
-The code under proof is called as it stands. Its integers are :class:`Integer`, which build terms of z3; where the code
-asks whether a comparison holds, each answer that is possible is followed, in a call of its own.
+The code under proof is called unchanged. Its integers are :class:`Integer`, which build z3 terms; where the code asks
+whether a comparison holds, each possible answer is followed in a call of its own.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ class NotProven(AssertionError):
 
 
 class _Unreachable(Exception):
-    """What is assumed contradicts itself: no integers lead here."""
+    """The assumptions contradict each other: no integers lead here."""
 
 
 class _Path:
-    """One way through the code: the answers that lead along it, and the facts that hold on it."""
+    """One path through the code: the answers that lead along it, and the facts that hold on it."""
 
     def __init__(self, answers: list[bool]) -> None:
         self.facts: list[z3.BoolRef] = []
@@ -39,7 +39,7 @@ class _Path:
         self._solver.add(*facts)
 
     def decide(self, claim: z3.BoolRef) -> bool:
-        """Return whether a comparison holds on this path; where it may or may not, the other way is left for later."""
+        """Return whether a comparison holds on this path; if undetermined, queue the other path."""
         if self._asked == len(self.answers):
             ways = [holds for holds in (True, False) if self._is_possible(_either(claim, holds))]
             if not ways:
@@ -52,7 +52,7 @@ class _Path:
         return holds
 
     def _is_possible(self, claim: z3.BoolRef) -> bool:
-        """Whether integers may lead there; what is not decided soon is followed."""
+        """Return whether integers may lead there; an undecided path is followed."""
         return bool(self._solver.check(claim) != z3.unsat)
 
 
@@ -80,12 +80,12 @@ def _on(path: _Path) -> Iterator[None]:
 
 
 def assume(*facts: Claim) -> None:
-    """State what holds from here on along the path that is being followed."""
+    """State a fact for the rest of the current path."""
     _following[-1].add(*[fact.term for fact in facts])
 
 
 class Claim:
-    """A comparison of unknown integers; asked for its truth it is decided by the path."""
+    """A comparison of unknown integers; its truth value is decided by the path."""
 
     def __init__(self, term: z3.BoolRef) -> None:
         self.term = term
@@ -104,7 +104,7 @@ class Claim:
         return Claim(z3.Not(self.term))
 
     def implies(self, other: Claim) -> Claim:
-        """Return that the other holds where this does."""
+        """Return the claim that the other holds where this one does."""
         return Claim(z3.Implies(self.term, other.term))
 
 
@@ -113,7 +113,7 @@ def _term(value: Integer | int) -> z3.ArithRef:
 
 
 class Integer:
-    """An unknown integer, or what was computed from some."""
+    """An unknown integer, or an expression of some."""
 
     def __init__(self, term: z3.ArithRef) -> None:
         self.term = term
@@ -137,7 +137,7 @@ class Integer:
         return Integer(_term(other) * self.term)
 
     def __floordiv__(self, other: Integer | int) -> Integer:
-        """Divide, rounding down as Python does; z3 does so for a divisor above 0, which is proven first."""
+        """Divide, rounding down as Python does; z3 does so for a positive divisor, which is proven first."""
         prove(Claim(_term(other) > 0))
         return Integer(self.term / _term(other))
 
@@ -174,7 +174,7 @@ class Integer:
 
 
 def lemma(claim: Claim) -> None:
-    """Prove a claim and build on it."""
+    """Prove a claim and use it as a fact."""
     prove(claim)
     assume(claim)
 
@@ -190,7 +190,7 @@ def integers(names: str) -> list[Integer]:
 
 
 def prove(claim: Claim | bool) -> None:
-    """Prove that a claim follows from what holds on the path; NotProven shows integers for which it does not."""
+    """Prove that a claim follows from the facts of the path; NotProven has a counterexample."""
     if isinstance(claim, bool):
         claim = Claim(z3.BoolVal(claim))
     solver = _solver(DECIDE_MS, *_following[-1].facts, z3.Not(claim.term))
@@ -201,9 +201,9 @@ def prove(claim: Claim | bool) -> None:
 
 
 def for_every_path(code: Callable[[], None]) -> int:
-    """Run ``code``, which assumes and proves, once along each path through it; return how many there are.
+    """Run ``code``, which assumes and proves, once along each path; return the number of paths.
 
-    NotProven where a claim does not hold, or where nothing could be proven because what is assumed is impossible.
+    NotProven where a claim does not hold, or where nothing was proven because the assumptions are contradictory.
     """
     untried: list[list[bool]] = [[]]
     followed = 0

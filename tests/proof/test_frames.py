@@ -1,8 +1,8 @@
-"""Proves that no step of the guard's core hands out an offset beyond the limits, whatever else goes wrong in it.
+"""Proves that no step of the guard's core outputs an offset beyond the limits, whatever else fails in it.
 
-The offsets that the core would send are replaced by any integers at all: the check before the frame is handed out is
-what is proven first. Then it is proven that the check stops nothing that the core itself computes from a safe state,
-so that a ramp to zero always leaves.
+The offsets that the core would send are replaced by arbitrary integers: the check before the output is proven first.
+Then it is proven that the check stops nothing that the core itself computes from a safe state, so that a ramp to zero
+always leaves.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from itertools import count
 
 import pytest
 
-from fdhil.guard import core
+from fdhil.guard import core, limits
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.path import Place
 from fdhil.guard.protocol import ON_PATH, SENDING, Mode
@@ -24,29 +24,31 @@ from tests.guard.machine import settings as guard_settings
 from tests.proof.symbolic import Integer, assume, for_every_path, integers, prove
 from tests.proof.test_motion import Axis
 
+CEILING, NEXT_OFFSETS = limits.ceiling.__name__, core._next_offsets.__name__
+
 pytestmark = pytest.mark.usefixtures("long_computation")
 
 MODES = sorted(SENDING)
 
 
 class AnyPath:
-    """A table of which nothing is known, not even that it is smooth."""
+    """A table with arbitrary offsets, not even smooth."""
 
     def offsets_at(self, row: int) -> tuple[Integer]:
         return (integers(f"table_{row}")[0],)
 
 
 class Core:
-    """The core with one axis, its limits, offset and rate unknown; axes are stepped one by one, and one stands for all.
+    """The core with one axis, its limits, offset and rate unknown; axes are stepped one by one with the same code.
 
-    Settings are refused (``settings._check_limits``) where the largest offset is beyond the compiled ceiling.
+    Settings are refused where the largest offset exceeds the compiled ceiling.
     """
 
     def __init__(self, mode: Mode, monkeypatch: pytest.MonkeyPatch) -> None:
         self.axis = Axis(monkeypatch)
         (self.ceiling,) = integers("ceiling")
         assume(self.axis.limits.offset <= self.ceiling)
-        monkeypatch.setattr(core, "ceiling", lambda _increments_per_mm: self.ceiling)
+        monkeypatch.setattr(core, CEILING, lambda _increments_per_mm: self.ceiling)
         monkeypatch.setattr(core, "type", lambda value: int if isinstance(value, Integer) else type(value), False)
         made = guard_settings(axes=("X",))
         self.settings: Settings = replace(made, axes=(replace(made.axes[0], limits=self.axis.limits),))
@@ -68,7 +70,7 @@ def frames_keep_limits(mode: Mode, monkeypatch: pytest.MonkeyPatch) -> None:
             return (), Alarm("OffsetRate")
         return (wanted,), None
 
-    monkeypatch.setattr(core, "_next_offsets", computed)
+    monkeypatch.setattr(core, NEXT_OFFSETS, computed)
     state, output = made.move()
     after = state.axes[0]
     if output.offsets is None:

@@ -1,12 +1,12 @@
-"""The proof fails where a limit or a transition is put wrong: else it would prove nothing."""
+"""The proof fails for a wrong limit or transition; otherwise it would prove nothing."""
 
 from __future__ import annotations
 
 import inspect
-import textwrap
+import sys
 from collections.abc import Callable
 from functools import partial
-from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -21,43 +21,44 @@ Theorem = Callable[[pytest.MonkeyPatch], None]
 PASSED_ON = partial(test_frames.frames_keep_limits, Mode.RAMP_DOWN)
 LEFT_BEHIND = partial(test_frames.frames_leave, Mode.RAMP_DOWN)
 
-MISTAKES: tuple[tuple[ModuleType, str, str, str, Theorem], ...] = (
-    (limits, "follow", "-limits.hard_rate, limits.hard_rate", "-limits.hard_rate, limits.hard_rate + 1",
+MISTAKES: tuple[tuple[Callable[..., Any], str, str, Theorem], ...] = (
+    (limits.follow, "-limits.hard_rate, limits.hard_rate", "-limits.hard_rate, limits.hard_rate + 1",
      test_motion.follow_keeps_limits),
-    (limits, "follow", "rate + limits.acceleration)", "rate + limits.acceleration + 3)",
+    (limits.follow, "rate + limits.acceleration)", "rate + limits.acceleration + 3)",
      test_motion.follow_keeps_limits),
-    (limits, "follow", "missing = wanted - offset - wanted_rate", "missing = offset - wanted - wanted_rate",
+    (limits.follow, "missing = wanted - offset - wanted_rate", "missing = offset - wanted - wanted_rate",
      test_motion.ramp_to_zero_ends),
-    (limits, "_inside", "limits.offset - outward * offset", "limits.offset + outward * offset",
+    (limits._inside, "limits.offset - outward * offset", "limits.offset + outward * offset",
      test_motion.follow_keeps_limits),
-    (limits, "_inside", "max(0, limits.offset - outward * offset)", "limits.offset", test_motion.follow_keeps_limits),
-    (limits, "brake", "speed = rate - clamp", "speed = rate + clamp", test_motion.brake_keeps_limits_and_ends),
-    (limits, "brake", "-limits.acceleration, limits.acceleration)", "0, limits.acceleration)",
+    (limits._inside, "max(0, limits.offset - outward * offset)", "limits.offset", test_motion.follow_keeps_limits),
+    (limits.brake, "speed = rate -", "speed = rate +", test_motion.brake_keeps_limits_and_ends),
+    (limits.brake, "-limits.acceleration, limits.acceleration)", "0, limits.acceleration)",
      test_motion.brake_keeps_limits_and_ends),
-    (limits, "violation", "abs(speed) <= limits.hard_rate", "speed <= limits.hard_rate",
+    (limits.violation, "abs(speed) <= limits.hard_rate", "speed <= limits.hard_rate",
      test_motion.check_lets_pass_only_what_keeps_limits),
-    (limits, "violation", "speed > 0 if offset > 0", "speed > 0 if offset < 0",
+    (limits.violation, "speed > 0 if offset > 0", "speed > 0 if offset < 0",
      test_motion.check_lets_pass_what_is_safe),
-    (core, "_move", "if wrong is not None", "if wrong is not None and state.measuring", PASSED_ON),
-    (core, "_wrong_frame", "abs(offset) <= ceiling", "offset <= ceiling", PASSED_ON),
-    (core, "_sent", "move = offset - axis.offset", "move = axis.offset - offset", PASSED_ON),
-    (core, "_sent", "offset=offset", "offset=axis.offset", PASSED_ON),
-    (core, "_move", "state = _arrived(", "return state, Output()\n    state = _arrived(", LEFT_BEHIND),
+    (core._move, "if wrong is not None", "if wrong is not None and state.measuring", PASSED_ON),
+    (core._wrong_frame, "abs(offset) <= ", "offset <= ", PASSED_ON),
+    (core._sent, "move = offset - axis.offset", "move = axis.offset - offset", PASSED_ON),
+    (core._sent, "offset=offset", "offset=axis.offset", PASSED_ON),
+    (core._move, f"state = {core._arrived.__name__}(",
+     f"return state, Output()\n    state = {core._arrived.__name__}(", LEFT_BEHIND),
 )  # fmt: skip
 
 
-def put_mistake(module: ModuleType, function: str, right: str, wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compile a function with one piece of it replaced, in its module's place."""
-    source = textwrap.dedent(inspect.getsource(getattr(module, function)))
+def put_mistake(function: Callable[..., Any], right: str, wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replace a function in its module by one with a mistake."""
+    module, name, source = sys.modules[function.__module__], function.__name__, inspect.getsource(function)
     assert right in source
-    monkeypatch.setattr(module, function, getattr(module, function))  # so that it is put back
-    exec(compile("from __future__ import annotations\n" + source.replace(right, wrong), function, "exec"), vars(module))
+    monkeypatch.setattr(module, name, function)  # so that it is put back
+    exec(compile("from __future__ import annotations\n" + source.replace(right, wrong), name, "exec"), vars(module))
 
 
-@pytest.mark.parametrize(("module", "function", "right", "wrong", "theorem"), MISTAKES)
+@pytest.mark.parametrize(("function", "right", "wrong", "theorem"), MISTAKES)
 def test_mistake_breaks_the_proof(
-    module: ModuleType, function: str, right: str, wrong: str, theorem: Theorem, monkeypatch: pytest.MonkeyPatch
+    function: Callable[..., Any], right: str, wrong: str, theorem: Theorem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    put_mistake(module, function, right, wrong, monkeypatch)
+    put_mistake(function, right, wrong, monkeypatch)
     with pytest.raises(NotProven):
         for_every_path(partial(theorem, monkeypatch))

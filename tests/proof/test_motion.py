@@ -1,7 +1,7 @@
-"""Proves for all limits and all integers that the motion of an offset keeps its limits and comes to zero.
+"""Proves for all limits and all integers that the motion of an offset keeps its limits and reaches zero.
 
-What is proven is the code of ``fdhil.guard.limits`` as it stands. ``stopping`` and ``approach`` multiply unknowns; they
-are proven to keep their promises first, and stand for those in what follows.
+The proven code is ``fdhil.guard.limits``, unchanged. ``stopping`` and ``approach`` multiply unknowns; their contracts
+are proven first and replace them in later proofs.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from fdhil.guard import limits
 from fdhil.guard.limits import OffsetLimits
 from tests.proof.contracts import Contracts
 from tests.proof.symbolic import Claim, Integer, assume, choose, for_every_path, integers, lemma, prove
+
+STOPPING, APPROACH, CLAMP = (each.__name__ for each in (limits.stopping, limits.approach, limits.clamp))
 
 pytestmark = pytest.mark.usefixtures("long_computation")
 
@@ -148,9 +150,9 @@ class Axis:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.contracts = Contracts()
-        for name in ("stopping", "approach"):
-            monkeypatch.setattr(limits, name, getattr(self.contracts, name))
-        monkeypatch.setattr(limits, "clamp", clamp)
+        monkeypatch.setattr(limits, STOPPING, self.contracts.stopping)
+        monkeypatch.setattr(limits, APPROACH, self.contracts.approach)
+        monkeypatch.setattr(limits, CLAMP, clamp)
         monkeypatch.setattr(limits, "max", larger, raising=False)
         self.offset, self.rate, most, rate, self.acceleration = integers("offset rate L S A")
         assume(most >= 1, rate >= 1, self.acceleration >= 1)

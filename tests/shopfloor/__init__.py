@@ -1,1 +1,1 @@
-"""Tests of what the networks of a shop floor are told."""
+"""Tests of the shop-floor publishers."""

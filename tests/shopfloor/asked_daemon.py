@@ -1,4 +1,4 @@
-"""News as a daemon's status gives them, and events, made up."""
+"""Updates derived from made-up daemon status documents and events."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ NOW = 1_700_000_000_000
 
 
 class Daemon:
-    """A status document that grows; ``news`` is what its next answer says."""
-
     def __init__(self, folder: Path, axes: tuple[str, ...] = ("X", "Y")) -> None:
         config = config_of(folder, axes)
         self._watch, self._listener = Watch(config, 0.0), Listener(config)
@@ -25,29 +23,24 @@ class Daemon:
         self.changes: dict[str, Any] = {}
 
     def news(self, *outcomes: Any) -> News:
-        """Return the news after ``outcomes``, a second later."""
         self._now_s += 1.0
-        for told in outcomes:
-            self._watch.outcome_came(told, self._now_s)
+        for result in outcomes:
+            self._watch.outcome_came(result, self._now_s)
         status = {"ok": True, "state": "OFF(SHADOW)", **self._watch.status(self._now_s), **self.changes}
         return self._listener.news(status, self.now_ms)
 
     def silence(self) -> News:
-        """Return the news of a daemon that does not answer."""
         self._now_s += 1.0
         return self._listener.news(None, self.now_ms, "is not running")
 
     @property
     def now_ms(self) -> int:
-        """The time of the last answer, Unix time in ms."""
         return NOW + round(1000 * self._now_s)
 
 
 def identified() -> tuple[Any, ...]:
-    """Return a window of axis X and the parameters that it led to."""
     return outcome(), published()
 
 
 def load_changed(text: str = "Jt rose") -> Notice:
-    """Return a notice about axis X."""
     return Notice("LoadChanged", "MAJOR", text, "X")

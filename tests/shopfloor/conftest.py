@@ -1,4 +1,4 @@
-"""The nodes that every OPC UA server has are made once for all tests."""
+"""Creates the standard OPC UA nodes once for all tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A status of the daemon in which everything is known, and publishers that run in this process."""
+"""A daemon status with every value known, and publishers that run in this process."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ PASS = {"pass": 4, "program": "/home/operator/part.ngc", "measured": {"rms_um": 
 
 
 def status(axes: str = "XY", **changes: Any) -> dict[str, Any]:
-    """Return what a daemon that knows everything answers; ``changes`` replace what is at the top."""
     return {
         "ok": True,
         "schema": "fdhil-status-1",
@@ -58,7 +57,6 @@ def status(axes: str = "XY", **changes: Any) -> dict[str, Any]:
 
 
 def axis_status() -> dict[str, Any]:
-    """Return an axis of it."""
     parameters = {
         name: {"value": VALUES[name], "low": 0.9 * VALUES[name], "high": 1.1 * VALUES[name], "unit": UNITS[name]}
         for name in PARAMETERS
@@ -72,18 +70,15 @@ def axis_status() -> dict[str, Any]:
 
 
 def notice(code: str, age_s: float, severity: str = "info", text: str = "it was so", axis: str = "") -> dict[str, Any]:
-    """Return a notice as the status has it."""
     return {"age_s": age_s, "code": code, "severity": severity, "text": text, "axis": axis, "tick": 0}
 
 
 def trouble(code: str, axis: str = "", severity: str = "MAJOR", text: str = "it is not so") -> dict[str, Any]:
-    """Return what is not as the configuration says, as the status has it."""
     return {"code": code, "severity": severity, "axis": axis, "text": text}
 
 
 @asynccontextmanager
 async def publishing(protocol: str, config: MachineConfig) -> AsyncIterator[asyncio.Task[None]]:
-    """Run a publisher in this process until the block is left."""
     task = asyncio.create_task(tables.load(tables.PUBLISHERS, protocol)(config))
     try:
         yield task
@@ -94,7 +89,6 @@ async def publishing(protocol: str, config: MachineConfig) -> AsyncIterator[asyn
 
 
 async def said(task: asyncio.Task[None], capsys: Any, words: str) -> str:
-    """Wait until a line with these words is in the log, and return it; the publisher's own error when it ends."""
     text = ""
     async with asyncio.timeout(120.0):
         while words not in text:

@@ -1,4 +1,4 @@
-"""A real broker, mosquitto, as a process; with TLS and passwords where that is wanted."""
+"""A real mosquitto broker as a process, optionally with TLS and passwords."""
 
 from __future__ import annotations
 
@@ -19,15 +19,10 @@ COMMAND = shutil.which("mosquitto") or "/usr/sbin/mosquitto"
 
 
 def open_to_all(port: int) -> str:
-    """Return the configuration of a broker that lets everyone in."""
     return f"listener {port} 127.0.0.1\nallow_anonymous true\n"
 
 
 def guarded(folder: Path, port: int, user: str, password: str) -> str:
-    """Return the configuration of a broker that speaks TLS alone, to one user with a certificate of its own.
-
-    Its files, and ``client.pem`` and ``client.key``, are made in ``folder``.
-    """
     certify(folder)
     subprocess.run(["mosquitto_passwd", "-b", "-c", folder / "passwords", user, password], check=True)
     (folder / "passwords").chmod(0o700)
@@ -39,7 +34,6 @@ def guarded(folder: Path, port: int, user: str, password: str) -> str:
 
 @asynccontextmanager
 async def broker(folder: Path, configuration: str, port: int) -> AsyncIterator[None]:
-    """Run mosquitto until the block is left."""
     file = folder / "mosquitto.conf"
     file.write_text(configuration)
     with (folder / "mosquitto.log").open("ab") as log:
@@ -67,7 +61,6 @@ async def _listening(process: asyncio.subprocess.Process, port: int) -> None:
 
 
 def certify(folder: Path) -> None:
-    """Write ``ca.pem``, and certificate and key of ``broker`` and ``client`` that it signed."""
     ca_key, ca_name = ec.generate_private_key(ec.SECP256R1()), _named("test works")
     ca = _signed(ca_name, ca_name, ca_key, ca_key, x509.BasicConstraints(ca=True, path_length=None))
     pem, plain = serialization.Encoding.PEM, serialization.NoEncryption()

@@ -1,4 +1,4 @@
-"""An MTConnect agent for the tests: it knows a Devices.xml, connects, pings, and takes what an adapter says in SHDR."""
+"""An MTConnect agent for tests: it reads a Devices.xml, connects, pings, and parses SHDR."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ LEVELS = {"NORMAL", "WARNING", "FAULT", "UNAVAILABLE"}
 
 
 def data_items(devices_xml: str) -> dict[str, dict[str, str]]:
-    """Return the attributes of each data item by its id."""
     root = ElementTree.fromstring(devices_xml)
     return {item.attrib["id"]: dict(item.attrib) for item in root.iter(f"{SPACE}DataItem")}
 
 
 class Agent:
-    """What an agent holds for true: values by data item, and the active alarms of each condition by their code."""
+    """An agent's view: values by data item, and the active alarms of each condition by their code."""
 
     def __init__(self, devices_xml: str) -> None:
         self.items = data_items(devices_xml)
@@ -32,7 +31,6 @@ class Agent:
         self.lines = 0
 
     def take(self, line: str) -> None:
-        """Take one line; AssertionError where it is not as the protocol has it."""
         self.lines += 1
         if line.startswith("*"):
             self.pongs += re.findall(r"^\* PONG (\d+)$", line)
@@ -67,13 +65,10 @@ class Agent:
 
 
 class Connected:
-    """An agent at work on a connection."""
-
     def __init__(self, agent: Agent, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.agent, self._reader, self._writer = agent, reader, writer
 
     async def until(self, so: Callable[[Agent], Any]) -> None:
-        """Take lines until it is ``so``; EOFError where the adapter ends the connection first."""
         async with asyncio.timeout(60):
             while not so(self.agent):
                 line = await self._reader.readline()
@@ -82,22 +77,18 @@ class Connected:
                 self.agent.take(line.decode().removesuffix("\n"))
 
     async def until_let_go(self) -> None:
-        """Read until the adapter ends the connection."""
         with contextlib.suppress(EOFError, OSError):
             await self.until(lambda _: False)
 
     def send(self, line: bytes) -> None:
-        """Send a line to the adapter."""
         self._writer.write(line)
 
     def pause(self) -> None:
-        """Read no more."""
         transport = self._writer.transport
         assert isinstance(transport, asyncio.ReadTransport)
         transport.pause_reading()
 
     async def leave(self) -> None:
-        """Close the connection."""
         self._writer.close()
         with contextlib.suppress(OSError):
             await self._writer.wait_closed()
@@ -105,7 +96,6 @@ class Connected:
 
 @asynccontextmanager
 async def connected(devices_xml: str, port: int, address: str = "127.0.0.1") -> AsyncIterator[Connected]:
-    """Connect an agent from an address of this computer to an adapter there until the block is left."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port, local_addr=(address, 0))
     agent = Connected(Agent(devices_xml), reader, writer)
     try:

@@ -1,4 +1,4 @@
-"""A Sparkplug host application for the tests, written from the specification alone: it decodes, and it objects.
+"""A Sparkplug host application for tests, written from the specification alone; it rejects violations.
 
 Wire format: protobuf's encoding guide. Field numbers, data types and order of messages: Eclipse Sparkplug 3.0.
 """
@@ -14,7 +14,6 @@ SIGNED_64, DOUBLE, BOOLEAN, STRING = 4, 10, 11, 12  # chapter 6.4.16
 
 
 def fields(data: bytes) -> Iterator[tuple[int, Any]]:
-    """Yield number and content of each field of a protobuf message."""
     at = 0
     while at < len(data):
         key, at = _varint(data, at)
@@ -46,8 +45,6 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
 
 @dataclass(slots=True)
 class Seen:
-    """A decoded metric; ``value`` is raw until its data type is known."""
-
     name: str = ""
     alias: int | None = None
     stamp_ms: int | None = None
@@ -57,7 +54,6 @@ class Seen:
     properties: dict[str, str] = field(default_factory=dict)
 
     def value(self, datatype: int) -> Any:
-        """Return the value by its data type; AssertionError where it stands in another's field."""
         if self.null:
             assert self.raw is None
             return None
@@ -72,7 +68,6 @@ class Seen:
 
 
 def decoded(payload: bytes) -> tuple[int | None, int | None, list[Seen]]:
-    """Return time stamp, sequence number and metrics of a payload."""
     stamp_ms = seq = None
     metrics = []
     for number, value in fields(payload):
@@ -112,15 +107,13 @@ def _properties(data: bytes) -> dict[str, str]:
         if number == 1:
             keys.append(value.decode())
         else:
-            told = dict(fields(value))
-            assert told[1] == STRING
-            values.append(told[8].decode())
+            result = dict(fields(value))
+            assert result[1] == STRING
+            values.append(result[8].decode())
     return dict(zip(keys, values, strict=True))
 
 
 class Host:
-    """Follows one edge node: what it must not do is an AssertionError, what it says is in ``values``."""
-
     def __init__(self) -> None:
         self.alive = False
         self.bd_seq: int | None = None
@@ -131,7 +124,6 @@ class Host:
         self._seq = 0
 
     def take(self, topic: str, payload: bytes) -> None:
-        """Take a message of the edge node."""
         namespace, _, verb, _, *device = topic.split("/")
         assert namespace == "spBv1.0"
         assert len(device) == (verb[0] == "D")
@@ -163,19 +155,19 @@ class Host:
             self.alive, self.values = False, {}
 
     def _born(self, device: str, metrics: list[Seen]) -> None:
-        told: dict[str, Any] = {}
+        result: dict[str, Any] = {}
         for metric in metrics:
             assert metric.name
-            assert metric.name not in told
+            assert metric.name not in result
             assert metric.datatype
-            told[metric.name] = metric.value(metric.datatype)
+            result[metric.name] = metric.value(metric.datatype)
             if metric.alias is not None:
                 assert self._types.get(metric.alias, (device, metric.name, 0))[:2] == (device, metric.name)
                 self._types[metric.alias] = (device, metric.name, metric.datatype)
         if not device:
-            self.bd_seq = told.pop("bdSeq")
-            assert told.pop("Node Control/Rebirth") is False
-        self.values[device] = told
+            self.bd_seq = result.pop("bdSeq")
+            assert result.pop("Node Control/Rebirth") is False
+        self.values[device] = result
         self.units[device] = {metric.name: metric.properties.get("engUnit", "") for metric in metrics}
 
     def _changed(self, device: str, metrics: list[Seen]) -> None:
@@ -189,7 +181,6 @@ class Host:
 
 
 def command(name: str, value: bool) -> bytes:
-    """Return the payload of an NCMD with one Boolean metric."""
     text = name.encode()
     metric = b"\x0a" + bytes([len(text)]) + text + b"\x20\x0b\x70" + bytes([value])
     return b"\x12" + bytes([len(metric)]) + metric

@@ -1,4 +1,4 @@
-"""A publisher is a small process: it stands beside an NC, and there may be four of them."""
+"""Publishers are small processes: up to four of them run next to an NC."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``fdhil publish mqtt`` as a process, a real daemon behind it and a real broker before it."""
+"""``fdhil publish mqtt`` as a process, with a real daemon and a real broker."""
 
 from __future__ import annotations
 
@@ -32,7 +32,6 @@ def _quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def written(folder: Path, port: int, more: str = "") -> Path:
-    """Return a machine's configuration that is told to the broker at ``port`` ten times a second."""
     file = folder / "machine.toml"
     file.write_text(f"{BENCH}[publish.mqtt]\nport = {port}\nperiod_s = 0.1\n{more}")
     return file
@@ -40,7 +39,6 @@ def written(folder: Path, port: int, more: str = "") -> Path:
 
 @asynccontextmanager
 async def publisher(file: Path) -> AsyncIterator[asyncio.subprocess.Process]:
-    """Run ``fdhil publish mqtt`` until the block is left; what it says goes to publish.log."""
     with (file.parent / "publish.log").open("ab") as log:
         arguments = ("-m", "fdhil", "publish", "mqtt", file)
         process = await asyncio.create_subprocess_exec(sys.executable, *arguments, stdout=log, stderr=log)
@@ -53,13 +51,10 @@ async def publisher(file: Path) -> AsyncIterator[asyncio.subprocess.Process]:
 
 
 class Listening:
-    """A host application on a real broker."""
-
     def __init__(self, client: aiomqtt.Client) -> None:
         self.client, self.host = client, Host()
 
     async def until(self, so: Callable[[Host], object]) -> None:
-        """Take what the edge node says until it is ``so``."""
         async with asyncio.timeout(120):
             while not so(self.host):
                 message = await anext(aiter(self.client.messages))
@@ -69,13 +64,11 @@ class Listening:
                     self.host.take(message.topic.value, message.payload)
 
     async def command(self, name: str) -> None:
-        """Send the edge node a command."""
         await self.client.publish("spBv1.0/fdhil/NCMD/bench", command(name, True))
 
 
 @asynccontextmanager
 async def host_application(port: int, **more: object) -> AsyncIterator[Listening]:
-    """Listen to everything that is Sparkplug's until the block is left."""
     async with aiomqtt.Client("127.0.0.1", port, timeout=120.0, **more) as client:  # type: ignore[arg-type]
         await client.subscribe("spBv1.0/#", qos=1)
         yield Listening(client)
@@ -97,13 +90,17 @@ async def test_from_birth_to_death_with_a_real_broker(tmp_path: Path) -> None:
                 await listening.until(lambda host: host.values["X"]["revision"] == 2.0)
                 x = listening.host.values["X"]
                 status = await status_when(path, lambda status: status["ok"])
-                told = status["axes"]["X"]["parameters"]["K"]
-                assert (x["K"], x["K_low"], x["K_high"]) == (told["value"], told["low"], told["high"])
+                shown_status = status["axes"]["X"]["parameters"]["K"]
+                assert (x["K"], x["K_low"], x["K_high"]) == (
+                    shown_status["value"],
+                    shown_status["low"],
+                    shown_status["high"],
+                )
                 await listening.command("arm")
                 await listening.command("Node Control/Rebirth")
                 await listening.until(lambda host: host.verbs.count("NBIRTH") == 2)
                 await listening.until(lambda host: {"X", "Y"} <= set(host.values))
-                assert listening.host.values["X"]["K"] == told["value"]
+                assert listening.host.values["X"]["K"] == shown_status["value"]
                 assert (await status_when(path, lambda status: status["ok"]))["armed"] is None
             await listening.until(lambda host: set(host.values) == {""})
             assert listening.host.values[""]["up"] is False
@@ -161,7 +158,7 @@ async def test_a_primary_host_application_is_waited_for(tmp_path: Path) -> None:
     port = free_port()
     file = written(tmp_path, port, 'primary_host = "scada"\n')
     async with broker(tmp_path, open_to_all(port), port), host_application(port) as listening, publisher(file):
-        await _said(tmp_path, "is there")
+        await _said(tmp_path, "connected to the broker")
         await _state(listening.client, True, 1)
         await listening.until(lambda host: host.alive)
         await _state(listening.client, False, 2)
@@ -172,12 +169,11 @@ async def test_a_primary_host_application_is_waited_for(tmp_path: Path) -> None:
 
 
 async def _state(client: aiomqtt.Client, online: bool, stamp_ms: int) -> None:
-    told = json.dumps({"online": online, "timestamp": stamp_ms})
-    await client.publish("spBv1.0/STATE/scada", told, qos=1, retain=True)
+    result = json.dumps({"online": online, "timestamp": stamp_ms})
+    await client.publish("spBv1.0/STATE/scada", result, qos=1, retain=True)
 
 
 async def _said(folder: Path, words: str) -> None:
-    """Wait until the publisher has said ``words``."""
     log = folder / "publish.log"
     for _ in range(2400):
         if log.exists() and words in log.read_text():

@@ -1,4 +1,4 @@
-"""A session with a broker: births, changes, silence, commands, a primary host; the broker is a list here."""
+"""A broker session: births, changes, silence, commands, a primary host; the broker is a list."""
 
 from __future__ import annotations
 
@@ -34,8 +34,6 @@ def _no_rest(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Broker:
-    """Stands in for the client of a broker: keeps what is published for a host application to hear."""
-
     def __init__(self) -> None:
         self.host = Host()
         self.subscribed: list[str] = []
@@ -57,11 +55,9 @@ class Broker:
             yield await self._commands.get()
 
     def send(self, topic: str, payload: bytes) -> None:
-        """Send a message to the edge node."""
         self._commands.put_nowait(SimpleNamespace(topic=aiomqtt.Topic(topic), payload=payload))
 
     async def until(self, so: Callable[[Host], bool]) -> None:
-        """Wait until it is ``so``."""
         async with asyncio.timeout(60):
             while not so(self.host):
                 await self._heard.wait()
@@ -74,7 +70,6 @@ def session_of(**settings: Any) -> Session:
 
 @asynccontextmanager
 async def connected(session: Session) -> AsyncIterator[Broker]:
-    """Serve one connection until the block is left."""
     broker = Broker()
     task = asyncio.create_task(session.run(cast(aiomqtt.Client, broker)))
     try:
@@ -148,12 +143,12 @@ async def test_a_slow_broker_is_told_the_newest_state_and_no_more_notices_than_m
         newest = daemon.news(*identified())
         session.hear(newest)
         await broker.until(lambda host: host.values["X"]["notice"] == "LoadChanged: 9")
-        told = broker.host.verbs[before:]
-        assert (told.count("DDATA/X"), told.count("NDATA")) == (3, 1)
+        result = broker.host.verbs[before:]
+        assert (result.count("DDATA/X"), result.count("NDATA")) == (3, 1)
         assert (broker.host.values["X"]["K"], broker.host.values["X"]["windows_accepted"]) == (0.8, 1)
-    said = capsys.readouterr().err
-    assert said.count("the oldest of 3 notices make room for newer ones") == 1
-    assert said.count("7 notices were not told one by one: the broker was too slow") == 1
+    output = capsys.readouterr().err
+    assert output.count("the oldest of 3 queued notices are dropped for newer ones") == 1
+    assert output.count("7 notices were not sent one by one: the broker was too slow") == 1
 
 
 async def test_a_trouble_is_an_alarm_until_it_is_over(tmp_path: Path) -> None:
@@ -248,8 +243,8 @@ async def test_a_broker_that_is_not_there_is_told_of_once_and_tried_again(
     async with publishing("mqtt", config_of(tmp_path, publish={"mqtt": {"port": 1}})):
         for _ in range(4):
             await tried.get()
-    said = capsys.readouterr().err
-    assert said.count("Connection refused; check host and port, and whether it runs; it is tried again") == 1
+    output = capsys.readouterr().err
+    assert output.count("Connection refused; check host and port, and whether it runs; retrying") == 1
 
 
 async def test_it_does_not_go_on_with_old_values_when_the_daemon_cannot_be_heard_any_more(

@@ -1,4 +1,4 @@
-"""The MTConnect adapter, read by an agent of the tests over TCP; its Devices.xml, by the words of the standard."""
+"""The MTConnect adapter, read by a test agent over TCP; its Devices.xml against the standard."""
 
 from __future__ import annotations
 
@@ -94,8 +94,8 @@ def test_only_what_changes_is_told_in_the_units_of_the_standard(tmp_path: Path) 
     before = daemon.news()
     agent = Agent(xml_of(before))
     after = daemon.news(*identified())
-    said = lines(picture(before), picture(after))
-    for line in said:
+    output = lines(picture(before), picture(after))
+    for line in output:
         agent.take(line)
     assert float(agent.values["X_K"]) == 0.8
     assert agent.items["X_K"]["units"] == "x:NEWTON_METER_PER_AMPERE"
@@ -107,8 +107,8 @@ def test_only_what_changes_is_told_in_the_units_of_the_standard(tmp_path: Path) 
     daemon.changes = {"nc": {"feed_mm_min": 1200.0, "feed_override": 0.5, "line": 7, "heard_s_ago": 0.1}}
     for line in lines(picture(after), picture(daemon.news())):
         agent.take(line)
-    told = {key: agent.values[f"machine_nc_{key}"] for key in ("feed", "feed_override", "line")}
-    assert told == {"feed": "20", "feed_override": "50", "line": "7"}
+    result = {key: agent.values[f"machine_nc_{key}"] for key in ("feed", "feed_override", "line")}
+    assert result == {"feed": "20", "feed_override": "50", "line": "7"}
     assert agent.items["machine_nc_feed"]["units"] == "MILLIMETER/SECOND"
 
 
@@ -151,15 +151,14 @@ def test_a_notice_is_a_message_of_one_line(tmp_path: Path) -> None:
 def test_any_text_stays_in_its_line_and_its_field(text: str) -> None:
     line = notice(Event("LoadChanged", "minor", text, "X", NOW, 0.0))
     program = shown(next(item for item in MACHINE if item.name == "nc_program"), text)
-    for said, bars in ((line, 3), (program, 0)):
-        assert said.count("|") == bars
-        assert said.isprintable()
-        said.encode()
+    for output, bars in ((line, 3), (program, 0)):
+        assert output.count("|") == bars
+        assert output.isprintable()
+        output.encode()
 
 
 @asynccontextmanager
 async def adapting() -> AsyncIterator[tuple[Adapter, int]]:
-    """Serve an adapter on a free port."""
     adapter = Adapter()
     listening = socket.create_server(("127.0.0.1", 0))
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)  # else a deaf agent's queue is megabytes
@@ -250,10 +249,10 @@ async def test_an_agent_that_does_not_read_is_let_go(tmp_path: Path, monkeypatch
 async def test_published_from_a_daemon_until_told_to_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
     config = config_of(tmp_path, publish={"mtconnect": {"port": 0, "period_s": 0.1}})
-    said = asyncio.Queue[str]()
-    monkeypatch.setattr(mtconnect, "say_ready", said.put_nowait)
+    output = asyncio.Queue[str]()
+    monkeypatch.setattr(mtconnect, "say_ready", output.put_nowait)
     publishing = asyncio.create_task(mtconnect.publish(config))
-    port = int((await said.get()).rpartition(":")[2])
+    port = int((await output.get()).rpartition(":")[2])
     async with connected(xml_of(Daemon(tmp_path, ("X",)).news()), port) as agent:
         await agent.until(lambda agent: agent.values.get("avail") == "UNAVAILABLE")
         async with serving(config, Machine()):

@@ -1,4 +1,4 @@
-"""The OPC UA server, read by asyncua's own client: values with quality, unit and time, alarms, and who may do what."""
+"""The OPC UA server, read by asyncua's client: values with quality, unit and time, alarms, and rights."""
 
 from __future__ import annotations
 
@@ -39,14 +39,11 @@ MACHINE_TOOL = "http://opcfoundation.org/UA/MachineTool/"
 
 
 class Stage:
-    """A server of the bench without a daemon: the tests say what the daemon would."""
-
     def __init__(self, config: MachineConfig, served: Served) -> None:
         self.served, self.listener = served, Listener(config)
         self.url = f"opc.tcp://127.0.0.1:{served.port}"
 
     async def say(self, answer: dict[str, Any] | None, now_ms: int = NOW_MS) -> None:
-        """Let the daemon answer, or be silent."""
         await self.served.tell(self.listener.news(answer, now_ms, "" if answer else "the daemon is not running"))
 
 
@@ -70,13 +67,10 @@ async def own(client: Client, name: str) -> Node:
 
 
 async def told_of(node: Node) -> Any:
-    """Read a value with its quality and time."""
     return await node.read_data_value(raise_on_bad_status=False)
 
 
 class Heard:
-    """What a subscription was told."""
-
     def __init__(self) -> None:
         self.events: list[Any] = []
         self.values: list[Any] = []
@@ -125,8 +119,8 @@ async def test_the_program_runs_or_is_interrupted_as_the_nc_says_and_no_mode_is_
         answer = status()
         answer["nc"]["motion"] = motion
         await stage.say(answer)
-        told = await told_of(state)
-        seen.append(told.Value.Value.Text if told.Value.Value else told.StatusCode.name)
+        result = await told_of(state)
+        seen.append(result.Value.Value.Text if result.Value.Value else result.StatusCode.name)
     assert seen == ["Running", "Interrupted", "BadNoDataAvailable"]
     mode = await machine.get_child([f"{tool}:Monitoring", f"{tool}:MachineTool", f"{tool}:OperationMode"])
     assert (await told_of(mode)).StatusCode.name == "BadNoDataAvailable"
@@ -138,9 +132,9 @@ async def test_parameters_have_intervals_units_and_times(client: Client) -> None
         assert read == pytest.approx([0.9 * value, value, 1.1 * value])
     unit = await (await own(client, "Y.Cd.unit")).read_value()
     assert (unit.UnitId, unit.DisplayName.Text) == (20053, "N·m")  # "NU"
-    told = await told_of(await own(client, "nc_line"))
-    assert told.Value.Value == 17.0
-    assert round(told.SourceTimestamp.timestamp() * 1000) == NOW_MS - 250
+    result = await told_of(await own(client, "nc_line"))
+    assert result.Value.Value == 17.0
+    assert round(result.SourceTimestamp.timestamp() * 1000) == NOW_MS - 250
     described: Any = await (await own(client, "Y.Cd_low")).read_description()
     assert "Coulomb friction" in described.Text
 
@@ -156,21 +150,21 @@ async def test_all_that_is_published_is_a_node_of_its_kind(client: Client) -> No
 async def test_what_is_not_known_has_a_bad_quality_and_so_has_all_while_the_daemon_is_silent(
     stage: Stage, client: Client
 ) -> None:
-    node, heard = await own(client, "X.R"), Heard()
+    node, received = await own(client, "X.R"), Heard()
     unheard = status()
     unheard["guard"]["heard_s_ago"] = 60.0
     await stage.say(unheard)
     offset = await told_of(await own(client, "X.offset"))
     assert offset.StatusCode.name == "BadNoDataAvailable"
-    subscription = await client.create_subscription(20, heard)
+    subscription = await client.create_subscription(20, received)
     await subscription.subscribe_data_change(node)
-    await until(lambda: heard.values == [0.5])
+    await until(lambda: received.values == [0.5])
     await stage.say(None)
-    await until(lambda: heard.values == [0.5, None])
+    await until(lambda: received.values == [0.5, None])
     read = await told_of(node)
     assert (read.StatusCode.name, read.Value.Value) == ("BadNoCommunication", None)
     await stage.say(status())
-    await until(lambda: heard.values == [0.5, None, 0.5])
+    await until(lambda: received.values == [0.5, None, 0.5])
     await subscription.delete()
 
 
@@ -183,19 +177,19 @@ async def with_offset(stage: Stage, um: float) -> None:
 async def test_client_with_a_deadband_is_told_what_creeps_and_that_the_daemon_is_silent(
     stage: Stage, client: Client
 ) -> None:
-    heard, text = Heard(), Heard()
+    received, text = Heard(), Heard()
     await with_offset(stage, 1.0)
-    subscription, other = await client.create_subscription(20, heard), await client.create_subscription(20, text)
+    subscription, other = await client.create_subscription(20, received), await client.create_subscription(20, text)
     await subscription.deadband_monitor(await own(client, "X.offset"), ua.Double(0.5))
     await other.deadband_monitor(await own(client, "state"), ua.Double(0.5))  # no number: each change
-    await until(lambda: heard.values == [1.0])
+    await until(lambda: received.values == [1.0])
     for creeping in (1.2, 1.4, 1.6, 1.8, 2.0, 2.2):
         await with_offset(stage, creeping)
-    await until(lambda: heard.values == [1.0, 1.6, 2.2])
+    await until(lambda: received.values == [1.0, 1.6, 2.2])
     await stage.say(None)
-    await until(lambda: heard.values == [1.0, 1.6, 2.2, None])
+    await until(lambda: received.values == [1.0, 1.6, 2.2, None])
     await with_offset(stage, 2.2)
-    await until(lambda: heard.values == [1.0, 1.6, 2.2, None, 2.2])
+    await until(lambda: received.values == [1.0, 1.6, 2.2, None, 2.2])
     await until(lambda: text.values == ["ACTIVE", None, "ACTIVE"])
     await subscription.delete()
     await other.delete()
@@ -210,7 +204,7 @@ def at(value: Any, quality: ua.StatusCode | None = GOOD, second: int = 0) -> ua.
 
 
 @pytest.mark.parametrize(
-    ("before", "now", "trigger", "band", "told"),
+    ("before", "now", "trigger", "band", "expected"),
     [
         (None, at(1.0), TRIGGER.Status, None, True),
         (at(1.0), at(1.0), TRIGGER.StatusValue, None, False),
@@ -233,17 +227,16 @@ def at(value: Any, quality: ua.StatusCode | None = GOOD, second: int = 0) -> ua.
     ],
 )
 async def test_a_client_is_told_each_change_of_what_it_was_told_last(
-    before: ua.DataValue | None, now: ua.DataValue, trigger: ua.DataChangeTrigger, band: float | None, told: bool
+    before: ua.DataValue | None, now: ua.DataValue, trigger: ua.DataChangeTrigger, band: float | None, expected: bool
 ) -> None:
     kind = BAND.None_ if band is None else BAND.Absolute
-    assert is_news(before, now, ua.DataChangeFilter(trigger, kind, band or 0.0)) is told
+    assert is_news(before, now, ua.DataChangeFilter(trigger, kind, band or 0.0)) is expected
     if trigger is TRIGGER.StatusValue and band is None:
-        assert is_news(before, now) is told
-        assert is_news(before, now, ua.DataChangeFilter(trigger, BAND.Percent, 50.0)) is told
+        assert is_news(before, now) is expected
+        assert is_news(before, now, ua.DataChangeFilter(trigger, BAND.Percent, 50.0)) is expected
 
 
 async def subscribed(client: Client, heard: Heard, at: str = "messages") -> Any:
-    """Subscribe to the machine's messages: alarms of AlertType, notices of NotificationEventType."""
     tool = await client.get_namespace_index(MACHINE_TOOL)
     subscription = await client.create_subscription(20, heard)
     types = [client.get_node(f"ns={tool};i=39"), client.get_node(f"ns={tool};i=35")]
@@ -257,19 +250,19 @@ async def subscribed(client: Client, heard: Heard, at: str = "messages") -> Any:
 async def test_an_alarm_is_a_condition_that_begins_and_ends_and_a_notice_is_an_event(
     at: str, stage: Stage, client: Client
 ) -> None:
-    heard = Heard()
-    subscription = await subscribed(client, heard, at)
+    received = Heard()
+    subscription = await subscribed(client, received, at)
     await stage.say(status(troubles=[trouble("NoSamples", "X", text="the drive sends no samples; check it")]))
-    await until(lambda: len(heard.events) == 1)
-    began = heard.events[0]
+    await until(lambda: len(received.events) == 1)
+    began = received.events[0]
     assert (began.ErrorCode, began.SourceName, began.Severity) == ("NoSamples", "X", 800)
     assert began.Message.Text == "the drive sends no samples; check it"
     assert getattr(began, "ActiveState/Id") is True
     assert began.Retain is True
     await stage.say(status(troubles=[trouble("NoSamples", "X")]))  # still so: told once
     await stage.say(status(uptime_s=2000.0, notices=[notice("Armed", 1005.0), notice("OverrideChanged", 0.5, "minor")]))
-    await until(lambda: len(heard.events) == 3)
-    by_code = {getattr(e, "ErrorCode", None) or e.Identifier: e for e in heard.events[1:]}
+    await until(lambda: len(received.events) == 3)
+    by_code = {getattr(e, "ErrorCode", None) or e.Identifier: e for e in received.events[1:]}
     assert getattr(by_code["NoSamples"], "ActiveState/Id") is False
     assert by_code["NoSamples"].Retain is False
     assert by_code["OverrideChanged"].Severity == 400
@@ -278,26 +271,26 @@ async def test_an_alarm_is_a_condition_that_begins_and_ends_and_a_notice_is_an_e
 
 async def test_a_client_that_comes_later_asks_for_what_is_on(stage: Stage, client: Client) -> None:
     await stage.say(status(troubles=[trouble("BusSilent")]))
-    heard = Heard()
-    subscription = await subscribed(client, heard, "server")
+    received = Heard()
+    subscription = await subscribed(client, received, "server")
     refresh = client.get_node(ua.ObjectIds.ConditionType_ConditionRefresh)
     kind = client.get_node(ua.ObjectIds.ConditionType)
     await kind.call_method(refresh.nodeid, ua.Variant(subscription.subscription_id, ua.VariantType.UInt32))
-    await until(lambda: any(getattr(event, "ErrorCode", None) == "BusSilent" for event in heard.events))
+    await until(lambda: any(getattr(event, "ErrorCode", None) == "BusSilent" for event in received.events))
     await subscription.delete()
     await stage.say(status())
 
 
 async def test_a_silent_daemon_is_an_alarm_and_ends_none(stage: Stage, client: Client) -> None:
     await stage.say(status(troubles=[trouble("BusSilent")]))
-    heard = Heard()
-    subscription = await subscribed(client, heard)
+    received = Heard()
+    subscription = await subscribed(client, received)
     await stage.say(None)
-    await until(lambda: len(heard.events) == 1)
-    assert heard.events[0].ErrorCode == "DaemonSilent"
+    await until(lambda: len(received.events) == 1)
+    assert received.events[0].ErrorCode == "DaemonSilent"
     await stage.say(status())
-    await until(lambda: len(heard.events) == 3)
-    assert {getattr(event, "ActiveState/Id") for event in heard.events[1:]} == {False}
+    await until(lambda: len(received.events) == 3)
+    assert {getattr(event, "ActiveState/Id") for event in received.events[1:]} == {False}
     await subscription.delete()
 
 
@@ -341,7 +334,6 @@ async def test_connections_of_one_address_keep_no_other_out(stage: Stage) -> Non
 
 @asynccontextmanager
 async def guarded(folder: Path, **keys: Any) -> AsyncIterator[str]:
-    """Serve with a certificate and a user; yield the address."""
     theirs = await certificates(folder, "server", "urn:fdhil:bench")
     users = folder / "users.json"
     write_users(users, {"scada": hashed(PASSWORD, "watch")})
@@ -352,7 +344,6 @@ async def guarded(folder: Path, **keys: Any) -> AsyncIterator[str]:
 
 
 async def entered(url: str, folder: Path, name: str, user: str | None, password: str = "") -> Any:
-    """Enter by a certificate of this name, read the state, and return its quality."""
     ours = await certificates(folder, name, f"urn:{name}") if not (folder / f"{name}.der").exists() else None
     certificate, key = ours or (folder / f"{name}.der", folder / f"{name}.pem")
     client = Client(url, PATIENCE_S)
@@ -457,7 +448,6 @@ async def test_a_real_daemon_is_read_and_its_end_is_seen(tmp_path: Path, capsys:
 
 
 async def read_when(node: Node, value: Any) -> None:
-    """Read until it is so."""
     async with asyncio.timeout(PATIENCE_S):
         while True:
             if (await told_of(node)).Value.Value == value:

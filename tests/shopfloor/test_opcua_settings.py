@@ -1,4 +1,4 @@
-"""Units of the OPC UA server, and whom its settings let in."""
+"""Units of the OPC UA server, and the clients that its settings accept."""
 
 from __future__ import annotations
 

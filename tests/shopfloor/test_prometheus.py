@@ -1,4 +1,4 @@
-"""Metrics for Prometheus: names and units, who may read them, and that alerts and dashboard name none that is not."""
+"""Prometheus metrics: names, units and access; alerts and dashboard refer only to existing metrics."""
 
 from __future__ import annotations
 
@@ -35,7 +35,6 @@ PATIENCE_S = 300.0
 
 
 def news_of(config: MachineConfig, *answers: dict[str, Any] | None) -> News:
-    """Return the news of the last of these answers."""
     listener = Listener(config)
     return [listener.news(each, NOW_MS, "" if each else "it is not running") for each in answers][-1]
 
@@ -65,7 +64,6 @@ def samples(text: str) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
 
 @pytest.fixture
 def everything(tmp_path: Path) -> News:
-    """What is told when everything is known and something is wrong."""
     config = config_of(tmp_path, "XY")
     first = status(notices=[])
     return news_of(config, first, status(troubles=[trouble("BusSilent")], notices=[notice("Armed", 0.1)]))
@@ -91,8 +89,8 @@ async def test_every_value_is_a_metric_in_base_units(everything: News) -> None:
     assert found["fdhil_alarm", (("axis", ""), ("code", "BusSilent"), ("severity", "MAJOR"))] == 1
     assert found["fdhil_notices_total", (("code", "Armed"), ("severity", "info"))] == 1
     assert found["fdhil_armed_info", (("method", "inverse"), ("program", "part.ngc"))] == 1
-    told = {value.item.name for value in everything.values if value.item.kind != "text"}
-    assert len({name for name, _ in found}) >= len(told)
+    result = {value.item.name for value in everything.values if value.item.kind != "text"}
+    assert len({name for name, _ in found}) >= len(result)
 
 
 async def test_a_silent_daemon_leaves_up_and_when_it_was_heard(tmp_path: Path) -> None:
@@ -133,7 +131,6 @@ async def test_there_is_one_page_and_it_is_for_reading(everything: News) -> None
 
 
 async def _nonsense_is_answered(address: httpx.URL, caplog: pytest.LogCaptureFixture) -> None:
-    """No stranger writes into the log, neither by what is no HTTP nor by asking for a socket."""
     socket = "Connection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
     socket += "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nHost: localhost\r\n\r\n"
     for sent, expected in (("\x16\x03\r\n\r\n", b" 400 "), (f"GET /metrics HTTP/1.1\r\n{socket}", b" 200 ")):
@@ -199,7 +196,6 @@ async def test_a_stranger_without_a_certificate_reads_nothing(
 
 
 async def metrics_when(client: httpx.AsyncClient, address: str, key: Any, value: float) -> dict[Any, float]:
-    """Read until a metric has this value."""
     async with asyncio.timeout(120.0):
         while True:
             found = samples((await client.get(address)).text)
@@ -227,7 +223,7 @@ def test_no_other_computer_is_served_unless_the_config_says_so(keys: dict[str, A
     ("keys", "words"),
     [
         ({"port": 0, "tls_certificate_file": "none.crt", "tls_key_file": "none.key"}, "TLS files cannot be used"),
-        ({"host": "203.0.113.1", "unprotected": True}, "cannot be opened"),  # TEST-NET-3: no computer has it
+        ({"host": "203.0.113.1", "unprotected": True}, "cannot listen"),  # TEST-NET-3: no computer has it
     ],
 )
 async def test_what_cannot_be_served_is_one_sentence(keys: dict[str, Any], words: str, tmp_path: Path) -> None:
@@ -236,7 +232,6 @@ async def test_what_cannot_be_served_is_one_sentence(keys: dict[str, Any], words
 
 
 def named(expression: str) -> set[str]:
-    """Return the metrics of fdhil that an expression names."""
     return set(re.findall(r"\bfdhil_[a-z_]+\b", expression))
 
 
@@ -303,15 +298,14 @@ async def test_a_real_prometheus_scrapes_and_an_alert_comes(tmp_path: Path, caps
 
 
 async def alerts_of(address: str, prometheus: asyncio.subprocess.Process) -> set[str]:
-    """Ask a Prometheus until an alert fires."""
     deadline_s = time.monotonic() + PATIENCE_S
     async with httpx.AsyncClient() as client:
         while time.monotonic() < deadline_s and prometheus.returncode is None:
             try:
-                told = (await client.get(f"{address}/api/v1/alerts")).json()["data"]["alerts"]
+                expected = (await client.get(f"{address}/api/v1/alerts")).json()["data"]["alerts"]
             except (httpx.TransportError, ValueError, KeyError):
-                told = []
-            if firing := {alert["labels"]["alertname"] for alert in told if alert["state"] == "firing"}:
+                expected = []
+            if firing := {alert["labels"]["alertname"] for alert in expected if alert["state"] == "firing"}:
                 return firing
             await asyncio.sleep(0.2)
     raise TimeoutError("no alert fired")

@@ -1,4 +1,4 @@
-"""What is published: every name has a value when everything is known, and none when nothing is."""
+"""Published items: every one has a value when everything is known, and none when nothing is."""
 
 from __future__ import annotations
 
@@ -117,5 +117,5 @@ async def test_every_publisher_lives_without_a_daemon_and_ends_when_it_is_told(
     port = 1 if protocol == "mqtt" else 0  # nobody listens there; the others take a free one
     config = config_of(tmp_path, publish={protocol: {"port": port}})
     async with publishing(protocol, config) as task:
-        assert "no value is known" in await said(task, capsys, "daemon: is not running")
+        assert "no values are published" in await said(task, capsys, "daemon: is not running")
     assert task.done()

@@ -1,4 +1,4 @@
-"""An edge node's messages, read by a host application that was written from the specification alone."""
+"""An edge node's messages, read by a host application written from the specification alone."""
 
 from __future__ import annotations
 
@@ -32,7 +32,6 @@ def metric(name: str, value: bool | float | str | None, datatype: int = DOUBLE, 
 
 
 def heard(host: Host, messages: Sequence[Message]) -> list[str]:
-    """Hand messages to the host; return their verbs, with the device."""
     before = len(host.verbs)
     for message in messages:
         host.take(message.topic, message.payload)
@@ -40,7 +39,6 @@ def heard(host: Host, messages: Sequence[Message]) -> list[str]:
 
 
 def begun(node: Sequence[Metric], **devices: Sequence[Metric]) -> tuple[EdgeNode, Host]:
-    """Return an edge node that has connected and is born, and the host that heard it."""
     edge, host = EdgeNode("works", "mill"), Host()
     edge.will(NOW)
     assert heard(host, edge.births(node, devices, NOW)) == ["NBIRTH", *(f"DBIRTH/{name}" for name in devices)]
@@ -137,8 +135,8 @@ def test_no_command_but_rebirth_is_one(payload: bytes, wanted: bool) -> None:
 
 @given(st.text(st.characters()), st.floats(), st.integers(-(2**63), 2**63 - 1))
 def test_any_value_arrives_or_is_null(text: str, number: float, count: int) -> None:
-    told = [metric("text", text, STRING), metric("number", number), metric("count", count, INT64)]
-    values = begun(told)[1].values[""]
+    result = [metric("text", text, STRING), metric("number", number), metric("count", count, INT64)]
+    values = begun(result)[1].values[""]
     assert values["text"] == text.encode("utf-8", "replace").decode()
     assert values["number"] == (number if math.isfinite(number) else None)
     assert values["count"] == count

@@ -1,4 +1,4 @@
-"""The unit of the publishers: a user of its own, little to reach, and a stop that waits for the daemon's answer."""
+"""The publishers' unit: its own user, restricted access, and a stop that waits for the daemon's answer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the tests on real interfaces share."""
+"""Fixtures shared by the tests on real interfaces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Network interfaces of SocketCAN as tests need them: frames on vcan0, up and down, a serial adapter on a pty."""
+"""SocketCAN interfaces for tests: frames on vcan0, up and down, a serial adapter on a pty."""
 
 from __future__ import annotations
 
@@ -20,19 +20,16 @@ _IFF_UP = 1
 
 
 def raw_socket(channel: str = "vcan0") -> socket.socket:
-    """A raw socket that others on the interface hear."""
     raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     raw.bind((channel,))
     return raw
 
 
 def send(raw: socket.socket, number: int, can_id: int = 0x181) -> None:
-    """Send a frame that carries a number."""
     raw.send(CAN_FRAME.pack(can_id, 8, struct.pack("<Q", number)))
 
 
 def set_up(channel: str, up: bool) -> None:
-    """Do what ``ip link set CHANNEL up`` or ``down`` does."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
         name, flags = _IFREQ.unpack(fcntl.ioctl(any_socket, _SIOCGIFFLAGS, _IFREQ.pack(channel.encode(), 0)))
         flags = flags | _IFF_UP if up else flags & ~_IFF_UP
@@ -40,11 +37,6 @@ def set_up(channel: str, up: bool) -> None:
 
 
 class SerialAdapter:
-    """A CAN interface of the kernel whose controller is this test: the slcan line discipline on a pty.
-
-    What it says makes genuine error frames and controller states; what nobody reads fills the transmit queue.
-    """
-
     def __init__(self) -> None:
         self._end, self._line = os.openpty()
         tty.setraw(self._line)
@@ -57,18 +49,15 @@ class SerialAdapter:
         set_up(self.channel, True)
 
     def say(self, line: str) -> None:
-        """Let the adapter say something; ``t1812AABB`` is a frame, ``sb255000`` a controller that is bus-off."""
         os.write(self._end, f"{line}\r".encode())
 
     def drain(self, wait_s: float = 0.0) -> int:
-        """Take what was sent to the adapter, as a bus does on which others acknowledge; return how many frames."""
         frames = 0
         while select.select([self._end], [], [], 0.0 if frames else wait_s)[0]:
             frames += os.read(self._end, 1 << 16).count(b"\r")
         return frames
 
     def unplug(self) -> None:
-        """The adapter is gone, and its interface with it."""
         for descriptor in (self._end, self._line):
             if descriptor >= 0:
                 os.close(descriptor)

@@ -1,4 +1,4 @@
-"""A controller that counts errors, goes off and is unplugged: genuine error frames of the kernel's slcan driver."""
+"""A controller that counts errors, goes off and is unplugged: real error frames of the kernel's slcan driver."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 
 def test_each_state_and_error_of_the_controller_is_told(adapter: SerialAdapter) -> None:
-    watch, heard = ErrorWatch(), 0
+    watch, received = ErrorWatch(), 0
     with CanBus("can0", settings_of(adapter)) as bus:
         for line, expected in SAID:
             adapter.say(line)
-            heard += 1
-            wait_for(lambda: bus.counters()["frames"] >= heard)  # noqa: B023 - it is asked now
+            received += 1
+            wait_for(lambda: bus.counters()["frames"] >= received)  # noqa: B023 - it is asked now
             notices = watch.feed(bus.drain(), time.monotonic_ns())
             assert [(notice.code, notice.severity) for notice in notices] == expected, line
     assert watch.count == len(SAID)
@@ -66,8 +66,6 @@ def test_a_controller_that_is_unplugged_ends_the_bus(adapter: SerialAdapter) -> 
 
 
 def test_a_full_transmit_queue_is_told_at_once(adapter: SerialAdapter) -> None:
-    """Nobody reads the far end of the line, as when no node acknowledges."""
-
     def pour(bus: TransmitBus) -> None:
         for _ in range(100_000):
             bus.send(0x601, bytes(8))

@@ -1,4 +1,4 @@
-"""Faults of the matrix on a real interface, in the middle of a cut: the kernel carries each frame to the guard."""
+"""Faults of the matrix on a real interface during a cut: the kernel carries each frame to the guard."""
 
 from __future__ import annotations
 
@@ -18,13 +18,10 @@ RUNNING = ("ACTIVE", "HOLD")
 
 
 def frame(cob_id: int, data: bytes, times: int = 1) -> Fault:
-    """Return the fault that another node sends this before each SYNC."""
     return lambda shop: shop.wire.feed([(cob_id, data, 0.0)] * times)
 
 
 def drive(**changes: object) -> Fault:
-    """Return the fault that the first drive is or does this."""
-
     def apply(shop: Shop) -> None:
         for name, value in changes.items():
             setattr(shop.drives[0], name, value)
@@ -68,7 +65,6 @@ FROZEN: dict[str, tuple[Fault, str]] = {
 
 
 def suffer(shop: Shop, fault: Fault) -> list[str]:
-    """Let the fault happen until the guard reacts, mend it and let it end; the classes that were told."""
     for _ in range(200):
         if shop.state not in RUNNING:
             break
@@ -84,7 +80,6 @@ def suffer(shop: Shop, fault: Fault) -> list[str]:
 
 
 def sends_nothing_more(shop: Shop) -> None:
-    """Check that no frame leaves the guard any more."""
     sent = len(shop.wire.sent)
     shop.run(50)
     assert len(shop.wire.sent) == sent

@@ -1,4 +1,4 @@
-"""The guard on real interfaces, in the middle of a cut: one that goes down, a queue that is full, a bus-off."""
+"""The guard on real interfaces during a cut: interface down, full queue, bus-off."""
 
 from __future__ import annotations
 
@@ -19,8 +19,6 @@ WANTED = Listener(commissioned(settings())).wanted_ids()
 
 
 class Wire(RawCan):
-    """The guard's own socket; what it sent is kept, and the drives and the NC are on the other side of the bus."""
-
     def __init__(self, allowed: frozenset[int], channel: str) -> None:
         super().__init__(raw_socket(channel), allowed, WANTED)
         self.sent: list[tuple[int, bytes]] = []
@@ -45,8 +43,6 @@ class OnVcan(Wire):
 
 
 class OnAdapter(Wire):
-    """``stuck``: nobody acknowledges what is sent."""
-
     def __init__(self, allowed: frozenset[int]) -> None:
         self.adapter = SerialAdapter()
         self.stuck = False
@@ -64,7 +60,6 @@ class OnAdapter(Wire):
             self._left = self._left + left if left else len(self.sent)  # what left while nobody waited is not counted
 
     def _until_heard(self, cob_id: int, data: bytes) -> None:
-        """Wait until the kernel has taken all from the line; a controller that is off delivers nothing any more."""
         last = CAN_FRAME.pack(cob_id, len(data), data)
         with contextlib.suppress(TimeoutError):
             while self._ear.recv(CAN_FRAME.size) != last:

@@ -1,4 +1,4 @@
-"""The raw socket on a real SocketCAN interface (vcan0): order, stamps, nothing lost, and every drop counted."""
+"""The raw socket on a real SocketCAN interface (vcan0): order, stamps, no loss, and every drop counted."""
 
 from __future__ import annotations
 
@@ -74,7 +74,6 @@ def sender() -> Iterator[socket.socket]:
 
 
 def surely_held(bus: CanBus) -> int:
-    """Frames that find room in the socket's buffer while nobody reads."""
     assert isinstance(bus._port, SocketCanPort)
     granted = bus._port._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
     return max(FULL_BUS, min(5_000, granted // FRAME_BYTES - FULL_BUS))
@@ -107,16 +106,15 @@ def test_frames_come_in_order_with_stamps_of_the_kernel(sender: socket.socket) -
 
 
 def test_of_a_full_bus_no_frame_is_lost(tmp_path: Path) -> None:
-    """Forty seconds of a full bus of 1 Mbit/s, in order; on a busy computer the bus waits."""
     file = tmp_path / "heard"
     file.write_bytes(bytes(8))
     numbers: list[int] = []
-    with CanBus("can0", SETTINGS) as bus, file.open("r+b") as shared, mmap.mmap(shared.fileno(), 8) as heard:
+    with CanBus("can0", SETTINGS) as bus, file.open("r+b") as shared, mmap.mmap(shared.fileno(), 8) as received:
         arguments = [sys.executable, "-c", SENDER, str(MANY), str(FULL_BUS), str(surely_held(bus)), str(file)]
         with subprocess.Popen(arguments) as process:
             while process.poll() is None:
                 numbers += bus.drain()["data"].tolist()
-                heard[:8] = len(numbers).to_bytes(8, "little")
+                received[:8] = len(numbers).to_bytes(8, "little")
                 time.sleep(0.05)
         wait_for(lambda: bus.counters()["frames"] + bus.counters()["lost"] >= MANY)
         numbers += bus.drain()["data"].tolist()
@@ -126,7 +124,6 @@ def test_of_a_full_bus_no_frame_is_lost(tmp_path: Path) -> None:
 
 @pytest.mark.fault("A6")
 def test_what_the_kernel_dropped_is_counted_exactly(sender: socket.socket) -> None:
-    """At once, and not only when another frame finds room."""
     port = SocketCanPort("can0", SETTINGS)
     port._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     ring, drops = FrameRing(1 << 14), []
@@ -186,16 +183,16 @@ def test_an_interface_that_is_down_or_missing_cannot_be_opened() -> None:
 async def test_an_interface_that_goes_down_and_up_again_is_heard_again(tmp_path: Path) -> None:
     source = BusSource("can0", machine(tmp_path, bus={"interface": "socketcan", "channel": "vcan0"}))
     source.open()
-    told: list[str] = []
+    result: list[str] = []
 
     async def until(condition: Callable[[], bool]) -> None:
         for _ in range(2000):
             if condition():
                 return
             await asyncio.sleep(0.02)
-        raise AssertionError(told)
+        raise AssertionError(result)
 
-    running = asyncio.create_task(source.run(lambda r: told.append(r.text) if isinstance(r, Notice) else None))
+    running = asyncio.create_task(source.run(lambda r: result.append(r.text) if isinstance(r, Notice) else None))
     try:
         for turn in range(3):
             with raw_socket() as sender:
@@ -203,11 +200,11 @@ async def test_an_interface_that_goes_down_and_up_again_is_heard_again(tmp_path:
                     send(sender, number)
             await until(lambda: source.counters()["frames"] == 50 * (turn + 1))  # noqa: B023 - it is asked now
             set_up("vcan0", False)
-            await until(lambda: sum("is down or gone (Network is down)" in text for text in told) == turn + 1)  # noqa: B023
+            await until(lambda: sum("is down or gone (Network is down)" in text for text in result) == turn + 1)  # noqa: B023
             await asyncio.sleep(0.2)
             set_up("vcan0", True)
-            await until(lambda: told.count("Bus can0 is back.") == turn + 1)  # noqa: B023
-            assert sum("is tried again" in text for text in told) == turn + 1
+            await until(lambda: result.count("Bus can0 is back.") == turn + 1)  # noqa: B023
+            assert sum("is tried again" in text for text in result) == turn + 1
     finally:
         set_up("vcan0", True)
         running.cancel()

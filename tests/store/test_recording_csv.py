@@ -88,8 +88,8 @@ def test_a_step_off_by_two_percent_is_a_gap() -> None:
         (_text(sample_rate_hz="9" * 5000), "sample_rate_hz = '9999"),
         (_text().replace(",2.50000,", "," + "9" * 5000 + ","), "non-finite value '9999"),
         (_text().replace(",2.50000,", "," + "x" * 5000 + ","), "'xxxxx"),
-        (_text() + "0," * 50_000 + "0\n", "has 100001 characters, which no row has"),
-        (_text().replace("time_s,", "time_s," + "x," * 50_000), "which no row has"),
+        (_text() + "0," * 50_000 + "0\n", "has 100001 characters, which no valid row has"),
+        (_text().replace("time_s,", "time_s," + "x," * 50_000), "which no valid row has"),
         (
             _text(voltage_begin_s="0", voltage_period_s="0.005", voltage_samples_V="0 " * 9_000_000),
             "too many voltage samples for a recording",
@@ -117,7 +117,7 @@ def test_a_file_that_is_no_text_or_not_there(tmp_path: Path) -> None:
         read_recording(tmp_path / "absent.csv")
     binary = tmp_path / "b.csv"
     binary.write_bytes(b"\xff\xfe\x00\x80" * 40)
-    with pytest.raises(RecordingError, match="no text file"):
+    with pytest.raises(RecordingError, match="not a text file"):
         read_recording(binary)
 
 

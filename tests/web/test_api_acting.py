@@ -58,7 +58,7 @@ async def test_what_would_move_is_shown_and_that_is_armed_by_name(config: Machin
         plan = (await client.get(PLAN)).json()
         assert [program["name"] for program in choice["programs"]] == ["part.ngc"]
         assert plan["axes"]["X"]["max_offset_um"] == 250.0  # the daemon's, whatever the file says
-        assert "the daemon runs with another configuration than the file" in plan["difference"]
+        assert "the configuration file has changed" in plan["difference"]
         assert plan["program"]["sha256"] == DIGEST
         assert "path" not in plan["program"]
         assert all(request["request"] == "status" for request in asked)  # showing does nothing
