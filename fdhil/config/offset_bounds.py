@@ -64,8 +64,8 @@ class OffsetBounds:
 
     @property
     def too_coarse(self) -> bool:
-        """Whether an increment is more than twice what a limit allows in one cycle."""
-        return min(self.offset, self.rate, self.acceleration) < LEAST_INCREMENTS
+        """Whether an increment is more than the largest offset, or more than twice what a cycle may change."""
+        return self.offset < 1.0 - _ULPS or min(self.rate, self.acceleration) < LEAST_INCREMENTS
 
     def time_to_safe_s(self, sync_period_s: float) -> float:
         """Return how long it takes at most from a fault to zero: n_detect + 1 + L/S + 3 S/A cycles."""
@@ -121,7 +121,7 @@ def _too_coarse(axis: Axis, limits: OffsetBounds) -> str:
         ("max_offset_um", limits.offset),
         ("max_speed_mm_s", limits.rate),
         ("max_acceleration_mm_s2", limits.acceleration),
-        key=lambda pair: pair[1],
+        key=lambda pair: pair[1] if pair[0] == "max_offset_um" else pair[1] / LEAST_INCREMENTS,
     )
     per_turn = axis.drive.increments_per_rev
     text = f"{per_turn:,} increments per turn are too coarse: {name} is {finest:.2g} of an increment per SYNC cycle"

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fdhil import config as machine_config
@@ -63,9 +63,21 @@ def documents() -> st.SearchStrategy[dict[str, Any]]:
     )
 
 
+def coarse_document() -> dict[str, Any]:
+    """Return an axis whose largest offset is just less than an increment."""
+    made = bench_document("X")
+    made["machine"]["sync_period_s"] = 0.004
+    axis = made["axis"]["X"]
+    axis |= {"screw_pitch_mm": 21.0, "rapid_speed_mm_s": 20.0, "max_acceleration_mm_s2": 321.0}
+    axis["drive"] = {"increments_per_rev": 4096}
+    axis["correction"] = {"max_offset_um": 5.0, "max_speed_mm_s": 1.0, "max_acceleration_mm_s2": 161.0}
+    return made
+
+
 @pytest.mark.usefixtures("long_computation")
 @settings(max_examples=150, deadline=None)
 @given(documents(), st.integers(0, 2**32 - 1))
+@example(coarse_document(), 0)
 def test_planner_and_guard_agree_on_every_axis_and_nothing_exceeds_a_ceiling(
     document: dict[str, Any], seed: int
 ) -> None:
