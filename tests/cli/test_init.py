@@ -96,7 +96,7 @@ def test_linuxcncs_files_and_few_answers_make_a_machine(fdhil: Said, tmp_path: P
     assert "rapid_speed_mm_s = 400.0  # LinuxCNC: [TRAJ] MAX_LINEAR_VELOCITY" in text
     assert "# table travel per motor revolution" in text
     assert "R = 0.5  # from the answers" in text
-    assert "Cd = 2.0  # guessed: 5 % of the continuous torque; the first rapids tell it" in text
+    assert "Cd = 2.0  # guessed: 5 % of the continuous torque; the first rapids identify it" in text
     assert "/work" not in text
 
 
@@ -276,7 +276,7 @@ def test_beside_an_nc_nothing_is_sent(
             thread.join()
     assert code == 0, err
     assert set(peer.heard) == {0x80}
-    assert "an NC runs it (SYNC heard), so no drive was asked" in out
+    assert "an NC runs it (SYNC received), so no drive was read" in out
 
 
 @pytest.mark.usefixtures("real_time")
@@ -286,7 +286,7 @@ def test_an_answer_that_the_drive_contradicts_is_noted(
     sheet = SHEET | RAPID | {"drive": {"increments_per_rev": 4096}}
     code, out, err = fdhil("init", tmp_path / "m.toml", "--answers", written(tmp_path, axis={"X": sheet}, bus=bus))
     assert code == 0, err
-    assert "note: axis.X.drive.increments_per_rev: the answers say 4096, the drive 65536" in out
+    assert "note: axis.X.drive.increments_per_rev: the answers have 4096, the drive has 65536" in out
     assert machine_config.load(tmp_path / "m.toml").axis["X"].drive.increments_per_rev == 4096
 
 
@@ -309,7 +309,7 @@ def test_an_axis_without_a_drive_is_refused(fdhil: Said, peer: DrivePeer, bus: d
     answers = written(tmp_path, axis={"X": sheet, "Y": sheet}, bus=bus)
     code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", answers)
     assert code == 2
-    assert "axis.Y.drive: has no drive: 1 found, 1 given to other axes" in err
+    assert "axis.Y.drive: has no drive: 1 found, 1 assigned to other axes" in err
     answers = written(tmp_path, axis={"X": SHEET | RAPID | {"drive": {"node_id": 9}}}, bus=bus)
     code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", answers)
     assert code == 2

@@ -115,7 +115,7 @@ def test_a_drive_that_takes_them_otherwise_is_refused_by_name_and_left_as_it_was
     with pytest.raises(DriveFault, match="FeedforwardOff: ") as caught:
         commission(settings, "X")
     assert says in str(caught.value)
-    assert "leave [axis.X.feedforward] out" in str(caught.value)
+    assert "remove [axis.X.feedforward]" in str(caught.value)
     assert drive.rpdo() == NOT_VALID
     assert drive.held() == (0, 0)
     assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
@@ -127,7 +127,7 @@ def test_another_mapping_is_refused_before_anything_is_written(
 ) -> None:
     drive, settings = peer
     drive.drive.remap(0x1602, entries)
-    with pytest.raises(DriveFault, match=r"FeedforwardOff: its RPDO3 maps .* where 60B1 and 60B2 belong"):
+    with pytest.raises(DriveFault, match=r"FeedforwardOff: its RPDO3 maps .* instead of 60B1 and 60B2"):
         commission(settings, "X")
     assert drive.rpdo() == NOT_VALID
     assert not {0x000, 0x080, 0x401} & set(drive.heard)

@@ -152,10 +152,10 @@ def test_another_master_ends_a_step_within_a_few_sync(step: str, what: str, rig:
             led_through(rig.config, done)
         rig.require_left_alone(nc, what, braking)
     left = {
-        "target": "axis X was left to it, its offset taken to zero",
+        "target": "axis X was left to that master, its offset set to zero",
         "offset": "X was stopped and its drive switched off, and may hold an offset of that master: power it off",
     }
-    assert left.get(what, "X was stopped, its offset taken to zero and its drive switched off") in str(told.value)
+    assert left.get(what, "X was stopped, its offset set to zero and its drive switched off") in str(told.value)
     assert ("0x1016 may be as fdhil wrote" in str(told.value)) is (step in ("watchdog test", "rapid"))
 
 
@@ -232,7 +232,7 @@ def test_a_drive_that_an_nc_stops_and_starts_is_left_without_an_offset(rig: Rig)
         master.wait_cycles(10_000)
 
     zeroed, thread = threading.Event(), threading.Thread(target=stop_and_start)
-    with pytest.raises(ForeignMaster, match=r"NMT commands; .* axis X was left to it, its offset taken to zero"):
+    with pytest.raises(ForeignMaster, match=r"NMT commands; .* axis X was left to that master, its offset set to zero"):
         led_through(rig.config, hold)
     assert rig.holds(lambda: rig.peer.drive.dictionary.number(0x60B0) == 0)
     zeroed.set()

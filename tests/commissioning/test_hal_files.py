@@ -101,7 +101,7 @@ def test_pins_and_gains_are_taken_from_the_files(tmp_path: Path) -> None:
     told = "\n".join(draft.notes)
     assert "the card measures no current" in told
     assert "position is that of the pulses" in told
-    assert "switch this loop off" not in told
+    assert "remove this loop" not in told
 
 
 def test_a_pid_that_commands_current_has_its_gains_converted(tmp_path: Path) -> None:

@@ -102,7 +102,7 @@ def test_identifier_of_a_node_that_is_heard_is_in_use(tmp_path: Path) -> None:
         assert clash is not None, hex(heard)
         assert (
             clash.cause
-            == "its RPDO2 has the COB-ID 309, which is that of RPDO2 of node-ID 9, which was heard on the bus"
+            == "its RPDO2 has the COB-ID 309, which belongs to RPDO2 of node-ID 9, which was received on the bus"
         )
     assert find_clash(config, "X", [0x609, 0x309 | 0x80000000, 0x18A]) is None
 
@@ -126,7 +126,7 @@ def test_nothing_is_sent_to_a_drive_whose_identifiers_are_anothers(monkeypatch: 
         points = {each.point: each for each in survey(master).findings}
         assert points[POINT].ok is False
         drive.heard.clear()
-        with pytest.raises(DriveFault, match="its RPDO2 has the COB-ID 309, which is that of RPDO2 of node-ID 9"):
+        with pytest.raises(DriveFault, match="its RPDO2 has the COB-ID 309, which belongs to RPDO2 of node-ID 9"):
             set_up_pdos(master)
         assert drive.heard == []
 
@@ -139,7 +139,7 @@ def test_commissioning_is_refused_beside_the_owner_of_an_identifier(monkeypatch:
     monkeypatch.setattr("fdhil.commissioning.identifiers.load_profile", lambda _drive: elsewhere)
     with (
         DrivePeer(settings) as drive,
-        pytest.raises(DriveFault, match="its RPDO1 has the COB-ID 202, which is that of"),
+        pytest.raises(DriveFault, match="its RPDO1 has the COB-ID 202, which belongs to"),
     ):
         commission(settings, "X")
     assert drive.heard == []
@@ -156,6 +156,6 @@ def test_guard_does_not_start_beside_the_owner_of_an_identifier(tmp_path: Path) 
         heard = can.Message(arbitration_id=0x709, data=b"\x05", is_extended_id=False)
         sender = bus.send_periodic(heard, 0.02)
         patch.setattr("fdhil.commissioning.compare.LISTEN_S", 0.3)
-        with pytest.raises(ConfigError, match="RPDO2 of node-ID 9, which was heard on the bus"):
+        with pytest.raises(ConfigError, match="RPDO2 of node-ID 9, which was received on the bus"):
             compare_again(config, "can0", lambda _text: None)
         sender.stop()

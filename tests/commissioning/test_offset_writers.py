@@ -269,7 +269,7 @@ def test_record_is_void_where_a_frame_beside_the_nc_carries_the_offset(
     traffic = heard(197, {0x3F0: struct.pack("<i", 197)})
     monkeypatch.setattr("fdhil.commissioning.compare._listen", lambda *_: traffic)
     compare_again(settings, "can0", told.append)
-    assert "nothing can be armed or adopted there" in told[0]
+    assert "the axis cannot be armed or adopted" in told[0]
     assert is_void(settings.store.directory, "X")
 
 
@@ -295,12 +295,12 @@ def own_profile(folder: Path, entries: str) -> dict[str, Any]:
         (
             "[[0x6078, 0, 32, true], [0x6041, 0, 16, false]]",
             [(0x6078, 0, 32), (0x6041, 0, 16)],
-            "6078:00 has 16 bits (by SDO), and TPDO2 maps it with 32",
+            "6078:00 has 16 bits (by SDO), but TPDO2 maps it with 32",
         ),
         (
             "[[0x6041, 0, 8, false], [0x6078, 0, 16, true]]",
             [(0x6041, 0, 8), (0x6078, 0, 16)],
-            "6041:00 has 16 bits (by SDO), and TPDO2 maps it with 8",
+            "6041:00 has 16 bits (by SDO), but TPDO2 maps it with 8",
         ),
     ],
 )

@@ -220,12 +220,12 @@ def test_what_leaves_the_travel_is_refused_before_a_bus_is_opened(floor: Floor) 
     code, said, _ = floor.play(STROKE, "--dry-run")
     assert (code, said["would_play"]) == (0, True)
     text = refused(floor, "G21 G90 G94\nG1 X70 F6000\nM2\n", "--yes")
-    assert "axis X: from a set-point it could not be braked inside its travel (row " in text
+    assert "axis X: it could not be braked inside its travel (row " in text
     assert "nothing was sent" in text
     floor.path.write_text(floor.path.read_text().replace("[axis.Y.setpoints]\ntravel_mm = [-20.0, 60.0]\n", ""))
     code, _, err = fdhil("play", floor.folder / "part.ngc", "--config", floor.path, "--yes", capsys=floor.capsys)
     assert code == 2
-    assert "axis.Y.setpoints: fdhil may send this axis no set-points" in err
+    assert "axis.Y.setpoints: is missing, so fdhil may not move this axis" in err
     assert floor.sent() <= DRIVES
 
 
@@ -248,7 +248,7 @@ def test_another_master_ends_what_is_played(what: str, floor: Floor) -> None:
         assert nc.count(SDO) <= 1
         assert what != "target" or nc.count(TARGET) == 0
     assert code == 1
-    left = "axis X was left to it, and axis Y was stopped and its drive switched off"
+    left = "axis X was left to that master, and axis Y was stopped and its drive switched off"
     assert "bus can0: an NC is sending" in document["stopped"]
     assert (left in document["stopped"]) is (what == "target")
     assert "0x1016 may be as fdhil wrote" in document["stopped"]

@@ -192,7 +192,7 @@ def test_nothing_is_asked_once_a_master_is_heard(peer: tuple[DrivePeer, MachineC
 
 def test_a_silent_bus_is_told() -> None:
     settings = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
-    with pytest.raises(ConnectError, match="no node was heard and none answered"):
+    with pytest.raises(ConnectError, match="no node sent a frame and none answered"):
         scan_bus("can0", settings, [])
 
 
@@ -296,7 +296,7 @@ def test_a_device_that_is_no_drive_is_told_as_such(peer: tuple[DrivePeer, Machin
     drive.drive.set_object(0x1000, 0, 0x00030191)
     found = {finding.point: finding for place, finding in check_machine(settings) if place == "axis X"}
     assert {point for point, finding in found.items() if finding.ok is False} == {"device"}
-    assert found["device"].cause == "it is no CiA 402 drive: 0x1000 says CiA 401, an I/O module"
+    assert found["device"].cause == "it is not a CiA 402 drive: 0x1000 reports CiA 401, an I/O module"
     assert found["cycle"].ok is None
     with Master(settings, "X") as master, pytest.raises(DriveFault, match="it is no CiA 402 drive"):
         check_axis(master)
@@ -334,7 +334,7 @@ def test_a_bus_of_another_bit_rate_is_not_asked(monkeypatch: pytest.MonkeyPatch)
         thread.start()
         try:
             for ask in (lambda: scan_bus("can0", settings, []), lambda: check_machine(settings)):
-                with pytest.raises(ConnectError, match="only frames in error are heard; nothing was sent"):
+                with pytest.raises(ConnectError, match="only error frames are received, so the bit rate is probably wrong; nothing was sent"):
                     ask()
         finally:
             stop.set()

@@ -94,7 +94,7 @@ def test_rows_that_lead_out_of_the_travel_are_braked_inside_it() -> None:
     points = SetPoints((X,), (0,))
     points.play(straight((0,), (HIGH + 5000,), (SPEED,), (ACCELERATION,)))
     out = sent(points)
-    assert points.stopped == "axis X: from a set-point it could not be braked inside its travel"
+    assert points.stopped == "axis X: it could not be braked inside its travel"
     inside(out, (0,), (X,))
     assert out[-1][0] > HIGH - 2 * SPEED
 
@@ -102,8 +102,8 @@ def test_rows_that_lead_out_of_the_travel_are_braked_inside_it() -> None:
 @pytest.mark.parametrize(
     ("rows", "why"),
     [
-        ([(3000.0,)], "a set-point is faster"),
-        ([(40.0,)], "a set-point asks for more acceleration"),
+        ([(3000.0,)], "a set-point exceeds the axis' speed"),
+        ([(40.0,)], "a set-point exceeds the axis' acceleration"),
         ([(math.inf,)], "is no number"),
         ([(1.0, 2.0)], "is no number"),
     ],

@@ -207,8 +207,8 @@ WRONG: dict[str, tuple[Callable[[DrivePeer], None], str]] = {
     "window off": (lambda p: p.drive.set_object(0x6065, 0, 0xFFFFFFFF), "0x6065 is off"),
     "window zero": (lambda p: p.drive.set_object(0x6065, 0, 0), "0x6065 is off"),
     "window too small": (lambda p: p.drive.set_object(0x6065, 0, 300), "too small"),
-    "gear x 10": (lambda p: p.drive.set_object(0x6091, 1, 10), "counts 6553.6 per motor revolution"),
-    "feed x 10": (lambda p: p.drive.set_object(0x6092, 1, 655360), "counts 655360 per motor revolution"),
+    "gear x 10": (lambda p: p.drive.set_object(0x6091, 1, 10), "6553.6 position increments per motor revolution"),
+    "feed x 10": (lambda p: p.drive.set_object(0x6092, 1, 655360), "655360 position increments per motor revolution"),
     "mapping": (
         lambda p: p.drive.remap(0x1A01, [(0x6041, 0, 16), (0x2101, 0, 16), (0x6078, 0, 16)]),
         "TPDO2 maps 60410010, 21010010, 60780010",
@@ -265,7 +265,7 @@ class HastyMaster(Master):
         (offset_doubled, "does not add 0x60B0"),
         (offset_negated, "does not add 0x60B0"),
         (offset_lost, "0x60B0 holds 0"),
-        (not_csp, "does not take the mode"),
+        (not_csp, "does not enter the mode"),
     ],
 )
 @pytest.mark.fault("E16")
@@ -456,7 +456,7 @@ def test_full_heartbeat_consumers_are_refused(peer: tuple[DrivePeer, MachineConf
     drive, settings = peer
     for sub in (1, 2, 3, 4):
         drive.drive.set_object(0x1016, sub, (10 + sub) << 16 | 500)
-    with Master(settings, "X") as master, pytest.raises(DriveFault, match="all entries of 0x1016 are taken"):
+    with Master(settings, "X") as master, pytest.raises(DriveFault, match="all entries of 0x1016 are in use"):
         watchdog(master)
 
 
@@ -481,7 +481,7 @@ def test_on_a_silent_bus_the_drive_alone_is_asked_what_it_is(monkeypatch: pytest
     monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.01)  # nothing ever comes
     settings = config()
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as other:
-        with pytest.raises(ConnectError, match=r"nothing was heard on the bus and node-ID 1 did not answer; check"):
+        with pytest.raises(ConnectError, match=r"no frame was received on the bus and node-ID 1 did not answer; check"):
             commission(settings, "X")
         sent = {(m.arbitration_id, bytes(m.data)) for m in iter(lambda: other.recv(0), None)}
         read, given_up = b"\x40\x00\x10\0\0\0\0\0", b"\x80\0\0\0\0\0\x04\x05"
@@ -496,7 +496,7 @@ def test_a_bus_of_another_bit_rate_gets_no_frame(monkeypatch: pytest.MonkeyPatch
         with Master(settings, "X") as master:
             other.send(can.Message(arbitration_id=0x4, data=bytes(8), is_error_frame=True))
             master.wait(lambda: master.heard.errors > 0, 5.0, "no frame in error")
-            with pytest.raises(ConnectError, match=r"only frames in error are heard; nothing was sent"):
+            with pytest.raises(ConnectError, match=r"only error frames are received, so the bit rate is probably wrong; nothing was sent"):
                 survey.listen(master)
         assert other.recv(0) is None
 
@@ -532,7 +532,7 @@ def test_states_are_shown(peer: tuple[DrivePeer, MachineConfig]) -> None:
 @pytest.mark.parametrize("per_mm", [40, 90])
 def test_a_scaling_that_knows_no_10_um_is_refused_before_anything_moves(per_mm: int) -> None:
     settings = config(drive={"increments_per_rev": 20 * per_mm})
-    with DrivePeer(settings) as drive, pytest.raises(DriveFault, match=r"its scaling is too coarse .* count finer"):
+    with DrivePeer(settings) as drive, pytest.raises(DriveFault, match=r"its scaling is too coarse .* finer resolution"):
         commission(settings, "X")
     assert not {0x000, 0x080, 0x201, 0x301} & set(drive.heard)
 
@@ -609,6 +609,6 @@ def test_what_could_not_be_rolled_back_is_told_after_ctrl_c_too(monkeypatch: pyt
         raise DriveFault(master.device, "it still holds an offset")
 
     monkeypatch.setattr(steps, "zero_offset", fails)
-    left = pytest.raises(ProtocolError, match="interrupted; the drive could not be left as it was")
+    left = pytest.raises(ProtocolError, match="interrupted; the drive could not be restored")
     with DrivePeer(settings), left, Master(settings, "X") as master, rolled_back(master):
         raise KeyboardInterrupt

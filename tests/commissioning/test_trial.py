@@ -83,7 +83,7 @@ def test_a_wrong_sign_and_what_nobody_saw_end_it_before_a_rapid(bench: Bench) ->
     with pytest.raises(DriveFault, match="SignOrScale: voltage times current, and times speed is negative"):
         bench.tried()
     bench.peer.drive.faults.signal("voltage").gain, bench.saw = 1.0, False
-    with pytest.raises(DriveFault, match=r"the table did not move as the drive says; another direction: drive.sign"):
+    with pytest.raises(DriveFault, match=r"the table did not move as the drive reports; check drive.sign"):
         bench.tried()
     assert "test rapids" not in bench.steps
     assert bench.stands_mm == pytest.approx(0.0, abs=0.05)
@@ -114,7 +114,7 @@ def test_stopped_trial_goes_on_within_the_room_that_it_began_with(bench: Bench) 
     moved = {**kept, "stopped_mm": stood_mm - 5.0}  # as if somebody had moved it since, or the encoder lost its zero
     progress.keep("room", progress._steps["room"].holds_for, moved)
     for _ in range(2):
-        with pytest.raises(DriveFault, match=r"by the room that the trial began with, not -2 to \+130 mm from here"):
+        with pytest.raises(DriveFault, match=r"by the room of the interrupted trial, but --room is -2 to \+130 mm from here"):
             bench.tried()
     progress.keep("room", progress._steps["room"].holds_for, kept)
     bench.steps.clear()
@@ -146,7 +146,7 @@ def test_software_limits_that_are_nearer_are_respected(bench: Bench) -> None:
     assert record is not None
     bench.record = record
     with pytest.raises(
-        DriveFault, match=r"stands at 0.000 mm and may go from -1.\d* to 250.\d* mm by its software limits"
+        DriveFault, match=r"its position is 0.000 mm, limited to -1.\d* to 250.\d* mm by its software limits"
     ):
         bench.tried()
     assert bench.steps == ["timing"]
