@@ -152,11 +152,11 @@ def test_inches_become_millimetres(tmp_path: Path) -> None:
     ("old", "new", "words"),
     [
         ("KINEMATICS = trivkins", "KINEMATICS = trivkins coordinates=yyy", "axis Y has a third joint, 2: ignored"),
-        ("KINEMATICS = trivkins", "KINEMATICS = trivkins coordinates=XYA", "axis A is rotary and left out: correct"),
+        ("KINEMATICS = trivkins", "KINEMATICS = trivkins coordinates=XYA", "axis A is rotary and ignored: correct"),
         ("COORDINATES = X Y Z", "COORDINATES = X Y B", "axis B is joint 4 of trivkins without coordinates=, and there"),
         ("[AXIS_Z]\nMAX_VELOCITY = 100", "[AXIS_Z]", "axis Z: [AXIS_Z] has no MAX_VELOCITY, so LinuxCNC uses 1"),
         ("MAX_VELOCITY = 550", "MAX_VELOCITY = 450", "ignores it in programmed moves; make both equal"),
-        ("FERROR = 5", "FERROR = 5\n[AXIS_X]\nMAX_VELOCITY = 9", "[AXIS_X] stands in the INI again"),
+        ("FERROR = 5", "FERROR = 5\n[AXIS_X]\nMAX_VELOCITY = 9", "[AXIS_X] occurs twice in the INI"),
         ("COORDINATES = X Y Z", "COORDINATES = X Y Z\nPLANNER_TYPE = 1\nMAX_LINEAR_JERK = 9000", "S-curve planner of"),
         ("COORDINATES = X Y Z", "COORDINATES = X Y Z\nPLANNER_TYPE = 1\nMAX_LINEAR_JERK = 0.5", "trapezoidal planner"),
         ("COORDINATES = X Y Z", "COORDINATES = X Y Z\nPLANNER_TYPE = 7", "PLANNER_TYPE 7 is unknown"),

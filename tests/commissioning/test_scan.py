@@ -285,7 +285,7 @@ def test_a_drive_without_a_following_error_window_is_not_commissioned(peer: tupl
     lacking(drive, 0x6065)
     with (
         Master(settings, "X") as master,
-        pytest.raises(DriveFault, match=r"it has no 0x6065 that can be read; its manual"),
+        pytest.raises(DriveFault, match=r"it has no 0x6065 that can be read; see its manual"),
     ):
         check_axis(master)
 
@@ -298,7 +298,7 @@ def test_a_device_that_is_no_drive_is_told_as_such(peer: tuple[DrivePeer, Machin
     assert {point for point, finding in found.items() if finding.ok is False} == {"device"}
     assert found["device"].cause == "it is not a CiA 402 drive: 0x1000 reports CiA 401, an I/O module"
     assert found["cycle"].ok is None
-    with Master(settings, "X") as master, pytest.raises(DriveFault, match="it is no CiA 402 drive"):
+    with Master(settings, "X") as master, pytest.raises(DriveFault, match="it is not a CiA 402 drive"):
         check_axis(master)
 
 
@@ -358,7 +358,7 @@ def test_what_an_ncs_traffic_shows_is_compared() -> None:
 def test_a_drive_on_another_node_id_is_told() -> None:
     found = heard(machine(), Wire(400, node_id=5))
     assert found["drive"].ok is False
-    assert found["TPDO1"].cause == "TPDO1 (181) came 0 times in 400 SYNC where 400 are due"
+    assert found["TPDO1"].cause == "TPDO1 (181) was received 0 times in 400 SYNC, 400 are due"
 
 
 @pytest.mark.parametrize(("bit", "state"), [(16, "on now"), (3, "off now")])

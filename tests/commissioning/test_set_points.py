@@ -104,8 +104,8 @@ def test_rows_that_lead_out_of_the_travel_are_braked_inside_it() -> None:
     [
         ([(3000.0,)], "a set-point exceeds the axis' speed"),
         ([(40.0,)], "a set-point exceeds the axis' acceleration"),
-        ([(math.inf,)], "is no number"),
-        ([(1.0, 2.0)], "is no number"),
+        ([(math.inf,)], "is not a number"),
+        ([(1.0, 2.0)], "is not a number"),
     ],
 )
 def test_a_wrong_row_never_leaves(rows: list[tuple[float, ...]], why: str) -> None:

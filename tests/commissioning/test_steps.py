@@ -154,7 +154,7 @@ def test_a_simulated_drive_that_slept_answers_one_sync_at_a_time(monkeypatch: py
 
 def test_an_object_that_no_tpdo_brings_is_told() -> None:
     settings = config(guard={})
-    with Master(settings, "X") as master, pytest.raises(DeviceTimeout, match="0x6064 does not come any more; check"):
+    with Master(settings, "X") as master, pytest.raises(DeviceTimeout, match="0x6064 is no longer received; check"):
         master.average(master.profile.position, 10)
 
 
@@ -339,7 +339,7 @@ def test_a_feeding_that_this_computer_missed_is_tried_again(fed: LateCycle) -> N
 @pytest.mark.usefixtures("long_computation")
 def test_a_computer_that_is_always_late_is_told(fed: LateCycle) -> None:
     fed.late = 99
-    with pytest.raises(DriveFault, match="missed our heartbeat 4 times; take load off this computer"):
+    with pytest.raises(DriveFault, match="missed fdhil's heartbeat 4 times; reduce this computer's load"):
         run_steps(fed.master, watchdog)
     assert fed.feedings == FEEDING_TRIES
 

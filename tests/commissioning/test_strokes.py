@@ -68,6 +68,6 @@ def test_strokes_of_a_rotary_axis_take_room_and_are_told_in_degrees() -> None:
 @pytest.mark.parametrize("axis", ["Y", "Y2"])
 def test_no_drive_of_a_gantry_axis_is_moved_alone(axis: str) -> None:
     machine = parse(rotary_and_gantry_document())
-    with pytest.raises(DriveFault, match=f"drive {axis}: Y and Y2 move one beam, and one of them alone would skew it"):
+    with pytest.raises(DriveFault, match=f"drive {axis}: Y and Y2 move one beam, which one alone would skew"):
         require_single_drive(machine, axis)
     require_single_drive(machine, "X")

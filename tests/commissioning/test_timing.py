@@ -39,7 +39,7 @@ def test_a_hole_that_would_end_a_correction_is_told() -> None:
 def test_an_answer_as_late_as_the_next_sync_is_told() -> None:
     (answer,) = judge_answers(measure(heard(answer_us=980), [TPDO]), PERIOD_S, counted=False)
     assert answer.ok is False
-    assert "answers come up to 0.98 ms after SYNC" in answer.cause
+    assert "answers arrive up to 0.98 ms after SYNC" in answer.cause
 
 
 @pytest.mark.parametrize("frames", [heard()[:0], heard()[1:3], heard()[:20]])

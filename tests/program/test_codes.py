@@ -266,11 +266,11 @@ def test_lines_that_are_made_as_they_are_read_are_kept_in_four_megabytes_at_most
 
 def test_a_called_block_that_there_is_not_is_told_by_its_number() -> None:
     """As it was written, and without the name that fdhil has for such a block."""
-    with pytest.raises(ProgramError, match="line 1, 'O99': is called and stands nowhere"):
+    with pytest.raises(ProgramError, match="line 1, 'O99': is called but does not exist"):
         run("M98 P99", "M2")
 
 
 def test_the_cornering_of_the_s_curve_planner_is_refused_by_its_name() -> None:
     for cycle in ("G80", "G81 X1 Z-1 R1"):
-        with pytest.raises(ProgramError, match=r"line 2, 'G64 R': is of the S-curve planner of LinuxCNC 2\.10"):
+        with pytest.raises(ProgramError, match=r"line 2, 'G64 R': is for the S-curve planner of LinuxCNC 2\.10"):
             list(interpret([f"F100 {cycle}", "G64 P0.01 R2", "G0 X1"]))

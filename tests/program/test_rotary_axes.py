@@ -139,9 +139,9 @@ def test_demand_file_of_a_gantry_needs_one_column(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("A_mm", "has a column A_mm, and the configuration has axis A in deg; write A_deg"),
-        ("X_mm,X_deg", "has a column X_deg, and the configuration has axis X in mm; write X_mm"),
-        ("C_deg", r"axis C moves, which the configuration lacks; add \[axis\.C\]"),
+        ("A_mm", "has a column A_mm, but the configuration has axis A in deg; write A_deg"),
+        ("X_mm,X_deg", "has a column X_deg, but the configuration has axis X in mm; write X_mm"),
+        ("C_deg", r"axis C moves, but the configuration lacks it; add \[axis\.C\]"),
     ],
 )
 def test_demand_file_in_another_unit_is_refused(name: str, expected: str, tmp_path: Path) -> None:
@@ -185,7 +185,7 @@ def test_absolute_words_of_a_wrapped_axis_turn_by_their_sign() -> None:
 
 def test_absolute_word_of_more_than_one_turn_is_refused_on_a_wrapped_axis() -> None:
     budget = Budget.of(machine(wrapped_axes=["A"]).nc)
-    with pytest.raises(ProgramError, match="line 1, 'A400': 400 is no position of a wrapped rotary axis"):
+    with pytest.raises(ProgramError, match="line 1, 'A400': 400 is not a position of a wrapped rotary axis"):
         list(interpret(["G90 G0 A400"], budget))
     assert [motion.rotary[0].end for motion in interpret(["G91 G0 A400"], budget) if isinstance(motion, Rapid)] == [
         400.0
