@@ -24,7 +24,9 @@ def compare_scale(master: Master) -> Iterator[Finding]:
     per_rev, source = reported
     found = f"{per_rev:g} per revolution"
     same = abs(per_rev - expected) <= 1e-6 * expected
-    cause = f"it has {per_rev:g} position increments per motor revolution ({source}), but the configuration has {expected}"
+    cause = (
+        f"it has {per_rev:g} position increments per motor revolution ({source}), but the configuration has {expected}"
+    )
     yield Finding("scale", wanted, found, same, cause, "correct the drive's factors or drive.increments_per_rev")
 
 

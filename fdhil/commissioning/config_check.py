@@ -123,7 +123,6 @@ def _record_of(config: MachineConfig, axis: str) -> CommissioningRecord | None:
 
 
 def _record(config: MachineConfig, axis: str, found: Survey) -> Iterator[Finding]:
-    """Yield nothing for a drive that was never signed off."""
     try:
         record = load_record(config.store.directory, axis, config.store.commissioning_key, may_lack_key=True)
     except StoreError as error:

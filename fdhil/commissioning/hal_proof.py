@@ -171,7 +171,6 @@ def _move(hal: HalAxis) -> tuple[float, int]:
 
 
 def _held(hal: HalAxis, step: int) -> Seen:
-    """Hold an offset until HAL has applied it long enough to be averaged; return the last attempt."""
     for _ in range(TRIES):
         seen = hal.run(2 * SETTLE_CYCLES, step)
         if set(seen.applied[-2 * AVERAGE_CYCLES :]) <= {step - 1, step, step + 1}:

@@ -103,7 +103,6 @@ _Use = tuple[int, str, str]
 
 
 def _in_use(config: MachineConfig, own: str) -> Iterator[_Use]:
-    """Yield the identifiers known from the configuration, except the PDOs of ``own`` itself."""
     key = f"axis.{own}.drive"
     yield from ((cob_id, service, key) for cob_id, service in _BROADCAST.items())
     for base, service in _SERVICES.items():

@@ -22,10 +22,7 @@ LAG_CYCLES = 300  # the following of the axis after its last set-point
 
 
 def move(
-    masters: Sequence[Master],
-    bounds: Sequence[Bounds],
-    rows: Float,
-    each_turn: Callable[[], None] = lambda: None,
+    masters: Sequence[Master], bounds: Sequence[Bounds], rows: Float, each_turn: Callable[[], None] = lambda: None
 ) -> None:
     """Play rows of increments (one column per master) on enabled drives of one cycle; return when they rest at the end.
 

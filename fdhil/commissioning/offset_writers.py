@@ -192,7 +192,6 @@ def _shown_offset(profile: DriveProfile, node_id: int, traffic: Traffic) -> tupl
 
 
 def _carries(traffic: Traffic, cob_id: int, held: int, bits: int) -> bool:
-    """Return whether a PDO's frame has this number at a byte boundary."""
     if not 0x180 <= cob_id < COB_SDO_RESPONSE:
         return False
     frame = traffic.data[cob_id].to_bytes(8, "little")[: traffic.length[cob_id]]

@@ -96,7 +96,6 @@ def _require_same(master: Master) -> None:
 
 
 def _give_back(master: Master, begun: list[tuple[PdoSpec, PdoFound]], error: BaseException) -> None:
-    """Restore the old PDOs in reverse order; ProtocolError if that fails too."""
     for spec, found in reversed(begun):
         try:
             _write(master, found, found.cob_id, found.kind, found.mapped)

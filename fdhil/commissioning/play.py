@@ -251,7 +251,6 @@ class Bench:
 
     @contextlib.contextmanager
     def _given_back(self, watching: contextlib.AbstractContextManager[None]) -> Iterator[None]:
-        """Report a failed restore, since the bus is gone, without hiding other errors."""
         with contextlib.ExitStack() as undo:
             undo.enter_context(watching)
             try:
@@ -264,7 +263,6 @@ class Bench:
                         self._say(f"0x1016 could not be restored ({error}); power the drive off and on again")
 
     def _switch_off(self) -> None:
-        """Wait until a guard has ramped its offsets to zero, then switch the power off step by step."""
         with undisturbed(), contextlib.suppress(DeviceError):  # of a bus that is gone: the cause has been reported
             if not self.loop.turning:
                 return

@@ -82,7 +82,6 @@ def _sign(what: str, product: str, correlation: float, where: str) -> Finding:
 
 
 def _speed(jog: Recording) -> Finding:
-    """Compare the speed (0x606C) with the derivative of the position."""
     rate = np.gradient(jog.position_mm, jog.dt_s) * 2 * math.pi / jog.pitch_mm
     known = np.isfinite(rate) & np.isfinite(jog.speed_rad_s)
     power = float(np.square(rate[known]).sum())

@@ -195,9 +195,7 @@ def straight(start: Row, goal: Row, speed: Row, acceleration: Row, rounding_cycl
     k = np.minimum(np.arange(math.ceil(whole) + 1), whole)
     up, down = np.minimum(k, ramp), np.minimum(whole - k, ramp)
     part = np.where(
-        k <= ramp,
-        steepest * up**2 / 2,
-        np.where(k >= whole - ramp, 1 - steepest * down**2 / 2, top * (k - ramp / 2)),
+        k <= ramp, steepest * up**2 / 2, np.where(k >= whole - ramp, 1 - steepest * down**2 / 2, top * (k - ramp / 2))
     )
     width = max(1, rounding_cycles)
     padded = np.concatenate([np.zeros(width - 1), part, np.ones(width - 1)])

@@ -23,14 +23,7 @@ from fdhil.commissioning.moving import held_back
 from fdhil.commissioning.progress import Found, Progress
 from fdhil.commissioning.record import CommissioningRecord, axis_digest
 from fdhil.commissioning.set_points import straight
-from fdhil.commissioning.survey import (
-    Survey,
-    faulted,
-    listen,
-    require,
-    require_enabled,
-    survey,
-)
+from fdhil.commissioning.survey import Survey, faulted, listen, require, require_enabled, survey
 from fdhil.commissioning.watchdog import watchdog_test
 from fdhil.config import CorrectionLimits, MachineConfig
 from fdhil.drivers.cia402.profile_file import NO_OFFSET_ADVICE, load_profile, no_offset
@@ -191,7 +184,6 @@ def sign_test(master: Master) -> float:
 
 
 def _sign_step(master: Master) -> int:
-    """Return the sign test's offset in increments; DriveFault if it is less than one."""
     scaling, um = master.config.axis[master.axis].scaling, min(SIGN_TEST_UM, _limits(master).max_offset_um)
     if not um / 1e3 * scaling.increments_per_mm >= 1.0:
         text = f"one increment is {1e3 / scaling.increments_per_mm:.3g} um, more than the sign test's {um:g} um"

@@ -92,7 +92,6 @@ def compare_own_identifiers(master: Master) -> Finding:
 
 
 def _ask_alone(master: Master) -> None:
-    """Read the device type on a silent bus; ConnectError if nothing can be read."""
     bus = f"bus {master.bus.name}"
     if master.heard.errors:
         raise ConnectError(bus, UNREADABLE)

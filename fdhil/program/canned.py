@@ -79,7 +79,6 @@ def _with(position: list[float], changed: dict[int, float]) -> list[float]:
 
 
 def _words(modal: Modal, block: Block, kept: dict[str, float]) -> dict[str, float]:
-    """Return the cycle's words, those of the block and those in force, in program units."""
     normal = PLANE_AXES[modal.plane_name][2]
     if AXES[normal] in block.words:
         kept[_DEPTH] = length_mm(modal, normal, block.words[AXES[normal]]) / modal.scale
@@ -94,7 +93,6 @@ def _mm(modal: Modal, letter: str, value: float) -> float:
 
 
 def _check(modal: Modal, block: Block, given: Mapping[str, float], words: Mapping[str, float]) -> None:
-    """Raise ProgramError for invalid words; ``given`` are the words available to the cycle."""
     code = modal.code
     first, second, normal = (AXES[axis] for axis in PLANE_AXES[modal.plane_name])
     if modal.feed_mode == 930:
@@ -189,7 +187,6 @@ class Hole:
         self.rapid(self.retract)
 
     def _back_bore(self) -> None:
-        """G87: next to the hole down, in, up to K and down again at feed, out of the hole and up."""
         modal, words = self.machine.modal, self.words
         first, second, normal = PLANE_AXES[modal.plane_name]
         letters = "ijk"[first], "ijk"[second], "ijk"[normal]

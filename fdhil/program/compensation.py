@@ -166,7 +166,6 @@ class Compensation:
 
 
 def _checked(piece: Piece, block: Block) -> Piece:
-    """Return a piece whose ends are final; ProgramError if cutting has reversed it."""
     if piece.centre is None:
         along = piece.checked_along or piece.leaving
         forward = _dot(piece.end - piece.start, along)

@@ -223,7 +223,6 @@ def _shifted(parts: list[Part], step: float) -> list[Part]:
 
 
 def _joined(parts: list[Part]) -> list[Part]:
-    """Cut neighbours at their common point; a part that this would reverse is omitted."""
     at = rounds = 0
     while at < len(parts) - 1:
         rounds += 1

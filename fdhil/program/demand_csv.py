@@ -139,7 +139,6 @@ def _check_times(path: Path, lines: Sequence[str], time_s: Float, sync_period_s:
 
 
 def _line_of(lines: Sequence[str], row: int) -> int:
-    """Return the 1-based line of a row, below the header."""
     return [number for number, line in enumerate(lines, 1) if line.strip()][row + 1]
 
 

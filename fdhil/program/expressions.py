@@ -63,7 +63,6 @@ class Reader:
         return _fault(self._context, word or self.text[self.word_at : self.word_at + 12], message)
 
     def _stranger(self) -> ProgramError:
-        """Return the error for a character outside the language, often pasted from a text processor."""
         end = self.at + 1
         while end < min(len(self.text), self.at + 4) and not self.text[end].isascii():
             end += 1

@@ -59,7 +59,6 @@ def cut(value: float) -> float:
 
 
 def _feed_word(code: str) -> slice | None:
-    """Return the position of the F word's value in a line without comments; None without an F word."""
     places = [place for place, character in enumerate(code) if not character.isspace()]
     text = "".join(code[place] for place in places).lower()
     reader = Reader(text, Variables(0, {}, {}), Budget().max_nesting)
@@ -103,7 +102,6 @@ class _Writer:
         return f"{raw[:end]} F{self._value(number, share)}{raw[end:]}"
 
     def _value(self, number: int, share: float) -> str:
-        """Return the value of an F word that gives a line its share of its feed."""
         if _NUMBER.fullmatch(self._in_force) is None and not self._everywhere:
             return f"[{_text(cut(share))} * {self._in_force}]" if share < 1.0 else self._in_force
         value = self._feeds[number] / self._scale if self._everywhere else float("".join(self._in_force.split()))
@@ -123,7 +121,6 @@ def _feeds(motions: Sequence[Motion]) -> dict[int, float]:
 def _first_difference(
     motions: Sequence[Motion], made: Sequence[bytes], shares: Mapping[int, float], budget: Budget
 ) -> int | None:
-    """Return the first line at which the new program differs from the intended motions; None if there is none."""
     try:
         new = list(interpret((line.decode("latin-1") for line in made), budget))
     except ProgramError as error:

@@ -249,7 +249,6 @@ class Flow:
     # --- subroutines ----------------------------------------------------------------------------------------------
 
     def _define(self, label: str, line: int) -> None:
-        """Remember the position of a subroutine and skip it."""
         if label in self._subs:
             raise ProgramError(line, f"O<{label}>", "is the name of another subroutine; choose another name")
         if self.depth:
@@ -333,7 +332,6 @@ class Flow:
         self._go_back()
 
     def _end_fanuc(self) -> bool:
-        """Return True if M99 ends a subroutine, False in the main program."""
         if not self.depth:
             return False
         frame = self._frames[-1]

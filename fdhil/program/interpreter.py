@@ -145,7 +145,6 @@ class Interpreter:
         return self._variables.state(), self._kept.state(), deepcopy(kept)
 
     def _simple(self, raw: str, line: int) -> Motion | None:
-        """Execute a block of G0, G1, X, Y, Z, F; return None for any other block."""
         match = _SIMPLE.fullmatch(raw) if self._plain else None
         if match is None:
             return None
@@ -191,7 +190,6 @@ class Interpreter:
         return Rapid(line, end, corner) if motion == 0 else Feed(line, end, feed, corner)
 
     def _line(self, raw: str, line: int) -> Motion | None:
-        """Execute a line; return the motion of a simple one, else the machine has the ordered motions."""
         known = self._fetch(raw, line)
         if known is None:
             return None
@@ -253,7 +251,6 @@ class Interpreter:
         return read(text, self._variables, self._budget.max_nesting)
 
     def _check_end(self) -> None:
-        """Reject an empty program, and one that begins with "%" and does not end with it."""
         line = max(1, self._flow.source.line)
         if self._percent:
             raise ProgramError(line, "%", "the program begins with % but does not end with it; add % or M2")
@@ -354,7 +351,6 @@ class Interpreter:
             raise block.fault(axis, "has no motion code; use G0, G1, G2 or G3")
 
     def _other_orders(self) -> Mapping[int, Callable[[Block], None]]:
-        """Return the actions of all motion codes except cycles."""
         machine, modal = self._machine, self._machine.modal
         return {
             0: lambda block: machine.rapid_to(block, targets.target(modal, block)),

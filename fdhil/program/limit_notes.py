@@ -58,7 +58,6 @@ def _note(demand: Trajectory, found: Float, limit: float, what: str, unit: str, 
 
 
 def _resolution(position_mm: Float) -> float:
-    """Return the smallest step of a demand, mm; 0 at standstill."""
     steps = np.abs(np.diff(position_mm))
     steps = steps[steps > 1e-9]
     return float(steps.min()) if steps.size else 0.0

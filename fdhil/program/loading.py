@@ -71,5 +71,4 @@ def program_digest(path: Path) -> str:
 
 
 def _at_once(path: str, flags: int) -> int:
-    """Open a file without waiting for the writer of a pipe."""
     return os.open(path, flags | os.O_NONBLOCK)

@@ -138,7 +138,6 @@ class Machine:
         self.out.append(motion)
 
     def _checked(self, block: Block, position: list[float]) -> Point:
-        """Return a position in machine mm; ProgramError if it is out of any machine's reach."""
         end = self.modal.machine(position)
         limit = self.budget.max_coordinate_mm
         for letter, value in zip("xyz", end, strict=True):
@@ -147,7 +146,6 @@ class Machine:
         return end
 
     def _turned(self, block: Block, position: list[float]) -> tuple[Turned, ...]:
-        """Return the axes other than X, Y and Z that a motion to this position names or moves."""
         before, self.others = self.others, self.modal.others(position)
         moved = zip(AXES[3:], before, self.others, strict=True)
         return tuple(

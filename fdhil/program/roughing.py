@@ -234,7 +234,6 @@ class Roughing:
             raise ContourError("it needs too many cuts, or its contour cannot be followed; use a larger I")
 
     def _pocket(self, place: int, kind: int) -> int | None:
-        """Cut one pocket from the part at ``place`` on; return the part at which the next one begins."""
         parts = self.tool.contour.parts
         self.level = self.begun[-1].imag
         while place < len(parts):
@@ -256,7 +255,6 @@ class Roughing:
             self.level -= self.depth
 
     def _pass(self, place: int) -> int:
-        """Cut at the present level as far as the contour allows; return the part to continue with."""
         parts = self.tool.contour.parts
         for hit in range(place, len(parts)):
             found = parts[hit].crossings(self.at.imag)

@@ -125,7 +125,6 @@ class Source:
         return text
 
     def _read(self) -> bytes:
-        """Read the current line; ProgramError if it is not text or too long."""
         try:
             if self._moved:
                 self._file.seek(self._end)
@@ -145,7 +144,6 @@ class Source:
         return raw
 
     def _draw(self, feed: Iterator[str]) -> bytes:
-        """Take one line from the iterable and store it, so that a loop can return to it."""
         line = next(feed, None)
         if line is None:
             return b""
@@ -157,6 +155,5 @@ class Source:
 
 @contextmanager
 def _spool() -> Iterator[IO[bytes]]:
-    """Keep a few lines in memory, many on disk."""
     with tempfile.SpooledTemporaryFile(_SPOOL_BYTES) as file:
         yield cast(IO[bytes], file)

@@ -138,7 +138,6 @@ def _order(block: Block) -> int:
 
 
 def _nurbs_chords(points: list[Weighted], order: int) -> Iterator[complex]:
-    """Yield the ends of chords along the curve; each span is halved until its middle is close to its chord."""
     left = 0
     for span in range(len(points) - order + 1):
         for part in range(4):  # a span may be S-shaped, so that its middle is not conclusive

@@ -186,7 +186,6 @@ def read(text: str, context: Context, max_nesting: int) -> Line:
 
 
 def _straight(words: list[tuple[str, Value]]) -> tuple[int | None, tuple[Value | None, ...] | None]:
-    """Return G0 or G1 and X, Y, Z, F if a line has only these words."""
     by_letter = dict(words)
     code = by_letter.pop("g", None)
     if len(by_letter) + (code is not None) != len(words) or not by_letter.keys() <= _STRAIGHT:

@@ -230,7 +230,7 @@ def said(old: str, new: str) -> Callable[[Bench], None]:
 
 # what is wrong -> how it gets so, what is said, and whether the drive was switched on before that
 WRONG: dict[str, tuple[Callable[[Bench], None], str, bool]] = {
-    "goes on without communication": (set_object(0x6007, 0, 0), "0x6007 is 0: it goes on", False),
+    "goes on without communication": (set_object(0x6007, 0, 0), "0x6007 is 0: it continues", False),
     "window off": (set_object(0x6065, 0, 0xFFFFFFFF), "0x6065 is off: it never detects", False),
     "gear x 10": (set_object(0x6091, 1, 10), "it has 6553.6 position increments per motor revolution", False),
     "scale of the config": (

@@ -90,7 +90,7 @@ def test_guard_of_a_dcf_sends_what_the_file_says(tmp_path: Path) -> None:
 )
 def test_guard_is_refused_that_would_send_what_is_in_use(offset_rpdo: int, whose: str, tmp_path: Path) -> None:
     config = config_of(tmp_path, offset_rpdo, "XY", node_id=9)
-    with pytest.raises(ConfigError, match=f"COB-ID {offset_rpdo:03X} .* the guard sends offsets, also belongs to {whose}"):
+    with pytest.raises(ConfigError, match=f"COB-ID {offset_rpdo:03X}, with which the guard sends offsets, also belongs to {whose}"):
         settings_of(config, "can0", tmp_path, "")
 
 

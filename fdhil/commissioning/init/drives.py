@@ -128,7 +128,6 @@ def told_by(read: Read, profile: DriveProfile | None) -> Iterator[tuple[str, Tol
 
 
 def _ratings(read: Read, current_unit: str) -> Iterator[tuple[str, Told]]:
-    """Yield the rated values that the current is relative to, the largest current, and K derived from both."""
     rated_ma, rated_mnm = read(Object.RATED_CURRENT, 0), read(Object.RATED_TORQUE, 0)
     if rated_ma and current_unit in ("permille_of_rated", "share_of_rated"):
         yield "drive.rated_current_a", Told(rounded(rated_ma / 1e3), "the drive: 0x6075")

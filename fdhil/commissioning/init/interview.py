@@ -94,14 +94,7 @@ def _one_of(path: str, words: Sequence[str], answer: str) -> str:
     return answer
 
 
-def settle_axis(
-    draft: Draft,
-    axis: str,
-    others: Sequence[str],
-    found: Found,
-    nc: Machine | None,
-    folder: Path,
-) -> None:
+def settle_axis(draft: Draft, axis: str, others: Sequence[str], found: Found, nc: Machine | None, folder: Path) -> None:
     """Settle [axis.X]; ``others`` are the axes before it, ``found`` the drives on the buses."""
     drive = _settle_drive(draft, axis, found)
     scale = nc.scales.get(axis) if nc else None
@@ -170,7 +163,6 @@ def settle_hal_axis(draft: Draft, axis: str, others: Sequence[str], nc: Machine,
 
 
 def _settle_pid(draft: Draft, here: str, unit_mm: float) -> None:
-    """Convert the gains of a pid that commands a current, once the pitch is known."""
     regulators = f"{here}.regulators"
     pitch = draft.get(f"{here}.screw_pitch_mm")
     if draft.get(f"{regulators}.pid_output") != "current" or not pitch:
@@ -220,7 +212,6 @@ def _taken(draft: Draft, axis: str) -> set[tuple[str, int, int]]:
 
 
 def _chosen(draft: Draft, axis: str, free: Sequence[FoundDrive]) -> FoundDrive | None:
-    """Return the found drive with the axis' node-ID; of several axes behind it the first free one."""
     _, node_id, number = _place(draft, axis)
     candidates = [drive for drive in free if drive.node_id == node_id]
     exact = [drive for drive in candidates if drive.logical_axis == number]
@@ -310,7 +301,6 @@ def _is_rotary(draft: Draft, axis: str) -> bool:
 
 
 def _path(draft: Draft, axis: str, key: str) -> str:
-    """Return the path of a key, in its rotary form for a rotary axis."""
     return f"axis.{axis}.{angular(key) if _is_rotary(draft, axis) else key}"
 
 
@@ -348,7 +338,6 @@ def _guess(draft: Draft, axis: str, question: Question) -> Told | None:
 
 
 def _tell_window(draft: Draft, axis: str, increments: int | None) -> None:
-    """The drive's own following-error window overrides the NC's."""
     turn, pitch = draft.get(f"axis.{axis}.drive.increments_per_rev"), draft.get(_path(draft, axis, PITCH.key))
     path = _path(draft, axis, "drive.following_error_window_mm")
     if increments in (None, *NO_OTHER_WINDOW) or not turn or not pitch:

@@ -84,7 +84,6 @@ def _text(path: Path) -> str:
 
 
 def _read_hal(ini: Ini, folder: Path) -> tuple[Hal, list[str]]:
-    """Read the HAL files in order; one that is Tcl or cannot be read is noted."""
     hal, notes = Hal(), []
     for line in ini.all("HAL", "HALFILE"):
         name = line.split()[0] if line.split() else ""
@@ -148,7 +147,6 @@ def _unit(ini: Ini, path: Path, letter: str, unit_mm: float) -> _Unit:
 
 
 def _travel(ini: Ini, joints: Mapping[str, int], units: Mapping[str, _Unit]) -> Iterator[str]:
-    """Yield how far the axes may travel: commissioning asks for room, and no configuration key holds it."""
     ways = []
     for letter, joint in joints.items():
         places = (f"AXIS_{letter}", f"JOINT_{joint}")
@@ -162,7 +160,6 @@ def _travel(ini: Ini, joints: Mapping[str, int], units: Mapping[str, _Unit]) -> 
 
 
 def _unit_mm(ini: Ini, path: Path) -> float:
-    """Return the machine's unit of length in mm; LinuxCNC also accepts the number of units in a millimetre."""
     named = ini.text("TRAJ", "LINEAR_UNITS").lower() or "mm"
     per_mm = finite(named)
     if named not in UNITS_MM and not (per_mm and per_mm > 0):
@@ -294,7 +291,6 @@ def _axis(ini: Ini, hal: Hal, letter: str, joint: int, unit: _Unit, machine: Mac
 
 
 def _scale(ini: Ini, hal: Hal, joint: int, factor: float) -> Scale | None:
-    """Return the scale that HAL sets on the component at the joint's feedback or command, else the INI's."""
     for pin in (f"joint.{joint}.motor-pos-fb", f"joint.{joint}.motor-pos-cmd"):
         for component in hal.around(pin):
             for name in _SCALE_PINS:
@@ -309,7 +305,6 @@ def _scale(ini: Ini, hal: Hal, joint: int, factor: float) -> Scale | None:
 
 
 def _beside(ini: Ini, letter: str, joint: int, unit: _Unit) -> Iterator[str]:
-    """Yield what LinuxCNC itself corrects, and what that means for fdhil's offsets."""
     section = f"JOINT_{joint}"
     if (ini.number(section, "BACKLASH") or 0.0) > 0 or ini.text(section, "COMP_FILE"):
         yield (
@@ -332,7 +327,6 @@ def _beside(ini: Ini, letter: str, joint: int, unit: _Unit) -> Iterator[str]:
 
 
 def _loops(hal: Hal, letter: str, joint: int) -> Iterator[str]:
-    """Yield what a loop in HAL means for a drive that closes its own loop."""
     for loop in hal.loops_behind(f"joint.{joint}.motor-pos-cmd"):
         gains = _gains(hal.given, loop)
         yield (

@@ -72,7 +72,6 @@ def make(
 
 
 def _of_hal(draft: Draft, file: Path, nc: Machine, pins: Collection[str]) -> Draft:
-    """Make the draft of a machine whose drives are HAL pins behind the bridge that LinuxCNC runs."""
     draft.notes = [note for note in draft.notes if note not in nc.loops]
     bridge = {"interface": "socketcand", "channel": "hal", "port": HAL_PORT, "offset_lead_cycles": HAL_LEAD}
     for key, value in bridge.items():
@@ -98,7 +97,6 @@ def _of_hal(draft: Draft, file: Path, nc: Machine, pins: Collection[str]) -> Dra
 
 
 def _buses(draft: Draft, interface: Told | None, *, offline: bool) -> Iterator[tuple[str, CanBus]]:
-    """Settle the bus interface and yield its settings; several if the answers have several."""
     if not draft.has_table("bus"):
         where = "socketcan for an adapter that `ip link` lists; docs/how-to/can-adapter.md has the others"
         if interface is None and offline:

@@ -46,8 +46,7 @@ def _rapid_rad_s(known: Known) -> float:
 DRIVE_TOOL = "the drive's own tool shows it; if unknown accept the proposal: fdhil reports later whether it fits"
 SHEET = "the motor's data sheet"
 PITCH = Question(
-    "screw_pitch_mm",
-    "the screw's label or drawing; with a gear: the travel of the table per motor revolution",
+    "screw_pitch_mm", "the screw's label or drawing; with a gear: the travel of the table per motor revolution"
 )
 QUESTIONS = (
     Question("drive.increments_per_rev", "the drive's tool: position increments per motor revolution"),

@@ -70,7 +70,6 @@ def _parts(motions: Iterable[Motion], config: MachineConfig, block_rows: int, ma
 
 
 def _stopped_at_probes(motions: Iterable[Motion]) -> Iterator[Motion]:
-    """Yield motions with a stop before and after each probe move, since an NC probes from rest."""
     for motion in motions:
         if isinstance(motion, Probe):
             yield Dwell(motion.line, 0.0)

@@ -127,7 +127,6 @@ class CornerRules:
         return np.minimum(step, np.sqrt(self._dt_s / turn.jump_by_jerk))
 
     def _sharp_along(self, turn: _Turn, speed: Float) -> Float:
-        """Return the acceleration along the path that remains besides a sharp corner's step."""
         if self._filter_s:
             return np.full(speed.size, _UNLIMITED)
         used = speed * turn.kink_by_acceleration / self._dt_s + speed**2 * turn.curve_by_acceleration
@@ -151,7 +150,6 @@ class CornerRules:
         return np.maximum(half, (turn.bend_by_jerk + root) / (2.0 * budget))
 
     def _speed(self, turn: _Turn, half: Float) -> Float:
-        """Return the speed at which blends of this half length keep acceleration and jerk."""
         turning = self._peak * turn.kink_by_acceleration / (2.0 * half) + turn.bend_by_acceleration
         speed = np.sqrt(_BLEND_SHARE / turning)
         if self._filter_s:
@@ -160,7 +158,6 @@ class CornerRules:
         return np.asarray(speed)
 
     def _along(self, turn: _Turn, half: Float, speed: Float) -> Float:
-        """Return the acceleration along the path that remains besides a blend."""
         bend = self._peak * turn.kink_by_acceleration / (2.0 * half) + turn.bend_by_acceleration
         along = np.maximum(1.0 - speed**2 * bend, 1.0 - _BLEND_SHARE) / turn.along_by_acceleration
         if self._filter_s:

@@ -133,7 +133,6 @@ class LookAhead:
         check_duration(int(self._place) // 2, now_s, self._max_s)
 
     def _plan(self, stop: bool) -> None:
-        """Plan the new pieces together with the waiting ones; with ``stop`` all of them, to rest at the end."""
         if self._new:
             self._learn()
         last = self._path_mm if stop else self._sure_mm()
@@ -152,7 +151,6 @@ class LookAhead:
             self._give(cuts[: count + 1], energy[: count + 1], between[:count], acceleration[:count])
 
     def _learn(self) -> None:
-        """Append the new pieces to the curve, and their limits and those of their corners to the limits."""
         new = np.array(self._new)
         pieces = np.concatenate([self._last, new])
         self._new, self._last = [], pieces[-1:]

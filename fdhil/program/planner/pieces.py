@@ -65,7 +65,6 @@ def piece(motion: Rapid | Feed | Arc, start: Place, limits: AxisLimits) -> Row |
 
 
 def _turning(pieces: Float) -> Iterator[tuple[Int, tuple[int, int, int]]]:
-    """Yield the rows of the arcs of each plane with the plane's axes."""
     for plane, name in enumerate(PLANES):
         rows = np.flatnonzero(pieces[:, KIND] == plane)
         if rows.size:

@@ -59,7 +59,6 @@ class Segments:
 
 
 def _ramped_share(into: Float, chosen: Float) -> Float:
-    """Return the travelled share after ``into`` seconds of a rapid: accelerate, cruise, brake."""
     acceleration, ramp_s = chosen[:, _RATE], chosen[:, _RAMP_S]
     left = chosen[:, _SPAN_S] - into
     share = acceleration * ramp_s * (into - ramp_s / 2.0)
@@ -129,7 +128,6 @@ class Timeline:
         self._append(tuple(still), span_s, _EVEN)
 
     def _stop(self, settle_rows: int) -> None:
-        """Hold until the next row, then until the smoothed demand has arrived."""
         row = self._limits.rows(self._now_s) + settle_rows
         self._hold(max(0.0, row * self._dt_s - self._now_s))
         self._now_s = row * self._dt_s

@@ -101,7 +101,6 @@ class Planner:
             before.end_speed = speed
 
     def _run(self, left: int) -> Iterator[Row]:
-        """Run cycles until no more than ``left`` segments wait."""
         queue, cycles = self._queue, self._cycles
         while len(queue) > left + 1 or (not left and queue):
             here = queue[0]

@@ -12,15 +12,7 @@ from dataclasses import dataclass
 
 from fdhil.program.motions import Place, Point
 from fdhil.program.planner.limits import AxisLimits
-from fdhil.program.planner.linuxcnc.segments import (
-    ALONG_SHARE,
-    EXACT,
-    NORMAL_SHARE,
-    PARABOLA,
-    STOP,
-    TANGENT,
-    Segment,
-)
+from fdhil.program.planner.linuxcnc.segments import ALONG_SHARE, EXACT, NORMAL_SHARE, PARABOLA, STOP, TANGENT, Segment
 from fdhil.program.planner.linuxcnc.shapes import Led, Line, Turn, cross, dot, minus, plus, unit
 
 _KINK_SHARE = 0.1
@@ -67,7 +59,6 @@ def _forget_kink(before: Segment, after: Segment) -> None:
 
 
 def _passed(before: Segment, after: Segment, limits: AxisLimits) -> bool:
-    """Return whether the kink may be passed at full speed; else store the speed it allows."""
     t1, t2 = before.shape.tangent(before.shape.length), after.shape.tangent(0.0)
     if dot(t1, t2) < _REVERSAL:
         before.ending = EXACT  # measured: a stop, without a reserve for it
@@ -129,7 +120,6 @@ class _Arc:
 
 
 def _arc(before: Segment, after: Segment, limits: AxisLimits) -> _Arc | None:
-    """Return the arc tangent to both segments; None if none fits, since both must lie in one plane."""
     one, two = before.shape, after.shape
     if isinstance(one, Led) or isinstance(two, Led):
         return None
@@ -225,7 +215,6 @@ def _fastest(before: Segment, after: Segment, half: float, limits: AxisLimits, n
 def _touching(
     one: Line | Turn, two: Line | Turn, radius: float, normal: Point, steep: float
 ) -> tuple[Turn, float, float] | None:
-    """Return the arc of a radius inside the corner, and the lengths that it uses of both segments."""
     corner = two.at(0.0)
     t1 = one.tangent(one.length)
     reach = radius / steep

@@ -51,7 +51,6 @@ class Cycles:
         self._check_end(here)
 
     def _begin(self, here: Segment) -> None:
-        """Set the limits of the segment that becomes active."""
         self._begun, self._along, self._target = here, here.along, here.target
         self._target_next = self._queue[1].target if len(self._queue) > 1 else 0.0
         self._end_speed = min(here.end_speed, self._target, self._target_next) if here.ending == TANGENT else 0.0
@@ -100,7 +99,6 @@ class Cycles:
             self.others = tuple(at + here - start for at, here, start in more)
 
     def _check_end(self, here: Segment) -> None:
-        """Switch to the next segment at the end of this one; within a cycle unless it stops."""
         to_go = here.shape.length - here.place
         if to_go <= _AT_END_MM:
             self._pass_on(here, here.speed)
@@ -124,7 +122,6 @@ class Cycles:
             self._left_s, self._end = left, end
 
     def _over(self) -> Segment:
-        """Leave the active segment for the next within a cycle."""
         self._left_over, self._left_s = self._left_s, 0.0
         self._pass_on(self._queue[0], self._end)
         here = self._queue[0]
