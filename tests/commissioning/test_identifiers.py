@@ -1,4 +1,4 @@
-"""A drive whose PDO has the identifier of another node is refused before a frame leaves, wherever that is from."""
+"""A drive whose PDO has another node's COB-ID is refused before a frame is sent."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ MAPPED = {
 
 
 def dcf_of_node_5(folder: Path, offset_rpdo: int) -> Path:
-    """Return a DCF of node 5 with a fixed mapping, whose COB-IDs are absolute; RPDO2 carries the offset."""
+    """Write a DCF of node 5 with a fixed mapping and absolute COB-IDs; RPDO2 carries the offset."""
     variables: list[Variable] = [*COMMON, *OFFSETS, *CURRENT, *pdos(4, 2, "ro", MAPPED)]
     lines = ["[DeviceComissioning]", "NodeID=5"]
     for line in eds_text(
@@ -90,7 +90,9 @@ def test_guard_of_a_dcf_sends_what_the_file_says(tmp_path: Path) -> None:
 )
 def test_guard_is_refused_that_would_send_what_is_in_use(offset_rpdo: int, whose: str, tmp_path: Path) -> None:
     config = config_of(tmp_path, offset_rpdo, "XY", node_id=9)
-    with pytest.raises(ConfigError, match=f"COB-ID {offset_rpdo:03X}, with which the guard sends offsets, also belongs to {whose}"):
+    with pytest.raises(
+        ConfigError, match=f"COB-ID {offset_rpdo:03X}, with which the guard sends offsets, also belongs to {whose}"
+    ):
         settings_of(config, "can0", tmp_path, "")
 
 
@@ -116,7 +118,7 @@ def test_axes_of_one_device_share_no_identifier() -> None:
 
 
 def test_nothing_is_sent_to_a_drive_whose_identifiers_are_anothers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A node that is not configured answers to 0x301: its heartbeat is heard while the drive is off."""
+    """A node that is not configured uses 0x301: its heartbeat is received while the drive is off."""
     settings = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex}, guard={"clock": "sync"})
     plain = load_profile(settings.axis["X"].drive)
     moved = replace(plain, rpdos=(plain.rpdos[0], replace(plain.rpdos[1], cob_base=0x308)))

@@ -1,4 +1,4 @@
-"""What LinuxCNC's own INI and HAL files tell; with the package installed, all of its sample machines are read."""
+"""Import of LinuxCNC's INI and HAL files; with the package installed, all of its sample machines are read."""
 
 from __future__ import annotations
 
@@ -207,7 +207,7 @@ MAX_VELOCITY=100
 
 @pytest.mark.parametrize(
     ("traj", "x", "y", "limits"),
-    [  # path, then speed and acceleration of X and Y that LinuxCNC 2.9 reaches with these files
+    [  # path speed, then speed and acceleration of X and Y in LinuxCNC 2.9 with these files
         ("MAX_LINEAR_VELOCITY=100", "", "", (100.0, 100.0, 2000.0, 100.0, 2000.0)),
         ("MAX_LINEAR_VELOCITY=100\nMAX_LINEAR_ACCELERATION=100", "", "", (100.0, 100.0, 2000.0, 100.0, 2000.0)),
         (
@@ -268,7 +268,7 @@ def test_a_position_loop_is_found_under_any_name_and_behind_a_chain(hal: str, lo
 
 
 def test_a_loop_that_the_command_does_not_reach_is_no_position_loop(tmp_path: Path) -> None:
-    """A spindle's, and one that is fed by the position only."""
+    """A spindle's loop, and one that gets only the position."""
     hal = "loadrt pid names=spindle,other\nnet s motion.spindle-speed-out => spindle.command\n"
     hal += "net y joint.1.motor-pos-cmd => sum2.y.in0\nnet fb sum2.y.out => other.feedback\n"
     assert machine(tmp_path, drives=HAL_TEXT + hal).notes == []
@@ -333,5 +333,5 @@ def test_all_sample_machines_of_the_package_are_read_or_refused_by_name() -> Non
             read += 1
             assert found.axes
     assert read > 250
-    named = ("COORDINATES", "before 2.8", "nosuchfile")  # robots, old files, and one that includes what is not there
+    named = ("COORDINATES", "before 2.8", "nosuchfile")  # robots, old files, and one with a missing include
     assert [text for text in refused if not any(word in text for word in named)] == []

@@ -1,4 +1,4 @@
-"""A jog of a motor by its equations: whatever has a wrong sign or unit is named, whatever pulls at the axis."""
+"""A jog of a simulated motor: a wrong sign or unit is named, whatever load acts on the axis."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ R, K, J, FRICTION = 0.5, 0.8, 0.075, 5.0
 
 
 def jogged(weight_nm: float = 0.0, top_mm_s: float = 5.0, way_mm: float = JOG) -> Recording:
-    """Rows of a jog to and fro; ``weight_nm`` pulls at the axis all the time."""
+    """Samples of a jog back and forth; ``weight_nm`` acts on the axis all the time."""
     part = straight((0.0,), (way_mm,), (top_mm_s * DT,), (50.0 * top_mm_s / 5.0 * DT**2,), 20)[:, 0]
     rest = np.zeros(300)
     position = np.concatenate([rest, part, rest + way_mm, way_mm - part, rest])
@@ -80,7 +80,7 @@ def test_what_is_wrong_is_named(what: str) -> None:
 
 @pytest.mark.fault("B10")
 def test_words_that_are_swapped_are_told() -> None:
-    """A float whose two words are swapped is noise of any size."""
+    """A float with swapped words is noise of any size."""
     jog = jogged()
     noise = frozen(np.random.default_rng(2).normal(size=jog.speed_rad_s.size) * 1e3)
     assert "SignOrScale: voltage times current" in causes(replace(jog, voltage_v=noise))

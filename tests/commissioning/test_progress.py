@@ -1,4 +1,4 @@
-"""What was proven is kept for the same drive and configuration alone, and only as it was written."""
+"""Completed steps are reused only for the same drive and configuration, and only from an unmodified file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commissioning record: it comes back as it was or is refused; without the key nobody can make one."""
+"""The commissioning record is loaded unchanged or refused; without the key none can be made."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_a_changed_record_is_refused(key: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("seal", ["of no key", "of another key", "none", "no text", "not ASCII"])
 def test_a_record_made_without_the_key_is_refused(seal: str, tmp_path: Path) -> None:
-    """Everybody can compute the digest anew; the seal takes the key."""
+    """Anyone can recompute the digest; the seal needs the key."""
     path = save_record(RECORD, tmp_path)
     forged = replace(RECORD, watchdog="proven", options={"6007": 0})
     seals: dict[str, Any] = {"of no key": forged.seal(b""), "of another key": forged.seal(b"k" * 64), "none": None,

@@ -59,9 +59,7 @@ def test_strokes_of_a_rotary_axis_take_room_and_are_told_in_degrees() -> None:
     assert rapid.speed_mm_s == pytest.approx(280.0 * axis.mm_per_unit)
     assert str(rapid).endswith("deg toward plus at 280 deg/s")
     assert str(plan_jog("A", axis, Room(0.0, 90.0))) == "2.86479 deg toward plus at 2.86 deg/s"
-    with pytest.raises(
-        DriveFault, match=r"the room is \+0 to \+0\.1 deg, but the jog needs 0\.286 deg to one side"
-    ):
+    with pytest.raises(DriveFault, match=r"the room is \+0 to \+0\.1 deg, but the jog needs 0\.286 deg to one side"):
         plan_jog("A", axis, Room(0.0, 0.1))
 
 

@@ -1,4 +1,4 @@
-"""How evenly SYNC came and how soon it was answered, from frames with their stamps."""
+"""Evenness of SYNC and delay of its answers, from frames with time stamps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TPDO = 0x181
 
 
 def heard(answer_us: int = 200, hole: int = 0) -> Frames:
-    """200 SYNCs, each answered; after the hundredth nothing for ``hole`` periods."""
+    """200 answered SYNCs, with a gap of ``hole`` periods after the hundredth."""
     rows = []
     for k in range(200):
         t_ns = 1_000_000 * (k + (hole if k > 100 else 0)) + (3000 if k % 2 else 0)

@@ -1,4 +1,4 @@
-"""What is wrong, or nobody allows, ends the trial of a simulated axis at rest; how a good one goes, see tests/cli."""
+"""Faults and refusals end the trial of a simulated axis at standstill; a successful trial is in tests/cli."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ROOM = Room(-2.0, 130.0)
 
 @dataclass
 class Bench:
-    """A simulated drive that is signed off, and what its operator was told and asked."""
+    """A signed-off simulated drive, and the questions to its operator."""
 
     peer: DrivePeer
     config: MachineConfig
@@ -44,7 +44,7 @@ class Bench:
         return self.saw
 
     def tried(self, room: Room = ROOM) -> Trial:
-        """Try the axis; afterwards it is off and stands."""
+        """Run the trial; afterwards the axis is off and at standstill."""
         store = self.config.store.directory
         try:
             return try_axis(self.config, self.record, room, Operator(self.report, self.look), Progress(store, "X"))
@@ -59,7 +59,6 @@ class Bench:
 
 @pytest.fixture
 def quick_trial(quick_commissioning: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A shorter jog, and no sensor that may deliver later."""
     monkeypatch.setattr("fdhil.commissioning.strokes.JOG_MM", 1.0)
     monkeypatch.setattr("fdhil.commissioning.trial.TIMING_CYCLES", 100)
     monkeypatch.setattr("fdhil.commissioning.trial.LAST_REST_S", 0.4)
@@ -111,10 +110,12 @@ def test_stopped_trial_goes_on_within_the_room_that_it_began_with(bench: Bench) 
     assert results["room"]["return"] is None
     kept = progress.found("room", progress._steps["room"].holds_for)
     assert kept is not None
-    moved = {**kept, "stopped_mm": stood_mm - 5.0}  # as if somebody had moved it since, or the encoder lost its zero
+    moved = {**kept, "stopped_mm": stood_mm - 5.0}  # as if it was moved since, or the encoder lost its zero
     progress.keep("room", progress._steps["room"].holds_for, moved)
     for _ in range(2):
-        with pytest.raises(DriveFault, match=r"by the room of the interrupted trial, but --room is -2 to \+130 mm from here"):
+        with pytest.raises(
+            DriveFault, match=r"by the room of the interrupted trial, but --room is -2 to \+130 mm from here"
+        ):
             bench.tried()
     progress.keep("room", progress._steps["room"].holds_for, kept)
     bench.steps.clear()
@@ -165,7 +166,7 @@ def test_a_drive_that_was_set_up_anew_is_not_moved(bench: Bench) -> None:
     [("jog", 22, "target"), ("jog", 22, "offset"), ("test rapids", 0, "SYNC"), ("test rapids", 0, "target")],
 )
 def test_another_master_ends_the_trial(step: str, braking: int, what: str, bench: Bench) -> None:
-    """Braked within its acceleration, switched off or left to the other master; nothing is kept of the step."""
+    """Braked within its acceleration, switched off or left to the other master; the step is not stored."""
 
     def begins(frame: Frame) -> bool:
         return bench.steps[-1:] == [step] and moves(frame)

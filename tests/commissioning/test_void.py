@@ -1,4 +1,4 @@
-"""What voids a commissioning record, what is compared, and what makes it hold again."""
+"""What voids a commissioning record, what is compared, and what makes it valid again."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_before_the_guard_starts_each_record_is_compared(tmp_path: Path, monkeyp
         save_record(replace(RECORD, axis=axis), store)
     void_record(store, "Y", "booted")
     compare_again(config, "can0", told.append)
-    assert compared == told == []  # beside an NC nothing is asked
+    assert compared == told == []  # with an NC on the bus nothing is read
     assert is_void(store, "Y")
     nc[0] = False
     compare_again(config, "can0", told.append)

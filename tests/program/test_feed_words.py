@@ -1,4 +1,4 @@
-"""A program with other feeds: F words replaced, everything else byte for byte, and never other motions."""
+"""Changed feeds in a program: F words are replaced, everything else is identical, and the motions never change."""
 
 from __future__ import annotations
 

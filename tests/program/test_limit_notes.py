@@ -1,4 +1,4 @@
-"""A recorded demand that exceeds the limits of its NC is reported with axis, figure and place."""
+"""A recorded demand that exceeds the limits of its NC is reported with axis, figure and position."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Demand CSV in and out, and what a file is by its suffix."""
+"""Reading and writing of demand CSV, and recognition of files by their suffix."""
 
 from __future__ import annotations
 
@@ -58,7 +58,6 @@ def test_a_broken_demand_is_a_recording_error(lines: list[str], tmp_path: Path) 
 
 
 def test_a_missing_column_is_told_with_the_line_that_is_wanted(tmp_path: Path) -> None:
-    """With the axes of this machine."""
     (tmp_path / "d.csv").write_text("time_s,X_mm\n" + "\n".join(row.rpartition(",")[0] for row in ROWS))
     with pytest.raises(
         RecordingError, match="no column Y_mm, Z_mm; a demand begins with the line time_s,X_mm,Y_mm,Z_mm"

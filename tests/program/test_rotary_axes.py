@@ -1,4 +1,4 @@
-"""Programs with A B C words: what the NC orders of a rotary axis, alone and with X Y Z, by each profile."""
+"""Programs with A B C words: the demand of a rotary axis, alone and with X Y Z, by each profile."""
 
 from __future__ import annotations
 
@@ -26,13 +26,12 @@ def planned(text: str, config: MachineConfig) -> Trajectory:
 
 
 def turned(demand: Trajectory, config: MachineConfig) -> Float:
-    """Return A (n,) in degrees."""
     return demand.position_mm["A"] / config.axis["A"].mm_per_unit
 
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_mixed_move_turns_the_table_in_the_time_of_its_feed_along_xyz(profile: str) -> None:
-    """RS274: F is that of X Y Z where they move; A keeps to their share of the way."""
+    """RS274: F applies to X Y Z if they move; A follows in proportion."""
     config = machine(profile)
     demand = planned("G94 F600|G1 X30 Y40 A90", config)
     x, a = demand.position_mm["X"], turned(demand, config)
