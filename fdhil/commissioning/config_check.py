@@ -83,11 +83,11 @@ def compare_bus(traffic: Traffic, config: MachineConfig) -> Iterator[Finding]:
         yield judge_sync((np.diff(traffic.sync_ns) * 1e-9).tolist(), period_s, config.guard.clock == "sync")
 
 
-def compare_asked(config: MachineConfig, axis: str, heard: Sequence[int] = ()) -> list[Finding]:
-    """Compare a drive by SDO, while no NC runs the bus; ``heard`` are COB-IDs already received there."""
+def compare_asked(config: MachineConfig, axis: str, received: Sequence[int] = ()) -> list[Finding]:
+    """Compare a drive by SDO, while no NC runs the bus; ``received`` are COB-IDs already received there."""
     node = f"node-ID {config.node_id(axis)}"
     with Master(config, axis) as master:
-        master.heard.ids.update(heard)
+        master.heard.ids.update(received)
         try:
             found = survey(master)
             seen = f"{node}, serial number {found.identity.serial}"

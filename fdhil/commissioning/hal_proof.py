@@ -72,20 +72,20 @@ class HalAxis:
 
     def run(self, cycles: int, increments: int | None) -> Seen:
         """Answer so many SYNCs with an offset (None: with nothing); return what HAL reported. DriveFault on silence."""
-        seen, heard_s = Seen(), time.monotonic()
+        seen, last_frame_s = Seen(), time.monotonic()
         while len(seen.applied) < cycles:
             self._port.receive(self._ring, 0.05)
             for frame in self._ring.drain():
                 can_id = int(frame["id"])
                 data = int(frame["data"]).to_bytes(8, "little")[: int(frame["dlc"])]
                 if can_id == COB_SYNC:
-                    heard_s = time.monotonic()
+                    last_frame_s = time.monotonic()
                     if increments is not None:
                         values = (increments, data[0])
                         self._port.send(self._offset.cob_base + self._node_id, pack(self._offset.entries, values))
                 elif can_id in self._tpdos:
                     self._take(can_id, data, seen)
-            if time.monotonic() - heard_s > SILENCE_S:
+            if time.monotonic() - last_frame_s > SILENCE_S:
                 text = f"the bridge has sent nothing for {SILENCE_S:g} s: HAL ramps the offset to zero by itself"
                 raise DriveFault(self.device, f"{text}; start LinuxCNC and repeat the command")
         return seen

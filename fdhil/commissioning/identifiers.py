@@ -50,15 +50,15 @@ class Clash:
 ADVICE = "correct drive.node_id, the COB-IDs in the EDS or DCF, or the profile: no two PDOs may share an identifier"
 
 
-def find_clash(config: MachineConfig, axis: str, heard: Collection[int] = (), *, sent: bool = False) -> Clash | None:
+def find_clash(config: MachineConfig, axis: str, received: Collection[int] = (), *, sent: bool = False) -> Clash | None:
     """Return the first PDO of an axis whose COB-ID is in use; ``sent``: only of those that a guard sends.
 
-    ``heard`` are COB-IDs received on the bus.
+    ``received`` are COB-IDs received on the bus.
     """
     profile, node = load_profile(config.axis[axis].drive), config.node_id(axis)
     specs = sent_pdos(config, axis, profile) if sent else [*profile.rpdos, *profile.tpdos]
     taken: dict[int, tuple[str, str]] = {}
-    for cob_id, *whose in (*_in_use(config, axis), *_nodes_heard(config, axis, heard)):
+    for cob_id, *whose in (*_in_use(config, axis), *_nodes_heard(config, axis, received)):
         taken.setdefault(cob_id, (whose[0], whose[1]))
     valid = [spec for spec in (*profile.rpdos, *profile.tpdos) if spec.valid]
     for spec in specs:
@@ -78,21 +78,21 @@ def sent_pdos(config: MachineConfig, axis: str, profile: DriveProfile) -> list[P
     return [pdo[0] for pdo in found if pdo is not None]
 
 
-def compare_identifiers(config: MachineConfig, axis: str, heard: Collection[int] = ()) -> Finding:
+def compare_identifiers(config: MachineConfig, axis: str, received: Collection[int] = ()) -> Finding:
     """Compare the drive's COB-IDs with all identifiers in use."""
-    clash = find_clash(config, axis, heard)
+    clash = find_clash(config, axis, received)
     expected = "unique"
     if clash is None:
         return Finding(POINT, expected, expected)
     return Finding(POINT, expected, f"{clash.cob_id:03X} belongs to {clash.whose}", False, clash.cause, ADVICE)
 
 
-def require_own_identifiers(config: MachineConfig, bus: str, heard: Collection[int] = ()) -> None:
+def require_own_identifiers(config: MachineConfig, bus: str, received: Collection[int] = ()) -> None:
     """Raise ConfigError if a guard on this bus would send with another node's identifier."""
     for name, axis in config.axis.items():
         if axis.correction is None or axis.drive.bus != bus:
             continue
-        clash = find_clash(config, name, heard, sent=True)
+        clash = find_clash(config, name, received, sent=True)
         if clash is not None:
             text = f"COB-ID {clash.cob_id:03X}, with which the guard sends offsets, also belongs to {clash.whose}"
             raise ConfigError("config", [ConfigFault(clash.key, text, ADVICE)])
@@ -121,7 +121,7 @@ def _in_use(config: MachineConfig, own: str) -> Iterator[_Use]:
             yield from _predefined(node, f"axis {name}", f"axis.{name}.drive")
 
 
-def _nodes_heard(config: MachineConfig, own: str, heard: Collection[int]) -> Iterator[_Use]:
+def _nodes_heard(config: MachineConfig, own: str, received: Collection[int]) -> Iterator[_Use]:
     bus = config.axis[own].drive.bus
     names = [name for name, axis in config.axis.items() if axis.drive.bus == bus]
     nodes = {config.node_id(name) for name in names} | {config.guard.node_id}
@@ -131,14 +131,14 @@ def _nodes_heard(config: MachineConfig, own: str, heard: Collection[int]) -> Ite
         for profile in (load_profile(config.axis[name].drive),)
         for spec in (*profile.rpdos, *profile.tpdos)
     }
-    for node in sorted(_senders(heard, known) - nodes):
+    for node in sorted(_senders(received, known) - nodes):
         yield from _predefined(node, f"node-ID {node}, which was received on the bus", f"axis.{own}.drive")
 
 
-def _senders(heard: Collection[int], known: Collection[int]) -> set[int]:
+def _senders(received: Collection[int], known: Collection[int]) -> set[int]:
     """Return the node-IDs that sent frames other than the PDOs in ``known``."""
     bases = (*_SERVICES, *COB_TPDO)
-    sent = (can_id for can_id in heard if can_id <= 0x7FF and can_id & 0x780 in bases and can_id not in known)
+    sent = (can_id for can_id in received if can_id <= 0x7FF and can_id & 0x780 in bases and can_id not in known)
     return {can_id & 0x7F for can_id in sent if can_id & 0x7F and can_id & 0x780 != COB_SDO_REQUEST}
 
 

@@ -186,25 +186,25 @@ class Master:
                     self.bus.send(spec.cob_base + self.node_id, bytes(spec.length))
 
     def take(self, can_id: int, data: bytes) -> None:
-        node, heard, spec = self.node_id, self.heard, self._tpdos.get(can_id)
+        node, feedback, spec = self.node_id, self.heard, self._tpdos.get(can_id)
         error = bool(can_id & ERROR_FLAG)
-        heard.errors, heard.frames = heard.errors + error, heard.frames + (not error)
-        heard.ids.add(can_id)
+        feedback.errors, feedback.frames = feedback.errors + error, feedback.frames + (not error)
+        feedback.ids.add(can_id)
         if spec is not None and len(data) >= spec.length:
             if can_id == self._last_answer:
                 self._take_answer()
             elif can_id in self._seldom:  # it follows the last answer to its SYNC
                 self._due[can_id] = self._answered + self._seldom[can_id]
             for entry, value in zip(spec.entries, cia402.unpack(spec.entries, data), strict=True):
-                heard.objects[entry.index, entry.sub] = value
-                heard.cycle[entry.index, entry.sub] = self.cycle
+                feedback.objects[entry.index, entry.sub] = value
+                feedback.cycle[entry.index, entry.sub] = self.cycle
         elif can_id == self.sdo.response_id:
             self.sdo.deliver(data)
         elif can_id == cia402.COB_EMCY + node:
-            heard.emergencies.append(data)
+            feedback.emergencies.append(data)
         elif can_id == cia402.COB_HEARTBEAT + node and data:
-            heard.nmt = data[0] & 0x7F
-            heard.boots += heard.nmt == cia402.Nmt.BOOT_UP
+            feedback.nmt = data[0] & 0x7F
+            feedback.boots += feedback.nmt == cia402.Nmt.BOOT_UP
         elif can_id in self._offset_ids and self.loop.beside_guard:
             self.loop.offsets_heard.add(can_id)
 

@@ -194,12 +194,12 @@ class Bench:
         """Raise DriveFault if an axis is outside its travel, or away from the start without ``go_to_start``."""
         for master, at, away, of in zip(self.masters, here, self.away_mm(here), self.plan.bounds, strict=True):
             if not of.low <= at <= of.high:
-                stands = self._shown(master, self._mm(master, at))
-                text = f"its position is {stands}, outside its travel; move it inside by hand"
+                position = self._shown(master, self._mm(master, at))
+                text = f"its position is {position}, outside its travel; move it inside by hand"
                 raise DriveFault(master.device, text)
             if abs(away) > NEAR_MM and not go_to_start:
-                stands, off = (self._shown(master, mm) for mm in (self._mm(master, at), abs(away)))
-                text = f"its position is {stands}, {off} from the start of the demand"
+                position, off = (self._shown(master, mm) for mm in (self._mm(master, at), abs(away)))
+                text = f"its position is {position}, {off} from the start of the demand"
                 raise DriveFault(master.device, f"{text}; move it there, or use --go-to-start to move it there slowly")
 
     def _mm(self, master: Master, increments: float) -> float:

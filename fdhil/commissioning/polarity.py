@@ -23,11 +23,11 @@ CODE = "SignOrScale"
 
 def judge_jog(jog: Recording, distance_mm: float, axis: Axis) -> Iterator[Finding]:
     """Compare the recording of a jog over ``distance_mm`` and back with an axis whose units are correct."""
-    asked = abs(distance_mm)
+    commanded = abs(distance_mm)
     way = float(np.nanmax(np.abs(jog.position_mm - jog.position_mm[np.isfinite(jog.position_mm)][0])))
-    wanted, went = axis.shown(asked, form="g"), axis.shown(way, form=".3f")
+    wanted, went = axis.shown(commanded, form="g"), axis.shown(way, form=".3f")
     cause = f"{CODE}: it was commanded {wanted}, but its position (0x6064) moved {went}"
-    same = abs(way - asked) <= TRAVEL_TOLERANCE * asked
+    same = abs(way - commanded) <= TRAVEL_TOLERANCE * commanded
     advice = "its set-point and position have different scales; correct its factors (0x6091, 0x6092)"
     yield Finding("travel", wanted, went, same, cause, advice)
     yield _speed(jog)

@@ -156,8 +156,8 @@ def scan_nodes(bus: BusScanner, axes: Mapping[int, str], descriptions: Sequence[
     if not found and master is None:
         text = "no node sent a frame and none answered; check the drives' supply, wiring and bit rate"
         raise ConnectError(f"bus {bus.name}", text)
-    asked = {node_id: _ask(bus, node_id, descriptions) for node_id in sorted(answering)}
-    nodes = [_node(bus.traffic, node_id, axes.get(node_id), asked.get(node_id)) for node_id in found]
+    answers = {node_id: _ask(bus, node_id, descriptions) for node_id in sorted(answering)}
+    nodes = [_node(bus.traffic, node_id, axes.get(node_id), answers.get(node_id)) for node_id in found]
     return BusScan(bus.name, master, bus.traffic.sync_period_s, tuple(nodes))
 
 

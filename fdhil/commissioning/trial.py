@@ -105,10 +105,10 @@ def try_axis(
                     operator.result("jog", trial.found["jog"])
                 operator.report("test rapids")
                 enable(master)
-                heard = rapids_to_and_fro(master, travel_mm, rapid, operator)
+                capture = rapids_to_and_fro(master, travel_mm, rapid, operator)
                 operator.report("restore")
-    trial.outcomes = tuple(identify(config, axis, heard.records, known))
-    trial.found |= judged(config, axis, trial.outcomes, heard.recording(), operator)
+    trial.outcomes = tuple(identify(config, axis, capture.records, known))
+    trial.found |= judged(config, axis, trial.outcomes, capture.recording(), operator)
     trial.found["test rapids"] = {"rapid": str(rapid), "moves": RAPIDS, **trial.found["test rapids"]}
     for step in FROM_RAPIDS:
         progress.keep(step, now, trial.found[step])
@@ -145,10 +145,10 @@ def _shown(master: Master, travel_mm: Travel) -> dict[str, str]:
 
 
 def judged(
-    config: MachineConfig, axis: str, outcomes: Sequence[Outcome], heard: Recording, operator: Operator
+    config: MachineConfig, axis: str, outcomes: Sequence[Outcome], recording: Recording, operator: Operator
 ) -> dict[str, Found]:
     """Return the rapids' results by step; DriveFault for the first deviation."""
-    balance = judge_acceleration(heard)
+    balance = judge_acceleration(recording)
     if balance.ok is False:
         raise DriveFault(f"drive {axis}", f"{balance.cause}; {balance.advice}")
     operator.result("test rapids", {balance.point: balance.found})
@@ -200,11 +200,11 @@ def time_bus(master: Master) -> Found:
 
 def jog_to_and_fro(master: Master, travel_mm: Travel, jog: Stroke, operator: Operator) -> Found:
     """Jog an enabled axis and back: units and signs must be right, also according to the operator; DriveFault."""
-    with Overhearing(master.config, master.axis) as heard:
+    with Overhearing(master.config, master.axis) as capture:
         for moved in (jog, jog.back()):
             stroke(master, travel_mm, moved, JOG_REST_S, operator.at)
-        wait_heard(master, heard)
-    findings = list(judge_jog(heard.recording(), jog.distance_mm, jog.axis))
+        wait_heard(master, capture)
+    findings = list(judge_jog(capture.recording(), jog.distance_mm, jog.axis))
     require(master, findings)
     saw = operator.saw(f"The drive moved {jog}, and back. Did the table do the same?")
     if saw is False:
@@ -216,24 +216,24 @@ def jog_to_and_fro(master: Master, travel_mm: Travel, jog: Stroke, operator: Ope
     return {"jog": str(jog), "seen": "not asked" if saw is None else "yes"} | {f.point: f.found for f in findings}
 
 
-def wait_heard(master: Master, heard: Overhearing) -> None:
+def wait_heard(master: Master, capture: Overhearing) -> None:
     """Wait until all moves so far have been recorded, by a separate sensor too."""
-    goal = heard.newest_tick + round(LAST_REST_S / master.period_s)
+    goal = capture.newest_tick + round(LAST_REST_S / master.period_s)
     patience_s = HEARD_TIMEOUT_S + LAST_REST_S
 
     def reached() -> bool:
-        heard.check()
-        return heard.newest_tick >= goal
+        capture.check()
+        return capture.newest_tick >= goal
 
     master.wait(reached, patience_s, "its TPDOs are no longer received; check the bus")
 
 
 def rapids_to_and_fro(master: Master, travel_mm: Travel, rapid: Stroke, operator: Operator) -> Overhearing:
     """Move an enabled axis back and forth as fast as G0, and return the recording."""
-    with Overhearing(master.config, master.axis, rapid.speed_mm_s) as heard:
+    with Overhearing(master.config, master.axis, rapid.speed_mm_s) as capture:
         master.wait_cycles(round(REST_S / master.period_s))
         for _ in range(RAPIDS // 2):
             for moved in (rapid, rapid.back()):
                 stroke(master, travel_mm, moved, REST_S, operator.at)
-        wait_heard(master, heard)
-    return heard
+        wait_heard(master, capture)
+    return capture

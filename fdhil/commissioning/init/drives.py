@@ -27,7 +27,7 @@ NO_WINDOW = (0, 0xFFFFFFFF)
 
 @dataclass(frozen=True, slots=True)
 class FoundDrive:
-    """A drive, or one axis of a multi-axis device; ``told`` by key within [axis.X], except its window and cycle."""
+    """A drive, or one axis of a multi-axis device; its values by key within [axis.X], without window and cycle."""
 
     bus: str
     node_id: int
