@@ -1,8 +1,8 @@
-"""Threads that run one at a time, by a clock of their own: a test of several threads does the same in every run.
+"""Threads that run one at a time, on their own clock: a test of several threads is repeatable.
 
-``virtual_threads`` takes the test and all threads that it starts. One of them runs until it sleeps or waits; then that
-one runs which has waited longest of those that may go on. The clock stands still while one runs; where all wait, it
-advances to the first deadline. So a busy host changes nothing, and a wait costs no time.
+``virtual_threads`` controls the test and all threads that it starts. One of them runs until it sleeps or waits; then
+the ready thread that has waited longest runs. The clock stands still while one runs; if all wait, it advances to the
+first deadline. So a busy host changes nothing, and a wait costs no time.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 FIRST_S = 1000.0
 FIRST_WALL_S = 1_790_000_000.0
-OUTSIDE_S = 0.001  # how often is looked for what comes from outside, where no thread has a deadline
+OUTSIDE_S = 0.001  # polling period for outside events if no thread has a deadline
 UNWOUND_S = 10.0
-ROUNDING_S = 1e-9  # who computes what is left of a time-out finds that it is over
+ROUNDING_S = 1e-9  # a computed remaining time-out is then zero
 
 _sleep, _monotonic, _wall_s = time.sleep, time.monotonic, time.time
 _start, _join, _wait = threading.Thread.start, threading.Thread.join, threading.Condition.wait
@@ -48,9 +48,9 @@ class _Mark(threading.local):
 
 
 class VirtualThreads:
-    """Runs the thread that makes it, and those that it starts; ``now_s`` is their monotonic time.
+    """Runs its own thread and those that it starts; ``now_s`` is their monotonic time.
 
-    ``seed``: which of those that may go on runs next is drawn by lot, where it is given.
+    ``seed``: the next of the ready threads is selected at random, if given.
     """
 
     def __init__(self, seed: int | None = None) -> None:
@@ -63,7 +63,7 @@ class VirtualThreads:
         self._thread.takes_turns = True
 
     def wait(self, ready: Callable[[], bool], seconds: float | None) -> bool:
-        """Let others run until ``ready``, at most for so long; return whether it is."""
+        """Let others run until ``ready``, at most for the given time; return whether it is."""
         turn = _Turn(ready, math.inf if seconds is None else self.now_s + seconds + ROUNDING_S)
         self._waiting.append(turn)
         self._hand_on(turn)
@@ -102,7 +102,7 @@ class VirtualThreads:
         while self._ended:
             _join(self._ended.pop())
 
-    # what stands in for the functions of the standard library -------------------------------------------------------
+    # replacements of standard-library functions ---------------------------------------------------------------------
 
     def monotonic(self) -> float:
         return self.now_s if self._thread.takes_turns else _monotonic()
@@ -117,7 +117,7 @@ class VirtualThreads:
             _sleep(seconds)
 
     def wait_condition(self, condition: Any, timeout: float | None = None) -> bool:
-        """Stand in for ``Condition.wait``; its ``notify`` releases the lock."""
+        """Replace ``Condition.wait``; its ``notify`` releases the lock."""
         if not self._thread.takes_turns:
             return _wait(condition, timeout)
         waiter = threading.Lock()
@@ -149,7 +149,7 @@ class VirtualThreads:
                 self._hand_on()
 
         thread.run = run_in_turn  # type: ignore[method-assign]
-        self._thread.takes_turns = False  # the new thread says that it exists before it waits for its turn
+        self._thread.takes_turns = False  # the new thread reports its start before it waits for its turn
         try:
             _start(thread)
         finally:
@@ -182,7 +182,7 @@ class VirtualThreads:
         return self.wait(lambda: bool(poll.poll(0)), seconds)
 
     def when_readable(self, call: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a call of a socket that lets others run until there is something to read."""
+        """Return a socket call that lets others run until there is data to read."""
 
         def waiting(connection: socket.socket, *given: Any) -> Any:
             blocks = connection.gettimeout() != 0 and connection.fileno() >= 0
@@ -197,8 +197,8 @@ class VirtualThreads:
         return waiting
 
     def install(self, patch: pytest.MonkeyPatch) -> None:
-        """Replace what threads wait with, and the clocks; a pool of threads waits by a queue made of these."""
-        # python-can measures how long it waits by the wall clock
+        """Replace the waiting functions of threads, and the clocks; a thread pool waits by a queue made of these."""
+        # python-can measures its waiting time by the wall clock
         for module, name in ((time, "monotonic"), (threading, "_time"), (queue, "time"), (can.bus, "time")):
             patch.setattr(module, name, self.monotonic)
         patch.setattr(time, "time", self.wall_s)
@@ -215,7 +215,7 @@ class VirtualThreads:
         patch.setattr(selectors.DefaultSelector, "select", lambda *given: self.select(*given))
 
     def release(self) -> None:
-        """Let every thread run on by itself."""
+        """Let every thread run freely."""
         self._thread.takes_turns, self._released = False, True
         while self._waiting:
             self._waiting.pop().go.release()
@@ -223,7 +223,7 @@ class VirtualThreads:
 
 @pytest.fixture
 def virtual_threads(request: pytest.FixtureRequest) -> Iterator[VirtualThreads]:
-    """Run the test and the threads that it starts one at a time on virtual time; a seed is its parameter."""
+    """Run the test and its threads one at a time on virtual time; its parameter is a seed."""
     threads = VirtualThreads(getattr(request, "param", None))
     with pytest.MonkeyPatch.context() as patch:
         threads.install(patch)

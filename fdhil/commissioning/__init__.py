@@ -1,1 +1,1 @@
-"""Scans, compares, moves by 10 um and signs off: the only room besides the guard that sends on a bus."""
+"""Commission drives: scan the bus, compare, move by 10 um, sign off. Only this package and the guard send on a bus."""

@@ -1,4 +1,4 @@
-"""Listens to a bus beside whoever runs it, and gathers the traffic of an NC and of the nodes. Sends nothing."""
+"""Record the traffic of a bus, of the NC and of all nodes, while somebody else runs it. Nothing is sent."""
 
 import statistics
 import threading
@@ -16,8 +16,8 @@ from fdhil.errors import ConnectError
 
 LISTEN_S = 2.5  # a heartbeat of one second comes twice
 UNREADABLE = (
-    "only frames in error are heard; nothing was sent, for it would disturb whoever talks there; "
-    "set the bit rate of the bus on the interface, and check termination and wiring"
+    "only error frames are received, so the bit rate is probably wrong; nothing was sent, not to disturb the bus; "
+    "set the bus's bit rate on the interface, then check termination and wiring"
 )
 _TURN_S = 0.002
 _MASTER_FRAMES = {COB_SYNC: "SYNC", COB_NMT: "NMT commands", 0x7E5: "LSS commands"}
@@ -29,7 +29,7 @@ _NODE_FUNCTIONS = (0x080, 0x180, 0x280, 0x380, 0x480, COB_SDO_RESPONSE, COB_HEAR
 
 
 def shows_master(can_id: int) -> str | None:
-    """What a frame with this id, its flags included, shows that only a master sends; None when a node may send it.
+    """Return what a frame with this COB-ID, flags included, shows that only a master sends; None if a node may send it.
 
     >>> shows_master(0x205)
     'set-points'
@@ -43,7 +43,7 @@ def shows_master(can_id: int) -> str | None:
 
 @dataclass(slots=True)
 class Traffic:
-    """The frames heard: per COB-ID those counted, the newest length and data; heartbeats and EMCY per node; errors.
+    """Counts the frames received: per COB-ID with the newest length and data, per node heartbeats and EMCY, and errors.
 
     ``requests`` are the COB-IDs of remote frames, with their flag.
     """
@@ -58,7 +58,7 @@ class Traffic:
     requests: set[int] = field(default_factory=set)
 
     def take(self, frames: Frames) -> None:
-        """Take a block of frames; those with 29 bit identifiers are left aside, error frames counted."""
+        """Add a block of frames; 29-bit identifiers are ignored, error frames are counted."""
         self.errors += int((frames["id"] & ERROR_FLAG != 0).sum())
         self.requests |= set(frames["id"][frames["id"] & ~np.uint32(0x7FF) == REMOTE_FLAG].tolist())
         for frame in frames[frames["id"] <= 0x7FF]:
@@ -75,43 +75,43 @@ class Traffic:
 
     @property
     def ids(self) -> tuple[int, ...]:
-        """COB-IDs that were heard so far; another thread may take frames meanwhile."""
+        """COB-IDs received so far; another thread may add frames meanwhile."""
         return tuple(self.count)
 
     @property
     def master(self) -> str | None:
-        """What shows that a master runs the bus, None when nothing does."""
+        """The evidence that a master runs the bus; None if there is none."""
         signs = [shows_master(can_id) for can_id in (*self.ids, *self.requests)]
         return "SYNC" if self.sync_ns else next((sign for sign in signs if sign), None)
 
     @property
     def nodes(self) -> set[int]:
-        """Node-IDs that were heard to send."""
+        """Node-IDs that have sent a frame."""
         return {i & 0x7F for i in self.ids if i & 0x780 in _NODE_FUNCTIONS and i & 0x7F}
 
     @property
     def sync_period_s(self) -> float | None:
-        """Median period of SYNC, None before the second one."""
+        """Median SYNC period; None before the second SYNC."""
         return _period_s(self.sync_ns)
 
     def heartbeat_s(self, node_id: int) -> float | None:
-        """Median period of a node's heartbeat, None before the second one."""
+        """Return the median period of a node's heartbeat; None before the second one."""
         return _period_s(self.beats.get(node_id, []))
 
     def nmt(self, node_id: int) -> str | None:
-        """The NMT state of a node's newest heartbeat, None without one."""
+        """Return the NMT state of a node's newest heartbeat; None without one."""
         data = self.data.get(COB_HEARTBEAT + node_id)
         known = {int(state): state.name.lower().replace("_", "-") for state in Nmt}
         return None if data is None else known.get(data & 0x7F, f"unknown ({data & 0x7F:02X})")
 
 
 def _period_s(stamps_ns: list[int]) -> float | None:
-    """Median of what lies between stamps, None of a single one: a producer or a stamp late once says nothing."""
+    """Return the median interval, robust against a single late stamp; None for fewer than two stamps."""
     return statistics.median(later - t for t, later in pairwise(stamps_ns)) * 1e-9 if stamps_ns[1:] else None
 
 
 class BusListener:
-    """Gathers the traffic of a bus in a thread of its own until it is closed; a context manager."""
+    """Records the traffic of a bus in its own thread until it is closed; a context manager."""
 
     def __init__(self, bus: CanBus) -> None:
         self.traffic = Traffic()
@@ -126,11 +126,11 @@ class BusListener:
             self.take(self._bus.drain())
 
     def take(self, frames: Frames) -> None:
-        """Take what came since the last turn."""
+        """Process the frames received since the last poll."""
         self.traffic.take(frames)
 
     def listen(self, seconds: float) -> None:
-        """Listen for a while; ConnectError when the bus ends meanwhile."""
+        """Listen for a time; ConnectError if the bus ends meanwhile."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             if self._bus.ended is not None:
@@ -138,7 +138,7 @@ class BusListener:
             time.sleep(0.01)
 
     def require_readable(self) -> None:
-        """ConnectError where frames in error are all that is heard: the bus talks at another bit rate."""
+        """Raise ConnectError if only error frames are received: the bus uses another bit rate."""
         if self.traffic.errors and not self.traffic.count:
             raise ConnectError(f"bus {self.name}", UNREADABLE)
 

@@ -1,7 +1,7 @@
-"""Notices another master on a bus that fdhil sends on, and decides what may still leave beside it.
+"""Detect another master on a bus that fdhil sends on, and decide which frames may still be sent.
 
-Every frame that comes passes :meth:`BusWatch.take` before anybody else reads it, and every frame that leaves passes
-:meth:`BusWatch.admit`: no step of a commissioning, of what is played or of a check has to look for another master.
+Every received frame passes :meth:`BusWatch.take` before any other reader, every sent one :meth:`BusWatch.admit`, so
+that commissioning, playback and comparison need no check of their own for another master.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ _DOWNLOAD = 1  # command specifier of an SDO request that writes (CiA 301, 7.2.4
 
 
 class BusWatch:
-    """``sign`` is what another master was first heard to send, None while none was heard; it is never taken back.
+    """Tracks another master on one bus.
 
-    ``sent_by_other`` are its COB-IDs, ``led_by_other`` the axes whose set-points it sends or whose node it stopped by
-    NMT; ``stopped`` are those that it has not started since. ``written`` are the objects that fdhil wrote, by node-ID
-    and index. One thread takes frames, any may send.
+    ``sign`` is the first frame of another master, None without one; it is never cleared. ``sent_by_other`` are the
+    COB-IDs it sent, ``led_by_other`` the axes whose set-points it sends or whose node it stopped by NMT; ``stopped``
+    are those it has not started since. ``written`` are the objects that fdhil wrote, by node-ID and index. One thread
+    adds received frames, any thread may send.
     """
 
     def __init__(self, name: str, guard_runs: Callable[[], bool] = lambda: False) -> None:
@@ -45,14 +46,14 @@ class BusWatch:
 
     @classmethod
     def of(cls, name: str, config: MachineConfig, guard_runs: Callable[[], bool] = lambda: False) -> BusWatch:
-        """Return the watch of a bus whose drives the configuration names; a guard that runs may send their offsets."""
+        """Return the watch of a bus with the drives of a configuration; a running guard may send their offsets."""
         watch = cls(name, guard_runs)
         for axis, settings in config.axis.items():
             if settings.drive.bus != name:
                 continue
             try:
                 profile = load_profile(settings.drive)
-            except (ConfigError, EdsError):  # it cannot be led; its node is watched by the standard's identifiers
+            except (ConfigError, EdsError):  # not controllable; its node is watched by the predefined identifiers
                 continue
             watch._add_drive(axis, profile, config.node_id(axis))
             if settings.table is not None and settings.table.cob_id is not None:
@@ -67,7 +68,7 @@ class BusWatch:
         self._axis_of |= dict.fromkeys({spec.cob_base + node_id for spec in profile.rpdos} - offsets, axis)
 
     def take(self, can_id: int, data: bytes) -> None:
-        """Take a frame that came, with the flags of its identifier."""
+        """Inspect a received frame; ``can_id`` includes its flags."""
         if can_id in self._harmless and can_id not in self._sent:
             return
         sign = self._sign_of(can_id)
@@ -88,7 +89,7 @@ class BusWatch:
         axes = {axis for axis, node in self._node_of.items() if node_id in (0, node)}
         if command == cia402.NmtCommand.START:
             self.stopped -= axes
-        elif command in tuple(cia402.NmtCommand):  # a node that is not operational takes no PDO
+        elif command in tuple(cia402.NmtCommand):  # a node that is not operational ignores PDOs
             self.stopped |= axes
             self.led_by_other |= axes
 
@@ -102,12 +103,12 @@ class BusWatch:
         return shows_master(can_id) or ("with identifiers of fdhil" if can_id in self._sent else None)
 
     def sync_came(self) -> bool:
-        """Whether another master sent SYNC since this was asked last."""
+        """Return whether another master has sent SYNC since the last call."""
         before, self._syncs_before = self._syncs_before, self._syncs
         return self._syncs_before > before
 
     def admit(self, can_id: int, data: bytes) -> None:
-        """Let a frame leave; ForeignMaster for one that may not leave beside another master."""
+        """Register a frame that is about to be sent; ForeignMaster if another master forbids it."""
         if not self.may_send(can_id):
             raise self.refusal("nothing more was sent")
         self._sent.add(can_id)
@@ -115,23 +116,23 @@ class BusWatch:
             self.written.add((can_id & 0x7F, int.from_bytes(data[1:3], "little")))
 
     def may_send(self, can_id: int) -> bool:
-        """Whether a frame may leave: beside another master only what brings a drive to rest that it does not lead."""
+        """Return whether a frame may be sent: with another master only what stops a drive that it does not control."""
         if self.sign is None or can_id == cia402.COB_SYNC or can_id & ~0x7F == cia402.COB_HEARTBEAT:
             return True
         axis = self._axis_of.get(can_id)
         return axis not in self.led_by_other if axis else can_id in self._offsets - self.sent_by_other
 
     def refusal(self, outcome: str) -> ForeignMaster:
-        """Return what to raise; ``outcome`` says how the drives were left."""
+        """Return the exception to raise; ``outcome`` describes how the drives were left."""
         sends = "SYNC or set-points" if self.sign in ("SYNC", "set-points") else self.sign
         text = f"an NC is sending {sends}; switch it off while fdhil acts on the bus, then start again"
         return ForeignMaster(
-            f"bus {self.name}", f"{text}: {outcome} (first heard: COB-ID {self._first_id & 0x7FF:03X})"
+            f"bus {self.name}", f"{text}: {outcome} (first frame: COB-ID {self._first_id & 0x7FF:03X})"
         )
 
 
 def offset_ids(profile: DriveProfile, node_id: int) -> Iterator[int]:
-    """Yield the COB-IDs of the RPDOs that carry no target, but what a guard sends."""
+    """Yield the COB-IDs of the RPDOs that carry offsets (sent by a guard) but no target."""
     offsets = {profile.offset, profile.speed_offset, profile.torque_offset}
     for spec in profile.rpdos:
         keys = {(entry.index, entry.sub) for entry in spec.entries}
@@ -140,7 +141,7 @@ def offset_ids(profile: DriveProfile, node_id: int) -> Iterator[int]:
 
 
 class WatchedRing(FrameRing):
-    """A ring whose frames a watch takes before they can be read."""
+    """Passes each frame to a watch before it can be read."""
 
     def __init__(self, capacity: int, watch: BusWatch) -> None:
         super().__init__(capacity)

@@ -1,7 +1,6 @@
-"""Compares drives with their records: read again by SDO, with no NC on the bus.
+"""Compare drives with their commissioning records by reading them again by SDO, while no NC runs the bus.
 
-The answer is one finding per axis; it is ok only where the fingerprint is the record's and nothing differs from the
-configuration either.
+Each axis gives one finding; it is ok if the fingerprint is unchanged and the drive matches the configuration.
 """
 
 from collections.abc import Callable
@@ -24,20 +23,20 @@ TURN_S = 0.1
 
 
 def found_fingerprint(found: Survey) -> str:
-    """Return the fingerprint of a drive as it was just read."""
+    """Return the fingerprint of a drive as just read."""
     identity = found.identity
     who = (identity.vendor_id, identity.product_code, identity.revision, identity.serial)
     return fingerprint(who, found.fingerprint, found.options)
 
 
 def compare_record(record: CommissioningRecord, found: Survey) -> Finding:
-    """Compare a drive as it was just read with its record."""
+    """Compare a drive as just read with its record."""
     wrong = next((each for each in found.findings if each.ok is False), None)
     cause = f"{wrong.cause}; {wrong.advice}" if wrong else ""
     seen = found_fingerprint(found)
     if not cause and seen != record.fingerprint:
-        cause = f"it is not as it was commissioned: {_difference(record, found)}"
-    advice = f"put it right with the drive's own tool, or run fdhil commission --axis {record.axis}"
+        cause = f"it has changed since it was commissioned: {_difference(record, found)}"
+    advice = f"correct it with the drive's own tool, or run fdhil commission --axis {record.axis}"
     return Finding(POINT, record.fingerprint, seen, not cause, cause, advice)
 
 
@@ -45,16 +44,16 @@ def _difference(record: CommissioningRecord, found: Survey) -> str:
     if record.serial != found.identity.serial:
         return f"its serial number is {found.identity.serial}, not {record.serial}"
     if record.mapping_fingerprint != found.fingerprint:
-        return "its PDOs are set up otherwise"
+        return "its PDO mapping is different"
     for key in sorted({*record.options, *found.options}):
         was, now = record.options.get(key), found.options.get(key)
         if was != now and not is_rpdo(key):
             return f"0x{key} is {'missing' if now is None else now}, and was {'missing' if was is None else was}"
-    return "vendor, product or revision are others"
+    return "its vendor, product or revision is different"
 
 
 def compare_drive(config: MachineConfig, record: CommissioningRecord) -> Finding:
-    """Read the drive by SDO and compare it; one that does not answer differs. ForeignMaster beside an NC."""
+    """Read the drive by SDO and compare it; one that does not answer differs. ForeignMaster if an NC runs the bus."""
     try:
         with Master(config, record.axis) as master:
             return compare_record(record, survey(master))
@@ -66,12 +65,13 @@ def compare_drive(config: MachineConfig, record: CommissioningRecord) -> Finding
 
 
 def compare_again(config: MachineConfig, bus: str, say: Callable[[str], None]) -> None:
-    """Before a guard starts: with no NC on the bus compare every commissioned drive; what differs voids its record.
+    """Compare every commissioned drive before a guard starts; a drive that differs voids its record.
 
-    Beside an NC nothing is sent, and the records hold as long as nothing against them is seen: a frame that carries
-    the offset of a drive and is none of its RPDOs is. ``say`` gets one sentence per record that is void now.
-    ConfigError where a COB-ID of the guard's is that of a node that is heard; ConnectError when the bus cannot be
-    opened; StoreError.
+    With an NC on the bus nothing is sent, and a record stays valid unless the traffic contradicts it: a frame that
+    carries the drive's offset and is none of its RPDOs does. ``say`` gets one sentence per voided record.
+
+    ConfigError if a COB-ID of the guard is used by a node on the bus; ConnectError if the bus cannot be opened;
+    StoreError.
     """
     records = _records(config, bus)
     if not records:
@@ -87,11 +87,11 @@ def compare_again(config: MachineConfig, bus: str, say: Callable[[str], None]) -
                 compared = compare_drive(config, record)
                 if compared.ok:
                     confirm_record(config.store.directory, record.axis, mark)
-        except ForeignMaster:  # it came meanwhile
+        except ForeignMaster:  # an NC started meanwhile
             return
         if not compared.ok:
             void_record(config.store.directory, record.axis, compared.cause)
-            text = f"RecordVoid: axis {record.axis}: {compared.cause}; nothing can be armed or adopted there"
+            text = f"RecordVoid: axis {record.axis}: {compared.cause}; the axis cannot be armed or adopted"
             say(f"{text}; {compared.advice}")
 
 
@@ -102,13 +102,13 @@ def _records(config: MachineConfig, bus: str) -> list[CommissioningRecord]:
             try:
                 record = load_record(config.store.directory, name, config.store.commissioning_key)
             except StoreError:
-                continue  # one that cannot be read is none, and is told when something is armed
+                continue  # arming reports an unreadable record
             records += [record] if record is not None else []
     return records
 
 
 def _listen(config: MachineConfig, bus: str) -> Traffic:
-    """Listen for a while, for less where an NC runs: then the nodes of the bus soon show themselves."""
+    """With an NC on the bus a shorter time is enough: its nodes show themselves at once."""
     with BusListener(CanBus(bus, config.bus[bus])) as listener:
         for turn in range(round(LISTEN_S / TURN_S)):
             listener.listen(TURN_S)

@@ -1,6 +1,6 @@
-"""Compares the machine on the bus with its configuration: drives, mapping, scales, cycle, rapid signal and sensors.
+"""Compare the machine on the bus with its configuration: drives, mapping, scales, cycle, rapid signal and sensors.
 
-Where an NC runs the bus nothing is sent: what its own traffic shows is compared, the rest is told as not compared.
+If an NC runs the bus nothing is sent: its traffic is compared, everything else is reported as not compared.
 """
 
 import asyncio
@@ -34,13 +34,13 @@ NC_OFF = "switch the NC off and check again"
 FIND = "find the drive's node-ID and check again"
 
 Place = tuple[str, Finding]
-"""The place of a finding (``bus can0``, ``axis X``) and the finding."""
+"""Where a finding applies (``bus can0``, ``axis X``), and the finding."""
 
 
 def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _text: None) -> list[Place]:
-    """Compare everything; what cannot be reached is a finding. ConnectError only for a bus that cannot be opened.
+    """Compare everything; an unreachable device is a finding. ConnectError only for a bus that cannot be opened.
 
-    ForeignMaster when an NC comes while the drives are asked.
+    ForeignMaster if an NC starts while the drives are read.
     """
     found: list[Place] = []
     for bus in dict.fromkeys(axis.drive.bus for axis in config.axis.values()):
@@ -63,31 +63,31 @@ def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _te
 
 
 def compare_bus(traffic: Traffic, config: MachineConfig) -> Iterator[Finding]:
-    """Tell who runs the bus, and at which period."""
+    """Report who runs the bus and at which SYNC period."""
     wanted = config.machine.sync_period_s
     expected, period_s = f"{wanted * 1e3:g} ms", traffic.sync_period_s
     if traffic.master is None:
-        yield Finding("NC", "off or on", "off: the drives are asked")
+        yield Finding("NC", "off or on", "off: the drives are read by SDO")
         return
-    yield Finding("NC", "off or on", f"on ({traffic.master} heard): nothing is sent")
+    yield Finding("NC", "off or on", f"on ({traffic.master} received): nothing is sent")
     if period_s is None:
-        yield Finding("SYNC", expected, "none heard", None, "the NC sends no SYNC yet", "let it enable the drives")
+        yield Finding("SYNC", expected, "none received", None, "the NC sends no SYNC yet", "let it enable the drives")
     elif config.guard.clock == "sync":
         yield Finding("SYNC", "counted, not timed", f"{period_s * 1e3:.3f} ms")
     else:
         same = abs(period_s - wanted) <= PERIOD_TOLERANCE * wanted
         found = f"{period_s * 1e3:.3f} ms"
-        cause = f"SYNC comes every {found} where the config has {expected}"
+        cause = f"the SYNC period is {found}, but the configuration has {expected}"
         yield Finding("SYNC", expected, found, same, cause, "correct machine.sync_period_s or the NC's cycle")
     if period_s is not None:
         yield judge_sync((np.diff(traffic.sync_ns) * 1e-9).tolist(), period_s, config.guard.clock == "sync")
 
 
-def compare_asked(config: MachineConfig, axis: str, heard: Sequence[int] = ()) -> list[Finding]:
-    """Compare the answers of the drive by SDO, with no NC on the bus; ``heard`` are COB-IDs that were heard there."""
+def compare_asked(config: MachineConfig, axis: str, received: Sequence[int] = ()) -> list[Finding]:
+    """Compare a drive by SDO, while no NC runs the bus; ``received`` are COB-IDs already received there."""
     node = f"node-ID {config.node_id(axis)}"
     with Master(config, axis) as master:
-        master.heard.ids.update(heard)
+        master.heard.ids.update(received)
         try:
             found = survey(master)
             seen = f"{node}, serial number {found.identity.serial}"
@@ -95,7 +95,7 @@ def compare_asked(config: MachineConfig, axis: str, heard: Sequence[int] = ()) -
                 return [
                     Finding("drive", node, seen),
                     *found.findings,
-                    *_not_compared(SDO_POINTS, "it is no drive", FIND),
+                    *_not_compared(SDO_POINTS, "it is not a drive", FIND),
                 ]
             return [
                 Finding("drive", node, seen),
@@ -112,8 +112,7 @@ def compare_asked(config: MachineConfig, axis: str, heard: Sequence[int] = ()) -
 
 
 def _not_compared(points: Sequence[str], cause: str, advice: str) -> list[Finding]:
-    """What is left to compare by SDO, and why it was not."""
-    return [Finding(point, "the config's", "not asked", None, cause, advice) for point in points]
+    return [Finding(point, "as configured", "not read", None, cause, advice) for point in points]
 
 
 def _record_of(config: MachineConfig, axis: str) -> CommissioningRecord | None:
@@ -124,7 +123,6 @@ def _record_of(config: MachineConfig, axis: str) -> CommissioningRecord | None:
 
 
 def _record(config: MachineConfig, axis: str, found: Survey) -> Iterator[Finding]:
-    """Whether the drive is the one that was signed off; nothing where none was."""
     try:
         record = load_record(config.store.directory, axis, config.store.commissioning_key, may_lack_key=True)
     except StoreError as error:
@@ -136,13 +134,13 @@ def _record(config: MachineConfig, axis: str, found: Survey) -> Iterator[Finding
 
 
 def compare_loops(config: MachineConfig, axis: str) -> Iterator[Finding]:
-    """Compare the regulators with those that the drive's rapids showed last; nothing where none did yet."""
+    """Compare the configured control loops with those identified last; nothing before the first identification."""
     try:
         with History.read(config.store.directory) as history:
-            told = history.loops(axis, 1)
-    except StoreError:  # there is no history yet, or the daemon tells what is wrong with it
+            identified = history.loops(axis, 1)
+    except StoreError:  # there is no history yet, or the daemon reports its fault
         return
-    for _, loops in told:
+    for _, loops in identified:
         settings = config.axis[axis]
         apart = [d for d in differences(settings, loops) if d.apart]
         found = ", ".join(f"{d.key} {d.found:.4g}" for d in apart) or "the same"
@@ -159,13 +157,12 @@ def _unreachable(point: str, expected: str, error: DeviceError) -> Finding:
 
 
 def _heartbeat(period_ms: int | None) -> Finding:
-    cause = "it sends no heartbeat (0x1017), and only its PDOs show that it lives"
+    cause = "it sends no heartbeat (0x1017), so only its PDOs show that it is alive"
     shown = f"{period_ms} ms" if period_ms else "none"
     return Finding("heartbeat", "any", shown, bool(period_ms), cause, "set 0x1017 to 100 with the drive's tool")
 
 
 def _rapid(config: MachineConfig, profile: DriveProfile, read: Callable[[], int | None]) -> Iterator[Finding]:
-    """The NC's signal of a rapid move, where the config counts on it."""
     if not load_event_source(config.g0.source).needs_input:
         yield Finding("rapid signal", config.g0.source, f"{config.g0.source} needs no input")
         return
@@ -193,7 +190,7 @@ def _voltage_object(config: MachineConfig, axis: str, profile: DriveProfile, mas
         return
     scale = profile.terminal_v_per_count(config.axis[axis])
     if not scale:
-        cause = f"profile {profile.name} tells the duty of the PWM, and the DC link is not known"
+        cause = f"profile {profile.name} reports a PWM duty, and the DC-link voltage is unknown"
         yield Finding("voltage", "from the drive", "a duty", False, cause, "set drive.dc_link_v, or use a sensor")
         return
     index, sub = profile.voltage
@@ -204,10 +201,10 @@ def _voltage_object(config: MachineConfig, axis: str, profile: DriveProfile, mas
 
 
 def compare_heard(traffic: Traffic, config: MachineConfig, axis: str) -> Iterator[Finding]:
-    """Compare the traffic of a running NC as far as it shows one drive; nothing is sent."""
+    """Compare one drive as far as the traffic of a running NC shows it; nothing is sent."""
     profile, node_id = load_profile(config.axis[axis].drive), config.node_id(axis)
     nmt = traffic.nmt(node_id)
-    cause = f"nothing was heard of node-ID {node_id}"
+    cause = f"no frame of node-ID {node_id} was received"
     shown = f"{cause}" if node_id not in traffic.nodes else f"node-ID {node_id}, {nmt or 'no heartbeat'}"
     advice = "check the drive's supply and drive.node_id"
     yield Finding("drive", f"node-ID {node_id}", shown, node_id in traffic.nodes, cause, advice)
@@ -225,11 +222,11 @@ def compare_heard(traffic: Traffic, config: MachineConfig, axis: str) -> Iterato
     if profile.find_tpdo(profile.offset) is not None:
         yield compare_heard_writers(config, axis, _record_of(config, axis), traffic)
     yield from _rapid(config, profile, lambda: _heard_value(traffic, profile, node_id))
-    yield from _not_compared(("device", *SDO_POINTS), "SDO belongs to the NC now", NC_OFF)
+    yield from _not_compared(("device", *SDO_POINTS), "only the NC may use SDO while it runs", NC_OFF)
 
 
 def _heard_pdo(traffic: Traffic, spec: PdoSpec, node_id: int) -> Finding:
-    """Whether a PDO comes as often, and is as long, as the profile says; without SYNC none is due."""
+    """Compare a PDO's rate and length with the profile; without SYNC none is due."""
     cob_id, syncs = spec.cob_base + node_id, len(traffic.sync_ns)
     count, length = traffic.count.get(cob_id, 0), traffic.length.get(cob_id, 0)
     due = syncs / spec.every_sync if spec.valid else 0.0
@@ -239,17 +236,16 @@ def _heard_pdo(traffic: Traffic, spec: PdoSpec, node_id: int) -> Finding:
         return Finding(spec.name, expected, "no SYNC", None, "the NC sends no SYNC yet", "let it enable the drives")
     shown = f"{count} in {syncs} SYNC" + (f", {length} bytes" if count else "")
     if count and length != spec.length:
-        cause = f"{spec.name} ({cob_id:03X}) has {length} bytes where the profile has {spec.length}"
+        cause = f"{spec.name} ({cob_id:03X}) has {length} bytes, but the profile has {spec.length}"
     else:
-        cause = f"{spec.name} ({cob_id:03X}) came {count} times in {syncs} SYNC where {due:.0f} are due"
+        cause = f"{spec.name} ({cob_id:03X}) was received {count} times in {syncs} SYNC, {due:.0f} are due"
     ok = length in (0, spec.length) and abs(count - due) <= max(2.0, RATE_TOLERANCE * due)
     return Finding(spec.name, expected, shown, ok, cause, advice)
 
 
 def _heard_table(traffic: Traffic, cob_id: int) -> Finding:
-    """Whether the TPDO of the table's encoder comes with every SYNC."""
     count, syncs = traffic.count.get(cob_id, 0), len(traffic.sync_ns)
-    cause = f"the table encoder's TPDO {cob_id:03X} came {count} times in {syncs} SYNC"
+    cause = f"the table encoder's TPDO {cob_id:03X} was received {count} times in {syncs} SYNC"
     advice = "start its node, make that TPDO synchronous (type 1), or correct cob_id of the table"
     ok = abs(count - syncs) <= max(2.0, RATE_TOLERANCE * syncs) if syncs else None
     return Finding("table encoder", f"{cob_id:03X} every SYNC", f"{count} in {syncs} SYNC", ok, cause, advice)
@@ -265,7 +261,7 @@ def _heard_value(traffic: Traffic, profile: DriveProfile, node_id: int) -> int |
 
 
 async def compare_sensors(config: MachineConfig, axis: str) -> list[Finding]:
-    """Reach and read the sensors of one axis; only reading, so that a running daemon misses nothing."""
+    """Connect to and read the sensors of one axis; reading alone does not disturb a running daemon."""
     return [await _sensor(point, sensor) for point, sensor in sensors_of(axis, config).items()]
 
 

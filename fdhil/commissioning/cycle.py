@@ -1,7 +1,7 @@
-"""Turns the cycle of the buses that fdhil runs itself: SYNC, the set-points that the next SYNC latches, what came.
+"""Run the SYNC cycle of the buses that fdhil controls: SYNC, the set-points it latches, and the received frames.
 
-One thread does it all by absolute deadlines, and everything that is sent in time leaves from its turn, so a program
-that hangs sends nothing more: the drives' own watchdogs see that.
+One thread works by absolute deadlines and sends everything that is time-critical. If the program hangs, nothing more is
+sent, and the drives' watchdogs react.
 """
 
 import threading
@@ -36,17 +36,17 @@ class Member(Landed, Protocol):
 
     @property
     def position(self) -> int | None:
-        """Its newest position in increments."""
+        """Newest position in increments."""
 
     def take(self, can_id: int, data: bytes) -> None:
-        """Take a frame that was heard on its bus."""
+        """Process a frame received on its bus."""
 
     def send_set_points(self) -> None:
         """Send what the next SYNC latches."""
 
 
 class Lateness:
-    """How late each SYNC left after its deadline, counted by microseconds; ``skipped``: cycles the computer missed."""
+    """Histogram, in microseconds, of how late each SYNC was sent; ``skipped``: cycles that the computer missed."""
 
     def __init__(self) -> None:
         self.counts = [0] * (MOST_CYCLE_US + 1)
@@ -61,7 +61,7 @@ class Lateness:
         self.most_us = max(self.most_us, late_us)
 
     def quantile_us(self, share: float) -> float:
-        """Return the lateness that this share of the SYNCs kept."""
+        """Return the lateness that this share of the SYNCs did not exceed."""
         wanted, seen = share * self.cycles, 0
         for late_us, count in enumerate(self.counts):
             seen += count
@@ -71,13 +71,13 @@ class Lateness:
 
 
 class Cycle:
-    """The thread that runs some buses; a context manager. Nothing is sent before ``produce_sync`` or by the members.
+    """Runs the cycle of some buses in its own thread; a context manager.
 
-    ``path`` gives the members' set-points while it is there, in their order; ``failure`` is what ended the thread.
-    ``guard_runs``: where it is given a guard alone sends offsets, and no member does; it tells whether one is there.
-    ``offsets_heard`` are those that came since the last SYNC. Where another master is heard the thread brings the
-    drives to rest, and sends no more.
-    ``realtime``: it asks for a real-time priority; ``scheduling`` says what it was given.
+    Nothing is sent before ``produce_sync``, except by the members. ``path`` supplies the members' set-points, in their
+    order; ``failure`` is what ended the thread. With ``guard_runs``, which returns whether a guard is running, only a
+    guard sends offsets. ``offsets_heard`` are those received since the last SYNC. If another master is detected, the
+    thread stops the drives and sends nothing more. ``realtime`` requests a real-time priority; ``scheduling`` is what
+    was granted.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Cycle:
         self._thread = threading.Thread(target=self._run, name="fdhil-cycle", daemon=True)
 
     def start(self) -> None:
-        """Begin to turn."""
+        """Start the thread."""
         self._thread.start()
 
     def _run(self) -> None:
@@ -133,7 +133,7 @@ class Cycle:
             self._landed.set()
 
     def _turn(self, due: float) -> float:
-        """Send what is due at ``due``, take what came, and return the next deadline after having waited for it."""
+        """Run one cycle that is due at ``due``; wait for the next deadline and return it."""
         if self.lockstep:
             self._receive()
         if self.taken is None:
@@ -144,7 +144,7 @@ class Cycle:
             self._receive()
         due += self.period_s
         now = time.monotonic()
-        if now > due + self.period_s:  # no SYNC is sent twice as fast to catch up
+        if now > due + self.period_s:  # missed SYNCs are not sent in a burst
             self._missed(int((now - due) / self.period_s))
             due = now
         time.sleep(max(0.0, due - now))
@@ -160,14 +160,14 @@ class Cycle:
             self._send_set_points()
 
     def _land(self, taken: TransmitBus) -> None:
-        """Send what brings the drives to rest by one SYNC more; afterwards the thread only listens."""
+        """Stop the drives, one SYNC per call; afterwards the thread only listens."""
         led = [member for member in self.members if member.led and self.producing]
         if self.path is not None:
             self.path.stop(f"another master sends {taken.watch.sign} on bus {taken.name}")
         if self._landing is None:
             self._landing = land(led, lambda: self.path is not None and not self.path.resting)
         if led and self._sync_lands:
-            self._send_heartbeat()  # a drive that misses it while it brakes stops by itself
+            self._send_heartbeat()  # without it a braking drive would stop by its watchdog
             self._send_sync()
         self._sync_lands = next(self._landing, None)
         if self._sync_lands:
@@ -178,17 +178,17 @@ class Cycle:
             self._landed.set()
 
     def _missed(self, periods: int) -> None:
-        """This computer slept; drives that stand at their last set-point by now are not jerked on."""
+        """Hold the path if this computer slept: the drives have stopped by now and must not be jerked on."""
         self.lateness.skipped += periods
         if periods > STALL_CYCLES and self.path is not None and not self.lockstep:
-            self.path.hold(f"this computer was late by {periods} SYNC; take load off it")
+            self.path.hold(f"this computer was late by {periods} SYNC; reduce its load")
 
     def _awaits_others(self) -> bool:
-        """Whether a simulated drive has yet to answer the last SYNC, or a guard to send its offset, as it did before.
+        """Return whether a simulated drive has yet to answer the last SYNC, or a guard to send its offset as before.
 
-        Their processes may sleep, and time is the SYNC count. One that has not answered in ``LOCKSTEP_WAIT_S``, or
-        ``GUARD_WAIT_S``, is not waited for until it answers again, and then until it has answered all that it slept
-        through: else there would be one SYNC on the way more than is answered, for good.
+        Time is the SYNC count, and the other processes may sleep. One that has not answered within ``LOCKSTEP_WAIT_S``,
+        or ``GUARD_WAIT_S``, is ignored until it has answered every SYNC it missed: otherwise one more SYNC than is
+        answered would stay in flight for good.
         """
         now = time.monotonic()
         if not self.lockstep or now >= self._sent_s + LOCKSTEP_WAIT_S:
@@ -210,7 +210,7 @@ class Cycle:
             self._sync_counter = self._sync_counter % self._sync_overflow + 1
             data = bytes([self._sync_counter])
         for bus in self.buses.values():
-            if not bus.watch.sync_came():  # one of another master is as good, and two are one too many
+            if not bus.watch.sync_came():  # another master's SYNC replaces ours
                 bus.send(cia402.COB_SYNC, data)
         self.count += 1
         self._sent_s = time.monotonic()
@@ -237,7 +237,7 @@ class Cycle:
                 for member in members:
                     member.take(can_id, payload)
 
-    # what is asked of it --------------------------------------------------------------------------------------
+    # requests from other threads -----------------------------------------------------------------------------
 
     def produce_sync(self, overflow: int) -> None:
         """Send SYNC from now on, with a counter up to ``overflow`` (0: without)."""
@@ -245,30 +245,30 @@ class Cycle:
 
     @property
     def producing(self) -> bool:
-        """Whether SYNC is being sent."""
+        """Whether SYNC is sent."""
         return self._sync_overflow is not None
 
     @property
     def turning(self) -> bool:
-        """Whether set-points leave."""
+        """Whether set-points are sent."""
         return self.producing and not self.lost and self._thread.is_alive()
 
     def stop_sync(self) -> None:
-        """Send SYNC and set-points no more."""
+        """Stop sending SYNC and set-points."""
         self._sync_overflow = None
 
     @property
     def taken(self) -> TransmitBus | None:
-        """A bus on which another master was heard, None where there is none."""
+        """A bus on which another master was detected; None without one."""
         return next((bus for bus in self.buses.values() if bus.watch.sign is not None), None)
 
     @property
     def lost(self) -> bool:
-        """Whether a bus has ended, or takes nothing more."""
+        """Whether a bus has ended or accepts no frames."""
         return self.failure is not None or any(bus.ended is not None for bus in self.buses.values())
 
     def check(self) -> None:
-        """Raise what ended the thread or a bus; beside another master that is done when the drives are at rest."""
+        """Raise what ended the thread or a bus; with another master only after the drives have stopped."""
         self._await_landing()
         if self.failure is not None:
             raise self.failure
@@ -281,7 +281,7 @@ class Cycle:
             self._landed.wait()
 
     def close(self) -> None:
-        """Stop sending and release the buses; where another master was heard the drives are at rest before."""
+        """Stop sending and release the buses; with another master only after the drives have stopped."""
         self._await_landing()
         self._stopping.set()
         self._thread.join(timeout=2.0)

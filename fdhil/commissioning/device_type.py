@@ -1,4 +1,4 @@
-"""Reads a device type: which device profile a node follows (0x1000 in CiA 301, 0x67FF in CiA 402-2). Pure."""
+"""Decode the device type: the device profile of a node (0x1000 in CiA 301, 0x67FF in CiA 402-2)."""
 
 DRIVES = 402
 _KINDS = {
@@ -13,7 +13,7 @@ _KINDS = {
 
 
 def is_drive(device_type: int | None) -> bool:
-    """Whether the device profile is CiA 402."""
+    """Return whether the device profile is CiA 402."""
     return device_type is not None and device_type & 0xFFFF == DRIVES
 
 

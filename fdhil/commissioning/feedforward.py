@@ -1,4 +1,4 @@
-"""Commissions the on-line feed-forward: its RPDO is exchanged only by a drive that takes it as it is meant.
+"""Commission the online feed-forward: its RPDO is enabled only on a drive that applies it as intended.
 
 Every refusal is a DriveFault that begins with ``FeedforwardOff``, the class under which arming would be refused.
 """
@@ -13,21 +13,21 @@ from fdhil.drivers.cia402.profile import PdoSpec
 from fdhil.errors import DeviceError, DriveFault, ProtocolError, SdoAbort
 
 INVALID_COB_ID = 0x80000000
-PROBE = (0x0102, 3)  # increments/s and 0.1 %: too little to feel, and bytes that tell an entry at another place
+PROBE = (0x0102, 3)  # increments/s and 0.1 %: negligible, with bytes that reveal a misplaced entry
 ARRIVED_CYCLES = 20
 
 
 def feedforward_object(number: int) -> str:
-    """Return the key under which a commissioning record keeps the RPDO's COB-ID: its parameter's index."""
+    """Return the key of the RPDO's COB-ID in a commissioning record: the index of its communication parameter."""
     return f"{Object.RPDO_PARAMETER + number - 1:04X}"
 
 
 @contextmanager
 def feedforward_open(master: Master) -> Iterator[dict[str, int]]:
-    """Set both offsets to 0 and make their RPDO valid, the axis disabled; back as it was when what follows fails.
+    """Set both offsets to 0 and enable their RPDO while the axis is disabled; restore it if the following steps fail.
 
-    Gives what goes into the record, the COB-ID that was read back; {} without [axis.X.feedforward]. DriveFault when
-    the drive maps them otherwise, or refuses.
+    Yields the COB-ID read back, for the record; {} without [axis.X.feedforward]. DriveFault if the drive maps the
+    offsets differently or refuses.
     """
     if master.config.axis[master.axis].feedforward is None:
         yield {}
@@ -41,7 +41,7 @@ def feedforward_open(master: Master) -> Iterator[dict[str, int]]:
         raise _refused(master, f"it refuses the RPDO of 60B1 and 60B2 ({abort})") from None
     try:
         yield {feedforward_object(spec.number): cob_id}
-    except BaseException as error:  # Ctrl-C, too: what is not signed off is not left exchanged
+    except BaseException as error:  # Ctrl-C, too: without a sign-off the RPDO is disabled again
         try:
             master.sdo.write_int(parameter, 1, before, 4)
             _write_zeros(master, spec)
@@ -53,7 +53,7 @@ def feedforward_open(master: Master) -> Iterator[dict[str, int]]:
 
 
 def _spec(master: Master) -> PdoSpec:
-    """The profile's RPDO; the drive must map the same, before anything is written."""
+    """The drive's mapping must match the profile before anything is written."""
     found = master.profile.find_rpdo(master.profile.speed_offset)
     if found is None or found[0].entry(master.profile.torque_offset) is None:
         raise _refused(master, "its profile has no RPDO with 60B1 and 60B2")
@@ -61,7 +61,7 @@ def _spec(master: Master) -> PdoSpec:
     mapped = next(pdo.mapped for one, pdo in read_pdos(master) if one is spec)
     if mapped != tuple(entry.mapping for entry in spec.entries):
         shown = ", ".join(f"{value:08X}" for value in mapped) or "nothing"
-        raise _refused(master, f"its {spec.name} maps {shown} where 60B1 and 60B2 belong")
+        raise _refused(master, f"its {spec.name} maps {shown} instead of 60B1 and 60B2")
     return spec
 
 
@@ -81,14 +81,14 @@ def _write_zeros(master: Master, spec: PdoSpec) -> None:
 
 
 def _refused(master: Master, cause: str) -> DriveFault:
-    advice = f"set the RPDO up with the drive's own tool, or leave [axis.{master.axis}.feedforward] out"
+    advice = f"set up the RPDO with the drive's own tool, or remove [axis.{master.axis}.feedforward]"
     return DriveFault(master.device, f"FeedforwardOff: {cause}; {advice}")
 
 
 def prove_feedforward(master: Master) -> None:
-    """Send both offsets while the axis is disabled, and read by SDO that they arrived; then the same with zeros.
+    """Send both offsets while the axis is disabled and read them back by SDO, then the same with zeros.
 
-    What they do is not tried: the drive's regulators are off. DriveFault when another value arrives.
+    Their effect is not tested: the drive's control loops are off. DriveFault if another value arrives.
     """
     if master.config.axis[master.axis].feedforward is None:
         return

@@ -1,4 +1,4 @@
-"""One point of a comparison between a drive and its configuration, and how an object that may lack is read."""
+"""Findings of a comparison between a drive and its configuration, and reading of optional objects."""
 
 from dataclasses import dataclass
 
@@ -9,10 +9,10 @@ from fdhil.errors import SdoAbort
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One point of the set-up, expected and found; ``ok`` None: it could not be compared.
+    """One compared item, expected and found; ``ok`` None: it could not be compared.
 
-    ``cause`` and ``advice`` are the halves of the sentence that tells what is wrong, or why it was not compared, and
-    what to do next. ``needed``: what cannot be compared here ends a commissioning.
+    ``cause`` says what is wrong or why the item was not compared, ``advice`` what to do next. ``needed``: commissioning
+    stops if the item cannot be compared.
     """
 
     point: str
@@ -25,7 +25,7 @@ class Finding:
 
 
 def read_optional(master: Master, index: int, sub: int = 0, *, signed: bool = False) -> int | None:
-    """Read an integer object, None when the drive does not have it, or refuses to tell it."""
+    """Read an integer object; None if the drive does not have it or refuses to return it."""
     try:
         return master.sdo.read_int(index, sub, signed=signed)
     except SdoAbort:
@@ -33,7 +33,7 @@ def read_optional(master: Master, index: int, sub: int = 0, *, signed: bool = Fa
 
 
 def has_object(master: Master, index: int) -> bool:
-    """Whether the drive has an object, also one that it refuses to tell."""
+    """Return whether the drive has an object, readable or not."""
     try:
         master.sdo.read(index)
     except SdoAbort as abort:
@@ -42,7 +42,7 @@ def has_object(master: Master, index: int) -> bool:
 
 
 def lacks(point: str, expected: str, *objects: str, needed: bool = False) -> Finding:
-    """A point that cannot be compared, for the drive has no such object."""
+    """Return the finding for an item that cannot be compared because the drive has no such object."""
     shown = " and ".join(objects)
-    advice = "its manual says what it does instead"
+    advice = "see its manual for what it does instead"
     return Finding(point, expected, f"no {shown}", None, f"it has no {shown} that can be read", advice, needed)

@@ -1,7 +1,7 @@
-"""Commissions an axis of HAL pins, LinuxCNC on and at rest: offsets arrive, are limited in HAL, and end without us.
+"""Commission an axis of HAL pins with LinuxCNC idle: offsets arrive, HAL limits them, and they end without fdhil.
 
-The bridge takes offsets as the guard sends them, each the answer to a SYNC. What HAL applied is read back in the cycle
-in which it acts. Whatever fails, sending stops, and HAL brings the offset to zero by itself.
+The bridge accepts offsets as the guard sends them, one per SYNC. The offset that HAL applies is read back in the same
+cycle. On any failure sending stops, and HAL ramps the offset to zero by itself.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from fdhil.drivers.can.frames import FrameRing
 from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.errors import DriveFault
 
-STEPS_UM = (10.0, 50.0)  # the second where friction holds the axis against the first
+STEPS_UM = (10.0, 50.0)  # the second if friction holds the axis against the first
 SETTLE_CYCLES, AVERAGE_CYCLES = 400, 100
 LISTEN_CYCLES = 200
-TRIES = 8  # a busy computer lets the streamer run empty now and then, which takes the offset away
+TRIES = 8  # on a busy computer the streamer occasionally runs empty, which removes the offset
 SILENCE_S = 2.0
 ZERO_WITHIN_CYCLES = 1000
 ENABLED_MASK, ENABLED = 0x6F, 0x27
@@ -33,7 +33,7 @@ FINGERPRINT = "hal"
 
 @dataclass(slots=True)
 class Seen:
-    """What HAL showed in each cycle, in increments: applied offset, demand with it, position; the last statusword."""
+    """What HAL reported per cycle, in increments: applied offset, demand with it, position; the last statusword."""
 
     applied: list[int] = field(default_factory=list)
     demand: list[int] = field(default_factory=list)
@@ -46,14 +46,14 @@ class Seen:
 
 
 class HalAxis:
-    """The connection to the bridge, and one axis on it; a context manager. ConnectError without the bridge."""
+    """Connects to the bridge for one axis; a context manager. ConnectError without the bridge."""
 
     def __init__(self, config: MachineConfig, axis: str) -> None:
         settings = config.axis[axis]
         self.device = f"axis {axis}"
         if settings.correction is None:
-            text = f"there is no [axis.{axis}.correction]: no offset may be added, and nothing is to be proven"
-            raise DriveFault(self.device, f"{text}; add that section, and write the HAL file again with fdhil init")
+            text = f"there is no [axis.{axis}.correction]: offsets are not allowed, so there is nothing to prove"
+            raise DriveFault(self.device, f"{text}; add that section and write the HAL file again with fdhil init")
         self.per_mm = settings.scaling.increments_per_mm
         self.bounds = OffsetBounds.of(settings, config.machine.sync_period_s)
         profile, self._node_id = load_profile(settings.drive), config.node_id(axis)
@@ -71,23 +71,23 @@ class HalAxis:
         self._port.close()
 
     def run(self, cycles: int, increments: int | None) -> Seen:
-        """Answer so many SYNCs with an offset (None: with nothing); return what HAL showed. DriveFault in silence."""
-        seen, heard_s = Seen(), time.monotonic()
+        """Answer so many SYNCs with an offset (None: with nothing); return what HAL reported. DriveFault on silence."""
+        seen, last_frame_s = Seen(), time.monotonic()
         while len(seen.applied) < cycles:
             self._port.receive(self._ring, 0.05)
             for frame in self._ring.drain():
                 can_id = int(frame["id"])
                 data = int(frame["data"]).to_bytes(8, "little")[: int(frame["dlc"])]
                 if can_id == COB_SYNC:
-                    heard_s = time.monotonic()
+                    last_frame_s = time.monotonic()
                     if increments is not None:
                         values = (increments, data[0])
                         self._port.send(self._offset.cob_base + self._node_id, pack(self._offset.entries, values))
                 elif can_id in self._tpdos:
                     self._take(can_id, data, seen)
-            if time.monotonic() - heard_s > SILENCE_S:
-                text = f"the bridge sends nothing for {SILENCE_S:g} s; is LinuxCNC running?"
-                raise DriveFault(self.device, f"{text} The offset goes to zero by itself; start LinuxCNC, then again")
+            if time.monotonic() - last_frame_s > SILENCE_S:
+                text = f"the bridge has sent nothing for {SILENCE_S:g} s: HAL ramps the offset to zero by itself"
+                raise DriveFault(self.device, f"{text}; start LinuxCNC and repeat the command")
         return seen
 
     def _take(self, can_id: int, data: bytes, seen: Seen) -> None:
@@ -103,9 +103,9 @@ class HalAxis:
 def commission_hal(
     config: MachineConfig, axis: str, report: Callable[[str], None] = lambda _step: None
 ) -> CommissioningRecord:
-    """Commission one axis and return its record (not saved yet); ``report`` gets each step's name before it.
+    """Commission one axis and return its record (not saved yet); ``report`` gets the name of each step before it.
 
-    DriveFault for what is not as it must be, ConnectError without the bridge.
+    DriveFault for every deviation, ConnectError without the bridge.
     """
     with HalAxis(config, axis) as hal:
         report("listen")
@@ -143,7 +143,7 @@ def _require_rest(hal: HalAxis) -> None:
 
 
 def _move(hal: HalAxis) -> tuple[float, int]:
-    """Step the offset; HAL must apply it within its limits, the demand and the table follow. Returns um, increments."""
+    """Step the offset: HAL must apply it within its limits, demand and position follow. Return um and increments."""
     before = hal.run(SETTLE_CYCLES, 0)
     _, rate, acceleration, *_ = hal.bounds.whole
     steps = [um for um in STEPS_UM if um * 1e-3 * hal.per_mm <= hal.bounds.offset]
@@ -152,26 +152,25 @@ def _move(hal: HalAxis) -> tuple[float, int]:
         after = _held(hal, step)
         if abs(after.mean(after.applied) - step) > 1.5:
             text = (
-                f"an offset of {um:g} um was sent, and HAL applies {after.mean(after.applied) / hal.per_mm * 1e3:.1f}"
+                f"an offset of {um:g} um was sent, but HAL applies {after.mean(after.applied) / hal.per_mm * 1e3:.1f}"
             )
             raise DriveFault(
-                hal.device, f"{text} um; load fdhil's HAL file, and see [axis.X.correction] against limit3"
+                hal.device, f"{text} um; load fdhil's HAL file, and compare [axis.X.correction] with limit3"
             )
         speeds = np.diff(after.applied)
         if np.abs(speeds).max() > 1.2 * rate + 2 or np.abs(np.diff(speeds)).max() > 1.2 * acceleration + 4:
-            text = "HAL applies a step faster than limit3 of this configuration lets it"
+            text = "HAL applies a step faster than limit3 of this configuration allows"
             raise DriveFault(hal.device, f"{text}; write the HAL file again with fdhil init, and restart LinuxCNC")
         if abs(after.mean(after.demand) - before.mean(before.demand) - step) > 1.5:
-            raise DriveFault(hal.device, "the offset does not reach the command; see the nets of fdhil's HAL file")
+            raise DriveFault(hal.device, "the offset does not reach the command; check the nets of fdhil's HAL file")
         moved = (after.mean(after.position) - before.mean(before.position)) / step
         if 0.5 <= moved <= 1.5:
             return moved * um, step
     text = f"an offset of {um:g} um moved the measured position by {moved * um:.1f} um"
-    raise DriveFault(hal.device, f"{text}; check position_feedback, its sign and scale, and how stiff the loop is")
+    raise DriveFault(hal.device, f"{text}; check position_feedback, its sign and scale, and the stiffness of the loop")
 
 
 def _held(hal: HalAxis, step: int) -> Seen:
-    """Hold an offset until HAL has applied it for long enough to be averaged; return the last try."""
     for _ in range(TRIES):
         seen = hal.run(2 * SETTLE_CYCLES, step)
         if set(seen.applied[-2 * AVERAGE_CYCLES :]) <= {step - 1, step, step + 1}:
@@ -180,9 +179,10 @@ def _held(hal: HalAxis, step: int) -> Seen:
 
 
 def _stop_answering(hal: HalAxis, held: int) -> None:
-    """Send nothing more: HAL must bring the offset to zero by itself."""
     _held(hal, held)
     seen = hal.run(ZERO_WITHIN_CYCLES, None)
     if any(seen.applied[-AVERAGE_CYCLES:]):
-        text = "HAL keeps the offset although nobody sends it: the watchdog does not work"
-        raise DriveFault(hal.device, f"{text}; restart LinuxCNC, and see fdhil-gate and fdhil-watchdog of the HAL file")
+        text = "HAL keeps the offset although none is sent: its watchdog does not work"
+        raise DriveFault(
+            hal.device, f"{text}; restart LinuxCNC and check fdhil-gate and fdhil-watchdog in the HAL file"
+        )

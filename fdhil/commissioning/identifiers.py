@@ -1,8 +1,8 @@
-"""Compares the COB-IDs of a drive's PDOs with all identifiers that are in use on its bus.
+"""Compare the COB-IDs of a drive's PDOs with all identifiers in use on its bus.
 
-A frame of ours that is another node's identifier moves something that nobody corrects. In use are the services of
+A frame of ours with another node's identifier would move an axis that is not corrected. In use are the services of
 CiA 301, the PDOs of every configured drive, the predefined identifiers of every other node that is configured or was
-heard, and what was heard.
+received, and all received identifiers.
 """
 
 from collections.abc import Collection, Iterator
@@ -34,7 +34,7 @@ _NODE_IDS = range(1, 128)
 
 @dataclass(frozen=True, slots=True)
 class Clash:
-    """A PDO of the profile whose COB-ID is in use, whose it is, and the key of the configuration that says so."""
+    """A PDO of the profile whose COB-ID is in use, by whom, and the configuration key that causes it."""
 
     pdo: str
     cob_id: int
@@ -44,57 +44,57 @@ class Clash:
     @property
     def cause(self) -> str:
         """The cause as a clause."""
-        return f"its {self.pdo} has the COB-ID {self.cob_id:03X}, which is that of {self.whose}"
+        return f"its {self.pdo} has the COB-ID {self.cob_id:03X}, which belongs to {self.whose}"
 
 
 ADVICE = "correct drive.node_id, the COB-IDs in the EDS or DCF, or the profile: no two PDOs may share an identifier"
 
 
-def find_clash(config: MachineConfig, axis: str, heard: Collection[int] = (), *, sent: bool = False) -> Clash | None:
-    """Return the first PDO of an axis whose COB-ID is in use; ``sent``: of those only that a guard sends.
+def find_clash(config: MachineConfig, axis: str, received: Collection[int] = (), *, sent: bool = False) -> Clash | None:
+    """Return the first PDO of an axis whose COB-ID is in use; ``sent``: only of those that a guard sends.
 
-    ``heard`` are COB-IDs that were heard on the bus.
+    ``received`` are COB-IDs received on the bus.
     """
     profile, node = load_profile(config.axis[axis].drive), config.node_id(axis)
     specs = sent_pdos(config, axis, profile) if sent else [*profile.rpdos, *profile.tpdos]
     taken: dict[int, tuple[str, str]] = {}
-    for cob_id, *whose in (*_in_use(config, axis), *_nodes_heard(config, axis, heard)):
+    for cob_id, *whose in (*_in_use(config, axis), *_nodes_heard(config, axis, received)):
         taken.setdefault(cob_id, (whose[0], whose[1]))
     valid = [spec for spec in (*profile.rpdos, *profile.tpdos) if spec.valid]
     for spec in specs:
         cob_id = spec.cob_base + node
         if cob_id in taken and (spec.valid or sent):
             return Clash(spec.name, cob_id, *taken[cob_id])
-        twin = next((each for each in valid if each.cob_base == spec.cob_base and each.name != spec.name), None)
-        if twin is not None and (spec.valid or sent):
-            return Clash(spec.name, cob_id, f"its own {twin.name}", f"axis.{axis}.drive")
+        other = next((each for each in valid if each.cob_base == spec.cob_base and each.name != spec.name), None)
+        if other is not None and (spec.valid or sent):
+            return Clash(spec.name, cob_id, f"its own {other.name}", f"axis.{axis}.drive")
     return None
 
 
 def sent_pdos(config: MachineConfig, axis: str, profile: DriveProfile) -> list[PdoSpec]:
-    """Return the RPDOs that a guard sends to an axis: that of its offset, and that of its feed-forward."""
+    """Return the RPDOs that a guard sends to an axis: the offset's, and the feed-forward's."""
     keys = [profile.offset] + [profile.speed_offset] * (config.axis[axis].feedforward is not None)
     found = [profile.find_rpdo(key) for key in keys]
     return [pdo[0] for pdo in found if pdo is not None]
 
 
-def compare_identifiers(config: MachineConfig, axis: str, heard: Collection[int] = ()) -> Finding:
-    """No PDO of a drive may have an identifier that is in use."""
-    clash = find_clash(config, axis, heard)
-    expected = "no other node's"
+def compare_identifiers(config: MachineConfig, axis: str, received: Collection[int] = ()) -> Finding:
+    """Compare the drive's COB-IDs with all identifiers in use."""
+    clash = find_clash(config, axis, received)
+    expected = "unique"
     if clash is None:
         return Finding(POINT, expected, expected)
-    return Finding(POINT, expected, f"{clash.cob_id:03X} is that of {clash.whose}", False, clash.cause, ADVICE)
+    return Finding(POINT, expected, f"{clash.cob_id:03X} belongs to {clash.whose}", False, clash.cause, ADVICE)
 
 
-def require_own_identifiers(config: MachineConfig, bus: str, heard: Collection[int] = ()) -> None:
-    """ConfigError where a guard on this bus would send what is another's identifier."""
+def require_own_identifiers(config: MachineConfig, bus: str, received: Collection[int] = ()) -> None:
+    """Raise ConfigError if a guard on this bus would send with another node's identifier."""
     for name, axis in config.axis.items():
         if axis.correction is None or axis.drive.bus != bus:
             continue
-        clash = find_clash(config, name, heard, sent=True)
+        clash = find_clash(config, name, received, sent=True)
         if clash is not None:
-            text = f"COB-ID {clash.cob_id:03X} is the guard's, which sends offsets with it, and that of {clash.whose}"
+            text = f"COB-ID {clash.cob_id:03X}, with which the guard sends offsets, also belongs to {clash.whose}"
             raise ConfigError("config", [ConfigFault(clash.key, text, ADVICE)])
 
 
@@ -103,7 +103,6 @@ _Use = tuple[int, str, str]
 
 
 def _in_use(config: MachineConfig, own: str) -> Iterator[_Use]:
-    """Yield the identifiers that the configuration knows of, but for the PDOs of ``own`` itself."""
     key = f"axis.{own}.drive"
     yield from ((cob_id, service, key) for cob_id, service in _BROADCAST.items())
     for base, service in _SERVICES.items():
@@ -122,7 +121,7 @@ def _in_use(config: MachineConfig, own: str) -> Iterator[_Use]:
             yield from _predefined(node, f"axis {name}", f"axis.{name}.drive")
 
 
-def _nodes_heard(config: MachineConfig, own: str, heard: Collection[int]) -> Iterator[_Use]:
+def _nodes_heard(config: MachineConfig, own: str, received: Collection[int]) -> Iterator[_Use]:
     bus = config.axis[own].drive.bus
     names = [name for name, axis in config.axis.items() if axis.drive.bus == bus]
     nodes = {config.node_id(name) for name in names} | {config.guard.node_id}
@@ -132,18 +131,18 @@ def _nodes_heard(config: MachineConfig, own: str, heard: Collection[int]) -> Ite
         for profile in (load_profile(config.axis[name].drive),)
         for spec in (*profile.rpdos, *profile.tpdos)
     }
-    for node in sorted(_senders(heard, known) - nodes):
-        yield from _predefined(node, f"node-ID {node}, which was heard on the bus", f"axis.{own}.drive")
+    for node in sorted(_senders(received, known) - nodes):
+        yield from _predefined(node, f"node-ID {node}, which was received on the bus", f"axis.{own}.drive")
 
 
-def _senders(heard: Collection[int], known: Collection[int]) -> set[int]:
-    """Return the node-IDs that were heard to send, by other frames than the PDOs that are ``known``."""
+def _senders(received: Collection[int], known: Collection[int]) -> set[int]:
+    """Return the node-IDs that sent frames other than the PDOs in ``known``."""
     bases = (*_SERVICES, *COB_TPDO)
-    sent = (can_id for can_id in heard if can_id <= 0x7FF and can_id & 0x780 in bases and can_id not in known)
+    sent = (can_id for can_id in received if can_id <= 0x7FF and can_id & 0x780 in bases and can_id not in known)
     return {can_id & 0x7F for can_id in sent if can_id & 0x7F and can_id & 0x780 != COB_SDO_REQUEST}
 
 
 def _predefined(node: int, whose: str, key: str) -> Iterator[_Use]:
-    """Yield the PDOs that a node has by default (CiA 301, table 39)."""
+    """Yield a node's default PDOs (CiA 301, table 39)."""
     for kind, bases in (("RPDO", COB_RPDO), ("TPDO", COB_TPDO)):
         yield from ((base + node, f"{kind}{k} of {whose}", key) for k, base in enumerate(bases, 1))

@@ -1,20 +1,20 @@
-"""Brings the drives to rest when another master is heard beside the cycle: the only thing that still leaves then."""
+"""Stop the drives when another master is detected during the cycle; only this is still sent then."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 
 from fdhil import cia402
 
-OFFSET_CYCLES = 3  # in so many steps an offset goes to zero, whatever its limits: the other master does not know of it
+OFFSET_CYCLES = 3  # steps to zero offset, regardless of the limits: the other master does not know of the offset
 WORD_CYCLES = 2
-GUARD_LANDING_CYCLES = 500  # so long a guard's offset is waited for; the drive holds it when SYNC ends
-START_CYCLES = 3000  # so long a node that the other master stopped is waited for
+GUARD_LANDING_CYCLES = 500  # the guard's time to zero its offset; the drive holds it when SYNC ends
+START_CYCLES = 3000  # wait for a node that the other master stopped
 OFF_WORDS = (cia402.CONTROL_SWITCH_ON, cia402.CONTROL_SHUTDOWN, cia402.CONTROL_DISABLE_VOLTAGE)
-"""Takes the power off, step by step."""
+"""Controlwords that switch the power stage off step by step."""
 
 
 class Landed(Protocol):
-    """A drive that is brought to rest."""
+    """A drive that can be stopped."""
 
     axis: str
 
@@ -24,7 +24,7 @@ class Landed(Protocol):
 
     @property
     def led_by_other(self) -> bool:
-        """Whether another master sends its set-points, or stopped its node."""
+        """Whether another master sends its set-points or stopped its node."""
 
     @property
     def stopped_by_other(self) -> bool:
@@ -32,11 +32,11 @@ class Landed(Protocol):
 
     @property
     def playing(self) -> bool:
-        """Whether planned offsets still wait to be sent."""
+        """Whether planned offsets are still to be sent."""
 
     @property
     def zeroes_offset(self) -> bool:
-        """Whether its offset is fdhil's to take to zero."""
+        """Whether fdhil, not a guard or another master, sends its offset."""
 
     @property
     def offset_by_other(self) -> bool:
@@ -44,23 +44,23 @@ class Landed(Protocol):
 
     @property
     def held_offset(self) -> int:
-        """The offset of a guard that it shows."""
+        """The guard's offset that the drive reports."""
 
     def land(self, cycles: int) -> None:
-        """Take the offset to zero in so many steps and send no other one any more."""
+        """Ramp the offset to zero in so many steps and send no other offset afterwards."""
 
     def switch_off(self, word: int) -> None:
         """Send this controlword from now on, and no offset."""
 
     def send_zero_offset(self) -> None:
-        """Send an offset of zero once, at once."""
+        """Send one offset of zero immediately."""
 
 
 def land(drives: Sequence[Landed], braking: Callable[[], bool]) -> Iterator[bool]:
-    """Yield once per cycle, whether SYNC and set-points are still needed.
+    """Stop the drives; yield once per cycle whether SYNC and set-points are still needed.
 
-    The axes brake, offsets go to zero, the drives are switched off. A drive that another master leads is left to it,
-    its offset at zero: where its node was stopped it hears that when it is started again.
+    The axes brake, offsets are ramped to zero, the drives are switched off. A drive that another master controls is
+    left to it with zero offset; if its node was stopped, it gets the zero after its restart.
     """
     for drive in drives:
         drive.land(OFFSET_CYCLES)
@@ -91,19 +91,19 @@ def _zero_when_started(drives: Sequence[Landed]) -> Iterator[bool]:
 
 
 def outcome(drives: Sequence[Landed], written: set[tuple[int, int]]) -> str:
-    """Return how the drives were left, as a part of a sentence; the mode is never given back, and is no news."""
-    told = [_left(drive) for drive in drives]
+    """Describe how the drives were left, as part of a sentence. The mode is never restored and not mentioned."""
+    parts = [_left(drive) for drive in drives]
     if objects := ", ".join(sorted({f"0x{index:04X}" for _, index in written if index != cia402.Object.MODE})):
-        told.append(f"{objects} may be as fdhil wrote them: power the drives off and on again")
-    return ", and ".join(told) or "nothing more was sent"
+        parts.append(f"{objects} may be as fdhil wrote them: power the drives off and on again")
+    return ", and ".join(parts) or "nothing more was sent"
 
 
 def _left(drive: Landed) -> str:
-    zero = ", its offset taken to zero" if drive.zeroes_offset else ""
+    zero = ", its offset set to zero" if drive.zeroes_offset else ""
     others = ", and may hold an offset of that master: power it off and on again" if drive.offset_by_other else ""
     if drive.stopped_by_other:
         unknown = ", and may hold an offset: power it off and on again" if drive.zeroes_offset else others
-        return f"axis {drive.axis} was left to it, which stopped its node{unknown}"
+        return f"axis {drive.axis} was left to that master, which stopped its node{unknown}"
     if drive.led_by_other:
-        return f"axis {drive.axis} was left to it{zero}"
+        return f"axis {drive.axis} was left to that master{zero}"
     return f"axis {drive.axis} was stopped{zero} and its drive switched off{others}"

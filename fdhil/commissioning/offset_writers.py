@@ -1,7 +1,7 @@
-"""Finds every RPDO of a drive by which another master could write its offsets (60B0, 60B1, 60B2), or hear our frames.
+"""Find every RPDO by which another master could write a drive's offsets (60B0, 60B1, 60B2) or receive fdhil's frames.
 
-The profile names the RPDOs that it needs, and no others. An NC that compensates the pitch of a screw may have set up
-one of its own: two masters that write one offset make the table step from the value of one to that of the other.
+The profile names only the RPDOs that fdhil needs. An NC that compensates the screw pitch may have set up its own: two
+masters that write one offset make the table step from one value to the other.
 """
 
 from collections.abc import Iterator
@@ -25,14 +25,14 @@ MOST_MISSING, MOST_MISSING_BEHIND = 16, 4
 INVALID_COB_ID = 1 << 31
 EXTENDED = 1 << 29
 MOST_MAPPED = 64
-LEAST_HELD = 8  # increments: less is found by chance in many frames
+LEAST_HELD = 8  # increments: smaller values occur by chance in many frames
 MULTIPLEXED = (254, 255)
-"""Numbers of mapped objects that make a PDO a multiplexed one: its frames name the object that they write (CiA 301)."""
+"""Numbers of mapped objects that mark a multiplexed PDO: its frames name the object that they write (CiA 301)."""
 
 
 @dataclass(frozen=True, slots=True)
 class OtherRpdo:
-    """An RPDO that the profile does not have: its number, the word of its COB-ID (bit 31: not valid), what it maps.
+    """An RPDO that the profile lacks: number, COB-ID word (bit 31: not valid), mapped objects.
 
     ``mapped`` is None for a multiplexed PDO, which may write any object.
     """
@@ -43,19 +43,19 @@ class OtherRpdo:
 
     @property
     def key(self) -> str:
-        """Under which a commissioning record keeps its COB-ID."""
+        """Key of its COB-ID in a commissioning record."""
         return f"{Object.RPDO_PARAMETER + self.number - 1:04X}"
 
     @property
     def valid(self) -> bool:
-        """Whether the drive takes its frames."""
+        """Whether the drive accepts its frames."""
         return not self.cob_id & INVALID_COB_ID
 
 
 def identifier_of(cob_id: int) -> int:
-    """Return the identifier in a COB-ID as a drive has it; bit 29 is kept, so that one of 29 bits is none of 11.
+    """Return the identifier in a drive's COB-ID word; bit 29 is kept to distinguish 29-bit identifiers.
 
-    Bit 30 says nothing of an RPDO (CiA 301, 7.5.2.35), and drives set it or not.
+    Bit 30 has no meaning for an RPDO (CiA 301, 7.5.2.35); drives may set it or not.
 
     >>> f"{identifier_of(0xC000_0205):X} {identifier_of(0x2000_0205):X}"
     '205 20000205'
@@ -64,10 +64,10 @@ def identifier_of(cob_id: int) -> int:
 
 
 def read_other_rpdos(master: Master) -> tuple[OtherRpdo, ...]:
-    """Read all RPDOs that the drive has beside the profile's; SdoAbort where one is there and cannot be read.
+    """Read all RPDOs of the drive that the profile lacks; SdoAbort if one exists but cannot be read.
 
-    Asked is from the first on, and at the first places of each further axis of a device (CiA 402-3), until so many in a
-    row do not exist; and whatever the drive's EDS has. A drive that numbers its RPDOs otherwise must have an EDS.
+    RPDOs are read from the first on, and from the first number of each further axis of a device (CiA 402-3), until so
+    many in succession do not exist; then those of the drive's EDS. A drive with another numbering needs an EDS.
     """
     own, found = {spec.number for spec in master.profile.rpdos}, dict[int, OtherRpdo | None]()
     for block in range(0, MOST_RPDOS, LOGICAL_AXIS_PDOS):
@@ -85,7 +85,7 @@ def read_other_rpdos(master: Master) -> tuple[OtherRpdo, ...]:
 
 
 def _of_eds(master: Master) -> set[int]:
-    """Return the RPDOs that the drive's EDS has; it may have more, or fewer."""
+    """The drive may have more RPDOs, or fewer."""
     eds = master.config.axis[master.axis].drive.eds
     return set() if eds is None else {place.number for place in read_device(eds).rpdos}
 
@@ -103,7 +103,7 @@ def _read(master: Master, number: int) -> OtherRpdo | None:
 
 
 def _number(master: Master, index: int, sub: int) -> int | None:
-    """Read an integer; None where the drive does not have it. Any other refusal is no answer: SdoAbort."""
+    """Return None only if the object does not exist; raise SdoAbort on any other refusal."""
     try:
         return master.sdo.read_int(index, sub)
     except SdoAbort as abort:
@@ -123,16 +123,16 @@ def offsets_of(master: Master, rpdo: OtherRpdo) -> tuple[int, ...]:
 
 
 def record_options(master: Master, rpdos: tuple[OtherRpdo, ...]) -> dict[str, int]:
-    """Return what a commissioning record keeps of them: the COB-IDs, for a running guard asks no drive by SDO.
+    """Return the COB-IDs to be stored in a commissioning record, since a running guard reads no drive by SDO.
 
-    Of those that are valid all, so that their frames are known to be harmless; of the others those with an offset.
+    All valid ones, so that their frames count as harmless; of the others those with an offset.
     """
     return {rpdo.key: rpdo.cob_id for rpdo in rpdos if rpdo.valid or offsets_of(master, rpdo)}
 
 
 def compare_writers(master: Master, rpdos: tuple[OtherRpdo, ...]) -> Finding:
-    """Nobody but us may write the offsets, and our frames may write nothing else."""
-    expected = "none but the profile's RPDOs"
+    """Verify that only fdhil can write the offsets, and that its frames write nothing else."""
+    expected = "only the profile's RPDOs"
     wrong = next(_wrong(master, rpdos), None)
     if wrong is None:
         return Finding(POINT, expected, expected)
@@ -161,9 +161,9 @@ def _wrong(master: Master, rpdos: tuple[OtherRpdo, ...]) -> Iterator[tuple[Other
 def compare_heard_writers(
     config: MachineConfig, name: str, record: CommissioningRecord | None, traffic: Traffic
 ) -> Finding:
-    """Compare what an axis' drive shows of its offset with the frames that are none of a configured drive's PDOs.
+    """Compare an axis' offset with the frames that are not PDOs of a configured drive.
 
-    By SDO nobody is asked where an NC runs the bus: a frame that carries what the drive holds has written it.
+    With an NC on the bus no drive is read by SDO: a frame that carries the drive's offset has written it.
     """
     profile, axis = load_profile(config.axis[name].drive), config.axis[name]
     kept = () if record is None else record.rpdos
@@ -173,18 +173,17 @@ def compare_heard_writers(
             found = load_profile(other.drive)
             known |= {spec.cob_base + config.node_id(each) for spec in (*found.rpdos, *found.tpdos)}
     held, bits = _shown_offset(profile, config.node_id(name), traffic)
-    expected = "written by nobody else"
+    expected = "written by fdhil only"
     for cob_id in sorted({*traffic.ids} - known) if abs(held) >= LEAST_HELD else ():
         if _carries(traffic, cob_id, held, bits):
             um = abs(held) / axis.scaling.increments_per_mm * 1e3
             cause = f"it holds an offset of {um:.1f} um, which the frame {cob_id:03X} of another master carries"
-            advice = "find what the NC sets up there, switch it off, and run fdhil check with the NC off"
+            advice = "find the NC function that writes it, switch it off, and run fdhil check with the NC off"
             return Finding(POINT, expected, f"{cob_id:03X}", False, cause, advice)
     return Finding(POINT, expected, expected)
 
 
 def _shown_offset(profile: DriveProfile, node_id: int, traffic: Traffic) -> tuple[int, int]:
-    """Return the offset that the drive's TPDO showed last, and its bits; 0 where none came."""
     found = profile.find_tpdo(profile.offset)
     data = None if found is None else traffic.data.get(found[0].cob_base + node_id)
     if found is None or data is None:
@@ -193,7 +192,6 @@ def _shown_offset(profile: DriveProfile, node_id: int, traffic: Traffic) -> tupl
 
 
 def _carries(traffic: Traffic, cob_id: int, held: int, bits: int) -> bool:
-    """Whether a PDO's frame has this number at one of its bytes."""
     if not 0x180 <= cob_id < COB_SDO_RESPONSE:
         return False
     frame = traffic.data[cob_id].to_bytes(8, "little")[: traffic.length[cob_id]]
@@ -201,6 +199,6 @@ def _carries(traffic: Traffic, cob_id: int, held: int, bits: int) -> bool:
 
 
 def unreadable(abort: SdoAbort) -> Finding:
-    """The finding where an RPDO of the drive is there and cannot be read."""
+    """Return the finding for an RPDO that exists but cannot be read."""
     cause = f"not all of its RPDOs can be read ({abort}): one may write its offset"
-    return Finding(POINT, "none but the profile's RPDOs", "unknown", None, cause, "see in its manual which it has")
+    return Finding(POINT, "only the profile's RPDOs", "unknown", None, cause, "look up its RPDOs in its manual")

@@ -1,4 +1,4 @@
-"""Hears one axis as the daemon would, while the commissioning moves it: the records of its drive and its sensors."""
+"""Record one axis as the daemon would while commissioning moves it: the samples of its drive and sensors."""
 
 import asyncio
 import threading
@@ -16,13 +16,13 @@ LONGEST_S = 600.0
 
 
 class Overhearing:
-    """The records of one axis, gathered in a thread of its own until it is closed; a context manager.
+    """Records of one axis, collected in its own thread until it is closed; a context manager.
 
-    It listens by a connection of its own: what is judged is what went over the bus. ``records`` grow while it is open.
+    It has its own connection, so that the traffic on the bus is assessed. ``records`` grow while it is open.
     """
 
     def __init__(self, config: MachineConfig, axis: str, rapid_mm_s: float | None = None) -> None:
-        """``rapid_mm_s`` is the speed of the rapids that will be seen; left out: the axis' own."""
+        """``rapid_mm_s`` is the speed of the test rapids; default: the axis' own."""
         self._config, self.axis = alone(config, axis, rapid_mm_s), axis
         self.records: list[Record] = []
         self._opened = threading.Event()
@@ -52,17 +52,17 @@ class Overhearing:
 
     @property
     def newest_tick(self) -> int:
-        """The newest tick of the axis that was heard, -1 before the first."""
+        """Newest tick received from the axis; -1 before the first."""
         blocks = (r for r in reversed(list(self.records)) if isinstance(r, AxisSamples) and r.tick.size)
         return next((int(block.tick[-1]) for block in blocks), -1)
 
     def check(self) -> None:
-        """Raise what ended the listening: a ConnectError of the bus or a sensor."""
+        """Raise what ended the recording: a ConnectError of the bus or a sensor."""
         if self._failure is not None:
             raise self._failure
 
     def recording(self) -> Recording:
-        """Return all rows that were heard."""
+        """Return all samples received."""
         period_s = self._config.machine.sync_period_s
         recent = RecentSamples(self.axis, self._config.axis[self.axis], round(LONGEST_S / period_s), period_s)
         for record in self.records:
@@ -83,7 +83,7 @@ class Overhearing:
 
 
 def alone(config: MachineConfig, axis: str, rapid_mm_s: float | None = None) -> MachineConfig:
-    """Return the configuration of one axis alone, whose rapids are told by its demand: no NC is there to tell them."""
+    """Return the configuration of one axis, with rapids inferred from its demand: no NC is there to report them."""
     settings = config.axis[axis]
     drive = settings.drive.model_copy(update={"node_id": config.node_id(axis)})
     rapid = rapid_mm_s or settings.rapid_speed_mm_s

@@ -1,7 +1,7 @@
-"""Sets a drive's PDOs up as its profile has them, by SDO, with no NC on the bus; nothing moves.
+"""Set up a drive's PDOs according to its profile by SDO, while no NC runs the bus; nothing moves.
 
-The order is that of CiA 301, 7.5.2.36 and 7.5.2.38: the PDO is made invalid, its mapping emptied, written and counted,
-and only then it is valid again. What fails is given back as it was.
+The order follows CiA 301, 7.5.2.36 and 7.5.2.38: the PDO is made invalid, its mapping is cleared, written and counted,
+then it is made valid again. On failure the old PDOs are restored.
 """
 
 from dataclasses import dataclass
@@ -22,16 +22,16 @@ TOO_LONG = 0x06040042
 
 @dataclass(frozen=True, slots=True)
 class SetUp:
-    """What was done to a drive: the PDOs written (none: all were right), and whether it keeps them when it is off."""
+    """The PDOs that were written (none: all were right), and whether the drive has stored them permanently."""
 
     written: tuple[str, ...]
     saved: bool | None
 
 
 def set_up_pdos(master: Master) -> SetUp:
-    """Write what differs from the profile and save it; DriveFault when the drive refuses, all PDOs are then as before.
+    """Write all PDOs that differ from the profile and store them; on DriveFault all PDOs are unchanged.
 
-    ``saved`` None: nothing was written, False: the drive has no 0x1010, or refuses it.
+    ``saved`` None: nothing was written, False: the drive has no 0x1010 or refuses it.
     """
     listen(master)
     _require_disabled(master)
@@ -46,7 +46,7 @@ def set_up_pdos(master: Master) -> SetUp:
             begun.append((spec, found))
             _write_spec(master, spec, found)
         _require_same(master)
-    except BaseException as error:  # Ctrl-C, too: half a mapping is worse than the old one
+    except BaseException as error:  # Ctrl-C, too: a partial mapping is worse than the old one
         _give_back(master, begun, error)
         raise
     return SetUp(tuple(spec.name for spec, _ in wrong), _save(master))
@@ -55,7 +55,7 @@ def set_up_pdos(master: Master) -> SetUp:
 def _require_disabled(master: Master) -> None:
     word = read_optional(master, Object.STATUSWORD)
     if word is not None and state_of(word) is State.OPERATION_ENABLED:
-        raise DriveFault(master.device, "it is in Operation enabled, and nothing was written; switch it off first")
+        raise DriveFault(master.device, "it is in Operation enabled, so nothing was written; switch it off first")
 
 
 def _write_spec(master: Master, spec: PdoSpec, found: PdoFound) -> None:
@@ -65,16 +65,16 @@ def _write_spec(master: Master, spec: PdoSpec, found: PdoFound) -> None:
         _write(master, found, wanted, spec.every_sync, tuple(entry.mapping for entry in spec.entries))
     except SdoAbort as abort:
         why = {
-            UNMAPPABLE: "it maps one of its objects into no such PDO",
-            TOO_LONG: "it does not map so many objects or bytes",
+            UNMAPPABLE: "one of these objects cannot be mapped into it",
+            TOO_LONG: "these are too many objects or bytes",
         }.get(abort.code, str(abort).removeprefix(f"{master.device}: "))
         listed = ", ".join(f"{entry.index:04X}:{entry.sub:02X}" for entry in spec.entries)
-        advice = "its PDOs are as before; base a profile of your own on this one, with what the drive takes"
+        advice = "its PDOs are unchanged; write your own profile based on this one, with objects that the drive can map"
         raise DriveFault(master.device, f"it refuses {spec.name} with {listed}: {why}; {advice}") from None
 
 
 def _write(master: Master, found: PdoFound, cob_id: int, kind: int, words: tuple[int, ...]) -> None:
-    """Write one PDO; a mapping that is right already is not touched: it may be fixed."""
+    """Write one PDO; a correct mapping is not written, since it may be read-only."""
     write = master.sdo.write_int
     write(found.parameter, 1, found.cob_id | INVALID_COB_ID, 4)
     if read_mapping(master, found.mapping) != words:
@@ -91,18 +91,17 @@ def _require_same(master: Master) -> None:
         finding = compare_pdo(spec, found, master.node_id)
         if finding.ok is False:
             raise DriveFault(
-                master.device, f"what was written is not what it holds ({finding.cause}); use its own tool"
+                master.device, f"it did not keep the written PDOs ({finding.cause}); use the drive's own tool"
             )
 
 
 def _give_back(master: Master, begun: list[tuple[PdoSpec, PdoFound]], error: BaseException) -> None:
-    """Write the old PDOs again, the last first; ProtocolError when that fails too."""
     for spec, found in reversed(begun):
         try:
             _write(master, found, found.cob_id, found.kind, found.mapped)
         except DeviceError as left:
             cause = str(error).removeprefix(f"{master.device}: ") or "it was interrupted"
-            text = f"{cause}; {spec.name} could not be given back ({left}); power the drive off and on again"
+            text = f"{cause}; {spec.name} could not be restored ({left}); power the drive off and on again"
             raise ProtocolError(master.device, text) from error
 
 

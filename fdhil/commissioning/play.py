@@ -1,8 +1,8 @@
-"""Plays a demand to the drives of a test bench that has no NC: fdhil is the NC for as long as it lasts.
+"""Play a demand on the drives of a test bench without an NC: fdhil acts as the NC meanwhile.
 
-It produces SYNC, is the NMT master and streams the set-points (0x607A) in cyclic synchronous position. Everything is
-checked before anything is sent, and whatever ends it, the axes are braked, the drives switched off and what was written
-is given back. A correction by the guard works beside it: the offsets (0x60B0) are the guard's alone.
+It produces SYNC, is the NMT master and streams the set-points (0x607A) in cyclic synchronous position mode. Everything
+is checked before anything is sent. However it ends, the axes are braked, the drives switched off and written objects
+restored. A guard can correct at the same time: the offsets (0x60B0) are the guard's alone.
 """
 
 import contextlib
@@ -29,22 +29,22 @@ from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault, DeviceError, DriveFault, ForeignMaster
 from fdhil.records import Float, Trajectory
 
-NEAR_MM = 0.05  # a start no farther away is gone to without being asked
-APPROACH_SHARE = 0.1  # of the speed an axis may have, on the way to the start
+NEAR_MM = 0.05  # a start within this distance needs no --go-to-start
+APPROACH_SHARE = 0.1  # of the axis' permitted speed, on the way to the start
 APPROACH_CYCLES = 50
-SETTLE_S = 0.3  # rest after the last row: the drives run their set-points late
-LANDING_S = 3.0  # a guard that ramps to zero needs less
+SETTLE_S = 0.3  # rest after the last row: the drives apply set-points with a delay
+LANDING_S = 3.0  # a guard needs less to ramp to zero
 OFF_CYCLES = 20
 BLOCK_ROWS = 256
 Signals = Callable[[SetPoints], contextlib.AbstractContextManager[None]]
-"""Has Ctrl-C and its like stop a path, instead of raising."""
+"""Makes Ctrl-C and similar signals stop a path instead of raising."""
 
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """What was played: rows of all, why it ended early (None: it did not), how late SYNC was, how it was scheduled.
+    """Result of a playback: rows played of all, why it ended early (None: it did not), SYNC lateness, scheduling.
 
-    ``left`` says how the drives were left, empty where ``stopped`` does.
+    ``left`` describes how the drives were left; empty if ``stopped`` does.
     """
 
     rows: int
@@ -57,7 +57,7 @@ class Played:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A demand as increments for every axis of the machine; an axis that it does not name stays where it stands."""
+    """A demand in increments for every axis of the machine; an axis that it does not name keeps its position."""
 
     config: MachineConfig
     trajectory: Trajectory
@@ -69,7 +69,7 @@ class Plan:
         return tuple(self.config.axis)
 
     def rows(self, here: Sequence[int]) -> Float:
-        """Return the set-points (n, axes) in increments; ``here`` is where the axes stand."""
+        """Return the set-points (n, axes) in increments; ``here`` are the present positions."""
         position, count = self.trajectory.position_mm, self.trajectory.time_s.size
         columns = []
         for axis, at in zip(self.axes, here, strict=True):
@@ -80,11 +80,13 @@ class Plan:
 
 
 def plan_play(config: MachineConfig, trajectory: Trajectory, source: str) -> Plan:
-    """Check a demand against [axis.*.setpoints]; ConfigError without that section, DriveFault for the first row out."""
+    """Check a demand against [axis.*.setpoints]; ConfigError without that section, DriveFault for an invalid row."""
     lacking = [name for name, axis in config.axis.items() if axis.setpoints is None]
     if lacking:
         faults = [
-            ConfigFault(f"axis.{name}.setpoints", "fdhil may send this axis no set-points", "give it its travel_mm")
+            ConfigFault(
+                f"axis.{name}.setpoints", "is missing, so fdhil may not move this axis", "add it with travel_mm"
+            )
             for name in lacking
         ]
         raise ConfigError(source, faults)
@@ -99,7 +101,7 @@ def plan_play(config: MachineConfig, trajectory: Trajectory, source: str) -> Pla
 
 
 def _require_inside(plan: Plan) -> None:
-    """Send the rows nowhere and see whether one is stopped."""
+    """Play the rows without sending them, to find the first one that would stop the motion."""
     middle = [round((of.low + of.high) / 2) for of in plan.bounds]
     rows = plan.rows(middle)
     points = SetPoints(plan.bounds, rows[0].round().astype(int).tolist())
@@ -109,48 +111,48 @@ def _require_inside(plan: Plan) -> None:
     if points.stopped is not None:
         row = min(points.played, len(rows) - 1)
         where = f"{plan.trajectory.time_s[row]:.3f} s, {plan.trajectory.place(row)}"
-        advice = "nothing was sent; change the program, or [axis.*.setpoints] where the machine has room for it"
+        advice = "nothing was sent; change the program, or [axis.*.setpoints] if the machine has the room"
         raise DriveFault("the demand", f"{points.stopped} (row {row + 1}, {where}); {advice}")
 
 
 def valid_records(config: MachineConfig) -> dict[str, CommissioningRecord]:
-    """Return the record of every axis; DriveFault where one is missing, void, or of another set-up."""
+    """Return the record of every axis; DriveFault if one is missing, void, or of another configuration."""
     found = {}
     for name in config.axis:
         record = load_record(config.store.directory, name, config.store.commissioning_key)
         if record is None or not of_config(record, config, name) or record.watchdog != "proven":
             what = "it is not commissioned with this configuration"
-            raise DriveFault(f"drive {name}", f"{what}, and nothing was sent; run fdhil commission --axis {name}")
+            raise DriveFault(f"drive {name}", f"{what}, so nothing was sent; run fdhil commission --axis {name}")
         if is_void(config.store.directory, name):
-            what = "it was set up anew or has rebooted since it was commissioned"
-            raise DriveFault(f"drive {name}", f"{what}, and nothing was sent; run fdhil check, which compares it")
+            what = "it was reconfigured or has rebooted since it was commissioned"
+            raise DriveFault(f"drive {name}", f"{what}, so nothing was sent; run fdhil check, which compares it")
         found[name] = record
     return found
 
 
 class Bench:
-    """The drives of a machine whose buses fdhil runs: ``say`` gets a sentence per step. See :func:`on_bench`."""
+    """The drives of a machine whose buses fdhil runs; ``say`` gets a sentence per step. See :func:`on_bench`."""
 
     def __init__(self, plan: Plan, loop: Cycle, masters: Sequence[Master], say: Callable[[str], None]) -> None:
         self.plan, self.loop, self.masters, self._say = plan, loop, tuple(masters), say
         self._config = plan.config
         self._boots: dict[str, int] = {}
 
-    # nothing is sent but SDO requests
+    # only SDO requests are sent
 
     def compare(self, records: Mapping[str, CommissioningRecord]) -> None:
-        """Listen, and refuse another master; read every drive, and refuse one that is not as it was signed off."""
+        """Listen and refuse another master; read every drive and refuse one that differs from its record."""
         self._say("listening: no NC may run the buses")
         for bus in self.loop.buses.values():
             listen(next(master for master in self.masters if master.bus is bus))
-        self._say("comparing the drives with their commissioning records; nothing moves")
+        self._say("comparing the drives with their commissioning records; no axis moves")
         for master in self.masters:
             self._boots[master.axis] = master.heard.boots
             finding = compare_record(records[master.axis], survey(master))
             require(master, [finding])
             held = read_optional(master, master.profile.offset[0], master.profile.offset[1], signed=True)
             if held:
-                text = f"it holds an offset (0x60B0) of {held} increments; run fdhil adopt before anything moves"
+                text = f"it holds an offset (0x60B0) of {held} increments; run fdhil adopt before you move it"
                 raise DriveFault(master.device, text)
         self._require_room(records)
         self._require_one_counter()
@@ -162,26 +164,26 @@ class Bench:
                 low, high = sorted(self._mm(master, limit) for limit in travel)
                 axis = self._config.axis[master.axis]
                 leave = f"{low / axis.mm_per_unit:g} to {axis.shown(high, form='g')}"
-                text = f"its software limits (0x607D) leave it {leave}, less than [axis.{master.axis}"
+                text = f"its software limits (0x607D) allow {leave}, less than [axis.{master.axis}"
                 raise DriveFault(master.device, f"{text}.setpoints] {axis.shown_key('travel_mm')}; correct that")
 
     def _require_one_counter(self) -> None:
         counters = {read_optional(master, Object.SYNC_COUNTER_OVERFLOW) or 0 for master in self.masters}
         if len(counters) > 1:
             shown = ", ".join(map(str, sorted(counters)))
-            raise DriveFault("the drives", f"they want different SYNC counters (0x1019: {shown}); set all to one value")
+            raise DriveFault("the drives", f"they need different SYNC counters (0x1019: {shown}); set all to one value")
 
     def as_compared(self) -> set[str]:
-        """Return the axes whose drives have not booted since they were compared, while SYNC goes on."""
-        self.masters[0].wait_cycles(OFF_CYCLES)  # so that what others have heard by now is heard here too
+        """Return the axes whose drives have not booted since they were compared, while SYNC continues."""
+        self.masters[0].wait_cycles(OFF_CYCLES)  # to receive every frame that others have received by now
         return {master.axis for master in self.masters if master.heard.boots == self._boots[master.axis]}
 
     def here(self) -> list[int]:
-        """Read where the axes stand, in increments."""
+        """Read the present positions in increments."""
         return [master.sdo.read_int(*master.profile.position, signed=True) for master in self.masters]
 
     def away_mm(self, here: Sequence[int]) -> list[float]:
-        """How far each axis is from the first row."""
+        """Return the distance of each axis from the first row."""
         first = self.plan.rows(here)[0]
         return [
             self._config.axis[master.axis].scaling.to_mm(float(start) - at)
@@ -189,16 +191,16 @@ class Bench:
         ]
 
     def require_start(self, here: Sequence[int], go_to_start: bool) -> None:
-        """DriveFault where an axis is outside its travel, or not at the start and nobody said that it may go there."""
+        """Raise DriveFault if an axis is outside its travel, or away from the start without ``go_to_start``."""
         for master, at, away, of in zip(self.masters, here, self.away_mm(here), self.plan.bounds, strict=True):
             if not of.low <= at <= of.high:
-                stands = self._shown(master, self._mm(master, at))
-                text = f"it stands at {stands}, outside its travel; bring it inside by hand"
+                position = self._shown(master, self._mm(master, at))
+                text = f"its position is {position}, outside its travel; move it inside by hand"
                 raise DriveFault(master.device, text)
             if abs(away) > NEAR_MM and not go_to_start:
-                stands, off = (self._shown(master, mm) for mm in (self._mm(master, at), abs(away)))
-                text = f"it stands at {stands}, {off} from the start of the demand"
-                raise DriveFault(master.device, f"{text}; move it there, or let it go there slowly with --go-to-start")
+                position, off = (self._shown(master, mm) for mm in (self._mm(master, at), abs(away)))
+                text = f"its position is {position}, {off} from the start of the demand"
+                raise DriveFault(master.device, f"{text}; move it there, or use --go-to-start to move it there slowly")
 
     def _mm(self, master: Master, increments: float) -> float:
         return self._config.axis[master.axis].scaling.to_mm(increments)
@@ -206,14 +208,14 @@ class Bench:
     def _shown(self, master: Master, mm: float) -> str:
         return self._config.axis[master.axis].shown(mm, form=".3f")
 
-    # the drives are led
+    # the drives are controlled
 
     @contextlib.contextmanager
     def led(self, written: Callable[[], None]) -> Iterator[None]:
-        """Take the bus over and hold every drive in Operation enabled; at the end they are off and as they were.
+        """Take over the bus and hold every drive in Operation enabled; at the end they are off and restored.
 
-        ``written`` is called while SYNC goes on when 0x1016 was written and when it was given back: a guard that heard
-        it takes the drives for set up anew.
+        ``written`` is called while SYNC runs, after 0x1016 was written and after it was restored: a guard that receives
+        these writes considers the drives reconfigured.
         """
         node_id, beat_s = self._config.play.node_id, self._config.play.heartbeat_s
         with self._bus_loss_told(), contextlib.ExitStack() as undo:
@@ -221,7 +223,7 @@ class Bench:
             for master in self.masters:
                 undo.enter_context(self._given_back(watched(master, node_id, beat_s)))
             undo.callback(self._switch_off)
-            self._say("starting SYNC and switching the drives on, held where they stand")
+            self._say("starting SYNC and switching the drives on at their present positions")
             for master in self.masters:
                 prepare(master)
             self.loop.heartbeat, self.loop.heartbeat_s = node_id, beat_s
@@ -237,7 +239,7 @@ class Bench:
         except DeviceError as error:
             if isinstance(error, ForeignMaster) or not self.loop.lost:
                 raise
-            what = "nothing more can be sent: a drive that is on stops by itself when it misses our heartbeat (0x1016)"
+            what = "nothing more can be sent: drives stop by themselves when they miss fdhil's heartbeat (0x1016)"
             raise DeviceError(error.device, f"{str(error).removeprefix(f'{error.device}: ')}; {what}") from None
 
     def _leave_bus(self, written: Callable[[], None]) -> None:
@@ -249,7 +251,6 @@ class Bench:
 
     @contextlib.contextmanager
     def _given_back(self, watching: contextlib.AbstractContextManager[None]) -> Iterator[None]:
-        """What cannot be given back, for the bus is gone, is told and hides nothing else."""
         with contextlib.ExitStack() as undo:
             undo.enter_context(watching)
             try:
@@ -259,11 +260,10 @@ class Bench:
                     try:
                         undo.close()
                     except DeviceError as error:
-                        self._say(f"0x1016 could not be given back ({error}); power the drive off and on again")
+                        self._say(f"0x1016 could not be restored ({error}); power the drive off and on again")
 
     def _switch_off(self) -> None:
-        """Wait until a guard has taken its offsets away, then take the power off, step by step."""
-        with undisturbed(), contextlib.suppress(DeviceError):  # of a bus that is gone: what went wrong is told already
+        with undisturbed(), contextlib.suppress(DeviceError):  # of a bus that is gone: the cause has been reported
             if not self.loop.turning:
                 return
             self._await_landing()
@@ -281,9 +281,9 @@ class Bench:
             self.masters[0].wait_cycles(OFF_CYCLES)
 
     def go_to_start(self, signals: Signals, asked: bool) -> str | None:
-        """Go slowly and straight to the first row; why it was stopped on the way, None when it is there.
+        """Move slowly and straight to the first row; return why it was stopped on the way, None on arrival.
 
-        DriveFault where an axis has moved away from it meanwhile and nobody ``asked`` that it goes there.
+        DriveFault if an axis has moved away from the start meanwhile and ``asked`` is false.
         """
         here = [master.target or 0 for master in self.masters]
         self.require_start(here, asked)
@@ -294,7 +294,7 @@ class Bench:
         return self._played(rows, signals).stopped
 
     def play(self, signals: Signals, begin: Callable[[], bool] = lambda: True) -> Played:
-        """Play the demand from where the axes are held, as soon as ``begin`` is true."""
+        """Play the demand from the held positions as soon as ``begin`` returns true."""
         rows = self.plan.rows([master.target or 0 for master in self.masters])
         self.loop.lateness = Lateness()
         return self._played(rows, signals, begin)
@@ -305,7 +305,7 @@ class Bench:
             while path.stopped is None and loop.turning and not begin():
                 self._watch(path)
             path.play(_in_blocks(rows))
-            while not path.resting and loop.turning:  # rows that nobody sends any more never end
+            while not path.resting and loop.turning:  # without a running cycle the rows would never end
                 self._watch(path)
             if path.stopped is None and loop.turning:
                 self.masters[0].wait_cycles(round(SETTLE_S / loop.period_s))
@@ -325,16 +325,16 @@ class Bench:
 
 
 def _in_blocks(rows: Float) -> Iterator[list[float]]:
-    """Yield the rows; a long program is not turned into a million lists at once, which no cycle would wait for."""
+    """Yield the rows; converting a long program to lists at once would delay the cycle."""
     for first in range(0, len(rows), BLOCK_ROWS):
         yield from rows[first : first + BLOCK_ROWS].tolist()
 
 
 @contextlib.contextmanager
 def on_bench(plan: Plan, say: Callable[[str], None], guard_runs: Callable[[], bool]) -> Iterator[Bench]:
-    """Open the buses of the machine; nothing is sent yet, and at the end everything is closed.
+    """Open the machine's buses and close them at the end; nothing is sent yet.
 
-    Offsets are those of another master where no guard runs.
+    Without a running guard, offsets count as another master's.
     """
     config = plan.config
     buses = dict.fromkeys(axis.drive.bus for axis in config.axis.values())

@@ -1,7 +1,7 @@
-"""Tells by a move to and fro whether speed, current and voltage have their unit and their sign. Pure.
+"""Check, by a move back and forth, the units and signs of speed, current and voltage. Pure.
 
-What is spent on a way that ends where it began is friction and heat alone, whatever weight or spring pulls at the
-axis: the integrals of i w, u i and u w over it are positive, and each needs two signs to be right (FAULTS B10).
+The energy spent on a path that ends where it began is only friction and heat, whatever weight or spring acts on the
+axis: the integrals of i w, u i and u w over it are positive, and each requires two correct signs (FAULTS B10).
 """
 
 import math
@@ -16,19 +16,19 @@ from fdhil.records import Float, Recording
 SPEED_TOLERANCE = 0.05
 TRAVEL_TOLERANCE = 0.02
 TABLE_TOLERANCE = 0.05  # backlash on a jog of 5 mm is less
-LEAST_CORRELATION = 0.05  # of two signals, by which the sign of their product is told
-RESTING = 0.2  # of the top speed: slower rows tell of offsets and rounding
+LEAST_CORRELATION = 0.05  # of two signals, to determine the sign of their product
+RESTING = 0.2  # of the top speed: slower samples show offsets and rounding
 CODE = "SignOrScale"
 
 
 def judge_jog(jog: Recording, distance_mm: float, axis: Axis) -> Iterator[Finding]:
-    """Compare what was heard of a jog over ``distance_mm`` and back with what an axis with right units shows."""
-    asked = abs(distance_mm)
+    """Compare the recording of a jog over ``distance_mm`` and back with an axis whose units are correct."""
+    commanded = abs(distance_mm)
     way = float(np.nanmax(np.abs(jog.position_mm - jog.position_mm[np.isfinite(jog.position_mm)][0])))
-    wanted, went = axis.shown(asked, form="g"), axis.shown(way, form=".3f")
-    cause = f"{CODE}: it was to go {wanted} and its position (0x6064) went {went}"
-    same = abs(way - asked) <= TRAVEL_TOLERANCE * asked
-    advice = "its set-point and its position count differently; correct its factors (0x6091, 0x6092)"
+    wanted, went = axis.shown(commanded, form="g"), axis.shown(way, form=".3f")
+    cause = f"{CODE}: it was commanded {wanted}, but its position (0x6064) moved {went}"
+    same = abs(way - commanded) <= TRAVEL_TOLERANCE * commanded
+    advice = "its set-point and position have different scales; correct its factors (0x6091, 0x6092)"
     yield Finding("travel", wanted, went, same, cause, advice)
     yield _speed(jog)
     yield from _table(jog)
@@ -38,15 +38,15 @@ def judge_jog(jog: Recording, distance_mm: float, axis: Axis) -> Iterator[Findin
     if voltage:
         yield _sign("voltage", "voltage times current, and times speed", min(voltage), VOLTAGE_ADVICE)
     else:
-        cause = "no voltage was heard"
-        yield Finding("voltage sign", "positive", "not told", None, cause, "R and L stay the data sheet's")
+        cause = "no voltage was recorded"
+        yield Finding("voltage sign", "positive", "unknown", None, cause, "R and L stay as in the data sheet")
 
 
 VOLTAGE_ADVICE = "the sensor's leads, its word order and [axis.*.voltage] scale"
 
 
 def signed_power(rows: Recording) -> dict[str, float]:
-    """Return the correlation of each two of current, speed and voltage over the rows that move: 1 to -1."""
+    """Return the correlation (-1 to 1) of each pair of current, speed and voltage over the samples in motion."""
     speed, current, voltage = rows.speed_rad_s, rows.current_a, voltage_of(rows)
     signals = {"current x speed": (current, speed)}
     if voltage is not None:
@@ -56,7 +56,7 @@ def signed_power(rows: Recording) -> dict[str, float]:
 
 
 def voltage_of(rows: Recording) -> Float | None:
-    """Return the voltage at each row (n,), that of a slower sensor by lines between its samples; None without one."""
+    """Return the voltage at each sample (n,), interpolated linearly from a slower sensor; None without one."""
     slow = rows.slow_voltage
     if slow is None:
         return rows.voltage_v
@@ -75,19 +75,18 @@ def _correlation(a: Float, b: Float) -> float:
 def _sign(what: str, product: str, correlation: float, where: str) -> Finding:
     shown = f"{correlation:+.2f}"
     if abs(correlation) < LEAST_CORRELATION:
-        cause = f"{CODE}: {product} come to nothing over a way to and fro ({shown}): its {what} tells nothing"
+        cause = f"{CODE}: {product} cancel out over a move back and forth ({shown}): the sign of its {what} is unknown"
         return Finding(f"{what} sign", "positive", shown, False, cause, f"check {where}")
-    cause = f"{CODE}: {product} is negative over a way to and fro ({shown}): its {what} has the wrong sign"
+    cause = f"{CODE}: {product} is negative over a move back and forth ({shown}): its {what} has the wrong sign"
     return Finding(f"{what} sign", "positive", shown, correlation > 0.0, cause, f"check {where}")
 
 
 def _speed(jog: Recording) -> Finding:
-    """Compare the speed (0x606C) with how the position changes."""
     rate = np.gradient(jog.position_mm, jog.dt_s) * 2 * math.pi / jog.pitch_mm
     known = np.isfinite(rate) & np.isfinite(jog.speed_rad_s)
     power = float(np.square(rate[known]).sum())
     ratio = float(rate[known] @ jog.speed_rad_s[known]) / power if power > 0.0 else 0.0
-    cause = f"{CODE}: its speed (0x606C) is {ratio:.3g} times what its position shows"
+    cause = f"{CODE}: its speed (0x606C) is {ratio:.3g} times the derivative of its position"
     same = abs(ratio - 1.0) <= SPEED_TOLERANCE
     return Finding("speed unit", "1", f"{ratio:.3f}", same, cause, "set drive.speed_unit, or its speed's unit (0x60A9)")
 
@@ -100,20 +99,20 @@ def _table(jog: Recording) -> Iterator[Finding]:
         return
     place, table = (values[known] - values[known][0] for values in (jog.position_mm, jog.table_mm))
     ratio = float(place @ table) / float(place @ place)
-    cause = f"{CODE}: its table goes {ratio:.3g} times the way of its motor"
+    cause = f"{CODE}: its table moves {ratio:.3g} times the distance of its motor"
     advice = "check drive.sign, screw_pitch_mm and increments_per_rev, then sign and scale of the table's encoder"
     yield Finding("table", "1", f"{ratio:.3f}", abs(ratio - 1.0) <= TABLE_TOLERANCE, cause, advice)
 
 
 def judge_acceleration(rows: Recording) -> Finding:
-    """While a rapid speeds up the winding takes power: the integral of u i is positive, and so is R."""
+    """Check the power balance: during acceleration of a rapid the integral of u i is positive, as R is."""
     voltage = voltage_of(rows)
     expected = "power in while accelerating"
     if voltage is None:
-        return Finding("power balance", expected, "no voltage", None, "no voltage was heard", "nothing")
+        return Finding("power balance", expected, "no voltage", None, "no voltage was recorded", "nothing")
     speed = np.abs(np.nan_to_num(rows.speed_rad_s))
     rising = np.gradient(speed, rows.dt_s) > 0.2 * float(np.max(np.gradient(speed, rows.dt_s)))
     known = rising & np.isfinite(voltage) & np.isfinite(rows.current_a)
     joule = float(voltage[known] @ rows.current_a[known]) * rows.dt_s
-    cause = f"{CODE}: it gave {-joule:.1f} J while it accelerated, which no motor does"
+    cause = f"{CODE}: it delivered {-joule:.1f} J while it accelerated, which is impossible for a motor"
     return Finding("power balance", expected, f"{joule:+.1f} J", joule > 0.0, cause, f"check {VOLTAGE_ADVICE}")

@@ -1,7 +1,7 @@
-"""Keeps what a commissioning has proven step by step, so that one that was stopped goes on where it ended.
+"""Store the results of commissioning steps, so that an interrupted commissioning continues where it stopped.
 
-A step holds for the drive and the configuration that it was done with, which a fingerprint tells. The file lies beside
-the record and is sealed with the same key: what is signed off may rest on it.
+A step is valid for the drive and configuration it was done with, identified by a fingerprint. The file is stored next
+to the record and sealed with the same key, since the sign-off may rely on it.
 """
 
 import hashlib
@@ -21,12 +21,12 @@ SCHEMA = "fdhil-commissioning-steps-1"
 MAX_BYTES = 256 * 1024
 
 Found = Mapping[str, Any]
-"""What a step found: names and JSON values; a step that could not tell something has None there and is not kept."""
+"""Results of a step: names and JSON values; a step with an undetermined result (None) is not stored."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One step that was done: for which drive and configuration, when, and what it found."""
+    """A completed step: the drive and configuration it is valid for, its time, and its results."""
 
     holds_for: str
     done_utc: str
@@ -34,15 +34,15 @@ class Step:
 
 
 def steps_path(directory: Path, axis: str) -> Path:
-    """Return where the steps of an axis are kept."""
+    """Return the file of an axis' completed steps."""
     return directory / f"commissioning-{axis}.steps.json"
 
 
 class Progress:
-    """The steps of one axis that were done; each is written as soon as it is.
+    """The completed steps of one axis; each is written as soon as it is done.
 
-    ``doubt`` says why a file that is there is not believed. ``on_kept`` is told of each step that need not be done
-    again. StoreError where the file is there and cannot be read, or the key.
+    ``doubt`` says why an existing file was rejected. ``on_kept`` is called for each reused step. StoreError if the file
+    or the key exists but cannot be read.
     """
 
     def __init__(self, directory: Path, axis: str, key: Path | None = None) -> None:
@@ -53,23 +53,23 @@ class Progress:
         self._steps = self._read()
 
     def kept(self, name: str, holds_for: str) -> Found | None:
-        """Return what a step found, where it was done with this drive and configuration, and tell so; else None."""
+        """Return the results of a step if it was done with this drive and configuration, and report it; else None."""
         found = self.found(name, holds_for)
         if found is not None:
             self.on_kept(name, self._steps[name])
         return found
 
     def found(self, name: str, holds_for: str) -> Found | None:
-        """Return what was kept under a name for this drive and configuration; else None."""
+        """Return what is stored under a name for this drive and configuration; else None."""
         step = self._steps.get(name)
         return None if step is None or step.holds_for != holds_for else step.found
 
     def done(self) -> dict[str, str]:
-        """Return when each step was done, whatever it was done with."""
+        """Return when each step was done, with any drive and configuration."""
         return {name: step.done_utc for name, step in self._steps.items()}
 
     def keep(self, name: str, holds_for: str, found: Found) -> None:
-        """Keep a step that was done, unless it could not tell something; StoreError."""
+        """Store a completed step, unless a result is undetermined; StoreError."""
         if None in found.values():
             return
         steps = {**self._steps, name: Step(holds_for, datetime.now(UTC).isoformat(timespec="seconds"), found)}
@@ -81,13 +81,13 @@ class Progress:
             raise StoreError(text) from None
         seal = _seal(document, sealing_key(self._key))
         content = json.dumps({**document, "seal": seal}, indent=2).encode()
-        if len(content) > MAX_BYTES:  # more would not be read again
-            raise StoreError(f"{self._path} has no room for another step; begin anew with fdhil commission --again")
+        if len(content) > MAX_BYTES:  # a larger file would not be read
+            raise StoreError(f"{self._path} has no room for another step; start over with fdhil commission --again")
         write_file(self._path, content)
         self._steps = steps
 
     def forget(self) -> None:
-        """Let all steps be done anew; StoreError."""
+        """Delete all completed steps; StoreError."""
         self._steps = {}
         try:
             self._path.unlink(missing_ok=True)
@@ -100,21 +100,21 @@ class Progress:
                 document = json.loads(file.read(MAX_BYTES))
             seal = str(document.pop("seal")).encode("utf-8", "replace")
             steps = {str(name): Step(**step) for name, step in document["steps"].items()}
-            told = (document["schema"], document["axis"]) == (SCHEMA, self._axis)
+            matches = (document["schema"], document["axis"]) == (SCHEMA, self._axis)
         except (FileNotFoundError, NotADirectoryError):
             return {}
-        except OSError as error:  # what was done may well be there: it is not written over
-            text = f"{self._path} cannot be read ({error.strerror}); check the disk, or move it away and do it all anew"
+        except OSError as error:  # completed steps may be in it: it is not overwritten
+            text = f"{self._path} cannot be read ({error.strerror}); check the disk, or move it away and start over"
             raise StoreError(text) from None
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            return self._doubted("it cannot be read")
-        sealed = self._key.exists() and _seal(document, sealing_key(self._key))  # a key is not made for reading
-        if not (told and sealed and hmac.compare_digest(seal, sealed.encode())):
-            return self._doubted("it was changed, or is another machine's")
+            return self._doubted("damaged")
+        sealed = self._key.exists() and _seal(document, sealing_key(self._key))  # reading creates no key
+        if not (matches and sealed and hmac.compare_digest(seal, sealed.encode())):
+            return self._doubted("modified, or of another machine")
         return steps
 
     def _doubted(self, why: str) -> dict[str, Step]:
-        self.doubt = f"{self._path.name} is not believed ({why}); every step is done anew"
+        self.doubt = f"{self._path.name} was rejected ({why}); every step is repeated"
         return {}
 
 

@@ -1,7 +1,7 @@
-"""Keeps the signed-off record of a commissioned drive as JSON in the store; one that was changed is refused.
+"""Store the signed-off record of a commissioned drive as JSON; a modified record is refused.
 
-It is sealed with a key that only its owner can read (mode 0600): who cannot read the key cannot make a record. See
-docs/decisions/0009-records-are-sealed.md for how far that goes.
+It is sealed with a key that only its owner can read (mode 0600): without the key no record can be made. See
+docs/decisions/0009-records-are-sealed.md for the limits of this protection.
 """
 
 import contextlib
@@ -33,12 +33,12 @@ SOFTWARE_LIMIT_KEYS = ("607D01", "607D02")
 
 @dataclass(frozen=True, slots=True)
 class CommissioningRecord:
-    """The findings and proofs of one drive.
+    """Findings and proofs of one drive.
 
     ``config_digest`` is :func:`axis_digest`. ``options`` holds 0x6007, 0x605A, 0x605E, 0x6065, 0x6085 and 0x1017 by
-    their hexadecimal index, as far as the drive has them, its software limits, and the COB-IDs of its RPDOs, as
-    :attr:`rpdos` gives them. ``offset_in_feedforward`` None: could not be told.
-    ``watchdog`` is ``proven`` when the drive stopped after our heartbeat did.
+    their hexadecimal index, if the drive has them, its software limits, and the COB-IDs of its RPDOs, see
+    :attr:`rpdos`. ``offset_in_feedforward`` None: undetermined. ``watchdog`` is ``proven`` if the drive stopped after
+    fdhil's heartbeat did.
     """
 
     axis: str
@@ -58,28 +58,28 @@ class CommissioningRecord:
 
     @property
     def travel(self) -> tuple[int, int] | None:
-        """The drive's software limits in its own increments; None where it has none."""
+        """The drive's software limits in its own increments; None without limits."""
         low, high = (self.options.get(key) for key in SOFTWARE_LIMIT_KEYS)
         return None if low is None or high is None else (low, high)
 
     @property
     def rpdos(self) -> tuple[int, ...]:
-        """The COB-IDs, as the drive has them, of the RPDOs that the profile lacks, and of the feed-forward's."""
+        """COB-ID words of the RPDOs that the profile lacks, and of the feed-forward's."""
         return tuple(cob_id for key, cob_id in self.options.items() if is_rpdo(key))
 
     @property
     def fingerprint(self) -> str:
-        """The drive as it was signed off, in 16 hexadecimal digits: what a comparison must find again."""
+        """16 hexadecimal digits of the signed-off drive, which a comparison must reproduce."""
         who = (self.vendor_id, self.product_code, self.revision, self.serial)
         return fingerprint(who, self.mapping_fingerprint, self.options)
 
     @property
     def digest(self) -> str:
-        """SHA-256 over all that the record says."""
+        """SHA-256 of the record's content."""
         return hashlib.sha256(self._text()).hexdigest()
 
     def seal(self, key: bytes) -> str:
-        """HMAC-SHA-256 over all that the record says."""
+        """Return the HMAC-SHA-256 of the record's content."""
         return hmac.new(key, self._text(), hashlib.sha256).hexdigest()
 
     def _text(self) -> bytes:
@@ -87,32 +87,31 @@ class CommissioningRecord:
 
 
 def is_rpdo(option: str) -> bool:
-    """Whether an option of a record is the COB-ID of one of the 512 RPDOs that a drive may have (0x1400 to 0x15FF)."""
+    """Return whether an option of a record is the COB-ID of one of a drive's 512 possible RPDOs (0x1400 to 0x15FF)."""
     return option[:2] in ("14", "15")
 
 
 def fingerprint(identity: Sequence[int], mapping_fingerprint: str, options: Mapping[str, int]) -> str:
-    """SHA-256, 16 hexadecimal digits, of a drive's identity, PDOs and options; an RPDO's COB-ID is in the PDOs."""
+    """Return 16 hexadecimal digits of SHA-256 over a drive's identity, PDOs and options (without RPDO COB-IDs)."""
     own = {key: value for key, value in options.items() if not is_rpdo(key)}
     text = json.dumps([list(identity), mapping_fingerprint, own], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def holds(record: CommissioningRecord | None, config: MachineConfig, axis: str) -> bool:
-    """Whether there is a record, of this configuration, and nothing was seen against it since."""
+    """Return whether there is a record of this configuration that has not been voided."""
     return of_config(record, config, axis) and not is_void(config.store.directory, axis)
 
 
 def of_config(record: CommissioningRecord | None, config: MachineConfig, axis: str) -> bool:
-    """Whether there is a record and it was made with this configuration."""
+    """Return whether there is a record that was made with this configuration."""
     return record is not None and record.readback_ok and record.config_digest == axis_digest(config, axis)
 
 
 def axis_digest(config: MachineConfig, axis: str) -> str:
-    """SHA-256, 16 hexadecimal digits, of all in the configuration that a commissioning depends on.
+    """Return 16 hexadecimal digits of SHA-256 over the configuration that a commissioning depends on.
 
-    Where sensors are reached, what the motor's data sheet says and what room there is may change without commissioning
-    again.
+    The sensors' connections, the motor's data sheet and the travel may change without commissioning again.
     """
     settings = config.axis[axis].model_dump(
         mode="json", exclude={"voltage", "nominal", "guessed", "regulators", "setpoints"}
@@ -126,8 +125,8 @@ def axis_digest(config: MachineConfig, axis: str) -> str:
 
 
 def _described(drive: Drive) -> dict[str, Any]:
-    """Return what the configuration says of the drive; a file by what it says, wherever it lies."""
-    said = drive.model_dump(mode="json", exclude={"eds"})
+    """Return the drive's configuration; a file counts by its content, wherever it is."""
+    described = drive.model_dump(mode="json", exclude={"eds"})
     new = {
         "source": "canopen",
         "hal": None,
@@ -136,22 +135,21 @@ def _described(drive: Drive) -> dict[str, Any]:
         "dc_link_v": None,
         "speed_unit": None,
     }
-    said = {key: value for key, value in said.items() if key not in new or value != new[key]}
+    described = {key: value for key, value in described.items() if key not in new or value != new[key]}
     if drive.profile not in tables.DRIVE_PROFILES or drive.eds is not None:
-        said["profile"] = repr(load_profile(drive))
-    return said
+        described["profile"] = repr(load_profile(drive))
+    return described
 
 
 def record_path(directory: Path, axis: str) -> Path:
-    """Return where an axis' record is kept."""
+    """Return the file of an axis' record."""
     return directory / f"commissioning-{axis}.json"
 
 
 def save_record(record: CommissioningRecord, directory: Path, key: Path | None = None) -> Path:
-    """Seal and write the record, whole or not at all, and return its path; StoreError.
+    """Seal and write the record atomically and return its path; StoreError.
 
-    ``key`` is the file of the sealing key, left out: ``commissioning.key`` in the directory; it is made where there is
-    none.
+    ``key`` is the file of the sealing key, by default ``commissioning.key`` in the directory; a missing key is created.
     """
     path = record_path(directory, record.axis)
     try:
@@ -168,15 +166,15 @@ def save_record(record: CommissioningRecord, directory: Path, key: Path | None =
 def load_record(
     directory: Path, axis: str, key: Path | None = None, *, may_lack_key: bool = False
 ) -> CommissioningRecord | None:
-    """Read an axis' record, None when there is none; StoreError when it is damaged, foreign, changed or not sealed.
+    """Read an axis' record, None without one; StoreError if it is damaged, foreign, modified or not sealed.
 
-    ``may_lack_key``: a caller that is not allowed to read the key takes the record by its digest alone; what decides
-    about the machine must be able to read it.
+    ``may_lack_key``: a caller without permission to read the key accepts the record by its digest alone; a caller that
+    decides about the machine must be able to read the key.
     """
     path = record_path(directory, axis)
     try:
         with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
-            raw = file.read(MAX_RECORD_BYTES + 1) or b""  # None: a pipe in its place that nobody writes to
+            raw = file.read(MAX_RECORD_BYTES + 1) or b""  # None: a pipe without a writer
     except FileNotFoundError:
         return None
     except OSError as error:
@@ -185,11 +183,11 @@ def load_record(
         document = json.loads(raw[:MAX_RECORD_BYTES])
         record = None if document.get("schema") == UNSEALED else _record(document)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
-        raise StoreError(f"{path} is no commissioning record; commission the axis again") from None
+        raise StoreError(f"{path} is not a commissioning record; commission the axis again") from None
     if record is None:
-        raise StoreError(f"{path} was written before records were sealed with a key; commission the axis again")
+        raise StoreError(f"{path} predates sealed records; commission the axis again")
     if document.get("schema") != SCHEMA or record.axis != axis or document.get("digest") != record.digest:
-        raise StoreError(f"{path} was changed after it was signed off; commission the axis again")
+        raise StoreError(f"{path} was modified after the sign-off; commission the axis again")
     secret = _key(key or directory / KEY_NAME, may_lack_key)
     given = str(document.get("seal")).encode("utf-8", "replace")
     if secret is not None and not hmac.compare_digest(given, record.seal(secret).encode()):
@@ -198,20 +196,20 @@ def load_record(
 
 
 def sealing_key(path: Path) -> bytes:
-    """Return the key that seals records; make one where there is none. StoreError."""
+    """Return the key that seals records; create it if missing. StoreError."""
     if not os.path.lexists(path):
         try:
             _make_key(path)
         except OSError as error:
-            text = f"{path}, the key of the records, cannot be made ({error.strerror}); check the folder and free space"
+            text = f"{path}, the key of the records, cannot be created ({error.strerror}); check folder and free space"
             raise StoreError(text) from None
     return _key(path, may_lack=False) or b""
 
 
 def _make_key(path: Path) -> None:
-    """Make a key, whole or not at all; one that another process has made meanwhile stays. OSError."""
+    """Create a key atomically; a key that another process creates meanwhile is kept. OSError."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    part.unlink(missing_ok=True)  # of a process that was killed
+    part.unlink(missing_ok=True)  # left by a killed process
     descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     try:
         with os.fdopen(descriptor, "wb") as file:
@@ -226,7 +224,7 @@ def _make_key(path: Path) -> None:
 
 
 def _key(path: Path, may_lack: bool) -> bytes | None:
-    """Return the sealing key, None where it ``may_lack`` and may not be read; StoreError when it keeps no secret."""
+    """Return the sealing key, None if it ``may_lack`` and cannot be read; StoreError if it is not secret."""
     advice = "delete it and commission every axis again"
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)

@@ -1,7 +1,7 @@
-"""Lists the nodes of a CAN bus: listens first, and reads by SDO only where no master is heard.
+"""List the nodes of a CAN bus: listen first, and read by SDO only if no master is detected.
 
-The default SDO channel of a drive has one client at a time, so beside an NC nothing at all is sent. Nothing is ever
-written, no NMT command and no SYNC leaves from here.
+A drive's default SDO channel has one client at a time, so with an NC on the bus nothing at all is sent. Nothing is ever
+written, and neither NMT commands nor SYNC are sent.
 """
 
 import time
@@ -23,12 +23,12 @@ from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, EdsError, For
 ANSWER_S = 0.3
 PACE_S = 0.001
 FITS = ("exact", "other revision", "any product")
-_ANY_NUMBER = 0xFFFFFFFF  # how some EDS say that they are for all products of the vendor; others say nothing
+_ANY_NUMBER = 0xFFFFFFFF  # marks an EDS for all products of the vendor; others omit the number
 _READ_DEVICE_TYPE = bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0])
 
 
 class BusScanner(BusListener):
-    """A bus that is listened to and, where no master is heard, asked; a context manager."""
+    """Listens to a bus and, if no master is detected, reads its nodes; a context manager."""
 
     def __init__(self, name: str, settings: CanBus) -> None:
         self._links: dict[int, SdoLink] = {}
@@ -36,16 +36,16 @@ class BusScanner(BusListener):
         super().__init__(self._sending)
 
     def take(self, frames: Frames) -> None:
-        """Hand the answers to what was asked over."""
+        """Deliver the answers to pending requests."""
         super().take(frames)
         for frame in frames[(frames["id"] & 0x780 == COB_SDO_RESPONSE) & (frames["id"] <= 0x7FF)]:
             if link := self._links.get(int(frame["id"]) & 0x7F):
                 link.deliver(int(frame["data"]).to_bytes(8, "little")[: int(frame["dlc"])])
 
     def answering(self) -> set[int]:
-        """Ask every node-ID for its device type; return those that answer.
+        """Request the device type of every node-ID; return the nodes that answer.
 
-        ConnectError when the bus takes no frame, which means that no node acknowledges one.
+        ConnectError if the bus accepts no frame, which means that no node acknowledges one.
         """
         for node_id in range(1, 128):
             try:
@@ -53,14 +53,14 @@ class BusScanner(BusListener):
             except ForeignMaster:
                 raise
             except DeviceError as error:
-                text = f"nothing acknowledges our frames ({error}); check the drives' supply, wiring and bit rate"
+                text = f"no node acknowledges fdhil's frames ({error}); check the drives' supply, wiring and bit rate"
                 raise ConnectError(f"bus {self.name}", text) from None
             time.sleep(PACE_S)
         self.listen(ANSWER_S)
         return {can_id & 0x7F for can_id in self.traffic.ids if can_id & 0x780 == COB_SDO_RESPONSE}
 
     def read(self, node_id: int, index: int, sub: int = 0) -> bytes | None:
-        """Read an object, None when the node does not have it or gives no answer that can be used; ForeignMaster."""
+        """Read an object; None if the node lacks it or gives no usable answer; ForeignMaster."""
         link = self._links.setdefault(node_id, SdoLink(f"node {node_id}", node_id, self._sending.send))
         try:
             return link.read(index, sub)
@@ -72,7 +72,7 @@ class BusScanner(BusListener):
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """An EDS or DCF file and the device it is for."""
+    """An EDS or DCF file and the device it describes."""
 
     path: Path
     vendor_id: int | None
@@ -80,7 +80,7 @@ class Description:
     revision: int | None
 
     def fits(self, identity: Identity) -> str | None:
-        """One of ``FITS``, the best first, or None when it is for another device."""
+        """Return one of ``FITS``, the best first, or None for another device."""
         if not self.vendor_id or self.vendor_id != identity.vendor_id:
             return None
         if self.product_code in (None, 0, _ANY_NUMBER):
@@ -92,7 +92,7 @@ class Description:
 
 @dataclass(frozen=True, slots=True)
 class EdsMatch:
-    """The description that fits a node best, and how it does: one of ``FITS``."""
+    """The best-matching description of a node and the kind of match, one of ``FITS``."""
 
     file: str
     fit: str
@@ -100,7 +100,7 @@ class EdsMatch:
 
 @dataclass(frozen=True, slots=True)
 class Answers:
-    """A node's answers by SDO; None where it has no such object."""
+    """A node's answers by SDO; None for an object it lacks."""
 
     identity: Identity
     device_type: int
@@ -119,7 +119,7 @@ class Answers:
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """One node: what was heard of it, and what it answered (None: it was not asked, or is silent)."""
+    """One node: what was received from it, and its answers (None: it was not read, or is silent)."""
 
     node_id: int
     axis: str | None
@@ -131,7 +131,7 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class BusScan:
-    """One bus; ``master`` tells what showed that an NC runs it, and then no node was asked."""
+    """One bus; ``master`` is the evidence that an NC runs it, and then no node was read."""
 
     bus: str
     master: str | None
@@ -140,31 +140,31 @@ class BusScan:
 
 
 def scan_bus(name: str, config: MachineConfig, descriptions: Sequence[Description]) -> BusScan:
-    """Listen, then ask where no master is heard. ConnectError when the bus cannot be reached or is silent."""
+    """Listen, then read the nodes if no master is detected. ConnectError if the bus is unreachable or silent."""
     axes = {config.node_id(axis): axis for axis, settings in config.axis.items() if settings.drive.bus == name}
     with BusScanner(name, config.bus[name]) as bus:
         return scan_nodes(bus, axes, descriptions)
 
 
 def scan_nodes(bus: BusScanner, axes: Mapping[int, str], descriptions: Sequence[Description]) -> BusScan:
-    """Listen to an open bus, then ask where no master is heard; ``axes`` by node-ID. Raises as ``scan_bus``."""
+    """Listen to an open bus, then read its nodes if no master is detected; ``axes`` by node-ID. ConnectError."""
     bus.listen(LISTEN_S)
     bus.require_readable()
     master = bus.traffic.master
     answering = set() if master else bus.answering()
     found = sorted(bus.traffic.nodes | answering)
     if not found and master is None:
-        text = "no node was heard and none answered; check the drives' supply, wiring and bit rate"
+        text = "no node sent a frame and none answered; check the drives' supply, wiring and bit rate"
         raise ConnectError(f"bus {bus.name}", text)
-    asked = {node_id: _ask(bus, node_id, descriptions) for node_id in sorted(answering)}
-    nodes = [_node(bus.traffic, node_id, axes.get(node_id), asked.get(node_id)) for node_id in found]
+    answers = {node_id: _ask(bus, node_id, descriptions) for node_id in sorted(answering)}
+    nodes = [_node(bus.traffic, node_id, axes.get(node_id), answers.get(node_id)) for node_id in found]
     return BusScan(bus.name, master, bus.traffic.sync_period_s, tuple(nodes))
 
 
 def _node(traffic: Traffic, node_id: int, axis: str | None, answers: Answers | None) -> Node:
     codes = sorted(traffic.emergencies.get(node_id, set()) - {0})
-    told = tuple(f"{code:04X} {emcy_text(code)}" for code in codes)
-    return Node(node_id, axis, traffic.nmt(node_id), traffic.heartbeat_s(node_id), told, answers)
+    emergencies = tuple(f"{code:04X} {emcy_text(code)}" for code in codes)
+    return Node(node_id, axis, traffic.nmt(node_id), traffic.heartbeat_s(node_id), emergencies, answers)
 
 
 def _ask(bus: BusScanner, node_id: int, descriptions: Sequence[Description]) -> Answers:
@@ -192,13 +192,13 @@ def _ask(bus: BusScanner, node_id: int, descriptions: Sequence[Description]) -> 
 
 
 def best_description(identity: Identity, descriptions: Sequence[Description]) -> tuple[Description, str] | None:
-    """Return the description that fits a node best, and how: one of ``FITS``; None where none is for it."""
+    """Return the best-matching description of a node and the kind of match, one of ``FITS``; None without one."""
     fits = [(description, fit) for description in descriptions if (fit := description.fits(identity)) is not None]
     return min(fits, key=lambda found: FITS.index(found[1]), default=None)
 
 
 def printable(data: bytes) -> str:
-    """Return a drive's text with whatever could steer a terminal shown as ``?``.
+    r"""Return a drive's text with every character that could control a terminal shown as ``?``.
 
     >>> printable(b"axis\\x1b[2J\\0")
     'axis?[2J'
@@ -208,7 +208,7 @@ def printable(data: bytes) -> str:
 
 
 def read_descriptions(places: Sequence[Path]) -> tuple[list[Description], list[EdsError]]:
-    """Read EDS and DCF files, and those in folders; returns them and what could not be read."""
+    """Read EDS and DCF files, also in folders; return them and the errors."""
     files = [f for place in places for f in (sorted(place.iterdir()) if place.is_dir() else [place])]
     found, faults = [], []
     for path in files:

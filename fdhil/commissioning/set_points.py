@@ -1,8 +1,8 @@
-"""Gives the set-points of one machine, one row per SYNC, and sees to it that none leaves its bounds. Pure.
+"""Generate the set-points of a machine, one row per SYNC, and keep every row inside its bounds. Pure.
 
-Whoever sends set-points has them from :meth:`SetPoints.step` and from nowhere else. A row may leave only if the axes
-can still be braked inside their travel from there: a stop is always possible, and always the same. It goes on straight
-ahead from the last two rows that left, each axis' speed falling in the same n cycles, n = ceil(max |v|/a), to zero.
+All set-points come from :meth:`SetPoints.step` alone. A row is sent only if the axes can still be braked inside their
+travel from there: a stop is always possible, and always the same. It continues straight ahead from the last two rows
+sent, each axis' speed falling to zero in the same n cycles, n = ceil(max |v|/a).
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ import numpy as np
 from fdhil.config import Axis
 from fdhil.records import Float
 
-ROUNDING = 2.0  # increments: what a demand that was rounded to increments adds to its second difference
-AGE_CYCLES = 4  # a position is so many SYNCs old at most, its sampling and the loop's own lag included
+ROUNDING = 2.0  # increments: contribution of rounding to the second difference of a demand
+AGE_CYCLES = 4  # largest age of a position in SYNCs, including sampling and loop lag
 Row = Sequence[float]
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """What may be sent to one axis, in drive increments and SYNC cycles.
+    """Limits of one axis' set-points, in drive increments and SYNC cycles.
 
-    ``low`` and ``high`` bound the travel, ``speed`` increments per cycle, ``acceleration`` increments per cycle
-    squared; a position farther than ``following_error`` from what was sent ends the motion.
+    ``low`` and ``high`` bound the travel, ``speed`` is in increments per cycle, ``acceleration`` in increments per
+    cycle squared; a position farther than ``following_error`` from the set-points ends the motion.
     """
 
     axis: str
@@ -66,11 +66,11 @@ class Bounds:
 
 
 class SetPoints:
-    """The set-points of some axes, resting at ``start`` until they :meth:`play`.
+    """The set-points of some axes, at rest at ``start`` until :meth:`play`.
 
-    ``stopped`` says why a motion was ended before its last row, None while none was; nothing is played after that.
-    ``cycles`` counts the steps, ``played`` the rows that left.
-    One thread takes the steps; :meth:`play` and :meth:`stop` may be called by another.
+    ``stopped`` says why a motion ended before its last row, None otherwise; nothing is played afterwards. ``cycles``
+    counts the steps, ``played`` the rows sent. One thread calls :meth:`step`; :meth:`play` and :meth:`stop` may be
+    called by another.
     """
 
     def __init__(self, bounds: Sequence[Bounds], start: Sequence[int]) -> None:
@@ -87,16 +87,16 @@ class SetPoints:
 
     @property
     def resting(self) -> bool:
-        """Whether nothing is played and the axes stand."""
+        """Whether nothing is played and the axes are at standstill."""
         return self._rows is None and self._last == self._before
 
     @property
     def position(self) -> tuple[float, ...]:
-        """The row that left last."""
+        """The last row sent."""
         return self._last
 
     def play(self, rows: Iterable[Row]) -> None:
-        """Send these rows, in increments, one per cycle; they begin where the axes rest. Ignored once stopped."""
+        """Send these rows, in increments, one per cycle; they begin at the rest position. Ignored once stopped."""
         if self.stopped is None:
             self._rows = iter(rows)
 
@@ -106,12 +106,12 @@ class SetPoints:
             self.stopped = why
 
     def hold(self, why: str) -> None:
-        """Stay at the row that left last: nothing left for so long that the drives stand there already."""
+        """Stay at the last row sent, since the drives have long stopped there."""
         self.stop(why)
         self._rows, self._brake, self._before = None, iter(()), self._last
 
     def step(self, positions: Sequence[int | None] = ()) -> tuple[int, ...]:
-        """Return what is sent in this cycle, in whole increments; ``positions`` are the drives' newest."""
+        """Return the set-points of this cycle in whole increments; ``positions`` are the drives' newest."""
         self._watch(positions)
         row = self._next()
         self._before, self._last = self._last, row
@@ -129,19 +129,18 @@ class SetPoints:
                 return self._last if row is None else tuple(map(float, row))
             self.stop(fault)
         if self.stopped is not None:
-            self._rows = None  # another thread may have given some while it was stopped
+            self._rows = None  # another thread may have called play meanwhile
             self._brake = self._braking() if self._brake is None else self._brake
         braked = None if self._brake is None else next(self._brake, None)
         return self._last if braked is None else braked
 
     def _ended(self) -> str | None:
-        """The rows are at their end: the axes must stand, or nearly."""
+        """At the end of the rows the axes must be at standstill, or nearly."""
         self._rows = None
         still = all(abs(v) <= of.acceleration + ROUNDING for v, of in zip(self._speed(), self.bounds, strict=True))
         return None if still else "the set-points ended in motion"
 
     def _speed(self) -> tuple[float, ...]:
-        """Increments per cycle at the row that left last."""
         return tuple(now - then for now, then in zip(self._last, self._before, strict=True))
 
     def _cycles_to_stop(self, speed: Sequence[float]) -> int:
@@ -155,18 +154,18 @@ class SetPoints:
             yield tuple(at + v * way for at, v in zip(start, speed, strict=True))
 
     def _fault(self, row: Row) -> str | None:
-        """Why this row may not leave, None when it may; written so that NaN may not."""
+        """Return why this row must not be sent, None if it may; NaN fails every comparison."""
         if len(row) != len(self.bounds) or not all(map(math.isfinite, row)):
-            return "a set-point is no number"
+            return "a set-point is not a number"
         speed = [now - then for now, then in zip(row, self._last, strict=True)]
         way = max(self._cycles_to_stop(speed) - 1, 0) / 2
         for at, v, before, of in zip(row, speed, self._speed(), self.bounds, strict=True):
             if not abs(v) <= of.speed + ROUNDING:
-                return f"axis {of.axis}: a set-point is faster than the axis may move"
+                return f"axis {of.axis}: a set-point exceeds the axis' speed"
             if not abs(v - before) <= of.acceleration + ROUNDING:
-                return f"axis {of.axis}: a set-point asks for more acceleration than the axis may have"
+                return f"axis {of.axis}: a set-point exceeds the axis' acceleration"
             if not (of.low <= at <= of.high and of.low <= at + v * way <= of.high):
-                return f"axis {of.axis}: from a set-point it could not be braked inside its travel"
+                return f"axis {of.axis}: it could not be braked inside its travel"
         return None
 
     def _watch(self, positions: Sequence[int | None]) -> None:
@@ -180,8 +179,8 @@ class SetPoints:
 def straight(start: Row, goal: Row, speed: Row, acceleration: Row, rounding_cycles: int = 1) -> Float:
     """Return rows (n, axes) straight from ``start`` to ``goal``, at rest at both ends, in the units of the arguments.
 
-    A trapezoid of speed in which the axis that needs longest has its ``speed`` and ``acceleration`` (per cycle and per
-    cycle squared), averaged over ``rounding_cycles`` so that the acceleration has no steps. The last row is the goal.
+    A trapezoid of speed in which the slowest axis has its ``speed`` and ``acceleration`` (per cycle and per cycle
+    squared), averaged over ``rounding_cycles`` to avoid steps of acceleration. The last row is the goal.
     """
     begin, end = np.asarray(start, dtype=float), np.asarray(goal, dtype=float)
     way = np.abs(end - begin)
@@ -196,9 +195,7 @@ def straight(start: Row, goal: Row, speed: Row, acceleration: Row, rounding_cycl
     k = np.minimum(np.arange(math.ceil(whole) + 1), whole)
     up, down = np.minimum(k, ramp), np.minimum(whole - k, ramp)
     part = np.where(
-        k <= ramp,
-        steepest * up**2 / 2,
-        np.where(k >= whole - ramp, 1 - steepest * down**2 / 2, top * (k - ramp / 2)),
+        k <= ramp, steepest * up**2 / 2, np.where(k >= whole - ramp, 1 - steepest * down**2 / 2, top * (k - ramp / 2))
     )
     width = max(1, rounding_cycles)
     padded = np.concatenate([np.zeros(width - 1), part, np.ones(width - 1)])

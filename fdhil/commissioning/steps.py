@@ -1,7 +1,7 @@
-"""Commissions one axis with no NC on the bus: reads, compares, moves by 10 um, proves the watchdog, signs off.
+"""Commission one axis while no NC runs the bus: read, compare, move by 10 um, prove the watchdog, sign off.
 
-``commission`` runs all steps; each step is a function of its own. Whatever fails, the offset goes back to 0, the drive
-is disabled and what was written is restored. See CiA 402-2 for the objects, CiA 301 7.2.8 for the heartbeat consumer.
+On any failure the offset is ramped to 0, the drive is disabled and written objects are restored. See CiA 402-2 for the
+objects, CiA 301 7.2.8 for the heartbeat consumer.
 """
 
 import contextlib
@@ -23,14 +23,7 @@ from fdhil.commissioning.moving import held_back
 from fdhil.commissioning.progress import Found, Progress
 from fdhil.commissioning.record import CommissioningRecord, axis_digest
 from fdhil.commissioning.set_points import straight
-from fdhil.commissioning.survey import (
-    Survey,
-    faulted,
-    listen,
-    require,
-    require_enabled,
-    survey,
-)
+from fdhil.commissioning.survey import Survey, faulted, listen, require, require_enabled, survey
 from fdhil.commissioning.watchdog import watchdog_test
 from fdhil.config import CorrectionLimits, MachineConfig
 from fdhil.drivers.cia402.profile_file import NO_OFFSET_ADVICE, load_profile, no_offset
@@ -39,7 +32,7 @@ from fdhil.errors import DeviceError, DriveFault, ForeignMaster, ProtocolError
 SIGN_TEST_UM = 10.0
 ENABLE_TIMEOUT_S = 5.0
 SETTLE_CYCLES = 400
-BOOTED = "it has booted since it was compared, and may not be set up as it was; commission it again"
+BOOTED = "it has booted since it was compared, so its set-up may have changed; commission it again"
 AVERAGE_CYCLES = 200
 RAMPS = 8
 MOST_RAMPS = 24
@@ -48,17 +41,17 @@ EARLY_CYCLES = 8
 
 
 class Excess(NamedTuple):
-    """What is left of a speed demand, as a share of the ramp's speed: as the last cycle explains it, and the first."""
+    """Unexplained speed demand as a share of the ramp's speed: judged by the last cycle, and by the first."""
 
     least: float
     most: float
 
 
 def prepare(master: Master) -> None:
-    """Select CSP, start SYNC and the node, and take the actual position as target; the drive is not enabled yet."""
+    """Select CSP, start SYNC and the node, and use the actual position as target; the drive is not enabled yet."""
     overflow = read_optional(master, Object.SYNC_COUNTER_OVERFLOW) or 0
     master.sdo.write_int(Object.MODE, 0, Mode.CYCLIC_SYNC_POSITION, 1)
-    master.nmt(NmtCommand.START)  # first: who is not started answers no SYNC
+    master.nmt(NmtCommand.START)  # first: a node that is not started ignores SYNC
     master.loop.produce_sync(overflow)
     master.wait(
         lambda: master.profile.position in master.heard.objects and master.profile.statusword in master.heard.objects,
@@ -70,7 +63,7 @@ def prepare(master: Master) -> None:
 
 
 def enable(master: Master) -> None:
-    """Bring the drive to Operation enabled, holding its position; DriveFault when it does not get there."""
+    """Bring the drive to Operation enabled, holding its position; DriveFault if it does not get there."""
     deadline = time.monotonic() + ENABLE_TIMEOUT_S * master.patience
     reset_tried = False
     while master.state() is not State.OPERATION_ENABLED:
@@ -92,14 +85,14 @@ def enable(master: Master) -> None:
         master.wait(
             lambda: master.heard.objects[mode] == Mode.CYCLIC_SYNC_POSITION,
             0.5,
-            "it does not take the mode cyclic synchronous position; check 0x6060 and 0x6502",
+            "it does not enter the mode cyclic synchronous position; check 0x6060 and 0x6502",
         )
     master.wait_cycles(SETTLE_CYCLES)
     require_enabled(master)
 
 
 def disable(master: Master) -> None:
-    """Take the power stage off, step by step, and leave the node pre-operational without SYNC."""
+    """Switch off the power stage step by step, and leave the node pre-operational without SYNC."""
     if not master.loop.producing:
         return
     for word in OFF_WORDS:
@@ -116,7 +109,7 @@ def disable(master: Master) -> None:
 
 
 def zero_offset(master: Master) -> None:
-    """Ramp the offset to 0 and make sure that the drive holds 0."""
+    """Ramp the offset to 0 and verify that the drive holds 0."""
     if master.target is None:
         return
     ramp(master, 0)
@@ -127,11 +120,11 @@ def zero_offset(master: Master) -> None:
 
 
 def ramp(master: Master, goal: int, step: int | None = None) -> int:
-    """Move the offset from where it is to ``goal``; return the cycle of the first that is sent.
+    """Ramp the offset to ``goal``; return the cycle in which the first value is sent.
 
-    By ``step`` increments per cycle; left out: within the limits, and at a quarter of the largest speed.
+    By ``step`` increments per cycle; default: within the limits, at a quarter of the largest speed.
     """
-    start = master.drop_offsets()  # Ctrl-C may have come in the midst of another ramp
+    start = master.drop_offsets()  # Ctrl-C may have interrupted another ramp
     if step is None:
         values = _gently(master, start, goal)
     else:
@@ -143,7 +136,6 @@ def ramp(master: Master, goal: int, step: int | None = None) -> int:
 
 
 def _gently(master: Master, start: int, goal: int) -> list[int]:
-    """Return the offsets from ``start`` to ``goal``, at rest at both."""
     limits = _limits(master)
     per_cycle = master.config.axis[master.axis].scaling.increments_per_mm * master.period_s
     speed, acceleration = limits.max_speed_mm_s * per_cycle / 4, limits.max_acceleration_mm_s2 * per_cycle
@@ -156,9 +148,9 @@ def _limits(master: Master) -> CorrectionLimits:
 
 
 def sign_test(master: Master) -> float:
-    """Offset the axis by +10 um: read-back, demand and table must follow, in sign and size; returns the table's um.
+    """Offset the axis by +10 um: read-back, demand and table must follow in sign and size; return the table's um.
 
-    The direction is the machine's: ``drive.sign`` is applied to what is sent and to what is read.
+    The direction is the machine's: ``drive.sign`` is applied to sent and received values.
     """
     settings = master.config.axis[master.axis]
     profile = master.profile
@@ -192,26 +184,25 @@ def sign_test(master: Master) -> float:
 
 
 def _sign_step(master: Master) -> int:
-    """Return by how many increments the sign test offsets the axis; DriveFault where that is less than one."""
     scaling, um = master.config.axis[master.axis].scaling, min(SIGN_TEST_UM, _limits(master).max_offset_um)
     if not um / 1e3 * scaling.increments_per_mm >= 1.0:
-        text = f"one increment is {1e3 / scaling.increments_per_mm:.3g} um, and the sign test moves it by {um:g} um"
-        advice = "let the drive count finer, and correct drive.increments_per_rev"
+        text = f"one increment is {1e3 / scaling.increments_per_mm:.3g} um, more than the sign test's {um:g} um"
+        advice = "set a finer resolution in the drive, and correct drive.increments_per_rev"
         raise DriveFault(master.device, f"{text}: its scaling is too coarse for any correction; {advice}")
     return scaling.to_increments(um / 1e3)
 
 
 def feedforward_test(master: Master) -> bool | None:
-    """Whether the offset's slope reaches the speed feed-forward; None when it cannot be told.
+    """Return whether the offset's slope reaches the speed feed-forward; None if undetermined.
 
-    The offset is ramped at standstill and the speed demand (0x606B) read while the ramp is young. A demand without
-    feed-forward grows as v (1 - exp(-Kv t)) at most, with it the share Kff of v is there at once. On a busy computer,
-    which sees few of the ramps begin, more are made.
+    The offset is ramped at standstill and the speed demand (0x606B) is read early in the ramp. Without feed-forward the
+    demand grows as v (1 - exp(-Kv t)) at most; with it, the share Kff of v is present at once. More ramps are made on a
+    busy computer, which captures the start of only a few.
     """
     settings = master.config.axis[master.axis]
     share = settings.regulators.speed_feedforward
     if share == 0.0:
-        return True  # there is no feed-forward that could miss it
+        return True  # without feed-forward there is nothing to reach
     step = _ramp_step(master.config, master.axis)
     if step < 1 or read_optional(master, Object.VELOCITY_DEMAND, signed=True) is None:
         return None
@@ -231,7 +222,7 @@ def feedforward_test(master: Master) -> bool | None:
 
 
 def _ramp_step(config: MachineConfig, axis: str) -> int:
-    """Increments per cycle of the feed-forward test's ramp: up to 2 mm/s and 40 um, inside the limits."""
+    """Return the ramp of the feed-forward test in increments per cycle: up to 2 mm/s and 40 um, within the limits."""
     settings = config.axis[axis]
     per_mm, limits = settings.scaling.increments_per_mm, settings.correction or CorrectionLimits()
     fastest = int(min(2.0, limits.max_speed_mm_s) * per_mm * config.machine.sync_period_s)
@@ -239,14 +230,14 @@ def _ramp_step(config: MachineConfig, axis: str) -> int:
 
 
 def largest_move_um(config: MachineConfig, axis: str) -> float:
-    """Return the longest way that a commissioning moves the axis."""
+    """Return the longest distance by which commissioning moves the axis."""
     settings = config.axis[axis]
     ramped = _ramp_step(config, axis) * RAMP_CYCLES / settings.scaling.increments_per_mm * 1e3
     return max(SIGN_TEST_UM, ramped)
 
 
 def _early_excess(master: Master, goal: int, step: int) -> list[Excess]:
-    """Speed demand over ramp speed, less what the position loop alone explains, for the first cycles of a ramp."""
+    """Return the speed demand relative to the ramp, less the position loop's share, for the first cycles of a ramp."""
     sign = 1 if goal > master.offset else -1
     settings = master.config.axis[master.axis]
     gain_per_cycle = settings.regulators.position_gain_per_s * master.period_s
@@ -259,7 +250,7 @@ def _early_excess(master: Master, goal: int, step: int) -> list[Excess]:
         first = master.cycle - in_force
         demand = master.sdo.read_int(Object.VELOCITY_DEMAND, signed=True) * unit * sign
         last = master.cycle - in_force
-        # the drive read it at some time between: a busy computer may ask before the ramp and hear it long afterwards
+        # the drive sampled it somewhere between: a busy computer may ask before the ramp and be answered much later
         if first >= 1 and last <= EARLY_CYCLES:
             explained = (1 - math.exp(-gain_per_cycle * age) for age in (last, first))
             excess.append(Excess(*(demand / ramp_rad_s - share for share in explained)))
@@ -267,7 +258,7 @@ def _early_excess(master: Master, goal: int, step: int) -> list[Excess]:
 
 
 def check_axis(master: Master) -> Survey:
-    """All that can be checked without moving; DriveFault for the first point that differs."""
+    """Check everything that needs no motion; DriveFault for the first difference."""
     found = survey(master)
     require(master, found.findings)
     _sign_step(master)
@@ -279,7 +270,7 @@ PROOFS: Mapping[str, Callable[[Master], Found]] = {
     "feed-forward test": lambda master: {"in_feedforward": feedforward_test(master)},
     "watchdog test": lambda master: {"watchdog": watchdog_test(master, enable)},
 }
-"""The steps that are done with the drive switched on; what they found goes into the record."""
+"""The steps with the drive switched on; their results go into the record."""
 
 
 def commission(
@@ -289,16 +280,14 @@ def commission(
     progress: Progress | None = None,
     result: Callable[[str, Found], None] = lambda _step, _found: None,
 ) -> CommissioningRecord:
-    """Commission one axis and return the signed-off record (not saved yet); ``report`` gets each step's name.
+    """Commission one axis and return the signed-off record (not saved yet).
 
-    ``result`` gets what a step found, after it.
+    ``report`` gets each step's name before it, ``result`` its results after it. Nothing moves before ``report`` returns
+    from ``enable``, and only the feed-forward's RPDO is written, and restored: an exception of ``report`` then leaves
+    no trace. With ``progress`` each completed step is stored, and a step stored for this drive, unchanged, is skipped.
 
-    Nothing moves before ``report`` returns from ``enable``, and nothing is written but the RPDO of the feed-forward,
-    which is given back: what ``report`` raises there ends it with no trace. With ``progress`` each step that is done is
-    kept, and one that was kept for this drive, as it is now, is not done again.
-
-    DriveFault (also for a drive that takes no offset), ProtocolError, DeviceTimeout or ConnectError, one sentence each,
-    after everything was rolled back; StoreError when a step cannot be kept.
+    DriveFault (also for a drive without offset object), ProtocolError, DeviceTimeout or ConnectError, after everything
+    was rolled back; StoreError if a step cannot be stored.
     """
     profile = load_profile(config.axis[axis].drive)
     if not profile.takes_offset:
@@ -330,7 +319,7 @@ def commission(
 
 
 def holds_for(config: MachineConfig, axis: str, found: Survey) -> str:
-    """Return the fingerprint of a drive, as it was just read, with its configuration."""
+    """Return the fingerprint of a drive, as just read, with its configuration."""
     return f"{axis_digest(config, axis)} {found_fingerprint(found)}"
 
 
@@ -341,7 +330,7 @@ def _proven(
     progress: Progress | None,
     result: Callable[[str, Found], None],
 ) -> Mapping[str, Found]:
-    """Return what each of the ``PROOFS`` found; the drive is switched on only where one is not kept."""
+    """Return the results of each of the ``PROOFS``; the drive is switched on only if one is not stored."""
     now = holds_for(master.config, master.axis, found)
     done = {name: progress.kept(name, now) if progress else None for name in PROOFS}
     proven = {name: kept for name, kept in done.items() if kept is not None}
@@ -364,10 +353,10 @@ def _proven(
 
 @contextlib.contextmanager
 def rolled_back(master: Master) -> Iterator[None]:
-    """Run steps; whatever happens, the offset goes to 0 and the drive is disabled afterwards.
+    """Run steps; afterwards, whatever happens, the offset is ramped to 0 and the drive disabled.
 
-    What cannot be undone is told beside what went wrong. Where another master was heard the cycle has brought the drive
-    to rest, and ForeignMaster is raised.
+    Actions that cannot be undone are reported with the error. If another master was detected, the cycle has stopped the
+    drive, and ForeignMaster is raised.
     """
     try:
         yield
@@ -379,9 +368,9 @@ def rolled_back(master: Master) -> Iterator[None]:
 
 
 def _roll_back(master: Master, first: str = "") -> bool:
-    """Offset to 0, drive disabled; return whether somebody wanted to stop it: all of it is done before that is heard.
+    """Zero the offset and disable the drive; return whether a signal to stop arrived, which waits until both are done.
 
-    ProtocolError, after ``first``, when the drive could not be left as it was.
+    ProtocolError, after ``first``, if the drive could not be restored.
     """
     faults: list[str] = []
     with held_back() as came:
@@ -395,6 +384,6 @@ def _roll_back(master: Master, first: str = "") -> bool:
     if master.loop.taken is not None:
         master.check()
     if faults:
-        text = f"{first}the drive could not be left as it was ({'; '.join(faults)}); power it off and on again"
+        text = f"{first}the drive could not be restored ({'; '.join(faults)}); power it off and on again"
         raise ProtocolError(master.device, text)
     return bool(came)

@@ -1,4 +1,4 @@
-"""Moves an enabled axis by strokes, inside its room and the drive's software limits."""
+"""Move an enabled axis by strokes, inside its room and the drive's software limits."""
 
 import math
 from collections.abc import Callable
@@ -11,14 +11,14 @@ from fdhil.commissioning.set_points import Bounds, straight
 from fdhil.commissioning.strokes import GENTLE, Room, Stroke
 from fdhil.errors import DriveFault
 
-SLACK_MM = 0.05  # by which an axis that came back may stand next to where it began
-STOOD_MM = 1.0  # an axis that moved by more since it was stopped was moved, or has lost its position
+SLACK_MM = 0.05  # tolerance of the return to the start
+STOOD_MM = 1.0  # an axis that differs by more since its stop was moved, or has lost its position
 RETURN_MM_S = 20.0
 RETURN_ACCELERATION_MM_S2 = 200.0
 
 
 class Travel(NamedTuple):
-    """From where to where an axis may go in machine coordinates, and where it stood at the start and when stopped."""
+    """Permitted travel of an axis in machine co-ordinates, and its position at the start and when stopped."""
 
     low_mm: float
     high_mm: float
@@ -26,25 +26,25 @@ class Travel(NamedTuple):
     stopped_mm: float = math.nan
 
     def is_resumed(self, room: Room, mm_per_unit: float, here_mm: float) -> bool:
-        """Whether ``room`` gave this travel at the start, and the axis stands where the trial was stopped."""
+        """Return whether ``room`` gave this travel at the start, and the axis is still where the trial was stopped."""
         low_mm, high_mm = (self.start_mm + way * mm_per_unit for way in (room.back, room.forward))
         same = max(abs(self.low_mm - low_mm), abs(self.high_mm - high_mm)) < SLACK_MM
         return same and abs(here_mm - self.stopped_mm) < STOOD_MM
 
 
 def position_mm(master: Master) -> float:
-    """Return where the axis stands."""
+    """Return the axis' position."""
     return master.config.axis[master.axis].scaling.to_mm(master.heard.objects[master.profile.position])
 
 
 def travel_of(master: Master, record: CommissioningRecord, room: Room, given: Travel | None = None) -> Travel:
-    """Return where the axis may go; DriveFault where another limit of its travel is nearer, or it stands outside.
+    """Return the permitted travel; DriveFault if another limit is nearer or the axis is outside.
 
-    ``given`` is the travel of the trial that was stopped: the same room means it again where the axis still stands
-    where it was stopped. Any other room counts from where the axis stands, and must be inside ``given``.
+    ``given`` is the travel of a stopped trial: the same room means the same travel, if the axis has not moved since.
+    Any other room counts from the present position, and must be inside ``given``.
     """
     settings = master.config.axis[master.axis]
-    scaling, said, unit = settings.scaling, settings.setpoints, settings.mm_per_unit
+    scaling, setpoints, unit = settings.scaling, settings.setpoints, settings.mm_per_unit
     here = position_mm(master)
     resumed = given is not None and given.is_resumed(room, unit, here)
     start = given.start_mm if given is not None and resumed else here
@@ -52,21 +52,21 @@ def travel_of(master: Master, record: CommissioningRecord, room: Room, given: Tr
     limits: dict[str, Travel] = {}
     if record.travel is not None:
         limits["its software limits (0x607D)"] = Travel(*sorted(scaling.to_mm(limit) for limit in record.travel))
-    if said is not None:
-        limits["[axis.*.setpoints]"] = Travel(*said.travel_mm)
+    if setpoints is not None:
+        limits["[axis.*.setpoints]"] = Travel(*setpoints.travel_mm)
     if given is not None and not resumed:
-        limits["the room that the trial began with"] = Travel(given.low_mm - SLACK_MM, given.high_mm + SLACK_MM)
+        limits["the room of the interrupted trial"] = Travel(given.low_mm - SLACK_MM, given.high_mm + SLACK_MM)
     for by, (least, most, *_) in limits.items():
         if low < least or high > most:
-            text = f"it stands at {settings.shown(here, form='.3f')} and may go from {least / unit:g} to "
-            text += f"{settings.shown(most, form='g')} by {by}, not {room} {settings.unit} from here"
-            advice = "give it another --room, or move it away from its end; --again begins a new trial"
+            text = f"its position is {settings.shown(here, form='.3f')}, limited to {least / unit:g} to "
+            text += f"{settings.shown(most, form='g')} by {by}, but --room is {room} {settings.unit} from here"
+            advice = "change --room, or move the axis away from its end; --again begins a new trial"
             raise DriveFault(master.device, f"{text}; {advice}")
     return Travel(low, high, start)
 
 
 def plan_return(master: Master, travel_mm: Travel) -> Stroke | None:
-    """Return the slow stroke back to where a stopped trial began; None where the axis stands there."""
+    """Return the slow stroke back to the start of a stopped trial; None if the axis is there."""
     away_mm, settings = travel_mm.start_mm - position_mm(master), master.config.axis[master.axis]
     if abs(away_mm) <= SLACK_MM:
         return None
@@ -78,13 +78,13 @@ def plan_return(master: Master, travel_mm: Travel) -> Stroke | None:
 def stroke(
     master: Master, travel_mm: Travel, moved: Stroke, rest_s: float, at: Callable[[float], None] = lambda _mm: None
 ) -> None:
-    """Move by one stroke and rest; as :func:`move` ends, also by Ctrl-C: the axis was braked then.
+    """Move by one stroke and rest. Ends as :func:`move`, also by Ctrl-C: the axis is braked.
 
     ``at`` is called with the position in mm while the axis moves.
     """
     settings, period_s = master.config.axis[master.axis], master.period_s
     bounds = Bounds.of(master.axis, settings, period_s, travel_mm[:2], moved.speed_mm_s, moved.acceleration_mm_s2)
-    start = 0 if master.target is None else master.target  # what is not held is refused where it would be moved
+    start = 0 if master.target is None else master.target  # move refuses an axis without a held target
     goal = start + round(settings.scaling.sign * moved.distance_mm * settings.scaling.increments_per_mm)
     rounding = round(moved.acceleration_mm_s2 / moved.jerk_mm_s3 / period_s)
     rows = straight((start,), (goal,), (bounds.speed,), (bounds.acceleration,), rounding)

@@ -1,7 +1,7 @@
-"""Reads a drive by SDO and compares it with its configuration, the first half of commissioning. Nothing moves.
+"""Read a drive by SDO and compare it with its configuration: the first half of commissioning. Nothing moves.
 
-``survey`` reads and compares everything and raises only for a drive that does not answer (DeviceTimeout,
-ProtocolError); ``require`` turns the first point that differs into a DriveFault.
+``survey`` reads and compares everything and raises only if the drive does not answer (DeviceTimeout, ProtocolError);
+``require`` turns the first difference into a DriveFault.
 """
 
 import hashlib
@@ -32,7 +32,7 @@ LISTEN_S = 2.0
 INVALID_COB_ID = 1 << 31
 NO_WINDOW = 0xFFFFFFFF
 SOFTWARE_LIMIT = 0x607D
-LAST_DUMMY = 0x07FF  # below: data types that fill the bits of a PDO
+LAST_DUMMY = 0x07FF  # up to here: data types that pad a PDO
 FIRST_DEVICE_TYPE = 0x67FF  # of the first of several devices behind one node
 NO_SOFTWARE_LIMIT = (-(2**31), 2**31 - 1)
 OPTIONS = (
@@ -57,10 +57,10 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """A drive as it was read: its identity, the mapping's fingerprint, its options, and every point compared.
+    """A drive as read: identity, the mapping's fingerprint, options, and every compared item.
 
-    ``rpdos`` are the COB-IDs of RPDOs that the profile does not have, as a record keeps them. Of a device that is no
-    drive nothing else is read.
+    ``rpdos`` are the COB-IDs of RPDOs that the profile lacks, as stored in a record. Of a device that is not a drive
+    nothing else is read.
     """
 
     identity: Identity
@@ -73,9 +73,9 @@ class Survey:
 
 
 def listen(master: Master) -> None:
-    """Listen without sending; ForeignMaster beside an NC: we are not the master then.
+    """Listen without sending; ForeignMaster if an NC runs the bus.
 
-    On a silent bus the drive is asked what it is: with the NC off, one that sends no heartbeat (0x1017 = 0) is silent.
+    On a silent bus the drive's device type is read: with the NC off, a drive without heartbeat (0x1017 = 0) is silent.
     """
     end = time.monotonic() + LISTEN_S
     while time.monotonic() < end:
@@ -87,12 +87,11 @@ def listen(master: Master) -> None:
 
 
 def compare_own_identifiers(master: Master) -> Finding:
-    """Compare the drive's COB-IDs with those that are in use, as the configuration and the bus show them."""
+    """Compare the drive's COB-IDs with those in use according to the configuration and the bus."""
     return compare_identifiers(master.config, master.axis, tuple(master.heard.ids))
 
 
 def _ask_alone(master: Master) -> None:
-    """Read the device type on a bus where nothing is heard; ConnectError when nothing can be read."""
     bus = f"bus {master.bus.name}"
     if master.heard.errors:
         raise ConnectError(bus, UNREADABLE)
@@ -101,12 +100,12 @@ def _ask_alone(master: Master) -> None:
     except ForeignMaster:
         raise
     except (DeviceTimeout, ProtocolError):
-        text = f"nothing was heard on the bus and node-ID {master.node_id} did not answer"
+        text = f"no frame was received on the bus and node-ID {master.node_id} did not answer"
         raise ConnectError(bus, f"{text}; check the drive's supply, wiring, bit rate and node_id") from None
 
 
 def survey(master: Master) -> Survey:
-    """Read everything that can be compared while the drive rests, and compare it."""
+    """Read everything that can be compared while the drive is at standstill, and compare it."""
     identity, device = read_identity(master), compare_device(master)
     if device.ok is False:
         return Survey(identity, "", {}, 0.0, (device,), is_drive=False)
@@ -130,34 +129,34 @@ def survey(master: Master) -> Survey:
 
 
 def require(master: Master, findings: Iterable[Finding]) -> None:
-    """DriveFault with cause and advice of the first point that differs, or is needed and could not be compared."""
+    """Raise DriveFault for the first item that differs, or is needed and could not be compared."""
     for finding in findings:
         if finding.ok is False or (finding.ok is None and finding.needed):
             raise DriveFault(master.device, f"{finding.cause}; {finding.advice}")
 
 
 def read_identity(master: Master) -> Identity:
-    """Read 0x1018; a number that the drive does not give is 0."""
+    """Read 0x1018; a number that the drive does not have is 0."""
     return Identity(*(read_optional(master, Object.IDENTITY, sub) or 0 for sub in (1, 2, 3, 4)))
 
 
 def compare_device(master: Master) -> Finding:
-    """The node must be a CiA 402 drive, or one of the devices behind it (0x67FF)."""
+    """Check that the node is a CiA 402 drive, or one of the devices behind it (0x67FF)."""
     own, first = (read_optional(master, index) for index in (Object.DEVICE_TYPE, FIRST_DEVICE_TYPE))
     expected, advice = "CiA 402, a drive", "correct drive.node_id; fdhil scan lists what is on the bus"
     if is_drive(own) or is_drive(first):
         return Finding("device", expected, expected)
     found = describe(own)
-    if own is None or own & 0xFFFF == 0:  # some drives follow CiA 402 and do not say so
-        cause = "it names no device profile (0x1000)"
+    if own is None or own & 0xFFFF == 0:  # some CiA 402 drives do not report their profile
+        cause = "it reports no device profile (0x1000)"
         if has_object(master, Object.STATUSWORD):
-            return Finding("device", expected, found, None, cause, "see in its manual that it follows CiA 402")
+            return Finding("device", expected, found, None, cause, "check in its manual that it follows CiA 402")
         return Finding("device", expected, found, False, f"{cause} and has no statusword (0x6041)", advice)
-    return Finding("device", expected, found, False, f"it is no CiA 402 drive: 0x1000 says {found}", advice)
+    return Finding("device", expected, found, False, f"it is not a CiA 402 drive: 0x1000 reports {found}", advice)
 
 
 def compare_identity(profile: DriveProfile, identity: Identity) -> Finding:
-    """Compare 0x1018 with the profile, where that names a vendor or product."""
+    """Compare 0x1018 with the profile, if that names a vendor or product."""
     wanted = ((profile.vendor_id, identity.vendor_id), (profile.product_code, identity.product_code))
     shown = f"vendor {identity.vendor_id:08X}, product {identity.product_code:08X}"
     vendor, product = ("any" if number is None else f"{number:08X}" for number, _ in wanted)
@@ -165,8 +164,8 @@ def compare_identity(profile: DriveProfile, identity: Identity) -> Finding:
     if all(found in (number, 0) or number is None for number, found in wanted) and (
         any(number and not found for number, found in wanted)
     ):
-        cause = f"it does not tell who it is: {shown} (0x1018)"
-        return Finding("identity", expected, shown, None, cause, "see by its label that the profile is the right one")
+        cause = f"it does not report its identity: {shown} (0x1018)"
+        return Finding("identity", expected, shown, None, cause, "check by its label that the profile is the right one")
     same = all(number in (None, found) for number, found in wanted)
     cause = f"it is {shown}, which profile {profile.name} is not made for"
     return Finding("identity", expected, shown, same, cause, "choose another profile")
@@ -174,7 +173,7 @@ def compare_identity(profile: DriveProfile, identity: Identity) -> Finding:
 
 @dataclass(frozen=True, slots=True)
 class PdoFound:
-    """The communication and mapping parameters of one PDO as the drive has them."""
+    """The communication and mapping parameters of one PDO in the drive."""
 
     parameter: int
     mapping: int
@@ -184,12 +183,12 @@ class PdoFound:
 
     @property
     def words(self) -> tuple[int, ...]:
-        """The numbers that the mapping's fingerprint is made of."""
+        """The numbers in the mapping's fingerprint."""
         return self.parameter, self.cob_id, self.kind, *self.mapped
 
 
 def read_pdos(master: Master) -> list[tuple[PdoSpec, PdoFound]]:
-    """Read the parameters of every PDO of the profile; one that the drive does not have maps nothing."""
+    """Read the parameters of every PDO of the profile; a missing PDO maps nothing."""
     places = (
         (Object.RPDO_PARAMETER, Object.RPDO_MAPPING, master.profile.rpdos),
         (Object.TPDO_PARAMETER, Object.TPDO_MAPPING, master.profile.tpdos),
@@ -210,15 +209,15 @@ def _read_pdo(master: Master, parameter: int, mapping: int) -> PdoFound:
 
 
 def read_mapping(master: Master, mapping: int) -> tuple[int, ...]:
-    """Read the words of a mapping parameter; one that the drive does not have maps nothing."""
+    """Read the entries of a mapping parameter; a missing one maps nothing."""
     count = read_optional(master, mapping, 0) or 0
     return tuple(read_optional(master, mapping, sub) or 0 for sub in range(1, count + 1))
 
 
 def compare_sizes(master: Master, pdos: Sequence[tuple[PdoSpec, PdoFound]]) -> Finding:
-    """Compare the size of each mapped object, as SDO tells it, with the bits that its PDO gives it.
+    """Compare the size of each mapped object, as SDO reports it, with its bits in the PDO.
 
-    One that is mapped longer than it is shifts all that follows it in the frame, and the mapping looks right.
+    An object that is mapped too long shifts all that follows in the frame, although the mapping looks right.
     """
     expected, compared = "as mapped", 0
     for spec, found in pdos:
@@ -228,12 +227,12 @@ def compare_sizes(master: Master, pdos: Sequence[tuple[PdoSpec, PdoFound]]) -> F
             compared += size is not None
             if size is not None and size != -(-bits // 8):
                 shown = f"{index:04X}:{sub:02X} has {8 * size} bits"
-                cause = f"{shown} (by SDO), and {spec.name} maps it with {bits}: what follows it is shifted"
+                cause = f"{shown} (by SDO), but {spec.name} maps it with {bits}: all that follows is shifted"
                 advice = f"correct 0x{found.mapping:04X} and the profile: every value of {spec.name} would be wrong"
                 return Finding("object sizes", expected, shown, False, cause, advice)
     if not compared:
-        cause = "it tells the size of none of its mapped objects"
-        return Finding("object sizes", expected, "not told", None, cause, "compare its mapping with its manual")
+        cause = "it does not report the size of its mapped objects"
+        return Finding("object sizes", expected, "not reported", None, cause, "compare its mapping with its manual")
     return Finding("object sizes", expected, f"{compared} as mapped")
 
 
@@ -245,7 +244,7 @@ def _read_size(master: Master, index: int, sub: int) -> int | None:
 
 
 def compare_other_rpdos(master: Master) -> tuple[list[Finding], dict[str, int]]:
-    """Compare the RPDOs that the profile does not have, where it can send offsets; and what a record keeps of them."""
+    """Compare the RPDOs that the profile lacks, if it can send offsets; return findings and record options."""
     if master.profile.find_rpdo(master.profile.offset) is None:
         return [], {}
     try:
@@ -256,16 +255,16 @@ def compare_other_rpdos(master: Master) -> tuple[list[Finding], dict[str, int]]:
 
 
 def compare_pdo(spec: PdoSpec, found: PdoFound, node_id: int) -> Finding:
-    """Compare one PDO with the profile: its mapping, COB-ID and, where it is valid, its transmission type."""
+    """Compare one PDO with the profile: mapping, COB-ID and, if valid, transmission type."""
     wanted = tuple(entry.mapping for entry in spec.entries)
     cob_id = spec.cob_base + node_id
     cause = ""
     if found.mapped != wanted:
-        cause = f"{spec.name} maps {_mapping(found.mapped)} where the profile has {_mapping(wanted)}"
+        cause = f"{spec.name} maps {_mapping(found.mapped)}, but the profile has {_mapping(wanted)}"
     elif identifier_of(found.cob_id) != cob_id or bool(found.cob_id & INVALID_COB_ID) == spec.valid:
         cause = f"{spec.name} has the COB-ID {found.cob_id:08X}, not {cob_id:03X}{'' if spec.valid else ', not valid'}"
     elif spec.valid and found.kind != spec.every_sync:
-        cause = f"{spec.name} has transmission type {found.kind} where the profile has {spec.every_sync}"
+        cause = f"{spec.name} has transmission type {found.kind}, but the profile has {spec.every_sync}"
     return Finding(
         spec.name,
         _pdo_text(cob_id, spec.valid, spec.every_sync, wanted),
@@ -285,12 +284,12 @@ def _pdo_text(cob_id: int, valid: bool, kind: int, mapped: tuple[int, ...]) -> s
 
 
 def compare_mode(master: Master) -> Iterator[Finding]:
-    """The drive must offer cyclic synchronous position and interpolate at the machine's SYNC period."""
+    """Check that the drive has cyclic synchronous position and interpolates at the machine's SYNC period."""
     modes, mode = read_optional(master, Object.SUPPORTED_MODES), master.profile.mode
     name = "cyclic synchronous position" if mode == Mode.CYCLIC_SYNC_POSITION else f"mode {mode}"
     if modes is None:
         yield lacks("mode", name, "0x6502")
-    elif mode > 0:  # a maker's own mode has no bit there
+    elif mode > 0:  # a vendor-specific mode has no bit
         offered = bool(modes >> (mode - 1) & 1)
         cause = f"it has no {name}{' mode' if mode == Mode.CYCLIC_SYNC_POSITION else ''} (0x6502)"
         shown = f"0x6502 = {modes:08X}"
@@ -304,12 +303,12 @@ def compare_mode(master: Master) -> Iterator[Finding]:
     period_s = value * 10.0**exponent
     found = f"{period_s * 1e3:g} ms"
     same = abs(period_s - master.period_s) <= 1e-6
-    cause = f"it interpolates over {found} (0x60C2) while SYNC comes every {wanted}"
+    cause = f"it interpolates over {found} (0x60C2), but the SYNC period is {wanted}"
     yield Finding("cycle", wanted, found, same, cause, "set 0x60C2 or machine.sync_period_s")
 
 
 def read_options(master: Master) -> dict[str, int]:
-    """Read option codes, window, heartbeat and software limits (607D01, 607D02); what is not there is left out."""
+    """Read option codes, window, heartbeat and software limits (607D01, 607D02); missing objects are omitted."""
     values = {f"{index:04X}": read_optional(master, index, signed=signed) for index, signed in OPTIONS}
     low, high = (read_optional(master, SOFTWARE_LIMIT, sub, signed=True) for sub in (1, 2))
     if low is not None and high is not None and low < high and (low, high) != NO_SOFTWARE_LIMIT:
@@ -318,14 +317,14 @@ def read_options(master: Master) -> dict[str, int]:
 
 
 def compare_options(master: Master, options: Mapping[str, int]) -> Iterator[Finding]:
-    """The drive must stop, and by a ramp, when communication is lost."""
+    """Check that the drive stops, and by a ramp, when communication is lost."""
     strict = " or ".join(map(str, master.profile.strict_abort_options))
     point, expected, abort = "communication lost", f"0x6007 = {strict}", options.get("6007")
-    if abort is None:  # the watchdog test of the commissioning shows what it does
+    if abort is None:  # the watchdog test will show its reaction
         yield lacks(point, expected, "0x6007")
     else:
         stops = abort in master.profile.strict_abort_options
-        cause = f"0x6007 is {abort}: it goes on when communication is lost"
+        cause = f"0x6007 is {abort}: it continues when communication is lost"
         yield Finding(point, expected, f"0x6007 = {abort}", stops, cause, f"set it to {strict}")
     point, expected = "stop by a ramp", "0x605A and 0x605E not 0"
     found = {f"0x{key}": options.get(key) for key in ("605A", "605E")}
@@ -333,12 +332,12 @@ def compare_options(master: Master, options: Mapping[str, int]) -> Iterator[Find
         yield lacks(point, expected, *missing)
         return
     shown = ", ".join(f"{key} = {'missing' if value is None else value}" for key, value in found.items())
-    cause = "0x605E or 0x605A is 0: it coasts instead of stopping by a ramp"
+    cause = "0x605E or 0x605A is 0: it coasts instead of ramping down"
     yield Finding(point, expected, shown, 0 not in found.values(), cause, "set both to 2")
 
 
 def compare_window(master: Master, options: Mapping[str, int], window_um: float) -> Iterator[Finding]:
-    """The drive must notice that it leaves its path, no sooner than at four times the largest offset."""
+    """Check that the drive detects a following error, no sooner than at four times the largest offset."""
     settings = master.config.axis[master.axis]
     largest = (settings.correction or CorrectionLimits()).max_offset_um
     wanted = settings.drive.following_error_window_mm * 1e3
@@ -347,7 +346,7 @@ def compare_window(master: Master, options: Mapping[str, int], window_um: float)
         yield lacks(point, expected, "0x6065", needed=True)
         return
     if options["6065"] in (0, NO_WINDOW):
-        cause = "0x6065 is off: it never notices a following error"
+        cause = "0x6065 is off: it never detects a following error"
         yield Finding(point, expected, "off", False, cause, "set a window")
         return
     cause = f"its following-error window is {window_um:g} um (0x6065)"
@@ -356,18 +355,18 @@ def compare_window(master: Master, options: Mapping[str, int], window_um: float)
         yield Finding(point, expected, f"{window_um:g} um", False, small, "set at least four times the largest offset")
         return
     same = abs(window_um - wanted) <= 0.01 * wanted
-    other = f"{cause} where the config has {wanted:g}"
+    other = f"{cause}, but the configuration has {wanted:g}"
     yield Finding(point, expected, f"{window_um:g} um", same, other, "correct drive.following_error_window_mm")
 
 
 def faulted(master: Master, what: str) -> DriveFault:
-    """Return what to raise for a drive in fault, with its error code."""
+    """Return the exception for a drive in fault, with its error code."""
     code = read_optional(master, 0x603F)
     shown = "no error code" if code is None else f"error code {code:04X}"
     return DriveFault(master.device, f"{what} ({shown}); remove the cause and start again")
 
 
 def require_enabled(master: Master) -> None:
-    """Raise DriveFault when the drive is not in Operation enabled any more."""
+    """Raise DriveFault if the drive has left Operation enabled."""
     if master.state() is not State.OPERATION_ENABLED:
         raise faulted(master, f"it fell from Operation enabled to {master.state().value}")

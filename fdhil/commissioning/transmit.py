@@ -1,7 +1,7 @@
-"""Opens a bus for sending: besides the guard's the only module that does, and commissioning alone may import it.
+"""Open a bus for sending: the only module besides the guard's that does, and only commissioning may import it.
 
-No periodic sending of any library is used anywhere: a kernel that goes on sending for a process that hangs would make
-a dead program look alive.
+No library's periodic sending is used anywhere: a kernel that keeps sending for a hung process would make a dead program
+look alive.
 """
 
 import errno
@@ -22,7 +22,7 @@ from fdhil.drivers.can.socketcan import CAN_FRAME, SocketCanPort
 from fdhil.drivers.can.socketcand import CONNECT_TIMEOUT_S, SocketcandPort
 from fdhil.errors import ConnectError, DeviceError
 
-LOOK_S = 0.25  # a bus is listened to for so long before the first frame leaves: SYNC of any NC comes meanwhile
+LOOK_S = 0.25  # listening time before the first frame is sent: any NC's SYNC arrives meanwhile
 
 
 class SendingPort(Port, Protocol):
@@ -33,16 +33,14 @@ class SendingPort(Port, Protocol):
 
 
 class SocketCanSender(SocketCanPort):
-    """A raw CAN socket; a full transmit queue (ENOBUFS) is an error at once, never a wait."""
+    """A raw CAN socket; a full transmit queue (ENOBUFS) is an immediate error, never a wait."""
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send one frame."""
         try:
             self._socket.send(CAN_FRAME.pack(can_id, len(data), data))
         except OSError as error:
-            full = (
-                "the transmit queue is full: no other node acknowledges what is sent, check supply, wiring and bit rate"
-            )
+            full = "the transmit queue is full: no other node acknowledges frames, check supply, wiring and bit rate"
             why = full if error.errno in (errno.ENOBUFS, errno.EAGAIN) else error.strerror
             raise DeviceError(self._name, f"the frame {can_id:03X} was not sent ({why})") from None
 
@@ -79,9 +77,9 @@ SENDERS: Mapping[str, Callable[[str, config.CanBus], SendingPort]] = {
 
 
 class TransmitBus(CanBus):
-    """A bus that is listened to and sent on; answers are waited for, so it is read frame by frame.
+    """A bus that is listened to and sent on; it is read frame by frame, since answers are waited for.
 
-    ``watch`` sees all that comes and goes; without one the identifiers of the machine's own drives are not known.
+    ``watch`` inspects all frames; without one the identifiers of the machine's own drives are unknown.
     """
 
     batch_s = 0.0
@@ -96,14 +94,14 @@ class TransmitBus(CanBus):
 
     def _open(self, settings: config.CanBus, filters: Sequence[Filter]) -> Port:
         if not settings.may_send:
-            text = f"{settings.interface} adapters are only listened to, and this has to send; use SocketCAN for it"
+            text = f"fdhil does not send on {settings.interface} adapters, which this command requires; use SocketCAN"
             raise ConnectError(self.name, text)
         self._send_lock = threading.Lock()
         self._sender = SENDERS[settings.interface](self.name, settings)
         return self._sender
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame; DeviceError when the bus does not take it, ForeignMaster when another master runs it."""
+        """Send one frame; DeviceError if the bus does not accept it, ForeignMaster if another master runs it."""
         time.sleep(max(0.0, self._free_from_s - time.monotonic()))
         with self._send_lock:
             self.watch.admit(can_id, data)

@@ -1,7 +1,7 @@
-"""Tries a commissioned axis by moving it inside the room that the operator gave: a jog, and rapids.
+"""Test a commissioned axis by moving it inside the operator's room: a jog, and rapids.
 
-The jog proves units and signs, the rapids identify the drive, and the last two of them must be as predicted. Set-points
-leave by ``set_points`` alone; whatever happens, also Ctrl-C, the axis is braked and the drive is switched off.
+The jog proves units and signs, the rapids identify the drive, and the last two must match the prediction. Set-points
+come from ``set_points`` alone; on any interruption, Ctrl-C included, the axis is braked and the drive switched off.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -29,22 +29,22 @@ from fdhil.records import Outcome, Recording
 
 RAPIDS = 6
 TIMING_CYCLES = 1000
-REST_S = 0.8  # between two strokes: a window wants a quarter second before it, and a third after
+REST_S = 0.8  # between two strokes: a window needs a quarter second before it, and a third after
 JOG_REST_S = 0.2
-LAST_REST_S = 1.8  # a separate sensor may deliver a second later
+LAST_REST_S = 1.8  # a separate sensor may deliver a second late
 HEARD_TIMEOUT_S = 10.0
 STEPS = ("timing", "jog", "test rapids", "identification", "acceptance")
 FROM_RAPIDS = STEPS[2:]
-GIVEN = "room"  # kept beside the steps: where a trial that was stopped may go
+GIVEN = "room"  # stored with the steps: the permitted travel of a stopped trial
 
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """Who is informed and asked: ``report`` gets the name of each step before it, and what it raises ends all.
+    """Callbacks to the operator: ``report`` gets the name of each step before it, and its exception ends the trial.
 
-    ``saw`` gets a question and returns what the operator saw, None where nobody was asked. ``result`` gets what a step
-    found; before the first move that of ``room``: where the axis stands, where it may go, and by which move it returns
-    to where a stopped trial began. ``at`` gets the position in mm while the axis moves.
+    ``saw`` gets a question and returns what the operator saw, None if not asked. ``result`` gets the results of a step;
+    before the first move those of ``room``: the position, the permitted travel, and the move back to the start of a
+    stopped trial. ``at`` gets the position in mm while the axis moves.
     """
 
     report: Callable[[str], None] = lambda _step: None
@@ -55,7 +55,7 @@ class Operator:
 
 @dataclass(slots=True)
 class Trial:
-    """What the trial of an axis found, step by step, and the outcomes of its rapids for the history."""
+    """Results of an axis' trial by step, and the outcomes of its rapids for the history."""
 
     found: dict[str, Found] = field(default_factory=dict)
     outcomes: tuple[Outcome, ...] = ()
@@ -69,9 +69,9 @@ def try_axis(
     progress: Progress,
     known: Known | None = None,
 ) -> Trial:
-    """Do all steps that are not kept and return what they found; nothing moves before ``report`` returns from ``jog``.
+    """Run all steps that are not stored, return their results; nothing moves before ``report`` returns from ``jog``.
 
-    DriveFault when something differs or is not believed, and as commissioning does, after everything was rolled back.
+    DriveFault for every deviation or rejected result, and as commissioning, after everything was rolled back.
     """
     axis, trial = record.axis, Trial()
     require_single_drive(config, axis)
@@ -105,10 +105,10 @@ def try_axis(
                     operator.result("jog", trial.found["jog"])
                 operator.report("test rapids")
                 enable(master)
-                heard = rapids_to_and_fro(master, travel_mm, rapid, operator)
+                capture = rapids_to_and_fro(master, travel_mm, rapid, operator)
                 operator.report("restore")
-    trial.outcomes = tuple(identify(config, axis, heard.records, known))
-    trial.found |= judged(config, axis, trial.outcomes, heard.recording(), operator)
+    trial.outcomes = tuple(identify(config, axis, capture.records, known))
+    trial.found |= judged(config, axis, trial.outcomes, capture.recording(), operator)
     trial.found["test rapids"] = {"rapid": str(rapid), "moves": RAPIDS, **trial.found["test rapids"]}
     for step in FROM_RAPIDS:
         progress.keep(step, now, trial.found[step])
@@ -116,7 +116,7 @@ def try_axis(
 
 
 def allowed(master: Master, record: CommissioningRecord, room: Room, progress: Progress, now: str) -> Travel:
-    """Return where the axis may go; a trial that was stopped elsewhere keeps to the room that it began with."""
+    """Return the permitted travel; a trial that was stopped elsewhere keeps the room that it began with."""
     given = progress.found(GIVEN, now)
     travel_mm = travel_of(master, record, room, Travel(**given) if given else None)
     if given is None:
@@ -128,12 +128,12 @@ def allowed(master: Master, record: CommissioningRecord, room: Room, progress: P
 
 @contextmanager
 def where_stopped(master: Master, progress: Progress, now: str) -> Iterator[None]:
-    """Keep where the axis stands after whatever ends a trial early: from there it may be resumed."""
+    """Store the axis' position if the trial ends early, so that it can be resumed from there."""
     try:
         yield
     except BaseException:  # Ctrl-C, too
         if given := progress.found(GIVEN, now):
-            with suppress(StoreError):  # why it ended is told
+            with suppress(StoreError):  # the cause is being raised
                 progress.keep(GIVEN, now, {**given, "stopped_mm": position_mm(master)})
         raise
 
@@ -145,10 +145,10 @@ def _shown(master: Master, travel_mm: Travel) -> dict[str, str]:
 
 
 def judged(
-    config: MachineConfig, axis: str, outcomes: Sequence[Outcome], heard: Recording, operator: Operator
+    config: MachineConfig, axis: str, outcomes: Sequence[Outcome], recording: Recording, operator: Operator
 ) -> dict[str, Found]:
-    """Return what the rapids tell, step by step; DriveFault for the first that is not as it must be."""
-    balance = judge_acceleration(heard)
+    """Return the rapids' results by step; DriveFault for the first deviation."""
+    balance = judge_acceleration(recording)
     if balance.ok is False:
         raise DriveFault(f"drive {axis}", f"{balance.cause}; {balance.advice}")
     operator.result("test rapids", {balance.point: balance.found})
@@ -167,7 +167,7 @@ def judged(
 
 @contextmanager
 def guarded(master: Master) -> Iterator[None]:
-    """Have the drive watch our heartbeat, so that it stops by itself when this process or the bus is gone."""
+    """Let the drive monitor fdhil's heartbeat, so that it stops by itself if this process or the bus fails."""
     play, loop = master.config.play, master.loop
     with ExitStack() as undo:
         undo.callback(setattr, loop, "heartbeat", None)
@@ -176,15 +176,15 @@ def guarded(master: Master) -> Iterator[None]:
         try:
             yield
         except BaseException:
-            with suppress(DeviceError):  # of a bus that is gone: why it ended is told already
+            with suppress(DeviceError):  # of a bus that is gone: the cause is being raised
                 undo.close()
             raise
 
 
 def time_bus(master: Master) -> Found:
-    """Listen beside our own SYNC: the drive must answer in time; DriveFault.
+    """Measure while fdhil sends SYNC: the drive must answer in time; DriveFault.
 
-    How evenly it comes is told, not judged: it is this computer's. ``fdhil check`` judges the NC's.
+    SYNC evenness is reported but not assessed, since it is this computer's; ``fdhil check`` assesses the NC's.
     """
     name, counted = master.bus.name, master.config.guard.clock == "sync"
     with CanBus(name, master.config.bus[name]) as bus:
@@ -199,41 +199,41 @@ def time_bus(master: Master) -> Found:
 
 
 def jog_to_and_fro(master: Master, travel_mm: Travel, jog: Stroke, operator: Operator) -> Found:
-    """Jog an enabled axis and back: units and signs must be right, also in the eyes of the operator; DriveFault."""
-    with Overhearing(master.config, master.axis) as heard:
+    """Jog an enabled axis and back: units and signs must be right, also according to the operator; DriveFault."""
+    with Overhearing(master.config, master.axis) as capture:
         for moved in (jog, jog.back()):
             stroke(master, travel_mm, moved, JOG_REST_S, operator.at)
-        wait_heard(master, heard)
-    findings = list(judge_jog(heard.recording(), jog.distance_mm, jog.axis))
+        wait_heard(master, capture)
+    findings = list(judge_jog(capture.recording(), jog.distance_mm, jog.axis))
     require(master, findings)
-    saw = operator.saw(f"The drive went {jog}, and back. Is that what you saw the table do?")
+    saw = operator.saw(f"The drive moved {jog}, and back. Did the table do the same?")
     if saw is False:
-        text = "the table did not move as the drive says"
+        text = "the table did not move as the drive reports"
         advice = (
-            "another direction: drive.sign; another distance: screw_pitch_mm or increments_per_rev; else a coupling"
+            "check drive.sign for the direction, screw_pitch_mm or increments_per_rev for the distance, else a coupling"
         )
         raise DriveFault(master.device, f"{text}; {advice}")
     return {"jog": str(jog), "seen": "not asked" if saw is None else "yes"} | {f.point: f.found for f in findings}
 
 
-def wait_heard(master: Master, heard: Overhearing) -> None:
-    """Wait until all that was moved so far has been heard, that of a separate sensor too."""
-    goal = heard.newest_tick + round(LAST_REST_S / master.period_s)
+def wait_heard(master: Master, capture: Overhearing) -> None:
+    """Wait until all moves so far have been recorded, by a separate sensor too."""
+    goal = capture.newest_tick + round(LAST_REST_S / master.period_s)
     patience_s = HEARD_TIMEOUT_S + LAST_REST_S
 
     def reached() -> bool:
-        heard.check()
-        return heard.newest_tick >= goal
+        capture.check()
+        return capture.newest_tick >= goal
 
-    master.wait(reached, patience_s, "its TPDOs are not heard any more; check the bus")
+    master.wait(reached, patience_s, "its TPDOs are no longer received; check the bus")
 
 
 def rapids_to_and_fro(master: Master, travel_mm: Travel, rapid: Stroke, operator: Operator) -> Overhearing:
-    """Move an enabled axis as fast as G0, to and fro, and return what was heard of it."""
-    with Overhearing(master.config, master.axis, rapid.speed_mm_s) as heard:
+    """Move an enabled axis back and forth as fast as G0, and return the recording."""
+    with Overhearing(master.config, master.axis, rapid.speed_mm_s) as capture:
         master.wait_cycles(round(REST_S / master.period_s))
         for _ in range(RAPIDS // 2):
             for moved in (rapid, rapid.back()):
                 stroke(master, travel_mm, moved, REST_S, operator.at)
-        wait_heard(master, heard)
-    return heard
+        wait_heard(master, capture)
+    return capture

@@ -1,8 +1,8 @@
-"""Marks a commissioning record as void: something against it was seen, and it was not compared since.
+"""Mark a commissioning record as void: something contradicts it, and the drive has not been compared since.
 
-A drive that has rebooted may have lost what is not stored in it; one that another master wrote to may be set up anew.
-The mark is a file of its own, so that it outlives every process; comparing the drive again removes it, unless
-something more was seen meanwhile: that makes another mark.
+A drive that has rebooted may have lost settings that it does not store; one that another master wrote to may have been
+reconfigured. The mark is a file, so that it outlives every process. Comparing the drive again removes it, unless a new
+contradiction meanwhile has made another mark.
 """
 
 import json
@@ -17,16 +17,16 @@ MOST_BYTES, MOST_REASON = 64 * 1024, 300
 
 
 def void_path(directory: Path, axis: str) -> Path:
-    """Return where the mark of an axis is kept."""
+    """Return the mark file of an axis."""
     return directory / f"commissioning-{axis}.void"
 
 
 Mark = tuple[int, int]
-"""What tells one mark from another."""
+"""Identifies a mark."""
 
 
 def is_void(directory: Path, axis: str) -> bool:
-    """Whether the axis' record is void; also where that cannot be told."""
+    """Return whether the axis' record is void, or whether that is unknown."""
     try:
         void_path(directory, axis).lstat()
     except FileNotFoundError:
@@ -37,7 +37,7 @@ def is_void(directory: Path, axis: str) -> bool:
 
 
 def void_reason(directory: Path, axis: str) -> str:
-    """Return what was seen against the axis' record, empty where that cannot be read."""
+    """Return what contradicts the axis' record; empty if it cannot be read."""
     try:
         with void_path(directory, axis).open("rb") as file:
             why = json.loads(file.read(MOST_BYTES))["why"]
@@ -47,7 +47,7 @@ def void_reason(directory: Path, axis: str) -> str:
 
 
 def void_mark(directory: Path, axis: str) -> Mark | None:
-    """Return which mark there is now: to be asked before the drive is compared. None: there is none."""
+    """Return the present mark, to be read before the drive is compared; None without one."""
     try:
         status = void_path(directory, axis).lstat()
     except OSError:
@@ -56,26 +56,26 @@ def void_mark(directory: Path, axis: str) -> Mark | None:
 
 
 def void_record(directory: Path, axis: str, why: str) -> None:
-    """Mark the axis' record as void, with the newest reason; StoreError when the mark cannot be written."""
+    """Mark the axis' record as void, with the newest reason; StoreError if the mark cannot be written."""
     path = void_path(directory, axis)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     text = json.dumps({"why": why, "seen_utc": datetime.now(UTC).isoformat(timespec="seconds")})
     try:
         make_folder(directory)
         with part.open("w", encoding="utf-8") as file:
-            part.rename(path)  # it is a mark as soon as it is there, even without a word in it
+            part.rename(path)  # the mark is valid as soon as it exists, even if empty
             sync_folder(directory)
             file.write(text + "\n")
             file.flush()
             os.fsync(file.fileno())
     except OSError as error:
         raise StoreError(
-            f"{path} cannot be written ({error.strerror}); until then arm nothing after a restart of the guard"
+            f"{path} cannot be written ({error.strerror}); until then do not arm after a restart of the guard"
         ) from None
 
 
 def confirm_record(directory: Path, axis: str, seen: Mark | None) -> None:
-    """Remove the mark that was ``seen`` before the drive was compared with its record; another stays. StoreError."""
+    """Remove the mark ``seen`` before the drive was compared; a newer mark stays. StoreError."""
     path = void_path(directory, axis)
     if seen is None or seen != void_mark(directory, axis):
         return

@@ -1,4 +1,4 @@
-"""Proves that a drive stops by itself when fdhil dies: CiA 301 7.2.8, the heartbeat consumer."""
+"""Prove that a drive stops by itself when fdhil dies: the heartbeat consumer, CiA 301 7.2.8."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -18,7 +18,7 @@ ANSWER_CYCLES = 20
 
 
 def watchdog_test(master: Master, enable: Callable[[Master], None]) -> str:
-    """Feed the drive our heartbeat, then starve it: it must stop by itself. Returns ``proven``; else DriveFault.
+    """Send fdhil's heartbeat, then stop it: the drive must stop by itself. Return ``proven``, else DriveFault.
 
     ``enable`` brings the drive back to Operation enabled.
     """
@@ -30,32 +30,32 @@ def watchdog_test(master: Master, enable: Callable[[Master], None]) -> str:
         undo.callback(master.sdo.write_int, Object.CONSUMER_HEARTBEAT, sub, before, 4)
         undo.callback(setattr, master, "heartbeat", False)
         fed_from = _feed(master, sub, entry, enable)
-        told = len(master.heard.emergencies)
+        before_count = len(master.heard.emergencies)
         master.heartbeat = False
         with contextlib.suppress(DeviceError):
-            master.wait(lambda: _reacted(master, told), STARVE_TIMEOUT_S, "")
-        master.wait_cycles(ANSWER_CYCLES)  # its EMCY may come after its statusword
+            master.wait(lambda: _reacted(master, before_count), STARVE_TIMEOUT_S, "")
+        master.wait_cycles(ANSWER_CYCLES)  # its EMCY may follow its statusword
         master.check()
-        if master.state() is State.OPERATION_ENABLED:  # by 0x1029 it may have left Operational, and tell nothing
+        if master.state() is State.OPERATION_ENABLED:  # by 0x1029 it may have left Operational silently
             master.nmt(NmtCommand.START)
             master.wait_cycles(ANSWER_CYCLES)
         if master.state() is State.OPERATION_ENABLED:
-            text = "it went on although our heartbeat stopped: its watchdog does not work; check 0x1016 and 0x6007"
+            text = "it did not stop when fdhil's heartbeat ended: its watchdog does not work; check 0x1016 and 0x6007"
             raise DriveFault(master.device, text)
         codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[fed_from:]]
         if EMCY_HEARTBEAT not in codes:
             shown = ", ".join(f"{code:04X} ({emcy_text(code)})" for code in codes) or "none"
             missed = f"8130 ({emcy_text(EMCY_HEARTBEAT)})"
-            text = f"it stopped with the EMCY {shown} instead of {missed}; find out what else stops it"
+            text = f"it stopped with the EMCY {shown} instead of {missed}; find the other cause of the stop"
             raise DriveFault(master.device, text)
     return "proven"
 
 
 @contextlib.contextmanager
 def watched(master: Master, node_id: int, period_s: float) -> Iterator[None]:
-    """Have the drive watch the heartbeat of ``node_id`` from its first one on, until the end.
+    """Let the drive monitor the heartbeat of ``node_id`` from its first one on, until the end.
 
-    DriveFault where it cannot, or does not keep what is written.
+    DriveFault if it cannot, or does not keep the written entry.
     """
     sub, before = consumer_slot(master, node_id)
     entry = _entry(node_id, period_s)
@@ -63,7 +63,7 @@ def watched(master: Master, node_id: int, period_s: float) -> Iterator[None]:
     try:
         master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, entry, 4)
         if master.sdo.read_int(Object.CONSUMER_HEARTBEAT, sub) != entry:
-            raise DriveFault(master.device, "it does not keep 0x1016, so it would not notice when fdhil dies")
+            raise DriveFault(master.device, "it does not keep 0x1016, so it would not detect that fdhil has died")
         yield
     finally:
         master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, 0, 4)
@@ -74,37 +74,37 @@ def _entry(node_id: int, period_s: float) -> int:
     return node_id << 16 | round(HEARTBEATS_MISSED * period_s * 1e3)
 
 
-def _reacted(master: Master, told: int) -> bool:
-    return master.state() is not State.OPERATION_ENABLED or len(master.heard.emergencies) > told
+def _reacted(master: Master, before_count: int) -> bool:
+    return master.state() is not State.OPERATION_ENABLED or len(master.heard.emergencies) > before_count
 
 
 def _feed(master: Master, sub: int, entry: int, enable: Callable[[Master], None]) -> int:
-    """Have the drive watch our heartbeat, and keep it content for a while; DriveFault when that cannot be done.
+    """Let the drive monitor fdhil's heartbeat without a fault for a while; DriveFault if that is impossible.
 
-    A busy computer sends a heartbeat late now and then, and the drive is right to stop then; that is tried again.
-    Returns how many emergencies came before it was content: what comes later may be of a heartbeat that was late.
+    A busy computer occasionally sends a heartbeat late, and the drive rightly stops; that is retried. Returns the
+    number of emergencies before success: later ones may stem from a late heartbeat.
     """
     for _ in range(FEEDING_TRIES):
         master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, entry, 4)
         if master.sdo.read_int(Object.CONSUMER_HEARTBEAT, sub) != entry:
-            raise DriveFault(master.device, "it does not keep 0x1016; it cannot watch over fdhil and must not be armed")
-        told = len(master.heard.emergencies)
+            raise DriveFault(master.device, "it does not keep 0x1016, so it cannot monitor fdhil and must not be armed")
+        before_count = len(master.heard.emergencies)
         master.heartbeat = True
         master.wait_cycles(round(FEEDING_S / master.period_s))
         if master.state() is State.OPERATION_ENABLED:
-            return told
-        codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[told:]]
+            return before_count
+        codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[before_count:]]
         if EMCY_HEARTBEAT not in codes:
             require_enabled(master)
         master.heartbeat = False
         master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, 0, 4)
         enable(master)
-    text = f"it missed our heartbeat {FEEDING_TRIES} times; take load off this computer and try again"
+    text = f"it missed fdhil's heartbeat {FEEDING_TRIES} times; reduce this computer's load and try again"
     raise DriveFault(master.device, text)
 
 
 def consumer_slot(master: Master, node_id: int) -> tuple[int, int]:
-    """Return a sub-index of 0x1016 that is free or ours, and its value."""
+    """Return a sub-index of 0x1016 that is free or fdhil's, and its value."""
     try:
         count = master.sdo.read_int(Object.CONSUMER_HEARTBEAT, 0)
         for sub in range(1, count + 1):
@@ -114,6 +114,6 @@ def consumer_slot(master: Master, node_id: int) -> tuple[int, int]:
     except SdoAbort as abort:
         if abort.code not in (NO_OBJECT, NO_SUB_INDEX):
             raise
-        text = "it has no heartbeat consumer (0x1016), so it cannot notice when fdhil dies; it must not be armed"
+        text = "it has no heartbeat consumer (0x1016), so it cannot detect that fdhil has died; it must not be armed"
         raise DriveFault(master.device, text) from None
-    raise DriveFault(master.device, "all entries of 0x1016 are taken; free one with the drive's tool")
+    raise DriveFault(master.device, "all entries of 0x1016 are in use; free one with the drive's tool")

@@ -1,4 +1,4 @@
-"""ISO 6983 programs and recorded demands: what the NC will order of the axes."""
+"""Interpret ISO 6983 programs and read recorded demands: the motion that the NC will command."""
 
 from fdhil.program.budget import Budget
 from fdhil.program.demand_csv import write_demand_csv

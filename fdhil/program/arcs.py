@@ -1,4 +1,4 @@
-"""Arcs: from the words of G2 and G3 to a centre, with the tolerances of a control."""
+"""Convert the words of G2 and G3 to arcs with a centre, within the tolerances of a control."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _CHORD_RELATIVE = 0.001  # by how much half the chord may exceed the radius of a
 
 
 def arc(machine: Machine, block: Block) -> None:
-    """Order the arc of a G2 or G3 block; ProgramError when its words give none."""
+    """Order the arc of a G2 or G3 block; ProgramError if its words define none."""
     modal, words = machine.modal, block.words
     axes = first, second, normal = plane_axes(modal, block)
     by_radius = "r" in words
@@ -35,7 +35,7 @@ def arc(machine: Machine, block: Block) -> None:
     clockwise = modal.motion == 20
     if by_radius:
         if first not in named and second not in named and "@" not in words and "^" not in words:
-            raise block.fault("r", "an arc by radius wants an end in its plane; a circle wants its centre")
+            raise block.fault("r", "an arc by radius needs an end in its plane; a full circle needs its centre")
         centre = _centre_of_radius_word(block, here, there, words["r"] * modal.scale, clockwise)
     else:
         centre = _centre_of_offsets(modal, block, first, second)
@@ -52,10 +52,10 @@ def arc(machine: Machine, block: Block) -> None:
 def _tilted(
     machine: Machine, block: Block, end: list[float], path: Swept, axes: tuple[int, int, int], feed: float
 ) -> None:
-    """Order an arc whose plane is turned about Z with its system: chords, since it lies in none of the planes."""
+    """Order an arc in a rotated co-ordinate system as chords, since it lies in none of the planes."""
     first, second, _ = axes
     if machine.compensation is not None:
-        what = "an arc outside the XY plane of a turned system cannot be compensated; end compensation by G40 first"
+        what = "an arc outside the XY plane of a rotated system cannot be compensated; end compensation by G40 first"
         raise block.fault(machine.modal.code, what)
     begin = list(machine.modal.position)
     x, y, radii = path.centre.real, path.centre.imag, path.radii
@@ -74,7 +74,7 @@ def _turns(block: Block) -> int:
     value = block.words.get("p", 1.0)
     turns = round(value)
     if not is_whole(value) or not 1 <= turns <= 1_000_000:
-        raise block.fault("p", "is no number of turns; P must be a whole number from 1 to 1000000")
+        raise block.fault("p", "is not a valid number of turns; P must be a whole number from 1 to 1000000")
     return turns
 
 
@@ -83,11 +83,13 @@ def _centre_of_offsets(modal: Modal, block: Block, first: int, second: int) -> c
     given = [letter for letter in letters if letter in block.words]
     wrong = [letter for letter in _OFFSETS if letter in block.words and letter not in letters]
     if wrong:
-        raise block.fault(wrong[0], f"gives no centre in the {modal.plane_name} plane; choose the plane or the letter")
+        raise block.fault(
+            wrong[0], f"defines no centre in the {modal.plane_name} plane; change the plane or the letter"
+        )
     if not given:
-        raise block.fault(modal.code, "an arc wants its centre (I J K) or its radius (R)")
+        raise block.fault(modal.code, "an arc needs its centre (I J K) or its radius (R)")
     if modal.arc_absolute and len(given) < 2:
-        raise block.fault(given[0], "an absolute centre (G90.1) wants both of its words")
+        raise block.fault(given[0], "an absolute centre (G90.1) needs both of its words")
     values = [block.words.get(letter, 0.0) * modal.scale for letter in letters]
     centre = complex(values[0], values[1])
     return centre if modal.arc_absolute else complex(modal.position[first], modal.position[second]) + centre
@@ -103,7 +105,7 @@ def _check_radii(block: Block, modal: Modal, begin_mm: float, finish_mm: float, 
 
 
 def radii_agree(begin_mm: float, finish_mm: float, scale: float) -> bool:
-    """Tell whether the radii at both ends of an arc are near enough for one arc (``scale``: mm of a unit)."""
+    """Return whether the radii at both ends of an arc are close enough (``scale``: mm per program unit)."""
     off, small = abs(begin_mm - finish_mm), _SPIRAL_SMALL[scale]
     return off <= small or off <= min(_SPIRAL_LARGE * small, _SPIRAL_RELATIVE * max(begin_mm, finish_mm))
 
@@ -118,7 +120,7 @@ def _centre_of_radius_word(block: Block, start: complex, end: complex, radius_mm
 
 
 def centre_of_radius(start: complex, end: complex, radius: float, clockwise: bool) -> complex:
-    """Return the centre of the arc of a radius between two points; a negative one takes the longer way round."""
+    """Return the centre of an arc of a radius between two points; a negative radius selects the longer way round."""
     half = abs(end - start) / 2.0
     height = math.sqrt(max(0.0, radius * radius - half * half))
     side = -1.0 if clockwise == (radius > 0) else 1.0

@@ -1,4 +1,4 @@
-"""A budget bounds what a program may spend: no input may hold the machine's computer for ever."""
+"""Bound the resources of an interpretation, so that no input can block the machine's computer forever."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from fdhil.program.dialect import LINUXCNC, Dialect
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Limits of one interpretation; whatever exceeds them ends in a ProgramError that names line and word.
+    """Limits of one interpretation; exceeding one raises a ProgramError that names line and word.
 
-    ``max_blocks`` lines read, those of a loop counted each time; ``max_repeated_blocks`` lines that loops and calls
-    execute again, and what these order beyond a motion each;
-    ``max_motions_per_block`` what one block may order; ``max_call_depth`` nested calls;
-    ``max_nesting`` brackets within a value and loops or conditions within one another; ``max_line_chars`` characters
-    of one line; ``max_coordinate_mm`` largest co-ordinate; ``max_kept_lines``, ``max_labels`` and ``max_parameters``
-    are kept in memory. ``dialect`` is how the program's numbers are read.
+    ``max_blocks`` lines read, those of a loop counted each time; ``max_repeated_blocks`` lines executed again by loops
+    and calls, and the motions beyond one that each orders; ``max_motions_per_block`` motions of one block;
+    ``max_call_depth`` nested calls; ``max_nesting`` brackets within a value, and loops or conditions within one
+    another; ``max_line_chars`` characters of a line; ``max_coordinate_mm`` largest co-ordinate; ``max_kept_lines``,
+    ``max_labels`` and ``max_parameters`` are kept in memory. ``dialect`` is how the program's numbers are read.
     """
 
     max_blocks: int = 10_000_000
@@ -34,5 +33,5 @@ class Budget:
 
     @classmethod
     def of(cls, nc: Nc) -> Budget:
-        """Return the budget and the dialect that a machine's configuration sets."""
+        """Return the budget and dialect of a machine's configuration."""
         return cls(nc.max_blocks, nc.max_repeated_blocks, max_call_depth=nc.max_call_depth, dialect=Dialect.of(nc))

@@ -1,4 +1,4 @@
-"""Words that need a code beside them: a letter that no code of the block reads is a mistake, and is refused."""
+"""Check words that need a code: a letter that no code of the block uses is an error."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ CYCLES = frozenset({730, 740, *range(810, 900, 10)})
 _COMPENSATION = frozenset({400, 410, 411, 420, 421})
 _LATHE = frozenset({700, 710, 711, 712, 720, 721, 722})
 
-# letter -> G codes times ten that read it, M codes that read it, how the error names them
+# letter -> G codes times ten that use it, M codes that use it, their names in the error
 _READERS: Mapping[str, tuple[frozenset[int], frozenset[int], str]] = {
     "d": (frozenset({410, 411, 420, 421, 960}) | _LATHE, frozenset(), "G41, G42, G70 or G96"),
     "e": (frozenset({700, 760}), frozenset({66, 67, 68}), "G70, G76 or M66 to M68"),
@@ -28,13 +28,13 @@ _READERS: Mapping[str, tuple[frozenset[int], frozenset[int], str]] = {
 }  # fmt: skip
 
 _CORNERING = (
-    "is of the S-curve planner of LinuxCNC 2.10, whose corners fdhil does not plan; leave R out, or "
+    "is for the S-curve planner of LinuxCNC 2.10, whose corners fdhil does not plan; remove R, or "
     "record the demand with fdhil record"
 )
 
 
 def check_readers(block: Block, motion: int | None) -> None:
-    """Raise ProgramError for a letter that neither a code of the block nor its ``motion`` reads."""
+    """Raise ProgramError for a letter that neither a code of the block nor its ``motion`` uses."""
     words = block.words
     if "r" in words and block.g.get("path control") == 640 and _READERS["r"][0].isdisjoint(block.g.values()):
         raise block.fault("G64 R", _CORNERING)
@@ -42,30 +42,30 @@ def check_readers(block: Block, motion: int | None) -> None:
         if letter in _READERS:
             g, m, names = _READERS[letter]
             if motion not in g and g.isdisjoint(block.g.values()) and m.isdisjoint(block.m.values()):
-                raise block.fault(letter, f"has no code that reads it; it belongs to {names}")
+                raise block.fault(letter, f"has no code that uses it; it belongs to {names}")
 
 
 def check_machine_words(block: Block) -> None:
-    """Raise ProgramError for values that a tool, a spindle, an input or an output cannot have."""
+    """Raise ProgramError for invalid values of a tool, a spindle, an input or an output."""
     words, m = block.words, block.m
     tool = words.get("t", 0.0)
     if tool < 0.0 or not is_whole(tool):
-        raise block.fault("t", "is no number of a tool; T must be a whole number from 0")
+        raise block.fault("t", "is not a valid tool number; T must be a whole number from 0")
     if words.get("$", 0.0) not in (0.0, -1.0):
-        raise block.fault("$", "is no spindle; the machine has spindle 0 alone")
+        raise block.fault("$", "is not a spindle; the machine has only spindle 0")
     if m.get("tool") == 61 and words.get("q", -1.0) < 0.0:
-        raise block.fault("M61", "wants the tool's number as Q, not negative")
+        raise block.fault("M61", "needs the tool number as Q, not negative")
     if m.get("spindle") == 19:
         if not 0.0 <= words.get("r", 0.0) <= 360.0:
-            raise block.fault("r", "is no angle of the spindle; R must be 0 to 360")
+            raise block.fault("r", "is not a valid spindle angle; R must be 0 to 360")
         if words.get("p", 0.0) not in (0.0, 1.0, 2.0):
-            raise block.fault("p", "is no way to turn the spindle; P must be 0, 1 or 2")
+            raise block.fault("p", "is not a valid spindle direction; P must be 0, 1 or 2")
     if "signals" in m:
         _check_signal(block, m["signals"])
 
 
 def _check_signal(block: Block, code: int) -> None:
-    """M62 to M65 name an output by P (LinuxCNC takes any), M67 and M68 by E; M66 an input by one of them."""
+    """M62 to M65 name an output by P (LinuxCNC accepts any), M67 and M68 by E; M66 an input by one of them."""
     words = block.words
     if code in (62, 63, 64, 65) and "p" in words:
         return
@@ -73,18 +73,18 @@ def _check_signal(block: Block, code: int) -> None:
     given = [letter for letter in ("pe" if code == 66 else wanted) if words.get(letter, -1.0) >= 0.0]
     if len(given) != 1:
         what = "one input as P or E" if code == 66 else f"the output's number as {wanted.upper()}"
-        raise block.fault(f"M{code}", f"wants {what}, not negative")
+        raise block.fault(f"M{code}", f"needs {what}, not negative")
     if code != 66:
         return
     wait = words.get("l", 0.0)
     if wait not in (0.0, 1.0, 2.0, 3.0, 4.0) or (given == ["e"] and wait != 0.0):
-        raise block.fault("M66", "wants L from 0 to 4, and 0 for an analogue input")
+        raise block.fault("M66", "needs L from 0 to 4, and 0 for an analogue input")
     if wait != 0.0 and words.get("q", 0.0) <= 0.0:
-        raise block.fault("M66", "wants the longest time to wait as Q")
+        raise block.fault("M66", "needs the maximum waiting time as Q")
 
 
 def one_reader_of_axes(block: Block) -> None:
-    """Raise ProgramError when two codes of the block both want its axis words."""
+    """Raise ProgramError if two codes of the block both use its axis words."""
     wanting = [code for group, code in block.g.items()
                if (group == "one-shot" and code in (100, 280, 300, 520, 920))
                or (group == "motion" and code != 800)]  # fmt: skip

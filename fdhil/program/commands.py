@@ -1,4 +1,4 @@
-"""O-words as they are read: a label, a keyword, and the values in brackets after it."""
+"""Parse O-words: a label, a keyword, and the values in brackets after it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FANUC = "fanuc"  # the keyword of a bare O-number
 
 
 class Command:
-    """One O-word; what follows its keyword is read when it is executed first, since what is skipped may be anything."""
+    """One O-word; what follows its keyword is parsed on first execution, since skipped lines may contain anything."""
 
     __slots__ = ("_label", "_reader", "_shown", "_values", "_variables", "keyword")
 
@@ -30,7 +30,7 @@ class Command:
             return
         match = _KEYWORD.match(text, reader.at)
         if match is None:
-            raise reader.fault("is no O-word; they are sub, call, while, do, repeat, if and their ends")
+            raise reader.fault("is not an O-word; O-words are sub, call, while, do, repeat, if and their ends")
         reader.at = match.end()
         self.keyword = match.group()
 
@@ -52,10 +52,10 @@ class Command:
         return [now(value) for value in self._values]
 
     def condition(self) -> float:
-        """Evaluate the one value that the command wants."""
+        """Evaluate the single value that the command needs."""
         values = self.values()
         if len(values) != 1:
-            raise self.fault("wants one value in brackets")
+            raise self.fault("needs one value in brackets")
         return values[0]
 
     def fault(self, message: str) -> ProgramError:

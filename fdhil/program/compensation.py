@@ -1,8 +1,8 @@
-"""Cutter compensation (G41, G42): the path of the tool's centre beside the programmed one.
+"""Cutter compensation (G41, G42): the path of the tool's centre parallel to the programmed one.
 
-Each programmed line or arc becomes its parallel at the tool's radius. Outside corners get an arc about the corner; at
-inside corners both parallels end where they cross, so a motion can be given out only when the next one is known. What
-lies between (moves along the normal, dwells) waits with it. Places in the plane are complex: first + j second.
+Each programmed line or arc becomes its parallel at the tool's radius. Outside corners get an arc around the corner; at
+inside corners both parallels end at their intersection, so a motion is ordered only when the next one is known. Moves
+along the normal and dwells in between are deferred with it. Points in the plane are complex: first + j second.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fdhil.program.words import Block
 _TANGENT_RAD = 0.05  # flatter corners are passed as if the path were smooth
 _BACKWARDS_MM = 1e-6
 _TIPS = {1: 1 - 1j, 2: -1 - 1j, 3: -1 + 1j, 4: 1 + 1j, 5: 1, 6: -1j, 7: -1, 8: 1j}  # z + j x
-_WRAPPED_RAD = 0.3  # an arc that turns so much more than programmed was cut beyond its other end
+_WRAPPED_RAD = 0.3  # an arc longer than programmed by this angle was cut beyond its other end
 
 
 @dataclass(slots=True)
@@ -38,10 +38,10 @@ class Piece:
     feed: float | None
     centre: complex | None = None
     turns: int = 0
-    angle: float = 0.0  # what an arc may turn at most before it is cut at its ends
+    angle: float = 0.0  # largest sweep of an arc before it is cut at its ends
     waiting: list[Waiting] = field(default_factory=list)
-    given: bool = False  # its motion was ordered already
-    checked_along: complex | None = None  # the way that it may not go against, where that is not ``leaving``
+    given: bool = False  # its motion has been ordered
+    checked_along: complex | None = None  # direction that it must not reverse, if not ``leaving``
 
     @property
     def radius(self) -> float:
@@ -51,7 +51,7 @@ class Piece:
 
 @dataclass(slots=True)
 class Waiting:
-    """What happens at the end of a piece, wherever that will be: a dwell, or a move of the other axes to ``whole``."""
+    """An action at the end of a piece: a dwell, or a move of the other axes to ``whole``."""
 
     block: Block
     dwell: Dwell | None = None
@@ -63,7 +63,7 @@ class Waiting:
 class Compensation:
     """Compensation by ``radius_mm`` on one ``side`` (1 left, -1 right) of the path.
 
-    ``orientation`` 1 to 8 tells where the tip of a turning tool lies about the centre of its nose.
+    ``orientation`` 1 to 8 is the position of a turning tool's tip relative to the centre of its nose.
     """
 
     radius_mm: float
@@ -75,7 +75,7 @@ class Compensation:
     def line(
         self, block: Block, start: complex, corner: complex, whole: list[float], feed: float | None
     ) -> list[Piece]:
-        """Take a programmed line that moves in the plane; return the pieces that are settled by it."""
+        """Add a programmed line in the plane; return the pieces that it completes."""
         length = abs(corner - start)
         if not self.entered and length <= self.radius_mm:
             raise block.fault(f"G{41 if self.side > 0 else 42}",
@@ -85,14 +85,14 @@ class Compensation:
         begin = start + aside if self.entered else start
         piece = Piece(block, begin, corner + aside, corner, way, way, whole, feed)
         if not self.entered:
-            piece.checked_along = aside  # as the reference does: it may enter backwards, to its side alone
+            piece.checked_along = aside  # as in the reference: it may enter backwards
         return self._next(piece)
 
     def arc(
         self, block: Block, start: complex, corner: complex, centre: complex, turns: int, whole: list[float],
         feed: float, angle: float,
     ) -> list[Piece]:  # fmt: skip
-        """Take a programmed arc of ``angle``; return the pieces that are settled by it."""
+        """Add a programmed arc of ``angle``; return the pieces that it completes."""
         sense = 1 if turns > 0 else -1
         near, far = abs(start - centre), abs(corner - centre)
         inward = self.side * sense * self.radius_mm
@@ -107,7 +107,7 @@ class Compensation:
         return self._next(Piece(block, begin, end, corner, heading, leaving, whole, feed, centre, turns, abs(angle)))
 
     def wait(self, waiting: Waiting) -> bool:
-        """Keep something until the end of the pending piece is known; False when nothing is pending."""
+        """Defer an action until the end of the pending piece is known; False if nothing is pending."""
         if self.pending is None:
             return False
         self.pending.waiting.append(waiting)
@@ -115,11 +115,11 @@ class Compensation:
 
     @property
     def tip(self) -> complex:
-        """Where the tool's tip lies from the centre of its nose, z + j x in mm."""
+        """Position of the tool's tip relative to the centre of its nose, z + j x in mm."""
         return _TIPS.get(self.orientation, 0) * self.radius_mm
 
     def settle(self) -> list[Piece]:
-        """Return what is pending as it is now: the machine stops there, but the next corner is still cut or rounded."""
+        """Return the pending piece as it is: the machine stops there, but the next corner is still cut or rounded."""
         if self.pending is None or self.pending.given:
             return []
         piece = replace(self.pending, waiting=[])
@@ -127,7 +127,7 @@ class Compensation:
         return [piece]
 
     def flush(self) -> list[Piece]:
-        """Return what is pending: no further motion will change it."""
+        """Return the pending piece, which no further motion will change."""
         last, self.pending = self.pending, None
         return [_checked(last, last.block)] if last is not None else []
 
@@ -147,9 +147,9 @@ class Compensation:
         return settled
 
     def _turn(self, before: Piece, piece: Piece) -> float:
-        """Angle (rad) by which the path turns toward the tool's side: positive at an inside corner.
+        """Return the angle (rad) by which the path turns toward the tool's side: positive at an inside corner.
 
-        Turning back is an outside corner, unless the arcs that meet both bend away from the tool.
+        A reversal is an outside corner, unless the arcs that meet both bend away from the tool.
         """
         turn = self.side * _angle(before.leaving, piece.heading)
         if abs(turn) <= math.pi - _TANGENT_RAD:
@@ -158,7 +158,7 @@ class Compensation:
         return math.pi if self.side * bend < 0.0 else -math.pi
 
     def _round(self, before: Piece, piece: Piece) -> Piece:
-        """The arc about an outside corner, at the height of the piece before it; a rapid goes straight."""
+        """Return the arc around an outside corner, at the height of the piece before it; a rapid goes straight."""
         last = before.waiting[-1].whole if before.waiting and before.waiting[-1].whole else before.whole
         whole = next((w.whole for w in reversed(before.waiting) if w.whole), last)
         return Piece(piece.block, before.end, piece.start, before.corner, before.leaving, piece.heading, list(whole),
@@ -166,7 +166,6 @@ class Compensation:
 
 
 def _checked(piece: Piece, block: Block) -> Piece:
-    """Return a piece whose ends are final; ProgramError when cutting it has turned it round."""
     if piece.centre is None:
         along = piece.checked_along or piece.leaving
         forward = _dot(piece.end - piece.start, along)
@@ -175,7 +174,7 @@ def _checked(piece: Piece, block: Block) -> Piece:
         turned = _sweep(piece)
         gouges = turned > piece.angle + _WRAPPED_RAD and turned * piece.radius > _BACKWARDS_MM
     if gouges:
-        raise block.fault("", "the tool would gouge beyond the inside corner; take a smaller one")
+        raise block.fault("", "the tool would gouge beyond the inside corner; use a smaller tool")
     return piece
 
 
@@ -189,7 +188,7 @@ def _sweep(piece: Piece) -> float:
 
 
 def _crossing(before: Piece, piece: Piece, radius: float, side: int) -> complex:
-    """Return where the parallels of two pieces cross at an inside corner, next to the corner."""
+    """Return the intersection of two pieces' parallels at an inside corner that is nearest to the corner."""
     corner = before.corner
     if before.centre is None and piece.centre is None:
         share = side * radius / (1.0 + _dot(before.leaving, piece.heading))
@@ -201,12 +200,11 @@ def _crossing(before: Piece, piece: Piece, radius: float, side: int) -> complex:
     else:
         found = _circles(before, piece)
     if not found:
-        raise piece.block.fault("", "the tool does not fit into the inside corner; take a smaller one")
+        raise piece.block.fault("", "the tool does not fit into the inside corner; use a smaller tool")
     return min(found, key=lambda point: (_turned_round(before, piece, point), abs(point - corner)))
 
 
 def _turned_round(before: Piece, piece: Piece, point: complex) -> bool:
-    """Tell whether cutting two pieces at ``point`` would make an arc of them longer than programmed."""
     cut = (replace(before, end=point), replace(piece, start=point))
     return any(part.centre is not None and _sweep(part) > part.angle + _WRAPPED_RAD for part in cut)
 
@@ -239,12 +237,12 @@ def _circles(one: Piece, two: Piece) -> list[complex]:
 
 
 def _entry_centre(block: Block, start: complex, end: complex, centre: complex, corner: complex) -> complex:
-    """Centre of the arc that enters compensation: from the tool's place, tangent to the programmed arc at its end."""
+    """Return the centre of the arc that enters compensation: from the tool's position to the programmed tangent."""
     inward = (centre - corner) / abs(centre - corner)
     chord = end - start
     along = _dot(inward, chord)
     if abs(along) < 1e-12:
-        raise block.fault("", "this arc cannot enter compensation; enter it by a straight move")
+        raise block.fault("", "this arc cannot enter compensation; enter by a straight move")
     return end - _dot(chord, chord) / (2.0 * along) * inward
 
 
@@ -253,5 +251,4 @@ def _dot(a: complex, b: complex) -> float:
 
 
 def _angle(a: complex, b: complex) -> float:
-    """Signed angle from one vector to another, -pi to pi."""
     return cmath.phase(a.conjugate() * b)

@@ -1,6 +1,6 @@
 """Contours of a turned part: lines and arcs in the ZX plane, as complex numbers z + j x, and their parallels.
 
-The geometry under G70 to G72: where a contour crosses a height, its mirror images, its parallel at a distance.
+Geometry for G70 to G72: intersections with a height, mirror images, parallels at a distance.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 _NEAR = 1e-6
-_SHORT = 1e-3  # what is shorter is left out of a parallel
-_GAP = 1e-2  # by which the ends at an outside corner must part before an arc joins them
+_SHORT = 1e-3  # shorter parts are omitted from a parallel
+_GAP = 1e-2  # smallest gap at an outside corner that an arc closes
 _MAX_STEPS = 5_000
 
 
 class ContourError(Exception):
-    """A contour that cannot be worked; the message is the reason, without line and word."""
+    """A contour that cannot be machined; the message is the reason, without line and word."""
 
 
 @dataclass(slots=True)
 class Part:
-    """A line from ``start`` to ``end``, or with a ``centre`` an arc, counter-clockwise (from Z to X) when ``ccw``.
+    """A line from ``start`` to ``end``, or with a ``centre`` an arc, counter-clockwise (from Z to X) if ``ccw``.
 
-    ``corner`` other than 0 marks a corner that is still to be rounded by that radius (with a centre) or cut (without).
+    ``corner`` other than 0 marks a corner to be rounded by that radius (with a centre) or cut (without).
     """
 
     start: complex
@@ -40,12 +40,12 @@ class Part:
         return chord if self.centre is None else min(chord, abs(self.start - self.centre))
 
     def mapped(self, turn: Callable[[complex], complex], mirrored: bool) -> Part:
-        """Return its image."""
+        """Return its image under a rotation or reflection."""
         centre = None if self.centre is None else turn(self.centre)
         return Part(turn(self.start), turn(self.end), centre, self.ccw != mirrored, self.corner)
 
     def falls(self) -> bool:
-        """Tell whether z never grows along it, within tolerance."""
+        """Return whether z never increases along it, within tolerance."""
         dz = (self.end - self.start).real
         if self.centre is None:
             return dz <= _SHORT
@@ -88,7 +88,7 @@ class Part:
             aside = 1j * distance * way
             length = abs(way)
             if length == 0.0:
-                raise ContourError("a line of the contour has no length; its corners take all of it")
+                raise ContourError("a line of the contour has no length; its corners use all of it")
             step = complex(aside.real / length, aside.imag / length)
             self.start, self.end = self.start + step, self.end + step
             return
@@ -102,23 +102,23 @@ class Part:
 
 @dataclass(slots=True)
 class Contour:
-    """A contour and how it lies: its ``parts`` are the programmed ones turned by ``turn`` after mirroring."""
+    """A contour and its orientation: ``parts`` are the programmed ones rotated by ``turn`` after mirroring."""
 
     parts: list[Part]
     turn: complex = 1.0 + 0.0j
     mirrored: bool = False
 
     def copy(self) -> Contour:
-        """Return a contour of its own."""
+        """Return an independent copy."""
         return Contour([replace(part) for part in self.parts], self.turn, self.mirrored)
 
     def programmed(self, place: complex) -> complex:
-        """Return a place as the program has it."""
+        """Return a point in the program's orientation."""
         back = self.turn.conjugate() * place
         return back.conjugate() if self.mirrored else back
 
     def lay_out(self, along_x: bool) -> None:
-        """Turn and mirror it for a cut along Z or ``along_x``, and work its corners; ContourError where that fails."""
+        """Rotate and mirror it for a cut along Z or ``along_x``, and finish its corners; ContourError on failure."""
         if along_x:
             self.quarter()
         self.lead_down()
@@ -126,7 +126,7 @@ class Contour:
         self.check_falling()
 
     def quarter(self) -> None:
-        """Turn it so that x becomes z."""
+        """Rotate it so that x becomes z."""
         self._map(-1j, False)
 
     def lead_down(self) -> None:
@@ -146,7 +146,7 @@ class Contour:
         self.mirrored = self.mirrored != mirrored
 
     def finish_corners(self) -> None:
-        """Round and cut the corners that are marked; ContourError where they are too small for that."""
+        """Round and cut the marked corners; ContourError if they are too small."""
         for before, part, after in zip(self.parts, self.parts[1:], self.parts[2:], strict=False):
             if part.corner:
                 _finish_corner(before, part, after)
@@ -158,12 +158,12 @@ class Contour:
         if (first.end - first.start).real > 0.0:
             first.start = complex(first.end.real, first.start.imag)
         if not all(part.falls() for part in self.parts):
-            raise ContourError("its contour does not go on in one direction along the cut")
+            raise ContourError("its contour does not continue in one direction along the cut")
 
     def widen(self, distance: float) -> None:
         """Move all but the first part to the parallel at ``distance``; the first one ends where that begins.
 
-        ContourError when that cannot be joined.
+        ContourError if the parts cannot be joined.
         """
         first = self.parts[0]
         across = (first.end - first.start) * (self.parts[-1].start - first.start).conjugate()
@@ -179,7 +179,7 @@ class Contour:
             parts = _joined(_shifted(parts, step))
             done += step
         if not parts or done != distance:
-            raise ContourError("the contour has no parallel at the distance left for finishing; take a smaller D")
+            raise ContourError("the contour has no parallel at the finishing allowance; use a smaller D")
         for before, after in pairwise(parts):
             before.end = after.start = (before.end + after.start) / 2.0
         first.end = parts[0].start
@@ -194,7 +194,7 @@ def _finish_corner(before: Part, part: Part, after: Part) -> None:
         if (one.end - two.start).real <= _GAP:
             break
     else:
-        raise ContourError("a corner is too small to be rounded or cut as A or C wants")
+        raise ContourError("a corner is too small for the rounding or cut by A or C")
     _cut(one, two)
     centre = (one.end + two.start) / 2.0
     one.shift(-distance)
@@ -207,7 +207,7 @@ def _finish_corner(before: Part, part: Part, after: Part) -> None:
 
 
 def _shifted(parts: list[Part], step: float) -> list[Part]:
-    """Shift parts, leave out what became too short, and join the ends at outside corners by arcs."""
+    """Shift parts, omit those that became too short, and join the ends at outside corners by arcs."""
     for part in parts:
         part.shift(step)
     parts = [part for part in parts if part.size >= _SHORT]
@@ -223,12 +223,11 @@ def _shifted(parts: list[Part], step: float) -> list[Part]:
 
 
 def _joined(parts: list[Part]) -> list[Part]:
-    """Cut neighbours at their common point; a part that was turned round by that is left out."""
     at = rounds = 0
     while at < len(parts) - 1:
         rounds += 1
         if rounds > _MAX_STEPS:
-            raise ContourError("the contour has no parallel at the distance left for finishing; take a smaller D")
+            raise ContourError("the contour has no parallel at the finishing allowance; use a smaller D")
         if not parts[at].falls() and at > 0:
             del parts[at if parts[at].size < parts[at - 1].size else at - 1]
             at = 0
@@ -268,7 +267,7 @@ def _two_lines(before: Part, after: Part) -> complex:
     turn = _along(after)
     start, end = (before.start - after.end) * turn, (before.end - after.end) * turn
     if start.imag - end.imag == 0.0:
-        raise ContourError("two lines of the contour follow each other in one direction; make them one")
+        raise ContourError("two consecutive lines of the contour have the same direction; join them")
     share = start.imag / (start.imag - end.imag)
     return (start + share * (end - start)) / turn + after.end
 

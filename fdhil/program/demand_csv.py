@@ -1,6 +1,6 @@
-"""Demand CSV: a recorded or exported reference, a row per SYNC period, ``time_s,X_mm,Y_mm[,Z_mm][,A_deg]``.
+"""Demand CSV: a recorded or exported reference, one row per SYNC period, ``time_s,X_mm,Y_mm[,Z_mm][,A_deg]``.
 
-Of a gantry axis one column is enough: the second drive has the same demand unless it has a column of its own.
+A gantry axis needs one column: the second drive has the same demand unless it has its own column.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ _OTHER_MARKS = {";": "semicolons", "\t": "tabs", "|": "bars", '"': "quotes"}  # 
 
 
 def require_digest(path: Path, found: str, sha256: str | None) -> None:
-    """Raise ProgramError when what is read of a file is not what ``sha256`` was given for."""
+    """Raise ProgramError if the content of a file does not have the digest ``sha256``."""
     if sha256 is not None and found != sha256:
-        raise ProgramError(0, "", f"{path} was changed while it was checked; nothing is armed, arm it again")
+        raise ProgramError(0, "", f"{path} was modified while it was checked, so it was not armed; arm it again")
 
 
 def read_demand_csv(path: Path, config: MachineConfig, sha256: str | None = None) -> Trajectory:
     """Read a demand CSV as the reference of a machine.
 
-    RecordingError when it cannot be read: a column is missing or there twice, the file was cut off, text or nothing
-    stands where a number belongs, times are not uniform, or an axis moves that the machine lacks. ConfigError when its
-    step is not the SYNC period. ProgramError when the file does not have the digest ``sha256``.
+    RecordingError if it cannot be read: a missing or duplicate column, a truncated file, a cell that is not a number,
+    non-uniform times, or motion of an axis that the machine lacks. ConfigError if its step is not the SYNC period.
+    ProgramError if the file does not have the digest ``sha256``.
     """
     content = read_content(path)
     require_digest(path, hashlib.sha256(content).hexdigest(), sha256)
@@ -54,13 +54,13 @@ def read_demand_csv(path: Path, config: MachineConfig, sha256: str | None = None
     wanted = ["time_s", *(f"{axis}_mm" for axis in config.axis if axis in "XYZ")]
     if absent := [name for name in wanted if name not in names]:
         found = [what for mark, what in _OTHER_MARKS.items() if mark in lines[0]]
-        instead = f"; its first line has {' and '.join(found)}, and names are parted by commas alone" if found else ""
+        instead = f"; its first line has {' and '.join(found)}, but only commas separate names" if found else ""
         begins = f"a demand begins with the line {','.join(wanted)}"
         raise RecordingError(f"{path}: there is no column {', '.join(absent)}{instead}; {begins}")
     if twice := next((name for k, name in enumerate(names) if name in names[:k]), None):
-        raise RecordingError(f"{path} has two columns {shown(twice)}, and nothing says which holds; leave one out")
+        raise RecordingError(f"{path} has two columns {shown(twice)}; remove one")
     if not text.endswith("\n"):
-        cut = f"line {len(lines)} has no end of line, so its last number may be cut"
+        cut = f"line {len(lines)} has no end of line, so its last number may be truncated"
         raise RecordingError(f"{path} is truncated: {cut}; copy it again")
     table = _numbers(path, lines, names)
     columns = {name: table[:, k] for k, name in enumerate(names)}
@@ -71,10 +71,10 @@ def read_demand_csv(path: Path, config: MachineConfig, sha256: str | None = None
         if unit in ("mm", "deg"):
             known = config.axis.get(axis)
             if known is None and np.ptp(column) > _MOVED_MM:
-                text = f"axis {axis} moves, which the configuration lacks; add [axis.{axis}] to it"
+                text = f"axis {axis} moves, but the configuration lacks it; add [axis.{axis}]"
                 raise RecordingError(f"{path}: {text}")
             if known is not None and known.unit != unit:
-                text = f"has a column {name}, and the configuration has axis {axis} in {known.unit}"
+                text = f"has a column {name}, but the configuration has axis {axis} in {known.unit}"
                 raise RecordingError(f"{path} {text}; write {axis}_{known.unit}, or correct unit in [axis.{axis}]")
             moved[axis] = column * known.mm_per_unit if known is not None else column
     moved |= {name: moved[name[0]] for name in config.axis if name not in moved and name[0] in moved}
@@ -106,11 +106,10 @@ def _numbers(path: Path, lines: Sequence[str], names: Sequence[str]) -> Float:
 
 
 def _bad_row(path: Path, lines: Sequence[str], names: Sequence[str]) -> RecordingError:
-    """Return the error that names the first line at fault."""
     for number, line in enumerate(lines[1:], 2):
         cells = line.split(",")
         if line.strip() and len(cells) != len(names):
-            what = f"has {len(cells)} values under {len(names)} columns"
+            what = f"has {len(cells)} values in {len(names)} columns"
             return RecordingError(f"{path} line {number} {what}; record or export it again")
         for cell in cells if line.strip() else []:
             try:
@@ -118,14 +117,14 @@ def _bad_row(path: Path, lines: Sequence[str], names: Sequence[str]) -> Recordin
             except ValueError:
                 finite = False
             if not finite:
-                what = f"has {shown(cell.strip())} where a finite number belongs"
+                what = f"has {shown(cell.strip())} instead of a finite number"
                 return RecordingError(f"{path} line {number} {what}; record or export it again")
     return RecordingError(f"{path} cannot be read as numbers; export it again")
 
 
 def _check_times(path: Path, lines: Sequence[str], time_s: Float, sync_period_s: float) -> None:
     if time_s.size < 2:
-        raise RecordingError(f"{path}: one row is no demand; record or export it again")
+        raise RecordingError(f"{path}: a demand needs at least two rows; record or export it again")
     steps = np.diff(time_s)
     step = float(np.median(steps))
     if abs(step - sync_period_s) > _STEP_TOLERANCE * sync_period_s + _ROUNDING_S:
@@ -140,17 +139,16 @@ def _check_times(path: Path, lines: Sequence[str], time_s: Float, sync_period_s:
 
 
 def _line_of(lines: Sequence[str], row: int) -> int:
-    """Return the 1-based line of a row; the names stand above them."""
     return [number for number, line in enumerate(lines, 1) if line.strip()][row + 1]
 
 
 def _check_speeds(path: Path, columns: Mapping[str, Float], config: MachineConfig) -> None:
-    """Refuse speeds that no unit but a mistaken one explains; tell of a demand that hardly moves."""
+    """Refuse speeds that only a wrong unit explains; warn about a demand that hardly moves."""
     ratios, speeds = {}, {}
     for name, values in columns.items():
         steps = np.abs(np.diff(values))
         moving = steps[steps > _MOVED_MM]
-        if moving.size:  # a step or two may be a jump, which is another matter
+        if moving.size:  # one or two steps may be a jump, which is checked elsewhere
             speeds[name] = float(np.median(moving)) / config.machine.sync_period_s
             ratios[name] = speeds[name] / config.axis[name].rapid_speed_mm_s
     if not ratios:
@@ -161,16 +159,18 @@ def _check_speeds(path: Path, columns: Mapping[str, Float], config: MachineConfi
         thousandths = "um" if axis.unit == "mm" else "mdeg"
         raise RecordingError(
             f"{path}: axis {name} moves at {speeds[name] / axis.mm_per_unit:.3g} {axis.unit}/s, {ratios[name]:.3g} "
-            f"times its rapid speed; is {name}_{axis.unit} in {thousandths} or in increments? give it in {axis.unit}, "
-            f"or correct {axis.shown_key('rapid_speed_mm_s')}"
+            f"times its rapid speed; is {name}_{axis.unit} in {thousandths} or in increments? "
+            f"convert it to {axis.unit}, or correct {axis.shown_key('rapid_speed_mm_s')}"
         )
     if ratios[name] < _TOO_SLOW and max(float(np.ptp(values)) for values in columns.values()) < _SMALL_MM:
-        text = "%s: no axis moves by more than %g mm or faster than %.2g of its rapid speed; is it in m? give mm"
+        text = (
+            "%s: no axis moves by more than %g mm or faster than %.2g of its rapid speed; is it in m? convert it to mm"
+        )
         logging.getLogger("fdhil").warning(text, path, _SMALL_MM, _TOO_SLOW)
 
 
 def write_demand_csv(trajectory: Trajectory, file: Path | IO[bytes]) -> None:
-    """Write a reference as demand CSV: mm and degrees with 9 decimals. RecordingError when it cannot be written."""
+    """Write a reference as demand CSV: mm and degrees with 9 decimals. RecordingError if it cannot be written."""
     decimals = max(6, min(12, 1 - math.floor(math.log10(trajectory.dt_s))))
     turn = trajectory.mm_per_degree
     moved = {f"{a}_deg" if a in turn else f"{a}_mm": p / turn.get(a, 1.0) for a, p in trajectory.position_mm.items()}

@@ -1,6 +1,6 @@
-"""The dialect of a program: LinuxCNC's, and what other NCs mean by P of a dwell and by a number without a point.
+"""The dialect of a program: LinuxCNC's, and other NCs' meaning of a dwell's P and of numbers without a decimal point.
 
-On a Haas or a Fanuc X10000 is 10 mm and G4 P500 half a second; LinuxCNC takes them as 10 m and 500 s.
+On a Haas or a Fanuc X10000 is 10 mm and G4 P500 half a second; LinuxCNC reads them as 10 m and 500 s.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _INCH, _INVERSE_TIME = 200, 930
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """How numbers are read; the keys of ``[nc]`` with these names say what each value means."""
+    """How numbers are read; see the keys of ``[nc]`` with these names for the values."""
 
     dwell_unit: Literal["s", "ms", "ms_without_point"] = "s"
     integers: Literal["whole", "thousandths", "thousandths_and_feed"] = "whole"
@@ -29,21 +29,21 @@ class Dialect:
 
     @classmethod
     def of(cls, nc: Nc) -> Dialect:
-        """Return the dialect that a machine's configuration sets."""
+        """Return the dialect of a machine's configuration."""
         return cls(nc.dwell_unit, nc.integers, nc.wrapped_axes)
 
     @property
     def plain(self) -> bool:
-        """Whether every length and angle is a number of whole units."""
+        """Whether every length and angle is in whole units."""
         return self.integers == "whole"
 
     def dwell_s(self, value: float, pointless: bool) -> float:
-        """Return the seconds of a dwell; ``pointless``: it is written without a decimal point."""
+        """Return a dwell in seconds; ``pointless``: it is written without a decimal point."""
         in_ms = self.dwell_unit == "ms" or (self.dwell_unit == "ms_without_point" and pointless)
         return value * 1e-3 if in_ms else value
 
     def read(self, block: Block, modal: Modal) -> Block:
-        """Return a block with its numbers without a point in whole units; Q is a length in pecking cycles alone."""
+        """Return a block with its integers converted to whole units; Q is a length in pecking cycles only."""
         if self.plain or not block.pointless:
             return block
         inch = block.g.get("units", _INCH if modal.scale == MM_PER_INCH else 0) == _INCH

@@ -1,8 +1,8 @@
-"""Values of the language: numbers, parameters, functions and bracketed expressions, read once, evaluated when executed.
+"""Values of the language (numbers, parameters, functions, expressions): parsed once, evaluated on execution.
 
-A value that is always the same becomes a number while it is read; any other becomes a function without arguments, so
-that a loop reads its lines once only. Operators bind in steps: ``**``; ``* / MOD``; ``+ -``; ``EQ NE GT GE LT LE``;
-``AND OR XOR``; equal ones from the left.
+A constant value becomes a number while it is parsed; any other becomes a function without arguments, so that a loop
+parses its lines only once. Operators bind in this order: ``**``; ``* / MOD``; ``+ -``; ``EQ NE GT GE LT LE``; ``AND OR
+XOR``; equal ones from the left.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ _STEPS = {
     "**": 6, "*": 5, "/": 5, "mod": 5, "+": 4, "-": 4,
     "eq": 3, "ne": 3, "gt": 3, "ge": 3, "lt": 3, "le": 3, "and": 2, "or": 2, "xor": 2,
 }  # fmt: skip
-_EQUAL = 1e-4  # numbers nearer than this are equal to EQ and NE, and to the integer that an index wants
+_EQUAL = 1e-4  # tolerance of EQ and NE, and of whole numbers
 
 
 class Context(Protocol):
-    """What values are evaluated in: the parameters (KeyError for one that is not there) and the line executed."""
+    """Evaluation context of values: the parameters (KeyError for a missing one) and the executed line."""
 
     line: int
 
@@ -45,7 +45,7 @@ def now(value: Value) -> float:
 
 
 class Reader:
-    """Reads values from ``text`` (lower case, without blanks and comments) at ``at``; ProgramError for what is none."""
+    """Parses values from ``text`` (lower case, no blanks and comments) at ``at``; ProgramError for invalid text."""
 
     __slots__ = ("_context", "_depth", "_max_depth", "at", "text", "word_at")
 
@@ -57,13 +57,12 @@ class Reader:
         self._depth = 0
 
     def fault(self, message: str, word: str | None = None) -> ProgramError:
-        """Return the error for the word being read (from ``word_at`` on), or for another one."""
+        """Return the error for the word being parsed (from ``word_at`` on), or for another one."""
         if word is None and not self.text[self.at : self.at + 1].isascii():
             return self._stranger()
         return _fault(self._context, word or self.text[self.word_at : self.word_at + 12], message)
 
     def _stranger(self) -> ProgramError:
-        """Return the error for a character that is none of the language, often pasted from a text processor."""
         end = self.at + 1
         while end < min(len(self.text), self.at + 4) and not self.text[end].isascii():
             end += 1
@@ -71,21 +70,21 @@ class Reader:
         character = next((way for way in ways if len(way) == 1), self.text[self.at])
         name = f"U+{ord(character):04X}, {unicodedata.name(character, 'unnamed').lower()}"
         word = self.text[self.word_at : self.at].upper() + character
-        return ProgramError(self._context.line, word, f"ends in a character that no NC knows ({name}); type it anew")
+        return ProgramError(self._context.line, word, f"ends in a character that no NC accepts ({name}); type it again")
 
     def done(self) -> bool:
-        """Tell whether the text is used up."""
+        """Return whether all of the text is parsed."""
         return self.at >= len(self.text)
 
     def take(self, mark: str) -> bool:
-        """Step over ``mark`` when it stands here."""
+        """Step over ``mark`` if it is next."""
         if self.text.startswith(mark, self.at):
             self.at += len(mark)
             return True
         return False
 
     def value(self) -> Value:
-        """Read one value: a number, ``#`` parameter, ``[expression]`` or function, each with or without a sign."""
+        """Parse one value: a number, ``#`` parameter, ``[expression]`` or function, each with or without a sign."""
         match = _NUMBER.match(self.text, self.at)
         if match is not None:
             self.at = match.end()
@@ -110,18 +109,18 @@ class Reader:
             return self._parameter()
         match = _FUNCTION.match(self.text, self.at)
         if match is None:
-            raise self.fault("is no value; a number, a parameter (#), a function or a bracket must stand here")
+            raise self.fault("is not a value; a number, a parameter (#), a function or a bracket is expected here")
         self.at = match.end()
         return self._function(match.group())
 
     def bracketed(self) -> Value:
-        """Read on to the bracket that closes the one just read, and return the expression's value."""
+        """Parse up to the bracket that closes the one just read, and return the expression's value."""
         values = [self.value()]
         operators: list[str] = []
         while not self.take("]"):
             match = _OPERATOR.match(self.text, self.at)
             if match is None:
-                what = "the bracket is not closed" if self.done() else "is no operator"
+                what = "the bracket is not closed" if self.done() else "is not an operator"
                 word = "[" if self.done() else self.text[self.at : self.at + 12]
                 raise self.fault(f"{what}; write [value operator value ...]", word)
             operator = match.group()
@@ -144,7 +143,7 @@ class Reader:
         return _numbered(self._context, self.value())
 
     def name(self) -> str:
-        """Read ``<name>``."""
+        """Parse ``<name>``."""
         end = self.text.find(">", self.at)
         if not self.take("<") or end < 0:
             raise self.fault("is a name without its closing '>'")
@@ -156,11 +155,11 @@ class Reader:
         if name == "exists":
             return self._exists()
         if not self.take("["):
-            raise self.fault("the function's argument must stand in brackets", name)
+            raise self.fault("the function's argument must be in brackets", name)
         argument = self.bracketed()
         if name == "atan":
             if not (self.take("/") and self.take("[")):
-                raise self.fault("ATAN wants two arguments: ATAN[y]/[x]", name)
+                raise self.fault("ATAN needs two arguments: ATAN[y]/[x]", name)
             other = self.bracketed()
             return lambda: math.degrees(math.atan2(now(argument), now(other)))
         return _applied(self._context, name, argument)
@@ -170,18 +169,18 @@ class Reader:
             name = self.name()
             if self.take("]"):
                 return lambda: _is_there(self._context, name)
-        raise self.fault("EXISTS wants the name of a parameter: EXISTS[#<name>]", "exists")
+        raise self.fault("EXISTS needs the name of a parameter: EXISTS[#<name>]", "exists")
 
 
 def is_whole(value: float) -> bool:
-    """Tell whether a value counts as a whole number."""
+    """Return whether a value counts as a whole number."""
     return abs(value - round(value)) <= _EQUAL
 
 
 def whole(context: Context, value: float, what: str) -> int:
-    """Return the whole number that a value must be."""
+    """Return a value as a whole number; ProgramError for any other value."""
     if not is_whole(value):
-        raise _fault(context, f"{what}{value:g}", "is no whole number, as it must be here")
+        raise _fault(context, f"{what}{value:g}", "is not a whole number, which is required here")
     return round(value)
 
 
@@ -190,7 +189,7 @@ def _fault(context: Context, word: str, message: str) -> ProgramError:
 
 
 def as_written(text: str) -> str:
-    """Return text whose characters stand for the bytes of a file: UTF-8 when it can be, else Latin-1."""
+    """Decode characters that represent the bytes of a file: UTF-8 if valid, else Latin-1."""
     try:
         return text.encode("latin-1").decode("utf-8")
     except UnicodeDecodeError:
@@ -199,7 +198,7 @@ def as_written(text: str) -> str:
 
 def _finite(context: Context, value: float, word: str) -> float:
     if value - value != 0.0:
-        raise _fault(context, word, "gives too large a number; write one that a machine can reach")
+        raise _fault(context, word, "is too large a number; use one that a machine can reach")
     return value
 
 
@@ -220,7 +219,7 @@ def _named(context: Context, name: str) -> Value:
         try:
             return context.named(name)
         except KeyError:
-            raise _fault(context, f"#<{name}>", "is a parameter that was never given a value; set it first") from None
+            raise _fault(context, f"#<{name}>", "is a parameter without a value; set it first") from None
 
     return read
 
@@ -237,7 +236,7 @@ def _number(context: Context, number: int) -> float:
     try:
         return context.number(number)
     except KeyError:
-        raise _fault(context, f"#{number}", "is no parameter; they are numbered 1 to 5601") from None
+        raise _fault(context, f"#{number}", "is not a parameter; parameters are numbered 1 to 5601") from None
 
 
 def _applied(context: Context, name: str, argument: Value) -> Value:

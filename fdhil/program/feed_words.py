@@ -1,4 +1,4 @@
-"""Other feeds for the lines of a program: its F words are replaced, everything else is kept byte for byte."""
+"""Change the feeds of a program's lines: its F words are replaced, everything else is kept byte for byte."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ _COMMENT = re.compile(r"\([^)]*\)?|;.*")
 _NUMBER = re.compile(r"[+-]?\s*(?:\d[\d\s]*\.?[\d\s]*|\.[\d\s]+)")
 _UNITS = re.compile(r"[Gg]\s*0*(2[01])(?![\d.])")
 _DIGITS = 3
-_SAME = 1e-6  # relative, of a feed that is written and read again
+_SAME = 1e-6  # relative tolerance of a feed that is written and parsed again
 
 
 def with_feeds(program: Path, shares: Mapping[int, float], budget: Budget) -> bytes:
-    """Return the program with the feed of each line in ``shares`` times its share (0..1, cut to three digits).
+    """Return the program with the feed of each line in ``shares`` times its share (0..1, truncated to three digits).
 
-    The new program is interpreted again: it orders the same motions, and of the other lines the same feeds.
-    ProgramError where that cannot be had by F words alone, and for a program in more files than one.
+    The new program is interpreted as a check: it orders the same motions, and the same feeds on all other lines.
+    ProgramError if F words alone cannot achieve that, and for a program with subroutines in other files.
     """
     run = Interpreter(program, budget, False)
     motions = list(run.run())
     if len(run.files) > 1:
-        text = "its subroutines lie in files of their own, whose feeds cannot be written; write them by hand"
+        text = "it has subroutines in other files, whose feeds cannot be written; write them by hand"
         raise ProgramError(0, "", f"{program}: {text}")
     feeds = _feeds(motions)
     raw = io.BytesIO(program.read_bytes()).readlines()
@@ -51,7 +51,7 @@ def with_feeds(program: Path, shares: Mapping[int, float], budget: Budget) -> by
 
 
 def cut(value: float) -> float:
-    """Return a feed cut to three digits: rounded up it would not be held."""
+    """Return a feed truncated to three digits, so that it does not exceed the limit."""
     if value <= 0.0:
         return 0.0
     unit = 10.0 ** (math.floor(math.log10(value)) - _DIGITS + 1)
@@ -59,13 +59,12 @@ def cut(value: float) -> float:
 
 
 def _feed_word(code: str) -> slice | None:
-    """Return where the value of the F word stands in a line whose comments are blanked, None where it has none."""
     places = [place for place, character in enumerate(code) if not character.isspace()]
     text = "".join(code[place] for place in places).lower()
     reader = Reader(text, Variables(0, {}, {}), Budget().max_nesting)
     reader.at = len(text) - len(without_number(text.lstrip("/")))
     words: list[tuple[str, Value]] = []
-    with suppress(ProgramError):  # what cannot be read is never executed
+    with suppress(ProgramError):  # an invalid line is never executed
         while not reader.done() and not text.startswith(("o", "%"), reader.at):
             read_word(reader, words, [])
             if words and words[-1][0] == "f":
@@ -74,12 +73,12 @@ def _feed_word(code: str) -> slice | None:
 
 
 class _Writer:
-    """Writes the lines anew in their order; ``everywhere`` gives each line that feeds a feed of its own."""
+    """Writes the lines in order; ``everywhere`` gives each line with a feed its own F word."""
 
     def __init__(self, feeds: Mapping[int, float], shares: Mapping[int, float], everywhere: bool) -> None:
         self._feeds, self._shares, self._everywhere = feeds, shares, everywhere
-        self._in_force = ""  # the F word's value as the program has it
-        self._changed = False  # another one is in force in what is written
+        self._in_force = ""  # the F word's value in the program
+        self._changed = False  # the written program has another one in force
         self._scale = 1.0
 
     def lines(self, raw: Sequence[bytes]) -> list[bytes]:
@@ -103,7 +102,6 @@ class _Writer:
         return f"{raw[:end]} F{self._value(number, share)}{raw[end:]}"
 
     def _value(self, number: int, share: float) -> str:
-        """Return the value of an F word that gives a line its share of the feed it has."""
         if _NUMBER.fullmatch(self._in_force) is None and not self._everywhere:
             return f"[{_text(cut(share))} * {self._in_force}]" if share < 1.0 else self._in_force
         value = self._feeds[number] / self._scale if self._everywhere else float("".join(self._in_force.split()))
@@ -113,8 +111,7 @@ class _Writer:
 
 
 def _text(value: float) -> str:
-    """Return a number as programs have it: no exponent."""
-    return f"{value:.9f}".rstrip("0").rstrip(".")
+    return f"{value:.9f}".rstrip("0").rstrip(".")  # programs have no exponents
 
 
 def _feeds(motions: Sequence[Motion]) -> dict[int, float]:
@@ -124,7 +121,6 @@ def _feeds(motions: Sequence[Motion]) -> dict[int, float]:
 def _first_difference(
     motions: Sequence[Motion], made: Sequence[bytes], shares: Mapping[int, float], budget: Budget
 ) -> int | None:
-    """Return the first line at which the new program does not what it must; None when it does."""
     try:
         new = list(interpret((line.decode("latin-1") for line in made), budget))
     except ProgramError as error:
@@ -136,7 +132,7 @@ def _first_difference(
 
 
 def _as_wanted(before: Motion, now: Motion, shares: Mapping[int, float]) -> bool:
-    """Whether a motion is the same but for a feed that is its share, cut to three digits."""
+    """Return whether a motion is unchanged except for its share of the feed, truncated to three digits."""
     if not isinstance(before, Feed | Arc) or not isinstance(now, Feed | Arc):
         return before == now
     share = shares.get(before.line, 1.0)

@@ -1,7 +1,7 @@
-"""Flow of a program: O-words (sub, call, return, while, do, repeat, if) and Fanuc calls (M98, M99).
+"""Control flow of a program: O-words (sub, call, return, while, do, repeat, if) and Fanuc calls (M98, M99).
 
-Nothing is compiled: a jump is a seek to a place in the source, and what must not be executed is read over. A label
-belongs to the subroutine it stands in; each call has labels, #1 to #30 and local names of its own.
+Nothing is compiled: a jump is a seek in the source, and lines that are not executed are skipped. A label belongs to its
+subroutine; each call has its own labels, #1 to #30 and local names.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _FILE_NAME = re.compile(r"[\w+-][\w .+-]*")
 
 
 class Flow:
-    """Where execution goes; ``on_return`` is told when a call ends, ``state`` copies what a loop may change."""
+    """Tracks the position of execution; ``on_return`` is called at the end of a call, ``state`` copies the state."""
 
     def __init__(
         self,
@@ -45,38 +45,38 @@ class Flow:
         self._entered: set[str] = set()
         self._skip: Skip | None = None
         self._entering = False
-        self.repeats = False  # lines may come again, so that it pays to keep them as they were read
-        self.repeating = False  # the lines at hand were executed before, in this loop or subroutine
+        self.repeats = False  # lines may be repeated, so that parsed lines are worth keeping
+        self.repeating = False  # the current lines were executed before, in this loop or subroutine
         self._known: dict[str, Command] = {}
         self._folder = source.folder
         self._files: list[Source] = [source]
 
     @property
     def depth(self) -> int:
-        """Number of calls under way."""
+        """Number of active calls."""
         return len(self._frames) - 1
 
     @property
     def skipping(self) -> bool:
-        """Whether lines are read over."""
+        """Whether lines are skipped."""
         return self._skip is not None
 
     @property
     def files(self) -> list[tuple[Path, str]]:
-        """The files that were opened so far and the digest of what is read of each, the program first."""
+        """The files opened so far with their digests, the program first."""
         return [(source.folder / source.name, source.sha256) for source in self._files if source.folder is not None]
 
     def close(self) -> None:
-        """Close every source that is open."""
+        """Close every open source."""
         for source in self._files:
             source.close()
 
     def at_end(self) -> None:
-        """Check that the program may end here; ProgramError when a label is sought or a call is under way."""
+        """Check that the program may end here; ProgramError if a label is still searched or a call is active."""
         if self._skip is not None:
             if self._skip.keywords == (FANUC,):
                 raise ProgramError(
-                    self._skip.line, f"O{self._skip.label}", "is called and stands nowhere; add that block"
+                    self._skip.line, f"O{self._skip.label}", "is called but does not exist; add that block"
                 )
             wanted = " or ".join(self._skip.keywords)
             raise ProgramError(self._skip.line, f"O<{self._skip.label}>", f"the program ends before its {wanted}")
@@ -85,7 +85,7 @@ class Flow:
             raise ProgramError(self.source.line, f"O<{name}>", "the file ends within the subroutine; add its endsub")
 
     def skip_over(self, raw: str, line: int) -> None:
-        """Look at a line that is read over: it may be the one that is sought."""
+        """Check a skipped line: it may be the one that is searched."""
         if _MAYBE_O_WORD.match(raw) is None:
             return
         command = self._known.get(raw)
@@ -108,7 +108,7 @@ class Flow:
             self.execute(command, line)
 
     def read(self, text: str) -> Command:
-        """Read a cleaned line that begins with O (after its line number)."""
+        """Parse a cleaned line that begins with O (after its line number)."""
         return Command(text, self._variables, self._budget.max_nesting)
 
     def execute(self, command: Command, line: int) -> None:
@@ -153,9 +153,9 @@ class Flow:
         labels = self._frames[-1].labels
         known = labels.get(label)
         if known is not None and (known.line != line or known.kind != kind):
-            raise ProgramError(line, f"O<{label}>", f"is the label of line {known.line} already; choose another one")
+            raise ProgramError(line, f"O<{label}>", f"is already the label of line {known.line}; choose another one")
         if known is None and len(labels) >= self._budget.max_labels:
-            raise GcodeBudget(line, f"O<{label}>", f"is one label more than the {self._budget.max_labels} allowed")
+            raise GcodeBudget(line, f"O<{label}>", f"exceeds the {self._budget.max_labels} labels allowed")
         if known is None:
             place = self.source.after() if kind in ("do", "repeat") else self.source.here()
             known = labels[label] = Label(kind, line, place)
@@ -168,15 +168,16 @@ class Flow:
         return known
 
     def _turn(self, label: str, state: Label, command: Command) -> None:
-        """Begin the next turn of a loop; ProgramError for one that is where it was before, so that it never ends."""
+        """Begin the next turn of a loop; ProgramError if its state has not changed, so that it would never end."""
         self._frames[-1].turning.add(label)
         self.repeating = True
         if state.turns.one_more(self._whole_state):
-            raise command.fault("ends a turn that changes nothing, so the loop never ends; let its condition change")
+            raise command.fault(
+                "ends a turn that changes nothing, so the loop never ends; change its condition in the loop"
+            )
         self.source.go(state.place)
 
     def _left(self, label: str) -> None:
-        """Note that a loop has ended."""
         frame = self._frames[-1]
         frame.turning.discard(label)
         frame.labels[label].turns.end()
@@ -248,9 +249,8 @@ class Flow:
     # --- subroutines ----------------------------------------------------------------------------------------------
 
     def _define(self, label: str, line: int) -> None:
-        """Meet a subroutine on the way: remember where it is and read over it."""
         if label in self._subs:
-            raise ProgramError(line, f"O<{label}>", "is a subroutine that is defined already; choose another name")
+            raise ProgramError(line, f"O<{label}>", "is the name of another subroutine; choose another name")
         if self.depth:
             raise ProgramError(line, f"O<{label}>", "is defined within a subroutine; move it out")
         self._subs[label] = (self.source.here(), False)
@@ -264,15 +264,15 @@ class Flow:
         self._variables.enter(arguments)
 
     def call_or_end(self, block: Block, text: str) -> bool:
-        """M98 and M99: they begin their line (``text``), whose other words are not executed; False ends the program."""
+        """Execute M98 or M99, which begin their line (``text``) without its other words; False ends the program."""
         code = block.m["call"]
         if not text.startswith(f"m{code}") or (code == 99 and text != "m99"):
-            raise block.fault(f"M{code}", "must begin its line; M99 stands alone, M98 with P and L")
+            raise block.fault(f"M{code}", "must begin its line; M99 has no other words, M98 has P and L")
         if code == 99:
             return self._end_fanuc()
         name, times = block.words.get("p", -1.0), block.words.get("l", 1.0)
         if name < 0.0 or not 0 <= times < 1e9 or not (is_whole(name) and is_whole(times)):
-            raise block.fault("M98", "wants the subroutine's number as P and may have its repeats as L")
+            raise block.fault("M98", "needs the subroutine's number as P and may have its repeats as L")
         if round(times) > 0:
             back = self.source.after()
             self._enter(Frame(str(round(name)), back, fanuc=True, again=round(times) - 1), block.line)
@@ -280,10 +280,10 @@ class Flow:
         return True
 
     def call_contour(self, block: Block, name: str) -> None:
-        """Enter the subroutine that describes a contour (G70 to G72.2); it must stand before the block."""
+        """Enter the subroutine that describes a contour (G70 to G72.2); it must precede the block."""
         known = self._subs.get(name)
         if known is None or known[1]:
-            raise block.fault("q", "names no subroutine that stands before this line")
+            raise block.fault("q", "names no subroutine before this line")
         self._enter(Frame(name, self.source.after()), block.line)
         self._variables.enter([])
 
@@ -301,7 +301,7 @@ class Flow:
             place, fanuc = known
             if fanuc != frame.fanuc:
                 how = "M98" if fanuc else "call"
-                raise ProgramError(line, f"O<{frame.name}>", f"is a subroutine that wants to be called by {how}")
+                raise ProgramError(line, f"O<{frame.name}>", f"is a subroutine that must be called by {how}")
             self._go(place)
             return
         path = self._file_of(frame.name)
@@ -323,23 +323,20 @@ class Flow:
     def _return(self, label: str, command: Command) -> None:
         frame = self._frames[-1]
         if not self.depth or frame.fanuc:
-            raise command.fault(f"has no subroutine to end; {command.keyword} belongs between sub and endsub")
+            raise command.fault(f"ends no subroutine; {command.keyword} belongs between sub and endsub")
         if command.keyword == "endsub" and frame.name != label:
-            raise command.fault(f"names another subroutine than O<{frame.name}>, which is under way")
+            raise command.fault(f"names another subroutine than the active O<{frame.name}>")
         values = command.values()
         self._variables.leave()
         self._variables.returned = values[0] if values else None
         self._go_back()
 
     def _end_fanuc(self) -> bool:
-        """M99: return True when it ends a subroutine, False in the main program."""
         if not self.depth:
             return False
         frame = self._frames[-1]
         if not frame.fanuc:
-            raise ProgramError(
-                self.source.line, "M99", "cannot end a subroutine that was called by an O-word; use endsub"
-            )
+            raise ProgramError(self.source.line, "M99", "cannot end a subroutine called by an O-word; use endsub")
         if frame.again > 0 and frame.entry is not None:
             frame.again -= 1
             frame.repeated = self.repeating = True

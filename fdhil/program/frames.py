@@ -1,4 +1,4 @@
-"""The flow of a program keeps places, labels, calls, and the turns of a loop, which show when it never ends."""
+"""State of the control flow: positions, labels, calls, and the turns of a loop, which reveal an endless one."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from dataclasses import dataclass, field
 
 from fdhil.program.source import Place
 
-_FIRST = 64  # short loops pay nothing
-_LOOKED_AT = 8  # so many turns are compared with every state that is kept
+_FIRST = 64  # no cost for short loops
+_LOOKED_AT = 8  # turns compared with each stored state
 
 
 @dataclass(slots=True)
 class Turns:
-    """The turns of one loop. A program reads nothing but itself, so equal states have equal futures.
+    """Turns of one loop. A program depends only on its own state, so equal states have equal futures.
 
-    States are kept at 64, 128, 256 and so on turns, and compared with those of the eight turns that follow.
+    States are stored at 64, 128, 256 and so on turns, and compared with those of the eight following turns.
     """
 
     count: int = 0
     kept: object = None
 
     def one_more(self, state: Callable[[], object]) -> bool:
-        """Count a turn; True when the state is one that was kept. ``state`` returns a copy that can be compared."""
+        """Count a turn; return True if the state equals the stored one. ``state`` returns a comparable copy."""
         self.count += 1
         if self.count < _FIRST:
             return False
@@ -36,13 +36,13 @@ class Turns:
         return False
 
     def end(self) -> None:
-        """Forget the turns: the loop has ended and may begin anew."""
+        """Reset the turns: the loop has ended and may begin again."""
         self.count, self.kept = 0, None
 
 
 @dataclass(slots=True)
 class Label:
-    """What is known of a label in this call: what opened it where, and how far it is."""
+    """State of a label in this call: what opened it where, and its progress."""
 
     kind: str
     line: int
@@ -54,9 +54,9 @@ class Label:
 
 @dataclass(slots=True)
 class Frame:
-    """One call: where to go back to, the labels of the subroutine, and whether its lines were executed before.
+    """One call: where to return to, the labels of the subroutine, and whether its lines were executed before.
 
-    ``repeated`` tells that of the call as a whole, ``turning`` are the loops that are beyond their first turn.
+    ``repeated`` applies to the call as a whole, ``turning`` are the loops beyond their first turn.
     """
 
     name: str
@@ -71,7 +71,7 @@ class Frame:
 
 @dataclass(slots=True)
 class Skip:
-    """Reading over lines until ``label`` comes with one of ``keywords``; then that line is executed or not."""
+    """Skipping of lines until ``label`` with one of ``keywords``; that line is then executed or not."""
 
     label: str
     keywords: tuple[str, ...]

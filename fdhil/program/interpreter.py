@@ -1,8 +1,7 @@
-"""The interpreter: blocks in the order of execution that RS-274 wants, motions out.
+"""The interpreter: executes blocks in the RS-274 order and yields motions.
 
-A block is executed feed mode, F, S, kept modes, spindle, dwell, plane, units, compensation, tool length, co-ordinate
-system, path control, distance, and its motion last. Simple blocks (G0 or G1 with X Y Z F) take a short way with the
-same meaning.
+Order within a block: feed mode, F, S, stored modes, spindle, dwell, plane, units, compensation, tool length,
+co-ordinate system, path control, distance, motion. Simple blocks (G0 or G1 with X Y Z F) take an equivalent shortcut.
 """
 
 from __future__ import annotations
@@ -43,11 +42,11 @@ _MACHINE_WORDS = frozenset("st$")
 def interpret(
     source: Path | Iterable[str], budget: Budget | None = None, *, block_delete: bool = False
 ) -> Iterator[Motion]:
-    """Yield the motions of an NC program in machine mm, line by line in flat memory.
+    """Yield the motions of an NC program in machine mm, line by line in constant memory.
 
-    ``source`` is a file or any iterable of lines; subroutines in files of their own are sought beside the file. With
-    ``block_delete`` lines that begin with "/" are left out. ProgramError with line and word for what is wrong, for what
-    fdhil does not know, and for what exceeds ``budget``. Start: offsets 0, position 0, G21 G17 G90 G94 G91.1 G54.
+    ``source`` is a file or any iterable of lines; subroutines in other files are searched next to the file. With
+    ``block_delete`` lines that begin with "/" are skipped. ProgramError with line and word for invalid or unsupported
+    words, and for exceeding ``budget``. Initial state: offsets 0, position 0, G21 G17 G90 G94 G91.1 G54.
     """
     return Interpreter(source, budget or Budget(), block_delete).run()
 
@@ -82,11 +81,11 @@ class Interpreter:
 
     @property
     def files(self) -> list[tuple[Path, str]]:
-        """The files that were opened so far and the digest of what is read of each, the program first."""
+        """The files opened so far with their digests, the program first."""
         return self._flow.files
 
     def close(self) -> None:
-        """Close the files; not needed once the motions were taken."""
+        """Close the files; not needed once all motions were yielded."""
         self._flow.close()
 
     def run(self) -> Iterator[Motion]:
@@ -113,7 +112,7 @@ class Interpreter:
             self._flow.close()
 
     def _next_line(self) -> tuple[str, int] | None:
-        """Return the next line to execute and its number, None after the last one; what is skipped is counted too."""
+        """Return the next line to execute and its number, None after the last one; skipped lines are counted too."""
         flow = self._flow
         while True:
             raw = flow.source.next(flow.repeating)
@@ -130,7 +129,7 @@ class Interpreter:
     def _count(self, raw: str, line: int) -> None:
         self._blocks += 1
         if self._blocks > self._budget.max_blocks:
-            what = f"more than {self._budget.max_blocks} blocks were executed; if they are meant,"
+            what = f"more than {self._budget.max_blocks} blocks were executed; if that is intended,"
             what += " raise max_blocks ([nc], or --max-blocks)"
             raise GcodeBudget(line, raw.strip()[:24], what)
         if self._flow.repeating:
@@ -141,12 +140,11 @@ class Interpreter:
                 raise GcodeBudget(line, raw.strip()[:24], what)
 
     def _state(self) -> object:
-        """Return a copy of all that the program has changed so far but its place."""
+        """Return a copy of everything that the program has changed so far, except its position."""
         kept = (self._machine, self._series, self._spline, self._nurbs, self._pending_tool, self._tool)
         return self._variables.state(), self._kept.state(), deepcopy(kept)
 
     def _simple(self, raw: str, line: int) -> Motion | None:
-        """Execute a block of G0, G1, X, Y, Z, F alone; None leaves it to the long way."""
         match = _SIMPLE.fullmatch(raw) if self._plain else None
         if match is None:
             return None
@@ -163,7 +161,7 @@ class Interpreter:
     def _straight(
         self, line: int, code: int | None, x: float | None, y: float | None, z: float | None, f: float | None
     ) -> Motion | None:
-        """Execute a block of G0 or G1 (times ten), X, Y, Z and F; None, and nothing done, leaves it to the long way."""
+        """Execute a block of G0 or G1 (times ten), X, Y, Z and F; return None, without effect, if it is not simple."""
         modal = self._machine.modal
         motion = modal.motion if code is None else code
         if motion not in (0, 10) or not modal.plain or self._nurbs.points or (x is None and y is None and z is None):
@@ -192,7 +190,6 @@ class Interpreter:
         return Rapid(line, end, corner) if motion == 0 else Feed(line, end, feed, corner)
 
     def _line(self, raw: str, line: int) -> Motion | None:
-        """Execute a line; return its motion when it took the short way, else what it orders goes to the machine."""
         known = self._fetch(raw, line)
         if known is None:
             return None
@@ -214,11 +211,11 @@ class Interpreter:
         return None
 
     def _block(self, known: Line) -> Block:
-        """Return the block that a line is now, with its numbers as the dialect reads them."""
+        """Return the block of a line at present, with its numbers as the dialect reads them."""
         return self._budget.dialect.read(known.block(self._variables), self._machine.modal)
 
     def _fetch(self, raw: str, line: int) -> Line | None:
-        """Return a line as it was read, None when it has no words; an O-word is executed."""
+        """Return a parsed line, None if it has no words; an O-word is executed."""
         self._variables.line = line
         known = self._known.get(raw)
         if known is None:
@@ -254,12 +251,11 @@ class Interpreter:
         return read(text, self._variables, self._budget.max_nesting)
 
     def _check_end(self) -> None:
-        """Refuse an empty program, and one that begins with "%" and does not end with it."""
         line = max(1, self._flow.source.line)
         if self._percent:
-            raise ProgramError(line, "%", "the program begins with % and ends without; add it, or M2")
+            raise ProgramError(line, "%", "the program begins with % but does not end with it; add % or M2")
         if self._empty_so_far:
-            raise ProgramError(line, "", "the program is empty; give one with at least one block")
+            raise ProgramError(line, "", "the program is empty; use one with at least one block")
 
     def _at_percent(self, line: int) -> None:
         if self._empty_so_far:
@@ -267,7 +263,7 @@ class Interpreter:
         elif self._percent or self._flow.depth:
             self._ended = True
         else:
-            raise ProgramError(line, "%", "encloses a program, so it must stand before it too")
+            raise ProgramError(line, "%", "must enclose the program; add it before the first block")
 
     def _execute(self, block: Block) -> None:
         machine, modal = self._machine, self._machine.modal
@@ -287,7 +283,7 @@ class Interpreter:
         modes.set_switches(modal, block)
         self._change_tool(block)
         if "modal state" in block.m and not self._kept.do(block.m["modal state"], self._flow.depth):
-            raise block.fault("M72", "has no modes to restore; keep them by M70 first")
+            raise block.fault("M72", "has no modes to restore; save them by M70 first")
         if block.g.get("one-shot") == 40:
             modes.dwell(machine, block)
         modes.set_units(modal, block)
@@ -313,7 +309,7 @@ class Interpreter:
             offsets.select_system(modal, self._variables, offsets.SYSTEMS[g["co-ordinate system"]])
 
     def _set(self, block: Block) -> bool:
-        """Do a one-shot code; True when one was done that uses the axis words."""
+        """Execute a one-shot code; return True if it uses the axis words."""
         modal, variables = self._machine.modal, self._variables
         code = block.g.get("one-shot", 40)
         if code in (281, 301):
@@ -335,7 +331,7 @@ class Interpreter:
         if "motion" in block.g:
             modal.motion = block.g["motion"]
         elif "machine co-ordinates" in block.g and modal.motion not in (0, 10):
-            raise block.fault("G53", "wants G0 or G1")
+            raise block.fault("G53", "needs G0 or G1")
         elif axes_used or _motion_of(modal, block) is None:
             return
         code = modal.motion
@@ -352,10 +348,9 @@ class Interpreter:
         elif code in self._orders:
             self._orders[code](block)
         elif axis is not None and not axes_used:
-            raise block.fault(axis, "has no motion to go with; give G0, G1, G2 or G3")
+            raise block.fault(axis, "has no motion code; use G0, G1, G2 or G3")
 
     def _other_orders(self) -> Mapping[int, Callable[[Block], None]]:
-        """Return what the motion codes other than cycles order of the machine."""
         machine, modal = self._machine, self._machine.modal
         return {
             0: lambda block: machine.rapid_to(block, targets.target(modal, block)),
@@ -371,7 +366,7 @@ class Interpreter:
         }
 
     def _work_contour(self, block: Block, before: int) -> None:
-        """G70 to G72.2: read the contour that the subroutine Q describes, without executing its blocks, and work it."""
+        """G70 to G72.2: read the contour of subroutine Q without executing its blocks, and machine it."""
         modal, flow = self._machine.modal, self._flow
         start = roughing.start_of(self._machine, block)
         here = list(modal.position)
@@ -394,7 +389,7 @@ class Interpreter:
 
 
 def _motion_of(modal: Modal, block: Block) -> int | None:
-    """Return the motion that the block says, or goes on with because it has words for it."""
+    """Return the motion code of the block, or the active one if the block has words for it."""
     if "motion" in block.g:
         return block.g["motion"]
     arc = modal.motion in arcs.CODES and any(letter in block.words for letter in "ijkr")

@@ -15,13 +15,13 @@ _MAX_PASSES = 10_000
 
 
 def synchronised(machine: Machine, block: Block) -> None:
-    """G33 is a feed of K per revolution to its target; G33.1 feeds there and back to where it started."""
+    """G33 feeds K per revolution to its target; G33.1 feeds there and back to its start."""
     modal = machine.modal
     code = modal.code
     if not axis_words(block):
-        raise block.fault(code, "wants axis words")
+        raise block.fault(code, "needs axis words")
     if "k" not in block.words:
-        raise block.fault(code, "wants K, the distance per revolution")
+        raise block.fault(code, "needs K, the distance per revolution")
     start = list(modal.position)
     feed = _synchronous_feed(modal, block, abs(block.words["k"]) * modal.scale)
     machine.line_to(block, target(modal, block), feed)
@@ -32,14 +32,17 @@ def synchronised(machine: Machine, block: Block) -> None:
 def _synchronous_feed(modal: Modal, block: Block, pitch_mm: float) -> float:
     if modal.spindle_turns == 0:
         code = modal.code
-        raise block.fault(code, "wants a turning spindle; give S and M3 or M4 first")
+        raise block.fault(code, "needs a turning spindle; use S and M3 or M4 first")
     return pitch_mm * modal.spindle_rpm
 
 
 @dataclass(frozen=True, slots=True)
 class Thread:
-    """A thread in mm: ``offset`` from the drive line to its crest (negative outside), ``depth`` in all, of the first
-    pass ``first``, ``degression`` of the later ones, ``slide`` = tan of the compound's angle, ``taper`` lengths."""
+    """A thread in mm.
+
+    ``offset`` from the drive line to its crest (negative outside), total ``depth``, depth ``first`` of the first pass,
+    ``degression`` of the later ones, ``slide`` = tan of the compound's angle, ``taper`` lengths.
+    """
 
     feed: float
     offset: float
@@ -54,13 +57,15 @@ class Thread:
 
     @property
     def taper_feed(self) -> float:
-        """Feed along a taper, so that the pitch along Z stays what it is."""
+        """Feed along a taper that keeps the pitch along Z."""
         return self.feed * math.hypot(self.depth, self.taper) / self.taper if self.taper else self.feed
 
     def depths(self) -> Iterator[float]:
         """Yield the depth of each pass, the full one ``springs`` times more."""
         number, depth, crest = 1, self.first, abs(self.offset)
-        while crest + depth < crest + self.depth and number < _MAX_PASSES:  # rounded from the drive line, as LinuxCNC
+        while (
+            crest + depth < crest + self.depth and number < _MAX_PASSES
+        ):  # rounded from the drive line, as in LinuxCNC
             yield depth
             number += 1
             depth = self.first * number ** (1.0 / self.degression)
@@ -107,7 +112,7 @@ def _cut(machine: Machine, block: Block, thread: Thread, start: list[float], end
 def _thread(modal: Modal, block: Block) -> Thread:
     words = block.words
     if not axis_words(block):
-        raise block.fault("G76", "wants Z, the thread's end")
+        raise block.fault("G76", "needs Z, the thread's end")
     for letter, meaning in (
         ("p", "the pitch"),
         ("i", "the thread's offset"),
@@ -115,13 +120,13 @@ def _thread(modal: Modal, block: Block) -> Thread:
         ("k", "the depth"),
     ):
         if letter not in words:
-            raise block.fault("G76", f"wants {letter.upper()}, {meaning}")
+            raise block.fault("G76", f"needs {letter.upper()}, {meaning}")
     if words["i"] == 0.0 or words["p"] <= 0.0 or not 0.0 < words["j"] < words["k"]:
-        raise block.fault("G76", "wants P and J greater than 0, K greater than J, and I other than 0")
+        raise block.fault("G76", "needs P and J greater than 0, K greater than J, and I other than 0")
     ends = round(words.get("l", 0.0))
     degression, springs, angle = words.get("r", 1.0), words.get("h", 0.0), words.get("q", 0.0)
     if ends < 0 or springs != round(springs) or springs > _MAX_PASSES or not abs(angle) < 89.0:
-        raise block.fault("G76", "wants H whole, L not negative, and Q below 89 degrees")
+        raise block.fault("G76", "needs H whole, L not negative, and Q below 89 degrees")
     half = modal.scale * (0.5 if modal.diameter else 1.0)
     return Thread(
         feed=_synchronous_feed(modal, block, words["p"] * modal.scale),

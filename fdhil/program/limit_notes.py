@@ -1,4 +1,4 @@
-"""Compares a recorded demand with the limits of the NC that made it: speed and acceleration of each axis, path speed.
+"""Compare a recorded demand with the limits of its NC: speed and acceleration of each axis, and path speed.
 
 A demand in increments has steps: differences are taken over as many rows as keep their rounding below a share of the
 limit. Pure.
@@ -13,8 +13,8 @@ import numpy as np
 from fdhil.config import MachineConfig, is_second_drive
 from fdhil.records import Float, Reason, Trajectory
 
-ROOM = 1.05  # times a limit, up to where it counts as kept
-ROUNDING_SHARE = 0.02  # of a limit, that the rounding of the demand may take
+ROOM = 1.05  # tolerance factor on a limit
+ROUNDING_SHARE = 0.02  # largest share of a limit due to rounding of the demand
 
 
 def limit_notes(demand: Trajectory, config: MachineConfig) -> tuple[Reason, ...]:
@@ -37,13 +37,13 @@ def _beyond(demand: Trajectory, config: MachineConfig) -> Iterator[Reason]:
             ("moves at", speed, "s", "rapid_speed_mm_s"),
             ("accelerates by", acceleration, "s2", "max_acceleration_mm_s2"),
         ):
-            told, limit = f"axis {name} {what}", getattr(axis, key) / unit
+            text, limit = f"axis {name} {what}", getattr(axis, key) / unit
             shown = f"axis.{name}.{axis.shown_key(key)}"
-            yield from _note(demand, found / unit, limit, told, f"{axis.unit}/{per}", shown)
+            yield from _note(demand, found / unit, limit, text, f"{axis.unit}/{per}", shown)
     if not speeds:
         return
     along, limit = np.sqrt(np.sum(np.square(speeds), axis=0)), config.nc.max_path_speed_mm_s
-    yield from _note(demand, along, limit, "the path is run at", "mm/s", "nc.max_path_speed_mm_s")
+    yield from _note(demand, along, limit, "the path speed is", "mm/s", "nc.max_path_speed_mm_s")
 
 
 def _note(demand: Trajectory, found: Float, limit: float, what: str, unit: str, key: str) -> Iterator[Reason]:
@@ -53,14 +53,11 @@ def _note(demand: Trajectory, found: Float, limit: float, what: str, unit: str, 
     line = f"line {demand.line[row]}, " if demand.line[row] else ""
     place = f"{line}{demand.time_s[row]:.3f} s, {demand.place(row)}"
     text = f"{what} {found[row]:.4g} {unit} at {place}: the limit of {key} is {limit:.4g}"
-    advice = (
-        f"correct {key} if the NC has another limit; else its planner exceeds its own, as S-curve planners do in blends"
-    )
+    advice = f"correct {key} if the NC has another limit; else its planner exceeds it, as S-curve planners do in blends"
     yield Reason("DemandBeyondLimits", text, advice)
 
 
 def _resolution(position_mm: Float) -> float:
-    """Return the smallest step of a demand, mm; 0 where it stands still."""
     steps = np.abs(np.diff(position_mm))
     steps = steps[steps > 1e-9]
     return float(steps.min()) if steps.size else 0.0
@@ -69,7 +66,7 @@ def _resolution(position_mm: Float) -> float:
 def _measured(
     of: Callable[[Float, int, float], tuple[Float, float]], position: Float, dt_s: float, limit: float, step: float
 ) -> Float:
-    """Return (n,) a derivative, over so few rows as its rounding allows."""
+    """Return a derivative (n,) over as few rows as its rounding allows."""
     rows = 1
     while of(position, rows, dt_s)[1] * step > ROUNDING_SHARE * limit and rows < position.size // 8:
         rows *= 2
@@ -77,19 +74,19 @@ def _measured(
 
 
 def _speed(position: Float, rows: int, dt_s: float) -> tuple[Float, float]:
-    """Return the speed's amount (n,) over ``rows``, and what a rounding of 1 mm at both ends makes of it."""
+    """Return the absolute speed (n,) over ``rows``, and the effect of a rounding of 1 mm at both ends."""
     span_s = rows * dt_s
     return _aligned(np.abs(position[rows:] - position[:-rows]) / span_s, position.size), 1.0 / span_s
 
 
 def _acceleration(position: Float, rows: int, dt_s: float) -> tuple[Float, float]:
-    """Return the acceleration's amount (n,) over ``rows`` to either side, and what roundings of 1 mm make of it."""
+    """Return the absolute acceleration (n,) over ``rows`` to either side, and the effect of roundings of 1 mm."""
     span_s = rows * dt_s
     bend = np.abs(position[2 * rows :] - 2.0 * position[rows:-rows] + position[: -2 * rows])
     return _aligned(bend / span_s**2, position.size), 2.0 / span_s**2
 
 
 def _aligned(found: Float, rows: int) -> Float:
-    """Return (rows,) values centred on their rows, 0 at the ends, where a recording may begin and end in motion."""
+    """Return (rows,) values centred on their rows, 0 at the ends, where a recording may begin or end in motion."""
     before = (rows - found.size) // 2
     return np.pad(found, (before, rows - found.size - before))

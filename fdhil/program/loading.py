@@ -1,4 +1,4 @@
-"""A file that orders motion, whatever it is: a demand CSV by its suffix, else an NC program."""
+"""Load a file that commands motion: a demand CSV by its suffix, else an NC program."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _PIECE_BYTES = 1 << 20
 
 
 def load_trajectory(path: Path, config: MachineConfig, sha256: str | None = None) -> Trajectory:
-    """Return the reference that a file orders of the machine.
+    """Return the machine's reference in a file.
 
     ``.csv`` is a demand CSV (RecordingError, ConfigError), anything else an NC program (ProgramError). ``sha256``: the
-    digest that the program must have; ProgramError where what is read has another.
+    required digest of the file; ProgramError if its content has another.
     """
     if is_demand(path):
         return read_demand_csv(path, config, sha256)
@@ -36,7 +36,7 @@ def is_demand(path: Path) -> bool:
 
 
 def open_program(path: Path, config: MachineConfig, sha256: str | None = None) -> Interpreter:
-    """Return the interpreter of an NC program as the machine reads it; ``sha256`` as in :func:`load_trajectory`."""
+    """Return the interpreter of an NC program in the machine's dialect; ``sha256`` as in :func:`load_trajectory`."""
     interpreter = Interpreter(path, Budget.of(config.nc), block_delete=False)
     try:
         require_digest(path, interpreter.files[0][1], sha256)
@@ -49,27 +49,26 @@ def open_program(path: Path, config: MachineConfig, sha256: str | None = None) -
 def program_digest(path: Path) -> str:
     """Return the SHA-256 of a program's or demand's bytes, 64 hexadecimal digits.
 
-    ProgramError when it is not there, larger than any program, or no plain file: a pipe would never end, and nothing
-    could be read of it again.
+    ProgramError if it is missing, larger than any program, or not a regular file: a pipe might never end and could not
+    be read again.
     """
     digest, left = hashlib.sha256(), MAX_BYTES
     try:
         with open(path, "rb", opener=_at_once) as file:
             found = os.fstat(file.fileno())
             if not stat.S_ISREG(found.st_mode):
-                raise ProgramError(0, "", f"{path} is a pipe or a device; give the program as a plain file")
-            left -= found.st_size  # a file of holes has a size, and takes no room on the disk
+                raise ProgramError(0, "", f"{path} is a pipe or a device; use a regular file")
+            left -= found.st_size  # a sparse file has a size without using the disk
             while left >= 0 and (piece := file.read(_PIECE_BYTES)):
                 digest.update(piece)
-                left = min(left, MAX_BYTES - file.tell())  # it may grow meanwhile
+                left = min(left, MAX_BYTES - file.tell())  # it may grow
     except OSError as error:
         raise ProgramError(0, "", f"{path} cannot be read ({error.strerror}); check the path") from None
     if left < 0:
-        text = f"{path} is larger than {MAX_BYTES >> 20} MiB, and nothing of it is read; give a program, or cut it"
+        text = f"{path} is larger than {MAX_BYTES >> 20} MiB, so it was not read; use a program, or split it"
         raise ProgramError(0, "", text)
     return digest.hexdigest()
 
 
 def _at_once(path: str, flags: int) -> int:
-    """Open a file; a pipe that nobody writes to is not waited for."""
     return os.open(path, flags | os.O_NONBLOCK)

@@ -1,4 +1,4 @@
-"""The interpreter's machine: it takes moves in active co-ordinates and orders motions in machine millimetres.
+"""The interpreter's machine: converts moves in active co-ordinates to motions in machine millimetres.
 
 With cutter compensation on, a move is ordered only when the next one is known.
 """
@@ -20,14 +20,14 @@ _TINY_MM = 1e-9
 
 @dataclass(slots=True)
 class Machine:
-    """The modal state, and the motions that the block at hand has ordered so far (``out``)."""
+    """The modal state, and the motions ordered by the current block so far (``out``)."""
 
     budget: Budget
     modal: Modal = field(default_factory=Modal)
     out: list[Motion] = field(default_factory=list)
     compensation: Compensation | None = None
     others: list[float] = field(default_factory=lambda: [0.0] * 6)  # A B C U V W of the last motion, machine
-    just_left: bool = False  # compensation, so that the next motion must be straight
+    just_left: bool = False  # compensation has just ended, so the next motion must be straight
 
     def rapid_to(self, block: Block, target: list[float]) -> None:
         """Order a rapid to a position in active co-ordinates."""
@@ -47,7 +47,7 @@ class Machine:
         self.line_to(block, target, feed_mm_min(self.modal, block, straight_length(self.modal.position, target)))
 
     def line_to(self, block: Block, target: list[float], feed: float | None) -> None:
-        """Order a straight line to a position in active co-ordinates at ``feed`` mm/min, a rapid where that is None."""
+        """Order a straight line to a position in active co-ordinates at ``feed`` mm/min, a rapid if None."""
         start = self.modal.position
         self.modal.position = target
         self.just_left = False
@@ -62,7 +62,7 @@ class Machine:
         self._give(self.compensation.line(block, a, b, target, feed))
 
     def dwell(self, block: Block, seconds: float) -> None:
-        """Order a dwell; ``seconds`` are those of P, or what the dialect has instead of seconds."""
+        """Order a dwell; ``seconds`` is P, in the dialect's unit."""
         dwell = Dwell(block.line, self.budget.dialect.dwell_s(seconds, "p" in block.pointless))
         if self.compensation is None or not self.compensation.wait(Waiting(block, dwell)):
             self._order(block, dwell)
@@ -80,12 +80,12 @@ class Machine:
         self._give(self.compensation.arc(block, start, corner, centre, turns, target, feed, angle))
 
     def settle(self) -> None:
-        """Order what waits for the next corner, since the machine stops here (M0, M1, M60)."""
+        """Order the piece that waits for the next corner, since the machine stops here (M0, M1, M60)."""
         if self.compensation is not None:
             self._give(self.compensation.settle())
 
     def end_compensation(self) -> None:
-        """Turn cutter compensation off (G40, program end) and order what waits."""
+        """Switch cutter compensation off (G40, program end) and order what waits."""
         if self.compensation is not None:
             self._give(self.compensation.flush())
             self.just_left = self.compensation.entered
@@ -96,14 +96,12 @@ class Machine:
         return complex(position[first], position[second])
 
     def _lifted(self, place: complex, whole: list[float]) -> list[float]:
-        """Return a place in the plane with the other axes of ``whole``."""
         first, second, _ = PLANE_AXES[self.modal.plane_name]
         lifted = list(whole)
         lifted[first], lifted[second] = place.real, place.imag
         return lifted
 
     def _give(self, pieces: list[Piece]) -> None:
-        """Order compensated pieces and what waited for their ends."""
         tip = self.compensation.tip if self.compensation is not None else 0.0
         for piece in pieces:
             end = self._lifted(piece.end + tip, piece.whole)
@@ -136,11 +134,10 @@ class Machine:
     def _order(self, block: Block, motion: Motion) -> None:
         if len(self.out) >= self.budget.max_motions_per_block:
             most = self.budget.max_motions_per_block
-            raise GcodeBudget(block.line, "", f"orders more than {most} motions; split it")
+            raise GcodeBudget(block.line, "", f"the block orders more than {most} motions; split it")
         self.out.append(motion)
 
     def _checked(self, block: Block, position: list[float]) -> Point:
-        """Return a position in machine mm; ProgramError when no machine reaches that."""
         end = self.modal.machine(position)
         limit = self.budget.max_coordinate_mm
         for letter, value in zip("xyz", end, strict=True):
@@ -149,7 +146,6 @@ class Machine:
         return end
 
     def _turned(self, block: Block, position: list[float]) -> tuple[Turned, ...]:
-        """Return the axes beside X, Y and Z that a motion to this position names or moves."""
         before, self.others = self.others, self.modal.others(position)
         moved = zip(AXES[3:], before, self.others, strict=True)
         return tuple(
@@ -159,12 +155,12 @@ class Machine:
         )
 
     def probe_to(self, block: Block, target: list[float], feed: float) -> None:
-        """Order a probe's move to a position in active co-ordinates at ``feed`` mm/min."""
+        """Order a probe move to a position in active co-ordinates at ``feed`` mm/min."""
         self.modal.position = target
         end, stop = self._checked(block, target), Corner("exact_stop")
         self._order(block, Probe(block.line, end, feed, stop, self._turned(block, target)))
 
     def stand_at(self, block: Block, position: list[float]) -> None:
-        """Be at a position without a listed motion (an operator's)."""
+        """Set the position without ordering a motion (the operator moves)."""
         self.modal.position = position
         self._checked(block, position)

@@ -1,7 +1,7 @@
-"""The modal state of the interpreter: where the tool is, in which co-ordinates, units, plane and modes.
+"""The modal state of the interpreter: position, co-ordinates, units, plane and modes.
 
-Lengths are millimetres and angles degrees throughout; ``scale`` is what one program unit of length is in mm. Positions
-have nine entries in the order X Y Z A B C U V W.
+Lengths are millimetres and angles degrees throughout; ``scale`` is one program unit of length in mm. Positions have
+nine entries in the order X Y Z A B C U V W.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ def _zeros() -> list[float]:
 
 @dataclass(slots=True)
 class Modal:
-    """Everything that one block leaves to the next; the defaults are those of a program's start.
+    """State that one block leaves to the next; the defaults are those of a program's start.
 
-    ``position`` is the controlled point in the active co-ordinates. It becomes machine co-ordinates by adding ``g92``,
-    turning about Z by ``rotation_deg`` and adding ``g5x``; the tool's length ``tool`` stands between it and the axes.
+    ``position`` is the controlled point in active co-ordinates. Machine co-ordinates result from adding ``g92``,
+    rotating about Z by ``rotation_deg`` and adding ``g5x``; ``tool`` is the tool's length between it and the axes.
     """
 
     position: list[float] = field(default_factory=_zeros)
@@ -62,7 +62,7 @@ class Modal:
     path_control: int = 640
     path_tolerance_mm: float = 0.0
     joining_mm: float = 0.0
-    wrapped: frozenset[int] = frozenset()  # rotary axes whose absolute words are within one turn
+    wrapped: frozenset[int] = frozenset()  # rotary axes with absolute words within one turn
 
     @property
     def plain(self) -> bool:
@@ -71,7 +71,7 @@ class Modal:
 
     @property
     def corner(self) -> Corner:
-        """How the motion at hand may be left, by the path control in force."""
+        """How the path may leave the end of the current motion, by the active path control."""
         if self.path_control != 640:
             return _EXACT[self.path_control]
         if not (self.path_tolerance_mm > 0.0 or self.joining_mm > 0.0):
@@ -80,7 +80,7 @@ class Modal:
 
     @property
     def code(self) -> str:
-        """The motion in force as a program has it: G38.2."""
+        """The motion in force in program notation: G38.2."""
         return g_word(self.motion)
 
     @property
@@ -89,7 +89,7 @@ class Modal:
         return (*PLANES, "UV", "UW", "VW")[self.plane]
 
     def unit(self, index: int) -> float:
-        """Return what one program unit of an axis is, in mm or degrees."""
+        """Return one program unit of an axis in mm or degrees."""
         return self.scale if AXES[index] in LINEAR else 1.0
 
     def machine(self, position: list[float] | None = None) -> Point:
@@ -109,7 +109,7 @@ class Modal:
         return [p + o + g for p, o, g in zip(position[3:], self.g92[3:], self.g5x[3:], strict=True)]
 
     def from_machine(self, machine: list[float]) -> list[float]:
-        """Return the position in active co-ordinates of a controlled point in machine co-ordinates."""
+        """Return the active co-ordinates of a controlled point in machine co-ordinates."""
         moved = [m - g for m, g in zip(machine, self.g5x, strict=True)]
         if self.rotation_deg:
             moved[0], moved[1] = rotate(moved[0], moved[1], -self.rotation_deg)
@@ -117,6 +117,6 @@ class Modal:
 
 
 def rotate(x: float, y: float, degrees: float) -> tuple[float, float]:
-    """Turn a point about the origin, counter-clockwise."""
+    """Rotate a point about the origin, counter-clockwise."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     return x * c - y * s, x * s + y * c

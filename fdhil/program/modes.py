@@ -1,4 +1,4 @@
-"""The modes that a block sets: feed, spindle, units, plane, distances; what cutter compensation forbids; the dwell."""
+"""Set the modes of a block: feed, spindle, units, plane, distances, cutter compensation; and the dwell."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def set_spindle(modal: Modal, block: Block) -> None:
     if "spindle mode" in block.g:
         modal.surface_speed = block.g["spindle mode"] == 960
     if block.g.get("spindle mode") == 960 and "s" not in block.words:
-        raise block.fault("G96", "constant surface speed wants the speed as S")
+        raise block.fault("G96", "constant surface speed needs the speed as S")
     if "spindle" in block.m:
         modal.spindle_turns = {3: 1, 4: -1}.get(block.m["spindle"], 0)
 
@@ -43,7 +43,7 @@ _OVERRIDES = {50: "feed_override", 51: "speed_override", 52: "adaptive_feed", 53
 
 
 def set_switches(modal: Modal, block: Block) -> None:
-    """Turn coolant (M7 to M9) and the operator's overrides (M48 to M53) on and off: read, without effect on motions."""
+    """Switch coolant (M7 to M9) and the operator's overrides (M48 to M53): parsed, without effect on motions."""
     coolant, override = block.m.get("coolant"), block.m.get("overrides")
     if coolant is not None:
         modal.mist = coolant == 7 or (modal.mist and coolant != 9)
@@ -55,10 +55,10 @@ def set_switches(modal: Modal, block: Block) -> None:
 
 
 def dwell(machine: Machine, block: Block) -> None:
-    """G4: LinuxCNC takes P-1 for a P that is missing, and lets any other negative dwell end at once."""
+    """G4: as LinuxCNC, treat a missing P as P-1, and end any other negative dwell at once."""
     seconds = block.words.get("p", _NO_DWELL)
     if seconds == _NO_DWELL:
-        raise block.fault("G4", "a dwell wants its seconds as P, not negative")
+        raise block.fault("G4", "a dwell needs its seconds as P, not negative")
     machine.dwell(block, max(0.0, seconds))
 
 
@@ -69,7 +69,7 @@ def set_units(modal: Modal, block: Block) -> None:
         modal.plane = PLANE_CODES.index(block.g["plane"])
     if "units" in block.g:
         before, modal.scale = modal.scale, MM_PER_INCH if block.g["units"] == 200 else 1.0
-        # the reference keeps the numbers of a tool's offsets, so that they change their meaning with the units
+        # the reference keeps the numbers of a tool's offsets, so their meaning changes with the units
         modal.tool = [t * modal.scale / before if axis not in (3, 4, 5) else t for axis, t in enumerate(modal.tool)]
 
 
@@ -92,7 +92,7 @@ _ORIGINS = (280, 281, 300, 301, 520, 920, 923)
 
 
 def check_compensated(modal: Modal, block: Block) -> None:
-    """Raise ProgramError for codes that cannot be used while cutter compensation is on."""
+    """Raise ProgramError for codes that are not allowed with cutter compensation on."""
     g, m = block.g, block.m
     refused = [g_word(g[group]) for group in _GROUPS_REFUSED if group in g]
     if g.get("plane", PLANE_CODES[modal.plane]) != PLANE_CODES[modal.plane]:
@@ -113,9 +113,9 @@ def check_compensated(modal: Modal, block: Block) -> None:
 
 
 def compensate(machine: Machine, block: Block, tool: bool) -> None:
-    """G40 turns cutter compensation off, G41 (left) and G42 (right) on; the .1 forms have the diameter as D.
+    """G40 switches cutter compensation off, G41 (left) and G42 (right) on; the .1 forms have the diameter as D.
 
-    ``tool`` tells whether a tool was changed in, whose radius fdhil, without a tool table, does not know.
+    ``tool``: a tool was changed in, whose radius is unknown, since fdhil has no tool table.
     """
     modal, code = machine.modal, block.g["cutter compensation"]
     modal.compensation = code
@@ -123,26 +123,26 @@ def compensate(machine: Machine, block: Block, tool: bool) -> None:
         machine.end_compensation()
         return
     if machine.compensation is not None:
-        raise block.fault(g_word(code), "compensation is on already; end it by G40 first")
+        raise block.fault(g_word(code), "compensation is already on; end it by G40 first")
     diameter = block.words.get("d")
     if modal.plane >= 2:
         what = f"does not work in the {modal.plane_name} plane; use G17 or G18"
         raise block.fault(g_word(code), what)
     if code % 10 == 0:
         if diameter or tool:
-            what = "fdhil has no tool table, so the radius is not known; give the diameter by G41.1 or G42.1 D"
+            what = "fdhil has no tool table, so the radius is unknown; use G41.1 or G42.1 with the diameter as D"
             raise block.fault(g_word(code), what)
         diameter = 0.0
     if diameter is None:
-        raise block.fault(g_word(code), "wants the tool's diameter as D")
+        raise block.fault(g_word(code), "needs the tool's diameter as D")
     radius = diameter / 2.0 * modal.scale
     side = (1 if code in (410, 411) else -1) * (1 if radius >= 0.0 else -1)
     machine.compensation = Compensation(abs(radius), side, _orientation(modal, block))
 
 
 def _orientation(modal: Modal, block: Block) -> int:
-    """Return L of G41.1 and G42.1: where the tip of a turning tool lies about the centre of its nose."""
+    """Return L of G41.1 and G42.1: the position of a turning tool's tip relative to the centre of its nose."""
     value = block.words.get("l", 0.0)
     if value < 0.0 or not is_whole(value) or (value and modal.plane != 1):
-        raise block.fault("l", "is no orientation of a turning tool; L must be 0 to 9, in the XZ plane (G18)")
+        raise block.fault("l", "is not a valid tool orientation; L must be 0 to 9, in the XZ plane (G18)")
     return round(value)

@@ -1,4 +1,4 @@
-"""The motions that a program orders, in machine millimetres: what the interpreter yields and the planner takes."""
+"""The motions that a program orders, in machine millimetres: output of the interpreter, input of the planner."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ ALL_AXES = "XYZABCUVW"
 Place = tuple[float, ...]  # of ALL_AXES: mm, of A B C degrees
 ORIGIN: Place = (0.0,) * len(ALL_AXES)
 PLANES = ("XY", "XZ", "YZ")
-# plane -> indices of its two axes in the order that makes a positive angle counter-clockwise seen from the positive
-# end of the normal axis, then the normal axis; XZ is turned about +Y from Z to X
+# plane -> indices of its two axes, ordered so that a positive angle is counter-clockwise seen from the positive end of
+# the normal axis, then the normal axis; XZ rotates about +Y from Z to X
 PLANE_AXES = {"XY": (0, 1, 2), "XZ": (2, 0, 1), "YZ": (1, 2, 0)}
 
 
 @dataclass(frozen=True, slots=True)
 class Corner:
-    """How a motion's end may be left: G61 on the exact path, G61.1 from an exact stop, G64 by a blend.
+    """How the path may leave a motion's end: G61 on the exact path, G61.1 from an exact stop, G64 by a blend.
 
-    ``tolerance_mm`` is how far a blend may be off the path (P); infinite where the program gives none. ``joining_mm``
-    is how far short lines may be off the one that they are joined to (Q).
+    ``tolerance_mm`` is the largest deviation of a blend from the path (P); infinite if the program gives none.
+    ``joining_mm`` is the largest deviation of short lines from the one that they are joined to (Q).
     """
 
     mode: Literal["exact_path", "exact_stop", "blend"] = "blend"
@@ -35,7 +35,7 @@ BLEND = Corner()
 
 
 class Turned(NamedTuple):
-    """What a motion orders of one axis of A B C (degrees) U V W (mm) in machine co-ordinates."""
+    """The order for one axis of A B C (degrees) U V W (mm) in machine co-ordinates."""
 
     axis: str
     start: float
@@ -46,7 +46,7 @@ class Turned(NamedTuple):
 class Rapid:
     """G0: a straight line at rapid speed to ``end`` (mm); ``line`` is the 1-based source line.
 
-    ``rotary`` are the axes beside X, Y and Z that the block names, or that it moves.
+    ``rotary`` are the axes other than X, Y and Z that the block names or moves.
     """
 
     line: int
@@ -68,16 +68,16 @@ class Feed:
 
 @dataclass(frozen=True, slots=True)
 class Probe(Feed):
-    """G38.2 to G38.5: a feed to its target, which ends where the probe touches or leaves: unknown before it runs."""
+    """G38.2 to G38.5: a feed to its target, which ends where the probe touches or leaves: unknown in advance."""
 
 
 @dataclass(frozen=True, slots=True)
 class Arc:
     """G2, G3: an arc, circle or helix to ``end`` (mm) at ``feed`` mm/min about ``centre``, None on the normal axis.
 
-    ``turns`` is 1 up to and including one circle, n for n - 1 whole circles more, negative clockwise seen from the
-    positive end of the normal axis; ``plane`` is one of ``PLANES``. Where the end is not as far from the centre as
-    the start the radius changes evenly with the angle.
+    ``turns`` is 1 up to and including one circle, n for n - 1 additional full circles, negative clockwise seen from the
+    positive end of the normal axis; ``plane`` is one of ``PLANES``. If start and end have different radii, the radius
+    changes linearly with the angle.
     """
 
     line: int
@@ -110,9 +110,9 @@ def reached(motion: Rapid | Feed | Arc, start: Place) -> Place:
 
 
 class Swept(NamedTuple):
-    """An arc as it is gone along, in mm and rad: its ``centre`` and the ``radii`` and the angle at its ends.
+    """An arc's geometry in mm and rad: its ``centre``, the ``radii`` at its ends, start angle and swept angle.
 
-    Places in a plane are complex: first + j second axis.
+    Points in a plane are complex: first + j second axis.
     """
 
     centre: complex
@@ -124,7 +124,7 @@ class Swept(NamedTuple):
 
     @staticmethod
     def of(motion: Arc, start: Sequence[float]) -> Swept:
-        """Return what an arc sweeps from ``start`` on."""
+        """Return the geometry of an arc from ``start``."""
         axes = PLANE_AXES[motion.plane]
         centre = complex(motion.centre[axes[0]] or 0.0, motion.centre[axes[1]] or 0.0)
         return swept(start, motion.end, centre, motion.turns, axes)
@@ -133,7 +133,7 @@ class Swept(NamedTuple):
 def swept(
     start: Sequence[float], end: Sequence[float], centre: complex, turns: int, axes: tuple[int, int, int]
 ) -> Swept:
-    """Return what an arc sweeps from start to end about a centre in the plane of ``axes`` (first, second, normal)."""
+    """Return the arc from start to end about a centre in the plane of ``axes`` (first, second, normal)."""
     first, second, normal = axes
     begin = complex(start[first], start[second]) - centre
     finish = complex(end[first], end[second]) - centre
@@ -145,7 +145,7 @@ def swept(
 
 
 def _swept_rad(begin: complex, finish: complex, turns: int) -> float:
-    """Return the signed angle (rad) from one radius to the other: coincident ones are a whole circle."""
+    """Return the signed angle (rad) from one radius to the other: coincident ones give a full circle."""
     circle = 2.0 * math.pi
     angle = math.remainder(cmath.phase(finish) - cmath.phase(begin), circle)
     if abs(angle) < 1e-12:

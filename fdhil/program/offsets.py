@@ -1,7 +1,8 @@
 """Co-ordinate systems: G54 to G59.3, G10 L2 and L20, G92, G52, tool length, and the homes of G28 and G30.
 
-Offsets live in numbered parameters in machine millimetres, as the language wants it: #5221 and on for G54, 20 numbers
-apart, with the rotation as the tenth; #5211 and on for G92, in force while #5210 is 1; #5161 and #5181 for the homes.
+Offsets are stored in numbered parameters in machine millimetres, as the language requires: #5221 and on for G54, 20
+numbers apart, with the rotation as the tenth; #5211 and on for G92, in force while #5210 is 1; #5161 and #5181 for the
+homes.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ CODE_OF_SYSTEM = {system: code for code, system in SYSTEMS.items()}
 
 
 def first_of(system: int) -> int:
-    """Return the number of the parameter that holds a system's X offset."""
+    """Return the parameter number of a system's X offset."""
     return 5221 + 20 * (system - 1)
 
 
 def select_system(modal: Modal, variables: Variables, system: int) -> None:
-    """Make G54 (1) to G59.3 (9) the active system: the tool stays where it is and gets new co-ordinates."""
+    """Make G54 (1) to G59.3 (9) the active system: the tool stays in place and gets new co-ordinates."""
     if system == modal.system:
         return
     modal.system = system
@@ -39,7 +40,7 @@ def select_system(modal: Modal, variables: Variables, system: int) -> None:
 
 
 def _change(modal: Modal, g5x: list[float], rotation_deg: float) -> None:
-    """Put other offsets of the active system in force; the reference turns the co-ordinates without G92's share."""
+    """Apply other offsets to the active system; the reference rotates the co-ordinates without G92's share."""
     position = list(modal.position)
     position[0], position[1] = rotate(position[0], position[1], modal.rotation_deg)
     position = [p + old - new for p, old, new in zip(position, modal.g5x, g5x, strict=True)]
@@ -48,23 +49,25 @@ def _change(modal: Modal, g5x: list[float], rotation_deg: float) -> None:
 
 
 def set_data(modal: Modal, variables: Variables, block: Block) -> None:
-    """G10: L2 sets a system's offsets, L20 sets them so that the tool stands at the words given.
+    """G10: L2 sets a system's offsets, L20 sets them so that the tool's position has the given words.
 
-    L1, L10 and L11 change the tool table, which moves nothing: fdhil reads them and keeps no table.
+    L1, L10 and L11 change the tool table, which moves nothing: fdhil parses them and has no table.
     """
     kind = block.words.get("l")
     if kind is None or round(kind) not in (*_TABLE, 2, 20) or not is_whole(kind):
-        raise block.fault("l" if kind is not None else "G10", "sets nothing; fdhil knows G10 L1, L2, L10, L11 and L20")
+        raise block.fault(
+            "l" if kind is not None else "G10", "is not supported; fdhil supports G10 L1, L2, L10, L11 and L20"
+        )
     if round(kind) in _TABLE:
         if block.words.get("p", 0.0) < 1.0:
-            raise block.fault("G10", "wants the tool's number as P, from 1")
+            raise block.fault("G10", "needs the tool number as P, from 1")
         return
     for letter in "ij":
         if letter in block.words:
             raise block.fault(letter, "belongs to a tool (L1, L10, L11), not to a co-ordinate system")
     number = int(block.words.get("p", -1.0))
     if not 0 <= number <= 9:
-        raise block.fault("p", "is no co-ordinate system; P must be 1 (G54) to 9 (G59.3), or 0 for the active one")
+        raise block.fault("p", "is not a co-ordinate system; P must be 1 (G54) to 9 (G59.3), or 0 for the active one")
     system = number or modal.system
     first = first_of(system)
     g5x = [variables.number(first + axis) for axis in range(9)]
@@ -86,7 +89,7 @@ def set_data(modal: Modal, variables: Variables, block: Block) -> None:
 
 
 def _offsets_for(modal: Modal, g5x: list[float], rotation_deg: float, words: dict[int, float]) -> list[float]:
-    """Return the offsets with which the present point has the co-ordinates ``words``; other axes keep theirs."""
+    """Return the offsets that give the present point the co-ordinates ``words``; other axes keep theirs."""
     machine = modal.machine_all()
     here = [m - o for m, o in zip(machine, g5x, strict=True)]
     here[0], here[1] = rotate(here[0], here[1], -rotation_deg)
@@ -96,11 +99,11 @@ def _offsets_for(modal: Modal, g5x: list[float], rotation_deg: float, words: dic
 
 
 def set_g92(modal: Modal, variables: Variables, block: Block) -> None:
-    """G92: the present point has the co-ordinates given; G52: the words are the offset itself."""
+    """G92: the present point gets the given co-ordinates; G52: the words are the offset itself."""
     words = axis_words(block)
     local = block.g["one-shot"] == 520
     if not words:
-        raise block.fault("G52" if local else "G92", "wants axis words")
+        raise block.fault("G52" if local else "G92", "needs axis words")
     new = list(modal.g92)
     for axis, value in words.items():
         value = length_mm(modal, axis, value)
@@ -112,7 +115,7 @@ def set_g92(modal: Modal, variables: Variables, block: Block) -> None:
 
 
 def drop_g92(modal: Modal, variables: Variables, code: int) -> None:
-    """G92.1 clears the offset, G92.2 suspends it, G92.3 takes it from its parameters again."""
+    """G92.1 clears the offset, G92.2 suspends it, G92.3 restores it from its parameters."""
     if code == 923:
         _put_g92(modal, [variables.number(G92_FIRST + axis) for axis in range(9)])
         variables.store(G92_IN_FORCE, 1.0)
@@ -130,11 +133,11 @@ def _put_g92(modal: Modal, g92: list[float]) -> None:
 
 
 def set_tool_length(modal: Modal, block: Block) -> None:
-    """G43.1 sets the tool's offsets; G43, G43.2 and G49 leave none, since fdhil knows no tool table."""
+    """G43.1 sets the tool's offsets; G43, G43.2 and G49 leave none, since fdhil has no tool table."""
     code = block.g["tool length"]
     if code == 432:
         if "h" not in block.words and not axis_words(block):
-            raise block.fault("G43.2", "wants the tool's number as H, or axis words")
+            raise block.fault("G43.2", "needs the tool number as H, or axis words")
         return
     words = {axis: length_mm(modal, axis, value) for axis, value in axis_words(block).items()}
     tool = [words.get(axis, modal.tool[axis]) if code == 431 else 0.0 for axis in range(9)]
@@ -145,7 +148,7 @@ def set_tool_length(modal: Modal, block: Block) -> None:
 
 
 def go_home(machine: Machine, variables: Variables, block: Block) -> None:
-    """G28, G30: by way of the words given, then to the home of the axes named (of all when none is)."""
+    """G28, G30: move via the given words, then to the home of the named axes (of all if none is named)."""
     modal = machine.modal
     words = axis_words(block)
     machine.rapid_to(block, target(modal, block))
@@ -156,6 +159,6 @@ def go_home(machine: Machine, variables: Variables, block: Block) -> None:
 
 
 def store_home(modal: Modal, variables: Variables, code: int) -> None:
-    """G28.1, G30.1: the present machine position becomes the home."""
+    """G28.1, G30.1: store the present machine position as home."""
     for axis, value in enumerate(modal.machine_all()):
         variables.store(HOME_FIRST[code - 1] + axis, value + modal.tool[axis])

@@ -1,4 +1,4 @@
-"""Numbered and named parameters: the variables of a program, and what it may read of the machine's state."""
+"""Numbered and named parameters: a program's variables, and its view of the machine's state."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _READ_ONLY = frozenset({*range(5400, 5410), *range(5420, 5429)})
 
 
 class Variables:
-    """The parameters #1 to #5602 and #<name>; #1 to #30 and names without leading underscore belong to the call.
+    """The parameters #1 to #5602 and #<name>; #1 to #30 and names without leading underscore are local to the call.
 
-    ``line`` is the line being executed, ``returned`` the value of the last subroutine; ``state_numbers`` and
-    ``state_names`` read the machine's state. KeyError for a parameter that is not there.
+    ``line`` is the executed line, ``returned`` the value of the last subroutine; ``state_numbers`` and ``state_names``
+    read the machine's state. KeyError for a missing parameter.
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class Variables:
         self._state_names = state_names
 
     def number(self, index: int) -> float:
-        """Return #index; 0 when it was never set."""
+        """Return #index; 0 if it was never set."""
         if index in self._state_numbers:
             return self._state_numbers[index]()
         if not 1 <= index <= LAST_NUMBER:
@@ -57,10 +57,10 @@ class Variables:
             self._numbers[key] = value
             return
         if key in self._state_names:
-            raise ProgramError(line, f"#<{key}>", "shows the machine's state and cannot be set; choose another name")
+            raise ProgramError(line, f"#<{key}>", "is read-only machine state; choose another name")
         names = self._globals if key.startswith("_") else self._locals
         if len(names) >= self._max and key not in names:
-            raise GcodeBudget(line, f"#<{key}>", f"is one parameter more than the {self._max} that are allowed")
+            raise GcodeBudget(line, f"#<{key}>", f"exceeds the {self._max} parameters allowed")
         names[key] = value
 
     def store(self, index: int, value: float) -> None:
@@ -68,7 +68,7 @@ class Variables:
         self._numbers[index] = value
 
     def state(self) -> object:
-        """Return a copy of what the call at hand and the whole program have set."""
+        """Return a copy of all parameters of the program and of the current call."""
         return dict(self._numbers), dict(self._globals), dict(self._locals), self.returned
 
     def enter(self, arguments: list[float] | None) -> None:
@@ -81,7 +81,7 @@ class Variables:
         self._locals = {}
 
     def leave(self) -> None:
-        """End a call: the caller's local parameters are back."""
+        """End a call and restore the caller's local parameters."""
         saved, self._locals = self._stack.pop()
         if saved is not None:
             for index in _LOCAL:

@@ -1,4 +1,4 @@
-"""Probe moves G38.2 to G38.5: taken to reach their targets without a touch, since where they touch is unknown."""
+"""Probe moves G38.2 to G38.5: they are assumed to reach their targets, since the touch point is unknown."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ def probe(machine: Machine, variables: Variables, block: Block) -> None:
     modal = machine.modal
     code = modal.code
     if modal.feed_mode == 930 or modal.feed_mm_min <= 0.0:
-        raise block.fault(code, "wants a feed rate per minute; give F")
+        raise block.fault(code, "needs a feed rate per minute; add F")
     end = target(modal, block)
     if not axis_words(block):
-        raise block.fault(code, "wants the axis words of its target")
+        raise block.fault(code, "needs the axis words of its target")
     if straight_length(modal.position, end) < _MIN_LENGTH_MM:
-        raise block.fault(code, "starts too near to its target to probe")
+        raise block.fault(code, "starts too close to its target")
     machine.probe_to(block, end, feed_mm_min(modal, block, 0.0))
     for axis, value in enumerate(end):
         variables.store(_PROBED_FIRST + axis, value / modal.unit(axis))

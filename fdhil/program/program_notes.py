@@ -1,4 +1,4 @@
-"""Questions what a program orders: what is unlikely is often a number that another NC reads otherwise. Pure."""
+"""Note implausible motions of a program, often caused by numbers that another NC reads differently. Pure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MOST_OF_A_KIND = 10
 
 
 class ProgramNotes:
-    """Collects notes while motions pass: long dwells, positions metres away, and what follows from a probe."""
+    """Collects notes while motions pass: long dwells, positions metres away, and consequences of a probe."""
 
     def __init__(self, dialect: Dialect) -> None:
         self._dialect = dialect
@@ -26,7 +26,7 @@ class ProgramNotes:
         return tuple(self._found.values())
 
     def watch(self, motions: Iterable[Motion]) -> Iterator[Motion]:
-        """Yield the motions as they are."""
+        """Yield the motions unchanged."""
         for motion in motions:
             if isinstance(motion, Dwell):
                 if motion.seconds > LONG_DWELL_S:
@@ -46,20 +46,20 @@ class ProgramNotes:
     def _dwell(self, seconds: float) -> tuple[str, str]:
         unit = self._dialect.dwell_unit
         how = "as LinuxCNC does" if unit == "s" else f'by [nc] dwell_unit = "{unit}"'
-        other = 'where the NC counts milliseconds, set [nc] dwell_unit = "ms" or "ms_without_point"'
+        other = 'if the NC reads milliseconds, set [nc] dwell_unit = "ms" or "ms_without_point"'
         text = f"the axes dwell for {seconds:g} s; P is read in {'seconds' if unit == 's' else 'that unit'}, {how}"
         return text, other if unit == "s" else "compare it with the NC's manual"
 
     def _position(self, axis: str, value: float) -> tuple[str, str]:
-        text = f"axis {axis} goes to {value:g} mm, farther than most machines"
+        text = f"axis {axis} moves to {value:g} mm, beyond the reach of most machines"
         if not self._dialect.plain:
             return f"{text}; numbers are read by [nc] integers", "compare it with the NC's manual"
         text += "; a number without a decimal point is read as whole units, as LinuxCNC does"
-        return text, 'where the NC counts it in thousandths, set [nc] integers = "thousandths"'
+        return text, 'if the NC reads thousandths, set [nc] integers = "thousandths"'
 
 
 _AFTER_PROBE = (
-    "where the probe touches is unknown: the path from there on, and all that uses #5061 to #5070, is shown as if the"
-    " probe reached its target without a touch",
-    "record the demand of a real run where the path after the probe matters",
+    "the touch point of the probe is unknown: the following path, and all uses of #5061 to #5070, assume that the"
+    " probe reaches its target without a touch",
+    "record the demand of a real run if the path after the probe matters",
 )

@@ -1,4 +1,4 @@
-"""Finds the first row of a demand whose set-points leave the 32 bits that a drive has for them."""
+"""Find the first row of a demand whose set-points exceed the 32-bit range of a drive."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fdhil.records import Float
 
 
 class Beyond(NamedTuple):
-    """A row beyond the range of an axis, and the sentence about it."""
+    """A row outside the range of an axis, and the message about it."""
 
     row: int
     axis: str
@@ -20,7 +20,7 @@ class Beyond(NamedTuple):
 
 
 def first_beyond(position_mm: Mapping[str, Float], config: MachineConfig) -> Beyond | None:
-    """Return the first row at which an axis is beyond its range, None where all (n,) positions fit."""
+    """Return the first row at which an axis is out of range; None if all (n,) positions fit."""
     found = []
     for name, axis in config.axis.items():
         reach = PositionRange.of(name, axis, config.machine.sync_period_s)

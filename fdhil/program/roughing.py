@@ -1,7 +1,7 @@
-"""G70 to G72.2: finishing and roughing a turned contour, which a subroutine (Q) describes in lines and arcs.
+"""G70 to G72.2: finishing and roughing of a turned contour, described by a subroutine (Q) in lines and arcs.
 
-G71 cuts along Z, G72 along X; .1 leaves pockets out, .2 cuts the pockets alone. D is what stays for finishing, I the
-depth of a cut, R the retract; G70 follows the contour P times from the distance D to E.
+G71 cuts along Z, G72 along X; .1 omits pockets, .2 cuts only the pockets. D is the finishing allowance, I the depth of
+a cut, R the retract; G70 follows the contour P times from the distance D to E.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _POCKETS_LEFT = 3
 
 @dataclass(slots=True)
 class Drawn:
-    """The contour that the blocks of a subroutine draw from ``at`` on, z + j x in program units."""
+    """The contour that a subroutine's blocks draw from ``at`` on, z + j x in program units."""
 
     modal: Modal
     motion: int
@@ -38,7 +38,7 @@ class Drawn:
     parts: list[Part] = field(default_factory=list)
 
     def add(self, block: Block) -> None:
-        """Take a block; ProgramError for an arc without centre, and for words that contradict."""
+        """Add a block; ProgramError for an arc without centre, and for contradictory words."""
         words, old = block.words, self.at
         self.motion = block.g.get("motion", self.motion)
         new = complex(self._end(block, "z", "w", old.real, 1.0), self._end(block, "x", "u", old.imag, self._per_x()))
@@ -53,7 +53,7 @@ class Drawn:
         else:
             return
         if "a" in words and "c" in words:
-            raise block.fault("c", "contradicts A at the same corner; round it or cut it")
+            raise block.fault("c", "contradicts A at the same corner; use one of them")
         if "a" in words or "c" in words:
             rounded = "a" in words
             self.parts.append(Part(new, new, new if rounded else None, corner=words["a" if rounded else "c"]))
@@ -75,7 +75,7 @@ class Drawn:
         words = block.words
         given = [letter for letter in "ik" if letter in words]
         if ("r" in words) == bool(given):
-            raise block.fault(g_word(self.motion), "an arc wants its centre (I K) or its radius (R)")
+            raise block.fault(g_word(self.motion), "an arc needs its centre (I K) or its radius (R)")
         if "r" in words:
             if words["r"] ** 2 < abs(new - old) ** 2 / 4.0:
                 raise block.fault("r", "is too small a radius to reach the end")
@@ -85,15 +85,15 @@ class Drawn:
 
 
 def start_of(machine: Machine, block: Block) -> complex:
-    """Go to where a cycle begins, X and Z of its block, and return that; ProgramError when it cannot begin."""
+    """Move to the start of a cycle, X and Z of its block, and return it; ProgramError if the cycle cannot begin."""
     modal, words = machine.modal, block.words
     code = modal.code
     if "q" not in words:
-        raise block.fault(code, "wants Q, the number of the subroutine with its contour")
+        raise block.fault(code, "needs Q, the number of the subroutine with its contour")
     if modal.plane != 1:
-        raise block.fault(code, "works in the XZ plane; give G18")
+        raise block.fault(code, "works in the XZ plane; use G18")
     if words.get("i", 1.0) <= 0.0:
-        raise block.fault("i", "is no depth of a cut; I must be positive")
+        raise block.fault("i", "is not a valid depth of cut; I must be positive")
     if machine.compensation is not None and modal.motion != FINISH:
         raise block.fault(code, "cannot be used with cutter compensation on")
     start, first = list(modal.position), list(modal.position)
@@ -101,13 +101,13 @@ def start_of(machine: Machine, block: Block) -> complex:
         if letter in words:
             value = length_mm(modal, axis, words[letter])
             start[axis] = value if modal.absolute else start[axis] + value
-            first[axis] = value  # the reference takes the words of the first rapid as absolute under G91 too
+            first[axis] = value  # the reference reads the words of the first rapid as absolute under G91 too
     machine.rapid_beside(block, first)
     return complex(start[2], start[0]) / modal.scale
 
 
 def work(machine: Machine, block: Block, drawn: Drawn, start: complex) -> None:
-    """Order the cycle of a block along what was drawn, from ``start`` (program units)."""
+    """Order the cycle of a block along the drawn contour, from ``start`` (program units)."""
     code, parts = machine.modal.motion, drawn.parts
     if len(parts) < 2:
         return
@@ -124,18 +124,18 @@ def work(machine: Machine, block: Block, drawn: Drawn, start: complex) -> None:
 
 @dataclass(slots=True)
 class Tool:
-    """Orders motions along a contour in whatever way that lies."""
+    """Orders motions along a contour in any orientation."""
 
     machine: Machine
     block: Block
     contour: Contour
 
     def rapid(self, place: complex) -> None:
-        """Go to a place at rapid speed."""
+        """Move to a point at rapid speed."""
         self.machine.rapid_to(self.block, self.whole(place))
 
     def feed(self, place: complex) -> None:
-        """Go straight to a place at the feed in force."""
+        """Move straight to a point at the feed in force."""
         self.machine.feed_to(self.block, self.whole(place))
 
     def follow(self, part: Part, end: complex) -> None:
@@ -152,12 +152,12 @@ class Tool:
         target, turns = self.whole(end), 1 if ccw else -1
         path = swept(modal.position, target, centre, turns, PLANE_AXES["XZ"])
         if not radii_agree(*path.radii, modal.scale):
-            raise ContourError("an arc of its contour ends at another radius than it begins; correct its centre")
+            raise ContourError("an arc of its contour begins and ends at different radii; correct its centre")
         feed = feed_mm_min(modal, block, path.length_mm)
         self.machine.arc_to(block, target, centre, turns, feed, path.angle_rad)
 
     def whole(self, place: complex) -> list[float]:
-        """Return a place in active co-ordinates of all axes."""
+        """Return a point in active co-ordinates of all axes."""
         there = self.contour.programmed(place) * self.machine.modal.scale
         whole = list(self.machine.modal.position)
         whole[2], whole[0] = there.real, there.imag
@@ -166,7 +166,7 @@ class Tool:
 
 def _finish(tool: Tool, first: float, last: float, passes: float) -> None:
     if passes > tool.machine.budget.max_motions_per_block:
-        raise tool.block.fault(f"P{passes:g}", "are too many passes; split them")
+        raise tool.block.fault(f"P{passes:g}", "is too many passes; split them")
     contour = tool.contour
     contour.lay_out(along_x=_wants_turn(contour))
     for number in range(int(passes), 0, -1):
@@ -179,7 +179,7 @@ def _finish(tool: Tool, first: float, last: float, passes: float) -> None:
 
 
 def _wants_turn(contour: Contour) -> bool:
-    """Tell whether the contour without its first part goes on along X alone, not along Z."""
+    """Return whether the contour without its first part continues along X only, not along Z."""
     rest = Contour(contour.copy().parts[1:])
     rest.lead_down()
     turned = not all(part.falls() for part in rest.parts)
@@ -204,18 +204,18 @@ def _rough(tool: Tool, code: int, words: dict[str, float]) -> None:
 
 @dataclass(slots=True)
 class Roughing:
-    """Cuts of ``depth`` down along the contour; after each one the tool leaves by ``escape``."""
+    """Cuts of ``depth`` down along the contour; after each one the tool retracts by ``escape``."""
 
     tool: Tool
     depth: float
     escape: complex
-    begun: list[complex]  # where the pockets under way were entered
+    begun: list[complex]  # entries of the active pockets
     at: complex = 0.0 + 0.0j
     level: float = 0.0
     turns: int = 0
 
     def cut(self, kind: int) -> None:
-        """Cut all (0), all but the pockets (1), or the pockets alone (2)."""
+        """Cut all (0), all but the pockets (1), or only the pockets (2)."""
         parts = self.tool.contour.parts
         self.at = parts[0].start
         place = 0
@@ -231,10 +231,9 @@ class Roughing:
     def _count(self) -> None:
         self.turns += 1
         if self.turns > self.tool.machine.budget.max_motions_per_block:
-            raise ContourError("it wants too many cuts, or its contour cannot be followed; take a larger I")
+            raise ContourError("it needs too many cuts, or its contour cannot be followed; use a larger I")
 
     def _pocket(self, place: int, kind: int) -> int | None:
-        """Cut one pocket from the part at ``place`` on; return the part at which the next one begins."""
         parts = self.tool.contour.parts
         self.level = self.begun[-1].imag
         while place < len(parts):
@@ -251,12 +250,11 @@ class Roughing:
     def _lower(self) -> None:
         above = self.level - _NEAR - self.at.imag
         if above > 1e6 * self.depth:
-            raise ContourError("it wants too many cuts; take a larger I")
+            raise ContourError("it needs too many cuts; use a larger I")
         while self.level - _NEAR > self.at.imag:
             self.level -= self.depth
 
     def _pass(self, place: int) -> int:
-        """Cut at the present level as far as the contour lets; return the part to go on with."""
         parts = self.tool.contour.parts
         for hit in range(place, len(parts)):
             found = parts[hit].crossings(self.at.imag)
@@ -265,7 +263,7 @@ class Roughing:
             z = found[0] if hit != place else found[-1]
             distance = abs(z - self.at.real)
             if z - _NEAR > self.at.real or (distance < _NEAR and hit == place):
-                continue  # only where this part begins
+                continue  # only at the start of this part
             if distance < _NEAR:
                 if abs(self.at - parts[hit].start) < _NEAR:
                     return hit
@@ -299,7 +297,7 @@ class Roughing:
             self.begun.append(self.at)
 
     def _dive(self, place: int, x: float) -> bool:
-        """Follow a part down to the height ``x``; True when it does not lead down."""
+        """Follow a part down to the height ``x``; True if it does not lead down."""
         part = self.tool.contour.parts[place]
         if part.centre is not None:
             return self._dive_arc(part, part.centre, x)
@@ -329,14 +327,14 @@ class Roughing:
                 end = complex(found[-1], x)
         elif found:
             if found[0] < centre.real:
-                return False  # hit at its back alone: the next level will do
+                return False  # reached only from behind: the next level will cut it
             end = complex(found[0], x)
         self.tool.follow(part, end)
         self.at = end
         return False
 
     def _climb(self, part: Part) -> bool:
-        """Follow a part up; True when it does not lead up to its end."""
+        """Follow a part up; True if it does not lead up to its end."""
         if part.centre is None:
             if part.end.imag + _NEAR < part.start.imag:
                 return True
@@ -370,7 +368,7 @@ class Roughing:
             self._follow_up(part)
 
     def _follow_up(self, part: Part) -> None:
-        """Follow an arc to its end, or to its crest when it falls behind that."""
+        """Follow an arc to its end, or to its crest if it falls after that."""
         end = part.end
         assert part.centre is not None
         if part.ccw and end.real < part.centre.real:

@@ -1,6 +1,6 @@
-"""A source reads the lines of a program, a file or any iterable of lines, once, with places to return to.
+"""Read the lines of a program, a file or any iterable of lines, once, with positions to return to.
 
-Only what a loop or a call may come back to is kept: a place in the file. Memory stays flat however long the program.
+Only positions for loops and calls are kept, so memory use is independent of the program's length.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from typing import IO, NamedTuple, cast
 from fdhil.errors import GcodeBudget, ProgramError
 
 _SPOOL_BYTES = 4_000_000
-MAX_BYTES = 1 << 30  # of a program that is corrected: ten million lines of a hundred characters
+MAX_BYTES = 1 << 30  # of a corrected program: ten million lines of a hundred characters
 _READ_AHEAD_BYTES = 1 << 18
 _MAX_KEPT = 2000
-_BYTE_ORDER_MARK = codecs.BOM_UTF8.decode("latin-1")  # editors on Windows begin a file in UTF-8 with it
+_BYTE_ORDER_MARK = codecs.BOM_UTF8.decode("latin-1")  # Windows editors begin UTF-8 files with it
 
 
 class Place(NamedTuple):
-    """A place before a line of a source: its byte offset and how many lines stand before it."""
+    """A position before a line of a source: its byte offset and the number of lines before it."""
 
     source: Source
     offset: int
@@ -33,11 +33,11 @@ class Place(NamedTuple):
 
 
 class Source:
-    """A program that is read line by line and can go back to a place; ProgramError when it cannot be read.
+    """A program that is read line by line and can return to a position; ProgramError if it cannot be read.
 
-    ``line`` is the 1-based number of the line last read; ``folder`` is where its subroutines lie, None for an iterable.
-    ``sha256`` is the digest of the file that is open, whatever its name becomes; empty for a device and a file of more
-    than ``MAX_BYTES``.
+    ``line`` is the 1-based number of the line last read; ``folder`` is where its subroutines are, None for an iterable.
+    ``sha256`` is the digest of the open file, even if it is renamed; empty for a device and a file larger than
+    ``MAX_BYTES``.
     """
 
     __slots__ = (
@@ -89,21 +89,21 @@ class Source:
         self._open.close()
 
     def here(self) -> Place:
-        """Return the place before the line last read."""
+        """Return the position before the line last read."""
         return Place(self, self._begin, self.line - 1)
 
     def after(self) -> Place:
-        """Return the place after the line last read."""
+        """Return the position after the line last read."""
         return Place(self, self._end, self.line)
 
     def go(self, place: Place) -> None:
-        """Return to a place of this source."""
+        """Return to a position of this source."""
         self._begin = self._end = place.offset
         self._moved = True
         self.line = place.lines
 
     def next(self, again: bool = False) -> str | None:
-        """Return the next line without its end, None after the last one; lines that come ``again`` are kept."""
+        """Return the next line without its end, None after the last one; repeated lines (``again``) are kept."""
         kept = self._kept.get(self._end) if again else None
         if kept is not None:
             self._moved = True
@@ -125,7 +125,6 @@ class Source:
         return text
 
     def _read(self) -> bytes:
-        """Read the line at hand; ProgramError for one that is no text or too long."""
         try:
             if self._moved:
                 self._file.seek(self._end)
@@ -139,13 +138,12 @@ class Source:
             word = raw[:12].decode("latin-1")
             raise GcodeBudget(self.line + 1, word, f"the line is longer than {self._max_chars} characters; split it")
         if self._end == 0 and raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-            raise ProgramError(1, "", "the file is text in UTF-16, which no NC reads; save it as ASCII or UTF-8")
+            raise ProgramError(1, "", "the file is UTF-16, which no NC reads; save it as ASCII or UTF-8")
         if b"\0" in raw:
-            raise ProgramError(self.line + 1, "\\0", "holds a zero byte, so this is no text; give an NC program")
+            raise ProgramError(self.line + 1, "\\0", "is a zero byte, so the file is not text; use an NC program")
         return raw
 
     def _draw(self, feed: Iterator[str]) -> bytes:
-        """Take one line from the iterable and keep it, so that a loop can come back to it."""
         line = next(feed, None)
         if line is None:
             return b""
@@ -157,6 +155,5 @@ class Source:
 
 @contextmanager
 def _spool() -> Iterator[IO[bytes]]:
-    """Keep lines in memory while they are few, else on the disk."""
     with tempfile.SpooledTemporaryFile(_SPOOL_BYTES) as file:
         yield cast(IO[bytes], file)

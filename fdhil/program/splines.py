@@ -1,7 +1,7 @@
-"""Splines become feeds along chords within a micrometre of them: G5 (cubic), G5.1 (quadratic), G5.2, G5.3 (NURBS).
+"""Splines as feeds along chords within a micrometre: G5 (cubic), G5.1 (quadratic), G5.2 and G5.3 (NURBS).
 
-G5.2 begins with the present point, the blocks after it give control points (X, Y, weight P), G5.3 orders the curve: a
-B-spline of order L over an open uniform knot vector. Places in the XY plane are complex: x + j y.
+G5.2 begins with the present point, the following blocks give control points (X, Y, weight P), G5.3 orders the curve: a
+B-spline of order L over an open uniform knot vector. Points in the XY plane are complex: x + j y.
 """
 
 from __future__ import annotations
@@ -28,38 +28,38 @@ Weighted = tuple[complex, float]  # a control point in mm of the active co-ordin
 
 @dataclass(slots=True)
 class Series:
-    """A series of G5 blocks shares the last control vector, mirrored where a block gives no I and J."""
+    """State of a series of G5 blocks: the last control vector, mirrored if a block has no I and J."""
 
     leaving: complex | None = None
 
 
 def spline(machine: Machine, series: Series, block: Block) -> None:
-    """Order the spline of a G5 or G5.1 block as feeds; ProgramError for words that give none."""
+    """Order the spline of a G5 or G5.1 block as feeds; ProgramError if its words define none."""
     modal, words, code = machine.modal, block.words, machine.modal.code
     if modal.plane != 0:
-        raise block.fault(code, "works in the XY plane; give G17 first")
+        raise block.fault(code, "works in the XY plane; use G17 first")
     if machine.compensation is not None:
         raise block.fault(code, "cannot be used with cutter compensation on")
     if not axis_words(block):
-        raise block.fault(code, "wants X or Y, the end of the curve")
+        raise block.fault(code, "needs X or Y, the end of the curve")
     if any(axis > 1 for axis in axis_words(block)):
-        raise block.fault(code, "moves X and Y alone; take the other axis words out")
+        raise block.fault(code, "moves only X and Y; remove the other axis words")
     whole = target(modal, block)
     start, end = complex(*modal.position[:2]), complex(*whole[:2])
     feed = spline_feed_mm_min(modal, block)
     heading = _vector(block, "ij", modal.scale)
     if modal.motion == 51:
         if heading is None:
-            raise block.fault(code, "wants I and J, the control point from the start")
+            raise block.fault(code, "needs I and J, the control point from the start")
         control = start + heading
         series.leaving = None
-        modal.motion = NO_MOTION  # G5.1 does not stay in force
+        modal.motion = NO_MOTION  # G5.1 is not modal
         points = (start, start + (control - start) * (2 / 3), end + (control - end) * (2 / 3), end)
     else:
         leaving = _vector(block, "pq", modal.scale)
         if leaving is None or ("p" in words) != ("q" in words) or ("i" in words) != ("j" in words):
-            raise block.fault(code, "wants both P and Q, and I and J both or none")
-        if heading is None:  # the first of a series leaves without a direction of its own, as in the reference
+            raise block.fault(code, "needs both P and Q, and both or none of I and J")
+        if heading is None:  # the first of a series starts without a direction, as in the reference
             heading = -series.leaving if series.leaving is not None else 0j
         series.leaving = leaving
         points = (start, start + heading, end + leaving, end)
@@ -87,40 +87,40 @@ def _vector(block: Block, letters: str, scale: float) -> complex | None:
 
 @dataclass(slots=True)
 class Nurbs:
-    """The control points gathered so far."""
+    """The control points collected so far."""
 
     points: list[Weighted] = field(default_factory=list)
     order: int = _USUAL_ORDER
 
     def gather(self, machine: Machine, block: Block) -> None:
-        """Take the control point of a block of G5.2; ProgramError for words that give none."""
+        """Add the control point of a G5.2 block; ProgramError if its words define none."""
         modal, words = machine.modal, block.words
         if modal.plane != 0:
-            raise block.fault("G5.2", "works in the XY plane; give G17 first")
+            raise block.fault("G5.2", "works in the XY plane; use G17 first")
         axes = axis_words(block)
         spline_feed_mm_min(modal, block)
         weight = words.get("p", None if self.points else 1.0)
         if weight is None or weight < 0.0:
-            raise block.fault("G5.2", "wants the weight of each control point as P, not negative")
+            raise block.fault("G5.2", "needs the weight of each control point as P, not negative")
         if not self.points:
             self.order = _order(block)
             self.points.append((complex(*modal.position[:2]), weight))
             if not axes:
                 return
         if 0 not in axes or 1 not in axes:
-            raise block.fault("G5.2", "wants both X and Y of a control point")
+            raise block.fault("G5.2", "needs both X and Y of a control point")
         if len(self.points) >= machine.budget.max_motions_per_block:
             raise block.fault("G5.2", f"has more than {len(self.points)} control points; split the curve")
         self.points.append((complex(*target(modal, block)[:2]), weight))
 
     def order_motions(self, machine: Machine, block: Block) -> None:
-        """Order the curve as feeds (G5.3) and forget its points; ProgramError when there are too few."""
+        """Order the curve as feeds (G5.3) and clear its points; ProgramError if there are too few."""
         points, self.points = self.points, []
         if len(points) < max(self.order, 2):
-            what = f"a curve of order {self.order} wants as many control points; {len(points)} were given"
+            what = f"a curve of order {self.order} needs as many control points; {len(points)} were given"
             raise block.fault("G5.3", what)
         if not any(weight for _, weight in points):
-            raise block.fault("G5.3", "all weights are zero; give one P that is not")
+            raise block.fault("G5.3", "all weights are zero; use a P that is not")
         places = list(_nurbs_chords(points, self.order))
         feed = spline_feed_mm_min(machine.modal, block)
         machine.modal.motion = NO_MOTION
@@ -132,16 +132,15 @@ class Nurbs:
 def _order(block: Block) -> int:
     value = block.words.get("l", float(_USUAL_ORDER))
     if not is_whole(value) or not 1 <= value <= 20:
-        raise block.fault("l", "is no order of a curve; L must be a whole number from 2 to 20")
+        raise block.fault("l", "is not a valid order; L must be a whole number from 2 to 20")
     order = round(value)
     return order if order > 1 else _USUAL_ORDER  # as LinuxCNC does
 
 
 def _nurbs_chords(points: list[Weighted], order: int) -> Iterator[complex]:
-    """Yield the ends of chords beside the curve, each span halved until its middle is near its chord."""
     left = 0
     for span in range(len(points) - order + 1):
-        for part in range(4):  # a span may be S-shaped, so that its middle tells nothing
+        for part in range(4):  # a span may be S-shaped, so that its middle is not conclusive
             for place in _split(points, order, span + part / 4, span + (part + 1) / 4, _MAX_SPLITS):
                 left += 1
                 if left > _MAX_CHORDS:
@@ -167,7 +166,7 @@ def _beside(a: complex, b: complex, point: complex) -> float:
 
 
 def _nurbs_at(points: list[Weighted], order: int, u: float) -> complex:
-    """The curve's point at ``u``, by de Boor's algorithm in homogeneous co-ordinates."""
+    """Return the curve's point at ``u``, by de Boor's algorithm in homogeneous co-ordinates."""
     last = len(points) - 1
     span = min(int(u), last - order + 1)
     index = span + order - 1

@@ -1,4 +1,4 @@
-"""The machine's state as a program reads it (#5420, #<_feed> and the like), and keeps it by M70 to M73."""
+"""The machine's state as a program reads it (#5420, #<_feed> and others), and its saving by M70 to M73."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fdhil.program.offsets import CODE_OF_SYSTEM, G92_IN_FORCE, drop_g92, select
 from fdhil.program.parameters import Variables
 
 Reading = Callable[[], float]
-# what M70 keeps: the modes, not the position and not the motion in force
+# saved by M70: the modes, without position and active motion
 _KEPT = (
     "scale", "plane", "absolute", "arc_absolute", "diameter", "feed_mode", "feed_word", "feed_mm_min", "spindle_rpm",
     "spindle_turns", "surface_speed", "flood", "mist", "feed_override", "speed_override", "adaptive_feed", "feed_hold",
@@ -21,7 +21,7 @@ _KEPT = (
 
 
 def numbers_of(modal: Modal) -> Mapping[int, Reading]:
-    """Return the numbered parameters that show the machine's state: #5420 to #5428, the controlled point."""
+    """Return the numbered parameters of the machine's state: #5420 to #5428, the controlled point."""
     fixed = {5400 + index: (lambda: 0.0) for index in range(14)}
     return {**fixed, **{5420 + index: _own(modal, index) for index in range(9)}}
 
@@ -29,7 +29,7 @@ def numbers_of(modal: Modal) -> Mapping[int, Reading]:
 def names_of(
     modal: Modal, line: Callable[[], int], depth: Callable[[], int], value: Callable[[], float | None]
 ) -> Mapping[str, Reading]:
-    """Return the named parameters that show the machine's state; a flag is 1 or 0."""
+    """Return the named parameters of the machine's state; a flag is 1 or 0."""
     readings: dict[str, Reading] = {
         "_metric": lambda: modal.scale == 1.0,
         "_imperial": lambda: modal.scale != 1.0,
@@ -88,7 +88,7 @@ class _Kept:
 
 
 class KeptModes:
-    """M70 keeps the modes of this call level, M71 forgets them, M72 restores them, M73 does so when the call ends."""
+    """Modes saved by M70 per call level; M71 discards them, M72 restores them, M73 does so at the call's end."""
 
     def __init__(self, modal: Modal, variables: Variables) -> None:
         self._modal = modal
@@ -96,7 +96,7 @@ class KeptModes:
         self._kept: dict[int, _Kept] = {}
 
     def do(self, code: int, level: int) -> bool:
-        """Do one of the four codes; False when M72 finds nothing to restore."""
+        """Execute one of the four codes; False if M72 has nothing to restore."""
         if code in (70, 73):
             values = {name: getattr(self._modal, name) for name in _KEPT}
             self._kept[level] = _Kept(values, self._variables.number(G92_IN_FORCE) == 1.0, code == 73)
@@ -109,11 +109,11 @@ class KeptModes:
         return True
 
     def state(self) -> object:
-        """Return a copy of what is kept."""
+        """Return a copy of the saved modes."""
         return dict(self._kept)
 
     def returned(self, level: int) -> None:
-        """Tell that the call of this level has ended."""
+        """Restore the modes saved by M73 at the end of a call of this level."""
         kept = self._kept.pop(level, None)
         if kept is not None and kept.restore_on_return:
             self._restore(kept)

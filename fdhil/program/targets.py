@@ -1,4 +1,4 @@
-"""The words of a block give its target, its length and its feed."""
+"""Evaluate the words of a block: its target, its length and its feed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _MIN_INVERSE_TIME_FEED = 0.1  # program units per minute; a move without length 
 
 
 def straight_length(start: list[float], end: list[float]) -> float:
-    """Length that a feed refers to: of X Y Z, else of U V W, else of A B C."""
+    """Return the length that a feed refers to: of X Y Z, else of U V W, else of A B C."""
     for first in (0, 6, 3):
         length = math.dist(start[first : first + 3], end[first : first + 3])
         if length > 0.0:
@@ -21,49 +21,49 @@ def straight_length(start: list[float], end: list[float]) -> float:
 
 
 def feed_mm_min(modal: Modal, block: Block, length_mm: float) -> float:
-    """Return the feed of a move of this length; ProgramError when none is in force."""
+    """Return the feed of a move of this length; ProgramError if none is in force."""
     if modal.feed_mode == 930:
         if "f" not in block.words:
-            raise block.fault("G93", "a feed move in inverse-time mode wants an F word of its own")
+            raise block.fault("G93", "a feed move in inverse-time mode needs its own F word")
         modal.feed_mm_min = max(_MIN_INVERSE_TIME_FEED * modal.scale, length_mm * block.words["f"])
         return modal.feed_mm_min
     if modal.feed_mm_min <= 0.0:
-        raise block.fault(modal.code, "there is no feed rate; give F before a feed move")
+        raise block.fault(modal.code, "there is no feed rate; add F before a feed move")
     if modal.feed_mode == 950:
         if modal.spindle_rpm <= 0.0:
-            raise block.fault("G95", "feed per revolution wants a spindle speed; give S")
+            raise block.fault("G95", "feed per revolution needs a spindle speed; add S")
         return modal.feed_mm_min * modal.spindle_rpm
     return modal.feed_mm_min
 
 
 def spline_feed_mm_min(modal: Modal, block: Block) -> float:
-    """Return the feed of a spline, which LinuxCNC does not work by inverse time: under G93 that of the move before."""
+    """Return the feed of a spline; under G93 that of the previous move, since LinuxCNC has no inverse-time splines."""
     if modal.feed_mode != 930:
         return feed_mm_min(modal, block, 0.0)
     code = modal.code
     if "f" not in block.words and modal.motion in (50, 51):
-        raise block.fault(code, "a feed move in inverse-time mode wants an F word of its own")
+        raise block.fault(code, "a feed move in inverse-time mode needs its own F word")
     if modal.feed_mm_min <= 0.0:
-        raise block.fault(code, "keeps the feed in force under G93, and there is none; give G94 and F")
+        raise block.fault(code, "keeps the active feed under G93, but there is none; use G94 and F")
     return modal.feed_mm_min
 
 
 def plane_axes(modal: Modal, block: Block) -> tuple[int, int, int]:
-    """Return the plane's axes as ``PLANE_AXES`` has them; ProgramError for a plane of U V W."""
+    """Return the plane's axes as in ``PLANE_AXES``; ProgramError for a plane of U V W."""
     axes = PLANE_AXES.get(modal.plane_name)
     if axes is None:
-        what = f"cannot be worked in the {modal.plane_name} plane, whose axes fdhil does not list; use G17, G18 or G19"
+        what = f"is not supported in the {modal.plane_name} plane; use G17, G18 or G19"
         raise block.fault(modal.code, what)
     return axes
 
 
 def axis_letter(block: Block) -> str | None:
-    """Return one letter of the block that says where it leads, None when there is none."""
+    """Return one axis letter of the block, None without one."""
     return next((letter for letter in block.words if letter in INDEX or letter in "@^"), None)
 
 
 def axis_words(block: Block) -> dict[int, float]:
-    """Return the block's axis words by the axis' index, in program units."""
+    """Return the block's axis words by axis index, in program units."""
     words = block.words
     return {INDEX[letter]: words[letter] for letter in AXES if letter in words}
 
@@ -76,12 +76,12 @@ def length_mm(modal: Modal, index: int, value: float) -> float:
 
 
 def target(modal: Modal, block: Block) -> list[float]:
-    """Return where the block's axis words lead, in active co-ordinates; G53 words are machine co-ordinates."""
+    """Return the target of the block's axis words in active co-ordinates; G53 words are machine co-ordinates."""
     words = axis_words(block)
     polar = "@" in block.words or "^" in block.words
     if "machine co-ordinates" in block.g:
         if polar or not modal.absolute or modal.motion not in (0, 10):
-            raise block.fault("G53", "wants absolute X Y Z words (G90) and G0 or G1")
+            raise block.fault("G53", "needs absolute X Y Z words (G90) and G0 or G1")
         whole = [c + t for c, t in zip(modal.machine_all(), modal.tool, strict=True)]
         for index, value in words.items():
             whole[index] = length_mm(modal, index, value)
@@ -101,12 +101,12 @@ def target(modal: Modal, block: Block) -> list[float]:
 
 
 def _wrapped(block: Block, index: int, word: float, place: float, now: float) -> float:
-    """Return where an absolute word turns a wrapped rotary axis from ``now``: its sign is the direction, as LinuxCNC's.
+    """Return the target of an absolute word of a wrapped rotary axis from ``now``: its sign is the direction.
 
-    LinuxCNC 2.9, WRAPPED_ROTARY: the angle within a turn is next reached in that direction.
+    LinuxCNC 2.9, WRAPPED_ROTARY: the axis moves to the angle within a turn that is next in that direction.
     """
     if abs(word) >= 360.0:
-        raise block.fault(AXES[index], f"{word:g} is no position of a wrapped rotary axis; give less than one turn")
+        raise block.fault(AXES[index], f"{word:g} is not a position of a wrapped rotary axis; use less than one turn")
     end = abs(place) + math.floor(now / 360.0) * 360.0
     backward = math.copysign(1.0, word) < 0.0
     if backward:
@@ -115,16 +115,16 @@ def _wrapped(block: Block, index: int, word: float, place: float, now: float) ->
 
 
 def _polar(modal: Modal, block: Block) -> tuple[float, float]:
-    """Return X and Y of polar words: @ the distance from the origin, ^ the angle; what is missing stays as it is."""
+    """Return X and Y of polar words: @ is the distance from the origin, ^ the angle; a missing one is unchanged."""
     for letter in "xy":
         if letter in block.words:
             raise block.fault(letter, "contradicts the polar words @ and ^ in the same block")
     letter = "@" if "@" in block.words else "^"
     if modal.plane != 0 and "plane" not in block.g:
-        raise block.fault(letter, "is a polar word, which wants the XY plane (G17)")
+        raise block.fault(letter, "is a polar word, which needs the XY plane (G17)")
     x, y = modal.position[0], modal.position[1]
     if x == 0.0 and y == 0.0 and not ("^" in block.words and modal.absolute):
-        raise block.fault(letter, "there is no angle at the origin; give an absolute one by ^")
+        raise block.fault(letter, "there is no angle at the origin; add an absolute one by ^")
     distance, angle = math.hypot(x, y), math.degrees(math.atan2(y, x))
     if not modal.absolute:
         distance += block.words.get("@", 0.0) * modal.scale

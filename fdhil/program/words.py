@@ -1,7 +1,7 @@
-"""Lines of text become blocks: words, codes by modal group, and parameter settings.
+"""Parse lines of text to blocks: words, codes by modal group, and parameter settings.
 
-Blanks, comments and case mean nothing outside names. A block has each letter once, except G, M and parameter settings.
-G codes are held times ten (G38.2 is 382).
+Blanks, comments and case are insignificant outside names. A block has each letter once, except G, M and parameter
+settings. G codes are stored times ten (G38.2 is 382).
 """
 
 from __future__ import annotations
@@ -61,15 +61,17 @@ M_GROUPS: Mapping[int, str] = _groups(
 
 
 def g_word(code: int) -> str:
-    """Return a G code that is held times ten as a program has it: G38.2."""
+    """Return a G code that is stored times ten in program notation: G38.2."""
     return f"G{code / 10:g}"
 
 
 @dataclass(slots=True)
 class Block:
-    """One line, read: ``words`` by letter (lower case, program units), G codes times ten and M codes by modal group,
-    and the parameter settings in their order, done after the whole line was read. ``pointless`` are the letters whose
-    value is a number without a decimal point."""
+    """One parsed line.
+
+    ``words`` by letter (lower case, program units), G codes times ten and M codes by modal group, and the parameter
+    settings in order, applied after the whole line. ``pointless`` are the letters whose value has no decimal point.
+    """
 
     line: int
     words: dict[str, float] = field(default_factory=dict)
@@ -86,9 +88,9 @@ class Block:
 
 
 def clean(raw: str, line: int) -> str:
-    """Return a line in lower case without blanks; ProgramError for a comment that is not closed.
+    """Return a line in lower case without blanks; ProgramError for an unclosed comment.
 
-    A comment between two words is left as one mark, since it may not stand within a word.
+    A comment between two words becomes a mark, since it must not be within a word.
     """
     if "(" in raw or ";" in raw:
         return _without_comments(raw, line).translate(_CLEANED).strip(_COMMENT)
@@ -111,9 +113,7 @@ def _without_comments(raw: str, line: int) -> str:
         if end < 0:
             raise ProgramError(line, raw[start : start + 12], "the comment is not closed; add ')'")
         if "(" in raw[start + 1 : end]:
-            raise ProgramError(
-                line, raw[start : start + 12], "a comment stands within a comment; take the inner one out"
-            )
+            raise ProgramError(line, raw[start : start + 12], "a comment contains a comment; remove the inner one")
         at = end + 1
     return "".join(kept)
 
@@ -129,10 +129,10 @@ def without_number(text: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A line that was read: ``fixed`` when it is always the same block, else its words and settings to evaluate.
+    """A parsed line: ``fixed`` if it is always the same block, else its words and settings to evaluate.
 
-    ``straight`` are X, Y, Z and F of a line that has no other words but G0 or G1 (``code``, times ten). ``pointless``
-    are the letters whose value is a number without a decimal point.
+    ``straight`` are X, Y, Z and F of a line without other words except G0 or G1 (``code``, times ten). ``pointless``
+    are the letters whose value has no decimal point.
     """
 
     fixed: Block | None
@@ -143,7 +143,7 @@ class Line:
     pointless: frozenset[str] = frozenset()
 
     def block(self, context: Context) -> Block:
-        """Return the block that the line is now, with the parameters as they are before its own settings."""
+        """Return the line's block at present, with the parameters before its own settings."""
         fixed, line = self.fixed, context.line
         if fixed is not None:
             return Block(line, fixed.words, fixed.g, fixed.m, pointless=self.pointless)
@@ -154,21 +154,21 @@ class Line:
         return _ended(block)
 
     def values(self, context: Context) -> list[tuple[int | str, float]]:
-        """Return the parameters that the line sets and their values, with the parameters as they are before that."""
+        """Return the parameters that the line sets and their values, with the parameters before that."""
         return [
             (key if isinstance(key, str) else whole(context, now(key), "#"), now(value)) for key, value in self.settings
         ]
 
 
 def _ended(block: Block) -> Block:
-    """Make G80 the motion of a block that has no other: beside one it says nothing."""
+    """G80 is the motion of a block that has no other; next to another it has no effect."""
     if "cycle end" in block.g:
         block.g.setdefault("motion", block.g["cycle end"])
     return block
 
 
 def read(text: str, context: Context, max_nesting: int) -> Line:
-    """Read a cleaned line; ProgramError with line and word for what the language does not allow."""
+    """Parse a cleaned line; ProgramError with line and word for invalid syntax."""
     reader = Reader(text, context, max_nesting)
     words: list[tuple[str, Value]] = []
     settings: list[tuple[Value | str, Value]] = []
@@ -186,7 +186,6 @@ def read(text: str, context: Context, max_nesting: int) -> Line:
 
 
 def _straight(words: list[tuple[str, Value]]) -> tuple[int | None, tuple[Value | None, ...] | None]:
-    """Return G0 or G1 and X, Y, Z, F when a line has these words alone."""
     by_letter = dict(words)
     code = by_letter.pop("g", None)
     if len(by_letter) + (code is not None) != len(words) or not by_letter.keys() <= _STRAIGHT:
@@ -198,26 +197,26 @@ def _straight(words: list[tuple[str, Value]]) -> tuple[int | None, tuple[Value |
 
 
 def read_word(reader: Reader, words: list[tuple[str, Value]], settings: list[tuple[Value | str, Value]]) -> None:
-    """Read the next word or the next setting of a parameter; ProgramError for what is neither."""
+    """Parse the next word or the next setting of a parameter; ProgramError for anything else."""
     reader.word_at = reader.at
     letter = reader.text[reader.at]
     if letter == "#":
         reader.at += 1
         key = reader.name() if reader.text.startswith("<", reader.at) else reader.value()
         if not reader.take("="):
-            raise reader.fault("a parameter's setting wants '=' and a value")
+            raise reader.fault("a parameter's setting needs '=' and a value")
         settings.append((key, reader.value()))
         return
     if letter == _COMMENT:
         reader.at += 1
         return
     if letter not in _LETTERS and letter not in "no":
-        raise reader.fault("is no word of the language; check the characters")
+        raise reader.fault("is not a word of the language; check the characters")
     reader.at += 1
     value = reader.value()
     if letter in "no":
         word = f"{letter}{value:g}" if isinstance(value, float) else None
-        raise reader.fault("stands where it may not; N and O begin a line", word)
+        raise reader.fault("is misplaced; N and O begin a line", word)
     words.append((letter, value))
 
 
@@ -227,7 +226,7 @@ def _add(block: Block, letter: str, value: float) -> None:
     elif letter == "m":
         _add_m(block, value)
     elif letter in block.words:
-        raise block.fault(f"{letter.upper()}{value:g}", "this letter stands twice in the block; keep one")
+        raise block.fault(f"{letter.upper()}{value:g}", "this letter occurs twice in the block; keep one")
     else:
         block.words[letter] = value
 
@@ -236,7 +235,7 @@ def _add_g(block: Block, value: float) -> None:
     code = round(value * 10.0)
     group = G_GROUPS.get(code) if abs(value * 10.0 - code) < 1e-3 else None
     if group is None:
-        raise block.fault(f"G{value:g}", "is a G code that fdhil does not know; see the list of codes")
+        raise block.fault(f"G{value:g}", "is a G code that fdhil does not support; see the list of codes")
     if group in block.g and group != "cycle end":
         other = g_word(block.g[group])
         raise block.fault(f"G{value:g}", f"contradicts {other} in the same block; keep one of them")
@@ -247,7 +246,7 @@ def _add_m(block: Block, value: float) -> None:
     code = round(value)
     group = M_GROUPS.get(code) if is_whole(value) else None
     if group is None:
-        raise block.fault(f"M{value:g}", "is an M code that fdhil does not know; see the list of codes")
+        raise block.fault(f"M{value:g}", "is an M code that fdhil does not support; see the list of codes")
     if group in block.m:
         raise block.fault(f"M{value:g}", f"contradicts M{block.m[group]} in the same block; keep one")
     block.m[group] = code

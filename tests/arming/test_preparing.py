@@ -233,7 +233,7 @@ def test_a_pipe_is_no_program_and_nobody_waits_for_it(config: MachineConfig, tmp
     os.mkfifo(tmp_path / "program.ngc")
     axis = AxisKnowledge(published(), 0.0, None, ())
     for program in (tmp_path / "program.ngc", Path(os.devnull)):
-        with pytest.raises(ProgramError, match="give the program as a plain file"):
+        with pytest.raises(ProgramError, match="use a regular file"):
             prepare(program, None, config, dict.fromkeys(config.axis, axis))
 
 
@@ -244,7 +244,7 @@ def test_file_of_holes_is_refused_by_its_size(name: str, config: MachineConfig, 
     (tmp_path / name).touch()
     os.truncate(tmp_path / name, 1 << 40)
     known = dict.fromkeys(config.axis, AxisKnowledge(published(), 0.0, None, ()))
-    with pytest.raises(ProgramError, match="is larger than 1024 MiB, and nothing of it is read"):
+    with pytest.raises(ProgramError, match="is larger than 1024 MiB, so it was not read"):
         prepare(tmp_path / name, None, config, known)
 
 

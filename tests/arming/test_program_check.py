@@ -231,7 +231,7 @@ def test_what_changes_while_it_is_checked_is_refused(which: str, config: Machine
         with (tmp_path / which).open("a") as file:
             file.write("(another)\n")
 
-    with pytest.raises(ProgramError, match=f"{which} was changed while it was checked"):
+    with pytest.raises(ProgramError, match=f"{which} was modified while it was checked"):
         check(program, program_digest(program), nominal_models(config), config, io.BytesIO(), change)
 
 

@@ -82,10 +82,10 @@ def test_rows_and_digest_are_of_one_content(name: str, config: MachineConfig, tm
     request = ArmRequest(program, program_digest(program), nominal_models(config), config, "mirror")
     other.write_text(texts[program.suffix].replace("0", "0.0", 1))
     other.rename(program)
-    with pytest.raises(ProgramError, match="was changed while it was checked"):
+    with pytest.raises(ProgramError, match="was modified while it was checked"):
         plan_whole(request, {})
-    with pytest.raises(ProgramError, match="was changed while it was checked"):
+    with pytest.raises(ProgramError, match="was modified while it was checked"):
         check(program, request.program_digest, request.models, config, io.BytesIO(), print)
     begin = Piece(0, {"X": [0], "Y": [0]}, {"X": [0], "Y": [0]}, True)
-    with pytest.raises(ProgramError, match="was changed while it was checked"):
+    with pytest.raises(ProgramError, match="was modified while it was checked"):
         FirstBlock(begin, program, request.models, config, request.program_digest)

@@ -376,7 +376,7 @@ def test_a_drive_that_must_not_be_used_is_refused(fdhil: Said, bench: Bench) -> 
     try:
         found = document(fdhil, "commission", bench.config("wrong.toml"), "--yes", code=1)
         assert found["axes"] == {}
-        assert found["refused"].startswith("drive X: 0x6007 is 0: it goes on when communication is lost; set it to")
+        assert found["refused"].startswith("drive X: 0x6007 is 0: it continues when communication is lost; set it to")
     finally:
         bench.fault(0x6007, 1)
 
@@ -427,7 +427,7 @@ def test_a_bus_without_a_node_is_told(fdhil: Said, tmp_path: Path) -> None:
         config = write_config(tmp_path, bus=f'interface = "socketcand"\nport = {hub.hub.settings["port"]}')
         code, out, err = fdhil("scan", config)
         assert (code, out) == (3, "")
-        assert "no node was heard and none answered" in err
+        assert "no node sent a frame and none answered" in err
     finally:
         hub.stop()
 
@@ -483,7 +483,7 @@ def test_a_check_beside_an_nc_compares_what_is_heard(fdhil: Said, cut: Bench) ->
 def test_another_sync_period_is_told(fdhil: Said, cut: Bench) -> None:
     config = cut.config("period.toml", "sync_period_s = 0.001", "sync_period_s = 0.0005")
     said = undisturbed(fdhil, cut, "check", config, code=1)
-    assert "where the config has 0.5 ms; correct machine.sync_period_s or the NC's cycle" in said
+    assert "but the configuration has 0.5 ms; correct machine.sync_period_s or the NC's cycle" in said
 
 
 def test_a_commissioning_beside_an_nc_is_refused(fdhil: Said, cut: Bench) -> None:

@@ -94,7 +94,7 @@ def test_linuxcncs_files_and_few_answers_make_a_machine(fdhil: Said, tmp_path: P
     assert "rapid_speed_mm_s = 400.0  # LinuxCNC: [TRAJ] MAX_LINEAR_VELOCITY" in text
     assert "# table travel per motor revolution" in text
     assert "R = 0.5  # from the answers" in text
-    assert "Cd = 2.0  # guessed: 5 % of the continuous torque; the first rapids tell it" in text
+    assert "Cd = 2.0  # guessed: 5 % of the continuous torque; the first rapids identify it" in text
     assert "/work" not in text
 
 
@@ -108,7 +108,7 @@ def test_rotary_axis_and_gantry_of_linuxcnc_need_a_radius_and_two_node_ids(fdhil
     arguments = ("init", file, "--from-linuxcnc", tmp_path / "mill.ini", "--offline", "--answers")
     code, _, err = fdhil(*arguments, written(tmp_path, axis=axes | {"A": sheet}))
     assert code == 2
-    assert "axis.A.radius_mm: is not known: of a rotary axis: the radius at which its angles count" in err
+    assert "axis.A.radius_mm: is unknown: of a rotary axis: the radius at which its angles count" in err
     assert not file.exists()
     code, _, err = fdhil(*arguments, written(tmp_path, axis=axes))
     assert code == 0, err
@@ -209,7 +209,7 @@ def test_numbers_that_cannot_be_of_one_machine_are_asked_again(
     file = tmp_path / "m.toml"
     code, out, err = fdhil("init", file, "--offline", said="\n".join(lines) + "\n")
     assert code == 0, (err, out)
-    assert "it cannot be" in err
+    assert "invalid:" in err
     assert machine_config.load(file).axis["X"].nominal.L == 0.005
 
 
@@ -274,7 +274,7 @@ def test_beside_an_nc_nothing_is_sent(
             thread.join()
     assert code == 0, err
     assert set(peer.heard) == {0x80}
-    assert "an NC runs it (SYNC heard), so no drive was asked" in out
+    assert "an NC runs it (SYNC received), so no drive was read" in out
 
 
 @pytest.mark.usefixtures("real_time")
@@ -284,7 +284,7 @@ def test_an_answer_that_the_drive_contradicts_is_noted(
     sheet = SHEET | RAPID | {"drive": {"increments_per_rev": 4096}}
     code, out, err = fdhil("init", tmp_path / "m.toml", "--answers", written(tmp_path, axis={"X": sheet}, bus=bus))
     assert code == 0, err
-    assert "note: axis.X.drive.increments_per_rev: the answers say 4096, the drive 65536" in out
+    assert "note: axis.X.drive.increments_per_rev: the answers have 4096, the drive has 65536" in out
     assert machine_config.load(tmp_path / "m.toml").axis["X"].drive.increments_per_rev == 4096
 
 
@@ -307,7 +307,7 @@ def test_an_axis_without_a_drive_is_refused(fdhil: Said, peer: DrivePeer, bus: d
     answers = written(tmp_path, axis={"X": sheet, "Y": sheet}, bus=bus)
     code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", answers)
     assert code == 2
-    assert "axis.Y.drive: has no drive: 1 found, 1 given to other axes" in err
+    assert "axis.Y.drive: has no drive: 1 found, 1 assigned to other axes" in err
     answers = written(tmp_path, axis={"X": SHEET | RAPID | {"drive": {"node_id": 9}}}, bus=bus)
     code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", answers)
     assert code == 2

@@ -78,7 +78,7 @@ def test_a_probe_is_listed_and_what_follows_it_is_said_to_be_unknown(
     assert document["motions"][2] == {"line": 7, "kind": "rapid", "end": [25.0, 0.0, 0.0]}
     (note,) = document["notes"]
     assert note["code"] == "UnknownAfterProbe"
-    assert note["text"].startswith("line 4: where the probe touches is unknown")
+    assert note["text"].startswith("line 4: the touch point of the probe is unknown")
 
 
 def test_rotary_words_are_listed_in_degrees_and_millimetres(
@@ -107,7 +107,7 @@ def test_rotary_words_are_listed_in_degrees_and_millimetres(
         (
             "G0 X0\nG1 X10000 F1000.\nM30\n",
             "FarPosition",
-            "line 2: axis X goes to 10000 mm, farther than most",
+            "line 2: axis X moves to 10000 mm, beyond the reach of most",
         ),
     ],
 )

@@ -152,10 +152,10 @@ def test_a_bus_without_drives_is_told(tmp_path: Path, capsys: pytest.CaptureFixt
     try:
         port = hub.hub.settings["port"]
         config = write_config(tmp_path, bus=f'interface = "socketcand"\nport = {port}')
-        assert_told(fdhil("scan", config, capsys=capsys), 3, "no node was heard and none answered")
+        assert_told(fdhil("scan", config, capsys=capsys), 3, "no node sent a frame and none answered")
         code, _, err = fdhil("commission", config, "--yes", capsys=capsys)
         assert code == 3
-        assert "nothing was heard on the bus and node-ID 1 did not answer" in err
+        assert "no frame was received on the bus and node-ID 1 did not answer" in err
     finally:
         hub.stop()
 

@@ -1,4 +1,4 @@
-"""What the tests of commissioning share."""
+"""Fixtures shared by the commissioning tests."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ from tests.short_waits import shorten_waits
 
 @pytest.fixture
 def quick_commissioning(virtual_threads: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run on virtual time, with shorter waits than on a real machine: the simulated drive settles sooner."""
+    """Run on virtual time with shorter waits than on a real machine, since the simulated drive settles sooner."""
     shorten_waits(monkeypatch)

@@ -1,4 +1,4 @@
-"""An NC that is switched on in the middle of what fdhil does on a bus of this process."""
+"""An NC that is switched on while fdhil acts on a bus of this process."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import can
 
 Frame = tuple[int, bytes]
 SYNC, NMT, TARGET, OFFSET, SDO, HEARTBEAT = 0x080, 0x000, 0x201, 0x301, 0x601, 0x764
-A_FEW = 11  # SYNC: it is noticed, the offset goes to zero, the drive is switched off
-TO_BRAKE = 17  # SYNC more where the axis moves, in these tests
+A_FEW = 11  # SYNCs for detection, ramp to zero offset, and switching off
+TO_BRAKE = 17  # additional SYNCs if the axis moves
 FOREIGN: dict[str, Frame] = {
     "SYNC": (SYNC, b""),
     "NMT": (NMT, b"\x01\x00"),
@@ -28,9 +28,9 @@ LEFT_TO_IT = {"target": TARGET, "offset": OFFSET}
 
 @dataclass
 class ForeignNc:
-    """Hears a bus, and is switched on by a frame; ``sent`` are the frames of fdhil after its own first one.
+    """Listens to a bus and is switched on by a frame; ``sent`` are fdhil's frames after the NC's first one.
 
-    What fdhil had sent before that is in the queue still, and is left out.
+    Frames that fdhil sent before, still in the queue, are omitted.
     """
 
     channel: str
@@ -85,7 +85,7 @@ def moves(frame: Frame) -> bool:
 
 
 class LateOperator(io.StringIO):
-    """Somebody who answers when an NC has just been switched on; ``question``: the how manieth of them."""
+    """Answers just after an NC was switched on; ``question``: at which question."""
 
     def __init__(self, nc: ForeignNc, answers: str = "y\n", question: int = 1) -> None:
         super().__init__(answers)

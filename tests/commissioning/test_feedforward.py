@@ -1,4 +1,4 @@
-"""Speed and torque offset: commissioned on a drive that maps and takes them as meant, refused by name on any other."""
+"""Speed and torque offset: commissioned on a drive that applies them correctly, refused by name on any other."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NOT_VALID = 0x80000401
 
 
 class Spoilt(DrivePeer):
-    """A drive in front of which ``spoil`` changes, answers (a list of frames) or swallows (None) what it is sent."""
+    """A drive whose received frames ``spoil`` changes, answers (a list of frames) or drops (None)."""
 
     spoil: Callable[[int, bytes], bytes | Frames | None] = staticmethod(lambda _id, data: data)
 
@@ -29,11 +29,11 @@ class Spoilt(DrivePeer):
         return changed or []
 
     def rpdo(self) -> int:
-        """The COB-ID of the RPDO with both offsets."""
+        """COB-ID of the RPDO with both offsets."""
         return self.drive.dictionary.number(0x1402, 1)
 
     def held(self) -> tuple[int, int]:
-        """Speed and torque offset in force."""
+        """Active speed and torque offset."""
         return self.drive.dictionary.number(0x60B1), self.drive.dictionary.number(0x60B2)
 
 
@@ -83,14 +83,13 @@ def keeps_it(can_id: int, data: bytes) -> bytes | None:
 
 
 def aborts(can_id: int, data: bytes) -> bytes | Frames:
-    """Any download to 0x1402 is refused: unsupported access."""
     if can_id == 0x601 and data[0] >> 5 == 1 and data[1:3] == b"\x02\x14":
         return [(0x581, b"\x80" + data[1:4] + (0x06010000).to_bytes(4, "little"))]
     return data
 
 
 def ignores(can_id: int, data: bytes) -> bytes | Frames:
-    """Any download to 0x1402 is confirmed and forgotten."""
+    """Confirm a download to 0x1402 without executing it."""
     if can_id == 0x601 and data[0] >> 5 == 1 and data[1:3] == b"\x02\x14":
         return [(0x581, b"\x60" + data[1:4] + bytes(4))]
     return data
@@ -115,7 +114,7 @@ def test_a_drive_that_takes_them_otherwise_is_refused_by_name_and_left_as_it_was
     with pytest.raises(DriveFault, match="FeedforwardOff: ") as caught:
         commission(settings, "X")
     assert says in str(caught.value)
-    assert "leave [axis.X.feedforward] out" in str(caught.value)
+    assert "remove [axis.X.feedforward]" in str(caught.value)
     assert drive.rpdo() == NOT_VALID
     assert drive.held() == (0, 0)
     assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
@@ -127,7 +126,7 @@ def test_another_mapping_is_refused_before_anything_is_written(
 ) -> None:
     drive, settings = peer
     drive.drive.remap(0x1602, entries)
-    with pytest.raises(DriveFault, match=r"FeedforwardOff: its RPDO3 maps .* where 60B1 and 60B2 belong"):
+    with pytest.raises(DriveFault, match=r"FeedforwardOff: its RPDO3 maps .* instead of 60B1 and 60B2"):
         commission(settings, "X")
     assert drive.rpdo() == NOT_VALID
     assert not {0x000, 0x080, 0x401} & set(drive.heard)

@@ -1,4 +1,4 @@
-"""Another master in the middle of what fdhil does on a bus: noticed within a few SYNC, and the drives are at rest."""
+"""Another master during fdhil's actions on a bus: it is detected within a few SYNC, and the drives are stopped."""
 
 from __future__ import annotations
 
@@ -51,8 +51,6 @@ pytestmark = pytest.mark.usefixtures("quick_commissioning")
 
 @dataclass(frozen=True)
 class Rig:
-    """A simulated drive on a bus of this process, and its configuration."""
-
     peer: DrivePeer
     config: MachineConfig
 
@@ -60,13 +58,13 @@ class Rig:
         return ForeignNc(self.config.bus["can0"].channel, FOREIGN[what], when, often)
 
     def require_left_alone(self, nc: ForeignNc, what: str, braking: int = 0) -> None:
-        """What fdhil sent beside the other master: a few SYNC, and the drive at rest or left to it."""
+        """fdhil may send only a few SYNC after the other master, and the drive must be stopped or left to it."""
         assert nc.on
         assert nc.count(OFFSET) <= A_FEW + braking
         assert nc.count(SYNC) <= A_FEW + braking
         assert nc.count(TARGET) <= A_FEW + braking
         assert nc.count(NMT) == 0
-        assert nc.count(SDO) <= 1  # it was under way
+        assert nc.count(SDO) <= 1  # it was in flight
         assert nc.count(HEARTBEAT) <= 2
         if what in LEFT_TO_IT:
             assert nc.count(LEFT_TO_IT[what]) <= 1
@@ -78,7 +76,7 @@ class Rig:
             assert self.holds(lambda: self.peer.drive.power.state.name in off)
 
     def holds(self, condition: Callable[[], bool]) -> bool:
-        """Whether it is true when the simulated drive has taken its frames."""
+        """Whether the condition holds after the simulated drive has processed its frames."""
         time.sleep(0.01)
         return condition()
 
@@ -114,7 +112,6 @@ def rapid(master: Master) -> None:
 
 
 def held_while_asked(master: Master) -> None:
-    """The operator looks at the axis, and thinks about it."""
     master.loop._landed.wait(60)
     steps.ramp(master, 33, 1)
 
@@ -137,7 +134,6 @@ STEPS: dict[str, tuple[Callable[[Master], None], Callable[[Frame], bool], int]] 
 
 
 def led_through(config: MachineConfig, step: Callable[[Master], None]) -> None:
-    """A step as a commissioning runs it."""
     with Master(config, "X") as master, steps.rolled_back(master):
         steps.prepare(master)
         steps.enable(master)
@@ -152,10 +148,10 @@ def test_another_master_ends_a_step_within_a_few_sync(step: str, what: str, rig:
             led_through(rig.config, done)
         rig.require_left_alone(nc, what, braking)
     left = {
-        "target": "axis X was left to it, its offset taken to zero",
+        "target": "axis X was left to that master, its offset set to zero",
         "offset": "X was stopped and its drive switched off, and may hold an offset of that master: power it off",
     }
-    assert left.get(what, "X was stopped, its offset taken to zero and its drive switched off") in str(told.value)
+    assert left.get(what, "X was stopped, its offset set to zero and its drive switched off") in str(told.value)
     assert ("0x1016 may be as fdhil wrote" in str(told.value)) is (step in ("watchdog test", "rapid"))
 
 
@@ -205,7 +201,7 @@ def test_a_record_holds_where_an_nc_comes_while_a_guard_starts(rig: Rig, monkeyp
 
 
 def test_a_heartbeat_like_ours_ends_the_watchdog_test(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another fdhil, on another computer: the drive would not notice that ours has stopped."""
+    """From another fdhil on another computer: the drive would not detect that this one's has stopped."""
     monkeypatch.setitem(FOREIGN, "heartbeat", (HEARTBEAT, b"\x05"))
     with rig.nc("heartbeat", is_heartbeat) as nc:
         with pytest.raises(ForeignMaster, match=r"an NC is sending with identifiers of fdhil; .* COB-ID 764"):
@@ -214,7 +210,7 @@ def test_a_heartbeat_like_ours_ends_the_watchdog_test(rig: Rig, monkeypatch: pyt
 
 
 def test_a_drive_that_an_nc_stops_and_starts_is_left_without_an_offset(rig: Rig) -> None:
-    """An NC stops the nodes first, sets them up, and starts them: what is sent meanwhile no drive takes."""
+    """An NC first stops the nodes, sets them up and starts them; meanwhile drives ignore all frames."""
     channel = rig.config.bus["can0"].channel
 
     def stop_and_start() -> None:
@@ -232,7 +228,7 @@ def test_a_drive_that_an_nc_stops_and_starts_is_left_without_an_offset(rig: Rig)
         master.wait_cycles(10_000)
 
     zeroed, thread = threading.Event(), threading.Thread(target=stop_and_start)
-    with pytest.raises(ForeignMaster, match=r"NMT commands; .* axis X was left to it, its offset taken to zero"):
+    with pytest.raises(ForeignMaster, match=r"NMT commands; .* axis X was left to that master, its offset set to zero"):
         led_through(rig.config, hold)
     assert rig.holds(lambda: rig.peer.drive.dictionary.number(0x60B0) == 0)
     zeroed.set()
@@ -253,7 +249,7 @@ def test_a_drive_that_an_nc_stops_for_good_may_hold_an_offset_and_that_is_report
 
 
 def test_no_frame_leaves_before_the_bus_was_listened_to(rig: Rig) -> None:
-    """Where a connection is opened next to an NC nothing has been received yet."""
+    """A connection opened next to an NC has not received anything yet."""
     with rig.nc("SYNC", lambda _frame: True) as nc:
         nc.on = True
         with Master(rig.config, "X") as master, pytest.raises(ForeignMaster):

@@ -101,7 +101,7 @@ def test_pins_and_gains_are_taken_from_the_files(tmp_path: Path) -> None:
     told = "\n".join(draft.notes)
     assert "the card measures no current" in told
     assert "position is that of the pulses" in told
-    assert "switch this loop off" not in told
+    assert "remove this loop" not in told
 
 
 def test_a_pid_that_commands_current_has_its_gains_converted(tmp_path: Path) -> None:
@@ -176,15 +176,15 @@ def test_a_component_that_is_loaded_already_is_named(tmp_path: Path) -> None:
     nc.hal.loaded.add("limit3")
     _, config = made(tmp_path, nc, answers(correction={}))
     text = correction_hal(config, "mill.toml", nc.joint_count, splices_of(nc.hal, nc.joints, "X"), nc.hal)
-    assert "# limit3 is loaded by your HAL files already" in text
+    assert "# Your HAL files already load limit3" in text
 
 
 @pytest.mark.parametrize(
     ("hal", "text"),
     [
         ("net x joint.0.motor-pos-cmd => joint.0.motor-pos-fb\n", "commands no drive"),
-        ("net x joint.0.motor-pos-cmd => pid.0.command\n", "joint.0.motor-pos-fb is on no signal"),
-        ("", "joint.0.motor-pos-cmd is on no signal"),
+        ("net x joint.0.motor-pos-cmd => pid.0.command\n", "joint.0.motor-pos-fb is not connected"),
+        ("", "joint.0.motor-pos-cmd is not connected"),
     ],
 )
 def test_a_joint_that_offsets_cannot_reach_is_refused_by_its_pin(hal: str, text: str) -> None:

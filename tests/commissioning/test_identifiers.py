@@ -1,4 +1,4 @@
-"""A drive whose PDO has the identifier of another node is refused before a frame leaves, wherever that is from."""
+"""A drive whose PDO has another node's COB-ID is refused before a frame is sent."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ MAPPED = {
 
 
 def dcf_of_node_5(folder: Path, offset_rpdo: int) -> Path:
-    """Return a DCF of node 5 with a fixed mapping, whose COB-IDs are absolute; RPDO2 carries the offset."""
+    """Write a DCF of node 5 with a fixed mapping and absolute COB-IDs; RPDO2 carries the offset."""
     variables: list[Variable] = [*COMMON, *OFFSETS, *CURRENT, *pdos(4, 2, "ro", MAPPED)]
     lines = ["[DeviceComissioning]", "NodeID=5"]
     for line in eds_text(
@@ -90,7 +90,9 @@ def test_guard_of_a_dcf_sends_what_the_file_says(tmp_path: Path) -> None:
 )
 def test_guard_is_refused_that_would_send_what_is_in_use(offset_rpdo: int, whose: str, tmp_path: Path) -> None:
     config = config_of(tmp_path, offset_rpdo, "XY", node_id=9)
-    with pytest.raises(ConfigError, match=f"COB-ID {offset_rpdo:03X} is the guard's, .* that of {whose}"):
+    with pytest.raises(
+        ConfigError, match=f"COB-ID {offset_rpdo:03X}, with which the guard sends offsets, also belongs to {whose}"
+    ):
         settings_of(config, "can0", tmp_path, "")
 
 
@@ -102,7 +104,7 @@ def test_identifier_of_a_node_that_is_heard_is_in_use(tmp_path: Path) -> None:
         assert clash is not None, hex(heard)
         assert (
             clash.cause
-            == "its RPDO2 has the COB-ID 309, which is that of RPDO2 of node-ID 9, which was heard on the bus"
+            == "its RPDO2 has the COB-ID 309, which belongs to RPDO2 of node-ID 9, which was received on the bus"
         )
     assert find_clash(config, "X", [0x609, 0x309 | 0x80000000, 0x18A]) is None
 
@@ -116,7 +118,7 @@ def test_axes_of_one_device_share_no_identifier() -> None:
 
 
 def test_nothing_is_sent_to_a_drive_whose_identifiers_are_anothers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A node that is not configured answers to 0x301: its heartbeat is heard while the drive is off."""
+    """A node that is not configured uses 0x301: its heartbeat is received while the drive is off."""
     settings = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex}, guard={"clock": "sync"})
     plain = load_profile(settings.axis["X"].drive)
     moved = replace(plain, rpdos=(plain.rpdos[0], replace(plain.rpdos[1], cob_base=0x308)))
@@ -126,7 +128,7 @@ def test_nothing_is_sent_to_a_drive_whose_identifiers_are_anothers(monkeypatch: 
         points = {each.point: each for each in survey(master).findings}
         assert points[POINT].ok is False
         drive.heard.clear()
-        with pytest.raises(DriveFault, match="its RPDO2 has the COB-ID 309, which is that of RPDO2 of node-ID 9"):
+        with pytest.raises(DriveFault, match="its RPDO2 has the COB-ID 309, which belongs to RPDO2 of node-ID 9"):
             set_up_pdos(master)
         assert drive.heard == []
 
@@ -139,7 +141,7 @@ def test_commissioning_is_refused_beside_the_owner_of_an_identifier(monkeypatch:
     monkeypatch.setattr("fdhil.commissioning.identifiers.load_profile", lambda _drive: elsewhere)
     with (
         DrivePeer(settings) as drive,
-        pytest.raises(DriveFault, match="its RPDO1 has the COB-ID 202, which is that of"),
+        pytest.raises(DriveFault, match="its RPDO1 has the COB-ID 202, which belongs to"),
     ):
         commission(settings, "X")
     assert drive.heard == []
@@ -156,6 +158,6 @@ def test_guard_does_not_start_beside_the_owner_of_an_identifier(tmp_path: Path) 
         heard = can.Message(arbitration_id=0x709, data=b"\x05", is_extended_id=False)
         sender = bus.send_periodic(heard, 0.02)
         patch.setattr("fdhil.commissioning.compare.LISTEN_S", 0.3)
-        with pytest.raises(ConfigError, match="RPDO2 of node-ID 9, which was heard on the bus"):
+        with pytest.raises(ConfigError, match="RPDO2 of node-ID 9, which was received on the bus"):
             compare_again(config, "can0", lambda _text: None)
         sender.stop()

@@ -1,4 +1,4 @@
-"""What LinuxCNC's own INI and HAL files tell; with the package installed, all of its sample machines are read."""
+"""Import of LinuxCNC's INI and HAL files; with the package installed, all of its sample machines are read."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_a_rotary_axis_is_read_in_degrees_and_the_second_joint_of_a_gantry_as_a_
     assert {axis: scale.increments_per_unit for axis, scale in found.scales.items()} == {
         "X": 1000.0, "Y": -819.2, "Y2": 819.2, "A": 8192.0
     }  # fmt: skip
-    assert found.notes == ["LinuxCNC lets go A -720 to 720 deg: give `fdhil commission --room` no more than that"]
+    assert found.notes == ["LinuxCNC allows A -720 to 720 deg: do not exceed that with `fdhil commission --room`"]
 
 
 def test_wrapped_rotary_axis_is_told(tmp_path: Path) -> None:
@@ -151,23 +151,23 @@ def test_inches_become_millimetres(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("KINEMATICS = trivkins", "KINEMATICS = trivkins coordinates=yyy", "axis Y has a third joint, 2: left out"),
-        ("KINEMATICS = trivkins", "KINEMATICS = trivkins coordinates=XYA", "axis A is rotary and left out: correct"),
+        ("KINEMATICS = trivkins", "KINEMATICS = trivkins coordinates=yyy", "axis Y has a third joint, 2: ignored"),
+        ("KINEMATICS = trivkins", "KINEMATICS = trivkins coordinates=XYA", "axis A is rotary and ignored: correct"),
         ("COORDINATES = X Y Z", "COORDINATES = X Y B", "axis B is joint 4 of trivkins without coordinates=, and there"),
-        ("[AXIS_Z]\nMAX_VELOCITY = 100", "[AXIS_Z]", "axis Z: [AXIS_Z] has no MAX_VELOCITY, so that LinuxCNC takes 1"),
-        ("MAX_VELOCITY = 550", "MAX_VELOCITY = 450", "does not keep it in programmed moves; make both equal"),
-        ("FERROR = 5", "FERROR = 5\n[AXIS_X]\nMAX_VELOCITY = 9", "[AXIS_X] stands in the INI again"),
+        ("[AXIS_Z]\nMAX_VELOCITY = 100", "[AXIS_Z]", "axis Z: [AXIS_Z] has no MAX_VELOCITY, so LinuxCNC uses 1"),
+        ("MAX_VELOCITY = 550", "MAX_VELOCITY = 450", "ignores it in programmed moves; make both equal"),
+        ("FERROR = 5", "FERROR = 5\n[AXIS_X]\nMAX_VELOCITY = 9", "[AXIS_X] occurs twice in the INI"),
         ("COORDINATES = X Y Z", "COORDINATES = X Y Z\nPLANNER_TYPE = 1\nMAX_LINEAR_JERK = 9000", "S-curve planner of"),
         ("COORDINATES = X Y Z", "COORDINATES = X Y Z\nPLANNER_TYPE = 1\nMAX_LINEAR_JERK = 0.5", "trapezoidal planner"),
         ("COORDINATES = X Y Z", "COORDINATES = X Y Z\nPLANNER_TYPE = 7", "PLANNER_TYPE 7 is unknown"),
-        ("KINEMATICS = trivkins", "KINEMATICS = xyzac-trt-kins", "takes each joint for the axis of its place"),
-        ("FERROR = 5", "FERROR = 5\nBACKLASH = 0.02", "leave that on: fdhil sees it in the demand"),
+        ("KINEMATICS = trivkins", "KINEMATICS = xyzac-trt-kins", "fdhil assigns the joints to the axes in the order"),
+        ("FERROR = 5", "FERROR = 5\nBACKLASH = 0.02", "leave that on: the demand contains it"),
         ("FERROR = 5", "FERROR = 5\nMIN_FERROR = 0.1", "an offset is a following error to LinuxCNC"),
-        ("[AXIS_X]", "[AXIS_X]\nOFFSET_AV_RATIO = 0.2", "keep them off while a correction is armed"),
+        ("[AXIS_X]", "[AXIS_X]\nOFFSET_AV_RATIO = 0.2", "do not use them while a correction is armed"),
         (
             "[JOINT_0]",
             "MAX_LIMIT=250\n[JOINT_0]\nMIN_LIMIT=-9\nMAX_LIMIT=300",
-            "lets go X -9 to 250 mm: give",
+            "allows X -9 to 250 mm: do not exceed",
         ),
         ("HALFILE = drives.hal", "HALFILE = drives.tcl", "HALFILE drives.tcl was not read"),
         ("HALFILE = drives.hal", "HALFILE = lost.hal", "HALFILE lost.hal was not read (No such file or directory)"),
@@ -207,7 +207,7 @@ MAX_VELOCITY=100
 
 @pytest.mark.parametrize(
     ("traj", "x", "y", "limits"),
-    [  # path, then speed and acceleration of X and Y that LinuxCNC 2.9 reaches with these files
+    [  # path speed, then speed and acceleration of X and Y in LinuxCNC 2.9 with these files
         ("MAX_LINEAR_VELOCITY=100", "", "", (100.0, 100.0, 2000.0, 100.0, 2000.0)),
         ("MAX_LINEAR_VELOCITY=100\nMAX_LINEAR_ACCELERATION=100", "", "", (100.0, 100.0, 2000.0, 100.0, 2000.0)),
         (
@@ -268,7 +268,7 @@ def test_a_position_loop_is_found_under_any_name_and_behind_a_chain(hal: str, lo
 
 
 def test_a_loop_that_the_command_does_not_reach_is_no_position_loop(tmp_path: Path) -> None:
-    """A spindle's, and one that is fed by the position only."""
+    """A spindle's loop, and one that gets only the position."""
     hal = "loadrt pid names=spindle,other\nnet s motion.spindle-speed-out => spindle.command\n"
     hal += "net y joint.1.motor-pos-cmd => sum2.y.in0\nnet fb sum2.y.out => other.feedback\n"
     assert machine(tmp_path, drives=HAL_TEXT + hal).notes == []
@@ -278,17 +278,17 @@ def test_a_position_loop_in_hal_is_noted_with_its_gains(tmp_path: Path) -> None:
     loop = "net y joint.1.motor-pos-cmd => pid.y.command\nsetp pid.y.Pgain 40\nsetp pid.y.FF1 1\n"
     (note,) = machine(tmp_path, drives=HAL_TEXT + loop).notes
     assert "HAL's pid.y closes the position loop (Pgain 40, FF1 1)" in note
-    assert "switch this loop off" in note
+    assert "remove this loop" in note
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "TRAJ.COORDINATES: names no linear axis"),
-        ("[AXIS_0]\nSCALE = 1", "is of a LinuxCNC before 2.8"),
+        ("", "TRAJ.COORDINATES: has no linear axis"),
+        ("[AXIS_0]\nSCALE = 1", "is for LinuxCNC before 2.8"),
         (INI.replace("= mm", "= cubit"), "TRAJ.LINEAR_UNITS: is 'cubit'"),
         ("#INCLUDE lost.inc", r"lost.inc cannot be read: No such file"),
-        ("#INCLUDE mill.ini", "include each other without end"),
+        ("#INCLUDE mill.ini", "include each other endlessly"),
     ],
 )
 def test_files_that_tell_no_machine_are_refused(text: str, words: str, tmp_path: Path) -> None:
@@ -333,5 +333,5 @@ def test_all_sample_machines_of_the_package_are_read_or_refused_by_name() -> Non
             read += 1
             assert found.axes
     assert read > 250
-    named = ("COORDINATES", "before 2.8", "nosuchfile")  # robots, old files, and one that includes what is not there
+    named = ("COORDINATES", "before 2.8", "nosuchfile")  # robots, old files, and one with a missing include
     assert [text for text in refused if not any(word in text for word in named)] == []

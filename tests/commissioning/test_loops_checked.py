@@ -1,4 +1,4 @@
-"""Whether the regulators in the configuration are those that the drive's rapids showed last."""
+"""The configured control loops are compared with those identified from the drive's last rapids."""
 
 from __future__ import annotations
 
@@ -19,14 +19,13 @@ DIFFER = Reason("LoopsDiffer", "the configured regulators leave 34 um", "write t
 
 
 def loops(*warnings: Reason) -> LoopEstimate:
-    """Loops with a position gain that is 10 % off, believed."""
     verdict = Verdict(True, None, (), 0.3, warnings)
     return LoopEstimate("X", "p_pi_pi", ("position_gain_per_s",), frozen([55.0]), frozen(np.eye(1)), verdict, 34.0)
 
 
 def test_what_the_rapids_showed_is_compared_with_the_configuration(tmp_path: Path) -> None:
     config = configuration.parse(bench_document() | {"store": {"directory": str(tmp_path)}})
-    assert not list(compare_loops(config, "X"))  # nothing is known yet
+    assert not list(compare_loops(config, "X"))  # before the first identification
     for found, same in ((loops(), True), (loops(DIFFER), False)):
         history = History.open(tmp_path)
         history.add_loops(found, Stamp(0.0, "boot-1", 1))

@@ -1,4 +1,4 @@
-"""Motions of a simulated drive: to their end, and braked by whatever ends them."""
+"""Motions of a simulated drive: played to their end, and braked on every interruption."""
 
 from __future__ import annotations
 
@@ -19,12 +19,10 @@ from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
 
 pytestmark = pytest.mark.usefixtures("quick_commissioning")
-SPEED_MM_S, ACCELERATION_MM_S2 = 20.0, 4000.0  # so slow that a host that is held up for a second changes nothing
+SPEED_MM_S, ACCELERATION_MM_S2 = 20.0, 4000.0  # slow enough that a delay of the host by a second changes nothing
 
 
 class Enabled:
-    """A simulated drive in Operation enabled, with its master and its bounds."""
-
     def __init__(self, peer: DrivePeer, config: MachineConfig, master: Master) -> None:
         self.peer, self.master = peer, master
         self.bounds = Bounds.of("X", config.axis["X"], config.machine.sync_period_s, (-50.0, 50.0), SPEED_MM_S)
@@ -90,5 +88,9 @@ def test_a_drive_that_trips_ends_the_motion(enabled: Enabled) -> None:
 
 def test_nothing_is_moved_that_is_not_held() -> None:
     config = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
-    with Master(config, "X") as master, pytest.raises(DriveFault, match="nothing is held"), following([master], []):
+    with (
+        Master(config, "X") as master,
+        pytest.raises(DriveFault, match="it holds no position"),
+        following([master], []),
+    ):
         pass

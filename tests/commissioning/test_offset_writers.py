@@ -1,4 +1,4 @@
-"""An RPDO of the drive that writes the offset and is not ours is found and refused, whatever its number and COB-ID."""
+"""A foreign RPDO of the drive that writes the offset is detected and refused, whatever its number and COB-ID."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def peer() -> Iterator[tuple[DrivePeer, MachineConfig]]:
 
 
 def give_rpdo(peer: DrivePeer, number: int, cob_id: int, words: Sequence[int], count: int | None = None) -> None:
-    """Give the drive an RPDO as another master would have set it up; its places are made of those of the fourth."""
+    """Give the drive an RPDO as another master would set it up, with object indices derived from the fourth's."""
     dictionary = peer.drive.dictionary
     for base in (0x1403, 0x1603):
         index = base + number - 4
@@ -167,7 +167,6 @@ def test_record_keeps_the_other_rpdos(peer: tuple[DrivePeer, MachineConfig]) -> 
 
 
 def test_record_is_void_where_a_second_writer_was_set_up_since(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before the guard starts, with the NC off, by SDO."""
     monkeypatch.setattr("fdhil.commissioning.compare.LISTEN_S", 0.2)
     settings, told = corrected(tmp_path), list[str]()
     with DrivePeer(settings) as drive:
@@ -194,7 +193,6 @@ def test_guard_is_told_the_cob_ids_of_the_record(tmp_path: Path) -> None:
 
 
 def test_bit_30_of_a_cob_id_says_nothing_of_an_rpdo(tmp_path: Path) -> None:
-    """Drives report it or not; the guard hears the same identifiers."""
     settings = corrected(tmp_path)
     kept = {"1403": 0x4000_0501, "1404": 0xC000_0333}
     save_record(replace(RECORD, options=kept), settings.store.directory)
@@ -222,7 +220,6 @@ def test_drive_of_another_bus_makes_no_identifier_harmless(tmp_path: Path) -> No
 
 
 def test_rpdo_of_29_bits_is_none_of_the_profiles(peer: tuple[DrivePeer, MachineConfig]) -> None:
-    """The drive does not take the guard's frames."""
     drive, settings = peer
     drive.drive.dictionary.numbers[0x140101] = 0x2000_0301
     findings = {each.point: each for each in surveyed(settings)[0].findings}
@@ -231,7 +228,7 @@ def test_rpdo_of_29_bits_is_none_of_the_profiles(peer: tuple[DrivePeer, MachineC
 
 
 def heard(held: int, frames: Mapping[int, bytes]) -> Traffic:
-    """What is heard of a drive that holds an offset, beside an NC that sends these frames, too."""
+    """Build the traffic of a drive with an offset while an NC also sends these frames."""
     sent = {0x381: struct.pack("<ii", held + 7, held), 0x201: struct.pack("<Hi", 15, 7), **frames}
     data = {cob_id: int.from_bytes(frame.ljust(8, b"\0"), "little") for cob_id, frame in sent.items()}
     return Traffic(count=dict.fromkeys(sent, 9), length={key: len(frame) for key, frame in sent.items()}, data=data)
@@ -245,13 +242,12 @@ def heard(held: int, frames: Mapping[int, bytes]) -> Traffic:
         (197, {0x3F0: struct.pack("<i", 198), 0x3F1: b"\xc5\0\0"}, ""),
         (197, {0x601: struct.pack("<i", 197), 0x301: struct.pack("<i", 197)}, ""),
         (1, {0x3F0: b"\1\0\0\0"}, ""),
-        (197, {0x501: struct.pack("<i", 197)}, ""),  # by its record this one writes something else
+        (197, {0x501: struct.pack("<i", 197)}, ""),  # according to the record it writes another object
     ],
 )
 def test_frame_that_carries_the_offset_of_a_drive_makes_its_record_void(
     held: int, frames: Mapping[int, bytes], found: str, tmp_path: Path
 ) -> None:
-    """With the NC on nothing is asked."""
     record = replace(RECORD, options={"1403": 0x4000_0501, "1404": 0x8000_03F0})
     settings, traffic = corrected(tmp_path), heard(held, frames)
     finding = compare_heard_writers(settings, "X", record, traffic)
@@ -269,7 +265,7 @@ def test_record_is_void_where_a_frame_beside_the_nc_carries_the_offset(
     traffic = heard(197, {0x3F0: struct.pack("<i", 197)})
     monkeypatch.setattr("fdhil.commissioning.compare._listen", lambda *_: traffic)
     compare_again(settings, "can0", told.append)
-    assert "nothing can be armed or adopted there" in told[0]
+    assert "the axis cannot be armed or adopted" in told[0]
     assert is_void(settings.store.directory, "X")
 
 
@@ -295,12 +291,12 @@ def own_profile(folder: Path, entries: str) -> dict[str, Any]:
         (
             "[[0x6078, 0, 32, true], [0x6041, 0, 16, false]]",
             [(0x6078, 0, 32), (0x6041, 0, 16)],
-            "6078:00 has 16 bits (by SDO), and TPDO2 maps it with 32",
+            "6078:00 has 16 bits (by SDO), but TPDO2 maps it with 32",
         ),
         (
             "[[0x6041, 0, 8, false], [0x6078, 0, 16, true]]",
             [(0x6041, 0, 8), (0x6078, 0, 16)],
-            "6041:00 has 16 bits (by SDO), and TPDO2 maps it with 8",
+            "6041:00 has 16 bits (by SDO), but TPDO2 maps it with 8",
         ),
     ],
 )
@@ -312,7 +308,7 @@ def test_object_that_is_mapped_in_another_size_is_found(
         drive.drive.remap(0x1A01, mapped)
         drive.drive.remap(0x1A03, [(0x6061, 0, 8)])
         findings = {each.point: each for each in survey(master).findings}
-    assert findings["TPDO2"].ok is True  # drive and profile agree, and are both wrong
+    assert findings["TPDO2"].ok is True  # drive and profile agree but are both wrong
     assert findings["object sizes"].ok is False
     assert says in findings["object sizes"].cause
 

@@ -1,4 +1,4 @@
-"""The PDOs of a drive are written as its profile has them, or stay as they were."""
+"""A drive's PDOs are written according to its profile, or remain unchanged."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_what_differs_is_written(what: str, peer: tuple[DrivePeer, MachineConfig
 
 
 def test_type_of_a_fixed_mapping_is_set(peer: tuple[DrivePeer, MachineConfig]) -> None:
-    """A drive that refuses every write to its mappings, as its EDS says: its transmission types can be written."""
+    """The drive refuses every write to its mappings, as in its EDS, but accepts transmission types."""
     drive, settings = peer
     entries = drive.drive.dictionary.entries
     fixed = {key: replace(entry, access="ro") for key, entry in entries.items() if 0x1600 <= key >> 8 < 0x1800}

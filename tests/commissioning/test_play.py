@@ -1,4 +1,4 @@
-"""fdhil play against simulated drives inside this process: played, refused, braked."""
+"""fdhil play with simulated drives in this process: played, refused, braked."""
 
 from __future__ import annotations
 
@@ -48,8 +48,6 @@ STROKE = "G21 G90 G94\nG1 X12 Y5 F6000\nG1 X20 Y0\nM2\n"
 
 @dataclass
 class Floor:
-    """Two simulated drives on a bus, their commissioned config, and a folder."""
-
     folder: Path
     path: Path
     config: MachineConfig
@@ -69,7 +67,7 @@ class Floor:
         return {can_id for peer in self.peers.values() for can_id in peer.heard}
 
     def off(self) -> bool:
-        """The drives are off, and what they watched before they watch again."""
+        """The drives are off, and their heartbeat consumers are restored."""
         drives = [peer.drive for peer in self.peers.values()]
         return all(
             drive.power.state.name in ("SWITCH_ON_DISABLED", "FAULT")
@@ -78,8 +76,6 @@ class Floor:
         )
 
     def while_it_plays(self, act: Callable[[], None], mm: float = 0.5) -> threading.Thread:
-        """Act as soon as X has gone so far."""
-
         def wait() -> None:
             while self.peers["X"].drive.table_mm < mm:
                 time.sleep(0.001)
@@ -122,7 +118,7 @@ def test_a_demand_is_played_to_its_end_from_the_start_that_is_gone_to_when_asked
     assert said["sync"]["cycles"] >= said["rows"]
     assert floor.table_mm() == pytest.approx([2.0, 0.0], abs=0.02)
     assert floor.off()
-    # SYNC, NMT, SDO, its heartbeat and the targets; the offsets are the guard's
+    # SYNC, NMT, SDO, heartbeat and targets; only the guard sends offsets
     assert floor.sent() - DRIVES <= {0x000, 0x080, 0x601, 0x602, 0x201, 0x202, 0x765}
 
 
@@ -151,7 +147,7 @@ def test_a_drive_that_trips_stops_the_others(floor: Floor) -> None:
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.fault("A23")
 def test_a_drive_that_boots_while_it_plays_is_not_vouched_for(floor: Floor) -> None:
-    """A daemon marks both: of X it heard the boot-up, of Y what play writes to it."""
+    """A daemon marks both: X for its boot-up, Y for the writes of play."""
 
     def boot() -> None:
         for axis in "XY":
@@ -168,7 +164,7 @@ def test_a_drive_that_boots_while_it_plays_is_not_vouched_for(floor: Floor) -> N
     guard.close()
     assert code == 0, err
     told = [request for request in guard.requests if request.get("axes")]
-    assert [sorted(request["axes"]) for request in told] == [["X", "Y"], ["Y"]]  # when it begins, and at its end
+    assert [sorted(request["axes"]) for request in told] == [["X", "Y"], ["Y"]]  # at its start and at its end
     assert [request["touched"] for request in told] == [{"X": 4, "Y": 5}] * 2
     assert [is_void(floor.config.store.directory, axis) for axis in "XY"] == [True, False]
     assert "RecordVoid: axis X: its drive rebooted after the comparison" in err
@@ -197,7 +193,6 @@ def test_nothing_is_sent_beside_an_nc(floor: Floor) -> None:
 
 
 def refused(floor: Floor, text: str = STROKE, *options: str) -> str:
-    """What it says; nothing moved."""
     code, said, _ = floor.play(text, *options)
     assert code == 1
     assert floor.table_mm() == pytest.approx([0.0, 0.0], abs=1e-3)
@@ -220,17 +215,16 @@ def test_what_leaves_the_travel_is_refused_before_a_bus_is_opened(floor: Floor) 
     code, said, _ = floor.play(STROKE, "--dry-run")
     assert (code, said["would_play"]) == (0, True)
     text = refused(floor, "G21 G90 G94\nG1 X70 F6000\nM2\n", "--yes")
-    assert "axis X: from a set-point it could not be braked inside its travel (row " in text
+    assert "axis X: it could not be braked inside its travel (row " in text
     assert "nothing was sent" in text
     floor.path.write_text(floor.path.read_text().replace("[axis.Y.setpoints]\ntravel_mm = [-20.0, 60.0]\n", ""))
     code, _, err = fdhil("play", floor.folder / "part.ngc", "--config", floor.path, "--yes", capsys=floor.capsys)
     assert code == 2
-    assert "axis.Y.setpoints: fdhil may send this axis no set-points" in err
+    assert "axis.Y.setpoints: is missing, so fdhil may not move this axis" in err
     assert floor.sent() <= DRIVES
 
 
 def leave_socket(folder: Path) -> None:
-    """What a guard that was killed leaves behind."""
     folder.mkdir(parents=True)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as killed:
         killed.bind(str(folder / "guard.sock"))
@@ -248,7 +242,7 @@ def test_another_master_ends_what_is_played(what: str, floor: Floor) -> None:
         assert nc.count(SDO) <= 1
         assert what != "target" or nc.count(TARGET) == 0
     assert code == 1
-    left = "axis X was left to it, and axis Y was stopped and its drive switched off"
+    left = "axis X was left to that master, and axis Y was stopped and its drive switched off"
     assert "bus can0: an NC is sending" in document["stopped"]
     assert (left in document["stopped"]) is (what == "target")
     assert "0x1016 may be as fdhil wrote" in document["stopped"]
@@ -277,7 +271,7 @@ def test_axes_that_are_held_at_the_start_are_switched_off_where_an_nc_comes(
 
 @pytest.mark.usefixtures("long_computation")
 def test_play_ends_where_an_nc_came_before_the_path_began(floor: Floor, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between the way to the start and the demand: the drives are off before the path is made."""
+    """Between the move to the start and the demand the drives are off before the path is created."""
     nc = ForeignNc(floor.config.bus["can0"].channel, FOREIGN["SYNC"], lambda _: False)
 
     def prepared_late(bench: Bench, signals: Signals) -> Played:

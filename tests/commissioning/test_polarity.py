@@ -1,4 +1,4 @@
-"""A jog of a motor by its equations: whatever has a wrong sign or unit is named, whatever pulls at the axis."""
+"""A jog of a simulated motor: a wrong sign or unit is named, whatever load acts on the axis."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ R, K, J, FRICTION = 0.5, 0.8, 0.075, 5.0
 
 
 def jogged(weight_nm: float = 0.0, top_mm_s: float = 5.0, way_mm: float = JOG) -> Recording:
-    """Rows of a jog to and fro; ``weight_nm`` pulls at the axis all the time."""
+    """Samples of a jog back and forth; ``weight_nm`` acts on the axis all the time."""
     part = straight((0.0,), (way_mm,), (top_mm_s * DT,), (50.0 * top_mm_s / 5.0 * DT**2,), 20)[:, 0]
     rest = np.zeros(300)
     position = np.concatenate([rest, part, rest + way_mm, way_mm - part, rest])
@@ -60,14 +60,14 @@ WRONG: dict[str, tuple[Callable[[Recording], Recording], str]] = {
     ),
     "speed": (
         lambda r: replace(r, speed_rad_s=-r.speed_rad_s),
-        "its speed (0x606C) is -1 times what its position shows",
+        "its speed (0x606C) is -1 times the derivative of its position",
     ),
     "speed x 10": (lambda r: replace(r, speed_rad_s=r.speed_rad_s * 10), "its speed (0x606C) is 10 times"),
     "way": (
         lambda r: replace(r, position_mm=r.position_mm * 2),
-        "it was to go 5 mm and its position (0x6064) went 10.000",
+        "it was commanded 5 mm, but its position (0x6064) moved 10.000",
     ),
-    "no current": (lambda r: replace(r, current_a=r.current_a * 0), "come to nothing"),
+    "no current": (lambda r: replace(r, current_a=r.current_a * 0), "cancel out"),
 }
 
 
@@ -80,7 +80,7 @@ def test_what_is_wrong_is_named(what: str) -> None:
 
 @pytest.mark.fault("B10")
 def test_words_that_are_swapped_are_told() -> None:
-    """A float whose two words are swapped is noise of any size."""
+    """A float with swapped words is noise of any size."""
     jog = jogged()
     noise = frozen(np.random.default_rng(2).normal(size=jog.speed_rad_s.size) * 1e3)
     assert "SignOrScale: voltage times current" in causes(replace(jog, voltage_v=noise))
@@ -98,7 +98,7 @@ def test_a_slower_sensor_is_judged_too() -> None:
 
 def test_without_a_voltage_nothing_is_said_of_it() -> None:
     (voltage,) = [f for f in judge_jog(replace(jogged(), voltage_v=None), JOG, AXIS) if f.point == "voltage sign"]
-    assert (voltage.ok, voltage.cause) == (None, "no voltage was heard")
+    assert (voltage.ok, voltage.cause) == (None, "no voltage was recorded")
 
 
 def test_a_motor_takes_power_while_it_accelerates() -> None:
@@ -106,7 +106,7 @@ def test_a_motor_takes_power_while_it_accelerates() -> None:
     assert judge_acceleration(rapid).ok is True
     assert rapid.voltage_v is not None
     wrong = judge_acceleration(replace(rapid, voltage_v=frozen(-rapid.voltage_v)))
-    assert (wrong.ok, "J while it accelerated, which no motor does" in wrong.cause) == (False, True)
+    assert (wrong.ok, "J while it accelerated, which is impossible for a motor" in wrong.cause) == (False, True)
 
 
 def test_a_table_that_goes_another_way_is_told() -> None:
@@ -116,5 +116,5 @@ def test_a_table_that_goes_another_way_is_told() -> None:
     )
     assert [f.point for f in judge_jog(seen, JOG, AXIS) if f.ok][2] == "table"
     turned = replace(jog, table_mm=-jog.position_mm)
-    assert "its table goes -1 times the way of its motor" in causes(turned)
+    assert "its table moves -1 times the distance of its motor" in causes(turned)
     assert causes(replace(jog, table_mm=jog.position_mm * np.nan)) == ""

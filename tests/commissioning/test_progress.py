@@ -1,4 +1,4 @@
-"""What was proven is kept for the same drive and configuration alone, and only as it was written."""
+"""Completed steps are reused only for the same drive and configuration, and only from an unmodified file."""
 
 from __future__ import annotations
 
@@ -83,8 +83,8 @@ def test_a_file_that_is_not_ours_is_not_believed(spoil: Callable[[Path], None], 
     spoil(steps_path(tmp_path, "X"))
     progress = Progress(tmp_path, "X")
     assert progress.done() == {}
-    assert progress.doubt.startswith("commissioning-X.steps.json is not believed (")
-    assert progress.doubt.endswith("every step is done anew")
+    assert progress.doubt.startswith("commissioning-X.steps.json was rejected (")
+    assert progress.doubt.endswith("every step is repeated")
     progress.keep("sign test", "this drive", FOUND)
     assert Progress(tmp_path, "X").kept("sign test", "this drive") == FOUND
 

@@ -1,4 +1,4 @@
-"""The commissioning record: it comes back as it was or is refused; without the key nobody can make one."""
+"""The commissioning record is loaded unchanged or refused; without the key none can be made."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ def test_a_changed_record_is_refused(key: str, tmp_path: Path) -> None:
     document = json.loads(path.read_text())
     document[key] = {"6007": 0} if key == "options" else "other" if key != "serial" else 5
     path.write_text(json.dumps(document))
-    with pytest.raises(StoreError, match="changed after it was signed off"):
+    with pytest.raises(StoreError, match="modified after the sign-off"):
         load_record(tmp_path, "X")
 
 
 @pytest.mark.parametrize("seal", ["of no key", "of another key", "none", "no text", "not ASCII"])
 def test_a_record_made_without_the_key_is_refused(seal: str, tmp_path: Path) -> None:
-    """Everybody can compute the digest anew; the seal takes the key."""
+    """Anyone can recompute the digest; the seal needs the key."""
     path = save_record(RECORD, tmp_path)
     forged = replace(RECORD, watchdog="proven", options={"6007": 0})
     seals: dict[str, Any] = {"of no key": forged.seal(b""), "of another key": forged.seal(b"k" * 64), "none": None,
@@ -65,7 +65,7 @@ def test_a_record_of_the_time_before_the_key_asks_for_commissioning(tmp_path: Pa
     document = json.loads(path.read_text()) | {"schema": "fdhil-commissioning-1"}
     del document["seal"]
     path.write_text(json.dumps(document))
-    with pytest.raises(StoreError, match="before records were sealed with a key; commission the axis again"):
+    with pytest.raises(StoreError, match="predates sealed records; commission the axis again"):
         load_record(tmp_path, "X")
 
 
@@ -121,7 +121,7 @@ def test_who_may_not_read_the_key_believes_the_digest_alone_if_it_says_so(
 @pytest.mark.timeout(60)
 def test_a_pipe_in_the_place_of_a_record_is_none_and_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(record_path(tmp_path, "X"))
-    with pytest.raises(StoreError, match="is no commissioning record"):
+    with pytest.raises(StoreError, match="is not a commissioning record"):
         load_record(tmp_path, "X")
 
 
@@ -142,7 +142,7 @@ def test_the_key_may_lie_elsewhere(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_what_is_no_record_is_refused(text: str, tmp_path: Path) -> None:
     record_path(tmp_path, "X").write_text(text)
-    with pytest.raises(StoreError, match="is no commissioning record; commission the axis again"):
+    with pytest.raises(StoreError, match="is not a commissioning record; commission the axis again"):
         load_record(tmp_path, "X")
 
 

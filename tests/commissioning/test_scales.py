@@ -1,4 +1,4 @@
-"""What a drive counts in is compared with the configuration, on simulated drives in the dress of foreign ones."""
+"""A drive's units are compared with the configuration, on simulated drives with vendor emulation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ pytestmark = pytest.mark.usefixtures("quick_commissioning")
 
 
 def compared(sheet: str, folder: Path, objects: Mapping[tuple[int, int], int], **drive: Any) -> dict[str, Finding]:
-    """Return the findings of a drive whose objects say this."""
     eds = write_eds(sheet, folder)
     document = bench_document("X")
     document["bus"] = {"can0": {"interface": "virtual", "channel": uuid.uuid4().hex}}
@@ -58,7 +57,7 @@ def test_the_speeds_unit_is_compared(word: int, unit: str | None, ok: bool, says
 def test_the_dc_link_is_compared_where_the_duty_is_multiplied_by_it(
     counts: int, volts: float | None, ok: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fdhil.sim.drive.servo.Drive.wall_clock", lambda *_: [])  # its supply stays as it is set
+    monkeypatch.setattr("fdhil.sim.drive.servo.Drive.wall_clock", lambda *_: [])  # its supply is constant
     found = compared("epos4", tmp_path, {(0x2200, 1): counts}, profile="epos4", dc_link_v=volts).get("DC link")
     assert found is not None
     assert found.ok is ok

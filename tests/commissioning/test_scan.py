@@ -1,4 +1,4 @@
-"""What a scan makes of traffic, of answers and of EDS files, and what a check makes of a drive that is not set up."""
+"""Scan results from traffic, answers and EDS files, and check results of a drive that is not set up."""
 
 from __future__ import annotations
 
@@ -36,7 +36,6 @@ WHO = Identity(1, 2, 3, 4)
 
 @pytest.fixture(autouse=True)
 def quick(virtual_threads: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Virtual time, and shorter waits than on a real machine."""
     shorten_waits(monkeypatch)
 
 
@@ -98,7 +97,7 @@ def test_a_node_that_comes_while_it_is_looked_who_is_there_disturbs_nobody(
 ) -> None:
     virtual_threads.release()
     request.addfinalizer(partial(sys.setswitchinterval, sys.getswitchinterval()))
-    sys.setswitchinterval(1e-6)  # threads take turns as often as they can
+    sys.setswitchinterval(1e-6)  # threads switch as often as possible
     ids = range(0x181, 0x1FF)
     for _ in range(30):
         heard = Traffic()
@@ -168,7 +167,7 @@ def test_a_node_that_lacks_objects_is_listed_all_the_same(
     assert answers.is_drive
     with BusScanner("can0", settings.bus["can0"]) as bus:
         assert bus.read(1, 0x5FFF) is None
-        monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.01)  # nothing ever comes
+        monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.01)  # receives nothing
         assert bus.read(9, 0x1000) is None
 
 
@@ -192,7 +191,7 @@ def test_nothing_is_asked_once_a_master_is_heard(peer: tuple[DrivePeer, MachineC
 
 def test_a_silent_bus_is_told() -> None:
     settings = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
-    with pytest.raises(ConnectError, match="no node was heard and none answered"):
+    with pytest.raises(ConnectError, match="no node sent a frame and none answered"):
         scan_bus("can0", settings, [])
 
 
@@ -220,7 +219,6 @@ def test_a_drive_that_is_not_set_up_differs_in_that_point_alone(
 
 
 def lacking(drive: DrivePeer, *indices: int) -> None:
-    """Take objects out of the drive's dictionary."""
     for index in indices:
         for key in [key for key in drive.drive.dictionary.entries if key >> 8 == index]:
             del drive.drive.dictionary.entries[key]
@@ -249,7 +247,7 @@ def test_what_the_drive_does_not_have_is_not_compared(point: str, peer: tuple[Dr
 def test_an_object_that_the_drive_refuses_to_tell_ends_no_check(
     code: AbortCode, peer: tuple[DrivePeer, MachineConfig]
 ) -> None:
-    """Some drives have objects without a value, and one refusal must not hide all else."""
+    """Some drives have objects without a value, and one refusal must not hide everything else."""
     drive, settings = peer
 
     def refuse() -> int:
@@ -280,12 +278,12 @@ def test_a_drive_that_coasts_is_told_though_the_other_object_is_missing(peer: tu
 
 
 def test_a_drive_without_a_following_error_window_is_not_commissioned(peer: tuple[DrivePeer, MachineConfig]) -> None:
-    """Nothing would stop it where it leaves its path, and no offset is small against a window that is not there."""
+    """Nothing would stop it when it leaves its path, and offsets could not be compared with the window."""
     drive, settings = peer
     lacking(drive, 0x6065)
     with (
         Master(settings, "X") as master,
-        pytest.raises(DriveFault, match=r"it has no 0x6065 that can be read; its manual"),
+        pytest.raises(DriveFault, match=r"it has no 0x6065 that can be read; see its manual"),
     ):
         check_axis(master)
 
@@ -296,9 +294,9 @@ def test_a_device_that_is_no_drive_is_told_as_such(peer: tuple[DrivePeer, Machin
     drive.drive.set_object(0x1000, 0, 0x00030191)
     found = {finding.point: finding for place, finding in check_machine(settings) if place == "axis X"}
     assert {point for point, finding in found.items() if finding.ok is False} == {"device"}
-    assert found["device"].cause == "it is no CiA 402 drive: 0x1000 says CiA 401, an I/O module"
+    assert found["device"].cause == "it is not a CiA 402 drive: 0x1000 reports CiA 401, an I/O module"
     assert found["cycle"].ok is None
-    with Master(settings, "X") as master, pytest.raises(DriveFault, match="it is no CiA 402 drive"):
+    with Master(settings, "X") as master, pytest.raises(DriveFault, match="it is not a CiA 402 drive"):
         check_axis(master)
 
 
@@ -334,7 +332,10 @@ def test_a_bus_of_another_bit_rate_is_not_asked(monkeypatch: pytest.MonkeyPatch)
         thread.start()
         try:
             for ask in (lambda: scan_bus("can0", settings, []), lambda: check_machine(settings)):
-                with pytest.raises(ConnectError, match="only frames in error are heard; nothing was sent"):
+                with pytest.raises(
+                    ConnectError,
+                    match="only error frames are received, so the bit rate is probably wrong; nothing was sent",
+                ):
                     ask()
         finally:
             stop.set()
@@ -358,7 +359,7 @@ def test_what_an_ncs_traffic_shows_is_compared() -> None:
 def test_a_drive_on_another_node_id_is_told() -> None:
     found = heard(machine(), Wire(400, node_id=5))
     assert found["drive"].ok is False
-    assert found["TPDO1"].cause == "TPDO1 (181) came 0 times in 400 SYNC where 400 are due"
+    assert found["TPDO1"].cause == "TPDO1 (181) was received 0 times in 400 SYNC, 400 are due"
 
 
 @pytest.mark.parametrize(("bit", "state"), [(16, "on now"), (3, "off now")])

@@ -1,4 +1,4 @@
-"""The set-points: whatever is asked for, what leaves stays inside its bounds and can be stopped there."""
+"""For any demand, the sent set-points stay inside their bounds and can be stopped there."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ Y = Bounds("Y", -1e6, 1e6, 800.0, 5.0, 16_384.0)
 
 
 def sent(points: SetPoints, most: int = 20_000) -> list[tuple[int, ...]]:
-    """All rows until the axes rest."""
     rows = [points.step()]
     while not points.resting and len(rows) < most:
         rows.append(points.step())
@@ -28,7 +27,7 @@ def sent(points: SetPoints, most: int = 20_000) -> list[tuple[int, ...]]:
 
 
 def inside(rows: Sequence[tuple[int, ...]], start: Sequence[int], bounds: Sequence[Bounds]) -> None:
-    """What left keeps the bounds, whole increments apart."""
+    """The sent rows keep the bounds to whole increments."""
     column = np.array([start, start, *rows, rows[-1]], dtype=float)
     for place, of in enumerate(bounds):
         path = column[:, place]
@@ -45,7 +44,7 @@ def test_a_way_there_is_played_to_its_end() -> None:
     out = sent(points)
     assert points.stopped is None
     assert out[-1] == (50_000, -20_000)
-    assert len(out) == len(rows) + 1  # and a cycle at rest
+    assert len(out) == len(rows) + 1  # and one cycle at rest
     inside(out, (0, 100), (X, Y))
 
 
@@ -67,7 +66,7 @@ def test_a_stop_brakes_at_once_and_straight_ahead(after: int) -> None:
     assert points.stopped == "Ctrl-C"
     inside(out, (0, 0), (X, Y))
     assert len(out) - after <= math.ceil(max(SPEED / ACCELERATION, 800 / 5)) + 2
-    assert all(abs(30_000 * x - 50_000 * y) <= 50_000 * 2 for x, y in out)  # it stays on the way
+    assert all(abs(30_000 * x - 50_000 * y) <= 50_000 * 2 for x, y in out)  # it stays on the path
     points.play([(0, 0)])
     assert points.step() == out[-1]
 
@@ -94,7 +93,7 @@ def test_rows_that_lead_out_of_the_travel_are_braked_inside_it() -> None:
     points = SetPoints((X,), (0,))
     points.play(straight((0,), (HIGH + 5000,), (SPEED,), (ACCELERATION,)))
     out = sent(points)
-    assert points.stopped == "axis X: from a set-point it could not be braked inside its travel"
+    assert points.stopped == "axis X: it could not be braked inside its travel"
     inside(out, (0,), (X,))
     assert out[-1][0] > HIGH - 2 * SPEED
 
@@ -102,10 +101,10 @@ def test_rows_that_lead_out_of_the_travel_are_braked_inside_it() -> None:
 @pytest.mark.parametrize(
     ("rows", "why"),
     [
-        ([(3000.0,)], "a set-point is faster"),
-        ([(40.0,)], "a set-point asks for more acceleration"),
-        ([(math.inf,)], "is no number"),
-        ([(1.0, 2.0)], "is no number"),
+        ([(3000.0,)], "a set-point exceeds the axis' speed"),
+        ([(40.0,)], "a set-point exceeds the axis' acceleration"),
+        ([(math.inf,)], "is not a number"),
+        ([(1.0, 2.0)], "is not a number"),
     ],
 )
 def test_a_wrong_row_never_leaves(rows: list[tuple[float, ...]], why: str) -> None:

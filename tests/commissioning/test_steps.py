@@ -1,4 +1,4 @@
-"""Commissioning against a simulated drive: a good one is signed off, every wrong set-up is refused with its reason."""
+"""Commissioning of a simulated drive: a good one is signed off, every wrong set-up is refused with its reason."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ pytestmark = pytest.mark.usefixtures("quick_commissioning")
 
 
 def config(**sections: Any) -> MachineConfig:
-    """The drive shares a busy computer: it is waited for, as any simulated one, and bears a late heartbeat."""
+    """The drive shares a busy computer: it is waited for like any simulated drive, and tolerates a late heartbeat."""
     sections = {"guard": {"clock": "sync", "heartbeat_s": 0.1}, **sections}
     return machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex}, **sections)
 
@@ -67,7 +67,7 @@ def test_a_good_drive_is_signed_off_and_left_as_it_was(peer: tuple[DrivePeer, Ma
     assert steps[0] == "listen"
     assert steps[-1] == "restore"
     assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
-    time.sleep(0.01)  # the peer has yet to hear the last command
+    time.sleep(0.01)  # the peer has yet to process the last command
     assert drive.drive.nmt == 0x7F
     assert drive.drive.dictionary.number(0x60B0) == 0
     assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == consumers
@@ -87,10 +87,10 @@ def test_a_drive_that_boots_while_it_is_commissioned_is_not_signed_off(peer: tup
 
 
 class SleepyPeer(DrivePeer):
-    """A simulated drive whose process sleeps now and then, as on a busy computer, until its watchdog is tried."""
+    """A simulated drive whose process occasionally sleeps, as on a busy computer, until its watchdog is tested."""
 
     def take(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
-        """Sleep longer than any mean is taken over, at every 40th SYNC of the first 400."""
+        """Sleep longer than any averaging time at every 40th of the first 400 SYNCs."""
         count = self.heard.count(0x080)
         if can_id == 0x080 and count % 40 == 0 and count <= 400:
             time.sleep(0.15)
@@ -107,12 +107,11 @@ def test_a_simulated_drive_may_sleep() -> None:
 
 
 class SlowPeer(DrivePeer):
-    """A simulated drive whose frames leave one by one, and which sleeps through many SYNCs once it is told to."""
+    """A simulated drive that sends frame by frame and sleeps through many SYNCs on request."""
 
     sleeping_s = 0.0
 
     def take(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
-        """Sleep before the next SYNC."""
         if can_id == 0x080 and self.sleeping_s:
             time.sleep(self.sleeping_s)
             self.sleeping_s = 0.0
@@ -126,7 +125,7 @@ class SlowPeer(DrivePeer):
 
 @pytest.mark.usefixtures("long_computation")
 def test_a_simulated_drive_that_slept_answers_one_sync_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The TPDOs of every tenth SYNC are waited for as well: a guard counts in which SYNC they come."""
+    """The TPDOs of every tenth SYNC are waited for as well: a guard counts in which SYNC they arrive."""
     settings = config()
     place = next(iter(settings.bus.values())).channel
     with SlowPeer(settings) as peer, Master(settings, "X") as master, can.Bus(place, "virtual") as listener:
@@ -136,7 +135,7 @@ def test_a_simulated_drive_that_slept_answers_one_sync_at_a_time(monkeypatch: py
             peer.sleeping_s = 0.2
             master.wait_cycles(50)  # most of them while it slept
         master.wait(lambda: not master.behind, 10.0, "it sleeps on")
-        master.wait_cycles(10)  # one before it has caught up
+        master.wait_cycles(10)  # one until it has caught up
         while listener.recv(0) is not None:
             pass
         master.wait_cycles(40)
@@ -154,7 +153,7 @@ def test_a_simulated_drive_that_slept_answers_one_sync_at_a_time(monkeypatch: py
 
 def test_an_object_that_no_tpdo_brings_is_told() -> None:
     settings = config(guard={})
-    with Master(settings, "X") as master, pytest.raises(DeviceTimeout, match="0x6064 does not come any more; check"):
+    with Master(settings, "X") as master, pytest.raises(DeviceTimeout, match="0x6064 is no longer received; check"):
         master.average(master.profile.position, 10)
 
 
@@ -188,7 +187,6 @@ def test_a_drive_that_counts_against_the_axis_passes() -> None:
 
 
 def watchdog(master: Master) -> str:
-    """The step as a commissioning runs it."""
     return watchdog_test(master, enable)
 
 
@@ -207,8 +205,8 @@ WRONG: dict[str, tuple[Callable[[DrivePeer], None], str]] = {
     "window off": (lambda p: p.drive.set_object(0x6065, 0, 0xFFFFFFFF), "0x6065 is off"),
     "window zero": (lambda p: p.drive.set_object(0x6065, 0, 0), "0x6065 is off"),
     "window too small": (lambda p: p.drive.set_object(0x6065, 0, 300), "too small"),
-    "gear x 10": (lambda p: p.drive.set_object(0x6091, 1, 10), "counts 6553.6 per motor revolution"),
-    "feed x 10": (lambda p: p.drive.set_object(0x6092, 1, 655360), "counts 655360 per motor revolution"),
+    "gear x 10": (lambda p: p.drive.set_object(0x6091, 1, 10), "6553.6 position increments per motor revolution"),
+    "feed x 10": (lambda p: p.drive.set_object(0x6092, 1, 655360), "655360 position increments per motor revolution"),
     "mapping": (
         lambda p: p.drive.remap(0x1A01, [(0x6041, 0, 16), (0x2101, 0, 16), (0x6078, 0, 16)]),
         "TPDO2 maps 60410010, 21010010, 60780010",
@@ -251,7 +249,7 @@ def not_csp(peer: DrivePeer) -> None:
 
 
 class HastyMaster(Master):
-    """A master that waits for the mode as long as for a real drive: its drive never shows it."""
+    """A master that waits for the mode only as long as for a real drive, since its drive never reports it."""
 
     def wait(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
         never = "the mode" in otherwise
@@ -265,7 +263,7 @@ class HastyMaster(Master):
         (offset_doubled, "does not add 0x60B0"),
         (offset_negated, "does not add 0x60B0"),
         (offset_lost, "0x60B0 holds 0"),
-        (not_csp, "does not take the mode"),
+        (not_csp, "does not enter the mode"),
     ],
 )
 @pytest.mark.fault("E16")
@@ -296,7 +294,7 @@ def test_a_watchdog_that_does_nothing_is_refused(
 
 
 class LateCycle(Cycle):
-    """A cycle on a computer that is held up: in the first ``late`` feedings no heartbeat follows the first one."""
+    """A cycle on a delayed computer: in the first ``late`` attempts no heartbeat follows the first one."""
 
     master: Master
     late = 0
@@ -318,7 +316,7 @@ class LateCycle(Cycle):
 
 @pytest.fixture
 def fed(peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch) -> Iterator[LateCycle]:
-    """A master that feeds the drive for a short time; afterwards the drive watches nobody any more, and is off."""
+    """A master that sends heartbeats for a short time; afterwards the drive's monitoring and power are off."""
     monkeypatch.setattr("fdhil.commissioning.watchdog.FEEDING_S", 0.6)
     drive, settings = peer
     cycle = LateCycle(settings, settings.bus)
@@ -339,7 +337,7 @@ def test_a_feeding_that_this_computer_missed_is_tried_again(fed: LateCycle) -> N
 @pytest.mark.usefixtures("long_computation")
 def test_a_computer_that_is_always_late_is_told(fed: LateCycle) -> None:
     fed.late = 99
-    with pytest.raises(DriveFault, match="missed our heartbeat 4 times; take load off this computer"):
+    with pytest.raises(DriveFault, match="missed fdhil's heartbeat 4 times; reduce this computer's load"):
         run_steps(fed.master, watchdog)
     assert fed.feedings == FEEDING_TRIES
 
@@ -371,7 +369,7 @@ def test_a_heartbeat_that_is_late_right_after_the_feeding_proves_as_much(
 
 
 class SlowReader(Master):
-    """A master on a busy computer: the first ``slow`` readings of the speed demand come too late to tell anything."""
+    """A master on a busy computer: the first ``slow`` readings of the speed demand arrive too late."""
 
     slow = 0
     late_cycles = 2 * steps.EARLY_CYCLES + steps.RAMP_CYCLES
@@ -414,7 +412,7 @@ def test_a_feedforward_that_is_never_seen_stays_untold(
         enable(master)
         master.slow = 1_000_000
         assert feedforward_test(master) is None
-        assert master.readings == 1 + steps.MOST_RAMPS * master.patience  # the object is there, and one a ramp
+        assert master.readings == 1 + steps.MOST_RAMPS * master.patience  # the object exists, and one reading per ramp
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -427,7 +425,7 @@ def test_what_was_read_before_the_ramp_is_no_missing_feedforward(
         prepare(master)
         enable(master)
         master.slow = 1_000_000
-        master.late_cycles = steps.EARLY_CYCLES + 4  # read before the ramp, heard in its midst
+        master.late_cycles = steps.EARLY_CYCLES + 4  # read before the ramp, received during it
         assert feedforward_test(master) is None
 
 
@@ -441,7 +439,7 @@ def test_a_mean_over_cycles_that_this_computer_slept_through_is_of_what_came(
         master.wait(lambda: position in master.heard.objects, 5.0, "no position comes")
 
         def slept(asked: Master) -> int:
-            """Return the cycle, and let twenty go by with the first that this thread asks for."""
+            """Return the cycle; at this thread's first call skip twenty cycles."""
             now = asked.loop.count
             if threading.current_thread() is threading.main_thread():
                 monkeypatch.undo()
@@ -456,7 +454,7 @@ def test_full_heartbeat_consumers_are_refused(peer: tuple[DrivePeer, MachineConf
     drive, settings = peer
     for sub in (1, 2, 3, 4):
         drive.drive.set_object(0x1016, sub, (10 + sub) << 16 | 500)
-    with Master(settings, "X") as master, pytest.raises(DriveFault, match="all entries of 0x1016 are taken"):
+    with Master(settings, "X") as master, pytest.raises(DriveFault, match="all entries of 0x1016 are in use"):
         watchdog(master)
 
 
@@ -464,7 +462,7 @@ def test_full_heartbeat_consumers_are_refused(peer: tuple[DrivePeer, MachineConf
     ("can_id", "shown"), [(0x080, "SYNC or set-points"), (0x302, "SYNC or set-points"), (0x605, "SDO requests")]
 )
 def test_an_nc_on_the_bus_is_left_alone(can_id: int, shown: str, peer: tuple[DrivePeer, MachineConfig]) -> None:
-    """Whatever it is that only a master sends, also to another drive: its SDO channels are its own."""
+    """Every frame that only a master sends counts, also to another drive with its own SDO channels."""
     drive, settings = peer
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc, Master(settings, "X") as master:
         nc.send(can.Message(arbitration_id=can_id, is_extended_id=False))
@@ -477,11 +475,10 @@ def test_an_nc_on_the_bus_is_left_alone(can_id: int, shown: str, peer: tuple[Dri
 
 @pytest.mark.fault("A29")
 def test_on_a_silent_bus_the_drive_alone_is_asked_what_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No SYNC, no NMT command, no set-point, and no frame to anybody else."""
-    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.01)  # nothing ever comes
+    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.01)  # receives nothing
     settings = config()
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as other:
-        with pytest.raises(ConnectError, match=r"nothing was heard on the bus and node-ID 1 did not answer; check"):
+        with pytest.raises(ConnectError, match=r"no frame was received on the bus and node-ID 1 did not answer; check"):
             commission(settings, "X")
         sent = {(m.arbitration_id, bytes(m.data)) for m in iter(lambda: other.recv(0), None)}
         read, given_up = b"\x40\x00\x10\0\0\0\0\0", b"\x80\0\0\0\0\0\x04\x05"
@@ -496,14 +493,17 @@ def test_a_bus_of_another_bit_rate_gets_no_frame(monkeypatch: pytest.MonkeyPatch
         with Master(settings, "X") as master:
             other.send(can.Message(arbitration_id=0x4, data=bytes(8), is_error_frame=True))
             master.wait(lambda: master.heard.errors > 0, 5.0, "no frame in error")
-            with pytest.raises(ConnectError, match=r"only frames in error are heard; nothing was sent"):
+            with pytest.raises(
+                ConnectError,
+                match=r"only error frames are received, so the bit rate is probably wrong; nothing was sent",
+            ):
                 survey.listen(master)
         assert other.recv(0) is None
 
 
 @pytest.mark.usefixtures("long_computation")
 def test_a_drive_without_a_heartbeat_is_commissioned(peer: tuple[DrivePeer, MachineConfig]) -> None:
-    """0x1017 = 0 is what many drives come with: with the NC off such a drive says nothing until it is asked."""
+    """Many drives are delivered with 0x1017 = 0: with the NC off they send nothing until they are read."""
     drive, settings = peer
     drive.drive.set_object(0x1017, 0, 0)
     record = commission(settings, "X")
@@ -511,7 +511,7 @@ def test_a_drive_without_a_heartbeat_is_commissioned(peer: tuple[DrivePeer, Mach
 
 
 def test_a_drive_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.01)  # nothing ever comes
+    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.01)  # receives nothing
     settings = config(drive={"node_id": 9})
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as other:
         other.send(can.Message(arbitration_id=0x701, data=[5], is_extended_id=False))
@@ -532,13 +532,16 @@ def test_states_are_shown(peer: tuple[DrivePeer, MachineConfig]) -> None:
 @pytest.mark.parametrize("per_mm", [40, 90])
 def test_a_scaling_that_knows_no_10_um_is_refused_before_anything_moves(per_mm: int) -> None:
     settings = config(drive={"increments_per_rev": 20 * per_mm})
-    with DrivePeer(settings) as drive, pytest.raises(DriveFault, match=r"its scaling is too coarse .* count finer"):
+    with (
+        DrivePeer(settings) as drive,
+        pytest.raises(DriveFault, match=r"its scaling is too coarse .* finer resolution"),
+    ):
         commission(settings, "X")
     assert not {0x000, 0x080, 0x201, 0x301} & set(drive.heard)
 
 
 class KeptOffsets(DrivePeer):
-    """A simulated drive that keeps every offset it was sent, and fires Ctrl-C once one of them is ``interrupt_at``."""
+    """A simulated drive that records every offset and raises Ctrl-C at ``interrupt_at``."""
 
     def __init__(self, config: MachineConfig, interrupt_at: int | None = None) -> None:
         super().__init__(config)
@@ -555,7 +558,6 @@ class KeptOffsets(DrivePeer):
 
 
 def enabled_and_rolled_back(settings: MachineConfig, step: Callable[[Master], object]) -> None:
-    """A step as a commissioning runs it."""
     with Master(settings, "X") as master, rolled_back(master):
         prepare(master)
         enable(master)
@@ -570,7 +572,7 @@ def test_a_ramp_that_is_stopped_on_its_way_turns_round_there(interrupt_at: int) 
         with pytest.raises(KeyboardInterrupt):
             enabled_and_rolled_back(settings, sign_test)
         offsets = drive.offsets
-    assert max(map(abs, np.diff(offsets))) <= 20  # never what a plan of before and one of now have between them
+    assert max(map(abs, np.diff(offsets))) <= 20  # never a step from an old plan to a new one
     assert max(offsets) <= 33
     assert offsets[-1] == 0
     assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
@@ -583,7 +585,7 @@ def test_an_offset_is_taken_away_within_the_acceleration() -> None:
     with KeptOffsets(settings) as drive:
         enabled_and_rolled_back(settings, lambda master: steps.ramp(master, 150, 1))
     assert max(drive.offsets) == 150
-    assert np.diff(drive.offsets).min() < -5  # 0.8 increments per cycle squared, and what is rounded
+    assert np.diff(drive.offsets).min() < -5  # 0.8 increments per cycle squared, plus rounding
     assert np.abs(np.diff(drive.offsets, 2)).max() <= 2
 
 
@@ -609,6 +611,6 @@ def test_what_could_not_be_rolled_back_is_told_after_ctrl_c_too(monkeypatch: pyt
         raise DriveFault(master.device, "it still holds an offset")
 
     monkeypatch.setattr(steps, "zero_offset", fails)
-    left = pytest.raises(ProtocolError, match="interrupted; the drive could not be left as it was")
+    left = pytest.raises(ProtocolError, match="interrupted; the drive could not be restored")
     with DrivePeer(settings), left, Master(settings, "X") as master, rolled_back(master):
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""``check`` tells whether the TPDO of a table encoder comes while the NC runs the bus."""
+"""``check`` reports whether the TPDO of a table encoder arrives while the NC runs the bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How evenly SYNC came and how soon it was answered, from frames with their stamps."""
+"""Evenness of SYNC and delay of its answers, from frames with time stamps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TPDO = 0x181
 
 
 def heard(answer_us: int = 200, hole: int = 0) -> Frames:
-    """200 SYNCs, each answered; after the hundredth nothing for ``hole`` periods."""
+    """200 answered SYNCs, with a gap of ``hole`` periods after the hundredth."""
     rows = []
     for k in range(200):
         t_ns = 1_000_000 * (k + (hole if k > 100 else 0)) + (3000 if k % 2 else 0)
@@ -39,7 +39,7 @@ def test_a_hole_that_would_end_a_correction_is_told() -> None:
 def test_an_answer_as_late_as_the_next_sync_is_told() -> None:
     (answer,) = judge_answers(measure(heard(answer_us=980), [TPDO]), PERIOD_S, counted=False)
     assert answer.ok is False
-    assert "answers come up to 0.98 ms after SYNC" in answer.cause
+    assert "answers arrive up to 0.98 ms after SYNC" in answer.cause
 
 
 @pytest.mark.parametrize("frames", [heard()[:0], heard()[1:3], heard()[:20]])

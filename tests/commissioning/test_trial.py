@@ -1,4 +1,4 @@
-"""What is wrong, or nobody allows, ends the trial of a simulated axis at rest; how a good one goes, see tests/cli."""
+"""Faults and refusals end the trial of a simulated axis at standstill; a successful trial is in tests/cli."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ROOM = Room(-2.0, 130.0)
 
 @dataclass
 class Bench:
-    """A simulated drive that is signed off, and what its operator was told and asked."""
+    """A signed-off simulated drive, and the questions to its operator."""
 
     peer: DrivePeer
     config: MachineConfig
@@ -44,7 +44,7 @@ class Bench:
         return self.saw
 
     def tried(self, room: Room = ROOM) -> Trial:
-        """Try the axis; afterwards it is off and stands."""
+        """Run the trial; afterwards the axis is off and at standstill."""
         store = self.config.store.directory
         try:
             return try_axis(self.config, self.record, room, Operator(self.report, self.look), Progress(store, "X"))
@@ -59,7 +59,6 @@ class Bench:
 
 @pytest.fixture
 def quick_trial(quick_commissioning: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A shorter jog, and no sensor that may deliver later."""
     monkeypatch.setattr("fdhil.commissioning.strokes.JOG_MM", 1.0)
     monkeypatch.setattr("fdhil.commissioning.trial.TIMING_CYCLES", 100)
     monkeypatch.setattr("fdhil.commissioning.trial.LAST_REST_S", 0.4)
@@ -83,12 +82,12 @@ def test_a_wrong_sign_and_what_nobody_saw_end_it_before_a_rapid(bench: Bench) ->
     with pytest.raises(DriveFault, match="SignOrScale: voltage times current, and times speed is negative"):
         bench.tried()
     bench.peer.drive.faults.signal("voltage").gain, bench.saw = 1.0, False
-    with pytest.raises(DriveFault, match=r"the table did not move as the drive says; another direction: drive.sign"):
+    with pytest.raises(DriveFault, match=r"the table did not move as the drive reports; check drive.sign"):
         bench.tried()
     assert "test rapids" not in bench.steps
     assert bench.stands_mm == pytest.approx(0.0, abs=0.05)
     assert Progress(bench.config.store.directory, "X").done().keys() == {"room"}
-    with pytest.raises(DriveFault, match=r"may go from -2.05 to 130.05 mm by the room that the trial began"):
+    with pytest.raises(DriveFault, match=r"limited to -2.05 to 130.05 mm by the room of the interrupted trial"):
         bench.tried(Room(-5.0, 130.0))
 
 
@@ -111,10 +110,12 @@ def test_stopped_trial_goes_on_within_the_room_that_it_began_with(bench: Bench) 
     assert results["room"]["return"] is None
     kept = progress.found("room", progress._steps["room"].holds_for)
     assert kept is not None
-    moved = {**kept, "stopped_mm": stood_mm - 5.0}  # as if somebody had moved it since, or the encoder lost its zero
+    moved = {**kept, "stopped_mm": stood_mm - 5.0}  # as if it was moved since, or the encoder lost its zero
     progress.keep("room", progress._steps["room"].holds_for, moved)
     for _ in range(2):
-        with pytest.raises(DriveFault, match=r"by the room that the trial began with, not -2 to \+130 mm from here"):
+        with pytest.raises(
+            DriveFault, match=r"by the room of the interrupted trial, but --room is -2 to \+130 mm from here"
+        ):
             bench.tried()
     progress.keep("room", progress._steps["room"].holds_for, kept)
     bench.steps.clear()
@@ -132,7 +133,7 @@ def test_stopped_trial_goes_on_within_the_room_that_it_began_with(bench: Bench) 
 
 def test_no_room_sends_nothing(bench: Bench) -> None:
     bench.peer.heard.clear()
-    with pytest.raises(DriveFault, match="test rapids, which need 102 mm"):
+    with pytest.raises(DriveFault, match="test rapids need 102 mm"):
         bench.tried(Room(-50.0, 90.0))
     assert bench.peer.heard == []
 
@@ -146,7 +147,7 @@ def test_software_limits_that_are_nearer_are_respected(bench: Bench) -> None:
     assert record is not None
     bench.record = record
     with pytest.raises(
-        DriveFault, match=r"stands at 0.000 mm and may go from -1.\d* to 250.\d* mm by its software limits"
+        DriveFault, match=r"its position is 0.000 mm, limited to -1.\d* to 250.\d* mm by its software limits"
     ):
         bench.tried()
     assert bench.steps == ["timing"]
@@ -165,7 +166,7 @@ def test_a_drive_that_was_set_up_anew_is_not_moved(bench: Bench) -> None:
     [("jog", 22, "target"), ("jog", 22, "offset"), ("test rapids", 0, "SYNC"), ("test rapids", 0, "target")],
 )
 def test_another_master_ends_the_trial(step: str, braking: int, what: str, bench: Bench) -> None:
-    """Braked within its acceleration, switched off or left to the other master; nothing is kept of the step."""
+    """Braked within its acceleration, switched off or left to the other master; the step is not stored."""
 
     def begins(frame: Frame) -> bool:
         return bench.steps[-1:] == [step] and moves(frame)

@@ -1,4 +1,4 @@
-"""What voids a commissioning record, what is compared, and what makes it hold again."""
+"""What voids a commissioning record, what is compared, and what makes it valid again."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_the_same_drive_is_found_again() -> None:
     assert finding.found == found_fingerprint(FOUND) == RECORD.fingerprint
 
 
-WRONG = Finding("scale", "1", "2", False, "its position counts twice", "correct the drive's factors")
+WRONG = Finding("scale", "1", "2", False, "it counts twice", "correct the drive's factors")
 
 
 @pytest.mark.parametrize(
@@ -85,8 +85,8 @@ WRONG = Finding("scale", "1", "2", False, "its position counts twice", "correct 
         (replace(FOUND, options={**FOUND.options, "607D01": 5}), "0x607D01 is 5, and was missing"),
         (replace(FOUND, identity=Identity(1, 2, 3, 5)), "its serial number is 5, not 4"),
         (replace(FOUND, identity=Identity(1, 9, 3, 4)), "vendor, product or revision"),
-        (replace(FOUND, fingerprint="other"), "its PDOs are set up otherwise"),
-        (replace(FOUND, findings=(WRONG,)), "its position counts twice; correct the drive's factors"),
+        (replace(FOUND, fingerprint="other"), "its PDO mapping is different"),
+        (replace(FOUND, findings=(WRONG,)), "it counts twice; correct the drive's factors"),
     ],
 )
 def test_another_drive_is_told_by_what_differs(found: Survey, told: str) -> None:
@@ -115,14 +115,14 @@ def test_before_the_guard_starts_each_record_is_compared(tmp_path: Path, monkeyp
         save_record(replace(RECORD, axis=axis), store)
     void_record(store, "Y", "booted")
     compare_again(config, "can0", told.append)
-    assert compared == told == []  # beside an NC nothing is asked
+    assert compared == told == []  # with an NC on the bus nothing is read
     assert is_void(store, "Y")
     nc[0] = False
     compare_again(config, "can0", told.append)
     assert compared == ["X", "Y"]
     assert is_void(store, "X")
     assert not is_void(store, "Y")
-    assert told == ["RecordVoid: axis X: it differs; nothing can be armed or adopted there; mend it"]
+    assert told == ["RecordVoid: axis X: it differs; the axis cannot be armed or adopted; mend it"]
     (store / "commissioning-X.json").write_text("damaged")
     compare_again(config, "can0", told.append)
     assert compared == ["X", "Y", "Y"]

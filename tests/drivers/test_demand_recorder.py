@@ -58,7 +58,7 @@ def test_lost_rows_are_gaps_and_never_filled(tmp_path: Path) -> None:
     assert recorded.gaps == (Gap("Y", 100, 102), Gap("Y", 200, 201))
     assert np.flatnonzero(np.isnan(recorded.reference.position_mm["Y"])).tolist() == [100, 101, 200]
     write_demand_csv(recorded.reference, tmp_path / "marked.csv")
-    with pytest.raises(RecordingError, match="line 102 has 'nan' where a finite number belongs"):
+    with pytest.raises(RecordingError, match="line 102 has 'nan' instead of a finite number"):
         load_trajectory(tmp_path / "marked.csv", bench_config())
 
 

@@ -125,7 +125,7 @@ def test_a_window_that_is_off_is_refused(twin: Twin, monkeypatch: pytest.MonkeyP
     wrong = settings.axis["X"].model_copy(
         update={"drive": settings.axis["X"].drive.model_copy(update={"increments_per_rev": 4096})}
     )
-    with patient(), pytest.raises(DriveFault, match="counts 65536 per motor revolution"):
+    with patient(), pytest.raises(DriveFault, match="65536 position increments per motor revolution"):
         commission(settings.model_copy(update={"axis": {"X": wrong}}), "X")
 
 

@@ -113,7 +113,7 @@ def assert_compared(machine: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert points[name]["state"] == "not compared"
     code, _, err = fdhil("commission", machine, "--yes", capsys=capsys)
     assert code == 1
-    assert err.startswith("refused: drive X: RPDO1 maps nothing where the profile has")
+    assert err.startswith("refused: drive X: RPDO1 maps nothing, but the profile has")
 
 
 @pytest.mark.usefixtures("processes")
@@ -138,7 +138,7 @@ def test_a_foreign_module_is_told_to_be_no_drive(
         assert (code, differ) == (1, ["device"])
         code, _, err = fdhil("commission", machine, "--yes", capsys=capsys)
         assert code == 1
-        assert "it is no CiA 402 drive: 0x1000 says CiA 401, an I/O module" in err
+        assert "it is not a CiA 402 drive: 0x1000 reports CiA 401, an I/O module" in err
 
 
 @pytest.mark.usefixtures("processes")

@@ -1,7 +1,7 @@
-"""Fuzzes one target with atheris: ``python -m tests.fuzz NAME --inputs N``; the figures are printed as JSON.
+"""Fuzz one target with atheris: ``python -m tests.fuzz NAME --inputs N``; the figures are printed as JSON.
 
-Only fdhil is instrumented, but for the modules that numba compiles. What hurts is kept, once for each way in which it
-hurts, and the search goes on.
+Only fdhil is instrumented, except the modules that numba compiles. One input per kind of failure is stored, and the
+search continues.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from tests.fuzz import TARGETS
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 COMPILED = ("njit", "@compiled", "@inlined")
-# what ends the process that reads is found once; to look for more of it costs a start each time
+# an input that ends the reading process is stored once; more of them would cost a start each
 UNSEEN = ["fdhil.store.reading_process"]
 
 
 def kernels() -> list[str]:
-    """Return the modules with functions that are compiled, which bear no instrument."""
+    """Return the modules with compiled functions, which cannot be instrumented."""
     files = (ROOT / "fdhil").rglob("*.py")
     found = [path for path in files if any(word in path.read_text("utf-8") for word in COMPILED)]
     return [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in found]
 
 
 def main() -> None:
-    """Read the options and fuzz; the process ends with 1 when anything hurt."""
+    """Parse the options and fuzz; exit with 1 if any input failed."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz")
     parser.add_argument("name", choices=TARGETS)
     parser.add_argument("--inputs", type=int, default=10_000)
@@ -58,10 +58,10 @@ def _fuzz(options: argparse.Namespace, corpus: Path, folder: Path) -> None:
         from tests.fuzz.targets import target_of
 
         target = target_of(options.name)
-        for seed in target.seeds:  # what is imported late is imported here
+        for seed in target.seeds:  # imports that would otherwise happen late
             tasting.judged(target, seed)
     gc.collect()
-    gc.freeze()  # what was imported is not looked through again and again
+    gc.freeze()  # imported objects are not scanned again and again
     corpus.mkdir(parents=True, exist_ok=True)
     for seed in target.seeds:
         (corpus / hashlib.sha256(seed).hexdigest()[:16]).write_bytes(seed)
@@ -80,7 +80,7 @@ def _escaped(word: bytes) -> str:
 
 
 class _Search:
-    """Counts inputs, keeps what hurt, and ends the process when enough were tasted."""
+    """Counts inputs, stores failing ones, and ends the process after enough inputs."""
 
     def __init__(self, options: argparse.Namespace, target: Any, tasting: Any) -> None:
         self._options, self._target, self._tasting = options, target, tasting
@@ -89,7 +89,6 @@ class _Search:
         self._begin_s, self._begin_cpu_s = time.monotonic(), tasting.processor_s(target)
 
     def taste(self, data: bytes) -> None:
-        """Taste one input of the fuzzer's."""
         begin_s = self._tasting.processor_s(self._target)
         finding = self._tasting.judged(self._target, data)
         self._slowest_s = max(self._slowest_s, self._tasting.processor_s(self._target) - begin_s)
@@ -123,7 +122,7 @@ class _Search:
         }
         print(json.dumps(figures), flush=True)
         sys.stderr.flush()
-        os._exit(bool(self._found))  # the fuzzer's own end would tell again what is told
+        os._exit(bool(self._found))  # the fuzzer's own end would repeat the report
 
 
 def _told(found: dict[tuple[str, str], int]) -> Sequence[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""Changes bytes at random by a seed: what the default tests taste, where no fuzzer may be installed."""
+"""Random mutation of bytes by a seed: used by the default tests, where no fuzzer may be installed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _ODD = (b"\0", b"\xff", b"\x7f", b"\x80", b"-1", b"nan", b"1e999", b"9" * 40, b"
 
 
 def mutants(target: Target, count: int, seed: int) -> Iterator[bytes]:
-    """Yield changed copies of the target's true examples."""
+    """Yield mutated copies of the target's valid examples."""
     rng = random.Random(f"{target.name} {seed}")
     for _ in range(count):
         data = bytearray(rng.choice(target.seeds))

@@ -1,7 +1,7 @@
-"""What every way in must keep to, and the judge of it.
+"""The rules for every entry point, and their assessment.
 
-A target's ``taste`` lets through the errors that its way in declares, and nothing else; it also raises AssertionError
-where an answer is none that may be given.
+A target's ``taste`` passes on the errors that its entry point declares, and no others; it also raises AssertionError on
+an answer that is not permitted.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from types import FrameType
 
 FOLDER = Path(__file__).parent
 FOUND = FOLDER / "found"
-LONGEST_S = 1.0  # of the time of a processor that counts to COUNT in COUNTED_S
+LONGEST_S = 1.0  # in the time of a processor that counts to COUNT in COUNTED_S
 COUNT, COUNTED_S = 1_000_000, 0.06
 GIVEN_UP_S = 20.0
 AGAIN = 4
@@ -29,16 +29,16 @@ _PEAK_KIB = re.compile(r"VmHWM:\s*(\d+)")
 
 
 def nobody() -> int | None:
-    """Return the process that works for this one where there is none."""
+    """Return None: no other process works for this one."""
     return None
 
 
 @dataclass(frozen=True)
 class Target:
-    """A way in: true examples, what any bytes do there, words that its inputs are made of, and how long one may be.
+    """An entry point: valid examples, its processing of any bytes, words of its inputs, and the largest length.
 
-    ``worker`` tells the process that works for this one, whose time and memory count as well; ``ready`` begins it, and
-    that is none of the input's time.
+    ``worker`` returns the process that works for this one, whose time and memory count as well; ``ready`` starts it,
+    which does not count for the input.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Target:
 
 
 def processor_s(target: Target) -> float:
-    """Return the processor time so far of this process and of the target's workers, those that ended included."""
+    """Return the processor time so far of this process and of the target's workers, including ended ones."""
     if target.worker is nobody:
         return time.process_time()
     ended, pid = resource.getrusage(resource.RUSAGE_CHILDREN), target.worker()
@@ -61,7 +61,7 @@ def processor_s(target: Target) -> float:
 
 
 def peaks_bytes(target: Target) -> tuple[int, int]:
-    """Return the most memory that this process and the target's worker ever had."""
+    """Return the peak memory of this process and the target's worker."""
     own, pid = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, target.worker()
     if pid is None:
         return own, 0
@@ -70,7 +70,7 @@ def peaks_bytes(target: Target) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Finding:
-    """An input that hurts: ``kind`` and ``place`` are the same for all that hurt in the same way."""
+    """A failing input: ``kind`` and ``place`` are equal for all inputs that fail in the same way."""
 
     kind: str
     place: str
@@ -78,13 +78,13 @@ class Finding:
 
 
 class TooLong(BaseException):
-    """An input took so long that it was given up; no ``except Exception`` of the product keeps it."""
+    """An input took too long and was aborted; no ``except Exception`` of the product catches it."""
 
 
 def judged(target: Target, data: bytes) -> Finding | None:
-    """Taste an input; return what is wrong with the answer.
+    """Process an input; return what is wrong with the answer.
 
-    What took too long is tasted again: a processor that others use as well is half as quick.
+    A slow input is processed again, since a shared processor is half as fast.
     """
     found = _judged_once(target, data)
     for _ in range(AGAIN):
@@ -115,7 +115,7 @@ def _judged_once(target: Target, data: bytes) -> Finding | None:
 
 
 def _counted_s() -> float:
-    """Return how long this processor counts just now: one that others heat or share is slower."""
+    """Return the present speed of this processor, which heat and other load reduce."""
     begin_s, number = time.process_time(), 0
     while number < COUNT:
         number += 1
@@ -124,7 +124,7 @@ def _counted_s() -> float:
 
 @contextmanager
 def _given_up() -> Iterator[None]:
-    """Raise TooLong in the middle of what takes for ever, by the processor's time and not by the clock."""
+    """Raise TooLong in an endless input, by processor time and not by the clock."""
 
     def give_up(_number: int, _frame: FrameType | None) -> None:
         raise TooLong
@@ -139,12 +139,12 @@ def _given_up() -> Iterator[None]:
 
 
 def _place(error: BaseException) -> str:
-    """Return the innermost line of fdhil that an error came through."""
+    """Return the innermost line of fdhil in an error's traceback."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if "/fdhil/" in f.filename]
     inside = frames or traceback.extract_tb(error.__traceback__)
     return f"{Path(inside[-1].filename).name}:{inside[-1].name}" if inside else "nowhere"
 
 
 def found_inputs(name: str) -> list[Path]:
-    """Return the inputs that once hurt a target."""
+    """Return the past findings of a target."""
     return sorted((FOUND / name).glob("*")) if (FOUND / name).is_dir() else []

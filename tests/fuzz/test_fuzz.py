@@ -1,4 +1,4 @@
-"""A little of ``make fuzz`` in every test run: true examples, what once hurt, and some hundred changed examples."""
+"""A short ``make fuzz`` in every test run: valid examples, past findings, and some hundred mutated examples."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_what_once_hurt_does_so_no_more(path: Path) -> None:
 
 @pytest.mark.usefixtures("long_computation")
 def test_what_is_not_declared_is_a_finding() -> None:
-    """Also what takes for ever, and what takes too much memory."""
+    """Also an input that never ends, and one that uses too much memory."""
 
     def taste(data: bytes) -> None:
         if data == b"for ever":

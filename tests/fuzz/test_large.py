@@ -1,4 +1,4 @@
-"""Inputs as large as their way in takes them: an answer as soon, and as short, as to any other."""
+"""Inputs of the largest accepted size: the answer is as fast, and as short, as for any other."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""LinuxCNC as a whole, headless, for as long as a test needs it: orders go in, the demand of each cycle comes out."""
+"""A complete headless LinuxCNC for the duration of a test: orders go in, the demand of each cycle comes out."""

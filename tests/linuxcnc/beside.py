@@ -1,4 +1,4 @@
-"""fdhil beside LinuxCNC as its user has it: commands in a shell, and what the simulated machine saw at its table."""
+"""fdhil next to LinuxCNC in normal use: commands in a shell, and the measurements at the simulated machine's table."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fdhil.prediction import contour_error_um
 from fdhil.records import Trajectory
 
 PATIENCE_S = 300.0
-TRIES = 5  # on an overloaded computer LinuxCNC's task feeds its planner too late now and then: another demand
+TRIES = 5  # on an overloaded computer LinuxCNC's task occasionally feeds its planner too late, which changes the demand
 SHUTTLE = "G21 G90\n" + "G0 X400 Y400\nG4 P0.3\nG0 X0 Y0\nG4 P0.3\n" * 3 + "M2\n"
 PART = """G21 G90 G17 G64 P0.01
 F9000
@@ -32,7 +32,6 @@ M2
 
 
 def fdhil(*arguments: object, code: int = 0) -> dict[str, Any]:
-    """Run a command as a user does and return its JSON document."""
     done = subprocess.run(
         ending_with_parent([sys.executable, "-m", "fdhil", *map(str, arguments), "--json"]),
         capture_output=True,
@@ -53,7 +52,6 @@ def until(ready: Callable[[], bool]) -> None:
 
 
 def record(config: Path, out: Path, cut: Callable[[], None]) -> None:
-    """Record a demand from the bus while something is cut."""
     command = [sys.executable, "-m", "fdhil", "record", str(config), "--out", str(out), "--rest", "0.6", "--json"]
     with subprocess.Popen(
         ending_with_parent(command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -67,12 +65,12 @@ def record(config: Path, out: Path, cut: Callable[[], None]) -> None:
 
 
 def repeated(status: Mapping[str, Any]) -> bool:
-    """Whether the last pass was the armed demand to its end; else the guard saw another one and ramped to zero."""
+    """Return whether the last pass was the armed demand to its end; otherwise the guard has ramped down."""
     return bool(status["passes"][-1]["ended_by"] == FINISHED)
 
 
 def contour_of_each_cut(trace: Path, part: Trajectory) -> list[float]:
-    """The contour error (um RMS), at the simulated table, of each time that the part was cut."""
+    """Return the contour error (um RMS) at the simulated table for each cut of the part."""
     table = np.genfromtxt(trace, delimiter=",", names=True)
     reference, place = (
         np.column_stack([table[f"{axis}_{what}_mm"] for axis in part.axes]) for what in ("reference", "table")

@@ -1,4 +1,4 @@
-"""A machine that has HAL pins and no CANopen drive: its LinuxCNC files, fdhil's configuration and HAL file for it."""
+"""A machine with HAL pins and no CANopen drive: its LinuxCNC files, fdhil's configuration and HAL file for it."""
 
 from __future__ import annotations
 
@@ -33,19 +33,16 @@ from tests.linuxcnc.hal_plant import (
 from tests.linuxcnc.machine import LinuxCnc
 
 RTAPI = "/usr/bin/rtapi_app"
-LEAD_CYCLES = 150  # a computer that tests run on is busy
+LEAD_CYCLES = 150  # the test computer is busy
 
 
 def plant_hal(text: str) -> Hal:
-    """Return what the HAL file of the plant says."""
     hal = Hal()
     parse_hal(text, Ini({}), lambda _name: "", hal)
     return hal
 
 
 def hal_pins(axis: str, joint: int, hal: Hal) -> dict[str, Any]:
-    """Return [axis.X.drive.hal] of an axis of the plant."""
-
     def source(name: str) -> str:
         return next(pin for pin in hal.nets[f"{axis.lower()}-{name}"] if pin.endswith(".out"))
 
@@ -53,7 +50,7 @@ def hal_pins(axis: str, joint: int, hal: Hal) -> dict[str, Any]:
         "position_command": f"joint.{joint}.motor-pos-cmd",
         "position_feedback": source("position"),
         "speed": source("speed-shown"),
-        "speed_mm_s_per_unit": PITCH_MM / (2 * math.pi),  # the plant has rad/s
+        "speed_mm_s_per_unit": PITCH_MM / (2 * math.pi),  # the plant's unit is rad/s
         "current": source("current-shown"),
         "voltage": source("voltage-shown"),
         "enabled": f"joint.{joint}.amp-enable-out",
@@ -61,7 +58,6 @@ def hal_pins(axis: str, joint: int, hal: Hal) -> dict[str, Any]:
 
 
 def document(folder: Path, bus_port: int, nc_port: int, axes: str = "XY", **correction: float) -> dict[str, Any]:
-    """Return the configuration of the machine as a parsed file."""
     regulators = {
         "structure": "linuxcnc_pid",
         "pid_output": "current",
@@ -104,7 +100,7 @@ def document(folder: Path, bus_port: int, nc_port: int, axes: str = "XY", **corr
 
 
 class HalMachine(LinuxCnc):
-    """LinuxCNC with the plant, fdhil's offsets spliced in, and both bridges."""
+    """LinuxCNC with the plant, fdhil's offsets inserted, and both bridges."""
 
     def __init__(self, file: Path, text: dict[str, Any], motors: Mapping[str, Mapping[str, float]]) -> None:
         file.write_text(to_toml(text))
@@ -117,7 +113,6 @@ class HalMachine(LinuxCnc):
         super().__init__(axes=axes, base=base, hal="source fdhil.hal\n", beside=beside)
 
     def pids_of(self, program: str) -> list[int]:
-        """Return the processes of LinuxCNC that run a program."""
         found = []
         for place in Path("/proc").glob("[0-9]*/cmdline"):
             with suppress(OSError):
@@ -127,7 +122,7 @@ class HalMachine(LinuxCnc):
         return found
 
     def prioritise(self, *others: int) -> None:
-        """Give LinuxCNC, the bridge and others real-time priority, as a machine does, where that is allowed."""
+        """Give LinuxCNC, the bridge and others real-time priority, as on a machine, if permitted."""
         programs = (RTAPI, "milltask", hal_bus.__file__)
         for pid in (*others, *(pid for program in programs for pid in self.pids_of(program))):
             for task in Path(f"/proc/{pid}/task").glob("*"):
@@ -136,7 +131,7 @@ class HalMachine(LinuxCnc):
 
 
 class HalTrace:
-    """A client of the bridge that keeps what each axis was ordered and where it was, for the end of a with block."""
+    """A client of the bridge that records demand and position of each axis; a context manager."""
 
     def __init__(self, port: int, nodes: int) -> None:
         self._nodes = nodes
@@ -156,12 +151,12 @@ class HalTrace:
         self._wire.close()
 
     def _read(self) -> None:
-        with suppress(ConnectionError):  # the bridge lets go what was not read yet
+        with suppress(ConnectionError):  # the bridge drops unread data
             while came := self._wire.recv(1 << 20):
                 self._came.append(came)
 
     def rows_mm(self) -> tuple[Float, Float, Float]:
-        """Return demand, position and applied offset (n, axes) in mm of each servo cycle that came whole."""
+        """Return demand, position and applied offset (n, axes) in mm of each complete servo cycle."""
         per_mm = HAL_INCREMENTS / PITCH_MM
         now: dict[int, bytes] = {}
         rows = []

@@ -1,7 +1,7 @@
 """A machine of HAL's own components for LinuxCNC: pid, an ideal-winding drive for current, motor, dry friction, screw.
 
 The motor with its current loop is linear between two servo cycles; its exact step (matrix exponential) is a few sums.
-Dry friction acts as one torque a cycle: what would stop the axis, at most Cd.
+Dry friction acts as one torque per cycle: the torque that would stop the axis, at most Cd.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import expm
 
 MOTOR = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
-# not what the data sheet says, heavier, and with friction of two directions ("Cd_back": toward minus)
+# heavier than in the data sheet, with friction by direction ("Cd_back": toward minus)
 OTHERS = {
     "X": {"R": 0.6, "L": 0.006, "K": 0.76, "Jt": 0.09, "ft": 0.08, "Cd": 6.0, "Cd_back": 4.5},
     "Y": {"R": 0.45, "L": 0.0045, "K": 0.85, "Jt": 0.065, "ft": 0.03, "Cd": 3.0, "Cd_back": 4.0},
@@ -21,9 +21,9 @@ OTHERS = {
 CURRENT_KP, CURRENT_KI = 12.566, 1256.64
 PITCH_MM, PERIOD_S = 20.0, 0.001
 SPEED_KP, POSITION_GAIN = 23.562, 50.0  # A.s/rad, 1/s
-# states of the plant, and what its step also takes: the current demand and the friction torque
+# states of the plant, and further inputs of its step: current demand and friction torque
 CURRENT, INTEGRAL, SPEED, PLACE, VOLTAGE = range(5)
-# of what sensors show (peak values): A, rad/s, V
+# noise of the sensors (peak values): A, rad/s, V
 NOISE = {"current": 0.2, "speed": 0.03, "voltage": 0.5}
 NAMES = ("current", "integral", "speed", "position", "voltage")
 
@@ -31,7 +31,7 @@ NAMES = ("current", "integral", "speed", "position", "voltage")
 def step_of(motor: Mapping[str, float]) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     """Return (5, 6) the next states of current, loop integral, speed, position and mean voltage.
 
-    Of current, integral, speed, position, current demand and friction torque.
+    Columns: current, integral, speed, position, current demand and friction torque.
     """
     r, el, k, j, f = (motor[name] for name in ("R", "L", "K", "Jt", "ft"))
     a = np.zeros((7, 7))  # current, integral, speed, position, sum of the voltage; demand, torque
@@ -49,7 +49,7 @@ def step_of(motor: Mapping[str, float]) -> np.ndarray[tuple[int, int], np.dtype[
 
 
 class Sums:
-    """Hands out instances of sum2, and writes what they add."""
+    """Allocates instances of sum2, and writes what they add."""
 
     def __init__(self, first: int = 0) -> None:
         self.lines: list[str] = []
@@ -57,7 +57,7 @@ class Sums:
         self._count = first
 
     def add(self, terms: Sequence[tuple[str, float]], out: str) -> None:
-        """Let signal ``out`` be the sum of signals times gains, computed when the thread comes to it."""
+        """Let signal ``out`` be the sum of signals times gains, computed in the order of the thread."""
         first, *rest = terms
         rest = rest or [(first[0], 0.0)]
         for number, (signal, gain) in enumerate(rest):
@@ -71,7 +71,7 @@ class Sums:
 
 
 def machine_hal(axes: str, motors: Mapping[str, Mapping[str, float]]) -> str:
-    """Return the HAL file of a machine with these axes, each a motor with a drive that takes a current."""
+    """Return the HAL file of a machine with these axes, each a motor with a current-controlled drive."""
     sums = Sums()
     lines = [
         f"loadrt trivkins coordinates={axes.lower()}",
@@ -108,7 +108,7 @@ def machine_hal(axes: str, motors: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def _noisy(number: int, signal: str, other: str, peak: float, sums: Sums) -> None:
-    """Add noise to a signal, as its sensor shows it: of the chaotic map x' = 1 - a x^2, of two signals in turn."""
+    """Add sensor noise to a signal: of the chaotic map x' = 1 - a x^2, of two signals in turn."""
     own = f"{signal}-map"
     sums.add([(f"{own}-square", -1.95 - 0.007 * number)], own)
     sums.lines += [f"setp {sums.functions[-1]}.offset 1"]
@@ -117,7 +117,7 @@ def _noisy(number: int, signal: str, other: str, peak: float, sums: Sums) -> Non
 
 
 def _with_limits(stepped: Sequence[str], axes: str) -> Iterator[str]:
-    """Put each axis' friction behind the three sums that it is made of."""
+    """Put each axis' friction after the three sums that it consists of."""
     each = len(stepped) // len(axes)
     for number in range(len(axes)):
         own = stepped[number * each : (number + 1) * each]

@@ -1,4 +1,4 @@
-"""A running LinuxCNC without a screen, and the stream of its demands into the simulated machine."""
+"""A running headless LinuxCNC, and the stream of its demands into the simulated machine."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.sim.twin_process import TwinProcess
 HERE = Path(__file__).parent
 PATIENCE_S = 300.0
 LEAVING_S = 30.0
-# what the how-to has: a row of the demand for each servo cycle of 1 ms
+# as in the how-to: a row of the demand per servo cycle of 1 ms
 ROWS = r"""stdbuf -oL halsampler -t | mawk -W interactive '
 BEGIN { print "time_s,X_mm,Y_mm" } NF >= 3 { printf "%.3f,%s,%s\n", $1 / 1000, $2, $3 }'"""
 
@@ -92,9 +92,8 @@ MAX_LINEAR_ACCELERATION = {acceleration}
 class LinuxCnc:
     """LinuxCNC, switched on and homed at 0; leaving the with block ends it.
 
-    ``hal`` are more lines of its HAL file, such as the one that loads the bridge; ``base`` is another HAL file than
-    that of joints without drives, and ``beside`` are files that it finds in its folder. AssertionError in LinuxCNC's
-    own words when it does not do its part.
+    ``hal`` are additional lines of its HAL file, for example to load the bridge; ``base`` replaces the HAL file of
+    joints without drives, and ``beside`` are files in its folder. AssertionError in LinuxCNC's own words if it fails.
     """
 
     def __init__(
@@ -134,7 +133,7 @@ class LinuxCnc:
     def _as_nobody(
         self, *command: str, environment: Mapping[str, str] | None = None, log: IO[bytes], out: int | None = None
     ) -> subprocess.Popen[bytes]:
-        """Start a command in a group of its own, as somebody else if this is root: LinuxCNC refuses to run as root."""
+        """Start a command in its own process group, not as root, since LinuxCNC refuses to run as root."""
         if os.geteuid() == 0:
             command = (
                 "setpriv",
@@ -180,19 +179,16 @@ class LinuxCnc:
         return "\n".join((self.folder / name).read_text()[-2000:] for name in files if (self.folder / name).exists())
 
     def order(self, order: str, **what: Any) -> None:
-        """Give an order and wait until the operator has done it."""
         assert self._lines is not None
         self._lines.write(json.dumps({"order": order, **what}) + "\n")
         self._lines.flush()
         self._answer()
 
     def run(self, program: str) -> None:
-        """Run a program to its end; the machine stands then."""
         self.start(program)
         self.order("rest")
 
     def start(self, program: str) -> None:
-        """Start a program."""
         path = self.folder / "program.ngc"
         path.write_text(program)
         path.chmod(0o644)
@@ -200,9 +196,9 @@ class LinuxCnc:
 
     @contextmanager
     def driving(self, twin: TwinProcess) -> Iterator[None]:
-        """Let what is ordered drive the simulated machine until the end of the block, which ends its demand.
+        """Let the demand drive the simulated machine until the end of the block, which ends the demand.
 
-        What LinuxCNC had ordered when the block was left is all in it, however far behind a busy host is.
+        The complete demand up to the end of the block is transferred, however slow the host is.
         """
         with (self.folder / "log").open("ab") as log:
             sampling = self._as_nobody("sh", "-c", ROWS, log=log, out=subprocess.PIPE)
@@ -219,7 +215,7 @@ class LinuxCnc:
             twin.close_panel()
 
     def _wait_until_fetched(self) -> None:
-        """Wait until no more samples are queued than come while one asks."""
+        """Wait until no more samples are queued than arrive during one request."""
         end = time.monotonic() + PATIENCE_S
         while (depth := self._queued()) > 100:
             assert time.monotonic() < end, f"{depth} samples of the demand are still queued"
@@ -232,7 +228,7 @@ class LinuxCnc:
         return int(told)
 
     def close(self) -> None:
-        """End LinuxCNC: its operator leaves, and it cleans up after itself."""
+        """End LinuxCNC: its operator leaves, and it cleans up."""
         if self._lines is not None:
             self._lines.close()
             with suppress(subprocess.TimeoutExpired):
@@ -251,11 +247,11 @@ class LinuxCnc:
 def write_machine(
     folder: Path, speed_mm_s: float, acceleration_mm_s2: float, hal: str, axes: str, base: str | None = None
 ) -> None:
-    """Write the files of a machine as its integrator has them: machine.ini, and the HAL file that it names."""
+    """Write the files of a machine as an integrator does: machine.ini, and its HAL file."""
     text = (HERE / "machine.hal").read_text() if base is None else base
     if base is None:
         text = text.replace("=xyz", f"={axes.lower()}").replace("joints=3", f"joints={len(axes)}")
-    if axes == "XY" and base is None:  # the bridge's channel has its joints only
+    if axes == "XY" and base is None:  # the bridge's channel has only its joints
         lines = text.replace(",fffssff", ",ffssff").splitlines()
         text = "\n".join(line for line in lines if "joint.2" not in line)
     (folder / "machine.hal").write_text(f"{text}\n{hal}")
@@ -281,7 +277,7 @@ def _alone() -> IO[bytes]:
 
 
 class DemandRecorder(LinuxCnc):
-    """A LinuxCNC that drives nothing: what its trajectory planner orders in each servo cycle is recorded."""
+    """A LinuxCNC without drives whose demand in each servo cycle is recorded."""
 
     def __init__(self, speed_mm_s: float = 500.0, acceleration_mm_s2: float = 2000.0, axes: str = "XYZ") -> None:
         super().__init__(speed_mm_s, acceleration_mm_s2, axes=axes)
@@ -295,13 +291,13 @@ class DemandRecorder(LinuxCnc):
         assert self._sampling.stdout is not None
         for line in self._sampling.stdout:
             words = line.split()
-            if len(words) == 5:  # the others report that samples were not fetched in time
+            if len(words) == 5:  # the others mean that samples were not fetched in time
                 self._samples.put([float(word) for word in words])
 
     def record(self, program: str) -> Float:
-        """Return the ordered axes (n, 3), mm or degrees, of each servo cycle of a program, from first to last motion.
+        """Return the demand (n, 3), mm or degrees, of each servo cycle of a program, from first to last motion.
 
-        It begins at zero, in the state after power-up. AssertionError when a cycle was not recorded or nothing moved.
+        It begins at zero, in the state after power-up. AssertionError if a cycle was not recorded or nothing moved.
         """
         self.order("reset")
         self.run(program)
@@ -313,7 +309,7 @@ class DemandRecorder(LinuxCnc):
         return np.asarray(samples[moving[0] : moving[-1] + 2, 1:4])
 
     def _between_marks(self) -> Iterator[list[float]]:
-        """Yield the samples from the end of the mark that the reset sets to the beginning of that after the program."""
+        """Yield the samples between the end of the reset's mark and the start of the mark after the program."""
         marks = 0
         marked = False
         while marks < 2:
@@ -324,7 +320,6 @@ class DemandRecorder(LinuxCnc):
                 yield sample
 
     def close(self) -> None:
-        """End the recording, and LinuxCNC."""
         _end(self._sampling)
         self._thread.join()
         assert self._sampling.stdout is not None
@@ -333,13 +328,11 @@ class DemandRecorder(LinuxCnc):
 
 
 def _pour(rows: IO[bytes], twin: TwinProcess) -> None:
-    """Hand the rows of the demand to the simulated machine until there are no more."""
     for line in rows:
         twin.send_line(line.decode().rstrip())
 
 
 def _end(child: subprocess.Popen[bytes]) -> None:
-    """End a process and whatever it has started, if it has not ended."""
     with suppress(ProcessLookupError):
         os.killpg(child.pid, signal.SIGTERM)
     try:

@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""The operator of a LinuxCNC machine without a screen: switches it on, homes it, and does what is ordered by TCP.
+"""The operator of a headless LinuxCNC machine: switches it on, homes it, and executes orders received by TCP.
 
 LinuxCNC starts this in place of its display, with the system's Python; it ends with the connection, and LinuxCNC with
 it. Orders and answers are lines of JSON: ``{"order": "run", "program": "/a/part.ngc"}`` gives ``{"done": "run"}`` or
@@ -23,18 +23,18 @@ AXES = os.environ["AXES"]
 JOINTS = len(AXES)
 PATIENCE_S = 300.0
 LOOK_S = 1.0
-# what a program may have left changed; the axes go back to zero
+# a program may have changed these; the axes return to zero
 ZERO = " ".join(f"{axis}0" for axis in AXES)
 POWER_UP = ["M64 P0", "G54 G92.1 G49 G40 G80 G8", *(f"G10 L2 P{system} {ZERO} R0" for system in range(1, 10))]
 POWER_UP += [f"G53 G0 {ZERO}", "G64 G17 G21 G90 G91.1 G94 G97 G98", "M5 M9 M48", "M65 P0"]
 
 
 class Failed(Exception):
-    """LinuxCNC did not do what was ordered."""
+    """LinuxCNC did not execute the order."""
 
 
 class Operator:
-    """Gives orders and waits, by LinuxCNC's status alone, until they are done."""
+    """Gives orders and waits, by LinuxCNC's status only, until they are done."""
 
     def __init__(self, wire: socket.socket) -> None:
         self._wire = wire
@@ -42,7 +42,6 @@ class Operator:
         self._said: list[str] = []
 
     def order(self, what: Callable[..., None], *arguments: Any) -> None:
-        """Give an order and wait until it is done."""
         what(*arguments)
         end = time.monotonic() + PATIENCE_S
         while (result := self.command.wait_complete(LOOK_S)) == -1 and time.monotonic() < end:
@@ -51,12 +50,11 @@ class Operator:
             raise Failed(f"{what.__name__}{arguments} was not done; {self._words()}")
 
     def wait(self, ready: Callable[[Any], bool]) -> None:
-        """Poll until something is so."""
         end = time.monotonic() + PATIENCE_S
         while time.monotonic() < end:
             with contextlib.suppress(
                 linuxcnc.error
-            ):  # on a busy host the status may be locked for longer than it waits
+            ):  # on a busy host the status may be locked for longer than the wait
                 self.status.poll()
                 if ready(self.status):
                     return
@@ -67,13 +65,12 @@ class Operator:
         raise Failed(f"the machine did not get there ({state}); {self._words()}")
 
     def _leave_when_alone(self) -> None:
-        """End, and LinuxCNC with it, when whoever gave the order has ended."""
+        """End, together with LinuxCNC, when the client has ended."""
         with contextlib.suppress(BlockingIOError):
             if not self._wire.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT):
                 sys.exit(1)
 
     def _has_failed(self) -> bool:
-        """Return whether LinuxCNC has reported an error since ``_words`` was asked for."""
         while (error := self.errors.poll()) is not None:
             self._said.append(str(error[1]).strip())
         return bool(self._said)
@@ -84,7 +81,7 @@ class Operator:
         return f"LinuxCNC says: {text}"
 
     def prepare(self) -> None:
-        """Switch the machine on and home it where it stands."""
+        """Switch the machine on and home it at its position."""
         self.order(self.command.state, linuxcnc.STATE_ESTOP_RESET)
         self.order(self.command.state, linuxcnc.STATE_ON)
         self.order(self.command.mode, linuxcnc.MODE_MANUAL)
@@ -94,11 +91,10 @@ class Operator:
         self.order(self.command.mode, linuxcnc.MODE_AUTO)
 
     def reset(self) -> None:
-        """Bring the machine to zero, and the interpreter to its state after power-up."""
+        """Move the machine to zero, and the interpreter to its state after power-up."""
         self.enter(*POWER_UP)
 
     def enter(self, *blocks: str) -> None:
-        """Have some blocks done one after another."""
         self.order(self.command.mode, linuxcnc.MODE_MDI)
         for block in blocks:
             self.order(self.command.mdi, block)
@@ -107,23 +103,22 @@ class Operator:
             raise Failed(self._words())
 
     def run(self, program: str) -> None:
-        """Start a program from its first line; return when it runs, or is over already."""
+        """Start a program from its first line; return when it runs, or has ended."""
         self.order(self.command.program_open, program)
-        self.command.auto(linuxcnc.AUTO_RUN, 0)  # whose completion is the program's
+        self.command.auto(linuxcnc.AUTO_RUN, 0)  # completed with the program
         self.wait(lambda status: status.interp_state != linuxcnc.INTERP_IDLE or self._is_complete(status))
 
     def _is_complete(self, status: Any) -> bool:
-        """Return whether LinuxCNC has done the last order, or failed to."""
+        """Return whether LinuxCNC has completed the last order, or failed."""
         return bool(status.echo_serial_number == self.command.serial and status.state != linuxcnc.RCS_EXEC)
 
     def rest(self) -> None:
-        """Wait until the program is over and the machine stands."""
+        """Wait until the program has ended and the machine is at standstill."""
         self.wait(lambda status: status.interp_state == linuxcnc.INTERP_IDLE and bool(status.inpos))
         if self._has_failed():
             raise Failed(self._words())
 
     def obey(self, order: dict[str, Any]) -> None:
-        """Do one order."""
         match order["order"]:
             case "run":
                 self.run(order["program"])
@@ -134,7 +129,7 @@ class Operator:
             case "rest":
                 self.rest()
             case "override":
-                self.command.feedrate(order["value"])  # done at once, complete only with the program that runs
+                self.command.feedrate(order["value"])  # done at once, but complete only with the running program
                 self.wait(lambda status: abs(status.feedrate - order["value"]) < 1e-6)
             case "rapid_override":
                 self.command.rapidrate(order["value"])
@@ -152,7 +147,7 @@ class Operator:
 
 
 def main() -> None:
-    """Serve whoever started LinuxCNC."""
+    """Serve the process that started LinuxCNC."""
     with (
         socket.create_connection(("127.0.0.1", int(os.environ["OPERATOR_PORT"]))) as wire,
         wire.makefile("rw") as lines,

@@ -1,4 +1,4 @@
-"""fdhil beside a real LinuxCNC: its moves are told by the bridge, exact to a cycle, whatever the bus lags behind."""
+"""fdhil next to a real LinuxCNC: the bridge reports its moves, exact to a cycle, regardless of the bus's lag."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ addf sampler.2 servo-thread
 
 @dataclass
 class Heard:
-    """What the machine's source handed over."""
+    """Records received from the machine's source."""
 
     records: list[Record] = field(default_factory=list)
     came: asyncio.Event = field(default_factory=asyncio.Event)
@@ -68,7 +68,7 @@ class Heard:
         self.came.set()
 
     def of(self, axis: str, newest: int | None = None) -> tuple[Int, Float]:
-        """Return ticks and demand (n,) of an axis, from the bus; ``newest`` blocks of it only."""
+        """Return ticks and demand (n,) of an axis, from the bus; only of the ``newest`` blocks."""
         mine = (r for r in reversed(self.records) if isinstance(r, AxisSamples) and r.axis == axis)
         blocks = list(islice(mine, newest))[::-1]
         return np.concatenate([b.tick for b in blocks]), np.concatenate([b.demand_mm for b in blocks])
@@ -78,11 +78,11 @@ class Heard:
 
     @property
     def state(self) -> NcState:
-        """What the NC said last."""
+        """The NC's last state."""
         return next(r for r in reversed(self.records) if isinstance(r, NcState))
 
     def place(self, axis: str) -> float:
-        """Where the NC said that an axis was, mm."""
+        """The axis' position as reported by the NC, mm."""
         return (self.state.demand_mm or {})[axis]
 
     async def until(self, holds: Callable[[], bool]) -> None:
@@ -92,7 +92,7 @@ class Heard:
                 await self.came.wait()
 
     async def rest(self, strokes: int) -> None:
-        """Wait until the bus has caught up: so many strokes of X are over, and it stands for long where the NC does."""
+        """Wait until the bus has caught up: so many strokes of X are completed, and it rests at the NC's position."""
 
         def stands() -> bool:
             if self.state.motion is not MoveKind.REST:
@@ -104,7 +104,7 @@ class Heard:
         await self.until(stands)
 
     def stands(self, ticks: int) -> bool:
-        """Whether the bus has stood for so long where the NC says that it is."""
+        """Return whether the bus has rested long enough at the NC's position."""
         demand = {axis: self.of(axis, 100)[1][-ticks:] for axis in "XY"}
         return all(np.ptp(demand[axis]) == 0 and abs(demand[axis][-1] - self.place(axis)) < 0.001 for axis in "XY")
 
@@ -121,7 +121,7 @@ async def listening(config: MachineConfig) -> AsyncIterator[Heard]:
 
 
 def beside(path: Path, twin: TwinProcess, port: int) -> MachineConfig:
-    """The twin's machine as fdhil listens to it, with LinuxCNC's bridge as its source of rapids."""
+    """The simulator's machine in fdhil's configuration, with LinuxCNC's bridge as its source of rapids."""
     bus = twin.ready["buses"]["can0"]
     text = path.read_text().replace("[bus.can0]\n", f"[bus.can0]\nport = {bus['port']}\n")
     listener = path.with_name("listener.toml")
@@ -145,7 +145,7 @@ def first_motion(demand: Float) -> int:
 
 @contextmanager
 def sampled(nc: LinuxCnc, path: Path) -> Iterator[None]:
-    """Write what the sampler sees, a row for each servo cycle, to a file."""
+    """Write the sampler's data to a file, one row per servo cycle."""
     with (nc.folder / "log").open("ab") as log, path.open("wb") as rows:
         command = ("stdbuf", "-oL", "halsampler", "-c", "2")
         sampler = nc._as_nobody(*command, environment=os.environ, log=log, out=rows.fileno())
@@ -173,7 +173,7 @@ async def test_linuxcncs_own_sequence_is_recovered(tmp_path: Path) -> None:
 
 
 def check_sequence(heard: Heard, axis: str, demand: Float, types: Sequence[int]) -> None:
-    """Compare with what the sampler saw, row by row: both begin with the first motion."""
+    """Compare with the sampler's data row by row; both begin with the first motion."""
     ticks, bus = heard.of(axis)
     offset = int(ticks[first_motion(bus)]) - first_motion(demand)
     n = min(demand.size, int(ticks[-1]) - offset)

@@ -1,4 +1,4 @@
-"""LinuxCNC with pid components and no CANopen drive: fdhil identifies, predicts and corrects by HAL pins alone."""
+"""LinuxCNC with pid components and no CANopen drive: fdhil identifies, predicts and corrects by HAL pins only."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.linuxcnc.hal_plant import MOTOR, OTHERS, PITCH_MM
 from tests.ports import free_port
 
 pytestmark = pytest.mark.debian
-# the first move takes both axes out of their friction, and longer than offsets are sent ahead
+# the first move overcomes the friction of both axes, and lasts longer than the offsets' lead
 PART = """G21 G90 G17 G64 P0.01
 F9000
 G1 X20 Y20
@@ -41,7 +41,7 @@ G1 X20 Y20
 G1 X0 Y0
 M2
 """
-PLANTS: dict[str, tuple[dict[str, dict[str, float]], float]] = {  # and by how much the contour error falls at least
+PLANTS: dict[str, tuple[dict[str, dict[str, float]], float]] = {  # and the minimum reduction of the contour error
     "benign": (dict.fromkeys("XY", MOTOR), 10.0),
     "realistic": (OTHERS, 4.0),
 }
@@ -50,8 +50,6 @@ PER_MM = HAL_INCREMENTS / PITCH_MM
 
 @dataclass
 class HalShop:
-    """LinuxCNC with the plant, its configuration, and the port of the bridge."""
-
     file: Path
     nc: HalMachine
     port: int
@@ -63,7 +61,7 @@ class HalShop:
         """Return demand, position and applied offset (n, 2) in mm, from the first motion of ``cut`` on."""
         with HalTrace(self.port, 2) as trace:
             cut()
-            time.sleep(0.5)  # the trace is of what LinuxCNC does, in real time
+            time.sleep(0.5)  # the trace records LinuxCNC in real time
         demand, position, offset = trace.rows_mm()
         moving = np.flatnonzero(np.abs(np.diff(demand, axis=0)).max(axis=1) > 0)
         rows = slice(moving[0], moving[-1] + 300)
@@ -122,7 +120,7 @@ def test_the_second_cut_is_corrected_by_hal_pins_alone(shop: HalShop, plant: str
 
 
 class Nonsense:
-    """A client of the bridge that sends offsets as it likes."""
+    """A client of the bridge that sends arbitrary offsets."""
 
     def __init__(self, port: int) -> None:
         self.wire = socket.create_connection(("127.0.0.1", port))
@@ -130,7 +128,7 @@ class Nonsense:
         self.rest = b""
 
     def run(self, cycles: int, offset_mm: Callable[[int], float | None]) -> list[float]:
-        """Answer so many SYNCs with the offset of X and Y; return what HAL applied to X in each cycle, mm."""
+        """Answer so many SYNCs with the offset of X and Y; return the offset applied to X in each cycle, mm."""
         applied: list[float] = []
         while len(applied) < cycles:
             *pieces, self.rest = (self.rest + self.wire.recv(1 << 16)).split(b">")
@@ -175,7 +173,7 @@ def test_hal_brings_the_offset_to_zero(shop: HalShop, nonsense: Nonsense, fault:
     nonsense.run(300, lambda _cycle: 0.0)
     held = nonsense.run(700, lambda _cycle: 0.05)
     assert held[-1] == pytest.approx(0.05, abs=1e-4)
-    if fault == "abort and estop":  # offsets are sent on
+    if fault == "abort and estop":  # offsets are still sent
         shop.nc.order("estop")
         left = nonsense.run(1500, lambda _cycle: 0.05)
     elif fault == "end":

@@ -1,4 +1,4 @@
-"""What fdhil learns in one run of a program holds for the next, if LinuxCNC orders the same again: does it?"""
+"""A learned offset is useful only if LinuxCNC repeats the same demand: does it?"""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def motions(reference_mm: Float) -> list[Float]:
 
 
 def test_between_two_rests_runs_are_the_same_to_the_last_digit(tmp_path: Path) -> None:
-    """A rest may last a cycle more or less: LinuxCNC's dwell ends when its task looks at the clock.
+    """A rest may differ by a cycle: LinuxCNC's dwell ends when its task checks the clock.
 
-    A host that has no time for LinuxCNC's task starves its planner, which then slows down between two blocks: such
-    a run is like no other. So as many as are the same are counted.
+    A host without time for LinuxCNC's task starves its planner, which then slows down between two blocks: such a run is
+    unique. Therefore the identical runs are counted.
     """
     config = write_config(tmp_path, 'pace = "lockstep"\nmodbus = false')
     with TwinProcess(config, "--demand", "-", "--trace", tmp_path / "trace.csv") as twin:

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.debian
 
 @dataclass
 class Shop:
-    """The simulated machine with its trace, and fdhil beside it, commissioned and listening."""
+    """The simulated machine with its trace, and fdhil commissioned and recording."""
 
     file: Path
     twin: TwinProcess

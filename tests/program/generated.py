@@ -1,4 +1,4 @@
-"""Programs made up at random, by seed: what the differential tests feed to both interpreters."""
+"""Random programs by seed, for the differential tests of both interpreters."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 
 class Writer:
-    """Writes one random program; ``lines`` grows. Co-ordinates have three decimals, so that four tell."""
+    """Writes one random program; ``lines`` grows. Co-ordinates have three decimals, so that four are conclusive."""
 
     def __init__(self, seed: int) -> None:
         self._random = random.Random(seed)
@@ -28,7 +28,6 @@ class Writer:
         return f"{value:g}" if "e" not in f"{value:g}" else "0"
 
     def axes(self, letters: str, least: int = 1) -> str:
-        """Return some axis words."""
         count = self._random.randint(least, len(letters))
         chosen = self._random.sample(letters, count)
         return " ".join(letter + self.number() for letter in chosen)
@@ -189,7 +188,7 @@ class Writer:
         ]
 
     def compensated(self) -> None:
-        """A path beside which a small tool goes; now and then it cannot."""
+        """A path with cutter compensation; occasionally one that is impossible."""
         pick = self._random
         plane = pick.choice(["G17", "G17", "G18"])
         first, second, normal = ("X", "Y", "Z") if plane == "G17" else ("X", "Z", "Y")
@@ -227,7 +226,7 @@ class Writer:
         self.lines += [f"G33 {self.axes('XZ')} K{round(pick.uniform(0.5, 3), 2)}", "G33.1 Z-20 K1.25", "G17 G80"]
 
     def contour(self) -> None:
-        """A turned contour in a subroutine, roughed and finished; now and then it cannot."""
+        """A turned contour in a subroutine, roughed and finished; occasionally an impossible one."""
         pick = self._random
         self._labels += 1
         label = self._labels
@@ -261,7 +260,7 @@ class Writer:
         self.lines += [f"G70 Q{label} {start} D0.3 E0 P{pick.randint(1, 3)}", "G17"]
 
     def series(self) -> None:
-        """Cycle blocks that go on with changed words, levels, planes and retracts."""
+        """Consecutive cycle blocks with changed words, levels, planes and retracts."""
         pick = self._random
         planes = [(17, "X", "Y", "Z"), (17, "X", "Y", "Z"), (18, "Z", "X", "Y"), (19, "Y", "Z", "X")]
         plane, first, second, normal = pick.choice(planes)

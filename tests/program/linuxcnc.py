@@ -1,4 +1,4 @@
-"""The reference interpreter as a separate program: ``rs274`` of LinuxCNC prints canonical calls, read here as motions.
+"""The reference interpreter as a separate program: ``rs274`` of LinuxCNC prints canonical calls, parsed as motions.
 
 Its co-ordinates are those of the program: the offsets and the rotation it prints are added here. Four decimals.
 """
@@ -19,13 +19,13 @@ from fdhil.program.motions import PLANE_AXES
 
 CASES = Path(__file__).parent / "differential.txt"
 RS274 = shutil.which("rs274")
-# a line number of nine digits fills its column, so that the call follows without a blank
+# a line number of nine digits fills its column, so the call follows without a blank
 _CALL = re.compile(r"^\s*\d+\s+N(?:\.+\s+|\s*\d+\s*)([A-Z0-9_]+)\((.*)\)\s*$")
 
 
 @dataclass
 class Answer:
-    """What the reference says: its motions up to the end or the error, and the error's text ("" for none)."""
+    """The reference's motions up to the end or the error, and the error's text ("" for none)."""
 
     motions: list[Motion] = field(default_factory=list)
     error: str = ""
@@ -75,7 +75,7 @@ class _Canon:
 
     def tap(self, values: list[float]) -> None:
         self.motions.append(Feed(0, self.machine(values[:3]), self.mm_min()))
-        self.motions.append(Feed(0, self.machine(self.at), math.nan))  # the speed of the way back (I) is not told
+        self.motions.append(Feed(0, self.machine(self.at), math.nan))  # the return speed (I) is not reported
 
     def arc(self, values: list[float]) -> None:
         first, second, normal = PLANE_AXES[self.plane]
@@ -127,9 +127,9 @@ class _Canon:
 
 
 def ask(program: Path, limit_s: float = 20.0, ini: str = "") -> Answer:
-    """Run the reference on a file and an INI of this text, with tools that have no length and no stored parameters.
+    """Run the reference on a file and an INI of this text, with tools without length and no stored parameters.
 
-    SubprocessError when it does not end in time, or crashes.
+    SubprocessError if it does not end in time, or crashes.
     """
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "tool.tbl").write_text("".join(f"T{n} P{n} Z0 D0\n" for n in range(1, 56)))
@@ -153,7 +153,7 @@ def ask(program: Path, limit_s: float = 20.0, ini: str = "") -> Answer:
 
 
 def cases() -> list[tuple[str, str]]:
-    """Return the written programs, and why they differ ("" where they must not)."""
+    """Return the written programs, and why they differ ("" if they must not)."""
     found, why = [], ""
     for line in CASES.read_text("utf-8").splitlines():
         if line.startswith("~"):
@@ -167,7 +167,7 @@ def cases() -> list[tuple[str, str]]:
 
 
 def difference(ours: list[Motion], theirs: list[Motion], tolerance_mm: float = 3e-4) -> str:
-    """Say where two lists of motions first differ, "" when they agree within the reference's decimals."""
+    """Return where two lists of motions first differ, "" if they agree within the reference's decimals."""
     abc: dict[str, float] = {}
     for number, (a, b) in enumerate(zip(ours, theirs, strict=False)):
         if type(a) is not type(b) or not _near(_figures(a), _figures(b), tolerance_mm):

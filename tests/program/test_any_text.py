@@ -1,4 +1,4 @@
-"""Whatever the text, the answer is motions or a ProgramError with its line, within the budget."""
+"""For any text, the result is motions or a ProgramError with its line, within the budget."""
 
 from __future__ import annotations
 

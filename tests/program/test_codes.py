@@ -1,4 +1,4 @@
-"""Codes one by one: motions worked out by hand or by geometry, without another interpreter."""
+"""Single codes: motions derived by hand or by geometry, without another interpreter."""
 
 from __future__ import annotations
 
@@ -25,17 +25,16 @@ def run(*lines: str) -> list[Motion]:
 
 
 def ends(*lines: str) -> Float:
-    """Where motions end, dwells left out."""
+    """Ends of the motions, without dwells."""
     return np.array([motion.end for motion in run(*lines) if not isinstance(motion, Dwell)])
 
 
 def kinds(*lines: str) -> str:
-    """R, F, A and D for the motions."""
     return "".join(type(motion).__name__[0] for motion in run(*lines))
 
 
 def test_a_nurbs_with_the_weights_of_a_circle_is_a_quarter_of_it() -> None:
-    """Quadratic, three points, the middle one weighs cos 45 degrees."""
+    """Quadratic, three points, the middle one with weight cos 45 degrees."""
     motions = run("G0 X10", "F300 G5.2 P1 L3", f"X10 Y10 P{math.sqrt(0.5):.15f}", "X0 Y10 P1", "G5.3")
     places = np.array([m.end for m in motions if isinstance(m, Feed)])
     assert np.hypot(places[:, 0], places[:, 1]) == pytest.approx(10.0, abs=1e-6)
@@ -76,7 +75,7 @@ STEP = ("F100 G18", "O100 sub", "G0 X2 Z0", "G1 Z-10", "X10", "O100 endsub", "G0
 
 
 def test_g71_cuts_along_z_in_steps_of_i_down_to_the_contour() -> None:
-    """A shaft of radius 2 and 10 long, out of one of radius 10: cuts at 10, 8, 6 and 4, then along the contour."""
+    """A shaft of radius 2 and length 10, from one of radius 10: cuts at 10, 8, 6 and 4, then along the contour."""
     motions = run(*STEP, "G71 Q100 X10 Z2 D0 I2 R0.5")
     cuts = [m for m in motions if isinstance(m, Feed)]
     at_wall = [m.end for m in cuts if m.end[2] == pytest.approx(-10.0, abs=1e-3)]
@@ -114,14 +113,14 @@ def test_a_contour_whose_corners_take_a_whole_line_is_refused() -> None:
 
 
 def test_an_arc_of_a_turned_system_outside_its_xy_plane_becomes_chords() -> None:
-    """A half circle in XZ, turned by 30 degrees about Z: all of it lies in the turned plane, 5 mm from its centre."""
+    """A half circle in XZ, rotated by 30 degrees about Z: all of it lies in the rotated plane, 5 mm from its centre."""
     places = ends("G10 L2 P1 R30", "F100 G18", "G2 X10 Z0 I5")
     way = np.array([math.cos(math.radians(30.0)), math.sin(math.radians(30.0)), 0.0])
     assert places[-1] == pytest.approx(10.0 * way, abs=1e-9)
     assert places @ [way[1], -way[0], 0.0] == pytest.approx(0.0, abs=1e-9)
     assert np.linalg.norm(places - 5.0 * way, axis=1) == pytest.approx(5.0, abs=1e-9)
     assert np.abs(np.diff(places[:, 2])).max() < 0.3
-    assert places[:, 2].min() == pytest.approx(-5.0, abs=1e-2)  # clockwise as seen from +Y, where Z points right, X up
+    assert places[:, 2].min() == pytest.approx(-5.0, abs=1e-2)  # clockwise seen from +Y, with Z to the right and X up
 
 
 def test_g70_enters_compensation_on_its_way_to_the_contour_in_every_pass() -> None:
@@ -180,7 +179,7 @@ def test_path_control_goes_with_each_motion() -> None:
 
 def test_a_feed_that_follows_the_spindle() -> None:
     assert run("M3 S100", "G33 Z-5 K1.5") == [Feed(2, (0.0, 0.0, -5.0), 150.0)]
-    assert run("M3 S0", "G33 Z-5 K1") == [Feed(2, (0.0, 0.0, -5.0), 0.0)]  # a spindle that stands; no plan takes it
+    assert run("M3 S0", "G33 Z-5 K1") == [Feed(2, (0.0, 0.0, -5.0), 0.0)]  # the spindle is stopped; no plan accepts it
     assert [m.feed for m in run("M3 S100", "G33.1 Z-5 K1 I2") if isinstance(m, Feed)] == [100.0, 200.0]
     with pytest.raises(ProgramError, match="spindle"):
         run("G33 Z-5 K1")
@@ -192,7 +191,7 @@ def test_a_feed_that_follows_the_spindle() -> None:
     ("G81 X1 Z-3 R2 L2", "RRFRRFR"),
 ])  # fmt: skip
 def test_what_a_cycle_is_made_of(line: str, expected: str) -> None:
-    """From Z5: to R over the place, down by feed, a dwell, and back by rapid, or by feed and a rapid of no length."""
+    """From Z5: to R above the hole, down by feed, a dwell, and back by rapid, or by feed and a rapid of no length."""
     assert kinds("F100 M3 S100 G99", "G0 Z5", line)[1:] == expected
 
 
@@ -237,7 +236,7 @@ LINES = 1_000_000
 
 @pytest.mark.usefixtures("long_computation")
 def test_a_million_lines_are_read_in_flat_memory(tmp_path: Path) -> None:
-    """A file of 20 Mbyte: what is held after twenty thousand lines is what was held after five hundred."""
+    """A file of 20 Mbyte: memory after twenty thousand lines equals that after five hundred."""
     path = tmp_path / "long.ngc"
     thousand = "".join(f"G1 X{number} Y{number % 89} F600\n" for number in range(1000))
     path.write_text(thousand * (LINES // 1000))
@@ -255,7 +254,7 @@ def test_a_million_lines_are_read_in_flat_memory(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("real_time")
 def test_lines_that_are_made_as_they_are_read_are_kept_in_four_megabytes_at_most() -> None:
-    """They might be needed again by a loop: beyond 4 Mbyte they go to the disk."""
+    """A loop might need them again: beyond 4 Mbyte they are stored on disk."""
     motions = interpret(f"G1 X{number % 997} F600 ({'x' * 3900})" for number in range(1500))
     tracemalloc.start()
     assert sum(1 for _ in motions) == 1500
@@ -265,12 +264,12 @@ def test_lines_that_are_made_as_they_are_read_are_kept_in_four_megabytes_at_most
 
 
 def test_a_called_block_that_there_is_not_is_told_by_its_number() -> None:
-    """As it was written, and without the name that fdhil has for such a block."""
-    with pytest.raises(ProgramError, match="line 1, 'O99': is called and stands nowhere"):
+    """As written, and without fdhil's internal name for such a block."""
+    with pytest.raises(ProgramError, match="line 1, 'O99': is called but does not exist"):
         run("M98 P99", "M2")
 
 
 def test_the_cornering_of_the_s_curve_planner_is_refused_by_its_name() -> None:
     for cycle in ("G80", "G81 X1 Z-1 R1"):
-        with pytest.raises(ProgramError, match=r"line 2, 'G64 R': is of the S-curve planner of LinuxCNC 2\.10"):
+        with pytest.raises(ProgramError, match=r"line 2, 'G64 R': is for the S-curve planner of LinuxCNC 2\.10"):
             list(interpret([f"F100 {cycle}", "G64 P0.01 R2", "G0 X1"]))

@@ -1,4 +1,4 @@
-"""Encodings: the text of a program may be stored in several, and text that no NC reads is named."""
+"""Encodings: a program may be stored in several, and text that no NC reads is refused by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A program with other feeds: F words replaced, everything else byte for byte, and never other motions."""
+"""Changed feeds in a program: F words are replaced, everything else is identical, and the motions never change."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_line_run_at_two_feeds_from_elsewhere_is_refused(tmp_path: Path) -> No
 
 def test_a_program_of_several_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "part2.ngc").write_text("o<part2> sub\nG1 X1 F100\no<part2> endsub\n")
-    with pytest.raises(ProgramError, match="files of their own"):
+    with pytest.raises(ProgramError, match="subroutines in other files"):
         written(tmp_path, b"o<part2> call\nM2\n", {2: 0.5})
 
 

@@ -9,12 +9,10 @@ from fdhil.program import Arc, Budget, Dwell, Feed, Motion, Rapid, interpret
 
 
 def run(*lines: str) -> list[Motion]:
-    """Interpret lines."""
     return list(interpret(lines))
 
 
 def fault(*lines: str) -> ProgramError:
-    """Interpret lines that must be refused."""
     with pytest.raises(ProgramError) as caught:
         run(*lines)
     return caught.value

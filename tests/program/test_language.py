@@ -1,4 +1,4 @@
-"""The language beyond single moves: flow, subroutines in files, cycles, compensation, threads, splines, kept modes."""
+"""The language beyond single moves: flow, subroutines in files, cycles, compensation, threads, splines, saved modes."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from fdhil.program import Arc, Budget, Dwell, Feed, Motion, Probe, Rapid, interp
 
 
 def ends(motions: list[Motion]) -> list[tuple[float, ...]]:
-    """Ends of the motions, 4 decimals; of a dwell its time."""
+    """Ends of the motions, 4 decimals; for a dwell its time."""
     return [(m.seconds,) if isinstance(m, Dwell) else tuple(round(v, 4) + 0.0 for v in m.end) for m in motions]
 
 
 def run(text: str) -> list[Motion]:
-    """Interpret lines that are parted by "|"."""
+    """Interpret lines separated by "|"."""
     return list(interpret(text.split("|")))
 
 

@@ -1,4 +1,4 @@
-"""A recorded demand that exceeds the limits of its NC is reported with axis, figure and place."""
+"""A recorded demand that exceeds the limits of its NC is reported with axis, figure and position."""
 
 from __future__ import annotations
 
@@ -67,5 +67,5 @@ def test_a_demand_beyond_a_limit_is_reported(acceleration: float, top: float, wo
 def test_a_path_faster_than_the_nc_allows_is_reported() -> None:
     x = ramp(1500.0, 80.0)
     (note,) = notes_of(x, x, config_of(max_path_speed_mm_s=100.0))
-    assert note.text.startswith("the path is run at 113.")
+    assert note.text.startswith("the path speed is 113.")
     assert "nc.max_path_speed_mm_s is 100" in note.text

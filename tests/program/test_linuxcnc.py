@@ -1,4 +1,4 @@
-"""Every motion against LinuxCNC's own interpreter, over generated programs and the package's examples."""
+"""Every motion compared with LinuxCNC's own interpreter, over generated programs and the package's examples."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.program.linuxcnc import Answer, ask, cases, difference
 pytestmark = pytest.mark.debian
 
 EXAMPLES = Path("/usr/share/linuxcnc/ncfiles")
-# what the examples do that fdhil does otherwise, and why
+# examples that fdhil executes differently, and why
 OTHERWISE = {
     "cone.ngc": "W words: the reference has no such axis, fdhil lists them",
     "lathe_g70_71_demo.ngc": "G70 with cutter compensation: goes to the contour's end first, mended in LinuxCNC 2.9.3",
@@ -26,7 +26,7 @@ OTHERWISE = {
     "x-trim.ngc": "a probe's end: fdhil's target, the reference 0.01 inch before it",
     "tool-length-probe.ngc": "a probe that begins where another ended",
 }
-# seeds whose path has a cusp where one of both sees an inside corner, the other an outside one
+# seeds whose path has a cusp: an inside corner for one interpreter, an outside one for the other
 CUSPS = {("compensation", seed) for seed in (140, 243, 287, 289, 290)}
 ROUNDING_MM = 5e-4
 ROUNDING_INCH_MM = 2e-2
@@ -43,7 +43,7 @@ def ours(path: Path) -> tuple[list[Motion], str]:
 
 
 def compare(motions: list[Motion], error: str, reference: Answer, tolerance_mm: float) -> str:
-    """Say what differs: an error on one side alone, or a motion."""
+    """Return the difference: an error on one side only, or a motion."""
     if bool(error) != bool(reference.error):
         return f"ours: {error or 'accepted'}, theirs: {reference.error or 'accepted'}"
     if error:
@@ -52,7 +52,7 @@ def compare(motions: list[Motion], error: str, reference: Answer, tolerance_mm: 
 
 
 def test_wrapped_rotary_axis_turns_as_the_reference_has_it(tmp_path: Path) -> None:
-    """Absolute words of either sign, G91, G53 and G92, in a random order."""
+    """Absolute words of either sign, G91, G53 and G92, in random order."""
     path, random = tmp_path / "program.ngc", np.random.default_rng(4)
     budget = Budget(dialect=Dialect(wrapped_axes=("A",)))
     for _ in range(20):
@@ -72,7 +72,7 @@ def test_generated_programs_give_the_motions_of_the_reference(group: str, tmp_pa
         tolerance_mm = ROUNDING_INCH_MM if "G20" in text else ROUNDING_MM
         try:
             reference = ask(path, 3.0)
-        except subprocess.SubprocessError:  # some contours hold the reference for ever, or crash it; fdhil answers
+        except subprocess.SubprocessError:  # some contours block the reference forever, or crash it; fdhil answers
             ours(path)
             continue
         told = compare(*ours(path), reference, tolerance_mm)
@@ -84,7 +84,7 @@ def test_the_examples_of_the_package_give_the_motions_of_the_reference() -> None
     agreed = 0
     for path in sorted(p for p in EXAMPLES.rglob("*.ngc") if p.name not in OTHERWISE):
         reference = ask(path)
-        if "no percent sign or program end" in reference.error:  # fdhil takes the file's end for the program's
+        if "no percent sign or program end" in reference.error:  # for fdhil the end of the file ends the program
             reference.error = ""
         told = compare(*ours(path), reference, ROUNDING_INCH_MM)
         if told and "no tool table" not in told:

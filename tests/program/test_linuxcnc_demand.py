@@ -1,8 +1,8 @@
-"""The profiles against the demand that LinuxCNC's own planner orders, millisecond by millisecond.
+"""The profiles compared with the demand of LinuxCNC's own planner, millisecond by millisecond.
 
-The profile ``linuxcnc`` does as it does. The trapezoidal one keeps what the axes can: LinuxCNC accelerates with 0.9 of
-the joints' acceleration where a motion ends exactly, with all of it where it blends by an arc, and with half of it
-where it blends by a parabola (measured on the package's version); that is why G64 is compared by path and time alone.
+The profile ``linuxcnc`` reproduces it. The trapezoidal one uses the axes' full limits: LinuxCNC accelerates with 0.9 of
+the joints' acceleration if a motion ends exactly, with all of it if it blends by an arc, and with half of it if it
+blends by a parabola (measured on the package's version); therefore G64 is compared by path and time only.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def ours(text: str, acceleration_mm_s2: float = ACCELERATION_MM_S2, profile: str
 def recorder(axes: str) -> Iterator[Theirs]:
     """LinuxCNC's rows for a program; more than ``most_rows`` or fewer than ``least_rows`` are recorded again, twice.
 
-    Where a busy computer holds its interpreter up, its planner has nothing to look ahead to and brakes; where it holds
-    up who reads the samples, some are lost.
+    A busy computer may delay its interpreter, so that its planner has nothing to look ahead to and brakes, or the
+    reader of the samples, so that some are lost.
     """
     with DemandRecorder(acceleration_mm_s2=ACCELERATION_MM_S2, axes=axes) as nc:
 
@@ -94,12 +94,12 @@ def test_g61_orders_the_same_positions_at_the_same_time(path: str, theirs: Their
     a = ours(text, EXACT_SHARE * ACCELERATION_MM_S2)
     b = theirs(text, 1.006 * len(a), 0.994 * len(a))
     assert len(a) == pytest.approx(len(b), rel=0.006)
-    per_corner_s = 0.0015  # about a cycle of the other planner at each stop, and one at the begin
+    per_corner_s = 0.0015  # about a cycle of the other planner at each stop, and one at the start
     assert apart_mm(a, b) <= 100.0 * per_corner_s * PATHS[path].count("\n")
 
 
-# on a circle LinuxCNC keeps 1 / sqrt(3) of the acceleration for the path at any feed, fdhil what turning leaves over;
-# where the feed is above what a circle allows, LinuxCNC takes all of the acceleration and not 0.9 of it
+# on a circle LinuxCNC reserves 1 / sqrt(3) of the acceleration for the path at any feed, fdhil the unused part;
+# if the feed exceeds the circle's limit, LinuxCNC uses all of the acceleration and not 0.9 of it
 @pytest.mark.parametrize(
     ("path", "feed", "share"),
     [("helix", 6000.0, 0.015), ("contour", 20000.0, 0.012), ("zigzag", 20000.0, 0.012), ("helix", 20000.0, 0.055)],
@@ -131,7 +131,7 @@ def test_g64_stays_within_p_and_takes_about_the_same_time(
 
 
 def polygon(seed: int, count: int = 14) -> str:
-    """Lines of 2 to 40 mm in any direction of space."""
+    """Lines of 2 to 40 mm in random directions."""
     random = np.random.default_rng(seed)
     ways = random.normal(size=(count, 3)) * [1.0, 1.0, 0.3]
     places = np.cumsum(ways / np.linalg.norm(ways, axis=1)[:, None] * random.uniform(2.0, 40.0, (count, 1)), axis=0)
@@ -160,7 +160,7 @@ PATHS |= {
 @pytest.mark.parametrize(("mode", "feed"), [("G61", 2e4), ("G64 P0.05", 6e3), ("G64 P0.2 Q0.02", 2e4)])
 @pytest.mark.parametrize("path", PATHS)
 def test_the_profile_of_linuxcnc_orders_its_demand(path: str, mode: str, feed: float, theirs: Theirs) -> None:
-    """Within 2 % of its time, and on its path: beside what one cycle of the other's lies apart."""
+    """Within 2 % of its time, and on its path up to the distance of one cycle."""
     text = program(path, mode, feed)
     a = ours(text, profile="linuxcnc")
     b = theirs(text, 1.02 * len(a))
@@ -170,7 +170,7 @@ def test_the_profile_of_linuxcnc_orders_its_demand(path: str, mode: str, feed: f
 
 
 def beside_mm(places: Float, path: Float) -> float:
-    """Largest distance of places from a path through points, which is refined to a hundredth of a cycle."""
+    """Largest distance of points from a path through points, refined to a hundredth of a cycle."""
     share = np.linspace(0.0, 1.0, 100, endpoint=False)[:, None, None]
     fine = (path[:-1] + share * (path[1:] - path[:-1])).reshape(-1, 3)
     return float(np.max(cKDTree(np.concatenate([fine, path[-1:]])).query(places)[0]))

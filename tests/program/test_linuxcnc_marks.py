@@ -1,4 +1,4 @@
-"""The programs on which ``rs274`` alone differs: what a whole LinuxCNC, a machine in mm, does with them."""
+"""Programs on which only ``rs274`` differs: executed by a complete LinuxCNC, a machine in mm."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from tests.program.linuxcnc import ask, cases, difference
 pytestmark = pytest.mark.debian
 
 MARKED = [(text, why) for text, why in cases() if why]
-NEAR_MM = 0.01  # LinuxCNC follows a spline by arcs of its own, some micrometres beside it
+NEAR_MM = 0.01  # LinuxCNC approximates a spline by arcs, some micrometres away from it
 
 
 def demand(text: str, axes: str = "XYZ") -> Float:
-    """Return what a LinuxCNC of its own orders: these programs write its parameters."""
+    """Return the demand of a separate LinuxCNC, since these programs write its parameters."""
     with DemandRecorder(axes=axes) as nc:
         return nc.record(text)
 
 
 def ends(text: str) -> Float:
-    """Where fdhil's motions end, the machine's zero first; a curve is chords by then."""
+    """Ends of fdhil's motions, the machine's zero first; curves are chords."""
     motions = [motion for motion in interpret(text.splitlines()) if not isinstance(motion, Dwell)]
     assert not any(isinstance(motion, Arc) for motion in motions)
     return np.array([(0.0, 0.0, 0.0), *(motion.end for motion in motions)])
 
 
 def apart_mm(places: Float, path: Float) -> float:
-    """Largest distance of places from a path through corners."""
+    """Largest distance of points from a path through corners."""
     parts = [np.linspace(a, b, 2 + int(np.linalg.norm(b - a) / 0.005)) for a, b in pairwise(path)]
     return float(np.max(cKDTree(np.concatenate(parts)).query(places)[0]))
 

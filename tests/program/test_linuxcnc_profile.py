@@ -1,4 +1,4 @@
-"""The profile that plans as LinuxCNC does, by what its rules are known to give, without LinuxCNC itself."""
+"""The profile that plans like LinuxCNC, compared with the known results of its rules, without LinuxCNC itself."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.program.test_planner import check_blocks
 
 ACCELERATION_MM_S2 = 2000.0
 INTERPOLATED_ROWS = 2
-STOP_MM = 1e-3  # what the joints' interpolation over three points makes of a stop for one cycle
+STOP_MM = 1e-3  # a stop of one cycle after the joints' interpolation over three points
 EXACT_PATH, EXACT_STOP = Corner("exact_path", 0.0), Corner("exact_stop", 0.0)
 
 
@@ -44,7 +44,7 @@ def accelerations(rows: Float) -> Float:
 
 
 def test_a_line_alone_is_a_trapezoid_of_half_the_acceleration_under_g64_and_of_all_under_g61() -> None:
-    """The last motion under G64 could still be blended, so that it keeps half."""
+    """The last motion under G64 could still be blended, so it uses half."""
     for corner, acceleration in ((Corner("blend", 0.05), 1000.0), (EXACT_PATH, 2000.0)):
         rows = rows_of([Feed(1, (100.0, 0.0, 0.0), 6000.0, corner)])
         assert rows[-1] == pytest.approx([100.0, 0.0, 0.0], abs=1e-9)
@@ -85,7 +85,7 @@ def test_a_circle_keeps_its_normal_share_and_half_of_the_acceleration_along_it()
 
 
 def test_beside_a_helix_a_parabola_overlaps_both_segments() -> None:
-    """A line and a helix lie in no plane, so that no arc fits; both keep half then, and the corner is cut by P."""
+    """A line and a helix are not in one plane, so no arc fits; both use half then, and the corner is cut by P."""
     corner = Corner("blend", 0.05)
     moves: list[Motion] = [
         Feed(1, (40.0, 0.0, 0.0), 6000.0, corner),
@@ -104,12 +104,12 @@ def test_beside_a_helix_a_parabola_overlaps_both_segments() -> None:
     [
         ("G3 X20 Y0 R12|G2 X40 Y0 R12|G3 X60 Y5 R15", 0.05, 6000, 923),
         ("G3 X20 Y0 R12|G2 X40 Y0 R12|G3 X60 Y5 R15", 0.5, 10000, 735),
-        ("G3 X20 Y0 R30|G3 X0 Y0 R30|G3 X20 Y0 R30", 0.2, 20000, 1133),  # so sharp that no arc is put between
+        ("G3 X20 Y0 R30|G3 X0 Y0 R30|G3 X20 Y0 R30", 0.2, 20000, 1133),  # too sharp for an arc
         ("G1 X10|G3 X30 Y0 R12|G2 X30 Y30 R20|G1 X0|G3 X0 Y10 R10.5", 0.2, 20000, 1330),
     ],
 )
 def test_corners_of_arcs_take_the_time_that_was_measured(path: str, tolerance: float, feed: int, rows: int) -> None:
-    """Rows of LinuxCNC 2.9's own demand for these programs, give or take two cycles."""
+    """Rows of LinuxCNC 2.9's own demand for these programs, within two cycles."""
     text = f"G64 P{tolerance}|F{feed}|{path}"
     assert len(rows_of(list(interpret(text.split("|"))))) == pytest.approx(rows + INTERPOLATED_ROWS, abs=3)
 
@@ -126,7 +126,7 @@ def test_rapid_and_feed_are_parted_by_a_stop_and_dwells_rest() -> None:
 
 
 def test_short_lines_are_joined_within_q() -> None:
-    """A sine in chords, at most 0.05 off a line; without Q none is joined but what lies on one line."""
+    """A sine in chords, at most 0.05 off a line; without Q only collinear chords are joined."""
     text = "G64 P0.05 Q0.05\nF6000\n" + "".join(f"G1 X{0.4 * n:.4f} Y{math.sin(0.08 * n):.4f}\n" for n in range(1, 200))
     moves = list(interpret(text.splitlines()))
     kept = list(joined(moves))

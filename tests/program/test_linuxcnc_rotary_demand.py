@@ -1,4 +1,4 @@
-"""The demand of mixed moves of linear and rotary axes, next to that of LinuxCNC's own trajectory planner."""
+"""The demand of mixed moves of linear and rotary axes, compared with LinuxCNC's own trajectory planner."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def theirs() -> Iterator[Theirs]:
 def test_linuxcnc_profile_plans_the_demand_of_a_rotary_axis(
     path: str, mode: str, feed: float, most: float, theirs: Theirs
 ) -> None:
-    """X, Y in mm and A in degrees at the same millisecond: under G61 exactly, under G64 to a few cycles."""
+    """X, Y in mm and A in degrees at the same millisecond: under G61 exactly, under G64 within a few cycles."""
     text = f"G21 G90 G17 {mode}\nF{feed:g}\n{TURNING[path]}M2\n"
     document = bench_document("XY")
     limits = {"rapid_speed_deg_s": 500.0, "max_acceleration_deg_s2": ACCELERATION_MM_S2, "screw_pitch_deg": 20.0}

@@ -1,4 +1,4 @@
-"""Demand CSV in and out, and what a file is by its suffix."""
+"""Reading and writing of demand CSV, and recognition of files by their suffix."""
 
 from __future__ import annotations
 
@@ -58,7 +58,6 @@ def test_a_broken_demand_is_a_recording_error(lines: list[str], tmp_path: Path) 
 
 
 def test_a_missing_column_is_told_with_the_line_that_is_wanted(tmp_path: Path) -> None:
-    """With the axes of this machine."""
     (tmp_path / "d.csv").write_text("time_s,X_mm\n" + "\n".join(row.rpartition(",")[0] for row in ROWS))
     with pytest.raises(
         RecordingError, match="no column Y_mm, Z_mm; a demand begins with the line time_s,X_mm,Y_mm,Z_mm"
@@ -73,15 +72,15 @@ DATA = "".join(f"{row}\n" for row in ROWS)
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        (NAMES + DATA[:-1], "is truncated: line 21 has no end of line, so its last number may be cut"),
-        (NAMES + "\n" + DATA.replace("0.005,0.5000,0.0", "0.005,0.5000"), "line 8 has 2 values under 3 columns"),
-        (NAMES + "\n" + DATA.replace("0.5000", "abc"), "line 8 has 'abc' where a finite number belongs"),
-        (NAMES + "\n" + DATA.replace("0.5000", "inf"), "line 8 has 'inf' where a finite number belongs"),
+        (NAMES + DATA[:-1], "is truncated: line 21 has no end of line, so its last number may be truncated"),
+        (NAMES + "\n" + DATA.replace("0.005,0.5000,0.0", "0.005,0.5000"), "line 8 has 2 values in 3 columns"),
+        (NAMES + "\n" + DATA.replace("0.5000", "abc"), "line 8 has 'abc' instead of a finite number"),
+        (NAMES + "\n" + DATA.replace("0.5000", "inf"), "line 8 has 'inf' instead of a finite number"),
         (NAMES + "\n" + DATA.replace("0.005,0.5000,0.0\n", "\n"), "line 9 is 0.002 s after the row before it"),
         (NAMES.replace("X", "Y") + DATA, "no column X_mm; a demand"),
         ("time_s,X_mm,Y_mm,X_mm\n" + DATA.replace("\n", ",0\n"), "has two columns 'X_mm'"),
-        (NAMES.replace(",", ";") + DATA.replace(",", ";"), "its first line has semicolons, and names are parted by"),
-        ('"time_s"\t"X_mm"\n', "its first line has tabs and quotes, and names are parted by commas alone"),
+        (NAMES.replace(",", ";") + DATA.replace(",", ";"), "its first line has semicolons, but only commas separate"),
+        ('"time_s"\t"X_mm"\n', "its first line has tabs and quotes, but only commas separate names"),
         (NAMES + "".join(f"{k / 1000},{k % 2}e300,0\n" for k in range(9)), "axis X moves at 1e+303 mm/s, 2e+300 times"),
     ],
 )
@@ -126,4 +125,4 @@ def test_a_demand_in_micrometres_is_refused_and_one_in_metres_is_told(
         load_trajectory(path, bench_config())
     path.write_text(straight(1e-3))
     load_trajectory(path, bench_config())
-    assert "is it in m? give mm" in caplog.records[0].getMessage()
+    assert "is it in m? convert it to mm" in caplog.records[0].getMessage()

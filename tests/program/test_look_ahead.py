@@ -1,4 +1,4 @@
-"""The look-ahead profiles: every limit kept, corners as G61, G61.1 and G64 P want them, in flat memory."""
+"""The look-ahead profiles: every limit kept, corners according to G61, G61.1 and G64 P, constant memory."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def cornered(moves: Sequence[Motion], corner: Corner) -> list[Motion]:
 
 
 def random_moves(seed: int, count: int = 12) -> list[Motion]:
-    """Lines and half circles of 0.1 to 30 mm in any direction, at feeds that change."""
+    """Lines and half circles of 0.1 to 30 mm in random directions, with changing feeds."""
     random = np.random.default_rng(seed)
     at = np.zeros(2)
     moves: list[Motion] = []
@@ -62,7 +62,6 @@ def random_moves(seed: int, count: int = 12) -> list[Motion]:
 
 
 def dense_path(moves: Sequence[Motion], config: MachineConfig) -> Float:
-    """The programmed path itself, finely."""
     at: Place = ORIGIN
     parts = []
     for move in moves:
@@ -79,7 +78,7 @@ def columns(reference: Trajectory) -> Float:
 
 
 def check_limits(reference: Trajectory, config: MachineConfig) -> None:
-    """Speed, acceleration and, for jerk_limited, jerk of every axis, as differences of what is ordered."""
+    """Speed, acceleration and, for jerk_limited, jerk of every axis, as differences of the demand."""
     for axis, path in reference.position_mm.items():
         settings = config.axis[axis]
         whole = np.concatenate([np.repeat(path[:1], 3), path])
@@ -112,7 +111,7 @@ def test_the_path_is_left_by_no_more_than_p(profile: str, tolerance_mm: float) -
         corner = Corner("blend", tolerance_mm) if tolerance_mm else EXACT_PATH
         reference = columns(plan(cornered(moves, corner), config))
         furthest = max(furthest, float(np.max(cKDTree(dense_path(moves, config)).query(reference)[0])))
-    sampling_mm = 0.003  # the finest a piece of 50 mm of arc was drawn
+    sampling_mm = 0.003  # finest resolution of an arc of 50 mm
     assert furthest <= tolerance_mm + sampling_mm
     assert furthest >= 0.6 * tolerance_mm
 
@@ -202,7 +201,7 @@ def test_a_long_program_is_planned_in_flat_memory() -> None:
 
 
 def test_short_blocks_reach_the_feed() -> None:
-    """A circle in chords of 0.1 mm: the look-ahead sees far enough, and a kink of 0.1 degrees needs no rounding."""
+    """A circle in chords of 0.1 mm: the look-ahead is long enough, and a kink of 0.1 degrees needs no rounding."""
     radius, count = 50.0, 3141
     angles = np.linspace(0.0, 2.0 * math.pi, count + 1)[1:]
     moves = [
@@ -218,9 +217,9 @@ def test_short_blocks_reach_the_feed() -> None:
 
 
 def test_the_smoothed_profile_is_what_it_was() -> None:
-    """``fir`` to the nanometre: digest of a reference that was made before the look-ahead profiles came.
+    """``fir`` to the nanometre: digest of a reference that was made before the look-ahead profiles existed.
 
-    Not to the last bit: the order in which a convolution adds depends on the processor.
+    Not to the last bit: the order of additions in a convolution depends on the processor.
     """
     reference = plan([*MOVES, Dwell(6, 0.3), *MOVES], bench_config())
     digest = hashlib.sha256()

@@ -1,4 +1,4 @@
-"""Loops that never end are told from long ones, and what loops and calls execute again has a limit of its own."""
+"""Endless loops are distinguished from long ones, and repeated execution has its own limit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WIDE = Budget(max_repeated_blocks=1_000_000)
         ("o<wait> do|G4 P0.1|o<wait> while [1]", 3, "O<WAIT> WHILE"),
         ("F100|o1 while [1]|G1 X1|X0|o1 endwhile", 5, "O1 ENDWHILE"),
         ("F100|o1 while [1]|G2 I5|G81 X0 Z-1 R1 L3|o1 endwhile", 5, "O1 ENDWHILE"),
-        ("#1=1|o1 while [#1]|#1=-#1|o1 endwhile", 4, "O1 ENDWHILE"),  # comes back in every other turn
+        ("#1=1|o1 while [#1]|#1=-#1|o1 endwhile", 4, "O1 ENDWHILE"),  # repeats in every other turn
         ("o1 sub|#1=[#1+5]|o1 endsub|o2 while [1]|o1 call [3]|o2 endwhile", 6, "O2 ENDWHILE"),
         ("o1 while [1]|o2 if [#1 lt 100]|#1=[#1+1]|o1 continue|o2 endif|o1 endwhile", 6, "O1 ENDWHILE"),
         ("F9 G41.1 D1|o1 while [1]|G1 X9|Y9|X0|Y0|o1 endwhile", 7, "O1 ENDWHILE"),
@@ -51,7 +51,7 @@ def test_a_long_loop_that_changes_something_ends(text: str) -> None:
 
 
 def test_what_loops_and_calls_execute_again_is_limited_and_the_rest_is_not() -> None:
-    """A main program that calls what stands behind it is no repetition, however long it is."""
+    """A main program that calls subroutines after it is not a repetition, however long it is."""
     straight = [f"G1 X{number} F9" for number in range(500)]
     narrow = Budget(max_repeated_blocks=100)
     main = ["M98 P1", *straight, "M98 P1", *straight, "M2", "O1", "G0 Y1", "M99"]
@@ -79,7 +79,7 @@ def test_what_a_repeated_block_orders_counts() -> None:
 
 
 def test_lines_come_again_from_a_file_as_from_memory(tmp_path: Path) -> None:
-    """The call stands in the last line, so that every return reads beyond what was read ahead."""
+    """The call is in the last line, so that every return reads beyond the read-ahead."""
     text = "F9\n#1=0\no1 sub\n#1=[#1+1]\nG1 X#1\no1 endsub\no2 repeat [3]\no1 call [#5420]\no2 endrepeat"
     path = tmp_path / "program.ngc"
     path.write_text(text)

@@ -64,7 +64,7 @@ def test_the_path_is_run_at_the_programmed_feed_without_a_stop_between_feeds() -
     speed = np.hypot(np.diff(x), np.diff(y)) / 1e-3
     length = 55 + 100 + 50 * math.pi + 50
     assert reference.time_s[-1] == pytest.approx(length / (10000 / 60), abs=2.1e-3)
-    moving = speed[: -round(0.5 / 1e-3)]  # the reference rests at its end
+    moving = speed[: -round(0.5 / 1e-3)]  # the reference is held at its end
     assert np.quantile(moving, 0.01) == pytest.approx(10000 / 60, rel=1e-4)
     assert y.min() >= 0.0
     assert y[np.abs(x - 150) < 0.1] == pytest.approx(5.0, abs=0.01)  # the lower half of the circle
@@ -110,7 +110,6 @@ def test_a_dwell_holds_all_axes() -> None:
 
 
 def check_blocks(moves: Sequence[Motion], config: MachineConfig, atol: float = 1e-9) -> None:
-    """Planned at once and in blocks of 333 rows: the same."""
     whole = plan(moves, config)
     blocks = list(stream(moves, config, 333))
     assert {block.time_s.size for block in blocks[:-1]} == {333}
@@ -166,7 +165,7 @@ def test_helices_and_spirals_end_where_they_are_told() -> None:
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize(
     ("text", "most", "linuxcnc_s"),
-    [  # what LinuxCNC 2.9 takes with [TRAJ] MAX_LINEAR_VELOCITY at this speed, run headless
+    [  # duration in LinuxCNC 2.9, headless, with [TRAJ] MAX_LINEAR_VELOCITY at this speed
         ("G0 X150 Y150", 100.0, 2.195),
         ("G64 P0.1|G1 X60 Y60 F12000|X120 Y0", 80.0, 2.204),
         ("G64 P0.1|G1 F12000|G2 X40 I20|G3 X80 I20|G1 X120", 60.0, 2.841),
@@ -186,7 +185,7 @@ def test_the_path_is_run_no_faster_than_the_nc_allows(profile: str, text: str, m
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_a_motion_of_an_axis_that_is_not_planned_is_refused_with_its_line(profile: str) -> None:
-    """Missing, or configured in mm; a word that leaves the axis where it is orders nothing."""
+    """Missing, or configured in mm; a word that keeps the axis in place orders nothing."""
     document = bench_document("XYA")
     document["nc"] = {"profile": profile}
     config = parse(document)

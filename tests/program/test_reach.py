@@ -24,7 +24,7 @@ PROFILES = ("fir", "trapezoidal", "jerk_limited", "linuxcnc")
 
 
 def fine_config(per_mm: float = 1e6, sign: int = 1, corrected: bool = True, **nc: Any) -> MachineConfig:
-    """Return the bench with one axis whose drive counts ``per_mm`` increments a millimetre."""
+    """Return the bench with one axis whose drive has ``per_mm`` increments per millimetre."""
     document = bench_document("X")
     document["axis"]["X"] |= {"screw_pitch_mm": 10.0, "drive": {"increments_per_rev": round(10 * per_mm), "sign": sign}}
     if not corrected:
@@ -85,7 +85,7 @@ def test_a_program_beyond_32_bits_is_refused_with_axis_line_and_the_last_positio
 def test_an_arc_between_two_ends_that_fit_is_refused_where_it_does_not() -> None:
     document = bench_document("XY")
     for axis in "XY":
-        document["axis"][axis]["drive"] = {"increments_per_rev": (1 << 31) - 1}  # 107 million a mm: +-19.75 mm
+        document["axis"][axis]["drive"] = {"increments_per_rev": (1 << 31) - 1}  # 107 million per mm: +-19.75 mm
     config = parse(document)
     program = ["G1 X19 Y0 F300", "G3 X19 Y2 J1 I0", "G1 X0"]
     with pytest.raises(ProgramError, match=r"line 2, 'X': axis X at 19\.75\d* mm: .* is 19\.75 mm"):

@@ -1,4 +1,4 @@
-"""Programs with A B C words: what the NC orders of a rotary axis, alone and with X Y Z, by each profile."""
+"""Programs with A B C words: the demand of a rotary axis, alone and with X Y Z, by each profile."""
 
 from __future__ import annotations
 
@@ -26,13 +26,12 @@ def planned(text: str, config: MachineConfig) -> Trajectory:
 
 
 def turned(demand: Trajectory, config: MachineConfig) -> Float:
-    """Return A (n,) in degrees."""
     return demand.position_mm["A"] / config.axis["A"].mm_per_unit
 
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_mixed_move_turns_the_table_in_the_time_of_its_feed_along_xyz(profile: str) -> None:
-    """RS274: F is that of X Y Z where they move; A keeps to their share of the way."""
+    """RS274: F applies to X Y Z if they move; A follows in proportion."""
     config = machine(profile)
     demand = planned("G94 F600|G1 X30 Y40 A90", config)
     x, a = demand.position_mm["X"], turned(demand, config)
@@ -139,9 +138,9 @@ def test_demand_file_of_a_gantry_needs_one_column(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("A_mm", "has a column A_mm, and the configuration has axis A in deg; write A_deg"),
-        ("X_mm,X_deg", "has a column X_deg, and the configuration has axis X in mm; write X_mm"),
-        ("C_deg", r"axis C moves, which the configuration lacks; add \[axis\.C\]"),
+        ("A_mm", "has a column A_mm, but the configuration has axis A in deg; write A_deg"),
+        ("X_mm,X_deg", "has a column X_deg, but the configuration has axis X in mm; write X_mm"),
+        ("C_deg", r"axis C moves, but the configuration lacks it; add \[axis\.C\]"),
     ],
 )
 def test_demand_file_in_another_unit_is_refused(name: str, expected: str, tmp_path: Path) -> None:
@@ -185,7 +184,7 @@ def test_absolute_words_of_a_wrapped_axis_turn_by_their_sign() -> None:
 
 def test_absolute_word_of_more_than_one_turn_is_refused_on_a_wrapped_axis() -> None:
     budget = Budget.of(machine(wrapped_axes=["A"]).nc)
-    with pytest.raises(ProgramError, match="line 1, 'A400': 400 is no position of a wrapped rotary axis"):
+    with pytest.raises(ProgramError, match="line 1, 'A400': 400 is not a position of a wrapped rotary axis"):
         list(interpret(["G90 G0 A400"], budget))
     assert [motion.rotary[0].end for motion in interpret(["G91 G0 A400"], budget) if isinstance(motion, Rapid)] == [
         400.0

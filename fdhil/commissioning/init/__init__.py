@@ -1,1 +1,1 @@
-"""From nothing to a configuration: what the NC's own files, the drives and the operator tell, and what is guessed."""
+"""Create a configuration from the NC's own files, the drives' answers, the operator's answers and default guesses."""

@@ -1,4 +1,4 @@
-"""A configuration that is being made: values with their sources, what is still missing, and remarks."""
+"""A configuration in the making: values with their sources, missing values, and remarks."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from fdhil.commissioning.init.told import Told
 from fdhil.config.reading import checked_value, field_at
 from fdhil.errors import ConfigError, ConfigFault
 
-OPERATOR = "asked: the operator's word"
+OPERATOR = "entered by the operator"
 ANSWERS = "from the answers"
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A question to the operator: the key's path, what it means, where its value is found, and what is proposed.
+    """A question to the operator: the key's path, its meaning, where to find the value, and the proposed value.
 
-    ``check`` returns the value of what was said; ConfigError with the reason where it is none.
+    ``check`` returns the value of an answer; ConfigError with the reason if the answer is invalid.
     """
 
     path: str
@@ -31,12 +31,12 @@ class Asked:
 
 Check = Callable[[str], Any]
 Ask = Callable[[Asked], Any]
-"""Return the operator's value; None: the proposal."""
+"""Returns the operator's value; None accepts the proposal."""
 
 
 @dataclass(slots=True)
 class Draft:
-    """``values`` by full path, as ``axis.X.nominal.R``; ``ask`` is None where nobody can be asked."""
+    """``values`` by full path, for example ``axis.X.nominal.R``; ``ask`` is None without an operator to ask."""
 
     ask: Ask | None = None
     values: dict[str, Told] = field(default_factory=dict)
@@ -44,7 +44,7 @@ class Draft:
     notes: list[str] = field(default_factory=list)
 
     def take(self, table: Mapping[str, Any], path: str = "") -> None:
-        """Take the nested tables of an answers file, whose keys are the configuration's; what is wrong is missing."""
+        """Add the nested tables of an answers file with configuration keys; invalid values are listed as missing."""
         for key, value in table.items():
             here = f"{path}.{key}" if path else key
             if isinstance(value, Mapping) and value:
@@ -53,66 +53,67 @@ class Draft:
                 self._take(here, value)
 
     def _take(self, path: str, value: Any) -> None:
-        if not isinstance(value, Mapping) and ".options." not in path:  # those are python-can's own
+        if not isinstance(value, Mapping) and ".options." not in path:  # python-can checks its own options
             try:
                 value = checked_value(path, value)
             except ConfigError as error:
                 self.missing += error.faults
         self.values[path] = Told(value, ANSWERS)
 
-    def tell(self, path: str, told: Told) -> None:
-        """Take what a device or a file tells; an answer stays, and where both differ that is noted."""
+    def tell(self, path: str, reported: Told) -> None:
+        """Add a value reported by a device or file; an answer takes precedence, and a contradiction is noted."""
         known = self.values.get(path)
         if known is None or known.guessed:
-            self.values[path] = told
-        elif not told.guessed and known.source == ANSWERS and not _same(known.value, told.value):
-            self.notes.append(f"{path}: the answers say {known.value}, {told.source.partition(':')[0]} {told.value}")
+            self.values[path] = reported
+        elif not reported.guessed and known.source == ANSWERS and not _same(known.value, reported.value):
+            source = reported.source.partition(":")[0]
+            self.notes.append(f"{path}: the answers have {known.value}, {source} has {reported.value}")
 
     def get(self, path: str) -> Any:
-        """Return a value, None where it is not known."""
-        told = self.values.get(path)
-        return None if told is None else told.value
+        """Return a value; None if it is unknown."""
+        found = self.values.get(path)
+        return None if found is None else found.value
 
     def has_table(self, path: str) -> bool:
-        """Whether a table, or any key in it, is there."""
+        """Return whether a table, or any key in it, has a value."""
         return path in self.values or any(key.startswith(f"{path}.") for key in self.values)
 
     def settle(self, path: str, where: str, proposal: Told | None = None, check: Check | None = None) -> None:
-        """Have a value for a key: what is known, else the operator's, else a guess; without any it is missing."""
+        """Fix the value of a key: the known one, else the operator's, else a guess; without any it is missing."""
         proposal = self.values.get(path) or proposal
         if proposal is not None and not proposal.guessed:
             self.values[path] = proposal
             return
-        meaning = field_at(path)
-        words = meaning.description or "" if meaning is not None else ""
+        key = field_at(path)
+        meaning = key.description or "" if key is not None else ""
         if self.ask is not None:
-            answer = self.ask(Asked(path, words, where, proposal, check or partial(checked_value, path)))
+            answer = self.ask(Asked(path, meaning, where, proposal, check or partial(checked_value, path)))
             proposal = proposal if answer is None else Told(answer, OPERATOR)
         if proposal is None:
-            self.missing.append(ConfigFault(path, f"is not known: {words}", where))
+            self.missing.append(ConfigFault(path, f"is unknown: {meaning}", where))
         else:
             self.values[path] = proposal
 
     def ask_again(self, path: str, why: str) -> None:
-        """Ask for a value that cannot be, and why it cannot; the old one is proposed, for another may be at fault."""
-        self.values[path] = Told(self.get(path), "as it was", guessed=True)
-        self.settle(path, f"it cannot be: {why}")
+        """Ask for an invalid value again, with the reason; the old value is proposed, for another one may be wrong."""
+        self.values[path] = Told(self.get(path), "unchanged", guessed=True)
+        self.settle(path, f"invalid: {why}")
 
     @property
     def guessed(self) -> int:
-        """How many values nobody told."""
-        return sum(told.guessed for told in self.values.values())
+        """Number of guessed values."""
+        return sum(value.guessed for value in self.values.values())
 
     @property
     def document(self) -> dict[str, Any]:
         """The values as nested tables."""
         tables: dict[str, Any] = {}
-        for path, told in self.values.items():
+        for path, sourced in self.values.items():
             *outer, key = path.split(".")
             table = tables
             for name in outer:
                 table = table.setdefault(name, {})
-            table[key] = told.value
+            table[key] = sourced.value
         return tables
 
 

@@ -1,6 +1,6 @@
-"""Finds the drives on a bus and asks each, by SDO, for what a configuration has of it. Nothing is written to a drive.
+"""Find the drives on a bus and read, by SDO, what a configuration needs of them. Nothing is written to a drive.
 
-Where an NC runs the bus nothing is sent at all; the drives are then known by their node-IDs alone.
+If an NC runs the bus nothing is sent at all; then only the drives' node-IDs are known.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,7 +27,7 @@ NO_WINDOW = (0, 0xFFFFFFFF)
 
 @dataclass(frozen=True, slots=True)
 class FoundDrive:
-    """A drive, or one axis of a device with several; ``told`` by key within [axis.X], its window and cycle apart."""
+    """A drive, or one axis of a multi-axis device; its values by key within [axis.X], without window and cycle."""
 
     bus: str
     node_id: int
@@ -41,14 +41,14 @@ class FoundDrive:
 
     @property
     def name(self) -> str:
-        """How it is shown: its node-ID and what it says it is."""
+        """Display name: the node-ID and the identification that the drive reports."""
         axis = f", axis {self.logical_axis} of it" if self.logical_axis > 1 else ""
         return f"node {self.node_id}{axis} ({self.label})"
 
 
 @dataclass(frozen=True, slots=True)
 class FoundBus:
-    """A bus; ``master`` shows that an NC runs it, None where nothing does."""
+    """A bus; ``master`` is the evidence that an NC runs it, None without an NC."""
 
     name: str
     master: str | None
@@ -57,7 +57,7 @@ class FoundBus:
 
 
 def find_drives(name: str, settings: CanBus, descriptions: Sequence[Description]) -> FoundBus:
-    """Listen to a bus, then ask its nodes; ConnectError when it cannot be reached or is silent."""
+    """Listen to a bus, then read its nodes; ConnectError if it cannot be reached or is silent."""
     with BusScanner(name, settings) as bus:
         scan = scan_nodes(bus, {}, descriptions)
         drives: list[FoundDrive] = []
@@ -65,22 +65,24 @@ def find_drives(name: str, settings: CanBus, descriptions: Sequence[Description]
             if node.answers is not None:
                 drives += _asked(bus, node.node_id, node.answers, descriptions)
             elif scan.master is not None:
-                drives.append(FoundDrive(name, node.node_id, "heard beside the NC, not asked"))
+                drives.append(FoundDrive(name, node.node_id, "received while an NC runs the bus, not read"))
         return FoundBus(name, scan.master, scan.sync_period_s, tuple(drives))
 
 
-def _asked(bus: BusScanner, node_id: int, said: Answers, descriptions: Sequence[Description]) -> Iterator[FoundDrive]:
-    best = best_description(said.identity, descriptions)
+def _asked(
+    bus: BusScanner, node_id: int, answers: Answers, descriptions: Sequence[Description]
+) -> Iterator[FoundDrive]:
+    best = best_description(answers.identity, descriptions)
     eds = best[0].path if best else None
-    profile = suggested(said, eds, partial(_number, bus, node_id, 1))
-    label = f"{said.name or 'unnamed'}, vendor {said.identity.vendor_id:08X}, serial {said.identity.serial}"
+    profile = suggested(answers, eds, partial(_number, bus, node_id, 1))
+    label = f"{answers.name or 'unnamed'}, vendor {answers.identity.vendor_id:08X}, serial {answers.identity.serial}"
     for axis in range(1, MOST_AXES + 1):
         read = partial(_number, bus, node_id, axis)
         if read(Object.STATUSWORD, 0) is None:
             return
-        told = dict(told_by(read, None if profile is None else read_profile(profile, eds)))
+        reported = dict(told_by(read, None if profile is None else read_profile(profile, eds)))
         window = read(Object.FOLLOWING_ERROR_WINDOW, 0)
-        yield FoundDrive(bus.name, node_id, label, axis, profile, eds, told, window, _cycle_s(read))
+        yield FoundDrive(bus.name, node_id, label, axis, profile, eds, reported, window, _cycle_s(read))
 
 
 def _number(bus: BusScanner, node_id: int, axis: int, index: int, sub: int) -> int | None:
@@ -90,7 +92,7 @@ def _number(bus: BusScanner, node_id: int, axis: int, index: int, sub: int) -> i
 
 
 def _cycle_s(read: Read) -> float | None:
-    """The period over which it interpolates set-points (0x60C2), None where it does not tell a possible one."""
+    """Return the interpolation period of set-points (0x60C2); None if the drive does not report a plausible one."""
     count, exponent = read(Object.INTERPOLATION_PERIOD, 1), read(Object.INTERPOLATION_PERIOD, 2)
     if not count or exponent is None:
         return None
@@ -98,9 +100,9 @@ def _cycle_s(read: Read) -> float | None:
     return rounded(period_s) if 1e-4 <= period_s <= 0.02 else None
 
 
-def suggested(said: Answers, eds: Path | None, read: Read) -> str | None:
-    """Return the profile for a drive: by its EDS, else of its maker's the one whose objects it has; None without."""
-    who = said.identity
+def suggested(answers: Answers, eds: Path | None, read: Read) -> str | None:
+    """Return the profile for a drive: by its EDS, else the profile of its vendor whose objects it has; None without."""
+    who = answers.identity
     if who.vendor_id == TWIN_VENDOR:
         return TWIN
     if eds is not None:
@@ -115,7 +117,7 @@ def suggested(said: Answers, eds: Path | None, read: Read) -> str | None:
 
 
 def told_by(read: Read, profile: DriveProfile | None) -> Iterator[tuple[str, Told]]:
-    """Yield what a drive tells of its scales and limits, by key within [axis.X]."""
+    """Yield what a drive reports of its scales and limits, by key within [axis.X]."""
     if (turn := increments_told(read)) is not None and turn[0] >= 4:
         yield "drive.increments_per_rev", Told(round(turn[0]), f"the drive: {turn[1]}")
     unit = speed_unit_of(read(Object.VELOCITY_UNIT, 0))
@@ -126,7 +128,6 @@ def told_by(read: Read, profile: DriveProfile | None) -> Iterator[tuple[str, Tol
 
 
 def _ratings(read: Read, current_unit: str) -> Iterator[tuple[str, Told]]:
-    """Yield the rated values that the drive's current is counted in, the largest current, and K by both of them."""
     rated_ma, rated_mnm = read(Object.RATED_CURRENT, 0), read(Object.RATED_TORQUE, 0)
     if rated_ma and current_unit in ("permille_of_rated", "share_of_rated"):
         yield "drive.rated_current_a", Told(rounded(rated_ma / 1e3), "the drive: 0x6075")
@@ -140,7 +141,7 @@ def _ratings(read: Read, current_unit: str) -> Iterator[tuple[str, Told]]:
 
 
 def _dc_link(read: Read, profile: DriveProfile | None) -> Iterator[tuple[str, Told]]:
-    """Yield the DC link's volts, which bound the motor's voltage, from the maker's object or 0x6079 (mV)."""
+    """Yield the DC-link voltage, which bounds the motor voltage, from the vendor's object or 0x6079 (mV)."""
     own = profile.dc_link if profile is not None else None
     for key, volts in ((own, profile.dc_link_v_per_count if profile else 0.0), ((DC_LINK_VOLTAGE, 0), 1e-3)):
         if key is not None and (counts := read(*key)):
@@ -152,5 +153,5 @@ def _dc_link(read: Read, profile: DriveProfile | None) -> Iterator[tuple[str, To
 
 
 def needs_dc_link(profile: DriveProfile | None) -> bool:
-    """Whether the configuration must say the DC link's volts: the voltage is a duty, and no TPDO tells them."""
+    """Return whether the configuration must give the DC-link voltage: the voltage is a duty and no TPDO has it."""
     return profile is not None and profile.duty_per_count > 0 and len(profile.voltage_objects) == 1

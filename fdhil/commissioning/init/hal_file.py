@@ -1,10 +1,10 @@
-"""Writes the HAL file that adds offsets between LinuxCNC's motion controller and the drives, and loads the bridges.
+"""Write the HAL file that adds offsets between LinuxCNC's motion controller and the drives, and loads the bridges.
 
-    streamer -> limit3 -> offset, between joint.N.motor-pos-cmd and what it commanded; the feedback to the joint less it
+    streamer -> limit3 -> offset, between joint.N.motor-pos-cmd and the pins it commanded; the joint's feedback less it
     heartbeat of the bridge -> oneshot, motion.motion-enabled, streamer not empty -> lut5 -> limit3.enable
 
-Only HAL's own components run in the servo thread. ``limit3`` bounds size, speed and acceleration of whatever comes, and
-brings the offset to zero when the bridge is silent, the streamer is empty or the machine is off. Pure.
+Only HAL's own components run in the servo thread. ``limit3`` bounds size, speed and acceleration of every offset, and
+ramps it to zero when the bridge is silent, the streamer is empty or the machine is off. Pure.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from fdhil.errors import ConfigError, ConfigFault
 
 WATCHDOG_S = 0.05  # beyond the lead
 ALL_THREE = 0x8  # lut5: in-0 and in-1 and not in-2
-MARGIN = 1.1  # limit3's over the guard's limits: it never acts while the guard does its work
+MARGIN = 1.1  # of limit3 over the guard's limits: it does not act while the guard works
 OWN = ("streamer", "limit3", "offset", "oneshot", "lut5")
 
 
 @dataclass(frozen=True, slots=True)
 class Splice:
-    """Where an axis' offset goes in: the signals of its command and feedback, and the pins that the command drives."""
+    """Where an axis' offset is inserted: the signals of command and feedback, and the pins that the command drives."""
 
     axis: str
     joint: int
@@ -37,7 +37,7 @@ class Splice:
 
 
 def splices_of(hal: Hal, joints: Mapping[str, int], axes: Sequence[str]) -> list[Splice]:
-    """Return where the offsets of ``axes`` go in; ConfigError that names the pin where HAL leaves no such place."""
+    """Return where the offsets of ``axes`` are inserted; ConfigError naming the pin if HAL has no such place."""
     found, faults = [], []
     for axis in axes:
         pins = tuple(f"joint.{joints[axis]}.motor-pos-{end}" for end in ("cmd", "fb"))
@@ -46,9 +46,11 @@ def splices_of(hal: Hal, joints: Mapping[str, int], axes: Sequence[str]) -> list
         where = f"axis.{axis}.correction"
         if not command or not feedback:
             missing = pins[0] if not command else pins[1]
-            faults.append(ConfigFault(where, f"{missing} is on no signal of the HAL files", "wire it, or leave it out"))
+            faults.append(
+                ConfigFault(where, f"{missing} is not connected in the HAL files", "connect it, or remove this section")
+            )
         elif command == feedback or not driven:
-            faults.append(ConfigFault(where, f"{pins[0]} commands no drive or pid component", "leave this section out"))
+            faults.append(ConfigFault(where, f"{pins[0]} commands no drive or pid component", "remove this section"))
         else:
             found.append(Splice(axis, joints[axis], command, feedback, driven))
     if faults:
@@ -57,7 +59,7 @@ def splices_of(hal: Hal, joints: Mapping[str, int], axes: Sequence[str]) -> list
 
 
 def correction_hal(config: MachineConfig, file: str, joints: int, splices: Sequence[Splice], hal: Hal) -> str:
-    """Return the text of the HAL file of a machine with so many joints whose configuration is in ``file``.
+    """Return the HAL file of a machine with so many joints whose configuration is in ``file``.
 
     Without ``splices`` it only loads the bridges.
     """
@@ -66,7 +68,7 @@ def correction_hal(config: MachineConfig, file: str, joints: int, splices: Seque
 
 def _lines(config: MachineConfig, file: str, joints: int, splices: Sequence[Splice], hal: Hal) -> Iterator[str]:
     yield from _comment(
-        "Written by fdhil init. Load it last: HALFILE = this file, behind the others in [HAL] of the INI. Without it "
+        "Written by fdhil init. Load it last: HALFILE = this file, after the others in [HAL] of the INI. Without it "
         "LinuxCNC runs as before."
     )
     if splices:
@@ -74,7 +76,9 @@ def _lines(config: MachineConfig, file: str, joints: int, splices: Sequence[Spli
         bus = config.bus[config.axis[splices[0].axis].drive.bus]
         yield from _wiring(splices, WATCHDOG_S + bus.offset_lead_cycles * config.machine.sync_period_s)
         yield from _order(splices, hal)
-    yield from _comment("The bridges: drives (pins of [axis.X.drive.hal]) and NC, a sampler each at the thread's end.")
+    yield from _comment(
+        "The bridges of the drives (pins of [axis.X.drive.hal]) and of the NC: one sampler each, last in the thread."
+    )
     linked = {pin for pins in hal.nets.values() for pin in pins}
     types = "f" * joints + "ssff" + "b" * len(linked & set(linuxcnc.HOLDS))
     port = config.nc_source.linuxcnc.port
@@ -86,10 +90,10 @@ def _lines(config: MachineConfig, file: str, joints: int, splices: Sequence[Spli
 
 
 def _components(config: MachineConfig, splices: Sequence[Splice], hal: Hal) -> Iterator[str]:
-    yield from _comment("The limits below bound every offset, whatever fdhil sends; fdhil cannot change them.")
+    yield from _comment("These limits bound every offset that fdhil sends; fdhil cannot change them.")
     for name in (name for name in OWN if name in hal.loaded):
         yield from _comment(
-            f"{name} is loaded by your HAL files already, and HAL loads a component once: add the names below to "
+            f"Your HAL files already load {name}, and HAL loads a component only once: add the names below to "
             "that line with names=, and delete the line here."
         )
     yield f"loadrt streamer depth=1000 cfg=s{'f' * len(splices)}"
@@ -101,7 +105,7 @@ def _components(config: MachineConfig, splices: Sequence[Splice], hal: Hal) -> I
     for splice in splices:
         axis, name = config.axis[splice.axis], f"fdhil-limit-{splice.axis.lower()}"
         pins = axis.drive.hal
-        assert pins is not None  # those alone are spliced
+        assert pins is not None  # offsets are inserted on HAL axes only
         unit, per_mm = pins.position_mm_per_unit, axis.scaling.increments_per_mm
         offset, rate, acceleration, *_ = OffsetBounds.of(axis, period_s).whole
         yield from _comment(
@@ -115,7 +119,9 @@ def _components(config: MachineConfig, splices: Sequence[Splice], hal: Hal) -> I
 
 
 def _wiring(splices: Sequence[Splice], watchdog_s: float) -> Iterator[str]:
-    yield from _comment("Offsets pass while the bridge's heart beats, the machine is on, and the streamer has rows.")
+    yield from _comment(
+        "Offsets pass while the bridge's heartbeat arrives, the machine is on, and the streamer has data."
+    )
     for key, value in (("width", watchdog_s), ("retriggerable", 1), ("rising", 1), ("falling", 1)):
         yield f"setp fdhil-watchdog.{key} {value:g}"
     yield f"setp fdhil-gate.function {ALL_THREE:#x}"
@@ -127,7 +133,9 @@ def _wiring(splices: Sequence[Splice], watchdog_s: float) -> Iterator[str]:
     yield f"net fdhil-on fdhil-gate.out => {enabled}"
     for place, splice in enumerate(splices, 1):
         x = splice.axis.lower()
-        yield from _comment(f"{splice.axis}: the command plus the offset goes to the drive, the joint sees it without.")
+        yield from _comment(
+            f"{splice.axis}: the drive gets the command plus the offset; the joint's feedback excludes it."
+        )
         yield f"net fdhil-table-{x} streamer.0.pin.{place} => fdhil-limit-{x}.in"
         yield f"net fdhil-applied-{x} fdhil-limit-{x}.out => fdhil-offset-{x}.offset"
         yield f"net {splice.command} => fdhil-offset-{x}.in"
@@ -140,22 +148,22 @@ def _wiring(splices: Sequence[Splice], watchdog_s: float) -> Iterator[str]:
 
 
 def _order(splices: Sequence[Splice], hal: Hal) -> Iterator[str]:
-    """Put the feedback before the motion controller, and the offset right behind it."""
+    """Put the feedback before the motion controller, and the offset right after it."""
     thread, functions = next(((t, f) for t, f in hal.threads.items() if "motion-controller" in f), ("servo-thread", []))
     before = [f"fdhil-offset-{s.axis.lower()}.update-feedback" for s in splices]
-    behind = ["streamer.0", "fdhil-watchdog", "fdhil-gate"]
-    behind += [f"fdhil-limit-{s.axis.lower()}" for s in splices]
-    behind += [f"fdhil-offset-{s.axis.lower()}.update-output" for s in splices]
+    after = ["streamer.0", "fdhil-watchdog", "fdhil-gate"]
+    after += [f"fdhil-limit-{s.axis.lower()}" for s in splices]
+    after += [f"fdhil-offset-{s.axis.lower()}.update-output" for s in splices]
     if not functions:
-        yield from _comment("The order of your thread is unknown: put these right behind motion-controller by hand.")
-        yield from (f"addf {function} {thread}" for function in (*before, *behind))
+        yield from _comment("The order of your thread is unknown: put these right after motion-controller by hand.")
+        yield from (f"addf {function} {thread}" for function in (*before, *after))
         return
     controller = functions.index("motion-controller")
     first = min(controller, functions.index("motion-command-handler") if "motion-command-handler" in functions else 99)
-    yield from _comment(f"In {thread}: feedback before function {first + 1}, offsets right behind motion-controller.")
+    yield from _comment(f"In {thread}: feedback before function {first + 1}, offsets right after motion-controller.")
     for place, function in enumerate(before):
         yield f"addf {function} {thread} {first + 1 + place}"
-    for place, function in enumerate(behind):
+    for place, function in enumerate(after):
         yield f"addf {function} {thread} {controller + 2 + len(before) + place}"
 
 

@@ -1,7 +1,7 @@
-"""Proposes the HAL pins of an axis, and the gains of the pid component in front of its drive, from LinuxCNC's files.
+"""Propose an axis' HAL pins, and the gains of the pid component before its drive, from LinuxCNC's files.
 
-A joint's feedback names the component that measures it; what else that component has is in ``hal_pins.toml``. Where HAL
-runs, only pins that it has are proposed. Pure.
+The joint's feedback names the component that measures it; the other pins of that component are in ``hal_pins.toml``. If
+HAL runs, only existing pins are proposed. Pure.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ CONSUMERS = re.compile(r"(pid|joint|axis|halui|sampler|at_pid)\b.*|.*\.(feedback
 
 @dataclass(slots=True)
 class Proposal:
-    """Values by their key of [axis.X], as ``drive.hal.speed``, and remarks."""
+    """Values by their key of [axis.X], for example ``drive.hal.speed``, and remarks."""
 
     told: dict[str, Told] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -37,7 +37,7 @@ def _components() -> tuple[Mapping[str, Any], ...]:
 
 
 def propose_axis(hal: Hal, axis: str, joint: int, unit_mm: float, running: Collection[str] = ()) -> Proposal:
-    """Return the pins and gains of an axis; ``running`` are the pins that HAL has now, empty where it does not run."""
+    """Return the pins and gains of an axis; ``running`` are the pins of the running HAL, empty if it does not run."""
     made = Proposal()
     source = "LinuxCNC: HAL files"
     command, feedback = (f"joint.{joint}.motor-pos-{end}" for end in ("cmd", "fb"))
@@ -45,19 +45,19 @@ def propose_axis(hal: Hal, axis: str, joint: int, unit_mm: float, running: Colle
     measured = next((pin for pin in hal.joined(feedback) if not CONSUMERS.match(pin)), None)
     if measured is None:
         made.notes.append(
-            f"axis {axis}: no component's pin is wired to {feedback}; name the pin of the measured position"
+            f"axis {axis}: no component's pin is connected to {feedback}; name the pin of the measured position"
         )
     else:
         made.told["drive.hal.position_feedback"] = Told(measured, source)
         _of_component(made, axis, measured.rpartition(".")[0], unit_mm, running)
-    made.told["drive.hal.enabled"] = Told(f"joint.{joint}.amp-enable-out", "LinuxCNC: the joint's own")
+    made.told["drive.hal.enabled"] = Told(f"joint.{joint}.amp-enable-out", "LinuxCNC: the joint's enable")
     if unit_mm != 1.0:
         made.told["drive.hal.position_mm_per_unit"] = Told(unit_mm, "LinuxCNC: [TRAJ] LINEAR_UNITS")
     for loop in hal.loops_behind(command)[:1]:
-        made.told |= {f"regulators.{key}": told for key, told in _gains(hal.given, loop, unit_mm)}
+        made.told |= {f"regulators.{key}": gain for key, gain in _gains(hal.given, loop, unit_mm)}
         made.notes.append(
-            f"axis {axis}: HAL's {loop} closes the position loop. Its output is taken for a speed in units/s; where "
-            "the drive takes it for a current set regulators.pid_output = 'current' and drive.hal.current = "
+            f"axis {axis}: HAL's {loop} closes the position loop. Its output is read as a speed in units/s; if the "
+            "drive reads it as a current, set regulators.pid_output = 'current' and drive.hal.current = "
             f"'{loop}.output' (docs/how-to/hal-mesa.md has the gains for it)"
         )
     return made
@@ -82,7 +82,7 @@ def _of_component(made: Proposal, axis: str, owner: str, unit_mm: float, running
 
 
 def _gains(given: Mapping[str, str], loop: str, unit_mm: float) -> Iterator[tuple[str, Told]]:
-    """Yield the keys of structure linuxcnc_pid whose output is a speed: gains per unit are then gains per mm."""
+    """Yield the keys of structure linuxcnc_pid with a speed output: gains per unit are then gains per mm."""
     yield "structure", Told("linuxcnc_pid", f"LinuxCNC: HAL's {loop}")
     keys = {
         "position_gain_per_s": ("Pgain", 1.0),
@@ -105,17 +105,17 @@ def _gains(given: Mapping[str, str], loop: str, unit_mm: float) -> Iterator[tupl
         yield "error_previous_target", Told(False, f"LinuxCNC: {loop}.error-previous-target")
 
 
-def current_gains(told: Mapping[str, Any], a_per_unit: float, unit_mm: float, pitch_mm: float) -> dict[str, float]:
-    """Return the regulator keys of a pid whose output a drive takes for its current, from those of a speed output.
+def current_gains(gains: Mapping[str, Any], a_per_unit: float, unit_mm: float, pitch_mm: float) -> dict[str, float]:
+    """Convert the keys of a pid with a speed output to those of one whose output the drive reads as a current.
 
     speed_kp (A.s/rad) is the component's Dgain, by which all its other gains are divided. ValueError without a Dgain.
     """
-    derivative = float(told.get("position_derivative", 0.0))
+    derivative = float(gains.get("position_derivative", 0.0))
     if derivative <= 0.0:
         raise ValueError("a pid that commands current needs a Dgain")
     speed_kp = derivative * abs(a_per_unit) / unit_mm * pitch_mm / (2 * math.pi)
     scaled: tuple[str, ...]
     scaled = ("position_gain_per_s", "position_ki_per_s2", "position_feedforward_per_s", "speed_feedforward")
     scaled += ("acceleration_feedforward_s", "jerk_feedforward_s2", "output_limit_mm_s")
-    found = {key: rounded(float(told[key]) / derivative) for key in scaled if key in told}
+    found = {key: rounded(float(gains[key]) / derivative) for key in scaled if key in gains}
     return found | {"speed_kp": rounded(speed_kp), "speed_ki": 0.0, "position_derivative": 1.0}

@@ -1,4 +1,4 @@
-"""Makes the values of a machine: takes what files and drives tell, asks for the rest, proposes what can be guessed."""
+"""Determine the values of a machine: use what files and drives report, ask for the rest, propose guesses."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -31,89 +31,82 @@ NO_OTHER_WINDOW = (0, 0xFFFFFFFF)
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """The drives that were found; ``complete``: there are no others, for the nodes of every bus were asked."""
+    """The found drives; ``complete``: there are no others, since the nodes of every bus were read."""
 
     drives: Sequence[FoundDrive]
     complete: bool
 
 
 def settle_machine(draft: Draft, buses: Sequence[FoundBus], name: str, nc: Machine | None) -> None:
-    """Settle [machine]: its name, and the SYNC period that files, answers or the bus tell; and how G0 is seen."""
+    """Settle [machine] (its name, the SYNC period from files, answers or the bus) and how G0 is recognised."""
     draft.settle("machine.name", "any name", Told(name, "guessed: the file's name", guessed=True))
     for bus in buses:
         if bus.master is not None:
             draft.notes.append(
-                f"bus {bus.name}: an NC runs it ({bus.master} heard), so no drive was asked; with the NC off init "
-                "takes scales and ratings from the drives"
+                f"bus {bus.name}: an NC runs it ({bus.master} received), so no drive was read; with the NC off init "
+                "reads scales and ratings from the drives"
             )
         if bus.sync_period_s is not None:
-            draft.tell("machine.sync_period_s", Told(_cycle(bus.sync_period_s), "heard: SYNC on the bus"))
+            draft.tell("machine.sync_period_s", Told(_cycle(bus.sync_period_s), "measured: SYNC on the bus"))
     cycles = {drive.cycle_s for bus in buses for drive in bus.drives} - {None}
-    usual = Told(0.001, "guessed: usual; it is the NC's cycle", guessed=True)
+    usual = Told(0.001, "guessed: a usual value; it must be the NC's cycle", guessed=True)
     if len(cycles) == 1:
         usual = Told(cycles.pop(), "guessed: the drives' own cycle, 0x60C2; it must be the NC's", guessed=True)
     draft.settle("machine.sync_period_s", "the NC's cycle: how often it sends SYNC", usual)
     if nc is not None:
-        where = "linuxcnc where its HAL file loads fdhil's bridge: line and override are then known; else inferred"
-        by_motion = "guessed: by the motion; 'linuxcnc' where its HAL file loads fdhil's bridge"
+        where = "'linuxcnc' if its HAL file loads fdhil's bridge, which reports line and override; else 'inferred'"
+        by_motion = "guessed: recognised by the motion; 'linuxcnc' if its HAL file loads fdhil's bridge"
         draft.settle("g0.source", where, Told("inferred", by_motion, guessed=True))
 
 
-def _cycle(heard_s: float) -> float:
-    """Return the period that an NC is set to, a multiple of a quarter of a millisecond, where one is near.
+def _cycle(measured_s: float) -> float:
+    """Return the period to which an NC is set, a multiple of a quarter of a millisecond, if one is near.
 
     >>> _cycle(0.000993), _cycle(0.0011)
     (0.001, 0.0011)
     """
-    usual_s = max(1, round(heard_s / 0.00025)) * 0.00025
-    return rounded(usual_s if abs(heard_s - usual_s) < 0.05 * usual_s else round(heard_s, 5))
+    usual_s = max(1, round(measured_s / 0.00025)) * 0.00025
+    return rounded(usual_s if abs(measured_s - usual_s) < 0.05 * usual_s else round(measured_s, 5))
 
 
 def axis_names(draft: Draft, nc: Machine | None, drives: Sequence[FoundDrive]) -> list[str]:
-    """Return the axes' letters: the NC's and the answers', else those that the operator gives."""
+    """Return the axes' letters: those of the NC and the answers, else the operator's."""
     named = [path.split(".")[1] for path in draft.values if path.startswith("axis.")]
     names = list(dict.fromkeys([*(nc.axes if nc else ()), *named]))
     if names:
         return names
     usual = "XYZUVW"[: len(drives)] or "X"
     draft.settle("axes", "their letters in the NC's programs", Told(usual, "one for each drive", True), _letters)
-    told = draft.values.pop("axes")
-    return list(dict.fromkeys(told.value))
+    letters = draft.values.pop("axes")
+    return list(dict.fromkeys(letters.value))
 
 
-def _letters(said: str) -> str:
-    letters = "".join(said.upper().replace(",", " ").split())
+def _letters(answer: str) -> str:
+    letters = "".join(answer.upper().replace(",", " ").split())
     if not (letters.isascii() and letters.isalpha()):
-        raise ConfigError("axes", [ConfigFault("axes", "must be letters, as X Y Z")])
+        raise ConfigError("axes", [ConfigFault("axes", "must be letters, for example X Y Z")])
     return letters
 
 
-def _one_of(path: str, words: Sequence[str], said: str) -> str:
-    if said not in words:
+def _one_of(path: str, words: Sequence[str], answer: str) -> str:
+    if answer not in words:
         raise ConfigError(path, [ConfigFault(path, f"must be {' or '.join(words)}")])
-    return said
+    return answer
 
 
-def settle_axis(
-    draft: Draft,
-    axis: str,
-    others: Sequence[str],
-    found: Found,
-    nc: Machine | None,
-    folder: Path,
-) -> None:
-    """Settle [axis.X]; ``others`` are the axes before it, ``found`` what is on the buses."""
+def settle_axis(draft: Draft, axis: str, others: Sequence[str], found: Found, nc: Machine | None, folder: Path) -> None:
+    """Settle [axis.X]; ``others`` are the axes before it, ``found`` the drives on the buses."""
     drive = _settle_drive(draft, axis, found)
     scale = nc.scales.get(axis) if nc else None
-    if is_second_drive(axis):  # it takes the rest from the first
+    if is_second_drive(axis):  # the rest is the first drive's
         if scale is not None:
             draft.tell(f"axis.{axis}.drive.sign", Told(-1 if scale.increments_per_unit < 0 else 1, scale.source))
         return
     if axis in "ABC":
-        draft.settle(f"axis.{axis}.unit", "deg for a table that turns", Told("deg", f"guessed: {axis} turns", True))
+        draft.settle(f"axis.{axis}.unit", "deg for a rotary table", Told("deg", f"guessed: {axis} is rotary", True))
     profile = _settle_profile(draft, axis, drive, folder)
-    for key, told in (drive.told if drive is not None else {}).items():
-        draft.tell(f"axis.{axis}.{key}", told)
+    for key, value in (drive.told if drive is not None else {}).items():
+        draft.tell(f"axis.{axis}.{key}", value)
     _settle_scale(draft, axis, scale, others)
     for question in QUESTIONS:
         if _applies(question.key, profile, _is_rotary(draft, axis)):
@@ -123,8 +116,8 @@ def settle_axis(
     _settle_correction(draft, axis, profile)
     if profile is not None and not profile.voltage_objects and not draft.has_table(f"axis.{axis}.voltage"):
         draft.notes.append(
-            f"axis {axis}: profile {profile.name} tells no voltage of the motor; K, inertia and friction are "
-            "identified, R and L stay as given, until a sensor is wired (docs/how-to/voltage-sensor.md)"
+            f"axis {axis}: profile {profile.name} has no motor voltage; K, inertia and friction are "
+            "identified, R and L stay as given until a sensor is connected (docs/how-to/voltage-sensor.md)"
         )
 
 
@@ -139,8 +132,8 @@ def settle_hal_axis(draft: Draft, axis: str, others: Sequence[str], nc: Machine,
     """Settle [axis.X] of an axis whose drive is HAL pins; a pin that a running HAL lacks is missing."""
     here = f"axis.{axis}"
     made = propose_axis(nc.hal, axis, nc.joints.get(axis, 0), nc.unit_mm, running)
-    for key, told in (("source", "hal"), ("bus", "hal"), ("profile", "hal")):
-        draft.tell(f"{here}.drive.{key}", Told(told, "asked: --hal"))
+    for key in ("source", "bus", "profile"):
+        draft.tell(f"{here}.drive.{key}", Told("hal", "option --hal"))
     for key, value in made.told.items():
         given = f"{here}.{key}" in draft.values or (
             key.endswith("torque") and f"{here}.drive.hal.current" in draft.values
@@ -164,36 +157,37 @@ def settle_hal_axis(draft: Draft, axis: str, others: Sequence[str], nc: Machine,
             draft.missing.append(ConfigFault(f"{here}.drive.hal.{key}", f"HAL has no pin {pin}", advice))
     if not draft.has_table(f"{here}.drive.hal.voltage"):
         draft.notes.append(
-            f"axis {axis}: no pin of a voltage; K, R and L stay as given, inertia and friction are found"
+            f"axis {axis}: no pin of a voltage; K, R and L stay as given, inertia and friction are identified"
         )
     _settle_correction(draft, axis, profile)
 
 
 def _settle_pid(draft: Draft, here: str, unit_mm: float) -> None:
-    """Take the gains of a pid that commands a current for what they are, once the pitch is known."""
     regulators = f"{here}.regulators"
     pitch = draft.get(f"{here}.screw_pitch_mm")
     if draft.get(f"{regulators}.pid_output") != "current" or not pitch:
         return
-    told = {path.rpartition(".")[2]: told.value for path, told in draft.values.items() if path.startswith(regulators)}
+    gains = {
+        path.rpartition(".")[2]: value.value for path, value in draft.values.items() if path.startswith(regulators)
+    }
     per_unit = draft.get(f"{here}.drive.hal.current_a_per_unit") or 1.0
     try:
-        found = current_gains(told, per_unit, unit_mm, pitch)
+        found = current_gains(gains, per_unit, unit_mm, pitch)
     except ValueError as error:
-        draft.missing.append(ConfigFault(f"{regulators}.pid_output", f"cannot be 'current': {error}", "see its setp"))
+        draft.missing.append(ConfigFault(f"{regulators}.pid_output", f"cannot be 'current': {error}", "check its setp"))
         return
     for key, value in found.items():
         draft.values[f"{regulators}.{key}"] = Told(value, "LinuxCNC: HAL's pid, whose output is a current")
 
 
 def _settle_drive(draft: Draft, axis: str, found: Found) -> FoundDrive | None:
-    """Settle which drive moves the axis; return it where it was found on a bus."""
+    """Settle which drive moves the axis; return it if it was found on a bus."""
     path = f"axis.{axis}.drive"
     taken = _taken(draft, axis)
     free = [drive for drive in found.drives if (drive.bus, drive.node_id, drive.logical_axis) not in taken]
     if found.complete and not free:
-        what = f"has no drive: {len(found.drives)} found, {len(taken)} given to other axes"
-        advice = "check its supply and wiring, or leave the axis out; --offline looks at no bus"
+        what = f"has no drive: {len(found.drives)} found, {len(taken)} assigned to other axes"
+        advice = "check its supply and wiring, or remove the axis; --offline skips the bus"
         draft.missing.append(ConfigFault(path, what, advice))
         return None
     only = found.complete and len(found.drives) == 1
@@ -202,7 +196,7 @@ def _settle_drive(draft: Draft, axis: str, found: Found) -> FoundDrive | None:
         source = "the drive on the bus" if only else "guessed: in the order on the bus"
         first = Told(free[0].node_id, source, guessed=not only)
     names = "; ".join(drive.name for drive in free)
-    draft.settle(f"{path}.node_id", f"found: {names}" if free else "the drive's switches or tool", first)
+    draft.settle(f"{path}.node_id", f"found: {names}" if free else "set by the drive's switches or tool", first)
     drive = _chosen(draft, axis, free)
     if drive is not None:
         _tell_place(draft, path, drive)
@@ -218,12 +212,11 @@ def _taken(draft: Draft, axis: str) -> set[tuple[str, int, int]]:
 
 
 def _chosen(draft: Draft, axis: str, free: Sequence[FoundDrive]) -> FoundDrive | None:
-    """Return the found drive that the axis' node-ID names; of several axes behind it the first that is free."""
     _, node_id, number = _place(draft, axis)
-    alike = [drive for drive in free if drive.node_id == node_id]
-    exact = [drive for drive in alike if drive.logical_axis == number]
+    candidates = [drive for drive in free if drive.node_id == node_id]
+    exact = [drive for drive in candidates if drive.logical_axis == number]
     given = f"axis.{axis}.drive.logical_axis" in draft.values
-    return next(iter(exact if exact or given else alike), None)
+    return next(iter(exact if exact or given else candidates), None)
 
 
 def _place(draft: Draft, axis: str) -> tuple[str, int, int]:
@@ -239,15 +232,15 @@ def _tell_place(draft: Draft, path: str, drive: FoundDrive) -> None:
 
 
 def _settle_profile(draft: Draft, axis: str, drive: FoundDrive | None, folder: Path) -> DriveProfile | None:
-    """Settle the drive's profile, and its EDS where that is needed; return it, None where it is not known.
+    """Settle the drive's profile, and its EDS if needed; return the profile, None if it is unknown.
 
-    One that cannot be read, or hears too little of the drive, is asked again where somebody can be.
+    A profile that cannot be read, or maps too little, is asked again if there is an operator.
     """
     path = f"axis.{axis}.drive"
     if drive is not None and drive.profile is not None:
         by = f"by its EDS {drive.eds.name}" if drive.eds else "by its vendor number"
         draft.tell(f"{path}.profile", Told(drive.profile, f"{by}: {drive.label}"))
-    draft.settle(f"{path}.profile", "`fdhil eds` suggests one by the drive's EDS; cia402 takes what that offers")
+    draft.settle(f"{path}.profile", "`fdhil eds` suggests one from the drive's EDS; cia402 uses what the EDS offers")
     while True:
         _settle_eds(draft, path, drive, folder)
         try:
@@ -260,11 +253,11 @@ def _settle_profile(draft: Draft, axis: str, drive: FoundDrive | None, folder: P
 
 
 def _settle_eds(draft: Draft, path: str, drive: FoundDrive | None, folder: Path) -> None:
-    """With its EDS a profile maps what this drive has, and no more; the generic one is made of nothing else."""
+    """With its EDS a profile maps exactly the drive's objects; the generic profile consists of nothing else."""
     if drive is not None and drive.eds is not None:
-        draft.tell(f"{path}.eds", Told(_from(drive.eds, folder), "fits the drive on the bus"))
+        draft.tell(f"{path}.eds", Told(_from(drive.eds, folder), "matches the drive on the bus"))
     if draft.get(f"{path}.profile") == GENERIC:
-        draft.settle(f"{path}.eds", "the drive's maker has it on his pages; put it beside this file, or give --eds")
+        draft.settle(f"{path}.eds", "from the manufacturer's web site; put it next to this file, or use --eds")
 
 
 def _profile(draft: Draft, path: str, folder: Path) -> DriveProfile | None:
@@ -276,13 +269,12 @@ def _profile(draft: Draft, path: str, folder: Path) -> DriveProfile | None:
 
 
 def _from(path: Path, folder: Path) -> str:
-    """Return a path as it is written into a file of ``folder``."""
     path, folder = path.resolve(), folder.resolve()
     return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
 
 
 def _settle_scale(draft: Draft, axis: str, scale: Scale | None, others: Sequence[str]) -> None:
-    """Of the NC's scale, the drive's increments and the pitch two tell the third; all three must agree."""
+    """Of the NC's scale, the drive's increments and the pitch two give the third; all three must agree."""
     turn, pitch = f"axis.{axis}.drive.increments_per_rev", _path(draft, axis, PITCH.key)
     if scale is not None:
         per_unit = abs(scale.increments_per_unit)
@@ -299,8 +291,8 @@ def _settle_scale(draft: Draft, axis: str, scale: Scale | None, others: Sequence
     if abs(found - per_unit) > 1e-3 * per_unit:
         unit = "deg" if _is_rotary(draft, axis) else "mm"
         draft.notes.append(
-            f"axis {axis}: {scale.source} is {per_unit:g} increments/{unit}, drive and pitch make {found:g}: one of "
-            "the three is wrong, or the NC's scale counts something else; measure before anything moves"
+            f"axis {axis}: {scale.source} is {per_unit:g} increments/{unit}, drive and pitch give {found:g}: one of "
+            "the three is wrong, or the NC's scale has another meaning; measure before anything moves"
         )
 
 
@@ -309,7 +301,6 @@ def _is_rotary(draft: Draft, axis: str) -> bool:
 
 
 def _path(draft: Draft, axis: str, key: str) -> str:
-    """Return the path of a key, as a rotary axis has it where the axis is one."""
     return f"axis.{axis}.{angular(key) if _is_rotary(draft, axis) else key}"
 
 
@@ -322,49 +313,48 @@ def _applies(key: str, profile: DriveProfile | None, rotary: bool) -> bool:
 
 
 def _settle(draft: Draft, axis: str, question: Question, others: Sequence[str]) -> None:
-    """Settle one key; where nothing tells or guesses it, a former axis' value is proposed to whoever is asked."""
+    """Settle one key; if no source and no guess has it, the value of the previous axis is proposed to the operator."""
     path = _path(draft, axis, question.key)
     proposal = _guess(draft, axis, question)
     if proposal is None and draft.ask is not None:
         key = path.removeprefix(f"axis.{axis}.")
-        former = [(other, told) for other in others if (told := draft.values.get(f"axis.{other}.{key}"))]
+        former = [(other, value) for other in others if (value := draft.values.get(f"axis.{other}.{key}"))]
         if former:
             proposal = Told(former[-1][1].value, f"guessed: as axis {former[-1][0]}", guessed=True)
     if proposal is None and question.guess is not None and question.follows and path not in draft.values:
-        return  # what it follows from is missing, and is told
+        return  # the value it follows from is reported as missing
     draft.settle(path, question.where, proposal)
 
 
 def _guess(draft: Draft, axis: str, question: Question) -> Told | None:
     here = f"axis.{axis}."
-    own = {path: told.value for path, told in draft.values.items() if path.startswith(here)}
-    known = {linear(path.removeprefix(here)): value for path, value in own.items()}  # guesses take ratios of lengths
+    own = {path: value.value for path, value in draft.values.items() if path.startswith(here)}
+    known = {linear(path.removeprefix(here)): value for path, value in own.items()}  # guesses use ratios of lengths
     try:
         value: Any = question.guess(known) if question.guess is not None else None
-    except (KeyError, TypeError, ZeroDivisionError):  # too little is known, or an answer is no number
+    except (KeyError, TypeError, ZeroDivisionError):  # too little is known, or an answer is not a number
         return None
     return None if value is None else Told(rounded(value), f"guessed: {question.how}", guessed=True)
 
 
 def _tell_window(draft: Draft, axis: str, increments: int | None) -> None:
-    """The drive's own following-error window goes before that of the NC."""
     turn, pitch = draft.get(f"axis.{axis}.drive.increments_per_rev"), draft.get(_path(draft, axis, PITCH.key))
     path = _path(draft, axis, "drive.following_error_window_mm")
     if increments in (None, *NO_OTHER_WINDOW) or not turn or not pitch:
         return
-    told = Told(rounded(increments * pitch / turn), "the drive: 0x6065")
+    window = Told(rounded(increments * pitch / turn), "the drive: 0x6065")
     known = draft.values.get(path)
     if known is not None and known.source.startswith("LinuxCNC"):
         del draft.values[path]
-    draft.tell(path, told)
+    draft.tell(path, window)
 
 
 def _settle_correction(draft: Draft, axis: str, profile: DriveProfile | None) -> None:
-    """Writing stays off unless somebody asks for it; even then nothing is sent before commissioning and arming."""
+    """Correction stays off unless requested; even then nothing is sent before commissioning and arming."""
     path = f"axis.{axis}.correction"
     if not draft.has_table(path) and draft.ask is not None:
         where = "yes or no; even with yes nothing is sent before `fdhil commission` and `fdhil arm`"
-        no = Told("no", "nothing is written to a drive unless it is asked for", guessed=True)
+        no = Told("no", "off unless requested: nothing is written to a drive", guessed=True)
         draft.settle(path, where, no, partial(_one_of, path, ("yes", "no")))
         if draft.values.pop(path).value == "yes":
             draft.values[path] = Told({}, OPERATOR)

@@ -1,6 +1,6 @@
-"""Takes from a LinuxCNC machine's own INI and HAL files what a configuration needs: axes, speeds, scales, the period.
+"""Read axes, speeds, scales and the period from a LinuxCNC machine's own INI and HAL files.
 
-Units: the INI's own ([TRAJ] LINEAR_UNITS) are taken to millimetres. Programmed moves keep [AXIS_x] MAX_VELOCITY and
+The INI's units ([TRAJ] LINEAR_UNITS) are converted to millimetres. Programmed moves keep [AXIS_x] MAX_VELOCITY and
 MAX_ACCELERATION, less the share of OFFSET_AV_RATIO, and [TRAJ] MAX_LINEAR_VELOCITY along the path; defaults are 1.
 Neither [JOINT_n] nor [TRAJ] MAX_LINEAR_ACCELERATION limits them (measured on LinuxCNC 2.9). Rotary axes are in degrees;
 the second joint of a gantry axis Y is the drive Y2.
@@ -25,15 +25,18 @@ UNITS_DEG = {"degree": 1.0, "deg": 1.0, "rad": math.degrees(1.0), "radian": math
 ALL_AXES = "XYZABCUVW"
 _SCALE_PINS = ("position-scale", "pos-scale", "scale")
 _SCALE_KEYS = ("SCALE", "INPUT_SCALE", "ENCODER_SCALE", "STEP_SCALE")
-DEFAULT_LIMIT = 1.0  # of a speed or acceleration that the INI lacks, in its unit
-LARGEST_RATIO, REPLACED_RATIO = 0.9, 0.1  # of OFFSET_AV_RATIO: what LinuxCNC accepts, and puts in place of others
+DEFAULT_LIMIT = 1.0  # speed or acceleration missing in the INI, in its unit
+LARGEST_RATIO, REPLACED_RATIO = (
+    0.9,
+    0.1,
+)  # of OFFSET_AV_RATIO: the largest that LinuxCNC accepts, and its replacement for larger ones
 LEAST_JERK, LARGEST_JERK = 1.0, 1e9  # of MAX_LINEAR_JERK; the latter is its default
 LARGEST_OFFSET_MM = 0.25  # the ceiling of [axis.X.correction]
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Increments per millimetre or degree, negative where the drive counts against the axis, and where it was read."""
+    """Increments per millimetre or degree, negative if the drive counts against the axis, and the source."""
 
     increments_per_unit: float
     source: str
@@ -41,9 +44,9 @@ class Scale:
 
 @dataclass(slots=True)
 class Machine:
-    """What the files tell: values by their key in the configuration, scales by axis, the axes' joints, HAL, remarks.
+    """What the files define: values by configuration key, scales by axis, the axes' joints, HAL, remarks.
 
-    ``loops`` are those remarks that are for drives which close their own loops.
+    ``loops`` are the remarks that apply to drives which close their own loops.
     """
 
     told: dict[str, Told] = field(default_factory=dict)
@@ -58,14 +61,14 @@ class Machine:
 
 
 def read_linuxcnc(path: Path) -> Machine:
-    """Read a machine's INI and the HAL files that it names; ConfigError where the INI tells no machine."""
+    """Read a machine's INI and the HAL files it names; ConfigError if the INI describes no machine."""
     folder = path.parent
     try:
         ini = parse_ini(_text(path), lambda name: _text(folder / name))
     except (OSError, ValueError) as error:
         name = Path(getattr(error, "filename", None) or path).name
         what = f"{name} cannot be read: {getattr(error, 'strerror', None) or error}"
-        raise _fault(path, "file", what, "give the INI with which LinuxCNC is started") from None
+        raise _fault(path, "file", what, "use the INI with which LinuxCNC is started") from None
     hal, notes = _read_hal(ini, folder)
     machine = machine_of(ini, hal, path)
     machine.notes = notes + machine.notes
@@ -76,20 +79,19 @@ def _text(path: Path) -> str:
     with path.open("rb") as file:
         raw = file.read(MAX_BYTES + 1)
     if len(raw) > MAX_BYTES:
-        raise ValueError("it is larger than 1 MiB")
+        raise ValueError("larger than 1 MiB")
     return raw.decode("utf-8", "replace")
 
 
 def _read_hal(ini: Ini, folder: Path) -> tuple[Hal, list[str]]:
-    """Read the HAL files in their order; one that cannot be read, or is Tcl, is told."""
     hal, notes = Hal(), []
     for line in ini.all("HAL", "HALFILE"):
         name = line.split()[0] if line.split() else ""
         place = folder / name
-        if name.startswith("LIB:") or not place.exists():  # as LinuxCNC looks for them
+        if name.startswith("LIB:") or not place.exists():  # LinuxCNC's search order
             place = HAL_LIBRARY / name.removeprefix("LIB:")
         if not name.endswith(".hal"):
-            notes.append(f"HALFILE {name} was not read: it is no plain HAL file; scales set there are asked for")
+            notes.append(f"HALFILE {name} was not read: it is not a plain HAL file; scales set there are asked for")
             continue
         try:
             parse_hal(_text(place), ini, lambda other: _text(folder / other), hal)
@@ -102,16 +104,16 @@ def _read_hal(ini: Ini, folder: Path) -> tuple[Hal, list[str]]:
 
 
 def machine_of(ini: Ini, hal: Hal, path: Path) -> Machine:
-    """Return what the parsed files tell; ConfigError where they tell no machine with linear axes."""
+    """Return the machine that the parsed files describe; ConfigError if it has no linear axis."""
     if "AXIS_0" in ini.sections and "JOINT_0" not in ini.sections:
-        what = "is of a LinuxCNC before 2.8: it has [AXIS_0] and no [JOINT_0]"
+        what = "is for LinuxCNC before 2.8: it has [AXIS_0] and no [JOINT_0]"
         raise _fault(path, "AXIS_0", what, "convert it with LinuxCNC's update_ini")
     unit_mm = _unit_mm(ini, path)
     machine = Machine(unit_mm=unit_mm, hal=hal)
     joints = machine.joints = _joints(ini, machine.notes)
     if not joints:
         advice = "[TRAJ] COORDINATES names the axes and [JOINT_n] describes each"
-        raise _fault(path, "TRAJ.COORDINATES", "names no linear axis with a joint", advice)
+        raise _fault(path, "TRAJ.COORDINATES", "has no linear axis with a joint", advice)
     machine.axes = tuple(joints)
     machine.joint_count = sum(section.startswith("JOINT_") for section in ini.sections)
     _common(ini, machine)
@@ -128,7 +130,7 @@ def machine_of(ini: Ini, hal: Hal, path: Path) -> Machine:
 
 
 class _Unit(NamedTuple):
-    """What fdhil has an axis in, and how much of that the INI's unit is."""
+    """The unit that fdhil uses for an axis, and the INI's unit as a multiple of it."""
 
     name: str
     factor: float
@@ -145,7 +147,6 @@ def _unit(ini: Ini, path: Path, letter: str, unit_mm: float) -> _Unit:
 
 
 def _travel(ini: Ini, joints: Mapping[str, int], units: Mapping[str, _Unit]) -> Iterator[str]:
-    """Say how far the axes may go: commissioning asks for room, and no key of the configuration holds it."""
     ways = []
     for letter, joint in joints.items():
         places = (f"AXIS_{letter}", f"JOINT_{joint}")
@@ -155,11 +156,10 @@ def _travel(ini: Ini, joints: Mapping[str, int], units: Mapping[str, _Unit]) -> 
             unit, factor = units[letter]
             ways.append(f"{letter} {max(low) * factor:g} to {min(high) * factor:g} {unit}")
     if ways:
-        yield f"LinuxCNC lets go {', '.join(ways)}: give `fdhil commission --room` no more than that"
+        yield f"LinuxCNC allows {', '.join(ways)}: do not exceed that with `fdhil commission --room`"
 
 
 def _unit_mm(ini: Ini, path: Path) -> float:
-    """Return the machine's unit of length in millimetres; LinuxCNC also takes the number of units in a millimetre."""
     named = ini.text("TRAJ", "LINEAR_UNITS").lower() or "mm"
     per_mm = finite(named)
     if named not in UNITS_MM and not (per_mm and per_mm > 0):
@@ -169,20 +169,20 @@ def _unit_mm(ini: Ini, path: Path) -> float:
 
 def _joints(ini: Ini, notes: list[str]) -> dict[str, int]:
     kinematics = ini.text("KINS", "KINEMATICS").split()
-    told = next((word[12:] for word in kinematics if word.lower().startswith("coordinates=")), "")
+    given = next((word[12:] for word in kinematics if word.lower().startswith("coordinates=")), "")
     named = "".join(ini.text("TRAJ", "COORDINATES").upper().split())
-    letters = told.upper() or named
+    letters = given.upper() or named
     numbered = list(enumerate(letters))
-    if kinematics and kinematics[0] == "trivkins" and not told:
+    if kinematics and kinematics[0] == "trivkins" and not given:
         numbered = [(joint, letter) for joint, letter in enumerate(ALL_AXES) if letter in named]
         for joint, letter in numbered:
             if f"JOINT_{joint}" not in ini.sections:
                 notes.append(
                     f"axis {letter} is joint {joint} of trivkins without coordinates=, and there is no "
-                    f"[JOINT_{joint}]: left out; for another number write KINEMATICS = trivkins coordinates={named}"
+                    f"[JOINT_{joint}]: ignored; for another number write KINEMATICS = trivkins coordinates={named}"
                 )
     if kinematics and kinematics[0] != "trivkins":
-        notes.append(f"KINEMATICS {kinematics[0]}: fdhil takes each joint for the axis of its place in {letters}")
+        notes.append(f"KINEMATICS {kinematics[0]}: fdhil assigns the joints to the axes in the order {letters}")
     joints: dict[str, int] = {}
     for joint, letter in numbered:
         section = f"JOINT_{joint}"
@@ -191,10 +191,10 @@ def _joints(ini: Ini, notes: list[str]) -> dict[str, int]:
         angular = ini.text(section, "TYPE").upper() == "ANGULAR"
         if letter in ALL_AXES and angular != (letter in ROTARY):
             kind, other = ("rotary", "ANGULAR") if letter in ROTARY else ("linear", "LINEAR")
-            text = f"axis {letter} is {kind} and left out: correct [{section}] TYPE to {other}, or the letter"
+            text = f"axis {letter} is {kind} and ignored: correct [{section}] TYPE to {other}, or the letter"
             notes.append(text)
         elif f"{letter}2" in joints:
-            notes.append(f"axis {letter} has a third joint, {joint}: left out; a gantry axis has two drives")
+            notes.append(f"axis {letter} has a third joint, {joint}: ignored; a gantry axis has two drives")
         elif letter in joints:
             joints[f"{letter}2"] = joint
         elif letter.isalpha() and letter.isascii():
@@ -208,15 +208,15 @@ def _common(ini: Ini, machine: Machine) -> None:
     period_ns = ini.number("EMCMOT", "SERVO_PERIOD")
     if period_ns:
         machine.told["machine.sync_period_s"] = Told(rounded(period_ns * 1e-9), "LinuxCNC: [EMCMOT] SERVO_PERIOD")
-    machine.notes += [f"[{name}] stands in the INI again: LinuxCNC reads the first one alone" for name in ini.repeated]
+    machine.notes += [f"[{name}] occurs twice in the INI: LinuxCNC reads only the first one" for name in ini.repeated]
 
 
 def _planner(ini: Ini, joints: Mapping[str, int], unit_mm: float, machine: Machine) -> None:
-    """Take the planner: LinuxCNC's trapezoidal one, or for PLANNER_TYPE 1 of 2.10 the nearest that fdhil has."""
-    told, path = machine.told, ini.number("TRAJ", "MAX_LINEAR_VELOCITY")
+    """Select the planner: LinuxCNC's trapezoidal one, or for PLANNER_TYPE 1 of 2.10 the nearest that fdhil has."""
+    values, path = machine.told, ini.number("TRAJ", "MAX_LINEAR_VELOCITY")
     if path is not None and path > 0:
-        told["nc.max_path_speed_mm_s"] = Told(rounded(path * unit_mm), "LinuxCNC: [TRAJ] MAX_LINEAR_VELOCITY")
-    told["nc.profile"] = Told("linuxcnc", "LinuxCNC plans the moves")
+        values["nc.max_path_speed_mm_s"] = Told(rounded(path * unit_mm), "LinuxCNC: [TRAJ] MAX_LINEAR_VELOCITY")
+    values["nc.profile"] = Told("linuxcnc", "LinuxCNC plans the moves")
     kind, jerk = ini.text("TRAJ", "PLANNER_TYPE"), ini.number("TRAJ", "MAX_LINEAR_JERK")
     if finite(kind) in (None, 0.0):
         return
@@ -230,25 +230,25 @@ def _planner(ini: Ini, joints: Mapping[str, int], unit_mm: float, machine: Machi
             "plans with the trapezoidal planner (0), and so does fdhil"
         )
         return
-    told["nc.profile"] = Told("jerk_limited", "LinuxCNC: [TRAJ] PLANNER_TYPE 1, the S-curve planner of 2.10")
+    values["nc.profile"] = Told("jerk_limited", "LinuxCNC: [TRAJ] PLANNER_TYPE 1, the S-curve planner of 2.10")
     for letter in (each for each in joints if each not in ROTARY and not is_second_drive(each)):
         source = "LinuxCNC: [TRAJ] MAX_LINEAR_JERK"
-        told[f"axis.{letter}.max_jerk_mm_s3"] = Told(rounded(min(jerk * unit_mm, LARGEST_JERK)), source)
+        values[f"axis.{letter}.max_jerk_mm_s3"] = Told(rounded(min(jerk * unit_mm, LARGEST_JERK)), source)
     machine.notes.append(
-        "[TRAJ] PLANNER_TYPE 1: the S-curve planner of LinuxCNC 2.10 is planned with profile jerk_limited, which keeps "
-        "the same jerk, but blends corners otherwise; judge programs by a recorded demand (fdhil record): "
-        "where the planner exceeds the axes' limits, predict reports it"
+        "[TRAJ] PLANNER_TYPE 1: profile jerk_limited models the S-curve planner of LinuxCNC 2.10 with the same jerk, "
+        "but different corner blends; assess programs by a recorded demand (fdhil record): predict reports where the "
+        "planner exceeds the axes' limits"
     )
 
 
 def _limit(ini: Ini, letter: str, joint: int, name: str, machine: Machine) -> tuple[float, str]:
-    """Return what [AXIS_x] lets programmed moves have of speed or acceleration, in the INI's unit, and its source."""
+    """Return the [AXIS_x] limit of speed or acceleration for programmed moves, in the INI's unit, and its source."""
     section = f"AXIS_{letter}"
     given = ini.number(section, name)
     value, source = DEFAULT_LIMIT if given is None or given <= 0 else given, f"LinuxCNC: [{section}] {name}"
     if given is None:
         source = f"LinuxCNC's default: [{section}] has no {name}"
-        machine.notes.append(f"axis {letter}: [{section}] has no {name}, so that LinuxCNC takes {DEFAULT_LIMIT:g} unit")
+        machine.notes.append(f"axis {letter}: [{section}] has no {name}, so LinuxCNC uses {DEFAULT_LIMIT:g} unit")
     ratio = ini.number(section, "OFFSET_AV_RATIO") or 0.0
     if not 0.0 <= ratio <= LARGEST_RATIO:
         ratio = REPLACED_RATIO
@@ -257,31 +257,31 @@ def _limit(ini: Ini, letter: str, joint: int, name: str, machine: Machine) -> tu
     of_joint = ini.number(f"JOINT_{joint}", name)
     if of_joint is not None and 0 < of_joint < value:
         machine.notes.append(
-            f"axis {letter}: [JOINT_{joint}] {name} is {of_joint:g}, less than {value:g} of [{section}]: LinuxCNC does "
-            "not keep it in programmed moves; make both equal"
+            f"axis {letter}: [JOINT_{joint}] {name} is {of_joint:g}, less than {value:g} of [{section}]: LinuxCNC "
+            "ignores it in programmed moves; make both equal"
         )
     return value * (1.0 - ratio), source
 
 
 def _axis(ini: Ini, hal: Hal, letter: str, joint: int, unit: _Unit, machine: Machine) -> None:
-    told, here, rotary, factor = machine.told, f"axis.{letter}", unit.name == "deg", unit.factor
+    values, here, rotary, factor = machine.told, f"axis.{letter}", unit.name == "deg", unit.factor
     if rotary:
-        told[f"{here}.unit"] = Told("deg", f"LinuxCNC: axis {letter} is rotary")
+        values[f"{here}.unit"] = Told("deg", f"LinuxCNC: axis {letter} is rotary")
         if ini.number(f"AXIS_{letter}", "WRAPPED_ROTARY"):
-            before = told["nc.wrapped_axes"].value if "nc.wrapped_axes" in told else []
-            told["nc.wrapped_axes"] = Told([*before, letter], "LinuxCNC: WRAPPED_ROTARY")
+            before = values["nc.wrapped_axes"].value if "nc.wrapped_axes" in values else []
+            values["nc.wrapped_axes"] = Told([*before, letter], "LinuxCNC: WRAPPED_ROTARY")
     most = f"MAX_{'ANGULAR' if rotary else 'LINEAR'}_VELOCITY"
     path = ini.number("TRAJ", most)
     value, source = _limit(ini, letter, joint, "MAX_VELOCITY", machine)
     if path is not None and 0 < path < value:  # a move of this axis alone is no faster
         value, source = path, f"LinuxCNC: [TRAJ] {most}"
-    told[f"{here}.rapid_speed_{unit.name}_s"] = Told(rounded(value * factor), source)
+    values[f"{here}.rapid_speed_{unit.name}_s"] = Told(rounded(value * factor), source)
     value, source = _limit(ini, letter, joint, "MAX_ACCELERATION", machine)
-    told[f"{here}.max_acceleration_{unit.name}_s2"] = Told(rounded(value * factor), source)
+    values[f"{here}.max_acceleration_{unit.name}_s2"] = Told(rounded(value * factor), source)
     ferror = ini.number(f"JOINT_{joint}", "FERROR")
     if ferror is not None and ferror > 0:
-        source = f"LinuxCNC: [JOINT_{joint}] FERROR; the drive's own 0x6065 is compared by fdhil check"
-        told[f"{here}.drive.following_error_window_{unit.name}"] = Told(rounded(ferror * factor), source)
+        source = f"LinuxCNC: [JOINT_{joint}] FERROR; fdhil check compares it with the drive's 0x6065"
+        values[f"{here}.drive.following_error_window_{unit.name}"] = Told(rounded(ferror * factor), source)
     scale = _scale(ini, hal, joint, factor)
     if scale is not None:
         machine.scales[letter] = scale
@@ -291,7 +291,6 @@ def _axis(ini: Ini, hal: Hal, letter: str, joint: int, unit: _Unit, machine: Mac
 
 
 def _scale(ini: Ini, hal: Hal, joint: int, factor: float) -> Scale | None:
-    """Return the scale that HAL sets on what is wired to the joint's feedback or command, else the INI's."""
     for pin in (f"joint.{joint}.motor-pos-fb", f"joint.{joint}.motor-pos-cmd"):
         for component in hal.around(pin):
             for name in _SCALE_PINS:
@@ -306,18 +305,17 @@ def _scale(ini: Ini, hal: Hal, joint: int, factor: float) -> Scale | None:
 
 
 def _beside(ini: Ini, letter: str, joint: int, unit: _Unit) -> Iterator[str]:
-    """Say what LinuxCNC itself corrects, and what that means beside fdhil's offsets."""
     section = f"JOINT_{joint}"
     if (ini.number(section, "BACKLASH") or 0.0) > 0 or ini.text(section, "COMP_FILE"):
         yield (
-            f"axis {letter}: LinuxCNC compensates backlash or the screw ([{section}] BACKLASH, COMP_FILE); leave that "
-            "on: fdhil sees it in the demand, and judges programs by a recorded demand (fdhil record)"
+            f"axis {letter}: LinuxCNC compensates backlash or screw pitch ([{section}] BACKLASH, COMP_FILE); leave "
+            "that on: the demand contains it; assess programs by a recorded demand (fdhil record)"
         )
     if ini.number(f"AXIS_{letter}", "OFFSET_AV_RATIO"):
         yield (
-            f"axis {letter}: external offsets are allowed ([AXIS_{letter}] OFFSET_AV_RATIO), and take their share of "
-            "speed and acceleration from every program, used or not; keep them off while a correction is "
-            "armed: the path would not be the one that was checked, and the guard refuses it"
+            f"axis {letter}: external offsets are allowed ([AXIS_{letter}] OFFSET_AV_RATIO), and reserve their share "
+            "of speed and acceleration in every program; do not use them while a correction is armed: the path "
+            "would differ from the checked one, and the guard refuses it"
         )
     least = ini.number(section, "MIN_FERROR")
     if least is not None and 0 < least * unit.factor < 2 * LARGEST_OFFSET_MM:  # and as many degrees
@@ -329,12 +327,11 @@ def _beside(ini: Ini, letter: str, joint: int, unit: _Unit) -> Iterator[str]:
 
 
 def _loops(hal: Hal, letter: str, joint: int) -> Iterator[str]:
-    """Say what a loop in HAL means for a drive that closes its own."""
     for loop in hal.loops_behind(f"joint.{joint}.motor-pos-cmd"):
         gains = _gains(hal.given, loop)
         yield (
-            f"axis {letter}: HAL's {loop} closes the position loop ({gains}); fdhil corrects drives that get position "
-            "set-points (0x607A) as they are: wire joint's motor-pos-cmd to the drive, and switch this loop off"
+            f"axis {letter}: HAL's {loop} closes the position loop ({gains}); fdhil corrects drives that receive "
+            "unmodified position set-points (0x607A): connect the joint's motor-pos-cmd to the drive, remove this loop"
         )
 
 

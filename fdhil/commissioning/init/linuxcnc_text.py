@@ -1,7 +1,7 @@
-"""Parses the text of LinuxCNC's INI and HAL files, as its documentation describes them ("INI Configuration", "HAL").
+"""Parse the text of LinuxCNC's INI and HAL files, as documented in its "INI Configuration" and "HAL".
 
-Pure: text in, tables out. Of HAL only what tells the scale of a joint and the loops around it is kept: the parameters
-that are set and the pins that each signal joins.
+Pure: text in, tables out. Of HAL only the parameters that are set and the pins on each signal are kept: they give the
+scale of a joint and the loops around it.
 """
 
 import re
@@ -14,37 +14,37 @@ _HAL_ARROWS = frozenset({"=>", "<=", "<=>"})
 _PIDS = {"pid": "pid", "at_pid": "pid"}  # component, and what its numbered instances are called
 _DEFAULT_LOOPS, _MOST_LOOPS = 3, 16
 _OUTPUT = re.compile(r".*out|sum$|result$|pos-cmd$")
-_ENDS = frozenset({"joint", "axis", "motion", "halui", "ini"})  # they belong to LinuxCNC itself
+_ENDS = frozenset({"joint", "axis", "motion", "halui", "ini"})  # LinuxCNC's own
 
 Read = Callable[[str], str]
-"""Return the text of a file that another one names; OSError or ValueError where it cannot be read."""
+"""Returns the text of a file that another one names; OSError or ValueError if it cannot be read."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ini:
-    """Sections of keys, in the order of the file; a key may come several times.
+    """Sections of keys in file order; a key may occur several times.
 
-    ``repeated`` are the sections that stand in the file again, which LinuxCNC never reads.
+    ``repeated`` are sections that occur again, which LinuxCNC ignores.
     """
 
     sections: Mapping[str, Mapping[str, tuple[str, ...]]]
     repeated: tuple[str, ...] = ()
 
     def all(self, section: str, key: str) -> tuple[str, ...]:
-        """Return every value of a key; empty where there is none."""
+        """Return every value of a key; empty without one."""
         return self.sections.get(section, {}).get(key, ())
 
     def text(self, section: str, key: str) -> str:
-        """Return a key's first value, as LinuxCNC takes it; empty where there is none."""
+        """Return a key's first value, as LinuxCNC does; empty without one."""
         return next(iter(self.all(section, key)), "")
 
     def number(self, section: str, key: str) -> float | None:
-        """Return a key's first word as a finite number, None where it is none."""
+        """Return a key's first word as a finite number; None if it is not one."""
         return finite(self.text(section, key))
 
 
 def finite(text: str) -> float | None:
-    """Return the first word of a text as a finite number, None where it is none.
+    """Return the first word of a text as a finite number; None if it is not one.
 
     >>> finite("20.0  # mm"), finite("fast"), finite("nan")
     (20.0, None, None)
@@ -57,7 +57,7 @@ def finite(text: str) -> float | None:
 
 
 def parse_ini(text: str, read: Read) -> Ini:
-    """Parse an INI file and those that it includes (``#INCLUDE file``); what is no section and no key is left out."""
+    """Parse an INI file and those that it includes (``#INCLUDE file``); any other line is ignored."""
     sections: dict[str, dict[str, tuple[str, ...]]] = {}
     current: dict[str, tuple[str, ...]] = {}
     repeated: dict[str, None] = {}
@@ -80,22 +80,21 @@ def _included(text: str, read: Read, depth: int = 0) -> Iterator[str]:
         words = line.split()
         if len(words) > 1 and words[0] == "#INCLUDE":
             if depth > 8:
-                raise ValueError("files include each other without end")
+                raise ValueError("files include each other endlessly")
             yield from _included(read(words[1]), read, depth + 1)
         else:
             yield line
 
 
 def _joined(text: str) -> Iterator[str]:
-    """Yield lines; one that ends with a backslash goes on in the next."""
-    yield from re.sub(r"\\[ \t]*\r?\n", " ", text).splitlines()
+    yield from re.sub(r"\\[ \t]*\r?\n", " ", text).splitlines()  # a backslash continues the line
 
 
 @dataclass(slots=True)
 class Hal:
-    """Parameters that are set, the pins that each signal joins, the components that are PID loops, those loaded at all.
+    """Parameters that are set, the pins on each signal, the components that are PID loops, and all loaded components.
 
-    ``threads`` has the functions of each thread, in their order.
+    ``threads`` holds the functions of each thread in order.
     """
 
     given: dict[str, str] = field(default_factory=dict)
@@ -109,11 +108,11 @@ class Hal:
         return sorted(other for pins in self.nets.values() if pin in pins for other in pins - {pin})
 
     def around(self, pin: str) -> list[str]:
-        """Return the components (with their instance) whose pins are on a pin's signal."""
+        """Return the components (with instance) whose pins are on a pin's signal."""
         return list(dict.fromkeys(other.rpartition(".")[0] for other in self.joined(pin)))
 
     def loops_behind(self, pin: str) -> list[str]:
-        """Return the PID loops that a pin commands, straight or through a chain of components (adders, limits, ...)."""
+        """Return the PID loops that a pin commands, directly or through a chain of components (adders, limits, ...)."""
         found: dict[str, None] = {}
         waiting, seen = [pin], {pin}
         while waiting:
@@ -128,15 +127,14 @@ class Hal:
         return sorted(found)
 
     def _outputs(self, component: str) -> list[str]:
-        """Return the wired pins of a component that hand on what it was given, by their names."""
         pins = [pin.rpartition(".") for pins in self.nets.values() for pin in pins]
         return sorted(f"{owner}.{name}" for owner, _, name in pins if owner == component and _OUTPUT.match(name))
 
 
 def parse_hal(text: str, ini: Ini, read: Read, hal: Hal, depth: int = 0) -> None:
-    """Add the commands of a HAL file, and of those that it sources, to ``hal``; unknown commands are left out."""
+    """Add the commands of a HAL file, and of those that it sources, to ``hal``; unknown commands are ignored."""
     for line in _joined(text):
-        # what is not in the INI stays as it is written
+        # keys missing in the INI are kept verbatim
         words = _SUBSTITUTE.sub(lambda found: ini.text(found[1], found[2]) or found[0], line).split()
         words = words[: next((k for k, word in enumerate(words) if word.startswith("#")), len(words))]
         match words:

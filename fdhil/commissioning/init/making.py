@@ -1,4 +1,4 @@
-"""Makes a machine's configuration file: the order of the questions, the last check, and the text."""
+"""Assemble a machine's configuration file: the order of the questions, the final check, and the text."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
@@ -19,10 +19,10 @@ from fdhil.errors import ConfigError, ConfigFault
 from fdhil.records import PARAMETERS
 
 Look = Callable[[str, CanBus], FoundBus]
-"""Find the drives on a bus; ConnectError."""
+"""Finds the drives on a bus; ConnectError."""
 
 HAL_PORT, HAL_LEAD = 5572, 20  # of the bridge: its TCP port, and by how many cycles offsets are sent ahead
-# from the gentlest on: what an axis of coarse increments, or an odd SYNC period, can keep
+# in ascending order: coarse increments or an odd SYNC period need larger limits
 LIMITS: tuple[Mapping[str, float], ...] = (
     {},
     {"max_speed_mm_s": 5.0, "max_acceleration_mm_s2": 1000.0},
@@ -41,18 +41,18 @@ def make(
     interface: Told | None = None,
     pins: Collection[str] | None = None,
 ) -> Draft:
-    """Return a draft of the machine's configuration; ``look`` None: no bus is looked at.
+    """Return a draft of the machine's configuration; ``look`` None skips the buses.
 
-    ``interface`` is the CAN interface that this PC has. ``pins``: the drives are HAL pins of ``nc``, these are the pins
-    that HAL has now (empty: it does not run). ConfigError with everything that is not known, where nobody
-    can be asked; ConnectError.
+    ``interface`` is the PC's CAN interface. ``pins``: the drives are HAL pins of ``nc``, and these are the pins of the
+    running HAL (empty if it does not run). ConfigError listing everything unknown if there is no operator to ask;
+    ConnectError.
     """
     draft = Draft(ask)
     draft.take(answers)
     if draft.missing:
         raise ConfigError(str(file), draft.missing)
-    for path, told in (nc.told if nc else {}).items():
-        draft.tell(path, told)
+    for path, value in (nc.told if nc else {}).items():
+        draft.tell(path, value)
     draft.notes += nc.notes if nc else []
     if nc is not None and pins is not None:
         return _of_hal(draft, file, nc, pins)
@@ -72,21 +72,20 @@ def make(
 
 
 def _of_hal(draft: Draft, file: Path, nc: Machine, pins: Collection[str]) -> Draft:
-    """Make the draft of a machine whose drives are HAL pins, by the bridge that LinuxCNC runs."""
     draft.notes = [note for note in draft.notes if note not in nc.loops]
     bridge = {"interface": "socketcand", "channel": "hal", "port": HAL_PORT, "offset_lead_cycles": HAL_LEAD}
     for key, value in bridge.items():
-        draft.tell(f"bus.hal.{key}", Told(value, "the bridge's"))
+        draft.tell(f"bus.hal.{key}", Told(value, "of the bridge"))
     draft.tell("g0.source", Told("linuxcnc", "fdhil's HAL file loads the bridge"))
     settle_machine(draft, (), file.stem, nc)
     names = [axis for axis in axis_names(draft, nc, ()) if axis not in ROTARY]
     for axis in set(nc.axes) & set(ROTARY):
-        draft.values = {path: told for path, told in draft.values.items() if not path.startswith(f"axis.{axis}.")}
+        draft.values = {path: value for path, value in draft.values.items() if not path.startswith(f"axis.{axis}.")}
         draft.values.pop("nc.wrapped_axes", None)
-        draft.notes.append(f"axis {axis}: rotary axes are not read from HAL pins; programs that move it are refused")
+        draft.notes.append(f"axis {axis}: rotary axes are not supported on HAL pins; programs that move it are refused")
     for place, axis in enumerate(names):
         if is_second_drive(axis):
-            text, advice = "is the second drive of a gantry: HAL pins of two are not supported", "leave the axis out"
+            text, advice = "is the second drive of a gantry, which HAL pins do not support", "remove the axis"
             draft.missing.append(ConfigFault(f"axis.{axis}", text, advice))
         else:
             settle_hal_axis(draft, axis, names[:place], nc, pins)
@@ -98,15 +97,14 @@ def _of_hal(draft: Draft, file: Path, nc: Machine, pins: Collection[str]) -> Dra
 
 
 def _buses(draft: Draft, interface: Told | None, *, offline: bool) -> Iterator[tuple[str, CanBus]]:
-    """Settle the way onto the bus and yield its settings; several where the answers have several."""
     if not draft.has_table("bus"):
         where = "socketcan for an adapter that `ip link` lists; docs/how-to/can-adapter.md has the others"
         if interface is None and offline:
-            interface = Told("can0", "guessed: no bus was looked at", guessed=True)
+            interface = Told("can0", "guessed: the bus was skipped", guessed=True)
         way = None if interface is None else replace(interface, value="socketcan")
         draft.settle("bus.can0.interface", where, way)
         if draft.get("bus.can0.interface") == "socketcand":
-            draft.settle("bus.can0.port", "the hub tells it when it starts; `fdhil sim` does")
+            draft.settle("bus.can0.port", "the hub prints it when it starts, as `fdhil sim` does")
         elif "bus.can0.interface" in draft.values:
             draft.settle("bus.can0.channel", "the interface's name, as `ip link` lists it", interface)
     if draft.missing:
@@ -116,7 +114,7 @@ def _buses(draft: Draft, interface: Told | None, *, offline: bool) -> Iterator[t
 
 
 def _fit_limits(draft: Draft, axis: str) -> None:
-    """Where the correction's own limits were left open, take the first that the axis' increments can keep."""
+    """If the correction's limits were left open, use the lowest that the axis' increments can keep."""
     path = f"axis.{axis}.correction"
     if draft.get(path) != {}:
         return
@@ -129,20 +127,20 @@ def _fit_limits(draft: Draft, axis: str) -> None:
             if limits:
                 del draft.values[path]
             for key, value in limits.items():
-                source = "guessed: the gentlest that these increments can keep"
+                source = "guessed: the lowest that these increments can keep"
                 draft.values[f"{path}.{key}"] = Told(value, source, guessed=True)
             return
 
 
 def conclude(draft: Draft, file: Path) -> str:
-    """Return the file's text. What cannot be of one machine is asked again; ConfigError where nobody can be asked.
+    """Return the file's text. Contradictory values are asked again; ConfigError if there is no operator to ask.
 
-    What can be, but hardly is, is noted.
+    Implausible values are noted.
     """
     for axis in draft.document.get("axis", {}):
         nominal = {key: draft.values.get(f"axis.{axis}.nominal.{key}") for key in PARAMETERS}
-        if unknown := [key for key, told in nominal.items() if told is not None and told.guessed]:
-            draft.values[f"axis.{axis}.guessed"] = Told(unknown, "nothing is compared with these guesses")
+        if unknown := [key for key, value in nominal.items() if value is not None and value.guessed]:
+            draft.values[f"axis.{axis}.guessed"] = Told(unknown, "guesses are not compared with measurements")
     while True:
         text = text_of(draft, file)
         try:
@@ -161,7 +159,7 @@ def conclude(draft: Draft, file: Path) -> str:
 def text_of(draft: Draft, file: Path) -> str:
     """Return the commented file."""
     head = (
-        f"{file.name}, made by fdhil init. Behind each value stands who said so; {draft.guessed} are guessed: check "
+        f"{file.name}, written by fdhil init. Each value is followed by its source; {draft.guessed} are guessed: check "
         "them. A line that begins with # and no space is a setting at its default."
     )
-    return filled(draft.document, {path: told.source for path, told in draft.values.items()}, head)
+    return filled(draft.document, {path: value.source for path, value in draft.values.items()}, head)

@@ -1,7 +1,7 @@
-"""What is asked about an axis: in which order, where the answer is found, and what is proposed where it can be guessed.
+"""Questions about an axis in their order: where to find the answer, and the proposal if it can be guessed.
 
-What a key means is its description in ``fdhil/config``; here stands only where to look. A proposal is calculated from
-what is known by then, in the keys of [axis.X].
+The meaning of a key is its description in ``fdhil/config``; here is only where to find it. A proposal is calculated
+from the known keys of [axis.X].
 """
 
 import math
@@ -11,7 +11,7 @@ from typing import Any
 
 Known = Mapping[str, Any]
 Guess = Callable[[Known], Any]
-"""Propose a value from what is known; KeyError where that is too little."""
+"""Proposes a value from the known ones; KeyError if too little is known."""
 
 FRICTION_SHARE = 0.05
 CURRENT_LOOP_HZ, SPEED_LOOP_HZ, SPEED_CORNER_HZ = 400.0, 40.0, 8.0
@@ -21,7 +21,7 @@ _PEAK = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """A key of [axis.X], ``where`` its value is found, a ``guess`` and the words for ``how`` it was made.
+    """A key of [axis.X], ``where`` to find its value, a ``guess``, and ``how`` the guess is made.
 
     ``follows``: the guess is always possible once the others are known, so that the key itself is never missing.
     """
@@ -34,7 +34,7 @@ class Question:
 
 
 def _torque_nm(known: Known) -> float:
-    """A motor's continuous torque, as far as it can be told."""
+    """The continuous torque as far as it is known; half the peak torque otherwise."""
     current = known.get("drive.rated_current_a") or known["regulators.current_limit_a"] / _PEAK
     return float(known["nominal.K"] * current)
 
@@ -43,15 +43,14 @@ def _rapid_rad_s(known: Known) -> float:
     return float(known["rapid_speed_mm_s"] / known["screw_pitch_mm"] * 2 * math.pi)
 
 
-DRIVE_TOOL = "the drive's own tool shows it; where it is unknown take the proposal: fdhil tells later whether it fits"
+DRIVE_TOOL = "the drive's own tool shows it; if unknown accept the proposal: fdhil reports later whether it fits"
 SHEET = "the motor's data sheet"
 PITCH = Question(
-    "screw_pitch_mm",
-    "the screw's label, or its drawing; behind a gear: what the table travels in one turn of the motor",
+    "screw_pitch_mm", "the screw's label or drawing; with a gear: the travel of the table per motor revolution"
 )
 QUESTIONS = (
-    Question("drive.increments_per_rev", "the drive's tool: what its position counts in one turn of the motor"),
-    Question("radius_mm", "the radius of the largest part on the table: there an angle is weighed as path error"),
+    Question("drive.increments_per_rev", "the drive's tool: position increments per motor revolution"),
+    Question("radius_mm", "the radius of the largest part on the table: there an angle is converted to path error"),
     Question("rapid_speed_mm_s", "the NC's parameter for rapids; 1 m/min is 16.67 mm/s"),
     Question("max_acceleration_mm_s2", "the NC's parameter for the axis; 1 m/s2 is 1000 mm/s2"),
     Question("drive.rated_current_a", "the drive's tool or object 0x6075; often the motor's continuous current"),
@@ -59,7 +58,7 @@ QUESTIONS = (
     Question("drive.dc_link_v", "the drive's display, or a meter at its DC link"),
     Question("nominal.R", f"{SHEET}, at 20 degC; for three phases that of one phase, half of terminal to terminal"),
     Question("nominal.L", f"{SHEET}, in henry: 5 mH is 0.005; for three phases that of one phase"),
-    Question("nominal.K", f"{SHEET}: torque per ampere of what the drive calls its current"),
+    Question("nominal.K", f"{SHEET}: torque per ampere of the drive's current"),
     Question(
         "nominal.Jt",
         f"the rotor's ({SHEET}) plus the screw's plus the table's mass in kg times (pitch in m / 6.283) squared",
@@ -80,20 +79,18 @@ QUESTIONS = (
     ),
     Question(
         "nominal.ft",
-        "take the proposal: the first rapids tell it",
+        "accept the proposal: the first rapids identify it",
         lambda known: FRICTION_SHARE * _torque_nm(known) / _rapid_rad_s(known),
-        "5 % of the continuous torque in a rapid; the first rapids tell it",
+        "5 % of the continuous torque in a rapid; the first rapids identify it",
     ),
     Question(
         "nominal.Cd",
-        "take the proposal: the first rapids tell it",
+        "accept the proposal: the first rapids identify it",
         lambda known: FRICTION_SHARE * _torque_nm(known),
-        "5 % of the continuous torque; the first rapids tell it",
+        "5 % of the continuous torque; the first rapids identify it",
     ),
     Question("regulators.position_gain_per_s", f"Kv; {DRIVE_TOOL}", lambda _known: USUAL_KV, "a usual value"),
-    Question(
-        "regulators.speed_feedforward", f"1 is all of it; {DRIVE_TOOL}", lambda _known: 1.0, "all of it, as is usual"
-    ),
+    Question("regulators.speed_feedforward", f"1 is full; {DRIVE_TOOL}", lambda _known: 1.0, "full, as is usual"),
     Question(
         "regulators.speed_kp",
         DRIVE_TOOL,

@@ -1,4 +1,4 @@
-"""One value of a configuration that is being made, and who said so."""
+"""One value of a configuration in the making, with its source."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """A value, and its ``source`` in words for the file; ``guessed``: it is a proposal that the operator must check."""
+    """A value with its ``source`` in words for the file; ``guessed``: a proposal that the operator must check."""
 
     value: Any
     source: str
@@ -14,7 +14,7 @@ class Told:
 
 
 def rounded(value: float) -> float:
-    """Return a number with six digits: what was calculated has no more to say.
+    """Return a number with six significant digits.
 
     >>> rounded(0.1 + 0.2)
     0.3

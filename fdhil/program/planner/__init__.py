@@ -1,9 +1,9 @@
-"""The NC's planner: motions -> reference on the SYNC grid, by the profile that the configuration names.
+"""The NC's planner: converts motions to a reference on the SYNC grid, by the configured profile.
 
-``fir``: the NC runs along the path at the programmed feed and smooths each axis' demand by causal moving averages,
-from rest at the start point. It stops exactly between rapid and feed, after each rapid and at a dwell, and between
-feeds only when the machine's configuration says so. ``trapezoidal`` and ``jerk_limited`` look ahead and keep each axis'
-limits; corners follow G61, G61.1 and G64 P. All sampling is by whole blocks of numpy.
+``fir``: the NC follows the path at the programmed feed and smooths each axis' demand by causal moving averages, from
+rest at the start point. It stops exactly between rapid and feed, after each rapid and at a dwell, and between feeds
+only if configured. ``trapezoidal`` and ``jerk_limited`` look ahead and keep each axis' limits; corners follow G61,
+G61.1 and G64 P. Sampling is by whole blocks in numpy.
 """
 
 from __future__ import annotations
@@ -32,10 +32,9 @@ _BLOCK_ROWS = 1 << 16
 
 
 def plan(motions: Iterable[Motion], config: MachineConfig, max_rows: int = MAX_ROWS) -> Trajectory:
-    """Return the reference that the NC makes of ``motions``; row 0 is the rest at machine zero.
+    """Return the reference that the NC plans from ``motions``; row 0 is at rest at machine zero.
 
-    ProgramError for an axis that the machine does not have, a feed of nothing, and a duration of more than
-    ``max_rows`` SYNC periods.
+    ProgramError for an axis that the machine lacks, a feed of zero, and more than ``max_rows`` SYNC periods.
     """
     notes = ProgramNotes(Dialect.of(config.nc))
     rows = np.concatenate(list(_parts(notes.watch(motions), config, _BLOCK_ROWS, max_rows)))
@@ -45,9 +44,9 @@ def plan(motions: Iterable[Motion], config: MachineConfig, max_rows: int = MAX_R
 def stream(
     motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float = math.inf
 ) -> Iterator[Trajectory]:
-    """Yield the same reference in blocks of ``block_rows`` (the last one shorter), in flat memory.
+    """Yield the same reference in blocks of ``block_rows`` (the last one shorter), in constant memory.
 
-    A block is there as soon as the motions that reach into it were read; its times go on from the block before.
+    A block is yielded as soon as its motions are known; its times continue those of the previous block.
     """
     row = 0
     waiting = np.empty((0, len(ALL_AXES) + 2))
@@ -71,7 +70,6 @@ def _parts(motions: Iterable[Motion], config: MachineConfig, block_rows: int, ma
 
 
 def _stopped_at_probes(motions: Iterable[Motion]) -> Iterator[Motion]:
-    """Yield motions with a stop before and after each probe move: an NC probes from rest, and goes on from rest."""
     for motion in motions:
         if isinstance(motion, Probe):
             yield Dwell(motion.line, 0.0)
@@ -119,7 +117,7 @@ def _trajectory(rows: Float, first_row: int, config: MachineConfig) -> Trajector
         name: frozen(rows[:, ALL_AXES.index(name[0])] * axis.mm_per_unit if name[0] in ALL_AXES else np.zeros(n))
         for name, axis in config.axis.items()
     }
-    if (beyond := first_beyond(position_mm, config)) is not None:  # an arc may, between two ends that fit
+    if (beyond := first_beyond(position_mm, config)) is not None:  # an arc may, between ends in range
         raise ProgramError(int(rows[beyond.row, -2]), beyond.axis, beyond.text)
     return Trajectory(
         dt_s=dt_s,

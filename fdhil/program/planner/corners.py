@@ -1,9 +1,9 @@
-"""Corners: how fast the path may pass from one piece to the next, and how it is rounded within the tolerance of G64 P.
+"""Corners: the speed of the path from one piece to the next, and its rounding within the tolerance of G64 P.
 
-A blend lets the piece before it fade while the one after it grows: over 2 d of path around the corner, at u from 0 to
+A blend fades the piece before it out while the one after it grows: over 2 d of path around the corner, at u from 0 to
 1, the point is p1(end - 2 d F(u)) + p2(2 d G(u)) - corner, where F is the integral of 1 - sigma from u to 1 and G that
 of sigma from 0 to u. With sigma = u this is the parabola of constant acceleration; with sigma = 3 u2 - 2 u3
-acceleration begins and ends at nothing. The length of the path and its course outside the blends stay what they are.
+acceleration begins and ends at zero. The length of the path, and the path outside the blends, are unchanged.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from fdhil.program.planner.limits import AxisLimits
 from fdhil.program.planner.pieces import ACCELERATION, BLENDS, JERK, LENGTH, SPEED, TOLERANCE, bends, directions
 from fdhil.records import Float
 
-ARC_SHARE = 0.866  # of the acceleration that turns; half of it is left along the path, as in LinuxCNC's planner
-_BLEND_SHARE = 0.9  # of the acceleration that a corner may take, so that some is left to pass it
-_JERK_SHARE = 0.5  # of the jerk that turning may take
+ARC_SHARE = 0.866  # of the acceleration used for turning; half remains along the path, as in LinuxCNC's planner
+_BLEND_SHARE = 0.9  # of the acceleration that a corner may use; the rest is for motion along the path
+_JERK_SHARE = 0.5  # of the jerk that turning may use
 _UNLIMITED = 1e12
 
 
 @dataclass(frozen=True, slots=True)
 class Corners:
-    """Of each corner (m,): half the blend's length ``half`` mm (0: none), speed, and acceleration along the path."""
+    """Per corner (m,): half the blend's length ``half`` mm (0: none), speed, and acceleration along the path."""
 
     half: Float
     speed: Float
@@ -33,7 +33,7 @@ class Corners:
 
 @dataclass(frozen=True, slots=True)
 class _Turn:
-    """What a corner asks of the axes at unit speed, as a share of their limits (m,): by its kink and by curvature."""
+    """A corner's demand on the axes at unit speed, as a share of their limits (m,): from its kink and its curvature."""
 
     kink: Float
     kink_by_acceleration: Float
@@ -58,7 +58,7 @@ class CornerRules:
         self._filter_s = filter_s
 
     def pieces(self, pieces: Float) -> tuple[Float, Float]:
-        """Return speed and acceleration (n,) along pieces of path, lowered where an arc turns."""
+        """Return speed and acceleration (n,) along pieces of path, reduced on arcs."""
         speed, acceleration = pieces[:, SPEED], pieces[:, ACCELERATION]
         curvature = np.maximum(bends(pieces), 1e-12)
         speed = np.minimum(speed, np.sqrt(ARC_SHARE * acceleration / curvature))
@@ -100,7 +100,7 @@ class CornerRules:
         before, after = pieces[:-1], pieces[1:]
         jerk = np.minimum(before[:, JERK], after[:, JERK])
         acceleration = np.minimum(before[:, ACCELERATION], after[:, ACCELERATION])
-        # an arc turns within the blend too, by half its length at most, which adds to the kink
+        # an arc also turns within the blend, by half its length at most, which adds to the kink
         curve = np.maximum(bend_out, bend_in)
         bend = curve + self._peak * (bend_out + bend_in) / 2.0
         return _Turn(
@@ -118,7 +118,7 @@ class CornerRules:
         )
 
     def _sharp_speed(self, turn: _Turn) -> Float:
-        """Speed at which the corner needs no rounding: its step fits into one period of the limits."""
+        """Return the speed at which a corner needs no rounding: its step is within the limits of one period."""
         if not self._filter_s:
             step = turn.kink_by_acceleration / self._dt_s
             root = np.sqrt(step**2 + 4.0 * _BLEND_SHARE * turn.curve_by_acceleration)
@@ -127,21 +127,19 @@ class CornerRules:
         return np.minimum(step, np.sqrt(self._dt_s / turn.jump_by_jerk))
 
     def _sharp_along(self, turn: _Turn, speed: Float) -> Float:
-        """Acceleration along the path that a sharp corner's step leaves over."""
         if self._filter_s:
             return np.full(speed.size, _UNLIMITED)
         used = speed * turn.kink_by_acceleration / self._dt_s + speed**2 * turn.curve_by_acceleration
         return np.asarray(np.maximum(1.0 - used, 1.0 - _BLEND_SHARE) / turn.along_by_acceleration)
 
     def _within(self, turn: _Turn, tolerance_mm: Float) -> Float:
-        """Largest half length that stays within the tolerance: d kink (1/4 or 3/16) + d2 curvature / 16 at most."""
+        """Return the largest half length within the tolerance: d kink (1/4 or 3/16) + d2 curvature / 16 at most."""
         tolerance = np.minimum(tolerance_mm, _UNLIMITED)
         linear = turn.kink * (0.1875 if self._filter_s else 0.25)
         root = np.sqrt(linear**2 + turn.bend * tolerance / 4.0)
         return np.asarray(2.0 * tolerance / np.maximum(linear + root, 1e-12))
 
     def _needed(self, turn: _Turn, speed: Float) -> Float:
-        """Half length at which a corner may be passed at ``speed``."""
         spared = np.maximum(_BLEND_SHARE - speed**2 * turn.bend_by_acceleration, _BLEND_SHARE / 2.0)
         half = self._peak * speed**2 * turn.kink_by_acceleration / (2.0 * spared)
         if not self._filter_s:
@@ -152,7 +150,6 @@ class CornerRules:
         return np.maximum(half, (turn.bend_by_jerk + root) / (2.0 * budget))
 
     def _speed(self, turn: _Turn, half: Float) -> Float:
-        """Speed at which blends of this half length keep acceleration and jerk."""
         turning = self._peak * turn.kink_by_acceleration / (2.0 * half) + turn.bend_by_acceleration
         speed = np.sqrt(_BLEND_SHARE / turning)
         if self._filter_s:
@@ -161,7 +158,6 @@ class CornerRules:
         return np.asarray(speed)
 
     def _along(self, turn: _Turn, half: Float, speed: Float) -> Float:
-        """Acceleration along the path that a blend leaves over."""
         bend = self._peak * turn.kink_by_acceleration / (2.0 * half) + turn.bend_by_acceleration
         along = np.maximum(1.0 - speed**2 * bend, 1.0 - _BLEND_SHARE) / turn.along_by_acceleration
         if self._filter_s:

@@ -1,4 +1,4 @@
-"""The path as a curve over its length: pieces one behind the other, their corners rounded."""
+"""The path as a curve over its length: consecutive pieces with rounded corners."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fdhil.records import Float
 
 
 class Curve:
-    """Pieces as far as they are known and still needed. ``smooth`` is the kind of its blends."""
+    """The known pieces that are still needed. ``smooth`` selects the kind of blend."""
 
     def __init__(self, smooth: bool) -> None:
         self._smooth = smooth
@@ -29,7 +29,7 @@ class Curve:
         self._half_mm = np.concatenate([self._half_mm, half_mm])
 
     def forget(self, before_mm: float) -> None:
-        """Drop the pieces that end before a length of path, but the last of them."""
+        """Drop the pieces that end before a length of path, except the last of them."""
         drop = int(np.searchsorted(self._end_mm, before_mm)) - 2
         if drop > 0:
             self._pieces, self._end_mm = self._pieces[drop:], self._end_mm[drop:]

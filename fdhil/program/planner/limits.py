@@ -1,4 +1,4 @@
-"""The limits that every planner keeps: the axes' own, the longest program, and the grid of SYNC rows."""
+"""Limits that every planner keeps: the axes', the longest program, and the grid of SYNC rows."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from fdhil.config import MachineConfig, PositionRange
 from fdhil.errors import ProgramError
 from fdhil.program.motions import ALL_AXES, ORIGIN, PLANE_AXES, Arc, Dwell, Motion, Place, Rapid, reached
 
-TICK_TOLERANCE = 1e-6  # of a row: an end so little after a row counts as on it
+TICK_TOLERANCE = 1e-6  # of a row: an end this close after a row counts as on it
 _TINY_MM = 1e-9
 _MAX_DWELL_ROWS = 1e9
 
 
 @dataclass(frozen=True, slots=True)
 class AxisLimits:
-    """Per axis of ``ALL_AXES``: speed (mm/s), acceleration (mm/s2) and jerk (mm/s3), infinite for one that is missing.
+    """Per axis of ``ALL_AXES``: speed (mm/s), acceleration (mm/s2) and jerk (mm/s3), infinite for a missing axis.
 
     Those of a rotary axis are in degrees.
     """
@@ -28,7 +28,7 @@ class AxisLimits:
     dt_s: float
     ranges: tuple[PositionRange | None, ...]
     path_speed: float  # mm/s along the path
-    linear: frozenset[str]  # axes A, B, C that the configuration has in mm
+    linear: frozenset[str]  # axes A, B, C configured in mm
 
     @staticmethod
     def of(config: MachineConfig) -> AxisLimits:
@@ -54,13 +54,13 @@ class AxisLimits:
         )
 
     def check(self, motion: Motion, start: Place) -> None:
-        """Raise ProgramError for an endless feed or dwell, an axis that the machine lacks, a place beyond 32 bits."""
+        """Raise ProgramError for an endless feed or dwell, an axis the machine lacks, a position beyond 32 bits."""
         if isinstance(motion, Dwell):
             if motion.seconds / self.dt_s > _MAX_DWELL_ROWS:
-                raise ProgramError(motion.line, f"P{motion.seconds:g}", "is too long a dwell to plan")
+                raise ProgramError(motion.line, f"P{motion.seconds:g}", "is too long a dwell")
             return
         if not isinstance(motion, Rapid) and not motion.feed > 0.0:
-            raise ProgramError(motion.line, "F", "the feed rate is 0, so the move would never end; give F")
+            raise ProgramError(motion.line, "F", "the feed rate is 0, so the move would never end; add F")
         end = reached(motion, start)
         moved = [abs(b - a) > _TINY_MM for a, b in zip(start, end, strict=True)]
         if isinstance(motion, Arc):
@@ -75,17 +75,17 @@ class AxisLimits:
 
     def _missing(self, axis: str) -> str:
         if axis in self.linear:
-            return f'which turns by degrees, and the configuration has it in mm; give [axis.{axis}] unit = "deg"'
+            return f'which is rotary, but the configuration has it in mm; set unit = "deg" in [axis.{axis}]'
         rotary = ' with unit = "deg" and radius_mm' if axis in "ABC" else ""
         return f"which the configuration lacks; add [axis.{axis}]{rotary}"
 
     def rows(self, seconds: float) -> int:
-        """Return the first SYNC row that is not before a time."""
+        """Return the first SYNC row at or after a time."""
         return math.ceil(seconds / self.dt_s - TICK_TOLERANCE)
 
 
 def checked(motions: Iterable[Motion], config: MachineConfig) -> Iterator[Motion]:
-    """Yield motions that the machine can be ordered; ProgramError for the first that it cannot."""
+    """Yield the motions that the machine can execute; ProgramError for the first that it cannot."""
     limits, at = AxisLimits.of(config), ORIGIN
     for motion in motions:
         limits.check(motion, at)

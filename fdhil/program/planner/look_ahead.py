@@ -1,8 +1,8 @@
-"""Look-ahead planning: the path at the highest speed that the axes and the corners allow, braked for in time.
+"""Look-ahead planning: the path at the highest speed that the axes and corners allow, braking in time.
 
 The profile ``trapezoidal`` keeps each axis' speed and acceleration; ``jerk_limited`` passes the length of path through
-a moving average as long as the jerk needs, which keeps the path and makes ramps S-shaped, and rounds corners smoothly.
-What is decided does not depend on what comes later: only what no further motion can slow down is given out.
+a moving average as long as the jerk requires, which keeps the path, makes ramps S-shaped and rounds corners smoothly.
+Decisions are final: a part is released only when no further motion can slow it down.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from fdhil.program.planner.limits import TICK_TOLERANCE, AxisLimits, check_durat
 from fdhil.program.planner.pieces import LENGTH, LINE, RAPID, WIDTH, Row, piece
 from fdhil.records import Float, Int
 
-_BATCH = 512  # pieces that are planned together
-_MOST = 4096  # pieces that may wait for what comes after them; then a stop behind them is assumed
+_BATCH = 512  # pieces planned together
+_MOST = 4096  # pieces that may wait for their successors; beyond that a stop after them is assumed
 _SHARP_ROWS = 1.5
 _BATCH_ROWS = 1 << 18
 
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """Phases of speed that order the rows from ``first_row`` to before ``end_row``; a place is 2 line + rapid."""
+    """Phases of speed for the rows from ``first_row`` to before ``end_row``; ``place`` is 2 line + rapid."""
 
     table: Float
     first_row: int
@@ -43,9 +43,9 @@ class Stretch:
 
 
 class LookAhead:
-    """Gives motions their speeds, from rest at machine zero; ``curve`` gives the points of the path.
+    """Plans the speeds of motions, from rest at machine zero; ``curve`` has the points of the path.
 
-    ProgramError when they last longer than ``max_rows``.
+    ProgramError if they last longer than ``max_rows``.
     """
 
     def __init__(self, config: MachineConfig, max_rows: float = math.inf) -> None:
@@ -65,11 +65,11 @@ class LookAhead:
         self.curve = Curve(smooth)
         self._at = ORIGIN
         self._new: list[Row] = []
-        self._last = np.empty((0, WIDTH))  # the newest piece that the curve has, unless a stop came after it
+        self._last = np.empty((0, WIDTH))  # the newest piece of the curve, unless a stop followed it
         self._stops_after = False
         self._before_rapid: float | None = None
-        self._ends = np.empty((0, 2))  # of pieces that are not given out: path at their end, and place
-        self._ahead = np.empty((0, 4))  # limits of speed that still matter
+        self._ends = np.empty((0, 2))  # of unreleased pieces: path at their end, and place
+        self._ahead = np.empty((0, 4))  # limits of speed that still apply
         self._path_mm = self._planned_mm = self._energy = 0.0
         self._now_s = 0.0
         self._place = 0.0
@@ -92,7 +92,6 @@ class LookAhead:
         yield self._due()
 
     def _due(self) -> Stretch:
-        """Hand out the rows whose phases are known."""
         end_row = max(self._row, self._limits.rows(self._now_s))
         stretch = Stretch(np.concatenate(self._table), self._row, end_row)
         self._row = end_row
@@ -134,7 +133,6 @@ class LookAhead:
         check_duration(int(self._place) // 2, now_s, self._max_s)
 
     def _plan(self, stop: bool) -> None:
-        """Plan what is new with what waits; with ``stop`` all of it, to rest at its end."""
         if self._new:
             self._learn()
         last = self._path_mm if stop else self._sure_mm()
@@ -153,20 +151,19 @@ class LookAhead:
             self._give(cuts[: count + 1], energy[: count + 1], between[:count], acceleration[:count])
 
     def _learn(self) -> None:
-        """Add the new pieces to the curve, and what they and the corners before them allow to the limits."""
         new = np.array(self._new)
         pieces = np.concatenate([self._last, new])
         self._new, self._last = [], pieces[-1:]
         corners = self._rules.corners(pieces)
-        first = pieces.shape[0] - new.shape[0]  # 0 where the first piece begins at rest
+        first = pieces.shape[0] - new.shape[0]  # 0 if the first piece begins at rest
         half = np.concatenate([np.zeros(1 - first), corners.half])
         self.curve.add(new, half)
         ends = self._path_mm + np.cumsum(new[:, LENGTH])
-        begins = np.concatenate([[self._path_mm], ends[:-1]])  # the very same numbers, so that nothing lies between
+        begins = np.concatenate([[self._path_mm], ends[:-1]])  # identical numbers, so that no gap remains
         self._path_mm = float(ends[-1])
         along, acceleration = self._rules.pieces(new)
         turns = begins[1 - first :]
-        # a sharp corner is passed evenly for as long as a third difference looks, so that nothing adds to its step
+        # constant speed around a sharp corner over the span of a third difference, so that nothing adds to its step
         around = np.maximum(corners.half, _SHARP_ROWS * self._dt_s * corners.speed)
         limits = [
             np.column_stack([begins, ends, along, acceleration]),
@@ -176,12 +173,11 @@ class LookAhead:
         self._ends = np.concatenate([self._ends, np.column_stack([ends, 2.0 * new[:, LINE] + new[:, RAPID]])])
 
     def _sure_mm(self) -> float:
-        """Up to where no motion that is not known yet can set a limit."""
+        """Return the path length up to which no future motion can set a limit."""
         reach = self._last[0, LENGTH] / 2.0 if self._last.size else 0.0
         return self._path_mm - float(reach) - self._reach_mm
 
     def _give(self, cuts: Float, energy: Float, between: Float, acceleration: Float) -> None:
-        """Turn planned stretches into phases, and forget what only they needed."""
         middles = (cuts[:-1] + cuts[1:]) / 2.0
         index = np.minimum(np.searchsorted(self._ends[:, 0], middles), len(self._ends) - 1)
         table = speed.phases(cuts, energy, between, acceleration, self._ends[index, 1], self._now_s)
@@ -194,7 +190,7 @@ class LookAhead:
 
 
 def _filter_rows(config: MachineConfig, limits: AxisLimits) -> int:
-    """Length of the average that turns steps of acceleration, from one limit to the other, into ramps of the jerk."""
+    """Return the length of the average that turns a step between the acceleration limits into a ramp of the jerk."""
     return max(
         1, limits.rows(max(2.0 * axis.max_acceleration_mm_s2 / axis.jerk_mm_s3 for axis in config.axis.values()))
     )

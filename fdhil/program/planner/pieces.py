@@ -1,4 +1,4 @@
-"""Motions as pieces of path in a table: lines and arcs, their lengths and limits, and how they begin and end."""
+"""Motions as rows of a table: lines and arcs with their lengths, limits, and tangents at both ends."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ KIND, LINE, RAPID, LENGTH, SPEED, ACCELERATION, JERK, BLENDS, TOLERANCE = range(
 START, STOP = slice(9, 18), slice(18, 27)
 _EXTRA = slice(27, 33)  # of an arc: centre, radius at start and end, angle at the start, angle swept
 WIDTH = 33
-_GROUPS = (slice(0, 3), slice(6, 9), slice(3, 6))  # the length of X Y Z, else of U V W, else of A B C: what F refers to
+_GROUPS = (slice(0, 3), slice(6, 9), slice(3, 6))  # F refers to the length of X Y Z, else of U V W, else of A B C
 LINE_KIND = -1.0
 _NO_EXTRA = (0.0,) * 6
 Row = tuple[float, ...]
@@ -28,13 +28,13 @@ def length_of(start: Place, end: Place) -> float:
 
 
 def path_limit(start: Place, end: Place, limits: AxisLimits) -> float:
-    """Return the largest speed along the path, which limits lengths and no angles."""
+    """Return the largest speed along the path, which limits lengths but not angles."""
     turns_alone = start[:3] == end[:3] and start[6:] == end[6:]
     return math.inf if turns_alone else limits.path_speed
 
 
 def piece(motion: Rapid | Feed | Arc, start: Place, limits: AxisLimits) -> Row | None:
-    """Return the row of one motion, None where it has no length. Speeds keep each axis within its own limit."""
+    """Return the row of one motion, None if it has no length. Speeds keep each axis within its limit."""
     extra: Row = _NO_EXTRA
     kind = LINE_KIND
     end = reached(motion, start)
@@ -65,7 +65,6 @@ def piece(motion: Rapid | Feed | Arc, start: Place, limits: AxisLimits) -> Row |
 
 
 def _turning(pieces: Float) -> Iterator[tuple[Int, tuple[int, int, int]]]:
-    """Yield the rows of the arcs of each plane with the plane's axes."""
     for plane, name in enumerate(PLANES):
         rows = np.flatnonzero(pieces[:, KIND] == plane)
         if rows.size:
@@ -112,7 +111,7 @@ def directions(pieces: Float, at_end: bool) -> tuple[Float, Float]:
 
 
 def bends(pieces: Float) -> Float:
-    """Return the curvature (n,) of pieces, 1/mm: of an arc the one at its smaller radius."""
+    """Return the curvature (n,) of pieces, 1/mm: for an arc the one at its smaller radius."""
     extra = pieces[:, _EXTRA]
     radius = np.minimum(extra[:, 2], extra[:, 3])
     curved = (pieces[:, KIND] >= 0.0) & (radius > 0.0)

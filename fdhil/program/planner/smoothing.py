@@ -1,4 +1,4 @@
-"""Causal moving averages in a row over each axis' demand: the usual FIR interpolation of an NC."""
+"""Cascaded causal moving averages of each axis' demand: the usual FIR interpolation of an NC."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from fdhil.records import Float
 
 
 class Smoother:
-    """Smooths the rows it is handed, block after block; before the first row everything rested where it starts.
+    """Smooths consecutive blocks of rows; before the first row everything is at rest there.
 
-    ``settle_rows`` is how many rows after its input has come to rest the output rests too.
+    ``settle_rows`` is the number of rows until the output rests after its input.
     """
 
     def __init__(self, averages_s: Sequence[float], dt_s: float) -> None:
@@ -37,7 +37,7 @@ class Smoother:
 
 
 def _mean(column: Float, length: int) -> Float:
-    """Mean of each ``length`` values in a row; a column that does not move stays what it is, to the last bit."""
+    """Return the mean of each ``length`` consecutive values; a constant column is returned bit for bit."""
     origin = column[0]
     if column[-1] == origin and bool(np.all(column == origin)):
         return column[length - 1 :]

@@ -1,4 +1,4 @@
-"""Speed along the path: limits of its stretches, braking in time for each, and phases of even acceleration."""
+"""Speed along the path: limits of its stretches, braking in time for each, and phases of constant acceleration."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ T, S, V, A, PLACE = range(5)
 
 
 def widened(limits: Float, filter_s: float) -> Float:
-    """Return limits (n, 4) reaching as far beyond their stretches as an average over ``filter_s`` looks.
+    """Return limits (n, 4) extended beyond their stretches by the reach of an average over ``filter_s``.
 
-    The average of a path that keeps ``v`` within v filter / 2 of a stretch keeps ``v`` while it is on the stretch.
+    If a path keeps ``v`` within v filter / 2 of a stretch, its average keeps ``v`` on the stretch.
     """
     margin = limits[:, SPEED] * filter_s / 2.0
     wide = limits.copy()
@@ -24,7 +24,7 @@ def widened(limits: Float, filter_s: float) -> Float:
 
 
 def grid(limits: Float, inner: Float, first: float, last: float) -> tuple[Float, Float, Float, Float]:
-    """Cut [first, last] where any limit or ``inner`` point lies.
+    """Cut [first, last] at the ends of all limits and at the ``inner`` points.
 
     Return the cuts (m + 1,), the speed limit at each cut (m + 1,), and speed and acceleration between them (m,).
     """
@@ -36,7 +36,7 @@ def grid(limits: Float, inner: Float, first: float, last: float) -> tuple[Float,
     between = np.full(cuts.size, np.inf)
     acceleration = np.full(cuts.size, np.inf)
     for column, painted in ((SPEED, between), (ACCELERATION, acceleration)):
-        for row in np.argsort(-limits[:, column]).tolist():  # the lowest is painted last, over all others
+        for row in np.argsort(-limits[:, column]).tolist():  # the lowest is painted last and prevails
             painted[low[row] : high[row]] = limits[row, column]
     point = limits[:, LOW] == limits[:, HIGH]
     inside = point & (limits[:, LOW] >= first) & (limits[:, HIGH] <= last)
@@ -50,7 +50,7 @@ def energies(at_cut: Float, gain: Float, first: float, last: float) -> Float:
     """Return the highest squared speed (m + 1,) at each cut from ``first`` to ``last``.
 
     Between two cuts it changes by at most ``gain`` (m,) = 2 acceleration x length; both passes of a look-ahead are
-    running minima of the limit minus (plus) what was gained up to there.
+    running minima of the limit minus (plus) the gain up to there.
     """
     bound = at_cut**2
     bound[0], bound[-1] = min(first, bound[0]), min(last, bound[-1])
@@ -67,7 +67,7 @@ def energies(at_cut: Float, gain: Float, first: float, last: float) -> Float:
 def phases(cuts: Float, energy: Float, speed: Float, acceleration: Float, place: Float, start_s: float) -> Float:
     """Return phases (3 m, 5): begin (s), path (mm), speed, acceleration and ``place`` of each stretch's three phases.
 
-    Each stretch speeds up to its limit, or as far as it can, keeps that, and slows down.
+    Each stretch accelerates to its limit, or as far as possible, keeps that speed, and decelerates.
     """
     length = np.diff(cuts)
     begin, end = energy[:-1], energy[1:]

@@ -1,4 +1,4 @@
-"""Motions with times: lines, arcs, rapids and holds in a row, and their positions at any rows of the SYNC grid."""
+"""Timed motions: consecutive lines, arcs, rapids and holds, and their positions at any rows of the SYNC grid."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from fdhil.records import Float, Int
 
 _BATCH = 4096
 _BATCH_ROWS = 1 << 18
-# columns behind those of a piece: when it ends, how long it lasts, and of a rapid the ramps at both ends
+# columns after those of a piece: end time, duration, and for a rapid the ramps at both ends
 _END_S, _SPAN_S, _RATE, _RAMP_S = range(WIDTH, WIDTH + 4)
 _EVEN = (0.0, 0.0)  # no ramps
 
 
 @dataclass(frozen=True)
 class Segments:
-    """Consecutive segments, (m, WIDTH + 4), that order the rows from ``first_row`` to before ``end_row``."""
+    """Consecutive segments, (m, WIDTH + 4), for the rows from ``first_row`` to before ``end_row``."""
 
     table: Float
     first_row: int
@@ -59,7 +59,6 @@ class Segments:
 
 
 def _ramped_share(into: Float, chosen: Float) -> Float:
-    """Share of the way after ``into`` seconds of a rapid: accelerate, cruise, brake."""
     acceleration, ramp_s = chosen[:, _RATE], chosen[:, _RAMP_S]
     left = chosen[:, _SPAN_S] - into
     share = acceleration * ramp_s * (into - ramp_s / 2.0)
@@ -68,9 +67,9 @@ def _ramped_share(into: Float, chosen: Float) -> Float:
 
 
 class Timeline:
-    """Gives motions their times, from rest at machine zero; ``settle_rows`` is what the smoothing needs to settle.
+    """Assigns times to motions, from rest at machine zero; ``settle_rows`` is the settling time of the smoothing.
 
-    ProgramError when they last longer than ``max_rows``.
+    ProgramError if they last longer than ``max_rows``.
     """
 
     def __init__(self, config: MachineConfig, settle_rows: int, max_rows: float = math.inf) -> None:
@@ -129,16 +128,17 @@ class Timeline:
         self._append(tuple(still), span_s, _EVEN)
 
     def _stop(self, settle_rows: int) -> None:
-        """Hold until the next row, then until the smoothed demand has arrived."""
         row = self._limits.rows(self._now_s) + settle_rows
         self._hold(max(0.0, row * self._dt_s - self._now_s))
         self._now_s = row * self._dt_s
 
     def _rapid(self, motion: Rapid) -> tuple[float, Row]:
-        """Return how long a rapid lasts, and its ramps: one trapezoid for all axes, so that none exceeds its limits."""
+        """Return the duration and ramps of a rapid: one trapezoid for all axes, so that none exceeds its limits."""
         end = reached(motion, self._at)
         way = [abs(b - a) for a, b in zip(self._at, end, strict=True)]
-        speed = min(v / w for v, w in zip(self._limits.speed, way, strict=True) if w)  # shares of the way per second
+        speed = min(
+            v / w for v, w in zip(self._limits.speed, way, strict=True) if w
+        )  # share of the distance per second
         speed = min(speed, path_limit(self._at, end, self._limits) / length_of(self._at, end))
         acceleration = min(a / w for a, w in zip(self._limits.acceleration, way, strict=True) if w)
         ramp_s = min(speed / acceleration, 1.0 / math.sqrt(acceleration))

@@ -1,4 +1,4 @@
-"""The ways in, one module each with ``target()``."""
+"""The entry points, one module each with ``target()``."""
 
 from __future__ import annotations
 

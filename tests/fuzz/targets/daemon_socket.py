@@ -1,4 +1,4 @@
-"""Lines on the daemon's socket, whoever sends them: each has one JSON answer, and arms nothing without the token."""
+"""Lines on the daemon's socket from any user: each has one JSON answer, and arms nothing without the token."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _SERVER = _LOOP.run_until_complete(_server())
 
 
 class _Client:
-    """Stands for the writer of a connection, which stands."""
+    """Stands in for the writer of an open connection."""
 
     HERE, THERE = socket.socketpair()
 
@@ -76,14 +76,13 @@ async def _answered(data: bytes) -> None:
 
 
 def taste(data: bytes) -> None:
-    """Let the user that the first byte says send the rest as a line."""
+    """Send the bytes as a line, from the user selected by the first byte."""
     if data:
         with patch.object(journal, "write_line"):
             _LOOP.run_until_complete(_answered(data))
 
 
 def target() -> Target:
-    """Return the target."""
     seeds = [bytes([k % 3]) + json.dumps(said).encode() for k, said in enumerate(SAID)]
     seeds += [b"\0" + json.dumps(said).encode() for said in SAID]
     words = [

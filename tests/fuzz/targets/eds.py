@@ -1,4 +1,4 @@
-"""EDS and DCF files: a dictionary and what the device offers, or an EdsError with the line."""
+"""EDS and DCF files: a dictionary and the device's capabilities, or an EdsError with the line."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PROFILE = read_profile("fdhil_twin")
 
 
 def taste(data: bytes) -> None:
-    """Read the bytes as the file of a drive, and see what the drive can."""
+    """Read the bytes as the file of a drive, and determine its capabilities."""
     path = Path(_FOLDER.name) / "drive.eds"
     path.write_bytes(data)
     try:
@@ -30,7 +30,6 @@ def taste(data: bytes) -> None:
 
 
 def target() -> Target:
-    """Return the target."""
     seeds = [path.read_bytes() for path in sorted(FILES.glob("*.txt"))]
     words = [
         b"[DeviceInfo]", b"[6064]", b"[1A00sub1]", b"[1A00]", b"ObjectType=0x9", b"SubNumber=", b"CompactSubObj=254",

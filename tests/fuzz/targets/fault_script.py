@@ -1,4 +1,4 @@
-"""Fault scripts of the simulated machine: entries, or a ConfigError that names what is wrong."""
+"""Fault scripts of the simulated machine: entries, or a ConfigError that names the fault."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ _FOLDER = tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir(
 
 
 def taste(data: bytes) -> None:
-    """Read the bytes as a script."""
     path = Path(_FOLDER.name) / "faults.toml"
     path.write_bytes(data)
     try:
@@ -25,7 +24,6 @@ def taste(data: bytes) -> None:
 
 
 def target() -> Target:
-    """Return the target."""
     seeds = [
         '[[fault]]\nat_s = 2.5\naxis = "X"\nfault = "load_torque"\nvalue = 5.0\nduration_s = 0.3\n',
         '[[fault]]\nat_sync = 100\nfault = "frame"\ncan_id = 0x301\ndata = "11 22"\n'

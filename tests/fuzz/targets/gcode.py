@@ -25,7 +25,6 @@ G0 G1 G2 G3 G41 G42 G40 G5.2 G5.3 G10L2 G33.1 G38.2 G53 G61 G71 G72 G76 G81 G83 
 
 
 def taste(data: bytes) -> None:
-    """Interpret the text as a program."""
     count = 0
     try:
         for motion in interpret(data.decode("latin-1").split("\n"), BUDGET):
@@ -39,7 +38,6 @@ def taste(data: bytes) -> None:
 
 
 def target() -> Target:
-    """Return the target."""
     shuttle = (ROOT / "configs" / "programs" / "shuttle.ngc").read_bytes()
     seeds = [shuttle, *(line.replace(";", "\n").encode() for line in PROGRAMS.splitlines())]
     return Target("gcode", seeds, taste, WORDS.encode().split(), 1500)

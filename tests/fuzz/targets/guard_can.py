@@ -1,6 +1,6 @@
-"""Frames into the guard, as a hub's text and as they are, through listener and core while an offset is being sent.
+"""Frames into the guard, as a hub's text and as binary, through listener and core while an offset is sent.
 
-Whatever comes, what the guard sends is whole increments and never beyond the ceiling.
+For any frames, the guard sends whole increments and never exceeds the ceiling.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from tests.guard.machine import Bench, bench
 from tests.guard.wire import CEILING
 
 MOST_CYCLES = 5
-_RECORD = struct.Struct("<BBB8s")  # which identifier, how long, how many SYNC before it, data
+_RECORD = struct.Struct("<BBB8s")  # identifier, length, number of SYNCs before it, data
 
 
 class _Hub:
-    """Stands for a connected socket of a hub: gives what it is told, in two pieces."""
+    """Stands in for a connected socket of a hub: delivers its data in two pieces."""
 
     def __init__(self, data: bytes) -> None:
         self._pieces = [data[: len(data) // 2], data[len(data) // 2 :]]
@@ -56,7 +56,7 @@ _IDS = (*_SENDING.listener.wanted_ids(), COB_SYNC, 0x7E5, 0x000)
 
 
 def _again() -> Bench:
-    """The bench in the middle of a cut, once more; what never changes is shared."""
+    """Return a copy of the bench in the middle of a cut; constant parts are shared."""
     made = copy.copy(_SENDING)
     made.listener, heard = Listener(made.settings), made.listener
     for mine, theirs in zip(made.listener._pdos.values(), heard._pdos.values(), strict=True):
@@ -69,7 +69,7 @@ def _again() -> Bench:
 
 
 def taste(data: bytes) -> None:
-    """Let the frames come, SYNCs between them; an even first byte means a hub's text."""
+    """Deliver the frames with SYNCs between them; an even first byte selects a hub's text."""
     machine, frames = _again(), _records(data[1:])
     if data and data[0] % 2 == 0:
         frames = [(0, cob_id, payload) for cob_id, payload in _text(data[1:], machine)]
@@ -115,7 +115,6 @@ def _text(data: bytes, machine: Bench) -> list[tuple[int, bytes]]:
 
 
 def target() -> Target:
-    """Return the target."""
     known = {cob_id: k for k, cob_id in enumerate(_IDS)}
     rows = [
         (0x381, struct.pack("<ii", 1000, 500)),

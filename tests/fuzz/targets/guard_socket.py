@@ -1,4 +1,4 @@
-"""What clients say on the guard's socket, and the tables that they hand over: a request, a table, or a refusal."""
+"""Requests on the guard's socket, and the tables passed with them: a request, a table, or a refusal."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ ROWS = {"X": [0, 1, 2, 3], "Y": [0, 0, 0, 0]}
 
 
 def taste(data: bytes) -> None:
-    """Read bytes as a request, and as a table."""
     document = parse_line(data)
     if document is not None:
         request = parse_request(document.get("request"), document, SETTINGS)
@@ -43,7 +42,6 @@ def taste(data: bytes) -> None:
 
 
 def target() -> Target:
-    """Return the target."""
     tables = [
         table.encode(["X", "Y"], ROWS, ROWS, "p"),
         table.encode(["X", "Y"], ROWS, ROWS, "p", final=False),

@@ -19,13 +19,13 @@ from tests.fuzz.tasting import Target
 
 CONFIG = machine(axes="X")
 FLAGS = (0, 0, 0, 0, 0, 0x20000000, 0x40000000, EXTENDED_FLAG)
-_ROW = struct.Struct("<hHBB8s")  # how much later than the one before, identifier, length, flags and unit, data
+_ROW = struct.Struct("<hHBB8s")  # time since the previous frame, identifier, length, flags and unit, data
 SILENCES = 8
 UNITS_NS = (10_000, 10_000, 1_000_000, 30_000_000)
 
 
 def taste(data: bytes) -> None:
-    """Decode what comes; an even first byte means a hub's text."""
+    """Decode the frames; an even first byte selects a hub's text."""
     decoder, hearing = BusDecoder("can0", CONFIG), Hearing(CONFIG, 0.0)
     sources = [load_event_source(CONFIG.g0.source)(axis, CONFIG) for axis in decoder.axes]
     hearing.source_opened(0.0)
@@ -51,7 +51,7 @@ def taste(data: bytes) -> None:
 
 
 def _blocks(frames: Frames, halved: int) -> list[Frames]:
-    """Cut where the bus was silent for long, which the daemon notices by a block without a frame, or in halves."""
+    """Split at long silences of the bus, which the daemon detects by a block without a frame, or in halves."""
     silent = np.flatnonzero(np.diff(frames["t_ns"]) > 1_000_000_000)[:SILENCES] + 1
     return np.split(frames, np.repeat(silent, 2) if silent.size else [frames.size // 2] * halved)
 
@@ -72,7 +72,6 @@ def _rows(data: bytes) -> list[Row]:
 
 
 def target() -> Target:
-    """Return the target."""
     seeds = []
     for counter in (True, False):
         rows, at_ns, packed = Wire(6, counter=counter).rows(), 1_000_000_000, b""

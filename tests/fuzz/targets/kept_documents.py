@@ -1,4 +1,4 @@
-"""Files that fdhil keeps or is given: read, or the error that their reader declares (None where it says so)."""
+"""Files that fdhil stores or receives: read, or the error that their reader declares (None if declared)."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ READERS: Mapping[str, Callable[[Path], object]] = {
 
 
 def taste(data: bytes) -> None:
-    """Read the bytes as the file that the first of them says."""
+    """Read the bytes as the file selected by the first of them."""
     name = [*READERS][data[0] % len(READERS)] if data else "model.json"
     path = FOLDER / name
     path.write_bytes(data[1:])
@@ -78,7 +78,6 @@ def taste(data: bytes) -> None:
 
 
 def _written() -> Mapping[str, bytes]:
-    """True examples of them."""
     from tests.commissioning.test_record import RECORD
 
     write_lesson(FOLDER / "lesson.npz", Lesson({"X": np.arange(4.0)}, 3.0, 0.5, (3.0, 1.0)))
@@ -102,7 +101,6 @@ def _written() -> Mapping[str, bytes]:
 
 
 def target() -> Target:
-    """Return the target."""
     written, names = _written(), [*READERS]
     seeds = [bytes([names.index(name)]) + content for name, content in written.items() if name in names]
     words = [b"NaN", b"1e999", b"null", b"true", b"[]", b"{}", b'"digest"', b'"schema"', b"PK\x01\x02", b"\x93NUMPY"]

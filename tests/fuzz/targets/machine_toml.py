@@ -1,4 +1,4 @@
-"""A machine's configuration: read, or a ConfigError with everything that is wrong, each with its key."""
+"""A machine's configuration: read, or a ConfigError with all faults, each with its key."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ operate = ["root"]
 
 
 def taste(data: bytes) -> None:
-    """Read the bytes as a configuration."""
     try:
         read = config.parse(config.toml_document(data, "machine.toml"), "machine.toml")
         config.unlikely(read)
@@ -37,7 +36,6 @@ def taste(data: bytes) -> None:
 
 
 def target() -> Target:
-    """Return the target."""
     one = bench_toml("X").encode()
     words = [f'"{name}"'.encode() for name in config.MachineConfig.model_fields]
     words += b"[axis.X.drive] [store] [publish.mqtt] [nc_source] [sim] nan inf -0.0 1e400 true {} [[ ]] '''".split()

@@ -1,4 +1,4 @@
-"""What comes over a serial line with Modbus RTU units: an answer or a declared error, never another unit's value."""
+"""Bytes on a serial line with Modbus RTU units: an answer or a declared error, never another unit's value."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PLACE = ModbusPlace(device="/dev/none")
 
 
 class _Port:
-    """Stands for the port: gives these pieces, then is silent."""
+    """Stands in for the port: delivers these pieces, then is silent."""
 
     is_open, last_ns, character_s = True, 0, 1e-4
 
@@ -39,7 +39,7 @@ class _Port:
 
 
 def _at_once(asking: Coroutine[None, None, Answer]) -> Answer:
-    """Run what never has to wait, without a loop."""
+    """Run a coroutine that never waits, without a loop."""
     try:
         asking.send(None)
     except StopIteration as end:
@@ -49,7 +49,7 @@ def _at_once(asking: Coroutine[None, None, Answer]) -> Answer:
 
 
 def taste(data: bytes) -> None:
-    """Ask for what the first two bytes say, hear the rest in pieces of a length that the third says."""
+    """Send the request in the first two bytes; receive the rest in pieces of the length in the third."""
     kind, count, size = (*data[:3], 0, 0, 0)[:3]
     request = Request("sensor", 1 + kind % 3, FUNCTIONS[kind % 4], 100, 1 + count % 9, 0.0)
     came, size = data[3:], 1 + size
@@ -65,7 +65,7 @@ def taste(data: bytes) -> None:
 
 
 def _is_frame_of(data: bytes, unit: int) -> bool:
-    """Whether some of the first 64 bytes are a frame, by the checksum as Modbus over serial line V1.02 6.2.2 has it."""
+    """Return whether some of the first 64 bytes are a frame, by the checksum of Modbus over serial line V1.02 6.2.2."""
     crc = 0xFFFF
     for size, byte in enumerate(data[:64] if data[0] == unit else b"", 1):
         crc ^= byte
@@ -77,7 +77,6 @@ def _is_frame_of(data: bytes, unit: int) -> bool:
 
 
 def target() -> Target:
-    """Return the target."""
     read = framed(1, b"\x04\x02\x01\x00")
     seeds = [
         b"\0\0\xff" + read,

@@ -1,4 +1,4 @@
-"""What a Modbus TCP device sends back: an answer of what was asked, or one declared error."""
+"""Answers of a Modbus TCP device: the requested values, or one declared error."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LOOP.set_exception_handler(lambda _loop, told: _RAISED.append(told["exception"]
 
 
 class _Wire:
-    """Stands for the transport: what is sent is answered with these bytes."""
+    """Stands in for the transport: every request is answered with these bytes."""
 
     def __init__(self, client: AsyncModbusTcpClient, answer: bytes) -> None:
         self._client, self._answer = client, answer
@@ -62,7 +62,7 @@ async def _asked(data: bytes) -> None:
 
 
 def taste(data: bytes) -> None:
-    """Ask for what the first two bytes say and hear the rest; what a callback of the wire raises is told in the log."""
+    """Send the request in the first two bytes and receive the rest; exceptions of callbacks are in the log."""
     _RAISED.clear()
     _LOOP.run_until_complete(_asked(data))
     if _RAISED:
@@ -70,7 +70,6 @@ def taste(data: bytes) -> None:
 
 
 def target() -> Target:
-    """Return the target."""
     head = b"\x00\x01\x00\x00"
     seeds = [
         b"\0\0" + head + b"\x00\x05\x01\x04\x02\x01\x00",

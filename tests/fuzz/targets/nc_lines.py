@@ -1,4 +1,4 @@
-"""What an NC's interfaces and a shop floor's hosts say: LinuxCNC's bridge, MTConnect over HTTP, SHDR, Sparkplug."""
+"""Data of an NC's interfaces and shop-floor hosts: LinuxCNC's bridge, MTConnect over HTTP, SHDR, Sparkplug."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _LOOP = asyncio.new_event_loop()
 
 
 def _block(first: int) -> tuple[TickTimes, AxisSamples]:
-    """Forty SYNCs, in which the axis goes on and stands again."""
+    """Forty SYNCs in which the axis moves and stops again."""
     tick = first + np.arange(40)
     way_mm, zeros = np.clip(0.1 * (tick - 20.0), 0.0, 4.0), np.zeros(40)
     samples = AxisSamples(
@@ -94,7 +94,7 @@ async def _xml(data: bytes) -> None:
 
 
 class _Agent:
-    """Stands for the connection of an agent."""
+    """Stands in for the connection of an agent."""
 
     class transport:  # noqa: N801 - as asyncio names it
         @staticmethod
@@ -121,7 +121,7 @@ WAYS: tuple[Callable[[bytes], Awaitable[None]], ...] = (_linuxcnc, _http, _xml, 
 
 
 def taste(data: bytes) -> None:
-    """Let the rest of the bytes come the way that the first says."""
+    """Deliver the rest of the bytes to the interface selected by the first."""
     if data:
         with suppress(DeviceError):
             _LOOP.run_until_complete(WAYS[data[0] % len(WAYS)](data[1:]))
@@ -152,7 +152,6 @@ HEAD = b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=a\r
 
 
 def target() -> Target:
-    """Return the target."""
     part = b"--a\r\nContent-length: %d\r\n\r\n%s" % (len(STREAMS), STREAMS.encode())
     seeds = [
         f"\0{HELLO}\n{STATE}\n{STATE}\n".encode(),

@@ -1,4 +1,4 @@
-"""An offer that a key has signed, or that nobody has, and the file of the answers: read, or refused with a sentence."""
+"""A signed or unsigned offer, and the file of the answers: read, or refused with a message."""
 
 from __future__ import annotations
 
@@ -45,13 +45,12 @@ READERS = (_parsed, _of_message, _of_text, _of_answers)
 
 
 def taste(data: bytes) -> None:
-    """Read the bytes as what the first of them says."""
+    """Read the bytes as the document selected by the first of them."""
     with suppress(FdhilError):
         READERS[data[0] % len(READERS) if data else 0](data[1:])
 
 
 def target() -> Target:
-    """Return the target."""
     offer = Offer.model_validate(TOLD)
     add_answer(FOLDER, Answer("friction", 3, 1, "d", "accepted", "Bert", "", 1.5, "c"))
     seeds = [

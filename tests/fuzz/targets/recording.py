@@ -1,7 +1,7 @@
-"""Recordings of every format: read, or a RecordingError that says what to do.
+"""Recordings of every format: read, or a RecordingError with advice.
 
-What the product reads in a fork for each file is read here in one fork until a file ends it, which is ten times as
-quick; that a fork's end is told as a refusal is tested beside the product.
+The product reads each file in a fork. Here one fork reads until a file ends it, which is ten times as fast; that a
+fork's end is reported as a refusal is tested elsewhere.
 """
 
 from __future__ import annotations
@@ -61,13 +61,12 @@ class _Reader:
 
 
 def _read_all(module: Any, asked: Connection, others: Connection) -> None:
-    """Read one file after another, as a fork of the product does."""
-    others.close()  # its end is to be heard
+    others.close()  # its end must be detected
     for number in signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP}:
-        signal.signal(number, signal.SIG_DFL)  # who fuzzes has handlers of its own
+        signal.signal(number, signal.SIG_DFL)  # the fuzzer has its own handlers
     faulthandler.disable()
     told = os.fdopen(os.dup(2), "w")
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries complain there of what is damaged
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries report damage there
     module.library()
     while True:
         try:
@@ -83,7 +82,6 @@ def _read_all(module: Any, asked: Connection, others: Connection) -> None:
 
 
 def target_of(name: str, longest: int, words: list[bytes]) -> Target:
-    """Return the target of one format."""
     form = tables.load(tables.RECORDING_FORMATS, name)
     whole = table_of(window(n=120))
     few = RecordingTable(whole.headers, {key: values[:20] for key, values in whole.columns.items()})
@@ -91,7 +89,7 @@ def target_of(name: str, longest: int, words: list[bytes]) -> Target:
 
     def taste(data: bytes) -> None:
         if not data:
-            return  # whoever reads a file asks that first
+            return  # every reader checks that first
         try:
             table = form.decode(data, "r") if reader is None else reader.read(data)
             if isinstance(table, FdhilError):

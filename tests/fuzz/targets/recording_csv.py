@@ -7,5 +7,4 @@ from tests.fuzz.tasting import Target
 
 
 def target() -> Target:
-    """Return the target."""
     return recording.target_of("csv", 4000, [b"# ", b",", b"\\n"])

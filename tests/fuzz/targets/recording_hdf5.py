@@ -7,5 +7,4 @@ from tests.fuzz.tasting import Target
 
 
 def target() -> Target:
-    """Return the target."""
     return recording.target_of("hdf5", 12000, [b"TREE", b"SNOD", b"HEAP", b"OHDR", b"GCOL"])

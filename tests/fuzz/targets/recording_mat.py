@@ -7,5 +7,4 @@ from tests.fuzz.tasting import Target
 
 
 def target() -> Target:
-    """Return the target."""
     return recording.target_of("mat", 4000, [b"\\x0e\\x00\\x00\\x00", b"\\x09\\x00\\x00\\x00", b"\\x00\\x01IM"])

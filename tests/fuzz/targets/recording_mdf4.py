@@ -7,5 +7,4 @@ from tests.fuzz.tasting import Target
 
 
 def target() -> Target:
-    """Return the target."""
     return recording.target_of("mdf4", 12000, [b"##HD", b"##DG", b"##CG", b"##CN", b"##DT", b"##TX", b"##DZ", b"##CC"])

@@ -7,5 +7,4 @@ from tests.fuzz.tasting import Target
 
 
 def target() -> Target:
-    """Return the target."""
     return recording.target_of("parquet", 6000, [b"PAR1", b"\\x15\\x00", b"\\xff\\xff\\xff\\x0f"])

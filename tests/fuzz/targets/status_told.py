@@ -1,4 +1,4 @@
-"""What the daemon tells of names, texts and numbers that others chose, on its way to a shop floor: lines stay lines."""
+"""The daemon's publication of names, texts and numbers from outside to a shop floor: lines stay lines."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from tests.shopfloor.made import notice as noticed
 
 CONFIG = config_of(Path("/nowhere"), ("X",))
 HEARD, BORN = Listener(CONFIG), Session(CONFIG.publish.mqtt, "node")
-BEFORE = HEARD.news(status("X", notices=[]), NOW_MS)  # what is new is told, not what was there before
+BEFORE = HEARD.news(status("X", notices=[]), NOW_MS)  # only new values are published
 SHOWN = picture(BEFORE)
 BORN.node.births(*BORN._metrics(BEFORE), NOW_MS)
 
 
 def taste(data: bytes) -> None:
-    """Put what the bytes hold, a JSON list or a text at each zero byte, where others choose what stands there."""
+    """Use the bytes, a JSON list or texts separated by zero bytes, for all values that come from outside."""
     told = _told(data)
     text, number = [str(item) for item in told[:4]], [x for x in told if type(x) in (int, float)]
     said = status(
@@ -47,7 +47,7 @@ def taste(data: bytes) -> None:
 
 
 def _again() -> Session:
-    """The session that has told what was before, once more; what never changes is shared."""
+    """Return a copy of the session with its published values; constant parts are shared."""
     session, node = copy.copy(BORN), copy.copy(BORN.node)
     session.node, session._notices = node, {}
     node._aliases, node._told = dict(node._aliases), {device: dict(told) for device, told in node._told.items()}
@@ -64,7 +64,6 @@ def _told(data: bytes) -> list[Any]:
 
 
 def target() -> Target:
-    """Return the target."""
     seeds = [b"part|1.ngc\0a\nb\0c|d\0\x1b[31mred", b'["part.ngc", 17, 1e3, "\\ud800", -1]', "Fräser\u2028\0µ".encode()]
     return Target(
         "status_told", seeds, taste, [b"|", b"\n", b"\\n", b"\\u2028", b"1e308", b"9" * 320, b"\xc2\x85"], 600

@@ -1,4 +1,4 @@
-"""Traces of other programs as text: columns of numbers, or a RecordingError that says what to do."""
+"""Traces of other programs as text: columns of numbers, or a RecordingError with advice."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DIALECTS = [
 
 
 def taste(data: bytes) -> None:
-    """Read the bytes by a map of which all columns, or none but the names, are in the file."""
+    """Read the bytes by a map with all columns in the file, or only the names."""
     for dialect in (DIALECTS[0], DIALECTS[3]):
         told = ColumnMap.model_validate(column_map(dialect))
         try:
@@ -33,7 +33,6 @@ def taste(data: bytes) -> None:
 
 
 def target() -> Target:
-    """Return the target."""
     few = {name: values[:12] for name, values in signals().items()}
     seeds = [write(dialect, few) for dialect in DIALECTS]
     return Target("trace_text", seeds, taste, WORDS, 2500)

@@ -1,6 +1,6 @@
-"""HTTP requests to ``fdhil web``, in process: every answer is a declared one, and none is a fault of fdhil.
+"""HTTP requests to ``fdhil web``, in process: every answer is a declared one, and none is an internal error.
 
-A password is not hashed here, and no program is dropped: both take time by design, and are ways in of their own.
+A password is not hashed here, and no program is uploaded: both take time by design, and are separate entry points.
 """
 
 from __future__ import annotations
@@ -86,15 +86,14 @@ async def _asked(data: bytes) -> None:
 
 
 def taste(data: bytes) -> None:
-    """Ask what the bytes say, as the user that the first of them says."""
+    """Send the request in the bytes, as the user selected by the first of them."""
     if data:
-        # by design a password takes a tenth of a second; a thread for each request takes most of the rest
+        # by design a password takes a tenth of a second; a thread per request takes most of the rest
         with patch.object(access, "matches", _no_match), patch.object(anyio.to_thread, "run_sync", _at_once):
             _LOOP.run_until_complete(_asked(data))
 
 
 def target() -> Target:
-    """Return the target."""
     seeds = [b"\x0dGET " + route.replace("{axis}", "X").encode() for route in ROUTES]
     seeds += [b"\x0eGET " + route.encode() + b"?axis=X&limit=3" for route in ROUTES if route.startswith("/api/")]
     seeds += [

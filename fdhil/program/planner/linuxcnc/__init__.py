@@ -1,8 +1,8 @@
 """The planner of LinuxCNC (2.8 and later), cycle by cycle: profile ``linuxcnc``.
 
-Built from its documentation and from the demand it orders each millisecond: trapezoidal speeds with the acceleration
-that corners and arcs leave, arcs or parabolas at corners within P, short lines joined within Q, and a look-ahead of
-fifty segments. Parabolas come from the overlap of two segments: the next one speeds up while the last one brakes.
+Modelled on its documentation and on its recorded demand: trapezoidal speeds with the acceleration that corners and arcs
+leave, arcs or parabolas at corners within P, short lines joined within Q, and a look-ahead of fifty segments. Parabolas
+result from overlapping segments: the next one accelerates while the last one brakes.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from fdhil.program.planner.linuxcnc.segments import STOP, TANGENT, Segment, segm
 from fdhil.records import Float
 
 _DEPTH = 50
-_UNSETTLED = 3  # of the newest segments the limits have just changed
+_UNSETTLED = 3  # newest segments, whose limits have just changed
 _INTERPOLATED_ROWS = 2
 Row = tuple[float, ...]  # the positions of ALL_AXES, source line, rapid
 
 
 class Planner:
-    """Turns motions into rows; ProgramError when they last longer than ``max_rows``."""
+    """Converts motions to rows; ProgramError if they last longer than ``max_rows``."""
 
     def __init__(self, config: MachineConfig, max_rows: float = math.inf) -> None:
         self._limits = AxisLimits.of(config)
@@ -45,7 +45,7 @@ class Planner:
         self._count = 0
 
     def parts(self, motions: Iterable[Motion], block_rows: int) -> Iterator[Float]:
-        """Yield positions of ``ALL_AXES``, source line and rapid (0 or 1) in blocks (n, 11), from the rest on."""
+        """Yield positions of ``ALL_AXES``, source line and rapid (0 or 1) in blocks (n, 11), beginning at rest."""
         rows: list[Row] = []
         past = np.zeros((2, len(ALL_AXES)))
         for row in self._rows(motions):
@@ -87,7 +87,7 @@ class Planner:
         self._look_back()
 
     def _look_back(self) -> None:
-        """Give the newest segments the speeds at which they may end, since there is one more to brake in."""
+        """Raise the end speeds of the newest segments, since there is one more to brake in."""
         queue = self._queue
         number = len(queue) - 1
         for place in range(number, max(0, number - _DEPTH), -1):
@@ -101,7 +101,6 @@ class Planner:
             before.end_speed = speed
 
     def _run(self, left: int) -> Iterator[Row]:
-        """Run cycles until no more than ``left`` segments wait."""
         queue, cycles = self._queue, self._cycles
         while len(queue) > left + 1 or (not left and queue):
             here = queue[0]
@@ -124,7 +123,7 @@ class Planner:
 
 
 def _part(rows: list[Row], past: Float) -> tuple[Float, Float]:
-    """Return a block of rows and its last two points: the joints' cubic interpolation weighs three points in a row."""
+    """Return a block of rows and its last two points, for the joints' cubic interpolation over three points."""
     table = np.array(rows, dtype=np.float64)
     points = np.concatenate([past, table[:, :-2]])
     table[:, :-2] = points[1:-1] + (points[:-2] - 2.0 * points[1:-1] + points[2:]) / 6.0

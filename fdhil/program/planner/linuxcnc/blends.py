@@ -1,8 +1,8 @@
-"""Blends decide how two segments meet: straight through, with a stop, by a parabola, or by an arc that touches both.
+"""Decide how two segments meet: straight through, with a stop, by a parabola, or by an arc tangent to both.
 
-What LinuxCNC's planner does, as its demand shows: a kink so slight that its step takes less than a tenth of the axes'
-acceleration is passed; under G64 the better of an arc and a parabola is taken, a parabola counting half, since both of
-its neighbours accelerate at half beside it.
+As LinuxCNC's planner does according to its demand: a kink whose step needs less than a tenth of the axes' acceleration
+is passed; under G64 the better of an arc and a parabola is chosen, a parabola counting half, since both of its
+neighbours accelerate at half there.
 """
 
 from __future__ import annotations
@@ -12,38 +12,30 @@ from dataclasses import dataclass
 
 from fdhil.program.motions import Place, Point
 from fdhil.program.planner.limits import AxisLimits
-from fdhil.program.planner.linuxcnc.segments import (
-    ALONG_SHARE,
-    EXACT,
-    NORMAL_SHARE,
-    PARABOLA,
-    STOP,
-    TANGENT,
-    Segment,
-)
+from fdhil.program.planner.linuxcnc.segments import ALONG_SHARE, EXACT, NORMAL_SHARE, PARABOLA, STOP, TANGENT, Segment
 from fdhil.program.planner.linuxcnc.shapes import Led, Line, Turn, cross, dot, minus, plus, unit
 
 _KINK_SHARE = 0.1
 _KINK_SHARE_OF_ARC = 0.5
-_TOLERANCE_SHARE = 0.25  # of a segment's length, where the program gives none
-_LENGTH_SHARE = 0.5  # of a segment's length that one blend may take
+_TOLERANCE_SHARE = 0.25  # of a segment's length, if the program gives none
+_LENGTH_SHARE = 0.5  # of a segment's length that one blend may use
 _GAP_CYCLES = 4.0
 _LEAST_ANGLE_RAD = 1e-6
 _REVERSAL = -1.0 + 1e-9
 _LEAST_RADIUS_MM = 1e-6
 _ROUNDING_MM = 1e-9
-_ARC_SHARE, _ARC_SHARE_AT_END = 1.0 / 3.0, 2.0 / 3.0  # of an arc's angle that one blend may take
+_ARC_SHARE, _ARC_SHARE_AT_END = 1.0 / 3.0, 2.0 / 3.0  # of an arc's angle that one blend may use
 _LEAST_HALF_OF_ARCS_RAD = math.pi / 12.0  # sharper corners of two arcs get no arc
 
 
 def join(before: Segment, after: Segment, limits: AxisLimits) -> tuple[Segment, ...]:
-    """Decide how ``before`` goes over into ``after``; return what stands for ``before`` from then on.
+    """Decide the transition from ``before`` to ``after``; return what replaces ``before``.
 
-    That is itself, with an arc behind it where one is put between them, or the arc alone where that takes it in.
+    That is ``before`` itself, followed by an arc if one is inserted, or the arc alone if it absorbs ``before``.
     """
     if before.rapid != after.rapid:
         before.ending = STOP
-    if before.turns or after.turns:  # measured: no arc between, and no kink is passed
+    if before.turns or after.turns:  # measured: no arc is inserted, and no kink is passed
         after.after_parabola = before.ending == PARABOLA
         return (before,)
     if before.ending == STOP or _passed(before, after, limits) or before.ending == EXACT:
@@ -67,10 +59,9 @@ def _forget_kink(before: Segment, after: Segment) -> None:
 
 
 def _passed(before: Segment, after: Segment, limits: AxisLimits) -> bool:
-    """Tell whether the kink may be passed at full speed; else what speed it allows is kept."""
     t1, t2 = before.shape.tangent(before.shape.length), after.shape.tangent(0.0)
     if dot(t1, t2) < _REVERSAL:
-        before.ending = EXACT  # measured: a stop, and nothing is kept back for it
+        before.ending = EXACT  # measured: a stop, without a reserve for it
         return False
     speed = min(before.free, after.free)
     step = speed / limits.dt_s + after.acceleration
@@ -88,7 +79,7 @@ def _passed(before: Segment, after: Segment, limits: AxisLimits) -> bool:
 def blend_speeds(before: Segment, after: Segment, probing: bool = False) -> tuple[float, float, float]:
     """Return the speeds at which a parabola begins in ``before`` and ends in ``after``, and that across the corner.
 
-    With ``probing`` a parabola is assumed that is not decided yet.
+    ``probing`` assumes a parabola that is not decided yet.
     """
     t1, t2 = before.shape.tangent(before.shape.length), after.shape.tangent(0.0)
     kept = after.after_parabola
@@ -102,7 +93,7 @@ def blend_speeds(before: Segment, after: Segment, probing: bool = False) -> tupl
     if before.tolerance > 0.0 and math.cos(half) > 1e-4:
         within = 2.0 * math.sqrt(a1 * before.tolerance / math.cos(half))
         v1, v2 = min(v1, within), min(v2, within)
-    # measured: the next segment speeds up with all it has while this one brakes
+    # measured: the next segment accelerates fully while this one brakes
     return v1, v1 / a1 * a2, math.sin(half) * (v1 + v2) / 2.0
 
 
@@ -112,7 +103,7 @@ class _Arc:
     taken: tuple[float, float]  # mm off the end of the one before and off the start of the one after
 
     def put_between(self, before: Segment, after: Segment, dt_s: float) -> tuple[Segment, ...]:
-        """Shorten both neighbours; what is left of a line for less than four cycles goes with the arc."""
+        """Shorten both neighbours; a line shorter than four cycles is merged with the arc."""
         one, two, arc = before.shape, after.shape, self.segment
         assert not isinstance(one, Led)
         assert not isinstance(two, Led)
@@ -129,7 +120,6 @@ class _Arc:
 
 
 def _arc(before: Segment, after: Segment, limits: AxisLimits) -> _Arc | None:
-    """Return the arc that touches both, None where none fits: they are to lie in one plane."""
     one, two = before.shape, after.shape
     if isinstance(one, Led) or isinstance(two, Led):
         return None
@@ -150,7 +140,7 @@ def _arc(before: Segment, after: Segment, limits: AxisLimits) -> _Arc | None:
     goal = min(max(before.free, after.free), _fastest(before, after, half, limits, normal))
     widest = math.tan(half_taken) * reach
     speed = min(math.sqrt(NORMAL_SHARE * limit * widest), goal)
-    # measured: where there is room, the arc lasts as long as half of the acceleration needs for its speed
+    # measured: if there is room, the arc lasts as long as half of the acceleration needs for its speed
     longest = speed * speed / (ALONG_SHARE * limit) / (math.pi - 2.0 * half_taken)
     radius = min(widest, max(speed * speed / (NORMAL_SHARE * limit), longest))
     found = _touching(one, two, radius, normal, math.tan(half))
@@ -169,8 +159,11 @@ def _arc(before: Segment, after: Segment, limits: AxisLimits) -> _Arc | None:
 
 @dataclass(frozen=True, slots=True)
 class _Room:
-    """What a blend may take of a segment: ``reach`` mm as if it were straight, ``most`` mm along it, and by how much
-    (rad) half the corner's angle counts as steeper."""
+    """The length that a blend may use of a segment.
+
+    ``reach`` mm as if it were straight, ``most`` mm along it, ``steeper``: angle (rad) by which half the corner counts
+    as steeper.
+    """
 
     reach: float
     most: float
@@ -178,7 +171,7 @@ class _Room:
 
 
 def _room(segment: Segment, other: Point, half: float, at_end: bool) -> _Room:
-    """Return what the corner with a segment of direction ``other`` may take: of an arc, less where it lies inside."""
+    """Return the room of a corner with a segment of direction ``other``: on an arc less if it lies inside."""
     shape = segment.shape
     if not isinstance(shape, Turn):
         reach = min(shape.length, segment.nominal * _LENGTH_SHARE) if at_end else shape.length * _LENGTH_SHARE
@@ -202,13 +195,12 @@ def _in_plane(shape: Line | Turn, normal: Point) -> bool:
 
 
 def _within_plane(limits: Place, normal: Point) -> float:
-    """Return the largest acceleration or speed that may point anywhere in a plane."""
     scales = [math.sqrt(max(0.0, 1.0 - n * n)) for n in normal]
     return min(limit / scale for limit, scale in zip(limits[:3], scales, strict=True) if scale > 1e-9)
 
 
 def _fastest(before: Segment, after: Segment, half: float, limits: AxisLimits, normal: Point) -> float:
-    """Return the speed at which the axes' speeds are kept along the whole of an arc from one way to the other."""
+    """Return the speed that keeps the axes' limits along the whole of an arc between both directions."""
     plane = _within_plane(limits.speed, normal)
     if isinstance(before.shape, Turn) or isinstance(after.shape, Turn):
         return plane
@@ -223,12 +215,11 @@ def _fastest(before: Segment, after: Segment, half: float, limits: AxisLimits, n
 def _touching(
     one: Line | Turn, two: Line | Turn, radius: float, normal: Point, steep: float
 ) -> tuple[Turn, float, float] | None:
-    """Return the arc of a radius inside the corner, and the lengths that it takes of both."""
     corner = two.at(0.0)
     t1 = one.tangent(one.length)
     reach = radius / steep
     centre = plus(plus(corner, t1, -reach), cross(normal, t1), radius)
-    for _ in range(30):  # from the centre between the tangents: bring its distance from both to the radius
+    for _ in range(30):  # Newton steps from the centre between the tangents until its distance from both is the radius
         (way1, d1, p1), (way2, d2, p2) = _nearest(one, centre), _nearest(two, centre)
         off1, off2 = radius - d1, radius - d2
         if abs(off1) + abs(off2) < 1e-10:
@@ -253,7 +244,7 @@ def _touching(
 
 
 def _nearest(shape: Line | Turn, place: Point) -> tuple[Point, float, Point]:
-    """Return the way from the nearest point of a shape to a place, its length, and the point."""
+    """Return direction and distance from the nearest point of a shape to a point, and that nearest point."""
     if isinstance(shape, Line):
         foot = plus(shape.start, shape.way, dot(minus(place, shape.start), shape.way))
     else:

@@ -1,4 +1,4 @@
-"""The servo cycles: each one moves the segment under way, and beside a parabola the next one too."""
+"""The servo cycles: each one moves the active segment, and during a parabola the next one too."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from fdhil.program.planner.linuxcnc.shapes import minus, plus
 _AT_END_MM = 1e-12
 _SPEED = 1e-8
 _LEAST_S = 1e-12
-_RAMP_S = 0.01  # segments that last no longer change their speed evenly
+_RAMP_S = 0.01  # segments up to this duration change their speed linearly
 
 
 class Cycles:
-    """Runs the segments of a queue; ``at`` is where X Y Z are ordered to be, ``others`` where A B C U V W are."""
+    """Executes the segments of a queue; ``at`` is the commanded X Y Z, ``others`` the commanded A B C U V W."""
 
     def __init__(self, queue: deque[Segment], dt_s: float) -> None:
         self._queue = queue
@@ -29,13 +29,12 @@ class Cycles:
         self._along = self._along_next = 0.0
         self._ramp = False
         self._braking = False
-        self._blend_from = 0.0  # speed at which the blend under way began, 0 for none
+        self._blend_from = 0.0  # speed at which the active blend began, 0 for none
         self._speeds = (0.0, 0.0)
-        self._left_s = 0.0  # of a cycle within which the segment under way ends
+        self._left_s = 0.0  # of the cycle within which the active segment ends
         self._left_over = self._end = 0.0
 
     def step(self) -> None:
-        """Run one cycle."""
         queue = self._queue
         here = queue[0]
         if here is not self._begun:
@@ -52,7 +51,6 @@ class Cycles:
         self._check_end(here)
 
     def _begin(self, here: Segment) -> None:
-        """Take the limits of a segment that becomes the one under way."""
         self._begun, self._along, self._target = here, here.along, here.target
         self._target_next = self._queue[1].target if len(self._queue) > 1 else 0.0
         self._end_speed = min(here.end_speed, self._target, self._target_next) if here.ending == TANGENT else 0.0
@@ -72,7 +70,7 @@ class Cycles:
             self._braking = _advance(here, dt, along, self._end_speed, self._target)
 
     def _ramped(self, here: Segment, dt: float, along: float, end: float) -> bool:
-        """Change the speed evenly up to the end of the segment; False where that asks for too much."""
+        """Change the speed linearly up to the end of the segment; False if that exceeds the acceleration."""
         to_go = here.shape.length - here.place
         mean = (here.speed + end) / 2.0
         if mean <= _SPEED or to_go <= 0.0:
@@ -87,7 +85,7 @@ class Cycles:
         return True
 
     def _blend(self, here: Segment, after: Segment) -> None:
-        """Speed the next segment up as far as this one has slowed down."""
+        """Accelerate the next segment in proportion to the deceleration of this one."""
         if not self._blend_from:
             if not (self._braking and here.speed < self._speeds[0]):
                 return
@@ -101,7 +99,6 @@ class Cycles:
             self.others = tuple(at + here - start for at, here, start in more)
 
     def _check_end(self, here: Segment) -> None:
-        """Go on to the next segment at the end of this one; within a cycle where it does not stop."""
         to_go = here.shape.length - here.place
         if to_go <= _AT_END_MM:
             self._pass_on(here, here.speed)
@@ -125,7 +122,6 @@ class Cycles:
             self._left_s, self._end = left, end
 
     def _over(self) -> Segment:
-        """Leave the segment under way for the next, in the midst of a cycle."""
         self._left_over, self._left_s = self._left_s, 0.0
         self._pass_on(self._queue[0], self._end)
         here = self._queue[0]
@@ -141,7 +137,7 @@ class Cycles:
 def _advance(here: Segment, dt: float, along: float, end: float, target: float) -> bool:
     """Move a segment by one cycle toward ``target``, so that it can still end at ``end``.
 
-    The speed is the highest from which it can brake in whole cycles; True while it brakes for that.
+    The speed is the highest from which it can brake in whole cycles; return whether it brakes for that.
     """
     speed = here.speed
     to_go = here.shape.length - here.place

@@ -1,7 +1,7 @@
-"""Joining short lines within Q (G64 P Q): feeds one behind the other become one where none of their ends is far off.
+"""Join short lines within Q (G64 P Q): consecutive feeds become one if none of their ends is far from it.
 
-As LinuxCNC does before it plans: a feed is joined to those before it while every end between stays within Q of the
-line from where the first began to where the last ends, and no more than a hundred are.
+As LinuxCNC does before planning: a feed is joined to the previous ones while every intermediate end is within Q of the
+line from the start of the first to the end of the last, up to a hundred feeds.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _MOST = 100
 
 
 def joined(motions: Iterable[Motion], start: Point = (0.0, 0.0, 0.0)) -> Iterator[Motion]:
-    """Yield motions with the feeds joined that their corner's ``joining_mm`` allows."""
+    """Yield motions with the feeds joined as their corner's ``joining_mm`` allows."""
     chain: list[Feed] = []
     at = start
     for motion in motions:
@@ -42,7 +42,7 @@ def _linkable(at: Point, chain: list[Feed], motion: Feed) -> bool:
     for feed in chain:
         off = minus(feed.end, at)
         share = min(1.0, max(0.0, dot(way, off) / square))
-        beside = minus(off, plus((0.0, 0.0, 0.0), way, share))
-        if dot(beside, beside) > last.corner.joining_mm**2:
+        deviation = minus(off, plus((0.0, 0.0, 0.0), way, share))
+        if dot(deviation, deviation) > last.corner.joining_mm**2:
             return False
     return True

@@ -1,4 +1,4 @@
-"""Segments: one motion each as LinuxCNC's planner queues it, with its limits and how it goes over into the next."""
+"""Segments: one motion each as LinuxCNC's planner queues it, with its limits and its transition to the next."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from fdhil.program.planner.linuxcnc.shapes import Shape, Turn
 from fdhil.program.planner.pieces import length_of, path_limit
 
 STOP, EXACT, PARABOLA, TANGENT = range(4)  # how a segment ends
-NORMAL_SHARE = math.sqrt(0.75)  # of the acceleration that turning may take
-ALONG_SHARE = 0.5  # what is left along the path then
+NORMAL_SHARE = math.sqrt(0.75)  # of the acceleration that turning may use
+ALONG_SHARE = 0.5  # remaining share along the path then
 _SHORTEST_CYCLES = 3.0
 _LEAST_RADIUS_MM = 1e-6
 _ENDS = {"exact_stop": STOP, "exact_path": EXACT, "blend": PARABOLA}
@@ -23,8 +23,8 @@ _ENDS = {"exact_stop": STOP, "exact_path": EXACT, "blend": PARABOLA}
 class Segment:
     """A piece of path with its limits: ``wanted`` mm/s as programmed, ``top`` mm/s, ``acceleration`` mm/s2.
 
-    ``bent`` is the radius of its curvature, infinite for a line; ``kink_speed`` is what its end may be passed with
-    without a blend, at the price of ``kept_back`` and ``kept_back_before`` of the acceleration.
+    ``bent`` is its radius of curvature, infinite for a line; ``kink_speed`` is the speed at which its end may be passed
+    without a blend, which reserves ``kept_back`` and ``kept_back_before`` of the acceleration.
     """
 
     line: int
@@ -44,10 +44,10 @@ class Segment:
     end_speed: float = 0.0
     place: float = 0.0
     speed: float = 0.0
-    between: bool = False  # an arc put between two motions
-    settled: bool = False  # its end will not move any more
+    between: bool = False  # an arc inserted between two motions
+    settled: bool = False  # its end is final
     others: Place = ORIGIN[3:]  # A B C U V W at its start
-    ways: Place = ORIGIN[3:]  # by how much they move on it
+    ways: Place = ORIGIN[3:]  # their distance on it
 
     @property
     def turns(self) -> bool:
@@ -55,7 +55,7 @@ class Segment:
         return any(self.ways)
 
     def others_at(self, distance: float) -> Place:
-        """Return where A B C U V W are at a distance from the start: they share the length evenly."""
+        """Return A B C U V W at a distance from the start: they are linear in the length."""
         if not self.turns:
             return self.others
         share = distance / self.nominal
@@ -63,12 +63,12 @@ class Segment:
 
     @property
     def free(self) -> float:
-        """Speed that it may reach as long as nothing is known of its neighbours."""
+        """Speed limit without regard to its neighbours."""
         return min(self.wanted, self.top)
 
     @property
     def target(self) -> float:
-        """Speed that it may reach."""
+        """Speed limit."""
         speed = self.free
         if self.settled and self.bent < math.inf:
             speed = min(speed, math.sqrt(NORMAL_SHARE * self._left * self.bent))
@@ -76,13 +76,13 @@ class Segment:
 
     @property
     def _left(self) -> float:
-        """Acceleration in all: halved beside a parabola, since both neighbours accelerate there."""
+        """Total acceleration: halved during a parabola, since both neighbours accelerate there."""
         left = self.acceleration * (1.0 - max(self.kept_back, self.kept_back_before))
         return left * 0.5 if self.ending == PARABOLA or self.after_parabola else left
 
     @property
     def along(self) -> float:
-        """Acceleration along the path: what turning at the top speed leaves over, and at least half."""
+        """Acceleration along the path: what turning at the top speed leaves, at least half."""
         left = self._left
         turning = self.top * self.top / self.bent
         if turning <= 0.0:
@@ -93,22 +93,22 @@ class Segment:
 
     @property
     def sure(self) -> float:
-        """Length that it will have at least: half of it may still go to a blend."""
+        """Guaranteed length: half of it may still be used by a blend."""
         return self.shape.length if self.settled else self.shape.length / 2.0
 
     @property
     def reachable(self) -> float:
-        """Speed that it reaches from rest to rest."""
+        """Highest speed from rest to rest."""
         return min(self.target, math.sqrt(self.along * self.sure))
 
     def settle(self, dt_s: float) -> None:
-        """Take as long as three cycles at least, now that its length is final."""
+        """Limit the speed to a duration of three cycles, now that the length is final."""
         self.settled = True
         self.top = min(self.top, self.shape.length / (_SHORTEST_CYCLES * dt_s))
 
 
 def segment(motion: Rapid | Feed | Arc, start: Place, limits: AxisLimits) -> Segment | None:
-    """Return the segment of a motion, None where it has no length."""
+    """Return the segment of a motion, None if it has no length."""
     end = reached(motion, start)
     ways = tuple(b - a for a, b in zip(start[3:], end[3:], strict=True))
     x, y, z = start[:3]
@@ -116,7 +116,7 @@ def segment(motion: Rapid | Feed | Arc, start: Place, limits: AxisLimits) -> Seg
         found = _turn(motion, shapes.turn(motion, (x, y, z)), ways, limits)
     else:
         shape = shapes.line((x, y, z), motion.end)
-        shape.length = shape.length or length_of(start, end)  # of a move of other axes alone
+        shape.length = shape.length or length_of(start, end)  # if only other axes move
         if shape.length <= 0.0:
             return None
         shares = [*shape.way, *(way / shape.length for way in ways)]
@@ -133,7 +133,7 @@ def segment(motion: Rapid | Feed | Arc, start: Place, limits: AxisLimits) -> Seg
 def _segment(
     motion: Rapid | Feed | Arc, shape: Shape, bounds: tuple[float, float, float], path_speed: float
 ) -> Segment:
-    """``bounds`` are top speed, acceleration and radius; ``path_speed`` limits what is ordered, as a feed does."""
+    """``bounds`` are top speed, acceleration and radius; ``path_speed`` limits the commanded speed, as a feed does."""
     top, acceleration, bent = bounds
     rapid = isinstance(motion, Rapid)
     corner = motion.corner
@@ -158,6 +158,6 @@ def _turn(motion: Arc, shape: Turn, ways: Place, limits: AxisLimits) -> Segment 
     radius = min(shape.radius, shape.radius + shape.growth)
     steep = shape.length / turning
     top = min(top, math.sqrt(NORMAL_SHARE * acceleration * steep * radius))
-    # measured: of a helix the whole rise counts, not that of a radian, so that it keeps more along the path
+    # measured: for a helix the whole rise counts, not that per radian, so more remains along the path
     bent = radius + sum(rise) ** 2 / radius if radius else _LEAST_RADIUS_MM
     return _segment(motion, shape, (top, acceleration, bent), limits.path_speed)

@@ -1,4 +1,4 @@
-"""Shapes of path: a straight line, an arc or helix in any plane, and a line that runs into an arc."""
+"""Shapes of path: a straight line, an arc or helix in any plane, and a line that leads into an arc."""
 
 from __future__ import annotations
 
@@ -14,29 +14,26 @@ def plus(a: Point, b: Point, share: float = 1.0) -> Point:
 
 
 def minus(a: Point, b: Point) -> Point:
-    """Return a - b."""
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
 def dot(a: Point, b: Point) -> float:
-    """Return the scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def cross(a: Point, b: Point) -> Point:
-    """Return the vector product."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def unit(a: Point) -> Point:
-    """Return the vector at length 1; zero stays zero."""
+    """Return the vector scaled to length 1; zero stays zero."""
     length = math.sqrt(dot(a, a))
     return (a[0] / length, a[1] / length, a[2] / length) if length > 0.0 else a
 
 
 @dataclass(slots=True)
 class Line:
-    """A line of ``length`` mm from ``start`` along the unit vector ``way``; 0 where others move alone."""
+    """A line of ``length`` mm from ``start`` along the unit vector ``way``; 0 if only other axes move."""
 
     start: Point
     way: Point
@@ -47,18 +44,18 @@ class Line:
         return plus(self.start, self.way, distance)
 
     def tangent(self, distance: float) -> Point:
-        """Return the unit direction at a distance from the start; LinuxCNC has X for a line without length."""
+        """Return the unit direction at a distance from the start; LinuxCNC uses X for a line without length."""
         return self.way if any(self.way) else (1.0, 0.0, 0.0)
 
     def cut(self, begin: float, end: float) -> None:
-        """Take ``begin`` and ``end`` mm off its ends."""
+        """Shorten it by ``begin`` and ``end`` mm."""
         self.start = plus(self.start, self.way, begin)
         self.length -= begin + end
 
 
 @dataclass(slots=True)
 class Turn:
-    """An arc of ``angle`` rad from ``centre`` + ``radius`` ``u`` to ``v``: ``growth`` of radius, ``rise`` in all."""
+    """An arc of ``angle`` rad from ``centre`` + ``radius`` ``u`` to ``v``; total ``growth`` of radius and ``rise``."""
 
     centre: Point
     u: Point
@@ -71,11 +68,10 @@ class Turn:
 
     @property
     def flat(self) -> bool:
-        """Whether it is an arc of one radius in one plane."""
+        """Whether it has one radius and lies in one plane."""
         return abs(self.growth) < 1e-9 and dot(self.rise, self.rise) < 1e-18
 
     def at(self, distance: float) -> Point:
-        """Return the point at a distance from the start."""
         share = distance / self.length
         radius = self.radius + self.growth * share
         c, s = radius * math.cos(self.angle * share), radius * math.sin(self.angle * share)
@@ -87,7 +83,6 @@ class Turn:
         )
 
     def tangent(self, distance: float) -> Point:
-        """Return the unit direction at a distance from the start."""
         share = distance / self.length
         radius, angle = self.radius + self.growth * share, self.angle * share
         c, s = math.cos(angle), math.sin(angle)
@@ -96,7 +91,7 @@ class Turn:
         return unit(plus(plus(self.rise, self.u, along_u), self.v, along_v))
 
     def cut(self, begin: float, end: float) -> None:
-        """Take ``begin`` and ``end`` mm off the ends of a flat one."""
+        """Shorten a flat arc by ``begin`` and ``end`` mm."""
         turned, left = begin / self.radius, (self.length - begin - end) / self.radius
         c, s = math.cos(turned), math.sin(turned)
         zero = (0.0, 0.0, 0.0)
@@ -106,23 +101,20 @@ class Turn:
 
 @dataclass(slots=True)
 class Led:
-    """A line that runs into an arc: the rest of a line that was too short to be a piece of its own."""
+    """A line that leads into an arc: the rest of a line that was too short for its own segment."""
 
     lead: Line
     turn: Turn
 
     @property
     def length(self) -> float:
-        """Length of both."""
         return self.lead.length + self.turn.length
 
     def at(self, distance: float) -> Point:
-        """Return the point at a distance from the start."""
         over = distance - self.lead.length
         return self.turn.at(over) if over > 0.0 else self.lead.at(distance)
 
     def tangent(self, distance: float) -> Point:
-        """Return the unit direction at a distance from the start."""
         over = distance - self.lead.length
         return self.turn.tangent(over) if over > 0.0 else self.lead.way
 
