@@ -17,13 +17,24 @@ from fdhil.identification.fit import Fit
 from fdhil.identification.identifiability import empty_estimate
 from fdhil.identification.signals import mended
 from fdhil.identification.spring import sprung
+from fdhil.identification.without_voltage import fit as fit_torque
 from fdhil.identification.without_voltage import told
 from fdhil.records import Estimate, Parameters, Reason, Result, Verdict, Window, WindowOutcome
-from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, WEIGHED, Evidence, Findings, ask
 from fdhil.validation.at_the_table import at_the_table
-from fdhil.validation.checks import PLATEAU
 from fdhil.validation.data_sheet import gain_error, scale_convention
 from fdhil.validation.signal_consistency import table_faults
+from fdhil.validation.table_assessment import TableAssessment
+from fdhil.validation.window_checks import (
+    FIT_CHECKS,
+    PLATEAU,
+    SIGNAL_CHECKS,
+    STUCK_SENSOR,
+    WEIGHED,
+    Findings,
+    run_checks,
+)
+from fdhil.validation.window_fit import WindowFit
+from fdhil.validation.window_signals import LEAST_SAMPLES, WindowSignals
 
 # what solvers raise; scipy's raise ValueError for what is not finite
 GAVE_UP = (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError, ValueError)
@@ -46,7 +57,7 @@ def analyse(
     """
     axis = own(window, axis)
     at_instants, cycles = with_demand_on_time(mended(window, settings.speed_source), axis, sync_period_s)
-    signals = Evidence(at_instants, settings, axis=axis, sync_period_s=sync_period_s, recorded=window)
+    signals = WindowSignals(at_instants, settings, axis, sync_period_s, recorded=window)
     outcome = replace(_with_table(_analysed(signals), signals), window=window)
     return _with_lead(outcome, cycles) if cycles else outcome
 
@@ -59,7 +70,7 @@ def _with_lead(outcome: WindowOutcome, cycles: int) -> WindowOutcome:
     return replace(outcome, verdict=verdict)
 
 
-def _with_table(outcome: WindowOutcome, signals: Evidence) -> WindowOutcome:
+def _with_table(outcome: WindowOutcome, signals: WindowSignals) -> WindowOutcome:
     """Return the outcome with what sensors at the table show: its true error, and a resonance.
 
     That takes the place of a configured one, or of one that the motor shows, and the window is analysed with it. A
@@ -69,7 +80,7 @@ def _with_table(outcome: WindowOutcome, signals: Evidence) -> WindowOutcome:
     if estimate is None or (window.table_mm is None and window.table_m_s2 is None):
         return outcome
     with np.errstate(over="ignore", invalid="ignore"):
-        faults = table_faults(window, signals.moving)
+        faults = table_faults(window, signals.motion_range)
     if faults:
         place = None if "table_mm" in faults else window.table_mm
         rate = None if "table_m_s2" in faults else window.table_m_s2
@@ -91,21 +102,23 @@ def _with_table(outcome: WindowOutcome, signals: Evidence) -> WindowOutcome:
     return outcome if seen is None else replace(outcome, at_table=seen)
 
 
-def _analysed(signals: Evidence) -> WindowOutcome:
+def _analysed(signals: WindowSignals) -> WindowOutcome:
     window, settings = signals.window, signals.settings
-    found = ask(BEFORE_ANY_FIT, signals, {})
+    found = run_checks(SIGNAL_CHECKS, signals, {})
     reasons = _listed(found)
-    if window.n < LEAST_ROWS or any(reason.code == UNFIT for reason in reasons):
-        return _outcome(replace(signals, estimate=_none(settings, Result.NOT_FINITE, reasons[0])), found)
+    if window.n < LEAST_SAMPLES or any(reason.code == UNFIT for reason in reasons):
+        return _outcome(TableAssessment(WindowFit(signals, _none(settings, Result.NOT_FINITE, reasons[0]))), found)
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            evidence = estimated(signals)
-            return _outcome(evidence, ask(OF_THE_FIT, evidence, found))
+            fitted = estimated(signals)
+            table = TableAssessment(fitted)
+            return _outcome(table, run_checks(FIT_CHECKS, table, found))
     except GAVE_UP as error:
         reason = gave_up(error, "look at the window's signals")
         # what each sensor's own rows tell holds all the same
-        found = ask(OF_THE_FIT[:1], signals, {**found, "solver": [reason]})
-        return _outcome(replace(signals, estimate=_none(settings, Result.DIVERGED, reason)), found)
+        found = {**found, "solver": [reason]}
+        found = run_checks((STUCK_SENSOR,), TableAssessment(WindowFit(signals)), found)
+        return _outcome(TableAssessment(WindowFit(signals, _none(settings, Result.DIVERGED, reason))), found)
 
 
 def own(window: Window, axis: Axis | None) -> Axis | None:
@@ -116,23 +129,24 @@ def own(window: Window, axis: Axis | None) -> Axis | None:
     return axis if abs(pitch - 1.0) < SAME_PITCH and 1.0 / OVERRIDE <= rapid <= OVERRIDE else None
 
 
-def estimated(signals: Evidence) -> Evidence:
+def estimated(signals: WindowSignals) -> WindowFit:
     """Return the evidence with the estimate by the method asked for, and the fit that is judged.
 
     Without a voltage [2] alone is fitted, with the torque constant of the recording or of the axis: there is no fit of
     both equations.
     """
     window, settings, axis = signals.window, signals.settings, signals.axis
-    if window.voltage_v is None and window.slow_voltage is None:
+    if not signals.has_voltage:
+        torque = fit_torque(window, settings)
         known = {} if axis is None else {"R": axis.nominal.R, "L": axis.nominal.L, "K": axis.nominal.K}
-        return replace(signals, estimate=told(window, signals.torque, known))
+        return WindowFit(signals, told(window, torque, known), torque=torque)
     name, estimator = chosen(settings)
     fit = _fitted(window, settings)
     if fit is not None and axis is not None:
         fit = maximum_likelihood.with_loops(fit, window, settings, axis, signals.sync_period_s)
     if name == maximum_likelihood.NAME and fit is not None:
-        return _with_spring(replace(signals, estimate=maximum_likelihood.finish(fit), fit=fit))
-    return replace(signals, estimate=estimator([window], settings), fit=fit)
+        return _with_spring(WindowFit(signals, maximum_likelihood.finish(fit), fit))
+    return WindowFit(signals, estimator([window], settings), fit)
 
 
 @lru_cache(maxsize=KEPT_FITS)
@@ -141,14 +155,14 @@ def _fitted(window: Window, settings: Identification) -> Fit | None:
     return maximum_likelihood.fit_windows([window], settings)
 
 
-def _with_spring(stiff: Evidence) -> Evidence:
+def _with_spring(stiff: WindowFit) -> WindowFit:
     """Return the evidence with a spring between motor and table, where there is one that explains the rapid as well.
 
     One that nobody told is sought where no regulators are known; else replays of rapids find it, better than one
     window's speed.
     """
     assert stiff.fit is not None
-    axis, weight = stiff.axis, stiff.weight
+    axis, weight = stiff.signals.axis, TableAssessment(stiff).budget
     if weight is None or (axis is not None and axis.resonance_hz is None):
         return stiff
     if axis is None and weight.unexplained_um < NOTICED * weight.limit_um:
@@ -156,8 +170,9 @@ def _with_spring(stiff: Evidence) -> Evidence:
     found = sprung(stiff.fit, axis)
     if found is None:
         return stiff
-    soft = replace(stiff, estimate=maximum_likelihood.finish(found), fit=found)
-    left = math.inf if soft.weight is None else soft.weight.unexplained_um
+    soft = WindowFit(stiff.signals, maximum_likelihood.finish(found), found)
+    budget = TableAssessment(soft).budget
+    left = math.inf if budget is None else budget.unexplained_um
     return soft if left < max(weight.limit_um, weight.unexplained_um) else stiff
 
 
@@ -183,36 +198,38 @@ def _speed_lag(window: Window) -> Reason | None:
     return Reason("SampleTiming", text, "take speed and position from one SYNC, or set [identification] speed_source")
 
 
-def _convention(evidence: Evidence) -> list[Reason]:
+def _convention(fitted: WindowFit) -> list[Reason]:
     """Return how the drive scales current and voltage, where the data sheet shows that it is not as the model's."""
-    if evidence.axis is None or evidence.estimate is None or evidence.estimate.missing:
+    axis, estimate = fitted.signals.axis, fitted.estimate
+    if axis is None or estimate is None or estimate.missing:
         return []
-    found = scale_convention(evidence.estimate, Parameters(**evidence.axis.nominal.model_dump()))
+    found = scale_convention(estimate, Parameters(**axis.nominal.model_dump()))
     return [] if found is None else [found]
 
 
-def _gain(evidence: Evidence) -> Iterator[Reason]:
+def _gain(fitted: WindowFit) -> Iterator[Reason]:
     """Yield the signal whose gain may be why the configured loops do not explain the rapid."""
-    if evidence.axis is not None and evidence.estimate is not None:
-        found = gain_error(evidence.estimate, Parameters(**evidence.axis.nominal.model_dump()))
+    axis, estimate = fitted.signals.axis, fitted.estimate
+    if axis is not None and estimate is not None:
+        found = gain_error(estimate, Parameters(**axis.nominal.model_dump()))
         if found is not None:
             yield found
 
 
-def _outcome(evidence: Evidence, found: Findings) -> WindowOutcome:
+def _outcome(table: TableAssessment, found: Findings) -> WindowOutcome:
     """Return the verdict: what is weighed refuses only where it does harm at the table, and warns else."""
-    weight = evidence.weight
+    weight, fitted = table.budget, table.fitted
     names = WEIGHED | {PLATEAU} if weight is not None and weight.through == "replay" else WEIGHED
     weighed = [r for name, told in found.items() if name in names for r in told]
     reasons = [r for name, told in found.items() if name not in names for r in told]
     # through ordinary loops only a share is known: what has a name says more
     if weight is not None and not weight.believed and (weight.in_um or not (reasons or weighed)):
-        reasons += [weight.reason(), *_gain(evidence)]
-    if not evidence.harmless:
+        reasons += [weight.reason(), *_gain(fitted)]
+    if not table.is_harmless:
         reasons, weighed = [*reasons, *weighed], []
-    if reasons and (lag := _speed_lag(evidence.window)) is not None:
+    if reasons and (lag := _speed_lag(fitted.window)) is not None:
         reasons.append(lag)
-    reasons += _convention(evidence)
+    reasons += _convention(fitted)
     unexplained = weight.unexplained_um if weight is not None and weight.in_um else None
-    verdict = Verdict(not reasons, evidence.fit_percent, tuple(reasons), unexplained, tuple(weighed))
-    return WindowOutcome(evidence.window, evidence.told, verdict)
+    verdict = Verdict(not reasons, fitted.fit_percent, tuple(reasons), unexplained, tuple(weighed))
+    return WindowOutcome(fitted.window, fitted.widened_estimate, verdict)

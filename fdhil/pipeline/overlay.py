@@ -11,9 +11,10 @@ from fdhil.identification.signals import mended
 from fdhil.pipeline.analysis import GAVE_UP, analyse, estimated, own
 from fdhil.pipeline.own_loops import OwnLoops
 from fdhil.records import LoopEstimate, Result, Window, WindowOutcome
-from fdhil.validation.evidence import Evidence
 from fdhil.validation.replay import Replay, replay_window
 from fdhil.validation.simulation import Simulated, simulated
+from fdhil.validation.table_assessment import TableAssessment
+from fdhil.validation.window_signals import WindowSignals
 
 NO_MODEL = {Result.NOT_FINITE, Result.DIVERGED}
 
@@ -46,11 +47,11 @@ def lay_over(window: Window, config: MachineConfig, loops: LoopEstimate | None =
         return bare
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            found = estimated(Evidence(at_instants, settings, axis=axis, sync_period_s=period_s, recorded=window))
+            found = estimated(WindowSignals(at_instants, settings, axis, period_s, recorded=window))
             assert found.estimate is not None
             driven = simulated(at_instants, found.estimate, found.fit)
             followed = None
-            if axis is not None and found.parameters is not None and found.weight is not None:  # else it cannot be run
+            if axis is not None and found.parameters is not None and TableAssessment(found).budget is not None:
                 followed = replay_window(at_instants, found.parameters, axis, period_s)
     except GAVE_UP:
         return bare

@@ -15,7 +15,7 @@ import numpy as np
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.windows import bridged, longest
 from fdhil.records import Float, NcMove, Reason, Window
-from fdhil.validation.evidence import Evidence
+from fdhil.validation.window_signals import WindowSignals
 
 CODE = "EpisodeAborted"
 ADVICE = "record a rapid without feed hold, override change or stop"
@@ -36,13 +36,13 @@ LEFT_MM = 1.0
 LEFT_SHARE = 0.01
 
 
-def interruptions(evidence: Evidence) -> Iterator[Reason]:
+def interruptions(signals: WindowSignals) -> Iterator[Reason]:
     """Yield the reason why the window is no whole rapid, with the figure that shows it."""
-    window = evidence.window
+    window = signals.window
     if window.nc is not None and (said := _said(window.nc)) is not None:
         yield Reason(CODE, said, NC_ADVICE)
         return
-    a, b = (min(row, window.n) for row in evidence.moving)
+    a, b = (min(row, window.n) for row in signals.motion_range)
     speed = _course(window.position_mm, window)
     if speed is None or b - a < 8:
         return

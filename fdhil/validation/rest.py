@@ -13,8 +13,9 @@ from fdhil.identification.motion import Noise
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.windows import carried, smooth
 from fdhil.records import Reason, Window
-from fdhil.validation.evidence import Evidence
 from fdhil.validation.significance import BUDGET
+from fdhil.validation.table_assessment import TableAssessment
+from fdhil.validation.window_fit import WindowFit
 
 Rows = np.ndarray[tuple[int], np.dtype[np.intp]]
 
@@ -27,29 +28,29 @@ HOLDING_SHARE = 1.15  # a drive at rest may hold as much as dry friction drags, 
 LEAST_TORQUE = 0.01
 
 
-def rest_faults(evidence: Evidence) -> Iterator[Reason]:
+def rest_faults(fitted: WindowFit) -> Iterator[Reason]:
     """Yield the sensors whose zero the rows at standstill contradict."""
-    window, fit, noise = evidence.window, evidence.on_time, evidence.noise
-    rows = np.flatnonzero(evidence.at_rest)
-    if rows.size < ROWS or (window.voltage_v is None and window.slow_voltage is None):
+    window, fit, noise = fitted.window, fitted.aligned_fit, fitted.signals.noise
+    rows = np.flatnonzero(fitted.signals.standstill)
+    if rows.size < ROWS or not fitted.signals.has_voltage:
         return
     speed = float(np.mean(window.speed_rad_s[rows]))
     limit = max(SURE * noise.speed_rad_s / np.sqrt(rows.size), LEAST_SPEED * window.rapid_speed_rad_s)
     if abs(speed) > limit:
         text = f"speed reads {speed:+.3g} rad/s at standstill, limit {limit:.2g}"
         yield Reason("CalibrationSuspect", text, "set the zero of the speed sensor at standstill")
-    yield from _contradiction(window, fit, noise, rows, evidence.lost_v)
+    yield from _contradiction(window, fit, noise, rows, fitted.lost_voltage_v)
 
 
-def friction_at_rest(evidence: Evidence) -> Iterator[Reason]:
+def friction_at_rest(table: TableAssessment) -> Iterator[Reason]:
     """Yield what friction holds at standstill, or takes to begin to move, that the model does not have."""
-    window, fit = evidence.window, evidence.on_time
-    rows = np.flatnonzero(evidence.at_rest)
-    if rows.size < ROWS or (window.voltage_v is None and window.slow_voltage is None):
+    fitted, signals = table.fitted, table.signals
+    rows = np.flatnonzero(signals.standstill)
+    if rows.size < ROWS or not signals.has_voltage:
         return
-    yield from _holding(window, fit, rows)
-    if (late := evidence.breakaway) is not None:
-        yield evidence.with_cost(late.reason(), evidence.breakaway_um(late))
+    yield from _holding(fitted.window, fitted.aligned_fit, rows)
+    if (late := fitted.breakaway) is not None:
+        yield table.append_cost(late.reason(), table.compute_breakaway_um(late))
 
 
 def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows, lost_v: float) -> Iterator[Reason]:

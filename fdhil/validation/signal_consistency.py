@@ -17,7 +17,7 @@ from fdhil.identification.motion import resolution
 from fdhil.identification.normal import solve
 from fdhil.identification.windows import bridged, carried, smooth
 from fdhil.records import Float, Reason, Recording, Window
-from fdhil.validation.evidence import Evidence, Signal
+from fdhil.validation.window_signals import SensorSignal, WindowSignals
 
 UNITS: Mapping[str, str] = {"voltage": "V", "current": "A", "speed": "rad/s", "position": "mm", "demand": "mm"}
 LEAST_FOLLOWED: Mapping[str, float] = {"voltage": 0.5, "current": 0.3}  # of their variance, by a rapid of any drive
@@ -49,9 +49,9 @@ def travel_mm(speed_rad_s: Float, dt_s: float, pitch_mm: float) -> Float:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def dead_signals(evidence: Evidence) -> Iterator[Reason]:
+def dead_signals(signals: WindowSignals) -> Iterator[Reason]:
     """Yield a reason for each signal that does not change while the axis moves, and for a demand that jumps."""
-    window, (begin, end) = evidence.recorded or evidence.window, evidence.moving
+    window, (begin, end) = signals.recorded or signals.window, signals.motion_range
     if not np.isfinite(window.speed_rad_s).any():
         return
     travel = travel_mm(window.speed_rad_s, window.dt_s, window.pitch_mm)
@@ -66,7 +66,7 @@ def dead_signals(evidence: Evidence) -> Iterator[Reason]:
         if moving.size >= LEAST_SAMPLES and np.ptp(moving) == 0.0:
             yield _stands_still(name, float(moving[0]), moved_mm)
         elif name == "demand":
-            yield from _jump_of_demand(evidence, values)
+            yield from _jump_of_demand(signals, values)
 
 
 def _stands_still(name: str, value: float, moved_mm: float) -> Reason:
@@ -74,22 +74,23 @@ def _stands_still(name: str, value: float, moved_mm: float) -> Reason:
     return Reason("StuckValue", text, f"check the {name} sensor or the object's mapping")
 
 
-def _jump_of_demand(evidence: Evidence, demand: Float) -> Iterator[Reason]:
+def _jump_of_demand(signals: WindowSignals, demand: Float) -> Iterator[Reason]:
     """Yield a reason where the demand goes farther from sample to sample than a rapid does in an NC's longest cycle."""
-    window = evidence.window
+    window = signals.window
     speed_mm_s = float(np.abs(smooth(window.speed_rad_s, window.dt_s)).max()) * window.pitch_mm / (2 * math.pi)
     steps = np.abs(np.diff(bridged(demand)))
     row = int(np.argmax(steps))
     if steps[row] > speed_mm_s * max(LONGEST_CYCLE_S, 2.0 * window.dt_s) + resolution(demand[np.isfinite(demand)]):
         takes = f"the axis takes {1e3 * steps[row] / speed_mm_s:.0f} ms for that" if speed_mm_s else "the speed is zero"
-        text = f"demand jumps by {steps[row]:.4g} mm at {evidence.time_s(row):.3f} s, as after a pause or lost samples"
-        yield Reason("StuckValue", f"{text}: {takes}", "check where the demand is recorded, or the object's mapping")
+        jump = f"demand jumps by {steps[row]:.4g} mm at {signals.get_time_s(row):.3f} s"
+        text = f"{jump}, as after a pause or lost samples: {takes}"
+        yield Reason("StuckValue", text, "check where the demand is recorded, or the object's mapping")
 
 
-def copied_signals(evidence: Evidence) -> Iterator[Reason]:
+def copied_signals(signals: WindowSignals) -> Iterator[Reason]:
     """Yield a reason for each two signals of which one is the other times a constant in every row."""
-    begin, end = evidence.moving
-    moving = {name: carried(values)[begin:end] for name, values in recorded_signals(evidence.window).items()}
+    begin, end = signals.motion_range
+    moving = {name: carried(values)[begin:end] for name, values in recorded_signals(signals.window).items()}
     for (one, values), (other, others) in combinations(moving.items(), 2):
         power = float(others @ others)
         if values.size < LEAST_SAMPLES or np.ptp(values) == 0.0 or not 0.0 < power < math.inf:
@@ -100,14 +101,14 @@ def copied_signals(evidence: Evidence) -> Iterator[Reason]:
             yield Reason("Implausible", text, "correct which column or object is which signal")
 
 
-def unrelated_signals(evidence: Evidence) -> Iterator[Reason]:
+def unrelated_signals(signals: WindowSignals) -> Iterator[Reason]:
     """Yield a reason for voltage and current where speed and acceleration explain too little of them."""
-    window = evidence.window
-    begin, end = evidence.moving
+    window = signals.window
+    begin, end = signals.motion_range
     speed = smooth(window.speed_rad_s, window.dt_s)
     motion = np.stack([np.ones(window.n), speed, np.gradient(speed, window.dt_s)])
-    signals = {k: v for k, v in recorded_signals(window).items() if k in LEAST_FOLLOWED}
-    parts = {name: (motion[:, begin:end], smooth(v, window.dt_s)[begin:end]) for name, v in signals.items()}
+    followed = {k: v for k, v in recorded_signals(window).items() if k in LEAST_FOLLOWED}
+    parts = {name: (motion[:, begin:end], smooth(v, window.dt_s)[begin:end]) for name, v in followed.items()}
     slow = window.slow_voltage
     if slow is not None:
         rows = slow.begin_s / window.dt_s + (np.arange(slow.voltage_v.size) + 0.5) * slow.period_s / window.dt_s
@@ -167,19 +168,19 @@ def table_faults(window: Window, moving: tuple[int, int]) -> Mapping[str, Reason
     return found
 
 
-def position_confirms(evidence: Evidence, signal: Signal, start: int, end: int) -> bool:
+def position_confirms(window: Window, signal: SensorSignal, start: int, end: int) -> bool:
     """Return whether the position travels as the speed says that repeats one reading in rows ``start`` to ``end`` - 1.
 
     A speed that is read in steps may lie half a step beside its reading, and the position one of its own.
     """
-    position = evidence.window.position_mm[start:end]
+    position = window.position_mm[start:end]
     known = np.isfinite(position)
     if signal.name != "speed" or np.count_nonzero(known) < 3 or np.ptp(position[known]) == 0.0:
         return False
-    to_mm = evidence.window.pitch_mm / (2 * math.pi) * evidence.window.dt_s
+    to_mm = window.pitch_mm / (2 * math.pi) * window.dt_s
     rows = np.flatnonzero(known) - np.flatnonzero(known)[0]
     beside = position[known] - position[known][0] - signal.values[start] * to_mm * rows
-    steps = STEPS_BESIDE * resolution(evidence.window.position_mm[np.isfinite(evidence.window.position_mm)])
+    steps = STEPS_BESIDE * resolution(window.position_mm[np.isfinite(window.position_mm)])
     return bool((np.abs(beside) <= signal.step / 2 * to_mm * rows + steps).all())
 
 

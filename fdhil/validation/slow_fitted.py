@@ -16,33 +16,33 @@ from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_start import sample_rows
 from fdhil.identification.slow_voltage import innovations_of
 from fdhil.records import Reason, SlowVoltage
-from fdhil.validation.evidence import Evidence
 from fdhil.validation.sensor_reconstruction import log_beyond
 from fdhil.validation.significance import BUDGET
 from fdhil.validation.slow_readings import LEAST_NOISE_SAMPLES, likely_same, runs
+from fdhil.validation.window_fit import WindowFit
 
 LEAST_OFFSET = 0.01  # of the peak of voltage or current
 LEAST_AT_REST = 12  # samples: with fewer, their own scatter is not known
 
 
-def slow_faults_beside(evidence: Evidence) -> Iterator[Reason]:
+def slow_faults_beside(fitted: WindowFit) -> Iterator[Reason]:
     """Yield what the samples of a slow voltage contradict of the model fitted to the window."""
-    slow, fit = evidence.window.slow_voltage, evidence.judged
+    slow, fit = fitted.window.slow_voltage, fitted.required_fit
     if slow is None or np.count_nonzero(np.isfinite(slow.voltage_v)) < LEAST_NOISE_SAMPLES:
         return
     if not (np.isfinite(fit.theta).all() and (fit.theta[:4] > 0).all()):
         return
-    yield from _stuck(evidence, slow)
-    yield from _off_at_rest(evidence, slow)
+    yield from _stuck(fitted, slow)
+    yield from _off_at_rest(fitted, slow)
 
 
-def _stuck(evidence: Evidence, slow: SlowVoltage) -> Iterator[Reason]:
+def _stuck(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
     """Yield a reason for a run of equal samples that the sensor's noise and the model let happen by no chance.
 
     That noise alone leaves a constant's reading alike, and that the model is as far from it by chance, are both needed
     of a sensor that works.
     """
-    fit, volts = evidence.judged, slow.voltage_v
+    fit, volts = fitted.required_fit, slow.voltage_v
     motion = fit.problem.motions[0]
     noise = fit.problem.noises[0].vector() ** 2
     made = innovations_of(motion, fit.theta, noise, float(fit.theta[6]))
@@ -55,22 +55,22 @@ def _stuck(evidence: Evidence, slow: SlowVoltage) -> Iterator[Reason]:
         squares = float(beyond[start + 1 : end] @ beyond[start + 1 : end])
         count = end - start - 1
         if math.log(volts.size) + count * same + min(log_beyond(squares, count), 0.0) < limit:
-            at = evidence.window.start_s + slow.begin_s + start * slow.period_s
+            at = fitted.window.start_s + slow.begin_s + start * slow.period_s
             lasts = 1e3 * (end - start) * slow.period_s
             text = f"voltage repeats {volts[start]:.6g} V for {lasts:.0f} ms from {at:.3f} s, current and speed do not"
             yield Reason("StuckValue", text, "check the sensor or the object's mapping")
             return
 
 
-def _off_at_rest(evidence: Evidence, slow: SlowVoltage) -> Iterator[Reason]:
+def _off_at_rest(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
     """Yield a reason where u = R i does not hold at standstill: there nothing else is asked of the model.
 
     The rapid's own rows tell an offset badly, for R and K imitate most of it.
     """
-    window, fit = evidence.window, evidence.judged
+    window, fit = fitted.window, fitted.required_fit
     theta = fit.theta
-    rows, begin = sample_rows(window, float(theta[6]), evidence.settings.lowpass_hz)
-    time, rest = np.arange(window.n) * window.dt_s, evidence.at_rest.astype(np.float64)
+    rows, begin = sample_rows(window, float(theta[6]), fitted.signals.settings.lowpass_hz)
+    time, rest = np.arange(window.n) * window.dt_s, fitted.signals.standstill.astype(np.float64)
     lasts = slow.period_s if window.voltage_sampling == "interval_mean" else 0.0
     ends = [np.interp(at, time, rest) for at in (begin - window.dt_s, begin + lasts / 2, begin + lasts + window.dt_s)]
     still = rows[np.min(ends, axis=0) == 1.0]

@@ -14,7 +14,6 @@ import numpy as np
 from fdhil.identification.motion import resolution
 from fdhil.identification.windows import carried, noise_of, runs_of, smooth
 from fdhil.records import Float, Reason, Window
-from fdhil.validation.evidence import Evidence
 from fdhil.validation.repeated_readings import alike
 from fdhil.validation.significance import BUDGET
 
@@ -27,9 +26,8 @@ LEAST_NOISE = 0.2  # of a step: what hides in the resolution
 LEAST_NOISE_SAMPLES = 20
 
 
-def slow_voltage_faults(evidence: Evidence) -> Iterator[Reason]:
+def slow_voltage_faults(window: Window) -> Iterator[Reason]:
     """Yield a reason where the samples of a slow voltage sensor repeat themselves, or lie at the sensor's limit."""
-    window = evidence.window
     slow = window.slow_voltage
     if slow is None or window.n == 0 or np.count_nonzero(np.isfinite(slow.voltage_v)) < LEAST_NOISE_SAMPLES:
         return

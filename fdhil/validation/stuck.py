@@ -17,12 +17,13 @@ import numpy as np
 
 from fdhil.identification.windows import runs_of
 from fdhil.records import Bool, Float, Reason
-from fdhil.validation.evidence import Evidence, Signal
 from fdhil.validation.plausibility import RAIL_SAMPLES
 from fdhil.validation.repeated_readings import LEAST_NOISE_ROWS, SIDE, alike, beyond_chance, wakes_with_a_jump
 from fdhil.validation.sensor_reconstruction import Bridge
 from fdhil.validation.signal_consistency import position_confirms
 from fdhil.validation.significance import BUDGET
+from fdhil.validation.window_fit import WindowFit
+from fdhil.validation.window_signals import SensorSignal
 
 NOISES = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
 SHORTEST_S = 0.003
@@ -41,7 +42,7 @@ WITHIN_STEP = 0.3  # of a step: how far from its middle a constant may lie that 
 class Readings:
     """One sensor over the window: ``steps`` (n,) in units of its resolution, and the half-open rows of the move."""
 
-    signal: Signal
+    signal: SensorSignal
     begin: int
     end: int
     dt_s: float
@@ -66,13 +67,14 @@ class Readings:
         return beyond_chance(self.steps[self.begin : self.end], start - self.begin, last - self.begin)
 
 
-def stuck_values(evidence: Evidence) -> Iterator[Reason]:
+def stuck_values(fitted: WindowFit) -> Iterator[Reason]:
     """Yield a reason for each sensor that surely stuck during the move; without a fit, its own rows alone are asked."""
-    begin, end = evidence.moving
-    for signal in evidence.sensors:
+    signals = fitted.signals
+    begin, end = signals.motion_range
+    for signal in signals.varying_sensors:
         if signal.step == 0.0:
             continue
-        readings = Readings(signal, begin, end, evidence.window.dt_s)
+        readings = Readings(signal, begin, end, signals.window.dt_s)
         same = np.diff(signal.values[begin:end]) == 0.0
         held = _update_rows(same)
         if held > 1 and held * readings.dt_s >= TOLD_S:
@@ -83,12 +85,12 @@ def stuck_values(evidence: Evidence) -> Iterator[Reason]:
             continue
         limit = BUDGET["stuck"].log_chance - math.log(np.count_nonzero(~same) + 2)
         runs = ((begin + start, begin + last) for start, last in runs_of(same)[:LONGEST_RUNS])
-        stuck = next((run for run in runs if _is_stuck(evidence, readings, *run, limit)), None)
+        stuck = next((run for run in runs if _is_stuck(fitted, readings, *run, limit)), None)
         if stuck is not None:
-            lasts_ms = 1e3 * (stuck[1] - stuck[0] + 1) * evidence.window.dt_s
+            lasts_ms = 1e3 * (stuck[1] - stuck[0] + 1) * signals.window.dt_s
             text = (
                 f"{signal.name} repeats {signal.values[stuck[0]]:.6g} {signal.unit} for {lasts_ms:.0f} ms "
-                f"from {evidence.time_s(stuck[0]):.3f} s while the axis moves"
+                f"from {signals.get_time_s(stuck[0]):.3f} s while the axis moves"
             )
             yield Reason("StuckValue", text, "check the sensor or the object's mapping")
 
@@ -101,15 +103,15 @@ def _update_rows(same: Bool) -> int:
     return rows if surely else 1
 
 
-def clipped_peaks(evidence: Evidence) -> Iterator[Reason]:
+def clipped_peaks(fitted: WindowFit) -> Iterator[Reason]:
     """Yield a reason for each sensor whose extreme was cut off where its rows do not show it by themselves.
 
     Model and the other sensors tell where it should have been.
     """
-    fit, bridge = evidence.judged, evidence.bridge
+    signals, fit, bridge = fitted.signals, fitted.required_fit, fitted.reconstruction
     if bridge is None:
         return
-    for signal in evidence.sensors:
+    for signal in signals.varying_sensors:
         noise, values = getattr(fit.problem.noises[0], NOISES[signal.name]), signal.values
         for rail in (np.nanmax(values), np.nanmin(values)):
             runs = runs_of(values == rail, RAIL_SAMPLES) if rail != 0.0 else []
@@ -119,34 +121,34 @@ def clipped_peaks(evidence: Evidence) -> Iterator[Reason]:
                 crossing = bridge.crossing(signal.name, start, end)
                 if crossing is None:
                     continue
-                if position_confirms(evidence, signal, start, end):
+                if position_confirms(signals.window, signal, start, end):
                     continue
                 if crossing.log_chance(start, end, float(rail), float(noise)) >= BUDGET["cut off"].log_chance:
                     continue
                 text = (
                     f"{signal.name} stays at its extreme {rail:.6g} {signal.unit} for {end - start} samples from "
-                    f"{evidence.time_s(start):.3f} s, where the other signals tell more"
+                    f"{signals.get_time_s(start):.3f} s, where the other signals tell more"
                 )
                 yield Reason("Saturated", text, "use a larger measuring range")
                 break
 
 
-def _is_stuck(evidence: Evidence, readings: Readings, start: int, last: int, limit: float) -> bool:
+def _is_stuck(fitted: WindowFit, readings: Readings, start: int, last: int, limit: float) -> bool:
     """Return whether rows ``start`` to ``last``, all alike, are less likely than ``limit`` by every explanation."""
     if (last - start) < max(2, round(SHORTEST_S / readings.dt_s)):
         return False
     if readings.steps[start] in readings.rails:
         return False  # that is for saturation to explain
-    if readings.noise < MOST_NOISE and position_confirms(evidence, readings.signal, start, last + 1):
+    if readings.noise < MOST_NOISE and position_confirms(fitted.window, readings.signal, start, last + 1):
         return False
-    computed = readings.signal.name == "speed" and evidence.window.speed_late_s is not None
+    computed = readings.signal.name == "speed" and fitted.window.speed_late_s is not None
     if not computed and _quieter_than_noise(readings, start, last, limit):
         return True
     if (last - start) * readings.dt_s < (COMPUTED * TOLD_S if computed else TOLD_S):
         return False
     if readings.beyond_chance(start, last):
         return True
-    bridge = evidence.bridge
+    bridge = fitted.reconstruction
     if bridge is None:
         part = readings.steps[readings.begin : readings.end]
         return wakes_with_a_jump(part, start - readings.begin, last - readings.begin)

@@ -12,11 +12,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from fdhil.identification.fit import Fit, but_delay, descend, with_delay
-from fdhil.identification.fit import fit as fitted
+from fdhil.identification.fit import fit as refit
 from fdhil.records import Reason
-from fdhil.validation.evidence import Evidence
 from fdhil.validation.shifts import LARGEST, Shift, shifts
 from fdhil.validation.significance import BUDGET
+from fdhil.validation.window_fit import WindowFit
 
 DOUBTFUL = 0.5  # samples: a delay that may be larger is searched for
 TOLD = 2.5  # standard deviations
@@ -27,20 +27,20 @@ FOUND = 0.1  # samples
 LATE = (1.5, 2.0, 2.5, 3.0)  # samples that a winding shorter than a sample is weighed against
 
 
-def voltage_late(evidence: Evidence) -> Iterator[Reason]:
+def voltage_late(fitted: WindowFit) -> Iterator[Reason]:
     """Yield a reason where the fit itself needs a delay of more than a sample."""
-    late_s = evidence.late_s
+    late_s = fitted.voltage_delay_s
     if late_s:
-        period_s = max(evidence.window.dt_s, evidence.judged.problem.motions[0].voltage_period_s)
+        period_s = max(fitted.window.dt_s, fitted.required_fit.problem.motions[0].voltage_period_s)
         yield _reason("voltage", "current and speed", late_s, period_s)
 
 
-def timing_faults(evidence: Evidence) -> Iterator[Reason]:
+def timing_faults(fitted: WindowFit) -> Iterator[Reason]:
     """Yield the signal that is late or early by more than a sample, with the figure."""
-    window, fit = evidence.window, evidence.on_time
+    window, fit = fitted.window, fitted.aligned_fit
     if fit.problem.motions[0].slow is not None:
         return  # there the delay is one of the parameters
-    voltage, current = evidence.shifts
+    voltage, current = fitted.delays
     if current.sure and abs(current.samples) * voltage.std > abs(voltage.samples) * current.std:
         yield _reason("current", "voltage and speed", current.samples * window.dt_s, window.dt_s)
         return
@@ -95,7 +95,7 @@ def searched(fit: Fit, first: Shift) -> float | None:
 
     def left(delay: float) -> float:
         nonlocal last
-        last = fitted([motion], with_delay(last.theta, delay * motion.dt_s), but_delay(last.free))
+        last = refit([motion], with_delay(last.theta, delay * motion.dt_s), but_delay(last.free))
         if not (np.isfinite(last.residuals).all() and np.isfinite(last.information).all()):
             return float("nan")
         return shifts(last)[0].samples - delay

@@ -10,8 +10,8 @@ import numpy as np
 from fdhil.identification.normal import inverse_gram
 from fdhil.identification.without_voltage import TorqueFit, candidates, effective_rows, late_s
 from fdhil.records import Reason, rms
-from fdhil.validation.evidence import Evidence
 from fdhil.validation.significance import BUDGET
+from fdhil.validation.window_signals import WindowSignals
 
 EDGES = 20  # instants at which a load may begin or end
 LEAST_LOAD = 0.05  # of the peak current: a screw's friction differs from place to place by less
@@ -20,12 +20,9 @@ LATE_ROWS = 1.0
 IMITATED = 1e-6  # of a course's power, below which only rounding is left of it
 
 
-def torque_late(evidence: Evidence) -> Iterator[Reason]:
+def torque_late(fitted: TorqueFit, dt: float) -> Iterator[Reason]:
     """Yield a reason where the current is late or early against the motion by surely more than a row."""
-    if evidence.torque is None:
-        return
-    late, std = late_s(evidence.torque)
-    dt = evidence.window.dt_s
+    late, std = late_s(fitted)
     if abs(late) > LATE_ROWS * dt + BUDGET["timing"].deviations * std:
         side = "late" if late > 0 else "early"
         text = f"current is {1e3 * abs(late):.2f} ms {side} against the motion, more than a row of {1e3 * dt:.3g} ms"
@@ -42,16 +39,13 @@ class Load:
     end: int
 
 
-def load_comes_and_goes(evidence: Evidence) -> Iterator[Reason]:
+def load_comes_and_goes(fitted: TorqueFit, signals: WindowSignals) -> Iterator[Reason]:
     """Yield a reason where a torque acts over a part of the move that neither the model nor friction explains."""
-    fitted = evidence.torque
-    if fitted is None:
-        return
     load = surest_load(fitted)
     least = LEAST_LOAD * float(np.abs(fitted.current).max())
     if abs(load.amplitude) > max(least, BUDGET["structure"].deviations * load.std):
         rows = np.flatnonzero(fitted.rows.usable)
-        a, b = (evidence.time_s(int(row)) for row in rows[[load.begin, load.end - 1]])
+        a, b = (signals.get_time_s(int(row)) for row in rows[[load.begin, load.end - 1]])
         text = f"a torque as of {load.amplitude:+.3g} A that is no friction acts from {a:.3f} to {b:.3f} s"
         yield Reason(
             "LoadDetected",
@@ -85,10 +79,9 @@ def surest_load(fitted: TorqueFit) -> Load:
     return Load(amplitude, std, begin, end)
 
 
-def torque_unexplained(evidence: Evidence) -> Iterator[Reason]:
+def torque_unexplained(fitted: TorqueFit) -> Iterator[Reason]:
     """Yield a reason where the model leaves more of the torque than a good one does."""
-    fitted = evidence.torque
-    if fitted is None or not fitted.unexplained > LARGEST_SHARE:
+    if not fitted.unexplained > LARGEST_SHARE:
         return
     text = f"the model leaves {fitted.unexplained:.1%} of the torque unexplained, limit {LARGEST_SHARE:.0%}"
     advice = "the drive does what the model does not have, or current and speed are not of one instant"

@@ -16,8 +16,8 @@ from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
 from fdhil.records import Recording, Window, frozen
-from fdhil.validation import Evidence
 from fdhil.validation.signal_consistency import missing_move
+from fdhil.validation.window_signals import WindowSignals
 from studies import real_plant
 from studies.bench import Array, shuttle
 from studies.real_plant import SLOW, SLOW_LOOPS, Sensors
@@ -126,7 +126,7 @@ def test_coarse_encoder_at_constant_speed_is_not_stuck(counts: int, kind: str) -
 def test_speed_sensor_that_sticks_while_the_axis_goes_on_is_named() -> None:
     recording = plant("slow").recording()
     (window,) = find_windows(recording)
-    begin = Evidence(window, SETTINGS).moving[0] + 20
+    begin = WindowSignals(window, SETTINGS).motion_range[0] + 20
     speed = np.array(window.speed_rad_s)
     speed[begin : begin + 60] = speed[begin]
     text = " ".join(r.text for r in analyse(replace(window, speed_rad_s=frozen(speed)), SETTINGS).verdict.reasons)

@@ -11,8 +11,9 @@ from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.records import Window, frozen
-from fdhil.validation import Evidence
 from fdhil.validation.stuck import noise_steps, stuck_values
+from fdhil.validation.window_fit import WindowFit
+from fdhil.validation.window_signals import WindowSignals
 from studies import drives, faults, signal_faults
 from studies.scenes import Sensor, demand_of, measured, recorded
 from tests.identification.recorded import windows
@@ -77,7 +78,8 @@ def test_a_coarse_sensor_that_sticks_is_told_by_its_neighbours() -> None:
         changes = [np.count_nonzero(np.diff(values[k : k + 60])) for k in rows]
         start = rows[int(np.argmax(changes))]
         assert max(changes) > 10
-        found = list(stuck_values(Evidence(_stuck(window, "current", start, 60), SETTINGS)))
+        signals = WindowSignals(_stuck(window, "current", start, 60), SETTINGS)
+        found = list(stuck_values(WindowFit(signals)))
         refused += any("current repeats" in reason.text for reason in found)
     assert refused == 4
 
