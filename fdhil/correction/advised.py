@@ -1,4 +1,4 @@
-"""Advises feeds without and with the correction: what the path may be run at, and how that is told as JSON."""
+"""Advises feeds without and with the correction, and builds the advice's JSON document."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def sources(
     config: MachineConfig,
     tolerance_um: float,
 ) -> tuple[Source, Source | None]:
-    """Return what makes the path at other feeds; of a demand (``motions`` None) a sure one and a hopeful one."""
+    """Return the path at other feeds; of a demand (``motions`` None) a cautious and a hopeful one."""
     if motions is None:
         return demand_sources(reference, models, config, tolerance_um)
     return program_source(list(motions), config), None
@@ -38,9 +38,9 @@ def advised(
     config: MachineConfig,
     tolerance_um: float,
 ) -> tuple[tuple[Advice, ...], dict[float, Advice] | None]:
-    """Return the advice by the sure source, and by the start of each stretch that by the hopeful one.
+    """Return the advice by the sure source, and that by the hopeful one by the start of each segment.
 
-    The correction is tried where every axis may have one.
+    The correction is tried if every axis allows one.
     """
     corrects = all(config.axis[axis].correction is not None for axis in models)
     judge = (lambda slower: corrected_contour_um(slower, models, config)) if corrects else None
@@ -51,7 +51,7 @@ def advised(
 
 
 def corrected_contour_um(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> Float:
-    """Contour error (n,) with the correction; where it is refused, inf in the rows at fault, the others unknown."""
+    """Return the contour error (n,) with the correction; if refused, inf in the rows at fault, NaN in the others."""
     planned = plan(reference, models, config)
     if not planned.refused:
         return planned.after.contour_um
@@ -68,7 +68,7 @@ def corrected_contour_um(reference: Trajectory, models: Mapping[str, Parameters]
 
 
 def entry(advice: Advice, most: Mapping[float, Advice] | None) -> dict[str, Any]:
-    """Return the advice for one stretch as JSON has it; ``most`` is that by the hopeful source."""
+    """Return the JSON document of a segment's advice; ``most`` is the advice by the hopeful source."""
     axis, what, share = advice.load
     asked = {"axis": axis, "what": what, "share": share}
     told = {

@@ -1,4 +1,4 @@
-"""A prediction, and a correction, as JSON has them."""
+"""Builds the JSON documents of a prediction and of a correction."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def prediction_document(predicted: Prediction, models: Mapping[str, Parameters])
 def correction_document(
     program: str, planned: Correction, predicted: Gain, models: Mapping[str, Parameters]
 ) -> dict[str, Any]:
-    """Return a correction: the prediction without it, what it leaves, its gain, and why it is refused where it is."""
+    """Return a correction: the prediction without it, its residual, its gain, and why it is refused if it is."""
     before, after = contour(planned.before), contour(planned.after) | {"rms_um": predicted.after_um}
     return {
         "schema": "fdhil-correct-1",
@@ -52,12 +52,12 @@ def contour(predicted: Prediction) -> dict[str, float]:
 
 
 def seen_at(models: Mapping[str, Parameters]) -> dict[str, str]:
-    """Return per axis where it is predicted: what a table does behind its motor only a known resonance tells."""
+    """Return per axis the point of prediction: the table if the model has a resonance, else the encoder."""
     return {axis: "table" if model.term("resonance") else "encoder" for axis, model in models.items()}
 
 
 def zones(predicted: Prediction) -> list[dict[str, Any]]:
-    """Return the zones with the line of each one's worst place."""
+    """Return the zones with the line of each one's largest error."""
     return [
         {
             "start_s": z.start_s,

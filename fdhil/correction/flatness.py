@@ -1,9 +1,9 @@
-"""Plans an on-line feed-forward: the drive is flat, its position tells speed and torque ([ROT 99] as [DES] proposes).
+"""Plans an on-line feed-forward: the drive is flat, speed and torque follow from its position ([ROT 99], [DES]).
 
-With w = r' 2 pi / pitch, equation [2] gives the torque Jt w' + ft w + Cd sign(w) that follows the path, with what the
-model has of terms; sent as torque offset (0x60B2), the speed loop has only the model's error left to do. What the
-drive's own feed-forward leaves out of the speed, or feeds forward half a cycle too early, is the speed offset (0x60B1).
-The position offset (0x60B0) stays 0. Each row needs two rows of look-ahead.
+With w = r' 2 pi / pitch, equation [2] gives the torque Jt w' + ft w + Cd sign(w) that follows the path, and the model's
+terms; sent as torque offset (0x60B2), it leaves only the model's error to the speed loop. The speed offset (0x60B1) is
+the part of the speed that the drive's own feed-forward lacks, or feeds forward half a cycle too early. The position
+offset (0x60B0) stays 0. Each row needs two rows of look-ahead.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def plan(reference: Trajectory, models: Mapping[str, Parameters], config: Machin
 def offsets(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: float) -> tuple[Float, Float]:
     """Return the speed offset (rad/s) and torque offset (N.m), (n,) each, of one axis.
 
-    The torque offset is in the drive's own torque: it turns N.m into current with the nominal torque constant.
+    The torque offset is in the drive's own torque: the drive converts N.m to current with the nominal torque constant.
     """
     p = parameters
     lead = lead_s(parameters, axis)
@@ -42,11 +42,11 @@ def offsets(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: float
     acceleration = np.gradient(demanded, dt_s)
     turning = np.where(np.abs(demanded) > STILL_RAD_S, demanded, 0.0)
     smooth, dry = resisting(p, turning, reference_mm * 2 * np.pi / axis.screw_pitch_mm)
-    # a load acts at rest too: what stands still while the axis does, the speed loop's integral holds by itself
+    # a load acts at rest too: there the speed loop's integral holds it
     current = (p.Jt * acceleration + smooth + dry - p.term("load")) / p.K
     times = np.arange(reference_mm.size) * dt_s
     early = np.interp(times + lead, times, current)
-    # what the drive feeds forward itself is the acceleration of the next row, held: half a cycle ahead as well
+    # the drive's own feed-forward is the acceleration of the next row, held: half a cycle ahead as well
     own = axis.regulators.torque_feedforward * axis.nominal.Jt / axis.nominal.K
     early -= own * np.interp(times + 0.5 * dt_s, times, acceleration)
     # the drive feeds forward the slope of the cycle that begins: half a cycle ahead of the speed at its row
@@ -61,5 +61,5 @@ def offsets(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: float
 
 
 def lead_s(parameters: Parameters, axis: Axis) -> float:
-    """Return by how much earlier the current must be asked for: the current loop's lag and half a hold."""
+    """Return the lead of the current command: the current loop's lag and half a hold."""
     return parameters.L / axis.regulators.current_kp + 0.5 * axis.regulators.speed_period_s

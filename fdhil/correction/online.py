@@ -1,8 +1,8 @@
-"""Finds the on-line feed-forward's law: speed and torque offsets as weights on the last targets that an NC has sent.
+"""Derives the on-line feed-forward's law: speed and torque offsets as weights of the last targets sent by an NC.
 
-The drive is flat ([DES], conclusion): its position tells speed and torque. On line only the past is known, so speed and
-acceleration are those of a polynomial through the last targets, by least squares, taken one cycle and the current
-loop's lag further on. That makes each offset a weighted sum of targets: whole numbers, cheap enough for every SYNC.
+The drive is flat ([DES], conclusion): speed and torque follow from its position. On line only the past is known, so
+speed and acceleration are those of a polynomial through the last targets, by least squares, extrapolated by one cycle
+and the current loop's lag. That makes each offset a weighted sum of targets: integers, cheap enough for every SYNC.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from fdhil.prediction.model_terms import mean_friction
 from fdhil.records import Float, Parameters
 
 ONE = 1 << 24  # the weights' scale
-AHEAD_CYCLES = 1.0  # from the newest target that is known to the one that the offset goes with
+AHEAD_CYCLES = 1.0  # from the newest known target to the one that the offset is sent with
 SPEED_ROWS, SPEED_ORDER = 8, 2
 ACCELERATION_ROWS, ACCELERATION_ORDER = 20, 4
-DRY_INCREMENTS = 0.5  # per cycle: from this speed on dry friction acts in full; below, rounding makes the direction
+DRY_INCREMENTS = 0.5  # per cycle: full dry friction from this speed on; below, rounding determines the direction
 FEEDFORWARD_EARLY_CYCLES = 0.5  # by which the drive's own speed feed-forward leads the speed at its row
 
 
 def derivative_weights(rows: int, order: int, ahead: float, which: int) -> Float:
     """Return (rows,) weights, newest first: the ``which``-th derivative, per cycle, ``ahead`` cycles from the newest.
 
-    A polynomial of ``order`` is laid through the rows by least squares.
+    A polynomial of ``order`` is fitted to the rows by least squares.
     """
     powers = np.vander(-np.arange(float(rows)), order + 1, increasing=True)
     at = [math.perm(k, which) * ahead ** (k - which) if k >= which else 0.0 for k in range(order + 1)]
@@ -37,10 +37,10 @@ def derivative_weights(rows: int, order: int, ahead: float, which: int) -> Float
 
 
 def law(parameters: Parameters, axis: Axis, sync_period_s: float) -> Mapping[str, Any]:
-    """Return the law of one axis as the guard takes it: ``speed``, ``torque``, ``pace`` weights and ``dry``.
+    """Return the law of one axis in the guard's form: ``speed``, ``torque``, ``pace`` weights and ``dry``.
 
-    In the drive's counts: increments/s, 0.1 % of the rated torque. What the drive feeds forward itself is left to it.
-    Friction is the mean of both directions; a load is held by the drive's own integral.
+    In the drive's counts: increments/s, 0.1 % of the rated torque. The drive's own feed-forward is left to it. Friction
+    is the mean of both directions; a load is held by the drive's own integral.
     """
     p, g, period = mean_friction(parameters), axis.regulators, sync_period_s
     later = AHEAD_CYCLES + lead_s(p, axis) / period
@@ -70,6 +70,6 @@ def _added(one: Float, other: Float) -> Float:
 
 
 def _whole(weights: Float) -> list[int]:
-    """Leave out the newest row's weight: the ways are counted from it, and all weights together are 0."""
+    """Omit the newest row's weight: distances are counted from it, and the sum of all weights is 0."""
     scaled: Sequence[float] = (weights[1:] * ONE).tolist()
     return [round(weight) for weight in scaled]

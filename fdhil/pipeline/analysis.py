@@ -1,4 +1,4 @@
-"""Analyses one window: asks the checks of its signals, estimates, and asks the checks of the fit."""
+"""Analyses one window: align signals, check signals, estimate, check the fit, assess the error at the table."""
 
 from __future__ import annotations
 
@@ -36,24 +36,23 @@ from fdhil.validation.window_checks import (
 from fdhil.validation.window_fit import WindowFit
 from fdhil.validation.window_signals import LEAST_SAMPLES, WindowSignals
 
-# what solvers raise; scipy's raise ValueError for what is not finite
+# errors of solvers; scipy's raise ValueError for values that are not finite
 GAVE_UP = (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError, ValueError)
-SAME_PITCH = 0.01  # to which a recording and the section of its axis agree
-OVERRIDE = 2.0  # by which their rapid speeds may differ: an override slows what is recorded
-NOTICED = 0.2  # of what a model may leave: with less left no resonance is sought
+SAME_PITCH = 0.01  # tolerance between a recording and its axis' section
+OVERRIDE = 2.0  # factor by which their rapid speeds may differ: an override slows the recorded move
+NOTICED = 0.2  # of the allowed residual: below, no resonance is searched for
 UNFIT = "NotFinite"
-KEPT_FITS = 12  # of the newest windows: a recording's rapids, or those that tell of a drive's loops
+KEPT_FITS = 12  # of the newest windows: a recording's rapids, or those that identify a drive's loops
 LAG_ROWS = 0.75  # a speed that is a difference of positions is half a row late
 
 
 def analyse(
     window: Window, settings: Identification, axis: Axis | None = None, sync_period_s: float | None = None
 ) -> WindowOutcome:
-    """Return what one window says of the drive, and whether it is believed; never raises, whatever the data.
+    """Return the estimate and verdict of one window; never raises, whatever the data.
 
-    The speed is brought to the instants of its rows first; the outcome's window is as it was recorded. With the
-    ``axis``' section the rapid is replayed through the closed loop, whose set-points come every ``sync_period_s``
-    (left out: with every row).
+    The speed is aligned to its rows first; the outcome's window is as it was recorded. With the ``axis``' section the
+    rapid is replayed through the closed loop, whose set-points come every ``sync_period_s`` (default: every row).
     """
     axis = own(window, axis)
     at_instants, cycles = with_demand_on_time(mended(window, settings.speed_source), axis, sync_period_s)
@@ -63,18 +62,17 @@ def analyse(
 
 
 def _with_lead(outcome: WindowOutcome, cycles: int) -> WindowOutcome:
-    """Return the outcome with the lead of the recorded set-point as a warning."""
-    text = f"the recorded set-point is {cycles} cycles ahead of the one that the drive follows, and was taken later"
-    reason = Reason("SampleTiming", text, "record the drive's own set-point, or leave it: nothing else depends on it")
+    text = f"the recorded set-point is {cycles} cycles ahead of the one that the drive follows, and was delayed by that"
+    reason = Reason("SampleTiming", text, "record the drive's own set-point, or ignore this: it has no other effect")
     verdict = replace(outcome.verdict, warnings=(*outcome.verdict.warnings, reason))
     return replace(outcome, verdict=verdict)
 
 
 def _with_table(outcome: WindowOutcome, signals: WindowSignals) -> WindowOutcome:
-    """Return the outcome with what sensors at the table show: its true error, and a resonance.
+    """Return the outcome with the results of sensors at the table: the true error, and a resonance.
 
-    That takes the place of a configured one, or of one that the motor shows, and the window is analysed with it. A
-    sensor that does not move as the motor does is left out, with a warning.
+    Such a resonance replaces a configured one, or one seen by the motor, and the window is analysed with it. A sensor
+    that does not move as the motor does is left out, with a warning.
     """
     window, estimate, axis = signals.window, outcome.estimate, signals.axis
     if estimate is None or (window.table_mm is None and window.table_m_s2 is None):
@@ -90,7 +88,7 @@ def _with_table(outcome: WindowOutcome, signals: WindowSignals) -> WindowOutcome
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             found = compliance(window, estimate.parameters())
-    except GAVE_UP:  # signals that no table has
+    except GAVE_UP:  # signals that are no table's motion
         found = None
     if found is not None:
         if axis is not None:
@@ -114,15 +112,15 @@ def _analysed(signals: WindowSignals) -> WindowOutcome:
             table = TableAssessment(fitted)
             return _outcome(table, run_checks(FIT_CHECKS, table, found))
     except GAVE_UP as error:
-        reason = gave_up(error, "look at the window's signals")
-        # what each sensor's own rows tell holds all the same
+        reason = gave_up(error, "inspect the window's signals")
+        # the checks of each sensor's own rows remain valid
         found = {**found, "solver": [reason]}
         found = run_checks((STUCK_SENSOR,), TableAssessment(WindowFit(signals)), found)
         return _outcome(TableAssessment(WindowFit(signals, _none(settings, Result.DIVERGED, reason))), found)
 
 
 def own(window: Window, axis: Axis | None) -> Axis | None:
-    """Return the axis' section if it may be that of the window: of another machine's regulators nothing is known."""
+    """Return the axis' section if it can be that of the window: the regulators of another machine are unknown."""
     if axis is None:
         return None
     pitch, rapid = window.pitch_mm / axis.screw_pitch_mm, window.rapid_speed_rad_s / axis.rapid_speed_rad_s
@@ -130,7 +128,7 @@ def own(window: Window, axis: Axis | None) -> Axis | None:
 
 
 def estimated(signals: WindowSignals) -> WindowFit:
-    """Return the evidence with the estimate by the method asked for, and the fit that is judged.
+    """Return the estimate by the configured method, with the fit that is checked.
 
     Without a voltage [2] alone is fitted, with the torque constant of the recording or of the axis: there is no fit of
     both equations.
@@ -151,15 +149,15 @@ def estimated(signals: WindowSignals) -> WindowFit:
 
 @lru_cache(maxsize=KEPT_FITS)
 def _fitted(window: Window, settings: Identification) -> Fit | None:
-    """Return the fit of a window, which holds for each section of the axis that it is analysed with."""
+    """Return the fit of a window, the same for each section of the axis with which it is analysed."""
     return maximum_likelihood.fit_windows([window], settings)
 
 
 def _with_spring(stiff: WindowFit) -> WindowFit:
-    """Return the evidence with a spring between motor and table, where there is one that explains the rapid as well.
+    """Return the fit with a spring between motor and table, if one explains the rapid as well.
 
-    One that nobody told is sought where no regulators are known; else replays of rapids find it, better than one
-    window's speed.
+    An unconfigured one is searched for only where the regulators are unknown; else replays of rapids find it, better
+    than one window's speed.
     """
     assert stiff.fit is not None
     axis, weight = stiff.signals.axis, TableAssessment(stiff).budget
@@ -177,8 +175,8 @@ def _with_spring(stiff: WindowFit) -> WindowFit:
 
 
 def gave_up(error: BaseException, advice: str) -> Reason:
-    """Return the reason of a solver that ended with an error."""
-    return Reason("SolverFailed", f"the solver gave up ({error})", advice)
+    """Return the reason of a solver that failed with an error."""
+    return Reason("SolverFailed", f"the solver failed ({error})", advice)
 
 
 def _none(settings: Identification, result: Result, reason: Reason) -> Estimate:
@@ -190,16 +188,14 @@ def _listed(found: Findings) -> tuple[Reason, ...]:
 
 
 def _speed_lag(window: Window) -> Reason | None:
-    """Return by how much the speed was moved to agree with the position, where a position that is early may be why."""
     late = window.speed_late_s
     if late is None or late < LAG_ROWS * window.dt_s:
         return None
-    text = f"speed was taken {1e3 * late:.2f} ms earlier to agree with the position, or the position is early by that"
+    text = f"speed was shifted {1e3 * late:.2f} ms earlier to match the position, unless the position is early by that"
     return Reason("SampleTiming", text, "take speed and position from one SYNC, or set [identification] speed_source")
 
 
 def _convention(fitted: WindowFit) -> list[Reason]:
-    """Return how the drive scales current and voltage, where the data sheet shows that it is not as the model's."""
     axis, estimate = fitted.signals.axis, fitted.estimate
     if axis is None or estimate is None or estimate.missing:
         return []
@@ -208,7 +204,6 @@ def _convention(fitted: WindowFit) -> list[Reason]:
 
 
 def _gain(fitted: WindowFit) -> Iterator[Reason]:
-    """Yield the signal whose gain may be why the configured loops do not explain the rapid."""
     axis, estimate = fitted.signals.axis, fitted.estimate
     if axis is not None and estimate is not None:
         found = gain_error(estimate, Parameters(**axis.nominal.model_dump()))
@@ -217,12 +212,12 @@ def _gain(fitted: WindowFit) -> Iterator[Reason]:
 
 
 def _outcome(table: TableAssessment, found: Findings) -> WindowOutcome:
-    """Return the verdict: what is weighed refuses only where it does harm at the table, and warns else."""
+    """Return the verdict: weighed findings refuse only if they do harm at the table, and warn else."""
     weight, fitted = table.budget, table.fitted
     names = WEIGHED | {PLATEAU} if weight is not None and weight.through == "replay" else WEIGHED
     weighed = [r for name, told in found.items() if name in names for r in told]
     reasons = [r for name, told in found.items() if name not in names for r in told]
-    # through ordinary loops only a share is known: what has a name says more
+    # an ordinary loop gives only a share: named reasons are more specific
     if weight is not None and not weight.believed and (weight.in_um or not (reasons or weighed)):
         reasons += [weight.reason(), *_gain(fitted)]
     if not table.is_harmless:

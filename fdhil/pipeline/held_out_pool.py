@@ -1,4 +1,4 @@
-"""Pools the windows of one recording, and validates pool and windows by moves that the model was not identified on."""
+"""Pools the windows of one recording, and validates them by moves that the model was not identified on."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ OF_ONE_MOVE = frozenset({LOOPS_DIFFER, "ValidationFailed"})
 
 SCALE_UNPROVEN = Reason(
     "ScaleUnproven",
-    "no data sheet is known: current and voltage in another scale (peak or RMS of a phase) give K, Jt, ft and Cd in it",
+    "no data sheet is known: current and voltage in another scale (peak or RMS of a phase) scale K, Jt, ft and Cd",
     "give --config with the motor's nominal K and Jt",
 )
 
 
 class HeldOutPool(NamedTuple):
-    """The ``outcomes`` as held-out moves show them, their pool, and what it leaves of moves it was not identified on.
+    """The ``outcomes`` as held-out moves show them, their pool, and its residual of moves it was not identified on.
 
     ``loops`` are the drive's own where the configured ones do not explain its moves.
     """
@@ -52,13 +52,13 @@ def pool_with_held_out(
     loops: LoopEstimate | None = None,
     sync_period_s: float | None = None,
 ) -> HeldOutPool:
-    """Pool the accepted windows, and judge all by the pool of the others.
+    """Pool the accepted windows, and validate each by the pool of the others.
 
     That needs the loops of the drive: ``axis`` with the ``loops`` that were identified, if they explain more. A window
-    that was refused because its own model does not explain its replay is accepted where the model of the others
-    predicts it to the tolerance; its reasons become warnings. Where it does not, the loops are identified again with
-    the pool's mechanics: moves both ways separate a load from friction. A pool that does not predict each of its moves
-    is not validated; one that does is not refused because the winding's R or L moves between them.
+    that was refused because its own model does not explain its replay is accepted if the model of the others predicts
+    it to the tolerance; its reasons become warnings. If not, the loops are identified again with the pool's mechanics:
+    moves in both directions separate a load from friction. A pool that does not predict each of its moves is not
+    validated; one that does is not refused because the winding's R or L changes between them.
     """
     estimate, verdict = pool(outcomes, settings)
     mine = own(outcomes[0].window, axis) if outcomes else None
@@ -93,7 +93,6 @@ def pool_with_held_out(
 
 
 def _with_spread(estimate: Estimate, outcomes: Sequence[WindowOutcome]) -> Estimate:
-    """Return the estimate with the spread of R and L between its windows added to their variances."""
     covariance = estimate.covariance.copy()
     for name in WINDING:
         values = [o.estimate.value(name) for o in outcomes if o.verdict.accepted and o.estimate is not None]
@@ -105,7 +104,7 @@ def _with_spread(estimate: Estimate, outcomes: Sequence[WindowOutcome]) -> Estim
 def _judged(
     outcomes: Sequence[WindowOutcome], estimate: Estimate | None, axis: Axis, sync_period_s: float
 ) -> tuple[Estimate | None, list[Replay | None]]:
-    """Return the pool with its presliding, and of each outcome the replay by the pool of the others, if it is used."""
+    """Return the pool with its presliding, and each accepted outcome's replay by the pool of the others."""
     moves: list[Move] = [
         (_on_time(o, axis, sync_period_s), o.estimate)
         for o in outcomes
@@ -126,7 +125,7 @@ def _on_time(outcome: WindowOutcome, axis: Axis, sync_period_s: float) -> Window
 
 
 def _is_doubtful(outcome: WindowOutcome) -> bool:
-    """Return whether a window was refused for its own model's replay alone: others may tell what it cannot."""
+    """Return whether a window was refused for its own model's replay alone: others may separate load and friction."""
     codes = {reason.code for reason in outcome.verdict.reasons}
     return outcome.estimate is not None and LOOPS_DIFFER in codes and codes <= OF_ONE_MOVE
 

@@ -1,4 +1,4 @@
-"""Lays the model over a recorded rapid: what a replay of it finds, and what such a drive would have done."""
+"""Overlays the model on a recorded rapid: the outcome of a replay, and the motion of the modelled drive."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ NO_MODEL = {Result.NOT_FINITE, Result.DIVERGED}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Overlay:
-    """A rapid with its model: ``outcome`` of a replay, and ``window``, whose speed is at the instants of its rows.
+    """A rapid with its model: ``outcome`` of a replay, and ``window`` with the speed aligned to its rows.
 
-    ``driven`` is the drive under the measured voltage, of which the share of the speed that is explained is taken.
-    ``followed`` is the closed loop along the demand, of which what is left at the table is. None: it cannot be run.
+    ``driven`` is the drive simulated from the measured voltage, the basis of the explained share of the speed.
+    ``followed`` is the closed loop along the demand, the basis of the residual at the table. None: it cannot be
+    simulated.
     """
 
     window: Window
@@ -34,9 +35,9 @@ class Overlay:
 
 
 def lay_over(window: Window, config: MachineConfig, loops: LoopEstimate | None = None) -> Overlay:
-    """Analyse a window as the daemon would now, and run what was found; never raises, whatever the data.
+    """Analyse a window as the daemon would now, and simulate the result; never raises, whatever the data.
 
-    ``loops`` are the newest that the history has of the axis' own.
+    ``loops`` are the newest identified ones of the axis in the history.
     """
     settings, period_s = config.identification, config.machine.sync_period_s
     section = OwnLoops(config.axis.get(window.axis), settings, period_s, loops).axis

@@ -1,6 +1,6 @@
-"""Seeks a drive's own loops where the configured ones do not explain its rapids, for the analysis to go on with.
+"""Identifies a drive's own loops if the configured ones do not explain its rapids, and analyses these again.
 
-Where other loops do not explain them, a resonance between motor and table may.
+If other loops do not explain them, a resonance between motor and table may.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from fdhil.validation.weight import LOOPS_DIFFER
 ENOUGH = 4  # windows, both directions twice
 KEPT = 6
 SIGNALS_AT_FAULT = frozenset({"StuckValue", "Implausible", "NotFinite", "StaleData", "EpisodeAborted"})
-# of a motor whose data sheet is not known: fast enough to be no part of what is sought
+# of a motor with unknown data sheet: fast enough not to affect the loops
 UNKNOWN_R, UNKNOWN_L = 1.0, 5e-3
 
 
@@ -32,12 +32,10 @@ def loops_of(
     *,
     growing: bool = True,
 ) -> LoopEstimate | None:
-    """Return the loops of a drive as the windows show them that were analysed; None where they show none.
+    """Return the loops of a drive by its analysed windows; None where they show none.
 
-    Without ``growing`` no other keys are tried than those that are configured.
-
-    What the axis' section or a window's own estimate does not tell of the winding is made up: the current loop hides
-    it. Windows that are believed go before the others, and a section that is another machine's is none.
+    Without ``growing`` no keys are tried but the configured ones. Unknown values of the winding are assumed: the
+    current loop hides them. Accepted windows precede the others, and a section of another machine is ignored.
     """
     axis = own(outcomes[0].window, axis) if outcomes else None
     told = [(o, mechanics_of(o, axis)) for o in outcomes]
@@ -49,7 +47,7 @@ def loops_of(
 
 
 def mechanics_of(outcome: WindowOutcome, axis: Axis | None) -> Parameters | None:
-    """Return the parameters of a window's estimate, its winding filled up; None where K, Jt, ft or Cd is not told."""
+    """Return the parameters of a window's estimate, its winding completed; None without K, Jt, ft or Cd."""
     if outcome.estimate is None:
         return None
     found = bounded(outcome.estimate, outcome.window.direction).parameters()
@@ -64,14 +62,14 @@ def mechanics_of(outcome: WindowOutcome, axis: Axis | None) -> Parameters | None
 def suspected(outcomes: Sequence[WindowOutcome]) -> bool:
     """Return whether some window is refused for its loops: the model explains its torque, and not its replay.
 
-    A window whose signals are at fault tells of no loops.
+    A window with faulty signals says nothing of the loops.
     """
     codes = ({reason.code for reason in o.verdict.reasons} for o in outcomes)
     return any(LOOPS_DIFFER in found and not found & SIGNALS_AT_FAULT for found in codes)
 
 
 def better_axis(axis: Axis | None, found: LoopEstimate | None) -> Axis | None:
-    """Return the axis with the loops that were found, where they explain what the configured ones do not; else None."""
+    """Return the axis with the loops that were found, if they explain what the configured ones do not; else None."""
     return with_loops(axis, found) if axis is not None and found is not None and better_loops(found) else None
 
 
@@ -91,7 +89,7 @@ def explained(
     sync_period_s: float | None,
     again: Callable[[Axis], Sequence[WindowOutcome]],
 ) -> tuple[Sequence[WindowOutcome], LoopEstimate | None]:
-    """Return the outcomes by the best that a recording shows of its drive, and its loops where they were sought.
+    """Return the outcomes by the best model of a recording's drive, and its loops if they were identified.
 
     ``again`` analyses its windows with another section of the axis.
     """
@@ -110,16 +108,16 @@ def explained(
 
 
 class OwnLoops:
-    """An axis' own loops as its rapids come one by one: each is analysed through the best that are known.
+    """Tracks an axis' own loops as its rapids arrive one by one: each is analysed through the best known ones.
 
-    They are fitted once after the first ``ENOUGH`` rapids, so that they are told, and sought where a rapid is
-    refused that was replayed: at once, and each time after twice as many refused rapids as before, since it takes long.
+    They are fitted once after the first ``ENOUGH`` rapids, to be reported, and again when a replayed rapid is refused:
+    at once, and each time after twice as many refused rapids as before, since it takes long.
     """
 
     def __init__(
         self, axis: Axis | None, settings: Identification, sync_period_s: float, known: LoopEstimate | None = None
     ) -> None:
-        """``axis`` is the machine's section, None where none is known: then no loops are sought.
+        """Start with the machine's section, None for an unknown machine: then no loops are searched for.
 
         ``known`` are those that were found in an earlier run.
         """
@@ -139,7 +137,7 @@ class OwnLoops:
         return changed_regulators(self._configured, self.axis)
 
     def analyse(self, window: Window) -> tuple[WindowOutcome, LoopEstimate | None]:
-        """Return what a window says of the drive, and its loops where they were sought again."""
+        """Return a window's outcome, and the loops if they were identified again."""
         if self._configured is not None:
             known = own(window, self._configured)
             (window,) = with_current_means([window], self._settings, known, self._period_s)
@@ -166,7 +164,6 @@ class OwnLoops:
     def _through_loops(
         self, window: Window, outcome: WindowOutcome, *, growing: bool
     ) -> tuple[WindowOutcome, LoopEstimate | None]:
-        """Return the outcome of a window by the loops that the newest rapids show, and those loops."""
         found = loops_of(tuple(self._outcomes), self._configured, self._settings, self._period_s, growing=growing)
         better = better_axis(self._configured, found)
         if better is None and found is not None and found.verdict.accepted:

@@ -1,7 +1,7 @@
-"""Seeks a resonance between motor and table where neither the configured loops nor others explain a drive's rapids.
+"""Searches for a resonance between motor and table if neither configured nor other loops explain a drive's rapids.
 
-The place of the motor is told far better than its speed, and the closed loop along the demand shows in it what the
-table's swing does to the motor: of all resonances that one is taken with which the replays leave least.
+The motor's position is measured far better than its speed, and the closed loop along the demand shows the table's
+reaction on the motor in it: the resonance with the smallest residual of the replays is used.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from fdhil.records import Parameters, Window
 from fdhil.validation.replay import replay_window
 
 GRID = np.geomspace(40.0, 250.0, 14)  # Hz
-HALVINGS = 2  # of the grid's steps about the best
-NOTICED = 0.01  # of the following error: with less left nothing is sought
-BETTER = 0.5  # of what is left, at most, with a resonance that is believed
+HALVINGS = 2  # of the grid's steps around the best
+NOTICED = 0.01  # of the following error: below, nothing is searched for
+BETTER = 0.5  # of the residual, at most, with an accepted resonance
 MOST_RAPIDS = 4
 
 Rapids = Sequence[tuple[Window, Parameters]]
 
 
 def softer_axis(rapids: Rapids, axis: Axis, sync_period_s: float) -> Axis | None:
-    """Return the axis with the resonance that rapids and what was identified of each show.
+    """Return the axis with the resonance that the rapids show.
 
-    None where one is told already, where the rapids are explained, and where none explains them.
+    None if one is configured already, if the rapids are explained, and if none explains them.
     """
     rapids = [pair for pair in rapids if not pair[1].term("resonance")][-MOST_RAPIDS:]
     if axis.resonance_hz is not None or not rapids:
@@ -40,7 +40,6 @@ def softer_axis(rapids: Rapids, axis: Axis, sync_period_s: float) -> Axis | None
 
 
 def _best(rapids: Rapids, axis: Axis, sync_period_s: float) -> float:
-    """Return the resonance with which replays leave least."""
     left: dict[float, float] = {}
 
     def tried(*resonances: float) -> float:
@@ -60,7 +59,7 @@ def _with(axis: Axis, hertz: float) -> Axis:
 
 
 def _left_um(rapids: Rapids, axis: Axis, sync_period_s: float) -> tuple[float, float]:
-    """Return the RMS over rapids of what their replays leave, and of the following error; nil where there is none."""
+    """Return the RMS residual of the rapids' replays, and of the following error; zero without any."""
     replays = [replay_window(window, drive, axis, sync_period_s) for window, drive in rapids]
     told = [(one.unexplained_um, one.measured_um) for one in replays if one is not None]
     left, following = np.sqrt(np.mean(np.square(told), axis=0)) if told else (0.0, 0.0)

@@ -19,7 +19,7 @@ from fdhil.records import PARAMETERS, Estimate, Reason, Verdict, Window, WindowO
 from fdhil.validation.agreement import moved
 from fdhil.validation.weight import LOOPS_DIFFER
 
-# what a window is refused for that says nothing of the direction: its samples, or how the move went
+# causes of refusal that do not concern the model: the samples, or the course of the move
 OF_THE_MOVE = (
     "Missing",
     "Episode",
@@ -32,7 +32,7 @@ OF_THE_MOVE = (
     "Timing",
 )
 WARMING = "R"
-_FIGURES = re.compile(r"[-+]?[0-9][-+.0-9e]*")  # in which warnings of one kind differ
+_FIGURES = re.compile(r"[-+]?[0-9][-+.0-9e]*")  # figures, in which warnings of one kind differ
 
 Told = list[tuple[Window, Estimate]]
 
@@ -40,10 +40,10 @@ Told = list[tuple[Window, Estimate]]
 def pool(
     outcomes: Sequence[WindowOutcome], settings: Identification, *, refit: bool = True
 ) -> tuple[Estimate | None, Verdict]:
-    """Estimate from the accepted windows together; None and a refusal when there is none, or when they disagree.
+    """Estimate from the accepted windows together; None and a refusal if there is none, or if they disagree.
 
-    With ``refit`` all samples are fitted once more, where the windows tell one and the same six parameters. Without it
-    the windows' own estimates are pooled, which is as good when each window tells all six, and takes no time.
+    With ``refit`` all samples are fitted once more, if the windows determine the same six parameters. Without it the
+    windows' own estimates are pooled, which is as good if each window determines all six, and takes no time.
     """
     if not outcomes:
         advice = "record moves at 60 % of the rapid speed or more, or identify from any move with --any-move"
@@ -56,7 +56,6 @@ def pool(
 
 
 def _with_drift(estimate: Estimate, members: Sequence[Member]) -> Estimate:
-    """Return the pool with what R drifts by over all windows in its interval: the winding warms."""
     apart = between(members)
     if not apart.walk.get(WARMING):
         return estimate
@@ -74,9 +73,9 @@ def together(
     *,
     refit: bool = False,
 ) -> tuple[Estimate | None, Verdict]:
-    """Return what ``members``, the accepted among the ``outcomes``, tell together, and whether that is believed.
+    """Return the joint estimate of ``members``, the accepted among the ``outcomes``, and its verdict.
 
-    ``history`` are all windows from which it follows by how much windows of this drive differ.
+    ``history`` are all windows that show how much windows of this drive differ.
     """
     accepted = [o for o in outcomes if o.verdict.accepted and o.estimate is not None]
     if not accepted:
@@ -89,8 +88,8 @@ def together(
         try:
             estimate = _estimated(told, members, between(history), settings, refit=refit)
         except GAVE_UP as error:
-            return None, Verdict(False, None, (gave_up(error, "look at the windows"),))
-        # where the voltage is slow, or there is none, R and L may stay open
+            return None, Verdict(False, None, (gave_up(error, "inspect the windows"),))
+        # with a slow voltage, or without one, R and L may be undetermined
         slow = any(window.slow_voltage is not None or window.voltage_v is None for window, _ in told)
         reasons += untold(estimate, slow=slow)
     beyond = unphysical(estimate)
@@ -100,7 +99,7 @@ def together(
 def _estimated(
     told: Told, members: Sequence[Member], apart: Between, settings: Identification, *, refit: bool
 ) -> Estimate:
-    """Return the estimate: of the samples once more where the windows are alike, else the mixed model's."""
+    """Return the estimate of all samples if the windows are of one kind, else the mixed model's."""
     first = told[0][1]
     quick = pooled(members, first, apart)
     whole = all(set(PARAMETERS) <= set(m.names) for m in members)
@@ -111,14 +110,14 @@ def _estimated(
     alike = pooled(members, first, ALIKE)
     if not again.names == alike.names == quick.names:
         return again
-    wider = np.nan_to_num(quick.covariance - alike.covariance)  # nothing where a slow voltage leaves R or L open
+    wider = np.nan_to_num(quick.covariance - alike.covariance)  # zero where a slow voltage leaves R or L undetermined
     return replace(again, covariance=frozen(again.covariance + wider))
 
 
 def one_sided(outcomes: Iterable[WindowOutcome]) -> list[Reason]:
-    """Return the reason when one direction alone is believed while the model was refused in the other.
+    """Return the reason if windows of one direction are accepted while the model was refused in the other.
 
-    A load that acts one way is part of dry friction then, and nothing tells how much of it.
+    A load that acts one way is part of dry friction then, by an unknown share.
     """
     listed = list(outcomes)
     believed = {o.window.direction for o in listed if o.verdict.accepted}
@@ -128,27 +127,28 @@ def one_sided(outcomes: Iterable[WindowOutcome]) -> list[Reason]:
     way = "positive" if refused[0].window.direction > 0 else "negative"
     cause = refused[0].verdict.reasons[0]
     text = (
-        f"no move in the {way} direction is believed ({cause.code}), and one direction tells no friction of the other"
+        f"no move in the {way} direction is accepted ({cause.code}), "
+        "and friction in one direction does not show that in the other"
     )
     return [Reason("OneDirection", text, cause.advice or "see why the other moves are refused")]
 
 
 def _loops_refuted(outcomes: Sequence[WindowOutcome]) -> list[Reason]:
-    """Return the reason when as many rapids refute the loops that the others were validated with as were accepted.
+    """Return the reason if as many rapids refute the loops as were accepted with them.
 
-    What they show are the drive's loops, not its parameters: a model would be used with loops that are wrong.
+    They concern the drive's loops, not its parameters: the model would be used with wrong loops.
     """
     refuting = [o for o in outcomes if [r.code for r in o.verdict.reasons] == [LOOPS_DIFFER]]
     accepted = sum(o.verdict.accepted for o in outcomes)
     if not refuting or len(refuting) < accepted:
         return []
     cause = refuting[0].verdict.reasons[0]
-    text = f"{len(refuting)} rapids refute the loops with which {accepted} were accepted, and none were found for all"
+    text = f"{len(refuting)} rapids refute the loops with which {accepted} were accepted, and no loops explain all"
     return [Reason(LOOPS_DIFFER, f"{text}: {cause.text}", cause.advice)]
 
 
 def refuses_the_model(outcome: WindowOutcome) -> bool:
-    """Return whether a window was refused for what its drive does, not for its samples or an aborted move."""
+    """Return whether a window was refused for its drive's behaviour, not for its samples or an aborted move."""
     codes = [reason.code for reason in outcome.verdict.reasons]
     return not outcome.verdict.accepted and not any(part in code for code in codes for part in OF_THE_MOVE)
 
@@ -161,7 +161,7 @@ def _verdict(accepted: Sequence[WindowOutcome], reasons: Sequence[Reason]) -> Ve
     warnings = {_FIGURES.sub("", str(warning)): warning for v in verdicts for warning in v.warnings}
     told = list(warnings.values())
     if len({o.window.direction for o in accepted}) == 1 and not reasons and accepted[0].window.is_rapid:
-        text = "all moves go one way: a constant load is part of Cd, as nothing tells it apart"
+        text = "all moves are in one direction: a constant load cannot be separated from Cd"
         told.append(Reason("OneDirection", text, "record rapids in both directions"))
     figure = max(unexplained, default=None)
     return Verdict(not reasons, min(fits, default=None), tuple(reasons), figure, tuple(told))

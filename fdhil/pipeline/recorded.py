@@ -1,4 +1,4 @@
-"""Analyses the windows of one recording of one axis, by the best that they show of its drive."""
+"""Analyses the windows of one recording of one axis, with the best model of its drive."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def analyse_windows(
     spread: Spread = map,
     done: Callable[[], None] = lambda: None,
 ) -> tuple[Sequence[WindowOutcome], LoopEstimate | None]:
-    """Return what each window says, and the drive's own loops where they had to be sought.
+    """Return the outcome of each window, and the drive's own loops if they had to be identified.
 
-    ``spread`` may use further processes, in order; ``done`` is told of each window.
+    ``spread`` may use further processes, in order; ``done`` is called after each window.
     """
     if windows:
         windows = with_current_means(windows, settings, own(windows[0], axis), sync_period_s)

@@ -1,4 +1,4 @@
-"""Tells how far each table is ahead of its motor along a path, where a resonance between them is known."""
+"""Computes how far each table leads its motor along a path, if its model has a resonance."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def ahead_of_motor_mm(
     models: Mapping[str, Parameters],
     config: MachineConfig,
 ) -> dict[str, Float]:
-    """Return table less motor (n,) in mm of each axis whose model has a resonance: what its encoder does not see.
+    """Return table less motor (n,) in mm of each axis with a resonance: the part that its encoder does not see.
 
     The axes follow ``position_mm`` (n,) with ``offset_um`` (n,).
     """

@@ -1,7 +1,7 @@
-"""Raises feeds that hold together a last time: each of them alone, while those beside it stay.
+"""Refines feasible feeds: each is raised alone, while those next to it stay.
 
-An error that two stretches make between them hardly goes with one of them alone, so that a search which moves both by
-what it learns of each ends a little early.
+An error between two segments hardly depends on either of them alone, so that a search which changes both by the result
+of each ends a little early.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import numpy as np
 from fdhil.prediction.feeds import AIM, STILL, WORTH, Feeds, Judge, Source, run, stretches
 from fdhil.records import Trajectory
 
-STEP = 1.05  # what is tried first
+STEP = 1.05  # first factor tried
 MOST_STEPS, MOST_STEP, LEAST_POWER = 3, 2.0, 0.05
-MOST_GROUPS = 3  # of stretches that do not touch each other
+MOST_GROUPS = 3  # of segments that do not touch each other
 Span = tuple[float, float]
 
 
 def raised_alone(feeds: Feeds, source: Source, judge: Judge, tolerance_um: float) -> Feeds:
-    """Return the feeds with each stretch raised that may be; they were run together again, and hold as before."""
+    """Return the feeds with each possible segment raised; together they keep the tolerance as before."""
     waiting = {k for k in feeds.held if feeds.share[k] * STEP <= 1.0}
     if not waiting:
         return feeds
@@ -40,7 +40,7 @@ def raised_alone(feeds: Feeds, source: Source, judge: Judge, tolerance_um: float
 
 
 class _Raising:
-    """Shares, all of which were run, and those that are run next."""
+    """Shares, all of which were evaluated."""
 
     def __init__(self, feeds: Feeds, source: Source, judge: Judge, tolerance_um: float) -> None:
         self._before, self._source, self._judge, self._tolerance_um = feeds, source, judge, tolerance_um
@@ -62,7 +62,7 @@ class _Raising:
         return chosen
 
     def step(self, factors: Mapping[int, float]) -> dict[int, float]:
-        """Run with some shares times their factors and keep those that hold; return by what these may go on."""
+        """Evaluate some shares times their factors and keep those within the tolerance; return their next factors."""
         tried = {k: min(1.0, self._share[k] * factor) for k, factor in factors.items()}
         reference, error_um = run(self._source, self._share | tried, self._judge)
         spoilt = _spans(reference, self._spoilt(error_um)).values()
@@ -77,12 +77,11 @@ class _Raising:
         return any(first - self._apart_s <= last_s and first_s <= last + self._apart_s for first, last in others)
 
     def _further(self, factor: float, before_um: float, now_um: float) -> float:
-        """Return the factor that brings an error to what is aimed at, by how it went with the last one."""
+        """Return the factor that brings an error to its target, by its change with the last one."""
         power = max(float(np.log(now_um / before_um) / np.log(factor)), LEAST_POWER) if before_um > 0.0 else 1.0
         return float(np.clip((AIM * self._tolerance_um / now_um) ** (1.0 / power), 1.0, MOST_STEP))
 
     def feeds(self) -> Feeds:
-        """Return the raised feeds where they hold together, those from before else."""
         if self._share == self._before.share:
             return self._before
         _, error_um = run(self._source, self._share, self._judge)
@@ -92,7 +91,6 @@ class _Raising:
 
 
 def _spans(reference: Trajectory, wanted: Collection[int]) -> dict[int, Span]:
-    """Return from when to when each stretch lasts."""
     stretch = stretches(reference)
     names, first = np.unique(stretch, return_index=True)
     _, last = np.unique(stretch[::-1], return_index=True)

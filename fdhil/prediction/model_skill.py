@@ -1,4 +1,4 @@
-"""Judges the skill of the closed-loop model: predicted against measured following error of one recorded move."""
+"""Assesses the skill of the closed-loop model: predicted against measured following error of one recorded move."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LONGEST_DELAY = 8.0  # in SYNC cycles
 
 
 def skill(window: Window, parameters: Parameters, axis: Axis, sync_period_s: float) -> Skill | None:
-    """Compare the predicted with the measured following error of a recorded move, as held-out moves are in a file.
+    """Compare the predicted with the measured following error of a recorded move, like held-out moves in a file.
 
     Lost rows are not compared. ``delay_ms`` is the shift of the prediction (positive: the drive is later) that explains
     the difference best. None where the rows are not the drive's set-points, or too few can be compared.

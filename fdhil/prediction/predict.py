@@ -18,7 +18,7 @@ from fdhil.records import Float, Parameters, Prediction, Trajectory, frozen
 def check_axes(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> None:
     """Raise ConfigError where an axis of the reference has no configuration or no model."""
     faults = [
-        ConfigFault(f"axis.{axis}", "the demand moves this axis, the configuration does not have it", "add its section")
+        ConfigFault(f"axis.{axis}", "the demand moves this axis, but the configuration lacks it", "add its section")
         for axis in reference.axes
         if axis not in config.axis
     ]
@@ -34,9 +34,9 @@ def check_axes(reference: Trajectory, models: Mapping[str, Parameters], config: 
 def predict(
     reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, zones_above_um: float | None = None
 ) -> Prediction:
-    """Predict what the drives leave of ``reference``; ConfigError when an axis has no model or configuration.
+    """Predict the path error along ``reference``; ConfigError if an axis has no model or configuration.
 
-    Zones are what stands out, or with ``zones_above_um`` all that is above it.
+    Zones are errors that stand out, or with ``zones_above_um`` all that exceed it.
     """
     smooth = {axis: without_dry_friction(model) for axis, model in models.items()}
     responses = _responses(reference, models, config)
@@ -44,7 +44,7 @@ def predict(
 
 
 def contour_um(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> Float:
-    """Return the contour error (n,) um alone, as :func:`predict` has it: for those who run many paths."""
+    """Return the contour error (n,) um alone, as :func:`predict` has it: for searches over many paths."""
     return _contour(reference, _responses(reference, models, config))
 
 
@@ -71,7 +71,7 @@ def _responses(
     check_axes(reference, models, config)
     responses = simulate_axes(models, config.axis, reference.dt_s, reference.position_mm, *offsets)
     faults = [
-        ConfigFault(f"model.{axis}", "is of no drive: run along the path it overflows", "look at its values and terms")
+        ConfigFault(f"model.{axis}", "is not a valid drive: its simulation overflows", "check its values and terms")
         for axis, response in responses.items()
         if not np.isfinite(response.end).all()
     ]
@@ -92,7 +92,6 @@ def _assemble(
     zones_above_um: float | None = None,
     without_friction: Callable[[], Float] | None = None,
 ) -> Prediction:
-    """Put the axes' responses together: errors per axis, contour error, zones."""
     axes = reference.axes
     contour = frozen(_contour(reference, responses))
     loop_s = max(1.0 / config.axis[axis].regulators.position_gain_per_s for axis in axes)

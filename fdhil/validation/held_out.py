@@ -1,7 +1,7 @@
-"""Judges a pooled model by moves that it was not identified on: what it leaves of their following error.
+"""Validates a pooled model by moves that it was not identified on: the residual of their following error.
 
-Each move is predicted by the pool of the others, so that no model is judged by what it was fitted to. What is left
-there is what a correction by the model leaves, too: the same drive, predicted through the same loops.
+Each move is predicted by the pool of the others, so that no model is validated by its own data. A correction by the
+model leaves that residual, too: the same drive, predicted through the same loops.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ Move = tuple[Window, Estimate]
 def predict_held_out(moves: Sequence[Move], model: Estimate, axis: Axis, sync_period_s: float) -> list[Replay | None]:
     """Return each move replayed by the pool of the others; None where its samples cannot be compared.
 
-    ``model`` is the pool of all: it gives the presliding, and predicts where the others are no drive. A single move is
-    predicted by ``model`` itself.
+    ``model`` is the pool of all: its presliding is used, and it predicts where the pool of the others is not a valid
+    drive. A single move is predicted by ``model`` itself.
     """
     members = [member(window, estimate, k) for k, (window, estimate) in enumerate(moves)]
     build_up = {TERM: model.value(TERM)} if TERM in model.names else {}
@@ -39,12 +39,11 @@ def predict_held_out(moves: Sequence[Move], model: Estimate, axis: Axis, sync_pe
 
 
 def _is_drive(p: Parameters) -> bool:
-    """Return whether a pool of fewer moves is a drive: K and Jt positive, friction known."""
     return bool(np.isfinite([p.K, p.Jt, p.ft, p.Cd]).all() and min(p.K, p.Jt) > 0.0)
 
 
 def worst_of(predicted: Sequence[Replay | None]) -> HeldOut | None:
-    """Return what is left of the worst of the moves; None where none could be compared."""
+    """Return the residual of the worst move; None where none could be compared."""
     told = [one for one in predicted if one is not None]
     if not told:
         return None
@@ -54,17 +53,17 @@ def worst_of(predicted: Sequence[Replay | None]) -> HeldOut | None:
 
 
 def is_predicted(found: Replay | None, settings: Identification) -> bool:
-    """Return whether a move that a model was not identified on is predicted to the tolerance."""
+    """Return whether a model predicts a move that it was not identified on to the tolerance."""
     return found is not None and found.unexplained_um <= settings.tolerance_for(found.measured_um)
 
 
 def held_out_reason(found: HeldOut, settings: Identification) -> Reason | None:
-    """Return why a model is not validated that does not predict the moves that it was not identified on."""
+    """Return why a model is not validated if it does not predict the moves that it was not identified on."""
     limit_um = settings.tolerance_for(found.following_um)
     if found.rms_um <= limit_um:
         return None
     text = (
-        f"identified on the other moves the model leaves {found.rms_um:.3g} um RMS of a following error of "
-        f"{found.following_um:.3g} um, limit {limit_um:.3g} um: it does not predict a move that it has not seen"
+        f"identified on the other moves, the model leaves {found.rms_um:.3g} um RMS of a following error of "
+        f"{found.following_um:.3g} um, limit {limit_um:.3g} um: it does not predict moves that it was not identified on"
     )
     return Reason("ValidationFailed", text, "record more rapids in both directions, at several speeds and lengths")

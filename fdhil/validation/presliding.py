@@ -1,7 +1,7 @@
-"""Fits the way over which dry friction builds up (presliding) to the replays of a drive's recorded moves.
+"""Fits the distance over which dry friction builds up (presliding) to the replays of a drive's recorded moves.
 
-Around each start, stop and reversal the following error shows it: friction that is there at once holds the table until
-it breaks loose, friction that builds up lets it creep. Nothing else of the model is changed.
+The following error shows it around each start, stop and reversal: friction that acts at once holds the table until it
+breaks loose, friction that builds up lets it creep. Nothing else of the model is changed.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from fdhil.validation.replay import replay_setpoints
 TERM = "presliding_um"
 TRIALS_UM = (1.0, 2.5, 6.0, 15.0, 40.0)
 MOST_WINDOWS = 4  # the newest: each has a start and a stop
-LEAST_SHARE = 0.1  # of what is left (its square) that the term must explain
+LEAST_SHARE = 0.1  # of the residual's square that the term must explain
 LEAST_UM = 0.05  # RMS that it must explain
-INDEPENDENT_S = 0.025  # over which what is left behind a position loop is correlated
+INDEPENDENT_S = 0.025  # over which the residual of a position loop is correlated
 STEP = 0.35  # of the logarithm, for the curvature
 
 
 def with_presliding(estimate: Estimate, windows: Sequence[Window], axis: Axis, sync_period_s: float) -> Estimate:
-    """Return the estimate with ``presliding_um`` where the recorded moves show it; itself where they do not.
+    """Return the estimate with ``presliding_um`` if the recorded moves show it, else unchanged.
 
     The standard deviation is that of the replays' least squares, of samples ``INDEPENDENT_S`` apart.
     """
     chosen = list(windows)[-MOST_WINDOWS:]
 
     def left(um: float) -> float:
-        """Return the mean square of what the replays leave, um2; infinite where none can be run."""
+        """Return the mean square of the replays' residuals, um2; infinite where none can be run."""
         parameters = estimate.parameters()
         parameters = parameters.changed(**{TERM: um}) if um > 0.0 else parameters
         found = [replay_setpoints(window, parameters, axis, sync_period_s) for window in chosen]
@@ -45,7 +45,7 @@ def with_presliding(estimate: Estimate, windows: Sequence[Window], axis: Axis, s
     if not trials or not min(trials) < sharp:
         return estimate
     near = math.log(TRIALS_UM[int(np.argmin(trials))])
-    from scipy.optimize import minimize_scalar  # late: it is slow to import
+    from scipy.optimize import minimize_scalar  # slow to import
 
     reach = (near - 1.0, near + 1.0)
     found = minimize_scalar(lambda log: left(math.exp(log)), bounds=reach, method="bounded", options={"xatol": 0.05})
@@ -60,7 +60,6 @@ def with_presliding(estimate: Estimate, windows: Sequence[Window], axis: Axis, s
 
 
 def _with_term(estimate: Estimate, value: float, std: float) -> Estimate:
-    """Return the estimate with the term behind the others, uncorrelated with them."""
     n = len(estimate.names)
     covariance: Float = np.zeros((n + 1, n + 1))
     covariance[:n, :n] = estimate.covariance

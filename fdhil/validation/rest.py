@@ -29,7 +29,7 @@ LEAST_TORQUE = 0.01
 
 
 def rest_faults(fitted: WindowFit) -> Iterator[Reason]:
-    """Yield the sensors whose zero the rows at standstill contradict."""
+    """Yield the sensors whose zero is contradicted by the samples at standstill."""
     window, fit, noise = fitted.window, fitted.aligned_fit, fitted.signals.noise
     rows = np.flatnonzero(fitted.signals.standstill)
     if rows.size < ROWS or not fitted.signals.has_voltage:
@@ -43,7 +43,7 @@ def rest_faults(fitted: WindowFit) -> Iterator[Reason]:
 
 
 def friction_at_rest(table: TableAssessment) -> Iterator[Reason]:
-    """Yield what friction holds at standstill, or takes to begin to move, that the model does not have."""
+    """Yield friction at standstill, or at the beginning of a move, that the model lacks."""
     fitted, signals = table.fitted, table.signals
     rows = np.flatnonzero(signals.standstill)
     if rows.size < ROWS or not signals.has_voltage:
@@ -87,12 +87,11 @@ def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows, lost_v: f
 
 
 def _resistance_share(fit: Fit) -> float:
-    """Return the standard deviation of the resistance as a share of it."""
     return maximum_likelihood.finish(fit).std("R") / float(fit.theta[0])
 
 
 def _holding(window: Window, fit: Fit, rows: Rows) -> Iterator[Reason]:
-    """A shaft that sticks although K i exceeds Cd has friction, or bears a load, that the model does not have."""
+    """Report a shaft at rest although K i exceeds Cd: the model lacks friction or a load."""
     held = float(fit.theta[2]) * float(np.median(smooth(carried(window.current_a), window.dt_s)[rows]))
     peak = abs(fit.theta[2]) * float(np.nanmax(np.abs(window.current_a)))
     spread = float(np.sqrt(inverse_of(fit.information)[0][5, 5]))
@@ -100,7 +99,7 @@ def _holding(window: Window, fit: Fit, rows: Rows) -> Iterator[Reason]:
     if abs(held) <= limit:
         return
     told = f"the shaft rests under {abs(held):.3g} N.m, though dry friction is {fit.theta[5]:.3g} N.m"
-    if held * window.direction < 0.0:  # what pushes against this direction holds the shaft
+    if held * window.direction < 0.0:  # a torque against this direction holds the shaft
         text = f"{told} in this direction: a load, or friction that differs by direction"
         yield Reason("ValidationFailed", text, "identify rapids of both directions")
     else:

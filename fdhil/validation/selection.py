@@ -1,8 +1,8 @@
-"""Takes the findings of one window one after the other: what each shows that those before it do not explain.
+"""Selects the findings of one window one after the other: what each shows that those before it do not explain.
 
 Many alternatives resemble each other, so that one thing that the model lacks shows as several. The most significant is
-taken, the others are judged anew beside it, and so on while one is beyond chance. Together with the parameters they are
-then one fit, whose amplitudes tell by how much the parameters were off without them.
+taken, the others are tested again given it, and so on while one is significant. Together with the parameters they are
+then one fit, whose amplitudes show how far the parameters were off without them.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from fdhil.identification.normal import inverse_of
 from fdhil.records import Float
 from fdhil.validation.score_bench import Bench, Finding
 
-NO_WORSE = 3.0  # standard deviations by which what explains less may do so by chance
+NO_WORSE = 3.0  # standard deviations by which an alternative may explain less by chance
 
 
 @dataclass(frozen=True, slots=True)
 class Lacking:
-    """What a model lacks: a finding, by how much it moves the parameters (k,), and its torque (n,), N.m, or none.
+    """A deficiency of a model: a finding, the shift of the parameters by it (k,), and its torque (n,), N.m, or None.
 
-    The parameters are those of the fit's jacobian, in its order. ``rivals`` are what explains the same nearly as well,
-    and may be there instead.
+    The parameters are those of the fit's jacobian, in its order. ``rivals`` explain the same nearly as well, and may be
+    present instead.
     """
 
     finding: Finding
@@ -36,12 +36,12 @@ class Lacking:
 
     @property
     def with_rivals(self) -> tuple[Lacking, ...]:
-        """The finding, and what may be there in its place."""
+        """The finding, and its alternatives."""
         return (self, *self.rivals)
 
 
 def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
-    """Return what surely is there beside the model, the most significant first; nothing where all may be chance."""
+    """Return the significant deficiencies of the model, the most significant first; none where all may be chance."""
     if not any(finding.sure for finding in findings):
         return []
     bench = Bench.of(fit)
@@ -67,7 +67,6 @@ def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
     moved = inverse_of(fit.information)[0] @ (fit.jacobian.T @ directions)
 
     def beside_others(n: int, k: int) -> Lacking:
-        """Return alternative ``k`` at the place of the ``n``-th that was taken."""
         places = [*taken[:n], k, *taken[n + 1 :]]
         amplitude = float((inverse_of(information[np.ix_(places, places)])[0] @ score[places])[n])
         return _lacking(findings[k], amplitude, moved[:, k])
@@ -80,7 +79,7 @@ def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
 
 
 def _lacking(finding: Finding, amplitude: float, moved: Float) -> Lacking:
-    """Return a finding with its amplitude beside the others; a sensor's own change has the other sign."""
+    """Return a finding with its amplitude given the others; a sensor's own change has the opposite sign."""
     load = None if finding.load_nm is None else amplitude * finding.load_nm
     told = amplitude if load is not None else -amplitude
     return Lacking(replace(finding, amplitude=told), amplitude * moved, load)

@@ -1,7 +1,8 @@
-"""Checks a slow voltage sensor's samples beside the fitted model: that they do not stick, nor are off at standstill.
+"""Checks a slow voltage sensor's samples against the fitted model: that none sticks or is off at standstill.
 
-The filter foretells each sample from current and speed, and says how surely. A working sensor repeats its reading where
-its noise and resolution let it, and where the voltage stays; a stuck one repeats it wherever the voltage goes.
+The filter predicts each sample from current and speed, with its standard deviation. A working sensor repeats its
+reading where its noise and resolution allow it, and where the voltage stays; a stuck one repeats it whatever the
+voltage does.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ LEAST_AT_REST = 12  # samples: with fewer, their own scatter is not known
 
 
 def slow_faults_beside(fitted: WindowFit) -> Iterator[Reason]:
-    """Yield what the samples of a slow voltage contradict of the model fitted to the window."""
+    """Yield the contradictions between the samples of a slow voltage and the model fitted to the window."""
     slow, fit = fitted.window.slow_voltage, fitted.required_fit
     if slow is None or np.count_nonzero(np.isfinite(slow.voltage_v)) < LEAST_NOISE_SAMPLES:
         return
@@ -37,10 +38,10 @@ def slow_faults_beside(fitted: WindowFit) -> Iterator[Reason]:
 
 
 def _stuck(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
-    """Yield a reason for a run of equal samples that the sensor's noise and the model let happen by no chance.
+    """Yield a reason for a run of equal samples that neither the sensor's noise nor the model explains by chance.
 
-    That noise alone leaves a constant's reading alike, and that the model is as far from it by chance, are both needed
-    of a sensor that works.
+    A working sensor needs both: its noise leaves the reading of a constant equal, and the model deviates from it by
+    chance.
     """
     fit, volts = fitted.required_fit, slow.voltage_v
     motion = fit.problem.motions[0]
@@ -48,7 +49,7 @@ def _stuck(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
     made = innovations_of(motion, fit.theta, noise, float(fit.theta[6]))
     errors, spread = made.values[2 * motion.n :], np.sqrt(made.variance[2 * motion.n :])
     step = resolution(volts[np.isfinite(volts)])
-    beyond = np.maximum(np.abs(errors) - step / 2, 0.0) / spread  # what its step does not hide
+    beyond = np.maximum(np.abs(errors) - step / 2, 0.0) / spread  # beyond its resolution
     limit = BUDGET["slow voltage"].log_chance
     same = math.log(max(likely_same(volts, max(step, 1e-12)), 1e-300))
     for start, end in runs(volts):
@@ -63,9 +64,9 @@ def _stuck(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
 
 
 def _off_at_rest(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
-    """Yield a reason where u = R i does not hold at standstill: there nothing else is asked of the model.
+    """Yield a reason if u = R i does not hold at standstill, where nothing else of the model is needed.
 
-    The rapid's own rows tell an offset badly, for R and K imitate most of it.
+    The rows of the rapid itself hardly show an offset, since R and K imitate most of it.
     """
     window, fit = fitted.window, fitted.required_fit
     theta = fit.theta
@@ -80,7 +81,7 @@ def _off_at_rest(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
     mean_a = float(np.mean(still[:, 2]))
     of_r = float(np.sqrt(inverse_of(fit.information)[0][0, 0])) * mean_a
     chance = BUDGET["standstill"].deviations * math.hypot(float(np.std(left, ddof=1)) / math.sqrt(len(left)), of_r)
-    # a steady signal may lie half a step from what is read
+    # a steady signal may be half a step from its reading
     hidden = 0.5 * (resolution(rows[:, 0]) + theta[0] * resolution(window.current_a[np.isfinite(window.current_a)]))
     off = float(np.mean(left))
     peak = min(float(np.nanmax(np.abs(slow.voltage_v))), theta[0] * float(np.nanmax(np.abs(window.current_a))))

@@ -1,7 +1,7 @@
-"""Refuses a slow voltage sensor whose own samples, before any fit, stand still while the axis does not.
+"""Refuses a slow voltage sensor whose own samples, before any fit, stay constant while the axis moves.
 
-A steady voltage that is read coarsely repeats itself, and that is no fault. So a run of equal samples is refused where
-the speed changes over it by more than such a reading hides, or where the sensor's noise would have changed it.
+A steady voltage that is read coarsely repeats itself, and that is no fault. So a run of equal samples is refused if the
+speed changes over it by more than such a reading hides, or if the sensor's noise would have changed it.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from fdhil.validation.significance import BUDGET
 LEAST_SAMPLES = 3
 MOVED_SAMPLES = 4  # equal while the speed changes: shorter runs may lie where current and speed balance
 SPEED_CHANGE = 0.05  # of the rapid speed
-READ_STEPS = 4.0  # by which a voltage changes before its equal readings are strange
+READ_STEPS = 4.0  # change of a voltage beyond which equal readings are implausible
 MOVING = 0.05  # of the rapid speed
-LEAST_NOISE = 0.2  # of a step: what hides in the resolution
+LEAST_NOISE = 0.2  # of a step: noise hidden by the resolution
 LEAST_NOISE_SAMPLES = 20
 
 
 def slow_voltage_faults(window: Window) -> Iterator[Reason]:
-    """Yield a reason where the samples of a slow voltage sensor repeat themselves, or lie at the sensor's limit."""
+    """Yield a reason if the samples of a slow voltage sensor repeat themselves, or stay at the sensor's limit."""
     slow = window.slow_voltage
     if slow is None or window.n == 0 or np.count_nonzero(np.isfinite(slow.voltage_v)) < LEAST_NOISE_SAMPLES:
         return
@@ -60,9 +60,9 @@ def runs(volts: Float) -> list[tuple[int, int]]:
 def _strange(window: Window, volts: Float, speed: Float, run: tuple[int, int], step: float, same: float) -> bool:
     start, end = run
     peak = float(np.nanmax(np.abs(volts)))
-    read = READ_STEPS * step / peak if peak else 0.0  # a sensor that only ever read 0 tells no step
+    read = READ_STEPS * step / peak if peak else 0.0  # a sensor that only reads 0 shows no step
     hidden = max(SPEED_CHANGE, read) * window.rapid_speed_rad_s
-    # its first and last sample may have been the last right one, and the first right one again
+    # the first sample of a run may still be correct, and the last one correct again
     inner = speed[start + 1 : end - 1]
     if end - start >= MOVED_SAMPLES and float(np.ptp(inner)) > hidden:
         return True
@@ -70,6 +70,6 @@ def _strange(window: Window, volts: Float, speed: Float, run: tuple[int, int], s
 
 
 def likely_same(volts: Float, step: float) -> float:
-    """Return how likely a constant in the middle of a step is read there, by the noise of third differences."""
+    """Return the probability that a constant mid-step is read there, by the noise of third differences."""
     noise = math.sqrt(max(noise_of(carried(volts)) ** 2 - step**2 / 12.0, (LEAST_NOISE * step) ** 2))
     return alike(noise / step)

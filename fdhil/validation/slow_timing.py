@@ -1,7 +1,7 @@
-"""Tells whether the current beside a slow voltage is late against the speed, by how much likelier that makes it.
+"""Checks whether the current recorded with a slow voltage is late against the speed, by the gain in likelihood.
 
-The delay of a slow voltage is one of the parameters. Current and speed come in the same rows: one that a drive or a
-recorder assigns to later ones shifts by whole rows, which a load along the ramps imitates badly.
+The delay of a slow voltage is one of the parameters. Current and speed come in the same rows: a current that a drive or
+a recorder assigns to later ones shifts by whole rows, which a load along the ramps imitates badly.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from fdhil.validation.significance import BUDGET
 from fdhil.validation.timing import SEARCH
 
 LEAST_GAIN = BUDGET["timing"].deviations ** 2
-FIRST_SHARE = 0.1  # of the gain wanted that the score, too small for a long delay, shows at first sight
+FIRST_SHARE = 0.1  # of the required gain that the score must show at first: it is too small for a long delay
 
 
 def current_late(window: Window, fit: Fit, least_gain: float) -> Iterator[Reason]:
-    """Yield a reason where the current is late by more than a row, and the window likelier so by ``least_gain``.
+    """Yield a reason if the current is late by more than a row, and the window likelier so by ``least_gain``.
 
     ``fit`` is the window's; the gain is one of twice the log likelihood.
     """
@@ -55,17 +55,16 @@ def current_late(window: Window, fit: Fit, least_gain: float) -> Iterator[Reason
 
 
 def _whole(rows: float) -> int:
-    """Return the next whole row, away from nothing: a score shows a long delay smaller than it is."""
+    """Return the next whole row, away from zero: a score underestimates a long delay."""
     return int(np.sign(rows) * np.ceil(abs(rows) - 0.5))
 
 
 def _earlier(current: Float, rows: int) -> Float:
-    """Return the current (n,) earlier by ``rows``; what is not known stays as it ends."""
     return current[np.clip(np.arange(current.size) + rows, 0, current.size - 1)]
 
 
 def _shift(fit: Fit) -> tuple[float, float]:
-    """Return by how many rows the innovations show the current late, and the standard deviation of that."""
+    """Return the current's delay by the innovations, in rows, and its standard deviation."""
     motion: Motion = fit.problem.motions[0]
     width = 2 * round(SMOOTHING_S / 2 / motion.dt_s) + 1
     earlier = replace(motion, current=motion.current + np.gradient(moving_mean(motion.current, width)))

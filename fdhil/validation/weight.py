@@ -1,9 +1,9 @@
-"""Weighs a window's model in micrometres at the table: what it leaves unexplained, and what its bias would make.
+"""Assesses a window's model in micrometres at the table: the residual that it leaves, and the error by its bias.
 
-Where the axis' regulators are known, the rapid is replayed through the closed loop with the model, and what that leaves
-of the measured positions is weighed against the tolerance. Where they are not, the torque that the model leaves is sent
-through an ordinary loop, and weighed against what all torque of the move makes there (the share hardly depends on the
-loop), or against the following error that was recorded where that is larger: a drive without feed-forward.
+Where the axis' regulators are known, the rapid is replayed through the closed loop with the model, and the residual of
+the measured positions is compared with the tolerance. Where they are not, the torque that the model leaves is passed
+through an ordinary loop, and compared with the effect of all torque of the move (the share hardly depends on the loop),
+or with the recorded following error where that is larger: a drive without feed-forward.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from fdhil.records import Bool, Float, Parameters, Reason, Window, rms
 from fdhil.validation.replay import Replay, replay_window
 from fdhil.validation.table_error import TableError
 
-MOST_SHARE = 0.15  # of what all torque makes: a model that leaves more of it is none, however much the axis lags
-NEXT_SPEED = 0.3  # of the rapid speed: that of a program that is cut
-SCATTER = 3.0  # deviations by which the power of noise may lie above what is expected
-BEGINNING_S = 0.060  # before the drive surely moves
+MOST_SHARE = 0.15  # of the effect of all torque: a model that leaves more is invalid, however much the axis lags
+NEXT_SPEED = 0.3  # of the rapid speed: speed of a cutting program
+SCATTER = 3.0  # deviations by which the power of noise may exceed the expected one
+BEGINNING_S = 0.060  # before the first row in motion
 SMOOTHING_S = 0.002  # of the current, whose noise would push a shaft at rest
-LOOPS_DIFFER = "LoopsDiffer"  # code of what the torque explains, and the closed loop does not
-NOISE_ROWS = 25.0e-3  # s: over which noise behind a position loop hangs together
+LOOPS_DIFFER = "LoopsDiffer"  # code if the model explains the torque but not the closed loop
+NOISE_ROWS = 25.0e-3  # s: over which noise behind a position loop is correlated
 
 
 def tolerance_um(settings: Identification, following_um: float) -> float:
@@ -39,10 +39,10 @@ def tolerance_um(settings: Identification, following_um: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Weight:
-    """What a model leaves of a rapid at the table, RMS um, and how much it may: ``limit_um`` of ``whole_um``.
+    """The residual of a model on a rapid at the table, RMS um, and its limit: ``limit_um`` of ``whole_um``.
 
-    ``torque_um`` is what the torque that it leaves makes. ``through`` says what all is told by: a replay of the rapid,
-    the axis' own loop without one, or an ordinary loop, where only the share is worth something.
+    ``torque_um`` is the effect of the unexplained torque. ``through`` is the loop used: a replay of the rapid, the
+    axis' own loop without one, or an ordinary loop, where only the share is meaningful.
     """
 
     unexplained_um: float
@@ -54,12 +54,12 @@ class Weight:
     """Whether the replay explains the rapid without the configured resonance."""
 
     def allows(self, um: float) -> bool:
-        """Return whether that much at the table does no harm."""
+        """Return whether that error at the table is within the limit."""
         return um <= self.limit_um
 
     @property
     def in_um(self) -> bool:
-        """Return whether all is in micrometres at the axis' own table."""
+        """Return whether all figures are micrometres at the axis' own table."""
         return self.through != "ordinary loop"
 
     @property
@@ -68,10 +68,10 @@ class Weight:
         return self.allows(self.unexplained_um)
 
     def reason(self) -> Reason:
-        """Return why the model is not believed."""
-        advice = "the drive does what the model does not have, or current and speed are not of one instant"
+        """Return why the model is not accepted."""
+        advice = "the drive has an effect that the model lacks, or current and speed are not sampled at one instant"
         if self.through != "replay":
-            text = f"the torque that the model leaves unexplained makes {self.told(self.unexplained_um)} at the table"
+            text = f"the torque that the model leaves unexplained causes {self.told(self.unexplained_um)} at the table"
             return Reason("ValidationFailed", f"{text}, limit {self.told(self.limit_um)}", advice)
         text = (
             f"the closed loop with this model leaves {self.unexplained_um:.3g} um RMS of a following error of "
@@ -79,24 +79,25 @@ class Weight:
         )
         if self.too_soft:
             return Reason(
-                "ValidationFailed", text, "without resonance_hz the model explains it: it is another, or none"
+                "ValidationFailed", text, "the model explains it without resonance_hz: correct that value, or remove it"
             )
         if self.allows(self.torque_um):
             advice = (
-                "the torque is explained, so the drive's loops are not as configured (fdhil identify --loops), or "
-                "demand and position are not what the drive follows: held, late, or of other samples"
+                "the model explains the torque: the drive's loops differ from the configuration "
+                "(fdhil identify --loops), or "
+                "demand and position are not those that the drive follows: held, late, or from other samples"
             )
             return Reason(LOOPS_DIFFER, text, advice)
         return Reason("ValidationFailed", text, advice)
 
     def told(self, um: float) -> str:
-        """Return an error at the table for people: in um, or as a share where the loops are not known."""
-        return f"{um:.2g} um" if self.in_um else f"{um / self.whole_um:.1%} of what all torque makes"
+        """Return an error at the table as text: in um, or as a share where the loops are unknown."""
+        return f"{um:.2g} um" if self.in_um else f"{um / self.whole_um:.1%} of the effect of all torque"
 
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """The rows of a window in which the drive surely moves to ``side`` (n,), +1 or -1, else 0; current and speed (n,).
+    """The rows of a window in which the drive moves to ``side`` (n,), +1 or -1, else 0; current and speed (n,).
 
     ``friction`` (n,) is the model's torque of friction and loads against the positive direction, N.m. ``begins`` (n,)
     marks the rows before those, in which the drive may begin to move.
@@ -122,7 +123,7 @@ class Move:
         return cls(carried(window.current_a), speed, side, friction, begins, window.dt_s)
 
     def integral(self, torque_nm: Float) -> Float:
-        """Return the integral (n,) of a torque (n,) over the rows in which the drive surely moves."""
+        """Return the integral (n,) of a torque (n,) over the rows in which the drive moves."""
         over = np.where(self.side[:-1] != 0, (torque_nm[1:] + torque_nm[:-1]) / 2, 0.0) * self.dt_s
         return np.concatenate([[0.0], np.cumsum(over)])
 
@@ -139,7 +140,7 @@ class Move:
         )
 
     def _at_the_beginning(self, p: Parameters) -> Float:
-        """Return the same of the rows in which it begins to move: what friction at rest does not hold turns it."""
+        """Return that momentum of the rows in which the move begins, by the torque beyond friction at rest."""
         rows = np.flatnonzero(self.begins)
         if rows.size == 0:
             return np.zeros(self.speed.size)
@@ -157,14 +158,14 @@ class Move:
         return self.integral(self.friction) + p.Jt * self.turned(self.speed)
 
     def slower(self, p: Parameters, share: float) -> Move:
-        """Return the move at a share of its speed, by the same model: what is cut."""
+        """Return the move at a share of its speed, by the same model: a cut."""
         speed = share * self.speed
         friction = self.friction + p.ft * (speed - self.speed)
         current = (p.Jt * np.gradient(speed, self.dt_s) + friction) / p.K
         return replace(self, speed=speed, friction=friction, current=np.where(self.side != 0, current, self.current))
 
     def of_shift(self, p: Parameters, shift: Float) -> Float:
-        """Return the momentum (n,) that parameters off by ``shift`` (6,) make."""
+        """Return the momentum (n,) by a shift of the parameters by ``shift`` (6,)."""
         _, _, of_k, of_jt, of_ft, of_cd = shift
         off = of_ft * self.speed + of_cd * self.side - of_k * self.current
         made: Float = self.integral(off) + of_jt * self.turned(self.speed)
@@ -172,7 +173,7 @@ class Move:
 
 
 def to_and_fro(momentum: Float) -> Float:
-    """Return the momentum (2 n,) of a move and its way back at once, where dry and viscous friction differ."""
+    """Return the momentum (2 n,) of a move and its immediate return, where dry and viscous friction differ."""
     return np.concatenate([momentum, momentum[-1] - momentum])
 
 
@@ -185,7 +186,7 @@ def weigh(
     axis: Axis | None,
     sync_period_s: float,
 ) -> Weight | None:
-    """Return what a model leaves of a window; ``noise`` are the deviations of current (A) and speed (rad/s)."""
+    """Return a model's residual of a window; ``noise`` are the deviations of current (A) and speed (rad/s)."""
     if not _runs(parameters):
         return None
     loop = TableError.of(parameters, window.pitch_mm, axis)
@@ -203,7 +204,7 @@ def weigh(
 
 
 def _stiff_um(window: Window, parameters: Parameters, axis: Axis | None, sync_period_s: float) -> float:
-    """Return what a replay leaves without the configured resonance; infinite where none is configured."""
+    """Return the residual of a replay without the configured resonance; infinite where none is configured."""
     if axis is None or axis.resonance_hz is None:
         return math.inf
     stiff = replace(parameters, terms=tuple(pair for pair in parameters.terms if not pair[0].startswith("resonance")))
@@ -212,7 +213,7 @@ def _stiff_um(window: Window, parameters: Parameters, axis: Axis | None, sync_pe
 
 
 def _followed_um(window: Window) -> float:
-    """Return the RMS following error that was recorded beyond that at rest, um; 0 where the demand was not."""
+    """Return the RMS following error that was recorded beyond that at rest, um; 0 without a recorded demand."""
     apart = (window.position_mm - window.demand_mm)[np.isfinite(window.position_mm - window.demand_mm)]
     if apart.size == 0 or not np.nanmax(window.demand_mm) > np.nanmin(window.demand_mm):
         return 0.0
@@ -229,7 +230,6 @@ def _replayed(window: Window, parameters: Parameters, axis: Axis | None, sync_pe
 
 
 def _beyond_noise(left: float, loop: TableError, p: Parameters, move: Move, noise: tuple[float, float]) -> float:
-    """Return what surely lies beyond the noise of the sensors."""
     n, dt_s = move.speed.size, move.dt_s
     current_a, speed_rad_s = noise
     moving = float(np.mean(move.side != 0))

@@ -1,8 +1,8 @@
 """Widens the intervals of an estimate by what its window shows beyond the model.
 
-Whatever moves the innovations in a direction that the parameters partly imitate has moved the parameters, too. By how
-much is known with its amplitude (White 1982: a model that is nearly right is biased by the projection of what it
-lacks). What surely is there and was not fitted is taken as one standard deviation of a doubt.
+An effect that moves the innovations in a direction that the parameters partly imitate has biased the parameters, too.
+The bias follows from its amplitude (White 1982: a model that is nearly right is biased by the projection of what it
+lacks). A significant deficiency that was not fitted adds its bias as one standard deviation.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from fdhil.records import PARAMETERS, Estimate, Float, frozen
 from fdhil.validation.selection import Lacking
 
 UNKNOWN_WAY = 2.0  # times an interval
-LAG_ROWS = 3.0  # what a sensor may lag without being named: a lag looks like the winding's own
+LAG_ROWS = 3.0  # lag of a sensor that may go unreported: it looks like the winding's own
 
 
 def widened(
     estimate: Estimate, fit: Fit, lacks: Sequence[Lacking], restless: Collection[str] = (), nameless: bool = False
 ) -> Estimate:
-    """Return the estimate with the shifts by all that the model surely lacks added to its covariance.
+    """Return the estimate with the shifts by all significant deficiencies added to its covariance.
 
-    ``restless`` are the signals whose innovations hang together, or scatter more than they should. Where no finding
-    explains that (``nameless``), nobody knows which way it moves the parameters, and every interval is doubled. Where
+    ``restless`` are the signals whose innovations are autocorrelated, or scatter more than they should. Where no
+    finding explains that (``nameless``), its effect on the parameters is unknown, and every interval is doubled. Where
     it shows in voltage or current, a sensor may lag, which looks like another winding.
     """
     covariance = estimate.covariance
@@ -58,16 +58,16 @@ def _lag(fit: Fit) -> Float:
 
 
 def _worst(estimate: Estimate, fit: Fit, lack: Lacking) -> Float:
-    """Return the shift (k,) by what is lacked or by a rival, whichever moves a parameter by more deviations."""
+    """Return the larger shift (k,) in standard deviations, of the deficiency or of an alternative."""
     shifts = [_of_names(estimate, fit, each.shift) for each in lack.with_rivals]
     deviations = np.sqrt(np.maximum(np.diag(estimate.covariance), np.finfo(np.float64).tiny))
     return max(shifts, key=lambda shift: float(np.abs(shift / deviations).max()))
 
 
 def _of_names(estimate: Estimate, fit: Fit, shift: Float) -> Float:
-    """Return the shift (k,) of what the estimate names, from that of the fit's free entries.
+    """Return the shift (k,) of the estimate's names, from that of the fit's free entries.
 
-    The parts of a ripple have no name of their own: what moves them is left to their covariance.
+    The parts of a ripple have no name of their own: their shift is left to their covariance.
     """
     moved = np.zeros(len(estimate.names))
     courses = fit.problem.motions[0].courses

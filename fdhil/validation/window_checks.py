@@ -79,7 +79,7 @@ def _check_sample_count(signals: WindowSignals) -> Iterator[Reason]:
         text = f"{rate}: a whole rapid has {window.n} samples, fewer than {LEAST_SAMPLES}"
         yield Reason("LowExcitation", text, "record at 1000 Hz or faster")
     else:
-        yield Reason("LowExcitation", f"{window.n} rows are no rapid move", "record a whole rapid")
+        yield Reason("LowExcitation", f"{window.n} samples are too few for a rapid move", "record a whole rapid")
 
 
 def _check_backlash(signals: WindowSignals) -> list[Reason]:
@@ -125,11 +125,11 @@ def _check_estimate(table: TableAssessment) -> Iterator[Reason]:
     yield from missing
     unconverged = bool(estimate.missing) and not missing and fitted.fit is not None and not fitted.fit.converged
     if unconverged or estimate.result is Result.DIVERGED:
-        yield Reason("SolverFailed", "the fit does not converge", "look at the window's signals")
+        yield Reason("SolverFailed", "the fit does not converge", "inspect the window's signals")
     yield from unphysical(fitted.widened_estimate or estimate, one_way=True)
     for name in estimate.terms:
         if name in NEVER_NEGATIVE and estimate.value(name) < -SURE * estimate.std(name):
-            text = f"{name} = {estimate.value(name):.4g} would add voltage: voltage or current is off"
+            text = f"{name} = {estimate.value(name):.4g} would add voltage: voltage or current has an offset"
             yield Reason("CalibrationSuspect", text, "set the zeros of current and voltage sensor at standstill")
 
 
@@ -145,7 +145,7 @@ def _check_stick_slip(table: TableAssessment) -> Iterator[Reason]:
     more, dry = estimate.value("stribeck"), abs(estimate.value("Cd"))
     torque_nm = estimate.value("K") * float(np.nanmax(np.abs(table.fitted.window.current_a)))
     least = max(dry, SLIPPING_SHARE * torque_nm)
-    advice = "lubricate the slide-way, and look at its guides, first of all"
+    advice = "lubricate the slide-way and inspect its guides first"
     text = f"higher than the dry friction of {dry:.3g} N.m: the axis"
     if more > least:
         yield Reason("ValidationFailed", f"friction at low speed is {more:.3g} N.m {text} slips", advice)
@@ -154,7 +154,7 @@ def _check_stick_slip(table: TableAssessment) -> Iterator[Reason]:
         known = budget.allows(um) or budget.allows(table.rest_position_error_um)
         if resting.deviation_nm < more <= least < more + beyond and not known:
             may = f"friction at low speed is {more:.3g} +- {beyond:.2g} N.m {text} may slip"
-            limit = f"where it rests is told to {budget.told(um)}, limit {budget.told(budget.limit_um)}"
+            limit = f"its position at rest is known to {budget.told(um)}, limit {budget.told(budget.limit_um)}"
             yield Reason("ValidationFailed", f"{may}, and {limit}", advice)
 
 
@@ -195,7 +195,7 @@ def _check_simulated_speed(table: TableAssessment) -> Iterator[Reason]:
     reached, least = fitted.fit_percent, expected_fit_percent(fitted.window, fitted.required_fit)
     if reached is not None and not reached >= least:
         text = f"the model simulated from the measured voltage follows the speed by {reached:.2f} %, not {least:.2f} %"
-        yield Reason("ValidationFailed", text, "the drive does what the model does not have")
+        yield Reason("ValidationFailed", text, "the drive has an effect that the model lacks")
 
 
 def _check_values(table: TableAssessment) -> Iterable[Reason]:

@@ -155,7 +155,7 @@ def test_a_gain_is_bounded_by_the_parameters_spread_and_by_the_skill(config: Mac
     assert poor.at_least is None
     for unknown in ((), (Skill("X", 1, math.nan, 1.0, 0.0, 900.0),)):
         assert predicted(skills=unknown).half_um is None
-    assert "how well it fits this machine is not known" in str(predicted(skills=()))
+    assert "its accuracy on this machine is unknown" in str(predicted(skills=()))
 
 
 def test_program_is_not_armed_when_the_last_moves_show_errors_that_make_a_position_worse(

@@ -72,7 +72,7 @@ def test_too_high_a_demand_is_refused_with_the_feed_that_can_be_held(method: str
     """20 m/min with 30 + 15 ms asks for 1.7 times the current limit; 9 to 11 m/min can be held."""
     correction = plan(bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG, method)
     assert {reason.code for reason in correction.refused} == {"DemandTooHigh"}
-    feed = float(correction.refused[0].advice.split()[3])
+    feed = float(correction.refused[0].advice.split()[4])
     assert 9 < feed < 11
     assert correction.after is correction.before
 

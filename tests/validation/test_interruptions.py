@@ -82,9 +82,9 @@ def test_an_override_that_changes_on_the_way_is_refused_with_the_speed(rate: obj
 @pytest.mark.parametrize(
     ("nc", "words"),
     [
-        (NcMove(12, "part.ngc", (0.5, 0.5), False), "the NC says that its override was 50 % in line 12"),
-        (NcMove(12, "part.ngc", (0.5, 1.0), False), "the NC says that its override was 50 to 100 % in line 12"),
-        (NcMove(None, None, None, True), "the NC says that its feed was held"),
+        (NcMove(12, "part.ngc", (0.5, 0.5), False), "the NC reports an override of 50 % in line 12"),
+        (NcMove(12, "part.ngc", (0.5, 1.0), False), "the NC reports an override of 50 to 100 % in line 12"),
+        (NcMove(None, None, None, True), "the NC reports a feed hold"),
     ],
 )
 def test_what_the_nc_says_was_no_rapid_as_planned_is_refused(nc: NcMove, words: str) -> None:
@@ -116,8 +116,8 @@ def test_a_drive_that_swings_through_rest_while_its_demand_goes_on_has_not_arriv
     held = faults.KINDS["feed hold"].make(np.random.default_rng([7, 2, 2049]))  # falls to 14 %, and swings through 0
     texts = [[str(r) for r in analyse(w, Identification()).verdict.reasons] for w in find_windows(held.recording)]
     assert [len(reasons) > 0 for reasons in texts] == [True, True]
-    assert texts[0] == ["EpisodeAborted: the demand moves on with 42 mm/s where the drive passes through rest"]
-    assert texts[1][0].startswith("EpisodeAborted: the demand moves on with ")  # nor does the rest of it begin there
+    assert texts[0] == ["EpisodeAborted: the demand continues at 42 mm/s while the drive passes through rest"]
+    assert texts[1][0].startswith("EpisodeAborted: the demand continues at ")  # nor does the rest of it begin there
 
 
 def _falls(drop: float, time_s: Array) -> Array:
