@@ -71,7 +71,7 @@ def entry(advice: Advice, most: Mapping[float, Advice] | None) -> dict[str, Any]
     """Return the JSON document of a segment's advice; ``most`` is the advice by the hopeful source."""
     axis, what, share = advice.load
     asked = {"axis": axis, "what": what, "share": share}
-    told = {
+    document = {
         "line": advice.line,
         "start_s": round(advice.start_s, 6),
         "end_s": round(advice.end_s, 6),
@@ -87,9 +87,9 @@ def entry(advice: Advice, most: Mapping[float, Advice] | None) -> dict[str, Any]
     }
     if most is not None:
         other = most.get(advice.start_s, advice)
-        told["hopeful_feed_mm_min"] = _feed(other.plain, advice.feed_mm_min)
-        told["corrected_hopeful_feed_mm_min"] = _feed(other.corrected, advice.feed_mm_min)
-    return told
+        document["hopeful_feed_mm_min"] = _feed(other.plain, advice.feed_mm_min)
+        document["corrected_hopeful_feed_mm_min"] = _feed(other.corrected, advice.feed_mm_min)
+    return document
 
 
 def _held(name: str, held: Held | None, feed_mm_min: float) -> dict[str, float | None]:

@@ -215,8 +215,8 @@ def _outcome(table: TableAssessment, found: Findings) -> WindowOutcome:
     """Return the verdict: weighed findings refuse only if they do harm at the table, and warn else."""
     weight, fitted = table.budget, table.fitted
     names = WEIGHED | {PLATEAU} if weight is not None and weight.through == "replay" else WEIGHED
-    weighed = [r for name, told in found.items() if name in names for r in told]
-    reasons = [r for name, told in found.items() if name not in names for r in told]
+    weighed = [r for name, each in found.items() if name in names for r in each]
+    reasons = [r for name, each in found.items() if name not in names for r in each]
     # an ordinary loop gives only a share: named reasons are more specific
     if weight is not None and not weight.believed and (weight.in_um or not (reasons or weighed)):
         reasons += [weight.reason(), *_gain(fitted)]

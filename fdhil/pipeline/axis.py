@@ -299,8 +299,8 @@ def _since_jump(known: Known) -> Sequence[Member]:
     if known.newest is None:
         return known.members
     now = known.newest.parameters.as_dict()
-    for k, told in reversed(list(enumerate(known.members))):
-        values = dict(zip(told.names, told.values.tolist(), strict=True))
+    for k, each in reversed(list(enumerate(known.members))):
+        values = dict(zip(each.names, each.values.tolist(), strict=True))
         if any(abs(values[n] - now[n]) > LEAST_JUMP[n] * abs(now[n]) for n in ("R", "L", "K", "Jt") if n in values):
             return known.members[k + 1 :]
     return known.members

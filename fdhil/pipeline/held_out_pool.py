@@ -113,8 +113,8 @@ def _judged(
     if estimate is None or not moves:
         return estimate, [None] * len(outcomes)
     estimate = with_presliding(estimate, [window for window, _ in moves], axis, sync_period_s)
-    told = iter(predict_held_out(moves, estimate, axis, sync_period_s))
-    return estimate, [next(told) if o.verdict.accepted and o.estimate is not None else None for o in outcomes]
+    replays = iter(predict_held_out(moves, estimate, axis, sync_period_s))
+    return estimate, [next(replays) if o.verdict.accepted and o.estimate is not None else None for o in outcomes]
 
 
 def _on_time(outcome: WindowOutcome, axis: Axis, sync_period_s: float) -> Window:

@@ -38,10 +38,10 @@ def loops_of(
     current loop hides them. Accepted windows precede the others, and a section of another machine is ignored.
     """
     axis = own(outcomes[0].window, axis) if outcomes else None
-    told = [(o, mechanics_of(o, axis)) for o in outcomes]
-    known = [(o, plant) for o, plant in told if plant is not None]
-    believed = [(o, plant) for o, plant in known if o.verdict.accepted]
-    chosen = believed or known
+    pairs = [(o, mechanics_of(o, axis)) for o in outcomes]
+    known = [(o, plant) for o, plant in pairs if plant is not None]
+    accepted = [(o, plant) for o, plant in known if o.verdict.accepted]
+    chosen = accepted or known
     windows, plants = [o.window for o, _ in chosen], [p for _, p in chosen]
     return identify_loops(windows, plants, axis, settings, sync_period_s, growing=growing)
 
@@ -78,8 +78,8 @@ def softened(outcomes: Collection[WindowOutcome], axis: Axis | None, sync_period
     left = [o for o in outcomes if suspected([o])] or [o for o in outcomes if o.verdict.accepted]
     if axis is None or sync_period_s is None or not left or own(left[0].window, axis) is None:
         return None
-    told = [(o.window, mechanics_of(o, axis)) for o in left]
-    return softer_axis([(w, plant) for w, plant in told if plant is not None], axis, sync_period_s)
+    pairs = [(o.window, mechanics_of(o, axis)) for o in left]
+    return softer_axis([(w, plant) for w, plant in pairs if plant is not None], axis, sync_period_s)
 
 
 def explained(

@@ -61,6 +61,6 @@ def _with(axis: Axis, hertz: float) -> Axis:
 def _left_um(rapids: Rapids, axis: Axis, sync_period_s: float) -> tuple[float, float]:
     """Return the RMS residual of the rapids' replays, and of the following error; zero without any."""
     replays = [replay_window(window, drive, axis, sync_period_s) for window, drive in rapids]
-    told = [(one.unexplained_um, one.measured_um) for one in replays if one is not None]
-    left, following = np.sqrt(np.mean(np.square(told), axis=0)) if told else (0.0, 0.0)
+    residuals = [(one.unexplained_um, one.measured_um) for one in replays if one is not None]
+    left, following = np.sqrt(np.mean(np.square(residuals), axis=0)) if residuals else (0.0, 0.0)
     return float(left), float(following)

@@ -34,7 +34,7 @@ OF_THE_MOVE = (
 WARMING = "R"
 _FIGURES = re.compile(r"[-+]?[0-9][-+.0-9e]*")  # figures, in which warnings of one kind differ
 
-Told = list[tuple[Window, Estimate]]
+WindowEstimates = list[tuple[Window, Estimate]]
 
 
 def pool(
@@ -81,36 +81,36 @@ def together(
     if not accepted:
         seen = dict.fromkeys(r for o in outcomes for r in o.verdict.reasons)
         return None, Verdict(False, None, tuple(seen))
-    told: Told = [(o.window, o.estimate) for o in accepted if o.estimate is not None]
+    estimates: WindowEstimates = [(o.window, o.estimate) for o in accepted if o.estimate is not None]
     reasons = list(one_sided(outcomes))
-    estimate = told[0][1]
-    if len(told) > 1:
+    estimate = estimates[0][1]
+    if len(estimates) > 1:
         try:
-            estimate = _estimated(told, members, between(history), settings, refit=refit)
+            estimate = _estimated(estimates, members, between(history), settings, refit=refit)
         except GAVE_UP as error:
             return None, Verdict(False, None, (gave_up(error, "inspect the windows"),))
         # with a slow voltage, or without one, R and L may be undetermined
-        slow = any(window.slow_voltage is not None or window.voltage_v is None for window, _ in told)
+        slow = any(window.slow_voltage is not None or window.voltage_v is None for window, _ in estimates)
         reasons += untold(estimate, slow=slow)
     beyond = unphysical(estimate)
-    return (estimate if beyond else bounded(estimate)), _verdict(accepted, [*reasons, *beyond, *moved(told)])
+    return (estimate if beyond else bounded(estimate)), _verdict(accepted, [*reasons, *beyond, *moved(estimates)])
 
 
 def _estimated(
-    told: Told, members: Sequence[Member], apart: Between, settings: Identification, *, refit: bool
+    estimates: WindowEstimates, members: Sequence[Member], apart: Between, settings: Identification, *, refit: bool
 ) -> Estimate:
     """Return the estimate of all samples if the windows are of one kind, else the mixed model's."""
-    first = told[0][1]
+    first = estimates[0][1]
     quick = pooled(members, first, apart)
     whole = all(set(PARAMETERS) <= set(m.names) for m in members)
-    deaf = all(window.voltage_v is None and window.slow_voltage is None for window, _ in told)
-    if deaf or quick.terms or apart.surely or (whole and not refit):
+    voltageless = all(window.voltage_v is None and window.slow_voltage is None for window, _ in estimates)
+    if voltageless or quick.terms or apart.surely or (whole and not refit):
         return quick
-    again = chosen(settings)[1]([window for window, _ in told], settings)
-    alike = pooled(members, first, ALIKE)
-    if not again.names == alike.names == quick.names:
+    again = chosen(settings)[1]([window for window, _ in estimates], settings)
+    same = pooled(members, first, ALIKE)
+    if not again.names == same.names == quick.names:
         return again
-    wider = np.nan_to_num(quick.covariance - alike.covariance)  # zero where a slow voltage leaves R or L undetermined
+    wider = np.nan_to_num(quick.covariance - same.covariance)  # zero where a slow voltage leaves R or L undetermined
     return replace(again, covariance=frozen(again.covariance + wider))
 
 
@@ -120,9 +120,9 @@ def one_sided(outcomes: Iterable[WindowOutcome]) -> list[Reason]:
     A load that acts one way is part of dry friction then, by an unknown share.
     """
     listed = list(outcomes)
-    believed = {o.window.direction for o in listed if o.verdict.accepted}
-    refused = [o for o in listed if o.window.direction not in believed and refuses_the_model(o)]
-    if len(believed) != 1 or not refused:
+    directions = {o.window.direction for o in listed if o.verdict.accepted}
+    refused = [o for o in listed if o.window.direction not in directions and refuses_the_model(o)]
+    if len(directions) != 1 or not refused:
         return []
     way = "positive" if refused[0].window.direction > 0 else "negative"
     cause = refused[0].verdict.reasons[0]
@@ -159,9 +159,9 @@ def _verdict(accepted: Sequence[WindowOutcome], reasons: Sequence[Reason]) -> Ve
     fits = [v.fit_percent for v in verdicts if v.fit_percent is not None]
     unexplained = [v.unexplained_um for v in verdicts if v.unexplained_um is not None]
     warnings = {_FIGURES.sub("", str(warning)): warning for v in verdicts for warning in v.warnings}
-    told = list(warnings.values())
+    unique = list(warnings.values())
     if len({o.window.direction for o in accepted}) == 1 and not reasons and accepted[0].window.is_rapid:
         text = "all moves are in one direction: a constant load cannot be separated from Cd"
-        told.append(Reason("OneDirection", text, "record rapids in both directions"))
+        unique.append(Reason("OneDirection", text, "record rapids in both directions"))
     figure = max(unexplained, default=None)
-    return Verdict(not reasons, min(fits, default=None), tuple(reasons), figure, tuple(told))
+    return Verdict(not reasons, min(fits, default=None), tuple(reasons), figure, tuple(unique))

@@ -160,10 +160,10 @@ class RecentSamples:
 
     def _slow_line(self) -> tuple[float, float] | None:
         """Return begin (ticks) of sample 0 and ticks per sample, by the newest blocks and the SYNC's arrivals."""
-        told = self._begins()
-        if told is None:
+        located = self._begins()
+        if located is None:
             return None
-        counter, begins = told
+        counter, begins = located
         nominal = 1 / self._samples_per_tick()
         spread = counter - counter.mean()
         power = float(spread @ spread)
@@ -211,10 +211,10 @@ class RecentSamples:
         ratio = round(samples)
         if ratio < 1 or abs(samples / ratio - 1) > RATE_TOLERANCE:
             return None
-        told = self._begins(self._period_ns)
-        if told is None:
+        located = self._begins(self._period_ns)
+        if located is None:
             return None
-        counter, begins = told
+        counter, begins = located
         ahead = float(np.median(counter - ratio * begins))
         offset = round(ahead)
         return _Placing(ratio, offset, (ahead - offset) / ratio * self._period_ns * 1e-9)

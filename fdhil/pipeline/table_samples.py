@@ -63,10 +63,10 @@ class RecentTable:
         for block in self._blocks["table_mm"]:
             row = np.rint(block.tick).astype(np.int64) - motion.start
             inside = (row >= 0) & (row < values.size)
-            row, tick, told = row[inside], block.tick[inside], block.values[inside]
+            row, tick, readings = row[inside], block.tick[inside], block.values[inside]
             further = np.interp(tick, at, motion.position_mm[known]) - motion.position_mm[row]
             sure = np.abs(motion.speed_mm_tick[row]) * block.tick_error <= UNSURE_MM
-            values[row[sure]] = (told - further)[sure]
+            values[row[sure]] = (readings - further)[sure]
         return frozen(values) if np.isfinite(values).any() else None
 
     def accelerations(self, motion: Motion) -> Float | None:
@@ -79,23 +79,27 @@ class RecentTable:
         n = motion.position_mm.size
         if not blocks or not n:
             return None
-        tick, told = (np.concatenate([getattr(b, name) for b in blocks]) for name in ("tick", "values"))
+        tick, readings = (np.concatenate([getattr(b, name) for b in blocks]) for name in ("tick", "values"))
         rising = np.concatenate([[True], np.diff(tick) > 0])
-        tick, told, rate = tick[rising], told[rising], blocks[-1].rate_per_tick
-        values = _means(tick - motion.start, told, n) if rate >= 1.0 else _cubic(tick - motion.start, told, n, 1 / rate)
+        tick, readings, rate = tick[rising], readings[rising], blocks[-1].rate_per_tick
+        values = (
+            _means(tick - motion.start, readings, n)
+            if rate >= 1.0
+            else _cubic(tick - motion.start, readings, n, 1 / rate)
+        )
         return frozen(values) if np.isfinite(values).any() else None
 
 
-def _means(place: Float, told: Float, n: int) -> Float:
+def _means(place: Float, readings: Float, n: int) -> Float:
     row = np.rint(place).astype(np.int64)
     inside = (row >= 0) & (row < n)
     count = np.bincount(row[inside], minlength=n)
     with np.errstate(invalid="ignore", divide="ignore"):
-        means: Float = np.bincount(row[inside], told[inside], minlength=n) / count
+        means: Float = np.bincount(row[inside], readings[inside], minlength=n) / count
     return means
 
 
-def _cubic(place: Float, told: Float, n: int, step: float) -> Float:
+def _cubic(place: Float, readings: Float, n: int, step: float) -> Float:
     """Return (n,) the values at rows 0.. of the cubic through the two samples on either side; NaN over a lost one."""
     values = np.full(n, np.nan)
     if place.size < 4:
@@ -107,7 +111,7 @@ def _cubic(place: Float, told: Float, n: int, step: float) -> Float:
     close = np.max([np.diff(place)[k + shift] for shift in (-1, 0, 1)], axis=0) < LONGEST_STEP * step
     rows, k = rows[close], k[close]
     u = (rows - place[k]) / (place[k + 1] - place[k])
-    before, left, right, after = (told[k + shift] for shift in (-1, 0, 1, 2))
+    before, left, right, after = (readings[k + shift] for shift in (-1, 0, 1, 2))
     # Catmull-Rom: the slope at a sample is that between its neighbours
     slope, slope_after = (right - before) / 2, (after - left) / 2
     values[np.flatnonzero(whole)[close]] = left + u * (

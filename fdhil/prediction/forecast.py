@@ -170,9 +170,9 @@ def zone_changes(
         peak = rows.start + int(np.argmax(np.maximum(prediction.contour_um, then.contour_um)[rows]))
         now_um, before_um = float(prediction.contour_um[rows].max()), float(then.contour_um[rows].max())
         by = ((axis, name, now_um - float(other[rows].max())) for (axis, name), other in without.items())
-        told = [(other.max_um, std) for other, std in recorded if _meet(zone, other)]
-        settings_um = before_um - max(told)[0] if told and not same_settings else None
-        std_then = max(told)[1] if told else float(std_um[peak])
+        earlier_zones = [(other.max_um, std) for other, std in recorded if _meet(zone, other)]
+        settings_um = before_um - max(earlier_zones)[0] if earlier_zones and not same_settings else None
+        std_then = max(earlier_zones)[1] if earlier_zones else float(std_um[peak])
         change = ZoneChange(
             line=int(reference.line[peak]),
             where=zone.where,
@@ -200,12 +200,12 @@ def course(sets: Sequence[ParameterSet], days: Float) -> Course:
     first = 0 if step is None else step + 1
     newest = sets[first:]
     celsius = np.array([np.nan if s.temperature_c is None else s.temperature_c for s in newest], dtype=np.float64)
-    beside = celsius if np.isfinite(celsius).all() and np.ptp(celsius) > 0 else None
+    celsius_known = celsius if np.isfinite(celsius).all() and np.ptp(celsius) > 0 else None
     found = {}
     for k, name in enumerate(PARAMETERS):
         values = np.array([getattr(s.parameters, name) for s in newest])
         stds = np.array([np.sqrt(max(float(np.nan_to_num(s.covariance[k, k])), 0.0)) for s in newest])
-        line = slope(values, days[first:], stds if (stds > 0).all() else None, beside)
+        line = slope(values, days[first:], stds if (stds > 0).all() else None, celsius_known)
         if line is not None:
             found[name] = line
     return Course(found, float(np.ptp(days[first:])))

@@ -150,9 +150,9 @@ def _agree(configured: float | str, shown: float | str) -> bool:
 
 def _physical_model(axis: str, published: ParameterSet, faults: list[ConfigFault]) -> Parameters:
     """Return the parameters of a set, moved into the physical bounds that an earlier fdhil exceeded by chance."""
-    told, covariance = values_of(published.parameters), published.covariance
-    names, values = tuple(told), np.array([*told.values()])
-    if all(bound.beyond(told) <= 0.0 for bound in physical.bounds(names)):
+    by_name, covariance = values_of(published.parameters), published.covariance
+    names, values = tuple(by_name), np.array([*by_name.values()])
+    if all(bound.beyond(by_name) <= 0.0 for bound in physical.bounds(names)):
         return published.parameters
     if covariance.shape != (len(names), len(names)) or beyond_chance(names, values, covariance):
         text = "Unphysical: friction in the newest set would drive the axis, or a value must not be negative"

@@ -43,7 +43,7 @@ def values_apart(estimate: Estimate, likeliest: Float) -> Iterator[Reason]:
             yield Reason("ValidationFailed", text, "identify by maximum_likelihood")
 
 
-def moved(told: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
+def moved(estimates: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
     """Return a reason for each parameter that differs between windows beyond chance and by enough to matter.
 
     L, K and Jt are the same in all windows, given in order. A drift by temperature is no jump: R is compared with the
@@ -54,7 +54,7 @@ def moved(told: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
     reasons: list[Reason] = []
     worst: Pair | None = None
     for name in PARAMETERS:
-        pair = _farthest(told, name)
+        pair = _farthest(estimates, name)
         if pair is None:
             continue
         worst = worst or pair
@@ -64,7 +64,7 @@ def moved(told: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
         reasons.append(Reason(code, text, "identify the windows before and after the change separately"))
     if len(reasons) == 1:
         return reasons
-    suspected = [worst] if worst is not None else [*pairwise(told), *_by_direction(told)]
+    suspected = [worst] if worst is not None else [*pairwise(estimates), *_by_direction(estimates)]
     sensors = [reason for pair in suspected if (reason := gain_change(*pair)) is not None]
     return sensors[:1] or reasons
 
@@ -74,9 +74,9 @@ def is_of_winding(reason: Reason) -> bool:
     return reason.code == "ParameterJump" and reason.text.split(" ", 1)[0] in WINDING
 
 
-def _farthest(told: Sequence[tuple[Window, Estimate]], name: str) -> Pair | None:
+def _farthest(estimates: Sequence[tuple[Window, Estimate]], name: str) -> Pair | None:
     """Return the two windows, in order, between which a parameter changes most, if that is a jump."""
-    known = [(w, e) for w, e in told if np.isfinite(e.value(name))]  # a slow voltage may leave R and L open
+    known = [(w, e) for w, e in estimates if np.isfinite(e.value(name))]  # a slow voltage may leave R and L open
     if len(known) < 2:
         return None
     pairs = list(combinations(known, 2)) if name not in WARMING else list(pairwise(known))
@@ -92,9 +92,9 @@ def _farthest(told: Sequence[tuple[Window, Estimate]], name: str) -> Pair | None
     return (one, other) if abs(other[1].value(name) - one[1].value(name)) > max(chance, least) else None
 
 
-def _by_direction(told: Sequence[tuple[Window, Estimate]]) -> Iterator[Pair]:
+def _by_direction(estimates: Sequence[tuple[Window, Estimate]]) -> Iterator[Pair]:
     for direction in (1, -1):
-        yield from pairwise([(w, e) for w, e in told if w.direction == direction])
+        yield from pairwise([(w, e) for w, e in estimates if w.direction == direction])
 
 
 def gain_change(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) -> Reason | None:

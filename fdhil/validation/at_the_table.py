@@ -49,9 +49,9 @@ def _zero(window: Window) -> float:
 
 def _predicted(window: Window, parameters: Parameters | None, axis: Axis | None, sync_period_s: float) -> Float | None:
     """Return the table position (n,) by the model, mm; None if model or loops are unknown."""
-    told = parameters is not None and np.isfinite(list(parameters.as_dict().values())).all()
+    complete = parameters is not None and np.isfinite(list(parameters.as_dict().values())).all()
     same_grid = abs(sync_period_s - window.dt_s) < 1e-3 * window.dt_s
-    if parameters is None or axis is None or not told or not same_grid or not np.isfinite(window.demand_mm).all():
+    if parameters is None or axis is None or not complete or not same_grid or not np.isfinite(window.demand_mm).all():
         return None
     offset = None if window.offset_mm is None else np.nan_to_num(window.offset_mm)
     return closed_loop.simulate(parameters, axis, sync_period_s, window.demand_mm, offset).table_mm

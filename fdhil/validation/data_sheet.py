@@ -36,16 +36,16 @@ def gain_error(estimate: Estimate, nominal: Parameters) -> Reason | None:
     """
     blind = set(WINDING) <= set(estimate.given)  # given values show no sensor's gain
     compared, tolerance = (TORQUES, FRICTION_TOLERANCE) if blind else (COMPARED, TOLERANCE)
-    told = [name for name in compared if estimate.value(name) > 0 and np.isfinite(estimate.std(name))]
-    told = [name for name in told if name not in estimate.given and getattr(nominal, name) > 0]
-    if len(told) < LEAST_BEYOND:
+    names = [name for name in compared if estimate.value(name) > 0 and np.isfinite(estimate.std(name))]
+    names = [name for name in names if name not in estimate.given and getattr(nominal, name) > 0]
+    if len(names) < LEAST_BEYOND:
         return None
-    rows = [PARAMETERS.index(name) for name in told]
-    values = np.array([estimate.value(name) for name in told])
-    apart = np.log(values / [getattr(nominal, name) for name in told])
+    rows = [PARAMETERS.index(name) for name in names]
+    values = np.array([estimate.value(name) for name in names])
+    apart = np.log(values / [getattr(nominal, name) for name in names])
     sure = BUDGET["data sheet"].deviations
     shared = np.zeros(len(rows)) if estimate.systematic is None else np.square(estimate.systematic[rows]).sum(axis=1)
-    chance = np.array([estimate.std(name) for name in told]) ** 2 - shared
+    chance = np.array([estimate.std(name) for name in names]) ** 2 - shared
     allowed = math.log1p(tolerance) + (sure * np.sqrt(np.maximum(chance, 0.0)) + np.sqrt(shared)) / values
     if np.count_nonzero(np.abs(apart) > allowed) < LEAST_BEYOND:
         return None
@@ -57,7 +57,7 @@ def gain_error(estimate: Estimate, nominal: Parameters) -> Reason | None:
     if not known:
         return None
     _, _, signals, gains = min(known)
-    shifts = ", ".join(f"{name} {math.expm1(shift):+.0%}" for name, shift in zip(told, apart, strict=True))
+    shifts = ", ".join(f"{name} {math.expm1(shift):+.0%}" for name, shift in zip(names, apart, strict=True))
     read = " and ".join(f"the {s} is read {g:.2f} times as large as it is" for s, g in zip(signals, gains, strict=True))
     text = f"{read}: that alone explains {shifts} against the data sheet, which may be {tolerance:.0%} off"
     advice = f"check the scale of the {' and the '.join(signals)}, or correct the nominal values"
@@ -70,9 +70,9 @@ def scale_convention(estimate: Estimate, nominal: Parameters) -> Reason | None:
     The torque of a motor is its power over its speed, so that K of [1] is K of [2], in values that keep the power. Peak
     values of a phase, or RMS ones, do not: K, Jt, ft and Cd are then off by one factor, and R and L by none.
     """
-    told = [name for name in COMPARED if name not in estimate.given and getattr(nominal, name) > 0]
-    apart = {name: estimate.value(name) / getattr(nominal, name) for name in told}
-    if set(told) != set(COMPARED) or not all(ratio > 0.0 for ratio in apart.values()):
+    names = [name for name in COMPARED if name not in estimate.given and getattr(nominal, name) > 0]
+    apart = {name: estimate.value(name) / getattr(nominal, name) for name in names}
+    if set(names) != set(COMPARED) or not all(ratio > 0.0 for ratio in apart.values()):
         return None
     share, inertia = math.log(apart["K"]), math.log(apart["Jt"])
     if abs(share) < math.log1p(TOLERANCE) or abs(share - inertia) > math.log1p(TOLERANCE):

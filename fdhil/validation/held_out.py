@@ -44,12 +44,12 @@ def _is_drive(p: Parameters) -> bool:
 
 def worst_of(predicted: Sequence[Replay | None]) -> HeldOut | None:
     """Return the residual of the worst move; None where none could be compared."""
-    told = [one for one in predicted if one is not None]
-    if not told:
+    compared = [one for one in predicted if one is not None]
+    if not compared:
         return None
-    worst = max(told, key=lambda one: one.unexplained_um)
-    most_um = max(float(np.abs(one.difference_um).max()) for one in told)
-    return HeldOut(len(told), worst.unexplained_um, most_um, worst.measured_um)
+    worst = max(compared, key=lambda one: one.unexplained_um)
+    most_um = max(float(np.abs(one.difference_um).max()) for one in compared)
+    return HeldOut(len(compared), worst.unexplained_um, most_um, worst.measured_um)
 
 
 def is_predicted(found: Replay | None, settings: Identification) -> bool:

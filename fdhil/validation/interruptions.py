@@ -67,8 +67,10 @@ def _said(nc: NcMove) -> str | None:
         return f"the NC reports a feed hold{where}"
     if nc.override is not None and max(abs(1.0 - override) for override in nc.override) > OVERRIDE:
         least, greatest = nc.override
-        told = f"{100 * least:.0f} %" if greatest - least < OVERRIDE else f"{100 * least:.0f} to {100 * greatest:.0f} %"
-        return f"the NC reports an override of {told}{where}"
+        share = (
+            f"{100 * least:.0f} %" if greatest - least < OVERRIDE else f"{100 * least:.0f} to {100 * greatest:.0f} %"
+        )
+        return f"the NC reports an override of {share}{where}"
     return None
 
 

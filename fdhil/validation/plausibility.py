@@ -102,8 +102,8 @@ def gaps(signals: WindowSignals) -> Iterator[Reason]:
 
 def _travels(window: Window, begin: int, end: int) -> bool:
     """Return whether the table moves while these rows are lost: the end of the move may lie within them."""
-    beside = window.position_mm[[max(0, begin - 1), min(end, window.n - 1)]]
-    return bool(abs(beside[1] - beside[0]) > STILL_MM)
+    edges = window.position_mm[[max(0, begin - 1), min(end, window.n - 1)]]
+    return bool(abs(edges[1] - edges[0]) > STILL_MM)
 
 
 def clipped(signals: WindowSignals) -> Iterator[Reason]:

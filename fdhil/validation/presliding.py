@@ -37,7 +37,7 @@ def with_presliding(estimate: Estimate, windows: Sequence[Window], axis: Axis, s
         parameters = estimate.parameters()
         parameters = parameters.changed(**{TERM: um}) if um > 0.0 else parameters
         found = [replay_setpoints(window, parameters, axis, sync_period_s) for window in chosen]
-        known = [told.unexplained_um**2 for told in found if told is not None]
+        known = [each.unexplained_um**2 for each in found if each is not None]
         return float(np.mean(known)) if known else math.inf
 
     sharp = left(0.0)

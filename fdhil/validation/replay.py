@@ -108,11 +108,11 @@ def replay_window(window: Window, parameters: Parameters, axis: Axis, sync_perio
         if parted is None:
             continue
         try:
-            told = replay(*signals, parted[0], axis, sync_period_s, window.offset_mm, standstill_a=parted[1])
-            told = told.during(*moving)
+            replayed = replay(*signals, parted[0], axis, sync_period_s, window.offset_mm, standstill_a=parted[1])
+            replayed = replayed.during(*moving)
         except ValueError:  # too few complete rows, or no valid drive
             return None
-        best = told if best is None or told.unexplained_um < best.unexplained_um else best
+        best = replayed if best is None or replayed.unexplained_um < best.unexplained_um else best
         if best.unexplained_um < ENOUGH * best.measured_um:
             break
     return best
@@ -128,10 +128,10 @@ def replay_setpoints(window: Window, parameters: Parameters, axis: Axis, sync_pe
     parameters = completed(parameters, Parameters(**axis.nominal.model_dump()))
     signals, held_a = (window.demand_mm, window.position_mm), _standstill_a(window)
     try:
-        told = replay(*signals, parameters, axis, sync_period_s, window.offset_mm, standstill_a=held_a)
+        replayed = replay(*signals, parameters, axis, sync_period_s, window.offset_mm, standstill_a=held_a)
     except ValueError:  # too few complete rows, or no valid drive
         return None
-    return told.during(*moving_range(window)) if np.isfinite(told.difference_um).all() else None
+    return replayed.during(*moving_range(window)) if np.isfinite(replayed.difference_um).all() else None
 
 
 def completed(parameters: Parameters, spare: Parameters) -> Parameters:

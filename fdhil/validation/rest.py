@@ -98,9 +98,9 @@ def _holding(window: Window, fit: Fit, rows: Rows) -> Iterator[Reason]:
     limit = HOLDING_SHARE * max(fit.theta[5], 0.0) + SURE * spread + LEAST_TORQUE * peak
     if abs(held) <= limit:
         return
-    told = f"the shaft rests under {abs(held):.3g} N.m, though dry friction is {fit.theta[5]:.3g} N.m"
+    rests = f"the shaft rests under {abs(held):.3g} N.m, though dry friction is {fit.theta[5]:.3g} N.m"
     if held * window.direction < 0.0:  # a torque against this direction holds the shaft
-        text = f"{told} in this direction: a load, or friction that differs by direction"
+        text = f"{rests} in this direction: a load, or friction that differs by direction"
         yield Reason("ValidationFailed", text, "identify rapids of both directions")
     else:
-        yield Reason("ValidationFailed", f"{told} (Stribeck)", "lubricate the slide-way, or check for a clamped axis")
+        yield Reason("ValidationFailed", f"{rests} (Stribeck)", "lubricate the slide-way, or check for a clamped axis")

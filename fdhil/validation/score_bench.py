@@ -57,8 +57,8 @@ class Finding:
 
     def reason(self) -> Reason:
         """Return the finding as a reason."""
-        told = self.text.format(self.amplitude)
-        return Reason(self.code, f"{told} ({abs(self.statistic):.0f} standard deviations)", self.advice)
+        text = self.text.format(self.amplitude)
+        return Reason(self.code, f"{text} ({abs(self.statistic):.0f} standard deviations)", self.advice)
 
 
 @dataclass(frozen=True, slots=True)

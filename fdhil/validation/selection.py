@@ -49,7 +49,7 @@ def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
     score, information = bench.scores(directions)
     whole = np.einsum("mq,mq->q", directions, directions)
     taken: list[int] = []
-    alike: list[npt.NDArray[np.intp]] = []
+    similar: list[npt.NDArray[np.intp]] = []
     while len(taken) < len(findings):
         shares = (
             information[:, taken] @ inverse_of(information[np.ix_(taken, taken)])[0]
@@ -63,7 +63,7 @@ def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
         if not replace(findings[best], statistic=float(statistic[best])).sure:
             break
         taken.append(best)
-        alike.append(np.flatnonzero(np.square(statistic) > statistic[best] ** 2 - NO_WORSE**2))
+        similar.append(np.flatnonzero(np.square(statistic) > statistic[best] ** 2 - NO_WORSE**2))
     moved = inverse_of(fit.information)[0] @ (fit.jacobian.T @ directions)
 
     def beside_others(n: int, k: int) -> Lacking:
@@ -73,7 +73,7 @@ def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
 
     found = []
     for n, k in enumerate(taken):
-        rivals = tuple(beside_others(n, int(other)) for other in alike[n] if other not in taken)
+        rivals = tuple(beside_others(n, int(other)) for other in similar[n] if other not in taken)
         found.append(replace(beside_others(n, k), rivals=rivals))
     return found
 
@@ -81,5 +81,5 @@ def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
 def _lacking(finding: Finding, amplitude: float, moved: Float) -> Lacking:
     """Return a finding with its amplitude given the others; a sensor's own change has the opposite sign."""
     load = None if finding.load_nm is None else amplitude * finding.load_nm
-    told = amplitude if load is not None else -amplitude
-    return Lacking(replace(finding, amplitude=told), amplitude * moved, load)
+    signed = amplitude if load is not None else -amplitude
+    return Lacking(replace(finding, amplitude=signed), amplitude * moved, load)

@@ -58,9 +58,9 @@ def dead_signals(signals: WindowSignals) -> Iterator[Reason]:
     part = travel[begin:end]
     moved_mm = float(part[-1] - part[0]) if part.size else 0.0
     if window.slow_voltage is not None:
-        told = window.slow_voltage.voltage_v[np.isfinite(window.slow_voltage.voltage_v)]
-        if told.size >= LEAST_SAMPLES and np.ptp(told) == 0.0:
-            yield _stands_still("voltage", float(told[0]), moved_mm)
+        readings = window.slow_voltage.voltage_v[np.isfinite(window.slow_voltage.voltage_v)]
+        if readings.size >= LEAST_SAMPLES and np.ptp(readings) == 0.0:
+            yield _stands_still("voltage", float(readings[0]), moved_mm)
     for name, values in recorded_signals(window).items():
         moving = values[begin:end][np.isfinite(values[begin:end])]
         if moving.size >= LEAST_SAMPLES and np.ptp(moving) == 0.0:
@@ -145,23 +145,23 @@ def table_faults(window: Window, moving: tuple[int, int]) -> Mapping[str, Reason
     found = {}
     if window.table_mm is not None and np.isfinite(window.position_mm).any():
         motor = bridged(window.position_mm)[rows]
-        beside = (window.table_mm[rows] - motor)[np.isfinite(window.table_mm[rows])]
-        apart, travel = float(np.ptp(beside)) if beside.size else 0.0, float(np.ptp(motor))
+        difference = (window.table_mm[rows] - motor)[np.isfinite(window.table_mm[rows])]
+        apart, travel = float(np.ptp(difference)) if difference.size else 0.0, float(np.ptp(motor))
         if apart > TABLE_MM + TABLE_SHARE * travel:
             text = f"table sensor and position differ by {apart:.4g} mm over {travel:.4g} mm of travel: not used"
             found["table_mm"] = Reason("Implausible", text, "check the table sensor, its scale, sign and axis")
     if window.table_m_s2 is not None:
         known = np.isfinite(window.table_m_s2[rows])
-        told = window.table_m_s2[rows][known]
+        readings = window.table_m_s2[rows][known]
         speed = smooth(window.speed_rad_s, window.dt_s)
         own = np.gradient(speed, window.dt_s)[rows][known] * window.pitch_mm / (2e3 * math.pi)
-        if told.size >= LEAST_SAMPLES and not np.ptp(told) > 0.0:
-            text = f"table acceleration is constant at {told[0]:.4g} m/s2: it is not used"
+        if readings.size >= LEAST_SAMPLES and not np.ptp(readings) > 0.0:
+            text = f"table acceleration is constant at {readings[0]:.4g} m/s2: it is not used"
             found["table_m_s2"] = Reason("StuckValue", text, "check the accelerometer")
-        elif told.size >= LEAST_SAMPLES and float(np.var(own)) > 0.0:
-            courses = np.stack([np.ones(told.size), own])
-            gain = float(solve(courses.T, told)[0][1])
-            if _explained(told, courses) > TABLE_FOLLOWS and not 1.0 / TABLE_GAIN < gain < TABLE_GAIN:
+        elif readings.size >= LEAST_SAMPLES and float(np.var(own)) > 0.0:
+            courses = np.stack([np.ones(readings.size), own])
+            gain = float(solve(courses.T, readings)[0][1])
+            if _explained(readings, courses) > TABLE_FOLLOWS and not 1.0 / TABLE_GAIN < gain < TABLE_GAIN:
                 text = f"table acceleration is {gain:.3g} times that of the motor: it is not used"
                 found["table_m_s2"] = Reason("CalibrationSuspect", text, "check the accelerometer's scale and sign")
     return found
@@ -178,9 +178,9 @@ def position_confirms(window: Window, signal: SensorSignal, start: int, end: int
         return False
     to_mm = window.pitch_mm / (2 * math.pi) * window.dt_s
     rows = np.flatnonzero(known) - np.flatnonzero(known)[0]
-    beside = position[known] - position[known][0] - signal.values[start] * to_mm * rows
+    error_mm = position[known] - position[known][0] - signal.values[start] * to_mm * rows
     steps = STEPS_BESIDE * resolution(window.position_mm[np.isfinite(window.position_mm)])
-    return bool((np.abs(beside) <= signal.step / 2 * to_mm * rows + steps).all())
+    return bool((np.abs(error_mm) <= signal.step / 2 * to_mm * rows + steps).all())
 
 
 def missing_move(recording: Recording) -> Reason | None:

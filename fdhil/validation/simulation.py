@@ -30,11 +30,11 @@ class Simulated:
 
 def fit_percent(window: Window, estimate: Estimate, fit: Fit | None) -> float | None:
     """Return 100 (1 - |w - what| / |w - mean w|) of the speed simulated from voltage; None without a model."""
-    told = simulated(window, estimate, fit)
-    if told is None:
+    motion = simulated(window, estimate, fit)
+    if motion is None:
         return None
-    known = np.isfinite(told.measured_rad_s)
-    return _explained_percent(told.measured_rad_s[known], told.speed_rad_s[known])
+    known = np.isfinite(motion.measured_rad_s)
+    return _explained_percent(motion.measured_rad_s[known], motion.speed_rad_s[known])
 
 
 def simulated(window: Window, estimate: Estimate, fit: Fit | None) -> Simulated | None:

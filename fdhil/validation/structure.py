@@ -36,9 +36,9 @@ def findings(fit: Fit) -> list[Finding]:
     edges = np.unique(np.linspace(rows[0], rows[-1] + 1, EDGES + 1).astype(int))
     drift = np.clip((np.arange(bench.motion.n) - edges[0]) / max(1, edges[-1] - edges[0]), 0.0, 1.0)
     found = [_load(bench, edges, drift), _low_speed_friction(bench), *_of_the_voltage(bench, drift)]
-    gains, foretold = _steps_and_drift(edges[2:-2:2], drift), bench.foretold()
+    gains, predicted = _steps_and_drift(edges[2:-2:2], drift), bench.foretold()
     for name, unit in (("voltage", "V"), ("current", "A"), ("speed", "rad/s")):
-        tried = bench.best(bench.gain_answers(foretold, name, gains))
+        tried = bench.best(bench.gain_answers(predicted, name, gains))
         found += [_gain(bench.motion.dt_s, name, edges[2:-2:2], tried), _offset(bench, name, unit, drift)]
     return sorted(found, key=lambda f: -abs(f.statistic))
 

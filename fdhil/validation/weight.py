@@ -192,15 +192,15 @@ def weigh(
     loop = TableError.of(parameters, window.pitch_mm, axis)
     whole, left = (rms(row) for row in loop.um(np.array([move.whole(parameters), move.left(parameters)]), window.dt_s))
     left = _beyond_noise(left, loop, parameters, move, noise)
-    told = _replayed(window, parameters, axis, sync_period_s)
-    if told is None and axis is not None:
+    replayed = _replayed(window, parameters, axis, sync_period_s)
+    if replayed is None and axis is not None:
         return Weight(left, tolerance_um(settings, whole), whole, left, "own loop")
-    if told is None:
+    if replayed is None:
         limit = min(TOLERANCE_SHARE * max(whole, _followed_um(window)), MOST_SHARE * whole)
         return Weight(left, limit, whole, left, "ordinary loop")
-    limit = tolerance_um(settings, told.measured_um)
-    soft = told.unexplained_um > limit and _stiff_um(window, parameters, axis, sync_period_s) <= limit
-    return Weight(told.unexplained_um, limit, told.measured_um, left, "replay", soft)
+    limit = tolerance_um(settings, replayed.measured_um)
+    soft = replayed.unexplained_um > limit and _stiff_um(window, parameters, axis, sync_period_s) <= limit
+    return Weight(replayed.unexplained_um, limit, replayed.measured_um, left, "replay", soft)
 
 
 def _stiff_um(window: Window, parameters: Parameters, axis: Axis | None, sync_period_s: float) -> float:
@@ -208,8 +208,8 @@ def _stiff_um(window: Window, parameters: Parameters, axis: Axis | None, sync_pe
     if axis is None or axis.resonance_hz is None:
         return math.inf
     stiff = replace(parameters, terms=tuple(pair for pair in parameters.terms if not pair[0].startswith("resonance")))
-    told = _replayed(window, stiff, axis.model_copy(update={"resonance_hz": None}), sync_period_s)
-    return math.inf if told is None else told.unexplained_um
+    replayed = _replayed(window, stiff, axis.model_copy(update={"resonance_hz": None}), sync_period_s)
+    return math.inf if replayed is None else replayed.unexplained_um
 
 
 def _followed_um(window: Window) -> float:
