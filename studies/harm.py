@@ -11,7 +11,6 @@ from fdhil.config.regulators import Regulators
 from fdhil.model import closed_loop
 from fdhil.records import PARAMETERS, Estimate, Float, Parameters, rms
 from fdhil.validation.agreement import LEAST_CHANGE
-from fdhil.validation.weight import tolerance_um
 from studies import drives
 from studies.drives import Drive
 from studies.scenes import Scene, demand_of
@@ -67,7 +66,7 @@ def beside_the_path(models: Sequence[Parameters], scene: Scene) -> list[str]:
         true = drives.run(scene.drive, demand, drives.CYCLE_S)
         for model in models:
             missed, following = _missed(model, axis, 1e3 * demand, 1e3 * true.position)
-            limit = limit or max(tolerance_um(Identification(), following), STEPS_UM)
+            limit = limit or max(Identification().tolerance_for(following), STEPS_UM)
             if missed > limit:
                 found.append(f"{missed:.2g} um of {following:.3g} um beside the path at {share:.0%} of the speed")
     return found

@@ -25,7 +25,7 @@ from fdhil.identification.loops import with_loops
 from fdhil.identification.windows import find_windows
 from fdhil.model.terms import with_resonance
 from fdhil.pipeline import analyse, pool
-from fdhil.pipeline.own_loops import better_axis, explained
+from fdhil.pipeline.identified_loops import better_axis, explained
 from fdhil.prediction.behind_motor import ahead_of_motor_mm
 from fdhil.prediction.contour import contour_error_um
 from fdhil.program.loading import load_trajectory

@@ -23,7 +23,6 @@ from fdhil.pipeline import analyse, pool
 from fdhil.records import PARAMETERS, Estimate, Parameters, Recording, Window, frozen, rms
 from fdhil.validation.data_sheet import gain_error
 from fdhil.validation.signal_consistency import missing_move
-from fdhil.validation.weight import tolerance_um
 from studies import pages
 from studies.bench import Array, shuttle
 from studies.judging import survey
@@ -242,7 +241,7 @@ def _beside_path(estimate: Estimate, plant: Plant) -> Iterator[str]:
         demand_mm = 1e3 * shuttle(0.2, share * plant.rapid_m_s, 1.0, 2)
         true = run(plant.machine.mechanics, 1e-3 * demand_mm, plant.machine.loops).motor_m * 1e3
         errors = [1e3 * rms(true - _predicted(e, plant, demand_mm)) for e in (estimate, _good(plant.machine.name))]
-        limit = max(LEAST_UM, tolerance_um(Identification(), 1e3 * rms(true - demand_mm)))
+        limit = max(LEAST_UM, Identification().tolerance_for(1e3 * rms(true - demand_mm)))
         if errors[0] > errors[1] + limit:
             yield f"{errors[0]:.3g} um beside the path"
 

@@ -10,9 +10,9 @@ from fdhil.config import Identification
 from fdhil.identification.loops import DIFFER
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import AxisPipeline, Known, analyse, pool
-from fdhil.pipeline.own_loops import OwnLoops, better_axis, loops_of, mechanics_of, suspected
+from fdhil.pipeline.identified_loops import OwnLoops, better_axis, loops_of, mechanics_of, suspected
 from fdhil.records import LoopEstimate, ParameterSet, Reason, Verdict, WindowOutcome, frozen
-from fdhil.validation.weight import LOOPS_DIFFER
+from fdhil.validation.table_error_budget import LOOPS_DIFFER
 from studies.bench import shuttle
 from studies.real_plant import Loops, Mechanics, Sensors, recording, run
 from tests.bench import bench_config

@@ -333,7 +333,7 @@ def test_nothing_is_published_from_one_direction_while_the_other_is_refused(
         reason = Reason("ValidationFailed", "the drive does what the model does not have")
         return outcome if window.direction > 0 else replace(outcome, verdict=Verdict(False, 90.0, (reason,)))
 
-    monkeypatch.setattr("fdhil.pipeline.own_loops.analyse", refusing)
+    monkeypatch.setattr("fdhil.pipeline.identified_loops.analyse", refusing)
     pipeline, told = AxisPipeline("X", config), []
     for k in range(1, 7):
         outcomes = pipeline.feed(vertical(config, k, 0.0))

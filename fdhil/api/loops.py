@@ -10,7 +10,7 @@ from typing import Any
 from fdhil.api.analysis import FileResult
 from fdhil.config import Axis, Identification, MachineConfig, Regulators
 from fdhil.daemon.outcome_json import loops_document
-from fdhil.pipeline.own_loops import loops_of
+from fdhil.pipeline.identified_loops import loops_of
 from fdhil.records import LoopEstimate
 
 ALL_FED = 0.01  # by which the share of the speed that is fed forward may differ from 1

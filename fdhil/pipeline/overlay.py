@@ -9,7 +9,7 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.identification.signals import mended
 from fdhil.pipeline.analysis import GAVE_UP, analyse, estimated, own
-from fdhil.pipeline.own_loops import OwnLoops
+from fdhil.pipeline.identified_loops import OwnLoops
 from fdhil.records import LoopEstimate, Result, Window, WindowOutcome
 from fdhil.validation.replay import Replay, replay_window
 from fdhil.validation.simulation import Simulated, simulated

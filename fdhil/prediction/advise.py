@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.prediction.feed_refinement import raised_alone
-from fdhil.prediction.feeds import Feeds, Judge, Source, highest, stretches, worst_rows
+from fdhil.prediction.feed_search import Feeds, Judge, Source, highest, raised_alone, stretches, worst_rows
 from fdhil.prediction.inverse_dynamics import required
 from fdhil.prediction.predict import contour_um, predict
 from fdhil.records import Float, Int, Parameters, Prediction, Zone

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from fdhil.config import MachineConfig
-from fdhil.prediction.feeds import Source
+from fdhil.prediction.feed_search import Source
 from fdhil.prediction.predict import predict
 from fdhil.program.planner.smoothing import Smoother
 from fdhil.records import Bool, Float, Int, Parameters, Trajectory, frozen, frozen_ints

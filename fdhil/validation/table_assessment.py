@@ -10,12 +10,11 @@ import numpy as np
 
 from fdhil.records import PARAMETERS, Float, Parameters, Reason, rms
 from fdhil.validation.breakaway import Breakaway
+from fdhil.validation.model_deficiencies import Lacking
 from fdhil.validation.replay import replay_window
-from fdhil.validation.selection import Lacking
 from fdhil.validation.shifts import LATE
 from fdhil.validation.structure import FRICTION, OFFSET_CURRENT
-from fdhil.validation.table_error import TableError
-from fdhil.validation.weight import NEXT_SPEED, Move, Weight, to_and_fro, weigh
+from fdhil.validation.table_error_budget import NEXT_SPEED, Move, TableError, Weight, to_and_fro, weigh
 from fdhil.validation.window_fit import WindowFit
 from fdhil.validation.window_signals import WindowSignals
 

@@ -16,9 +16,7 @@ from fdhil.validation.plausibility import clipped, gaps, missing_plateau, missin
 from fdhil.validation.rest import friction_at_rest, rest_faults
 from fdhil.validation.signal_consistency import copied_signals, dead_signals, unrelated_signals
 from fdhil.validation.simulation import expected_fit_percent
-from fdhil.validation.slow_fitted import slow_faults_beside
-from fdhil.validation.slow_readings import slow_voltage_faults
-from fdhil.validation.slow_timing import current_late
+from fdhil.validation.slow_voltage_checks import current_late, slow_faults_beside, slow_voltage_faults
 from fdhil.validation.stuck import clipped_peaks, stuck_values
 from fdhil.validation.table_assessment import TableAssessment
 from fdhil.validation.timing import timing_faults, voltage_late
@@ -182,6 +180,14 @@ def _check_structure(table: TableAssessment) -> Iterator[Reason]:
             yield table.append_cost(lack.finding.reason(), table.compute_cost_um(lack))
 
 
+def _check_whiteness(table: TableAssessment) -> Iterable[Reason]:
+    return [reason for _, reason in table.fitted.autocorrelation]
+
+
+def _check_excess_noise(table: TableAssessment) -> Iterable[Reason]:
+    return [reason for _, reason in table.fitted.excess_noise]
+
+
 def _check_voltage_delay(table: TableAssessment) -> Iterable[Reason]:
     fitted = table.fitted
     if fitted.voltage_delay_s:  # a deficiency explains it, where there is one
@@ -203,17 +209,8 @@ def _check_values(table: TableAssessment) -> Iterable[Reason]:
     return values_apart(table.fitted.estimate, table.fitted.required_fit.theta[:6])
 
 
-MODEL = (
-    "estimate",
-    "fit",
-    "late voltage",
-    "late current",
-    "structure",
-    "whiteness",
-    "excess noise",
-    "standstill",
-    "friction at rest",
-)
+DELAYS = ("late voltage", "late current")
+MODEL = ("estimate", "fit", *DELAYS, "structure", "whiteness", "excess noise", "standstill", "friction at rest")
 SIGNAL_CHECKS: Sequence[Check[WindowSignals]] = (
     Check("finite", not_finite),
     Check("stages", lambda signals: missing_stages(signals.window), _is_rapid),
@@ -243,25 +240,13 @@ FIT_CHECKS: Sequence[Check[TableAssessment]] = (
     Check("fit", _check_fit_exists, lambda table: table.signals.has_voltage, ("estimate",)),
     Check("late voltage", _check_electrical_delay, _has_fit),
     Check("late current", _check_current_delay, _has_sound_fit, ("late voltage",)),
-    Check("structure", _check_structure, _has_sound_fit, ("late voltage", "late current"), weighed=True),
-    Check(
-        "whiteness",
-        lambda table: [reason for _, reason in table.fitted.autocorrelation],
-        _has_sound_fit,
-        ("late voltage", "late current", "structure"),
-        weighed=True,
-    ),
-    Check(
-        "excess noise",
-        lambda table: [reason for _, reason in table.fitted.excess_noise],
-        _has_sound_fit,
-        ("late voltage", "late current", "structure"),
-        weighed=True,
-    ),
+    Check("structure", _check_structure, _has_sound_fit, DELAYS, weighed=True),
+    Check("whiteness", _check_whiteness, _has_sound_fit, (*DELAYS, "structure"), weighed=True),
+    Check("excess noise", _check_excess_noise, _has_sound_fit, (*DELAYS, "structure"), weighed=True),
     # a late current looks like a shaft that moves at rest
-    Check("standstill", lambda table: rest_faults(table.fitted), _has_sound_fit, ("late voltage", "late current")),
-    Check("friction at rest", friction_at_rest, _has_sound_fit, ("late voltage", "late current"), weighed=True),
-    Check("delay", _check_voltage_delay, _has_fit, ("late voltage", "late current", "standstill")),
+    Check("standstill", lambda table: rest_faults(table.fitted), _has_sound_fit, DELAYS),
+    Check("friction at rest", friction_at_rest, _has_sound_fit, DELAYS, weighed=True),
+    Check("delay", _check_voltage_delay, _has_fit, (*DELAYS, "standstill")),
     Check("simulation", _check_simulated_speed, _has_fit, (*MODEL, "delay"), weighed=True),
     Check("values", _check_values, _has_fit, (*MODEL, "delay")),
     Check("slow sensor", lambda table: slow_faults_beside(table.fitted), _has_fit, ("range", "slow readings")),

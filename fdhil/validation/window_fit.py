@@ -13,15 +13,14 @@ from fdhil.identification.fit import Fit, but_delay, fit, with_delay
 from fdhil.identification.without_voltage import TorqueFit
 from fdhil.records import PARAMETERS, Estimate, Parameters, Reason, Window
 from fdhil.validation.breakaway import Breakaway, breakaway
+from fdhil.validation.model_deficiencies import Lacking, lacking, widened
 from fdhil.validation.replay import completed
 from fdhil.validation.score_bench import Finding
-from fdhil.validation.selection import Lacking, lacking
 from fdhil.validation.sensor_reconstruction import Bridge
 from fdhil.validation.shifts import Shift, late_findings, shifts
 from fdhil.validation.simulation import fit_percent
 from fdhil.validation.structure import DEAD_TIME, findings
 from fdhil.validation.whiteness import coloured, noisy
-from fdhil.validation.widening import widened
 from fdhil.validation.window_signals import WindowSignals
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fdhil.correction import plan
-from fdhil.correction.flatness import offsets
+from fdhil.correction.flatness_feedforward import offsets
 from fdhil.prediction import predict, predict_corrected
 from fdhil.prediction.models import nominal_models
 from tests.bench import bench_config

@@ -10,10 +10,10 @@ import pytest
 
 from fdhil.config import MachineConfig
 from fdhil.correction import plan as plan_correction
-from fdhil.correction.advised import corrected_contour_um
+from fdhil.correction.result_documents import corrected_contour_um
 from fdhil.prediction import predict
 from fdhil.prediction.advise import Advice, Held, advise
-from fdhil.prediction.feeds import RAPID, REST, Source, at_shares, highest, program_source, stretches, worst_rows
+from fdhil.prediction.feed_search import RAPID, REST, Source, at_shares, highest, program_source, stretches, worst_rows
 from fdhil.prediction.models import nominal_models
 from fdhil.program import Dwell, Feed, interpret
 from fdhil.program.budget import Budget

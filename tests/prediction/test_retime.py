@@ -11,7 +11,7 @@ import pytest
 from fdhil.config import MachineConfig
 from fdhil.prediction import predict
 from fdhil.prediction.advise import advise
-from fdhil.prediction.feeds import program_source
+from fdhil.prediction.feed_search import program_source
 from fdhil.prediction.models import nominal_models
 from fdhil.prediction.retime import Averages, demand_sources, stretches_around
 from fdhil.program import interpret

@@ -16,7 +16,7 @@ from fdhil.pipeline import analyse
 from fdhil.pipeline.analysis import own
 from fdhil.records import PARAMETERS, Parameters, Window, WindowOutcome, rms
 from fdhil.validation.replay import replay_window
-from fdhil.validation.table_error import TableError
+from fdhil.validation.table_error_budget import TableError
 from studies import bench, real_plant
 from studies.real_plant import Loops, Mechanics, Sensors
 

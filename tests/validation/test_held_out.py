@@ -11,8 +11,14 @@ import pytest
 from fdhil.config import Identification
 from fdhil.model import closed_loop
 from fdhil.records import PARAMETERS, Estimate, Float, Parameters, Result, Window, frozen
-from fdhil.validation.held_out import held_out_reason, is_predicted, predict_held_out, worst_of
-from fdhil.validation.presliding import TERM, with_presliding
+from fdhil.validation.held_out_moves import (
+    TERM,
+    held_out_reason,
+    is_predicted,
+    predict_held_out,
+    with_presliding,
+    worst_of,
+)
 from studies.bench import shuttle
 from tests.bench import bench_config
 from tests.validation.test_at_the_table import AXIS, PERIOD_S, rapids

@@ -14,7 +14,7 @@ from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
 from fdhil.records import Window, frozen
 from fdhil.validation.backlash import backlash, dead_band, overrun
-from fdhil.validation.selection import lacking
+from fdhil.validation.model_deficiencies import lacking
 from fdhil.validation.structure import findings
 from studies import drives, faults
 from studies.drives import Drive, Move

@@ -9,7 +9,7 @@ import numpy as np
 from fdhil.config import Identification
 from fdhil.pipeline import analyse
 from fdhil.records import Float, Stages, Window, frozen
-from fdhil.validation.slow_readings import slow_voltage_faults
+from fdhil.validation.slow_voltage_checks import slow_voltage_faults
 from studies.slow_sensor import slow_windows
 
 

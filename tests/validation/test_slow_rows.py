@@ -10,7 +10,7 @@ import pytest
 from fdhil.identification.estimators.maximum_likelihood import fit_windows
 from fdhil.pipeline import analyse
 from fdhil.records import Window, frozen
-from fdhil.validation.slow_timing import current_late
+from fdhil.validation.slow_voltage_checks import current_late
 from fdhil.validation.stuck import stuck_values
 from fdhil.validation.window_fit import WindowFit
 from fdhil.validation.window_signals import WindowSignals

@@ -11,7 +11,7 @@ from fdhil.identification.identifiability import untold
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
 from fdhil.records import Reason, Result, WindowOutcome, frozen
-from fdhil.validation.slow_readings import slow_voltage_faults
+from fdhil.validation.slow_voltage_checks import slow_voltage_faults
 from studies.judging import GOOD
 from studies.slow_recordings import recording_of
 from studies.slow_sensor import SETTINGS, slow_windows

@@ -1,21 +1,78 @@
 """Identifies a drive's own loops if the configured ones do not explain its rapids, and analyses these again.
 
-If other loops do not explain them, a resonance between motor and table may.
+If other loops do not explain them, a resonance between motor and table may: the motor's position is measured far better
+than its speed, and the closed loop along the demand shows the table's reaction on the motor in it, so that the
+resonance with the smallest residual of the replays is used.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from functools import partial
+
+import numpy as np
 
 from fdhil.config import Axis, Identification
 from fdhil.identification.current_means import with_current_means
 from fdhil.identification.loops import better_loops, changed_regulators, identify_loops, with_loops
 from fdhil.identification.physical_bounds import bounded
 from fdhil.pipeline.analysis import analyse, own
-from fdhil.pipeline.own_resonance import softer_axis
 from fdhil.records import LoopEstimate, Parameters, Window, WindowOutcome
-from fdhil.validation.weight import LOOPS_DIFFER
+from fdhil.validation.replay import replay_window
+from fdhil.validation.table_error_budget import LOOPS_DIFFER
+
+GRID = np.geomspace(40.0, 250.0, 14)  # Hz
+HALVINGS = 2  # of the grid's steps around the best
+NOTICED = 0.01  # of the following error: below, nothing is searched for
+BETTER = 0.5  # of the residual, at most, with an accepted resonance
+MOST_RAPIDS = 4
+
+Rapids = Sequence[tuple[Window, Parameters]]
+
+
+def softer_axis(rapids: Rapids, axis: Axis, sync_period_s: float) -> Axis | None:
+    """Return the axis with the resonance that the rapids show.
+
+    None if one is configured already, if the rapids are explained, and if none explains them.
+    """
+    rapids = [pair for pair in rapids if not pair[1].term("resonance")][-MOST_RAPIDS:]
+    if axis.resonance_hz is not None or not rapids:
+        return None
+    left, following = _left_um(rapids, axis, sync_period_s)
+    if not left > NOTICED * following:
+        return None
+    found = _best(rapids[-1:], axis, sync_period_s)
+    soft = _with(axis, found)
+    return soft if _left_um(rapids, soft, sync_period_s)[0] < BETTER * left else None
+
+
+def _best(rapids: Rapids, axis: Axis, sync_period_s: float) -> float:
+    left: dict[float, float] = {}
+
+    def tried(*resonances: float) -> float:
+        for hertz in resonances:
+            left[hertz] = _left_um(rapids, _with(axis, hertz), sync_period_s)[0]
+        return min(left, key=left.__getitem__)
+
+    best, ratio = tried(*GRID.tolist()), float(GRID[1] / GRID[0])
+    for _ in range(HALVINGS):
+        ratio **= 0.5
+        best = tried(best / ratio, best * ratio)
+    return best
+
+
+def _with(axis: Axis, hertz: float) -> Axis:
+    return axis.model_copy(update={"resonance_hz": hertz})
+
+
+def _left_um(rapids: Rapids, axis: Axis, sync_period_s: float) -> tuple[float, float]:
+    """Return the RMS residual of the rapids' replays, and of the following error; zero without any."""
+    replays = [replay_window(window, drive, axis, sync_period_s) for window, drive in rapids]
+    residuals = [(one.unexplained_um, one.measured_um) for one in replays if one is not None]
+    left, following = np.sqrt(np.mean(np.square(residuals), axis=0)) if residuals else (0.0, 0.0)
+    return float(left), float(following)
+
 
 ENOUGH = 4  # windows, both directions twice
 KEPT = 6
@@ -172,3 +229,34 @@ class OwnLoops:
             return outcome, found
         self.axis = better.model_copy(update={"resonance_hz": self.axis.resonance_hz})
         return (analyse(window, self._settings, self.axis, self._period_s) if growing else outcome), found
+
+
+Work = Callable[[Window], WindowOutcome]
+Spread = Callable[[Work, Sequence[Window]], Iterable[WindowOutcome]]
+
+
+def analyse_windows(
+    windows: Sequence[Window],
+    settings: Identification,
+    axis: Axis | None = None,
+    sync_period_s: float | None = None,
+    spread: Spread = map,
+    done: Callable[[], None] = lambda: None,
+) -> tuple[Sequence[WindowOutcome], LoopEstimate | None]:
+    """Return the outcome of each window, and the drive's own loops if they had to be identified.
+
+    ``spread`` may use further processes, in order; ``done`` is called after each window.
+    """
+    if windows:
+        windows = with_current_means(windows, settings, own(windows[0], axis), sync_period_s)
+    work = partial(analyse, settings=settings, axis=axis, sync_period_s=sync_period_s)
+
+    def told() -> Iterator[WindowOutcome]:
+        for outcome in spread(work, windows):
+            done()
+            yield outcome
+
+    def again(better: Axis) -> Sequence[WindowOutcome]:
+        return list(spread(partial(work, axis=better), windows))
+
+    return explained(list(told()), axis, settings, sync_period_s, again)
