@@ -1,4 +1,4 @@
-"""A drive with a filter that its configuration does not know is judged by the loops that its own rapids show."""
+"""A drive with a filter that is not configured is assessed by the loops that its own rapids show."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ PERIOD_S = 1e-3
 
 
 def outcomes(loops: Loops) -> list[WindowOutcome]:
-    """Return two rapids of the bench's axis with these loops, judged by the configured ones."""
     moved = run(Mechanics(), shuttle(moves=2), loops)
     windows = find_windows(recording(moved, Mechanics(), Sensors(), 0.5))
     return [analyse(window, SETTINGS, AXIS, PERIOD_S) for window in windows]

@@ -1,4 +1,4 @@
-"""The table of checks and the budget behind their thresholds: what is listed holds together."""
+"""The table of checks and the false-alarm budget behind their thresholds are consistent."""
 
 from __future__ import annotations
 

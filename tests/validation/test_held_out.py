@@ -1,4 +1,4 @@
-"""A model is judged by moves that it was not identified on, and friction that builds up is identified from them."""
+"""A model is validated by moves that it was not identified on, and its presliding is identified from them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ SETTINGS = Identification()
 
 @lru_cache(maxsize=4)
 def moves(presliding_um: float) -> list[Window]:
-    """Return a rapid back and forth whose positions are those of a drive with this presliding."""
     demand_mm = 1e3 * shuttle(moves=2)
     drive = TRUE.changed(**{TERM: presliding_um}) if presliding_um else TRUE
     response = closed_loop.simulate(drive, AXIS, PERIOD_S, demand_mm)
@@ -75,7 +74,6 @@ def test_pool_that_does_not_predict_the_other_move_is_refused() -> None:
 
 
 def test_friction_that_builds_up_lets_the_table_creep_where_sharp_friction_holds_it() -> None:
-    """Within the band of dry friction a bristle gives way by its share of the presliding way."""
     axis = bench_config().axis["X"]
     demand_mm = np.linspace(0.0, 0.5e-3, 200)
     sharp, soft = (

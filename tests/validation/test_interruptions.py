@@ -1,4 +1,4 @@
-"""Rapids in a job: found among feed moves, and refused with the figure when they were not carried out as ordered."""
+"""Rapids in a job: found among feed moves, and refused with the figure if not executed as ordered."""
 
 from __future__ import annotations
 

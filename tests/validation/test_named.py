@@ -1,4 +1,4 @@
-"""Faults that have a name and a figure: backlash, drifting sensors, a gain that moved between two rapids."""
+"""Faults with a code and a figure: backlash, drifting sensors, a gain that changed between two rapids."""
 
 from __future__ import annotations
 

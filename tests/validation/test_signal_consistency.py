@@ -1,4 +1,4 @@
-"""Signals of a rapid that are dead, swapped, copied or of another axis are refused by their names."""
+"""Signals of a rapid that are dead, swapped, copied or of another axis are refused by name."""
 
 from __future__ import annotations
 
@@ -33,7 +33,6 @@ def plant(name: str) -> Plant:
 
 
 def refusals(recording: Recording) -> str:
-    """Return all that a recording's rapids are refused for, as one text."""
     outcomes = [analyse(window, SETTINGS) for window in find_windows(recording)]
     _, verdict = pool(outcomes, SETTINGS)
     return " ".join(reason.text for reason in verdict.reasons)
@@ -105,7 +104,6 @@ def test_recording_at_rest_hides_no_rapid() -> None:
 
 
 def _coarse(counts: int, kind: str) -> list[Window]:
-    """Return a rapid at a constant speed, as an encoder of so many counts a turn shows it."""
     moved = real_plant.run(SLOW, shuttle(0.1, 0.126, 2.0), SLOW_LOOPS)
     sensors = Sensors(speed="difference" if kind == "difference" else "sensor", encoder_bits=np.log2(counts))
     recording = real_plant.recording(moved, SLOW, sensors, 0.126, 3)
@@ -159,7 +157,6 @@ def test_identify_names_the_speed_that_hides_a_rapid(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def at_table() -> Window:
-    """Return a rapid with an encoder and an accelerometer at the table, which hangs on a spring."""
     soft = replace(SLOW, resonance_hz=60.0)
     moved = real_plant.run(soft, shuttle(0.1, 0.2, 2.0), SLOW_LOOPS)
     recording = real_plant.recording(moved, soft, Sensors(), 0.2)

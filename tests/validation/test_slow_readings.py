@@ -1,4 +1,4 @@
-"""What a slow voltage sensor's own samples tell: stuck and clipped ones are named, steady coarse ones are not."""
+"""A slow voltage sensor's own samples: stuck and clipped ones are reported, steady coarse ones are not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Current and speed beside a slow voltage: what is steady does not stick, and what is late is told by its rows."""
+"""Current and speed recorded with a slow voltage: a steady signal is not stuck, a late one is detected by its rows."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from studies.slow_sensor import SETTINGS, slow_windows
 
 
 def _coarse(window: Window) -> Window:
-    """Return the window with readings so coarse that equal ones are no wonder: 0.3 A, 0.4 rad/s."""
+    """Return the window with coarse readings that are often equal: 0.3 A, 0.4 rad/s."""
     current, speed = (np.round(v / s) * s for v, s in ((window.current_a, 0.3), (window.speed_rad_s, 0.4)))
     return replace(window, current_a=frozen(current), speed_rad_s=frozen(speed))
 

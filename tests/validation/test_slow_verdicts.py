@@ -1,4 +1,4 @@
-"""Verdicts on windows with a slow voltage: what it cannot tell is null and no fault, what it contradicts is one."""
+"""Verdicts on windows with a slow voltage: undetermined values are null and no fault, contradictions are faults."""
 
 from __future__ import annotations
 

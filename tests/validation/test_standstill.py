@@ -1,4 +1,4 @@
-"""What standstill tells of the sensors' zeros, and what is lost just as the move ends."""
+"""Standstill reveals the sensors' zeros, and samples lost at the end of the move."""
 
 from __future__ import annotations
 

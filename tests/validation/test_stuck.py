@@ -1,4 +1,4 @@
-"""A sensor that sticks is told from a steady signal that is read coarsely: by how likely the repeats were."""
+"""A stuck sensor is distinguished from a steady coarse signal by the probability of its repeats."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ FIELDS = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"
 
 
 def _coarse(seed: int, **steps: float) -> Window:
-    """A rapid with little noise, sensors in steps that are shares of their peaks."""
     sizes = tuple(steps.get(name, 1e-4) for name in FIELDS)
     scene = replace(SCENE, noise=0.001, steps=(sizes[0], sizes[1], sizes[2]))
     rows = measured(np.random.default_rng(seed), scene, drives.run(scene.drive, demand_of(scene), scene.dt_s))

@@ -1,4 +1,4 @@
-"""A voltage or current that is late by some rows is refused with its delay, also where rows are fine."""
+"""A voltage or current that is late by some rows is refused with its delay, also with fine rows."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ SETTINGS = Identification()
 
 
 def _window(late: dict[str, int], sampling: VoltageSampling = "interval_mean", dt_s: float = FINE_S) -> Window:
-    """Return a rapid whose short winding and noisy, coarse voltage hide a delay where rows are fine."""
     drive = replace(SCENE.drive, L=SCENE.drive.R * 0.0045)
     scene = replace(SCENE, drive=drive, dt_s=dt_s, noise=0.0045, sampling=sampling, steps=(2e-3, 1e-5, 1e-4))
     rows = measured(np.random.default_rng(5), scene, drives.run(drive, demand_of(scene), dt_s))

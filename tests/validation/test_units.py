@@ -1,4 +1,4 @@
-"""A column in another unit than its name says is told with that unit; a recording in its own units never is."""
+"""A column in another unit than its name says is reported with that unit; a correct recording never is."""
 
 from __future__ import annotations
 
