@@ -25,6 +25,12 @@ from fdhil.records import Float, Parameters, Prediction, Trajectory
 
 STILL_RAD_S = 1e-6
 PER_MILLE = 1e-3  # 0x60B2 counts in 0.1 % of the rated torque
+ONE = 1 << 24  # the weights' scale
+AHEAD_CYCLES = 1.0  # from the newest known target to the one that the offset is sent with
+SPEED_ROWS, SPEED_ORDER = 8, 2
+ACCELERATION_ROWS, ACCELERATION_ORDER = 20, 4
+DRY_INCREMENTS = 0.5  # per cycle: full dry friction from this speed on; below, rounding determines the direction
+FEEDFORWARD_EARLY_CYCLES = 0.5  # by which the drive's own speed feed-forward leads the speed at its row
 
 
 def plan(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, _before: Prediction) -> Plan:
@@ -69,14 +75,6 @@ def offsets(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: float
 def lead_s(parameters: Parameters, axis: Axis) -> float:
     """Return the lead of the current command: the current loop's lag and half a hold."""
     return parameters.L / axis.regulators.current_kp + 0.5 * axis.regulators.speed_period_s
-
-
-ONE = 1 << 24  # the weights' scale
-AHEAD_CYCLES = 1.0  # from the newest known target to the one that the offset is sent with
-SPEED_ROWS, SPEED_ORDER = 8, 2
-ACCELERATION_ROWS, ACCELERATION_ORDER = 20, 4
-DRY_INCREMENTS = 0.5  # per cycle: full dry friction from this speed on; below, rounding determines the direction
-FEEDFORWARD_EARLY_CYCLES = 0.5  # by which the drive's own speed feed-forward leads the speed at its row
 
 
 def derivative_weights(rows: int, order: int, ahead: float, which: int) -> Float:

@@ -48,10 +48,11 @@ def demand(
     for axis in reference.axes:
         asked = required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
         share, what = max(zip((float(one.max()) for one in asked), ("current", "voltage"), strict=True))
+        peak = float(np.abs(before.current_a[axis]).max()) / config.axis[axis].regulators.current_limit_a
         place = reference.place(int(np.argmax(np.maximum(*asked))))
         if share > 1.0 or before.limited_s[axis] > STEADY_S:
             refused.append((axis, share, what, place))
-        elif share > NEAR_SHARE or before.limited_s[axis] > 0.0 or _peak_share(before, axis, config) > NEAR_SHARE:
+        elif share > NEAR_SHARE or peak > NEAR_SHARE or before.limited_s[axis] > 0.0:
             text = f"axis {axis} is near its {what} limit at {place}: little reserve remains for disturbances"
             warnings.append(Reason("NearLimit", text, "lower the feed if the path error matters there"))
     if not refused:
@@ -69,10 +70,6 @@ def demand(
         )
         for axis, share, what, place in refused
     ), tuple(warnings)
-
-
-def _peak_share(before: Prediction, axis: str, config: MachineConfig) -> float:
-    return float(np.abs(before.current_a[axis]).max()) / config.axis[axis].regulators.current_limit_a
 
 
 def worse_rows(before_um: Float, after_um: Float, dt_s: float) -> Bool:

@@ -103,7 +103,7 @@ def _with_table(outcome: WindowOutcome, signals: WindowSignals) -> WindowOutcome
 def _analysed(signals: WindowSignals) -> WindowOutcome:
     window, settings = signals.window, signals.settings
     found = run_checks(SIGNAL_CHECKS, signals, {})
-    reasons = _listed(found)
+    reasons = [reason for each in found.values() for reason in each]
     if window.n < LEAST_SAMPLES or any(reason.code == UNFIT for reason in reasons):
         return _outcome(TableAssessment(WindowFit(signals, _none(settings, Result.NOT_FINITE, reasons[0]))), found)
     try:
@@ -181,10 +181,6 @@ def gave_up(error: BaseException, advice: str) -> Reason:
 
 def _none(settings: Identification, result: Result, reason: Reason) -> Estimate:
     return empty_estimate(chosen(settings)[0], result, reason)
-
-
-def _listed(found: Findings) -> tuple[Reason, ...]:
-    return tuple(reason for reasons in found.values() for reason in reasons)
 
 
 def _speed_lag(window: Window) -> Reason | None:

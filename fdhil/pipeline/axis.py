@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from fdhil.config import Identification, MachineConfig
+from fdhil.config import MachineConfig
 from fdhil.identification.between import HISTORY, Member
 from fdhil.identification.drift import LEAST_JUMP, DriftTracker, Point
 from fdhil.identification.pooling import change_covariance, member
@@ -109,7 +109,9 @@ class AxisPipeline:
         """
         self.axis = axis
         self._config = config
-        self._settings = _settings(config, method)
+        self._settings = config.identification
+        if method is not None:
+            self._settings = config.identification.model_copy(update={"method": method})
         self._period_s = config.machine.sync_period_s
         known = known or Known()
         self._recent = RecentSamples(axis, config.axis[axis], self._ticks(RECENT_S), self._period_s)
@@ -247,7 +249,8 @@ class AxisPipeline:
                 self._history.popleft()
             estimate, verdict = self._pooled()
         if estimate is None or not verdict.accepted:
-            text = "the newest pool is not accepted (" + _listed(verdict) + "), the previous set stays in use"
+            why = "; ".join(str(reason) for reason in verdict.reasons)
+            text = f"the newest pool is not accepted ({why}), the previous set stays in use"
             codes = tuple(reason.code for reason in verdict.reasons)
             again, self._withheld = self._withheld == codes, codes
             return [] if again else [Notice("ValidationFailed", "minor", text, self.axis, window.start_tick)]
@@ -304,11 +307,3 @@ def _since_jump(known: Known) -> Sequence[Member]:
         if any(abs(values[n] - now[n]) > LEAST_JUMP[n] * abs(now[n]) for n in ("R", "L", "K", "Jt") if n in values):
             return known.members[k + 1 :]
     return known.members
-
-
-def _listed(verdict: Verdict) -> str:
-    return "; ".join(str(reason) for reason in verdict.reasons)
-
-
-def _settings(config: MachineConfig, method: str | None) -> Identification:
-    return config.identification if method is None else config.identification.model_copy(update={"method": method})

@@ -29,6 +29,13 @@ BETTER = 0.5  # of the residual, at most, with an accepted resonance
 MOST_RAPIDS = 4
 
 Rapids = Sequence[tuple[Window, Parameters]]
+ENOUGH = 4  # windows, both directions twice
+KEPT = 6
+SIGNALS_AT_FAULT = frozenset({"StuckValue", "Implausible", "NotFinite", "StaleData", "EpisodeAborted"})
+# of a motor with unknown data sheet: fast enough not to affect the loops
+UNKNOWN_R, UNKNOWN_L = 1.0, 5e-3
+Work = Callable[[Window], WindowOutcome]
+Spread = Callable[[Work, Sequence[Window]], Iterable[WindowOutcome]]
 
 
 def softer_axis(rapids: Rapids, axis: Axis, sync_period_s: float) -> Axis | None:
@@ -72,13 +79,6 @@ def _left_um(rapids: Rapids, axis: Axis, sync_period_s: float) -> tuple[float, f
     residuals = [(one.unexplained_um, one.measured_um) for one in replays if one is not None]
     left, following = np.sqrt(np.mean(np.square(residuals), axis=0)) if residuals else (0.0, 0.0)
     return float(left), float(following)
-
-
-ENOUGH = 4  # windows, both directions twice
-KEPT = 6
-SIGNALS_AT_FAULT = frozenset({"StuckValue", "Implausible", "NotFinite", "StaleData", "EpisodeAborted"})
-# of a motor with unknown data sheet: fast enough not to affect the loops
-UNKNOWN_R, UNKNOWN_L = 1.0, 5e-3
 
 
 def loops_of(
@@ -229,10 +229,6 @@ class OwnLoops:
             return outcome, found
         self.axis = better.model_copy(update={"resonance_hz": self.axis.resonance_hz})
         return (analyse(window, self._settings, self.axis, self._period_s) if growing else outcome), found
-
-
-Work = Callable[[Window], WindowOutcome]
-Spread = Callable[[Work, Sequence[Window]], Iterable[WindowOutcome]]
 
 
 def analyse_windows(

@@ -48,6 +48,13 @@ WARMING = "R"
 _FIGURES = re.compile(r"[-+]?[0-9][-+.0-9e]*")  # figures, in which warnings of one kind differ
 
 WindowEstimates = list[tuple[Window, Estimate]]
+OF_ONE_MOVE = frozenset({LOOPS_DIFFER, "ValidationFailed"})
+"""Codes of a window whose own model does not explain its replay: moves one way do not separate load and friction."""
+SCALE_UNPROVEN = Reason(
+    "ScaleUnproven",
+    "no data sheet is known: current and voltage in another scale (peak or RMS of a phase) scale K, Jt, ft and Cd",
+    "give --config with the motor's nominal K and Jt",
+)
 
 
 def pool(
@@ -178,17 +185,6 @@ def _verdict(accepted: Sequence[WindowOutcome], reasons: Sequence[Reason]) -> Ve
         unique.append(Reason("OneDirection", text, "record rapids in both directions"))
     figure = max(unexplained, default=None)
     return Verdict(not reasons, min(fits, default=None), tuple(reasons), figure, tuple(unique))
-
-
-OF_ONE_MOVE = frozenset({LOOPS_DIFFER, "ValidationFailed"})
-"""Codes of a window whose own model does not explain its replay: moves one way do not separate load and friction."""
-
-
-SCALE_UNPROVEN = Reason(
-    "ScaleUnproven",
-    "no data sheet is known: current and voltage in another scale (peak or RMS of a phase) scale K, Jt, ft and Cd",
-    "give --config with the motor's nominal K and Jt",
-)
 
 
 class HeldOutPool(NamedTuple):

@@ -36,6 +36,10 @@ LONGEST_S, LONGEST_SHARE = 120.0, 10.0  # a path is not slowed beyond both, the 
 
 # contour error (n,) um of a reference; inf where the drives cannot follow, NaN where the error is then unknown
 Judge = Callable[[Trajectory], Float]
+STEP = 1.05  # first factor tried
+MOST_STEPS, MOST_STEP, LEAST_POWER = 3, 2.0, 0.05
+MOST_GROUPS = 3  # of segments that do not touch each other
+Span = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,12 +262,6 @@ class _Search:
                 stretch.learn(shares.get(k, 1.0), error, k not in bad)
                 stretch.lost |= seconds > self._longest_s and k in bad and stretch.low is None
         return bad
-
-
-STEP = 1.05  # first factor tried
-MOST_STEPS, MOST_STEP, LEAST_POWER = 3, 2.0, 0.05
-MOST_GROUPS = 3  # of segments that do not touch each other
-Span = tuple[float, float]
 
 
 def raised_alone(feeds: Feeds, source: Source, judge: Judge, tolerance_um: float) -> Feeds:

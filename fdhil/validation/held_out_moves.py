@@ -28,6 +28,7 @@ LEAST_SHARE = 0.1  # of the residual's square that the term must explain
 LEAST_UM = 0.05  # RMS that it must explain
 INDEPENDENT_S = 0.025  # over which the residual of a position loop is correlated
 STEP = 0.35  # of the logarithm, for the curvature
+Move = tuple[Window, Estimate]
 
 
 def with_presliding(estimate: Estimate, windows: Sequence[Window], axis: Axis, sync_period_s: float) -> Estimate:
@@ -74,9 +75,6 @@ def _with_term(estimate: Estimate, value: float, std: float) -> Estimate:
         shared = frozen(np.vstack([shared, np.zeros((1, shared.shape[1]))]))
     names = (*estimate.names, TERM)
     return replace(estimate, names=names, values=values, covariance=frozen(covariance), systematic=shared)
-
-
-Move = tuple[Window, Estimate]
 
 
 def predict_held_out(moves: Sequence[Move], model: Estimate, axis: Axis, sync_period_s: float) -> list[Replay | None]:

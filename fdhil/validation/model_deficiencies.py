@@ -25,6 +25,8 @@ from fdhil.records import PARAMETERS, Estimate, Float, frozen
 from fdhil.validation.score_bench import Bench, Finding
 
 NO_WORSE = 3.0  # standard deviations by which an alternative may explain less by chance
+UNKNOWN_WAY = 2.0  # times an interval
+LAG_ROWS = 3.0  # lag of a sensor that may go unreported: it looks like the winding's own
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,24 +77,17 @@ def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
     def beside_others(n: int, k: int) -> Lacking:
         places = [*taken[:n], k, *taken[n + 1 :]]
         amplitude = float((inverse_of(information[np.ix_(places, places)])[0] @ score[places])[n])
-        return _lacking(findings[k], amplitude, moved[:, k])
+        finding = findings[k]
+        load = None if finding.load_nm is None else amplitude * finding.load_nm
+        # a sensor's own change has the opposite sign of its correction
+        signed = replace(finding, amplitude=amplitude if load is not None else -amplitude)
+        return Lacking(signed, amplitude * moved[:, k], load)
 
     found = []
     for n, k in enumerate(taken):
         rivals = tuple(beside_others(n, int(other)) for other in similar[n] if other not in taken)
         found.append(replace(beside_others(n, k), rivals=rivals))
     return found
-
-
-def _lacking(finding: Finding, amplitude: float, moved: Float) -> Lacking:
-    """Return a finding with its amplitude given the others; a sensor's own change has the opposite sign."""
-    load = None if finding.load_nm is None else amplitude * finding.load_nm
-    signed = amplitude if load is not None else -amplitude
-    return Lacking(replace(finding, amplitude=signed), amplitude * moved, load)
-
-
-UNKNOWN_WAY = 2.0  # times an interval
-LAG_ROWS = 3.0  # lag of a sensor that may go unreported: it looks like the winding's own
 
 
 def widened(
@@ -106,16 +101,14 @@ def widened(
     """
     covariance = estimate.covariance
     for lack in lacks:
-        covariance = covariance + _square(_worst(estimate, fit, lack))
+        shift = _worst(estimate, fit, lack)
+        covariance = covariance + np.outer(shift, shift)
     if nameless:
         covariance = UNKNOWN_WAY**2 * covariance
     if {"voltage", "current"} & set(restless):
-        covariance = covariance + _square(_of_names(estimate, fit, _lag(fit)))
+        shift = _of_names(estimate, fit, _lag(fit))
+        covariance = covariance + np.outer(shift, shift)
     return replace(estimate, covariance=frozen(covariance))
-
-
-def _square(doubt: Float) -> Float:
-    return np.outer(doubt, doubt)
 
 
 def _lag(fit: Fit) -> Float:

@@ -47,14 +47,11 @@ def warnings_of(window: Window) -> list[Reason]:
             text = f"{signal.name} has steps of {step:.3g} {signal.unit}, {100 * step / span:.1f} % of the range used"
             found.append(Reason("Quantised", text, "use a finer scale in the drive's mapping"))
     if window.temperature_c is not None and not -HOTTEST_C < window.temperature_c < HOTTEST_C:
-        text = f"{window.temperature_c:g} degC is not a plausible machine temperature{_kelvin(window.temperature_c)}"
+        text = f"{window.temperature_c:g} degC is not a plausible machine temperature"
+        celsius = window.temperature_c - 273.15
+        text += f"; {celsius:.0f} degC in kelvin?" if -50.0 < celsius < HOTTEST_C else ""
         found.append(Reason("Implausible", text, "give temperature_C in degrees Celsius: drift is compared with it"))
     return found
-
-
-def _kelvin(celsius: float) -> str:
-    guess = celsius - 273.15
-    return f"; {guess:.0f} degC in kelvin?" if -50.0 < guess < HOTTEST_C else ""
 
 
 def not_finite(signals: WindowSignals) -> Iterator[Reason]:

@@ -59,7 +59,8 @@ def shifts(fit: Fit) -> tuple[Shift, Shift]:
     whole = whole - jacobian @ (inverse @ (jacobian.T @ whole))
     for kind, values in ((VOLTAGE, voltage_v(motion, fit.theta)), (CURRENT, motion.current)):
         slope = np.gradient(moving_mean(values, width))
-        answer = answers(motion, fit.theta, gains, kind, [slope], _no_rise(kind, motion.n))[:, 0]
+        rise = [np.zeros(motion.n)] if kind == VOLTAGE else None
+        answer = answers(motion, fit.theta, gains, kind, [slope], rise)[:, 0]
         rest = answer - jacobian @ (inverse @ (jacobian.T @ answer))
         power = float(rest @ rest)
         if not power > 0.0:
@@ -69,7 +70,3 @@ def shifts(fit: Fit) -> tuple[Shift, Shift]:
         found.append(Shift(-float(score), std, -float(score), answer))
     voltage, current = found
     return replace(voltage, samples=voltage.samples + float(fit.theta[6]) / motion.dt_s), current
-
-
-def _no_rise(kind: int, n: int) -> list[Float] | None:
-    return [np.zeros(n)] if kind == VOLTAGE else None

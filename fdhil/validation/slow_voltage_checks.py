@@ -40,6 +40,10 @@ READ_STEPS = 4.0  # change of a voltage beyond which equal readings are implausi
 MOVING = 0.05  # of the rapid speed
 LEAST_NOISE = 0.2  # of a step: noise hidden by the resolution
 LEAST_NOISE_SAMPLES = 20
+LEAST_OFFSET = 0.01  # of the peak of voltage or current
+LEAST_AT_REST = 12  # samples: with fewer, their own scatter is not known
+LEAST_GAIN = BUDGET["timing"].deviations ** 2
+FIRST_SHARE = 0.1  # of the required gain that the score must show at first: it is too small for a long delay
 
 
 def slow_voltage_faults(window: Window) -> Iterator[Reason]:
@@ -89,10 +93,6 @@ def likely_same(volts: Float, step: float) -> float:
     """Return the probability that a constant mid-step is read there, by the noise of third differences."""
     noise = math.sqrt(max(noise_of(carried(volts)) ** 2 - step**2 / 12.0, (LEAST_NOISE * step) ** 2))
     return alike(noise / step)
-
-
-LEAST_OFFSET = 0.01  # of the peak of voltage or current
-LEAST_AT_REST = 12  # samples: with fewer, their own scatter is not known
 
 
 def slow_faults_beside(fitted: WindowFit) -> Iterator[Reason]:
@@ -159,10 +159,6 @@ def _off_at_rest(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
         yield Reason("CalibrationSuspect", text, "set the zero of both sensors at standstill")
 
 
-LEAST_GAIN = BUDGET["timing"].deviations ** 2
-FIRST_SHARE = 0.1  # of the required gain that the score must show at first: it is too small for a long delay
-
-
 def current_late(window: Window, fit: Fit, least_gain: float) -> Iterator[Reason]:
     """Yield a reason if the current is late by more than a row, and the window likelier so by ``least_gain``.
 
@@ -173,11 +169,12 @@ def current_late(window: Window, fit: Fit, least_gain: float) -> Iterator[Reason
     if not (found / std) ** 2 > max(LEAST_GAIN, FIRST_SHARE * least_gain):
         return
     for _ in range(SEARCH):
-        wanted = rows + _whole(found)
-        if wanted == rows:
+        step = int(np.sign(found) * np.ceil(abs(found) - 0.5))  # away from zero: a score underestimates a long delay
+        if step == 0:
             break
-        rows = wanted
-        last = maximum_likelihood.fit([replace(plain, current=_earlier(plain.current, rows))], last.theta, last.free)
+        rows += step
+        earlier = plain.current[np.clip(np.arange(plain.n) + rows, 0, plain.n - 1)]
+        last = maximum_likelihood.fit([replace(plain, current=earlier)], last.theta, last.free)
         if not (np.isfinite(last.residuals).all() and np.isfinite(last.information).all()):
             return
         found, _ = _shift(last)
@@ -188,15 +185,6 @@ def current_late(window: Window, fit: Fit, least_gain: float) -> Iterator[Reason
             f"more than a sample of {1e3 * window.dt_s:g} ms"
         )
         yield Reason("SampleTiming", text, "take voltage, current and speed from one SYNC, or enter the sensor's delay")
-
-
-def _whole(rows: float) -> int:
-    """Return the next whole row, away from zero: a score underestimates a long delay."""
-    return int(np.sign(rows) * np.ceil(abs(rows) - 0.5))
-
-
-def _earlier(current: Float, rows: int) -> Float:
-    return current[np.clip(np.arange(current.size) + rows, 0, current.size - 1)]
 
 
 def _shift(fit: Fit) -> tuple[float, float]:

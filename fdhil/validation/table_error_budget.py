@@ -34,6 +34,13 @@ ORDINARY_SPEED_HZ, ORDINARY_KV = 30.0, 30.0
 INTEGRAL_SHARE = 0.2  # of the speed loop's corner: the corner of its integral
 SETTLED_S = 0.5  # by then a loop has settled: earlier torque has no effect
 UM_PER_MM = 1e3
+MOST_SHARE = 0.15  # of the effect of all torque: a model that leaves more is invalid, however much the axis lags
+NEXT_SPEED = 0.3  # of the rapid speed: speed of a cutting program
+SCATTER = 3.0  # deviations by which the power of noise may exceed the expected one
+BEGINNING_S = 0.060  # before the first row in motion
+SMOOTHING_S = 0.002  # of the current, whose noise would push a shaft at rest
+LOOPS_DIFFER = "LoopsDiffer"  # code if the model explains the torque but not the closed loop
+NOISE_ROWS = 25.0e-3  # s: over which noise behind a position loop is correlated
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,15 +100,6 @@ class TableError:
         power = np.abs(self.response(size, dt_s)[1:]) ** 2
         step = 2 * np.sin(math.pi * np.fft.rfftfreq(size)[1:])
         return math.sqrt(float(power @ (white**2 + (walk / step) ** 2)) * 2 / size)
-
-
-MOST_SHARE = 0.15  # of the effect of all torque: a model that leaves more is invalid, however much the axis lags
-NEXT_SPEED = 0.3  # of the rapid speed: speed of a cutting program
-SCATTER = 3.0  # deviations by which the power of noise may exceed the expected one
-BEGINNING_S = 0.060  # before the first row in motion
-SMOOTHING_S = 0.002  # of the current, whose noise would push a shaft at rest
-LOOPS_DIFFER = "LoopsDiffer"  # code if the model explains the torque but not the closed loop
-NOISE_ROWS = 25.0e-3  # s: over which noise behind a position loop is correlated
 
 
 @dataclass(frozen=True, slots=True)
