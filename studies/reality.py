@@ -26,8 +26,8 @@ from fdhil.identification.windows import find_windows
 from fdhil.model.terms import with_resonance
 from fdhil.pipeline import analyse, pool
 from fdhil.pipeline.identified_loops import better_axis, explained
-from fdhil.prediction.behind_motor import ahead_of_motor_mm
 from fdhil.prediction.contour import contour_error_um
+from fdhil.prediction.predict import ahead_of_motor_mm
 from fdhil.program.loading import load_trajectory
 from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Parameters, Trajectory, WindowOutcome, rms
 from studies import pages

@@ -73,8 +73,8 @@ class Carry:
 class Solution:
     """A block's ``offset`` (n,) in increments, the resulting position (n,) in mm, and the unrounded guess.
 
-    ``rms_um`` is the residual; ``needed_um`` the largest offset that the linear loop asks for, in row ``needed_at``: if
-    it exceeds the limit, the block was not solved.
+    ``rms_um`` is the residual; ``needed_um`` the largest offset that the linear loop needs, in row ``needed_at``: if it
+    exceeds the limit, the block was not solved.
     """
 
     offset: Float

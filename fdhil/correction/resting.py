@@ -106,10 +106,10 @@ class _Length:
 
 
 class _Lead:
-    """The answer to an offset d from row 2 on, as a cubic spline of knots ``step`` rows apart.
+    """The response to an offset d from row 2 on, as a cubic spline of knots ``step`` rows apart.
 
-    ``spline`` (free + step, m) holds d's basis, ``bends`` its second differences, ``effect`` (n, m) what each of them
-    asks for, in A. A rest of less than n rows uses their first rows.
+    ``spline`` (free + step, m) is the basis of d, ``bends`` its second differences, ``effect`` (n, m) the current, A,
+    that each of them causes. A rest of less than n rows uses their first rows.
     """
 
     def __init__(self, answer_a: Float, free: int) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
 
@@ -191,36 +190,26 @@ def _speed_lag(window: Window) -> Reason | None:
     return Reason("SampleTiming", text, "take speed and position from one SYNC, or set [identification] speed_source")
 
 
-def _convention(fitted: WindowFit) -> list[Reason]:
-    axis, estimate = fitted.signals.axis, fitted.estimate
-    if axis is None or estimate is None or estimate.missing:
-        return []
-    found = scale_convention(estimate, Parameters(**axis.nominal.model_dump()))
-    return [] if found is None else [found]
-
-
-def _gain(fitted: WindowFit) -> Iterator[Reason]:
-    axis, estimate = fitted.signals.axis, fitted.estimate
-    if axis is not None and estimate is not None:
-        found = gain_error(estimate, Parameters(**axis.nominal.model_dump()))
-        if found is not None:
-            yield found
-
-
 def _outcome(table: TableAssessment, found: Findings) -> WindowOutcome:
     """Return the verdict: weighed findings refuse only if they do harm at the table, and warn else."""
     weight, fitted = table.budget, table.fitted
+    axis, estimate = table.signals.axis, fitted.estimate
+    nominal = None if axis is None else Parameters(**axis.nominal.model_dump())
     names = WEIGHED | {PLATEAU} if weight is not None and weight.through == "replay" else WEIGHED
     weighed = [r for name, each in found.items() if name in names for r in each]
     reasons = [r for name, each in found.items() if name not in names for r in each]
     # an ordinary loop gives only a share: named reasons are more specific
     if weight is not None and not weight.believed and (weight.in_um or not (reasons or weighed)):
-        reasons += [weight.reason(), *_gain(fitted)]
+        reasons.append(weight.reason())
+        if nominal is not None and estimate is not None and (gain := gain_error(estimate, nominal)) is not None:
+            reasons.append(gain)
     if not table.is_harmless:
         reasons, weighed = [*reasons, *weighed], []
     if reasons and (lag := _speed_lag(fitted.window)) is not None:
         reasons.append(lag)
-    reasons += _convention(fitted)
+    if nominal is not None and estimate is not None and not estimate.missing:
+        scale = scale_convention(estimate, nominal)
+        reasons += [] if scale is None else [scale]
     unexplained = weight.unexplained_um if weight is not None and weight.in_um else None
     verdict = Verdict(not reasons, fitted.fit_percent, tuple(reasons), unexplained, tuple(weighed))
     return WindowOutcome(fitted.window, fitted.widened_estimate, verdict)

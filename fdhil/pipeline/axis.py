@@ -66,8 +66,10 @@ class _Rapid:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What the history knows of an axis: the first values in either direction, the newest published set, and the
-    newest accepted windows' estimates, for the tracker and for the pool, and the newest identified loops.
+    """The history of an axis: the first values in either direction, the newest published set, and more.
+
+    ``points`` and ``members`` are the newest accepted windows' estimates, for the tracker and for the pool; ``loops``
+    are the newest identified loops.
     """
 
     first: Mapping[int, Parameters] = field(default_factory=dict)
@@ -103,9 +105,9 @@ class AxisPipeline:
         known: Known | None = None,
         with_skill: bool = True,
     ) -> None:
-        """``method`` names an estimator (None: the config's choice); ``known`` is where an earlier run left off.
+        """Start with the estimator ``method`` (None: the configured one), from the state ``known`` of an earlier run.
 
-        ``with_skill`` False leaves out what needs the axis' own section, for a recording of which none is known.
+        ``with_skill`` False omits what needs the axis' own section, for a recording of which none is known.
         """
         self.axis = axis
         self._config = config

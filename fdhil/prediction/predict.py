@@ -8,7 +8,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
-from fdhil.model.closed_loop import Response, simulate_axes
+from fdhil.model.closed_loop import Response, simulate, simulate_axes
 from fdhil.prediction.contour import contour_error_um
 from fdhil.prediction.model_terms import without_dry_friction
 from fdhil.prediction.zones import find_zones
@@ -63,6 +63,26 @@ def predict_corrected(
     offset_mm = {axis: values * 1e-3 for axis, values in (offset_um or {}).items()}
     offsets = (offset_mm, speed_offset_rad_s, torque_offset_nm)
     return _assemble(reference, _responses(reference, models, config, *offsets), config)
+
+
+def ahead_of_motor_mm(
+    position_mm: Mapping[str, Float],
+    offset_um: Mapping[str, Float],
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+) -> dict[str, Float]:
+    """Return table less motor (n,) in mm of each axis with a resonance: the part that its encoder does not see.
+
+    The axes follow ``position_mm`` (n,) with ``offset_um`` (n,).
+    """
+    period_s = config.machine.sync_period_s
+    found = {}
+    for axis, path_mm in position_mm.items():
+        if models[axis].term("resonance"):
+            offset_mm = offset_um[axis] * 1e-3
+            response = simulate(models[axis], config.axis[axis], period_s, path_mm, offset_mm)
+            found[axis] = response.table_mm - response.position_mm
+    return found
 
 
 def _responses(

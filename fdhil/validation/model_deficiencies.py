@@ -25,7 +25,7 @@ from fdhil.records import PARAMETERS, Estimate, Float, frozen
 from fdhil.validation.score_bench import Bench, Finding
 
 NO_WORSE = 3.0  # standard deviations by which an alternative may explain less by chance
-UNKNOWN_WAY = 2.0  # times an interval
+UNKNOWN_BIAS = 2.0  # times an interval
 LAG_ROWS = 3.0  # lag of a sensor that may go unreported: it looks like the winding's own
 
 
@@ -104,7 +104,7 @@ def widened(
         shift = _worst(estimate, fit, lack)
         covariance = covariance + np.outer(shift, shift)
     if nameless:
-        covariance = UNKNOWN_WAY**2 * covariance
+        covariance = UNKNOWN_BIAS**2 * covariance
     if {"voltage", "current"} & set(restless):
         shift = _of_names(estimate, fit, _lag(fit))
         covariance = covariance + np.outer(shift, shift)

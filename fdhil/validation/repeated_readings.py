@@ -12,7 +12,7 @@ from fdhil.records import Bool, Float
 from fdhil.validation.significance import BUDGET
 
 RESOLVED = 0.2  # of a step: noise below it hides in the resolution
-TOLD_STEPS = 1.0  # of noise, beyond which two of three readings differ
+INFORMATIVE_STEPS = 1.0  # of noise, beyond which two of three readings differ
 LEAST_NOISE_ROWS = 20
 SIDE = 3  # rows on either side of a run that are compared with it, in lengths of the run
 
@@ -37,7 +37,7 @@ def beyond_chance(values: Float, start: int, end: int) -> bool:
         chance = max(chance, likely_reading(others, step) ** length)
     for side in sides:
         # with noise of several steps no reading is frequent: rows with this one were clipped as well
-        if values[side].size >= length and noise_of(values[side]) < TOLD_STEPS * step:
+        if values[side].size >= length and noise_of(values[side]) < INFORMATIVE_STEPS * step:
             likely = all_within(length, values[side] == values[start]), all_within(length - 1, same[side])
             chance = max(chance, *likely)
     return values.size * chance < BUDGET["saturated"].chance

@@ -19,7 +19,7 @@ from fdhil.identification.kalman import DELAY, departure
 from fdhil.identification.motion import BROKEN, Modes
 from fdhil.records import Float
 
-BESIDE_S = 0.040  # around the doubted rows that are included: some time constants of a winding
+NEIGHBOUR_S = 0.040  # around the doubted rows that are included: some time constants of a winding
 SMOOTHING_S = 0.004
 COURSE = 0.3  # of a voltage's change from row to row: uncertainty of its course between them
 RISES = 1.5  # of the same: its possible rise within one row
@@ -58,7 +58,7 @@ class Bridge:
         None where samples are lost there, or no other sensor is read.
         """
         motion, theta = self.fit.problem.motions[0], self.fit.theta
-        rows = round(BESIDE_S / motion.dt_s)
+        rows = round(NEIGHBOUR_S / motion.dt_s)
         part = slice(max(0, start - rows), min(motion.n, end + rows))
         if (motion.mode[part] == BROKEN).any():
             return None

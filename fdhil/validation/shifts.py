@@ -11,13 +11,14 @@ from fdhil.identification.filtering import moving_mean
 from fdhil.identification.fit import Fit
 from fdhil.identification.innovations import CURRENT, VOLTAGE, answers
 from fdhil.identification.normal import inverse_of
-from fdhil.records import Float
+from fdhil.records import Float, Reason
 from fdhil.validation.score_bench import Finding, courses, expected_correlation
 from fdhil.validation.significance import BUDGET
 
 SMOOTHING_S = 0.010  # short enough for the jerk-limited course of a rapid
 LARGEST = 1.0  # samples: a recorder may assign a value to the SYNC before or after it
 LEAST = 0.1  # samples: the effect of regulators within one stays below
+ADVICE = "take voltage, current and speed from one SYNC, or enter the sensor's delay"
 LATE = " late"  # ends the names of these findings
 
 
@@ -36,11 +37,17 @@ class Shift:
         return abs(self.samples) > max(LARGEST, BUDGET["timing"].deviations * self.std)
 
 
+def build_delay_reason(name: str, others: str, late_s: float, period_s: float) -> Reason:
+    """Return the reason for a signal that is late (early: negative) against others by more than a sample."""
+    delay = f"{1e3 * abs(late_s):.3g} ms {'late' if late_s > 0 else 'early'}"
+    text = f"{name} is {delay} against {others}, more than a sample of {1e3 * period_s:.3g} ms"
+    return Reason("SampleTiming", text, ADVICE)
+
+
 def late_findings(shown: tuple[Shift, Shift]) -> list[Finding]:
     """Return the delays of voltage and current that exceed what regulators cause within a sample, as findings."""
-    advice = "take voltage, current and speed from one SYNC, or enter the sensor's delay"
     return [
-        Finding("SampleTiming", name + " is {:+.2g} samples late", advice, LEAST, shift.own / shift.std, -shift.own,
+        Finding("SampleTiming", name + " is {:+.2g} samples late", ADVICE, LEAST, shift.own / shift.std, -shift.own,
                 shift.direction, name=name + LATE)
         for name, shift in zip(("voltage", "current"), shown, strict=True)
         if abs(shift.own) > LEAST and np.isfinite(shift.std)

@@ -24,7 +24,7 @@ LEAST_FOLLOWED: Mapping[str, float] = {"voltage": 0.5, "current": 0.3}  # of the
 LEAST_SAMPLES = 12  # of a signal, by which it may be compared with the motion
 TABLE_MM, TABLE_SHARE = 1.0, 0.05  # by which a table may differ from the motor: backlash, a soft screw, a late sensor
 TABLE_GAIN, TABLE_FOLLOWS = 1.5, 0.3  # scale error of an accelerometer, and its share explained by the motor
-STEPS_BESIDE = 1.5  # of a position: joint quantisation error of two readings
+QUANTISATION_STEPS = 1.5  # of a position: joint quantisation error of two readings
 SAME = 1e-9  # of the peak, to which one column is a multiple of another
 LONGEST_CYCLE_S = 0.012  # longest cycle of an NC, in which its demand changes once
 STILL_MM = 1.0  # travel from which a recording contains a move
@@ -179,7 +179,7 @@ def position_confirms(window: Window, signal: SensorSignal, start: int, end: int
     to_mm = window.pitch_mm / (2 * math.pi) * window.dt_s
     rows = np.flatnonzero(known) - np.flatnonzero(known)[0]
     error_mm = position[known] - position[known][0] - signal.values[start] * to_mm * rows
-    steps = STEPS_BESIDE * resolution(window.position_mm[np.isfinite(window.position_mm)])
+    steps = QUANTISATION_STEPS * resolution(window.position_mm[np.isfinite(window.position_mm)])
     return bool((np.abs(error_mm) <= signal.step / 2 * to_mm * rows + steps).all())
 
 

@@ -28,7 +28,7 @@ from fdhil.identification.windows import carried, noise_of, runs_of, smooth
 from fdhil.records import Float, Reason, SlowVoltage, Window
 from fdhil.validation.repeated_readings import alike
 from fdhil.validation.sensor_reconstruction import log_beyond
-from fdhil.validation.shifts import LARGEST, SMOOTHING_S
+from fdhil.validation.shifts import LARGEST, SMOOTHING_S, build_delay_reason
 from fdhil.validation.significance import BUDGET
 from fdhil.validation.timing import SEARCH
 from fdhil.validation.window_fit import WindowFit
@@ -179,12 +179,7 @@ def current_late(window: Window, fit: Fit, least_gain: float) -> Iterator[Reason
             return
         found, _ = _shift(last)
     if abs(rows) > LARGEST and _cost(fit) - _cost(last) > max(LEAST_GAIN, least_gain):
-        late_ms = 1e3 * window.dt_s * abs(rows)
-        text = (
-            f"current is {late_ms:.3g} ms {'late' if rows > 0 else 'early'} against speed and voltage, "
-            f"more than a sample of {1e3 * window.dt_s:g} ms"
-        )
-        yield Reason("SampleTiming", text, "take voltage, current and speed from one SYNC, or enter the sensor's delay")
+        yield build_delay_reason("current", "speed and voltage", rows * window.dt_s, window.dt_s)
 
 
 def _shift(fit: Fit) -> tuple[float, float]:

@@ -27,11 +27,11 @@ from fdhil.validation.window_signals import SensorSignal
 
 NOISES = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
 SHORTEST_S = 0.003
-TOLD_S = 0.010  # the shortest run that is compared with its neighbours or the other signals
+COMPARED_S = 0.010  # the shortest run that is compared with its neighbours or the other signals
 COMPUTED = 2.0  # times that, for a speed computed from positions: its neighbours scatter without noise
 LONGEST_RUNS = 2  # of a signal that are checked: a sensor sticks longer than chance repeats
 LEAST_NOISE = 0.2  # steps: noise hidden by the resolution
-TOLD_NOISE = 0.6  # steps: below it, the scatter of readings depends on the signal's position within its step
+INFORMATIVE_NOISE = 0.6  # steps: below it, the scatter of readings depends on the signal's position within its step
 MOST_NOISE = 3.0  # steps: with more, a working sensor repeats no reading, whatever the position
 LEAST_CHANGES = 6  # of a held reading, at equal numbers of rows
 PARTS = 4  # of a run: its first and its last one are checked alone too
@@ -77,7 +77,7 @@ def stuck_values(fitted: WindowFit) -> Iterator[Reason]:
         readings = Readings(signal, begin, end, signals.window.dt_s)
         same = np.diff(signal.values[begin:end]) == 0.0
         held = _update_rows(same)
-        if held > 1 and held * readings.dt_s >= TOLD_S:
+        if held > 1 and held * readings.dt_s >= COMPARED_S:
             text = f"{signal.name} changes only every {1e3 * held * readings.dt_s:.3g} ms: samples in between repeat it"
             yield Reason("StuckValue", text, "record it at the drive's own rate, or at the rate at which it changes")
             continue
@@ -141,7 +141,7 @@ def _is_stuck(fitted: WindowFit, readings: Readings, start: int, last: int, limi
     computed = readings.signal.name == "speed" and fitted.window.speed_late_s is not None
     if not computed and _quieter_than_noise(readings, start, last, limit):
         return True
-    if (last - start) * readings.dt_s < (COMPUTED * TOLD_S if computed else TOLD_S):
+    if (last - start) * readings.dt_s < (COMPUTED * COMPARED_S if computed else COMPARED_S):
         return False
     if readings.beyond_chance(start, last):
         return True
@@ -172,11 +172,11 @@ def _elsewhere(bridge: Bridge, readings: Readings, start: int, last: int, limit:
 def _quieter_than_noise(readings: Readings, start: int, last: int, limit: float) -> bool:
     """Return whether noise would have changed a reading even of a constant in the middle of its step."""
     steps, rows = readings.steps, SIDE * (last - start + 1)
-    if readings.noise < TOLD_NOISE or (last - start) * math.log(alike(readings.noise)) > limit:
+    if readings.noise < INFORMATIVE_NOISE or (last - start) * math.log(alike(readings.noise)) > limit:
         return False
     sides = (steps[max(0, start - rows) : start], steps[last + 1 : last + 1 + rows])
     least = min([noise_steps(side) for side in sides if side.size >= LEAST_NOISE_ROWS], default=readings.noise)
-    return least >= TOLD_NOISE and (last - start) * math.log(alike(least)) < limit
+    return least >= INFORMATIVE_NOISE and (last - start) * math.log(alike(least)) < limit
 
 
 def noise_steps(readings: Float) -> float:

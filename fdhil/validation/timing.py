@@ -15,12 +15,12 @@ import numpy as np
 from fdhil.identification.fit import Fit, but_delay, descend, with_delay
 from fdhil.identification.fit import fit as refit
 from fdhil.records import Reason
-from fdhil.validation.shifts import LARGEST, Shift, shifts
+from fdhil.validation.shifts import LARGEST, Shift, build_delay_reason, shifts
 from fdhil.validation.significance import BUDGET
 from fdhil.validation.window_fit import WindowFit
 
 DOUBTFUL = 0.5  # samples: a delay that may be larger is searched for
-TOLD = 2.5  # standard deviations
+SEARCH_DEVIATIONS = 2.5  # standard deviations
 STRIDE = 1.0  # samples: other parameters fitted to no delay may hide most of a delay of several
 SEARCH = 6  # fits: each removes most of the residual
 REACH = 16.0  # samples: longer ones show in whole samples, see identification.delay
@@ -33,7 +33,7 @@ def voltage_late(fitted: WindowFit) -> Iterator[Reason]:
     late_s = fitted.voltage_delay_s
     if late_s:
         period_s = max(fitted.window.dt_s, fitted.required_fit.problem.motions[0].voltage_period_s)
-        yield _reason("voltage", "current and speed", late_s, period_s)
+        yield build_delay_reason("voltage", "current and speed", late_s, period_s)
 
 
 def timing_faults(fitted: WindowFit) -> Iterator[Reason]:
@@ -43,12 +43,12 @@ def timing_faults(fitted: WindowFit) -> Iterator[Reason]:
         return  # there the delay is one of the parameters
     voltage, current = fitted.delays
     if current.sure and abs(current.samples) * voltage.std > abs(voltage.samples) * current.std:
-        yield _reason("current", "voltage and speed", current.samples * window.dt_s, window.dt_s)
+        yield build_delay_reason("current", "voltage and speed", current.samples * window.dt_s, window.dt_s)
         return
-    if abs(voltage.samples) + TOLD * voltage.std > DOUBTFUL:
+    if abs(voltage.samples) + SEARCH_DEVIATIONS * voltage.std > DOUBTFUL:
         samples = searched(fit, voltage)
         if samples is not None and abs(samples) > LARGEST:
-            yield _reason("voltage", "current and speed", samples * window.dt_s, window.dt_s)
+            yield build_delay_reason("voltage", "current and speed", samples * window.dt_s, window.dt_s)
             return
     yield from _short_winding(fit)
 
@@ -76,14 +76,6 @@ def _short_winding(fit: Fit) -> Iterator[Reason]:
             return
 
 
-def _reason(name: str, others: str, late_s: float, period_s: float) -> Reason:
-    text = (
-        f"{name} is {1e3 * abs(late_s):.2f} ms {'late' if late_s > 0 else 'early'} against {others}, "
-        f"more than a sample of {1e3 * period_s:.3g} ms"
-    )
-    return Reason("SampleTiming", text, "take voltage, current and speed from one SYNC, or enter the sensor's delay")
-
-
 def searched(fit: Fit, first: Shift) -> float | None:
     """Return the delay of the voltage in samples beyond which, all else fitted to it, the innovations show no more.
 
@@ -103,7 +95,7 @@ def searched(fit: Fit, first: Shift) -> float | None:
 
     rest = first.samples - begun
     stride = max(2.0 * abs(rest), STRIDE)  # a residual delay is underestimated
-    found = _root(left, begun, rest, -stride if rest < -TOLD * first.std else stride)
+    found = _root(left, begun, rest, -stride if rest < -SEARCH_DEVIATIONS * first.std else stride)
     return found if found is not None and _deviance(fit) - _deviance(last) > BUDGET["timing"].deviations ** 2 else None
 
 

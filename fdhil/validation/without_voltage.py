@@ -10,6 +10,7 @@ import numpy as np
 from fdhil.identification.normal import inverse_gram
 from fdhil.identification.without_voltage import TorqueFit, candidates, effective_rows, late_s
 from fdhil.records import Reason, rms
+from fdhil.validation.shifts import build_delay_reason
 from fdhil.validation.significance import BUDGET
 from fdhil.validation.window_signals import WindowSignals
 
@@ -24,9 +25,7 @@ def torque_late(fitted: TorqueFit, dt: float) -> Iterator[Reason]:
     """Yield a reason if the current is late or early against the motion by significantly more than a row."""
     late, std = late_s(fitted)
     if abs(late) > LATE_ROWS * dt + BUDGET["timing"].deviations * std:
-        side = "late" if late > 0 else "early"
-        text = f"current is {1e3 * abs(late):.2f} ms {side} against the motion, more than a row of {1e3 * dt:.3g} ms"
-        yield Reason("SampleTiming", text, "take current, speed and position from one SYNC")
+        yield build_delay_reason("current", "the motion", late, dt)
 
 
 @dataclass(frozen=True, slots=True)
