@@ -5,7 +5,7 @@ from __future__ import annotations
 from fdhil.pipeline.analysis import analyse
 from fdhil.pipeline.axis import POOL_WINDOWS, AxisPipeline, Known, Record
 from fdhil.pipeline.identified_loops import analyse_windows
-from fdhil.pipeline.window_pool import pool, pool_with_held_out
+from fdhil.pipeline.validated_pool import pool, pool_with_held_out
 
 __all__ = [
     "POOL_WINDOWS",

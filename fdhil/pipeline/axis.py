@@ -18,7 +18,7 @@ from fdhil.identification.pooling import change_covariance, member
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline.identified_loops import OwnLoops
 from fdhil.pipeline.recent_samples import RecentSamples
-from fdhil.pipeline.window_pool import one_sided, refuses_the_model, together
+from fdhil.pipeline.validated_pool import one_sided, refuses_the_model, together
 from fdhil.prediction import skill
 from fdhil.records import (
     AxisSamples,
