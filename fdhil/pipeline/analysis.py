@@ -54,8 +54,8 @@ def analyse(
     rapid is replayed through the closed loop, whose set-points come every ``sync_period_s`` (default: every row).
     """
     axis = own(window, axis)
-    at_instants, cycles = with_demand_on_time(mended(window, settings.speed_source), axis, sync_period_s)
-    signals = WindowSignals(at_instants, settings, axis, sync_period_s, recorded=window)
+    aligned, cycles = with_demand_on_time(mended(window, settings.speed_source), axis, sync_period_s)
+    signals = WindowSignals(aligned, settings, axis, sync_period_s, recorded=window)
     outcome = replace(_with_table(_analysed(signals), signals), window=window)
     return _with_lead(outcome, cycles) if cycles else outcome
 

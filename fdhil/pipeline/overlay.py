@@ -42,18 +42,18 @@ def lay_over(window: Window, config: MachineConfig, loops: LoopEstimate | None =
     settings, period_s = config.identification, config.machine.sync_period_s
     section = OwnLoops(config.axis.get(window.axis), settings, period_s, loops).axis
     outcome = analyse(window, settings, section, period_s)
-    at_instants, axis = mended(window, settings.speed_source), own(window, section)
-    bare = Overlay(at_instants, outcome)
+    aligned, axis = mended(window, settings.speed_source), own(window, section)
+    bare = Overlay(aligned, outcome)
     if outcome.estimate is None or outcome.estimate.result in NO_MODEL:
         return bare
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            found = estimated(WindowSignals(at_instants, settings, axis, period_s, recorded=window))
+            found = estimated(WindowSignals(aligned, settings, axis, period_s, recorded=window))
             assert found.estimate is not None
-            driven = simulated(at_instants, found.estimate, found.fit)
+            driven = simulated(aligned, found.estimate, found.fit)
             followed = None
             if axis is not None and found.parameters is not None and TableAssessment(found).budget is not None:
-                followed = replay_window(at_instants, found.parameters, axis, period_s)
+                followed = replay_window(aligned, found.parameters, axis, period_s)
     except GAVE_UP:
         return bare
     return replace(bare, driven=driven, followed=followed)
