@@ -1,4 +1,4 @@
-"""Tells whether a believed model does harm: a parameter beyond its interval, or a path beyond the tolerance."""
+"""Assesses whether an accepted model does harm: a parameter beyond its interval, or a path beyond the tolerance."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STEPS_UM = 0.5  # what set-points and positions are rounded to, and less
 
 
 def axis_of(scene: Scene) -> Axis:
-    """Return the section that a machine with this drive and its regulators has."""
+    """Return the section of a machine with this drive and its regulators."""
     d, move = scene.drive, scene.move
     gains = d.vector()
     return Axis(
@@ -43,7 +43,7 @@ def axis_of(scene: Scene) -> Axis:
 
 
 def off(estimate: Estimate, drive: Drive) -> list[str]:
-    """Return the parameters that lie farther from the drive's than their intervals say, and than matters."""
+    """Return the parameters that deviate from the drive's by more than their intervals, and by enough to matter."""
     found = []
     for name in PARAMETERS:
         value, std, true = estimate.value(name), estimate.std(name), drive.truth()[name]
@@ -53,7 +53,7 @@ def off(estimate: Estimate, drive: Drive) -> list[str]:
 
 
 def beside_the_path(models: Sequence[Parameters], scene: Scene) -> list[str]:
-    """Return by how much the table of the true machine, at the rapid and at what is cut, is not where a model says.
+    """Return the distance of the true machine's table from the prediction, at the rapid and when cutting.
 
     The tolerance is that of the rapid, in micrometres.
     """
