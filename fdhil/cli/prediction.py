@@ -282,7 +282,7 @@ def _show_prediction(
 ) -> None:
     from fdhil.cli.forecast import crossing_text
     from fdhil.correction import result_documents
-    from fdhil.prediction.gain import plus_minus
+    from fdhil.prediction.gain import format_half_interval
 
     contour, time_s = result_documents.contour(predicted), predicted.reference.time_s
     click.echo(
@@ -294,7 +294,7 @@ def _show_prediction(
     for note in predicted.reference.notes:
         click.echo(f"note, {note}; {note.advice}", err=True)
     for zone in shown:
-        std = f" {plus_minus(INTERVAL_95 * zone['std_um'])}" if "std_um" in zone else ""
+        std = f" {format_half_interval(INTERVAL_95 * zone['std_um'])}" if "std_um" in zone else ""
         line = f"line {zone['line']}, " if zone["line"] else ""
         click.echo(
             f"  {zone['start_s']:8.3f} s .. {zone['end_s']:8.3f} s  {zone['max_um']:8.1f}{std} um  {zone['cause']:12}"

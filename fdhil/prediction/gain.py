@@ -44,22 +44,22 @@ class Gain(NamedTuple):
     def __str__(self) -> str:
         if self.half_um is None:
             return f"{self.after_um:.2f} um RMS by the model alone; its accuracy on this machine is unknown"
-        return at_most(self.after_um, self.half_um)
+        return format_upper_limit(self.after_um, self.half_um)
 
 
-def at_most(model_um: float, half_um: float) -> str:
+def format_upper_limit(model_um: float, half_um: float) -> str:
     """Return a predicted RMS as text: the end of its 95 % interval first, as it is not symmetric.
 
-    >>> at_most(0.08, 1.6)
+    >>> format_upper_limit(0.08, 1.6)
     'at most 1.68 um RMS (95 %), 0.08 by the model'
     """
     return f"at most {model_um + half_um:.2f} um RMS (95 %), {model_um:.2f} by the model"
 
 
-def plus_minus(half: float, decimals: int = 1) -> str:
+def format_half_interval(half: float, decimals: int = 1) -> str:
     """Return half an interval as text; a value below its digits is shown as smaller than they.
 
-    >>> plus_minus(0.44), plus_minus(0.004)
+    >>> format_half_interval(0.44), format_half_interval(0.004)
     ('± 0.4', '± <0.1')
     """
     shown = f"{half:.{decimals}f}"

@@ -77,10 +77,10 @@ def resisting(parameters: Parameters, speed_rad_s: Float, angle_rad: Float) -> t
     return smooth_nm, dry_nm
 
 
-def main_name(name: str) -> str:
+def get_main_term(name: str) -> str:
     """Return the term that a name belongs to: a ripple's phase to the ripple.
 
-    >>> main_name("ripple_screw_1_phase"), main_name("stribeck_speed"), main_name("Jt")
+    >>> get_main_term("ripple_screw_1_phase"), get_main_term("stribeck_speed"), get_main_term("Jt")
     ('ripple_screw_1', 'stribeck', 'Jt')
     """
     return next((name.removesuffix(part) for part in _PARTS if name.endswith(part)), name)
@@ -90,7 +90,7 @@ def families(names: Sequence[str]) -> Mapping[str, tuple[str, ...]]:
     """Return the names that belong together, by their main name."""
     found: dict[str, tuple[str, ...]] = {}
     for name in names:
-        main = main_name(name)
+        main = get_main_term(name)
         found[main] = (*found.get(main, ()), name)
     return found
 
@@ -100,7 +100,7 @@ def put_back(now: Parameters, earlier: Parameters, names: Sequence[str]) -> Para
     before, present = values_of(earlier), values_of(now)
     changed = {}
     for name in names:
-        part = main_name(name) != name
+        part = get_main_term(name) != name
         changed[name] = before.get(name, present.get(name, 0.0) if part else 0.0)
     return now.changed(**changed)
 

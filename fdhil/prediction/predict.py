@@ -44,7 +44,7 @@ def predict(
 
 
 def contour_um(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> Float:
-    """Return the contour error (n,) um alone, as :func:`predict` has it: for searches over many paths."""
+    """Return the contour error (n,) um alone, as predicted above: for searches over many paths."""
     return _contour(reference, _responses(reference, models, config))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.model import closed_loop
 from fdhil.prediction.contour import contour_error_um
-from fdhil.prediction.model_terms import main_name, values_of
+from fdhil.prediction.model_terms import get_main_term, values_of
 from fdhil.prediction.predict import check_axes
 from fdhil.records import Float, Parameters, Prediction, Trajectory, unit_of
 
@@ -107,7 +107,7 @@ def sensitivity_um(
     for axis in reference.axes:
         moved, steps, _ = found[axis]
         for k, (name, value) in enumerate(values_of(models[axis]).items()):
-            if main_name(name) != name:
+            if get_main_term(name) != name:
                 continue
             contour = contour_error_um(path, reference.table_mm({**here, axis: moved[k]}), reference.dt_s)
             per_percent = 0.01 * abs(value) / steps[k]

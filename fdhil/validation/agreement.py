@@ -70,7 +70,7 @@ def moved(estimates: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
 
 
 def is_of_winding(reason: Reason) -> bool:
-    """Return whether a reason of :func:`moved` says that R or L jumps: the current loop hides that at the table."""
+    """Return whether a reason reports a jump of R or L: the current loop hides that at the table."""
     return reason.code == "ParameterJump" and reason.text.split(" ", 1)[0] in WINDING
 
 

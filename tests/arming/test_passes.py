@@ -16,7 +16,7 @@ from fdhil.arming.passes import Pass
 from fdhil.arming.preparing import Armament, Refused
 from fdhil.config import MachineConfig
 from fdhil.prediction import contour_error_um
-from fdhil.prediction.gain import Gain, joint_held_out_um, plus_minus, worst_skill_um
+from fdhil.prediction.gain import Gain, format_half_interval, joint_held_out_um, worst_skill_um
 from fdhil.records import AxisSamples, Correction, Float, Notice, Skill, frozen, frozen_ints
 from tests.arming.mill import Mill
 from tests.arming.test_ahead import opened
@@ -176,11 +176,11 @@ def test_gain_includes_what_held_out_moves_show_and_is_unknown_where_an_axis_has
 
 
 def test_a_spread_below_the_digits_is_not_zero() -> None:
-    assert plus_minus(0.44) == "± 0.4"
-    assert plus_minus(0.05) == "± 0.1"
-    assert plus_minus(0.004) == "± <0.1"
-    assert plus_minus(0.0) == "± <0.1"
-    assert plus_minus(0.004, 2) == "± <0.01"
+    assert format_half_interval(0.44) == "± 0.4"
+    assert format_half_interval(0.05) == "± 0.1"
+    assert format_half_interval(0.004) == "± <0.1"
+    assert format_half_interval(0.0) == "± <0.1"
+    assert format_half_interval(0.004, 2) == "± <0.01"
 
 
 def test_a_table_behind_a_known_spring_is_measured_where_it_is(
