@@ -119,7 +119,7 @@ def replay_window(window: Window, parameters: Parameters, axis: Axis, sync_perio
 
 
 def replay_setpoints(window: Window, parameters: Parameters, axis: Axis, sync_period_s: float) -> Replay | None:
-    """Return the replay of a window as above, by this very model: no share of load is fitted.
+    """Return the replay of a window of set-points by this very model: no share of load is fitted.
 
     None too where the axis had not come to rest before: its regulators' state then is not recorded.
     """
