@@ -322,7 +322,7 @@ def test_nothing_is_published_from_one_direction_while_the_other_is_refused(
 ) -> None:
     def refusing(window: Window, *known: Any) -> WindowOutcome:
         outcome = analyse(window, *known)
-        reason = Reason("ValidationFailed", "the drive does what the model does not have")
+        reason = Reason("ValidationFailed", "the drive has an effect that the model lacks")
         return outcome if window.direction > 0 else replace(outcome, verdict=Verdict(False, 90.0, (reason,)))
 
     monkeypatch.setattr("fdhil.pipeline.identified_loops.analyse", refusing)

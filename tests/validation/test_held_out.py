@@ -68,7 +68,7 @@ def test_pool_that_does_not_predict_the_other_move_is_refused() -> None:
     assert held_out_reason(kept, SETTINGS) is None
     reason = held_out_reason(left, SETTINGS)
     assert reason is not None
-    assert "does not predict a move that it has not seen" in reason.text
+    assert "does not predict moves that it was not identified on" in reason.text
     assert left.moves == 2
     assert left.max_um > left.rms_um > kept.rms_um
 
