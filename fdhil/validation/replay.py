@@ -20,7 +20,7 @@ SHARES_OF_LOAD = (0.0, -0.5, -0.25, -0.75, 0.5, 1.0, 2.0)  # of the friction in 
 ENOUGH = 0.02  # of the following error: below, no better share is searched for
 STANDSTILL_S = 0.015  # over which the current before a move is taken
 REST_MM, REST_STEPS = 5e-3, 3.0  # a position that changes by no more, or by no more of its own steps, stands
-_EDGE = 8  # rows at either end that a shifted comparison omits
+_EDGE = 8  # rows at either end that a shifted comparison leaves out
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +184,7 @@ def _standstill_rows(window: Window) -> int:
 
 
 def _standstill_a(window: Window) -> float:
+    """Return the current that the drive holds in the first rows of a window, which begins at rest."""
     held = window.current_a[: _standstill_rows(window)]
     held = held[np.isfinite(held)]
     return float(held.mean()) if held.size else 0.0
