@@ -272,8 +272,8 @@ def test_lines_of_the_daemon_as_json(capsys: pytest.CaptureFixture[str]) -> None
 
 def test_terms_and_what_is_warned_of_are_told_beside_the_table() -> None:
     load = {"value": 2.5, "std": 0.01, "low": 2.48, "high": 2.52, "unit": "N.m"}
-    axis = {"terms": {"load": load}, "unexplained_um": 0.25, "warnings": ["OneDirection: all moves are in one direction"]}
-    told = "load 2.50 ±0.02 N.m; 0.25 um of a rapid unexplained; OneDirection: all moves are in one direction"
+    axis = {"terms": {"load": load}, "unexplained_um": 0.25, "warnings": ["OneDirection: all moves go one way"]}
+    told = "load 2.50 ±0.02 N.m; 0.25 um of a rapid unexplained; OneDirection: all moves go one way"
     assert believed(axis) == told
     assert believed({"terms": None, "unexplained_um": None, "warnings": []}) == ""
 
