@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.inverse import scattered
 from fdhil.config import MachineConfig
-from fdhil.correction.online import law
+from fdhil.correction.flatness_feedforward import law
 from fdhil.guard.feedforward import Law
 from fdhil.guard.requests import parse_law
 from fdhil.model import closed_loop

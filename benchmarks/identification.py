@@ -25,7 +25,7 @@ from fdhil.config import Identification
 from fdhil.daemon.kernel_warmup import nominal_rapid
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import AxisPipeline, analyse
-from fdhil.pipeline.recorded import analyse_windows
+from fdhil.pipeline.identified_loops import analyse_windows
 from fdhil.records import Window
 from fdhil.store.recording_csv import parse_recording
 from studies import bench, real_plant

@@ -15,7 +15,7 @@ ESTIMATORS: Mapping[str, str] = {
 DEFAULT_ESTIMATOR = "maximum_likelihood"
 CORRECTIONS: Mapping[str, str] = {
     "mirror": "fdhil.correction.mirror:plan",
-    "flatness": "fdhil.correction.flatness:plan",
+    "flatness": "fdhil.correction.flatness_feedforward:plan",
     "inverse": "fdhil.correction.inverse:plan",
 }
 DEFAULT_CORRECTION = "inverse"

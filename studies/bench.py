@@ -145,7 +145,7 @@ def shuttle(
     smoothing: float = 0.02,
     first: int = 1,
 ) -> Array:
-    """Return the demand (m, 1 ms rows) of ``moves`` rapids to and fro, trapezoids of speed smoothed once."""
+    """Return the demand (m, 1 ms rows) of ``moves`` rapids back and forth, trapezoids of speed smoothed once."""
     dt = CYCLE_STEPS * STEP_S
     ramp = min(speed / acceleration, np.sqrt(distance / acceleration))
     top = ramp * acceleration

@@ -222,7 +222,7 @@ def _told_for(method: str, found: Sequence[Figures], names: Names) -> str:
 
 
 def _price(found: Sequence[Figures], names: Names) -> str:
-    """Tell what the instruments cost in ft and Cd, beside the likelihood."""
+    """Describe the loss of precision in ft and Cd by the instruments, compared with the likelihood."""
     methods, filters, parameters = names
     iv, ml = methods.index("instrumental_variables"), methods.index("maximum_likelihood")
     pair = [parameters.index("ft"), parameters.index("Cd")]

@@ -79,7 +79,7 @@ PARTS: Mapping[str, Callable[[argparse.Namespace, Path], Found]] = {
 
 
 def measured(options: argparse.Namespace) -> dict[str, Any]:
-    """Measure what was asked for; the rest stays as it is in the file."""
+    """Measure the requested parts; the others stay as they are in the file."""
     path = options.out / "crash.json"
     parts = json.loads(path.read_text("utf-8"))["figures"]["parts"] if path.exists() else {}
     for part in options.parts:

@@ -1,4 +1,4 @@
-"""What the figures of the crash study say: its page, and what they are for the goals."""
+"""The page of the crash study, and its figures for the goals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LEAST_CUTS = 60
 
 
 def goals(parts: Figures) -> dict[str, Any]:
-    """Return what the figures say to the goals."""
+    """Return the figures for the goals."""
     every = {part: list(parts.get(part, {}).values()) for part in ("calls", "cuts", "disks", "clocks")}
     runs = sum(sum(kind["runs"].values()) for kind in every["calls"])
     cuts, lost = (

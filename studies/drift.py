@@ -74,7 +74,7 @@ def told(outcomes: Sequence[WindowOutcome]) -> tuple[Array, Array]:
 
 
 def warming(seed: int) -> Array:
-    """Return the relative errors of the slopes of ft and Cd, and whether their intervals hold the truth (2, 2)."""
+    """Return the relative errors of the slopes of ft and Cd, and whether their intervals cover the truth (2, 2)."""
     rng = np.random.default_rng([1, seed])
     plant = drawn(rng)
     outcomes = []
@@ -171,7 +171,7 @@ def pooled(seed: int) -> Array:
 
 
 def due(seed: int) -> tuple[bool, bool, float]:
-    """Return whether the date of a limit was told, whether its interval held it, and its error (days).
+    """Return whether the date of a limit was predicted, whether its interval covered it, and its error (days).
 
     Cd wears by 0.5 % a day; 30 daily rapids; the limit is 50 % more, 100 days from the first.
     """

@@ -81,7 +81,7 @@ def lasting(recording: Recording, rows: float, seed: int) -> list[Window]:
 
 
 def coverage(recording: Recording, rows: float, runs: int) -> Array:
-    """Return the share (6,) of the likelihood's 95 % intervals that hold the truth where noise lasts ``rows``."""
+    """Return the share (6,) of the likelihood's 95 % intervals that cover the truth with noise over ``rows``."""
     inside = []
     for seed in range(runs):
         estimate = maximum_likelihood.estimate(lasting(recording, rows, seed), Identification())

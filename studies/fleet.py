@@ -94,7 +94,7 @@ def _rest(pause_s: float, over: Any) -> None:
 
 
 def checked(database: Postgres, machines: Sequence[MachineConfig], days: Sequence[MachineConfig]) -> dict[str, int]:
-    """Compare each record in the database with what the machines were to tell."""
+    """Compare each record in the database with those that the machines should have sent."""
     with psycopg.connect(database.connection, autocommit=True) as db:
         db.execute("CREATE TEMP TABLE told (day int, sequence bigint, message text)")
         db.execute("CREATE TEMP TABLE recorded (machine text, day int)")
@@ -199,7 +199,7 @@ PARTS = {"calm": calm, "cut": cut, "killed": killed}
 
 
 def measured(options: argparse.Namespace) -> Mapping[str, Any]:
-    """Measure what was asked for; the rest stays as it is in the file."""
+    """Measure the requested parts; the others stay as they are in the file."""
     path = options.out / "fleet.json"
     found: dict[str, Any] = json.loads(path.read_text("utf-8"))["figures"] if path.exists() else {}
     for name in options.parts:

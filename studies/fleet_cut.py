@@ -1,4 +1,4 @@
-"""A network that can be cut: what goes between two ends is dropped, and neither is told."""
+"""A network that can be cut: data between its two ends is dropped, and neither end is notified."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Network:
         threading.Thread(target=self._answer, daemon=True).start()
 
     def close(self) -> None:
-        """Take no more connections."""
+        """Stop accepting connections."""
         self._door.shutdown(socket.SHUT_RDWR)  # wakes who waits at it
         self._door.close()
 

@@ -67,6 +67,6 @@ def copied(days: Sequence[MachineConfig], folder: Path, machines: int, server: s
 
 
 def told(config: MachineConfig) -> list[tuple[int, str]]:
-    """Return number and digest of each record that a machine is to tell."""
+    """Return number and digest of each record that a machine should send."""
     with closing(sqlite3.connect(config.store.directory / HISTORY_FILE)) as db:
         return db.execute("SELECT id, message FROM outbox ORDER BY id").fetchall()

@@ -96,7 +96,7 @@ def counted(database: Postgres) -> int:
 
 
 def wait_for(holds: Callable[[], bool], what: str, patience_s: float = 1200.0) -> float:
-    """Wait until something holds, and return how long it took."""
+    """Wait for a condition, and return how long it took."""
     begin_s = time.monotonic()
     while not holds():
         if time.monotonic() - begin_s > patience_s:

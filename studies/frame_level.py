@@ -1,4 +1,4 @@
-"""The ramps of every row at any time of a program: the guard's decisions in this process, judged by their frames."""
+"""The ramps of every fault at any time of a program: the guard's decisions in this process, checked by their frames."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class LateListener(Listener):
 
 
 class Cut(Bench):
-    """A machine in the cut whose frames are judged by the wire; ``tamper`` is what the guard hears of the others."""
+    """A machine in the cut whose frames are checked on the wire; ``tamper`` changes what the guard receives."""
 
     tamper: Tamper | None = None
     changed_at = 0
@@ -61,7 +61,7 @@ class Cut(Bench):
             super().hear(*frame)
 
     def step(self, inputs: Inputs) -> Output:
-        """Decide, and judge what leaves."""
+        """Decide, and check the frames sent."""
         if inputs.unsent and self.outputs and self.outputs[-1].offsets is not None:
             for k in inputs.unsent:
                 self.wires[k].lost()
@@ -201,7 +201,7 @@ def batched(values: Sequence[int], size: int) -> list[tuple[int, ...]]:
 
 
 def _spoil(cut: Cut, by: int) -> None:
-    """From the next row on the table asks for a step of so much, where there is room away from zero."""
+    """From the next row on the table asks for a step of this size, where there is room away from zero."""
     assert cut.path is not None
     row = cut.state.places[0].row + 1
     columns = [list(column) for column in cut.path.offset]
@@ -231,7 +231,7 @@ def _one_sync(cut: Cut, row: str, k: int) -> None:
 
 
 def descents(row: str, times: int, seed: int) -> tuple[list[Descent | None], list[str], int]:
-    """Have ``times`` faults of a row, each at a random SYNC with an offset applied, before the path ends by itself.
+    """Inject a fault ``times`` times, each at a random SYNC with an offset applied, before the path ends by itself.
 
     Returns the descents, what was wrong, and the SYNC judged.
     """

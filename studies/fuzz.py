@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def measure(options: argparse.Namespace) -> Figures:
-    """Fuzz the targets one after another, then judge slips."""
+    """Fuzz the targets one after another, then assess slips."""
     path = options.out / "fuzz.json"
     before = json.loads(path.read_text("utf-8"))["figures"] if options.add and path.is_file() else {}
     parts: dict[str, Figures] = dict(before.get("targets", {}))
@@ -102,7 +102,7 @@ def judged_slips(count: int, seed: int) -> Figures:
 
 
 def goals(figures: Mapping[str, Any]) -> Figures:
-    """Return what the goals R12 and R17 say of these figures."""
+    """Return the goals R12 and R17 by these figures."""
     parts, letters = figures["targets"], figures["slips"]
     total, found = sum(part["inputs"] for part in parts.values()), sum(len(part["found"]) for part in parts.values())
     whole = sum(part["inputs"] >= GOAL for part in parts.values())

@@ -34,7 +34,7 @@ FORGETS: Pair = (0, 0)
 
 
 class FedWire:
-    """Judges the speed and torque offsets to one drive by the frames on the wire: ``ours`` says what is wrong."""
+    """Checks the speed and torque offsets to one drive by the frames on the wire: ``ours`` returns the violation."""
 
     def __init__(self) -> None:
         self.last = self.before = FORGETS
@@ -44,7 +44,7 @@ class FedWire:
         self.last = self.before
 
     def ours(self, pair: Pair) -> str | None:
-        """A frame of the guard: inside the limits, and each value zero or no more than its rate from the last."""
+        """Check a frame of the guard: inside the limits, and each value zero or no more than its rate from the last."""
         before = self.before = self.last
         self.last = pair
         bounds = ((FED.speed, FED.speed_rate), (FED.torque, FED.torque_rate))
@@ -95,7 +95,7 @@ class Walk:
     def cycle(
         self, request: Request | None = None, late: bool = False, unsent: Sequence[int] = (), nc: bool = True
     ) -> None:
-        """One SYNC; its frames are judged. ``unsent``: the axes whose frames of the step before did not leave."""
+        """Run one SYNC and check its frames. ``unsent``: the axes whose frames of the step before were not sent."""
         machine = self.machine
         if unsent and machine.outputs:
             self._not_left(machine.outputs[-1], unsent)
@@ -114,7 +114,7 @@ class Walk:
                 self.fed_wires[k].lost()
 
     def judge(self, output: Output, late: bool) -> None:
-        """Judge what left at a SYNC, or at the local timer without one."""
+        """Check the frames sent at a SYNC, or at the local timer without one."""
         machine, before, self.mode = self.machine, self.mode, self.machine.mode
         if self.mode is not before:
             self.seen[f"{before.value} to {self.mode.value}"] += 1
@@ -163,7 +163,7 @@ def compared(walk: Walk, valid: bool = True) -> Request:
 
 
 def armed(walk: Walk) -> None:
-    """All good again: compared, adopted where something stands, armed and into the path."""
+    """Restore a valid state: compared, residual offsets adopted, armed and on the path."""
     machine = walk.machine
     for drive in machine.drives:
         drive.statusword, drive.mode, drive.answers, drive.scale, drive.position_error = ENABLED, 8, True, 1.0, 0
@@ -187,7 +187,7 @@ def armed(walk: Walk) -> None:
 
 
 def restarted(walk: Walk) -> None:
-    """The guard is killed; the next one knows nothing, the drive holds what it held."""
+    """Kill the guard; the next one has no state, the drive keeps its offset."""
     machine = walk.machine
     again = Bench(machine.settings, machine.path, machine.demand, machine.drives)
     again.tick, again.counter, again.row = machine.tick, machine.counter, machine.row
@@ -249,7 +249,7 @@ def rebooted(walk: Walk) -> None:
 
 
 def requested(walk: Walk) -> None:
-    """Any request at any time, one to arm what must not be on beside what is on included."""
+    """Send any request at any time, including one to arm a method that is not allowed with the active one."""
     valid = walk.rng.random() < 0.8
     kind = walk.rng.choice(("arm", "feedforward", "disarm", "adopt", "adopt", "stop", "compared"))
     if kind == "compared":

@@ -1,4 +1,4 @@
-"""Tells whether a believed model does harm: a parameter beyond its interval, or a path beyond the tolerance."""
+"""Assesses whether an accepted model does harm: a parameter beyond its interval, or a path beyond the tolerance."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from fdhil.config.regulators import Regulators
 from fdhil.model import closed_loop
 from fdhil.records import PARAMETERS, Estimate, Float, Parameters, rms
 from fdhil.validation.agreement import LEAST_CHANGE
-from fdhil.validation.weight import tolerance_um
 from studies import drives
 from studies.drives import Drive
 from studies.scenes import Scene, demand_of
@@ -22,7 +21,7 @@ STEPS_UM = 0.5  # what set-points and positions are rounded to, and less
 
 
 def axis_of(scene: Scene) -> Axis:
-    """Return the section that a machine with this drive and its regulators has."""
+    """Return the section of a machine with this drive and its regulators."""
     d, move = scene.drive, scene.move
     gains = d.vector()
     return Axis(
@@ -44,7 +43,7 @@ def axis_of(scene: Scene) -> Axis:
 
 
 def off(estimate: Estimate, drive: Drive) -> list[str]:
-    """Return the parameters that lie farther from the drive's than their intervals say, and than matters."""
+    """Return the parameters that deviate from the drive's by more than their intervals, and by enough to matter."""
     found = []
     for name in PARAMETERS:
         value, std, true = estimate.value(name), estimate.std(name), drive.truth()[name]
@@ -54,7 +53,7 @@ def off(estimate: Estimate, drive: Drive) -> list[str]:
 
 
 def beside_the_path(models: Sequence[Parameters], scene: Scene) -> list[str]:
-    """Return by how much the table of the true machine, at the rapid and at what is cut, is not where a model says.
+    """Return the distance of the true machine's table from the prediction, at the rapid and when cutting.
 
     The tolerance is that of the rapid, in micrometres.
     """
@@ -67,7 +66,7 @@ def beside_the_path(models: Sequence[Parameters], scene: Scene) -> list[str]:
         true = drives.run(scene.drive, demand, drives.CYCLE_S)
         for model in models:
             missed, following = _missed(model, axis, 1e3 * demand, 1e3 * true.position)
-            limit = limit or max(tolerance_um(Identification(), following), STEPS_UM)
+            limit = limit or max(Identification().tolerance_for(following), STEPS_UM)
             if missed > limit:
                 found.append(f"{missed:.2g} um of {following:.3g} um beside the path at {share:.0%} of the speed")
     return found

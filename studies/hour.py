@@ -54,7 +54,7 @@ WHERE: Mapping[str, str] = {
 
 @dataclass
 class Step:
-    """Something that the retrofitter does: how long the computer took, and what he had to know."""
+    """A step of the retrofitter: how long the computer took, and the knowledge that it required."""
 
     name: str
     known: Mapping[str, str]
@@ -76,7 +76,7 @@ class Retrofit:
 
     @contextmanager
     def step(self, name: str, **known: str) -> Iterator[None]:
-        """Measure a step and tell it; ``known`` is what he must know for it."""
+        """Measure a step and report it; ``known`` is the required knowledge."""
         print(f"{name} ...", flush=True)
         step, begun_s = Step(name, known), time.monotonic()
         yield
@@ -93,12 +93,12 @@ class Retrofit:
         return dict(json.loads(done.stdout))
 
     def status(self) -> dict[str, Any]:
-        """Ask the daemon."""
+        """Query the daemon's status."""
         return self.fdhil("status", self.file)
 
 
 def twin_of(folder: Path) -> Path:
-    """Write the simulated machine's own file: the drives as they are, of which fdhil is told nothing."""
+    """Write the simulator's own configuration: the real drives, hidden from fdhil."""
     document = machine_document()
     document["sim"]["pace"] = "lockstep"
     (folder / "twin.toml").write_text(to_toml(document))
@@ -106,7 +106,7 @@ def twin_of(folder: Path) -> Path:
 
 
 def answers_of(folder: Path, twin: TwinProcess, port: int) -> dict[str, str]:
-    """Write the answers, those of the data sheets; return each with where it stands."""
+    """Write the answers from the data sheets; return each with its source."""
     sheet = machine_document()["axis"]
     told: dict[str, Any] = {
         "bus": {name: dict(bus) for name, bus in twin.ready["buses"].items()},
@@ -154,7 +154,7 @@ def set_up(hour: Retrofit, twin: TwinProcess, port: int) -> None:
 
 
 def cut(hour: Retrofit, nc: LinuxCnc) -> None:
-    """From the first rapids to the corrected cut."""
+    """Run from the first rapids to the corrected cut."""
     part = hour.folder / "part.csv"
     with hour.step("rapids of each axis, until fdhil believes what it has identified"):
         nc.run(SHUTTLE)
@@ -197,7 +197,7 @@ def install(hour: Retrofit) -> None:
 
 
 def tell(hour: Retrofit, before_um: float, after_um: float) -> None:
-    """Print the steps, what had to be known, and what came of it."""
+    """Print the steps, the required knowledge, and the results."""
     print("\nminutes  step")
     for step in hour.steps:
         print(f"{step.seconds / 60:7.1f}  {step.name}")
@@ -211,7 +211,7 @@ def tell(hour: Retrofit, before_um: float, after_um: float) -> None:
 
 
 def main() -> None:
-    """Go the whole way."""
+    """Run all steps."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--install", action="store_true", help="begin with pip install into a fresh environment")
     options = parser.parse_args()

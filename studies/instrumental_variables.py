@@ -86,7 +86,7 @@ def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
 
 
 def raw_values(windows: Sequence[Window], settings: Identification) -> Float | None:
-    """Return [R, L, K, Jt, ft, Cd] (6,) unjudged; None when there are too few rows."""
+    """Return [R, L, K, Jt, ft, Cd] (6,) unchecked; None when there are too few rows."""
     rows = gather([w for w in windows if w.voltage_v is not None], settings)
     return None if rows is None else fit(rows)[ORDER]
 
@@ -164,7 +164,7 @@ def _condition(instruments: Float, regressor: Float) -> float:
 
 
 def _finish(rows: Rows, theta: Float, windows: Sequence[Window], settings: Identification) -> Estimate:
-    """Return the judged estimate with the sandwich covariance of both steps."""
+    """Return the checked estimate with the sandwich covariance of both steps."""
     one, two = rows.instruments(theta)
     residuals = residuals_of(theta, rows.electrical, rows.mechanical)
     window = windows[0]
@@ -182,7 +182,7 @@ def _finish(rows: Rows, theta: Float, windows: Sequence[Window], settings: Ident
 def _gammas(
     theta: Float, residuals: tuple[Float, Float], impulse: Float, slope: Float, noise: Float
 ) -> list[list[Float]]:
-    """Return the residuals' covariances by lag: sensor noise through known filters, larger where residuals say so."""
+    """Return the residuals' covariances by lag: sensor noise through known filters, larger if residuals show so."""
     others = residual_gammas(theta, impulse, slope, np.append(0.0, noise[1:]))[0][0].max()
     shown = float(np.mean(residuals[0] ** 2) - others) / float(impulse @ impulse)
     noise = np.append(max(shown, LEAST_VOLTAGE_SHARE * noise[0]), noise[1:])

@@ -1,4 +1,4 @@
-"""Judges recordings one by one, counts them by kind, and tells it as a table."""
+"""Assesses recordings one by one, counts them by kind, and writes the table."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Judged:
 
 @dataclass
 class Tally:
-    """What became of the recordings of one kind; ``least`` is the smallest severity, ``wrong`` holds seeds.
+    """The results of the recordings of one kind; ``least`` is the smallest severity, ``wrong`` holds seeds.
 
     ``silent`` counts those that were accepted without a warning; None where that was not counted.
     """
@@ -66,14 +66,14 @@ class Tally:
 
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> Tally:
-        """Return what a page's figures tell."""
+        """Return the tally of a page's figures."""
         return cls(**{**told, "codes": Counter(told["codes"]), "left_open": Counter(told["left_open"])})
 
 
 def judge(
     kind: str, seed: int, spoilt: faults.Spoilt, scene: Scene | None = None, *, configured: bool = False
 ) -> Judged:
-    """Return what the validation says of one recording, ``configured`` with the machine's section.
+    """Return the validation's verdict of one recording, ``configured`` with the machine's section.
 
     Of a ``scene`` with the true drive is told, too, what of that does harm.
     """
@@ -109,7 +109,7 @@ def _harm(outcomes: Iterable[WindowOutcome], scene: Scene) -> tuple[str, ...]:
 
 
 def survey(seeds: Iterable[int], one: Callable[[int], Made], processes: int) -> Iterator[Made]:
-    """Yield what ``one`` makes of each seed."""
+    """Yield the result of ``one`` for each seed."""
     if processes < 2:
         yield from map(one, seeds)
         return
@@ -140,7 +140,7 @@ def tally(judged: Iterable[Judged], kinds: Mapping[str, faults.Kind]) -> dict[st
 
 
 def report(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> list[str]:
-    """Return what became of good recordings and of bad ones, in words and as a table."""
+    """Return the results of valid and faulty recordings, in words and as a table."""
     fine, bad = counted[GOOD], [counted[name] for name in kinds]
     parts = ("count", "accepted", "harmful", "right")
     recordings, accepted, harmful, right = (sum(getattr(e, part) for e in bad) for part in parts)
@@ -195,7 +195,7 @@ def _row(name: str, kind: faults.Kind, entry: Tally) -> list[str]:
 
 
 def _worst(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> str:
-    """Name the kinds that are named rightly least often."""
+    """Name the kinds with the lowest rate of correct names."""
     shares = {name: counted[name].right / counted[name].count for name in kinds if counted[name].count}
     least = sorted((name for name, share in shares.items() if share < NAMED), key=shares.__getitem__)
     told = [f"{name} ({shares[name]:.0%})" for name in least]
@@ -207,7 +207,7 @@ def _percent(part: int, whole: int) -> str:
 
 
 def _at_most(count: int, total: int) -> str:
-    """Tell the share that is not exceeded with 95 % certainty (Clopper and Pearson)."""
+    """Return the share that is not exceeded with 95 % certainty (Clopper and Pearson)."""
     if count >= total:
         return "nothing can be told of the share"
     return f"with 95 % certainty less than {float(beta.ppf(0.95, count + 1, total - count)):.2%}"

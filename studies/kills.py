@@ -33,7 +33,7 @@ PROCESS_ROWS = tuple(row for row, of in RAMPED.items() if of.process)
 
 
 def until_off(live: LiveGuard, of: Row, row: str, rate: int, found: Found) -> None:
-    """Let SYNC go on until the guard sends no more, and judge the way there from the last value in the trace."""
+    """Let SYNC continue until the guard stops sending, and check the ramp from the last value in the trace."""
     start = live.trace[0][1]
     seen = len(live.events)
     live.until(lambda: live.was("RAMP_DOWN OFF FROZEN", seen), f"{row}: noticed", 2000)
@@ -56,7 +56,7 @@ def until_off(live: LiveGuard, of: Row, row: str, rate: int, found: Found) -> No
 
 
 def fault(live: LiveGuard, row: str, found: Found) -> None:
-    """One fault of a row at a random SYNC of a program."""
+    """Inject one fault of a kind at a random SYNC of a program."""
     of = RAMPED[row]
     live.into_the_cut()
     rate = max(abs(b - a) for a, b in zip(live.trace[-2][1], live.trace[-1][1], strict=True))
@@ -136,7 +136,7 @@ def hangs(live: LiveGuard, times: int) -> Found:
 
 
 def restarts(live: LiveGuard, times: int) -> Found:
-    """R7: a guard starts beside drives that hold something, or nothing."""
+    """R7: a guard starts with drives that hold an offset, or none."""
     found = Found()
     first = int(live.rng.integers(len(STALE)))
     for k in range(times):
@@ -145,7 +145,7 @@ def restarts(live: LiveGuard, times: int) -> Found:
 
 
 def restart(live: LiveGuard, stale: str, found: Found) -> None:
-    """Kill the guard, have the drives hold something, and start the next one."""
+    """Kill the guard, make the drives hold an offset, and start the next one."""
     if stale == "zero":
         live.arm()
     else:
@@ -191,7 +191,7 @@ PARTS: Mapping[str, Callable[[LiveGuard, int], Found]] = {
 
 
 def live_part(name: str, times: int, seed: int, interface: str = "socketcand") -> Found:
-    """Have a part of the study on processes of its own."""
+    """Run a part of the study on processes of its own."""
     with tempfile.TemporaryDirectory(prefix="fdhil-kills-") as folder:
         live = LiveGuard(Path(folder), seed, interface)
         try:
@@ -207,14 +207,14 @@ def live_part(name: str, times: int, seed: int, interface: str = "socketcand") -
 
 
 def frame_part(row: str, times: int, seed: int) -> Found:
-    """Have a row's faults by the guard's decisions alone."""
+    """Inject the faults of a kind into the guard's decisions alone."""
     ways, wrong, sync = descents(row, times, seed)
     wrong += [f"{row}: {way}" for way in ways if way is None or not way.within]
     return Found(sync=sync, wrong=wrong, descents={row: ways})
 
 
 def once(file: Path | None, part: Callable[..., Found], *arguments: Any) -> Found:
-    """Have a part, or read what an earlier run that was broken off had of it."""
+    """Run a part, or read the result of an earlier, interrupted run."""
     if file is None:
         return part(*arguments)
     if not file.exists():
@@ -225,7 +225,7 @@ def once(file: Path | None, part: Callable[..., Found], *arguments: Any) -> Foun
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """Have all parts, and return what became of them."""
+    """Run all parts, and return their results."""
     jobs = []
     with ProcessPoolExecutor(options.processes) as pool:
 

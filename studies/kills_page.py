@@ -28,7 +28,7 @@ class Found:
     descents: dict[str, list[Descent | None]] = field(default_factory=dict)
 
     def add(self, other: Found) -> None:
-        """Take in what another part saw."""
+        """Add the results of another part."""
         self.frames += other.frames
         self.sync += other.sync
         self.counts += other.counts
@@ -38,7 +38,7 @@ class Found:
 
     @classmethod
     def read(cls, document: Mapping[str, Any]) -> Found:
-        """Return what a document of its fields says."""
+        """Return the result read from a document of its fields."""
         ways = {row: [way and Descent(*way) for way in found] for row, found in document["descents"].items()}
         return cls(**{**document, "counts": Counter(document["counts"]), "descents": ways})
 

@@ -38,7 +38,7 @@ SDO_LATE_S = (0.55, 0.7, 0.9, 1.2, 1.45, 1.6, 2.2, 6.0)  # each later than the t
 
 
 class Questioned:
-    """A device all of whose registers hold the number of the question that is being asked."""
+    """A device all of whose registers contain the number of the current request."""
 
     trigger: int | None = None
 
@@ -54,7 +54,7 @@ class Questioned:
 
 
 class LatePort(port.SerialPort):
-    """A serial port without a line: what is sent is answered at a moment drawn by chance, and spoilt as ordered."""
+    """A serial port without a line: requests are answered at a random time, and corrupted as ordered."""
 
     def __init__(
         self, place: SerialPlace, loop: VirtualLoop, rng: random.Random, most_late: float, noise: float
@@ -99,7 +99,7 @@ class LatePort(port.SerialPort):
 def modbus(
     questions: int, seed: int, most_late: float, kinds: tuple[str, ...] = (), noise: float = 0.0
 ) -> Counter[str]:
-    """Ask so often over a line whose answers are late by up to ``most_late`` time-outs, and spoilt by these ``kinds``.
+    """Send requests over a line whose answers are late by up to ``most_late`` time-outs, and corrupted by ``kinds``.
 
     ``noise``: how often something is on the line that is no answer.
 
@@ -182,7 +182,7 @@ def _waiting_in(node: Node) -> type[queue.Queue[bytes]]:
 
 
 def sdo_reads(questions: int, seed: int, most_late_s: float) -> Counter[str]:
-    """Read two objects so often, with answers that are late by up to so much, doubled or lost; count as above."""
+    """Read two objects repeatedly, with answers that are late, doubled or lost; count as above."""
     late = [FrameFault("late", seconds, percent=6) for seconds in SDO_LATE_S if seconds <= most_late_s]
     faults = FrameFaults([*late, FrameFault("duplicate", percent=3), FrameFault("drop", percent=3)], seed)
     node, rng, seen = Node(faults), random.Random(seed), Counter[str]()

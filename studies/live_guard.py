@@ -71,7 +71,7 @@ def wave(rng: np.random.Generator, limit: int) -> tuple[Float, list[Column]]:
 
 
 class Daemon:
-    """A forked process that loads the table, arms and says that it lives, until it is killed or the study ends."""
+    """A forked process that loads the table, arms and sends its heartbeat, until it is killed or the study ends."""
 
     def __init__(self, folder: Path, demand: list[Column], offsets: list[Column]) -> None:
         self._told, telling = os.pipe()
@@ -84,11 +84,11 @@ class Daemon:
         self.armed = False
 
     def fileno(self) -> int:
-        """The pipe on which it says that it has armed."""
+        """Return the pipe on which it reports that it has armed."""
         return self._told
 
     def heard(self, word: bytes = b"armed") -> bool:
-        """Take what it said; it has armed when it said so. RuntimeError when it said anything else."""
+        """Receive its report; it has armed when it reports so. RuntimeError for any other report."""
         text = os.read(self._told, 4096)
         if text != word:
             raise RuntimeError(f"the daemon: {text.decode() or 'has ended'}")
@@ -224,7 +224,7 @@ class LiveGuard:
         self._bus.flush(time.monotonic())
 
     def _listen(self, before: Mapping[int, int]) -> None:
-        """Take what comes until a period has passed, and of a guard that goes on sending until its frames have come.
+        """Receive until a period has passed and, of a guard that continues sending, until its frames have arrived.
 
         One that begins may lag behind: the next SYNC waits until nothing of it comes any more.
         """
@@ -266,7 +266,7 @@ class LiveGuard:
         self._send(self.machine.receive("can0", frame))
 
     def _read_journal(self) -> None:
-        """Follow the guard's state to know whether a frame is to be waited for; nothing is judged by it."""
+        """Follow the guard's state to decide whether to wait for a frame; no check depends on it."""
         *lines, self._lines = (self._lines + os.read(self._journal, 1 << 16)).split(b"\n")
         for line in lines:
             event = json.loads(line)
@@ -279,7 +279,7 @@ class LiveGuard:
         return self.state not in ("", "OFF", "FROZEN")
 
     def _judge(self, axis: int, value: int) -> None:
-        """Judge a frame by those before it on the wire and by what the drive holds.
+        """Check a frame by those before it on the wire and by the drive's offset.
 
         One that goes on from rest where the offset was moving follows a cycle that the guard missed: it is counted.
         """
@@ -294,7 +294,7 @@ class LiveGuard:
             self.wrong.append(f"SYNC {self.tick}, {AXES[axis]}: {wrong}")
 
     def held(self) -> list[int]:
-        """What the drives hold as offset, in increments."""
+        """Return the offsets that the drives hold, in increments."""
         return [unit.drive.dictionary.number(0x60B0, 0) for unit in self.machine.units.values()]
 
     def forget(self) -> None:
@@ -328,11 +328,11 @@ class LiveGuard:
         self.cycle()
 
     def was(self, states: str, since: int) -> bool:
-        """Whether the guard's journal told one of these states after so many of its lines."""
+        """Return whether the guard's journal reported one of these states after this many lines."""
         return any(event.get("state", "-") in states.split() for event in self.events[since:])
 
     def run(self, cycles: int) -> None:
-        """So many SYNC."""
+        """Run this many SYNC."""
         for _ in range(cycles):
             self.cycle()
 
@@ -383,7 +383,7 @@ class LiveGuard:
         return os.waitstatus_to_exitcode(status)
 
     def arm(self) -> None:
-        """A new daemon, armed for the next program from where the machine stands."""
+        """Start a new daemon, armed for the next program from the current position."""
         self.machine.nc.stop()
         self.until(lambda: not self.machine.nc.busy, "the NC stands")
         self.run(5)

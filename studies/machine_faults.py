@@ -16,7 +16,7 @@ SEAM_S = 0.2  # rest before the second of two joined runs
 
 
 def of_machine(change: Callable[[Rng, Scene], tuple[Scene, Array | None, float]]) -> Callable[[Rng], Spoilt]:
-    """Return the maker of rapids of a machine that ``change`` spoils (its scene, a load torque per cycle)."""
+    """Return the maker of rapids of a machine that ``change`` corrupts (its scene, a load torque per cycle)."""
 
     def make(rng: Rng) -> Spoilt:
         scene, load, severity = change(rng, draw_scene(rng))
@@ -124,7 +124,7 @@ def override_changed(rng: Rng, scene: Scene) -> tuple[Array, float]:
 
 
 def hold_resumed(rng: Rng, scene: Scene) -> tuple[Array, float]:
-    """Share of the speed that a feed hold takes away before it is released."""
+    """Share by which a feed hold reduces the speed before it is released."""
     drop = rng.uniform(0.2, 0.95)
     move = replace(scene.move, distance=scene.move.distance + 0.25 * scene.move.speed)
     t1 = move.speed / move.acceleration + rng.uniform(0.12, 0.2)

@@ -65,7 +65,7 @@ def measured(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def already_noticed(file: Path, mutants: Sequence[Mutant]) -> dict[str, str]:
-    """Return those that the last run's figures say were noticed, of modules that are as they were."""
+    """Return the mutants that the last run detected, in unchanged modules."""
     figures = json.loads(file.read_text("utf-8"))["figures"]
     left = {row["what"] for row in figures["left"]}
     same = {module for module, digest in figures["texts"].items() if digest == text_digest(module)}

@@ -1,4 +1,4 @@
-"""Puts one mistake at a time into a package and sees whether its tests notice.
+"""Puts one mutant at a time into a package and checks whether its tests detect it.
 
 mutmut makes the mistakes of the code (an operator turned, a number one higher, an argument left out); a constant is one
 higher, a table has a row less. The tests are collected once, and each mistake is judged in a process forked from there,
@@ -77,7 +77,7 @@ class _Visitor(MutationVisitor):
 
 
 def of_code(name: str) -> Iterator[Mutant]:
-    """Return all mistakes in the functions of a module, and in those that stand in its tables."""
+    """Return all mutants of the functions of a module, including those in its tables."""
     file = str(Path(str(import_module(name).__file__)).resolve())
     wrapper = MetadataWrapper(cst.parse_module(Path(file).read_text("utf-8")), unsafe_skip_copy=True)
     visitor = _Visitor(mutation_operators, IgnoredCode(set(), set(), set()))
@@ -155,7 +155,7 @@ def of_values(name: str) -> Iterator[Mutant]:
 
 
 def _changed(value: Any) -> Iterator[tuple[str, str, Any]]:
-    """Return what stood there, what stands there now, and the changed value."""
+    """Return the old text, the new text, and the changed value."""
     if type(value) in (int, float):
         yield f"{value:g}", f"{value + 1:g}", value + 1
     elif isinstance(value, Mapping):
@@ -198,7 +198,7 @@ def function_of(module: str, place: str) -> FunctionType:
 
 
 def put(mutant: Mutant) -> None:
-    """Put the mistake into this process; SyntaxError when it is no program."""
+    """Apply the mutant to this process; SyntaxError if it is not valid code."""
     if not mutant.text:
         return _put_value(mutant)
     target = function_of(mutant.module, mutant.place)

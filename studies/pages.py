@@ -33,7 +33,7 @@ def conduct(
     seeds: Callable[[argparse.Namespace], str],
     measure: Callable[[argparse.Namespace], Any],
 ) -> Any:
-    """Read the options, measure, and write figures, page and plot; ``seeds`` tells which ones the options mean.
+    """Read the options, measure, and write figures, page and plot; ``seeds`` describes the options' seeds.
 
     Returns the figures as the file has them.
     """
@@ -98,7 +98,7 @@ def plain(value: Any) -> Any:
 
 
 def write_page(path: Path) -> str:
-    """Write the page and the plot of the figures in ``path`` beside it; returns the page."""
+    """Write the page and the plot of the figures in ``path`` next to it; return the page."""
     document = json.loads(path.read_text("utf-8"))
     text = rendered(document)
     path.with_suffix(".md").write_text(text, "utf-8")

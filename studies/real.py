@@ -42,7 +42,7 @@ def bench_steps(path: Path) -> Recording:
 
 
 def told(axis: str, dt_s: float, speed_rad_s: Array, current_a: Array) -> Recording:
-    """Return a recording of speed and current alone; the place is that of the speed's integral."""
+    """Return a recording of speed and current alone; the position is the speed's integral."""
     steps = (speed_rad_s[1:] + speed_rad_s[:-1]) / 2 * dt_s
     position = frozen(np.concatenate([[0.0], np.cumsum(steps)]) * PITCH_MM / (2 * np.pi))
     return Recording(
@@ -62,7 +62,7 @@ def told(axis: str, dt_s: float, speed_rad_s: Array, current_a: Array) -> Record
 
 
 def figures_of(recording: Recording) -> dict[str, Any]:
-    """Return what is made of one recording, with the course of its torque and of the model's."""
+    """Return the results of one recording, with the course of its torque and of the model's."""
     outcomes = [analyse(window, Identification()) for window in find_windows(recording)]
     return {
         "axis": recording.axis,
@@ -104,7 +104,7 @@ def _course(outcome: WindowOutcome) -> dict[str, Array]:
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """Return what is made of each recording."""
+    """Return the results of each recording."""
     read = dict(zip(RECORDINGS, (scope, bench_steps), strict=True))
     return {name: figures_of(read[name](options.folder / name)) for name in RECORDINGS}
 

@@ -277,7 +277,7 @@ def _vectors(mechanics: Mechanics, loops: Loops) -> tuple[Array, Array]:
 
 
 def at_rest(mechanics: Mechanics, loops: Loops, position_m: float) -> Array:
-    """Return the state (7,) of an axis that has stood for long: its regulators hold what friction does not."""
+    """Return the state (7,) of an axis at standstill: its regulators hold the load that friction does not."""
     mechanical, drive = _vectors(mechanics, loops)
     angle = position_m / mechanics.pitch_m * 2 * np.pi
     start = np.array([0.0, 0.0, angle, 0.0, angle, 0.0, 0.0])

@@ -25,9 +25,9 @@ from fdhil.identification.loops import with_loops
 from fdhil.identification.windows import find_windows
 from fdhil.model.terms import with_resonance
 from fdhil.pipeline import analyse, pool
-from fdhil.pipeline.own_loops import better_axis, explained
-from fdhil.prediction.behind_motor import ahead_of_motor_mm
+from fdhil.pipeline.identified_loops import better_axis, explained
 from fdhil.prediction.contour import contour_error_um
+from fdhil.prediction.predict import ahead_of_motor_mm
 from fdhil.program.loading import load_trajectory
 from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Parameters, Trajectory, WindowOutcome, rms
 from studies import pages
@@ -62,7 +62,7 @@ PASSES = 3  # in which the machine learns
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """One machine of the study: what it is, and what its configuration tells: ``told`` regulators, and a resonance.
+    """One machine of the study, and its configured (``told``) regulators and resonance.
 
     ``told_resonance_hz`` is 0 where nobody has measured it.
     """
@@ -76,7 +76,7 @@ class Machine:
     told_resonance_hz: float = 0.0
 
     def truth(self, direction: int = 0) -> Array:
-        """Return the six (6,) as the machine's own current sensor sees them: its gain is in no recording.
+        """Return the six (6,) as seen by the machine's own current sensor: its gain is in no recording.
 
         Moves in one ``direction`` alone see a constant load, and the friction of that direction, as dry friction.
         """
@@ -88,7 +88,7 @@ class Machine:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What was made of one machine: windows believed, errors of the pool in per cent and in its deviations, the cut."""
+    """The results of one machine: accepted windows, errors of the pool in per cent and in its deviations, the cut."""
 
     name: str
     base: str
@@ -165,7 +165,7 @@ def machines(base: str) -> list[Machine]:
 
 
 def _like(real: Mechanics, base: Mechanics, scaled: Mapping[str, float]) -> Mechanics:
-    """Return the effects of ``real``, told in shares, on another base."""
+    """Return the effects of ``real``, given as shares, on another base."""
     same = {"R": base.R, "L": base.L, "K": base.K, "Jt": base.Jt, "ft": base.ft, "Cd": base.Cd}
     ripple = scaled["motor_ripple_nm"] * real.motor_ripple_nm / 0.4
     return replace(real, **same, load_nm=real.load_nm / 5.0 * base.Cd, motor_ripple_nm=ripple)
@@ -189,7 +189,7 @@ def random_machines(count: int, seed: int) -> list[Machine]:
 
 
 def config_of(machine: Machine) -> MachineConfig:
-    """Return the machine's configuration: the base's nominal values and the regulators that were told."""
+    """Return the machine's configuration: the base's nominal values and the configured regulators."""
     m, _, rapid_m_s, acceleration_m_s2, _ = BASES[machine.base]
     gains = ("position_gain_per_s", "speed_feedforward", "speed_kp", "speed_ki", "current_kp", "current_ki")
     told = {k: v for k, v in asdict(machine.told).items() if k in (*gains, "current_limit_a", "voltage_limit_v")}
@@ -219,7 +219,7 @@ def path(base: str) -> Trajectory:
 
 
 def outcomes_of(machine: Machine, seed: int) -> tuple[list[WindowOutcome], float, LoopEstimate | None]:
-    """Return what is made of the machine's rapids, the RMS of their following error in um, loops other than told."""
+    """Return the outcomes of the machine's rapids, the RMS following error in um, and loops other than configured."""
     _, _, rapid_m_s, acceleration_m_s2, _ = BASES[machine.base]
     config = config_of(machine)
     outcomes: list[WindowOutcome] = []
@@ -244,7 +244,7 @@ def outcomes_of(machine: Machine, seed: int) -> tuple[list[WindowOutcome], float
 
 
 def cut(machine: Machine, reference: Trajectory, offset_um: Mapping[str, Array] | None = None) -> tuple[Array, Array]:
-    """Return where the table is (n, d), and where the motors' encoders say that it is, in mm."""
+    """Return the table's path (n, d) and that of the motors' encoders, in mm."""
     tables, motors = [], []
     step_mm = machine.mechanics.pitch_m * 1e3 / 65536
     for axis in reference.axes:
@@ -260,7 +260,7 @@ def cut(machine: Machine, reference: Trajectory, offset_um: Mapping[str, Array] 
 def contour(
     machine: Machine, model: Parameters, loops: LoopEstimate | None
 ) -> tuple[float, float, float, tuple[float, ...]]:
-    """Return RMS um at the table without and with the correction, the most that a point gets worse, what passes leave.
+    """Return RMS um at the table without and with the correction, the largest degradation, and the passes' residuals.
 
     In these the machine learns from what its motors' encoders measure.
     """
@@ -301,7 +301,7 @@ def errors_of(estimate: Estimate | None, truth: Array) -> tuple[Array, Array]:
 
 
 def examine(machine: Machine, seed: int = 0) -> Found:
-    """Return what is made of one machine."""
+    """Return the results of one machine."""
     outcomes, following_um, loops = outcomes_of(machine, seed)
     settings = config_of(machine).identification
     estimate, verdict = pool(outcomes, settings)
@@ -337,7 +337,7 @@ def _whole(estimate: Estimate) -> bool:
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """Return what is made of every machine."""
+    """Return the results of every machine."""
     alone = [machine for base in BASES for machine in machines(base)]
     several = random_machines(options.machines, options.seed)
     with ProcessPoolExecutor(options.processes) as executor:
@@ -385,7 +385,7 @@ def _coverage(found: Sequence[Mapping[str, Any]], key: str, k: int) -> str:
 
 
 def _held(found: Sequence[Mapping[str, Any]], key: str, k: int) -> tuple[float, int]:
-    """Return the share of a parameter's 95 % intervals that hold the truth, and how many there are."""
+    """Return the share of a parameter's 95 % intervals that cover the truth, and their number."""
     values = np.array(
         [row[k] for f in found for row in ([f[key]] if key == "deviations" else f[key]) if row[k] is not None]
     )

@@ -30,7 +30,7 @@ class Sensor:
         return readings
 
     def moves(self, start: int, end: int) -> bool:
-        """Return whether the truth moves by more over these rows than what a reading of it may be off."""
+        """Return whether the truth moves by more over these rows than the error of a reading."""
         return float(np.ptp(self.true[start:end])) > MOVED * math.hypot(self.noise, self.step)
 
 
@@ -59,7 +59,7 @@ class Rows:
     cruise: tuple[int, int]
 
     def peak(self, name: str) -> float:
-        """Largest magnitude of a signal."""
+        """Return the largest magnitude of a signal."""
         return float(np.abs(self.signals[name]).max())
 
     def with_signals(self, **signals: Array) -> Rows:
@@ -106,7 +106,7 @@ def demand_of(scene: Scene, *rates: Array) -> Array:
 
 
 def measured(rng: Rng, scene: Scene, signals: Signals) -> Rows:
-    """Return what the sensors give of a run: noise, then resolution."""
+    """Return the sensors' readings of a run: noise, then resolution."""
     voltage = signals.voltage if scene.sampling == "interval_mean" else signals.voltage_instant
     sensors = {}
     sizes = (0.4, 0.4, 1.0)
@@ -125,7 +125,7 @@ def measured(rng: Rng, scene: Scene, signals: Signals) -> Rows:
 
 
 def recorded(scene: Scene, rows: Rows, *, says_rapid: bool = True) -> Recording:
-    """Return the rows as a recording; ``says_rapid``: its header holds the rapid speed."""
+    """Return the rows as a recording; ``says_rapid``: its header contains the rapid speed."""
     s = rows.signals
     n = s["speed"].size
     rapid = scene.move.speed / scene.drive.pitch_m * 2 * np.pi
@@ -148,7 +148,7 @@ def recorded(scene: Scene, rows: Rows, *, says_rapid: bool = True) -> Recording:
 
 
 def good(rng: Rng) -> Spoilt:
-    """A rapid, or one to and one fro, without any fault."""
+    """Return a rapid, or one in each direction, without any fault."""
     scene = draw_scene(rng)
     out = drives.rates(scene.move)
     ways = [out, -out][: int(rng.integers(1, 3))]

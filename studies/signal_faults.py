@@ -1,4 +1,4 @@
-"""Faults of sensors, wiring and recorder: a good rapid, then spoilt; each returns its severity too."""
+"""Faults of sensors, wiring and recorder: a valid rapid, then corrupted; each returns its severity too."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SignalFault = Callable[[Rng, Rows], tuple[Rows, float]]
 
 
 def of_signals(fault: SignalFault) -> Callable[[Rng], Spoilt]:
-    """Return the maker of good rapids whose recording is then spoilt."""
+    """Return the maker of valid rapids whose recording is then corrupted."""
 
     def make(rng: Rng) -> Spoilt:
         scene = draw_scene(rng)
@@ -129,7 +129,7 @@ def frames_lost(rng: Rng, rows: Rows) -> tuple[Rows, float]:
 
 
 def counted_gap(rng: Rng, rows: Rows) -> tuple[Rows, float]:
-    """Samples that are lost, and said to be, in one stretch within the move."""
+    """Samples that are lost, and reported as lost, in one stretch within the move."""
     length = int(rng.integers(4, 60))
     start = int(rng.uniform(rows.moving[0], rows.moving[1] - length))
     signals = {name: values.copy() for name, values in rows.signals.items()}

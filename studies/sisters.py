@@ -33,12 +33,12 @@ Draw = Callable[[np.random.Generator, int], list[Course]]
 
 
 def single(name: str, value: float, std: float = 0.0, axis: str = "X") -> Course:
-    """Return an axis of which one set is known, without temperature."""
+    """Return an axis with one known set, without temperature."""
     return Course(name, axis, frozen([value]), frozen([np.nan]), frozen([0.0]), std)
 
 
 def by_one_set(rng: np.random.Generator, count: int) -> list[Course]:
-    """Return axes of which one set is known."""
+    """Return axes with one known set."""
     return [single(str(k), 1.0 + SPREAD * z) for k, z in enumerate(rng.normal(size=count))]
 
 
@@ -61,7 +61,7 @@ def drawn(
 
 
 def in_steady_halls(rng: np.random.Generator, count: int) -> list[Course]:
-    """Return machines each of whose halls has one temperature: their own sets show nothing of it."""
+    """Return machines in halls of constant temperature: their own sets do not show its effect."""
     courses = []
     for course in drawn(rng, count):
         at_c = frozen(np.full(SETS, course.temperatures_c[0]))
@@ -71,13 +71,13 @@ def in_steady_halls(rng: np.random.Generator, count: int) -> list[Course]:
 
 
 def half_without_thermometer(rng: np.random.Generator, count: int) -> list[Course]:
-    """Return machines every other of which has no thermometer."""
+    """Return machines of which every second has no thermometer."""
     unknown = frozen(np.full(SETS, np.nan))
     return [replace(c, temperatures_c=unknown) if k % 2 else c for k, c in enumerate(drawn(rng, count))]
 
 
 def with_a_busy_one(rng: np.random.Generator, count: int) -> list[Course]:
-    """Return machines beside one with a hundred times the sets, and another slope: it may be accused, others not."""
+    """Return machines with a peer that has a hundred times the sets and another slope: only that may be reported."""
     courses = drawn(rng, count)
     at_c = frozen(rng.uniform(15, 35, SETS_OF_THE_BUSY))
     values = frozen(np.median(courses[0].values) * (1 - 3 * PER_K * (at_c - np.median(at_c))))
@@ -109,7 +109,7 @@ def largest(kind: str, count: int, groups: int, seed: int = 0) -> Float:
 
 
 def share_found(count: int, worn: int, shift: float, groups: int, seed: int = 0) -> float:
-    """Return the share of worn axes that are found, where ``worn`` of a group are off by ``shift`` spreads."""
+    """Return the detected share of worn axes, where ``worn`` of a group are off by ``shift`` spreads."""
     rng = np.random.default_rng([seed, count, worn])
     found = 0
     for _ in range(groups):
@@ -122,22 +122,22 @@ def share_found(count: int, worn: int, shift: float, groups: int, seed: int = 0)
 
 
 def least_found(worn: Callable[[int], int], groups: int, count: int) -> int | None:
-    """Return the deviation from which on nine of ten are found, in spreads; None beyond all that was tried."""
+    """Return the deviation from which nine of ten are detected, in spreads; None beyond all tried values."""
     return next((s for s in SHIFTS if share_found(count, worn(count), s, groups) >= FOUND), None)
 
 
 def one(_count: int) -> int:
-    """Return how many are worn: one."""
+    """Return the number of worn axes: one."""
     return 1
 
 
 def a_quarter(count: int) -> int:
-    """Return how many are worn: a quarter, and at least one."""
+    """Return the number of worn axes: a quarter, and at least one."""
     return max(1, count // 4)
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """Return alarms and the bound that would be right for each size and kind, and what is found."""
+    """Return alarms and the correct bound for each size and kind, and the detection rate."""
     os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
     with ProcessPoolExecutor(options.processes) as pool:
         kinds = {kind: pool.map(partial(largest, kind, groups=options.groups), SIZES) for kind in KINDS}

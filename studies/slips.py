@@ -1,4 +1,4 @@
-"""One wrong character in a configuration: a reader never takes it for what stands in another line.
+"""One wrong character in a configuration: a reader never takes it for the content of another line.
 
 A character of the file is left out, doubled with another, or replaced. What is read then either means the same, or is
 refused with its line or key; else the very value that was mistyped is another one that a machine may have, or a key
@@ -63,12 +63,12 @@ class Reader:
 
     @staticmethod
     def _read(text: str) -> tuple[Leaves, Leaves]:
-        """Return what a text says, and what is made of it."""
+        """Return the parsed text, and the configuration made of it."""
         raw = config.toml_document(text.encode("utf-8"), SAMPLE.name)
         return leaves(raw), leaves(config.parse(raw, SAMPLE.name).model_dump(mode="json"))
 
     def outcome(self, at: int, text: str) -> str:
-        """Return what became of a slip at a place, one of ``OUTCOMES``."""
+        """Return the outcome of a slip at a position, one of ``OUTCOMES``."""
         lines = self._text.splitlines()
         number = self._text.count("\n", 0, at)
         words = {*_keys(lines[number]), *_keys(text.splitlines()[min(number, text.count(chr(10)))])}
@@ -104,7 +104,7 @@ def _line_told(told: str) -> int:
 
 
 def judged(chosen: Iterator[tuple[int, str]] | list[tuple[int, str]], text: str) -> tuple[Counter[str], list[str]]:
-    """Count the outcomes of slips, and show those that must not be."""
+    """Count the outcomes of slips, and list those that must not occur."""
     reader, counts, wrong = Reader(text), Counter[str](), []
     for at, slipped in chosen:
         outcome = reader.outcome(at, slipped)

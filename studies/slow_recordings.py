@@ -28,7 +28,7 @@ Maker = Callable[[Rng], Spoilt]
 def sampled(
     fine: Array, step_s: float, begin_s: npt.NDArray[np.floating], period_s: float, sampling: VoltageSampling
 ) -> Array:
-    """Return what a sensor tells of a voltage held over steps of ``step_s``, of samples that begin at ``begin_s``."""
+    """Return a sensor's samples of a voltage held over steps of ``step_s``, beginning at ``begin_s``."""
     if sampling == "instant":
         return np.asarray(fine[np.clip((begin_s / step_s + 1e-6).astype(int), 0, fine.size - 1)])
     swept = np.concatenate([[0.0], np.cumsum(fine)]) * step_s
@@ -108,7 +108,7 @@ def _of_voltage(spoil: Callable[[Rng, Sensed], tuple[Sensed, float]]) -> Maker:
 
 
 def _of_rows(fault: signal_faults.SignalFault) -> Maker:
-    """Spoil the rows as the other study does; the slow sensor goes on by its own clock, whatever rows are lost."""
+    """Corrupt the rows as the other study does; the slow sensor continues by its own clock, whatever rows are lost."""
 
     def make(rng: Rng) -> Spoilt:
         scene = scene_of(rng)

@@ -88,7 +88,7 @@ def one_fit(case: Case, seed: int) -> tuple[Array, Array, float]:
 
 
 def intervals(seeds: range, processes: int) -> list[dict[str, Any]]:
-    """Return for each setting RMS errors (7,), the shares (7,) of 95 % intervals that hold, and a fit's time."""
+    """Return for each setting RMS errors (7,), the coverage (7,) of 95 % intervals, and a fit's time."""
     found = []
     for sampling, period, noise in product(SAMPLINGS, PERIODS_S, NOISES):
         made = list(survey(seeds, partial(one_fit, Case(sampling, period, noise)), processes))
@@ -103,18 +103,18 @@ def intervals(seeds: range, processes: int) -> list[dict[str, Any]]:
 
 
 def good(seed: int, study: int) -> Judged:
-    """Judge one good recording: one rapid, or every other time two."""
+    """Assess one valid recording: one rapid, or every other time two."""
     return judge(GOOD, seed, recording_of(seed, study, TO_AND_FRO if seed % 2 else GOOD))
 
 
 def bad(seed: int, study: int) -> Judged:
-    """Judge one recording with the kind of fault that ``seed`` chooses."""
+    """Assess one recording with the kind of fault that ``seed`` chooses."""
     name = list(KINDS)[seed % len(KINDS)]
     return judge(name, seed, recording_of(seed, study, name))
 
 
 def verdicts(seeds_of_good: range, seeds_of_bad: range, study: int, processes: int) -> dict[str, Any]:
-    """Return what became of the recordings, by kind, and print those that were judged wrongly."""
+    """Return the results of the recordings, by kind, and print those with a wrong verdict."""
     results = list(survey(seeds_of_good, partial(good, study=study), processes))
     results += survey(seeds_of_bad, partial(bad, study=study), processes)
     for one in results:
@@ -153,7 +153,7 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
 
 
 def _told(found: Sequence[Mapping[str, Any]]) -> str:
-    """Say how far the parameters are off by each way of sampling, and the least share of intervals that hold them."""
+    """Describe the parameters' errors by each way of sampling, and the lowest coverage of their intervals."""
     words = []
     for sampling in dict.fromkeys(told["sampling"] for told in found):
         rms = np.array([told["rms"] for told in found if told["sampling"] == sampling], dtype=np.float64)

@@ -46,7 +46,7 @@ FLAT = ("descriptors", "threads", "children")
 
 
 def at_speed_up(folder: Path, seed: int, rounds: int) -> None:
-    """Let a shop work for so many rounds at speed-up."""
+    """Let a plant work for this many rounds at speed-up."""
     _provenance(folder, f"--rapids {rounds * RAPIDS} --hours 0", seed)
     shop = Shop(folder, document_of(folder, PERIOD_S, lockstep=True))
     with _open(shop):
@@ -56,7 +56,7 @@ def at_speed_up(folder: Path, seed: int, rounds: int) -> None:
 
 
 def fill(folder: Path, seed: int) -> Path:
-    """Return a store that a shop has filled at speed-up, so far that the pages hold no more by another rapid."""
+    """Return a store filled by an accelerated plant until the pages do not grow with another rapid."""
     shop = Shop(folder, document_of(folder, PERIOD_S, lockstep=True))
     kept = folder / "kept"
     if not kept.exists():
@@ -71,7 +71,7 @@ def fill(folder: Path, seed: int) -> Path:
 
 
 def by_the_clock(folder: Path, seed: int, hours: float, rest_s: float, filled: Path, command: str) -> None:
-    """Let a shop with a filled store work by the clock for so long, with a rest after each round but the first ones."""
+    """Let a plant with a filled store work by the clock, with a rest after each round but the first ones."""
     _provenance(folder, command, seed)
     shop = Shop(folder, document_of(folder, PERIOD_S, lockstep=False), filled)
     with _open(shop):
@@ -83,7 +83,7 @@ def by_the_clock(folder: Path, seed: int, hours: float, rest_s: float, filled: P
 
 
 def real(folder: Path, options: argparse.Namespace) -> None:
-    """Let so many shops work by the clock at the same time."""
+    """Let this many plants work by the clock at the same time."""
     command = f"--rapids 0 --hours {options.hours:g} --rest {options.rest:g} --shops {options.shops}"
     filled = fill(folder / "filled", options.seed)
     common = options.hours, options.rest, filled, command
@@ -141,7 +141,7 @@ def longest_life(samples: Sequence[Mapping[str, Any]], name: str, where: str) ->
 
 
 def figures_of(folder: Path, per_day: bool) -> dict[str, Any]:
-    """Return what a run tells: growth of each process per day of work (``per_day``: of the clock), and all counts."""
+    """Return a run's figures: growth of each process per day of work (``per_day``: of the clock), and all counts."""
     samples = read(folder)
     if not samples:
         return {}
@@ -185,7 +185,7 @@ def _process(name: str, life: Sequence[Mapping[str, Any]], where: str, day: floa
 
 
 def goal(week: Mapping[str, Any], hours: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return whether the goal is met, and the figure that says so.
+    """Return whether the goal is met, and its figure.
 
     In a few real hours a growth per day is known to some 10 MB: there nothing may grow for certain.
     """
@@ -206,7 +206,7 @@ def goal(week: Mapping[str, Any], hours: Sequence[Mapping[str, Any]]) -> dict[st
 
 
 def _growths(run: Mapping[str, Any]) -> Iterator[tuple[str, Slope]]:
-    """Yield how each of fdhil's processes grew, where it lived long enough to tell."""
+    """Yield the growth of each of fdhil's processes that lived long enough."""
     for name in OURS:
         grown = run["processes"].get(name, {}).get("a_day", {}).get("resident_mb")
         if grown is not None:
@@ -214,7 +214,7 @@ def _growths(run: Mapping[str, Any]) -> Iterator[tuple[str, Slope]]:
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """Run what is asked for, or read what is there, and conclude."""
+    """Run the requested parts, or read the existing samples, and conclude."""
     path = options.out / "soak.json"
     before = json.loads(path.read_text("utf-8"))["figures"] if options.add and path.is_file() else {}
     with tempfile.TemporaryDirectory(prefix="fdhil-soak-") as temporary:

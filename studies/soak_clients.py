@@ -73,7 +73,7 @@ def scrape(shop: Shop) -> int:
 
 @contextlib.contextmanager
 def asking(shop: Shop, request: dict[str, Any]) -> Iterator[socket.socket]:
-    """Connect to the daemon's socket and ask; what comes is the caller's to read, or to leave."""
+    """Connect to the daemon's socket and send requests; the caller may read the answers or leave."""
     path: Path = shop.folder / "run" / SOCKET_NAME
     with socket.socket(socket.AF_UNIX) as client:
         client.settimeout(WAIT_S)
@@ -83,7 +83,7 @@ def asking(shop: Shop, request: dict[str, Any]) -> Iterator[socket.socket]:
 
 
 def viewer_that_leaves(shop: Shop) -> int:
-    """Read some of the live stream, then be gone in the middle of a line."""
+    """Read some of the live stream, then disconnect in the middle of a line."""
     with asking(shop, {"request": "live"}) as client:
         for _ in range(5):
             client.recv(1000)
@@ -91,7 +91,7 @@ def viewer_that_leaves(shop: Shop) -> int:
 
 
 def rude_client(shop: Shop) -> int:
-    """Say what is no request, and leave a half one."""
+    """Send an invalid request, and leave a partial one."""
     with asking(shop, {"request": "what?", "x": "\x1b[31m" * 200}) as client:
         client.recv(100)
         client.sendall(b'{"request": "sta')
@@ -105,13 +105,13 @@ class Silent:
         self._stack = contextlib.ExitStack()
 
     def come(self, shop: Shop) -> int:
-        """One more, in the place of the one before."""
+        """Connect once more, in place of the previous connection."""
         self.leave()
         self._stack.enter_context(asking(shop, {"request": "live"}))
         return 0
 
     def leave(self) -> None:
-        """Be gone."""
+        """Disconnect."""
         self._stack.close()
 
 

@@ -87,7 +87,7 @@ class Life:
             self.note()
 
     def happen(self, name: str, event: Event) -> None:
-        """Let one thing happen; what it asked for and did not get is counted."""
+        """Run one event; requests without an answer are counted."""
         self.happened[name] += 1
         try:
             bad = event.act(self)
@@ -98,7 +98,7 @@ class Life:
             self.failed[name] += bad
 
     def settle(self) -> None:
-        """Wait until the daemon has analysed what it heard."""
+        """Wait until the daemon has analysed what it received."""
         before, same = None, 0
         while same < SETTLED_LOOKS:
             axes = self.shop.told("axes")
@@ -145,7 +145,7 @@ class Event:
 
 
 def clients(life: Life) -> int:
-    """Browsers and scrapers look in, a viewer leaves in mid-line, somebody says nonsense."""
+    """Run browsers and scrapers, a viewer that leaves in mid-line, and a client with invalid requests."""
     shop = life.shop
     return browse(shop) + scrape(shop) + viewer_that_leaves(shop) + rude_client(shop)
 
@@ -263,7 +263,7 @@ def disk_full(life: Life) -> int:
 
 
 def acknowledge(life: Life) -> int:
-    """Somebody acknowledges every notice."""
+    """Acknowledge every notice."""
     return int(not life.shop.ask("acknowledge", up_to=2**31, by="soak").get("ok"))
 
 
@@ -278,7 +278,7 @@ def again(name: str, number: int) -> Callable[[Life], int]:
 
 
 def program(life: Life) -> int:
-    """Somebody drops a program in a browser."""
+    """Upload a program in a browser."""
     return drop_a_program(life.shop, f"part{life.rounds}.ngc", f"(part {life.rounds})\n{CORNER}")
 
 

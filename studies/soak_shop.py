@@ -141,7 +141,7 @@ class Shop:
             self.wait(lambda: guard_socket.exists(), "the guard's socket is there", process)
 
     def attend(self) -> None:
-        """Start again what has ended, as systemd would, and count it."""
+        """Restart processes that have ended, as systemd would, and count them."""
         for name, process in list(self.processes.items()):
             try:
                 process.check()
@@ -180,7 +180,7 @@ class Shop:
     _guard_waits: bool = False
 
     def check(self) -> None:
-        """Have the drives compared with what was signed off (they booted), then let the NC have them."""
+        """Have the drives compared with their commissioned state (they booted), then release them to the NC."""
         if self._guard_waits:
             self.start("guard")
             self._guard_waits = False
@@ -189,7 +189,7 @@ class Shop:
         self.nc(on=True)
 
     def close(self) -> None:
-        """End everything; what was measured stays."""
+        """End everything; the measurements stay."""
         for process in (*self.processes.values(), self.twin):
             process.stop()
         if self.mounted:
@@ -206,7 +206,7 @@ class Shop:
         return dict(json.loads(done.stdout)) if done.stdout else {}
 
     def ask(self, request: str, **more: Any) -> dict[str, Any]:
-        """Ask the daemon."""
+        """Send a request to the daemon."""
         return dict(ask(self.folder / "run" / SOCKET_NAME, {"request": request, **more}, timeout_s=PATIENCE_S))
 
     def status(self) -> dict[str, Any] | None:
@@ -221,7 +221,7 @@ class Shop:
         return (self.status() or {}).get(key) or {}
 
     def wait(self, done: Callable[[], bool], what: str, process: Process | None = None) -> None:
-        """Wait until something holds; FdhilError when it does not within ten minutes, or a process has ended."""
+        """Wait for a condition; FdhilError after ten minutes, or if a process has ended."""
         until_s = time.monotonic() + PATIENCE_S
         while not done():
             (process or self.twin).check()

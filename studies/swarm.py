@@ -63,7 +63,7 @@ class Life:
         return self.rng.choice(list(self.machine.plant.units))
 
     def live(self) -> None:
-        """Let the machine learn its models, then work and suffer until its time is over, and come to rest."""
+        """Let the machine learn its models, then work under faults until its time is over, and settle."""
         machine = self.machine
         end_s = machine.clock.now_s() + self.seconds
         machine.start("guard")
@@ -126,7 +126,7 @@ class Life:
         return "\n".join([*lines, "G1 " + " ".join(f"{axis}0" for axis in axes) + " F8000", "G4 P0.2", "M2", ""])
 
     def restore(self) -> None:
-        """Do what an operator does before the next part: end faults, start what is dead, take over what is left."""
+        """Do what an operator does before the next part: end faults, restart dead processes, adopt residual offsets."""
         machine = self.machine
         with contextlib.suppress(RuntimeError):
             machine.run_until(lambda: machine.plant.faults.idle, FAULTS_END_S)
@@ -148,7 +148,7 @@ class Life:
             machine.attest()
 
     def rest(self) -> None:
-        """End all faults, and see the drives come to zero with no more than what the messages advise."""
+        """End all faults, and verify that the drives come to zero with only the actions that the messages advise."""
         machine = self.machine
         for _ in range(3):
             self.restore()
@@ -311,7 +311,7 @@ def life_of(seed: int, seconds: float, folder: Path) -> tuple[list[str], Counter
 
 
 def judged(seed: int, seconds: float) -> tuple[int, list[str], dict[str, int], float]:
-    """Let one machine live; return its seed, what was wrong, what was counted, and the processor time."""
+    """Let one machine live; return its seed, violations, counts, and the processor time."""
     begun_s = time.process_time()
     with tempfile.TemporaryDirectory(prefix="swarm-") as folder:
         wrong, counted, _ = life_of(seed, seconds, Path(folder))
@@ -340,7 +340,7 @@ def replay(seed: int, seconds: float) -> str:
 
 
 def code_digest() -> str:
-    """Return the digest of the code that lives and judges."""
+    """Return the digest of the code under test."""
     files = sorted(path for pattern in CODE for path in pages.ROOT.glob(pattern))
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:16]
 

@@ -20,13 +20,13 @@ from studies.scenes import draw_scene
 
 
 def good(seed: int, study: int = 1) -> Judged:
-    """Judge one good recording."""
+    """Assess one valid recording."""
     draws = [study, 1, seed]
     return judge(GOOD, seed, faults.good(_rng(draws)), draw_scene(_rng(draws)), configured=bool(seed % 2))
 
 
 def bad(seed: int, study: int = 1) -> Judged:
-    """Judge one recording with the kind of fault that ``seed`` chooses."""
+    """Assess one recording with the kind of fault that ``seed`` chooses."""
     names = list(faults.KINDS)
     name = names[seed % len(names)]
     draws = [study, 2, seed]
@@ -40,7 +40,7 @@ def _rng(draws: Sequence[int]) -> np.random.Generator:
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """Return for each study what became of its recordings, by kind."""
+    """Return for each study the results of its recordings, by kind."""
     path = options.out / "verdicts.json"
     found: dict[str, Any] = json.loads(path.read_text("utf-8"))["figures"] if options.add and path.is_file() else {}
     for study in options.study:

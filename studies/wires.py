@@ -39,7 +39,7 @@ TCP_TIMEOUT_S = 1.0
 
 
 def over_tcp(questions: int, kind: str) -> Counter[str]:
-    """Ask a unit on a real TCP connection whose answers are spoilt now and then; counts as of ``modbus``."""
+    """Query a unit on a real TCP connection whose answers are corrupted now and then; counts as in ``modbus``."""
     sensor, device = VoltageSensor(1000.0, 300.0, 0.0, np.random.default_rng(1)), Questioned()
     sensor.faults.answers[kind] = 100.0 / 3
     servers = SensorServers({"X": sensor}, {"X": ("127.0.0.1", 0)}, {"X": device})
@@ -71,7 +71,7 @@ def over_tcp(questions: int, kind: str) -> Counter[str]:
 
 
 def losses(frames: int, seed: int, can_ids: set[int], percent: float) -> Counter[str]:
-    """Lose some of so many frames of a bus; counts what was sent, lost, reported, and rows with another row's value."""
+    """Lose some frames of a bus; count sent, lost and reported ones, and rows with another row's value."""
     seen: Counter[str] = Counter()
     while seen["frames"] < frames:
         wire = Wire(n=TICKS)
@@ -103,7 +103,7 @@ def _decoded(wire: Wire, faults: FrameFaults, decoder: BusDecoder, seen: Counter
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the counts of every part, and what they say of the goals."""
+    """Return the counts of every part, and the goals by them."""
     n, seed = options.questions, options.seed
     promised = {
         "Modbus RTU, late by up to 2 time-outs": modbus(5 * n // 2, seed, 2.0),
@@ -128,7 +128,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def goals(promised: Mapping[str, Mapping[str, int]], frames: list[list[Any]]) -> dict[str, Any]:
-    """Return what the counts say of the goals R8 and R9."""
+    """Return the goals R8 and R9 by the counts."""
     wrong, late, spoilt = (sum(seen.get(key, 0) for seen in promised.values()) for key in ("wrong", "late", "spoilt"))
     stale = promised.get(SDO, {}).get("late", 0)
     lost, told, sent = (sum(seen.get(key, 0) for _, _, seen in frames) for key in ("lost", "reported", "frames"))

@@ -23,7 +23,6 @@ from fdhil.pipeline import analyse, pool
 from fdhil.records import PARAMETERS, Estimate, Parameters, Recording, Window, frozen, rms
 from fdhil.validation.data_sheet import gain_error
 from fdhil.validation.signal_consistency import missing_move
-from fdhil.validation.weight import tolerance_um
 from studies import pages
 from studies.bench import Array, shuttle
 from studies.judging import survey
@@ -80,7 +79,7 @@ class Plant:
     other: Run
 
     def recording(self, *, voltage: bool = True) -> Recording:
-        """Return the rapid as it is recorded."""
+        """Return the rapid as recorded."""
         return self._recorded(self.move, 1, voltage=voltage)
 
     def _recorded(self, moved: Run, seed: int, *, voltage: bool = True) -> Recording:
@@ -122,25 +121,25 @@ PLANTS: Mapping[str, Callable[[], Plant]] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with which ``signals``, and their ``values`` (n,) by name."""
+    """A fault of ``signals``, and their ``values`` (n,) by name."""
 
     signals: tuple[str, ...]
     way: str
     values: Mapping[str, Array]
 
     def __and__(self, other: Fault) -> Fault:
-        """Return both faults at once; where they concern one signal, the other's."""
+        """Return both faults at once; if they concern one signal, the other's."""
         names = tuple(dict.fromkeys((*self.signals, *other.signals)))
         return Fault(names, f"{self.way} + {other.way}", {**self.values, **other.values})
 
     @property
     def is_gain(self) -> bool:
-        """Whether the scale of voltage or current is wrong, which nothing but a data sheet tells."""
+        """Whether the scale of voltage or current is wrong, which only a data sheet reveals."""
         return any(way in SCALES for way in self.way.split(" + ")) and any(name in GAINS for name in self.signals)
 
 
 def faults_of(plant: Plant) -> list[Fault]:
-    """Return every fault of one signal, and of two that are taken for each other."""
+    """Return every fault of one signal, and of two that are confused."""
     recorded = plant.recording()
     signals = {name: np.array(getattr(recorded, field)) for name, field in FIELDS.items()}
     (window,) = find_windows(recorded)
@@ -197,14 +196,14 @@ def faulty(recorded: Recording, fault: Fault) -> Recording:
 
 @dataclass(frozen=True)
 class Judged:
-    """What became of a faulty recording: one of ``RESULTS``, and why."""
+    """The result of a faulty recording: one of ``RESULTS``, and why."""
 
     result: str
     text: str
 
 
 def judge(plant: Plant, recorded: Recording, fault: Fault, *, configured: bool) -> Judged:
-    """Return what becomes of the recording with a fault, with the machine's section or without.
+    """Return the result of the recording with a fault, with the machine's section or without.
 
     No loops of the drive's own are sought: where the configured ones do not explain the rapid, it is refused.
     """
@@ -237,12 +236,12 @@ def _beside_interval(estimate: Estimate, plant: Plant, direction: int) -> Iterat
 
 
 def _beside_path(estimate: Estimate, plant: Plant) -> Iterator[str]:
-    """Yield by how much the table is not where the model predicts it, more than the good recording's model errs."""
+    """Yield the deviation of the table from the prediction, beyond that of the valid recording's model."""
     for share in RAPID_SHARES:
         demand_mm = 1e3 * shuttle(0.2, share * plant.rapid_m_s, 1.0, 2)
         true = run(plant.machine.mechanics, 1e-3 * demand_mm, plant.machine.loops).motor_m * 1e3
         errors = [1e3 * rms(true - _predicted(e, plant, demand_mm)) for e in (estimate, _good(plant.machine.name))]
-        limit = max(LEAST_UM, tolerance_um(Identification(), 1e3 * rms(true - demand_mm)))
+        limit = max(LEAST_UM, Identification().tolerance_for(1e3 * rms(true - demand_mm)))
         if errors[0] > errors[1] + limit:
             yield f"{errors[0]:.3g} um beside the path"
 
@@ -279,7 +278,7 @@ Counts = tuple[Case, dict[str, dict[str, int]], list[str]]
 
 
 def examine(number: int, cases: Sequence[Case], pairs: int, seed: int) -> Counts:
-    """Return how often each result came for faults alone and for two at once, and what was wrong in silence."""
+    """Return how often each result occurred for single and double faults, and the undetected ones."""
     name, voltage, configured = case = cases[number]
     plant = PLANTS[name]()
     counts: dict[str, Counter[str]] = {"alone": Counter(), "two at once": Counter()}

@@ -157,7 +157,7 @@ def test_the_source_archive_holds_what_is_needed_and_nothing_else(tmp_path: Path
 
 
 def test_every_reason_to_refuse_a_window_is_explained() -> None:
-    paths = [*ROOT.glob("fdhil/validation/*.py"), ROOT / "fdhil" / "pipeline" / "pooling.py"]
+    paths = [*ROOT.glob("fdhil/validation/*.py"), ROOT / "fdhil" / "pipeline" / "validated_pool.py"]
     sources = "".join(path.read_text("utf-8") for path in paths)
     codes = set(re.findall(r'"([A-Z][a-z]+[A-Z][A-Za-z]+)"', sources))
     codes |= set(re.findall(r'Reason\(\s*"([A-Z][A-Za-z]+)"', sources))

@@ -1,4 +1,4 @@
-"""A drive with a filter that its configuration does not know is judged by the loops that its own rapids show."""
+"""A drive with a filter that is not configured is assessed by the loops that its own rapids show."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from fdhil.config import Identification
 from fdhil.identification.loops import DIFFER
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import AxisPipeline, Known, analyse, pool
-from fdhil.pipeline.own_loops import OwnLoops, better_axis, loops_of, mechanics_of, suspected
+from fdhil.pipeline.identified_loops import OwnLoops, better_axis, loops_of, mechanics_of, suspected
 from fdhil.records import LoopEstimate, ParameterSet, Reason, Verdict, WindowOutcome, frozen
-from fdhil.validation.weight import LOOPS_DIFFER
+from fdhil.validation.table_error_budget import LOOPS_DIFFER
 from studies.bench import shuttle
 from studies.real_plant import Loops, Mechanics, Sensors, recording, run
 from tests.bench import bench_config
@@ -23,7 +23,6 @@ PERIOD_S = 1e-3
 
 
 def outcomes(loops: Loops) -> list[WindowOutcome]:
-    """Return two rapids of the bench's axis with these loops, judged by the configured ones."""
     moved = run(Mechanics(), shuttle(moves=2), loops)
     windows = find_windows(recording(moved, Mechanics(), Sensors(), 0.5))
     return [analyse(window, SETTINGS, AXIS, PERIOD_S) for window in windows]

@@ -1,4 +1,4 @@
-"""One axis' sequence: the right stretch is cut, what was lost stays lost, what jumped is held back, bits repeat."""
+"""The pipeline of one axis: complete windows, lost samples stay NaN, jumps are held back, bit-identical results."""
 
 from __future__ import annotations
 
@@ -46,22 +46,19 @@ from tests.store.made import bits, same
 
 @pytest.fixture
 def config(tmp_path: Path) -> MachineConfig:
-    """The bench, one axis; least squares, because what is tested here is the sequence, not the estimator."""
+    """The bench, one axis; least squares, because the sequence is tested here, not the estimator."""
     return config_of(tmp_path, identification={"method": "least_squares"})
 
 
 def fed(pipeline: AxisPipeline, records: Sequence[Record]) -> list[Outcome]:
-    """Feed records one by one and return all outcomes."""
     return [outcome for record in records for outcome in pipeline.feed(record)]
 
 
 def windows_of(outcomes: Sequence[Outcome]) -> list[Window]:
-    """Return the windows among outcomes."""
     return [outcome.window for outcome in outcomes if isinstance(outcome, WindowOutcome)]
 
 
 def numbers(outcomes: Sequence[Outcome]) -> list[object]:
-    """Return everything that outcomes say as comparable values, arrays as bytes."""
     told: list[object] = []
     for outcome in outcomes:
         if isinstance(outcome, WindowOutcome):
@@ -105,7 +102,6 @@ def test_the_sizes_of_blocks_change_nothing(cut: list[int], seed: int) -> None:
 
 
 def reblocked(records: Sequence[Record], cut: Sequence[int]) -> list[Record]:
-    """Return the records with their samples in blocks of other sizes; events as early as they can come."""
     blocks = [record for record in records if isinstance(record, AxisSamples)]
     names = ("tick", "demand_mm", "position_mm", "speed_rad_s", "current_a", "voltage_v", "offset_mm", "statusword")
     whole = {name: np.concatenate([getattr(block, name) for block in blocks]) for name in names}
@@ -128,7 +124,7 @@ def test_a_replayed_window_gives_the_same_bits_through_a_file(config: MachineCon
 
 
 def test_a_gain_that_is_wrong_all_along_is_told_once_against_the_data_sheet(config: MachineConfig) -> None:
-    """No window can show it; the sets are published all the same, since the data sheet may be what is wrong."""
+    """No window can show it; the sets are published nevertheless, since the data sheet may be wrong."""
     records = [
         replace(r, voltage_v=frozen(1.2 * r.voltage_v)) if isinstance(r, AxisSamples) and r.voltage_v is not None else r
         for r in rapids(config, count=2)
@@ -155,7 +151,6 @@ def test_lost_samples_are_nan_and_listed_and_refused(config: MachineConfig) -> N
 
 
 def without(block: AxisSamples, ticks: range) -> AxisSamples:
-    """Return a block without the samples of some ticks."""
     keep = ~np.isin(block.tick, list(ticks))
     names = ("tick", "demand_mm", "position_mm", "speed_rad_s", "current_a", "voltage_v", "offset_mm", "statusword")
     return replace(block, **{name: getattr(block, name)[keep] for name in names})
@@ -218,7 +213,6 @@ def test_one_window_that_is_off_leaves_no_trace(config: MachineConfig) -> None:
 
 
 def beside_a_sensor(config: MachineConfig) -> RecentSamples:
-    """Return the recent samples of an axis whose voltage comes from a sensor of its own."""
     axis = config.axis["X"]
     section = axis.model_copy(update={"voltage": axis.voltage.model_copy(update={"source": "modbus"})})
     return RecentSamples("X", section, 20_000, 1e-3)
@@ -273,7 +267,6 @@ def test_lost_sensor_samples_and_an_unfit_rate_stay_unknown(config: MachineConfi
 
 
 def samples(tick: np.ndarray) -> AxisSamples:
-    """Return samples that stand still."""
     zeros = frozen(np.zeros(tick.size))
     ticks = frozen_ints(tick)
     return AxisSamples("X", ticks, zeros, zeros, zeros, zeros, None, zeros, frozen_ints(zeros))
@@ -300,7 +293,6 @@ def test_a_window_that_leaves_l_open_is_accepted_and_publishes_nothing(tmp_path:
 
 
 def vertical(config: MachineConfig, k: int, load_nm: float) -> Window:
-    """Return a rapid of an axis on which a constant load acts: it is part of the dry friction of its direction."""
     axis, side = config.axis["X"], 1 if k % 2 else -1
     nominal = axis.nominal.model_copy(update={"Cd": 5.0 + side * load_nm})
     made = nominal_rapid("X", axis.model_copy(update={"nominal": nominal}), 0.001, side, seed=k)
@@ -330,10 +322,10 @@ def test_nothing_is_published_from_one_direction_while_the_other_is_refused(
 ) -> None:
     def refusing(window: Window, *known: Any) -> WindowOutcome:
         outcome = analyse(window, *known)
-        reason = Reason("ValidationFailed", "the drive does what the model does not have")
+        reason = Reason("ValidationFailed", "the drive has an effect that the model lacks")
         return outcome if window.direction > 0 else replace(outcome, verdict=Verdict(False, 90.0, (reason,)))
 
-    monkeypatch.setattr("fdhil.pipeline.own_loops.analyse", refusing)
+    monkeypatch.setattr("fdhil.pipeline.identified_loops.analyse", refusing)
     pipeline, told = AxisPipeline("X", config), []
     for k in range(1, 7):
         outcomes = pipeline.feed(vertical(config, k, 0.0))

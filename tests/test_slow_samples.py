@@ -1,4 +1,4 @@
-"""A sensor slower than the SYNC keeps its own samples: they are given with their times and the clock's error."""
+"""A sensor slower than the SYNC keeps its own samples, with their times and the clock's error."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SKEW = 1.0002  # the sensor's clock runs slower than the drive's by this factor
 
 
 def _recent(rate_hz: float, begin_ticks: float, samples: int, lost: int = -1) -> tuple[RecentSamples, Float]:
-    """Return a recent with 2 s of a drive and of a sensor whose sample c is c V and begins ``begin_ticks`` late.
+    """Return a buffer with 2 s of a drive and of a sensor whose sample c is c V and begins ``begin_ticks`` late.
 
     Block ``lost`` of the sensor's 20 is left out.
     """

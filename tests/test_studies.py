@@ -1,4 +1,4 @@
-"""The studies' own arithmetic: what they conclude from runs follows from the runs."""
+"""The arithmetic of the studies: their conclusions follow from their runs."""
 
 from __future__ import annotations
 

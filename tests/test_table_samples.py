@@ -1,4 +1,4 @@
-"""What sensors at the table said is laid on the rows of the drive's samples, or left out."""
+"""Samples of sensors at the table are placed on the rows of the drive's samples, or dropped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever identify validates, a window or a pool, predict, correct and arming take, on any drive."""
+"""Every model that identify validates, of a window or a pool, is usable by predict, correct and arm, on any drive."""
 
 from __future__ import annotations
 
@@ -46,7 +46,6 @@ PLANTS = {
 
 
 def short_move() -> Trajectory:
-    """Return a move there and back, as an NC smooths it."""
     way = np.concatenate([np.linspace(0.0, 5.0, 60), np.linspace(5.0, 0.0, 60), np.zeros(180)])
     return trajectory(smooth(way[:, None], (0.060, 0.030), 0.001), "X")
 
@@ -56,7 +55,6 @@ MOVE = short_move()
 
 @cache
 def identified(plant: real.Mechanics) -> FileResult:
-    """Return what ``fdhil identify`` makes of four rapids of a plant."""
     loops = real.SLOW_LOOPS if plant.Jt < 0.05 else None
     outcomes = [analyse(window, Identification()) for window in rapids(plant, None, loops, moves=4, seed=3)]
     estimate, verdict = pool(outcomes, Identification())
@@ -66,12 +64,10 @@ def identified(plant: real.Mechanics) -> FileResult:
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.usefixtures("long_computation")
 def test_most_plants_are_validated() -> None:
-    """Else there would be nothing to take."""
     assert sum(identified(plant).verdict.accepted for plant in PLANTS.values()) >= 9
 
 
 def model_of(told: dict[str, Any]) -> dict[str, Any]:
-    """Return the model file's axis of a window or pool as ``identify --json`` has it."""
     six = {name: figures["value"] for name, figures in told["parameters"].items()}
     return {**six, "terms": {name: figures["value"] for name, figures in told["terms"].items()}}
 
@@ -95,7 +91,7 @@ def test_validated_model_is_taken(plant: str, tmp_path: Path) -> None:
 
 
 def test_pool_whose_friction_at_standstill_chance_made_negative_is_taken(tmp_path: Path) -> None:
-    """Each window's friction is hardly told from zero; together they have -6.4 +- 2.0 N.m next to a Cd of 4.95."""
+    """Each window hardly separates the friction from zero; together they have -6.4 +- 2.0 N.m at a Cd of 4.95."""
     names = (*PARAMETERS, "stribeck", "stribeck_speed")
     values = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 4.95, -6.4, 8.0])
     covariance = np.diag([1e-8, 1e-10, 1e-8, 1e-10, 1e-6, 0.25, 2.8**2, 1.0])

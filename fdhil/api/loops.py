@@ -8,7 +8,7 @@ from typing import Any
 from fdhil.api.analysis import FileResult
 from fdhil.config import Axis, Identification, MachineConfig, Regulators
 from fdhil.daemon.outcome_json import loops_document
-from fdhil.pipeline.own_loops import loops_of
+from fdhil.pipeline.identified_loops import loops_of
 from fdhil.records import LoopEstimate
 
 ALL_FED = 0.01  # tolerance of a feed-forward share of 1

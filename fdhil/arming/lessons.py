@@ -19,7 +19,7 @@ from fdhil.correction.inverse import common_delay_s, delayed
 from fdhil.correction.learning import Lesson, learn
 from fdhil.correction.limits import fit_all
 from fdhil.prediction import contour_error_um
-from fdhil.prediction.behind_motor import ahead_of_motor_mm
+from fdhil.prediction.predict import ahead_of_motor_mm
 from fdhil.records import Float, Parameters, Reason, rms, table_path
 from fdhil.store.lessons import lesson_path, read_lesson, write_lesson
 

@@ -22,7 +22,7 @@ from fdhil.correction.learning import Lesson
 from fdhil.errors import StoreError
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.contour import WINDOW_S
-from fdhil.prediction.gain import at_most
+from fdhil.prediction.gain import format_upper_limit
 from fdhil.records import AxisSamples, Float, Int, MoveKind, NcState, Notice, Parameters, Reason, table_path
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
@@ -326,7 +326,7 @@ def _gains(summary: Mapping[str, Any], measured: Mapping[str, Any]) -> dict[str,
 def _text(report: Mapping[str, Any]) -> str:
     name, measured, half = Path(report["program"]).name, report["measured"], report["predicted"]["uncertainty_um"]
     predicted = report["predicted"]["rms_um"]
-    shown = f"{predicted:.2f} by the model" if half is None else at_most(predicted, half)
+    shown = f"{predicted:.2f} by the model" if half is None else format_upper_limit(predicted, half)
     text = f"pass {report['pass']} of {name}: contour error measured {measured['rms_um']:.2f} um RMS,"
     text += f" {measured['max_um']:.1f} at most (predicted {shown};"
     text += f" without correction {report['predicted_without']['rms_um']:.1f} predicted"

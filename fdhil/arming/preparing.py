@@ -18,7 +18,7 @@ from fdhil.commissioning.feedforward import feedforward_object
 from fdhil.commissioning.offset_writers import INVALID_COB_ID, identifier_of
 from fdhil.commissioning.record import CommissioningRecord, holds, load_record
 from fdhil.config import MachineConfig
-from fdhil.correction import gate, online
+from fdhil.correction import flatness_feedforward, gate
 from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.identification.loops import regulators_of
 from fdhil.model.terms import with_resonance
@@ -235,7 +235,7 @@ def prepare_feeding(config: MachineConfig, known: Mapping[str, AxisKnowledge]) -
     if isinstance(found, Refused):
         return found
     models, own = found
-    laws = {name: online.law(models[name], own.axis[name], own.machine.sync_period_s) for name in axes}
+    laws = {name: flatness_feedforward.law(models[name], own.axis[name], own.machine.sync_period_s) for name in axes}
     records = _records(axes, config)
     facts = feeding_facts(axes, config, known) | {
         "commissioned": all(holds(record, config, axis) for axis, record in records.items()),

@@ -20,7 +20,7 @@ from fdhil.cli.prediction import inputs
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig
     from fdhil.prediction.advise import Advice
-    from fdhil.prediction.feeds import Source
+    from fdhil.prediction.feed_search import Source
     from fdhil.records import Parameters, Trajectory
 
 UNHELD = "{} lines leave the tolerance at every feed tried, without the correction"
@@ -56,7 +56,7 @@ def advise(
     if out is not None and program.suffix.lower() == ".csv":
         raise click.UsageError("--out writes F words, which a demand does not have; give the NC program")
     reference, models, config = inputs(program, config_path, model_path, from_history)
-    from fdhil.correction.advised import advised, entry
+    from fdhil.correction.result_documents import advised, entry
 
     corrects = all(config.axis[axis].correction is not None for axis in reference.axes)
     forewarn("predict", *(["correct"] if corrects else []))
@@ -104,7 +104,7 @@ def _sources(
     config: MachineConfig,
     tolerance_um: float,
 ) -> tuple[Source, Source | None]:
-    from fdhil.correction.advised import sources
+    from fdhil.correction.result_documents import sources
     from fdhil.program import Budget, interpret
 
     motions = None if program.suffix.lower() == ".csv" else list(interpret(program, Budget.of(config.nc)))

@@ -149,7 +149,7 @@ def show_compared(found: Mapping[str, Any] | None) -> None:
     """Print the zones with significant changes, largest change first, and their causes."""
     if found is None:
         return
-    from fdhil.prediction.gain import plus_minus
+    from fdhil.prediction.gain import format_half_interval
 
     revisions = ", ".join(f"{axis} {revision}" for axis, revision in found["revisions"].items())
     since = f"since this program was predicted on {found['at'][:10]} (revisions {revisions})"
@@ -163,7 +163,7 @@ def show_compared(found: Mapping[str, Any] | None) -> None:
         line = f"line {zone['line']}, " if zone["line"] else ""
         half_um = INTERVAL_95 * zone["std_um"]
         click.echo(
-            f"  {zone['change_um']:+.1f} {plus_minus(half_um)} um at {line}{zone['where']} ({zone['cause']},"
+            f"  {zone['change_um']:+.1f} {format_half_interval(half_um)} um at {line}{zone['where']} ({zone['cause']},"
             f" {zone['before_um']:.1f} -> {zone['now_um']:.1f}){_because(zone)}"
         )
     if len(beyond) > MANY_CHANGES:

@@ -14,7 +14,7 @@ from fdhil.config import Axis
 from fdhil.identification.loops import better_loops, changed_regulators, regulators_of, with_loops
 from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Reason
 from fdhil.store.output import open_output
-from fdhil.validation.weight import LOOPS_DIFFER
+from fdhil.validation.table_error_budget import LOOPS_DIFFER
 
 
 def write_model(results: Sequence[FileResult], axes: Mapping[str, Axis], path: Path) -> None:

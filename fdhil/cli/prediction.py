@@ -94,7 +94,7 @@ def predict(options: Asked, sensitivity: bool, tolerance_um: float | None, since
         raise click.UsageError("--tolerance-um and --since need --from-history")
     reference, models, config = inputs(options.program, options.config_path, options.model_path, options.from_history)
     from fdhil import prediction
-    from fdhil.correction.document import prediction_document
+    from fdhil.correction.result_documents import prediction_document
 
     forewarn("predict")
     predicted = prediction.predict(reference, models, config)
@@ -175,7 +175,7 @@ def correct(options: Asked, method: str | None) -> int:
     reference, models, config = inputs(options.program, options.config_path, options.model_path, options.from_history)
     from fdhil import correction
     from fdhil.api.machine import held_out_max_um
-    from fdhil.correction.document import correction_document
+    from fdhil.correction.result_documents import correction_document
     from fdhil.prediction.models import load_model_file
     from fdhil.store.known_gain import known_gain
 
@@ -278,20 +278,20 @@ def _show_prediction(
     predicted: Prediction, zones: Sequence[Mapping[str, Any]] | None = None, tolerance_um: float | None = None
 ) -> None:
     from fdhil.cli.forecast import crossing_text
-    from fdhil.correction import document
-    from fdhil.prediction.gain import plus_minus
+    from fdhil.correction import result_documents
+    from fdhil.prediction.gain import format_half_interval
 
-    contour, time_s = document.contour(predicted), predicted.reference.time_s
+    contour, time_s = result_documents.contour(predicted), predicted.reference.time_s
     click.echo(
         f"{time_s[-1] - time_s[0]:.2f} s of path: contour error {contour['rms_um']:.1f} um RMS,"
         f" {contour['max_um']:.1f} um at most" + (f"; {MEANING}" if zones and "std_um" in zones[0] else "")
     )
-    entries = document.zones(predicted) if zones is None else zones
+    entries = result_documents.zones(predicted) if zones is None else zones
     shown = sorted(sorted(entries, key=lambda zone: -zone["max_um"])[:MANY_ZONES], key=lambda zone: zone["start_s"])
     for note in predicted.reference.notes:
         click.echo(f"note, {note}; {note.advice}", err=True)
     for zone in shown:
-        std = f" {plus_minus(INTERVAL_95 * zone['std_um'])}" if "std_um" in zone else ""
+        std = f" {format_half_interval(INTERVAL_95 * zone['std_um'])}" if "std_um" in zone else ""
         line = f"line {zone['line']}, " if zone["line"] else ""
         click.echo(
             f"  {zone['start_s']:8.3f} s .. {zone['end_s']:8.3f} s  {zone['max_um']:8.1f}{std} um  {zone['cause']:12}"
@@ -314,7 +314,7 @@ def _driver(per_axis: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def _show_correction(planned: Correction, predicted: Gain, models: Mapping[str, Parameters]) -> None:
-    from fdhil.correction import document
+    from fdhil.correction import result_documents
 
     _show_prediction(planned.before)
     for reason in planned.warnings:
@@ -323,9 +323,9 @@ def _show_correction(planned: Correction, predicted: Gain, models: Mapping[str, 
         click.echo(f"refused, {reason}; {reason.advice}")
     if not planned.refused:
         sure = "" if predicted.at_least is None else f", at least {predicted.at_least:.1f} times better"
-        most = f"{document.contour(planned.after)['max_um']:.1f} um at most"
+        most = f"{result_documents.contour(planned.after)['max_um']:.1f} um at most"
         click.echo(f"predicted with the {planned.method} correction: {predicted}; {most}{sure}")
-        blind = [axis for axis, where in document.seen_at(models).items() if where == "encoder"]
+        blind = [axis for axis, where in result_documents.seen_at(models).items() if where == "encoder"]
         if blind:
             text = f"this applies at the encoders of {', '.join(blind)}, which do not measure oscillation of the table"
             click.echo(f"{text}; if the table oscillates behind its motor, set resonance_hz of the axis")

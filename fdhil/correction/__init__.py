@@ -1,4 +1,4 @@
-"""Plans offsets that make up for the predicted path error: methods, limits, the gate."""
+"""Plans offsets that compensate the predicted path error: methods, limits, the gate."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""Solves one block of one axis: offsets, in whole increments and inside their limits, that keep it on its target.
+"""Solves one block of one axis: offsets, in whole increments and within their limits, that keep it on its target.
 
-The offset is improved by iteration: simulate the closed loop with it, put the remaining error through the inverse of
+The offset is improved by iteration: simulate the closed loop with it, pass the remaining error through the inverse of
 the linear loop, add. Two things are not left to the iteration. The limits hold at every step. And where the axis rests,
 the speed loop's integral would wind up and the table slip by micrometres now and then: there the offset leads the
-current to the middle of the dry friction's band and keeps the position loop silent.
+current to the middle of the dry friction's band and keeps the position loop at rest.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from fdhil.model.kernels import SPEED, TABLE_SPEED
 from fdhil.records import Bool, Float, Parameters
 
 ITERATIONS = 8
-GOOD_ENOUGH_UM, PEAK_UM = 0.05, 0.15  # RMS and largest: below what the drive's increments (0.3 um) can tell
+GOOD_ENOUGH_UM, PEAK_UM = 0.05, 0.15  # RMS and largest: below the drive's increments (0.3 um)
 PEAK_SHARE = 0.3
-LEAST_PROGRESS = 0.85  # what an iteration may leave of the best so far; two that leave more end it
+LEAST_PROGRESS = 0.85  # of the best residual so far; two iterations that leave more end the search
 STILL_MM_S = 1e-3
 SHORTEST_REST_S = 0.03
 LEAD_S = 0.02  # before an axis starts again the offset is free
-STUCK_UM = 1.5  # a table that rests further away than this is moved, not held
+STUCK_UM = 1.5  # a table that rests farther from its target is moved, not held
 SEARCH_S = 0.15
-BAND = 0.97  # of the dry friction: safely stuck
+BAND = 0.97  # of the dry friction: safely held
 FADE_S = 0.04
 FORGET_S = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class AxisLoop:
-    """One axis as the inverse sees it."""
+    """One axis with its inverse."""
 
     parameters: Parameters
     axis: Axis
@@ -58,10 +58,10 @@ class AxisLoop:
 
 @dataclass(frozen=True, slots=True)
 class Carry:
-    """The hand-over to the next block: the state at its first row, the increments fixed ahead of and in it, a guess.
+    """The state for the next block: the drive's state at its first row, two fixed increments, a guess.
 
     ``fixed`` (2,): offsets of the next block's first two rows, which the last cycles have already used. ``guess`` (m,):
-    unrounded offsets found for the rows that were looked at.
+    unrounded offsets of the look-ahead rows.
     """
 
     state: State
@@ -71,10 +71,10 @@ class Carry:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """A block's ``offset`` (n,) in increments, the position (n,) in mm that it leads to, and the unrounded guess.
+    """A block's ``offset`` (n,) in increments, the resulting position (n,) in mm, and the unrounded guess.
 
-    ``rms_um`` is what is left; ``needed_um`` the largest offset that the linear loop asks for, in row ``needed_at``:
-    where it exceeds the limit, the block was not solved.
+    ``rms_um`` is the residual; ``needed_um`` the largest offset that the linear loop needs, in row ``needed_at``: if it
+    exceeds the limit, the block was not solved.
     """
 
     offset: Float
@@ -88,7 +88,7 @@ class Solution:
 def rests(reference_mm: Float, target_mm: Float, sync_period_s: float, ends: bool) -> list[tuple[int, int]]:
     """Return half-open ranges of rows in which reference and target stand still for long enough.
 
-    ``ends``: the reference ends here, so the last rest has no start behind it.
+    ``ends``: the reference ends here, so no start follows the last rest.
     """
     limit = STILL_MM_S * sync_period_s
     still = (np.abs(np.diff(reference_mm, append=reference_mm[-1])) <= limit) & (
@@ -122,7 +122,7 @@ def solve(loop: AxisLoop, reference_mm: Float, target_mm: Float, carry: Carry, e
     best_worth = np.inf
     for iteration in range(ITERATIONS + 1):
         offset, position, error = _run(loop, reference_mm, target_mm, guess, carry, still, lead=iteration > 0)
-        unknown = 0 if ends else round(FORGET_S / loop.sync_period_s)  # what follows would change these rows
+        unknown = 0 if ends else round(FORGET_S / loop.sync_period_s)  # later rows would change these
         error[n - unknown :] = 0.0
         left_um = 1e3 * (target_mm - position)[: max(1, n - unknown)]
         rms_um = float(np.sqrt(np.mean(left_um**2)))
@@ -139,7 +139,7 @@ def solve(loop: AxisLoop, reference_mm: Float, target_mm: Float, carry: Carry, e
             guess = best.guess
             continue
         guess = guess + gain * loop.inverse.apply(error) / loop.increment_mm
-        if iteration == 0:  # before the limits act, the linear loop says what the path needs
+        if iteration == 0:  # before the limits act, the linear loop gives the offset that the path needs
             needed_um = float(np.abs(guess).max()) * loop.limits.um_per_increment
             if needed_um > loop.limits.offset * loop.limits.um_per_increment:
                 return replace(best, needed_um=needed_um, needed_at=int(np.argmax(np.abs(guess))))
@@ -159,12 +159,12 @@ def _run(
 ) -> tuple[Float, Float, Float]:
     """Simulate with the guess inside its limits; return offset (increments), position, and the error to work on.
 
-    ``lead``: the offsets of the rests lead the current to rest; the first look does without.
+    ``lead``: the offsets at rest lead the current to rest; the first iteration does without.
     """
     offset = np.empty(guess.size)
     offset[:2] = carry.fixed[: offset.size]
     before = (float(offset[min(1, offset.size - 1)]), float(offset[0]))
-    guess[2:] = fit(guess[2:], loop.limits, before)  # kept: a guess beyond the limits would only wind up
+    guess[2:] = fit(guess[2:], loop.limits, before)  # kept within the limits: else the guess would wind up
     offset[2:] = np.rint(guess[2:])
     position = np.empty(guess.size)
     error_of_rest = np.zeros(guess.size)
@@ -211,7 +211,7 @@ def _stuck(loop: AxisLoop, response: Response, target_mm: Float, first: int) -> 
 
 
 def _hold(loop: AxisLoop, reference_mm: Float, offset: Float, state: State, row: int, stop: int) -> None:
-    """Write the offset of a rest from ``row`` + 2 on, and fade what differs from the guess behind it."""
+    """Write the offset of a rest from ``row`` + 2 on, and fade out its difference from the guess after it."""
     if stop - row < 3:
         return
     n = offset.size
@@ -223,7 +223,6 @@ def _hold(loop: AxisLoop, reference_mm: Float, offset: Float, state: State, row:
 
 
 def _fade(rows: int, sync_period_s: float) -> Float:
-    """A smooth factor (rows,) from 1 down to 0 within ``FADE_S``."""
     share = np.minimum(np.arange(1, min(rows, int(np.ceil(FADE_S / sync_period_s))) + 1) * sync_period_s / FADE_S, 1.0)
     factor = np.zeros(rows)
     factor[: share.size] = 0.5 * (1 + np.cos(np.pi * share))

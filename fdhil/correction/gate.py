@@ -1,4 +1,4 @@
-"""The gate refuses what is not predicted to help, and says with every refusal what to do about it."""
+"""Refuses corrections that are not predicted to help, and adds advice to every refusal."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from fdhil.config import MachineConfig, share_fault
 from fdhil.prediction.inverse_dynamics import held_share, required
 from fdhil.records import Bool, Float, Parameters, Prediction, Reason, Trajectory
 
-STEADY_S = 0.02  # a limit that acts shorter than this in all costs no more than a settling
+STEADY_S = 0.02  # a limit that acts for less in total has no lasting effect
 NEAR_SHARE = 0.95  # of a current or voltage limit: worth a warning
 LEAST_GAIN = 1.05  # before / after RMS
-NOTHING_UM = 0.05  # an RMS below this is nothing to correct
-WORSE_UM = 1.0  # by how much a zone's largest error may grow
+NOTHING_UM = 0.05  # a smaller RMS needs no correction
+WORSE_UM = 1.0  # allowed growth of a zone's largest error
 HELD_OUT_SHARE = 0.43  # of the largest error in held-out moves: how much worse a position gets (studies.zoo: 0.39-0.48)
-ZONE_S = 0.1  # errors this near to each other are one zone
-MASK_S, FADE_S = 0.04, 0.06  # what is left alone around a row that gets worse, and how far the fade reaches
+ZONE_S = 0.1  # closer errors belong to one zone
+MASK_S, FADE_S = 0.04, 0.06  # uncorrected time around a row that gets worse, and duration of the fade
 
 
 def writing_off(axes: Sequence[str], config: MachineConfig) -> tuple[Reason, ...]:
@@ -43,35 +43,33 @@ def _unwritable(axis: str, config: MachineConfig) -> Reason | None:
 def demand(
     reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, before: Prediction
 ) -> tuple[tuple[Reason, ...], tuple[Reason, ...]]:
-    """Return (refused, warnings): no offset helps a drive whose current or voltage is at its limit."""
+    """Return (refused, warnings): no offset helps a drive at its current or voltage limit."""
     refused, warnings = [], []
     for axis in reference.axes:
         asked = required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
         share, what = max(zip((float(one.max()) for one in asked), ("current", "voltage"), strict=True))
+        peak = float(np.abs(before.current_a[axis]).max()) / config.axis[axis].regulators.current_limit_a
         place = reference.place(int(np.argmax(np.maximum(*asked))))
         if share > 1.0 or before.limited_s[axis] > STEADY_S:
             refused.append((axis, share, what, place))
-        elif share > NEAR_SHARE or before.limited_s[axis] > 0.0 or _peak_share(before, axis, config) > NEAR_SHARE:
-            text = f"axis {axis} comes near its {what} limit at {place}: little is left for a disturbance"
+        elif share > NEAR_SHARE or peak > NEAR_SHARE or before.limited_s[axis] > 0.0:
+            text = f"axis {axis} is near its {what} limit at {place}: little reserve remains for disturbances"
             warnings.append(Reason("NearLimit", text, "lower the feed if the path error matters there"))
     if not refused:
         return (), tuple(warnings)
     held = held_share(reference, models, config)
     fastest = float(np.linalg.norm(np.diff(reference.path_mm, axis=0), axis=1).max()) / reference.dt_s * 0.06
-    advice = f"a feed of {held * fastest:.1f} m/min ({held * 100:.0f} % of {fastest:.1f}) can be held, or smooth more"
+    feed = f"{held * fastest:.1f} m/min ({held * 100:.0f} % of {fastest:.1f})"
+    advice = f"lower the feed to {feed}, or increase the smoothing"
     return tuple(
         Reason(
             "DemandTooHigh",
-            f"axis {axis} is asked for {share * 100:.0f} % of its {what} limit at {place} and has a limit acting for"
+            f"axis {axis} needs {share * 100:.0f} % of its {what} limit at {place} and is limited for"
             f" {before.limited_s[axis] * 1e3:.0f} ms: no offset can help",
             advice,
         )
         for axis, share, what, place in refused
     ), tuple(warnings)
-
-
-def _peak_share(before: Prediction, axis: str, config: MachineConfig) -> float:
-    return float(np.abs(before.current_a[axis]).max()) / config.axis[axis].regulators.current_limit_a
 
 
 def worse_rows(before_um: Float, after_um: Float, dt_s: float) -> Bool:
@@ -82,12 +80,13 @@ def worse_rows(before_um: Float, after_um: Float, dt_s: float) -> Bool:
 
 
 def harm_advice(models: Mapping[str, Parameters]) -> str:
-    """Say what may be done where a correction would do harm."""
+    """Return the advice where a correction would do harm."""
     swinging = {axis: model.term("resonance") for axis, model in models.items() if model.term("resonance")}
     if not swinging:
         return "try the method inverse, or lower the feed there"
-    told = ", ".join(f"{axis} at {hertz:.0f} Hz" for axis, hertz in swinging.items())
-    return f"lower the feed there, or smooth more: a table that swings behind its motor ({told}) is beyond the drive"
+    axes = ", ".join(f"{axis} at {hertz:.0f} Hz" for axis, hertz in swinging.items())
+    advice = "lower the feed there, or increase the smoothing"
+    return f"{advice}: the drive cannot compensate a table that oscillates behind its motor ({axes})"
 
 
 def fade(worse: Bool, dt_s: float) -> Float:
@@ -99,7 +98,7 @@ def fade(worse: Bool, dt_s: float) -> Float:
 
 
 def held_out(largest_um: float | None) -> tuple[Reason, ...]:
-    """Refuse a model whose largest error in held-out moves, at a late reversal mostly, would show in good positions."""
+    """Refuse a model whose largest error in held-out moves, mostly at a late reversal, would affect good positions."""
     if largest_um is None or largest_um * HELD_OUT_SHARE <= WORSE_UM:
         return ()
     text = f"held-out moves were predicted to {largest_um:.1f} um only: a position that is good now may get worse by "
@@ -109,9 +108,9 @@ def held_out(largest_um: float | None) -> tuple[Reason, ...]:
 
 
 def gains(then_um: float, now_um: float) -> tuple[Reason, ...]:
-    """Refuse a correction whose contour error's RMS is not predicted to shrink as a whole."""
+    """Refuse a correction that is not predicted to reduce the RMS contour error."""
     if then_um < NOTHING_UM:
-        return (Reason("NoGain", f"the path error is {then_um:.3f} um RMS already", "nothing needs a correction"),)
+        return (Reason("NoGain", f"the path error is {then_um:.3f} um RMS already", "no correction is needed"),)
     if not now_um * LEAST_GAIN <= then_um:
         text = f"the path error would be {now_um:.1f} um RMS with the correction, {then_um:.1f} um without"
         return (Reason("NoGain", text, "try the method inverse, or lower the feed"),)
@@ -119,7 +118,7 @@ def gains(then_um: float, now_um: float) -> tuple[Reason, ...]:
 
 
 def result(before: Prediction, after: Prediction, untouched: bool = False) -> tuple[Reason, ...]:
-    """Refuse a correction that is not predicted to help as a whole, or (unless ``untouched``) makes a zone worse."""
+    """Refuse a correction that is not predicted to help, or (unless ``untouched``) that makes a zone worse."""
     none = gains(before.rms_um, after.rms_um)
     if none:
         return none

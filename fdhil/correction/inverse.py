@@ -1,9 +1,8 @@
 """Plans the inverse correction: offsets that keep each table on r(t - tau), with one delay tau for all axes.
 
 Aiming at the path, not at the clock, lets a drive that lags keep its lag: only where the axes lag by different times,
-or where the lag changes, are offsets needed. The path is worked through in blocks with a look-ahead, each from the
-state that the block before it left: memory stays flat, and the first offsets are there before the path is known to its
-end.
+or where the lag changes, are offsets needed. The path is solved in blocks with a look-ahead, each from the final state
+of the one before: memory stays constant, and the first offsets are available before the end of the path is known.
 """
 
 from __future__ import annotations
@@ -26,16 +25,16 @@ from fdhil.records import Float, Parameters, Prediction, Reason, Trajectory
 
 BLOCK_S = 2.0
 LOOK_AHEAD_S = 0.5
-# a lag that costs less than this share of the largest offset is made up for; a larger one is left to the drive
+# a lag that needs less than this share of the largest offset is compensated; a larger one is left to the drive
 SMALL_LAG_SHARE = 0.25
 
 
 def common_delay_s(
     speeds_mm_s: Mapping[str, float], models: Mapping[str, Parameters], config: MachineConfig
 ) -> tuple[float, tuple[Reason, ...]]:
-    """Return tau, and ``LagTooLarge`` for axes whose own delay is so far from it that no offset may bridge it.
+    """Return tau, and ``LagTooLarge`` for axes whose own delay is too far from it for an offset.
 
-    It is 0 where the offsets can make up for every axis' own delay at its speed, else amid their delays.
+    It is 0 if the offsets can compensate every axis' own delay at its speed, else the middle of their delays.
     """
     period = config.machine.sync_period_s
     delays = {axis: linear.delay_s(models[axis], config.axis[axis], period) for axis in speeds_mm_s}
@@ -79,14 +78,14 @@ def plan(reference: Trajectory, models: Mapping[str, Parameters], config: Machin
 
 @dataclass(slots=True)
 class AxisInverse:
-    """The inverse of one axis, worked through block by block: ``carry`` is what the last block left."""
+    """The inverse of one axis, solved block by block; ``carry`` is the state after the last block."""
 
     loop: AxisLoop
     carry: Carry
 
     @staticmethod
     def of(parameters: Parameters, config: MachineConfig, axis: str, start_mm: float) -> AxisInverse:
-        """Return it at rest at ``start_mm``, without an offset; ValueError when writing is off for the axis."""
+        """Return it at rest at ``start_mm``, without an offset; ValueError if writing is off for the axis."""
         period, drive = config.machine.sync_period_s, config.axis[axis]
         limits = PlanLimits.of(drive, period)
         loop = AxisLoop(
@@ -101,9 +100,9 @@ class AxisInverse:
         return AxisInverse(loop, Carry(closed_loop.standing(parameters, drive, start_mm), np.zeros(2), np.empty(0)))
 
     def block(self, reference_mm: Float, target_mm: Float, rows: int, ends: bool) -> Solution:
-        """Solve the next ``rows``, with what is known of the rows behind them, and go on to those.
+        """Solve the next ``rows`` with the known rows behind them, and advance.
 
-        ``ends``: there are none.
+        ``ends``: no rows follow.
         """
         loop, carry = self.loop, self.carry
         solution = solve(loop, reference_mm, target_mm, carry, ends)
@@ -128,5 +127,5 @@ class AxisInverse:
 
 
 def block_rows(sync_period_s: float) -> tuple[int, int]:
-    """Return how many rows a block has, and how many are looked at behind it."""
+    """Return the rows of a block, and of its look-ahead."""
     return round(BLOCK_S / sync_period_s), round(LOOK_AHEAD_S / sync_period_s)

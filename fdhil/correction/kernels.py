@@ -1,4 +1,4 @@
-"""Compiled kernels project an offset onto what it may do, measure it and round it."""
+"""Compiled kernels that project an offset onto its limits, measure it and round it."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def extent(offset: Float, start: Float, acceleration: float, window: int) -> tup
     highest, fastest, hardest, farthest, longest = 0.0, 0.0, 0.0, 0.0, 0.0
     one, two = start[0], start[1]
     travel = 0.0
-    past = np.zeros(window)  # of the last rows, what each travelled
+    past = np.zeros(window)  # travel of each of the last rows
     for k in range(offset.size):
         rate = offset[k] - one
         highest, fastest = max(highest, abs(offset[k])), max(fastest, abs(rate))
@@ -170,9 +170,10 @@ def extent(offset: Float, start: Float, acceleration: float, window: int) -> tup
 
 @compiled
 def rounded(exact: Float, settled: int, uneven: float) -> Float:
-    """Round (n,) with the error carried on; from row ``settled`` on change the increment as seldom as it can be.
+    """Round (n,) with the error carried on; from row ``settled`` on change the increment as rarely as possible.
 
-    Rows 0 and 1 are rounded alone. ``uneven``: rounding error (increments times rows) that ends an increment's turn.
+    Rows 0 and 1 are rounded alone. ``uneven``: rounding error (increments times rows) after which the increment
+    changes.
     """
     out = np.rint(exact)
     carried = 0.0

@@ -1,10 +1,10 @@
-"""Learns from each pass of a program what no model holds: the next pass of the same program is corrected by it.
+"""Learns an offset from each pass of a program: the next pass is corrected by the repeating error that no model has.
 
-Iterative learning [Bristow, Tharayil, Alleyne 2006]: u' = Q (u + g L e), with e the error that the drive's own
+Iterative learning control [Bristow, Tharayil, Alleyne 2006]: u' = Q (u + g L e), with e the error that the drive's own
 encoder measured on the SYNC grid, L the zero-phase inverse of the identified loop, and Q a zero-phase low-pass above
-which no model of a drive is trusted. What is learned stays small beside what an offset may be. After a pass that is
-worse than the one before less is learned, and a pass worse than the first ends all that was. What a motor's encoder
-cannot see, the screw's wind-up and its pitch, is not learned.
+which no model of a drive is reliable. The learned offset stays a small share of the allowed one. After a pass that is
+worse than the one before, the gain is reduced; a pass worse than the first discards the learned offset. Errors that the
+motor's encoder does not see, the screw's wind-up and its pitch, are not learned.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from fdhil.correction.mirror import allowed_um
 from fdhil.records import Float, Parameters, Trajectory
 
 CORNER_HZ = 60.0  # of Q
-GAIN = 0.7  # g: two passes take nine tenths of what repeats, and the noise of one counts for little
-KEPT = 0.98  # of what was learned, from pass to pass: what is no longer confirmed fades
+GAIN = 0.7  # g: two passes remove nine tenths of the repeating error, and the noise of one has little effect
+KEPT = 0.98  # of the learned offset, from pass to pass: unconfirmed parts fade
 MOST_SHARE = 0.2  # of the largest offset that an axis may have
-WORSE = 1.1  # times the pass before: by more than this no two good passes differ
+WORSE = 1.1  # times the pass before: good passes differ by less
 CAUTION, TRUST = 0.5, 1.25  # factors on the gain after a pass that was worse, and after one that was not
 PADDING_S = 0.25
 
 
 @dataclass(frozen=True, slots=True)
 class Lesson:
-    """What the passes of one program have taught: ``offset_um`` (n,) per axis is added to the plan's in the next pass.
+    """The learned offset of one program: ``offset_um`` (n,) per axis is added to the plan's in the next pass.
 
-    ``gain`` is what the next error counts. ``curve_um`` is the RMS of the contour error that each pass so far measured,
-    ``without_um`` that of the last pass in which nothing learned was in force.
+    ``gain`` is the weight of the next error. ``curve_um`` is the RMS contour error that each pass so far measured,
+    ``without_um`` that of the last pass without a learned offset.
     """
 
     offset_um: Mapping[str, Float]
@@ -43,7 +43,7 @@ class Lesson:
 
     @staticmethod
     def none(reference: Trajectory) -> Lesson:
-        """Return that of a program which was never cut."""
+        """Return the zero offset of a program without passes."""
         return Lesson(dict.fromkeys(reference.axes, np.zeros(reference.time_s.size)))
 
 
@@ -54,10 +54,10 @@ def learn(
     models: Mapping[str, Parameters],
     config: MachineConfig,
 ) -> Lesson:
-    """Return the lesson after a whole, undisturbed pass with ``lesson.offset_um`` in force.
+    """Return the learned offset after a complete, undisturbed pass with ``lesson.offset_um`` active.
 
     ``error_um`` (n,) per axis is target less measured position in each row of the program, ``rms_um`` the RMS of the
-    pass' contour error. A pass worse than the last without all that was learned ends it.
+    pass' contour error. A pass worse than the last one without a learned offset discards it.
     """
     curve = (*lesson.curve_um, rms_um)
     learned = any(np.any(offset) for offset in lesson.offset_um.values())
@@ -78,8 +78,8 @@ def learn(
 
 
 def _low_passed(values: Float, period_s: float) -> Float:
-    """Return the values (n,) without what lies above the corner, without delay, and at rest at both ends."""
-    from scipy.signal import butter, sosfiltfilt  # costs a third of a second, which the daemon's start can spare
+    """Return the values (n,) low-pass filtered without delay, and at rest at both ends."""
+    from scipy.signal import butter, sosfiltfilt  # takes a third of a second to import
 
     sections = butter(2, min(CORNER_HZ, 0.2 / period_s), fs=1 / period_s, output="sos")
     pad = round(PADDING_S / period_s)

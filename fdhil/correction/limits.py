@@ -19,13 +19,13 @@ from fdhil.records import Bool, Float, Int, Reason
 # rounding a curve to whole increments moves its first difference by up to 1, its second by up to 2
 ROUNDING_RATE, ROUNDING_ACCELERATION = 1.0, 2.0
 _PASSES = 8
-_NEAR = 150  # rows beside a broken one that are planned anew with it
+_NEAR = 150  # rows around a violation that are planned again with it
 _SLACK = 0.05  # increments by which a seam may miss, far below the rounding
 
 
 @dataclass(frozen=True, slots=True)
 class PlanLimits(OffsetBounds):
-    """The limits of an offset in increments, and the size of these."""
+    """The limits of an offset in increments, and their size."""
 
     um_per_increment: float
 
@@ -37,7 +37,7 @@ class PlanLimits(OffsetBounds):
 
     @property
     def curve(self) -> PlanLimits:
-        """The limits of a curve that is rounded afterwards: less by the rounding, where that leaves enough."""
+        """The limits of a curve that is rounded afterwards: reduced by the rounding, where that leaves enough."""
         return replace(
             self,
             offset=self.offset - 0.5,
@@ -49,9 +49,9 @@ class PlanLimits(OffsetBounds):
 
 
 def check(offset_increments: Int, limits: PlanLimits, before: tuple[float, float] = (0.0, 0.0)) -> list[Reason]:
-    """Return what a table (n,) breaks: empty, or ``OffsetLimit``, ``OffsetRate``, ``OffsetEnergy`` with its figure.
+    """Return the limits that a table (n,) violates: ``OffsetLimit``, ``OffsetRate``, ``OffsetEnergy``, with its figure.
 
-    ``before``: the two offsets ahead of the first row, the nearer one first. Rounding to increments is allowed for.
+    ``before``: the two offsets ahead of the first row, the nearer one first. Rounding to increments is tolerated.
     """
     um = limits.um_per_increment
     _, fast, hard, reach, travel = kernels.extent(
@@ -104,7 +104,7 @@ def fit(wanted: Float, limits: PlanLimits, before: tuple[float, float] = (0.0, 0
 
 
 def _projected(goal: Float, limits: PlanLimits, before: tuple[float, float]) -> Float:
-    """Project onto rate, acceleration and amplitude; far from what breaks them the goal stays as it is."""
+    """Project onto rate, acceleration and amplitude; far from violations the goal stays as it is."""
     high, fast, hard, _, _ = kernels.extent(goal, np.array(before), limits.acceleration, limits.window)
     if high <= limits.offset and fast <= limits.rate and hard <= limits.acceleration:
         return goal
@@ -124,7 +124,6 @@ def _projected(goal: Float, limits: PlanLimits, before: tuple[float, float]) -> 
 
 
 def _breaks(offset: Float, limits: PlanLimits, before: tuple[float, float], slack: float = 0.0) -> Bool:
-    """Return (n,) the rows at which a limit is broken by more than ``slack`` increments."""
     rate = np.diff(offset, prepend=before[0])
     acceleration = np.diff(rate, prepend=before[0] - before[1])
     return np.asarray(
@@ -135,7 +134,7 @@ def _breaks(offset: Float, limits: PlanLimits, before: tuple[float, float], slac
 
 
 def _calm(travel: Float, allowed: float, window: int) -> Float:
-    """A factor (n,) <= 1 that shrinks the offset wherever the second around it travels too far."""
+    """Return a factor (n,) <= 1 that reduces the offset where its travel within a second is too long."""
     if travel.max(initial=0.0) <= allowed:
         return np.ones(travel.size)
     factor = np.minimum(1.0, allowed / np.maximum(travel, 1e-12))

@@ -1,8 +1,8 @@
-"""Takes the closed loop as a linear system: its delay, and a zero-phase inverse of it up to a bandwidth.
+"""Treats the closed loop as a linear system: its delay, and its zero-phase inverse up to a bandwidth.
 
 Away from the limits and from changes of the friction's sign the loop from offset to position is linear, whatever the
-regulators: one simulated impulse tells all. Its inverse is regularised, so that nothing is asked for where the drive
-gives no answer, and it is applied to a recorded or planned error, so it may look ahead and need not delay.
+regulators: one simulated impulse describes it. Its inverse is regularised, so that it asks for nothing where the drive
+does not respond, and it is applied to a recorded or planned error, so it may look ahead and need not delay.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from fdhil.records import Float, Parameters
 
 BANDWIDTH_HZ = 120.0
 REGULARISATION = 1e-3
-RESONANCE_SHARE = 0.5  # of a resonance's frequency: near it a little error of the model turns the answer's sign
+RESONANCE_SHARE = 0.5  # of a resonance's frequency: near it a small model error inverts the response
 IMPULSE_S = 1.0
-AHEAD_S = 0.064  # of the impulse's answer that may come before it: the feed-forward looks ahead
+AHEAD_S = 0.064  # of the impulse response before the impulse: the feed-forward looks ahead
 PAD_S = 0.5
 RAMP_MM_S, RAMP_S = 1.0, 1.5
 
@@ -45,7 +45,7 @@ class Inverse:
 
 
 def unlimited(parameters: Parameters, axis: Axis, dry_nm: float = 0.0) -> tuple[Parameters, Axis]:
-    """Return what of the loop is linear, without limits, and with another dry friction: without any it is linear."""
+    """Return the linear part of the loop, without limits, and with another dry friction: without any it is linear."""
     free = axis.regulators.model_copy(update={"current_limit_a": 1e9, "voltage_limit_v": 1e9})
     return model_terms.linear(parameters, dry_nm), axis.model_copy(update={"regulators": free})
 
@@ -55,7 +55,7 @@ def delay_s(parameters: Parameters, axis: Axis, sync_period_s: float) -> float:
     linear, free = unlimited(parameters, axis)
     ramp = np.arange(round(RAMP_S / sync_period_s), dtype=np.float64) * (sync_period_s * RAMP_MM_S)
     response = closed_loop.simulate(linear, free, sync_period_s, ramp)
-    # the last rows look beyond the end, where the reference is held
+    # the last rows depend on the reference beyond its end, where it is held
     return float((ramp[-8] - response.position_mm[-8]) / RAMP_MM_S)
 
 

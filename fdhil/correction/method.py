@@ -1,4 +1,4 @@
-"""States the correction methods' common form: what each takes and returns."""
+"""Defines the common interface of the correction methods."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from fdhil.records import Float, Parameters, Prediction, Reason, Trajectory
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A method's answer: ``offset_um`` (n,) per axis, inside the limits and in whole increments.
+    """A method's result: ``offset_um`` (n,) per axis, within the limits and in whole increments.
 
-    ``delay_s`` is the common delay tau that the method aims at, r(t - tau). ``refused`` is what the method itself found
-    to be impossible. ``untouched``: the offset is sent as the method gives it, or not at all (mirror). The speed and
-    torque offsets (0x60B1, 0x60B2) are empty but for an on-line feed-forward.
+    ``delay_s`` is the common delay tau that the method aims at, r(t - tau). ``refused`` are the method's own refusals.
+    ``untouched``: the offset is sent unchanged, or not at all (mirror). The speed and torque offsets (0x60B1, 0x60B2)
+    are empty except for an on-line feed-forward.
     """
 
     offset_um: Mapping[str, Float]

@@ -11,7 +11,7 @@ from fdhil.correction.limits import fit_all
 from fdhil.correction.method import Plan
 from fdhil.records import Parameters, Prediction, Reason, Trajectory
 
-FULL = 0.95  # of the speed fed forward: less leaves a lag
+FULL = 0.95  # of the speed feed-forward: less leaves a lag
 
 
 def plan(
@@ -20,9 +20,9 @@ def plan(
     config: MachineConfig,
     before: Prediction,
 ) -> Plan:
-    """Return offset = -error of the prediction ``before``, inside the limits.
+    """Return offset = -error of the prediction ``before``, within the limits.
 
-    Refused with ``LagTooLarge`` where the error exceeds what an offset may be: a clipped mirror is no mirror.
+    Refused with ``LagTooLarge`` if the error exceeds the largest offset: a clipped mirror is not a mirror.
     """
     wanted = {axis: -error for axis, error in before.error_um.items()}
     largest = {axis: float(np.abs(offset).max(initial=0.0)) for axis, offset in wanted.items()}
@@ -34,7 +34,7 @@ def plan(
 def too_large(
     needed_um: Mapping[str, float], models: Mapping[str, Parameters], config: MachineConfig
 ) -> tuple[Reason, ...]:
-    """Return the reason for each axis whose largest offset is beyond its ceiling."""
+    """Return the reason for each axis whose required offset exceeds its limit."""
     return tuple(
         lag_reason(axis, needed, allowed_um(config, axis), models[axis], config.axis[axis])
         for axis, needed in needed_um.items()
@@ -43,18 +43,18 @@ def too_large(
 
 
 def allowed_um(config: MachineConfig, axis: str) -> float:
-    """Return the largest offset that an axis may have, 0 where writing is off."""
+    """Return the largest allowed offset of an axis, 0 if writing is off."""
     limits = config.axis[axis].correction
     return limits.max_offset_um if limits is not None else 0.0
 
 
 def lag_reason(name: str, needed_um: float, allowed_um: float, model: Parameters, axis: Axis) -> Reason:
-    """Say that an axis lags, or its table swings, by more than an offset may make up for."""
+    """Return the reason for an axis that lags, or a table that oscillates, by more than an offset may compensate."""
     feedforward, hertz = axis.regulators.speed_feedforward, model.term("resonance")
     needs = f"needs offsets of {needed_um:.0f} um, {allowed_um:.0f} um are allowed"
     if hertz and feedforward >= FULL:
-        text = f"axis {name} {needs}: its table swings behind the motor at {hertz:.0f} Hz, beyond the drive's reach"
-        return Reason("ResonanceBeyondReach", text, "lower the feed, or smooth more")
+        text = f"axis {name} {needs}: its table oscillates behind the motor at {hertz:.0f} Hz, beyond the drive's reach"
+        return Reason("ResonanceBeyondReach", text, "lower the feed, or increase the smoothing")
     advice = (
         f"enable the drive's speed feed-forward (it is {feedforward:g}), then identify and plan again"
         if feedforward < FULL

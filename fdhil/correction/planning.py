@@ -26,8 +26,8 @@ def plan(
 ) -> Correction:
     """Plan the correction of ``reference``; refusals are values, with all offsets 0 and ``after`` = ``before``.
 
-    ``held_out_um`` is the largest error that the models leave of moves that they were not identified on, if known.
-    ConfigError when an axis has no model; KeyError for an unknown method.
+    ``held_out_um`` is the models' largest error in moves that they were not identified on, if known. ConfigError if an
+    axis has no model; KeyError for an unknown method.
     """
     name = method or tables.DEFAULT_CORRECTION
     factory: Method = tables.load(tables.CORRECTIONS, name)
@@ -65,10 +65,10 @@ def _frozen(offsets: Mapping[str, Float]) -> dict[str, Float]:
 def _mask_harm(
     reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, before: Prediction, wanted: Plan
 ) -> tuple[Mapping[str, Float], Prediction, tuple[Reason, ...]]:
-    """Leave alone the zones that would get worse; return the offsets, what they leave, and a warning.
+    """Leave zones uncorrected that would get worse; return the offsets, their residual, and a warning.
 
-    What a method wants untouched stays as it is, and the warning says where it harms. An on-line feed-forward has no
-    offsets that could be masked.
+    An offset that must stay unchanged is not masked: the warning says where it harms. An on-line feed-forward has no
+    offsets to mask.
     """
     offset, speed, torque = wanted.offset_um, wanted.speed_offset_rad_s, wanted.torque_offset_nm
     after = predict_corrected(reference, models, config, offset, speed, torque)
@@ -90,5 +90,5 @@ def _mask_harm(
     first, last = reference.time_s[np.flatnonzero(worse)[[0, -1]]]
     text = f"{worse.sum() * reference.dt_s:.2f} s between {first:.2f} s and {last:.2f} s would get worse"
     if not wanted.untouched:
-        text += " and are left as they are"
+        text += " and are left uncorrected"
     return offset, after, (Reason("HarmPredicted", text, gate.harm_advice(models)),)

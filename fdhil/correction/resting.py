@@ -1,7 +1,7 @@
-"""Keeps a resting axis at rest: while dry friction holds the table an offset moves the regulators alone.
+"""Keeps a resting axis at rest: while dry friction holds the table an offset changes the regulators alone.
 
-Left alone, their integrals wind up on the remaining error until the table slips by micrometres, now and then. While
-it is held the regulators alone are a linear system, whatever their structure: two simulated answers tell which offset
+Without it, their integrals wind up on the remaining error until the table slips by micrometres, now and then. While it
+is held the regulators alone are a linear system, whatever their structure: two simulated responses show which offset
 leads the current to the middle of the dry friction's band, and which one, by asking for no motion, keeps it there.
 """
 
@@ -23,21 +23,21 @@ from fdhil.model.kernels import CURRENT_DEMAND, POSITION, TABLE
 from fdhil.prediction.model_terms import Band, band
 from fdhil.records import Float, Parameters
 
-FREE_S = 0.3  # in which the current is led away
-WATCHED_S = 0.06  # behind it, in which the current must have come to rest
-STEADINESS = 3.0  # A per increment a cycle^2: how smooth the offset is to be, against how small the current
+FREE_S = 0.3  # in which the current is brought to its target
+WATCHED_S = 0.06  # after it, in which the current must have settled
+STEADINESS = 3.0  # A per increment/cycle^2: weight of the offset's smoothness against the current
 AGAIN_S = 0.4
-UNEVEN = 20.0  # increments times cycles of rounding error after which the other neighbour is taken
+UNEVEN = 20.0  # increments times cycles of rounding error after which the other neighbour is used
 PASSES = 3
-LENGTHS_KEPT = 8  # of rests: an iteration meets most of them again
+LENGTHS_KEPT = 8  # of rests: most recur in each iteration
 KNOT_ROWS = 8
-EVERY = 3  # of the cycles says enough: the current cannot change faster than the spline
-RIDGE = 1e-6  # for splines that lie behind a short rest but for their tail
+EVERY = 3  # every n-th cycle suffices: the current cannot change faster than the spline
+RIDGE = 1e-6  # for splines of which only the tail lies within a short rest
 HELD_NM = 1e9
 
 
 class Resting:
-    """The rests of one axis: what depends on its drive alone is found once."""
+    """Holds one axis at rest; quantities that depend on its drive alone are computed once."""
 
     def __init__(self, parameters: Parameters, axis: Axis, sync_period_s: float, increment_mm: float) -> None:
         self._held = closed_loop.prepare(*unlimited(parameters, axis, HELD_NM), sync_period_s)
@@ -51,7 +51,7 @@ class Resting:
         self._lead = _Lead(self._answer_a, self._free)
 
     def band_at(self, position_mm: float) -> Band:
-        """Return the torques that hold the table at a place."""
+        """Return the torques that hold the table at a position."""
         return band(self._parameters, position_mm * self._rad_per_mm)
 
     def quiet(self, reference_mm: Float, fixed: Float, state: State) -> Float:
@@ -64,7 +64,7 @@ class Resting:
         middle_a = self.band_at(stands_mm).middle / self._parameters.K
         offset = np.full(reference_mm.size, silent)
         offset[:2] = fixed
-        for first in range(0, reference_mm.size - 2, self._again):  # what rounding left is led away as well
+        for first in range(0, reference_mm.size - 2, self._again):  # the effect of rounding is compensated as well
             rest = reference_mm[first:]
             exact = np.full(rest.size, silent)
             exact[:2] = offset[first : first + 2]
@@ -83,8 +83,8 @@ class Resting:
 def run_with(
     drive: Ready, reference_mm: Float, offset: Float, increment_mm: float, state: State, rows: int
 ) -> Response:
-    """Run a drive's next ``rows`` cycles with an offset in increments; both paths begin with the first of them."""
-    ahead = min(rows + 2, reference_mm.size)  # a cycle looks two rows ahead and no further
+    """Simulate a drive's next ``rows`` cycles with an offset in increments; both paths begin with the first of them."""
+    ahead = min(rows + 2, reference_mm.size)  # a cycle depends on two further rows
     return drive.run(Commands(reference_mm[:ahead] + offset[:ahead] * increment_mm), state, 0, rows)
 
 
@@ -95,7 +95,7 @@ def _demand(response: Response) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class _Length:
-    """A rest of some length: which of the splines count in it, how stiff they are, and both as one matrix."""
+    """The splines within a rest of some length, their stiffness, and both as one matrix."""
 
     effect: Float
     even: Float
@@ -106,14 +106,14 @@ class _Length:
 
 
 class _Lead:
-    """The answer to an offset d from row 2 on, as a cubic spline of knots ``step`` rows apart.
+    """The response to an offset d from row 2 on, as a cubic spline of knots ``step`` rows apart.
 
-    ``spline`` (free + step, m) holds d's basis, ``bends`` its second differences, ``effect`` (n, m) what each of them
-    asks for, in A. A rest of less than n rows uses their first rows.
+    ``spline`` (free + step, m) is the basis of d, ``bends`` its second differences, ``effect`` (n, m) the current, A,
+    that each of them causes. A rest of less than n rows uses their first rows.
     """
 
     def __init__(self, answer_a: Float, free: int) -> None:
-        """Prepare for rests of up to ``free`` rows and longer; ``answer_a`` (n,): what an offset of 1 in row 2 does."""
+        """Prepare for rests of any length; ``answer_a`` (n,) is the response to an offset of 1 in row 2."""
         pieces = max(1, round(free / KNOT_ROWS))
         self._free, self._step = free, free / pieces
         knots = np.arange(-3, pieces + 5) * self._step
@@ -130,9 +130,9 @@ class _Lead:
         free = min(n - 2, self._free)
         goes_on = n > free + 2
         columns = round(self._free / self._step) if goes_on else int(np.ceil(free / self._step)) + 3
-        seen = n if goes_on else n - 2  # the last cycles of a rest look at rows behind it
+        seen = n if goes_on else n - 2  # the last cycles of a rest depend on rows after it
         rows = free + 2 if goes_on else free
-        # of the first columns nothing but the last few has bends behind these rows
+        # of these columns only the last few have bends beyond these rows
         behind = slice(rows, rows + round(4 * self._step) + 2)
         stiffness = self._stiffness[:columns, :columns] - (
             self._smooth[:columns, behind] @ self._bends[behind, :columns]
@@ -155,7 +155,7 @@ class _Lead:
         base_a = base_a[: EVERY * len(effect) : EVERY]
         bent = length.bend_first * (before[0] - 2 * before[1]) + length.bend_second * before[1]
         found = dposv(length.even, -(effect.T @ base_a) - bent)[1]
-        for _ in range(PASSES - 1):  # the largest currents weigh most: it is they that break the table loose
+        for _ in range(PASSES - 1):  # the largest currents have the largest weight: they break the table loose
             weighted = effect.T * (1.0 + (base_a + effect @ found) ** 2)
             found = dposv(weighted @ effect + length.stiffness, -(weighted @ base_a) - bent)[1]
         return np.asarray(length.spline @ found)

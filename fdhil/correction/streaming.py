@@ -1,9 +1,9 @@
-"""Streams the inverse correction while the path is still being made: blocks of 2 s with 0.5 s of look-ahead.
+"""Streams the inverse correction while the path is still generated: blocks of 2 s with 0.5 s of look-ahead.
 
-A block is there as soon as its look-ahead is, so nothing waits for the end of the program ([DES], conclusion: "an
-on-line technique is to be studied"). Each block passes limits and gate alone; what is kept between blocks is one state
-per axis and half a second of path. The axes take turns in one thread: beside a machine that runs the other core is the
-guard's, and two threads that share a core's caches take half as much processor again.
+A block is available as soon as its look-ahead is, so nothing waits for the end of the program ([DES], conclusion: "an
+on-line technique is to be studied"). Each block passes limits and gate alone; the state between blocks is one state per
+axis and half a second of path. The axes take turns in one thread: next to a running machine the other core is the
+guard's, and two threads that share a core's caches take half as much processor time again.
 """
 
 from __future__ import annotations
@@ -24,16 +24,15 @@ from fdhil.model.closed_loop import Commands, Response, State, standing
 from fdhil.prediction.contour import WINDOW_S, contour_error_um
 from fdhil.records import Float, Parameters, Reason, table_path
 
-LIMITED_S = 0.02  # a limit that acts longer than this within a block is no settling
+LIMITED_S = 0.02  # longer limiting within a block is not settling
 
 
 @dataclass(frozen=True, slots=True)
 class StreamBlock:
     """The settled rows from ``first_row`` on: offsets per axis in um, contour error (n,) without and with them.
 
-    ``refused`` is not empty where the gate does not let the block through: its offsets are 0 then, and the stream ends
-    there unless it is told to go on. ``at`` holds the row of each refusal in the whole, which may be one of the rows
-    that were only looked at.
+    ``refused`` is not empty if the gate rejects the block: its offsets are 0 then, and the stream ends there unless it
+    is told to continue. ``at`` holds the row of each refusal in the whole, which may be a row of the look-ahead.
     """
 
     first_row: int
@@ -46,15 +45,13 @@ class StreamBlock:
 
 
 class _Refusal(NamedTuple):
-    """A reason, and the row of the block that it is about."""
-
     row: int
     reason: Reason
 
 
 @dataclass(slots=True)
 class _Axis:
-    """One axis between two blocks; ``free`` is the state that it would have without any offset."""
+    """One axis between two blocks; ``free`` is the state without any offset."""
 
     name: str
     inverse: AxisInverse
@@ -63,7 +60,7 @@ class _Axis:
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
-    """One block of one axis: offsets (um), positions without and with them, and what was in the way."""
+    """One block of one axis: offsets (um), positions without and with them, and refusals."""
 
     offset_um: Float
     before_mm: Float
@@ -78,9 +75,9 @@ def stream(
     *,
     goes_on: bool = False,
 ) -> Iterator[StreamBlock]:
-    """Correct a reference that comes in pieces (mm per axis, (m,), in order, of any length); yield blocks of it.
+    """Correct a reference that arrives in pieces (mm per axis, (m,), in order, of any length); yield blocks of it.
 
-    ``goes_on``: also behind a refused block, to learn of them all. ValueError when an axis may not be written. The
+    ``goes_on``: continue after a refused block, to report them all. ValueError if an axis may not be written. The
     result is that of the whole reference planned at once.
     """
     period = config.machine.sync_period_s
@@ -89,7 +86,7 @@ def stream(
     path: dict[str, Float] = {}
     axes: dict[str, _Axis] = {}
     delay = 0.0
-    kept = row = 0  # rows of ``path`` that lie before the block, and the block's number in the whole
+    kept = row = 0  # rows of ``path`` before the block, and the first row of the block
     source = iter(pieces)
     ended = False
     while not ended:
@@ -110,7 +107,7 @@ def stream(
             # before any speed is known: as if every axis may run its rapid speed
             delay, _ = common_delay_s({name: config.axis[name].rapid_speed_mm_s for name in path}, models, config)
         length = next(iter(path.values())).size - kept
-        # one row more than the look-ahead tells that the path goes on
+        # one row beyond the look-ahead shows that the path continues
         while (length > block + ahead or piece is None) and not ended:
             ended = length <= block + ahead
             rows = length if ended else block
@@ -128,7 +125,7 @@ def stream(
 
 
 def _solve(axis: _Axis, path: Float, kept: int, rows: int, delay_rows: float, ends: bool) -> _Piece:
-    """Solve one block of one axis and move the axis to the next one."""
+    """Solve one block of one axis and advance to the next one."""
     reference = np.ascontiguousarray(path[kept:])
     target = np.ascontiguousarray(delayed(path, delay_rows)[kept:])
     loop = axis.inverse.loop
@@ -141,14 +138,12 @@ def _solve(axis: _Axis, path: Float, kept: int, rows: int, delay_rows: float, en
 
 
 def _refused(name: str, loop: AxisLoop, solution: Solution, free: Response, rows: int) -> tuple[_Refusal, ...]:
-    """Return the objections of one axis alone to a block: lag, a drive at its limit, an offset that breaks a limit."""
+    """Return one axis' refusals of a block: lag, a drive at its limit, an offset that violates a limit."""
     um = loop.limits.um_per_increment
     refused = []
     if free.limited_s > LIMITED_S:
-        text = (
-            f"axis {name} has a current or voltage limit acting for {free.limited_s * 1e3:.0f} ms: no offset can help"
-        )
-        reason = Reason("DemandTooHigh", text, "lower the feed, or smooth more")
+        text = f"axis {name} is at its current or voltage limit for {free.limited_s * 1e3:.0f} ms: no offset can help"
+        reason = Reason("DemandTooHigh", text, "lower the feed, or increase the smoothing")
         refused.append(_Refusal(int(np.argmax(free.limited > 0.0)), reason))
     elif solution.needed_um > loop.limits.offset * um:
         reason = lag_reason(name, solution.needed_um, loop.limits.offset * um, loop.parameters, loop.axis)
@@ -169,7 +164,6 @@ def _gated(
     config: MachineConfig,
     window: int,
 ) -> StreamBlock:
-    """Put the axes together and ask the gate."""
     low, high = max(0, kept - window), kept + rows + window
     around = table_path((*path,), np.column_stack([values[low:high] for values in path.values()]))
     errors = []
@@ -179,7 +173,7 @@ def _gated(
     refused = [refusal for piece in result.values() for refusal in piece.refused]
     before_um, after_um = errors
     worse = np.flatnonzero(gate.worse_rows(before_um, after_um, config.machine.sync_period_s))
-    if worse.size and not refused:  # what a limit does to a block that was not solved says nothing more
+    if worse.size and not refused:  # after a refusal the contour error adds nothing
         at = int(worse[np.argmax(after_um[worse])])
         text = f"the contour error would grow to {after_um[at]:.1f} um; without offsets it is {before_um.max():.1f} um"
         refused.append(_Refusal(at, Reason("HarmPredicted", text, "lower the feed, or identify again")))

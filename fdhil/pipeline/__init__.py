@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from fdhil.pipeline.analysis import analyse
 from fdhil.pipeline.axis import POOL_WINDOWS, AxisPipeline, Known, Record
-from fdhil.pipeline.held_out_pool import pool_with_held_out
-from fdhil.pipeline.pooling import pool
-from fdhil.pipeline.recorded import analyse_windows
+from fdhil.pipeline.identified_loops import analyse_windows
+from fdhil.pipeline.validated_pool import pool, pool_with_held_out
 
 __all__ = [
     "POOL_WINDOWS",

@@ -1,9 +1,8 @@
-"""Analyses one window: asks the checks of its signals, estimates, and asks the checks of the fit."""
+"""Analyses one window: align signals, check signals, estimate, check the fit, assess the error at the table."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
 
@@ -17,59 +16,68 @@ from fdhil.identification.fit import Fit
 from fdhil.identification.identifiability import empty_estimate
 from fdhil.identification.signals import mended
 from fdhil.identification.spring import sprung
+from fdhil.identification.without_voltage import fit as fit_torque
 from fdhil.identification.without_voltage import told
 from fdhil.records import Estimate, Parameters, Reason, Result, Verdict, Window, WindowOutcome
-from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, WEIGHED, Evidence, Findings, ask
 from fdhil.validation.at_the_table import at_the_table
-from fdhil.validation.checks import PLATEAU
 from fdhil.validation.data_sheet import gain_error, scale_convention
 from fdhil.validation.signal_consistency import table_faults
+from fdhil.validation.table_assessment import TableAssessment
+from fdhil.validation.window_checks import (
+    FIT_CHECKS,
+    PLATEAU,
+    SIGNAL_CHECKS,
+    STUCK_SENSOR,
+    WEIGHED,
+    Findings,
+    run_checks,
+)
+from fdhil.validation.window_fit import WindowFit
+from fdhil.validation.window_signals import LEAST_SAMPLES, WindowSignals
 
-# what solvers raise; scipy's raise ValueError for what is not finite
+# errors of solvers; scipy's raise ValueError for values that are not finite
 GAVE_UP = (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError, ValueError)
-SAME_PITCH = 0.01  # to which a recording and the section of its axis agree
-OVERRIDE = 2.0  # by which their rapid speeds may differ: an override slows what is recorded
-NOTICED = 0.2  # of what a model may leave: with less left no resonance is sought
+SAME_PITCH = 0.01  # tolerance between a recording and its axis' section
+OVERRIDE = 2.0  # factor by which their rapid speeds may differ: an override slows the recorded move
+NOTICED = 0.2  # of the allowed residual: below, no resonance is searched for
 UNFIT = "NotFinite"
-KEPT_FITS = 12  # of the newest windows: a recording's rapids, or those that tell of a drive's loops
+KEPT_FITS = 12  # of the newest windows: a recording's rapids, or those that identify a drive's loops
 LAG_ROWS = 0.75  # a speed that is a difference of positions is half a row late
 
 
 def analyse(
     window: Window, settings: Identification, axis: Axis | None = None, sync_period_s: float | None = None
 ) -> WindowOutcome:
-    """Return what one window says of the drive, and whether it is believed; never raises, whatever the data.
+    """Return the estimate and verdict of one window; never raises, whatever the data.
 
-    The speed is brought to the instants of its rows first; the outcome's window is as it was recorded. With the
-    ``axis``' section the rapid is replayed through the closed loop, whose set-points come every ``sync_period_s``
-    (left out: with every row).
+    The speed is aligned to its rows first; the outcome's window is as it was recorded. With the ``axis``' section the
+    rapid is replayed through the closed loop, whose set-points come every ``sync_period_s`` (default: every row).
     """
     axis = own(window, axis)
-    at_instants, cycles = with_demand_on_time(mended(window, settings.speed_source), axis, sync_period_s)
-    signals = Evidence(at_instants, settings, axis=axis, sync_period_s=sync_period_s, recorded=window)
+    aligned, cycles = with_demand_on_time(mended(window, settings.speed_source), axis, sync_period_s)
+    signals = WindowSignals(aligned, settings, axis, sync_period_s, recorded=window)
     outcome = replace(_with_table(_analysed(signals), signals), window=window)
     return _with_lead(outcome, cycles) if cycles else outcome
 
 
 def _with_lead(outcome: WindowOutcome, cycles: int) -> WindowOutcome:
-    """Return the outcome with the lead of the recorded set-point as a warning."""
-    text = f"the recorded set-point is {cycles} cycles ahead of the one that the drive follows, and was taken later"
-    reason = Reason("SampleTiming", text, "record the drive's own set-point, or leave it: nothing else depends on it")
+    text = f"the recorded set-point is {cycles} cycles ahead of the one that the drive follows, and was delayed by that"
+    reason = Reason("SampleTiming", text, "record the drive's own set-point, or ignore this: it has no other effect")
     verdict = replace(outcome.verdict, warnings=(*outcome.verdict.warnings, reason))
     return replace(outcome, verdict=verdict)
 
 
-def _with_table(outcome: WindowOutcome, signals: Evidence) -> WindowOutcome:
-    """Return the outcome with what sensors at the table show: its true error, and a resonance.
+def _with_table(outcome: WindowOutcome, signals: WindowSignals) -> WindowOutcome:
+    """Return the outcome with the results of sensors at the table: the true error, and a resonance.
 
-    That takes the place of a configured one, or of one that the motor shows, and the window is analysed with it. A
-    sensor that does not move as the motor does is left out, with a warning.
+    Such a resonance replaces a configured one, or one seen by the motor, and the window is analysed with it. A sensor
+    that does not move as the motor does is left out, with a warning.
     """
     window, estimate, axis = signals.window, outcome.estimate, signals.axis
     if estimate is None or (window.table_mm is None and window.table_m_s2 is None):
         return outcome
     with np.errstate(over="ignore", invalid="ignore"):
-        faults = table_faults(window, signals.moving)
+        faults = table_faults(window, signals.motion_range)
     if faults:
         place = None if "table_mm" in faults else window.table_mm
         rate = None if "table_m_s2" in faults else window.table_m_s2
@@ -79,7 +87,7 @@ def _with_table(outcome: WindowOutcome, signals: Evidence) -> WindowOutcome:
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             found = compliance(window, estimate.parameters())
-    except GAVE_UP:  # signals that no table has
+    except GAVE_UP:  # signals that are no table's motion
         found = None
     if found is not None:
         if axis is not None:
@@ -91,64 +99,67 @@ def _with_table(outcome: WindowOutcome, signals: Evidence) -> WindowOutcome:
     return outcome if seen is None else replace(outcome, at_table=seen)
 
 
-def _analysed(signals: Evidence) -> WindowOutcome:
+def _analysed(signals: WindowSignals) -> WindowOutcome:
     window, settings = signals.window, signals.settings
-    found = ask(BEFORE_ANY_FIT, signals, {})
-    reasons = _listed(found)
-    if window.n < LEAST_ROWS or any(reason.code == UNFIT for reason in reasons):
-        return _outcome(replace(signals, estimate=_none(settings, Result.NOT_FINITE, reasons[0])), found)
+    found = run_checks(SIGNAL_CHECKS, signals, {})
+    reasons = [reason for each in found.values() for reason in each]
+    if window.n < LEAST_SAMPLES or any(reason.code == UNFIT for reason in reasons):
+        return _outcome(TableAssessment(WindowFit(signals, _none(settings, Result.NOT_FINITE, reasons[0]))), found)
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            evidence = estimated(signals)
-            return _outcome(evidence, ask(OF_THE_FIT, evidence, found))
+            fitted = estimated(signals)
+            table = TableAssessment(fitted)
+            return _outcome(table, run_checks(FIT_CHECKS, table, found))
     except GAVE_UP as error:
-        reason = gave_up(error, "look at the window's signals")
-        # what each sensor's own rows tell holds all the same
-        found = ask(OF_THE_FIT[:1], signals, {**found, "solver": [reason]})
-        return _outcome(replace(signals, estimate=_none(settings, Result.DIVERGED, reason)), found)
+        reason = gave_up(error, "inspect the window's signals")
+        # the checks of each sensor's own rows remain valid
+        found = {**found, "solver": [reason]}
+        found = run_checks((STUCK_SENSOR,), TableAssessment(WindowFit(signals)), found)
+        return _outcome(TableAssessment(WindowFit(signals, _none(settings, Result.DIVERGED, reason))), found)
 
 
 def own(window: Window, axis: Axis | None) -> Axis | None:
-    """Return the axis' section if it may be that of the window: of another machine's regulators nothing is known."""
+    """Return the axis' section if it can be that of the window: the regulators of another machine are unknown."""
     if axis is None:
         return None
     pitch, rapid = window.pitch_mm / axis.screw_pitch_mm, window.rapid_speed_rad_s / axis.rapid_speed_rad_s
     return axis if abs(pitch - 1.0) < SAME_PITCH and 1.0 / OVERRIDE <= rapid <= OVERRIDE else None
 
 
-def estimated(signals: Evidence) -> Evidence:
-    """Return the evidence with the estimate by the method asked for, and the fit that is judged.
+def estimated(signals: WindowSignals) -> WindowFit:
+    """Return the estimate by the configured method, with the fit that is checked.
 
     Without a voltage [2] alone is fitted, with the torque constant of the recording or of the axis: there is no fit of
     both equations.
     """
     window, settings, axis = signals.window, signals.settings, signals.axis
-    if window.voltage_v is None and window.slow_voltage is None:
+    if not signals.has_voltage:
+        torque = fit_torque(window, settings)
         known = {} if axis is None else {"R": axis.nominal.R, "L": axis.nominal.L, "K": axis.nominal.K}
-        return replace(signals, estimate=told(window, signals.torque, known))
+        return WindowFit(signals, told(window, torque, known), torque=torque)
     name, estimator = chosen(settings)
     fit = _fitted(window, settings)
     if fit is not None and axis is not None:
         fit = maximum_likelihood.with_loops(fit, window, settings, axis, signals.sync_period_s)
     if name == maximum_likelihood.NAME and fit is not None:
-        return _with_spring(replace(signals, estimate=maximum_likelihood.finish(fit), fit=fit))
-    return replace(signals, estimate=estimator([window], settings), fit=fit)
+        return _with_spring(WindowFit(signals, maximum_likelihood.finish(fit), fit))
+    return WindowFit(signals, estimator([window], settings), fit)
 
 
 @lru_cache(maxsize=KEPT_FITS)
 def _fitted(window: Window, settings: Identification) -> Fit | None:
-    """Return the fit of a window, which holds for each section of the axis that it is analysed with."""
+    """Return the fit of a window, the same for each section of the axis with which it is analysed."""
     return maximum_likelihood.fit_windows([window], settings)
 
 
-def _with_spring(stiff: Evidence) -> Evidence:
-    """Return the evidence with a spring between motor and table, where there is one that explains the rapid as well.
+def _with_spring(stiff: WindowFit) -> WindowFit:
+    """Return the fit with a spring between motor and table, if one explains the rapid as well.
 
-    One that nobody told is sought where no regulators are known; else replays of rapids find it, better than one
-    window's speed.
+    An unconfigured one is searched for only where the regulators are unknown; else replays of rapids find it, better
+    than one window's speed.
     """
     assert stiff.fit is not None
-    axis, weight = stiff.axis, stiff.weight
+    axis, weight = stiff.signals.axis, TableAssessment(stiff).budget
     if weight is None or (axis is not None and axis.resonance_hz is None):
         return stiff
     if axis is None and weight.unexplained_um < NOTICED * weight.limit_um:
@@ -156,63 +167,49 @@ def _with_spring(stiff: Evidence) -> Evidence:
     found = sprung(stiff.fit, axis)
     if found is None:
         return stiff
-    soft = replace(stiff, estimate=maximum_likelihood.finish(found), fit=found)
-    left = math.inf if soft.weight is None else soft.weight.unexplained_um
+    soft = WindowFit(stiff.signals, maximum_likelihood.finish(found), found)
+    budget = TableAssessment(soft).budget
+    left = math.inf if budget is None else budget.unexplained_um
     return soft if left < max(weight.limit_um, weight.unexplained_um) else stiff
 
 
 def gave_up(error: BaseException, advice: str) -> Reason:
-    """Return the reason of a solver that ended with an error."""
-    return Reason("SolverFailed", f"the solver gave up ({error})", advice)
+    """Return the reason of a solver that failed with an error."""
+    return Reason("SolverFailed", f"the solver failed ({error})", advice)
 
 
 def _none(settings: Identification, result: Result, reason: Reason) -> Estimate:
     return empty_estimate(chosen(settings)[0], result, reason)
 
 
-def _listed(found: Findings) -> tuple[Reason, ...]:
-    return tuple(reason for reasons in found.values() for reason in reasons)
-
-
 def _speed_lag(window: Window) -> Reason | None:
-    """Return by how much the speed was moved to agree with the position, where a position that is early may be why."""
     late = window.speed_late_s
     if late is None or late < LAG_ROWS * window.dt_s:
         return None
-    text = f"speed was taken {1e3 * late:.2f} ms earlier to agree with the position, or the position is early by that"
+    text = f"speed was shifted {1e3 * late:.2f} ms earlier to match the position, unless the position is early by that"
     return Reason("SampleTiming", text, "take speed and position from one SYNC, or set [identification] speed_source")
 
 
-def _convention(evidence: Evidence) -> list[Reason]:
-    """Return how the drive scales current and voltage, where the data sheet shows that it is not as the model's."""
-    if evidence.axis is None or evidence.estimate is None or evidence.estimate.missing:
-        return []
-    found = scale_convention(evidence.estimate, Parameters(**evidence.axis.nominal.model_dump()))
-    return [] if found is None else [found]
-
-
-def _gain(evidence: Evidence) -> Iterator[Reason]:
-    """Yield the signal whose gain may be why the configured loops do not explain the rapid."""
-    if evidence.axis is not None and evidence.estimate is not None:
-        found = gain_error(evidence.estimate, Parameters(**evidence.axis.nominal.model_dump()))
-        if found is not None:
-            yield found
-
-
-def _outcome(evidence: Evidence, found: Findings) -> WindowOutcome:
-    """Return the verdict: what is weighed refuses only where it does harm at the table, and warns else."""
-    weight = evidence.weight
+def _outcome(table: TableAssessment, found: Findings) -> WindowOutcome:
+    """Return the verdict: weighed findings refuse only if they do harm at the table, and warn else."""
+    weight, fitted = table.budget, table.fitted
+    axis, estimate = table.signals.axis, fitted.estimate
+    nominal = None if axis is None else Parameters(**axis.nominal.model_dump())
     names = WEIGHED | {PLATEAU} if weight is not None and weight.through == "replay" else WEIGHED
-    weighed = [r for name, told in found.items() if name in names for r in told]
-    reasons = [r for name, told in found.items() if name not in names for r in told]
-    # through ordinary loops only a share is known: what has a name says more
+    weighed = [r for name, each in found.items() if name in names for r in each]
+    reasons = [r for name, each in found.items() if name not in names for r in each]
+    # an ordinary loop gives only a share: named reasons are more specific
     if weight is not None and not weight.believed and (weight.in_um or not (reasons or weighed)):
-        reasons += [weight.reason(), *_gain(evidence)]
-    if not evidence.harmless:
+        reasons.append(weight.reason())
+        if nominal is not None and estimate is not None and (gain := gain_error(estimate, nominal)) is not None:
+            reasons.append(gain)
+    if not table.is_harmless:
         reasons, weighed = [*reasons, *weighed], []
-    if reasons and (lag := _speed_lag(evidence.window)) is not None:
+    if reasons and (lag := _speed_lag(fitted.window)) is not None:
         reasons.append(lag)
-    reasons += _convention(evidence)
+    if nominal is not None and estimate is not None and not estimate.missing:
+        scale = scale_convention(estimate, nominal)
+        reasons += [] if scale is None else [scale]
     unexplained = weight.unexplained_um if weight is not None and weight.in_um else None
-    verdict = Verdict(not reasons, evidence.fit_percent, tuple(reasons), unexplained, tuple(weighed))
-    return WindowOutcome(evidence.window, evidence.told, verdict)
+    verdict = Verdict(not reasons, fitted.fit_percent, tuple(reasons), unexplained, tuple(weighed))
+    return WindowOutcome(fitted.window, fitted.widened_estimate, verdict)

@@ -1,8 +1,8 @@
-"""Carries the samples of one axis to outcomes: what is cut, held back, pooled, published, judged.
+"""Processes the samples of one axis: extracts windows, analyses, tracks drift, pools, publishes, assesses the model.
 
-:class:`AxisPipeline` keeps the recent samples, cuts a window when a rapid move is over, has it analysed,
-holds back what jumped, pools the accepted windows, publishes a parameter set when the pool is validated, and judges the
-closed-loop model by every recorded move. A replayed window takes the very same way (``feed(window)``).
+:class:`AxisPipeline` keeps the recent samples, extracts a window of each completed rapid, has it analysed, holds back
+windows with a parameter jump, pools the accepted ones, publishes a parameter set when the pool is validated, and
+compares the closed-loop model with every recorded move. A replayed window is processed alike (``feed(window)``).
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from fdhil.config import Identification, MachineConfig
+from fdhil.config import MachineConfig
 from fdhil.identification.between import HISTORY, Member
 from fdhil.identification.drift import LEAST_JUMP, DriftTracker, Point
 from fdhil.identification.pooling import change_covariance, member
 from fdhil.identification.windows import find_windows
-from fdhil.pipeline.own_loops import OwnLoops
-from fdhil.pipeline.pooling import one_sided, refuses_the_model, together
+from fdhil.pipeline.identified_loops import OwnLoops
 from fdhil.pipeline.recent_samples import RecentSamples
+from fdhil.pipeline.validated_pool import one_sided, refuses_the_model, together
 from fdhil.prediction import skill
 from fdhil.records import (
     AxisSamples,
@@ -42,12 +42,12 @@ from fdhil.records import (
 )
 from fdhil.validation.data_sheet import gain_error
 
-RECENT_S = 30.0  # a rapid that is longer than this is cut short, and then refused for its missing stage
-LEAD_S = 0.25  # standstill wanted before a rapid
+RECENT_S = 30.0  # longer rapids are truncated, and then refused for a missing stage
+LEAD_S = 0.25  # standstill before a rapid
 SETTLE_S = 0.30  # after the demand has ended: the shaft comes to rest, and stays there for the window's margin
 VOLTAGE_PATIENCE_S = 1.0  # how much later than the drive's samples a separate sensor may deliver
-WAITING_RAPIDS = 300  # for their samples: one each 0.1 s; older ones' samples are no longer kept when they come
-POOL_WINDOWS = 4  # both directions twice: enough to tell viscous from dry friction, few enough to follow drift
+WAITING_RAPIDS = 300  # one each 0.1 s; the samples of older ones are dropped before a voltage could arrive
+POOL_WINDOWS = 4  # both directions twice: enough to separate viscous from dry friction, few enough to follow drift
 
 JUMPS = {"LoadChanged", "ParameterJump"}
 
@@ -66,8 +66,10 @@ class _Rapid:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What the history knows of an axis: the first values in either direction, the newest published set, and the
-    newest accepted windows' estimates, for the tracker and for the pool, and the newest identified loops.
+    """The history of an axis: the first values in either direction, the newest published set, and more.
+
+    ``points`` and ``members`` are the newest accepted windows' estimates, for the tracker and for the pool; ``loops``
+    are the newest identified loops.
     """
 
     first: Mapping[int, Parameters] = field(default_factory=dict)
@@ -79,14 +81,12 @@ class Known:
 
 @dataclass(frozen=True, slots=True)
 class _Pooled:
-    """An accepted window, and what it tells a pool."""
-
     outcome: WindowOutcome
     member: Member
 
 
 def newest(found: Sequence[_Pooled]) -> list[_Pooled]:
-    """Return the newest windows, and so many older ones that either direction is there twice where it can be."""
+    """Return the newest windows, and as many older ones as give each direction two, where possible."""
     kept = set(range(max(0, len(found) - POOL_WINDOWS), len(found)))
     for direction in (1, -1):
         its = [k for k, each in enumerate(found) if each.outcome.window.direction == direction]
@@ -95,7 +95,7 @@ def newest(found: Sequence[_Pooled]) -> list[_Pooled]:
 
 
 class AxisPipeline:
-    """Everything that is known of one axis, and what follows from the next record of it."""
+    """The state of one axis, and the outcomes of its next record."""
 
     def __init__(
         self,
@@ -105,13 +105,15 @@ class AxisPipeline:
         known: Known | None = None,
         with_skill: bool = True,
     ) -> None:
-        """``method`` names an estimator (None: the config's choice); ``known`` is where an earlier run left off.
+        """Start with the estimator ``method`` (None: the configured one), from the state ``known`` of an earlier run.
 
-        ``with_skill`` False leaves out what needs the axis' own section, for a recording of which none is known.
+        ``with_skill`` False omits what needs the axis' own section, for a recording of which none is known.
         """
         self.axis = axis
         self._config = config
-        self._settings = _settings(config, method)
+        self._settings = config.identification
+        if method is not None:
+            self._settings = config.identification.model_copy(update={"method": method})
         self._period_s = config.machine.sync_period_s
         known = known or Known()
         self._recent = RecentSamples(axis, config.axis[axis], self._ticks(RECENT_S), self._period_s)
@@ -125,11 +127,11 @@ class AxisPipeline:
         self._tracker.resume(known.first, known.points)
         self._history: deque[Member] = deque(_since_jump(known), maxlen=HISTORY)
         self._with_skill = with_skill
-        # else the axis' section is made up
+        # without it the axis' section is invented
         self._loops = OwnLoops(config.axis[axis] if with_skill else None, self._settings, self._period_s, known.loops)
         self._gain_suspected = False
         self._place = self._history[-1].place if self._history else 0
-        self._withheld: tuple[str, ...] = ()  # why the newest pool was not published: told once
+        self._withheld: tuple[str, ...] = ()  # why the newest pool was not published: reported once
 
     @property
     def published(self) -> ParameterSet | None:
@@ -140,7 +142,7 @@ class AxisPipeline:
         return round(seconds / self._period_s)
 
     def feed(self, record: Record) -> list[Outcome]:
-        """Take one record and return what follows from it; a record of another axis is ignored."""
+        """Process one record and return its outcomes; a record of another axis is ignored."""
         if isinstance(record, TickTimes):
             self._recent.add(record)
             return self._cut_what_is_over()
@@ -160,7 +162,7 @@ class AxisPipeline:
 
     def _note_grid(self, samples: AxisSamples) -> None:
         newest = self._recent.newest_tick
-        if newest is not None and samples.tick[0] <= newest:  # the SYNC count began anew
+        if newest is not None and samples.tick[0] <= newest:  # the SYNC count was restarted
             self._recent.clear()
             self._rapids.clear()
 
@@ -190,7 +192,7 @@ class AxisPipeline:
         return not (self._recent.separate_voltage and patient and not self._recent.voltage_reaches(last))
 
     def _cut(self, rapid: _Rapid) -> list[Window]:
-        """Return the window of a rapid that is over; none when the shaft never came near the rapid speed."""
+        """Return the window of a completed rapid; none if the shaft never came near the rapid speed."""
         newest = self._recent.newest_tick
         assert newest is not None
         end = newest if rapid.end is None else rapid.end
@@ -200,7 +202,7 @@ class AxisPipeline:
             temperature_c=None if self._temperature is None else self._temperature.celsius,
             source=rapid.source,
         )
-        # the neighbours of a rapid may reach into what is cut; they have their own
+        # neighbouring rapids may reach into the recording; they have windows of their own
         windows = [w for w in find_windows(recording) if rapid.start <= w.start_tick + w.n // 2 <= end]
         return [replace(w, nc=rapid.nc) for w in windows]
 
@@ -210,7 +212,7 @@ class AxisPipeline:
         outcomes: list[Outcome] = [outcome] if loops is None else [outcome, loops]
         if refuses_the_model(outcome):
             self._refused[window.direction] = outcome
-        # a correction needs all six: what a slow voltage leaves open keeps the older set in use
+        # a correction needs all six: with undetermined values the previous set stays in use
         if outcome.verdict.accepted and outcome.estimate is not None and not outcome.estimate.missing:
             self._refused.pop(window.direction, None)
             notices = self._track(outcome, outcome.estimate)
@@ -221,7 +223,7 @@ class AxisPipeline:
         return [*outcomes, judged] if judged else outcomes
 
     def _track(self, outcome: WindowOutcome, estimate: Estimate) -> list[Notice]:
-        """Hold a window back that jumped; once further ones agree with it they are the new pool."""
+        """Hold back a window with a parameter jump; once further ones agree with it they are the new pool."""
         window = outcome.window
         self._place += 1
         found = _Pooled(outcome, member(window, estimate, self._place))
@@ -241,7 +243,7 @@ class AxisPipeline:
         return notices
 
     def _publish(self, window: Window) -> list[Outcome]:
-        """Publish what the pool says; windows that no longer agree with the newest leave it, the oldest first."""
+        """Publish the pool's estimate; windows that no longer agree with the newest leave it, the oldest first."""
         estimate, verdict = self._pooled()
         while not verdict.accepted and len(self._pool) > 1 and not one_sided(self._judged()):
             self._pool.pop(0)
@@ -249,7 +251,8 @@ class AxisPipeline:
                 self._history.popleft()
             estimate, verdict = self._pooled()
         if estimate is None or not verdict.accepted:
-            text = "the pool of the newest windows is not believed (" + _listed(verdict) + "), the older set stays"
+            why = "; ".join(str(reason) for reason in verdict.reasons)
+            text = f"the newest pool is not accepted ({why}), the previous set stays in use"
             codes = tuple(reason.code for reason in verdict.reasons)
             again, self._withheld = self._withheld == codes, codes
             return [] if again else [Notice("ValidationFailed", "minor", text, self.axis, window.start_tick)]
@@ -271,7 +274,7 @@ class AxisPipeline:
         return [self._published, *self._against_data_sheet(estimate, window.start_tick)]
 
     def _judged(self) -> list[WindowOutcome]:
-        """Return the windows that the pool is judged by: its own, and one of a direction whose moves are refused."""
+        """Return the windows that decide on the pool: its own, and one of a direction whose moves are refused."""
         return [*(found.outcome for found in self._pool), *self._refused.values()]
 
     def _pooled(self) -> tuple[Estimate | None, Verdict]:
@@ -279,8 +282,8 @@ class AxisPipeline:
         return together(self._judged(), members, tuple(self._history), self._settings)
 
     def _against_data_sheet(self, estimate: Estimate, tick: int) -> list[Notice]:
-        """Tell once, and again after it was gone, that only a sensor's gain explains how the set is off nominal."""
-        if not self._with_skill:  # the axis' section is made up
+        """Report, when it first appears, that only a sensor's gain explains the offset from the nominal values."""
+        if not self._with_skill:  # the axis' section is invented
             return []
         nominal = Parameters(**self._config.axis[self.axis].nominal.model_dump())
         reason, before = gain_error(estimate, nominal), self._gain_suspected
@@ -290,7 +293,6 @@ class AxisPipeline:
         return [Notice(reason.code, "minor", f"{reason.text}; {reason.advice}", self.axis, tick)]
 
     def _judge(self, window: Window, published: ParameterSet | None) -> Skill | None:
-        """Compare the move with what the set that was valid before it predicts; None where that cannot be done."""
         if published is None or not self._with_skill:
             return None
         axis = self._loops.axis or self._config.axis[self.axis]
@@ -298,20 +300,12 @@ class AxisPipeline:
 
 
 def _since_jump(known: Known) -> Sequence[Member]:
-    """Return what the newest windows tell, from the last on that does not agree with the newest published set."""
+    """Return the newest windows after the last one that does not agree with the newest published set."""
     if known.newest is None:
         return known.members
     now = known.newest.parameters.as_dict()
-    for k, told in reversed(list(enumerate(known.members))):
-        values = dict(zip(told.names, told.values.tolist(), strict=True))
+    for k, each in reversed(list(enumerate(known.members))):
+        values = dict(zip(each.names, each.values.tolist(), strict=True))
         if any(abs(values[n] - now[n]) > LEAST_JUMP[n] * abs(now[n]) for n in ("R", "L", "K", "Jt") if n in values):
             return known.members[k + 1 :]
     return known.members
-
-
-def _listed(verdict: Verdict) -> str:
-    return "; ".join(str(reason) for reason in verdict.reasons)
-
-
-def _settings(config: MachineConfig, method: str | None) -> Identification:
-    return config.identification if method is None else config.identification.model_copy(update={"method": method})

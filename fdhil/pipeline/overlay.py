@@ -1,4 +1,4 @@
-"""Lays the model over a recorded rapid: what a replay of it finds, and what such a drive would have done."""
+"""Overlays the model on a recorded rapid: the outcome of a replay, and the motion of the modelled drive."""
 
 from __future__ import annotations
 
@@ -9,21 +9,23 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.identification.signals import mended
 from fdhil.pipeline.analysis import GAVE_UP, analyse, estimated, own
-from fdhil.pipeline.own_loops import OwnLoops
+from fdhil.pipeline.identified_loops import OwnLoops
 from fdhil.records import LoopEstimate, Result, Window, WindowOutcome
-from fdhil.validation.evidence import Evidence
 from fdhil.validation.replay import Replay, replay_window
 from fdhil.validation.simulation import Simulated, simulated
+from fdhil.validation.table_assessment import TableAssessment
+from fdhil.validation.window_signals import WindowSignals
 
 NO_MODEL = {Result.NOT_FINITE, Result.DIVERGED}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Overlay:
-    """A rapid with its model: ``outcome`` of a replay, and ``window``, whose speed is at the instants of its rows.
+    """A rapid with its model: ``outcome`` of a replay, and ``window`` with the speed aligned to its rows.
 
-    ``driven`` is the drive under the measured voltage, of which the share of the speed that is explained is taken.
-    ``followed`` is the closed loop along the demand, of which what is left at the table is. None: it cannot be run.
+    ``driven`` is the drive simulated from the measured voltage, the basis of the explained share of the speed.
+    ``followed`` is the closed loop along the demand, the basis of the residual at the table. None: it cannot be
+    simulated.
     """
 
     window: Window
@@ -33,25 +35,25 @@ class Overlay:
 
 
 def lay_over(window: Window, config: MachineConfig, loops: LoopEstimate | None = None) -> Overlay:
-    """Analyse a window as the daemon would now, and run what was found; never raises, whatever the data.
+    """Analyse a window as the daemon would now, and simulate the result; never raises, whatever the data.
 
-    ``loops`` are the newest that the history has of the axis' own.
+    ``loops`` are the newest identified ones of the axis in the history.
     """
     settings, period_s = config.identification, config.machine.sync_period_s
     section = OwnLoops(config.axis.get(window.axis), settings, period_s, loops).axis
     outcome = analyse(window, settings, section, period_s)
-    at_instants, axis = mended(window, settings.speed_source), own(window, section)
-    bare = Overlay(at_instants, outcome)
+    aligned, axis = mended(window, settings.speed_source), own(window, section)
+    bare = Overlay(aligned, outcome)
     if outcome.estimate is None or outcome.estimate.result in NO_MODEL:
         return bare
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            found = estimated(Evidence(at_instants, settings, axis=axis, sync_period_s=period_s, recorded=window))
+            found = estimated(WindowSignals(aligned, settings, axis, period_s, recorded=window))
             assert found.estimate is not None
-            driven = simulated(at_instants, found.estimate, found.fit)
+            driven = simulated(aligned, found.estimate, found.fit)
             followed = None
-            if axis is not None and found.parameters is not None and found.weight is not None:  # else it cannot be run
-                followed = replay_window(at_instants, found.parameters, axis, period_s)
+            if axis is not None and found.parameters is not None and TableAssessment(found).budget is not None:
+                followed = replay_window(aligned, found.parameters, axis, period_s)
     except GAVE_UP:
         return bare
     return replace(bare, driven=driven, followed=followed)

@@ -1,8 +1,8 @@
-"""Keeps the recent samples of one axis on the SYNC grid, and cuts a stretch of them.
+"""Keeps the recent samples of one axis on the SYNC grid, and extracts recordings from them.
 
-Pure: nothing here knows a clock. A lost sample stays NaN, and a separate sensor's voltage is placed by the offset
-between its own count and the SYNC count, never by single arrival times. Rows are copied once, from the blocks that
-came over the bus to the stretch that is cut; its windows are views of it.
+Pure: no clock is read. A lost sample stays NaN, and a separate sensor's voltage is placed by the offset between its own
+count and the SYNC count, never by single arrival times. Rows are copied once, from the received blocks to the
+recording; its windows are views of it.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from fdhil.records import (
     read_only,
 )
 
-PLACING_BLOCKS = 40  # some 2 s of a sensor that is asked every 50 ms
+PLACING_BLOCKS = 40  # some 2 s of a sensor that is polled every 50 ms
 CLOCK_TOLERANCE = 500e-6  # two quartz clocks
-LEAST_FOR_RATE = 100  # samples from which the sensor's own rate is believed
+LEAST_FOR_RATE = 100  # samples from which the sensor's own rate is used
 MOST_LATE = 0.499  # of a period: the samples keep their order
-RATE_TOLERANCE = 0.01  # a sensor's rate may be off a multiple of the SYNC rate by this much
+RATE_TOLERANCE = 0.01  # tolerance of a sensor's rate to a multiple of the SYNC rate
 
 Block = TypeVar("Block")
 
@@ -65,7 +65,7 @@ class RecentSamples:
         return int(self._samples[-1].tick[-1]) if self._samples else None
 
     def clear(self) -> None:
-        """Forget everything: the SYNC count began anew."""
+        """Discard everything: the SYNC count was restarted."""
         self._first_tick = None
         self._samples.clear()
         self._voltage.clear()
@@ -73,7 +73,7 @@ class RecentSamples:
         self._table.clear()
 
     def add(self, block: AxisSamples | VoltageSamples | TableSamples | TickTimes) -> None:
-        """Append a block and let go what is older than the capacity; an empty block is nothing."""
+        """Append a block and drop what is older than the capacity; an empty block is ignored."""
         if isinstance(block, TableSamples):
             self._table.add(block)
             return
@@ -95,10 +95,10 @@ class RecentSamples:
         return place is not None and int(self._voltage[-1].counter[-1]) >= place.counter_of(tick + 1)
 
     def cut(self, start: int, stop: int) -> Recording:
-        """Return the ticks ``start`` .. ``stop`` - 1, or those since the first; what was never received is NaN.
+        """Return the ticks ``start`` .. ``stop`` - 1, or those since the first; samples never received are NaN.
 
         Row k of the voltage is the mean over the period that begins at tick k (or the instant, as the source samples);
-        its delay is what the placing on whole ticks left over.
+        its delay is the residual of the alignment to whole ticks.
         """
         first = start if self._first_tick is None else self._first_tick
         start = max(start, first)
@@ -144,9 +144,9 @@ class RecentSamples:
         return self._period_ns * 1e-9 * self._voltage[-1].sample_rate_hz
 
     def _begins(self, spare_ns: float = 0.0) -> tuple[Int, Float] | None:
-        """Return count and begin (ticks) of the newest samples, looked up among the SYNC's arrivals; None without any.
+        """Return count and begin (ticks) of the newest samples, interpolated in the SYNC's arrivals; None without any.
 
-        The newest blocks alone are used: two clocks that drift apart move by less than 0.1 sample in that time.
+        Only the newest blocks are used: two clocks that drift apart differ by less than 0.1 sample in that time.
         """
         if not self._voltage or not self._times:
             return None
@@ -159,11 +159,11 @@ class RecentSamples:
         return (counter[inside], np.interp(begins_ns[inside], tick_ns, tick)) if inside.any() else None
 
     def _slow_line(self) -> tuple[float, float] | None:
-        """Return begin (ticks) of sample 0 and ticks per sample, as the newest blocks and the SYNC's arrivals show."""
-        told = self._begins()
-        if told is None:
+        """Return begin (ticks) of sample 0 and ticks per sample, by the newest blocks and the SYNC's arrivals."""
+        located = self._begins()
+        if located is None:
             return None
-        counter, begins = told
+        counter, begins = located
         nominal = 1 / self._samples_per_tick()
         spread = counter - counter.mean()
         power = float(spread @ spread)
@@ -172,7 +172,7 @@ class RecentSamples:
         return float(np.median(begins - slope * counter)), slope
 
     def _slow(self, start: int, n: int) -> SlowVoltage | None:
-        """Return the sensor's samples that lie wholly between the ticks, on its own grid; None without any."""
+        """Return the sensor's samples that lie entirely between the ticks, on its own grid; None without any."""
         line = self._slow_line()
         if line is None:
             return None
@@ -203,18 +203,18 @@ class RecentSamples:
         return values.reshape(-1, place.ratio).mean(axis=1), place.delay_s
 
     def _placing(self) -> _Placing | None:
-        """Return the sensor's place on the grid; None while it is not known or its rate is no multiple of SYNC's.
+        """Return the sensor's alignment to the grid; None while it is unknown or its rate is no multiple of SYNC's.
 
-        The median of what each sample begins ahead of its tick decides.
+        It is the median of the samples' lead over their ticks.
         """
         samples = self._samples_per_tick() if self._voltage else 0.0
         ratio = round(samples)
         if ratio < 1 or abs(samples / ratio - 1) > RATE_TOLERANCE:
             return None
-        told = self._begins(self._period_ns)
-        if told is None:
+        located = self._begins(self._period_ns)
+        if located is None:
             return None
-        counter, begins = told
+        counter, begins = located
         ahead = float(np.median(counter - ratio * begins))
         offset = round(ahead)
         return _Placing(ratio, offset, (ahead - offset) / ratio * self._period_ns * 1e-9)
@@ -222,26 +222,24 @@ class RecentSamples:
 
 @dataclass(frozen=True, slots=True)
 class _Placing:
-    """Sensor sample ``offset`` + ``ratio`` * k begins with tick k, but that the voltage is late by ``delay_s``."""
+    """Sensor sample ``offset`` + ``ratio`` * k begins with tick k, except that the voltage is late by ``delay_s``."""
 
     ratio: int
     offset: int
     delay_s: float
 
     def counter_of(self, tick: int) -> int:
-        """Return the sensor's count at a tick."""
         return self.offset + self.ratio * tick
 
 
 def _append(queue: deque[Block], block: Block, at: Callable[[Block], Int], reach: float) -> None:
-    """Append a block, and let go those whose last row is more than ``reach`` before its own."""
     queue.append(block)
     while at(block)[-1] - at(queue[0])[-1] > reach:
         queue.popleft()
 
 
 def _placed(parts: Iterable[tuple[Int, Float]], first: int, n: int) -> Float:
-    """Return the values (n,) of ``parts``, each with its counts, from the count ``first`` on; NaN where none is."""
+    """Return the values (n,) of ``parts``, each with its counts, from the count ``first`` on; NaN without a value."""
     values = np.full(n, np.nan)
     for counts, part in parts:
         row = counts - first

@@ -1,4 +1,4 @@
-"""Predicts the path error that the closed loops leave: axis errors, contour error, zones; and judges how well."""
+"""Predicts the path error of the closed loops: axis errors, contour error, zones, and the model's own skill."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Advises feeds: where a path leaves a tolerance, why, and the highest feed of each stretch at which it would not."""
+"""Advises feeds: where a path leaves a tolerance, why, and the highest feed of each segment that keeps it."""
 
 from __future__ import annotations
 
@@ -8,21 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.prediction.feed_refinement import raised_alone
-from fdhil.prediction.feeds import Feeds, Judge, Source, highest, stretches, worst_rows
+from fdhil.prediction.feed_search import Feeds, Judge, Source, highest, raised_alone, stretches, worst_rows
 from fdhil.prediction.inverse_dynamics import required
 from fdhil.prediction.predict import contour_um, predict
 from fdhil.records import Float, Int, Parameters, Prediction, Zone
 
-ALONG_MM = 1e-9  # a row that moves less has no direction
+ALONG_MM = 1e-9  # rows that move less have no direction
 
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """The highest ``share`` of the feed that keeps a stretch within the tolerance; None where none that was tried does.
+    """The highest ``share`` of the feed that keeps a segment within the tolerance; None if no tried share does.
 
-    ``left_um`` is its largest error at ``tried``: at ``share``, or at the lowest that was tried. ``run`` is the share
-    at which it was run when the others were found to hold.
+    ``left_um`` is its largest error at ``tried``: at ``share``, or at the lowest tried share. ``run`` is the share used
+    while the other segments were searched.
     """
 
     share: float | None
@@ -33,10 +32,10 @@ class Held:
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """One stretch that leaves the tolerance: its error as programmed, where and why, and the feeds that keep it.
+    """One segment that leaves the tolerance: its error as programmed, where and why, and the feeds that keep it.
 
-    ``line`` 0: a recorded demand, from ``start_s`` to ``end_s``. ``axis`` is off the path most. ``load``: (axis,
-    "current" or "voltage", share of its limit) of what the stretch asks most of. ``corrected`` None: not tried.
+    ``line`` 0: a recorded demand, from ``start_s`` to ``end_s``. ``axis`` has the largest error across the path.
+    ``load``: (axis, "current" or "voltage", share of its limit) of the largest demand. ``corrected`` None: not tried.
     """
 
     line: int
@@ -59,11 +58,10 @@ def advise(
     tolerance_um: float,
     corrected: Judge | None = None,
 ) -> tuple[Advice, ...]:
-    """Return one advice per stretch whose contour error exceeds ``tolerance_um``, as programmed or when its neighbours
-    are slowed, in the order of the path.
+    """Return one advice per segment whose contour error exceeds ``tolerance_um``, in the order of the path.
 
-    ``corrected`` judges a reference with its correction. The feeds hold together: the path with every stretch at its
-    own was predicted as a whole.
+    Segments that exceed it only once their neighbours are slowed are included. ``corrected`` predicts a reference with
+    its correction. The feeds are valid together: the path with every segment at its own was predicted as a whole.
     """
     reference = source.at({})
     prediction = predict(reference, models, config, zones_above_um=tolerance_um)
@@ -115,13 +113,12 @@ def _held(feeds: Feeds, stretch: int) -> Held:
 
 
 def _zone(prediction: Prediction, row: int) -> Zone | None:
-    """Return the zone around a row, or the one next to it: the shortest ones are left out."""
+    """Return the zone around a row, or the nearest one: the shortest zones are left out."""
     time = float(prediction.reference.time_s[row])
     return min(prediction.zones, key=lambda z: max(z.start_s - time, time - z.end_s), default=None)
 
 
 def _off(prediction: Prediction, row: int) -> str:
-    """Return the axis whose error across the path is the largest at a row."""
     reference = prediction.reference
     error = np.array([prediction.error_um[axis][row] for axis in reference.axes])
     first, last = max(row - 1, 0), min(row + 1, reference.time_s.size - 1)
@@ -132,7 +129,6 @@ def _off(prediction: Prediction, row: int) -> str:
 
 
 def _load(loads: Mapping[str, tuple[Float, Float]], rows: Int) -> tuple[str, str, float]:
-    """Return what some rows ask most of, as a share of its limit."""
     return max(
         (
             (axis, what, float(shares[rows].max()))

@@ -14,7 +14,7 @@ from fdhil.errors import RecordingError
 from fdhil.records import Float, frozen
 
 GRID = 720  # angles at which the runs are compared
-NEAR = 0.2  # of the radius: rows farther from the circle lead to it or away from it
+NEAR = 0.2  # of the radius: rows farther from the circle are lead-in or lead-out
 TURN = 2 * np.pi
 
 
@@ -28,7 +28,7 @@ class Circular:
 
     @property
     def deviations_um(self) -> tuple[float, float]:
-        """G of the counter-clockwise and of the clockwise run: what lies between its two concentric circles.
+        """G of the counter-clockwise and of the clockwise run: the distance between its two concentric circles.
 
         Their common centre is the least-squares centre of the run itself.
         """
@@ -37,7 +37,7 @@ class Circular:
 
     @property
     def both_um(self) -> float:
-        """G(b): what lies between two concentric circles around both runs."""
+        """G(b): the distance between two concentric circles around both runs."""
         return float(np.ptp(np.concatenate([self.counter_um, self.clockwise_um])))
 
     @property
@@ -55,15 +55,15 @@ class Circular:
 def evaluate(path_mm: Float, radius_mm: float, centre_mm: tuple[float, float] | None = None) -> Circular:
     """Evaluate a path (n, 2) that runs the circle in both directions, each for 360 degrees or more.
 
-    Of each run the middle 360 degrees count, so that starting and stopping do not. Without a centre it is the middle
-    of what the path covers. RecordingError when there are no two such runs.
+    The middle 360 degrees of each run count, so that starting and stopping do not. The default centre is the middle of
+    the path's extent. RecordingError without two such runs.
     """
     centre = (path_mm.min(axis=0) + path_mm.max(axis=0)) / 2 if centre_mm is None else np.asarray(centre_mm)
     away = path_mm - centre
     radius = np.hypot(*away.T)
     on = np.abs(radius - radius_mm) < NEAR * radius_mm
     if np.count_nonzero(on) < GRID // 8:
-        raise RecordingError(f"the path runs no circle of {radius_mm:g} mm radius; check the radius")
+        raise RecordingError(f"the path contains no circle of {radius_mm:g} mm radius; check the radius")
     angle, deviation_um = np.unwrap(np.arctan2(away[on, 1], away[on, 0])), (radius[on] - radius_mm) * 1e3
     turned = angle - angle[0]
     split = int(np.argmax(np.abs(turned)))
@@ -79,7 +79,6 @@ def evaluate(path_mm: Float, radius_mm: float, centre_mm: tuple[float, float] | 
 
 
 def _middle_turn(angle: Float, deviation_um: Float) -> Float:
-    """Return the deviation (GRID,) at equal angles over the middle 360 degrees of a run."""
     inside = np.abs(angle - (angle[0] + angle[-1]) / 2) <= TURN / 2
     at = np.mod(angle[inside], TURN)
     order = np.argsort(at, kind="stable")

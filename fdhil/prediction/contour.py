@@ -1,4 +1,4 @@
-"""Measures the contour error: how far the table is from the path, wherever along the path it should be."""
+"""Computes the contour error: the distance from the table to the path, whatever its position along the path."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def contour_error_um(reference_mm: Float, actual_mm: Float, dt_s: float, first: 
 
 
 def nearest_points_mm(reference_mm: Float, actual_mm: Float, dt_s: float, first: int) -> Float:
-    """Return the points (m, d) of the path (n, d) from which the contour error of the actual points (m, d) counts.
+    """Return the points (m, d) of the path (n, d) nearest to the actual points (m, d).
 
     The actual points belong to the rows of the reference from ``first`` on.
     """

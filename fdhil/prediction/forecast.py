@@ -1,4 +1,4 @@
-"""Forecasts a path's error from the parameters' history: when a zone leaves a tolerance, and what a step has cost."""
+"""Forecasts a path's error from the parameters' history: when a zone leaves a tolerance, and the cost of a step."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from fdhil.records import PARAMETERS, Float, Parameters, ParameterSet, Predictio
 
 BEYOND_CHANCE = 3.0  # standard deviations
 GROUPS: Mapping[str, tuple[str, ...]] = {"inertia": ("Jt",), "friction": ("ft", "Cd")}
-COMMON_UM = 0.01  # a step that costs less is not told
+COMMON_UM = 0.01  # steps that cost less are not reported
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A sudden change of an axis' inertia or friction, and what it costs on a path.
+    """A sudden change of an axis' inertia or friction, and its cost on a path.
 
     ``changed`` maps a symbol to (before, now). ``cost_um`` is the largest change of the contour error, + worse, at
     ``line`` (0: a demand) and ``where``; ``rms_um`` the change of the whole path's RMS.
@@ -39,10 +39,10 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class ZoneChange:
-    """The change of one zone since a program was last compared: its largest contour error ``before`` and ``now``, um.
+    """The change of one zone since the last comparison: its largest contour error ``before`` and ``now``, um.
 
-    ``by`` is what each parameter that changed did to it: (axis, symbol, um), the most first; putting one back alone
-    would undo so much. ``settings_um`` is what a changed configuration did, None where it is the same.
+    ``by`` is the effect of each changed parameter: (axis, symbol, um), the largest first; restoring it alone would undo
+    that much. ``settings_um`` is the effect of a changed configuration, None where it is the same.
     """
 
     line: int
@@ -57,9 +57,9 @@ class ZoneChange:
 
 @dataclass(frozen=True, slots=True)
 class Crossing:
-    """When a zone leaves the tolerance if the parameters go on as they did: days from the newest ones, 95 % interval.
+    """When a zone leaves the tolerance if the trends continue: days from the newest parameters, 95 % interval.
 
-    ``axis`` and ``parameter`` drive it most.
+    ``axis`` and ``parameter`` have the largest effect.
     """
 
     days: float
@@ -71,7 +71,7 @@ class Crossing:
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """The slope per day of each of an axis' parameters that has one, and over how many days it was seen."""
+    """The slope per day of each of an axis' parameters that has one, and the observed days."""
 
     slopes: Mapping[str, Slope]
     span_days: float
@@ -95,7 +95,7 @@ def _apart(before: ParameterSet, now: ParameterSet, k: int) -> bool:
 
 
 def last_step(sets: Sequence[ParameterSet]) -> int | None:
-    """Return the place, in an axis' sets (oldest first), of the last one before the newest step; None without one."""
+    """Return the index, in an axis' sets (oldest first), of the last one before the newest step; None without one."""
     for k in range(len(sets) - 2, -1, -1):
         if moved(sets[k], sets[k + 1]) and moved(sets[k], sets[-1]):
             return k
@@ -109,9 +109,9 @@ def step_costs(
     now: Mapping[str, ParameterSet],
     config: MachineConfig,
 ) -> tuple[Step, ...]:
-    """Return what each axis' inertia and friction cost since ``earlier``, dearest first.
+    """Return the cost of each axis' changes of inertia and friction since ``earlier``, the largest first.
 
-    Each is put back alone; ``models`` are those of ``prediction``, whose values ``now`` holds.
+    Each is restored alone; ``models`` are those of ``prediction``, whose values ``now`` holds.
     """
     reference = prediction.reference
     steps = []
@@ -150,10 +150,10 @@ def zone_changes(
     config: MachineConfig,
     same_settings: bool,
 ) -> tuple[ZoneChange, ...]:
-    """Return per zone what became of it since ``earlier`` parameters were used, the zones that are gone included.
+    """Return the change of each zone since ``earlier`` parameters were used, including zones that are gone.
 
-    ``std_um`` (n,) is of the present prediction; ``recorded`` are the zones as they were told then, each with its
-    standard deviation: where the configuration has changed since, they say what that did.
+    ``std_um`` (n,) is that of the present prediction; ``recorded`` are the zones as reported then, each with its
+    standard deviation: if the configuration has changed since, they show its effect.
     """
     reference = prediction.reference
     then = predict(reference, {**models, **earlier}, config)
@@ -170,9 +170,9 @@ def zone_changes(
         peak = rows.start + int(np.argmax(np.maximum(prediction.contour_um, then.contour_um)[rows]))
         now_um, before_um = float(prediction.contour_um[rows].max()), float(then.contour_um[rows].max())
         by = ((axis, name, now_um - float(other[rows].max())) for (axis, name), other in without.items())
-        told = [(other.max_um, std) for other, std in recorded if _meet(zone, other)]
-        settings_um = before_um - max(told)[0] if told and not same_settings else None
-        std_then = max(told)[1] if told else float(std_um[peak])
+        earlier_zones = [(other.max_um, std) for other, std in recorded if _meet(zone, other)]
+        settings_um = before_um - max(earlier_zones)[0] if earlier_zones and not same_settings else None
+        std_then = max(earlier_zones)[1] if earlier_zones else float(std_um[peak])
         change = ZoneChange(
             line=int(reference.line[peak]),
             where=zone.where,
@@ -192,26 +192,27 @@ def _meet(zone: Zone, other: Zone) -> bool:
 
 
 def course(sets: Sequence[ParameterSet], days: Float) -> Course:
-    """Return how an axis' parameters go on, from its sets published on ``days`` (n,): what came before the last step
-    says nothing of it, and what follows the temperature, where that is known, is no course in time.
+    """Return the trends of an axis' parameters, from its sets published on ``days`` (n,).
+
+    Sets before the last step are ignored, and a change that follows a known temperature is not a trend in time.
     """
     step = last_step(sets)
     first = 0 if step is None else step + 1
     newest = sets[first:]
     celsius = np.array([np.nan if s.temperature_c is None else s.temperature_c for s in newest], dtype=np.float64)
-    beside = celsius if np.isfinite(celsius).all() and np.ptp(celsius) > 0 else None
+    celsius_known = celsius if np.isfinite(celsius).all() and np.ptp(celsius) > 0 else None
     found = {}
     for k, name in enumerate(PARAMETERS):
         values = np.array([getattr(s.parameters, name) for s in newest])
         stds = np.array([np.sqrt(max(float(np.nan_to_num(s.covariance[k, k])), 0.0)) for s in newest])
-        line = slope(values, days[first:], stds if (stds > 0).all() else None, beside)
+        line = slope(values, days[first:], stds if (stds > 0).all() else None, celsius_known)
         if line is not None:
             found[name] = line
     return Course(found, float(np.ptp(days[first:])))
 
 
 def span_days(courses: Mapping[str, Course]) -> float:
-    """Return the days that every axis with a course has been watched; 0 without any."""
+    """Return the days that every axis with a trend has been observed; 0 without any."""
     return min((known.span_days for known in courses.values() if known.slopes), default=0.0)
 
 
@@ -222,9 +223,10 @@ def crossing(
     courses: Mapping[str, Course],
     tolerance_um: float,
 ) -> Crossing | None:
-    """Return when the zone's largest error crosses the tolerance, to first order; None where that is not foreseeable:
-    it falls, its slope may as well be nil, or the day is farther ahead than the history reaches. It must be within the
-    tolerance now.
+    """Return when the zone's largest error crosses the tolerance, to first order; None if that is not foreseeable.
+
+    It is not if the error falls, if its slope may as well be zero, or if the day is farther ahead than the history
+    reaches. The zone must be within the tolerance now.
     """
     rates: dict[tuple[str, str], float] = {}
     variance = 0.0

@@ -1,7 +1,7 @@
 """Predicts the gain of a correction, with its uncertainty.
 
-What the model leaves of its own correction is the model against itself. What it leaves of recorded moves that it was
-not identified on, a correction by it leaves too, in addition: no more is predicted than those moves show.
+The residual of the model's own correction compares the model with itself. A correction also leaves the model's residual
+of recorded moves that it was not identified on: no larger gain is predicted than those moves show.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Gain(NamedTuple):
 
     @property
     def at_least(self) -> float | None:
-        """By what factor the error is at least predicted to shrink; None when nothing better than 1 is known."""
+        """The least predicted factor by which the error shrinks; None unless more than 1 is known."""
         if self.half_um is None or self.after_um + self.half_um <= 0.0:
             return None
         factor = self.before_um / (self.after_um + self.half_um)
@@ -43,23 +43,23 @@ class Gain(NamedTuple):
 
     def __str__(self) -> str:
         if self.half_um is None:
-            return f"{self.after_um:.2f} um RMS by the model alone, how well it fits this machine is not known here"
-        return at_most(self.after_um, self.half_um)
+            return f"{self.after_um:.2f} um RMS by the model alone; its accuracy on this machine is unknown"
+        return format_upper_limit(self.after_um, self.half_um)
 
 
-def at_most(model_um: float, half_um: float) -> str:
-    """Return a predicted RMS as text: the end of its 95 % interval first, as it has no symmetric one.
+def format_upper_limit(model_um: float, half_um: float) -> str:
+    """Return a predicted RMS as text: the end of its 95 % interval first, as it is not symmetric.
 
-    >>> at_most(0.08, 1.6)
+    >>> format_upper_limit(0.08, 1.6)
     'at most 1.68 um RMS (95 %), 0.08 by the model'
     """
     return f"at most {model_um + half_um:.2f} um RMS (95 %), {model_um:.2f} by the model"
 
 
-def plus_minus(half: float, decimals: int = 1) -> str:
-    """Return half an interval as text; what the digits cannot show is said to be smaller than they.
+def format_half_interval(half: float, decimals: int = 1) -> str:
+    """Return half an interval as text; a value below its digits is shown as smaller than they.
 
-    >>> plus_minus(0.44), plus_minus(0.004)
+    >>> format_half_interval(0.44), format_half_interval(0.004)
     ('± 0.4', '± <0.1')
     """
     shown = f"{half:.{decimals}f}"
@@ -75,8 +75,8 @@ def gain(
 ) -> Gain:
     """Return the predicted gain of a correction.
 
-    ``covariances`` (6, 6), and ``held_out_um``, the RMS that the model leaves of moves that it was not identified on,
-    are per axis; where an axis that moves has no held-out moves the uncertainty is not known.
+    ``covariances`` (6, 6), and ``held_out_um``, the model's RMS residual of moves that it was not identified on, are
+    per axis; without held-out moves of a moving axis the uncertainty is unknown.
     """
     reference = planned.before.reference
     before_um, after_um = planned.before.rms_um, planned.after.rms_um
@@ -95,22 +95,22 @@ def moving_axes(reference: Trajectory) -> tuple[str, ...]:
 
 
 def with_held_out_um(after_um: float, left_um: float | None) -> float:
-    """Return the RMS (um) that a correction leaves with what held-out moves show; None: there are none."""
+    """Return the RMS (um) of a correction, including the residual of held-out moves; None: there are none."""
     return after_um if left_um is None else math.hypot(after_um, MARGIN * left_um)
 
 
 def worst_skill_um(skills: Mapping[str, Sequence[Skill]]) -> dict[str, float]:
-    """Return what the model left of the last recorded moves, RMS um, by the worst of each axis that has any."""
+    """Return the model's RMS residual of the last recorded moves, um, the worst of each axis that has any."""
     return {axis: float(np.max([skill.rms_um for skill in found])) for axis, found in skills.items() if found}
 
 
 def largest_skill_um(skills: Mapping[str, Sequence[Skill]]) -> dict[str, float]:
-    """Return the largest error (um) that the model left of the last recorded moves, of each axis that has any."""
+    """Return the model's largest error (um) in the last recorded moves, of each axis that has any."""
     return {axis: float(np.max([skill.max_um for skill in found])) for axis, found in skills.items() if found}
 
 
 def joint_held_out_um(held_out_um: Mapping[str, float], axes: Sequence[str]) -> float | None:
-    """Return the error (um) in the plane or space of what held-out moves show of each axis; None where one has none."""
+    """Return the joint error (um) of held-out moves in plane or space; None if an axis has none."""
     if not axes or not all(axis in held_out_um for axis in axes):
         return None
     um = math.hypot(*(held_out_um[axis] for axis in axes))

@@ -1,4 +1,4 @@
-"""Inverse dynamics tells what a path demands of a drive: [DES] eqs. 1 and 2 turned around."""
+"""Computes the current and voltage that a path demands of a drive: [DES] eqs. 1 and 2 inverted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fdhil.model import closed_loop
 from fdhil.prediction.model_terms import resisting
 from fdhil.records import Float, Parameters, Trajectory
 
-SHARE_STEP = 2e-3  # to which the feed that can be held is found
+SHARE_STEP = 2e-3  # resolution of the feasible feed
 
 
 def required(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: float) -> tuple[Float, Float]:
@@ -35,7 +35,7 @@ def required(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: floa
 def held_share(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> float:
     """Return the largest share <= 1 of the feed at which no limit of any drive acts, to ``SHARE_STEP``.
 
-    At a share of the feed an NC with fixed smoothing times orders as large a share of speed and acceleration, so the
+    At a share of the feed an NC with fixed smoothing times commands the same share of speed and acceleration, so the
     path scaled by it shows the demand on the drives, dry friction included.
     """
 

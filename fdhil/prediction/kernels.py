@@ -1,4 +1,4 @@
-"""Compiled kernels search the contour error."""
+"""Compiled kernels that search for the contour error."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ def _segment(path: Float, j: int, point: Float) -> float:
 
 @compiled
 def _row(path: Float, j: int, point: Float) -> float:
-    """Return the distance from ``point`` (d,) to row j of ``path``."""
     square = 0.0
     for a in range(point.size):
         square += (point[a] - path[j, a]) ** 2
@@ -36,9 +35,9 @@ def _row(path: Float, j: int, point: Float) -> float:
 
 @compiled
 def _beyond(arc: Float, reach: float, begin: int, end: int) -> int:
-    """Return the first row from ``begin`` to ``end`` (which may lie before it) that is farther along than ``reach``.
+    """Return the first row from ``begin`` to ``end`` (in either direction) that is farther along than ``reach``.
 
-    ``reach`` is a length from row ``begin``; where no row is that far, the one behind ``end``.
+    ``reach`` is a length from row ``begin``; if no row is that far, the one behind ``end`` is returned.
     """
     way = 1 if end >= begin else -1
     far = abs(end - begin)
@@ -61,9 +60,9 @@ def _beyond(arc: Float, reach: float, begin: int, end: int) -> int:
 def contour(path: Float, actual: Float, half_window: int, first: int) -> Float:
     """Return (m,) the distance of each row of ``actual`` (m, d) to the polyline of ``path`` (n, d) within the window.
 
-    Row k of ``actual`` belongs to row ``first`` + k. A stretch of the path is passed over only where its length proves
-    that no point of it can be nearer than the best one found, so the result is that of the full search. The search
-    begins where the row before was nearest: on a slow path that is many rows from the row itself.
+    Row k of ``actual`` belongs to row ``first`` + k. A part of the path is skipped only if its length proves that no
+    point of it can be nearer than the best one found, so the result is that of the full search. The search begins at
+    the previous row's nearest point: on a slow path that is many rows from the row itself.
     """
     n, d = path.shape
     arc = np.zeros(n)

@@ -1,4 +1,4 @@
-"""Judges the skill of the closed-loop model: predicted against measured following error of one recorded move."""
+"""Assesses the skill of the closed-loop model: predicted against measured following error of one recorded move."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ LONGEST_DELAY = 8.0  # in SYNC cycles
 
 
 def skill(window: Window, parameters: Parameters, axis: Axis, sync_period_s: float) -> Skill | None:
-    """Compare the predicted with the measured following error of a recorded move, as held-out moves are in a file.
+    """Compare the predicted with the measured following error of a recorded move, like held-out moves in a file.
 
     Lost rows are not compared. ``delay_ms`` is the shift of the prediction (positive: the drive is later) that explains
     the difference best. None where the rows are not the drive's set-points, or too few can be compared.
     """
-    told = replay_setpoints(window, parameters, axis, sync_period_s)
-    if told is None:
+    replayed = replay_setpoints(window, parameters, axis, sync_period_s)
+    if replayed is None:
         return None
     return Skill(
         axis=window.axis,
         tick=window.start_tick,
-        rms_um=rms(told.difference_um),
-        max_um=float(np.abs(told.difference_um).max()),
-        delay_ms=_delay(window.position_mm, told.predicted_mm, told.rows) * sync_period_s * 1e3,
-        measured_rms_um=told.measured_um,
+        rms_um=rms(replayed.difference_um),
+        max_um=float(np.abs(replayed.difference_um).max()),
+        delay_ms=_delay(window.position_mm, replayed.predicted_mm, replayed.rows) * sync_period_s * 1e3,
+        measured_rms_um=replayed.measured_um,
     )
 
 

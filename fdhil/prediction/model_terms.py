@@ -1,4 +1,4 @@
-"""Takes a model's terms apart: what is left of it without dry friction, as a linear system, or with a resonance."""
+"""Derives variants of a model: without dry friction, linear, with averaged friction; and groups its terms."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fdhil.records import PARAMETERS, Bool, Float, Parameters
 
 DRY = ("coulomb_positive", "coulomb_negative", "stribeck", "stribeck_speed", "presliding_um")
 LINEAR = ("resonance", "resonance_damping", "resonance_share")
-# what a term's second and third value are called: they mean nothing alone
+# suffixes of a term's second and third value, which have no meaning alone
 _PARTS = ("_phase", "_speed", "_damping", "_share")
 
 
@@ -28,16 +28,16 @@ def without_dry_friction(parameters: Parameters) -> Parameters:
 
 
 def linear(parameters: Parameters, dry_nm: float = 0.0) -> Parameters:
-    """Return what of a model is linear, with another dry friction: without any it is a linear system.
+    """Return the linear part of a model with another dry friction: without any it is a linear system.
 
-    A load, ripples and a dead time move where the system works, not how it answers an offset.
+    A load, ripples and a dead time shift the operating point, not the response to an offset.
     """
     mean = mean_friction(parameters)
     return replace(mean, Cd=dry_nm, terms=tuple(pair for pair in mean.terms if pair[0] in LINEAR))
 
 
 def mean_friction(parameters: Parameters) -> Parameters:
-    """Return the six with friction that is the mean of both directions, and the terms that are none of friction."""
+    """Return the six with friction averaged over both directions, and the terms other than friction."""
     p = parameters
     viscous = 0.5 * (p.term("viscous_positive", p.ft) + p.term("viscous_negative", p.ft))
     dry = 0.5 * (p.term("coulomb_positive", p.Cd) + p.term("coulomb_negative", p.Cd))
@@ -46,14 +46,14 @@ def mean_friction(parameters: Parameters) -> Parameters:
 
 
 class Band(NamedTuple):
-    """The torques of a motor, N.m, between which dry friction holds the shaft."""
+    """The motor torques, N.m, between which dry friction holds the shaft."""
 
     low: float
     high: float
 
     @property
     def middle(self) -> float:
-        """The torque at which it is held best."""
+        """The middle of the band, farthest from breaking loose."""
         return 0.5 * (self.low + self.high)
 
     def holds(self, torque_nm: Float, share: float) -> Bool:
@@ -70,37 +70,37 @@ def band(parameters: Parameters, angle_rad: float) -> Band:
 
 
 def resisting(parameters: Parameters, speed_rad_s: Float, angle_rad: Float) -> tuple[Float, Float]:
-    """Return the torque (n,) against the positive direction of a shaft that turns: its smooth and its dry part."""
+    """Return the torque (n,) against the positive direction of a turning shaft: its smooth and its dry part."""
     dry = replace(parameters, ft=0.0, terms=tuple(pair for pair in parameters.terms if pair[0] in DRY))
     models = without_dry_friction(parameters), dry
     smooth_nm, dry_nm = (terms.torque(model, speed_rad_s, angle_rad) for model in models)
     return smooth_nm, dry_nm
 
 
-def main_name(name: str) -> str:
+def get_main_term(name: str) -> str:
     """Return the term that a name belongs to: a ripple's phase to the ripple.
 
-    >>> main_name("ripple_screw_1_phase"), main_name("stribeck_speed"), main_name("Jt")
+    >>> get_main_term("ripple_screw_1_phase"), get_main_term("stribeck_speed"), get_main_term("Jt")
     ('ripple_screw_1', 'stribeck', 'Jt')
     """
     return next((name.removesuffix(part) for part in _PARTS if name.endswith(part)), name)
 
 
 def families(names: Sequence[str]) -> Mapping[str, tuple[str, ...]]:
-    """Return the names that belong together by the one that stands for them."""
+    """Return the names that belong together, by their main name."""
     found: dict[str, tuple[str, ...]] = {}
     for name in names:
-        main = main_name(name)
+        main = get_main_term(name)
         found[main] = (*found.get(main, ()), name)
     return found
 
 
 def put_back(now: Parameters, earlier: Parameters, names: Sequence[str]) -> Parameters:
-    """Return the model of now with what some names had earlier; a term that one of them lacks is nil there."""
+    """Return the current model with earlier values of some names; a term that one of them lacks is zero there."""
     before, present = values_of(earlier), values_of(now)
     changed = {}
     for name in names:
-        part = main_name(name) != name
+        part = get_main_term(name) != name
         changed[name] = before.get(name, present.get(name, 0.0) if part else 0.0)
     return now.changed(**changed)
 

@@ -1,8 +1,8 @@
 """Reads model files: the parameters of each axis as JSON, ``{"X": {"R", "L", "K", "Jt", "ft", "Cd"}, ...}``.
 
-An axis may have three tables more: ``terms``, the value of each term that has joined the six; ``loops``, keys of
-``[axis.X.regulators]`` that were identified and take the place of the configuration's; ``held_out``, what the model
-leaves of moves that it was not identified on.
+An axis may have three more tables: ``terms``, the value of each additional term; ``loops``, identified keys of
+``[axis.X.regulators]`` that replace the configuration's; ``held_out``, the model's residual of moves that it was not
+identified on.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MAX_BYTES = 64 * 1024
 SHOWN_CHARS = 40
 MOST_FAULTS = 50
 LARGEST, SMALLEST = 1e12, 1e-12
-COPIED = 1e-3  # to which a value agrees that was copied from what fdhil shows
+COPIED = 1e-3  # tolerance of a value copied from fdhil's output
 _TABLES = ("terms", "loops", "held_out")
 TERMS = ("load", "coulomb_positive", "coulomb_negative", "viscous_positive", "viscous_negative", "stribeck",
          "stribeck_speed", "presliding_um", "ripple_screw_1", "ripple_screw_1_phase", "ripple_motor_1",
@@ -44,8 +44,8 @@ Loops = Mapping[str, Mapping[str, float | str]]
 class ModelFile(NamedTuple):
     """The contents of a model file by axis; an axis without a table of loops has none in ``loops``.
 
-    ``held_out_um`` is the RMS in um that the model leaves of moves that it was not identified on, and
-    ``held_out_max_um`` the largest error of any of them, where they are given.
+    ``held_out_um`` is the model's RMS residual, um, of moves that it was not identified on, and ``held_out_max_um`` the
+    largest error in any of them, where they are given.
     """
 
     parameters: dict[str, Parameters]
@@ -60,15 +60,15 @@ def nominal_models(config: MachineConfig) -> dict[str, Parameters]:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object of JSON; ValueError where it has a name twice, of which one would be passed over in silence."""
+    """Return an object of JSON; ValueError for a repeated name, of which one would be ignored silently."""
     found = dict(pairs)
     if len(found) < len(pairs):
-        raise ValueError(f"{max(found, key=[name for name, _ in pairs].count)[:SHOWN_CHARS]!r} is there twice")
+        raise ValueError(f"{max(found, key=[name for name, _ in pairs].count)[:SHOWN_CHARS]!r} appears twice")
     return found
 
 
 def load_model_file(path: Path) -> ModelFile:
-    """Read a model file; ConfigError with all its faults: missing or unknown keys, no numbers, negative values."""
+    """Read a model file; ConfigError with all its faults: missing or unknown keys, invalid numbers, negative values."""
     try:
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1)
@@ -79,7 +79,7 @@ def load_model_file(path: Path) -> ModelFile:
     try:
         document = json.loads(raw.decode("utf-8"), object_pairs_hook=_once)
     except (UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise _cannot(path, f"is no model: {str(error)[:120]}", "fdhil identify --json gives the values") from None
+        raise _cannot(path, f"is no model file: {str(error)[:120]}", "fdhil identify --json gives the values") from None
     if not isinstance(document, dict) or not document:
         raise _cannot(path, "holds no axis", 'write {"X": {"R": .., "L": .., "K": .., "Jt": .., "ft": .., "Cd": ..}}')
     faults: list[ConfigFault] = []
@@ -96,7 +96,7 @@ def load_model_file(path: Path) -> ModelFile:
 
 
 def with_loops(config: MachineConfig, loops: Loops, source: str) -> MachineConfig:
-    """Return the configuration with keys of the regulators changed; ConfigError with what is wrong with them."""
+    """Return the configuration with keys of the regulators changed; ConfigError with their faults."""
     known = {axis: values for axis, values in loops.items() if axis in config.axis}
     if not known:
         return config
@@ -111,8 +111,8 @@ def validated_models(
 ) -> tuple[dict[str, Parameters], MachineConfig]:
     """Return the model of each published set, and the configuration with the loops that they were validated with.
 
-    ConfigError where a drive showed other loops than those configured, and the configuration has been changed since:
-    neither is known to be the drive's. The same for a set that no drive can be.
+    ConfigError if a drive showed other loops than those configured, and the configuration has been changed since:
+    neither is known to be the drive's. The same for a set with unphysical values.
     """
     faults: list[ConfigFault] = []
     models = {axis: _physical_model(axis, published, faults) for axis, published in sets.items()}
@@ -124,7 +124,7 @@ def validated_models(
             loops[axis] = published.loops
         elif apart := loops_apart(published.loops, config.axis[axis].regulators):
             text = f"LoopsDiffer: the rapids showed other loops ({apart}), and the configuration has been changed since"
-            advice = "enter what the rapids showed, or let the machine make a few rapids with this configuration"
+            advice = "enter the loops that the rapids showed, or run a few rapids with this configuration"
             faults.append(ConfigFault(f"axis.{axis}.regulators", text, advice))
     if faults:
         raise ConfigError(source, faults)
@@ -132,9 +132,10 @@ def validated_models(
 
 
 def loops_apart(loops: Mapping[str, float | str], regulators: Regulators) -> str:
-    """Return where loops that rapids showed differ from the configured regulators, for people; empty: nowhere."""
+    """Return the differences between loops that rapids showed and the configured regulators, as text; empty: none."""
     pairs = [(key, shown, getattr(regulators, key)) for key, shown in loops.items()]
-    return ", ".join(f"{key} {_brief(shown)} for {_brief(has)}" for key, shown, has in pairs if not _agree(has, shown))
+    apart = [(key, shown, has) for key, shown, has in pairs if not _agree(has, shown)]
+    return ", ".join(f"{key} {_brief(shown)} instead of {_brief(has)}" for key, shown, has in apart)
 
 
 def _brief(value: float | str) -> str:
@@ -148,13 +149,13 @@ def _agree(configured: float | str, shown: float | str) -> bool:
 
 
 def _physical_model(axis: str, published: ParameterSet, faults: list[ConfigFault]) -> Parameters:
-    """Return the parameters of a set, within the physical bounds where an earlier fdhil left them beyond by chance."""
-    told, covariance = values_of(published.parameters), published.covariance
-    names, values = tuple(told), np.array([*told.values()])
-    if all(bound.beyond(told) <= 0.0 for bound in physical.bounds(names)):
+    """Return the parameters of a set, moved into the physical bounds that an earlier fdhil exceeded by chance."""
+    by_name, covariance = values_of(published.parameters), published.covariance
+    names, values = tuple(by_name), np.array([*by_name.values()])
+    if all(bound.beyond(by_name) <= 0.0 for bound in physical.bounds(names)):
         return published.parameters
     if covariance.shape != (len(names), len(names)) or beyond_chance(names, values, covariance):
-        text = "Unphysical: the friction of the newest set would push its axis, or another value cannot be negative"
+        text = "Unphysical: friction in the newest set would drive the axis, or a value must not be negative"
         faults.append(ConfigFault(axis, text, "record rapids in both directions, and identify the axis again"))
         return published.parameters
     return Parameters.of(dict(zip(names, nearest(names, values, covariance).tolist(), strict=True)))
@@ -184,7 +185,6 @@ def _parameters(axis: str, values: Any, faults: list[ConfigFault]) -> Parameters
 
 
 def _table(axis: str, name: str, values: Any, faults: list[ConfigFault]) -> dict[str, Any]:
-    """Return one of an axis' two tables, empty where it is left out."""
     table = values.get(name, {}) if isinstance(values, dict) else {}
     if not isinstance(table, dict):
         faults.append(ConfigFault(f"{axis}.{name}", f"must be a table of names, not {_shown(table)}"))
@@ -193,7 +193,6 @@ def _table(axis: str, name: str, values: Any, faults: list[ConfigFault]) -> dict
 
 
 def _held_out_um(axis: str, key: str, values: Any, faults: list[ConfigFault]) -> float | None:
-    """Return what a model leaves of moves that it was not identified on, um; None where that is not given."""
     table = _table(axis[:SHOWN_CHARS], "held_out", values, faults if key == "rms_um" else [])
     if not table or (key != "rms_um" and key not in table):
         return None
@@ -208,11 +207,10 @@ def _held_out_um(axis: str, key: str, values: Any, faults: list[ConfigFault]) ->
 def _unknown(axis: str, name: str, known: tuple[str, ...], listed: str) -> ConfigFault:
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
     hint = f"did you mean {near[0]!r}?" if near else f"{listed} {', '.join(known)}"
-    return ConfigFault(f"{axis}.{name[:SHOWN_CHARS]}", "is no parameter", hint)
+    return ConfigFault(f"{axis}.{name[:SHOWN_CHARS]}", "is not a parameter", hint)
 
 
 def _term_faults(axis: str, terms: Mapping[str, Any], dry_nm: Any) -> list[ConfigFault]:
-    """Say what is wrong with the terms: names, values, and what means nothing without another."""
     place, faults = f"{axis}.terms", []
     for name, value in terms.items():
         if name in PARAMETERS or unit_of(name) is None:
@@ -221,20 +219,19 @@ def _term_faults(axis: str, terms: Mapping[str, Any], dry_nm: Any) -> list[Confi
             faults.append(ConfigFault(f"{place}.{name}", fault, f"in {unit_of(name)}"))
     for main, (name, *_) in families(tuple(terms)).items():
         if main not in terms:
-            text = f"means nothing without {main[:SHOWN_CHARS]}"
+            text = f"has no meaning without {main[:SHOWN_CHARS]}"
             faults.append(ConfigFault(f"{place}.{name[:SHOWN_CHARS]}", text))
     if "stribeck" in terms and "stribeck_speed" not in terms:
-        faults.append(ConfigFault(f"{place}.stribeck", "needs stribeck_speed beside it", "in rad/s"))
+        faults.append(ConfigFault(f"{place}.stribeck", "requires stribeck_speed", "in rad/s"))
     if not faults and "stribeck" in terms and _fault("Cd", dry_nm) is None:
         friction = {"Cd": dry_nm, **terms}
         if any(bound.beyond(friction) > 0.0 for bound in physical.bounds(tuple(friction)) if len(bound.weights) > 1):
-            text = "takes more from the dry friction than there is: at standstill it would be below 0"
+            text = "exceeds the dry friction: at standstill friction would be below 0"
             faults.append(ConfigFault(f"{place}.stribeck", text, "in N.m"))
     return faults
 
 
 def _fault(name: str, value: Any) -> str | None:
-    """Say what is wrong with a value, None when nothing is."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return f"must be a number, not {_shown(value)}"
     if abs(value) > LARGEST or not math.isfinite(value) or 0 < abs(value) < SMALLEST:
@@ -256,14 +253,13 @@ def _shown(value: Any) -> str:
 def models_for(
     reference: Trajectory, given: Mapping[str, Parameters], config: MachineConfig, source: str
 ) -> dict[str, Parameters]:
-    """Return a model for every axis of the reference; an axis that stands still may lack one and gets the nominal.
+    """Return a model for every axis of the reference; an axis at rest may lack one and gets the nominal.
 
-    Where the configuration knows of a resonance that the model does not have, the model gets it. ConfigError where an
-    axis that moves has none.
+    A model without a resonance gets the configured one. ConfigError if an axis that moves has no model.
     """
     nominal = nominal_models(config)
     faults = [
-        ConfigFault(axis, "moves and has no model", "identify it, or leave the option out to use the nominal values")
+        ConfigFault(axis, "moves and has no model", "identify it, or omit the option to use the nominal values")
         for axis in reference.axes
         if axis not in given and np.ptp(reference.position_mm[axis]) > 0.0
     ]

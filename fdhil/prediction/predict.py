@@ -8,7 +8,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
-from fdhil.model.closed_loop import Response, simulate_axes
+from fdhil.model.closed_loop import Response, simulate, simulate_axes
 from fdhil.prediction.contour import contour_error_um
 from fdhil.prediction.model_terms import without_dry_friction
 from fdhil.prediction.zones import find_zones
@@ -18,7 +18,7 @@ from fdhil.records import Float, Parameters, Prediction, Trajectory, frozen
 def check_axes(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> None:
     """Raise ConfigError where an axis of the reference has no configuration or no model."""
     faults = [
-        ConfigFault(f"axis.{axis}", "the demand moves this axis, the configuration does not have it", "add its section")
+        ConfigFault(f"axis.{axis}", "the demand moves this axis, but the configuration lacks it", "add its section")
         for axis in reference.axes
         if axis not in config.axis
     ]
@@ -34,9 +34,9 @@ def check_axes(reference: Trajectory, models: Mapping[str, Parameters], config: 
 def predict(
     reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, zones_above_um: float | None = None
 ) -> Prediction:
-    """Predict what the drives leave of ``reference``; ConfigError when an axis has no model or configuration.
+    """Predict the path error along ``reference``; ConfigError if an axis has no model or configuration.
 
-    Zones are what stands out, or with ``zones_above_um`` all that is above it.
+    Zones are errors that stand out, or with ``zones_above_um`` all that exceed it.
     """
     smooth = {axis: without_dry_friction(model) for axis, model in models.items()}
     responses = _responses(reference, models, config)
@@ -44,7 +44,7 @@ def predict(
 
 
 def contour_um(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> Float:
-    """Return the contour error (n,) um alone, as :func:`predict` has it: for those who run many paths."""
+    """Return the contour error (n,) um alone, as predicted above: for searches over many paths."""
     return _contour(reference, _responses(reference, models, config))
 
 
@@ -65,13 +65,33 @@ def predict_corrected(
     return _assemble(reference, _responses(reference, models, config, *offsets), config)
 
 
+def ahead_of_motor_mm(
+    position_mm: Mapping[str, Float],
+    offset_um: Mapping[str, Float],
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+) -> dict[str, Float]:
+    """Return table less motor (n,) in mm of each axis with a resonance: the part that its encoder does not see.
+
+    The axes follow ``position_mm`` (n,) with ``offset_um`` (n,).
+    """
+    period_s = config.machine.sync_period_s
+    found = {}
+    for axis, path_mm in position_mm.items():
+        if models[axis].term("resonance"):
+            offset_mm = offset_um[axis] * 1e-3
+            response = simulate(models[axis], config.axis[axis], period_s, path_mm, offset_mm)
+            found[axis] = response.table_mm - response.position_mm
+    return found
+
+
 def _responses(
     reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, *offsets: Mapping[str, Float] | None
 ) -> Mapping[str, Response]:
     check_axes(reference, models, config)
     responses = simulate_axes(models, config.axis, reference.dt_s, reference.position_mm, *offsets)
     faults = [
-        ConfigFault(f"model.{axis}", "is of no drive: run along the path it overflows", "look at its values and terms")
+        ConfigFault(f"model.{axis}", "is not a valid drive: its simulation overflows", "check its values and terms")
         for axis, response in responses.items()
         if not np.isfinite(response.end).all()
     ]
@@ -92,7 +112,6 @@ def _assemble(
     zones_above_um: float | None = None,
     without_friction: Callable[[], Float] | None = None,
 ) -> Prediction:
-    """Put the axes' responses together: errors per axis, contour error, zones."""
     axes = reference.axes
     contour = frozen(_contour(reference, responses))
     loop_s = max(1.0 / config.axis[axis].regulators.position_gain_per_s for axis in axes)

@@ -1,10 +1,9 @@
-"""Runs a recorded demand at other feeds: it has no lines, and what the NC would make of another feed is not in it.
+"""Generates a recorded demand at other feeds: it has no lines, and the NC's response to another feed is not in it.
 
-Where the NC is an interpolator of the configured averages (``[nc] smoothing_s``), these can be taken off the demand,
-the path under them run at another speed, and the averages put on again: the demand is then what the NC would order. A
-demand that was not made so shows it, see ``unsmoothed``, and the truth lies between two rules: that the averages, or
-the acceleration, stay (cautious), and that time itself is stretched, so that accelerations fall with the square of the
-feed (hopeful).
+If the NC is an interpolator of the configured averages (``[nc] smoothing_s``), these can be removed from the demand,
+the path under them run at another speed, and the averages applied again: the demand is then the NC's. Otherwise the
+truth lies between two rules: that the averages, or the acceleration, stay (cautious), and that time itself is
+stretched, so that accelerations fall with the square of the feed (hopeful).
 """
 
 from __future__ import annotations
@@ -17,26 +16,26 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from fdhil.config import MachineConfig
-from fdhil.prediction.feeds import Source
+from fdhil.prediction.feed_search import Source
 from fdhil.prediction.predict import predict
 from fdhil.program.planner.smoothing import Smoother
 from fdhil.records import Bool, Float, Int, Parameters, Trajectory, frozen, frozen_ints
 
-APART_S = 0.1  # an error that swings through 0 makes several peaks of one corner
-EXACT_MM = 5e-3  # what rounding to 9 decimals makes of a minute under two averages; other averages leave far more
+APART_S = 0.1  # an error that oscillates through 0 has several peaks at one corner
+EXACT_MM = 5e-3  # effect of rounding to 9 decimals on a minute under two averages; other averages leave far more
 RESTING_MM = 1e-7  # a step below it is the rounding of a file
-TOO_FAST = 1.05  # of the rapid speed: no NC ordered that
+TOO_FAST = 1.05  # of the rapid speed: beyond any NC's command
 
-# path (n, d), stretch and share of the feed of each row (n,) -> path (m, d) and stretch (m,) at those feeds
+# path (n, d), segment and share of the feed of each row (n,) -> path (m, d) and segment (m,) at those feeds
 Rule = Callable[[Float, Int, Float], tuple[Float, Int]]
 
 
 def demand_sources(
     reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, tolerance_um: float
 ) -> tuple[Source, Source | None]:
-    """Return a demand as a source; where two rules bracket the truth, the cautious and the hopeful one.
+    """Return a demand as a source; if two rules bracket the truth, the cautious and the hopeful one.
 
-    Its stretches reach from half way behind one place that leaves the tolerance to half way before the next.
+    Its segments reach from half way behind one position that leaves the tolerance to half way before the next.
     """
     contour = predict(reference, models, config).contour_um
     stretch = stretches_around(contour > tolerance_um, round(APART_S / reference.dt_s))
@@ -76,21 +75,21 @@ def _source(reference: Trajectory, path: Float, stretch: Int, rule: Rule) -> Sou
             line=frozen_ints(lines),
         )
 
-    # a stretch ends where all is quiet: what is behind it is not its own
+    # a segment ends where the error is small: later errors are not its own
     return Source(at, line=lambda _: 0, feed_mm_min=lambda k: float(fastest[k]), after_s=0.0)
 
 
 class Averages:
-    """The rules of one NC, and the moving averages that it puts on each axis' demand."""
+    """The rules of one NC, and the moving averages that it applies to each axis' demand."""
 
     def __init__(self, smoothing_s: Sequence[float], dt_s: float) -> None:
         self._smoothing_s, self._dt_s = smoothing_s, dt_s
         self._lengths = [max(1, math.floor(average / dt_s + 0.5)) for average in smoothing_s]
 
     def taken_off(self, path: Float) -> Float | None:
-        """Return the path (n, d) that these averages turn into ``path``; None where none does.
+        """Return the path (n, d) that these averages turn into ``path``; None if there is none.
 
-        Of an average over m rows, x[k] = x[k - m] + m (y[k] - y[k - 1]). What was not made so does not come to rest.
+        Of an average over m rows, x[k] = x[k - m] + m (y[k] - y[k - 1]). A demand made otherwise does not come to rest.
         """
         moving = np.flatnonzero(np.any(np.abs(np.diff(path, axis=0)) > RESTING_MM, axis=1))
         under = path
@@ -105,12 +104,12 @@ class Averages:
         return under if np.abs(under[arrived:] - path[-1]).max() <= EXACT_MM else None
 
     def _on(self, rows: Float) -> Float:
-        """Put the averages on rows (n, d) that rest at both ends."""
+        """Apply the averages to rows (n, d) that rest at both ends."""
         smoother = Smoother(self._smoothing_s, self._dt_s)
         return smoother(np.concatenate([rows, np.repeat(rows[-1:], smoother.settle_rows, axis=0)]))
 
     def smoothed(self, path: Float, stretch: Int, share: Float) -> tuple[Float, Int]:
-        """The path under the averages at other speeds, and the averages on again."""
+        """Return the path under the averages at other speeds, with the averages applied again."""
         rows = _rows(1.0 / share)
         grid = np.arange(len(path), dtype=np.float64)
         moved = self._on(np.column_stack([np.interp(rows, grid, column) for column in path.T]))
@@ -118,21 +117,20 @@ class Averages:
         return moved, np.concatenate([found, np.full(len(moved) - found.size, found[-1])])
 
     def _faded(self, values: Float) -> Float:
-        """Values (n,) that change from one to the next as an averaged demand does."""
         return self._on(values[:, None])[: values.size, 0]
 
     def stretched(self, path: Float, stretch: Int, share: Float) -> tuple[Float, Int]:
-        """Time stretched: speeds fall with the share, accelerations with its square."""
+        """Stretch time: speeds fall with the share, accelerations with its square."""
         rows = _rows(1.0 / self._faded(share))
         return _along(path, rows), stretch[rows.astype(np.int64)]
 
     def scaled(self, path: Float, stretch: Int, share: Float) -> tuple[Float, Int]:
-        """Each move shorter by the share: speeds and accelerations fall with it, as where averages stay."""
+        """Shorten each move by the share: speeds and accelerations fall with it, as with constant averages."""
         steps = np.diff(path, axis=0) * self._faded(share)[:-1, None]
         return path[0] + np.concatenate([np.zeros((1, path.shape[1])), np.cumsum(steps, axis=0)]), stretch
 
     def capped(self, path: Float, stretch: Int, share: Float) -> tuple[Float, Int]:
-        """The speed held below a share of the stretch's fastest: accelerations stay, as where they are the limit."""
+        """Limit the speed to a share of the segment's fastest: accelerations stay, as where they are the limit."""
         speed = _steps(path)
         most = self._faded(np.where(share < 1.0, share * _fastest(speed, stretch)[stretch], speed.max()))
         rows = _rows(np.maximum(1.0, speed / np.maximum(most, 1e-12)))
@@ -140,12 +138,11 @@ class Averages:
 
 
 def _steps(path: Float) -> Float:
-    """Return (n,) how far each row of a path (n, d) is from the next."""
+    """Return (n,) the distance from each row of a path (n, d) to the next."""
     return np.asarray(np.linalg.norm(np.diff(path, axis=0, append=path[-1:]), axis=1))
 
 
 def _fastest(speed: Float, stretch: Int) -> Float:
-    """Return the largest speed of each stretch, by its number."""
     fastest = np.zeros(int(stretch[-1]) + 1)
     np.maximum.at(fastest, stretch, speed)
     return fastest
@@ -159,5 +156,5 @@ def _rows(lasts: Float) -> Float:
 
 
 def _along(path: Float, rows: Float) -> Float:
-    """A demand between its rows: smooth, or the kinks at each row would ask for twice the acceleration."""
+    """Interpolate a demand smoothly: kinks at each row would ask for twice the acceleration."""
     return np.asarray(CubicSpline(np.arange(len(path)), path)(rows))

@@ -1,4 +1,4 @@
-"""Propagates the parameters' uncertainty to the predicted path, and tells which parameter matters where."""
+"""Propagates the parameters' uncertainty to the predicted path, and computes the path's sensitivity to each."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.model import closed_loop
 from fdhil.prediction.contour import contour_error_um
-from fdhil.prediction.model_terms import main_name, values_of
+from fdhil.prediction.model_terms import get_main_term, values_of
 from fdhil.prediction.predict import check_axes
 from fdhil.records import Float, Parameters, Prediction, Trajectory, unit_of
 
 STEP = 0.005  # relative change of a parameter for its derivative
-# a friction may be 0: its step is not relative then; a phase is relative to a radian
+# friction may be 0: its step is absolute then; a phase is relative to a radian
 SMALLEST = {"N.m.s": 1e-4, "N.m": 1e-2, "rad": 1.0}
 
 
 def _changed(parameters: Parameters, name: str) -> tuple[Parameters, float]:
-    """Return the parameters with one of them, or of the terms, a little larger, and by how much."""
+    """Return the parameters with one parameter or term slightly increased, and the step."""
     value = values_of(parameters)[name]
     step = max(abs(value) * STEP, SMALLEST.get(unit_of(name) or "", 0.0) * STEP)
     return parameters.changed(**{name: value + step}), step
@@ -32,8 +32,7 @@ def _positions(
     config: MachineConfig,
     offset_um: Mapping[str, Float] | None,
 ) -> dict[str, tuple[Float, Float, Float]]:
-    """Return of each axis (k, n) positions with each of the six and the terms changed in turn, the steps (k,), and
-    (n,) with none."""
+    """Return per axis positions (k, n) with each value perturbed in turn, the steps (k,), and unperturbed ones (n,)."""
     check_axes(reference, models, config)
 
     def one(axis: str) -> tuple[Float, Float, Float]:
@@ -58,9 +57,9 @@ def contour_std_um(
 ) -> Float:
     """Return (n,) one standard deviation of the table's distance from the path, propagated from the parameters'.
 
-    ``covariances`` (k, k) per axis, of the six and the first terms of its model; what it does not cover, and NaN,
-    counts as known exactly. First order: the position's derivative by each parameter, of which only what is across the
-    path counts; at rest all of it does.
+    ``covariances`` (k, k) per axis, of the six and the first terms of its model; values that it does not cover, and
+    NaN, count as known exactly. First order: the position's derivative by each parameter, of which only the part across
+    the path counts; at rest all of it does.
     """
     found = _positions(reference, models, config, offset_um)
     variances = []
@@ -70,13 +69,13 @@ def contour_std_um(
         derivative = ((moved - here) / steps[:, None])[: len(covariance)]
         variances.append(np.einsum("in,ij,jn->n", derivative, covariance, derivative))
     across = _across(reference)
-    # axes are identified apart from each other, so that their errors are independent
+    # axes are identified separately, so that their errors are independent
     variance = sum(v * share for v, share in zip(variances, across, strict=True))
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)) * 1e3)
 
 
 def _across(reference: Trajectory) -> list[Float]:
-    """Return per axis (n,) the share of an axis' variance that is across the path: 1 - t^2 of its direction t."""
+    """Return per axis (n,) the share of its variance that is across the path: 1 - t^2 of its direction t."""
     path, columns = reference.path_mm, reference.table_axes
     drives = Counter(axis[0] for axis in reference.axes)  # a gantry axis is at the mean of two
     if path.shape[1] == 1:
@@ -96,8 +95,8 @@ def sensitivity_um(
 ) -> tuple[Mapping[str, Mapping[str, float]], ...]:
     """Return per zone of ``prediction`` how much its largest contour error rises per 1 % of each parameter, um.
 
-    A mapping axis -> parameter or term -> um, in the order of the zones: it names what drives a zone's error. What is
-    only a part of a term, a phase or the speed of its course, is not listed.
+    A mapping axis -> parameter or term -> um, in the order of the zones: it shows what drives a zone's error. Parts of
+    a term, such as a phase or a speed, are not listed.
     """
     reference = prediction.reference
     found = _positions(reference, models, config, offset_um)
@@ -108,7 +107,7 @@ def sensitivity_um(
     for axis in reference.axes:
         moved, steps, _ = found[axis]
         for k, (name, value) in enumerate(values_of(models[axis]).items()):
-            if main_name(name) != name:
+            if get_main_term(name) != name:
                 continue
             contour = contour_error_um(path, reference.table_mm({**here, axis: moved[k]}), reference.dt_s)
             per_percent = 0.01 * abs(value) / steps[k]

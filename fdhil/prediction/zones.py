@@ -1,4 +1,4 @@
-"""Finds zones: stretches of the path whose contour error stands out, where they are and why they are there."""
+"""Finds zones: parts of the path whose contour error stands out, where they are and what causes them."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from fdhil.records import Bool, Float, Int, Trajectory, Zone
 # an error stands out above this share of the largest one, and never below a micrometre
 SHARE = 0.05
 FLOOR_UM = 1.0
-# times in units of the slowest position loop's own, 1 / Kv: an event explains the errors shortly before it (the NC's
-# smoothing) and as long as the loops need to settle, most of it while it is RECENT; what is nearer than TOGETHER they
-# answer as one
+# times in units of the slowest position loop's, 1 / Kv: an event explains errors shortly before it (the NC's
+# smoothing) and until the loops have settled, most of all while it is RECENT; events closer than TOGETHER count
+# as one
 BEFORE, AFTER, RECENT, TOGETHER = 2.5, 10.0, 5.0, 2.0
 TURNING_RAD_S = 0.1  # less is straight: a radius of 2 m at 12 m/min
-CHANGED = 0.5  # of the acceleration across the path: such a change of it is a corner
-BACK_RAD = np.deg2rad(179.0)  # in one row: the path goes back along its own line, which is a reversal
-MOST_OF_IT = 0.5  # of an error that is still there without dry friction: then it is not friction's
+CHANGED = 0.5  # of the acceleration across the path: a larger change of it is a corner
+BACK_RAD = np.deg2rad(179.0)  # in one row: the path returns along its own line, a reversal
+MOST_OF_IT = 0.5  # of an error that remains without dry friction: above, friction is not its cause
 CHANGE = 1e-6  # of the largest speed, from one row to the next: less is none
-PAUSE_S = 0.01  # a rest that is shorter is no stop
+PAUSE_S = 0.01  # shorter rests are no stop
 MERGE_S = 0.03
 SHORTEST_S = 0.003
 TO_REST = ("stop", "start")
@@ -32,7 +32,7 @@ CAUSES = ("saturation", "corner", "start", "stop", "reversal", "circular lag", "
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """The course of a reference, (n,) each: path speed in mm/s, turn rate in rad/s, and the rows of its events.
+    """The geometry of a reference, (n,) each: path speed in mm/s, turn rate in rad/s, and the rows of its events.
 
     ``arc``: it turns, and not in a corner.
     """
@@ -51,7 +51,7 @@ def geometry(reference: Trajectory, loop_s: float) -> Geometry:
     velocity[:-1] = np.diff(path, axis=0) / dt
     speed = np.linalg.norm(velocity, axis=1)
     moving = speed > 1e-3 * max(float(speed.max()), 1e-9)
-    # where an axis turns around it stands still for an instant: that is no stop
+    # at a reversal an axis stands still for an instant: that is no stop
     step = np.diff(_joined(moving, PAUSE_S, dt).astype(np.int8), prepend=0, append=0)
     start, stop = step[:-1] == 1, np.zeros(len(path), dtype=np.bool_)
     stop[np.clip(np.flatnonzero(step == -1), 0, len(path) - 1)] = True
@@ -68,7 +68,7 @@ def geometry(reference: Trajectory, loop_s: float) -> Geometry:
 
 
 def _leading_to(events: Bool, changing: Bool) -> Bool:
-    """Rows of the unbroken change of speed that leads to an event: an axis that brakes errs before it stops."""
+    """Mark the continuous change of speed that leads to an event: a braking axis has an error before it stops."""
     here = changing | events | np.roll(events, -1)
     run = np.cumsum(np.diff(here.astype(np.int8), prepend=0) == 1)  # the number of the last run that has begun
     last = np.zeros(int(run[-1]) + 1, dtype=np.int64)
@@ -78,7 +78,7 @@ def _leading_to(events: Bool, changing: Bool) -> Bool:
 
 
 def _turn_rate(velocity: Float, speed: Float, moving: Bool, dt: float) -> Float:
-    """Angle between successive directions of motion, per second; 0 at rest."""
+    """Return the angle between successive directions of motion, per second; 0 at rest."""
     unit = velocity / np.maximum(speed, 1e-12)[:, None]
     chord = np.linalg.norm(np.diff(unit, axis=0), axis=1)
     angle = 2 * np.arcsin(np.minimum(chord / 2, 1.0))
@@ -88,18 +88,17 @@ def _turn_rate(velocity: Float, speed: Float, moving: Bool, dt: float) -> Float:
 
 
 def _joined(rows: Bool, gap_s: float, dt: float) -> Bool:
-    """Rows with the gaps between them closed that are shorter than ``gap_s``."""
     return rows | (_near(rows, gap_s, 0.0, dt) & _near(rows, 0.0, gap_s, dt))
 
 
 def _corners(velocity: Float, turn_rate: Float, speed: Float, loop_s: float, dt: float) -> Bool:
-    """Rows at which the curvature changes by more than the loops can follow: a turn begins, ends, tightens, or changes
-    its side or plane.
+    """Mark rows at which the curvature changes by more than the loops can follow.
 
-    What happens within the loops' time they answer as one, so that the chords of a circle are a circle; and a change
-    counts by the acceleration across the path that it makes there, against the largest one around.
+    A turn begins, ends, tightens, or changes its side or plane. Changes within the loops' time count as one, so that
+    the chords of a circle are a circle; a change counts by its acceleration across the path, against the largest one
+    around.
     """
-    from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d  # late: identifying needs none
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d  # not needed by identification
 
     half, around = max(1, round(TOGETHER * loop_s / dt)), round(AFTER * loop_s / dt)
     pace = np.maximum(uniform_filter1d(speed, half), 1e-9)
@@ -116,7 +115,7 @@ def _corners(velocity: Float, turn_rate: Float, speed: Float, loop_s: float, dt:
 
 
 def _reversals(velocity: Float) -> Bool:
-    """Rows at which an axis changes its direction, whether or not it rests in between."""
+    """Mark rows at which an axis changes its direction, whether or not it rests in between."""
     found = np.zeros(velocity.size, dtype=np.bool_)
     going = np.flatnonzero(np.abs(velocity) > 1e-6 * max(float(np.abs(velocity).max()), 1e-12))
     signs = np.sign(velocity[going])
@@ -134,9 +133,9 @@ def find_zones(
 ) -> tuple[Zone, ...]:
     """Return the zones in the order of time; ``limited`` (n,) is the share of each cycle with a limit acting.
 
-    ``loop_s`` is the slowest position loop's time, 1 / Kv. ``above_um``: every error above it belongs to a zone; left
-    out, what stands out against the largest. ``without_friction`` gives the contour error (n,) um that would be left
-    without dry friction; left out, every error beside a reversal is taken for friction's.
+    ``loop_s`` is the slowest position loop's time, 1 / Kv. ``above_um``: every error above it belongs to a zone;
+    default: errors that stand out against the largest. ``without_friction`` gives the contour error (n,) um without dry
+    friction; without it, every error near a reversal is attributed to friction.
     """
     above = contour_um > (max(FLOOR_UM, SHARE * float(contour_um.max())) if above_um is None else above_um)
     if not above.any():
@@ -168,13 +167,13 @@ def _peak(contour_um: Float, first: int, last: int) -> int:
 
 
 def _turn(shape: Geometry, peak: int, loop_s: float, dt: float) -> int:
-    """Return the row at which the path turns most just before an error."""
+    """Return the row with the largest turn rate just before an error."""
     begin = max(0, peak - round(RECENT * loop_s / dt))
     return begin + int(np.argmax(shape.turn_rate[begin : peak + round(BEFORE * loop_s / dt) + 1]))
 
 
 def _corners_joined(runs: Sequence[_Run], shape: Geometry, contour_um: Float, loop_s: float, dt: float) -> list[_Run]:
-    """Join what the beginning and the end of the same turn leave, one right behind the other."""
+    """Merge the zones at the beginning and at the end of the same turn if one follows the other."""
     joined: list[_Run] = []
     for run in runs:
         before = joined[-1] if joined else None
@@ -188,9 +187,9 @@ def _corners_joined(runs: Sequence[_Run], shape: Geometry, contour_um: Float, lo
 
 
 def _causes(shape: Geometry, limited: Float, loop_s: float, dt: float) -> Int:
-    """Return (n,) an index into ``CAUSES`` plus a multiple of their number that parts one corner from the next.
+    """Return (n,) an index into ``CAUSES`` plus a multiple of their number that separates successive corners.
 
-    Where several events are near, the more violent one explains the error.
+    If several events are near, the more violent one explains the error.
     """
     before_s, after_s = BEFORE * loop_s, AFTER * loop_s
     cause = np.full(shape.speed.size, CAUSES.index("straight"), dtype=np.int64)
@@ -212,7 +211,7 @@ def _name_again(
     loop_s: float,
     without_friction: Callable[[], Float] | None,
 ) -> None:
-    """Look at the largest error of each run: what is near in time may not be what makes it."""
+    """Revise each run's cause by its largest error: the nearest event may not be its cause."""
     names = [CAUSES[k % len(CAUSES)] for k in cause[[first for first, _ in runs]]]
     free = contour_um
     if without_friction is None:
@@ -250,7 +249,7 @@ def _ordinal(rows: Bool, before_s: float, dt: float) -> Int:
 
 
 def _near(rows: Bool, before_s: float, after_s: float, dt: float) -> Bool:
-    """Rows within ``before_s`` ahead of and ``after_s`` behind any of ``rows``."""
+    """Mark rows within ``before_s`` ahead of and ``after_s`` behind any of ``rows``."""
     before, after = round(before_s / dt), round(after_s / dt)
     marks = np.zeros(rows.size + 1, dtype=np.int64)
     events = np.flatnonzero(rows)
@@ -260,7 +259,7 @@ def _near(rows: Bool, before_s: float, after_s: float, dt: float) -> Bool:
 
 
 def _runs(above: Bool, cause: Int, dt: float) -> list[tuple[int, int]]:
-    """Half-open runs of one cause above the threshold; gaps shorter than ``MERGE_S`` do not part them."""
+    """Return half-open runs of one cause above the threshold; gaps shorter than ``MERGE_S`` do not split them."""
     edges = np.flatnonzero(np.diff(np.where(_joined(above, MERGE_S, dt), cause, -1), prepend=-2, append=-2) != 0)
     runs = []
     for first, last in pairwise(edges.tolist()):

@@ -13,7 +13,7 @@ from fdhil.records import PARAMETERS, Estimate, Float, Reason, Window
 from fdhil.validation.significance import BUDGET
 
 BEYOND_CHANCE = BUDGET["between windows"].deviations
-MODEL_SHARE = 0.003  # how well equal drives agree at any noise: the voltage's course within a sample is not known
+MODEL_SHARE = 0.003  # agreement of equal drives at any noise: the voltage's course within a sample is unknown
 UNEXPLAINED = 30.0  # chi-square of 5 degrees of freedom: 2e-5 by chance
 GAINS: Mapping[str, Float] = {  # powers of R, L, K, Jt, ft, Cd
     "voltage": np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0]),
@@ -29,9 +29,9 @@ Pair = tuple[tuple[Window, Estimate], tuple[Window, Estimate]]
 
 
 def values_apart(estimate: Estimate, likeliest: Float) -> Iterator[Reason]:
-    """Yield a reason for each value that its own interval puts apart from the ``likeliest`` (6,) of the same window.
+    """Yield a reason for each value that its own interval separates from the ``likeliest`` (6,) of the same window.
 
-    The structure is tested about the likeliest values: what another method says is believed as far as it agrees.
+    The structure is tested about the likeliest values: the values of another method are accepted as far as they agree.
     """
     for name, best in zip(PARAMETERS, likeliest, strict=True):
         value, std = estimate.value(name), estimate.std(name)
@@ -43,40 +43,40 @@ def values_apart(estimate: Estimate, likeliest: Float) -> Iterator[Reason]:
             yield Reason("ValidationFailed", text, "identify by maximum_likelihood")
 
 
-def moved(told: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
+def moved(estimates: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
     """Return a reason for each parameter that differs between windows beyond chance and by enough to matter.
 
-    L, K and Jt are the same in all windows, given in order. What warms drifts from window to window and is no jump: R
-    is compared with the window before, friction with that before in the same direction, as a load and the screw make
-    it another in the other. One sensor's gain moves several parameters at once, each in its own proportion: where that
-    explains all of it, the sensor is the reason, even where no parameter alone moves enough to tell.
+    L, K and Jt are the same in all windows, given in order. A drift by temperature is no jump: R is compared with the
+    window before, friction with that before in the same direction, since a load and the screw change it in the other.
+    One sensor's gain changes several parameters at once, each in its own proportion: where that explains all of it, the
+    sensor is the reason, even where no single parameter changes significantly.
     """
     reasons: list[Reason] = []
     worst: Pair | None = None
     for name in PARAMETERS:
-        pair = _farthest(told, name)
+        pair = _farthest(estimates, name)
         if pair is None:
             continue
         worst = worst or pair
         code = "LoadChanged" if name == "Jt" else "ParameterJump"
         before, after = (estimate.value(name) for _, estimate in pair)
-        text = f"{name} moves from {before:.4g} to {after:.4g} between the windows"
-        reasons.append(Reason(code, text, "identify the windows before and after the change apart"))
+        text = f"{name} changes from {before:.4g} to {after:.4g} between the windows"
+        reasons.append(Reason(code, text, "identify the windows before and after the change separately"))
     if len(reasons) == 1:
         return reasons
-    suspected = [worst] if worst is not None else [*pairwise(told), *_by_direction(told)]
+    suspected = [worst] if worst is not None else [*pairwise(estimates), *_by_direction(estimates)]
     sensors = [reason for pair in suspected if (reason := gain_change(*pair)) is not None]
     return sensors[:1] or reasons
 
 
 def is_of_winding(reason: Reason) -> bool:
-    """Return whether a reason of :func:`moved` says that R or L moves: the current loop hides it at the table."""
+    """Return whether a reason reports a jump of R or L: the current loop hides that at the table."""
     return reason.code == "ParameterJump" and reason.text.split(" ", 1)[0] in WINDING
 
 
-def _farthest(told: Sequence[tuple[Window, Estimate]], name: str) -> Pair | None:
-    """Return the two windows, in order, between which a parameter moves most, where that is a jump; else None."""
-    known = [(w, e) for w, e in told if np.isfinite(e.value(name))]  # a slow voltage may leave R and L open
+def _farthest(estimates: Sequence[tuple[Window, Estimate]], name: str) -> Pair | None:
+    """Return the two windows, in order, between which a parameter changes most, if that is a jump."""
+    known = [(w, e) for w, e in estimates if np.isfinite(e.value(name))]  # a slow voltage may leave R and L open
     if len(known) < 2:
         return None
     pairs = list(combinations(known, 2)) if name not in WARMING else list(pairwise(known))
@@ -92,22 +92,21 @@ def _farthest(told: Sequence[tuple[Window, Estimate]], name: str) -> Pair | None
     return (one, other) if abs(other[1].value(name) - one[1].value(name)) > max(chance, least) else None
 
 
-def _by_direction(told: Sequence[tuple[Window, Estimate]]) -> Iterator[Pair]:
-    """Yield each window with the one before it in its direction."""
+def _by_direction(estimates: Sequence[tuple[Window, Estimate]]) -> Iterator[Pair]:
     for direction in (1, -1):
-        yield from pairwise([(w, e) for w, e in told if w.direction == direction])
+        yield from pairwise([(w, e) for w, e in estimates if w.direction == direction])
 
 
 def gain_change(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) -> Reason | None:
-    """Return the reason when one sensor's gain explains all that differs between two estimates; None when none does.
+    """Return the reason if one sensor's gain explains all differences between two estimates; None if none does.
 
     With g the factor of a sensor's gain, [1] and [2] hold again for parameters times g to the powers of ``GAINS``.
     """
     before, after = one[1], other[1]
     names = [name for name in PARAMETERS if before.value(name) > 0 and after.value(name) > 0]
-    if len(names) < len(PARAMETERS) - 1:  # friction may be nil
+    if len(names) < len(PARAMETERS) - 1:  # friction may be zero
         return None
-    if one[0].direction != other[0].direction:  # what a load and the screw make of friction is no gain's doing
+    if one[0].direction != other[0].direction:  # load and screw change friction by direction
         names = [name for name in names if name not in FRICTION]
     rows = [PARAMETERS.index(name) for name in names]
     moved = np.log(after.values[rows] / before.values[rows])
@@ -125,12 +124,12 @@ def gain_change(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) ->
     share = float(np.expm1(amplitude))
     if abs(amplitude) < BEYOND_CHANCE * deviation or abs(share) < LEAST_GAIN_CHANGE:
         return None
-    text = f"the gain of {sensor} changes by {share:+.2%} between the windows: that alone explains what moves"
+    text = f"the gain of {sensor} changes by {share:+.2%} between the windows: that alone explains all changes"
     return Reason("CalibrationSuspect", text, f"check the {sensor} sensor and its wiring")
 
 
 def _unexplained(moved: Float, weight: Float, pattern: Float) -> tuple[float, float]:
-    """Return the best amplitude of a pattern, and the chi-square that it leaves."""
+    """Return the best amplitude of a pattern, and the chi-square of the residuals."""
     amplitude = float(pattern @ weight @ moved / (pattern @ weight @ pattern))
     rest = moved - amplitude * pattern
     return amplitude, float(rest @ weight @ rest)

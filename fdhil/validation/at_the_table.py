@@ -1,4 +1,4 @@
-"""Tells what an encoder at the table saw of a move: its true error, and what of it the motor's encoder does not see."""
+"""Measures a move by an encoder at the table: its true error, and what of it the motor's encoder does not see."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from fdhil.model import closed_loop
 from fdhil.records import AtTable, Float, Parameters, Window, rms
 
 LEAST_ROWS = 20
-LONGEST_MM = 1e6  # no axis is so long
+LONGEST_MM = 1e6  # longer than any axis
 STANDSTILL_S = 0.05  # before the move, in which the zero of the table's encoder is taken
 
 
 def at_the_table(
     window: Window, parameters: Parameters | None, axis: Axis | None, sync_period_s: float | None = None
 ) -> AtTable | None:
-    """Return what the table's encoder saw of a move; None without one, or where it saw little of it.
+    """Return the table's error during a move; None without an encoder there, or if it covers little of the move.
 
-    Its zero is the drive's where the axis stands before the move. With the ``axis`` the closed loop of ``parameters``
-    is run along the demand, which comes every ``sync_period_s``; a constant is not left of it, since friction holds the
-    screw bent where the axis stands.
+    Its zero is the drive's at standstill before the move. With the ``axis`` the closed loop of ``parameters`` is
+    simulated along the demand, which comes every ``sync_period_s``; a constant difference is removed, since friction
+    holds the screw bent at standstill.
     """
     if window.table_mm is None:
         return None
@@ -38,7 +38,7 @@ def at_the_table(
 
 
 def _zero(window: Window) -> float:
-    """Return by how much the table's encoder counts more than the drive's where the axis stands before the move."""
+    """Return the offset of the table's encoder from the drive's at standstill before the move, mm."""
     assert window.table_mm is not None
     apart = window.table_mm - window.position_mm
     first = moving_range(window)[0]
@@ -48,10 +48,10 @@ def _zero(window: Window) -> float:
 
 
 def _predicted(window: Window, parameters: Parameters | None, axis: Axis | None, sync_period_s: float) -> Float | None:
-    """Return the table's place (n,) as the model has it; None where model or loops are not known."""
-    told = parameters is not None and np.isfinite(list(parameters.as_dict().values())).all()
+    """Return the table position (n,) by the model, mm; None if model or loops are unknown."""
+    complete = parameters is not None and np.isfinite(list(parameters.as_dict().values())).all()
     same_grid = abs(sync_period_s - window.dt_s) < 1e-3 * window.dt_s
-    if parameters is None or axis is None or not told or not same_grid or not np.isfinite(window.demand_mm).all():
+    if parameters is None or axis is None or not complete or not same_grid or not np.isfinite(window.demand_mm).all():
         return None
     offset = None if window.offset_mm is None else np.nan_to_num(window.offset_mm)
     return closed_loop.simulate(parameters, axis, sync_period_s, window.demand_mm, offset).table_mm

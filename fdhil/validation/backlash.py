@@ -1,10 +1,10 @@
 """Measures backlash: how far the motor turns before the table follows, in micrometres at the table.
 
-While the table stands still, the integral of the motor's speed is the dead band that is being crossed. It is measured
-from the row in which the current leaves its level of standstill up to the row in which the table surely moves, less
-what the table has moved by then; its standard deviation is that of the integral, with the uncertainty of the speed's
-zero. When the motor brakes, the table runs on through the same dead band to its other flank: a second measurement,
-which a screw's wind-up disturbs too, so that it may confirm the first but not stand alone.
+While the table stands still, the integral of the motor's speed is the part of the dead band that is crossed. It is
+measured from the sample in which the current leaves its level of standstill up to the sample in which the table moves,
+less the table's motion by then; its standard deviation is that of the integral, with the uncertainty of the speed's
+zero. When the motor brakes, the table coasts through the same dead band to its other flank: a second measurement, which
+a screw's wind-up disturbs too, so that it may confirm the first but not replace it.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from fdhil.records import Float, Reason, Window
 from fdhil.validation.significance import BUDGET
 
 LIKELY = 2.0  # of the first measurement, which the second may confirm
-LEAST_UM = 20.0  # a screw's wind-up before the table starts, which is no play
+LEAST_UM = 20.0  # wind-up of a screw before the table starts, which is no backlash
 WOUND_UP_UM = 60.0  # a screw's wind-up as it unwinds and winds up again from driving to braking
 LEAST_ROWS = 8
-AFTER_S = 0.003  # the table follows by now, and the play it had is taken up
+AFTER_S = 0.003  # by then the table follows and the dead band is crossed
 LONGEST_S = 0.060  # before the table moves: a longer integral gathers more noise than dead band
 SMOOTHING_S = 0.002
 CHANGED = 5.0  # standard deviations by which a current leaves its level of standstill
 BEYOND_NOISE = 3.0  # standard deviations of the noise in a drop of the speed
-CROSSED_UM = 150.0  # what the table may have run on by when the second measurement ends
+CROSSED_UM = 150.0  # travel of the coasting table at which the second measurement ends
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +41,11 @@ class DeadBand:
 
     @property
     def sure(self) -> bool:
-        """Return whether it is beyond chance."""
+        """Return whether it is significant."""
         return abs(self.um) > BUDGET["play"].deviations * self.std_um
 
     def reason(self) -> Reason:
-        """Return it as the reason of a refusal."""
+        """Return the dead band as a reason to refuse a window."""
         text = f"the motor turns {self.um:.0f} ± {self.std_um:.0f} um before the table follows (backlash)"
         return Reason("ValidationFailed", text, "check screw, nut, coupling and bearings for play")
 
@@ -64,14 +64,13 @@ class _Course:
     current_noise: float  # before that
 
     def parted_um(self, a: int, b: int, zero_mm_s: float) -> float:
-        """Return by how much the motor turns more than the table moves from row ``a`` to ``b``."""
         turned = float(((self.speed_mm_s[a:b] + self.speed_mm_s[a + 1 : b + 1]) / 2 - zero_mm_s).sum()) * self.dt_s
         return 1e3 * (turned - float(self.position_mm[b] - self.position_mm[a]))
 
     def std_um(self, a: int, b: int, zero_rows: float) -> float:
-        """Return its standard deviation, with a zero that is the mean of ``zero_rows``.
+        """Return the standard deviation of that, with a zero that is the mean of ``zero_rows``.
 
-        The row in which the flanks meet may lie anywhere between two samples of the speed, which drops there.
+        The flanks may meet at any time between two samples of the speed, which drops there.
         """
         rows = b - a
         chance = self.noise_mm * math.sqrt(rows + rows**2 / zero_rows)
@@ -94,12 +93,12 @@ def _course(window: Window) -> _Course | None:
 
 
 def dead_band(window: Window) -> DeadBand | None:
-    """Return what the motor turns before the table follows; None where position or standstill are not recorded."""
+    """Return how far the motor turns before the table follows; None without a recorded position or standstill."""
     begin, end = moving_range(window)
     course = _course(window)
     if course is None or window.stages.accelerate is None or begin < LEAST_ROWS:
         return None
-    # the table moves for sure from this row on
+    # from this row on the table moves
     limit = 3 * course.quantum_mm + 1e-3
     moves = np.flatnonzero(np.abs(course.position_mm[:end] - course.position_mm[0]) > limit)
     if moves.size == 0:
@@ -110,13 +109,13 @@ def dead_band(window: Window) -> DeadBand | None:
     if not np.isfinite(window.speed_rad_s[:stop]).all() or start >= stop:
         return None
     start = _torque_changes(course, start, first)
-    # the axis may still settle from its last move, which is no offset of the speed; after the move it may do so unseen,
-    # within its play
+    # the axis may still settle from its last move, which is no offset of the speed; within its dead band that is
+    # not observable after the move
     return DeadBand(course.parted_um(start, stop, _zero(course, 0, start)), course.std_um(start, stop, start))
 
 
 def _zero(course: _Course, a: int, b: int) -> float:
-    """Return what the speed reads (mm/s) beyond the table's own motion from row ``a`` to ``b``."""
+    """Return the speed's reading (mm/s) beyond the table's own motion from row ``a`` to ``b``."""
     moved = float(course.position_mm[b] - course.position_mm[a]) / ((b - a) * course.dt_s)
     return float(course.speed_mm_s[a:b].mean()) - moved
 
@@ -132,10 +131,10 @@ def _torque_changes(course: _Course, start: int, first: int) -> int:
 
 
 def overrun(window: Window) -> DeadBand | None:
-    """Return what the table moves more than the motor turns when braking begins; None where that is not seen.
+    """Return how much more the table moves than the motor when braking begins; None where that is not observable.
 
-    The force on the table reverses with the motor's torque: from there on the table would coast, and runs ahead of the
-    motor by the second integral of what brakes the motor, until its other flank is reached.
+    The force on the table reverses with the motor's torque: from there on the table would coast, and leads the motor by
+    the second integral of the braking deceleration, until its other flank is reached.
     """
     course = _course(window)
     stages = window.stages
@@ -162,13 +161,13 @@ def overrun(window: Window) -> DeadBand | None:
 
 
 def _gain(course: _Course, a: int, b: int, cruising: float) -> float:
-    """Return the acceleration (mm/s2) a unit of current gives the whole drive, friction taken from the cruise."""
+    """Return the acceleration (mm/s2) of the whole drive per unit of current, friction taken from the cruise."""
     pushed = float((course.current[a:b] - cruising).sum()) * course.dt_s
     return float(course.speed_mm_s[b - 1] - course.speed_mm_s[a]) / pushed if pushed > 0.0 else 0.0
 
 
 def backlash(window: Window) -> DeadBand | None:
-    """Return the dead band where it is beyond chance and larger than what a screw's wind-up explains."""
+    """Return the dead band if it is significant and larger than a screw's wind-up explains."""
     found = dead_band(window)
     if found is None or found.um <= LEAST_UM:
         return None

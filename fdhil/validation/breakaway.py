@@ -1,4 +1,4 @@
-"""Measures what friction takes at rest beyond the model: the impulse by which a move begins late."""
+"""Measures breakaway: the torque impulse beyond the model's friction that delays the start of a move."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from fdhil.validation.significance import BUDGET
 SURE = BUDGET["standstill"].deviations
 LEAST_BREAKAWAY = 0.02  # of the peak torque
 AFTER_S = 0.015
-HELD_SHARE = 0.7  # of dry friction: what surely does not move the shaft
+HELD_SHARE = 0.7  # of dry friction: torque that cannot turn the shaft
 LONGEST_BREAKAWAY_S = 0.060
 
 
 @dataclass(frozen=True, slots=True)
 class Breakaway:
-    """A torque (N.m, against the positive direction) for some time before row ``begin``, as the move begins.
+    """A torque (N.m, against the positive direction) before row ``begin``, as the move begins.
 
-    ``more``: it is more than the model's.
+    ``more``: it exceeds the model's; else it falls short of it.
     """
 
     excess_nm: float
@@ -37,7 +37,7 @@ class Breakaway:
         return np.where(np.arange(n) >= self.begin, self.excess_nm * self.lasted_s, 0.0)
 
     def reason(self) -> Reason:
-        """Return it as the reason of a refusal."""
+        """Return the breakaway torque as a reason to refuse a window."""
         text = (
             f"beginning to move takes {abs(self.excess_nm):.3g} N.m {'more' if self.more else 'less'} "
             f"over {1e3 * self.lasted_s:.0f} ms than friction drags (Stribeck)"
@@ -46,10 +46,10 @@ class Breakaway:
 
 
 def breakaway(window: Window, fit: Fit) -> Breakaway | None:
-    """Return what the move takes more to begin than the model says, None where that is chance or little.
+    """Return the additional torque needed to begin the move; None if it is insignificant or small.
 
-    From rest, Jt w(t) is the integral of what K i exceeds dry friction by, less viscous friction. The current's noise
-    averages out in that integral, so the speed it predicts for the first surely moving rows is sharp.
+    From rest, Jt w(t) is the integral of the excess of K i over dry friction, less viscous friction. The current's
+    noise averages out in that integral, so the speed it predicts for the first rows in motion is sharp.
     """
     motion, theta = fit.problem.motions[0], fit.theta
     sure = np.flatnonzero(np.abs(motion.mode) == 1)
@@ -63,7 +63,7 @@ def breakaway(window: Window, fit: Fit) -> Breakaway | None:
     torque = side * theta[2] * motion.current[still:end]
     speed = side * motion.speed[still:end]
     drag = theta[5] + side * terms_nm(motion, theta)[still:end]
-    drag[: begin - still] = drag[begin - still]  # what joined the six is known where the shaft surely moves
+    drag[: begin - still] = drag[begin - still]  # terms are known only where the shaft moves
     net = np.where(np.arange(still, end) < begin, np.maximum(torque - drag, 0.0), torque - drag)
     net = net - theta[4] * np.maximum(speed, 0.0)
     predicted = np.concatenate([[0.0], np.cumsum((net[1:] + net[:-1]) / 2)]) * window.dt_s / theta[3]
@@ -79,7 +79,7 @@ def breakaway(window: Window, fit: Fit) -> Breakaway | None:
 
 
 def _rest_before(fit: Fit, begin: int, side: int) -> int | None:
-    """Return the last row before the move at which the torque surely holds the shaft at rest; None without one."""
+    """Return the last row before the move at which the torque cannot turn the shaft; None without one."""
     motion, noise = fit.problem.motions[0], fit.problem.noises[0]
     rows = max(8, round(0.010 / motion.dt_s))
     first = max(rows, begin - round(LONGEST_BREAKAWAY_S / motion.dt_s))

@@ -1,9 +1,9 @@
-"""Checks that the rapid was carried out as ordered: one plateau, both ramps alike, rest where the demand rests.
+"""Checks that a rapid was executed as ordered: one plateau, equal ramps, at rest where the demand rests.
 
 Feed override and feed hold change the speed on the way; an abort brakes harder than any planned ramp or leaves the
-demand behind. Position and demand tell, so that no fault of the speed sensor can pass for one. A slower rapid at a
-constant override keeps its three stages and is as good as any, where no NC says that it was one: what is known to be
-no rapid as planned is refused. A hold that comes to rest leaves two whole moves.
+demand behind. Position and demand show it, so that no fault of the speed sensor is mistaken for one. A slower rapid at
+a constant override keeps its three stages and is valid, unless the NC reports the override: such a rapid is refused. A
+hold that comes to rest leaves two complete moves.
 """
 
 from __future__ import annotations
@@ -15,34 +15,34 @@ import numpy as np
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.windows import bridged, longest
 from fdhil.records import Float, NcMove, Reason, Window
-from fdhil.validation.evidence import Evidence
+from fdhil.validation.window_signals import WindowSignals
 
 CODE = "EpisodeAborted"
 ADVICE = "record a rapid without feed hold, override change or stop"
 LABORATORY = "record a whole move from rest to rest, or identify from any move with --any-move (any_move=True)"
-NC_ADVICE = "rapids teach at an override of 100 % and without feed hold"
+NC_ADVICE = "only rapids at an override of 100 % and without feed hold are used"
 OVERRIDE = 0.005  # that is still 100 %
 SMOOTHING_S = 0.020
 TOP = 0.95
 OVERSHOOT = 0.85
 RAMP_S = 0.005
-LEAST_DIP = 0.06  # of the plateau: a drive's own following of one ramp stays below
+LEAST_DIP = 0.06  # of the plateau: a drive's lag along one ramp stays below
 HELD_S = 0.040
 HELD_RATE = 0.2  # of the steepest ramp: a speed that changes more slowly is held
 BETWEEN = (0.1, 0.92)  # of the plateau: a ramp with limited jerk is slow only beyond them
 HARDER = 2.0
-MOVES_ON = 0.03  # of the plateau: a demand that rests, or turns, is slower in some row
+MOVES_ON = 0.03  # of the plateau: a demand that rests, or reverses, is slower in some row
 LEFT_MM = 1.0
 LEFT_SHARE = 0.01
 
 
-def interruptions(evidence: Evidence) -> Iterator[Reason]:
-    """Yield the reason why the window is no whole rapid, with the figure that shows it."""
-    window = evidence.window
+def interruptions(signals: WindowSignals) -> Iterator[Reason]:
+    """Yield the reason why the window is not a complete rapid, with the figure that shows it."""
+    window = signals.window
     if window.nc is not None and (said := _said(window.nc)) is not None:
         yield Reason(CODE, said, NC_ADVICE)
         return
-    a, b = (min(row, window.n) for row in evidence.moving)
+    a, b = (min(row, window.n) for row in signals.motion_range)
     speed = _course(window.position_mm, window)
     if speed is None or b - a < 8:
         return
@@ -62,19 +62,20 @@ def interruptions(evidence: Evidence) -> Iterator[Reason]:
 
 
 def _said(nc: NcMove) -> str | None:
-    """Return what the NC itself says was no whole rapid; at another speed than planned its demand is another, too."""
     where = "" if nc.line is None else f" in line {nc.line}"
     if nc.held:
-        return f"the NC says that its feed was held{where}"
+        return f"the NC reports a feed hold{where}"
     if nc.override is not None and max(abs(1.0 - override) for override in nc.override) > OVERRIDE:
         least, greatest = nc.override
-        told = f"{100 * least:.0f} %" if greatest - least < OVERRIDE else f"{100 * least:.0f} to {100 * greatest:.0f} %"
-        return f"the NC says that its override was {told}{where}"
+        share = (
+            f"{100 * least:.0f} %" if greatest - least < OVERRIDE else f"{100 * least:.0f} to {100 * greatest:.0f} %"
+        )
+        return f"the NC reports an override of {share}{where}"
     return None
 
 
 def _plateau(window: Window, moving: Float, speed: Float) -> float:
-    """Return the speed the rapid is held at: the longest level, or a higher one that no overshoot explains."""
+    """Return the plateau speed: the longest level, or a higher one that no overshoot explains."""
     high = float(np.quantile(moving, TOP))
     if window.stages.cruise is None:
         return high
@@ -90,7 +91,7 @@ def _course(position_mm: Float, window: Window, seconds: float = SMOOTHING_S) ->
     known = position_mm[np.isfinite(position_mm)]
     if known.size < 2 or np.ptp(known) == 0.0:
         return None
-    position = bridged(position_mm)  # across a gap: one even speed
+    position = bridged(position_mm)  # constant speed across a gap
     width = 2 * round(seconds / window.dt_s / 2) + 1
     if position.size < width:
         return None
@@ -99,7 +100,7 @@ def _course(position_mm: Float, window: Window, seconds: float = SMOOTHING_S) ->
 
 
 def _dip(window: Window, seen: Float, plateau: float, begin: int, overshoot: Float) -> str | None:
-    """Return where the speed falls and rises again; not beneath a plateau that it had overshot by more before."""
+    """Return where the speed falls and rises again, unless it had overshot the plateau by more before."""
     before = np.maximum.accumulate(seen)
     after = np.maximum.accumulate(seen[::-1])[::-1]
     depth = np.minimum(before, after) - seen
@@ -126,10 +127,10 @@ def _held(window: Window, seen: Float, plateau: float, begin: int) -> str | None
     fast = np.flatnonzero((middle >= BETWEEN[1] * plateau) | (rate >= HELD_RATE * rate.max()))
     fast = fast[fast >= end - reach]
     if demand is None and fast.size and middle[fast[0]] >= BETWEEN[1] * plateau:
-        return None  # it arrives there without another ramp: a regulator that settles
+        return None  # it gets there without another ramp: the regulator settles
     return (
         f"the speed is held at {level:.4g} mm/s for {1e3 * (end - start) * window.dt_s:.0f} ms from "
-        f"{_at(window, begin + start)} s, beside its plateau of {plateau:.4g} mm/s"
+        f"{_at(window, begin + start)} s, below its plateau of {plateau:.4g} mm/s"
     )
 
 
@@ -148,7 +149,6 @@ def _quick_stop(window: Window, begin: int, end: int) -> str | None:
 
 
 def _left_behind(window: Window, end: int) -> str | None:
-    """Compare where table and demand rest after the move."""
     demand = window.demand_mm[np.isfinite(window.demand_mm)]
     if window.stages.brake is None or demand.size == 0 or np.ptp(demand) == 0.0:
         return None
@@ -164,7 +164,7 @@ def _left_behind(window: Window, end: int) -> str | None:
 
 
 def _moves_on(window: Window, begin: int, end: int, plateau: float) -> str | None:
-    """Tell whether the drive only swings through rest, before or after the move, while its demand goes on."""
+    """Return whether the drive only passes through rest, before or after the move, while its demand goes on."""
     speed = _course(window.demand_mm, window, RAMP_S)
     if speed is None:
         return None
@@ -172,7 +172,7 @@ def _moves_on(window: Window, begin: int, end: int, plateau: float) -> str | Non
     stages = window.stages
     for ended, part in ((stages.accelerate, speed[: begin + reach]), (stages.brake, speed[max(0, end - reach) :])):
         if ended is not None and (least := float(part.min())) > MOVES_ON * plateau:
-            return f"the demand moves on with {least:.4g} mm/s where the drive passes through rest"
+            return f"the demand continues at {least:.4g} mm/s while the drive passes through rest"
     return None
 
 

@@ -1,4 +1,4 @@
-"""Checks what must hold of the signals before any fit is believed: finite, not clipped, no hidden gap."""
+"""Checks the signals before any fit: finite, not clipped, no hidden gap."""
 
 from __future__ import annotations
 
@@ -10,107 +10,102 @@ import numpy as np
 from fdhil.identification.motion import resolution
 from fdhil.identification.windows import bridged, carried, longest
 from fdhil.records import Float, Reason, Window
-from fdhil.validation.evidence import STILL_MM, Evidence, signals_of
 from fdhil.validation.repeated_readings import beyond_chance
 from fdhil.validation.signal_consistency import position_confirms, travel_mm
 from fdhil.validation.significance import BUDGET
+from fdhil.validation.window_signals import STILL_MM, WindowSignals, collect_sensors
 
 TOLERATED_GAP = 3  # rows: a longer gap hides what the drive did
 TOLERATED_LOSS = 0.02
 RAIL_SAMPLES = 3
 QUANTISATION = 1 / 50
-SCALE_TOLERANCE = 0.005  # of the travel: pitch and speed scale are known to that
-ELASTIC_UM = 60.0  # a screw's wind-up, and backlash too small to be told
+SCALE_TOLERANCE = 0.005  # of the travel: tolerance of pitch and speed scale
+ELASTIC_UM = 60.0  # a screw's wind-up, and backlash too small to detect
 
 
-# travel of the position per travel of the integral of speed, and the unit that makes it so
+# travel of the position per travel of the integral of speed, and the unit error that causes it
 UNITS_MISTAKEN: Mapping[float, str] = {
-    1e3: "as a position in mm where m belong",
-    1e6: "as a position in um where m belong",
-    1e3 / 25.4: "as a position in inches where m belong",
-    1e-3: "as a screw pitch in mm where m belong, or times in ms where s belong",
-    math.pi / 30: "as a speed in 1/min where rad/s belong",
-    math.pi / 180: "as a speed in degrees per second where rad/s belong",
-    -1.0: "as a position that counts against the speed",
+    1e3: "as if the position were in mm instead of m",
+    1e6: "as if the position were in um instead of m",
+    1e3 / 25.4: "as if the position were in inches instead of m",
+    1e-3: "as if the screw pitch were in mm instead of m, or times in ms instead of s",
+    math.pi / 30: "as if the speed were in 1/min instead of rad/s",
+    math.pi / 180: "as if the speed were in degrees per second instead of rad/s",
+    -1.0: "as if position and speed had opposite signs",
 }
 UNIT_TOLERANCE = 0.02
-HOTTEST_C = 120.0  # no slide-way, screw or winding in service
+HOTTEST_C = 120.0  # above any slide-way, screw or winding in service
 
 
 def warnings_of(window: Window) -> list[Reason]:
-    """Return what is worth telling but does not refuse the window: coarse quantisation, an odd temperature."""
+    """Return warnings that do not refuse the window: coarse quantisation, an implausible temperature."""
     found = []
-    for signal in signals_of(window):
+    for signal in collect_sensors(window):
         finite = signal.values[np.isfinite(signal.values)]
         span, step = float(np.ptp(finite)) if finite.size else 0.0, signal.step
         if span > 0 and step > QUANTISATION * span:
-            text = (
-                f"{signal.name} comes in steps of {step:.3g} {signal.unit}, {100 * step / span:.1f} % of the range used"
-            )
+            text = f"{signal.name} has steps of {step:.3g} {signal.unit}, {100 * step / span:.1f} % of the range used"
             found.append(Reason("Quantised", text, "use a finer scale in the drive's mapping"))
     if window.temperature_c is not None and not -HOTTEST_C < window.temperature_c < HOTTEST_C:
-        text = f"{window.temperature_c:g} degC is no temperature of a machine{_kelvin(window.temperature_c)}"
-        found.append(Reason("Implausible", text, "give temperature_C in degrees Celsius, drift is told against it"))
+        text = f"{window.temperature_c:g} degC is not a plausible machine temperature"
+        celsius = window.temperature_c - 273.15
+        text += f"; {celsius:.0f} degC in kelvin?" if -50.0 < celsius < HOTTEST_C else ""
+        found.append(Reason("Implausible", text, "give temperature_C in degrees Celsius: drift is compared with it"))
     return found
 
 
-def _kelvin(celsius: float) -> str:
-    guess = celsius - 273.15
-    return f"; {guess:.0f} degC in kelvin?" if -50.0 < guess < HOTTEST_C else ""
-
-
-def not_finite(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason for each signal with values that are no numbers, and for one that no drive has."""
-    lost, largest = np.zeros(evidence.window.n, dtype=bool), 0.0
-    for begin, end in evidence.window.gaps:
+def not_finite(signals: WindowSignals) -> Iterator[Reason]:
+    """Yield a reason for each signal with values that are not finite, and for one that no drive reaches."""
+    lost, largest = np.zeros(signals.window.n, dtype=bool), 0.0
+    for begin, end in signals.window.gaps:
         lost[begin:end] = True
-    for signal in evidence.signals:
+    for signal in signals.sensors:
         finite = np.isfinite(signal.values)
         largest = max(largest, float(np.abs(signal.values[finite]).max(initial=0.0)))
         bad = ~finite & ~lost
         if bad.any():
-            first = evidence.time_s(int(np.argmax(bad)))
+            first = signals.get_time_s(int(np.argmax(bad)))
             text = f"{signal.name} is not finite in {int(bad.sum())} rows, first at {first:.3f} s"
             yield Reason("NotFinite", text, "check the sensor and its scaling")
     if largest > 1e9:
-        yield Reason("NotFinite", f"a signal reaches {largest:.3g}, which no drive does", "check the scaling")
+        yield Reason("NotFinite", f"a signal reaches {largest:.3g}, beyond any drive", "check the scaling")
 
 
-def missing_stages(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason where the move does not begin or end at rest."""
-    stages = evidence.window.stages
+def missing_stages(window: Window) -> Iterator[Reason]:
+    """Yield a reason if the move does not begin or end at rest."""
+    stages = window.stages
     for name, stage in (("accel", stages.accelerate), ("brake", stages.brake)):
         if stage is None:
             what = {"accel": "acceleration", "brake": "braking to rest"}[name]
             yield Reason(f"MissingStage({name})", f"the move has no {what}", "record the whole of a longer rapid")
 
 
-def missing_plateau(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason where the speed is constant nowhere: friction and inertia then are told apart by noise alone."""
-    if evidence.window.stages.cruise is None:
+def missing_plateau(window: Window) -> Iterator[Reason]:
+    """Yield a reason if the speed is never constant: only noise then separates friction from inertia."""
+    if window.stages.cruise is None:
         text = "the move has no 100 ms of constant speed"
         yield Reason("MissingStage(cruise)", text, "record the whole of a longer rapid")
 
 
-def gaps(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason where more of the move is lost than a fit may pass over."""
-    window, (a, b) = evidence.window, evidence.moving
+def gaps(signals: WindowSignals) -> Iterator[Reason]:
+    """Yield a reason if more of the move is lost than a fit may skip."""
+    window, (a, b) = signals.window, signals.motion_range
     inside = [(g, h) for g, h in window.gaps if (g < b and h > a) or _travels(window, g, h)]
     rows = sum(h - g for g, h in inside)
     if rows and (max(h - g for g, h in inside) > TOLERATED_GAP or rows > TOLERATED_LOSS * (b - a)):
-        text = f"{rows} of {b - a} samples of the move are lost, the first at {evidence.time_s(inside[0][0]):.3f} s"
+        text = f"{rows} of {b - a} samples of the move are lost, the first at {signals.get_time_s(inside[0][0]):.3f} s"
         yield Reason("StaleData", text, "find where frames are lost: bus load, receive buffer")
 
 
 def _travels(window: Window, begin: int, end: int) -> bool:
     """Return whether the table moves while these rows are lost: the end of the move may lie within them."""
-    beside = window.position_mm[[max(0, begin - 1), min(end, window.n - 1)]]
-    return bool(abs(beside[1] - beside[0]) > STILL_MM)
+    edges = window.position_mm[[max(0, begin - 1), min(end, window.n - 1)]]
+    return bool(abs(edges[1] - edges[0]) > STILL_MM)
 
 
-def clipped(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason for each extreme at which a signal stays for longer than its own rows explain."""
-    for signal in evidence.sensors:
+def clipped(signals: WindowSignals) -> Iterator[Reason]:
+    """Yield a reason for each extreme at which a signal stays longer than its own samples explain."""
+    for signal in signals.varying_sensors:
         values = signal.values
         if not np.isfinite(values).any():
             continue
@@ -118,27 +113,27 @@ def clipped(evidence: Evidence) -> Iterator[Reason]:
             start, end = longest(values == rail)
             if rail == 0.0 or end - start < RAIL_SAMPLES or not beyond_chance(values, start, end - 1):
                 continue
-            if position_confirms(evidence, signal, start, end):
+            if position_confirms(signals.window, signal, start, end):
                 continue
             text = (
                 f"{signal.name} stays at its {side} extreme {rail:.6g} {signal.unit} for {end - start} samples "
-                f"from {evidence.time_s(start):.3f} s"
+                f"from {signals.get_time_s(start):.3f} s"
             )
             yield Reason("Saturated", text, "use a larger measuring range")
 
 
-def position_parted(evidence: Evidence) -> Iterator[Reason]:
+def position_parted(signals: WindowSignals) -> Iterator[Reason]:
     """Compare the position with the integral of speed: a hidden gap, a stuck signal or a wrong scale shows up.
 
-    By the backlash that the window shows, both may part.
+    Both may differ by the backlash that the window shows.
     """
-    window, play = evidence.window, evidence.play
+    window, play = signals.window, signals.backlash
     if not np.isfinite(window.position_mm).any() or np.ptp(carried(window.position_mm)) == 0.0:
         return
-    # lost rows are bridged for this comparison alone
+    # lost rows are interpolated for this comparison alone
     position, travel = bridged(window.position_mm), travel_mm(window.speed_rad_s, window.dt_s, window.pitch_mm)
     to_mm = window.dt_s * window.pitch_mm / (2 * math.pi)
-    noise = evidence.noise.speed_rad_s * to_mm
+    noise = signals.noise.speed_rad_s * to_mm
     rounding = resolution(window.speed_rad_s[np.isfinite(window.speed_rad_s)]) / 2 * to_mm
     quantum = max(resolution(position), 1e-6)
     error = position - position[0] - travel
@@ -147,20 +142,20 @@ def position_parted(evidence: Evidence) -> Iterator[Reason]:
         yield unit
         return
     elastic = 1e-3 * (ELASTIC_UM + 1.5 * (play.um if play is not None else 0.0))
-    yield from _jump(evidence, error, noise, quantum, elastic, rounding)
+    yield from _jump(signals, error, noise, quantum, elastic, rounding)
     yield from _scale(travel, error, noise, quantum, elastic + rounding * error.size)
 
 
 def _jump(
-    evidence: Evidence, error: Float, noise: float, quantum: float, elastic: float, rounding: float
+    signals: WindowSignals, error: Float, noise: float, quantum: float, elastic: float, rounding: float
 ) -> Iterator[Reason]:
-    """Find the stretch over which position and integral part most beyond noise, at any length up to 100 ms.
+    """Find the interval, up to 100 ms long, over which position and integral differ most beyond noise.
 
-    A speed that is read in steps may be off by ``rounding`` mm in each sample, always to one side.
+    A quantised speed may be off by ``rounding`` mm in each sample, always to one side.
     """
     worst, where, amount = 0.0, 0, 0.0
     for seconds in (0.0, 0.005, 0.02, 0.05, 0.1):
-        length = max(1, round(seconds / evidence.window.dt_s))
+        length = max(1, round(seconds / signals.window.dt_s))
         if length >= error.size:
             continue
         change = np.abs(error[length:] - error[:-length])
@@ -170,12 +165,12 @@ def _jump(
         if change[k] / allowed > worst:
             worst, where, amount = float(change[k] / allowed), k, float(change[k])
     if worst > 1.0:
-        text = f"position and the integral of speed part by {1e3 * amount:.0f} um at {evidence.time_s(where):.3f} s"
+        at = f"at {signals.get_time_s(where):.3f} s"
+        text = f"position and the integral of speed differ by {1e3 * amount:.0f} um {at}"
         yield Reason("Implausible", text, "samples are lost or repeated there: check counters and time stamps")
 
 
 def _unit(travel: Float, error: Float) -> Reason | None:
-    """Return the unit that explains how position and integral of speed differ, where one does."""
     whole = float(travel[-1])
     times = 1.0 + float(error[-1]) / whole if whole else 1.0
     for factor, meaning in UNITS_MISTAKEN.items():

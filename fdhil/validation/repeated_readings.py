@@ -1,4 +1,4 @@
-"""Tells how likely equal readings are: of a constant read in steps, and beside the rows before and after them."""
+"""Computes how likely equal readings are: of a quantised constant, and by the samples before and after them."""
 
 from __future__ import annotations
 
@@ -12,50 +12,50 @@ from fdhil.records import Bool, Float
 from fdhil.validation.significance import BUDGET
 
 RESOLVED = 0.2  # of a step: noise below it hides in the resolution
-TOLD_STEPS = 1.0  # of noise, beyond which two readings in three differ
+INFORMATIVE_STEPS = 1.0  # of noise, beyond which two of three readings differ
 LEAST_NOISE_ROWS = 20
-SIDE = 3  # rows beside a run of equal readings that tell of it, in lengths of the run
+SIDE = 3  # rows on either side of a run that are compared with it, in lengths of the run
 
 
 def alike(noise: float) -> float:
-    """Return how likely a constant in the middle of a step is read there; its ``noise`` is in steps."""
+    """Return the probability that a constant in the middle of a step is read there; ``noise`` is in steps."""
     return math.erf(1.0 / (math.sqrt(8.0) * noise))
 
 
 def beyond_chance(values: Float, start: int, end: int) -> bool:
-    """Return whether the readings of rows ``start`` to ``end``, all alike, are more than the rows about them explain.
+    """Return whether the equal readings of rows ``start`` to ``end`` are more than the neighbouring rows explain.
 
     Either side may explain them: by how often it has that very reading (a constant read coarsely), or by how often it
-    repeats its reading (a signal that creeps through the steps). Noise of several steps leaves neither.
+    repeats its reading (a signal that creeps through the steps). Noise of several steps explains neither.
     """
     length = end - start + 1
     chance = 0.0
     same, step = np.diff(values) == 0.0, resolution(values[np.isfinite(values)])
     sides = (slice(max(0, start - SIDE * length), start), slice(end + 1, end + 1 + SIDE * length))
     for others in (values[sides[0]], values[sides[1]], np.concatenate([values[:start], values[end + 1 :]])):
-        # the rows beside may lie at the edge of a step, and the run in its middle
+        # the neighbouring rows may lie at the edge of a step, and the run in its middle
         chance = max(chance, likely_reading(others, step) ** length)
     for side in sides:
-        # where noise goes through several steps, no reading comes often: what has this one was cut off as well
-        if values[side].size >= length and noise_of(values[side]) < TOLD_STEPS * step:
+        # with noise of several steps no reading is frequent: rows with this one were clipped as well
+        if values[side].size >= length and noise_of(values[side]) < INFORMATIVE_STEPS * step:
             likely = all_within(length, values[side] == values[start]), all_within(length - 1, same[side])
             chance = max(chance, *likely)
     return values.size * chance < BUDGET["saturated"].chance
 
 
 def likely_reading(values: Float, step: float) -> float:
-    """Return how likely a constant with the noise of ``values`` is read alike at most: in the middle of a ``step``."""
+    """Return the largest probability that a constant with the noise of ``values`` repeats its reading: mid-``step``."""
     third = np.diff(values, 3)
     third = third[np.isfinite(third)]
     if third.size < LEAST_NOISE_ROWS or step == 0.0:
         return 0.0
-    # what is read in steps has the steps' own scatter too
+    # quantisation adds its own scatter
     variance = float(np.mean(third**2)) / 20.0 - step**2 / 12
     return alike(math.sqrt(max(variance, (RESOLVED * step) ** 2)) / step)
 
 
 def all_within(length: int, others: Bool) -> float:
-    """Return how likely ``length`` given rows all have what these and ``others`` have as often as they do, anywhere.
+    """Return the probability that ``length`` given rows have what these and ``others`` have as often as they do.
 
     Exact for rows that may be exchanged for each other (Fisher): no level of noise is needed.
     """
@@ -66,7 +66,7 @@ def all_within(length: int, others: Bool) -> float:
 
 
 def wakes_with_a_jump(part: Float, start: int, end: int) -> bool:
-    """Return whether the signal goes on after a run of repeats by more than it ever changes otherwise."""
+    """Return whether the signal resumes after a run of repeats by more than it ever changes otherwise."""
     change = np.abs(np.diff(part))
     if end >= change.size:
         return False

@@ -1,4 +1,4 @@
-"""Replays a recorded move through the closed loop: the one comparison by which a model is weighed at the table."""
+"""Replays a recorded move through the closed loop: the one comparison by which a model is assessed at the table."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fdhil.records import PARAMETERS, Float, Int, Parameters, Window, rms
 LEAST_ROWS = 20
 OFF_GRID = 1e-3  # of a cycle, by which a row may differ from it
 SHARES_OF_LOAD = (0.0, -0.5, -0.25, -0.75, 0.5, 1.0, 2.0)  # of the friction in this direction, the likeliest first
-ENOUGH = 0.02  # of the following error: left with less, no better share is looked for
+ENOUGH = 0.02  # of the following error: below, no better share is searched for
 STANDSTILL_S = 0.015  # over which the current before a move is taken
 REST_S = 0.05  # an axis at rest has stood for so long: within it a deviation that still decays shows as motion
 REST_MM, REST_STEPS = 3e-3, 3.0  # a position that changes by no more, or by no more of its own steps, stands
@@ -47,12 +47,12 @@ class Replay:
 
     @property
     def predicted_mm(self) -> Float:
-        """Where the drive's encoder was at the SYNC instants (n,), as the model has it."""
+        """The predicted position of the drive's encoder at the SYNC instants (n,)."""
         return self.response.position_mm
 
     @property
     def unexplained_um(self) -> float:
-        """RMS of what the model does not explain, without what the position's own steps make of any model."""
+        """RMS difference that the model does not explain, less the effect of the position's resolution."""
         return math.sqrt(max(0.0, rms(self.difference_um) ** 2 - self.step_um**2 / 12.0))
 
     @property
@@ -70,12 +70,11 @@ def replay(
     offset_mm: Float | None = None,
     standstill_a: float | None = None,
 ) -> Replay:
-    """Run a move from rest, rows (n,) on the SYNC grid, through the closed loop and compare it with the measured one.
+    """Simulate a move from rest, rows (n,) on the SYNC grid, in the closed loop and compare it with the measured one.
 
-    A resonance that the axis' section tells of is the model's, as it is where it predicts.
-    ``demand_mm`` is r[k], what the drive follows at row k; lost rows are NaN and not compared. ``standstill_a`` is what
-    the regulators hold before the move (None: what they need). ValueError when fewer than ``LEAST_ROWS`` rows can be
-    compared.
+    A resonance in the axis' section is part of the model, as it is in predictions. ``demand_mm`` is r[k], which the
+    drive follows at row k; lost rows are NaN and not compared. ``standstill_a`` is the current that the regulators hold
+    before the move (None: what they need). ValueError when fewer than ``LEAST_ROWS`` rows can be compared.
     """
     parameters = with_resonance(parameters, axis)
     demand = _filled(demand_mm, "demand")
@@ -86,7 +85,7 @@ def replay(
     rows = np.flatnonzero(np.isfinite(demand_mm) & np.isfinite(position_mm))
     rows = rows[(rows >= _EDGE) & (rows < demand.size - _EDGE)]
     if rows.size < LEAST_ROWS:
-        raise ValueError(f"a move with {rows.size} whole rows is too short to judge the model")
+        raise ValueError(f"a move with {rows.size} whole rows is too short to assess the model")
     difference = (position_mm - response.position_mm)[rows] * 1e3
     return Replay(
         response, rows, difference, (position_mm - demand_mm)[rows] * 1e3, 1e3 * resolution(position_mm[rows])
@@ -96,10 +95,10 @@ def replay(
 def replay_window(window: Window, parameters: Parameters, axis: Axis, sync_period_s: float) -> Replay | None:
     """Return the replay of a window whose rows are the drive's set-points; None for any other.
 
-    What a drive makes of its set-points between rows, or of those between two rows, is not recorded. None too where
-    demand or position were not recorded, or did not move. What is compared is the move: where within its friction the
-    shaft comes to rest, one rapid does not tell. Its dry friction holds a constant load, too; how much of it is load
-    shows as it leaves rest alone: of what it may be, that is taken which explains the rapid best.
+    The drive's response between rows is not recorded. None too where demand or position were not recorded, or did not
+    move. The move alone is compared: the position at which the shaft rests within its friction cannot be predicted from
+    one rapid. Dry friction holds a constant load, too; its share shows only at the start of the move: the share that
+    explains the rapid best is used.
     """
     if not _rows_are_setpoints(window, sync_period_s):
         return None
@@ -110,20 +109,20 @@ def replay_window(window: Window, parameters: Parameters, axis: Axis, sync_perio
         if parted is None:
             continue
         try:
-            told = replay(*signals, parted[0], axis, sync_period_s, window.offset_mm, standstill_a=parted[1])
-            told = told.during(*moving)
-        except ValueError:  # too few whole rows, or no drive
+            replayed = replay(*signals, parted[0], axis, sync_period_s, window.offset_mm, standstill_a=parted[1])
+            replayed = replayed.during(*moving)
+        except ValueError:  # too few complete rows, or no valid drive
             return None
-        best = told if best is None or told.unexplained_um < best.unexplained_um else best
+        best = replayed if best is None or replayed.unexplained_um < best.unexplained_um else best
         if best.unexplained_um < ENOUGH * best.measured_um:
             break
     return best
 
 
 def replay_setpoints(window: Window, parameters: Parameters, axis: Axis, sync_period_s: float) -> Replay | None:
-    """Return the replay of a window as :func:`replay_window`, by this very model: nothing is fitted to it.
+    """Return the replay of a window of set-points by this very model: no share of load is fitted.
 
-    None too where the axis had not come to rest before: what its regulators held then is not recorded.
+    None too where the axis had not come to rest before: its regulators' state then is not recorded.
     """
     begin = moving_range(window)[0]
     rest = slice(begin - math.ceil(REST_S / window.dt_s), begin)
@@ -137,14 +136,14 @@ def replay_setpoints(window: Window, parameters: Parameters, axis: Axis, sync_pe
     ]
     held_a = _mean(window.current_a[rest][: round(STANDSTILL_S / window.dt_s)])
     try:
-        told = replay(*signals, parameters, axis, sync_period_s, window.offset_mm, standstill_a=held_a)
-    except ValueError:  # too few whole rows, or no drive
+        replayed = replay(*signals, parameters, axis, sync_period_s, window.offset_mm, standstill_a=held_a)
+    except ValueError:  # too few complete rows, or no valid drive
         return None
-    return told.during(*moving_range(window)) if np.isfinite(told.difference_um).all() else None
+    return replayed.during(*moving_range(window)) if np.isfinite(replayed.difference_um).all() else None
 
 
 def completed(parameters: Parameters, spare: Parameters) -> Parameters:
-    """Return the parameters with what is not known of them taken from ``spare``: R and L do little at the table."""
+    """Return the parameters with unknown R and L taken from ``spare``: they have little effect at the table."""
     values = parameters.as_dict()
     return parameters.changed(
         **{name: getattr(spare, name) for name in PARAMETERS[:2] if not math.isfinite(values[name])}
@@ -152,7 +151,6 @@ def completed(parameters: Parameters, spare: Parameters) -> Parameters:
 
 
 def _rows_are_setpoints(window: Window, sync_period_s: float) -> bool:
-    """Return whether a window's rows are the drive's set-points, and demand and position were recorded and moved."""
     on_grid = abs(window.dt_s / sync_period_s - 1.0) <= OFF_GRID
     return on_grid and _moves(window.demand_mm) and _moves(window.position_mm)
 
@@ -160,9 +158,9 @@ def _rows_are_setpoints(window: Window, sync_period_s: float) -> bool:
 def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tuple[Parameters, float] | None:
     """Return a drive that moves the same way in ``direction`` with a load, and the current that it holds at rest.
 
-    With the friction Cd + D and a load D that helps the move it goes as with Cd. D is ``share`` of Cd, at least what
-    holds the shaft under the current; None where that is no share of this sign. Where no load holds it, it has friction
-    at rest that the model lacks, and the current is what the model holds.
+    With the friction Cd + D and a load D that helps the move it moves as with Cd. D is ``share`` of Cd, at least what
+    holds the shaft under the current; None where no share of this sign does. Where no load holds it, it has friction at
+    rest that the model lacks, and the current is what the model holds.
     """
     helping = share * p.Cd
     held, rests = direction * (p.K * current_a - p.term("load")), max(p.term("stribeck"), 0.0)
@@ -170,10 +168,10 @@ def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tu
     if share == 0.0:
         helping = max(0.0, least, -p.Cd)  # a load that helps may be more than friction: then their sum is below 0
     elif share < 0.0:
-        helping = max(helping, least, -p.Cd)  # so much of it as holds the shaft
+        helping = max(helping, least, -p.Cd)  # as much as holds the shaft
         if helping >= 0.0:
             return None
-    most = p.Cd + rests  # held less what the load takes is at most the friction at rest
+    most = p.Cd + rests  # the holding torque less the load's share is at most the friction at rest
     current = current_a - direction * max(0.0, held - most) / p.K
     if helping == 0.0:
         return p, current
@@ -205,7 +203,7 @@ def _moves(values: Float) -> bool:
 
 
 def _filled(values: Float, what: str) -> Float:
-    """Return the values with lost rows bridged: the demand is smooth, and what it drives there is not compared."""
+    """Return the values with lost rows interpolated: the demand is smooth, and its effect there is not compared."""
     good = np.isfinite(values)
     if not good.any():
         raise ValueError(f"the move has no {what}")

@@ -13,8 +13,9 @@ from fdhil.identification.motion import Noise
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.windows import carried, smooth
 from fdhil.records import Reason, Window
-from fdhil.validation.evidence import Evidence
 from fdhil.validation.significance import BUDGET
+from fdhil.validation.table_assessment import TableAssessment
+from fdhil.validation.window_fit import WindowFit
 
 Rows = np.ndarray[tuple[int], np.dtype[np.intp]]
 
@@ -27,29 +28,29 @@ HOLDING_SHARE = 1.15  # a drive at rest may hold as much as dry friction drags, 
 LEAST_TORQUE = 0.01
 
 
-def rest_faults(evidence: Evidence) -> Iterator[Reason]:
-    """Yield the sensors whose zero the rows at standstill contradict."""
-    window, fit, noise = evidence.window, evidence.on_time, evidence.noise
-    rows = np.flatnonzero(evidence.at_rest)
-    if rows.size < ROWS or (window.voltage_v is None and window.slow_voltage is None):
+def rest_faults(fitted: WindowFit) -> Iterator[Reason]:
+    """Yield the sensors whose zero is contradicted by the samples at standstill."""
+    window, fit, noise = fitted.window, fitted.aligned_fit, fitted.signals.noise
+    rows = np.flatnonzero(fitted.signals.standstill)
+    if rows.size < ROWS or not fitted.signals.has_voltage:
         return
     speed = float(np.mean(window.speed_rad_s[rows]))
     limit = max(SURE * noise.speed_rad_s / np.sqrt(rows.size), LEAST_SPEED * window.rapid_speed_rad_s)
     if abs(speed) > limit:
         text = f"speed reads {speed:+.3g} rad/s at standstill, limit {limit:.2g}"
         yield Reason("CalibrationSuspect", text, "set the zero of the speed sensor at standstill")
-    yield from _contradiction(window, fit, noise, rows, evidence.lost_v)
+    yield from _contradiction(window, fit, noise, rows, fitted.lost_voltage_v)
 
 
-def friction_at_rest(evidence: Evidence) -> Iterator[Reason]:
-    """Yield what friction holds at standstill, or takes to begin to move, that the model does not have."""
-    window, fit = evidence.window, evidence.on_time
-    rows = np.flatnonzero(evidence.at_rest)
-    if rows.size < ROWS or (window.voltage_v is None and window.slow_voltage is None):
+def friction_at_rest(table: TableAssessment) -> Iterator[Reason]:
+    """Yield friction at standstill, or at the beginning of a move, that the model lacks."""
+    fitted, signals = table.fitted, table.signals
+    rows = np.flatnonzero(signals.standstill)
+    if rows.size < ROWS or not signals.has_voltage:
         return
-    yield from _holding(window, fit, rows)
-    if (late := evidence.breakaway) is not None:
-        yield evidence.with_cost(late.reason(), evidence.breakaway_um(late))
+    yield from _holding(fitted.window, fitted.aligned_fit, rows)
+    if (late := fitted.breakaway) is not None:
+        yield table.append_cost(late.reason(), table.compute_breakaway_um(late))
 
 
 def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows, lost_v: float) -> Iterator[Reason]:
@@ -86,21 +87,20 @@ def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows, lost_v: f
 
 
 def _resistance_share(fit: Fit) -> float:
-    """Return the standard deviation of the resistance as a share of it."""
     return maximum_likelihood.finish(fit).std("R") / float(fit.theta[0])
 
 
 def _holding(window: Window, fit: Fit, rows: Rows) -> Iterator[Reason]:
-    """A shaft that sticks although K i exceeds Cd has friction, or bears a load, that the model does not have."""
+    """Report a shaft at rest although K i exceeds Cd: the model lacks friction or a load."""
     held = float(fit.theta[2]) * float(np.median(smooth(carried(window.current_a), window.dt_s)[rows]))
     peak = abs(fit.theta[2]) * float(np.nanmax(np.abs(window.current_a)))
     spread = float(np.sqrt(inverse_of(fit.information)[0][5, 5]))
     limit = HOLDING_SHARE * max(fit.theta[5], 0.0) + SURE * spread + LEAST_TORQUE * peak
     if abs(held) <= limit:
         return
-    told = f"the shaft rests under {abs(held):.3g} N.m, though dry friction is {fit.theta[5]:.3g} N.m"
-    if held * window.direction < 0.0:  # what pushes against this direction holds the shaft
-        text = f"{told} in this direction: a load, or friction that differs by direction"
+    rests = f"the shaft rests under {abs(held):.3g} N.m, though dry friction is {fit.theta[5]:.3g} N.m"
+    if held * window.direction < 0.0:  # a torque against this direction holds the shaft
+        text = f"{rests} in this direction: a load, or friction that differs by direction"
         yield Reason("ValidationFailed", text, "identify rapids of both directions")
     else:
-        yield Reason("ValidationFailed", f"{told} (Stribeck)", "lubricate the slide-way, or check for a clamped axis")
+        yield Reason("ValidationFailed", f"{rests} (Stribeck)", "lubricate the slide-way, or check for a clamped axis")

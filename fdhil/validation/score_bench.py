@@ -1,7 +1,7 @@
-"""Scores what a fitted model may lack: how its innovations answer an alternative, beyond what the parameters imitate.
+"""Scores deficiencies of a fitted model: how its innovations answer an alternative that parameters cannot imitate.
 
-What of an alternative's direction the six cannot imitate is compared with the innovations: a statistic in standard
-deviations, and the alternative's amplitude in its own unit.
+The part of an alternative's direction that the six parameters cannot imitate is compared with the innovations: the
+result is a statistic in standard deviations, and the alternative's amplitude in its own unit.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from fdhil.identification.slow_voltage import innovations_of
 from fdhil.records import Float, Reason
 from fdhil.validation.significance import BUDGET
 
-IMITATED = 1e-6  # share of a direction below which only rounding is left of it
+IMITATED = 1e-6  # share of a direction below which only rounding remains
 LAGS = 25
 SLOPE_S = 0.005  # over which the acceleration is taken
 _KINDS = {"current": CURRENT, "speed": SPEED}
@@ -29,10 +29,10 @@ _KINDS = {"current": CURRENT, "speed": SPEED}
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What one alternative shows: its class, how it reads, its statistic (standard deviations) and amplitude.
+    """The result of one alternative: its code and text, its statistic (standard deviations) and amplitude.
 
-    ``least`` is the smallest amplitude that matters, in the amplitude's own unit. ``direction`` (m,) is how it moves
-    the innovations, a unit of it, and ``load_nm`` (n,) the unit's torque, where it is one.
+    ``least`` is the smallest amplitude that matters, in the amplitude's own unit. ``direction`` (m,) is the change of
+    the innovations per unit, and ``load_nm`` (n,) the unit's torque, where it is one.
     """
 
     code: str
@@ -47,27 +47,27 @@ class Finding:
 
     @property
     def sure(self) -> bool:
-        """Return whether the finding is beyond chance."""
+        """Return whether the finding is significant."""
         return abs(self.statistic) > BUDGET["structure"].deviations
 
     @property
     def matters(self) -> bool:
-        """Return whether the finding is beyond chance and large enough to matter."""
+        """Return whether the finding is significant and large enough to matter."""
         return self.sure and abs(self.amplitude) > self.least
 
     def reason(self) -> Reason:
         """Return the finding as a reason."""
-        told = self.text.format(self.amplitude)
-        return Reason(self.code, f"{told} ({abs(self.statistic):.0f} standard deviations)", self.advice)
+        text = self.text.format(self.amplitude)
+        return Reason(self.code, f"{text} ({abs(self.statistic):.0f} standard deviations)", self.advice)
 
 
 @dataclass(frozen=True, slots=True)
 class Bench:
     """One fitted window on which alternatives are tried: how innovations answer, and what imitates them.
 
-    ``imitating`` (m, k + c) are jacobian and the courses that the voltage may have within its samples; ``inverse``
-    (k + c, k + c) is the covariance of their sizes, of which one deviation of each course is all that is expected;
-    ``held`` (k + c,) are the sizes that the innovations show.
+    ``imitating`` (m, k + c) are the jacobian and the courses that the voltage may have within its samples; ``inverse``
+    (k + c, k + c) is the covariance of their sizes, with one standard deviation of each course as its prior; ``held``
+    (k + c,) are the sizes that the innovations show.
     """
 
     fit: Fit
@@ -78,7 +78,7 @@ class Bench:
 
     @classmethod
     def of(cls, fit: Fit) -> Bench:
-        """Return the bench for a window's fit."""
+        """Return the score test of a window's fit."""
         imitating = np.column_stack([fit.jacobian, courses(fit)])
         gram, k = imitating.T @ imitating, fit.jacobian.shape[1]
         gram[:k, :k] = fit.information
@@ -109,9 +109,9 @@ class Bench:
         return self._answers(_KINDS[name], getattr(motion, name) * courses, None)
 
     def foretold(self) -> Motion:
-        """Return the motion with each reading as those before it foretell it: a gain acts on what is measured.
+        """Return the motion with each reading as predicted by those before it: a gain acts on what is measured.
 
-        A reading holds its own innovation. Of a gain that the parameters imitate, that alone would be left.
+        A reading contains its own innovation. Of a gain that the parameters imitate, only that would remain.
         """
         motion, fit = self.motion, self.fit
         if motion.slow is None:
@@ -163,8 +163,8 @@ class Bench:
     def scores(self, directions: Float) -> tuple[Float, Float]:
         """Return score (q,) and information (q, q) of ``directions`` (m, q) beyond what imitates them.
 
-        What the voltage's course within its samples may give is taken out as far as it is expected, so that what it
-        does not give is seen as sharply as ever (generalised least squares).
+        The effect of the voltage's course within its samples is removed as far as it is expected, so that anything else
+        is detected as sharply as ever (generalised least squares).
         """
         shared = self.imitating.T @ directions
         score = directions.T @ self.fit.residuals - shared.T @ self.held
@@ -179,9 +179,9 @@ class Bench:
         return k, float(statistic[k]), float(amplitude[k]), matrix[:, k]
 
     def tested(self, score: Float, weight: Float, whole: Float) -> tuple[Float, Float]:
-        """Return statistics and amplitudes; 0 where the parameters imitate all but rounding of ``whole``.
+        """Return statistics and amplitudes; 0 where the parameters imitate all of ``whole`` but rounding.
 
-        The variance of a score is its ``weight``, more where innovations hang together.
+        The variance of a score is its ``weight``, more where innovations are autocorrelated.
         """
         seen = weight > IMITATED * whole
         safe = np.where(seen, weight, 1.0)
@@ -190,11 +190,11 @@ class Bench:
 
 @lru_cache(maxsize=2)
 def courses(fit: Fit) -> Float:
-    """Return how the innovations (m, c) answer one standard deviation of what is not known between voltage samples.
+    """Return how the innovations (m, c) answer one standard deviation of the unknown course between voltage samples.
 
-    Interval means leave the course within a sample open. Instants, taken in step with a regulator that answers a rising
-    back-EMF, are off in proportion to the acceleration too; what they are off in proportion to current and its slope,
-    R and L imitate.
+    Interval means leave the course within a sample open. Instants that are synchronous with a regulator which answers a
+    rising back-EMF have an error in proportion to the acceleration, too; errors in proportion to current and its slope
+    are imitated by R and L.
     """
     shape = fit.problem.course_effects(fit.theta)
     motion, theta = fit.problem.motions[0], fit.theta
@@ -212,10 +212,10 @@ def courses(fit: Fit) -> Float:
 
 @lru_cache(maxsize=2)
 def expected_correlation(fit: Fit) -> Float:
-    """Return the autocorrelation (LAGS,) of the current's innovations that instants of a noisy voltage give.
+    """Return the autocorrelation (LAGS,) of the current's innovations that instants of a noisy voltage cause.
 
-    Two neighbouring intervals share the noise of the instant between them, which a filter for white noise does not
-    know: with h the answer to one volt over one interval, noise of variance q gives q/2 (h h at one lag less and more).
+    Two neighbouring intervals share the noise of the instant between them, which a filter for white noise ignores: with
+    h the answer to one volt over one interval, noise of variance q gives q/2 (h h at one lag less and more).
     """
     motion, gains = fit.problem.motions[0], fit.problem.filters[0]
     known = np.flatnonzero(np.abs(motion.mode) == 1)
@@ -223,7 +223,7 @@ def expected_correlation(fit: Fit) -> Float:
         return np.zeros(LAGS)
     row = int(known[known.size // 2])
     pulse = np.zeros(motion.n)
-    # what the fit needs beyond the sensor's noise is the regulators' doing, and is not shared in that way
+    # noise beyond the sensor's is caused by the regulators, and is not shared in that way
     pulse[row] = min(fit.problem.noises[0].voltage_v, motion.noise.voltage_v)
     answer = answers(motion, fit.theta, gains, VOLTAGE, pulse[None], np.zeros((1, motion.n)))
     h = np.zeros(3 * LAGS)

@@ -1,7 +1,7 @@
-"""Tells what a sensor should have read over some rows, by the other two and by its own rows beside them.
+"""Reconstructs a sensor's readings over some rows from the other two and from its own rows around them.
 
 The drive's equations with the fitted parameters, and the voltage as a third state that walks from row to row: a Kalman
-filter tells how much less likely the most likely course is with the doubted readings than without them.
+filter shows how much less likely the most likely course is with the doubted readings than without them.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from fdhil.identification.kalman import DELAY, departure
 from fdhil.identification.motion import BROKEN, Modes
 from fdhil.records import Float
 
-BESIDE_S = 0.040  # rows beside the doubted ones that are taken in: some time constants of a winding
+NEIGHBOUR_S = 0.040  # around the doubted rows that are included: some time constants of a winding
 SMOOTHING_S = 0.004
-COURSE = 0.3  # of a voltage's change from row to row: what is not known of its course between them
-RISES = 1.5  # of the same: by how much it may rise over one
+COURSE = 0.3  # of a voltage's change from row to row: uncertainty of its course between them
+RISES = 1.5  # of the same: its possible rise within one row
 SIGNALS = ("current", "speed", "voltage")
 
 
 @dataclass(frozen=True, slots=True)
 class Bridge:
-    """A fitted window: readings (n, 3) of current, speed and voltage, their variances, and how far states walk."""
+    """A fitted window: readings (n, 3) of current, speed and voltage, their variances, and the states' walks."""
 
     fit: Fit
     readings: Float
@@ -37,7 +37,7 @@ class Bridge:
 
     @classmethod
     def over(cls, fit: Fit) -> Bridge:
-        """Return the bridge of a fit's window."""
+        """Return the reconstruction of a fit's window."""
         motion, theta = fit.problem.motions[0], fit.theta
         noise = np.maximum(fit.problem.noises[0].vector(), motion.noise.vector())[[1, 2, 0]]
         voltage = voltage_v(motion, theta)
@@ -53,12 +53,12 @@ class Bridge:
         return cls(fit, np.column_stack([motion.current, motion.speed, voltage]), variances, np.column_stack(walks))
 
     def crossing(self, name: str, start: int, end: int) -> Crossing | None:
-        """Return rows ``start`` to ``end`` - 1 and those beside them, without what sensor ``name`` reads in them.
+        """Return rows ``start`` to ``end`` - 1 and those around them, without the readings of sensor ``name`` in them.
 
-        None where samples are lost there, or nothing else is read.
+        None where samples are lost there, or no other sensor is read.
         """
         motion, theta = self.fit.problem.motions[0], self.fit.theta
-        rows = round(BESIDE_S / motion.dt_s)
+        rows = round(NEIGHBOUR_S / motion.dt_s)
         part = slice(max(0, start - rows), min(motion.n, end + rows))
         if (motion.mode[part] == BROKEN).any():
             return None
@@ -85,9 +85,9 @@ class Bridge:
 
 @dataclass(frozen=True)
 class Crossing:
-    """The rows about a run whose readings of one ``signal`` are left out; they begin at row ``begin`` of the window.
+    """The rows around a run whose readings of one ``signal`` are left out; they begin at row ``begin`` of the window.
 
-    Readings within ``mixed`` rows of the run's ends are mixed from the run and what is beside it.
+    Readings within ``mixed`` rows of the run's ends mix samples from inside and outside the run.
     """
 
     theta: Float
@@ -103,14 +103,14 @@ class Crossing:
 
     @cached_property
     def free(self) -> tuple[float, float]:
-        """Return the squares and the news of the best course that leaves the run out."""
+        """Return the squares and the degrees of freedom of the best course that leaves the run out."""
         return self._squares(self.readings, self.variances)
 
     def log_chance(self, start: int, end: int, level: float, deviation: float) -> float:
-        """Return log p that a living sensor is as far from ``level`` in rows ``start`` to ``end`` - 1 of the window.
+        """Return log p that a working sensor is as far from ``level`` in rows ``start`` to ``end`` - 1 of the window.
 
-        It is that of the sum of squares by which these readings, each with a ``deviation``, make the best course of
-        all sensors worse.
+        It is that of the sum of squares by which these readings, each with a ``deviation``, make the best course of all
+        sensors worse.
         """
         first, beyond = start - self.begin + self.mixed, end - self.begin - self.mixed
         if beyond <= first:

@@ -1,4 +1,4 @@
-"""Tells by how many samples voltage and current are late, by what that does to the smooth part of a fitted window."""
+"""Estimates the delays of voltage and current from the innovations of a fitted window's smooth part."""
 
 from __future__ import annotations
 
@@ -11,36 +11,43 @@ from fdhil.identification.filtering import moving_mean
 from fdhil.identification.fit import Fit
 from fdhil.identification.innovations import CURRENT, VOLTAGE, answers
 from fdhil.identification.normal import inverse_of
-from fdhil.records import Float
+from fdhil.records import Float, Reason
 from fdhil.validation.score_bench import Finding, courses, expected_correlation
 from fdhil.validation.significance import BUDGET
 
-SMOOTHING_S = 0.010  # of the jerk-limited course of a rapid nothing is lost over this time
+SMOOTHING_S = 0.010  # short enough for the jerk-limited course of a rapid
 LARGEST = 1.0  # samples: a recorder may assign a value to the SYNC before or after it
-LEAST = 0.1  # samples: what regulators do within one stays below
+LEAST = 0.1  # samples: the effect of regulators within one stays below
+ADVICE = "take voltage, current and speed from one SYNC, or enter the sensor's delay"
 LATE = " late"  # ends the names of these findings
 
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """By how many samples the voltage or current of a window is late (early: negative), and the standard deviation."""
+    """The delay of a window's voltage or current in samples (early: negative), and its standard deviation."""
 
     samples: float
     std: float
-    own: float = 0.0  # of the samples, what the fit does not have yet
+    own: float = 0.0  # samples beyond the delay of the fit
     direction: Float = field(default_factory=lambda: np.zeros(0))
 
     @property
     def sure(self) -> bool:
-        """Return whether it is beyond chance and more than a sample."""
+        """Return whether it is significant and more than a sample."""
         return abs(self.samples) > max(LARGEST, BUDGET["timing"].deviations * self.std)
 
 
+def build_delay_reason(name: str, others: str, late_s: float, period_s: float) -> Reason:
+    """Return the reason for a signal that is late (early: negative) against others by more than a sample."""
+    delay = f"{1e3 * abs(late_s):.3g} ms {'late' if late_s > 0 else 'early'}"
+    text = f"{name} is {delay} against {others}, more than a sample of {1e3 * period_s:.3g} ms"
+    return Reason("SampleTiming", text, ADVICE)
+
+
 def late_findings(shown: tuple[Shift, Shift]) -> list[Finding]:
-    """Return the delays of voltage and current that are more than what regulators do within a sample, as findings."""
-    advice = "take voltage, current and speed from one SYNC, or enter the sensor's delay"
+    """Return the delays of voltage and current that exceed what regulators cause within a sample, as findings."""
     return [
-        Finding("SampleTiming", name + " is {:+.2g} samples late", advice, LEAST, shift.own / shift.std, -shift.own,
+        Finding("SampleTiming", name + " is {:+.2g} samples late", ADVICE, LEAST, shift.own / shift.std, -shift.own,
                 shift.direction, name=name + LATE)
         for name, shift in zip(("voltage", "current"), shown, strict=True)
         if abs(shift.own) > LEAST and np.isfinite(shift.std)
@@ -48,7 +55,7 @@ def late_findings(shown: tuple[Shift, Shift]) -> list[Finding]:
 
 
 def shifts(fit: Fit) -> tuple[Shift, Shift]:
-    """Return the delay of voltage and of current that the innovations show, each as if it alone were there."""
+    """Return the delay of voltage and of current that the innovations show, each as if it were the only one."""
     motion, gains = fit.problem.motions[0], fit.problem.filters[0]
     width = 2 * round(SMOOTHING_S / 2 / motion.dt_s) + 1
     found = []
@@ -59,7 +66,8 @@ def shifts(fit: Fit) -> tuple[Shift, Shift]:
     whole = whole - jacobian @ (inverse @ (jacobian.T @ whole))
     for kind, values in ((VOLTAGE, voltage_v(motion, fit.theta)), (CURRENT, motion.current)):
         slope = np.gradient(moving_mean(values, width))
-        answer = answers(motion, fit.theta, gains, kind, [slope], _no_rise(kind, motion.n))[:, 0]
+        rise = [np.zeros(motion.n)] if kind == VOLTAGE else None
+        answer = answers(motion, fit.theta, gains, kind, [slope], rise)[:, 0]
         rest = answer - jacobian @ (inverse @ (jacobian.T @ answer))
         power = float(rest @ rest)
         if not power > 0.0:
@@ -69,7 +77,3 @@ def shifts(fit: Fit) -> tuple[Shift, Shift]:
         found.append(Shift(-float(score), std, -float(score), answer))
     voltage, current = found
     return replace(voltage, samples=voltage.samples + float(fit.theta[6]) / motion.dt_s), current
-
-
-def _no_rise(kind: int, n: int) -> list[Float] | None:
-    return [np.zeros(n)] if kind == VOLTAGE else None

@@ -1,8 +1,8 @@
-"""Checks that the signals of a rapid belong together, whatever the drive's parameters are.
+"""Checks that the signals of a rapid are consistent, whatever the drive's parameters are.
 
-Every rapid accelerates, cruises and brakes. So each signal changes; position and demand travel as far as the speed
-says; the current makes acceleration and friction, and the voltage overcomes the back-EMF and drives that current: both
-follow the speed and its rate. No two signals are the same column.
+Every rapid accelerates, cruises and brakes. So each signal changes; position and demand travel as far as the integral
+of speed; the current produces acceleration and friction, and the voltage overcomes the back-EMF and drives that
+current: both follow the speed and its rate. No two signals are the same column.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from fdhil.identification.motion import resolution
 from fdhil.identification.normal import solve
 from fdhil.identification.windows import bridged, carried, smooth
 from fdhil.records import Float, Reason, Recording, Window
-from fdhil.validation.evidence import Evidence, Signal
+from fdhil.validation.window_signals import SensorSignal, WindowSignals
 
 UNITS: Mapping[str, str] = {"voltage": "V", "current": "A", "speed": "rad/s", "position": "mm", "demand": "mm"}
 LEAST_FOLLOWED: Mapping[str, float] = {"voltage": 0.5, "current": 0.3}  # of their variance, by a rapid of any drive
 LEAST_SAMPLES = 12  # of a signal, by which it may be compared with the motion
-TABLE_MM, TABLE_SHARE = 1.0, 0.05  # by which a table may part from the motor: play, a screw that gives, a late sensor
-TABLE_GAIN, TABLE_FOLLOWS = 1.5, 0.3  # of an accelerometer's scale, and its share that the motor explains, to tell it
-STEPS_BESIDE = 1.5  # of a position, by which two readings of it are off together
+TABLE_MM, TABLE_SHARE = 1.0, 0.05  # by which a table may differ from the motor: backlash, a soft screw, a late sensor
+TABLE_GAIN, TABLE_FOLLOWS = 1.5, 0.3  # scale error of an accelerometer, and its share explained by the motor
+QUANTISATION_STEPS = 1.5  # of a position: joint quantisation error of two readings
 SAME = 1e-9  # of the peak, to which one column is a multiple of another
-LONGEST_CYCLE_S = 0.012  # of an NC, in which its demand changes once
-STILL_MM = 1.0  # of travel, from which on a recording shows a move
+LONGEST_CYCLE_S = 0.012  # longest cycle of an NC, in which its demand changes once
+STILL_MM = 1.0  # travel from which a recording contains a move
 
 
 def recorded_signals(window: Window) -> dict[str, Float]:
-    """Return the signals (n,) that were recorded, by name; one that is missing throughout is left out."""
+    """Return the recorded signals (n,), by name; one that is missing throughout is left out."""
     signals = {
         "voltage": window.voltage_v,
         "current": window.current_a,
@@ -43,71 +43,71 @@ def recorded_signals(window: Window) -> dict[str, Float]:
 
 
 def travel_mm(speed_rad_s: Float, dt_s: float, pitch_mm: float) -> Float:
-    """Return the integral (n,) of the speed in mm of the table; lost samples are bridged."""
+    """Return the integral (n,) of the speed in mm of the table; lost samples are interpolated."""
     speed = bridged(speed_rad_s)
     steps = (speed[1:] + speed[:-1]) * (dt_s * pitch_mm / (4 * math.pi))
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def dead_signals(evidence: Evidence) -> Iterator[Reason]:
+def dead_signals(signals: WindowSignals) -> Iterator[Reason]:
     """Yield a reason for each signal that does not change while the axis moves, and for a demand that jumps."""
-    window, (begin, end) = evidence.recorded or evidence.window, evidence.moving
+    window, (begin, end) = signals.recorded or signals.window, signals.motion_range
     if not np.isfinite(window.speed_rad_s).any():
         return
     travel = travel_mm(window.speed_rad_s, window.dt_s, window.pitch_mm)
     part = travel[begin:end]
     moved_mm = float(part[-1] - part[0]) if part.size else 0.0
     if window.slow_voltage is not None:
-        told = window.slow_voltage.voltage_v[np.isfinite(window.slow_voltage.voltage_v)]
-        if told.size >= LEAST_SAMPLES and np.ptp(told) == 0.0:
-            yield _stands_still("voltage", float(told[0]), moved_mm)
+        readings = window.slow_voltage.voltage_v[np.isfinite(window.slow_voltage.voltage_v)]
+        if readings.size >= LEAST_SAMPLES and np.ptp(readings) == 0.0:
+            yield _stands_still("voltage", float(readings[0]), moved_mm)
     for name, values in recorded_signals(window).items():
         moving = values[begin:end][np.isfinite(values[begin:end])]
         if moving.size >= LEAST_SAMPLES and np.ptp(moving) == 0.0:
             yield _stands_still(name, float(moving[0]), moved_mm)
         elif name == "demand":
-            yield from _jump_of_demand(evidence, values)
+            yield from _jump_of_demand(signals, values)
 
 
 def _stands_still(name: str, value: float, moved_mm: float) -> Reason:
-    text = f"{name} stands still at {value:.6g} {UNITS[name]} while the integral of speed travels {moved_mm:.4g} mm"
+    text = f"{name} stays at {value:.6g} {UNITS[name]} while the integral of speed travels {moved_mm:.4g} mm"
     return Reason("StuckValue", text, f"check the {name} sensor or the object's mapping")
 
 
-def _jump_of_demand(evidence: Evidence, demand: Float) -> Iterator[Reason]:
-    """Yield a reason where the demand goes farther from sample to sample than a rapid does in an NC's longest cycle."""
-    window = evidence.window
+def _jump_of_demand(signals: WindowSignals, demand: Float) -> Iterator[Reason]:
+    window = signals.window
     speed_mm_s = float(np.abs(smooth(window.speed_rad_s, window.dt_s)).max()) * window.pitch_mm / (2 * math.pi)
     steps = np.abs(np.diff(bridged(demand)))
     row = int(np.argmax(steps))
     if steps[row] > speed_mm_s * max(LONGEST_CYCLE_S, 2.0 * window.dt_s) + resolution(demand[np.isfinite(demand)]):
         takes = f"the axis takes {1e3 * steps[row] / speed_mm_s:.0f} ms for that" if speed_mm_s else "the speed is zero"
-        text = f"demand jumps by {steps[row]:.4g} mm at {evidence.time_s(row):.3f} s, as after a pause or lost samples"
-        yield Reason("StuckValue", f"{text}: {takes}", "check where the demand is recorded, or the object's mapping")
+        jump = f"demand jumps by {steps[row]:.4g} mm at {signals.get_time_s(row):.3f} s"
+        text = f"{jump}, as after a pause or lost samples: {takes}"
+        yield Reason("StuckValue", text, "check where the demand is recorded, or the object's mapping")
 
 
-def copied_signals(evidence: Evidence) -> Iterator[Reason]:
+def copied_signals(signals: WindowSignals) -> Iterator[Reason]:
     """Yield a reason for each two signals of which one is the other times a constant in every row."""
-    begin, end = evidence.moving
-    moving = {name: carried(values)[begin:end] for name, values in recorded_signals(evidence.window).items()}
+    begin, end = signals.motion_range
+    moving = {name: carried(values)[begin:end] for name, values in recorded_signals(signals.window).items()}
     for (one, values), (other, others) in combinations(moving.items(), 2):
         power = float(others @ others)
         if values.size < LEAST_SAMPLES or np.ptp(values) == 0.0 or not 0.0 < power < math.inf:
             continue
         factor = float(values @ others) / power
         if np.abs(values - factor * others).max() <= SAME * np.abs(values).max():
-            text = f"{one} and {other} are one signal: in every sample {one} is {factor:.6g} times {other}"
+            text = f"{one} and {other} are the same signal: in every sample {one} is {factor:.6g} times {other}"
             yield Reason("Implausible", text, "correct which column or object is which signal")
 
 
-def unrelated_signals(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason for voltage and current where speed and acceleration explain too little of them."""
-    window = evidence.window
-    begin, end = evidence.moving
+def unrelated_signals(signals: WindowSignals) -> Iterator[Reason]:
+    """Yield a reason for voltage and current if speed and acceleration explain too little of them."""
+    window = signals.window
+    begin, end = signals.motion_range
     speed = smooth(window.speed_rad_s, window.dt_s)
     motion = np.stack([np.ones(window.n), speed, np.gradient(speed, window.dt_s)])
-    signals = {k: v for k, v in recorded_signals(window).items() if k in LEAST_FOLLOWED}
-    parts = {name: (motion[:, begin:end], smooth(v, window.dt_s)[begin:end]) for name, v in signals.items()}
+    followed = {k: v for k, v in recorded_signals(window).items() if k in LEAST_FOLLOWED}
+    parts = {name: (motion[:, begin:end], smooth(v, window.dt_s)[begin:end]) for name, v in followed.items()}
     slow = window.slow_voltage
     if slow is not None:
         rows = slow.begin_s / window.dt_s + (np.arange(slow.voltage_v.size) + 0.5) * slow.period_s / window.dt_s
@@ -125,7 +125,7 @@ def unrelated_signals(evidence: Evidence) -> Iterator[Reason]:
 
 
 def _explained(values: Float, courses: Float) -> float:
-    """Return the share of the variance of ``values`` (m,) that ``courses`` (q, m) explain; 1 where nothing varies."""
+    """Return the share of the variance of ``values`` (m,) that ``courses`` (q, m) explain; 1 if they are constant."""
     size = values.size
     variance = float(np.var(values)) if size >= LEAST_SAMPLES else 0.0
     scale = np.abs(courses).max(axis=1, keepdims=True) if size else np.ones((len(courses), 1))
@@ -139,48 +139,48 @@ def _explained(values: Float, courses: Float) -> float:
 def table_faults(window: Window, moving: tuple[int, int]) -> Mapping[str, Reason]:
     """Return why the sensors at the table are not used, by the window's field: they do not move as the motor does.
 
-    What the screw gives and how late a sensor is stays below the tolerance, and so is no fault.
+    Differences by the screw's deflection or a sensor's delay are below the tolerance, and not a fault.
     """
     rows = slice(*moving)
     found = {}
     if window.table_mm is not None and np.isfinite(window.position_mm).any():
         motor = bridged(window.position_mm)[rows]
-        beside = (window.table_mm[rows] - motor)[np.isfinite(window.table_mm[rows])]
-        apart, travel = float(np.ptp(beside)) if beside.size else 0.0, float(np.ptp(motor))
+        difference = (window.table_mm[rows] - motor)[np.isfinite(window.table_mm[rows])]
+        apart, travel = float(np.ptp(difference)) if difference.size else 0.0, float(np.ptp(motor))
         if apart > TABLE_MM + TABLE_SHARE * travel:
-            text = f"table sensor and position part by {apart:.4g} mm over a travel of {travel:.4g} mm: it is not used"
+            text = f"table sensor and position differ by {apart:.4g} mm over {travel:.4g} mm of travel: not used"
             found["table_mm"] = Reason("Implausible", text, "check the table sensor, its scale, sign and axis")
     if window.table_m_s2 is not None:
         known = np.isfinite(window.table_m_s2[rows])
-        told = window.table_m_s2[rows][known]
+        readings = window.table_m_s2[rows][known]
         speed = smooth(window.speed_rad_s, window.dt_s)
         own = np.gradient(speed, window.dt_s)[rows][known] * window.pitch_mm / (2e3 * math.pi)
-        if told.size >= LEAST_SAMPLES and not np.ptp(told) > 0.0:
-            text = f"table acceleration stands still at {told[0]:.4g} m/s2: it is not used"
+        if readings.size >= LEAST_SAMPLES and not np.ptp(readings) > 0.0:
+            text = f"table acceleration is constant at {readings[0]:.4g} m/s2: it is not used"
             found["table_m_s2"] = Reason("StuckValue", text, "check the accelerometer")
-        elif told.size >= LEAST_SAMPLES and float(np.var(own)) > 0.0:
-            courses = np.stack([np.ones(told.size), own])
-            gain = float(solve(courses.T, told)[0][1])
-            if _explained(told, courses) > TABLE_FOLLOWS and not 1.0 / TABLE_GAIN < gain < TABLE_GAIN:
+        elif readings.size >= LEAST_SAMPLES and float(np.var(own)) > 0.0:
+            courses = np.stack([np.ones(readings.size), own])
+            gain = float(solve(courses.T, readings)[0][1])
+            if _explained(readings, courses) > TABLE_FOLLOWS and not 1.0 / TABLE_GAIN < gain < TABLE_GAIN:
                 text = f"table acceleration is {gain:.3g} times that of the motor: it is not used"
                 found["table_m_s2"] = Reason("CalibrationSuspect", text, "check the accelerometer's scale and sign")
     return found
 
 
-def position_confirms(evidence: Evidence, signal: Signal, start: int, end: int) -> bool:
-    """Return whether the position travels as the speed says that repeats one reading in rows ``start`` to ``end`` - 1.
+def position_confirms(window: Window, signal: SensorSignal, start: int, end: int) -> bool:
+    """Return whether the position moves as by the speed that repeats one reading in rows ``start`` to ``end`` - 1.
 
-    A speed that is read in steps may lie half a step beside its reading, and the position one of its own.
+    A quantised speed may be half a step from its reading, and the position one of its own.
     """
-    position = evidence.window.position_mm[start:end]
+    position = window.position_mm[start:end]
     known = np.isfinite(position)
     if signal.name != "speed" or np.count_nonzero(known) < 3 or np.ptp(position[known]) == 0.0:
         return False
-    to_mm = evidence.window.pitch_mm / (2 * math.pi) * evidence.window.dt_s
+    to_mm = window.pitch_mm / (2 * math.pi) * window.dt_s
     rows = np.flatnonzero(known) - np.flatnonzero(known)[0]
-    beside = position[known] - position[known][0] - signal.values[start] * to_mm * rows
-    steps = STEPS_BESIDE * resolution(evidence.window.position_mm[np.isfinite(evidence.window.position_mm)])
-    return bool((np.abs(beside) <= signal.step / 2 * to_mm * rows + steps).all())
+    error_mm = position[known] - position[known][0] - signal.values[start] * to_mm * rows
+    steps = QUANTISATION_STEPS * resolution(window.position_mm[np.isfinite(window.position_mm)])
+    return bool((np.abs(error_mm) <= signal.step / 2 * to_mm * rows + steps).all())
 
 
 def missing_move(recording: Recording) -> Reason | None:

@@ -1,7 +1,7 @@
-"""Shares one budget of false alarms among all checks; every threshold of chance follows from it.
+"""Divides one budget of false alarms among all checks; every threshold of chance follows from it.
 
-What is beyond chance refuses nothing by itself where a window has a thousand rows: each check also asks whether what
-it finds is large enough to matter, which is physics and stands beside the check.
+Significance alone refuses nothing where a window has a thousand rows: each check also requires that its finding is
+large enough to matter, which is physics and stands with the check.
 """
 
 from __future__ import annotations
@@ -11,24 +11,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from statistics import NormalDist
 
-FALSE_ALARMS = 0.01  # of one good window, by all checks together, were what they find large enough to matter
+FALSE_ALARMS = 0.01  # of one good window, by all checks together, if every finding were large enough to matter
 
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """What one check may spend: its ``share`` of the budget, among ``tests`` that are alike."""
+    """The share of one check in the budget, divided among ``tests`` of the same kind."""
 
     share: float
     tests: int = 1
 
     @property
     def chance(self) -> float:
-        """Chance of a false alarm of one test."""
+        """Probability of a false alarm of one test."""
         return FALSE_ALARMS * self.share / self.tests
 
     @property
     def log_chance(self) -> float:
-        """Logarithm of that chance."""
+        """Logarithm of that probability."""
         return math.log(self.chance)
 
     @property
@@ -47,7 +47,7 @@ BUDGET: Mapping[str, Share] = {
     "slow voltage": Share(1e-3),  # 1e-5, shared by all its samples
     "position": Share(1e-3, 5000),  # rows, each over five lengths: 6 deviations
     "play": Share(6.8e-4),  # 4.5 deviations
-    "cut off": Share(6e-4, 6),  # extremes: 1e-6, for the voltage's course within a row is known least there
+    "cut off": Share(6e-4, 6),  # extremes: 1e-6, as the voltage's course within a row is least known there
     "between windows": Share(3.44e-4, 6),  # parameters: 5 deviations
     "standstill": Share(1.52e-5, 4),  # 5.5 deviations: the noise of standstill may not be that of the move
 }

@@ -1,4 +1,4 @@
-"""Simulates the speed from the measured voltage, and tells how much of the measured speed that explains."""
+"""Simulates the speed from the measured voltage, and computes how much of the measured speed that explains."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from fdhil.records import Estimate, Float, Parameters, Window
 
 LEAST_FIT_PERCENT = 80.0
 EXCESS = 1.5  # of the variance that noise explains
-SHAPE_SHARE = 0.002  # of the rapid speed: what the voltage's course within a sample leaves open
+SHAPE_SHARE = 0.002  # of the rapid speed: uncertainty by the voltage's course within a sample
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulated:
-    """A drive simulated from its measured voltage at ``time_s`` (m,) after row 0, beside its measured speed there."""
+    """A drive simulated from its measured voltage at ``time_s`` (m,) after row 0, with its measured speed there."""
 
     time_s: Float
     current_a: Float
@@ -30,18 +30,18 @@ class Simulated:
 
 def fit_percent(window: Window, estimate: Estimate, fit: Fit | None) -> float | None:
     """Return 100 (1 - |w - what| / |w - mean w|) of the speed simulated from voltage; None without a model."""
-    told = simulated(window, estimate, fit)
-    if told is None:
+    motion = simulated(window, estimate, fit)
+    if motion is None:
         return None
-    known = np.isfinite(told.measured_rad_s)
-    return _explained_percent(told.measured_rad_s[known], told.speed_rad_s[known])
+    known = np.isfinite(motion.measured_rad_s)
+    return _explained_percent(motion.measured_rad_s[known], motion.speed_rad_s[known])
 
 
 def simulated(window: Window, estimate: Estimate, fit: Fit | None) -> Simulated | None:
     """Simulate a window's current and speed from its voltage alone; None without a model or a voltage.
 
-    A delay of the voltage that the estimate found, and that is no more than a sample, is taken out first. Where a slow
-    voltage leaves R or L open, the fit's own value is taken: a simulation needs all.
+    An estimated delay of the voltage of up to one sample is removed first. Where a slow voltage leaves R or L
+    undetermined, the fit's own value is used: a simulation needs all.
     """
     if window.voltage_v is None and window.slow_voltage is None:
         return None
@@ -70,12 +70,11 @@ def _complete(estimate: Estimate, fit: Fit | None) -> Estimate:
 
 
 def _slowly(window: Window, parameters: Parameters, delay_s: float) -> Simulated:
-    """Simulate on the grid of the slow sensor itself, and compare with the measured speed at its instants."""
     slow = window.slow_voltage
     assert slow is not None
     begin: Float = slow.begin_s - delay_s + slow.period_s * np.arange(slow.voltage_v.size, dtype=np.float64)
     voltage = carried(slow.voltage_v)
-    if slow.late_s is not None:  # of a sensor that was asked: its values are brought to the grid, and across its holes
+    if slow.late_s is not None:  # of a polled sensor: its values are interpolated to the grid, and across its gaps
         known = np.isfinite(slow.voltage_v)
         voltage = np.interp(begin, (begin + slow.late_s)[known], slow.voltage_v[known]) if known.any() else voltage
     current, speed = simulate_plant(parameters, voltage, slow.period_s, window.voltage_sampling)
@@ -91,9 +90,9 @@ def _explained_percent(measured: Float, speed: Float) -> float | None:
 
 
 def expected_fit_percent(window: Window, fit: Fit) -> float:
-    """Return the fit that a right model has at least, from the noise of speed and of the voltage that drives it."""
+    """Return the least fit of a correct model, from the noise of speed and of the voltage that drives it."""
     if window.slow_voltage is not None:
-        return LEAST_FIT_PERCENT  # the voltage's course within its samples is not known
+        return LEAST_FIT_PERCENT  # the voltage's course within its samples is unknown
     noise = fit.problem.motions[0].noise
     own = fit.problem.noises[0].voltage_v
     p = Parameters(*fit.theta[:6])

@@ -1,8 +1,8 @@
 """Tests whether the model has the drive's structure, by scores of the fitted model's innovations.
 
 Each alternative (a load torque for a while, a sensor gain that steps, friction that rises at low speed, an offset, a
-delay) moves the innovations in its own direction. Only what is both beyond chance and large enough to matter counts.
-Whiteness over lags catches what has no name.
+delay) moves the innovations in its own direction. Only findings that are both significant and large enough to matter
+count. Whiteness over lags detects what no alternative describes.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from fdhil.validation.score_bench import Bench, Finding
 
 EDGES = 20  # instants at which a load may begin or end, or a gain may step
 LEAST_TORQUE = 0.01  # of the peak torque
-LEAST_GAIN = 0.01  # what pooled windows may differ in K
+LEAST_GAIN = 0.01  # allowed difference of K between pooled windows
 LEAST_OFFSET = 0.01  # of the signal's peak
 STRIBECK_SPEEDS = (0.01, 0.03, 0.06, 0.12, 0.25)  # of the rapid speed
 DEAD_TIME, OFFSET_CURRENT, FRICTION, WARMING = "dead_time", "current offset", "friction", "warming"
-QUICKEST_PER_S = 0.035  # of the resistance: copper under 40 A/mm2 that gives no heat away, 8.8 K/s
+QUICKEST_PER_S = 0.035  # of the resistance: copper under 40 A/mm2 without cooling, 8.8 K/s
 CHANCE = 3.0  # standard deviations
 SATURATED = 0.02  # of the peak current, at which an inverter's dead time has its whole effect
 
 
 def findings(fit: Fit) -> list[Finding]:
-    """Return what the fit of one window shows beyond the model, the most significant first."""
+    """Return what the innovations of one window show beyond the model, the most significant first."""
     bench = Bench.of(fit)
     rows = np.flatnonzero(np.abs(bench.motion.mode) == 1)
     if rows.size < 2 * EDGES:
@@ -36,9 +36,9 @@ def findings(fit: Fit) -> list[Finding]:
     edges = np.unique(np.linspace(rows[0], rows[-1] + 1, EDGES + 1).astype(int))
     drift = np.clip((np.arange(bench.motion.n) - edges[0]) / max(1, edges[-1] - edges[0]), 0.0, 1.0)
     found = [_load(bench, edges, drift), _low_speed_friction(bench), *_of_the_voltage(bench, drift)]
-    gains, foretold = _steps_and_drift(edges[2:-2:2], drift), bench.foretold()
+    gains, predicted = _steps_and_drift(edges[2:-2:2], drift), bench.foretold()
     for name, unit in (("voltage", "V"), ("current", "A"), ("speed", "rad/s")):
-        tried = bench.best(bench.gain_answers(foretold, name, gains))
+        tried = bench.best(bench.gain_answers(predicted, name, gains))
         found += [_gain(bench.motion.dt_s, name, edges[2:-2:2], tried), _offset(bench, name, unit, drift)]
     return sorted(found, key=lambda f: -abs(f.statistic))
 
@@ -49,7 +49,6 @@ def _steps_and_drift(edges: npt.NDArray[np.int_], drift: Float) -> Float:
 
 
 def _load(bench: Bench, edges: npt.NDArray[np.int_], drift: Float) -> Finding:
-    """Try a constant torque between every two edges, and one that rises over the move."""
     motion = bench.motion
     matrix = bench.load_answers(_steps_and_drift(edges[:-1], drift))
     score, information = bench.scores(matrix)
@@ -71,7 +70,7 @@ def _load(bench: Bench, edges: npt.NDArray[np.int_], drift: Float) -> Finding:
         torque, direction = drift, matrix[:, -1]
     return Finding(
         "LoadDetected",
-        f"a torque of {{:+.3g}} N.m that is no friction {span}",
+        f"a torque of {{:+.3g}} N.m other than friction {span}",
         "identify from moves without cutting, clamping or collision, or check current and position",
         LEAST_TORQUE * bench.peak_torque,
         *found,
@@ -88,12 +87,11 @@ def _apart(gram: Float) -> Float:
 
 
 def _gain(dt_s: float, name: str, edges: npt.NDArray[np.int_], tried: tuple[int, float, float, Float]) -> Finding:
-    """Return the best of those ``tried``: a gain that steps at one of ``edges`` and stays, or one that drifts."""
     k, statistic, amplitude, direction = tried
     drifts = k == edges.size
     at = "over the move" if drifts else f"at {edges[k] * dt_s:.3f} s of the window"
     text = f"the gain of {name} {'drifts' if drifts else 'changes'} by {{:+.2%}} {at}"
-    # what is tried is the correction of the signal, so the sensor's own change has the other sign
+    # the correction of the signal is tried, so the sensor's own change has the opposite sign
     return Finding(
         "CalibrationSuspect",
         text,
@@ -106,7 +104,6 @@ def _gain(dt_s: float, name: str, edges: npt.NDArray[np.int_], tried: tuple[int,
 
 
 def _offset(bench: Bench, name: str, unit: str, drift: Float) -> Finding:
-    """Try an offset that is there throughout, and one that drifts from nothing on over the move."""
     motion = bench.motion
     peak = float(np.abs(motion.voltage_mean if name == "voltage" else getattr(motion, name)).max())
     k, statistic, amplitude, direction = bench.best(bench.offset_answers(name, np.vstack([np.ones(motion.n), drift])))
@@ -117,7 +114,7 @@ def _offset(bench: Bench, name: str, unit: str, drift: Float) -> Finding:
 
 
 def _of_the_voltage(bench: Bench, drift: Float) -> list[Finding]:
-    """Try what else is between the recorded voltage and the winding: dead time, a bus that sags, a winding that warms.
+    """Test losses between the recorded voltage and the winding: dead time, a bus that sags, a winding that warms.
 
     Of these voltages only a part reaches the motor, or is needed there: each is tried as what is missing.
     """
@@ -130,7 +127,7 @@ def _of_the_voltage(bench: Bench, drift: Float) -> list[Finding]:
             DEAD_TIME,
             np.clip(current / (SATURATED * peak), -1.0, 1.0),
             ("CalibrationSuspect", "{:+.3g} V are lost before the motor, whatever its current (dead time)"),
-            "set voltage_source = 'command' where the voltage is what the drive asks for",
+            "set voltage_source = 'command' if the recorded voltage is the drive's command",
             LEAST_OFFSET * most,
         ),
         (
@@ -159,7 +156,7 @@ def _of_the_voltage(bench: Bench, drift: Float) -> list[Finding]:
 
 
 def _warms(finding: Finding, bench: Bench, drift: Float) -> bool:
-    """Return whether a winding can have changed so: copper under a current warms, and no faster than it can."""
+    """Return whether a winding can have changed so: copper under a current warms, at a limited rate."""
     lasted_s = float(np.count_nonzero((drift > 0.0) & (drift < 1.0))) * bench.motion.dt_s
     most = QUICKEST_PER_S * lasted_s * float(bench.fit.theta[0])
     chance = CHANCE * abs(finding.amplitude / finding.statistic) if finding.statistic else 0.0
@@ -167,13 +164,11 @@ def _warms(finding: Finding, bench: Bench, drift: Float) -> bool:
 
 
 def _places(motion: Motion) -> tuple[Float, Float]:
-    """Return the rows (n,), and those at which the samples (m,) of the voltage lie."""
     rows = np.arange(motion.n, dtype=np.float64)
     return rows, motion.at_voltage(rows) if motion.slow is not None else rows
 
 
 def _low_speed_friction(bench: Bench) -> Finding:
-    """Try friction that rises towards standstill, over several ranges of speed."""
     motion = bench.motion
     top = float(np.abs(motion.speed).max())
     moving = np.where(np.abs(motion.mode) == 1, motion.mode, 0)

@@ -1,9 +1,9 @@
-"""Refuses a sensor that repeats a reading longer than a living one could: by its noise, its neighbours, the others.
+"""Refuses a sensor that repeats a reading longer than a working one could: by its noise, neighbours, other sensors.
 
-A steady signal that is read coarsely repeats itself for long, and that is no fault. So a run of equal readings is
-judged by how likely it was: noise would have changed a reading even in the middle of a step; or the rows beside it
-change more often; or, where it moves, the fitted model and the other two sensors say that it was elsewhere. A run is
-refused where one of these leaves a chance below the budget's, shared by all readings at which one might begin.
+A steady signal that is read coarsely repeats itself for long, and that is no fault. So the probability of a run of
+equal readings is computed: noise would have changed a reading even in the middle of a step; or the neighbouring rows
+change more often; or, in motion, the fitted model and the other two sensors place the signal elsewhere. A run is
+refused if one of these leaves a probability below the budget's, shared by all readings at which one might begin.
 """
 
 from __future__ import annotations
@@ -17,31 +17,32 @@ import numpy as np
 
 from fdhil.identification.windows import runs_of
 from fdhil.records import Bool, Float, Reason
-from fdhil.validation.evidence import Evidence, Signal
 from fdhil.validation.plausibility import RAIL_SAMPLES
 from fdhil.validation.repeated_readings import LEAST_NOISE_ROWS, SIDE, alike, beyond_chance, wakes_with_a_jump
 from fdhil.validation.sensor_reconstruction import Bridge
 from fdhil.validation.signal_consistency import position_confirms
 from fdhil.validation.significance import BUDGET
+from fdhil.validation.window_fit import WindowFit
+from fdhil.validation.window_signals import SensorSignal
 
 NOISES = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
 SHORTEST_S = 0.003
-TOLD_S = 0.010  # the shortest run that its neighbours or the other signals are asked about
-COMPUTED = 2.0  # times that, of a speed that a drive computes from positions: its neighbours scatter without noise
-LONGEST_RUNS = 2  # of a signal that are judged: a sensor sticks longer than chance repeats
-LEAST_NOISE = 0.2  # steps: what hides in the resolution
-TOLD_NOISE = 0.6  # steps: below it, how readings scatter depends on where in its step the signal lies
-MOST_NOISE = 3.0  # steps: with more, a living sensor repeats no reading, whatever the position says
-LEAST_CHANGES = 6  # after equal numbers of rows, of a reading that is held between them
-PARTS = 4  # of a run: its first and its last one are judged alone too
-WITHIN_STEP = 0.3  # of a step: how far from its middle a constant may lie that is read there for long
+COMPARED_S = 0.010  # the shortest run that is compared with its neighbours or the other signals
+COMPUTED = 2.0  # times that, for a speed computed from positions: its neighbours scatter without noise
+LONGEST_RUNS = 2  # of a signal that are checked: a sensor sticks longer than chance repeats
+LEAST_NOISE = 0.2  # steps: noise hidden by the resolution
+INFORMATIVE_NOISE = 0.6  # steps: below it, the scatter of readings depends on the signal's position within its step
+MOST_NOISE = 3.0  # steps: with more, a working sensor repeats no reading, whatever the position
+LEAST_CHANGES = 6  # of a held reading, at equal numbers of rows
+PARTS = 4  # of a run: its first and its last one are checked alone too
+WITHIN_STEP = 0.3  # of a step: distance from its middle of a constant that is read there for long
 
 
 @dataclass(frozen=True)
 class Readings:
     """One sensor over the window: ``steps`` (n,) in units of its resolution, and the half-open rows of the move."""
 
-    signal: Signal
+    signal: SensorSignal
     begin: int
     end: int
     dt_s: float
@@ -62,91 +63,89 @@ class Readings:
         return float(np.nanmin(self.steps)), float(np.nanmax(self.steps))
 
     def beyond_chance(self, start: int, last: int) -> bool:
-        """Return whether how often the rows beside the run change leaves it no chance."""
+        """Return whether the run is longer than the changes of its neighbouring rows explain."""
         return beyond_chance(self.steps[self.begin : self.end], start - self.begin, last - self.begin)
 
 
-def stuck_values(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason for each sensor that surely stuck during the move; without a fit, its own rows alone are asked."""
-    begin, end = evidence.moving
-    for signal in evidence.sensors:
+def stuck_values(fitted: WindowFit) -> Iterator[Reason]:
+    """Yield a reason for each sensor that stuck during the move; without a fit, by its own rows alone."""
+    signals = fitted.signals
+    begin, end = signals.motion_range
+    for signal in signals.varying_sensors:
         if signal.step == 0.0:
             continue
-        readings = Readings(signal, begin, end, evidence.window.dt_s)
+        readings = Readings(signal, begin, end, signals.window.dt_s)
         same = np.diff(signal.values[begin:end]) == 0.0
         held = _update_rows(same)
-        if held > 1 and held * readings.dt_s >= TOLD_S:
-            text = (
-                f"{signal.name} changes only every {1e3 * held * readings.dt_s:.3g} ms: the samples between repeat it"
-            )
+        if held > 1 and held * readings.dt_s >= COMPARED_S:
+            text = f"{signal.name} changes only every {1e3 * held * readings.dt_s:.3g} ms: samples in between repeat it"
             yield Reason("StuckValue", text, "record it at the drive's own rate, or at the rate at which it changes")
             continue
         limit = BUDGET["stuck"].log_chance - math.log(np.count_nonzero(~same) + 2)
         runs = ((begin + start, begin + last) for start, last in runs_of(same)[:LONGEST_RUNS])
-        stuck = next((run for run in runs if _is_stuck(evidence, readings, *run, limit)), None)
+        stuck = next((run for run in runs if _is_stuck(fitted, readings, *run, limit)), None)
         if stuck is not None:
-            lasts_ms = 1e3 * (stuck[1] - stuck[0] + 1) * evidence.window.dt_s
+            lasts_ms = 1e3 * (stuck[1] - stuck[0] + 1) * signals.window.dt_s
             text = (
                 f"{signal.name} repeats {signal.values[stuck[0]]:.6g} {signal.unit} for {lasts_ms:.0f} ms "
-                f"from {evidence.time_s(stuck[0]):.3f} s while the axis moves"
+                f"from {signals.get_time_s(stuck[0]):.3f} s while the axis moves"
             )
             yield Reason("StuckValue", text, "check the sensor or the object's mapping")
 
 
 def _update_rows(same: Bool) -> int:
-    """Return after how many rows readings change, where that is the same number too often for chance; else 1."""
+    """Return the number of rows between changes of the readings, if it is regular beyond chance; else 1."""
     changes = np.flatnonzero(~same)
     rows = int(np.gcd.reduce(np.diff(changes))) if changes.size >= LEAST_CHANGES else 1
     surely = rows > 1 and -(changes.size - 1) * math.log(rows) < BUDGET["stuck"].log_chance
     return rows if surely else 1
 
 
-def clipped_peaks(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason for each sensor whose extreme was cut off where its rows do not show it by themselves.
+def clipped_peaks(fitted: WindowFit) -> Iterator[Reason]:
+    """Yield a reason for each sensor whose extreme was clipped although its own rows do not show it.
 
-    Model and the other sensors tell where it should have been.
+    Model and the other sensors show where it should have been.
     """
-    fit, bridge = evidence.judged, evidence.bridge
+    signals, fit, bridge = fitted.signals, fitted.required_fit, fitted.reconstruction
     if bridge is None:
         return
-    for signal in evidence.sensors:
+    for signal in signals.varying_sensors:
         noise, values = getattr(fit.problem.noises[0], NOISES[signal.name]), signal.values
         for rail in (np.nanmax(values), np.nanmin(values)):
             runs = runs_of(values == rail, RAIL_SAMPLES) if rail != 0.0 else []
             if runs and beyond_chance(values, runs[0][0], runs[0][1] - 1):
-                continue  # this is told without a model
+                continue  # found without a model already
             for start, end in runs:
                 crossing = bridge.crossing(signal.name, start, end)
                 if crossing is None:
                     continue
-                if position_confirms(evidence, signal, start, end):
+                if position_confirms(signals.window, signal, start, end):
                     continue
                 if crossing.log_chance(start, end, float(rail), float(noise)) >= BUDGET["cut off"].log_chance:
                     continue
                 text = (
                     f"{signal.name} stays at its extreme {rail:.6g} {signal.unit} for {end - start} samples from "
-                    f"{evidence.time_s(start):.3f} s, where the other signals tell more"
+                    f"{signals.get_time_s(start):.3f} s, where the other signals show more"
                 )
                 yield Reason("Saturated", text, "use a larger measuring range")
                 break
 
 
-def _is_stuck(evidence: Evidence, readings: Readings, start: int, last: int, limit: float) -> bool:
-    """Return whether rows ``start`` to ``last``, all alike, are less likely than ``limit`` by every explanation."""
+def _is_stuck(fitted: WindowFit, readings: Readings, start: int, last: int, limit: float) -> bool:
     if (last - start) < max(2, round(SHORTEST_S / readings.dt_s)):
         return False
     if readings.steps[start] in readings.rails:
-        return False  # that is for saturation to explain
-    if readings.noise < MOST_NOISE and position_confirms(evidence, readings.signal, start, last + 1):
+        return False  # reported as saturation
+    if readings.noise < MOST_NOISE and position_confirms(fitted.window, readings.signal, start, last + 1):
         return False
-    computed = readings.signal.name == "speed" and evidence.window.speed_late_s is not None
+    computed = readings.signal.name == "speed" and fitted.window.speed_late_s is not None
     if not computed and _quieter_than_noise(readings, start, last, limit):
         return True
-    if (last - start) * readings.dt_s < (COMPUTED * TOLD_S if computed else TOLD_S):
+    if (last - start) * readings.dt_s < (COMPUTED * COMPARED_S if computed else COMPARED_S):
         return False
     if readings.beyond_chance(start, last):
         return True
-    bridge = evidence.bridge
+    bridge = fitted.reconstruction
     if bridge is None:
         part = readings.steps[readings.begin : readings.end]
         return wakes_with_a_jump(part, start - readings.begin, last - readings.begin)
@@ -154,9 +153,9 @@ def _is_stuck(evidence: Evidence, readings: Readings, start: int, last: int, lim
 
 
 def _elsewhere(bridge: Bridge, readings: Readings, start: int, last: int, limit: float) -> bool:
-    """Return whether the model and the other sensors put the signal elsewhere over the run, or at either end of it.
+    """Return whether the model and the other sensors place the signal elsewhere over the run, or at either end.
 
-    A sensor that sticks is furthest from the truth where it wakes.
+    The error of a stuck sensor is largest just before it resumes.
     """
     crossing = bridge.crossing(readings.signal.name, start + 1, last + 1)
     if crossing is None:
@@ -173,15 +172,15 @@ def _elsewhere(bridge: Bridge, readings: Readings, start: int, last: int, limit:
 def _quieter_than_noise(readings: Readings, start: int, last: int, limit: float) -> bool:
     """Return whether noise would have changed a reading even of a constant in the middle of its step."""
     steps, rows = readings.steps, SIDE * (last - start + 1)
-    if readings.noise < TOLD_NOISE or (last - start) * math.log(alike(readings.noise)) > limit:
+    if readings.noise < INFORMATIVE_NOISE or (last - start) * math.log(alike(readings.noise)) > limit:
         return False
     sides = (steps[max(0, start - rows) : start], steps[last + 1 : last + 1 + rows])
     least = min([noise_steps(side) for side in sides if side.size >= LEAST_NOISE_ROWS], default=readings.noise)
-    return least >= TOLD_NOISE and (last - start) * math.log(alike(least)) < limit
+    return least >= INFORMATIVE_NOISE and (last - start) * math.log(alike(least)) < limit
 
 
 def noise_steps(readings: Float) -> float:
-    """Return the noise of a signal read in steps, from its third differences without those that a corner makes."""
+    """Return the noise of a quantised signal in steps, from its third differences without those at corners."""
     third = np.diff(readings, 3)
     square = third[np.isfinite(third)] ** 2
     if square.size == 0:

@@ -1,8 +1,9 @@
-"""Tells by how much voltage and current are late, from the fitted window's innovations.
+"""Checks the delays of voltage and current by the fitted window's innovations.
 
-A delay is told by what it does to the smooth part of a signal: differences between neighbouring rows hold more noise
-than signal where rows are fine, which hides a delay of several of them. Resistance and inductance imitate most of a
-late voltage, and not in proportion to the delay, so that its size is searched for with the others fitted anew.
+A delay is estimated from its effect on the smooth part of a signal: where rows are fine, differences between
+neighbouring rows hold more noise than signal, which hides a delay of several of them. Resistance and inductance imitate
+most of a late voltage, and not in proportion to the delay, so that its size is searched for with the others fitted
+again.
 """
 
 from __future__ import annotations
@@ -12,51 +13,51 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from fdhil.identification.fit import Fit, but_delay, descend, with_delay
-from fdhil.identification.fit import fit as fitted
+from fdhil.identification.fit import fit as refit
 from fdhil.records import Reason
-from fdhil.validation.evidence import Evidence
-from fdhil.validation.shifts import LARGEST, Shift, shifts
+from fdhil.validation.shifts import LARGEST, Shift, build_delay_reason, shifts
 from fdhil.validation.significance import BUDGET
+from fdhil.validation.window_fit import WindowFit
 
 DOUBTFUL = 0.5  # samples: a delay that may be larger is searched for
-TOLD = 2.5  # standard deviations
-STRIDE = 1.0  # samples: with other parameters fitted to none, hardly anything may be left of a delay of several
-SEARCH = 6  # fits: each takes away most of what is left
+SEARCH_DEVIATIONS = 2.5  # standard deviations
+STRIDE = 1.0  # samples: other parameters fitted to no delay may hide most of a delay of several
+SEARCH = 6  # fits: each removes most of the residual
 REACH = 16.0  # samples: longer ones show in whole samples, see identification.delay
 FOUND = 0.1  # samples
-LATE = (1.5, 2.0, 2.5, 3.0)  # samples that a winding shorter than a sample is weighed against
+LATE = (1.5, 2.0, 2.5, 3.0)  # delays in samples that are compared with a winding shorter than a sample
 
 
-def voltage_late(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason where the fit itself needs a delay of more than a sample."""
-    late_s = evidence.late_s
+def voltage_late(fitted: WindowFit) -> Iterator[Reason]:
+    """Yield a reason if the fit itself needs a delay of more than a sample."""
+    late_s = fitted.voltage_delay_s
     if late_s:
-        period_s = max(evidence.window.dt_s, evidence.judged.problem.motions[0].voltage_period_s)
-        yield _reason("voltage", "current and speed", late_s, period_s)
+        period_s = max(fitted.window.dt_s, fitted.required_fit.problem.motions[0].voltage_period_s)
+        yield build_delay_reason("voltage", "current and speed", late_s, period_s)
 
 
-def timing_faults(evidence: Evidence) -> Iterator[Reason]:
+def timing_faults(fitted: WindowFit) -> Iterator[Reason]:
     """Yield the signal that is late or early by more than a sample, with the figure."""
-    window, fit = evidence.window, evidence.on_time
+    window, fit = fitted.window, fitted.aligned_fit
     if fit.problem.motions[0].slow is not None:
         return  # there the delay is one of the parameters
-    voltage, current = evidence.shifts
+    voltage, current = fitted.delays
     if current.sure and abs(current.samples) * voltage.std > abs(voltage.samples) * current.std:
-        yield _reason("current", "voltage and speed", current.samples * window.dt_s, window.dt_s)
+        yield build_delay_reason("current", "voltage and speed", current.samples * window.dt_s, window.dt_s)
         return
-    if abs(voltage.samples) + TOLD * voltage.std > DOUBTFUL:
+    if abs(voltage.samples) + SEARCH_DEVIATIONS * voltage.std > DOUBTFUL:
         samples = searched(fit, voltage)
         if samples is not None and abs(samples) > LARGEST:
-            yield _reason("voltage", "current and speed", samples * window.dt_s, window.dt_s)
+            yield build_delay_reason("voltage", "current and speed", samples * window.dt_s, window.dt_s)
             return
     yield from _short_winding(fit)
 
 
 def _short_winding(fit: Fit) -> Iterator[Reason]:
-    """A late voltage makes the current follow early, which a winding without inductance would do too.
+    """Yield a reason if a short winding may as well be a late voltage: both make the current follow early.
 
-    Where the time constant found is less than a sample, the window is refused unless it is surely likelier so than with
-    a longer winding and a late voltage.
+    If the time constant found is less than a sample, the window is refused unless it is significantly likelier than
+    with a longer winding and a late voltage.
     """
     motion, theta = fit.problem.motions[0], fit.theta
     if theta[1] > theta[0] * motion.dt_s:
@@ -75,34 +76,26 @@ def _short_winding(fit: Fit) -> Iterator[Reason]:
             return
 
 
-def _reason(name: str, others: str, late_s: float, period_s: float) -> Reason:
-    text = (
-        f"{name} is {1e3 * abs(late_s):.2f} ms {'late' if late_s > 0 else 'early'} against {others}, "
-        f"more than a sample of {1e3 * period_s:.3g} ms"
-    )
-    return Reason("SampleTiming", text, "take voltage, current and speed from one SYNC, or enter the sensor's delay")
-
-
 def searched(fit: Fit, first: Shift) -> float | None:
-    """Return the samples of the voltage's delay beyond which, all else fitted to it, the innovations show no more.
+    """Return the delay of the voltage in samples beyond which, all else fitted to it, the innovations show no more.
 
-    ``first`` is what they show to begin with; where that tells no direction, the voltage is taken to be late, as
-    sensors are. The delay must make the window likelier by as much as a sure finding: what regulators do within a
-    sample shifts the innovations too, but that gets no likelier by it. None otherwise.
+    ``first`` is their first estimate; where it shows no direction, the voltage is assumed late, as sensors are. None
+    unless the delay makes the window significantly likelier: regulators shift the innovations within a sample too, but
+    that does not make the window likelier.
     """
     motion = fit.problem.motions[0]
     begun, last = float(fit.theta[6]) / motion.dt_s, fit
 
     def left(delay: float) -> float:
         nonlocal last
-        last = fitted([motion], with_delay(last.theta, delay * motion.dt_s), but_delay(last.free))
+        last = refit([motion], with_delay(last.theta, delay * motion.dt_s), but_delay(last.free))
         if not (np.isfinite(last.residuals).all() and np.isfinite(last.information).all()):
             return float("nan")
         return shifts(last)[0].samples - delay
 
     rest = first.samples - begun
-    stride = max(2.0 * abs(rest), STRIDE)  # what is left shows smaller than it is
-    found = _root(left, begun, rest, -stride if rest < -TOLD * first.std else stride)
+    stride = max(2.0 * abs(rest), STRIDE)  # a residual delay is underestimated
+    found = _root(left, begun, rest, -stride if rest < -SEARCH_DEVIATIONS * first.std else stride)
     return found if found is not None and _deviance(fit) - _deviance(last) > BUDGET["timing"].deviations ** 2 else None
 
 
@@ -112,9 +105,9 @@ def _deviance(fit: Fit) -> float:
 
 
 def _root(left: Callable[[float], float], begun: float, rest: float, stride: float) -> float | None:
-    """Return where ``left`` vanishes, by secants that stay within the bracket once there is one; None when lost.
+    """Return the zero of ``left``, by secants within the bracket once there is one; None without a finite value.
 
-    ``rest`` is left at ``begun``; the first step is ``stride``.
+    ``rest`` is the value at ``begun``; the first step is ``stride``.
     """
     known = [(begun, rest)]
     here = begun + stride

@@ -1,4 +1,4 @@
-"""Finds what has no name of its own: innovations that hang together over lags, and noise that no sensor has."""
+"""Detects unmodelled effects of unknown kind: autocorrelated innovations, and more noise than any sensor has."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from fdhil.records import Float, Reason, Window
 from fdhil.validation.score_bench import LAGS, expected_correlation
 from fdhil.validation.significance import BUDGET
 
-PRACTICAL_CORRELATION = 0.25  # smaller ones come from the voltage's course within a sample and do no harm
+PRACTICAL_CORRELATION = 0.25  # smaller ones are caused by the voltage's course within a sample and are harmless
 NOISE_RATIO = 1.6
-LOOK = "the drive does what the model does not have: look at the residuals"
+LOOK = "the drive has an effect that the model lacks: inspect the residuals"
 _FIELDS = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
 
 
 def coloured(fit: Fit) -> Iterator[tuple[str, Reason]]:
-    """Yield signal and reason where its innovations hang together: neither by chance, over all lags, nor by little."""
+    """Yield signal and reason if its innovations are autocorrelated beyond chance over all lags, and not by little."""
     motion = fit.problem.motions[0]
     rows = (np.abs(motion.mode) == 1) & motion.observed
     e = fit.residuals[: 2 * motion.n].reshape(-1, 2)[rows]
@@ -30,10 +30,10 @@ def coloured(fit: Fit) -> Iterator[tuple[str, Reason]]:
     limit = max(BUDGET["whiteness"].deviations / np.sqrt(e.shape[0]), PRACTICAL_CORRELATION)
     for k, name in enumerate(("current", "speed")):
         if name == "current" and motion.slow is not None:
-            continue  # a slow voltage does not foretell the current from row to row
+            continue  # a slow voltage does not predict the current from row to row
         power = float(e[:, k] @ e[:, k])
         correlations = np.array([e[lag:, k] @ e[:-lag, k] for lag in range(1, LAGS + 1)]) / power
-        if name == "current":  # noise levels may be fitted so as to hide a part of what is expected
+        if name == "current":  # fitted noise levels may hide a part of the expected correlation
             expected = expected_correlation(fit)
             correlations = correlations - np.clip(correlations, np.minimum(expected, 0.0), np.maximum(expected, 0.0))
         worst = int(np.argmax(np.abs(correlations)))
@@ -46,9 +46,9 @@ def coloured(fit: Fit) -> Iterator[tuple[str, Reason]]:
 
 
 def noisy(fit: Fit, window: Window) -> Iterator[tuple[str, Reason]]:
-    """Yield signal and reason where the fit needs more noise than the signal's own scatter from row to row shows.
+    """Yield signal and reason if the fit needs more noise than the signal's own scatter from row to row.
 
-    What the voltage's course within its samples may add, and the parameters do not imitate, is no reason.
+    The effect of the voltage's course within its samples, which the parameters do not imitate, is no reason.
     """
     fitted = fit.problem.noises[0]
     course = fit.problem.shape_effect(fit.theta)
@@ -63,7 +63,7 @@ def noisy(fit: Fit, window: Window) -> Iterator[tuple[str, Reason]]:
         if name == "voltage":
             seen = float(np.hypot(seen, _aliased_v(fit, window)))
         seen = float(np.hypot(seen, shape * wanted))
-        if name == "voltage" and fit.problem.slow:  # what current and speed leave open of a sample hides its noise
+        if name == "voltage" and fit.problem.slow:  # the undetermined part of a sample hides its noise
             motion, theta = fit.problem.motions[0], fit.theta
             open_v = left_open_v(motion, theta, fitted.vector() ** 2)
             wanted, seen = float(np.hypot(wanted, open_v)), float(np.hypot(seen, open_v))
@@ -73,7 +73,7 @@ def noisy(fit: Fit, window: Window) -> Iterator[tuple[str, Reason]]:
 
 
 def _aliased_v(fit: Fit, window: Window) -> float:
-    """Return the voltage that instants may miss of the course between them: the same doubt that R and L carry."""
+    """Return the voltage that instants may miss of the course between them: the same uncertainty that R and L carry."""
     motion = fit.problem.motions[0]
     doubt = aliasing(window.voltage_sampling, motion.voltage_period_s) * np.abs(fit.theta[:6])
     current = motion.current[np.isfinite(motion.current)]
@@ -83,7 +83,7 @@ def _aliased_v(fit: Fit, window: Window) -> float:
 
 
 def _scatter(values: Float | None) -> float:
-    """Return what a signal scatters from row to row: noise, resolution, and what it does within a few rows."""
+    """Return a signal's scatter from row to row: noise, resolution, and its course within a few rows."""
     third = np.diff(values, 3) if values is not None else np.zeros(0)
     third = third[np.isfinite(third)]
     return float(np.sqrt(np.mean(third * third) / 20.0)) if third.size else 0.0

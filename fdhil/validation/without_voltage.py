@@ -1,4 +1,4 @@
-"""Checks what current and position alone tell: a late current, a load that comes and goes, torque left unexplained."""
+"""Checks that need current and position alone: a late current, an intermittent load, unexplained torque."""
 
 from __future__ import annotations
 
@@ -10,26 +10,22 @@ import numpy as np
 from fdhil.identification.normal import inverse_gram
 from fdhil.identification.without_voltage import TorqueFit, candidates, effective_rows, late_s
 from fdhil.records import Reason, rms
-from fdhil.validation.evidence import Evidence
+from fdhil.validation.shifts import build_delay_reason
 from fdhil.validation.significance import BUDGET
+from fdhil.validation.window_signals import WindowSignals
 
 EDGES = 20  # instants at which a load may begin or end
-LEAST_LOAD = 0.05  # of the peak current: a screw's friction differs from place to place by less
-LARGEST_SHARE = 0.10  # of the torque's RMS that the model may leave unexplained: more, and it is no model of this drive
+LEAST_LOAD = 0.05  # of the peak current: a screw's friction varies along its length by less
+LARGEST_SHARE = 0.10  # of the torque's RMS that a valid model of the drive may leave unexplained
 LATE_ROWS = 1.0
-IMITATED = 1e-6  # of a course's power, below which only rounding is left of it
+IMITATED = 1e-6  # of a course's power, below which only rounding remains
 
 
-def torque_late(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason where the current is late or early against the motion by surely more than a row."""
-    if evidence.torque is None:
-        return
-    late, std = late_s(evidence.torque)
-    dt = evidence.window.dt_s
+def torque_late(fitted: TorqueFit, dt: float) -> Iterator[Reason]:
+    """Yield a reason if the current is late or early against the motion by significantly more than a row."""
+    late, std = late_s(fitted)
     if abs(late) > LATE_ROWS * dt + BUDGET["timing"].deviations * std:
-        side = "late" if late > 0 else "early"
-        text = f"current is {1e3 * abs(late):.2f} ms {side} against the motion, more than a row of {1e3 * dt:.3g} ms"
-        yield Reason("SampleTiming", text, "take current, speed and position from one SYNC")
+        yield build_delay_reason("current", "the motion", late, dt)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,17 +38,14 @@ class Load:
     end: int
 
 
-def load_comes_and_goes(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason where a torque acts over a part of the move that neither the model nor friction explains."""
-    fitted = evidence.torque
-    if fitted is None:
-        return
+def load_comes_and_goes(fitted: TorqueFit, signals: WindowSignals) -> Iterator[Reason]:
+    """Yield a reason if a torque acts during part of the move that neither the model nor friction explains."""
     load = surest_load(fitted)
     least = LEAST_LOAD * float(np.abs(fitted.current).max())
     if abs(load.amplitude) > max(least, BUDGET["structure"].deviations * load.std):
         rows = np.flatnonzero(fitted.rows.usable)
-        a, b = (evidence.time_s(int(row)) for row in rows[[load.begin, load.end - 1]])
-        text = f"a torque as of {load.amplitude:+.3g} A that is no friction acts from {a:.3f} to {b:.3f} s"
+        a, b = (signals.get_time_s(int(row)) for row in rows[[load.begin, load.end - 1]])
+        text = f"a torque equivalent to {load.amplitude:+.3g} A, other than friction, acts from {a:.3f} to {b:.3f} s"
         yield Reason(
             "LoadDetected",
             text,
@@ -61,15 +54,15 @@ def load_comes_and_goes(evidence: Evidence) -> Iterator[Reason]:
 
 
 def surest_load(fitted: TorqueFit) -> Load:
-    """Return the load between two edges that the fit shows most surely, beside all that friction may be.
+    """Return the most significant load between two edges, in addition to all possible friction.
 
-    Friction at low speed and ripples are no load, whether they were worth joining or not.
+    Friction at low speed and ripples are no load, whether they were added to the model or not.
     """
     design = np.column_stack([fitted.design, *(term.columns for term in candidates(fitted))])
     inverse, _ = inverse_gram(design)
     left = fitted.current - design @ (inverse @ (design.T @ fitted.current))
     edges = np.linspace(0, left.size, EDGES + 1).astype(int)
-    # of a step from the begin to an edge, products with design and residual are sums up to it; a load is two steps
+    # products of a step up to an edge with design and residual are sums up to that edge; a load is two steps
     shared = np.vstack([np.zeros(len(inverse)), np.cumsum(design, axis=0)])[edges]
     score = np.append(0.0, np.cumsum(left))[edges]
     gram = np.minimum.outer(edges, edges) - shared @ inverse @ shared.T
@@ -85,11 +78,10 @@ def surest_load(fitted: TorqueFit) -> Load:
     return Load(amplitude, std, begin, end)
 
 
-def torque_unexplained(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason where the model leaves more of the torque than a good one does."""
-    fitted = evidence.torque
-    if fitted is None or not fitted.unexplained > LARGEST_SHARE:
+def torque_unexplained(fitted: TorqueFit) -> Iterator[Reason]:
+    """Yield a reason if the model leaves more of the torque than a good one does."""
+    if not fitted.unexplained > LARGEST_SHARE:
         return
     text = f"the model leaves {fitted.unexplained:.1%} of the torque unexplained, limit {LARGEST_SHARE:.0%}"
-    advice = "the drive does what the model does not have, or current and speed are not of one instant"
+    advice = "the drive has an effect that the model lacks, or current and speed are not sampled at one instant"
     yield Reason("ValidationFailed", text, advice)

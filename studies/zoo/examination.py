@@ -27,7 +27,7 @@ NOTHING = {"gain": None, "refused": ["NoModel"]}
 
 
 def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Return what is made of every machine, by kind and seed."""
+    """Return the results of every machine, by kind and seed."""
     chosen = [kind for kind in KINDS if options.kind in kind.name]
     tasks = [(kind, options.seed + k) for kind in chosen for k in range(options.draws)]
     done = []
@@ -39,7 +39,7 @@ def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def examine(kind: Kind, seed: int) -> dict[str, Any]:
-    """Return what fdhil and the other methods make of one machine."""
+    """Return the results of fdhil and the other methods for one machine."""
     axes = machine(kind, seed)
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
@@ -79,7 +79,7 @@ def _asked(*words: str) -> dict[str, Any]:
 
 
 def _axis(document: Mapping[str, Any], axis: Axis, columns: Mapping[str, Array]) -> dict[str, Any]:
-    """Return what is made of one axis: windows, errors of the pool, the other methods' errors."""
+    """Return the results of one axis: windows, errors of the pool, errors of the other methods."""
     truth, windows, pooled = axis.truth(), document["windows"], document["pooled"]
     believed = [window for window in windows if window["validated"]]
     return {
@@ -121,7 +121,7 @@ def _peer(method: Any, axis: Axis, columns: Mapping[str, Array]) -> dict[str, fl
 
 
 def _corrected(place: Path, axes: Mapping[str, Axis], model: Path) -> dict[str, Any]:
-    """Return what ``correct`` says of the program, and what the machine's table gets."""
+    """Return the result of ``correct`` for the program, and the error at the machine's table."""
     kind = next(iter(axes.values())).kind
     planned = _asked("correct", f"{place}/demand.csv", "--config", f"{place}/machine.toml", "--model", str(model),
                      "--out", f"{place}/offsets.csv")  # fmt: skip

@@ -16,7 +16,7 @@ from fdhil.arming.passes import Pass
 from fdhil.arming.preparing import Armament, Refused
 from fdhil.config import MachineConfig
 from fdhil.prediction import contour_error_um
-from fdhil.prediction.gain import Gain, joint_held_out_um, plus_minus, worst_skill_um
+from fdhil.prediction.gain import Gain, format_half_interval, joint_held_out_um, worst_skill_um
 from fdhil.records import AxisSamples, Correction, Float, Notice, Skill, frozen, frozen_ints
 from tests.arming.mill import Mill
 from tests.arming.test_ahead import opened
@@ -150,7 +150,7 @@ def test_a_gain_is_bounded_by_the_parameters_spread_and_by_the_skill(config: Mac
     assert poor.at_least is None
     for unknown in ((), (Skill("X", 1, math.nan, 1.0, 0.0, 900.0),)):
         assert predicted(skills=unknown).half_um is None
-    assert "how well it fits this machine is not known" in str(predicted(skills=()))
+    assert "its accuracy on this machine is unknown" in str(predicted(skills=()))
 
 
 def test_program_is_not_armed_when_the_last_moves_show_errors_that_make_a_position_worse(
@@ -171,11 +171,11 @@ def test_gain_includes_what_held_out_moves_show_and_is_unknown_where_an_axis_has
 
 
 def test_a_spread_below_the_digits_is_not_zero() -> None:
-    assert plus_minus(0.44) == "± 0.4"
-    assert plus_minus(0.05) == "± 0.1"
-    assert plus_minus(0.004) == "± <0.1"
-    assert plus_minus(0.0) == "± <0.1"
-    assert plus_minus(0.004, 2) == "± <0.01"
+    assert format_half_interval(0.44) == "± 0.4"
+    assert format_half_interval(0.05) == "± 0.1"
+    assert format_half_interval(0.004) == "± <0.1"
+    assert format_half_interval(0.0) == "± <0.1"
+    assert format_half_interval(0.004, 2) == "± <0.01"
 
 
 def test_a_table_behind_a_known_spring_is_measured_where_it_is(

@@ -310,7 +310,7 @@ def test_a_set_is_planned_with_the_loops_it_was_validated_with(config: MachineCo
     assert isinstance(request, ArmRequest)
     assert request.config.axis["X"].regulators.speed_filter_s == 0.002
     older = replace(newest, config_digest="another")
-    with pytest.raises(ConfigError, match=r"LoopsDiffer: .*speed_filter_s 0.002 for 0"):
+    with pytest.raises(ConfigError, match=r"LoopsDiffer: .*speed_filter_s 0.002 instead of 0"):
         prepare(program, None, config, known(config, published=older))
 
 

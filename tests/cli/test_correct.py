@@ -64,7 +64,7 @@ def test_text_for_people(bench: Path) -> None:
     result = invoke("correct", bench / "demand.csv", "--config", bench / "bench.toml", "--method", "mirror")
     assert result.exit_code == 0
     assert "predicted with the mirror correction: " in result.stdout
-    assert "by the model alone, how well it fits this machine is not known here" in result.stdout
+    assert "by the model alone; its accuracy on this machine is unknown" in result.stdout
     assert "times better" not in result.stdout
 
 

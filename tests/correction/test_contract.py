@@ -1,4 +1,4 @@
-"""The contract of every listed correction method, whoever wrote it."""
+"""The contract of every listed correction method."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ REFERENCE = bench_trajectory(10)
 
 @pytest.fixture(scope="module", params=list(tables.CORRECTIONS))
 def planned(request: pytest.FixtureRequest) -> tuple[str, Correction]:
-    """A listed method and what it plans on the bench."""
     return request.param, plan(REFERENCE, MODELS, CONFIG, request.param)
 
 
@@ -56,7 +55,6 @@ def test_position_offsets_or_an_on_line_feed_forward_never_both(planned: tuple[s
 
 @pytest.mark.parametrize("name", tables.CORRECTIONS)
 def test_at_rest_nothing_is_asked_for(name: str) -> None:
-    """The factory itself: at rest a method gives a Plan of zeros, the same each time."""
     at_rest = trajectory(np.zeros((600, 2)))
     before = predict(at_rest, MODELS, CONFIG)
     first, second = (tables.load(tables.CORRECTIONS, name)(at_rest, MODELS, CONFIG, before) for _ in range(2))
@@ -68,7 +66,6 @@ def test_at_rest_nothing_is_asked_for(name: str) -> None:
 
 @pytest.mark.parametrize("name", tables.CORRECTIONS)
 def test_a_method_keeps_the_limits_by_itself(name: str) -> None:
-    """What is planned afterwards, where a zone would get worse, must not be what makes it fit."""
     wanted = tables.load(tables.CORRECTIONS, name)(REFERENCE, MODELS, CONFIG, predict(REFERENCE, MODELS, CONFIG))
     assert wanted.refused == ()
     for axis, offset in wanted.offset_um.items():

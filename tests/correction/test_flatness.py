@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fdhil.correction import plan
-from fdhil.correction.flatness import offsets
+from fdhil.correction.flatness_feedforward import offsets
 from fdhil.prediction import predict, predict_corrected
 from fdhil.prediction.models import nominal_models
 from tests.bench import bench_config
@@ -22,7 +22,7 @@ MODELS = nominal_models(CONFIG)
 
 @pytest.mark.parametrize(("feed", "feedforward"), [(10, 1.0), (20, 1.0), (10, 0.5), (10, 0.0)])
 def test_fifty_times_better_whatever_the_drives_feed_forward(feed: float, feedforward: float) -> None:
-    """Also on drives whose lag is too large for position offsets; position offsets stay 0."""
+    """Includes drives whose lag is too large for position offsets; position offsets stay 0."""
     config = changed(speed_feedforward=feedforward)
     reference = bench_trajectory(feed)
     correction = plan(reference, MODELS, config, "flatness")
@@ -47,7 +47,6 @@ def test_offsets_are_whole_counts_of_the_drive() -> None:
 
 
 def test_torque_is_told_in_the_drives_own_torque() -> None:
-    """The drive turns N.m into current with its nominal constant, whatever the motor's is."""
     axis = CONFIG.axis["X"]
     path = np.asarray(bench_trajectory(10).position_mm["X"])
     _, nominal = offsets(path, MODELS["X"], axis, 0.001)

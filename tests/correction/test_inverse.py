@@ -1,4 +1,4 @@
-"""The inverse correction: what it leaves when plant and model differ, its limits, its blocks, its delay."""
+"""The inverse correction: its residual when plant and model differ, its limits, its blocks, its delay."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ SCATTER = {"R": 0.001, "L": 0.003, "K": 0.0005, "Jt": 0.001, "ft": 0.02, "Cd": 0
 
 
 def scattered(seed: int) -> dict[str, Parameters]:
-    """Plants that differ from the model as much as a model from one rapid differs from its plant."""
     random = np.random.default_rng(seed)
     plants = {}
     for axis in "XY":
@@ -39,7 +38,6 @@ def scattered(seed: int) -> dict[str, Parameters]:
 
 
 def assert_within_limits(correction: Correction) -> None:
-    """Amplitude with braking, rate, acceleration, variation; whole increments."""
     for axis, offset in correction.offset_um.items():
         limits = PlanLimits.of(CONFIG.axis[axis], 0.001)
         increments = offset / limits.um_per_increment
@@ -51,7 +49,7 @@ def assert_within_limits(correction: Correction) -> None:
 
 @pytest.mark.parametrize(("feed", "smoothing"), [(10, (0.060, 0.030)), (20, (0.060, 0.030)), (10, (0.030, 0.015))])
 def test_sixty_times_better_with_an_identified_model(feed: float, smoothing: tuple[float, float]) -> None:
-    """On plants that scatter: RMS, no point worse by 2 um, no zone by 1 um, 8 times better than the mirror."""
+    """On scattered plants: RMS, no point worse by 2 um, no zone by 1 um, 8 times better than the mirror."""
     reference = bench_trajectory(feed, smoothing)
     correction = plan(reference, MODELS, CONFIG, "inverse")
     mirror = plan(reference, MODELS, CONFIG, "mirror")
@@ -72,7 +70,7 @@ def test_sixty_times_better_with_an_identified_model(feed: float, smoothing: tup
 
 @pytest.mark.parametrize("feed", [10, 20])
 def test_a_jerky_demand(feed: float) -> None:
-    """Steps of acceleration, as LinuxCNC orders them: 14 times better, twice as good as the mirror."""
+    """Steps of acceleration, as by LinuxCNC: 14 times better, twice as good as the mirror."""
     reference = trajectory(jerky_demand(feed))
     correction = plan(reference, MODELS, CONFIG, "inverse")
     assert correction.refused == ()
@@ -89,7 +87,7 @@ def test_a_jerky_demand(feed: float) -> None:
 
 @pytest.mark.parametrize("feed", [10, 20])
 def test_rounded_corners_leave_no_oscillation(feed: float) -> None:
-    """Figure 20: the mirror's error swings on behind each arc; here nothing that swings is left to be seen."""
+    """Figure 20: with the mirror the error oscillates behind each arc; with the inverse no oscillation is visible."""
     reference = trajectory(rounded_demand(feed))
     correction = plan(reference, MODELS, CONFIG, "inverse")
     assert_within_limits(correction)
@@ -101,14 +99,14 @@ def test_rounded_corners_leave_no_oscillation(feed: float) -> None:
 
 
 def swing(error_um: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
-    """The largest standard deviation (um) within 0.1 s of what is faster than 5 Hz."""
+    """Return the largest standard deviation (um) within 0.1 s of the part above 5 Hz."""
     slow = np.convolve(error_um, np.ones(200) / 200, mode="same")
     windows = np.lib.stride_tricks.sliding_window_view(error_um - slow, 100)
     return float(windows.std(axis=1).max())
 
 
 def test_corners_do_not_oscillate() -> None:
-    """Around a corner the corrected error stays below a micrometre, where the mirror leaves 10 and more."""
+    """Around a corner the corrected error stays below a micrometre; the mirror leaves 10 and more."""
     reference = bench_trajectory(10)
     after = plan(reference, MODELS, CONFIG, "inverse").after
     for zone in predict(reference, MODELS, CONFIG).zones:
@@ -117,7 +115,7 @@ def test_corners_do_not_oscillate() -> None:
 
 
 def test_a_model_that_is_far_off_still_helps() -> None:
-    """5 to 10 % wrong parameters leave a few micrometres."""
+    """Parameter errors of 5 to 10 % leave a few micrometres."""
     reference = bench_trajectory(10, (0.030, 0.015))
     correction = plan(reference, MODELS, CONFIG, "inverse")
     off = replace(MODELS["X"], R=0.53, L=0.0053, K=0.78, Jt=0.079, ft=0.055, Cd=5.5)
@@ -128,7 +126,6 @@ def test_a_model_that_is_far_off_still_helps() -> None:
 
 
 def test_seams_between_blocks_do_not_show() -> None:
-    """The rows around a seam are as good as the rest, and a piece of the path more does not change the first blocks."""
     reference = bench_trajectory(10)
     correction = plan(reference, MODELS, CONFIG, "inverse")
     seam = np.abs(reference.time_s - BLOCK_S) < 0.1
@@ -143,7 +140,7 @@ def test_delay_is_that_of_the_position_loop(feedforward: float, expected: float)
 
 
 def test_a_slow_path_on_a_lagging_drive_needs_small_offsets() -> None:
-    """With one delay for all axes only the corners need offsets: at 4 m/min they fit, the lag itself would not."""
+    """With one delay for all axes only the corners need offsets: at 4 m/min these are small enough, the lag is not."""
     config = changed(speed_feedforward=0.5)
     reference = bench_trajectory(4)
     correction = plan(reference, MODELS, config, "inverse")
@@ -156,7 +153,7 @@ def test_a_slow_path_on_a_lagging_drive_needs_small_offsets() -> None:
 
 @pytest.mark.parametrize("feedforward", [0.5, 0.0])
 def test_a_lag_beyond_the_ceiling_is_refused_with_the_advice_to_feed_forward(feedforward: float) -> None:
-    """At 10 m/min even the corners alone ask for more than an offset may be."""
+    """At 10 m/min even the corners alone exceed the largest offset."""
     correction = plan(bench_trajectory(10), MODELS, changed(speed_feedforward=feedforward), "inverse")
     assert {reason.code for reason in correction.refused} == {"LagTooLarge"}
     assert f"feed-forward (it is {feedforward:g})" in correction.refused[0].advice
@@ -164,7 +161,6 @@ def test_a_lag_beyond_the_ceiling_is_refused_with_the_advice_to_feed_forward(fee
 
 
 def test_axes_with_different_lags_are_refused() -> None:
-    """Half the difference of their delays at full speed is more than an offset may be."""
     config = changed()
     slow = changed(speed_feedforward=0.5).axis["Y"]
     mixed = config.model_copy(update={"axis": {"X": config.axis["X"], "Y": slow}})
@@ -173,7 +169,6 @@ def test_axes_with_different_lags_are_refused() -> None:
 
 
 def test_the_linear_inverse_undoes_the_linear_loop() -> None:
-    """An error below the bandwidth is undone to a per mille by one step."""
     axis = CONFIG.axis["X"]
     parameters = replace(MODELS["X"], Cd=0.0)
     undo = inverse(parameters, axis, 0.001, 2000)
@@ -184,7 +179,6 @@ def test_the_linear_inverse_undoes_the_linear_loop() -> None:
 
 
 def random_path(seed: int) -> Trajectory:
-    """Moves and rests of two axes in random order, away from the limits."""
     random = np.random.default_rng(seed)
     speeds = np.concatenate(
         [np.repeat(random.uniform(-90, 90, (1, 2)) * (random.random(2) > 0.3), random.integers(80, 500), axis=0)
@@ -198,7 +192,6 @@ def random_path(seed: int) -> Trajectory:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_random_paths_get_better_within_the_limits(seed: int) -> None:
-    """Reversals, rests and single-axis moves in any order."""
     reference = random_path(seed)
     correction = plan(reference, MODELS, CONFIG, "inverse")
     assert correction.refused == ()
@@ -221,7 +214,6 @@ def test_narrow_limits_are_kept() -> None:
 
 @pytest.mark.parametrize("rows", [2, 3, 4, 40, 1999, 2000, 2001, 2500, 2501, 2502])
 def test_any_length_of_path(rows: int) -> None:
-    """A path that ends anywhere, in or at the edge of a block, has an offset for each row, within the limits."""
     reference = trajectory(bench_demand(10)[300 : 300 + rows])
     correction = plan(reference, MODELS, CONFIG, "inverse")
     assert all(offset.size == rows for offset in correction.offset_um.values())
@@ -230,7 +222,6 @@ def test_any_length_of_path(rows: int) -> None:
 
 @pytest.mark.parametrize("rest_s", [0.5, 2.0, 4.5])
 def test_a_rest_across_blocks(rest_s: float) -> None:
-    """An axis may stand still where one block ends and the next begins, or through a whole block."""
     demand = bench_demand(10)[:1000]
     pause = np.repeat(demand[-1:], round(rest_s / 0.001), axis=0)
     there = smooth(np.concatenate([demand, pause, demand[::-1], np.repeat(demand[:1], 200, axis=0)]), (0.06,), 0.001)

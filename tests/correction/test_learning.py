@@ -1,4 +1,4 @@
-"""Learning from pass to pass on a plant that the model does not hold, measured by its motor's encoder."""
+"""Iterative learning on a plant with effects that the model lacks, measured by its motor's encoder."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ REAL = Mechanics(static=0.2, asymmetry=0.05, screw_ripple=0.05, motor_ripple_nm=
 
 
 def cut(mechanics: Mechanics, loops: Loops, reference: Trajectory, offset_um: Mapping[str, Float]) -> dict[str, Float]:
-    """Return where the encoders of X and Y say that they are, mm."""
     found = {}
     for axis, path in reference.position_mm.items():
         begin = at_rest(mechanics, loops, float(path[0]) * 1e-3)
@@ -35,7 +34,7 @@ def cut(mechanics: Mechanics, loops: Loops, reference: Trajectory, offset_um: Ma
 
 
 def passes(count: int, loops: Loops, wear: float = 0.0, disturbed: int = -1) -> tuple[list[float], list[float]]:
-    """Return the RMS (um) of each pass as it learned, and of the model alone on the same machine at that pass."""
+    """Return the RMS (um) of each pass with learning, and of the model alone on the same machine at that pass."""
     config, reference = bench_config(), bench_trajectory(10)
     models = dict.fromkeys(reference.axes, Parameters.of(REAL.truth()).changed(Cd=5.2))
     offset = plan(reference, models, config).offset_um
@@ -56,12 +55,10 @@ def passes(count: int, loops: Loops, wear: float = 0.0, disturbed: int = -1) -> 
 
 
 def left(reference: Trajectory, at: Mapping[str, Float]) -> float:
-    """Return the RMS of the contour error, um."""
     return rms(contour_error_um(reference.path_mm, np.column_stack(list(at.values())), reference.dt_s))
 
 
 def bounded(lesson: Lesson, config: MachineConfig) -> None:
-    """Nothing learned is beyond its share of what an offset may be."""
     for axis, offset in lesson.offset_um.items():
         limits = config.axis[axis].correction
         assert limits is not None

@@ -19,7 +19,6 @@ NARROW = PlanLimits(160.0, 6.5, 0.82, 9830.0, 1000, 0.305)  # 50 um, 2 mm/s, 250
 
 
 def test_limits_are_those_of_the_configuration_and_the_axis() -> None:
-    """Config values in increments per cycle, and never more than a share of what the axis itself can do."""
     assert pytest.approx(250.0 / BENCH.um_per_increment) == BENCH.offset
     assert pytest.approx(20.0 / BENCH.um_per_increment) == BENCH.rate
     slow = AXIS.model_copy(update={"rapid_speed_mm_s": 100.0, "max_acceleration_mm_s2": 1000.0})
@@ -41,7 +40,6 @@ def test_limits_are_those_of_the_configuration_and_the_axis() -> None:
     ],
 )
 def test_check_names_what_is_broken(offsets: np.ndarray[tuple[int], np.dtype[np.float64]], code: str | None) -> None:
-    """Amplitude with braking, rate, acceleration."""
     codes = [reason.code for reason in check(offsets.astype(np.int64), BENCH)]
     if code is None and offsets.max() > 100:
         assert "OffsetEnergy" in codes
@@ -50,7 +48,6 @@ def test_check_names_what_is_broken(offsets: np.ndarray[tuple[int], np.dtype[np.
 
 
 def test_total_variation_is_that_of_the_last_second() -> None:
-    """Each row's figure is the travel of the window that ends there."""
     rate = np.random.default_rng(1).normal(0, 3, 500)
     expected = [np.abs(rate[max(0, k - 99) : k + 1]).sum() for k in range(500)]
     assert np.allclose(variation(rate, 100), expected)
@@ -59,7 +56,6 @@ def test_total_variation_is_that_of_the_last_second() -> None:
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0.1, 2000), st.floats(1, 300), st.booleans())
 def test_what_is_planned_passes_the_check(seed: int, amplitude: float, period: float, narrow: bool) -> None:
-    """Whatever is wanted: noise, steps, waves far beyond the limits."""
     random = np.random.default_rng(seed)
     rows = np.arange(random.integers(3, 1500))
     wanted = amplitude * (np.sin(rows * 2 * np.pi / period) + random.normal(0, 0.1, rows.size))
@@ -69,13 +65,11 @@ def test_what_is_planned_passes_the_check(seed: int, amplitude: float, period: f
 
 
 def test_a_feasible_offset_is_left_as_it_is() -> None:
-    """A good curve is not moved by a bit."""
     wanted = 300 * np.sin(np.arange(2000) * 2 * np.pi / 400) ** 2
     assert np.array_equal(fit(wanted, BENCH), wanted)
 
 
 def test_the_plan_is_the_nearest_one() -> None:
-    """No small feasible change brings it nearer to what is wanted."""
     random = np.random.default_rng(3)
     wanted = 200 * np.sign(np.sin(np.arange(400) * 2 * np.pi / 200 - 0.5)) + random.normal(0, 2, 400)
     planned = fit(wanted, BENCH)
@@ -97,7 +91,6 @@ def test_the_plan_is_the_nearest_one() -> None:
 
 
 def test_a_continued_plan_keeps_the_limits_at_the_seam() -> None:
-    """A block that follows another begins where that one ended, at its rate."""
     first = to_increments(fit(150 * np.sin(np.arange(500) / 30.0) ** 2, BENCH))
     before = (float(first[-1]), float(first[-2]))
     second = to_increments(fit(np.full(400, -200.0), BENCH, before))

@@ -1,4 +1,4 @@
-"""Corrections of the bench path: what each method leaves and what the gate refuses."""
+"""Corrections of the bench path: the residual of each method and the refusals of the gate."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ MODELS = nominal_models(CONFIG)
 
 
 def changed(**regulators: Any) -> configuration.MachineConfig:
-    """The bench with other regulators on both axes."""
     document = copy.deepcopy(bench_document())
     for axis in document["axis"].values():
         axis["regulators"] |= regulators
@@ -30,7 +29,6 @@ def changed(**regulators: Any) -> configuration.MachineConfig:
 
 @pytest.mark.parametrize(("feed", "rms_um", "max_um"), [(10, 3.5, 20.3), (20, 7.0, 32.0)])
 def test_mirror_leaves_what_the_bench_says(feed: float, rms_um: float, max_um: float) -> None:
-    """Seven to nine times better on the bench, within the limits; unfiltered, and a warning where that harms."""
     correction = plan(bench_trajectory(feed), MODELS, CONFIG, "mirror")
     assert correction.refused == ()
     assert rms(correction.after.contour_um) == pytest.approx(rms_um, rel=0.02)
@@ -46,7 +44,7 @@ def test_mirror_leaves_what_the_bench_says(feed: float, rms_um: float, max_um: f
 
 @pytest.mark.parametrize(("feedforward", "before_um", "after_um"), [(0.5, 85, 67), (0.0, 110, 233)])
 def test_mirror_on_a_lagging_drive(feedforward: float, before_um: float, after_um: float) -> None:
-    """The largest error at D without limits: with H far from 1 the mirror barely helps, or harms."""
+    """The largest error at D without limits: with H far from 1 the mirror hardly helps, or harms."""
     reference, config = bench_trajectory(10), changed(speed_feedforward=feedforward)
     x, y = reference.position_mm["X"], reference.position_mm["Y"]
     at_d = np.hypot(x - 150, y - 5) < 20
@@ -60,7 +58,6 @@ def test_mirror_on_a_lagging_drive(feedforward: float, before_um: float, after_u
 
 @pytest.mark.parametrize("method", ["mirror", "inverse"])
 def test_a_lagging_drive_is_refused(method: str) -> None:
-    """The offsets would be beyond the ceiling; the advice is the drive's own feed-forward."""
     correction = plan(bench_trajectory(10), MODELS, changed(speed_feedforward=0.5), method)
     assert {reason.code for reason in correction.refused} == {"LagTooLarge"}
     assert "feed-forward" in correction.refused[0].advice
@@ -69,10 +66,10 @@ def test_a_lagging_drive_is_refused(method: str) -> None:
 
 @pytest.mark.parametrize("method", [None, "mirror"])
 def test_too_high_a_demand_is_refused_with_the_feed_that_can_be_held(method: str | None) -> None:
-    """20 m/min with 30 + 15 ms asks for 1.7 times the current limit; 9 to 11 m/min can be held."""
+    """20 m/min with 30 + 15 ms needs 1.7 times the current limit; 9 to 11 m/min are feasible."""
     correction = plan(bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG, method)
     assert {reason.code for reason in correction.refused} == {"DemandTooHigh"}
-    feed = float(correction.refused[0].advice.split()[3])
+    feed = float(correction.refused[0].advice.split()[4])
     assert 9 < feed < 11
     assert correction.after is correction.before
 
@@ -84,7 +81,6 @@ def test_nearness_to_a_limit_warns_and_does_not_refuse() -> None:
 
 
 def test_writing_is_off_without_limits() -> None:
-    """No [axis.X.correction], no offsets."""
     document = bench_document()
     del document["axis"]["Y"]["correction"]
     correction = plan(bench_trajectory(10), MODELS, configuration.parse(document), "mirror")
@@ -93,13 +89,11 @@ def test_writing_is_off_without_limits() -> None:
 
 
 def test_nothing_to_correct_is_no_gain() -> None:
-    """A path at rest needs no offsets."""
     correction = plan(trajectory(np.zeros((200, 2))), MODELS, CONFIG, "mirror")
     assert [reason.code for reason in correction.refused] == ["NoGain"]
 
 
 def test_correction_is_refused_when_held_out_moves_show_errors_that_make_a_position_worse() -> None:
-    """What the model errs by around a reversal it adds where the path was good; small errors refuse nothing."""
     reference = bench_trajectory(10)
     refused, accepted = (plan(reference, MODELS, CONFIG, held_out_um=um) for um in (4.0, 1.0))
     assert [reason.code for reason in refused.refused] == ["HarmPredicted"]

@@ -1,4 +1,4 @@
-"""Offsets of a resting axis: the current is led to rest, whatever the length of the rest."""
+"""Offsets of a resting axis: the current settles, whatever the length of the rest."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ INCREMENT_MM = 20.0 / 65536
 
 @pytest.mark.parametrize("rows", [3, 4, 5, 12, 100, 299, 300, 301, 302, 303, 360, 900])
 def test_any_length_of_rest(rows: int) -> None:
-    """Whole increments for every row, the first two as they were, and never far from where the axis stands."""
     resting = Resting(MODELS["X"], CONFIG.axis["X"], 0.001, INCREMENT_MM)
     state = closed_loop.start(0.0)
     offset = resting.quiet(np.zeros(rows), np.array([3.0, 2.0]), state)
@@ -29,7 +28,6 @@ def test_any_length_of_rest(rows: int) -> None:
 
 
 def test_the_current_comes_to_rest() -> None:
-    """With an integral that would break the table loose, the current ends far inside the dry friction's band."""
     axis, model = CONFIG.axis["X"], MODELS["X"]
     moved = closed_loop.simulate(model, axis, 0.001, np.concatenate([np.linspace(0.0, 0.02, 40), np.full(62, 0.02)]))
     state = moved.end

@@ -1,4 +1,4 @@
-"""The correction of a path that is still being made."""
+"""The correction of a path that is still being generated."""
 
 from __future__ import annotations
 
@@ -21,14 +21,12 @@ MODELS = nominal_models(CONFIG)
 
 
 def pieces(demand: Float, size: int) -> Iterator[Mapping[str, Float]]:
-    """A demand as it comes from a planner."""
     for first in range(0, len(demand), size):
         yield {axis: demand[first : first + size, a] for a, axis in enumerate("XY")}
 
 
 @pytest.mark.parametrize("size", [7, 500, 2500, 100_000])
 def test_streaming_gives_what_planning_gives(size: int) -> None:
-    """Whatever the pieces, the offsets are those of the whole path planned at once, bit by bit."""
     demand = bench_demand(10)
     whole = plan(trajectory(demand), MODELS, CONFIG, "inverse")
     blocks = list(stream(pieces(demand, size), MODELS, CONFIG))
@@ -40,7 +38,7 @@ def test_streaming_gives_what_planning_gives(size: int) -> None:
 
 
 def test_a_block_needs_only_its_look_ahead() -> None:
-    """The first 2 s are there when 2.5 s and a row of the path exist."""
+    """The first 2 s are available when 2.5 s and a row of the path are."""
     demand = bench_demand(10)
     taken = 0
 
@@ -57,7 +55,6 @@ def test_a_block_needs_only_its_look_ahead() -> None:
 
 
 def test_a_longer_path_keeps_the_offsets_of_its_settled_blocks() -> None:
-    """What lies beyond the look-ahead cannot change a block."""
     demand = bench_demand(10)
     other = demand.copy()
     other[2501:] = demand[2500]
@@ -66,7 +63,6 @@ def test_a_longer_path_keeps_the_offsets_of_its_settled_blocks() -> None:
 
 
 def test_a_refused_block_ends_the_stream() -> None:
-    """A lag too large for the offsets: the first block says so, and nothing follows."""
     blocks = list(stream(pieces(bench_demand(10), 500), MODELS, changed(speed_feedforward=0.5)))
     assert len(blocks) == 1
     assert "LagTooLarge" in {reason.code for reason in blocks[0].refused}
@@ -74,13 +70,11 @@ def test_a_refused_block_ends_the_stream() -> None:
 
 
 def test_saturation_ends_the_stream() -> None:
-    """A drive at its current limit cannot be helped."""
     blocks = list(stream(pieces(bench_demand(20, (0.030, 0.015)), 500), MODELS, CONFIG))
     assert "DemandTooHigh" in {reason.code for reason in blocks[-1].refused}
 
 
 def test_a_stream_that_goes_on_names_every_place() -> None:
-    """Two moves of four ask more of the drive than it has: each is refused at its row, what lies between is planned."""
     calm = bench_demand(10)
     shift, hard = calm[-1] - calm[0], bench_demand(20, (0.030, 0.015))
     between = np.concatenate([calm, calm[::-1], calm]) + 2 * shift
@@ -97,7 +91,7 @@ def test_a_stream_that_goes_on_names_every_place() -> None:
 
 
 def test_seams_do_not_show() -> None:
-    """Near a seam the error is no larger than it is there when the seams lie elsewhere, to 0.05 um."""
+    """Near a seam the error is no larger than with the seams elsewhere, to 0.05 um."""
     there = bench_demand(10)
     shift = 731  # rows of rest ahead: every seam moves to another place of the path
     paths = there, np.concatenate([np.repeat(there[:1], shift, axis=0), there])
@@ -115,7 +109,6 @@ def test_seams_do_not_show() -> None:
 
 @pytest.mark.usefixtures("long_computation")
 def test_memory_is_flat() -> None:
-    """After the first blocks a longer program needs no more memory: what is kept is half a second of path."""
     there = bench_demand(20)
     loop = np.concatenate([there, there[::-1]])
 
@@ -135,5 +128,4 @@ def test_memory_is_flat() -> None:
 
 
 def test_no_path_gives_no_block() -> None:
-    """An empty source ends at once."""
     assert list(stream(iter([]), MODELS, CONFIG)) == []

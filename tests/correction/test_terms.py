@@ -1,4 +1,4 @@
-"""Prediction and correction with what joins the six, on a plant that shares no numerics with the model."""
+"""Prediction and correction with additional model terms, on a plant that shares no numerics with the model."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ PLAIN = Parameters.of(Mechanics().truth())
 
 
 def told(m: Mechanics) -> Parameters:
-    """Return the model of a plant that is known exactly."""
     terms: dict[str, float] = {}
     if m.load_nm:
         terms["load"] = m.load_nm
@@ -46,7 +45,7 @@ def told(m: Mechanics) -> Parameters:
 def cut(
     m: Mechanics, offset_um: Mapping[str, Float] | None = None, loops: Loops | None = None, path: Trajectory = PATH
 ) -> Float:
-    """Return the contour error (n,) at the table; the axes stand with the current that load and ripple ask for."""
+    """Return the contour error (n,) at the table; at rest the axes hold the current that load and ripple need."""
     positions = []
     for axis, demand in path.position_mm.items():
         angle = demand[0] / m.pitch_m / 1e3 * 2 * np.pi
@@ -75,7 +74,6 @@ EFFECTS: Mapping[str, tuple[dict[str, Any], float]] = {
 
 @pytest.mark.parametrize("effect", sampled([*EFFECTS][::-1], every=4))
 def test_what_the_model_knows_is_predicted_and_corrected(effect: str) -> None:
-    """Predicted to a tenth of a micrometre, as much smaller as the least gain says, and nowhere worse."""
     changes, least = EFFECTS[effect]
     plant = replace(Mechanics(), **changes)
     model = told(plant)
@@ -90,7 +88,7 @@ def test_what_the_model_knows_is_predicted_and_corrected(effect: str) -> None:
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("hertz", [50.0, 80.0])
 def test_a_configured_resonance_need_not_be_exact(hertz: float) -> None:
-    """15 % off in either way: far better than without, where a fifth of the path gets worse."""
+    """15 % off in either direction: far better than without, where a fifth of the path gets worse."""
     plant = replace(Mechanics(), resonance_hz=hertz)
     before = cut(plant)
     blind = cut(plant, plan(PATH, {"X": PLAIN, "Y": PLAIN}, CONFIG).offset_um)
@@ -102,7 +100,7 @@ def test_a_configured_resonance_need_not_be_exact(hertz: float) -> None:
 
 
 def test_a_resonance_beyond_the_drives_reach_is_told() -> None:
-    """No offset within the limits undoes what the table swings at 20 Hz."""
+    """No offset within the limits compensates the table's oscillation at 20 Hz."""
     model = PLAIN.changed(resonance=20.0, resonance_damping=0.03)
     refused = plan(PATH, {"X": model, "Y": model}, CONFIG).refused
     assert {reason.code for reason in refused} == {"ResonanceBeyondReach"}
@@ -110,7 +108,7 @@ def test_a_resonance_beyond_the_drives_reach_is_told() -> None:
 
 
 def test_loops_as_identified_are_used() -> None:
-    """A filter of 1 ms on the speed feedback that the configuration does not know costs everything, known nothing."""
+    """A speed feedback filter of 1 ms that is not configured costs everything; identified, nothing."""
     loops = Loops(speed_filter_s=1e-3)
     known = with_loops(CONFIG, {axis: {"speed_filter_s": 1e-3} for axis in "XY"}, "loops")
     models = {"X": PLAIN, "Y": PLAIN}
@@ -121,7 +119,6 @@ def test_loops_as_identified_are_used() -> None:
 
 
 def test_a_stream_takes_terms_as_a_plan_does() -> None:
-    """The first block of the stream is that of the whole, bit by bit."""
     model = told(replace(Mechanics(), load_nm=5.0, static=0.2, asymmetry=0.1))
     models = {"X": model, "Y": model}
     whole = plan(PATH, models, CONFIG)

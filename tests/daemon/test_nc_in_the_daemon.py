@@ -40,6 +40,6 @@ async def test_what_the_nc_says_of_a_rapid_goes_with_its_window(tmp_path: Path) 
     with History.read(config.store.directory) as history:
         first, second = history.windows("X")
     assert [window.nc and window.nc["line"] for window in (first, second)] == [12, 14]
-    assert second.reasons[0] == "EpisodeAborted: the NC says that its override was 70 % in line 14"
+    assert second.reasons[0] == "EpisodeAborted: the NC reports an override of 70 % in line 14"
     stored = [read_window(file.path).nc for file in list_windows(config.store.directory / "windows").windows]
     assert moves[0] in stored

@@ -15,7 +15,7 @@ from fdhil.identification.spring import RESONANCE, SHARE, sprung
 from fdhil.identification.spring_torques import Spring, Torques
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
-from fdhil.pipeline.own_loops import OwnLoops, softened
+from fdhil.pipeline.identified_loops import OwnLoops, softened
 from fdhil.records import PARAMETERS, Window, WindowOutcome
 from studies.bench import shuttle
 from studies.real_plant import (

@@ -16,7 +16,7 @@ from fdhil.arming.token import read_token
 from fdhil.cli.demo.processes import Process
 from fdhil.commissioning.record import save_record
 from fdhil.commissioning.steps import commission
-from fdhil.correction.online import law
+from fdhil.correction.flatness_feedforward import law
 from fdhil.guard.interlocks import FEEDFORWARD_FACTS
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Float

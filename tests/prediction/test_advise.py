@@ -1,4 +1,4 @@
-"""The feeds that keep a tolerance, checked by running them."""
+"""The feeds that keep a tolerance, verified by prediction."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import pytest
 
 from fdhil.config import MachineConfig
 from fdhil.correction import plan as plan_correction
-from fdhil.correction.advised import corrected_contour_um
+from fdhil.correction.result_documents import corrected_contour_um
 from fdhil.prediction import predict
 from fdhil.prediction.advise import Advice, Held, advise
-from fdhil.prediction.feeds import RAPID, REST, Source, at_shares, highest, program_source, stretches, worst_rows
+from fdhil.prediction.feed_search import RAPID, REST, Source, at_shares, highest, program_source, stretches, worst_rows
 from fdhil.prediction.models import nominal_models
 from fdhil.program import Dwell, Feed, interpret
 from fdhil.program.budget import Budget
@@ -42,15 +42,16 @@ def corrected(reference: Trajectory) -> Float:
 
 
 def shares_of(advice: tuple[Advice, ...], held: Callable[[Advice], Held | None]) -> dict[int, float]:
-    """The share of each line."""
     found = {a.line: held(a) for a in advice}
     return {line: one.share for line, one in found.items() if one is not None and one.share is not None}
 
 
 @pytest.mark.usefixtures("long_computation")
 def test_a_beyond_the_drives_feed_is_told_with_the_feeds_that_hold() -> None:
-    """20 m/min asks for 1.7 times the current. Each line has its own feed, also where the correction is refused as
-    programmed; they keep the tolerance, 5 % more do not."""
+    """20 m/min needs 1.7 times the current. Each line has its own feed, also if the correction is refused.
+
+    Together they keep the tolerance, 5 % more do not.
+    """
     motions = list(interpret(FAST, Budget.of(SHARP.nc)))
     source = program_source(motions, SHARP)
     advice = advise(source, MODELS, SHARP, 50.0, lambda r: corrected_contour_um(r, MODELS, SHARP))
@@ -70,7 +71,7 @@ def test_a_beyond_the_drives_feed_is_told_with_the_feeds_that_hold() -> None:
 
 @pytest.mark.parametrize("seed", range(10))
 def test_the_advised_feeds_hold_and_more_does_not(seed: int) -> None:
-    """Any program, drives, smoothing and tolerance: all advised feeds together hold, all of them 5 % faster do not."""
+    """For any program, drives, smoothing and tolerance: all advised feeds together keep it, 5 % more do not."""
     random = np.random.default_rng(1000 + seed)
     config = bench_config(str(random.choice(["XY", "XYZ"])))
     smoothing = ((0.060, 0.030), (0.040,))[seed % 2]
@@ -89,7 +90,6 @@ def test_the_advised_feeds_hold_and_more_does_not(seed: int) -> None:
 
 
 def test_no_line_alone_may_run_much_faster() -> None:
-    """Two lines share the error of the corner between them: each is as fast as the other lets it."""
     lines = ["G21 G90 G64 F12000", "G1 X40", "Y12", "X70 Y45", "G3 X90 Y25 I20", "G1 X90 Y-20", "M2"]
     source = program_source(list(interpret(lines, Budget.of(CONFIG.nc))), CONFIG)
     shares = shares_of(advise(source, MODELS, CONFIG, 35.0), lambda a: a.plain)
@@ -101,7 +101,7 @@ def test_no_line_alone_may_run_much_faster() -> None:
 
 
 def test_worst_rows_of_stretches_that_come_again() -> None:
-    """Line 1 twice, line 2 between: each with the largest error in it and behind it, a rapid not judged."""
+    """Line 1 twice, line 2 between: each with the largest error in it and behind it, a rapid not assessed."""
     stretch = np.array([1, 1, 2, 2, 1, RAPID, 3, REST])
     error = np.array([1.0, 2.0, 7.0, 1.0, 3.0, 99.0, 4.0, 5.0])
     assert worst_rows(stretch, error, 0.001, 0.001) == {1: (7.0, 2), 2: (7.0, 2), 3: (5.0, 7)}
@@ -111,12 +111,10 @@ def test_worst_rows_of_stretches_that_come_again() -> None:
 def largest(
     source: Source, shares: Mapping[int, float], models: Mapping[str, Parameters], config: MachineConfig
 ) -> float:
-    """Largest contour error of the feeds with these shares."""
     return float(predict(source.at(shares), models, config).contour_um.max())
 
 
 def any_program(random: np.random.Generator, config: MachineConfig) -> list[str]:
-    """Straights and arcs, some of them short, some in space."""
     lines = [f"G21 G90 G64 F{random.uniform(3000, 15000):.0f}"]
     at = np.zeros(2)
     for _ in range(random.integers(2, 7)):
@@ -138,7 +136,6 @@ def any_program(random: np.random.Generator, config: MachineConfig) -> list[str]
 
 
 def test_the_line_before_a_corner_answers_for_it() -> None:
-    """The corner's error shows in the line behind it, and comes from both."""
     source = program_source(list(interpret(PROGRAM, Budget.of(CONFIG.nc))), CONFIG)
     advice = advise(source, MODELS, CONFIG, 60.0)
     assert [a.line for a in advice] == [2, 3]
@@ -147,14 +144,13 @@ def test_the_line_before_a_corner_answers_for_it() -> None:
 
 
 def test_a_path_within_the_tolerance_needs_no_advice() -> None:
-    """Nothing is listed."""
     source = program_source(list(interpret(PROGRAM, Budget.of(CONFIG.nc))), CONFIG)
     assert advise(source, MODELS, CONFIG, 250.0) == ()
 
 
 @pytest.mark.usefixtures("real_time")
 def test_a_tight_tolerance_is_held_by_one_percent_of_the_feed() -> None:
-    """Dry friction leaves 10 um of a corner down to a few hundredths of 15 m/min; a twentieth of them no feed holds."""
+    """Dry friction leaves 10 um of a corner down to a few hundredths of 15 m/min; no feed keeps a twentieth of them."""
     source = program_source(list(interpret(PROGRAM[:3], Budget.of(CONFIG.nc))), CONFIG)
     shares = shares_of(advise(source, MODELS, CONFIG, 10.0), lambda a: a.plain)
     assert 0.005 < shares[3] < 0.05
@@ -166,14 +162,12 @@ def test_a_tight_tolerance_is_held_by_one_percent_of_the_feed() -> None:
 
 
 def test_rapids_are_not_judged_and_rests_are() -> None:
-    """What the table does after the last line is that line's error."""
     program = "G0 X20\nG1 Y30 F15000\nM2".splitlines()
     source = program_source(list(interpret(program, Budget.of(CONFIG.nc))), CONFIG)
     assert set(stretches(source.at({})).tolist()) == {RAPID, REST, 2}
 
 
 def test_only_feeds_are_scaled() -> None:
-    """Dwells and rapids stay."""
     motions = list(interpret(PROGRAM, Budget.of(CONFIG.nc)))
     halved = at_shares(motions, lambda _: 0.5)
     assert [m.feed for m in halved if isinstance(m, Feed)] == [7500.0, 7500.0]
@@ -181,7 +175,7 @@ def test_only_feeds_are_scaled() -> None:
 
 
 def made(errors: Callable[[Mapping[int, float]], list[float]]) -> tuple[Source, Callable[[Trajectory], Float]]:
-    """Stretches 1, 2 .. of one row each whose errors depend on the shares as told."""
+    """Return segments 1, 2 .. of one row each whose errors depend on the shares as given."""
     asked: list[Mapping[int, float]] = []
 
     def at(shares: Mapping[int, float]) -> Trajectory:
@@ -195,7 +189,7 @@ def made(errors: Callable[[Mapping[int, float]], list[float]]) -> tuple[Source, 
 
 @pytest.mark.parametrize("power", [0.3, 1.0, 2.0])
 def test_an_error_that_goes_with_a_power_of_the_feed(power: float) -> None:
-    """The share is the one at which it is at the tolerance, to 5 %."""
+    """The share is the one at which the error equals the tolerance, to 5 %."""
     source, judge = made(lambda shares: [40.0 * shares.get(1, 1.0) ** power, 100.0 * shares.get(2, 1.0) ** power])
     found = highest(source, {1: 40.0, 2: 100.0}, judge, 20.0)
     for k, error in ((1, 40.0), (2, 100.0)):
@@ -204,7 +198,7 @@ def test_an_error_that_goes_with_a_power_of_the_feed(power: float) -> None:
 
 
 def test_a_neighbour_that_is_slowed_gives_room() -> None:
-    """Stretch 1 leaves the tolerance by what stretch 2 does: with that slowed, it may run nearly as programmed."""
+    """Segment 2 causes the error of segment 1: with that slowed, segment 1 may run nearly as programmed."""
     source, judge = made(lambda s: [15.0 * s.get(1, 1.0) + 30.0 * s.get(2, 1.0) ** 2, 80.0 * s.get(2, 1.0)])
     found = highest(source, {1: 45.0, 2: 80.0}, judge, 20.0)
     assert found.held == {1, 2}
@@ -213,7 +207,6 @@ def test_a_neighbour_that_is_slowed_gives_room() -> None:
 
 
 def test_a_stretch_that_is_spoilt_by_another_joins() -> None:
-    """It was within the tolerance as programmed, and is not when its neighbour slows down."""
     source, judge = made(lambda s: [40.0 * s.get(1, 1.0), 30.0 * s.get(2, 1.0) - 15.0 * s.get(1, 1.0)])
     found = highest(source, {1: 40.0}, judge, 20.0)
     assert found.held == {1, 2}
@@ -222,8 +215,6 @@ def test_a_stretch_that_is_spoilt_by_another_joins() -> None:
 
 
 def test_what_is_not_known_is_not_slowed() -> None:
-    """While one stretch is beyond the drives nothing is known of the other, which then turns out to hold."""
-
     def errors(shares: Mapping[int, float]) -> list[float]:
         beyond = shares.get(1, 1.0) > 0.4
         return [np.inf if beyond else 10.0, np.nan if beyond else 19.0]
@@ -236,7 +227,6 @@ def test_what_is_not_known_is_not_slowed() -> None:
 
 
 def test_an_error_of_the_acceleration_falls_only_at_a_low_feed() -> None:
-    """It is the same down to a fifth of the feed, where ramps become too short for it, and then falls."""
     source, judge = made(lambda shares: [50.0 * min(1.0, shares.get(1, 1.0) / 0.2), 40.0 * shares.get(2, 1.0)])
     found = highest(source, {1: 50.0, 2: 40.0}, judge, 20.0)
     assert found.held == {1, 2}
@@ -244,7 +234,6 @@ def test_an_error_of_the_acceleration_falls_only_at_a_low_feed() -> None:
 
 
 def test_an_error_that_does_not_come_from_the_feed_is_lost_soon() -> None:
-    """No feed holds it; the other stretch is not held up."""
     trials: list[int] = []
 
     def errors(shares: Mapping[int, float]) -> list[float]:

@@ -1,4 +1,4 @@
-"""The circular test: what ISO 230-4 calls G, H and F, of circles whose errors are known."""
+"""The circular test of ISO 230-4: G, H and F of circles with known errors."""
 
 from __future__ import annotations
 
@@ -21,12 +21,10 @@ Error = Callable[[Float], Float]
 
 
 def always(error_um: float) -> Error:
-    """The same radial error everywhere."""
     return lambda at: np.full(at.shape, error_um)
 
 
 def runs(counter_um: Error, clockwise_um: Error, turns: float = 1.3, points: int = 9000) -> Float:
-    """A path from the centre to the circle, around it in both directions, with radial errors by angle."""
     angle = np.linspace(0.0, turns * 2 * np.pi, points)
     way = [np.column_stack([np.linspace(0.0, RADIUS, 200), np.zeros(200)])]
     for at, error_um in ((angle, counter_um), (angle[::-1], clockwise_um)):
@@ -42,7 +40,6 @@ def test_a_true_circle_has_no_deviation() -> None:
 
 
 def test_runs_of_different_size_are_hysteresis() -> None:
-    """Each run by itself is round."""
     found = evaluate(runs(always(4.0), always(-2.0)), RADIUS, (0.0, 0.0))
     assert found.hysteresis_um == pytest.approx(6.0, abs=0.01)
     assert found.both_um == pytest.approx(6.0, abs=0.01)
@@ -51,7 +48,6 @@ def test_runs_of_different_size_are_hysteresis() -> None:
 
 
 def test_an_ellipse_is_told_by_its_axes() -> None:
-    """One axis longer than the other by a scale: twice its amplitude, and no hysteresis."""
     found = evaluate(runs(lambda at: 5.0 * np.cos(2 * at), lambda at: 5.0 * np.cos(2 * at)), RADIUS, (0.0, 0.0))
     assert found.deviations_um == pytest.approx((10.0, 10.0), abs=0.02)
     assert found.hysteresis_um < 0.02
@@ -59,7 +55,7 @@ def test_an_ellipse_is_told_by_its_axes() -> None:
 
 
 def test_where_the_circle_lies_does_not_matter() -> None:
-    """A ball bar does not know the programmed centre: 20 um beside it are no deviation."""
+    """A ball bar does not measure the programmed centre: an offset of 20 um is no deviation."""
     moved = runs(always(3.0), always(3.0)) + np.array([120.02, -79.98])
     for centre in ((120.0, -80.0), None):
         found = evaluate(moved, RADIUS, centre)
@@ -68,7 +64,7 @@ def test_where_the_circle_lies_does_not_matter() -> None:
 
 
 def test_starting_and_stopping_do_not_count() -> None:
-    """Of a run of more than a turn the middle 360 degrees are evaluated."""
+    """The middle 360 degrees of a longer run are evaluated."""
     path = runs(always(0.0), always(0.0), turns=1.5)
     path[200:1200] *= 1.001  # 50 um at the start of the first run
     assert evaluate(path, RADIUS, (0.0, 0.0)).both_um < 0.01
@@ -86,7 +82,7 @@ def test_another_radius_is_refused() -> None:
 
 
 def test_the_program_has_the_numbers_that_were_asked_for() -> None:
-    """G code knows no exponents, and a circle of 50.12345 mm is none of 50.1234 mm."""
+    """G code has no exponents, and a circle of 50.12345 mm is not one of 50.1234 mm."""
     program = circle_program(("X", "Y"), 50.123456, 1_000_000.0)
     assert "G3 X50.123456 Y0 I-50.123456 J0 P2 F1000000.000000" in program
     assert "e" not in circle_program(("X", "Y"), 0.1, 0.00001)
@@ -94,7 +90,6 @@ def test_the_program_has_the_numbers_that_were_asked_for() -> None:
 
 @pytest.mark.parametrize("plane", [("X", "Y"), ("X", "Z"), ("Y", "Z")])
 def test_the_program_runs_the_circle_first_counter_clockwise(plane: tuple[str, str], tmp_path: Path) -> None:
-    """As the plane's axes count, in each plane, twice around in both directions."""
     program = tmp_path / "circle.ngc"
     program.write_text(circle_program(plane, 10.0, 3000.0))
     reference = load_trajectory(program, bench_config(axes="XYZ"))

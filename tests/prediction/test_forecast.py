@@ -20,13 +20,13 @@ STD = np.array([0.003 * value for value in NOMINAL.as_dict().values()])
 
 
 def published(axis: str, revision: int, **changed: float) -> ParameterSet:
-    """A set with some values other than nominal, known to 0.3 %."""
+    """Return a set with some values other than nominal, known to 0.3 %."""
     values = NOMINAL.changed(**changed)
     return ParameterSet(axis, revision, values, frozen(np.diag(STD**2)), 3, 0, None, "digest")
 
 
 def with_lines(reference: Trajectory) -> Trajectory:
-    """The reference as a program of one line per 100 ms would give it."""
+    """Return the reference as a program with one line per 100 ms."""
     return replace(reference, line=frozen_ints(1 + np.arange(reference.time_s.size) // 100))
 
 
@@ -47,8 +47,6 @@ def test_a_fixture_costs_what_the_prediction_without_it_says() -> None:
 
 
 def test_zones_that_came_and_went_are_told_with_what_did_it() -> None:
-    """More inertia on X, more of it and of dry friction on Y: at the largest change, what each is said to do adds
-    up to it. A zone that is gone is listed too."""
     reference = with_lines(bench_trajectory(10))
     earlier = {"X": NOMINAL, "Y": replace(NOMINAL, Cd=1.0, Jt=0.06)}
     models = {"X": replace(NOMINAL, Jt=0.085), "Y": NOMINAL}
@@ -73,7 +71,6 @@ def test_zones_that_came_and_went_are_told_with_what_did_it() -> None:
 
 
 def test_a_change_to_the_better_saves() -> None:
-    """Friction that falls costs at the stops; where it rises again the same is saved. ft and Cd go together."""
     reference = bench_trajectory(10)
     low, usual = {"X": published("X", 2, ft=0.01, Cd=1.0)}, {"X": published("X", 1)}
     costs = []
@@ -89,7 +86,6 @@ def test_a_change_to_the_better_saves() -> None:
 
 
 def test_the_last_step_is_found_and_drift_is_none() -> None:
-    """The newest jump between two revisions that is still there."""
     course = [0.075, 0.0752, 0.0751, 0.085, 0.0851]
     assert last_step([published("X", k, Jt=jt) for k, jt in enumerate(course)]) == 2
     assert last_step([published("X", k, Jt=0.075 + 0.0005 * k) for k in range(9)]) is None
@@ -98,7 +94,7 @@ def test_the_last_step_is_found_and_drift_is_none() -> None:
 
 
 def test_the_day_on_which_a_zone_leaves_the_tolerance() -> None:
-    """Jt rises by 0.1 % a day: the prediction with the parameters of that day is at the tolerance."""
+    """Jt rises by 0.1 % a day: with that day's parameters the predicted error equals the tolerance."""
     reference = bench_trajectory(10)
     days = np.arange(-20.0, 1.0)
     random = np.random.default_rng(3)
@@ -123,12 +119,10 @@ def test_the_day_on_which_a_zone_leaves_the_tolerance() -> None:
 
 
 def only_jt(known: Course) -> Course:
-    """Leave the other parameters out of a course."""
     return replace(known, slopes={"Jt": known.slopes["Jt"]})
 
 
 def test_what_may_stand_still_is_not_foreseen() -> None:
-    """No slope beyond chance, or one to the better: no day."""
     reference = bench_trajectory(10)
     models = {"X": NOMINAL, "Y": NOMINAL}
     predicted = predict(reference, models, CONFIG)
@@ -143,7 +137,6 @@ def test_what_may_stand_still_is_not_foreseen() -> None:
 
 
 def test_slopes_begin_behind_the_last_step() -> None:
-    """A step is not a slope."""
     values = [0.075] * 6 + [0.085] * 6
     found = course([published("X", k, Jt=jt) for k, jt in enumerate(values)], np.arange(12.0))
     assert abs(found.slopes["Jt"].value) < 1e-9
@@ -152,7 +145,6 @@ def test_slopes_begin_behind_the_last_step() -> None:
 
 
 def test_a_parameter_set_without_covariance_still_has_steps() -> None:
-    """NaN covariance counts as known exactly."""
     unknown = frozen(np.full((6, 6), np.nan))
     before, after = (replace(published("X", k, Jt=jt), covariance=unknown) for k, jt in ((1, 0.075), (2, 0.085)))
     assert last_step([before, after]) == 0
@@ -160,7 +152,7 @@ def test_a_parameter_set_without_covariance_still_has_steps() -> None:
 
 
 def test_a_term_that_joined_or_left_is_told_as_a_whole() -> None:
-    """What falling friction did since the program was predicted without it, and the other way round."""
+    """The effect of falling friction since a prediction without it, and the reverse."""
     reference = bench_trajectory(10)
     rich = NOMINAL.changed(stribeck=2.0, stribeck_speed=10.0)
     for earlier, now in ((NOMINAL, rich), (rich, NOMINAL)):

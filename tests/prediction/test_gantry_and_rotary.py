@@ -1,4 +1,4 @@
-"""The path of a machine with a rotary axis and a gantry axis: what counts as contour error, and its correction."""
+"""The path of a machine with a rotary and a gantry axis: its contour error and its correction."""
 
 from __future__ import annotations
 
@@ -37,7 +37,6 @@ def test_contour_error_of_a_table_that_turns_alone_grows_with_the_radius() -> No
 
 
 def test_contour_error_of_a_mixed_move_is_that_of_x_and_of_the_angle_times_the_radius() -> None:
-    """A straight line in X and A: the distance across it, in the plane of X and the arc."""
     config = rotary(100.0)
     reference = demand("F1200|G1 X20 A20", config)
     predicted = predict(reference, nominal_models(config), config)

@@ -1,4 +1,4 @@
-"""A model's terms taken apart: bands, torques, families."""
+"""Variants of a model: bands, torques, term families."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ RICH = BASE.changed(
 
 
 def test_the_band_that_holds_a_shaft_is_what_the_torques_leave() -> None:
-    """Load and ripple shift it, what differs by direction makes it lopsided: from -2.5 to 9.5 N.m here."""
+    """Load and ripple shift the band, different friction by direction makes it asymmetric: -2.5 to 9.5 N.m here."""
     found = band(RICH, 0.0)
     assert found == pytest.approx((2.5 - 5.0, 2.5 + 7.0))
     assert found.middle == pytest.approx(3.5)
@@ -36,7 +36,6 @@ def test_the_band_that_holds_a_shaft_is_what_the_torques_leave() -> None:
 
 
 def test_the_torque_against_motion_is_the_sum_of_its_terms() -> None:
-    """Of the docstring of Parameters, in both directions and at rest."""
     speed, angle = np.array([20.0, -5.0, 0.0]), np.array([0.3, 1.0, 2.0])
     smooth, dry = resisting(RICH, speed, angle)
     ripple = 0.5 * np.sin(2 * angle + np.pi / 2)
@@ -47,7 +46,6 @@ def test_the_torque_against_motion_is_the_sum_of_its_terms() -> None:
 
 
 def test_what_a_path_demands_has_the_terms_in_it() -> None:
-    """At constant speed the current is the friction's, a load adds its own."""
     axis = bench_config().axis["X"]
     path = np.linspace(0.0, 100.0, 1001)
     amperes = [required(path, model, axis, 0.001)[0][500] * 200.0 for model in (BASE, BASE.changed(load=2.0))]
@@ -70,7 +68,6 @@ def test_without_dry_friction_the_rest_stays() -> None:
 
 
 def test_a_term_is_put_back_as_a_whole() -> None:
-    """One that was not there before is nil, one that is gone comes back with its parts."""
     names = ("stribeck", "stribeck_speed")
     assert put_back(RICH, BASE, names).term("stribeck") == 0.0
     assert put_back(RICH, BASE, names).term("stribeck_speed") == 10.0

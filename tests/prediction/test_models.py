@@ -1,4 +1,4 @@
-"""Model files: what is wrong is said, all at once, as a config error."""
+"""Model files: all faults are reported at once, as a config error."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ GOOD: dict[str, Any] = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.0, 
 
 
 def write(folder: Path, text: str) -> Path:
-    """Write a model file."""
     path = folder / "m.json"
     path.write_text(text)
     return path
@@ -57,31 +56,29 @@ def test_reads_what_held_out_moves_show(tmp_path: Path) -> None:
         ({"held_out": {"rms_um": 0.7, "max_um": "2"}}, "X.held_out.max_um: must be a finite number of at least 0"),
         ({"held_out": 3}, "X.held_out: must be a table"),
         ({"terms": {"presliding_um": -2}}, "X.terms.presliding_um: must be at least 0"),
-        ({"terms": {"loadd": 1.0}}, "X.terms.loadd: is no parameter (did you mean 'load'?)"),
-        ({"terms": {"Cd": 1.0}}, "X.terms.Cd: is no parameter"),
+        ({"terms": {"loadd": 1.0}}, "X.terms.loadd: is not a parameter (did you mean 'load'?)"),
+        ({"terms": {"Cd": 1.0}}, "X.terms.Cd: is not a parameter"),
         ({"terms": {"load": "2"}}, "X.terms.load: must be a number, not '2' (in N.m)"),
         ({"terms": {"viscous_positive": -0.1}}, "X.terms.viscous_positive: must be at least 0"),
         ({"terms": {"resonance": 80, "resonance_share": 1.0}}, "X.terms.resonance_share: must be from 0.01 to 0.99"),
         ({"terms": {"resonance": 80, "resonance_share": 0}}, "X.terms.resonance_share: must be from 0.01 to 0.99"),
-        ({"terms": {"stribeck": 1.0}}, "X.terms.stribeck: needs stribeck_speed beside it"),
+        ({"terms": {"stribeck": 1.0}}, "X.terms.stribeck: requires stribeck_speed"),
         ({"terms": {"stribeck": 1.0, "stribeck_speed": 0}}, "X.terms.stribeck_speed: must be above 0"),
-        ({"terms": {"stribeck": -6.0, "stribeck_speed": 5}}, "X.terms.stribeck: takes more from the dry friction"),
-        ({"terms": {"stribeck_speed": 5}}, "X.terms.stribeck_speed: means nothing without stribeck"),
-        ({"terms": {"ripple_motor_24_phase": 1}}, "means nothing without ripple_motor_24"),
-        ({"terms": {"ripple_motor_0": 1}}, "X.terms.ripple_motor_0: is no parameter"),
+        ({"terms": {"stribeck": -6.0, "stribeck_speed": 5}}, "X.terms.stribeck: exceeds the dry friction"),
+        ({"terms": {"stribeck_speed": 5}}, "X.terms.stribeck_speed: has no meaning without stribeck"),
+        ({"terms": {"ripple_motor_24_phase": 1}}, "has no meaning without ripple_motor_24"),
+        ({"terms": {"ripple_motor_0": 1}}, "X.terms.ripple_motor_0: is not a parameter"),
         ({"terms": [1]}, "X.terms: must be a table of names, not [1]"),
         ({"loops": 3}, "X.loops: must be a table of names, not 3"),
     ],
 )
 def test_names_the_fault(tmp_path: Path, change: dict[str, Any], message: str) -> None:
-    """Each wrong value is named with its axis and key."""
     with pytest.raises(ConfigError) as caught:
         load_model_file(write(tmp_path, json.dumps({"X": GOOD | change})))
     assert message in str(caught.value)
 
 
 def test_terms_and_loops_are_read(tmp_path: Path) -> None:
-    """Terms join the parameters in their order; keys of the regulators take the place of the configuration's."""
     terms = {"load": -2.5, "stribeck": -1.0, "stribeck_speed": 12.0, "ripple_screw_1": 0.2, "ripple_screw_1_phase": -1}
     found = load_model_file(
         write(tmp_path, json.dumps({"X": GOOD | {"terms": terms, "loops": {"speed_kp": 21.0, "speed_filter_s": 5e-4}}}))
@@ -104,14 +101,12 @@ def test_terms_and_loops_are_read(tmp_path: Path) -> None:
     ],
 )
 def test_loops_that_no_drive_has_are_refused(loops: dict[str, Any], message: str) -> None:
-    """In the words of the configuration, whose keys they are."""
     with pytest.raises(ConfigError) as caught:
         with_loops(bench_config(), {"X": loops}, "m.json")
     assert message in str(caught.value)
 
 
 def test_a_configured_resonance_is_in_the_model() -> None:
-    """Unless the model has its own."""
     config = bench_config()
     axis = config.axis["X"].model_copy(update={"resonance_hz": 80.0, "resonance_damping": 0.05})
     config = config.model_copy(update={"axis": {**config.axis, "X": axis}})
@@ -126,7 +121,6 @@ def test_a_configured_resonance_is_in_the_model() -> None:
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"X": 3}', "no json", '{"X": {"R": 1}}', "[" * 100_000])
 def test_refuses_other_files(tmp_path: Path, text: str) -> None:
-    """What is no model file is a config error, never another exception."""
     with pytest.raises(ConfigError):
         load_model_file(write(tmp_path, text))
 
@@ -135,19 +129,17 @@ def test_refuses_other_files(tmp_path: Path, text: str) -> None:
 def test_what_is_there_twice_is_refused(tmp_path: Path, text: str) -> None:
     file = tmp_path / "model.json"
     file.write_text(text)
-    with pytest.raises(ConfigError, match="is there twice"):
+    with pytest.raises(ConfigError, match="appears twice"):
         load_model_file(file)
 
 
 def test_all_faults_at_once(tmp_path: Path) -> None:
-    """Not only the first fault is told."""
     with pytest.raises(ConfigError) as caught:
         load_model_file(write(tmp_path, json.dumps({"X": {"R": -1}, "Y": 2})))
     assert len(caught.value.faults) == 7
 
 
 def test_an_axis_that_stands_still_needs_no_model() -> None:
-    """Only an axis that moves must have been identified."""
     config = bench_config()
     demand = np.column_stack([np.linspace(0, 1, 10), np.zeros(10)])
     nominal = nominal_models(config)
@@ -161,7 +153,6 @@ FILTERED: Mapping[str, float | str] = {"speed_filter_s": 0.002, "speed_kp": 23.4
 
 
 def set_with(loops: Mapping[str, float | str] | None, digest: str = CONFIG.digest) -> dict[str, ParameterSet]:
-    """Return a published set of X that was validated with these loops."""
     return {"X": replace(published(), config_digest=digest, loops=loops)}
 
 
@@ -177,15 +168,16 @@ def test_a_published_set_is_used_with_the_loops_it_was_validated_with() -> None:
 
 def test_loops_of_an_earlier_configuration_are_refused_unless_it_has_them_now() -> None:
     older = set_with(FILTERED, "another")
-    with pytest.raises(ConfigError, match=r"axis\.X\.regulators: LoopsDiffer: .*speed_filter_s 0.002 for 0,") as error:
+    with pytest.raises(
+        ConfigError, match=r"axis\.X\.regulators: LoopsDiffer: .*speed_filter_s 0.002 instead of 0,"
+    ) as error:
         validated_models(older, CONFIG, "store")
-    assert "enter what the rapids showed" in str(error.value)
+    assert "enter the loops that the rapids showed" in str(error.value)
     copied = with_loops(CONFIG, {"X": {**FILTERED, "speed_kp": 23.402}}, "copied")
     assert validated_models(older, copied, "store")[1] is copied
 
 
 def published_friction(dry_nm: float, stribeck_nm: float, covariance: Float) -> dict[str, ParameterSet]:
-    """Return a set of X with friction at low speed, as a history may have it."""
     parameters = BENCH.changed(Cd=dry_nm, stribeck=stribeck_nm, stribeck_speed=8.0)
     return {"X": replace(published(parameters=parameters), covariance=covariance)}
 
@@ -196,5 +188,5 @@ def test_an_older_set_that_chance_made_unphysical_is_used_within_the_bounds() ->
     assert models["X"].Cd + models["X"].term("stribeck") == 0.0
     assert models["X"].Cd == pytest.approx(4.95 + 1.45 / (1 + 2.8**2))
     for told in (published_friction(4.95, -26.4, covariance), published_friction(4.95, -6.4, np.zeros((6, 6)))):
-        with pytest.raises(ConfigError, match="X: Unphysical: the friction of the newest set would push"):
+        with pytest.raises(ConfigError, match="X: Unphysical: friction in the newest set would drive"):
             validated_models(told, CONFIG, "store")

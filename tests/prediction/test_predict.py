@@ -1,4 +1,4 @@
-"""The path errors of the bench, predicted: the published figures, zones, drifts, and the contour error's own laws."""
+"""Predicted path errors of the bench: the published figures, zones, drifts, and properties of the contour error."""
 
 from __future__ import annotations
 
@@ -34,7 +34,6 @@ def test_bench_figures(feed: float, smoothing: tuple[float, float], rms_um: floa
 
 
 def test_zones_name_place_and_cause() -> None:
-    """The corners A, C, E and G of the path, and the reversal at the bottom of the arc D."""
     zones = predict(bench_trajectory(10), MODELS, CONFIG).zones
     corners = [zone.where for zone in zones if zone.cause == "corner"]
     expected = [(0, 55), (100, 55), (200, 55), (250, 55)]
@@ -48,7 +47,7 @@ def test_zones_name_place_and_cause() -> None:
 
 
 def test_saturation_is_named() -> None:
-    """20 m/min with short smoothing asks for more than the current limit."""
+    """20 m/min with short smoothing exceeds the current limit."""
     prediction = predict(bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG)
     assert prediction.limited_s["X"] > 0.1
     assert {zone.cause for zone in prediction.zones} == {"saturation"}
@@ -61,7 +60,7 @@ def test_saturation_is_named() -> None:
 def test_drifts_change_the_path(
     drift: dict[str, float], at_e_um: tuple[float, float], largest_um: tuple[float, float]
 ) -> None:
-    """Figures 14 and 15: a drift on one axis alone moves the path, near E by little (friction) or much (inertia)."""
+    """Figures 14 and 15: a drift on one axis moves the path, near E by little (friction) or much (inertia)."""
     reference = bench_trajectory(10)
     healthy = predict(reference, MODELS, CONFIG)
     drifted = predict(reference, MODELS | {"X": MODELS["X"].changed(**drift)}, CONFIG)
@@ -73,7 +72,6 @@ def test_drifts_change_the_path(
 
 
 def test_an_axis_without_model_is_a_config_error() -> None:
-    """Both what has no model and what has no configuration are named."""
     with pytest.raises(ConfigError, match=r"model\.Y"):
         predict(bench_trajectory(10), {"X": MODELS["X"]}, CONFIG)
     with pytest.raises(ConfigError, match=r"axis\.Y"):
@@ -81,7 +79,6 @@ def test_an_axis_without_model_is_a_config_error() -> None:
 
 
 def brute_force(reference: Float, actual: Float, half: int) -> Float:
-    """The full search over all segments within the window."""
     out = np.empty(len(actual))
     for k, point in enumerate(actual):
         low, high = max(0, k - half), min(len(reference) - 1, k + half)
@@ -96,7 +93,6 @@ def brute_force(reference: Float, actual: Float, half: int) -> Float:
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.floats(0, 50))
 def test_contour_error_is_that_of_the_full_search(seed: int, d: int, noise: float) -> None:
-    """Nothing that the search passes over could have been nearer."""
     random = np.random.default_rng(seed)
     steps = random.normal(0, 1, (120, d)) * (random.random((120, 1)) > 0.3)
     reference = np.cumsum(steps, axis=0)
@@ -107,7 +103,7 @@ def test_contour_error_is_that_of_the_full_search(seed: int, d: int, noise: floa
 
 
 def test_contour_error_of_some_rows_is_theirs_among_all() -> None:
-    """Asked for rows 40 to 69 alone, the path before and behind them counts as before."""
+    """For rows 40 to 69 alone, the path before and behind them counts as before."""
     random = np.random.default_rng(3)
     reference = np.cumsum(random.normal(0, 1, (120, 2)), axis=0)
     actual = reference + random.normal(0, 1, (120, 2))
@@ -117,13 +113,11 @@ def test_contour_error_of_some_rows_is_theirs_among_all() -> None:
 
 @pytest.mark.parametrize("first", [None, -1, 2])
 def test_contour_error_wants_shapes_that_fit(first: int | None) -> None:
-    """Different numbers of rows cannot be compared, nor rows beyond the path."""
     with pytest.raises(ValueError, match="must both be"):
         contour_error_um(np.zeros((4, 2)), np.zeros((3, 2)), 0.001, first)
 
 
 def rapid(**signals: Any) -> Window:
-    """A rapid of the model itself."""
     return replace(nominal_rapid("Y", CONFIG.axis["Y"], 0.001, 1, seed=0), **signals)
 
 
@@ -132,7 +126,7 @@ def skill_of(window: Window) -> Skill | None:
 
 
 def test_skill_of_a_perfect_model_is_perfect_and_finds_a_delay() -> None:
-    """The model's own response has no error but noise; the same response two cycles late shows 2 ms."""
+    """The model's own response has only noise as its error; the same response two cycles late shows 2 ms."""
     window = rapid()
     same = skill_of(window)
     assert same is not None
@@ -168,7 +162,6 @@ def test_skill_is_not_known_of_a_move_that_begins_while_the_axis_still_settles()
 
 
 def test_one_axis_alone() -> None:
-    """With a single axis the contour error is what overshoots the ends of the path."""
     demand = bench_trajectory(10).position_mm["Y"][:, None]
     prediction = predict(trajectory(np.asarray(demand), "Y"), MODELS, CONFIG)
     assert prediction.contour_um.max() < np.abs(prediction.error_um["Y"]).max()

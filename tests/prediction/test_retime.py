@@ -11,7 +11,7 @@ import pytest
 from fdhil.config import MachineConfig
 from fdhil.prediction import predict
 from fdhil.prediction.advise import advise
-from fdhil.prediction.feeds import program_source
+from fdhil.prediction.feed_search import program_source
 from fdhil.prediction.models import nominal_models
 from fdhil.prediction.retime import Averages, demand_sources, stretches_around
 from fdhil.program import interpret
@@ -26,22 +26,22 @@ PROGRAM = "G1 X0 Y55 F10000\nX100\nG3 X200 Y55 I50 J0\nG1 X250 Y55\nX250 Y0\nM2\
 
 
 def rounded(reference: Trajectory, decimals: int) -> Trajectory:
-    """The demand as a file of so many decimals has it."""
     return replace(
         reference, position_mm={a: frozen(np.round(path, decimals)) for a, path in reference.position_mm.items()}
     )
 
 
 def largest(reference: Trajectory) -> float:
-    """Largest contour error, um."""
     return float(predict(reference, MODELS, CONFIG).contour_um.max())
 
 
 @pytest.mark.parametrize("share", [0.7, 0.3])
 @pytest.mark.parametrize(("decimals", "within_um"), [(9, 0.3), (6, 0.3)])
 def test_a_slower_demand_is_what_the_nc_would_order(share: float, decimals: int, within_um: float) -> None:
-    """With the averages taken off and on again (9 decimals), or with every move scaled (6): the errors of the program
-    at that feed. Time stretched would promise half of them."""
+    """With the averages removed and applied again (9 decimals), or each move scaled (6): the program's own errors.
+
+    Stretched time would predict half of them.
+    """
     program = program_source(list(interpret(PROGRAM, Budget.of(CONFIG.nc))), CONFIG)
     truth = largest(program.at(dict.fromkeys(range(1, 6), share)))
     sure, hopeful = demand_sources(rounded(program.at({}), decimals), MODELS, CONFIG, 1e6)
@@ -52,7 +52,6 @@ def test_a_slower_demand_is_what_the_nc_would_order(share: float, decimals: int,
 
 
 def test_the_averages_are_known_again_and_others_are_not() -> None:
-    """What was smoothed otherwise, or not at all, does not come to rest without the averages."""
     averages = Averages((0.060, 0.030), 0.001)
     path = np.column_stack([bench_trajectory(10).position_mm[axis] for axis in "XY"])
     under = averages.taken_off(path)
@@ -66,7 +65,6 @@ def test_the_averages_are_known_again_and_others_are_not() -> None:
 
 @pytest.mark.parametrize("profile", ["fir", "trapezoidal"])
 def test_at_the_feed_as_recorded_it_is_the_demand(profile: str) -> None:
-    """Whatever the rule."""
     config = CONFIG.model_copy(update={"nc": CONFIG.nc.model_copy(update={"profile": profile})})
     for reference in (bench_trajectory(10), trajectory(jerky_demand(10))):
         for source in filter(None, demand_sources(reference, MODELS, config, 30.0)):
@@ -76,7 +74,6 @@ def test_at_the_feed_as_recorded_it_is_the_demand(profile: str) -> None:
 
 
 def test_rules_differ_in_what_falls_with_the_feed() -> None:
-    """Of one move at half the feed: acceleration as it was, half of it, a quarter of it."""
     path = np.asarray(jerky_demand(10)[:300, 1:])
     averages, stretch, share = Averages((), 0.001), np.ones(len(path), dtype=np.int64), np.full(len(path), 0.5)
 
@@ -95,7 +92,7 @@ def test_rules_differ_in_what_falls_with_the_feed() -> None:
     "config", [CONFIG, CONFIG.model_copy(update={"nc": CONFIG.nc.model_copy(update={"profile": "trapezoidal"})})]
 )
 def test_each_zone_of_a_demand_has_its_feed(config: MachineConfig) -> None:
-    """Zones in the order of time, each with its own feed; together they hold, 5 % more do not."""
+    """Zones in the order of time, each with its own feed; together they keep the tolerance, 5 % more do not."""
     reference = trajectory(jerky_demand(10))
     sure, hopeful = demand_sources(reference, MODELS, config, 20.0)
     assert hopeful is not None
@@ -119,7 +116,6 @@ def test_each_zone_of_a_demand_has_its_feed(config: MachineConfig) -> None:
 
 
 def test_stretches_meet_half_way_between_errors() -> None:
-    """A short gap parts nothing."""
     over = np.zeros(20, dtype=np.bool_)
     over[[2, 3, 5, 14]] = True
     assert stretches_around(over, 4).tolist() == [1] * 9 + [2] * 11

@@ -32,18 +32,15 @@ M2
 
 @pytest.fixture(scope="module", name="reference")
 def _reference() -> Trajectory:
-    """The program as the NC orders it."""
     return plan_program(interpret(PROGRAM, Budget.of(CONFIG.nc)), CONFIG)
 
 
 @pytest.fixture(scope="module", name="correction")
 def _correction(reference: Trajectory) -> Correction:
-    """Its correction."""
     return plan_correction(reference, MODELS, CONFIG)
 
 
 def test_all_axes_move_and_count(reference: Trajectory, correction: Correction) -> None:
-    """The contour error is the distance in space: more than that of any plane, less than that of the axes together."""
     assert reference.axes == ("X", "Y", "Z")
     before = correction.before
     space = np.column_stack([before.predicted_mm[axis] for axis in "XYZ"])
@@ -57,7 +54,7 @@ def test_all_axes_move_and_count(reference: Trajectory, correction: Correction) 
 
 
 def test_the_correction_corrects_all_of_them(correction: Correction) -> None:
-    """60 times smaller on the model, within the limits on all three axes, also where Z alone drifted."""
+    """60 times smaller on the model, within the limits on all three axes, also if only Z drifted."""
     assert correction.refused == ()
     assert all(np.abs(correction.offset_um[axis]).max() > 5 for axis in "XYZ")
     assert rms(correction.before.contour_um) > 60 * rms(correction.after.contour_um)
@@ -69,7 +66,6 @@ def test_the_correction_corrects_all_of_them(correction: Correction) -> None:
 
 
 def test_uncertainty_and_sensitivity_know_the_third_axis(reference: Trajectory, correction: Correction) -> None:
-    """A covariance of Z alone makes the last stretch uncertain, where Z alone moves away; its inertia drives it."""
     values = np.array(list(MODELS["Z"].as_dict().values()))
     known = np.zeros((6, 6))
     std = contour_std_um(reference, MODELS, {"X": known, "Y": known, "Z": np.diag((0.01 * values) ** 2)}, CONFIG)
@@ -79,7 +75,6 @@ def test_uncertainty_and_sensitivity_know_the_third_axis(reference: Trajectory, 
 
 
 def test_prediction_needs_no_rotation_of_axes(reference: Trajectory) -> None:
-    """Equal drives: with the axes exchanged the errors are exchanged, the contour error stays."""
     turned = replace(reference, position_mm={a: reference.position_mm[b] for a, b in zip("XYZ", "YZX", strict=True)})
     one, other = predict(reference, MODELS, CONFIG), predict(turned, MODELS, CONFIG)
     assert np.array_equal(one.error_um["Y"], other.error_um["X"])

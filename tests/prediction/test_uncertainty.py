@@ -24,8 +24,10 @@ COVARIANCE[4, 5] = COVARIANCE[5, 4] = -0.9 * np.sqrt(COVARIANCE[4, 4] * COVARIAN
 
 @pytest.mark.usefixtures("long_computation")
 def test_standard_deviation_is_that_of_drawn_plants() -> None:
-    """Where the table is well off the path the contour error scatters as told, within the error of 60 draws; 95 % of
-    the draws are within 1.96 of it."""
+    """Away from the path the contour error scatters as predicted, within the error of 60 draws.
+
+    95 % of the draws are within 1.96 of it.
+    """
     reference = bench_trajectory(10)
     told = contour_std_um(reference, MODELS, {"X": COVARIANCE, "Y": COVARIANCE}, CONFIG)
     random = np.random.default_rng(5)
@@ -43,13 +45,13 @@ def test_standard_deviation_is_that_of_drawn_plants() -> None:
 
 
 def test_an_exact_model_has_no_uncertainty() -> None:
-    """Covariances of 0 or NaN (a parameter the data cannot tell, taken as known) add nothing."""
+    """Covariances of 0 or NaN (an undetermined parameter, taken as known) add nothing."""
     reference = bench_trajectory(10)
     assert contour_std_um(reference, MODELS, {"X": np.zeros((6, 6)), "Y": np.full((6, 6), np.nan)}, CONFIG).max() == 0.0
 
 
 def test_inertia_drives_the_corners() -> None:
-    """At the corners the inertia matters most; the rise is that of a prediction with 1 % more of it."""
+    """At the corners the inertia has the largest effect: that of a prediction with 1 % more."""
     reference = bench_trajectory(10)
     prediction = predict(reference, MODELS, CONFIG)
     sensitivities = sensitivity_um(prediction, MODELS, CONFIG)
@@ -64,7 +66,7 @@ def test_inertia_drives_the_corners() -> None:
 
 
 def test_terms_have_their_share_of_the_uncertainty() -> None:
-    """Falling friction that is known to 0.5 N.m adds what it moves; a covariance of the six alone leaves it out."""
+    """Falling friction known to 0.5 N.m adds its effect; a covariance of the six alone omits it."""
     reference = bench_trajectory(10)
     models = {axis: MODELS[axis].changed(stribeck=1.0, stribeck_speed=10.0) for axis in "XY"}
     six, eight = np.zeros((6, 6)), np.zeros((8, 8))
@@ -80,7 +82,6 @@ def test_terms_have_their_share_of_the_uncertainty() -> None:
 
 
 def test_a_term_is_named_where_it_drives_a_zone() -> None:
-    """Per cent of a term's value, its phase apart."""
     reference = bench_trajectory(10)
     rich = MODELS["X"].changed(stribeck=2.0, stribeck_speed=10.0, ripple_screw_1=0.5, ripple_screw_1_phase=1.0)
     models = {"X": rich, "Y": MODELS["Y"]}

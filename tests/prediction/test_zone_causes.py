@@ -24,23 +24,19 @@ NC = {"fir": CONFIG, "linuxcnc": LINUXCNC}
 
 
 def planned(text: str, config: MachineConfig) -> Trajectory:
-    """The program as the NC orders it."""
     return plan_program(list(interpret(text.splitlines(), Budget.of(config.nc))), config)
 
 
 def zones_of(reference: Trajectory, config: MachineConfig = CONFIG) -> tuple[Zone, ...]:
-    """Zones with nominal drives."""
     return predict(reference, nominal_models(config), config).zones
 
 
 def nearest(zone: Zone, places: tuple[tuple[float, float], ...]) -> float:
-    """Distance in mm to the nearest of some places."""
     at = np.array([float(word) for word in zone.where.split()[1::2]])[:2]
     return min(float(np.linalg.norm(at - place)) for place in places)
 
 
 def seconds(zones: tuple[Zone, ...], cause: str) -> float:
-    """For how long a cause is told."""
     return sum(zone.end_s - zone.start_s for zone in zones if zone.cause == cause)
 
 
@@ -55,7 +51,7 @@ def seconds(zones: tuple[Zone, ...], cause: str) -> float:
     ],
 )
 def test_the_bench_has_four_corners_however_wide_the_nc_blends_them(feed: int, mode: str, widest_mm: float) -> None:
-    """A blend of 2 to 200 ms: what is large is a corner, each near its place; the half circle is not."""
+    """Blends of 2 to 200 ms: large errors are corners, each near its position; the half circle is not."""
     if mode == "fir":
         zones = zones_of(bench_trajectory(feed))
     else:
@@ -79,7 +75,6 @@ def test_the_stick_at_the_bottom_is_a_reversal_until_the_lag_is_more() -> None:
 
 @pytest.mark.parametrize("feed", [10, 20])
 def test_a_rounded_path_errs_where_its_arcs_begin_and_end(feed: int) -> None:
-    """The loops follow the arcs once they have settled: only what is left in the middle of one is circular lag."""
     zones = zones_of(trajectory(rounded_demand(feed)))
     assert {zone.cause for zone in sorted(zones, key=lambda z: -z.max_um)[:2]} == {"corner"}
     lag = [zone for zone in zones if zone.cause == "circular lag"]
@@ -101,7 +96,6 @@ def test_a_rounded_path_errs_where_its_arcs_begin_and_end(feed: int) -> None:
     ],
 )
 def test_circles(nc: str, radius_mm: float, feed_mm_min: float, cause: str) -> None:
-    """A small or fast circle lags; on a slow one the axes stick where they turn around. It has no corner."""
     config = NC[nc]
     program = f"G21 G90 G64\nG3 X0 Y0 I{radius_mm} P4 F{feed_mm_min}\nM2\n"
     reference = planned(program, config)
@@ -123,7 +117,7 @@ def test_a_circle_beyond_the_drives_is_saturation() -> None:
 
 @pytest.mark.parametrize("nc", NC)
 def test_chords_of_a_circle_are_a_circle(nc: str) -> None:
-    """Each chord turns by 5 degrees within 18 ms, less than the loops can tell apart."""
+    """Each chord turns by 5 degrees within 18 ms, below the loops' time."""
     angle = np.linspace(0.0, 4 * np.pi, 145)[1:]
     chords = [f"G1 X{20 - 20 * np.cos(a):.4f} Y{20 * np.sin(a):.4f} F6000" for a in angle]
     zones = zones_of(planned("\n".join(["G21 G90 G64 P0.01", *chords, "M2"]), NC[nc]), NC[nc])
@@ -134,7 +128,6 @@ def test_chords_of_a_circle_are_a_circle(nc: str) -> None:
 @pytest.mark.parametrize("nc", NC)
 @pytest.mark.parametrize("radius_mm", [5, 20])
 def test_a_helix_is_a_circle(nc: str, radius_mm: float) -> None:
-    """Its plane of turning does not change."""
     space = bench_config("XYZ")
     config = space.model_copy(update={"nc": NC[nc].nc})
     zones = zones_of(planned(f"G21 G90 G64\nG3 X0 Y0 I{radius_mm} Z20 P3 F8000\nM2\n", config), config)
@@ -146,7 +139,7 @@ def test_a_helix_is_a_circle(nc: str, radius_mm: float) -> None:
     ("gain", "cause", "never"), [(20.0, "corner", "circular lag"), (100.0, "circular lag", "corner")]
 )
 def test_what_is_a_corner_goes_with_the_time_of_the_loops(gain: float, cause: str, never: str) -> None:
-    """The same arc of 90 degrees: slow loops still answer its beginning when it ends, fast ones are settled always."""
+    """The same arc of 90 degrees: slow loops have not settled at its end, fast ones always have."""
     axes = {
         name: axis.model_copy(update={"regulators": axis.regulators.model_copy(update={"position_gain_per_s": gain})})
         for name, axis in CONFIG.axis.items()

@@ -63,7 +63,7 @@ def test_a_refused_correction_says_why() -> None:
     refused = plan(bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG)
     page = correction_page("part.ngc", "bench", refused)
     assert ("correction", "refused") in page.headline
-    assert "can be held" in page.sections[0].text
+    assert "lower the feed to" in page.sections[0].text
     assert not re.search(r"\de[+-]\d", " ".join(value for _, value in page.headline))
 
 

@@ -236,7 +236,7 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
 
 
 def test_terms_warnings_and_what_is_unexplained_are_kept(tmp_path: Path) -> None:
-    warning = Reason("OneDirection", "all moves go one way", "record both")
+    warning = Reason("OneDirection", "all moves are in one direction", "record both")
     made = outcome()
     warned = replace(made, verdict=replace(made.verdict, unexplained_um=1.25, warnings=(warning,)))
     loaded = replace(published(), parameters=BENCH.changed(load=2.5), unexplained_um=1.25, warnings=(warning,))
@@ -244,7 +244,7 @@ def test_terms_warnings_and_what_is_unexplained_are_kept(tmp_path: Path) -> None
         history.add_window(warned, "", STAMP)
         history.add_revision(loaded, [1], STAMP)
         (window,), (revision,) = history.windows(), history.revisions()
-    assert (window.unexplained_um, window.warnings) == (1.25, ("OneDirection: all moves go one way",))
+    assert (window.unexplained_um, window.warnings) == (1.25, ("OneDirection: all moves are in one direction",))
     assert window.friction is not None
     assert window.friction["value"] == pytest.approx(5.0 + 0.05 * window.friction["speed_rad_s"])
     assert revision.set.parameters == BENCH.changed(load=2.5)

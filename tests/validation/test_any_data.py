@@ -20,7 +20,6 @@ EXTREMES = [0.0, 1e-300, 1e-12, 1e6, 1e300, -1e300, np.nan, np.inf, -np.inf]
 
 
 def assert_answered(outcome: WindowOutcome) -> None:
-    """Check that an outcome is an answer: values with intervals, or reasons."""
     assert outcome.verdict.accepted == (not outcome.verdict.reasons)
     assert outcome.estimate is not None
     for name in outcome.estimate.names:

@@ -1,4 +1,4 @@
-"""A model is weighed in micrometres at the table: on drives that were made by another simulation than the model's."""
+"""A model is assessed in micrometres at the table, on drives from another simulation than the model's."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fdhil.pipeline import analyse
 from fdhil.pipeline.analysis import own
 from fdhil.records import PARAMETERS, Parameters, Window, WindowOutcome, rms
 from fdhil.validation.replay import replay_window
-from fdhil.validation.table_error import TableError
+from fdhil.validation.table_error_budget import TableError
 from studies import bench, real_plant
 from studies.real_plant import Loops, Mechanics, Sensors
 
@@ -49,7 +49,6 @@ AXIS = axis_of(Mechanics(), Loops())
 
 @lru_cache(maxsize=16)
 def rapids(mechanics: Mechanics = PLAIN, loops: Loops = LOOPS, sensors: Sensors = SENSORS) -> list[Window]:
-    """Return a rapid to and one fro."""
     run = real_plant.run(mechanics, bench.shuttle(moves=2), loops)
     return find_windows(real_plant.recording(run, mechanics, sensors, 0.5))
 
@@ -149,7 +148,6 @@ def test_rows_that_are_no_set_points_are_not_replayed() -> None:
 
 
 def test_a_torque_makes_at_the_table_what_the_drive_says() -> None:
-    """The formula against the closed loop itself: a load that steps in the middle of a rest."""
     mechanics, rows = Mechanics(Cd=1e-6), 1500
     loop = TableError.of(Parameters.of(mechanics.truth()), 20.0, AXIS)
     load = np.where(np.arange(rows) >= 500, 1.0, 0.0)

@@ -1,4 +1,4 @@
-"""The table of checks and the budget behind their thresholds: what is listed holds together."""
+"""The table of checks and the false-alarm budget behind their thresholds are consistent."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from fdhil.config import Identification
 from fdhil.identification.estimators.maximum_likelihood import fit_windows
 from fdhil.pipeline import analyse
 from fdhil.records import Reason
-from fdhil.validation import BEFORE_ANY_FIT, OF_THE_FIT, Check, Evidence, ask
 from fdhil.validation.agreement import values_apart
 from fdhil.validation.significance import BUDGET
+from fdhil.validation.window_checks import FIT_CHECKS, SIGNAL_CHECKS, Check, run_checks
+from fdhil.validation.window_signals import WindowSignals
 from tests.identification.recorded import windows
 
 SETTINGS = Identification()
@@ -21,18 +22,19 @@ SETTINGS = Identification()
 
 def test_a_check_is_passed_over_for_one_that_comes_before_it() -> None:
     before: list[str] = []
-    for check in (*BEFORE_ANY_FIT, *OF_THE_FIT):
+    for check in (*SIGNAL_CHECKS, *FIT_CHECKS):
         assert set(check.unless) <= set(before)
         assert check.name not in before
         before.append(check.name)
 
 
 def test_what_explains_a_finding_stands_in_its_place() -> None:
-    told = Reason("Told", "first")
-    first, second = Check("first", lambda _: [told]), Check("second", lambda _: [told], unless=("first",))
-    evidence = Evidence(windows(0.002)[0], SETTINGS)
-    assert ask([first, second], evidence, {}) == {"first": [told]}
-    assert ask([second], evidence, {"first": []}) == {"first": [], "second": [told]}
+    reason = Reason("Implausible", "first")
+    first: Check[WindowSignals] = Check("first", lambda _: [reason])
+    second: Check[WindowSignals] = Check("second", lambda _: [reason], unless=("first",))
+    signals = WindowSignals(windows(0.002)[0], SETTINGS)
+    assert run_checks([first, second], signals, {}) == {"first": [reason]}
+    assert run_checks([second], signals, {"first": []}) == {"first": [], "second": [reason]}
 
 
 def test_the_budget_is_spent_once_and_gives_every_threshold() -> None:

@@ -1,4 +1,4 @@
-"""A gain that is wrong all along: the recording cannot tell it, the data sheet does."""
+"""A gain that is wrong throughout shows in no recording, only against the data sheet."""
 
 from __future__ import annotations
 
@@ -28,13 +28,12 @@ COLUMN = {"voltage": 1, "current": 2, "speed": 3}
 
 
 def estimate(**factors: float) -> Estimate:
-    """An estimate that is the data sheet's, each parameter times its factor, told to 0.1 %."""
+    """Return the data sheet's values as an estimate, each times its factor, known to 0.1 %."""
     values = np.array([getattr(NOMINAL, name) * factors.get(name, 1.0) for name in PARAMETERS])
     return Estimate("any", PARAMETERS, frozen(values), frozen(np.diag((1e-3 * values) ** 2)), {}, Result.OK)
 
 
 def scaled(text: str, signal: str, gain: float) -> str:
-    """A recording with one column multiplied."""
     lines = []
     for line in text.splitlines():
         cells = line.split(",")
@@ -50,7 +49,6 @@ def shuttle() -> str:
 
 
 def test_the_scales_of_the_model_are_what_an_identification_finds(shuttle: str) -> None:
-    """R, L, K, Jt, ft and Cd follow the powers of a signal's gain, so that no fit can see it."""
     from fdhil.validation.agreement import GAINS
 
     def fitted(text: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

@@ -1,4 +1,4 @@
-"""A model is judged by moves that it was not identified on, and friction that builds up is identified from them."""
+"""A model is validated by moves that it was not identified on, and its presliding is identified from them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,14 @@ import pytest
 from fdhil.config import Identification
 from fdhil.model import closed_loop
 from fdhil.records import PARAMETERS, Estimate, Float, Parameters, Result, Window, frozen
-from fdhil.validation.held_out import held_out_reason, is_predicted, predict_held_out, worst_of
-from fdhil.validation.presliding import TERM, with_presliding
+from fdhil.validation.held_out_moves import (
+    TERM,
+    held_out_reason,
+    is_predicted,
+    predict_held_out,
+    with_presliding,
+    worst_of,
+)
 from fdhil.validation.replay import replay_setpoints
 from studies.bench import shuttle
 from tests.bench import bench_config
@@ -24,7 +30,6 @@ SETTINGS = Identification()
 
 @lru_cache(maxsize=4)
 def moves(presliding_um: float) -> list[Window]:
-    """Return a rapid back and forth whose positions are those of a drive with this presliding."""
     demand_mm = 1e3 * shuttle(moves=2)
     drive = TRUE.changed(**{TERM: presliding_um}) if presliding_um else TRUE
     response = closed_loop.simulate(drive, AXIS, PERIOD_S, demand_mm)
@@ -72,13 +77,12 @@ def test_pool_that_does_not_predict_the_other_move_is_refused() -> None:
     assert held_out_reason(kept, SETTINGS) is None
     reason = held_out_reason(left, SETTINGS)
     assert reason is not None
-    assert "does not predict a move that it has not seen" in reason.text
+    assert "does not predict moves that it was not identified on" in reason.text
     assert left.moves == 2
     assert left.max_um > left.rms_um > kept.rms_um
 
 
 def test_friction_that_builds_up_lets_the_table_creep_where_sharp_friction_holds_it() -> None:
-    """Within the band of dry friction a bristle gives way by its share of the presliding way."""
     axis = bench_config().axis["X"]
     demand_mm = np.linspace(0.0, 0.5e-3, 200)
     sharp, soft = (

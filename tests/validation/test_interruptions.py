@@ -1,4 +1,4 @@
-"""Rapids in a job: found among feed moves, and refused with the figure when they were not carried out as ordered."""
+"""Rapids in a job: found among feed moves, and refused with the figure if not executed as ordered."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from fdhil.config import Identification
 from fdhil.identification.windows import find_windows, moving_range
 from fdhil.pipeline import analyse
 from fdhil.records import NcMove, WindowOutcome
-from fdhil.validation import Evidence
 from fdhil.validation.interruptions import interruptions
+from fdhil.validation.window_signals import WindowSignals
 from studies import drives, faults
 from studies.drives import Array, Drive, Move
 from studies.judging import judge
@@ -82,16 +82,16 @@ def test_an_override_that_changes_on_the_way_is_refused_with_the_speed(rate: obj
 @pytest.mark.parametrize(
     ("nc", "words"),
     [
-        (NcMove(12, "part.ngc", (0.5, 0.5), False), "the NC says that its override was 50 % in line 12"),
-        (NcMove(12, "part.ngc", (0.5, 1.0), False), "the NC says that its override was 50 to 100 % in line 12"),
-        (NcMove(None, None, None, True), "the NC says that its feed was held"),
+        (NcMove(12, "part.ngc", (0.5, 0.5), False), "the NC reports an override of 50 % in line 12"),
+        (NcMove(12, "part.ngc", (0.5, 1.0), False), "the NC reports an override of 50 to 100 % in line 12"),
+        (NcMove(None, None, None, True), "the NC reports a feed hold"),
     ],
 )
 def test_what_the_nc_says_was_no_rapid_as_planned_is_refused(nc: NcMove, words: str) -> None:
     (outcome,) = _judged(_rows(drives.rates(MOVE)))
-    evidence = Evidence(replace(outcome.window, nc=nc), Identification())
-    assert [str(reason) for reason in interruptions(evidence)] == [f"EpisodeAborted: {words}"]
-    good = Evidence(replace(outcome.window, nc=NcMove(12, "part.ngc", (1.0, 1.0), False)), Identification())
+    signals = WindowSignals(replace(outcome.window, nc=nc), Identification())
+    assert [str(reason) for reason in interruptions(signals)] == [f"EpisodeAborted: {words}"]
+    good = WindowSignals(replace(outcome.window, nc=NcMove(12, "part.ngc", (1.0, 1.0), False)), Identification())
     assert list(interruptions(good)) == []
 
 
@@ -116,8 +116,8 @@ def test_a_drive_that_swings_through_rest_while_its_demand_goes_on_has_not_arriv
     held = faults.KINDS["feed hold"].make(np.random.default_rng([7, 2, 2049]))  # falls to 14 %, and swings through 0
     texts = [[str(r) for r in analyse(w, Identification()).verdict.reasons] for w in find_windows(held.recording)]
     assert [len(reasons) > 0 for reasons in texts] == [True, True]
-    assert texts[0] == ["EpisodeAborted: the demand moves on with 42 mm/s where the drive passes through rest"]
-    assert texts[1][0].startswith("EpisodeAborted: the demand moves on with ")  # nor does the rest of it begin there
+    assert texts[0] == ["EpisodeAborted: the demand continues at 42 mm/s while the drive passes through rest"]
+    assert texts[1][0].startswith("EpisodeAborted: the demand continues at ")  # nor does the rest of it begin there
 
 
 def _falls(drop: float, time_s: Array) -> Array:
@@ -131,13 +131,13 @@ def test_a_drive_that_creeps_towards_a_demanded_speed_is_not_held_there() -> Non
         rates = drives.rates(scene.move, partial(_falls, drop))
         rows = measured(np.random.default_rng(7), scene, drives.run(slow, demand_of(scene, rates), scene.dt_s))
         (window,) = find_windows(recorded(scene, rows))
-        assert [reason.code for reason in interruptions(Evidence(window, Identification()))] == said
+        assert [reason.code for reason in interruptions(WindowSignals(window, Identification()))] == said
 
 
 def test_a_slow_plateau_is_seen_through_a_coarse_scale() -> None:
     fallen = faults.KINDS["override changed"].make(np.random.default_rng([61, 2, 2888]))  # rows of 0.25 ms, slow ramps
     (window,) = find_windows(fallen.recording)
-    (reason,) = interruptions(Evidence(window, Identification()))
+    (reason,) = interruptions(WindowSignals(window, Identification()))
     assert "held at 96." in reason.text
 
 

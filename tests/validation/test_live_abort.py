@@ -1,4 +1,4 @@
-"""A rapid aborted on the running machine: the axis' pipeline cuts its window and refuses it by name."""
+"""A rapid aborted on the running machine: its window is extracted and refused with its code."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ BLOCK = 40
 
 
 def _live(rates: Array) -> list[Record]:
-    """Return what a driver yields of one rapid with these path speeds: blocks of samples, and the NC's events."""
     rows = measured(
         np.random.default_rng(7),
         SCENE,

@@ -1,4 +1,4 @@
-"""Faults that have a name and a figure: backlash, drifting sensors, a gain that moved between two rapids."""
+"""Faults with a code and a figure: backlash, drifting sensors, a gain that changed between two rapids."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
 from fdhil.records import Window, frozen
 from fdhil.validation.backlash import backlash, dead_band, overrun
-from fdhil.validation.selection import lacking
+from fdhil.validation.model_deficiencies import lacking
 from fdhil.validation.structure import findings
 from studies import drives, faults
 from studies.drives import Drive, Move

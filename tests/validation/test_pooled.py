@@ -1,4 +1,4 @@
-"""Pooling by information against fitting everything once more."""
+"""Pooling by information compared with a joint fit."""
 
 from __future__ import annotations
 
@@ -89,7 +89,6 @@ def test_a_gain_that_changes_between_rapids_is_told_where_no_parameter_alone_tel
 
 
 def real(mechanics: real_plant.Mechanics, moves: int = 4) -> list[WindowOutcome]:
-    """Return the windows of a shuttle of an axis with what real machines have, analysed."""
     run, sensors = real_plant.run(mechanics, bench.shuttle(moves=moves)), real_plant.Sensors()
     recording = real_plant.recording(run, mechanics, sensors, 0.5, seed=2)
     return [analyse(window, Identification()) for window in find_windows(recording)]
@@ -107,7 +106,6 @@ def test_friction_that_differs_by_direction_is_a_load_and_no_jump(refit: bool) -
 
 
 def test_a_counterweight_that_is_off_by_three_times_the_friction_is_told() -> None:
-    """Of one direction alone its friction is negative; both together are a drive."""
     outcomes = real(replace(PLANT, load_nm=15.0))
     assert [o.estimate is not None and o.estimate.value("Cd") < 0 for o in outcomes] == [False, True, False, True]
     estimate, verdict = pool(outcomes, Identification())
@@ -119,7 +117,6 @@ def test_a_counterweight_that_is_off_by_three_times_the_friction_is_told() -> No
 
 @pytest.mark.parametrize("number", [1, 2])
 def test_weight_that_moves_the_axis_is_not_told_from_one_direction(number: int) -> None:
-    """Each window is sound: what resists the other direction, they do not tell."""
     mechanics = real_plant.Mechanics(Cd=1.0, load_nm=5.8)
     outcomes = [analyse(window, Identification()) for window in rapids(mechanics, moves=4)]
     lowered = [outcome for outcome in outcomes if outcome.window.direction < 0][:number]

@@ -1,4 +1,4 @@
-"""Signals of a rapid that are dead, swapped, copied or of another axis are refused by their names."""
+"""Signals of a rapid that are dead, swapped, copied or of another axis are refused by name."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
 from fdhil.records import Recording, Window, frozen
-from fdhil.validation import Evidence
 from fdhil.validation.signal_consistency import missing_move
+from fdhil.validation.window_signals import WindowSignals
 from studies import real_plant
 from studies.bench import Array, shuttle
 from studies.real_plant import SLOW, SLOW_LOOPS, Sensors
@@ -33,7 +33,6 @@ def plant(name: str) -> Plant:
 
 
 def refusals(recording: Recording) -> str:
-    """Return all that a recording's rapids are refused for, as one text."""
     outcomes = [analyse(window, SETTINGS) for window in find_windows(recording)]
     _, verdict = pool(outcomes, SETTINGS)
     return " ".join(reason.text for reason in verdict.reasons)
@@ -53,7 +52,7 @@ def test_dead_signals_are_named_with_what_the_speed_travels(names: tuple[str, ..
         recording = changed(recording, name, lambda values: np.full_like(values, 400.0))
     text = refusals(recording)
     for name in names:
-        assert f"{name} stands still at 400" in text
+        assert f"{name} stays at 400" in text
     assert "the integral of speed travels 399.9 mm" in text
 
 
@@ -105,7 +104,6 @@ def test_recording_at_rest_hides_no_rapid() -> None:
 
 
 def _coarse(counts: int, kind: str) -> list[Window]:
-    """Return a rapid at a constant speed, as an encoder of so many counts a turn shows it."""
     moved = real_plant.run(SLOW, shuttle(0.1, 0.126, 2.0), SLOW_LOOPS)
     sensors = Sensors(speed="difference" if kind == "difference" else "sensor", encoder_bits=np.log2(counts))
     recording = real_plant.recording(moved, SLOW, sensors, 0.126, 3)
@@ -126,7 +124,7 @@ def test_coarse_encoder_at_constant_speed_is_not_stuck(counts: int, kind: str) -
 def test_speed_sensor_that_sticks_while_the_axis_goes_on_is_named() -> None:
     recording = plant("slow").recording()
     (window,) = find_windows(recording)
-    begin = Evidence(window, SETTINGS).moving[0] + 20
+    begin = WindowSignals(window, SETTINGS).motion_range[0] + 20
     speed = np.array(window.speed_rad_s)
     speed[begin : begin + 60] = speed[begin]
     text = " ".join(r.text for r in analyse(replace(window, speed_rad_s=frozen(speed)), SETTINGS).verdict.reasons)
@@ -144,7 +142,7 @@ def test_slow_voltage_that_stands_still_is_named() -> None:
     slow = window.slow_voltage
     assert slow is not None
     dead = replace(window, slow_voltage=replace(slow, voltage_v=frozen(0.0 * slow.voltage_v)))
-    assert "voltage stands still at 0 V" in analyse(dead, SETTINGS).verdict.reasons[0].text
+    assert "voltage stays at 0 V" in analyse(dead, SETTINGS).verdict.reasons[0].text
 
 
 def test_identify_names_the_speed_that_hides_a_rapid(tmp_path: Path) -> None:
@@ -159,7 +157,6 @@ def test_identify_names_the_speed_that_hides_a_rapid(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def at_table() -> Window:
-    """Return a rapid with an encoder and an accelerometer at the table, which hangs on a spring."""
     soft = replace(SLOW, resonance_hz=60.0)
     moved = real_plant.run(soft, shuttle(0.1, 0.2, 2.0), SLOW_LOOPS)
     recording = real_plant.recording(moved, soft, Sensors(), 0.2)
@@ -179,10 +176,10 @@ def test_good_table_sensors_are_used_without_a_warning(at_table: Window) -> None
 @pytest.mark.parametrize(
     ("field", "change", "text"),
     [
-        ("table_mm", lambda v: 0 * v, "table sensor and position part by"),
-        ("table_mm", lambda v: -v, "table sensor and position part by"),
-        ("table_mm", lambda v: 2 * v, "table sensor and position part by"),
-        ("table_m_s2", lambda v: 0 * v, "table acceleration stands still"),
+        ("table_mm", lambda v: 0 * v, "table sensor and position differ by"),
+        ("table_mm", lambda v: -v, "table sensor and position differ by"),
+        ("table_mm", lambda v: 2 * v, "table sensor and position differ by"),
+        ("table_m_s2", lambda v: 0 * v, "table acceleration is constant"),
         ("table_m_s2", lambda v: -v, "table acceleration is -"),
         ("table_m_s2", lambda v: v / 9.81, "table acceleration is 0.1"),
     ],

@@ -1,4 +1,4 @@
-"""Every fault that the verdicts' study draws is drawn with a slow voltage too."""
+"""Every fault of the verdict study is drawn with a slow voltage, too."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a slow voltage sensor's own samples tell: stuck and clipped ones are named, steady coarse ones are not."""
+"""A slow voltage sensor's own samples: stuck and clipped ones are reported, steady coarse ones are not."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ import numpy as np
 from fdhil.config import Identification
 from fdhil.pipeline import analyse
 from fdhil.records import Float, Stages, Window, frozen
-from fdhil.validation import Evidence
-from fdhil.validation.slow_readings import slow_voltage_faults
+from fdhil.validation.slow_voltage_checks import slow_voltage_faults
 from studies.slow_sensor import slow_windows
 
 
 def _told(window: Window, volts: Float) -> list[str]:
     assert window.slow_voltage is not None
     changed = replace(window, slow_voltage=replace(window.slow_voltage, voltage_v=frozen(volts)))
-    return [reason.code for reason in slow_voltage_faults(Evidence(changed, Identification()))]
+    return [reason.code for reason in slow_voltage_faults(changed)]
 
 
 def _volts(window: Window) -> Float:

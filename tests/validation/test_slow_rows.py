@@ -1,4 +1,4 @@
-"""Current and speed beside a slow voltage: what is steady does not stick, and what is late is told by its rows."""
+"""Current and speed recorded with a slow voltage: a steady signal is not stuck, a late one is detected by its rows."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ import pytest
 from fdhil.identification.estimators.maximum_likelihood import fit_windows
 from fdhil.pipeline import analyse
 from fdhil.records import Window, frozen
-from fdhil.validation import Evidence
-from fdhil.validation.slow_timing import current_late
+from fdhil.validation.slow_voltage_checks import current_late
 from fdhil.validation.stuck import stuck_values
+from fdhil.validation.window_fit import WindowFit
+from fdhil.validation.window_signals import WindowSignals
 from studies.slow_sensor import SETTINGS, slow_windows
 
 
 def _coarse(window: Window) -> Window:
-    """Return the window with readings so coarse that equal ones are no wonder: 0.3 A, 0.4 rad/s."""
+    """Return the window with coarse readings that are often equal: 0.3 A, 0.4 rad/s."""
     current, speed = (np.round(v / s) * s for v, s in ((window.current_a, 0.3), (window.speed_rad_s, 0.4)))
     return replace(window, current_a=frozen(current), speed_rad_s=frozen(speed))
 
@@ -29,14 +30,14 @@ def _stuck(window: Window, name: str, start: int, rows: int) -> list[str]:
     stuck = replace(window, current_a=held) if name == "current_a" else replace(window, speed_rad_s=held)
     fit = fit_windows([stuck], SETTINGS)
     assert fit is not None
-    return [reason.text.split(" ")[0] for reason in stuck_values(Evidence(stuck, SETTINGS, fit=fit))]
+    return [reason.text.split(" ")[0] for reason in stuck_values(WindowFit(WindowSignals(stuck, SETTINGS), fit=fit))]
 
 
 def test_a_steady_signal_that_is_read_coarsely_does_not_stick() -> None:
     (window,) = slow_windows(0.005)
     fit = fit_windows([_coarse(window)], SETTINGS)
     assert fit is not None
-    assert list(stuck_values(Evidence(_coarse(window), SETTINGS, fit=fit))) == []
+    assert list(stuck_values(WindowFit(WindowSignals(_coarse(window), SETTINGS), fit=fit))) == []
     assert _stuck(_coarse(window), "current_a", 500, 60) == []  # at full speed the current stays
 
 

@@ -1,4 +1,4 @@
-"""Score tests on a window with a slow voltage: noise alone must not speak for a sensor's gain."""
+"""Score tests on a window with a slow voltage: noise alone must not indicate a sensor's gain."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Verdicts on windows with a slow voltage: what it cannot tell is null and no fault, what it contradicts is one."""
+"""Verdicts on windows with a slow voltage: undetermined values are null and no fault, contradictions are faults."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from fdhil.identification.identifiability import untold
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
 from fdhil.records import Reason, Result, WindowOutcome, frozen
-from fdhil.validation import Evidence
-from fdhil.validation.slow_readings import slow_voltage_faults
+from fdhil.validation.slow_voltage_checks import slow_voltage_faults
 from studies.judging import GOOD
 from studies.slow_recordings import recording_of
 from studies.slow_sensor import SETTINGS, slow_windows
@@ -62,7 +61,7 @@ def test_a_slow_sensor_that_stands_while_the_voltage_creeps_is_stuck(seed: int) 
     # at full speed, where the speed changes too little and a coarse reading hides the noise: the model tells
     recording = recording_of(seed, 2, "voltage stuck").recording
     (window,) = find_windows(recording)
-    assert list(slow_voltage_faults(Evidence(window, SETTINGS))) == []
+    assert list(slow_voltage_faults(window)) == []
     texts = [reason.text for reason in analyse(window, SETTINGS).verdict.reasons if reason.code == "StuckValue"]
     assert len(texts) == 1
     assert "voltage repeats" in texts[0]

@@ -1,4 +1,4 @@
-"""What standstill tells of the sensors' zeros, and what is lost just as the move ends."""
+"""Standstill reveals the sensors' zeros, and samples lost at the end of the move."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.windows import find_windows, moving_range
 from fdhil.pipeline import analyse
 from fdhil.records import Float, Reason, Window, frozen
-from fdhil.validation import Evidence
 from fdhil.validation.rest import rest_faults
+from fdhil.validation.window_fit import WindowFit
+from fdhil.validation.window_signals import WindowSignals
 from studies import faults
 from tests.identification.recorded import windows
 
@@ -27,7 +28,7 @@ def _at_rest(window: Window) -> Sequence[Reason]:
     assert fit is not None
     return [
         reason
-        for reason in rest_faults(Evidence(window, SETTINGS, fit=fit))
+        for reason in rest_faults(WindowFit(WindowSignals(window, SETTINGS), fit=fit))
         if "at standstill the current" in reason.text
     ]
 

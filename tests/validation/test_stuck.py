@@ -1,4 +1,4 @@
-"""A sensor that sticks is told from a steady signal that is read coarsely: by how likely the repeats were."""
+"""A stuck sensor is distinguished from a steady coarse signal by the probability of its repeats."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.records import Window, frozen
-from fdhil.validation import Evidence
 from fdhil.validation.stuck import noise_steps, stuck_values
+from fdhil.validation.window_fit import WindowFit
+from fdhil.validation.window_signals import WindowSignals
 from studies import drives, faults, signal_faults
 from studies.scenes import Sensor, demand_of, measured, recorded
 from tests.identification.recorded import windows
@@ -23,7 +24,6 @@ FIELDS = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"
 
 
 def _coarse(seed: int, **steps: float) -> Window:
-    """A rapid with little noise, sensors in steps that are shares of their peaks."""
     sizes = tuple(steps.get(name, 1e-4) for name in FIELDS)
     scene = replace(SCENE, noise=0.001, steps=(sizes[0], sizes[1], sizes[2]))
     rows = measured(np.random.default_rng(seed), scene, drives.run(scene.drive, demand_of(scene), scene.dt_s))
@@ -77,7 +77,8 @@ def test_a_coarse_sensor_that_sticks_is_told_by_its_neighbours() -> None:
         changes = [np.count_nonzero(np.diff(values[k : k + 60])) for k in rows]
         start = rows[int(np.argmax(changes))]
         assert max(changes) > 10
-        found = list(stuck_values(Evidence(_stuck(window, "current", start, 60), SETTINGS)))
+        signals = WindowSignals(_stuck(window, "current", start, 60), SETTINGS)
+        found = list(stuck_values(WindowFit(signals)))
         refused += any("current repeats" in reason.text for reason in found)
     assert refused == 4
 

@@ -1,4 +1,4 @@
-"""What must not depend on how the bench is looked at: direction, units, the order of windows."""
+"""Results do not depend on direction, units or the order of windows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A voltage or current that is late by some rows is refused with its delay, also where rows are fine."""
+"""A voltage or current that is late by some rows is refused with its delay, also with fine rows."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.records import VoltageSampling, Window
-from fdhil.validation import Evidence
 from fdhil.validation.score_bench import expected_correlation
 from fdhil.validation.shifts import Shift, shifts
 from fdhil.validation.timing import searched, timing_faults
+from fdhil.validation.window_fit import WindowFit
+from fdhil.validation.window_signals import WindowSignals
 from studies import drives, faults
 from studies.scenes import demand_of, measured, recorded
 from tests.validation.test_interruptions import SCENE
@@ -26,7 +27,6 @@ SETTINGS = Identification()
 
 
 def _window(late: dict[str, int], sampling: VoltageSampling = "interval_mean", dt_s: float = FINE_S) -> Window:
-    """Return a rapid whose short winding and noisy, coarse voltage hide a delay where rows are fine."""
     drive = replace(SCENE.drive, L=SCENE.drive.R * 0.0045)
     scene = replace(SCENE, drive=drive, dt_s=dt_s, noise=0.0045, sampling=sampling, steps=(2e-3, 1e-5, 1e-4))
     rows = measured(np.random.default_rng(5), scene, drives.run(drive, demand_of(scene), dt_s))
@@ -55,7 +55,7 @@ def test_a_delay_of_which_the_other_parameters_leave_nothing_at_first_is_searche
     assert fit is not None
     assert abs(shifts(fit)[0].samples) < 0.5
     assert not analyse(window, SETTINGS).verdict.accepted
-    (reason,) = timing_faults(Evidence(window, SETTINGS, fit=fit))
+    (reason,) = timing_faults(WindowFit(WindowSignals(window, SETTINGS), fit=fit))
     assert float(re.findall(r"is ([\d.]+) ms", reason.text)[0]) == pytest.approx(late.severity * 0.25, abs=0.2)
 
 

@@ -1,4 +1,4 @@
-"""A column in another unit than its name says is told with that unit; a recording in its own units never is."""
+"""A column in another unit than its name says is reported with that unit; a correct recording never is."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ def speeds(recording: Recording, factor: float) -> Recording:
 @pytest.mark.parametrize(
     ("signal", "factor", "words"),
     [
-        ("position", 1e3, "travels 1000 times the integral of speed, as a position in mm where m belong"),
+        ("position", 1e3, "travels 1000 times the integral of speed, as if the position were in mm instead of m"),
         ("position", 1e3 / 25.4, "inches"),
-        ("speed", 30 / math.pi, "as a speed in 1/min"),
+        ("speed", 30 / math.pi, "as if the speed were in 1/min"),
         ("speed", 180 / math.pi, "degrees per second"),
-        ("position", -1.0, "counts against the speed"),
-        ("pitch", 1e3, "as a screw pitch in mm where m belong, or times in ms where s belong"),
+        ("position", -1.0, "as if position and speed had opposite signs"),
+        ("pitch", 1e3, "as if the screw pitch were in mm instead of m, or times in ms instead of s"),
     ],
 )
 def test_a_unit_is_named(signal: str, factor: float, words: str, recording: Recording) -> None:
@@ -64,6 +64,6 @@ def test_a_temperature_in_kelvin_is_told_and_refuses_nothing(recording: Recordin
     warm = window_of(replace(recording, temperature_c=294.65))
     assert analyse(warm, Identification()).verdict.accepted
     assert [str(reason) for reason in warnings_of(warm)] == [
-        "Implausible: 294.65 degC is no temperature of a machine; 22 degC in kelvin?"
+        "Implausible: 294.65 degC is not a plausible machine temperature; 22 degC in kelvin?"
     ]
     assert warnings_of(window_of(replace(recording, temperature_c=60.0))) == []

@@ -1,4 +1,4 @@
-"""Verdicts: good windows are accepted, each kind of fault is refused under its own name."""
+"""Verdicts: valid windows are accepted, each kind of fault is refused under its own code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Windows without a voltage: believed as they are, refused for what current and position alone can tell."""
+"""Windows without a voltage: accepted if valid, refused for faults that current and position show."""
 
 from __future__ import annotations
 
@@ -148,7 +148,6 @@ def test_a_triangular_move_is_listed_with_its_parameters_and_not_believed() -> N
 
 
 def test_a_drive_without_feed_forward_is_weighed_by_its_following_error() -> None:
-    """A torque that would be too much of what the torque makes is nothing beside what the loop itself leaves."""
     window = screw_windows()[0]
     rng = np.random.default_rng(3)
     waves = 0.04 * np.abs(window.current_a).max() * np.sin(np.arange(window.n) / 15.0 + rng.uniform(0, 6))

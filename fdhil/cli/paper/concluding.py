@@ -9,7 +9,7 @@ import numpy as np
 from fdhil.cli.paper import paths
 from fdhil.cli.paper.claims import Claim, Trial, make_claim
 from fdhil.cli.paper.scenarios import DEMANDED, machine
-from fdhil.correction import flatness
+from fdhil.correction import flatness_feedforward
 from fdhil.prediction import predict
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Prediction
@@ -57,7 +57,7 @@ def _on_line() -> Claim:
         model, axis = nominal_models(config)["X"], config.axis["X"]
         known = np.asarray(reference.position_mm["X"])
         middle = known.size // 2
-        whole, part = (flatness.offsets(p, model, axis, reference.dt_s) for p in (known, known[:middle]))
+        whole, part = (flatness_feedforward.offsets(p, model, axis, reference.dt_s) for p in (known, known[:middle]))
         same = [np.flatnonzero(a[:middle] != b) for a, b in zip(whole, part, strict=True)]
         first = min((int(rows[0]) for rows in same if rows.size), default=middle)
         seconds = (middle - first) * reference.dt_s

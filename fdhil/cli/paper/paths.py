@@ -14,7 +14,7 @@ from fdhil.cli.paper import bench
 from fdhil.cli.paper.drawings import Traced
 from fdhil.cli.paper.scenarios import PATHS, machine
 from fdhil.config import MachineConfig
-from fdhil.correction import flatness, linear
+from fdhil.correction import flatness_feedforward, linear
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.models import nominal_models
 from fdhil.prediction.predict import predict_corrected
@@ -77,7 +77,7 @@ def corrected(scenario: str, method: str, program: str = SLOW) -> Prediction:
     models = nominal_models(config)
     if method == "flatness":
         offsets = {
-            axis: flatness.offsets(np.asarray(path), models[axis], config.axis[axis], before.reference.dt_s)
+            axis: flatness_feedforward.offsets(np.asarray(path), models[axis], config.axis[axis], before.reference.dt_s)
             for axis, path in before.reference.position_mm.items()
         }
         speed, torque = ({axis: pair[k] for axis, pair in offsets.items()} for k in (0, 1))

@@ -18,10 +18,9 @@ import numpy as np
 from fdhil import correction
 from fdhil.bounded_process import limit_process, receive_request, report
 from fdhil.config import MachineConfig
-from fdhil.correction.advised import advised, entry, sources
-from fdhil.correction.document import correction_document
+from fdhil.correction.result_documents import advised, correction_document, entry, sources
 from fdhil.errors import FdhilError, ProgramError
-from fdhil.prediction.feeds import Source
+from fdhil.prediction.feed_search import Source
 from fdhil.prediction.models import models_for, nominal_models, validated_models
 from fdhil.program import Budget, interpret, planner
 from fdhil.program.demand_csv import read_demand_csv

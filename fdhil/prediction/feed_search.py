@@ -1,8 +1,12 @@
-"""Searches the highest feed of each stretch of a path that keeps a tolerance, by running the whole path."""
+"""Searches for the highest feed of each segment of a path that keeps a tolerance, by predicting the whole path.
+
+Then each feed is raised alone, while those next to it stay: an error between two segments hardly depends on either of
+them alone, so that a search which changes both by the result of each ends a little early.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,33 +17,37 @@ from fdhil.program import Arc, Feed, Motion
 from fdhil.program import plan as plan_program
 from fdhil.records import Float, Int, Trajectory
 
-AFTER_S = 0.2  # an error belongs to what was ordered up to so long before it: the loops need to settle
-RAPID, REST = -1, -2  # rows of no stretch: not judged at all, and judged for the stretch before
-NARROW = 1.02  # two shares nearer than this are not parted further
+AFTER_S = 0.2  # an error belongs to commands up to this long before it: the loops need to settle
+RAPID, REST = -1, -2  # rows without a segment: not assessed, and assessed for the segment before
+NARROW = 1.02  # shares closer than this are not refined further
 LEAST_FALL, MOST_FALL, RISE = 0.97, 0.25, 1.05  # of a share, from one trial to the next
-POWERS = (0.3, 3.0)  # of the share, that an error may go with
-AIM, FULL = 0.996, 0.99  # of the tolerance: what is aimed at, and what is near enough
-PATIENCE = 2  # so many rises in a row by the power law of the last trials
-EDGE = 0.1  # of a bracket, in logarithms: a trial keeps away from its ends
-LOWEST = 1e-3  # share of the feed that is tried
+POWERS = (0.3, 3.0)  # limits of the exponent p of error ~ share ** p
+AIM, FULL = 0.996, 0.99  # of the tolerance: the target, and what is close enough
+PATIENCE = 2  # successive rises by the power law of the last trials
+EDGE = 0.1  # of a bracket, in logarithms: distance of a trial from its ends
+LOWEST = 1e-3  # lowest share of the feed that is tried
 # an error that keeps STILL of itself while its feed falls to 1 / FAR does not come from the feed; over less it may
 # come from the NC's acceleration, which is the same until the feed is below what a ramp gains while the loops settle
 STILL, FAR = 0.9, 8.0
-SLACK, MOST_RISES = 0.97, 2  # of the tolerance: what leaves more room is tried at a higher feed, so many times
+SLACK, MOST_RISES = 0.97, 2  # of the tolerance: with more slack a higher feed is tried, up to this many times
 MOST_TRIALS = 80
-WORTH, FEW = 1.02, 0.02  # a trial that lets so few stretches run faster by so much is not run
-LONGEST_S, LONGEST_SHARE = 120.0, 10.0  # a path that lasts longer than both, the latter times its own, is not slowed
+WORTH, FEW = 1.02, 0.02  # trials that speed up fewer segments, or by less, are skipped
+LONGEST_S, LONGEST_SHARE = 120.0, 10.0  # a path is not slowed beyond both, the latter times its own duration
 
-# contour error (n,) um of a reference; inf where the drives cannot do it, NaN where that leaves the error unknown
+# contour error (n,) um of a reference; inf where the drives cannot follow, NaN where the error is then unknown
 Judge = Callable[[Trajectory], Float]
+STEP = 1.05  # first factor tried
+MOST_STEPS, MOST_STEP, LEAST_POWER = 3, 2.0, 0.05
+MOST_GROUPS = 3  # of segments that do not touch each other
+Span = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A path that can be had with every stretch at its own share of the feed (1 where none is given).
+    """A path that can be generated with every segment at its own share of the feed (default 1).
 
-    The ``line`` of its references is the stretch of a row, 0 for a rest; ``line`` and ``feed_mm_min`` tell of a stretch
-    what the user calls it. Errors up to ``after_s`` behind a stretch are its own.
+    The ``line`` of its references is the segment of a row, 0 for a rest; ``line`` and ``feed_mm_min`` give the user's
+    line and feed of a segment. Errors up to ``after_s`` behind a segment are its own.
     """
 
     at: Callable[[Mapping[int, float]], Trajectory]
@@ -67,13 +75,13 @@ def program_source(motions: Sequence[Motion], config: MachineConfig) -> Source:
 
 
 def stretches(reference: Trajectory) -> Int:
-    """Return (n,) the stretch that each row belongs to, RAPID or REST."""
-    # rows without a line are a rest: what remains of the line before
+    """Return (n,) the segment that each row belongs to, RAPID or REST."""
+    # rows without a line are a rest: they settle from the line before
     return np.where(reference.rapid, RAPID, np.where(reference.line > 0, reference.line, REST))
 
 
 def worst_rows(stretch: Int, contour_um: Float, dt_s: float, after_s: float) -> dict[int, tuple[float, int]]:
-    """Return for each stretch the largest error in it and ``after_s`` behind it, and its row; -1 where it is NaN."""
+    """Return for each segment the largest error in it and ``after_s`` behind it, and its row; -1 where it is NaN."""
     judged = np.where(stretch != RAPID, np.nan_to_num(contour_um, nan=-1.0, posinf=np.inf), 0.0)
     size = round(after_s / dt_s) + 1
     ahead = maximum_filter1d(judged, size, origin=-(size // 2), mode="constant") if size > 1 else judged
@@ -91,7 +99,7 @@ def worst_rows(stretch: Int, contour_um: Float, dt_s: float, after_s: float) -> 
 
 
 def run(source: Source, shares: Mapping[int, float], judge: Judge) -> tuple[Trajectory, dict[int, float]]:
-    """Run a path with its stretches at some shares; return it, and the largest error of each stretch, -1: unknown."""
+    """Generate a path with its segments at some shares; return it, and each segment's largest error, -1: unknown."""
     reference = source.at(shares)
     worst = worst_rows(stretches(reference), judge(reference), reference.dt_s, source.after_s)
     return reference, {k: error for k, (error, _) in worst.items()}
@@ -99,9 +107,9 @@ def run(source: Source, shares: Mapping[int, float], judge: Judge) -> tuple[Traj
 
 @dataclass(frozen=True, slots=True)
 class Feeds:
-    """The share of the feed of each stretch as they were run together, its largest error, and which are held by it.
+    """The share of the feed of each segment as evaluated together, its largest error, and which are ``held`` by it.
 
-    ``tried`` is of each the lowest share that was tried, with the largest error there.
+    ``tried`` is the lowest tried share of each, with the largest error there.
     """
 
     share: Mapping[int, float]
@@ -111,10 +119,10 @@ class Feeds:
 
 
 def highest(source: Source, over: Mapping[int, float], judge: Judge, tolerance_um: float) -> Feeds:
-    """Return the highest shares at which ``over`` (stretch -> its error as programmed, um) keep the tolerance.
+    """Return the highest shares at which ``over`` (segment -> its error as programmed, um) keep the tolerance.
 
-    Every trial runs the whole path with each stretch at its own share; a stretch that leaves the tolerance because of
-    its neighbours joins. The shares returned were run together and held, but for those that no share holds.
+    Every trial predicts the whole path with each segment at its own share; a segment that leaves the tolerance because
+    of its neighbours joins. The returned shares keep it together, except those that no share keeps.
     """
     search = _Search(source, judge, tolerance_um, over)
     search.settle()
@@ -127,9 +135,9 @@ def highest(source: Source, over: Mapping[int, float], judge: Judge, tolerance_u
 
 @dataclass(slots=True)
 class _Stretch:
-    """The bracket of one stretch: ``low`` holds, ``high`` does not; it is ``lost`` when no share is worth a trial.
+    """The bracket of one segment: ``low`` keeps the tolerance, ``high`` does not; ``lost``: no share is worth a trial.
 
-    ``risen`` is how often in a row a higher share held.
+    ``risen`` counts successive higher shares within the tolerance.
     """
 
     share: float = 1.0
@@ -140,7 +148,6 @@ class _Stretch:
     tried: list[tuple[float, float]] = field(default_factory=list)
 
     def learn(self, share: float, error_um: float, holds: bool) -> None:
-        """Take in a trial."""
         self.tried.append((share, error_um))
         if not holds:
             self.risen = 0
@@ -156,7 +163,7 @@ class _Stretch:
                 self.low = None
 
     def next_share(self, tolerance_um: float) -> float:
-        """Return the share to try next, ``low`` when there is nothing more to tell."""
+        """Return the share to try next, ``low`` when the search has ended."""
         share, error = self.tried[-1]
         if self.low is None and self._is_lost(share, error):
             self.lost = True
@@ -168,7 +175,7 @@ class _Stretch:
         wanted = share * (AIM * tolerance_um / error) ** (1.0 / self._power()) if 0.0 < error < np.inf else 0.0
         if self.low is None:
             return max(LOWEST, float(np.clip(wanted, MOST_FALL * share, LEAST_FALL * share)))
-        if self.risen > PATIENCE:  # its error hardly goes with its own share: halve the bracket
+        if self.risen > PATIENCE:  # its error hardly depends on its own share: halve the bracket
             wanted = max(wanted, float(np.sqrt(self.low * (self.high or 1.0))))
         if self.high is None:
             return min(1.0, max(wanted, RISE * self.low))
@@ -176,7 +183,7 @@ class _Stretch:
         return float(np.clip(wanted, self.low * margin, self.high / margin))
 
     def _no_better(self) -> float:
-        """Return the highest share that was tried and below which the error is hardly less."""
+        """Return the highest tried share below which the error is hardly less."""
         least = min(error for _, error in self.tried)
         return max(share for share, error in self.tried if STILL * error <= least)
 
@@ -185,7 +192,7 @@ class _Stretch:
         return self.lost or share <= LOWEST or bool(faster and error_um > STILL * faster[-1])
 
     def _power(self) -> float:
-        """Return p of error ~ share ** p as the last trials have it: 2 for inertia, near 0 for dry friction."""
+        """Return p of error ~ share ** p by the last trials: 2 for inertia, near 0 for dry friction."""
         known = [(s, e) for s, e in self.tried if 0.0 < e < np.inf]
         if len(known) < 2 or known[-1][0] == known[-2][0]:
             return 2.0
@@ -194,7 +201,7 @@ class _Stretch:
 
 
 class _Search:
-    """Brackets of all stretches at once."""
+    """Brackets of all segments at once."""
 
     def __init__(self, source: Source, judge: Judge, tolerance_um: float, over: Mapping[int, float]) -> None:
         self._source, self._judge, self._tolerance_um = source, judge, tolerance_um
@@ -204,7 +211,7 @@ class _Search:
         self._kept: dict[int, tuple[float, float]] = {}
 
     def settle(self) -> None:
-        """Run trials until the shares hold together and no higher ones are worth a trial."""
+        """Run trials until the shares keep the tolerance together and no higher ones are worth a trial."""
         while self._trials < MOST_TRIALS:
             shares = {k: s.share for k, s in self._open.items()}
             bad = self._run(shares)
@@ -220,7 +227,7 @@ class _Search:
                 return
 
     def rises(self) -> bool:
-        """Return whether some stretch has room left, its bracket being from when its neighbours were faster."""
+        """Reopen segments with slack, whose bracket dates from faster neighbours; return whether there are any."""
         slack = [
             s
             for k, s in self._open.items()
@@ -232,7 +239,6 @@ class _Search:
         return bool(slack)
 
     def feeds(self) -> Feeds:
-        """Return the last shares that held together."""
         known = {k: self._kept.get(k, s.tried[-1] if s.tried else (s.share, np.inf)) for k, s in self._open.items()}
         held = frozenset(k for k, (_, error_um) in self._kept.items() if error_um <= self._tolerance_um)
         tried = {k: min(s.tried, default=known[k]) for k, s in self._open.items()}
@@ -241,7 +247,7 @@ class _Search:
         )
 
     def _run(self, shares: Mapping[int, float]) -> set[int]:
-        """Run the path; return the stretches that leave the tolerance."""
+        """Evaluate the shares; return the segments that leave the tolerance."""
         reference, error_um = run(self._source, shares, self._judge)
         seconds = float(reference.time_s[-1] - reference.time_s[0])
         if self._trials == 0:
@@ -256,3 +262,82 @@ class _Search:
                 stretch.learn(shares.get(k, 1.0), error, k not in bad)
                 stretch.lost |= seconds > self._longest_s and k in bad and stretch.low is None
         return bad
+
+
+def raised_alone(feeds: Feeds, source: Source, judge: Judge, tolerance_um: float) -> Feeds:
+    """Return the feeds with each possible segment raised; together they keep the tolerance as before."""
+    waiting = {k for k in feeds.held if feeds.share[k] * STEP <= 1.0}
+    if not waiting:
+        return feeds
+    raising = _Raising(feeds, source, judge, tolerance_um)
+    for _ in range(MOST_GROUPS):
+        if not waiting:
+            break
+        group = raising.group(waiting)
+        waiting -= group
+        factors = dict.fromkeys(group, STEP)
+        for _ in range(MOST_STEPS):
+            factors = raising.step(factors)
+            if not factors:
+                break
+    return raising.feeds()
+
+
+class _Raising:
+    """Shares, all of which were evaluated."""
+
+    def __init__(self, feeds: Feeds, source: Source, judge: Judge, tolerance_um: float) -> None:
+        self._before, self._source, self._judge, self._tolerance_um = feeds, source, judge, tolerance_um
+        self._share = dict(feeds.share)
+        self._apart_s = 2 * source.after_s
+        self._reference, self._error_um = run(source, self._share, judge)
+        self._most_um = {k: max(tolerance_um, um / STILL) for k, um in self._error_um.items() if um > tolerance_um}
+
+    def _spoilt(self, error_um: Mapping[int, float]) -> list[int]:
+        return [k for k, um in error_um.items() if not 0.0 <= um <= self._most_um.get(k, self._tolerance_um)]
+
+    def group(self, waiting: Collection[int]) -> set[int]:
+        """Return some of ``waiting`` that do not touch each other, in the order of the path."""
+        chosen, end_s = set(), -np.inf
+        for k, (first_s, last_s) in sorted(_spans(self._reference, waiting).items(), key=lambda item: item[1]):
+            if first_s > end_s:
+                chosen.add(k)
+                end_s = last_s + self._apart_s
+        return chosen
+
+    def step(self, factors: Mapping[int, float]) -> dict[int, float]:
+        """Evaluate some shares times their factors and keep those within the tolerance; return their next factors."""
+        tried = {k: min(1.0, self._share[k] * factor) for k, factor in factors.items()}
+        reference, error_um = run(self._source, self._share | tried, self._judge)
+        spoilt = _spans(reference, self._spoilt(error_um)).values()
+        good = {k for k, span in _spans(reference, tried).items() if not self._near(span, spoilt)}
+        further = {k: self._further(tried[k] / self._share[k], self._error_um[k], error_um[k]) for k in good}
+        self._share |= {k: tried[k] for k in good}
+        self._error_um |= {k: error_um[k] for k in good}
+        return {k: factor for k, factor in further.items() if factor > WORTH and tried[k] < 1.0}
+
+    def _near(self, span: Span, others: Iterable[Span]) -> bool:
+        first_s, last_s = span
+        return any(first - self._apart_s <= last_s and first_s <= last + self._apart_s for first, last in others)
+
+    def _further(self, factor: float, before_um: float, now_um: float) -> float:
+        """Return the factor that brings an error to its target, by its change with the last one."""
+        power = max(float(np.log(now_um / before_um) / np.log(factor)), LEAST_POWER) if before_um > 0.0 else 1.0
+        return float(np.clip((AIM * self._tolerance_um / now_um) ** (1.0 / power), 1.0, MOST_STEP))
+
+    def feeds(self) -> Feeds:
+        if self._share == self._before.share:
+            return self._before
+        _, error_um = run(self._source, self._share, self._judge)
+        if self._spoilt(error_um):
+            return self._before
+        return replace(self._before, share=self._share, left_um={k: error_um.get(k, 0.0) for k in self._share})
+
+
+def _spans(reference: Trajectory, wanted: Collection[int]) -> dict[int, Span]:
+    stretch = stretches(reference)
+    names, first = np.unique(stretch, return_index=True)
+    _, last = np.unique(stretch[::-1], return_index=True)
+    start, dt_s = float(reference.time_s[0]), reference.dt_s
+    ends = zip(names.tolist(), first.tolist(), (stretch.size - last).tolist(), strict=True)
+    return {k: (start + begin * dt_s, start + end * dt_s) for k, begin, end in ends if k in wanted}

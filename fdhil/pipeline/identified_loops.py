@@ -1,27 +1,84 @@
-"""Seeks a drive's own loops where the configured ones do not explain its rapids, for the analysis to go on with.
+"""Identifies a drive's own loops if the configured ones do not explain its rapids, and analyses these again.
 
-Where other loops do not explain them, a resonance between motor and table may.
+If other loops do not explain them, a resonance between motor and table may: the motor's position is measured far better
+than its speed, and the closed loop along the demand shows the table's reaction on the motor in it, so that the
+resonance with the smallest residual of the replays is used.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from functools import partial
+
+import numpy as np
 
 from fdhil.config import Axis, Identification
 from fdhil.identification.current_means import with_current_means
 from fdhil.identification.loops import better_loops, changed_regulators, identify_loops, with_loops
 from fdhil.identification.physical_bounds import bounded
 from fdhil.pipeline.analysis import analyse, own
-from fdhil.pipeline.own_resonance import softer_axis
 from fdhil.records import LoopEstimate, Parameters, Window, WindowOutcome
-from fdhil.validation.weight import LOOPS_DIFFER
+from fdhil.validation.replay import replay_window
+from fdhil.validation.table_error_budget import LOOPS_DIFFER
 
+GRID = np.geomspace(40.0, 250.0, 14)  # Hz
+HALVINGS = 2  # of the grid's steps around the best
+NOTICED = 0.01  # of the following error: below, nothing is searched for
+BETTER = 0.5  # of the residual, at most, with an accepted resonance
+MOST_RAPIDS = 4
+
+Rapids = Sequence[tuple[Window, Parameters]]
 ENOUGH = 4  # windows, both directions twice
 KEPT = 6
 SIGNALS_AT_FAULT = frozenset({"StuckValue", "Implausible", "NotFinite", "StaleData", "EpisodeAborted"})
-# of a motor whose data sheet is not known: fast enough to be no part of what is sought
+# of a motor with unknown data sheet: fast enough not to affect the loops
 UNKNOWN_R, UNKNOWN_L = 1.0, 5e-3
+Work = Callable[[Window], WindowOutcome]
+Spread = Callable[[Work, Sequence[Window]], Iterable[WindowOutcome]]
+
+
+def softer_axis(rapids: Rapids, axis: Axis, sync_period_s: float) -> Axis | None:
+    """Return the axis with the resonance that the rapids show.
+
+    None if one is configured already, if the rapids are explained, and if none explains them.
+    """
+    rapids = [pair for pair in rapids if not pair[1].term("resonance")][-MOST_RAPIDS:]
+    if axis.resonance_hz is not None or not rapids:
+        return None
+    left, following = _left_um(rapids, axis, sync_period_s)
+    if not left > NOTICED * following:
+        return None
+    found = _best(rapids[-1:], axis, sync_period_s)
+    soft = _with(axis, found)
+    return soft if _left_um(rapids, soft, sync_period_s)[0] < BETTER * left else None
+
+
+def _best(rapids: Rapids, axis: Axis, sync_period_s: float) -> float:
+    left: dict[float, float] = {}
+
+    def tried(*resonances: float) -> float:
+        for hertz in resonances:
+            left[hertz] = _left_um(rapids, _with(axis, hertz), sync_period_s)[0]
+        return min(left, key=left.__getitem__)
+
+    best, ratio = tried(*GRID.tolist()), float(GRID[1] / GRID[0])
+    for _ in range(HALVINGS):
+        ratio **= 0.5
+        best = tried(best / ratio, best * ratio)
+    return best
+
+
+def _with(axis: Axis, hertz: float) -> Axis:
+    return axis.model_copy(update={"resonance_hz": hertz})
+
+
+def _left_um(rapids: Rapids, axis: Axis, sync_period_s: float) -> tuple[float, float]:
+    """Return the RMS residual of the rapids' replays, and of the following error; zero without any."""
+    replays = [replay_window(window, drive, axis, sync_period_s) for window, drive in rapids]
+    residuals = [(one.unexplained_um, one.measured_um) for one in replays if one is not None]
+    left, following = np.sqrt(np.mean(np.square(residuals), axis=0)) if residuals else (0.0, 0.0)
+    return float(left), float(following)
 
 
 def loops_of(
@@ -32,24 +89,22 @@ def loops_of(
     *,
     growing: bool = True,
 ) -> LoopEstimate | None:
-    """Return the loops of a drive as the windows show them that were analysed; None where they show none.
+    """Return the loops of a drive by its analysed windows; None where they show none.
 
-    Without ``growing`` no other keys are tried than those that are configured.
-
-    What the axis' section or a window's own estimate does not tell of the winding is made up: the current loop hides
-    it. Windows that are believed go before the others, and a section that is another machine's is none.
+    Without ``growing`` no keys are tried but the configured ones. Unknown values of the winding are assumed: the
+    current loop hides them. Accepted windows precede the others, and a section of another machine is ignored.
     """
     axis = own(outcomes[0].window, axis) if outcomes else None
-    told = [(o, mechanics_of(o, axis)) for o in outcomes]
-    known = [(o, plant) for o, plant in told if plant is not None]
-    believed = [(o, plant) for o, plant in known if o.verdict.accepted]
-    chosen = believed or known
+    pairs = [(o, mechanics_of(o, axis)) for o in outcomes]
+    known = [(o, plant) for o, plant in pairs if plant is not None]
+    accepted = [(o, plant) for o, plant in known if o.verdict.accepted]
+    chosen = accepted or known
     windows, plants = [o.window for o, _ in chosen], [p for _, p in chosen]
     return identify_loops(windows, plants, axis, settings, sync_period_s, growing=growing)
 
 
 def mechanics_of(outcome: WindowOutcome, axis: Axis | None) -> Parameters | None:
-    """Return the parameters of a window's estimate, its winding filled up; None where K, Jt, ft or Cd is not told."""
+    """Return the parameters of a window's estimate, its winding completed; None without K, Jt, ft or Cd."""
     if outcome.estimate is None:
         return None
     found = bounded(outcome.estimate, outcome.window.direction).parameters()
@@ -64,14 +119,14 @@ def mechanics_of(outcome: WindowOutcome, axis: Axis | None) -> Parameters | None
 def suspected(outcomes: Sequence[WindowOutcome]) -> bool:
     """Return whether some window is refused for its loops: the model explains its torque, and not its replay.
 
-    A window whose signals are at fault tells of no loops.
+    A window with faulty signals says nothing of the loops.
     """
     codes = ({reason.code for reason in o.verdict.reasons} for o in outcomes)
     return any(LOOPS_DIFFER in found and not found & SIGNALS_AT_FAULT for found in codes)
 
 
 def better_axis(axis: Axis | None, found: LoopEstimate | None) -> Axis | None:
-    """Return the axis with the loops that were found, where they explain what the configured ones do not; else None."""
+    """Return the axis with the loops that were found, if they explain what the configured ones do not; else None."""
     return with_loops(axis, found) if axis is not None and found is not None and better_loops(found) else None
 
 
@@ -80,8 +135,8 @@ def softened(outcomes: Collection[WindowOutcome], axis: Axis | None, sync_period
     left = [o for o in outcomes if suspected([o])] or [o for o in outcomes if o.verdict.accepted]
     if axis is None or sync_period_s is None or not left or own(left[0].window, axis) is None:
         return None
-    told = [(o.window, mechanics_of(o, axis)) for o in left]
-    return softer_axis([(w, plant) for w, plant in told if plant is not None], axis, sync_period_s)
+    pairs = [(o.window, mechanics_of(o, axis)) for o in left]
+    return softer_axis([(w, plant) for w, plant in pairs if plant is not None], axis, sync_period_s)
 
 
 def explained(
@@ -91,7 +146,7 @@ def explained(
     sync_period_s: float | None,
     again: Callable[[Axis], Sequence[WindowOutcome]],
 ) -> tuple[Sequence[WindowOutcome], LoopEstimate | None]:
-    """Return the outcomes by the best that a recording shows of its drive, and its loops where they were sought.
+    """Return the outcomes by the best model of a recording's drive, and its loops if they were identified.
 
     ``again`` analyses its windows with another section of the axis.
     """
@@ -110,16 +165,16 @@ def explained(
 
 
 class OwnLoops:
-    """An axis' own loops as its rapids come one by one: each is analysed through the best that are known.
+    """Tracks an axis' own loops as its rapids arrive one by one: each is analysed through the best known ones.
 
-    They are fitted once after the first ``ENOUGH`` rapids, so that they are told, and sought where a rapid is
-    refused that was replayed: at once, and each time after twice as many refused rapids as before, since it takes long.
+    They are fitted once after the first ``ENOUGH`` rapids, to be reported, and again when a replayed rapid is refused:
+    at once, and each time after twice as many refused rapids as before, since it takes long.
     """
 
     def __init__(
         self, axis: Axis | None, settings: Identification, sync_period_s: float, known: LoopEstimate | None = None
     ) -> None:
-        """``axis`` is the machine's section, None where none is known: then no loops are sought.
+        """Start with the machine's section, None for an unknown machine: then no loops are searched for.
 
         ``known`` are those that were found in an earlier run.
         """
@@ -139,7 +194,7 @@ class OwnLoops:
         return changed_regulators(self._configured, self.axis)
 
     def analyse(self, window: Window) -> tuple[WindowOutcome, LoopEstimate | None]:
-        """Return what a window says of the drive, and its loops where they were sought again."""
+        """Return a window's outcome, and the loops if they were identified again."""
         if self._configured is not None:
             known = own(window, self._configured)
             (window,) = with_current_means([window], self._settings, known, self._period_s)
@@ -166,7 +221,6 @@ class OwnLoops:
     def _through_loops(
         self, window: Window, outcome: WindowOutcome, *, growing: bool
     ) -> tuple[WindowOutcome, LoopEstimate | None]:
-        """Return the outcome of a window by the loops that the newest rapids show, and those loops."""
         found = loops_of(tuple(self._outcomes), self._configured, self._settings, self._period_s, growing=growing)
         better = better_axis(self._configured, found)
         if better is None and found is not None and found.verdict.accepted:
@@ -175,3 +229,30 @@ class OwnLoops:
             return outcome, found
         self.axis = better.model_copy(update={"resonance_hz": self.axis.resonance_hz})
         return (analyse(window, self._settings, self.axis, self._period_s) if growing else outcome), found
+
+
+def analyse_windows(
+    windows: Sequence[Window],
+    settings: Identification,
+    axis: Axis | None = None,
+    sync_period_s: float | None = None,
+    spread: Spread = map,
+    done: Callable[[], None] = lambda: None,
+) -> tuple[Sequence[WindowOutcome], LoopEstimate | None]:
+    """Return the outcome of each window, and the drive's own loops if they had to be identified.
+
+    ``spread`` may use further processes, in order; ``done`` is called after each window.
+    """
+    if windows:
+        windows = with_current_means(windows, settings, own(windows[0], axis), sync_period_s)
+    work = partial(analyse, settings=settings, axis=axis, sync_period_s=sync_period_s)
+
+    def told() -> Iterator[WindowOutcome]:
+        for outcome in spread(work, windows):
+            done()
+            yield outcome
+
+    def again(better: Axis) -> Sequence[WindowOutcome]:
+        return list(spread(partial(work, axis=better), windows))
+
+    return explained(list(told()), axis, settings, sync_period_s, again)

@@ -1,0 +1,291 @@
+"""Pools the accepted windows of one drive, refuses a pool that disagrees, and validates it by held-out moves."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from fdhil.config import Axis, Identification
+from fdhil.identification.between import ALIKE, Between, Member, between
+from fdhil.identification.demand_lead import with_demand_on_time
+from fdhil.identification.estimators import chosen
+from fdhil.identification.identifiability import unphysical, untold
+from fdhil.identification.loops import identify_loops
+from fdhil.identification.physical_bounds import bounded
+from fdhil.identification.pooling import member, pooled
+from fdhil.pipeline.analysis import GAVE_UP, gave_up, own
+from fdhil.pipeline.identified_loops import better_axis
+from fdhil.records import PARAMETERS, Estimate, HeldOut, LoopEstimate, Reason, Verdict, Window, WindowOutcome, frozen
+from fdhil.validation.agreement import WINDING, is_of_winding, moved
+from fdhil.validation.held_out_moves import (
+    Move,
+    held_out_reason,
+    is_predicted,
+    predict_held_out,
+    with_presliding,
+    worst_of,
+)
+from fdhil.validation.replay import Replay
+from fdhil.validation.table_error_budget import LOOPS_DIFFER
+
+# causes of refusal that do not concern the model: the samples, or the course of the move
+OF_THE_MOVE = (
+    "Missing",
+    "Episode",
+    "Stale",
+    "Stuck",
+    "Saturated",
+    "Implausible",
+    "NotFinite",
+    "LoadDetected",
+    "Timing",
+)
+WARMING = "R"
+_FIGURES = re.compile(r"[-+]?[0-9][-+.0-9e]*")  # figures, in which warnings of one kind differ
+
+WindowEstimates = list[tuple[Window, Estimate]]
+OF_ONE_MOVE = frozenset({LOOPS_DIFFER, "ValidationFailed"})
+"""Codes of a window whose own model does not explain its replay: moves one way do not separate load and friction."""
+SCALE_UNPROVEN = Reason(
+    "ScaleUnproven",
+    "no data sheet is known: current and voltage in another scale (peak or RMS of a phase) scale K, Jt, ft and Cd",
+    "give --config with the motor's nominal K and Jt",
+)
+
+
+def pool(
+    outcomes: Sequence[WindowOutcome], settings: Identification, *, refit: bool = True
+) -> tuple[Estimate | None, Verdict]:
+    """Estimate from the accepted windows together; None and a refusal if there is none, or if they disagree.
+
+    With ``refit`` all samples are fitted once more, if the windows determine the same six parameters. Without it the
+    windows' own estimates are pooled, which is as good if each window determines all six, and takes no time.
+    """
+    if not outcomes:
+        advice = "record moves at 60 % of the rapid speed or more, or identify from any move with --any-move"
+        return None, Verdict(False, None, (Reason("NoWindow", "the recording holds no rapid move", advice),))
+    members = [member(o.window, o.estimate, k) for k, o in enumerate(outcomes) if o.verdict.accepted and o.estimate]
+    estimate, verdict = together(outcomes, members, members, settings, refit=refit)
+    estimate = estimate and _with_drift(estimate, members)
+    refuted = _loops_refuted(outcomes) if verdict.accepted else []
+    return estimate, replace(verdict, accepted=False, reasons=tuple(refuted)) if refuted else verdict
+
+
+def _with_drift(estimate: Estimate, members: Sequence[Member]) -> Estimate:
+    apart = between(members)
+    if not apart.walk.get(WARMING):
+        return estimate
+    covariance, k = estimate.covariance.copy(), estimate.names.index(WARMING)
+    places = [m.place for m in members]
+    covariance[k, k] += apart.walk[WARMING] * apart.sizes[WARMING] ** 2 * (max(places) - min(places))
+    return replace(estimate, covariance=frozen(covariance))
+
+
+def together(
+    outcomes: Sequence[WindowOutcome],
+    members: Sequence[Member],
+    history: Sequence[Member],
+    settings: Identification,
+    *,
+    refit: bool = False,
+) -> tuple[Estimate | None, Verdict]:
+    """Return the joint estimate of ``members``, the accepted among the ``outcomes``, and its verdict.
+
+    ``history`` are all windows that show how much windows of this drive differ.
+    """
+    accepted = [o for o in outcomes if o.verdict.accepted and o.estimate is not None]
+    if not accepted:
+        seen = dict.fromkeys(r for o in outcomes for r in o.verdict.reasons)
+        return None, Verdict(False, None, tuple(seen))
+    estimates: WindowEstimates = [(o.window, o.estimate) for o in accepted if o.estimate is not None]
+    reasons = list(one_sided(outcomes))
+    estimate = estimates[0][1]
+    if len(estimates) > 1:
+        try:
+            estimate = _estimated(estimates, members, between(history), settings, refit=refit)
+        except GAVE_UP as error:
+            return None, Verdict(False, None, (gave_up(error, "inspect the windows"),))
+        # with a slow voltage, or without one, R and L may be undetermined
+        slow = any(window.slow_voltage is not None or window.voltage_v is None for window, _ in estimates)
+        reasons += untold(estimate, slow=slow)
+    beyond = unphysical(estimate)
+    return (estimate if beyond else bounded(estimate)), _verdict(accepted, [*reasons, *beyond, *moved(estimates)])
+
+
+def _estimated(
+    estimates: WindowEstimates, members: Sequence[Member], apart: Between, settings: Identification, *, refit: bool
+) -> Estimate:
+    """Return the estimate of all samples if the windows are of one kind, else the mixed model's."""
+    first = estimates[0][1]
+    quick = pooled(members, first, apart)
+    whole = all(set(PARAMETERS) <= set(m.names) for m in members)
+    voltageless = all(window.voltage_v is None and window.slow_voltage is None for window, _ in estimates)
+    if voltageless or quick.terms or apart.surely or (whole and not refit):
+        return quick
+    again = chosen(settings)[1]([window for window, _ in estimates], settings)
+    same = pooled(members, first, ALIKE)
+    if not again.names == same.names == quick.names:
+        return again
+    wider = np.nan_to_num(quick.covariance - same.covariance)  # zero where a slow voltage leaves R or L undetermined
+    return replace(again, covariance=frozen(again.covariance + wider))
+
+
+def one_sided(outcomes: Iterable[WindowOutcome]) -> list[Reason]:
+    """Return the reason if windows of one direction are accepted while the model was refused in the other.
+
+    A load that acts one way is part of dry friction then, by an unknown share.
+    """
+    listed = list(outcomes)
+    directions = {o.window.direction for o in listed if o.verdict.accepted}
+    refused = [o for o in listed if o.window.direction not in directions and refuses_the_model(o)]
+    if len(directions) != 1 or not refused:
+        return []
+    way = "positive" if refused[0].window.direction > 0 else "negative"
+    cause = refused[0].verdict.reasons[0]
+    text = (
+        f"no move in the {way} direction is accepted ({cause.code}), "
+        "and friction in one direction does not show that in the other"
+    )
+    return [Reason("OneDirection", text, cause.advice or "see why the other moves are refused")]
+
+
+def _loops_refuted(outcomes: Sequence[WindowOutcome]) -> list[Reason]:
+    """Return the reason if as many rapids refute the loops as were accepted with them.
+
+    They concern the drive's loops, not its parameters: the model would be used with wrong loops.
+    """
+    refuting = [o for o in outcomes if [r.code for r in o.verdict.reasons] == [LOOPS_DIFFER]]
+    accepted = sum(o.verdict.accepted for o in outcomes)
+    if not refuting or len(refuting) < accepted:
+        return []
+    cause = refuting[0].verdict.reasons[0]
+    text = f"{len(refuting)} rapids refute the loops with which {accepted} were accepted, and no loops explain all"
+    return [Reason(LOOPS_DIFFER, f"{text}: {cause.text}", cause.advice)]
+
+
+def refuses_the_model(outcome: WindowOutcome) -> bool:
+    """Return whether a window was refused for its drive's behaviour, not for its samples or an aborted move."""
+    codes = [reason.code for reason in outcome.verdict.reasons]
+    return not outcome.verdict.accepted and not any(part in code for code in codes for part in OF_THE_MOVE)
+
+
+def _verdict(accepted: Sequence[WindowOutcome], reasons: Sequence[Reason]) -> Verdict:
+    """Return the pool's verdict: its own reasons, the worst of the windows' figures, each of their warnings once."""
+    verdicts = [o.verdict for o in accepted]
+    fits = [v.fit_percent for v in verdicts if v.fit_percent is not None]
+    unexplained = [v.unexplained_um for v in verdicts if v.unexplained_um is not None]
+    warnings = {_FIGURES.sub("", str(warning)): warning for v in verdicts for warning in v.warnings}
+    unique = list(warnings.values())
+    if len({o.window.direction for o in accepted}) == 1 and not reasons and accepted[0].window.is_rapid:
+        text = "all moves are in one direction: a constant load cannot be separated from Cd"
+        unique.append(Reason("OneDirection", text, "record rapids in both directions"))
+    figure = max(unexplained, default=None)
+    return Verdict(not reasons, min(fits, default=None), tuple(reasons), figure, tuple(unique))
+
+
+class HeldOutPool(NamedTuple):
+    """The ``outcomes`` as held-out moves show them, their pool, and its residual of moves it was not identified on.
+
+    ``loops`` are the drive's own where the configured ones do not explain its moves.
+    """
+
+    outcomes: Sequence[WindowOutcome]
+    estimate: Estimate | None
+    verdict: Verdict
+    held_out: HeldOut | None
+    loops: LoopEstimate | None
+
+
+def pool_with_held_out(
+    outcomes: Sequence[WindowOutcome],
+    settings: Identification,
+    axis: Axis | None = None,
+    loops: LoopEstimate | None = None,
+    sync_period_s: float | None = None,
+) -> HeldOutPool:
+    """Pool the accepted windows, and validate each by the pool of the others.
+
+    That needs the loops of the drive: ``axis`` with the ``loops`` that were identified, if they explain more. A window
+    that was refused because its own model does not explain its replay is accepted if the model of the others predicts
+    it to the tolerance; its reasons become warnings. If not, the loops are identified again with the pool's mechanics:
+    moves in both directions separate a load from friction. A pool that does not predict each of its moves is not
+    validated; one that does is not refused because the winding's R or L changes between them.
+    """
+    estimate, verdict = pool(outcomes, settings)
+    mine = own(outcomes[0].window, axis) if outcomes else None
+    if mine is None and verdict.accepted:
+        verdict = replace(verdict, warnings=(*verdict.warnings, SCALE_UNPROVEN))
+    if mine is None or sync_period_s is None:
+        return HeldOutPool(outcomes, estimate, verdict, None, loops)
+    best = better_axis(mine, loops) or mine
+    trial = [_accepted(o) if _is_doubtful(o) else o for o in outcomes]
+    if any(map(_is_doubtful, outcomes)) and (all_moves := pool(trial, settings)[0]) is not None:
+        predicted = _judged(trial, all_moves, best, sync_period_s)[1]
+        if not all(is_predicted(p, settings) for o, p in zip(trial, predicted, strict=True) if o.verdict.accepted):
+            windows = [_on_time(o, mine, sync_period_s) for o in trial if o.verdict.accepted]
+            plants = [all_moves.parameters()] * len(windows)
+            found = identify_loops(windows, plants, mine, settings, sync_period_s)
+            if (better := better_axis(mine, found)) is not None:
+                best, loops = better, found
+                predicted = _judged(trial, all_moves, best, sync_period_s)[1]
+        kept = [t if is_predicted(p, settings) else o for o, t, p in zip(outcomes, trial, predicted, strict=True)]
+        outcomes = kept
+        estimate, verdict = pool(outcomes, settings)
+    estimate, predicted = _judged(outcomes, estimate, best, sync_period_s)
+    held = worst_of(predicted)
+    reason = None if held is None else held_out_reason(held, settings)
+    if reason is not None and verdict.accepted:
+        verdict = replace(verdict, accepted=False, reasons=(reason,))
+    elif held is not None and reason is None and all(map(is_of_winding, verdict.reasons)):
+        if verdict.reasons and estimate is not None:
+            estimate = _with_spread(estimate, outcomes)
+        verdict = replace(verdict, accepted=True, reasons=(), warnings=(*verdict.warnings, *verdict.reasons))
+    return HeldOutPool(outcomes, estimate, verdict, held, loops)
+
+
+def _with_spread(estimate: Estimate, outcomes: Sequence[WindowOutcome]) -> Estimate:
+    covariance = estimate.covariance.copy()
+    for name in WINDING:
+        values = [o.estimate.value(name) for o in outcomes if o.verdict.accepted and o.estimate is not None]
+        k = estimate.names.index(name)
+        covariance[k, k] += float(np.nanvar(values))
+    return replace(estimate, covariance=frozen(covariance))
+
+
+def _judged(
+    outcomes: Sequence[WindowOutcome], estimate: Estimate | None, axis: Axis, sync_period_s: float
+) -> tuple[Estimate | None, list[Replay | None]]:
+    """Return the pool with its presliding, and each accepted outcome's replay by the pool of the others."""
+    moves: list[Move] = [
+        (_on_time(o, axis, sync_period_s), o.estimate)
+        for o in outcomes
+        if o.verdict.accepted and o.estimate is not None
+    ]
+    if estimate is None or not moves:
+        return estimate, [None] * len(outcomes)
+    estimate = with_presliding(estimate, [window for window, _ in moves], axis, sync_period_s)
+    replays = iter(predict_held_out(moves, estimate, axis, sync_period_s))
+    return estimate, [next(replays) if o.verdict.accepted and o.estimate is not None else None for o in outcomes]
+
+
+def _on_time(outcome: WindowOutcome, axis: Axis, sync_period_s: float) -> Window:
+    """Return the window with the demand that the drive follows, where the recorded one is ahead of it."""
+    if all(warning.code != "SampleTiming" for warning in outcome.verdict.warnings):
+        return outcome.window
+    return with_demand_on_time(outcome.window, axis, sync_period_s)[0]
+
+
+def _is_doubtful(outcome: WindowOutcome) -> bool:
+    """Return whether a window was refused for its own model's replay alone: others may separate load and friction."""
+    codes = {reason.code for reason in outcome.verdict.reasons}
+    return outcome.estimate is not None and LOOPS_DIFFER in codes and codes <= OF_ONE_MOVE
+
+
+def _accepted(outcome: WindowOutcome) -> WindowOutcome:
+    verdict = outcome.verdict
+    warnings = (*verdict.warnings, *verdict.reasons)
+    return replace(outcome, verdict=replace(verdict, accepted=True, reasons=(), warnings=warnings))
