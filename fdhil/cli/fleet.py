@@ -105,7 +105,7 @@ def _answer(fleet: Path, question: str, **given: str | None) -> dict[str, Any]:
     with with_extra():
         from fdhil.fleet import questions, sets
     with sets.asking(settings) as db:
-        answer: dict[str, Any] = getattr(questions, question)(db, **given)
+        answer: dict[str, Any] = questions.QUERIES[question](db, **given)
     return answer
 
 

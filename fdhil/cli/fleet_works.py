@@ -129,7 +129,7 @@ def web(fleet: Path, host: str | None, port: int | None, as_json: bool) -> None:
 
     def ask(question: str, **given: str | None) -> Any:
         with sets.asking(settings) as db:
-            return getattr(questions, question)(db, **given)
+            return questions.QUERIES[question](db, **given)
 
     own = placed(settings.web, host, port)
     serving.serve(own, lambda: make_fleet_app(own, ask), lambda url: tell_ready("all machines", url, as_json))

@@ -15,7 +15,8 @@ import pytest
 from fdhil.cli import fleet_view
 from fdhil.fleet.export import KEY_BYTES, export
 from fdhil.fleet.message import Message, digest_of
-from fdhil.fleet.questions import compare, outliers, services, status, trend
+from fdhil.fleet.questions import compare, outliers, status, trend
+from fdhil.fleet.services import services
 from fdhil.fleet.sets import asking, entered
 from tests.fleet.machine import Machine, written
 from tests.fleet.servers import Postgres

@@ -77,8 +77,8 @@ async def test_first_the_database_then_the_answer(collector: Collector, monkeypa
     log: list[str] = []
 
     async def write(self: Collector, received: Sequence[Received], db: object) -> None:
-        assert [each.told.reason for each in received if isinstance(each.told, Unread)] == [
-            "it does not begin as a fdhil-record-1 does"
+        assert [each.content.reason for each in received if isinstance(each.content, Unread)] == [
+            "it has no fdhil-record-1 header"
         ]
         log.append("written")
 

@@ -28,7 +28,7 @@ def test_a_key_is_made_once_and_kept_from_others(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="read by others"):
         key_of(tmp_path / "key")
     (tmp_path / "short").touch(0o600)
-    with pytest.raises(StoreError, match="no key"):
+    with pytest.raises(StoreError, match="not a valid key"):
         key_of(tmp_path / "short")
 
 

@@ -111,7 +111,7 @@ async def test_a_user_whose_token_an_account_has_signed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", ["", "SUAA", "-----BEGIN NATS USER JWT-----\nx\n"])
 def test_a_file_without_a_seed_is_told_before_anything_is_tried(content: str, tmp_path: Path) -> None:
     (tmp_path / "creds").write_text(content)
-    with pytest.raises(ConnectError, match="holds no user's seed"):
+    with pytest.raises(ConnectError, match="contains no user seed"):
         transport.check_credentials(NatsServer(credentials_file=tmp_path / "creds"), "uplink")
     with pytest.raises(ConnectError, match="cannot be used"):
         transport.check_credentials(NatsServer(credentials_file=tmp_path / "none"), "uplink")

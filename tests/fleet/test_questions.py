@@ -185,9 +185,9 @@ async def test_a_record_that_the_database_does_not_take_is_put_aside_alone(
     machine.record(2)
     machine.close()
     received = received_of(told_by(machine)[:13])
-    record = received[bad].told
+    record = received[bad].content
     assert isinstance(record, Record)
-    received[bad] = received[bad]._replace(told=record._replace(text='{"text": "\\u0000"}'))
+    received[bad] = received[bad]._replace(content=record._replace(text='{"text": "\\u0000"}'))
     await keep(fleet_of(database, tmp_path), received)
     assert database.ask("SELECT count(*) FROM fleet.records") == [(12,)]
     ((subject, reason, payload),) = database.ask("SELECT subject, reason, payload FROM fleet.refused")

@@ -206,7 +206,7 @@ def test_on_a_cluster_that_is_there_and_goes_away(
         scheduler.kill()
         _, err = again.communicate(timeout=180)
     assert again.returncode == 3
-    assert "what is done stays" in err
+    assert "completed windows are kept" in err
     assert len(err.splitlines()) == 1
 
 

@@ -114,10 +114,10 @@ class TestWithADatabase:
             objects.keep(works.objects.directory, name, b"window")
             os.utime(objects.path_of(works.objects.directory, name), (1.0, 1.0))
         await keep(works, told)
-        last = told[-1].told
+        last = told[-1].content
         assert isinstance(last, Record)
         for name, at in ((names[0], MONTHS[1]), (names[1], datetime(2026, 5, 10, tzinfo=UTC)), (names[2], NOW)):
-            await keep(works, [told_at(told[-1]._replace(told=last._replace(message=name, window=None)), at)])
+            await keep(works, [told_at(told[-1]._replace(content=last._replace(message=name, window=None)), at)])
             database.ask(f"UPDATE fleet.records SET window_name = '{name}' WHERE message = '{name}'")
         objects.keep(works.objects.directory, names[3], b"window")  # on its way: its row is not there yet
         found = let_go(works)

@@ -75,7 +75,7 @@ class Shop:
             log.unlink(missing_ok=True)
             with running(log, "uplink", self.files[name]) as process:
                 until(lambda: "all that was recorded is sent" in process.said, "it has sent all")
-            if "no offers can be fetched" not in log.read_text():
+            if "offers cannot be fetched" not in log.read_text():
                 break
 
     def lying(self, name: str) -> list[str]:
@@ -108,7 +108,7 @@ async def shop(tmp_path: Path, database: Postgres, capsys: Any) -> AsyncIterator
 def collected(shop: Shop, tmp_path: Path) -> Iterator[Shop]:
     """The works while its collector runs."""
     with running(tmp_path / "collect.log", "fleet", "collect", shop.fleet) as collector:
-        until(lambda: "the server and the database are there" in collector.said, "it collects")
+        until(lambda: "connected to the server and the database" in collector.said, "it collects")
         yield shop
 
 
@@ -167,7 +167,7 @@ def test_a_version_is_one_change_and_only_rises(shop: Shop) -> None:
     shop.change.write_text(CHANGE.replace("0.061", "0.07"))
     assert "with other values" in shop.stage(1)["error"]["text"]
     shop.change.write_text(CHANGE.replace("version = 3", "version = 2"))
-    assert "give the file version 4" in shop.stage(1)["error"]["text"]
+    assert "set version = 4 in the file" in shop.stage(1)["error"]["text"]
     shop.change.write_text(CHANGE.replace("version = 3", "version = 4").replace("V-800", "V-900"))
     assert shop.stage(0)["left"] == []
     assert "no machine left" in shop.opened(1)["error"]["text"]
@@ -260,4 +260,4 @@ async def test_without_the_right_or_the_stream_what_lies_there_stays(
     for _ in range(2):
         letterbox._next_s = 0.0
         assert await look(config, letterbox, timeout_s=1.0) == ["friction-3.offer"]  # it is never answered
-    assert capfd.readouterr().err.count("no offers can be fetched") == 1
+    assert capfd.readouterr().err.count("offers cannot be fetched") == 1

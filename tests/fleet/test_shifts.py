@@ -69,8 +69,10 @@ async def test_of_each_shift_the_newest_set_is_kept_however_it_comes(
 
 async def test_a_set_that_is_none_hides_no_other(works: Fleet, database: Postgres, tmp_path: Path) -> None:
     received = told(tmp_path / "mill-1", 1)
-    sets = [each.told for each in received if isinstance(each.told, Record) and each.told.kind == "parameters"]
-    lost = received[-1]._replace(told=sets[0]._replace(sequence=99, message="f" * 64, text='{"left_out": "damaged"}'))
+    sets = [each.content for each in received if isinstance(each.content, Record) and each.content.kind == "parameters"]
+    lost = received[-1]._replace(
+        content=sets[0]._replace(sequence=99, message="f" * 64, text='{"left_out": "damaged"}')
+    )
     await keep(works, [*received, lost])
     assert {row[5] for row in database.ask(KEPT)} == {each.sequence for each in sets}
 

@@ -151,7 +151,7 @@ def test_what_the_server_has_no_room_for_stays_on_the_machine(tmp_path: Path, da
         file = written(tmp_path / "mill", "mill-1", server=server.url, windows="all")
         works = of_the_works(tmp_path, server, database, max_bytes=1 << 17)
         with running(tmp_path / "first.log", "fleet", "collect", works) as collector:  # makes the stream
-            until(lambda: "the server and the database are there" in collector.said, "the stream is there")
+            until(lambda: "connected to the server and the database" in collector.said, "the stream is there")
         machine = Machine(file)
         expected = machine.record(16)
         log = tmp_path / "uplink.log"

@@ -110,7 +110,7 @@ def test_a_worker_with_other_code_or_without_the_windows_is_refused(windows: lis
     method = rapids.method(tmp_path / "objects")
     with pytest.raises(FdhilError, match="has another fdhil"):
         analyse_again(windows, Method(method.settings, {}, method.folder, "of another"))
-    with pytest.raises(FdhilError, match="does not see"):
+    with pytest.raises(FdhilError, match="cannot read"):
         analyse_again(windows, rapids.method(tmp_path / "elsewhere"))
 
 

@@ -66,9 +66,9 @@ async def test_many_collectors_with_the_same_records_keep_each_once(
 async def test_a_text_is_in_the_database_as_it_came(
     text: str, works: Fleet, told: list[Received], database: Postgres
 ) -> None:
-    record = told[1].told
+    record = told[1].content
     assert isinstance(record, Record)
     for _ in range(2):  # new, and known
-        await keep(works, [told[0], told[1]._replace(told=record._replace(text=text))])
+        await keep(works, [told[0], told[1]._replace(content=record._replace(text=text))])
     ((found,),) = database.ask(f"SELECT record FROM fleet.records WHERE message = '{record.message}'")
     assert found == json.loads(text)

@@ -74,15 +74,15 @@ async def keep(fleet: Fleet, received: Sequence[Received]) -> None:
 
 def told_at(received: Received, at: datetime, stored: datetime | None = None) -> Received:
     """Return what was received as recorded at a time, and stored then or later."""
-    assert isinstance(received.told, Record)
-    return received._replace(stored_at=stored or at, told=received.told._replace(recorded_at=at))
+    assert isinstance(received.content, Record)
+    return received._replace(stored_at=stored or at, content=received.content._replace(recorded_at=at))
 
 
 def at_days(machine: Machine, begin: datetime) -> list[Received]:
     """Return what a machine told, one round of its records each day."""
     received, windows = [], Counter[str]()
     for each in received_of(told_by(machine)):
-        assert isinstance(each.told, Record)
-        windows[each.told.axis] += each.told.kind == "window"
-        received.append(told_at(each, begin + timedelta(days=max(windows[each.told.axis] - 1, 0))))
+        assert isinstance(each.content, Record)
+        windows[each.content.axis] += each.content.kind == "window"
+        received.append(told_at(each, begin + timedelta(days=max(windows[each.content.axis] - 1, 0))))
     return received
