@@ -1,4 +1,4 @@
-"""Spoils a reported signal as a fault script orders it."""
+"""Falsifies a reported signal as ordered by a fault script."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -10,8 +10,8 @@ import numpy as np
 class SignalFault:
     """Errors of one reported signal, in its own unit; applied in this order.
 
-    ``delay_cycles``: slow. ``gain``, ``offset``: wrong. ``clip``: saturates at +-clip. ``resolution``: coarse.
-    ``garbage``: random values of up to +-``garbage``. ``stuck``: the last value for ever.
+    ``delay_cycles``: delay. ``gain``, ``offset``: scaling. ``clip``: saturation at +-clip. ``resolution``:
+    quantisation. ``garbage``: random values of up to +-``garbage``. ``stuck``: the last value for ever.
     """
 
     delay_cycles: int = 0
@@ -25,7 +25,7 @@ class SignalFault:
     _held: float | None = field(default=None, repr=False, compare=False)
 
     def apply(self, value: float, rng: np.random.Generator) -> float:
-        """Return what is reported for ``value``."""
+        """Return the reported value for ``value``."""
         if self.delay_cycles:
             self._late.append(value)
             value = self._late[0]

@@ -1,4 +1,4 @@
-"""Simulates what is mounted at a table: an encoder node on the bus and an accelerometer that streams lines of text."""
+"""Simulates the sensors at a table: an encoder node on the bus and an accelerometer that streams lines of text."""
 
 import math
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ LIMITS = {
     "uint32": (0, 2**32 - 1),
 }
 _NOISE_BLOCK = 1024
-OFF_RATE = 1.007  # of the nominal rate: the sensor's oscillator is no quartz
-TILT_M_S2 = 0.3  # what a sensor that is not quite level has of the earth's
+OFF_RATE = 1.007  # of the nominal rate: the sensor has an RC oscillator
+TILT_M_S2 = 0.3  # share of gravity in a slightly tilted sensor
 KEPT_LINES = 2000
 WITHOUT_SYNC_S = 0.05
-MOST_CYCLES = 200  # that are made up for at a time
-SEED = 406  # beside the machine's: the other sensors' noise stays what it is without these
+MOST_CYCLES = 200  # limit of cycles made up at once
+SEED = 406  # added to the machine's seed, so that the other sensors' noise does not change
 
 
 class _Noise:
@@ -34,14 +34,13 @@ class _Noise:
         self._drawn: list[float] = []
 
     def next(self) -> float:
-        """Return the next value."""
         if not self._drawn:
             self._drawn = (self._rng.standard_normal(_NOISE_BLOCK) * self._std).tolist()
         return self._drawn.pop()
 
 
 class EncoderNode:
-    """A CANopen encoder (CiA 406) whose TPDO carries the table's place at every SYNC; it starts by itself."""
+    """A CANopen encoder (CiA 406) whose TPDO carries the table position at every SYNC; it starts by itself."""
 
     def __init__(self, settings: TableEncoder, noise_um: float, rng: np.random.Generator) -> None:
         assert settings.cob_id is not None
@@ -60,7 +59,7 @@ class EncoderNode:
         return [(0x700 + self.node_id, b"\0")]
 
     def receive(self, can_id: int, data: bytes) -> list[Frame]:
-        """Obey an NMT command and return what is sent because of it."""
+        """Execute an NMT command and return the answer."""
         if can_id != 0 or len(data) != 2 or data[1] not in (0, self.node_id):
             return []
         if data[0] in (0x81, 0x82):
@@ -76,7 +75,7 @@ class EncoderNode:
         return [(0x700 + self.node_id, bytes([self.nmt]))]
 
     def at_sync(self, table_mm: float) -> list[Frame]:
-        """Return the TPDO with the place at this SYNC; a count beyond its type begins anew, as counters do."""
+        """Return the TPDO with the position at this SYNC; counts beyond the type wrap around."""
         if self.nmt != OPERATIONAL:
             return []
         s = self._settings
@@ -88,9 +87,9 @@ class EncoderNode:
 
 
 class TableAccelerometer:
-    """An accelerometer that streams a line per sample: the mean of its interval, in counts; :meth:`take` hands it out.
+    """An accelerometer that streams a line per sample: the mean over its interval, in counts.
 
-    It samples by the simulated time and with its own oscillator.
+    It samples in simulated time, with its own oscillator.
     """
 
     def __init__(self, settings: Accelerometer, period_s: float, noise_m_s2: float, rng: np.random.Generator) -> None:
@@ -105,7 +104,7 @@ class TableAccelerometer:
         self._lines: list[str] = []
 
     def at_sync(self, speed_m_s: float) -> None:
-        """Take the table's speed at a SYNC; between two it is a line."""
+        """Process the table's speed at a SYNC, interpolated linearly between SYNCs."""
         before, self._speed = self._speed, speed_m_s
         self._cycle += 1
         while self._next <= self._cycle:
@@ -125,7 +124,7 @@ class TableAccelerometer:
             self._lines.append(",".join(numbers))
 
     def take(self) -> bytes:
-        """Return the lines since the last time."""
+        """Return the lines since the last call."""
         if not self._lines:
             return b""
         lines, self._lines = self._lines, []
@@ -133,7 +132,7 @@ class TableAccelerometer:
 
 
 class TableSensors:
-    """All sensors at the tables of one machine, by axis."""
+    """All table sensors of one machine, by axis."""
 
     def __init__(self, config: MachineConfig) -> None:
         noise, period_s = config.sim.noise, config.machine.sync_period_s
@@ -145,8 +144,8 @@ class TableSensors:
         self._synced, self._streamed_s = False, 0.0
         self._encoders: dict[str, EncoderNode] = {}
         self.accelerometers: dict[str, TableAccelerometer] = {}
-        for place, (axis, section) in enumerate(config.axis.items()):
-            seeds = np.random.SeedSequence([config.sim.seed, SEED, place]).spawn(2)
+        for n, (axis, section) in enumerate(config.axis.items()):
+            seeds = np.random.SeedSequence([config.sim.seed, SEED, n]).spawn(2)
             rngs = [np.random.default_rng(seed) for seed in seeds]
             if section.table is not None and section.table.source == "canopen":
                 self._encoders[axis] = EncoderNode(section.table, noise.table_um, rngs[0])
@@ -155,7 +154,7 @@ class TableSensors:
                 self.accelerometers[axis] = TableAccelerometer(settings, period_s, noise.table_m_s2, rngs[1])
 
     def frame_bytes(self, bus: str) -> list[int]:
-        """Return the data bytes of what the encoders of a bus send at every SYNC."""
+        """Return the sizes of the encoder frames of a bus per SYNC, bytes."""
         return [node.frame_bytes for axis, node in self._encoders.items() if self._bus[axis] == bus]
 
     def power_on(self) -> list[BusFrame]:
@@ -163,13 +162,13 @@ class TableSensors:
         return [(self._bus[axis], frame) for axis, node in self._encoders.items() for frame in node.power_on()]
 
     def receive(self, bus: str, frame: Frame) -> list[Frame]:
-        """Take a frame from a bus and return what its encoders send because of it."""
+        """Process a frame of a bus and return the answers of its encoders."""
         if frame[0] != 0:
             return []
         return [one for axis, node in self._encoders.items() if self._bus[axis] == bus for one in node.receive(*frame)]
 
     def wall_clock(self, now_s: float, alone: Sequence[Drive]) -> list[BusFrame]:
-        """Return the heartbeats that are due; accelerometers stream on at drives that no SYNC keeps the time of."""
+        """Return the due heartbeats; accelerometers of drives without SYNC keep streaming."""
         if self._synced:
             self._synced, self._streamed_s = False, now_s
         elif now_s - self._streamed_s > WITHOUT_SYNC_S:
@@ -180,7 +179,7 @@ class TableSensors:
         return [(self._bus[axis], one) for axis, node in self._encoders.items() for one in node.wall_clock(now_s)]
 
     def at_sync(self, drive: Drive, table_rad_s: float) -> list[Frame]:
-        """Return what an axis' encoder sends at a SYNC at which its table has this speed."""
+        """Sample an axis at a SYNC with this table speed; return its encoder's frame."""
         self._synced = True
         self._stream(drive.axis, table_rad_s)
         encoder = self._encoders.get(drive.axis)

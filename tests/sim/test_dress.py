@@ -291,7 +291,7 @@ def test_the_nc_leads_a_drive_by_the_mapping_that_it_has(tmp_path: Path) -> None
     twin.switch_on()
     twin.run(20)
     (error,) = [event["text"] for event in twin.events if event["event"] == "error"]
-    assert error.startswith("drive X has 6064 in no PDO")
+    assert error.startswith("drive X maps 6064 in no PDO")
     rig = Rig.of(twin.machine.units["X"].drive)
     remap(rig, 0x1800, 0x181, 255, 0x60410010)
     remap(rig, 0x1802, 0x381, 2, 0x30D10220, 0x60640020)

@@ -213,7 +213,7 @@ def test_temperature_moves_the_friction() -> None:
     rig.drive.set_temperature(30.0)
     assert rig.drive.physics.parameters.ft == 0.0
     for wrong in ({"Jt": 0.0}, {"R": float("nan")}, {"ft": -1.0}):
-        with pytest.raises(ValueError, match="no value of a feed drive"):
+        with pytest.raises(ValueError, match="is unphysical"):
             rig.drive.set_parameters(**wrong)
     with pytest.raises(TypeError):
         rig.drive.set_parameters(mass=1.0)

@@ -120,10 +120,10 @@ def test_a_share_of_the_frames_is_what_is_asked_for() -> None:
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
-        ({"kind": "los"}, "'los' is none of drop"),
-        ({"kind": "mutate", "value": 65}, "bits that are turned over: 65 is not among"),
-        ({"kind": "delay", "value": 1.5}, "no whole number"),
-        ({"kind": "drop", "percent": 0}, "no percentage"),
+        ({"kind": "los"}, "unknown fault 'los'; the faults are drop"),
+        ({"kind": "mutate", "value": 65}, "bits that are flipped"),
+        ({"kind": "delay", "value": 1.5}, "not a whole number"),
+        ({"kind": "drop", "percent": 0}, "percent is 0"),
         ({"kind": "inject", "data": bytes(9), "can_ids": {1}}, "at most 8"),
         ({"kind": "inject"}, "one identifier"),
     ],

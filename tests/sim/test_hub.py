@@ -197,7 +197,7 @@ def _until_closed(connection: socket.socket) -> bytes:
 def test_a_port_in_use_is_one_sentence() -> None:
     hub = Hub("can0")
     try:
-        with pytest.raises(ConnectError, match=rf"bus can0: TCP port {hub.port} .* cannot be had"):
+        with pytest.raises(ConnectError, match=rf"bus can0: TCP port {hub.port} .* cannot be opened"):
             Hub("can0", port=hub.port)
     finally:
         hub.close()

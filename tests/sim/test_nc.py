@@ -210,7 +210,7 @@ def test_a_silent_drive_stops_the_path() -> None:
     twin = TwinInHand(twin_config())
     twin.switch_on()
     twin.machine.units["Y"].power(False)
-    assert "drive Y sends no statusword" in twin.run_until("error")["text"]
+    assert "drive Y stopped sending its statusword" in twin.run_until("error")["text"]
 
 
 def test_switching_off_disables_the_drives_and_frees_the_bus() -> None:

@@ -96,5 +96,5 @@ def test_warmth_and_a_changed_plant_keep_what_reality_adds() -> None:
     assert rig.drive.physics.parameters.Cd == pytest.approx(4.0)
     rig.drive.set_parameters(Jt=0.09)
     assert rig.drive.physics.parameters.Jt == 0.09
-    with pytest.raises(TypeError, match="load is no parameter"):
+    with pytest.raises(TypeError, match="load: not a parameter"):
         rig.drive.set_parameters(load=1.0)

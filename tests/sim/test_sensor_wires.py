@@ -56,7 +56,7 @@ def test_units_of_one_line_and_what_is_said_of_them(tmp_path: Path) -> None:
 def test_a_device_that_is_there_is_not_taken_away(tmp_path: Path) -> None:
     there = tmp_path / "ttyUSB0"
     there.write_text("a real one")
-    with pytest.raises(ConnectError, match="name one that is not there yet"):
+    with pytest.raises(ConnectError, match="choose an unused name"):
         SerialLines({str(there): RtuUnits()}).start()
     assert there.read_text() == "a real one"
 

@@ -323,7 +323,7 @@ def test_wrong_scripts_and_options_are_exit_code_2(failing: Callable[..., tuple[
     script.write_text("[[fault]]\nfault = 'meteor'\n")
     code, text = failing(path, "--faults", script)
     assert code == 2
-    assert "'meteor' is none of" in text
+    assert "unknown fault 'meteor'" in text
     code, text = failing(path, "--demand", "a.csv", "--program", "b.ngc")
     assert code == 2
     assert "not both" in text

@@ -123,5 +123,5 @@ def test_a_stream_is_a_device_that_goes_with_the_simulator(tmp_path: Path) -> No
     port.close()
     assert not device.is_symlink()
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(ConnectError, match="is there already"):
+    with pytest.raises(ConnectError, match="already exists"):
         StreamPort("accelerometer X", str(tmp_path / "file"))

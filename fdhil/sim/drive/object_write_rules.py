@@ -1,4 +1,4 @@
-"""Gives SDO writes to the drive their meaning beyond storing the value: rules and actions by object."""
+"""Registers rules and actions for SDO writes to the drive's objects."""
 
 from collections.abc import Callable
 
@@ -14,21 +14,21 @@ _NOT_STORED = frozenset({0x1003, 0x1010, 0x1011, 0x6040, 0x6060, 0x607A, 0x60B0,
 
 
 class StoredParameters:
-    """The non-volatile memory behind 0x1010 and 0x1011: values that a boot starts with instead of the defaults."""
+    """The non-volatile memory behind 0x1010 and 0x1011: power-on values that replace the defaults."""
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
         self._values: dict[Entry, int] = {}
 
     def restore(self, which: Callable[[Entry], bool]) -> None:
-        """Give the chosen entries their defaults, or what was saved."""
+        """Set the chosen entries to their saved or default values."""
         self._dictionary.reset(which)
         self._dictionary.numbers.update({e.place: v for e, v in self._values.items() if which(e)})
         for call in self._dictionary.restored:
             call()
 
     def save(self) -> None:
-        """Keep all parameters; set-points and the controlword are none."""
+        """Save all parameters, without set-points and controlword."""
         self._values = {
             entry: self._dictionary.numbers[entry.place]
             for entry in self._dictionary.entries.values()
@@ -36,7 +36,7 @@ class StoredParameters:
         }
 
     def forget(self) -> None:
-        """Boot with the defaults next time."""
+        """Discard the saved values: the next boot uses the defaults."""
         self._values = {}
 
 
@@ -50,8 +50,11 @@ def register_write_rules(
     on_controlword: Callable[[], None],
     on_communication: Callable[[], None],
 ) -> None:
-    """Attach the rules. ``changeable`` says whether the drive is pre-operational, ``powered`` whether current flows;
-    ``on_controlword`` and ``on_communication`` are called after a write of 0x6040 or 0x6060 and of 0x1005."""
+    """Attach the rules.
+
+    ``changeable`` returns whether the drive is pre-operational, ``powered`` whether current flows; ``on_controlword``
+    and ``on_communication`` are called after a write to 0x6040 or 0x6060 and to 0x1005.
+    """
 
     def at_rest(_entry: Entry, _value: int) -> None:
         if not changeable():
@@ -59,7 +62,7 @@ def register_write_rules(
 
     def sync_id(entry: Entry, value: int) -> None:
         at_rest(entry, value)
-        if value & ~0x7FF or value == 0:  # it consumes SYNC and does not produce it
+        if value & ~0x7FF or value == 0:  # the drive consumes SYNC and never produces it
             raise TransferAbort(AbortCode.RANGE)
 
     def counter_overflow(entry: Entry, value: int) -> None:
@@ -72,7 +75,7 @@ def register_write_rules(
             raise TransferAbort(AbortCode.RANGE)
 
     def without_power() -> None:
-        if powered():  # writing flash takes longer than the loops can wait
+        if powered():  # writing to flash would stall the loops
             raise TransferAbort(AbortCode.DEVICE_STATE)
 
     def save() -> None:
@@ -90,7 +93,7 @@ def register_write_rules(
 
     def interpolation_time(entry: Entry, value: int) -> None:
         cycle = entry.default
-        if entry.low is not None and isinstance(cycle, int) and value % cycle:  # whole cycles of the drive
+        if entry.low is not None and isinstance(cycle, int) and value % cycle:  # must be whole drive cycles
             raise TransferAbort(AbortCode.RANGE)
 
     def homing_method(_entry: Entry, value: int) -> None:
@@ -123,7 +126,7 @@ def register_write_rules(
             0x606000: lambda _: on_controlword(),
         }
     )
-    # the capability, whatever was written: parameters are saved on command
+    # reads return the capability: parameters are saved on command
     dictionary.read_hooks.update({0x101001: lambda: 1, 0x101101: lambda: 1, 0x212000: trace.content})
 
 
