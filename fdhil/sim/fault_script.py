@@ -48,7 +48,7 @@ def parse(item: object, axes: tuple[str, ...]) -> FaultEntry:
         ]
         raise ConfigError("fault", faults) from None
     if entry.axis is not None and entry.axis not in axes:
-        raise ConfigError("fault", [ConfigFault("axis", f"there is no axis {entry.axis!r}", f"use {', '.join(axes)}")])
+        raise ConfigError("fault", [ConfigFault("axis", f"unknown axis {entry.axis!r}", f"use {', '.join(axes)}")])
     return entry
 
 

@@ -125,7 +125,7 @@ def test_any_modbus_client_reads_the_sensor(twin: TwinProcess) -> None:
 
 def test_panel_mistakes_are_events(twin: TwinProcess, tmp_path: Path) -> None:
     twin.command("dance")
-    assert "no command 'dance'" in twin.event("error")["text"]
+    assert "unknown panel command 'dance'" in twin.event("error")["text"]
     twin.command("play", file=str(tmp_path / "missing.csv"))
     assert "missing.csv" in twin.event("error")["text"]
 

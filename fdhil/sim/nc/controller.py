@@ -229,9 +229,7 @@ class NcController:
             link.wiring = self._wiring(link.axis)
             if link.wiring.missing:
                 what = " and ".join(link.wiring.missing)
-                self._give_up(
-                    f"drive {link.axis} maps {what} in no PDO; the NC stays off. Configure its mapping (0x1400 to 0x1BFF)"
-                )
+                self._give_up(f"drive {link.axis} maps {what} in no PDO: the NC stays off. Map it (0x1400 to 0x1BFF)")
                 return []
         self._by_answer = {(link.bus, pdo.cob_id): link for link in self._links for pdo in link.wiring.answers}
         self.phase, self._waited = Phase.ENABLE, 0
