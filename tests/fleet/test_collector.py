@@ -82,7 +82,7 @@ async def test_first_the_database_then_the_answer(collector: Collector, monkeypa
         ]
         log.append("written")
 
-    monkeypatch.setattr(Collector, "_write", write)
+    monkeypatch.setattr(Collector, Collector._write.__name__, write)
     await take(collector, told(log), Told("fdhil.v1.mill-1.records", b"{\n{}\n", log))
     assert log == ["written", "ack", "ack"]
     assert collector.kept == 2
@@ -96,7 +96,7 @@ async def test_what_is_not_in_the_database_is_given_back(collector: Collector, m
     async def write(self: Collector, received: Sequence[Received], db: object) -> None:
         raise psycopg.OperationalError("the disk is full")
 
-    monkeypatch.setattr(Collector, "_write", write)
+    monkeypatch.setattr(Collector, Collector._write.__name__, write)
     with pytest.raises(psycopg.OperationalError):
         await take(collector, told(log), told(log))
     assert (log, collector.kept) == (["nak", "nak"], 0)

@@ -92,7 +92,7 @@ async def test_a_forecast_is_made_once_a_day_and_when_a_service_is_new(
         looked.extend(axes)
         return really(db, axes, shares)
 
-    monkeypatch.setattr(forecasts, "_forecasts", looking)
+    monkeypatch.setattr(forecasts, really.__name__, looking)
 
     def asked() -> tuple[list[dict[str, Any]], list[Axis]]:
         looked.clear()

@@ -118,9 +118,9 @@ def test_a_worker_with_other_code_or_without_the_windows_is_refused(windows: lis
 def test_a_scheduler_that_is_not_there_is_told(tmp_path: Path) -> None:
     """In a process of its own: the library leaves a thread behind where it finds no scheduler."""
     (tmp_path / "fleet.toml").write_text("")
-    quick = "from fdhil.cli.main import main; from fdhil.fleet import workers; workers.CONNECT_S = 2; main()"
+    quick = f"from fdhil.cli.main import main; import {workers.__module__} as pools; pools.CONNECT_S = 2; main()"
     command = [sys.executable, "-c", quick, "fleet", "reanalyse", str(tmp_path / "fleet.toml")]
     told = subprocess.run([*command, "--scheduler", f"tcp://127.0.0.1:{free_port()}"], capture_output=True, text=True)
     assert (told.returncode, told.stdout) == (3, "")
-    assert "does not answer" in told.stderr
+    assert "does not respond" in told.stderr
     assert len(told.stderr.splitlines()) == 1

@@ -21,6 +21,7 @@ from fdhil.config import MachineConfig
 from fdhil.pipeline import AxisPipeline
 from fdhil.program import load_trajectory
 from fdhil.records import Notice, Outcome
+from fdhil.sim import service as sim_service
 from fdhil.sim.service import LOCKSTEP_HOLDING_WAIT_S, SimService
 from tests.bench import bench_document
 
@@ -134,7 +135,7 @@ def sections() -> dict[str, Any]:
 @pytest.fixture
 def bench(transport: str, sections: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
     """Serve the bench's twin on the transport; it waits for a guard that is held up with a zero, too."""
-    monkeypatch.setattr("fdhil.sim.service.LOCKSTEP_WAIT_S", LOCKSTEP_HOLDING_WAIT_S)
+    monkeypatch.setattr(sim_service, "LOCKSTEP_WAIT_S", LOCKSTEP_HOLDING_WAIT_S)
     document = bench_document() | sections
     TRANSPORTS[transport](document)
     events: queue.Queue[dict[str, Any]] = queue.Queue()

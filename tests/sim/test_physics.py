@@ -198,8 +198,8 @@ def test_the_kernel_runs_bit_by_bit_the_same_in_plain_python(monkeypatch: pytest
     for points in reference:
         compiled.cycle(True, command(points))
         compiled_rows.append((compiled.angle_rad, compiled.current_a, compiled.voltage_mean_v))
-    for name in ("run_cycle", "_step", "_coast"):
-        monkeypatch.setattr(physics, name, getattr(physics, name).py_func)
+    for kernel in (physics.run_cycle, physics._step, physics._coast):
+        monkeypatch.setattr(physics, kernel.py_func.__name__, kernel.py_func)
     for points in reference:
         plain.cycle(True, command(points))
         plain_rows.append((plain.angle_rad, plain.current_a, plain.voltage_mean_v))
