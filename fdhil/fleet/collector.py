@@ -28,14 +28,7 @@ from fdhil.errors import StoreError
 from fdhil.fleet import migrations, objects
 from fdhil.fleet.message import Record, Unread, decode
 from fdhil.fleet.migrations import NOTE_INCOMING, NOTE_SHIFTS
-from fdhil.fleet.transport import (
-    ERRORS,
-    cause_of,
-    check_credentials,
-    connected,
-    prepare_stream,
-    try_for_good,
-)
+from fdhil.fleet.transport import ERRORS, cause_of, check_credentials, connected, prepare_stream, try_for_good
 
 BATCH = 100  # messages per transaction
 AHEAD = timedelta(days=1)  # tolerated lead of a machine's clock over the server's

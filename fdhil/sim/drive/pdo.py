@@ -8,19 +8,7 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-from fdhil.sim.drive.dictionary import (
-    I8,
-    I16,
-    I32,
-    U8,
-    U16,
-    U32,
-    AbortCode,
-    DataType,
-    Dictionary,
-    Entry,
-    TransferAbort,
-)
+from fdhil.sim.drive.dictionary import I8, I16, I32, U8, U16, U32, AbortCode, DataType, Dictionary, Entry, TransferAbort
 from fdhil.sim.drive.objects import INVALID, NO_RTR
 from fdhil.sim.frame import Frame
 
