@@ -145,7 +145,6 @@ class Letterbox:
         return [of_answer(asdict(each), self._machine, store) for each in self._answers()]
 
     def told(self, count: int) -> None:
-        """Count answers as reported."""
         self._reported += count
 
     def _answers(self) -> list[Answer]:

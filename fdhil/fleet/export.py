@@ -124,5 +124,4 @@ def _write(
 
 
 def pseudonym(key: bytes, machine: str) -> str:
-    """Return the pseudonym under which a machine is exported."""
     return hmac.new(key, machine.encode(), hashlib.sha256).hexdigest()[:NAME_CHARS]

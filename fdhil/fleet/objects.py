@@ -9,7 +9,6 @@ from fdhil.store.atomic import make_folder, store_error, write_file
 
 
 def path_of(folder: Path, name: str) -> Path:
-    """Return the path of the window of that name."""
     return folder / name[:2] / f"{name}.parquet"
 
 

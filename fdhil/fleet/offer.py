@@ -89,7 +89,6 @@ class Offer(Change):
 
 
 def canonical(offer: Offer) -> bytes:
-    """Return the canonical line of an offer."""
     return json.dumps(offer.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 

@@ -193,7 +193,6 @@ def _weighed(judged: Judged, offer: Offer, machine: Present) -> Judged:
 
 
 def _loosened(old: MachineConfig, new: MachineConfig) -> Iterator[Changed]:
-    """Yield the guard's limits that become larger."""
     before = guard_limits(old)
     for name, value in guard_limits(new).items():
         if name not in before or value > before[name]:

@@ -49,8 +49,7 @@ class Scope:
     axis: str | None = None
 
 
-def unseen(done: int, total: int) -> None:
-    """Ignore the progress."""
+def unseen(done: int, total: int) -> None: ...
 
 
 def reanalyse(fleet: Fleet, method: Method, scope: Scope, pool: WindowCrew, progress: Progress = unseen) -> int:

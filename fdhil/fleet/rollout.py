@@ -69,8 +69,6 @@ def _flat(tables: Mapping[str, Any], place: str = "") -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """The response of a machine to an offered change."""
-
     machine: str
     stage: int
     answer: str

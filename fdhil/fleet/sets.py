@@ -62,7 +62,6 @@ def entered(fleet: Fleet) -> Iterator[Db]:
 
 
 def unreachable(error: psycopg.Error) -> ConnectError:
-    """Return the error for a database that cannot be opened or fails."""
     text = f"{' '.join(str(error).split())}; check [database] connection and that it is running"
     return ConnectError("PostgreSQL", text)
 
@@ -73,7 +72,6 @@ def axes_of(db: Db, axis: str | None = None) -> list[Axis]:
 
 
 def asked(axes: Sequence[Axis]) -> dict[str, list[str]]:
-    """Return axes as arguments of a query with OF_AXES."""
     return {"machines": [machine for machine, _ in axes], "axes": [axis for _, axis in axes]}
 
 
@@ -106,5 +104,4 @@ def known(value: float) -> float | None:
 
 
 def date_of(at: datetime) -> str:
-    """Return a time in ISO format, for JSON."""
     return at.isoformat(timespec="seconds")

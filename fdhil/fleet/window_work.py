@@ -25,8 +25,6 @@ LIBRARIES = ("numpy", "scipy", "numba", "pyarrow")
 
 
 class Stored(NamedTuple):
-    """A stored window and its machine."""
-
     machine: str
     name: str
 
@@ -100,7 +98,6 @@ def analyse_again(windows: Sequence[Stored], method: Method) -> list[Again]:
 
 
 def told(window: Stored, result: Mapping[str, Any]) -> Again:
-    """Return a result in its stored form."""
     text = json.dumps(result, sort_keys=True, allow_nan=False)
     return Again(window, text, hashlib.sha256(text.encode()).hexdigest())
 

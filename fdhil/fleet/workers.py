@@ -73,7 +73,6 @@ class Cluster(Executor):
         self.client = client
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Return the future of work submitted to a worker."""
         given = self.client.submit(fn, *args, pure=False, **kwargs)
 
         async def result() -> Any:

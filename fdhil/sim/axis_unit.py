@@ -22,8 +22,6 @@ class RpdoStream:
     late: int = 0
 
     def step(self, received: bool) -> None:
-        """Count a cycle in which the RPDO was received  or not."""
-
         if received:
             self.late += self.gap
             self.active, self.gap = True, 0
@@ -62,7 +60,6 @@ class AxisUnit:
         self.drive.on_cycle(self.cycle_ended)
 
     def power(self, on: bool) -> None:
-        """Switch the drive's supply on or off."""
         if on:
             self.outbox.extend((self.bus, frame) for frame in self.drive.power_on())
         else:

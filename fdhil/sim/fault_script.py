@@ -70,7 +70,6 @@ class FaultSchedule:
 
     @property
     def idle(self) -> bool:
-        """Whether there is nothing to start or to end."""
         return not self._waiting and not self._running
 
     def step(self, tick: int, row: int | None) -> list[FaultEntry]:

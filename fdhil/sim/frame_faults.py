@@ -104,7 +104,6 @@ class _Active:
     met: int = 0
 
     def meets(self, can_id: int, way: Way, sync: int) -> bool:
-        """Whether this frame is affected now."""
         fault = self.fault
         if (fault.way is not None and way != fault.way) or (fault.can_ids is not None and can_id not in fault.can_ids):
             return False
@@ -186,7 +185,6 @@ class FrameFaults:
         return passed
 
     def due(self, way: Way, now_s: float) -> list[Passed]:
-        """Return the delayed frames that are due now."""
         return self._released(lambda held: held.way == way and (held.sync <= self.sync or held.at_s <= now_s))
 
     def due_s(self) -> float:

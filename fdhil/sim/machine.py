@@ -265,7 +265,6 @@ class Machine:
     # -- played files
 
     def trace(self, path: Path) -> None:
-        """Record the next played file."""
         self._next_trace = path
 
     def _record(self, row: Row | None) -> None:
@@ -286,7 +285,6 @@ class Machine:
             self.events.append({"event": "error", "text": str(error)})
 
     def take_events(self) -> list[Event]:
-        """Return the events of machine and NC since the last call."""
         if self.nc.events:
             self._complete_events()
         events, self.events = self.events, []
@@ -327,7 +325,6 @@ class Machine:
         return str(recorder.path)
 
     def close(self) -> None:
-        """Discard an unfinished trace."""
         if self._recorder is not None:
             self._recorder.abandon()
             self._recorder = None

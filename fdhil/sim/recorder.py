@@ -46,7 +46,6 @@ class Recorder:
             raise _not_written(self.path, error) from None
 
     def abandon(self) -> None:
-        """Close and remove the partial file."""
         self._file.close()
         self._part.unlink(missing_ok=True)
 

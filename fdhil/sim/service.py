@@ -249,7 +249,6 @@ class SimService:
 
     @property
     def is_joined(self) -> bool:
-        """Whether another party is on the buses, as far as that is visible."""
         return any(bus.is_joined for bus in self._buses.values())
 
     def run(self, play: Path | None = None, trace: Path | None = None) -> None:

@@ -27,8 +27,6 @@ SEED = 406  # added to the machine's seed, so that the other sensors' noise does
 
 
 class _Noise:
-    """White noise, drawn in blocks."""
-
     def __init__(self, std: float, rng: np.random.Generator) -> None:
         self._std, self._rng = std, rng
         self._drawn: list[float] = []
@@ -54,12 +52,10 @@ class EncoderNode:
         self._due_s = 0.0
 
     def power_on(self) -> list[Frame]:
-        """Return the boot-up message."""
         self.nmt = OPERATIONAL
         return [(0x700 + self.node_id, b"\0")]
 
     def receive(self, can_id: int, data: bytes) -> list[Frame]:
-        """Execute an NMT command and return the answer."""
         if can_id != 0 or len(data) != 2 or data[1] not in (0, self.node_id):
             return []
         if data[0] in (0x81, 0x82):
@@ -68,7 +64,6 @@ class EncoderNode:
         return []
 
     def wall_clock(self, now_s: float) -> list[Frame]:
-        """Return the heartbeat when it is due."""
         if now_s < self._due_s:
             return []
         self._due_s = now_s + HEARTBEAT_S
@@ -124,7 +119,6 @@ class TableAccelerometer:
             self._lines.append(",".join(numbers))
 
     def take(self) -> bytes:
-        """Return the lines since the last call."""
         if not self._lines:
             return b""
         lines, self._lines = self._lines, []
@@ -132,8 +126,6 @@ class TableAccelerometer:
 
 
 class TableSensors:
-    """All table sensors of one machine, by axis."""
-
     def __init__(self, config: MachineConfig) -> None:
         noise, period_s = config.sim.noise, config.machine.sync_period_s
         self._bus = {axis: section.drive.bus for axis, section in config.axis.items()}
@@ -158,11 +150,9 @@ class TableSensors:
         return [node.frame_bytes for axis, node in self._encoders.items() if self._bus[axis] == bus]
 
     def power_on(self) -> list[BusFrame]:
-        """Return the boot-up messages."""
         return [(self._bus[axis], frame) for axis, node in self._encoders.items() for frame in node.power_on()]
 
     def receive(self, bus: str, frame: Frame) -> list[Frame]:
-        """Process a frame of a bus and return the answers of its encoders."""
         if frame[0] != 0:
             return []
         return [one for axis, node in self._encoders.items() if self._bus[axis] == bus for one in node.receive(*frame)]

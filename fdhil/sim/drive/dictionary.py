@@ -115,7 +115,6 @@ class Entry:
 
     @property
     def place(self) -> int:
-        """The key under which its value is stored."""
         return self.key if self.home is None else self.home
 
     @property
@@ -125,7 +124,6 @@ class Entry:
 
     @property
     def signed(self) -> bool:
-        """Whether it is an INTEGER type."""
         return self.type in SIGNED
 
     def renumbered(self, by: int) -> Entry:
@@ -136,7 +134,6 @@ class Entry:
 
     @property
     def limited(self) -> bool:
-        """Whether it accepts only some numbers of its type."""
         return (self.low, self.high, self.choice) != (None, None, None)
 
     def encode(self, value: Value) -> bytes:
@@ -230,7 +227,6 @@ class Dictionary:
         self.reset(lambda _: True)
 
     def reset(self, which: Callable[[Entry], bool]) -> None:
-        """Reset the chosen entries to their defaults."""
         for entry in (*self._within, *self.entries.values()):
             if which(entry):
                 self._store(entry, entry.default)
@@ -255,11 +251,9 @@ class Dictionary:
         return found
 
     def number(self, index: int, sub: int = 0) -> int:
-        """Return the value of a number."""
         return self.numbers[index << 8 | sub]
 
     def shown(self, entry: Entry) -> int:
-        """Return the value of an entry in counts on the wire."""
         return entry.counts(self.numbers[entry.place])
 
     def read(self, index: int, sub: int) -> bytes:

@@ -71,7 +71,6 @@ class Gauge:
     magnitude: bool = False
 
     def counts(self, value: float) -> int:
-        """Convert a value to counts of the object."""
         return self.entry.counts(round((abs(value) if self.magnitude else value) / self.per_count))
 
     def unit(self, sign: int) -> tuple[str, float]:
@@ -205,8 +204,6 @@ class _Exchange:
 
 
 class _Tailor:
-    """Adapts the objects of an EDS to the drive's own."""
-
     def __init__(self, sheet: Sheet, own: tuple[Object, ...], ratings: Ratings, cut: Tailoring, serial: int) -> None:
         self._sheet, self._ratings, self._cut = sheet, ratings, cut
         self._own = {entry.key: entry for item in own for entry in item.entries}

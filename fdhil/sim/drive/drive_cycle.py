@@ -45,7 +45,6 @@ class DriveCycle:
         self.reset()
 
     def reset(self) -> None:
-        """Reset the supervision at a boot."""
         self._over_window = self._last_offset = 0
 
     @property
@@ -67,7 +66,6 @@ class DriveCycle:
         return tripped
 
     def integrate(self) -> None:
-        """Integrate the motion over the cycle."""
         physics, motion = self._plant.physics, self._motion
         ended_v = physics.voltage_mean_v
         if motion.loops is not self._loops:

@@ -70,7 +70,6 @@ class Emergencies:
         return [self.waiting.pop(0)]
 
     def drop(self) -> None:
-        """Discard the queued frames."""
         self.waiting = []
 
     def _queue(self, code: int, register: int, detail: bytes) -> None:
@@ -169,7 +168,6 @@ class NodeGuarding:
         self._asked_s: float | None = None
 
     def request(self, state: int, now_s: float) -> bytes:
-        """Return the answer to a remote frame."""
         self._asked_s = now_s
         answer = bytes([self._toggle | state])
         self._toggle ^= 0x80

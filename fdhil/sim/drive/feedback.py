@@ -125,7 +125,6 @@ class Feedback:
         return clip(self._kv * (p0 - position) + self._kff * f0 + v0 * self._inc_per_rad, INT32)
 
     def show_state(self) -> None:
-        """Update statusword and mode display."""
         word = self._power.state | _VOLTAGE_ENABLED | _REMOTE
         if self._power.powered:
             word |= self._motion.status_bits

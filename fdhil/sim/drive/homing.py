@@ -14,8 +14,6 @@ _WATCHED = {-1: NEGATIVE, 1: POSITIVE}
 
 
 class Homing(Enum):
-    """The state of a homing run."""
-
     IDLE = auto()
     RUNNING = auto()
     DONE = auto()
@@ -82,7 +80,6 @@ class Switches:
 
     @property
     def mounted(self) -> bool:
-        """Whether any switch is mounted."""
         return (self.negative, self.positive, self.home) != (None, None, None)
 
     def inputs(self, raw: float) -> int:
@@ -105,7 +102,6 @@ class HomingRun:
         self.reset()
 
     def reset(self) -> None:
-        """Reset to idle, at power-on or when the mode is left."""
         self.state = Homing.IDLE
         self.home = 0.0
         self._legs: list[Leg] = []

@@ -26,14 +26,12 @@ class LssSlave:
         self.reset()
 
     def reset(self) -> None:
-        """Return to the waiting state at a boot."""
         self._configuring = False
         self._selected = 0
         self._identified = 0
         self._scanned = 0
 
     def power_on(self) -> None:
-        """Restore the stored node-ID."""
         self.pending = self._stored
 
     def receive(self, data: bytes) -> bytes | None:

@@ -24,8 +24,6 @@ _FAR = 1e12  # increments: a search runs until it finds its mark
 
 
 class Source(Enum):
-    """The source of the set-point."""
-
     OFF = auto()
     CYCLIC = auto()
     PROFILE = auto()
@@ -112,7 +110,6 @@ class Motion:
 
     @property
     def bound(self) -> bool:
-        """Whether the set-points come with the SYNC."""
         return self._power.powered and self._numbers[0x606000] in modes.CYCLIC
 
     # -- statusword and controlword

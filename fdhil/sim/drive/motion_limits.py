@@ -52,7 +52,6 @@ class Window:
         self._cycles = 0
 
     def step(self, error: float) -> None:
-        """Count a cycle with this error."""
         inside = abs(error) <= self._numbers.get(self._width, NO_WINDOW)
         self._cycles = self._cycles + 1 if inside else 0
 

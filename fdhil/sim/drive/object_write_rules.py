@@ -21,7 +21,6 @@ class StoredParameters:
         self._values: dict[Entry, int] = {}
 
     def restore(self, which: Callable[[Entry], bool]) -> None:
-        """Set the chosen entries to their saved or default values."""
         self._dictionary.reset(which)
         self._dictionary.numbers.update({e.place: v for e, v in self._values.items() if which(e)})
         for call in self._dictionary.restored:

@@ -57,7 +57,6 @@ class Ratings:
 
     @classmethod
     def of(cls, config: MachineConfig, axis: str) -> Ratings:
-        """Read the ratings from the machine's configuration."""
         section = config.axis[axis]
         return cls(
             node_id=config.node_id(axis),

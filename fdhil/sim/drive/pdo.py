@@ -89,7 +89,6 @@ class PdoEngine:
         self.sent, self.sent_before = set(), set()
 
     def stop(self) -> None:
-        """Stop all PDOs when OPERATIONAL is left."""
         self._rpdos, self._tpdos = {}, []
         self.heard, self.heard_before = set(), set()
         self.sent, self.sent_before = set(), set()
@@ -120,7 +119,6 @@ class PdoEngine:
             )
 
     def mapped(self, direction: str, number: int) -> list[Entry]:
-        """Return the objects that a PDO carries."""
         return [entry for entry, _ in self._mapped(_PLACES[direction][1] + number - 1) if entry is not None]
 
     def numbers(self, direction: str) -> Iterator[int]:
@@ -152,7 +150,6 @@ class PdoEngine:
     # -- reception
 
     def receives(self, can_id: int) -> bool:
-        """Return whether an RPDO has this identifier."""
         return can_id in self._rpdos
 
     def receive(self, can_id: int, data: bytes, now_s: float) -> Pdo | None:
@@ -176,7 +173,6 @@ class PdoEngine:
             self.sent.add(self._rpdos[can_id].number)
 
     def latch(self) -> None:
-        """Apply the RPDOs received since the last SYNC."""
         for pdo in self._rpdos.values():
             if pdo.pending is not None and pdo.synchronous:
                 self.apply(pdo)

@@ -88,12 +88,10 @@ class PowerStage:
 
     @property
     def faulty(self) -> bool:
-        """Whether a fault waits for its reset."""
         return self.state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
 
     @property
     def follows(self) -> bool:
-        """Whether the drive follows its set-points."""
         return self.state is State.OPERATION_ENABLED and self.ramp is None
 
     def control(self, word: int) -> bool:

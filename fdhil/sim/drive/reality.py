@@ -74,12 +74,10 @@ class RealPhysics(Physics):
 
     @property
     def table_speed_rad_s(self) -> float:
-        """The table's speed, as that of the shaft it follows."""
         p, angle = self._p, float(self._x[cycle.TABLE])
         return float(self._x[cycle.TABLE_SPEED] * (1.0 + p[cycle.PITCH] * math.cos(angle) + p[cycle.PITCH_RATE]))
 
     def rehearse(self) -> None:
-        """Run one cycle on a copy of the state to compile the kernels."""
         self._run_real(self._x.copy(), self.voltage_v.copy(), False, (0.0,) * 8)
 
     def cycle(self, enabled: bool, command: Command) -> None:

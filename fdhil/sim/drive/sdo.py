@@ -67,7 +67,6 @@ class SdoServer:
         return isinstance(self._transfer, _BlockDownload) and not self._transfer.complete
 
     def reset(self) -> None:
-        """Drop the present transfer."""
         self._transfer = None
 
     def request(self, data: bytes) -> list[bytes]:

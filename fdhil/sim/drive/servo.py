@@ -94,7 +94,6 @@ class Drive(CanopenNode):
 
     @property
     def tick(self) -> int:
-        """The number of cycles run."""
         return self._cycle.tick
 
     @property
@@ -175,7 +174,6 @@ class Drive(CanopenNode):
 
     @property
     def moves_alone(self) -> bool:
-        """Whether the drive moves by its own clock."""
         return self._clock.leads and not self._cycle.stands
 
     def _move_alone(self, now_s: float, alone: bool) -> None:

@@ -32,11 +32,9 @@ class CyclicSetpoints:
         self.preset(Target(0.0, 0.0, 0.0, 0.0))
 
     def preset(self, target: Target) -> None:
-        """Fill the whole delay with one target."""
         self._queue.extend([target] * (self._delay + 2))
 
     def push(self, target: Target) -> None:
-        """Append the target latched at a SYNC."""
         self._queue.append(target)
 
     @property
@@ -76,7 +74,6 @@ class Interpolation:
         self._from = self._to = Target(0.0, 0.0, 0.0, 0.0)
 
     def preset(self, target: Target) -> None:
-        """Hold a target."""
         self._from = self._to = target
         self._step = 0
 
@@ -105,7 +102,6 @@ class Ramp:
         self.start(0.0)
 
     def start(self, value: float) -> None:
-        """Continue from a value."""
         self.before = self.now = float(value)
 
     def advance(self, target: float, rising: float, falling: float) -> None:
@@ -125,7 +121,6 @@ class Profile:
         self._speed = 0.0
 
     def start(self, position: float, speed: float) -> None:
-        """Continue from a demand and its speed."""
         position = float(position)  # an int would make numba compile the cycle again
         before = position - speed * self._period_s
         self._points = (before, position, position + speed * self._period_s)
@@ -171,7 +166,6 @@ class Profile:
         return following, position + moved
 
     def command(self) -> Command:
-        """Return the command of the beginning cycle."""
         first, second, third = self._points
         return (
             first, second, (second - first) / self._period_s, (third - second) / self._period_s, 0.0, 0.0, 0.0, 0.0,

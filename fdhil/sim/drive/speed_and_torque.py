@@ -35,18 +35,15 @@ class SpeedAndTorque:
         self.stands = Window(numbers, 0x606F00, 0x607000, period_s)
 
     def start(self, actual: Actual) -> None:
-        """Continue from the actual speed and torque."""
         self._speed.start(actual.speed)
         self._torque.start(actual.current_a / self._amperes)
 
     def watch(self, actual: Actual) -> None:
-        """Update the speed windows at the start of a cycle."""
         self.at_speed.step(actual.speed - self._target_speed)
         self.stands.step(actual.speed)
 
     @property
     def torque_reached(self) -> bool:
-        """Whether the torque ramp has reached its target."""
         return self._torque.before == self._torque.now
 
     @property

@@ -15,11 +15,9 @@ class TraceBuffer:
         self._rows = 0
 
     def clear(self) -> None:
-        """Delete all rows."""
         self._rows = 0
 
     def append(self, tick: int, demand: int, position: int, speed: int, current: int, voltage: int) -> None:
-        """Record one cycle."""
         offset = self._rows % TRACE_CYCLES * ROW.size
         ROW.pack_into(self._ring, offset, tick & 0xFFFFFFFF, demand, position, speed, current, voltage)
         self._rows += 1

@@ -31,8 +31,6 @@ _MAX_OVERRIDE = 1.5
 
 
 class Phase(Enum):
-    """The state of the NC's control over the drives."""
-
     OFF = auto()
     CONFIGURE = auto()
     ENABLE = auto()
@@ -146,7 +144,6 @@ class NcController:
 
     @property
     def on(self) -> bool:
-        """Whether it controls the bus."""
         return self.phase is not Phase.OFF
 
     def _refusal(self, job: Job) -> str:

@@ -92,7 +92,6 @@ class DriveLink:
 
     @property
     def state(self) -> State:
-        """The power state of its last statusword."""
         return State.NOT_READY if self.status is None else power_state(self.status)
 
     def set_point(self, target: int) -> list[BusFrame]:

@@ -100,7 +100,6 @@ class RowPlayer:
 
     @property
     def ended(self) -> bool:
-        """Whether every row has been played."""
         return self._at > self._last
 
     def step(self, rate: float) -> tuple[list[float], bool]:
@@ -124,13 +123,10 @@ class RowPlayer:
 
 @dataclass(slots=True)
 class Pause:
-    """Rest for a number of cycles."""
-
     cycles: int
 
     @property
     def ended(self) -> bool:
-        """Whether it is over."""
         return self.cycles <= 0
 
 
@@ -166,7 +162,6 @@ class Job:
 
     @property
     def awaited(self) -> bool:
-        """Whether it has too few rows to start."""
         return isinstance(self.demand, DemandStream) and not self.demand.rows and not self.demand.ended
 
     def finished(self, played: int, stopped: bool) -> dict[str, Any]:

@@ -105,7 +105,6 @@ class DemandStream:
 
     @property
     def runs_dry(self) -> bool:
-        """Whether the next row is due and missing."""
         return self._flows and not self._waiting and not self._closed
 
     @property
@@ -120,7 +119,6 @@ class DemandStream:
 
     @property
     def ended(self) -> bool:
-        """Whether all rows have been played."""
         return self._closed and not self._waiting
 
     def step(self, rate: float) -> tuple[list[float], bool]:

@@ -88,7 +88,6 @@ class WakePipe:
             os.set_blocking(end, False)
 
     def fileno(self) -> int:
-        """Return the end that becomes readable."""
         return self._ends[0]
 
     def wake(self) -> None:
@@ -97,12 +96,10 @@ class WakePipe:
             os.write(self._ends[1], b"\0")
 
     def clear(self) -> None:
-        """Remove the pending wake calls."""
         with suppress(BlockingIOError):
             os.read(self._ends[0], 4096)
 
     def close(self) -> None:
-        """Close both ends."""
         ends, self._ends = self._ends, (-1, -1)  # their numbers may be reused: a late wake must not reach another file
         for end in ends:
             os.close(end)

@@ -72,7 +72,6 @@ class FaultBus(can.BusABC):
             raise can.CanOperationError(os.strerror(error.number), error.number) from None
 
     def shutdown(self) -> None:
-        """Leave the bus."""
         super().shutdown()
         self._bus.shutdown()
 

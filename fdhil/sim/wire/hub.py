@@ -110,7 +110,6 @@ class Hub(Attachment):
 
     @property
     def clients(self) -> int:
-        """The number of clients that receive frames."""
         return sum(client.raw for client in self._clients)
 
     def readers(self) -> list[socket.socket]:
@@ -137,7 +136,6 @@ class Hub(Attachment):
             client.gone = True
 
     def send(self, frames: Sequence[Frame], sender: object = None) -> None:
-        """Queue frames for every client but the sender."""
         if not self._clients:
             return
         text = encode(frames, time.time())

@@ -73,7 +73,6 @@ class VoltageSensor:
         self._block = header + counts + [0] * (BLOCK - number)
 
     def registers(self) -> list[int]:
-        """Return the present content of all registers."""
         with self._lock:
             newest, count = (self._recent[-1] if self._recent else 0.0), max(self._count - 1, 0)
         head = struct.pack(">fIfff", newest, count & 0xFFFFFFFF, self.rate_hz, self.volts_per_count, self.celsius)
@@ -82,7 +81,6 @@ class VoltageSensor:
     trigger: int | None = TRIGGER
 
     def words(self) -> dict[int, int]:
-        """Return all registers by address."""
         return dict(enumerate(self.registers()))
 
     def newest(self, number: int) -> tuple[int, list[float]]:

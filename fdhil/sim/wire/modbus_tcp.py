@@ -63,7 +63,6 @@ class SensorServers:
             raise
 
     def stop(self) -> None:
-        """Close every port and end the thread."""
         asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()

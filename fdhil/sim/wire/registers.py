@@ -59,7 +59,6 @@ class OneValue:
         self._settings, self._kind, self._read = settings, kind, read
 
     def words(self) -> dict[int, int]:
-        """Return the registers of the number."""
         settings = self._settings
         raw = (self._read() - settings.offset) / settings.scale
         return _placed(settings.address, packed(raw, self._kind, settings.word_order, settings.byte_order))
@@ -85,7 +84,6 @@ class Block:
         return {**(self._latched or {}), self.trigger: 0}
 
     def latch(self) -> None:
-        """Copy the newest samples into the block."""
         self._latched = self._now()
 
     def _now(self) -> dict[int, int]:
@@ -113,11 +111,9 @@ class Joined:
         self.trigger = next((one.trigger for one in maps if one.trigger is not None), None)
 
     def words(self) -> dict[int, int]:
-        """Return all registers."""
         return {address: word for one in self._maps for address, word in one.words().items()}
 
     def latch(self) -> None:
-        """Latch all maps."""
         for one in self._maps:
             one.latch()
 
@@ -132,5 +128,4 @@ def map_of(settings: Voltage, own: RegisterMap, samples: Samples) -> RegisterMap
 
 
 def thermometer_map(settings: Thermometer, samples: Samples) -> RegisterMap:
-    """Return the registers of a thermometer."""
     return OneValue(settings, settings.type, lambda: samples.celsius)

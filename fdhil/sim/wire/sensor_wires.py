@@ -91,7 +91,6 @@ class SensorWires:
                 self.ready[axis] = {"device": voltage.device, "unit": voltage.unit}
 
     def stop(self) -> None:
-        """Close every port and remove the devices."""
         if self._lines is not None:
             self._lines.stop()
         self._tcp.stop()

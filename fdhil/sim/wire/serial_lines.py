@@ -81,11 +81,9 @@ class RtuUnits:
         return b""
 
     def due_s(self) -> float:
-        """Return when a delayed answer is due."""
         return self._late[0][0] if self._late else float("inf")
 
     def tell(self) -> list[bytes]:
-        """Return the delayed answer."""
         return self._late.popleft()[1] if self._late else []
 
 
@@ -107,14 +105,12 @@ class TextInstrument:
         self._next_s = float("inf") if settings.query else time.monotonic()
 
     def take(self, data: bytes) -> list[bytes]:
-        """Answer each complete query."""
         if not self._query:
             return []
         *questions, self._buffer = (self._buffer + data).split(self._query)
         return [line for _ in questions for line in self.tell()]
 
     def due_s(self) -> float:
-        """Return when the next line is due."""
         return self._next_s
 
     def tell(self) -> list[bytes]:
@@ -193,7 +189,6 @@ class SerialLines:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread and remove the devices."""
         self._ending = True
         self._pipe.wake()
         self._thread.join()

@@ -38,7 +38,6 @@ class StreamPort:
                 return
 
     def close(self) -> None:
-        """Close it and remove its link."""
         if self._link.is_symlink() and str(self._link.readlink()) == self.path:
             self._link.unlink()
         for descriptor in (self._ours, self._theirs):
