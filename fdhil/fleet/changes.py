@@ -1,6 +1,5 @@
 """Summarises what a re-analysis changed: parameter shifts per axis, and windows whose verdict changed."""
 
-from collections.abc import Mapping
 from typing import Any, LiteralString
 
 from fdhil.errors import StoreError
@@ -83,9 +82,8 @@ def changes(db: Db, revision: int, by: str) -> dict[str, Any]:
         "by": by,
         "moved": [row | {"unit": unit_of(row["parameter"])} for row in moved],
         "verdicts": db.execute(_LABELLED + _VERDICTS, arguments).fetchall(),
-        "listed": [_plain(row) for row in db.execute(_LABELLED + _LISTED, arguments)],
+        "listed": [
+            row | {"recorded_at": row["recorded_at"].isoformat(timespec="seconds")}
+            for row in db.execute(_LABELLED + _LISTED, arguments)
+        ],
     }
-
-
-def _plain(row: Mapping[str, Any]) -> dict[str, Any]:
-    return dict(row) | {"recorded_at": row["recorded_at"].isoformat(timespec="seconds")}

@@ -266,7 +266,8 @@ async def _next(reader: JetStreamContext.PullSubscription) -> tuple[list[Msg], l
     messages, received = await _fetch(reader), list[Received]()
     try:
         for message in messages:
-            received += _received(message)
+            stored_at = message.metadata.timestamp
+            received += [Received(message.subject, stored_at, part) for part in decode(message.subject, message.data)]
             await asyncio.sleep(0)  # let the pending writes proceed
     except asyncio.CancelledError:
         await _refuse(messages)
@@ -291,11 +292,6 @@ async def _give_back(coming: asyncio.Future[tuple[list[Msg], list[Received]]]) -
 async def _refuse(messages: Sequence[Msg]) -> None:
     for message in messages:
         await message.nak()
-
-
-def _received(message: Msg) -> list[Received]:
-    stored_at = message.metadata.timestamp
-    return [Received(message.subject, stored_at, content) for content in decode(message.subject, message.data)]
 
 
 def _rows(known: Known) -> Iterator[str]:

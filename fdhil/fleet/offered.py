@@ -124,7 +124,10 @@ def judge(place: Path, machine: Present) -> Judged:
         document = _content(place)
         judged = replace(judged, document=hashlib.sha256(document).hexdigest())
         offer = read(document, machine.config.offers.trust)
-        judged = replace(judged, offer=offer, answers=[each for each in machine.answers if _is_of(each, offer)])
+        key = (offer.name, offer.version)
+        judged = replace(
+            judged, offer=offer, answers=[each for each in machine.answers if (each.name, each.version) == key]
+        )
         _require_in_force(offer, machine)
         _require_for(offer, machine)
         evaluated = _weighed(judged, offer, machine)
@@ -140,10 +143,6 @@ def _require_same(judged: Judged) -> None:
     if judged.changes and accepted and judged.document not in [each.document for each in accepted]:
         text = f"{judged.offer} was accepted with other values by {accepted[-1].by}, and a version never changes"
         raise OfferRefused(f"{text}; ask the fleet server for a newer version, and find out who signed this one")
-
-
-def _is_of(answer: Answer, offer: Offer) -> bool:
-    return (answer.name, answer.version) == (offer.name, offer.version)
 
 
 def _require_in_force(offer: Offer, machine: Present) -> None:

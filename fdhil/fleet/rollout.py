@@ -146,8 +146,12 @@ async def standing(db: Db, change: Change) -> Standing:
     ]  # fmt: skip
     known = {each.machine for each in offered}
     query = "SELECT machine, about FROM fleet.machines ORDER BY machine"
-    machines = [row for row in await (await db.execute(query)).fetchall() if _has(row["about"], change.labels)]
-    return Standing(offered, [row["machine"] for row in machines if row["machine"] not in known])
+    left = []
+    for row in await (await db.execute(query)).fetchall():
+        labels = (row["about"] or {}).get("labels") or {}
+        if row["machine"] not in known and change.labels.items() <= labels.items():
+            left.append(row["machine"])
+    return Standing(offered, left)
 
 
 def _require_new(change: Change, version: int, digest: str) -> None:
@@ -157,10 +161,6 @@ def _require_new(change: Change, version: int, digest: str) -> None:
     if change.version == version and change.digest != digest:
         text = f"version {version} of {change.name} was offered with other values, labels or text"
         raise OfferRefused(f"{text}; set version = {version + 1} in the file")
-
-
-def _has(about: Mapping[str, Any] | None, labels: Mapping[str, str]) -> bool:
-    return labels.items() <= ((about or {}).get("labels") or {}).items()
 
 
 def chosen(found: Standing, count: int | None, names: Sequence[str], despite: str) -> list[str]:

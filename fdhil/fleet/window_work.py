@@ -109,7 +109,9 @@ def lost(window: Stored) -> Again:
 
 def _result(window: Stored, method: Method) -> dict[str, Any]:
     config = method.machines.get(window.machine)
-    settings = method.settings if config is None else _of_machine(config, method.settings)
+    settings = method.settings
+    if config is not None:
+        settings = config.identification.model_copy(update={"method": settings.method} if settings.method else {})
     try:
         recorded = decode_window(_content(window.name, method.folder), window.name)
         axis = None if config is None else config.axis.get(recorded.axis)
@@ -118,10 +120,6 @@ def _result(window: Stored, method: Method) -> dict[str, Any]:
     except (FdhilError, MemoryError) as error:
         return {"error": {"class": type(error).__name__, "text": str(error) or "out of memory"}}
     return _document(outcome) | {"configured": axis is not None}
-
-
-def _of_machine(config: MachineConfig, asked: Identification) -> Identification:
-    return config.identification.model_copy(update={"method": asked.method} if asked.method else {})
 
 
 def _content(name: str, folder: Path) -> bytes:
