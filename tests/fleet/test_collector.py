@@ -1,4 +1,4 @@
-"""A collector answers for a message when it is in the database, and never before."""
+"""A collector acknowledges a message only after it is in the database."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DIGEST, STORE = "a" * 64, "5" * 32
 
 @dataclass
 class Told:
-    """A message of the stream; ``log`` has what was answered."""
+    """A message of the stream; ``log`` records the answers."""
 
     subject: str
     data: bytes
@@ -44,7 +44,7 @@ class Told:
 
 
 class Reader:
-    """Gives messages once, and then has none."""
+    """Returns its messages once."""
 
     nothing: type[Exception] = nats.errors.TimeoutError
 
@@ -145,7 +145,7 @@ def test_a_collector_that_is_killed_spoils_no_window_that_another_one_keeps(
         raise KeyboardInterrupt
 
     def other_begins(descriptor: int) -> None:
-        """Let another one begin the same window, and end, between this one's last byte and its rename."""
+        """Let another collector write the same window between this one's last byte and its rename."""
         fsync(descriptor)
         if stat.S_ISREG(os.fstat(descriptor).st_mode):
             with monkeypatch.context() as inner:

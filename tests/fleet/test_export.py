@@ -1,4 +1,4 @@
-"""What is given away does not say whose it is."""
+"""The anonymous export does not identify machines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A server with TLS, passwords and permissions as the document has them: each machine tells its own, no other reads."""
+"""A server with TLS, passwords and documented permissions: machines publish their own records and read none."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SECRET = "canary-51c07"
 
 
 def guard(folder: Path) -> str:
-    """Return the part of the server's configuration that keeps others out."""
+    """Return the access rules of the server's configuration."""
     certify(folder)
     tls = f'tls {{ cert_file: "{folder}/broker.pem", key_file: "{folder}/broker.key" }}\n'
     rights = 'permissions: { publish: ["fdhil.v1.%s.>"], subscribe: ["_INBOX_fdhil-%s.>"] }'
@@ -48,7 +48,7 @@ def entering(server: Server, folder: Path, user: str) -> NatsServer:
 
 
 async def forge(client: Client) -> None:
-    """Publish in the name of mill-1; what the server says against it has come when this ends."""
+    """Publish in the name of mill-1 and wait for the server's error."""
     try:
         await client.jetstream().publish("fdhil.v1.mill-1.records", b"{}", timeout=1.0)
     finally:
@@ -84,7 +84,7 @@ async def test_each_tells_its_own_and_only_the_collector_reads(
 
 
 async def unheard(error: Exception) -> None:
-    """Leave an error to whoever waits for what it ended."""
+    """Ignore an error that the caller has already caused to end the connection."""
 
 
 async def test_who_has_no_credentials_gets_nothing(server: Server, tmp_path: Path) -> None:

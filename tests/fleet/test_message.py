@@ -1,4 +1,4 @@
-"""What a machine tells is what a collector reads; whatever else comes is refused by name."""
+"""Records survive encoding and decoding; all other input is refused with a reason."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def payload_of(told: Mapping[str, Any]) -> bytes:
 
 
 def refused(payload: bytes, subject: str = "fdhil.v1.mill-1.records") -> str:
-    """Return why the only part of a message is no record."""
+    """Return why the single part of a message is invalid."""
     (told,) = decode(subject, payload)
     assert isinstance(told, Unread)
     return told.reason

@@ -1,4 +1,4 @@
-"""What is asked of all machines: the command line, with a real database behind it."""
+"""Queries about all machines: the command line with a real database."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def works(database: Postgres, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def machines(tmp_path: Path) -> Iterator[list[Machine]]:
-    """Six of one kind, whose fourth has a worn X axis."""
+    """Six machines of one kind; the fourth has a worn X axis."""
     made = []
     for k in range(6):
         labels = {"type": "V-800", "screw": "A"}
@@ -44,7 +44,7 @@ def machines(tmp_path: Path) -> Iterator[list[Machine]]:
 
 
 def asked(capsys: pytest.CaptureFixture[str], code: int, *words: object) -> Any:
-    """Ask with and without --json; return the document and the text."""
+    """Query with and without --json; return the document and the text."""
     found, text, err = fdhil("fleet", *map(str, words), capsys=capsys)
     assert (found, err) == (code, "")
     found, out, err = fdhil("fleet", *map(str, words), "--json", capsys=capsys)

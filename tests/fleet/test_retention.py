@@ -1,4 +1,4 @@
-"""What is too old goes whole; what counts from it, and what comes late or twice, stays right."""
+"""Old months are dropped whole; reference records, late records and repeated records stay correct."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def test_months_are_counted_back_over_the_turn_of_a_year() -> None:
 class TestWithADatabase:
     @pytest.fixture
     def works(self, database: Postgres, tmp_path: Path) -> Fleet:
-        """Records of mid-month are kept for three months, windows for one."""
+        """Keep records for three months and windows for one."""
         kept = Retention(record_months=3, window_months=1)
         return fleet_of(database, tmp_path).model_copy(update={"retention": kept})
 
     @pytest.fixture
     def told(self, tmp_path: Path) -> list[Received]:
-        """What a machine told of itself, and two rounds of each of its axes in each of three months."""
+        """A machine's description, and two rounds of each of its axes in each of three months."""
         machine = Machine(written(tmp_path / "mill", "mill-1"))
         machine.record(6)
         machine.close()
@@ -89,7 +89,7 @@ class TestWithADatabase:
     async def test_a_collector_that_knew_the_month_before_it_went_goes_on(
         self, works: Fleet, told: list[Received], database: Postgres
     ) -> None:
-        """Its next record of that month is in records_other; whoever makes the month again is not stopped by it."""
+        """Its next record of that month is in records_other and does not prevent a new partition."""
         await keep(works, told[:4])
         let_go(works)
         database.ask("""INSERT INTO fleet.records SELECT machine, 'late', recorded_at, store, 999, axis, kind, now(),

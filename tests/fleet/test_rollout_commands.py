@@ -1,4 +1,4 @@
-"""The commands of the roll-out, as an operator and a person at the works call them."""
+"""The roll-out commands, as called by an operator and at the fleet server."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def file(works: Works, tmp_path: Path) -> Path:
 
 
 def lay(works: Works, file: Path, **changes: Any) -> MachineConfig:
-    """Lay an offer where the uplink would."""
+    """Place an offer where the uplink would."""
     config = machine_config.load(file)
     config.offers_directory.mkdir(parents=True, exist_ok=True)
     version = changes.get("version", 3)

@@ -1,4 +1,4 @@
-"""At the machine: what an offer would change, and that nothing but its operator's answer changes it."""
+"""At the machine: the effect of an offer, and that only the operator's answer applies it."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ def test_a_loosened_limit_is_named_and_asked_for(works: Works, file: Path) -> No
 def test_what_loosens_the_guard_by_another_way_is_found(
     values: dict[str, Any], limit: str, works: Works, file: Path
 ) -> None:
-    """No key of the guard is offered, and still it would let more through."""
+    """An offer without any guard key can still loosen a limit of the guard."""
     file.write_text(file.read_text().replace("[axis.X.regulators]", "[axis.X.feedforward]\n\n[axis.X.regulators]"))
     found = judged(works, file, values=values)
     assert f"the guard: axis X, {limit}" in [each.path for each in found.loosens]
@@ -203,7 +203,7 @@ def test_a_rejected_offer_changes_nothing_and_may_be_accepted_later(works: Works
 
 
 def test_what_was_accepted_and_is_in_force_is_not_rejected(works: Works, file: Path) -> None:
-    """Nor when it is over by now; who has put the old values back may say so."""
+    """Also after its expiry; once the old values are restored it may be rejected."""
     before = file.read_bytes()
     done = accept(works.carried(), file, "Bert", may_loosen=False)
     for expires_s in (NOW + 3600, NOW - 1):

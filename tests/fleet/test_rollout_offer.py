@@ -1,4 +1,4 @@
-"""An offer is believed when a trusted key has signed just these bytes, and it offers what may be offered."""
+"""An offer is accepted only if a trusted key signed exactly these bytes, and its changes are allowed."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_a_value_that_no_machine_could_have_is_not_signed(works: Works) -> None:
 
 
 def test_every_key_of_the_configuration_is_decided_upon() -> None:
-    """A section that is new needs a decision: it is named, or a table above it is."""
+    """A new section needs a policy for itself or for a table above it."""
     for table in sections():
         for key, _ in table.keys:
             path = f"{table.path}.{key}"

@@ -1,4 +1,4 @@
-"""A change from the works to machines and their answers back, stage by stage, with real servers between."""
+"""A roll-out from the fleet server to machines and their answers back, stage by stage, with real servers."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ MACHINES = ("mill-1", "mill-2", "mill-3")
 
 
 class Shop:
-    """A works with its servers and machines, each with its uplink."""
+    """A fleet server with its processes and machines, each with its uplink."""
 
     def __init__(self, folder: Path, database: Postgres, server: NatsServer, capsys: Any) -> None:
         self._folder, self._capsys = folder, capsys
@@ -63,13 +63,13 @@ class Shop:
         return machine_config.load(self.files[name])
 
     def fdhil(self, code: int, *words: object) -> Any:
-        """Run a command of fdhil with --json, and return what it tells."""
+        """Run a command with --json and return its document."""
         done = fdhil(*map(str, words), "--json", capsys=self._capsys)
         assert done[0] == code, done
         return json.loads(done[1])
 
     def uplink(self, name: str) -> None:
-        """Run a machine's uplink until it has fetched and sent what there is."""
+        """Run a machine's uplink until everything is fetched and sent."""
         log = self._folder / f"{name}.log"
         for _ in range(3):  # on a busy host an answer may come too late, and it looks again after a minute only
             log.unlink(missing_ok=True)
@@ -79,11 +79,10 @@ class Shop:
                 break
 
     def lying(self, name: str) -> list[str]:
-        """Return the offers that lie at a machine."""
         return [path.name for path in lying(self.config(name).offers_directory)]
 
     def stage(self, code: int, *options: object) -> Any:
-        """Look at the roll-out, or open a stage with the options."""
+        """Show the roll-out, or open a stage with the options."""
         return self.fdhil(code, "fleet", "stage", self.fleet, self.change, *options)
 
     def opened(self, code: int, *options: object) -> Any:
@@ -106,7 +105,7 @@ async def shop(tmp_path: Path, database: Postgres, capsys: Any) -> AsyncIterator
 
 @pytest.fixture
 def collected(shop: Shop, tmp_path: Path) -> Iterator[Shop]:
-    """The works while its collector runs."""
+    """The fleet server while its collector runs."""
     with running(tmp_path / "collect.log", "fleet", "collect", shop.fleet) as collector:
         until(lambda: "connected to the server and the database" in collector.said, "it collects")
         yield shop
@@ -183,7 +182,7 @@ def test_where_the_server_is_away_no_stage_is_opened(shop: Shop, tmp_path: Path)
 
 
 def guarded(folder: Path) -> str:
-    """Return the part of the server's configuration as the document has it."""
+    """Return the documented access rules of the server's configuration."""
     certify(folder)
     tls = f'tls {{ cert_file: "{folder}/broker.pem", key_file: "{folder}/broker.key" }}\n'
     rights = (
@@ -202,7 +201,7 @@ def server(tmp_path: Path) -> Iterator[NatsServer]:
 
 
 async def look(config: MachineConfig, letterbox: Letterbox | None = None, timeout_s: float = 60.0) -> list[str]:
-    """Have a machine's letterbox look, and return which offers lie there then."""
+    """Let a machine fetch offers, and return those present."""
     assert config.uplink is not None
     async with connected(config.uplink, f"fdhil-{config.works_name}", "uplink") as client:
         await (letterbox or Letterbox(config)).look(client.jetstream(timeout=timeout_s), "5" * 32)

@@ -54,7 +54,7 @@ def test_the_trace_has_a_row_per_demand_row_and_300_ms(tmp_path: Path) -> None:
 
 
 def test_an_offset_reaches_the_row_it_was_sent_with(tmp_path: Path) -> None:
-    """A guard that answers SYNC k - 1 with o[k + 2] corrects row k + 2, no earlier and no later."""
+    """A guard that answers SYNC k - 1 with o[k + 2] corrects exactly row k + 2."""
     twin = TwinInHand(twin_config())
     twin.switch_on()
     rows = corner()
@@ -137,7 +137,7 @@ def test_a_listed_rpdo_that_does_not_exist_is_refused(listed: str) -> None:
 
 @pytest.mark.usefixtures("long_computation")
 def test_two_runs_are_equal_bit_by_bit() -> None:
-    """Noise, stick-slip, sensors: nothing but the seed and the SYNCs decides."""
+    """Noise, stick-slip and sensors depend on the seed and the SYNCs only."""
 
     def run(seed: int) -> tuple[list[tuple[int, bytes]], list[int]]:
         noise = {"voltage_v": 0.06, "current_a": 0.05, "speed_rad_s": 0.15}
@@ -268,7 +268,6 @@ def test_a_fault_script_acts_at_its_time_and_ends(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_every_fault_ends_without_a_trace(name: str) -> None:
-    """Being listed is being tested: started, run, ended, and the machine is as it was."""
     twin = TwinInHand(twin_config("X"))
     twin.switch_on()
     item = {"axis": "X", "fault": name, "value": 2.0, "duration_s": 0.003, "can_id": 0x555, "data": "01"}

@@ -1,4 +1,4 @@
-"""What real axes have, as the drive's objects tell it: speed, voltage, position, a weight that hangs on the axis."""
+"""Effects of real axes as reported by the drive's objects: speed, voltage, position, gravity load."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def way_mm(n: int = 300) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def told(rig: Rig, *objects: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Move the axis; return what the objects told at each SYNC, (n, objects)."""
+    """Move the axis; return the objects' values at each SYNC, (n, objects)."""
     rows = []
     for target in np.rint(way_mm() * INC_PER_MM).astype(int):
         rig.cycle(int(target))

@@ -1,4 +1,4 @@
-"""The services around the drive, with the `canopen` library as the foreign master: LSS, guarding, blocks, RTR, boot."""
+"""CANopen services of the drive, with the `canopen` library as foreign master: LSS, guarding, blocks, RTR, boot."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def server() -> SdoServer:
 
 
 def send_block(sdo: SdoServer, content: bytes, skip: int = 0) -> list[bytes]:
-    """Send one block, the segment number ``skip`` lost; return what was answered."""
+    """Send one block without the segment number ``skip``; return the answer."""
     parts = [content[n : n + 7].ljust(7, b"\0") for n in range(0, len(content), 7)]
     answers: list[bytes] = []
     for number, part in enumerate(parts, 1):
@@ -392,7 +392,7 @@ def test_objects_that_drives_have() -> None:
 
 
 def test_drives_of_two_machines_have_serial_numbers_of_their_own() -> None:
-    """A record made on another simulator's drive is void on this one."""
+    """A commissioning record of another simulator's drive is invalid here."""
     machines = [parse(bench_document("XY") | {"machine": {"name": name}}) for name in "AB"]
     numbers = [serial_number(machine, axis) for machine in machines for axis in "XY"]
     assert len(set(numbers)) == 4

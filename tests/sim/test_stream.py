@@ -1,4 +1,4 @@
-"""A demand that comes row by row: the lead, holes, wrong rows, and the NC that plays it."""
+"""A demand that arrives row by row: lead, gaps, invalid rows, and the NC that plays it."""
 
 from __future__ import annotations
 

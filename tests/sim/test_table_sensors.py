@@ -1,4 +1,4 @@
-"""The twin's sensors at the table: an encoder node on the bus, an accelerometer that streams, a module on Modbus."""
+"""The simulated table sensors: an encoder node on the bus, a streaming accelerometer, a Modbus module."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_the_encoder_obeys_nmt_and_beats() -> None:
 
 
 def sampled(speeds_m_s: np.ndarray[Any, Any], **keys: Any) -> tuple[list[int], np.ndarray[Any, Any]]:
-    """Return counts and accelerations (m/s2) of the lines of a table with these speeds at the SYNCs."""
+    """Return counts and accelerations (m/s2) of the lines for these table speeds at the SYNCs."""
     settings = Accelerometer(**{"device": "/dev/none", "scale": 1e-3, "rate_hz": 800.0} | keys)
     sensor = TableAccelerometer(settings, 1e-3, 0.0, np.random.default_rng(1))
     text = b""
