@@ -49,7 +49,7 @@ class Response:
     end: State
     sync_period_s: float
     parted: bool = False
-    """Whether the table is told apart from the motor."""
+    """Whether table and motor are separate masses."""
 
     @property
     def position_mm(self) -> Float:

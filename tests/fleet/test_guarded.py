@@ -68,7 +68,7 @@ async def test_each_tells_its_own_and_only_the_collector_reads(
         reader = await transport.prepare_stream(collector.jetstream(timeout=60.0), Stream(max_bytes=1 << 26))
         async with connected(settings, "fdhil-mill-1", "uplink") as client:
             sender = Sender(machine.config, settings)
-            stolen = await client.subscribe("fdhil.v1.>")  # what others tell is not its to read
+            stolen = await client.subscribe("fdhil.v1.>")  # it may not read the records of others
             position, entries = await sender._next(client.jetstream())
             await sender._send(client.jetstream(), position, entries, client.max_payload)
             await client.flush()

@@ -61,7 +61,7 @@ class TestWithADatabase:
         found = let_go(works)
         assert found["months"] == ["records_2026_01", "records_2026_03"]
         assert partitions(database) == ["records_2026_06", "records_other"]
-        assert machines(database) == before  # how many were heard, none missing, and what the machine is
+        assert machines(database) == before  # number of records, none missing, and the machine's description
         assert before[0][2] == 0
         assert database.ask("SELECT first_at FROM fleet.axes WHERE axis = 'X'") == [(first[1],)]
         kept = database.ask("SELECT axis, kind FROM fleet.kept ORDER BY axis, kind")

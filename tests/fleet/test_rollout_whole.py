@@ -128,7 +128,7 @@ def test_a_change_goes_out_stage_by_stage(collected: Shop) -> None:
     until(lambda: shop.told("SELECT count(*) FROM fleet.offer_answers") == [(1,)], "the answer has come")
     assert "nothing was identified with it yet" in shop.opened(1, "--count", 1)["error"]["text"]
 
-    machine = Machine(shop.files["mill-1"])  # the daemon, started anew
+    machine = Machine(shop.files["mill-1"])  # the restarted daemon
     digest = shop.config("mill-1").digest
     noticed = Notice("MaintenanceDue", "minor", "Friction rises; look at the lubrication.", "X", 1000)
     lies = Notice("OfferWaits", "minor", "the works offers a change: friction version 4")

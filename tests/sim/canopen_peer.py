@@ -21,7 +21,7 @@ class DirectBus(can.BusABC):
 
     def __init__(self, drive: Drive) -> None:
         super().__init__("direct")
-        self._is_shutdown = True  # there is nothing to shut down, and no need to be told so
+        self._is_shutdown = True  # nothing to shut down: no warning
         self.drive = drive
         self.network: canopen.Network | None = None
 

@@ -106,7 +106,7 @@ def test_sync_with_and_without_counter() -> None:
     rig.nmt(0x01)
     assert len(rig.sync(b"\x01")) == 2
     assert emergencies(rig.sync()) == [0x8240]
-    assert rig.sync() == []  # told once
+    assert rig.sync() == []  # reported once
     rig.nmt(0x80)
     rig.write(0x1005, 0, 0x81, 4)
     rig.nmt(0x01)

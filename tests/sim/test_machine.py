@@ -366,7 +366,7 @@ def test_lockstep_runs_when_everything_is_there_and_waits_longer_for_who_holds_a
     assert pace.due_s(waits=True, idle=False) == 12.0
     assert pace.due_s(waits=True, idle=False, holds=True) == 18.0
     assert settings(clock="sync").silence_s > 8.0 + 1.0, "a guard must not take the wait for a dead bus"
-    assert pace.due_s(waits=False, idle=True) == pytest.approx(10.004)  # it stands: nobody is kept busy for nothing
+    assert pace.due_s(waits=False, idle=True) == pytest.approx(10.004)  # idle: listeners are spared
 
 
 def test_a_lockstep_machine_that_ran_ahead_of_the_clock_does_not_stand_still_afterwards() -> None:

@@ -175,7 +175,7 @@ class LssBus(can.BusABC):
 
 @pytest.fixture
 def lss(monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Rig, Rig]:
-    monkeypatch.setattr("canopen.lss.time.sleep", lambda _: None)  # nobody here needs a pause
+    monkeypatch.setattr("canopen.lss.time.sleep", lambda _: None)  # no pauses needed
     first, second = Rig(machine("XY"), "X"), Rig(machine("XY"), "Y")
     master: Any = LssBus(first, second).network.lss
     master.RESPONSE_TIMEOUT = 0.001
@@ -321,7 +321,7 @@ def test_nothing_but_heartbeats_leaves_in_nmt_stopped() -> None:
     assert {can_id for can_id, _ in sent} == {0x701}
     rig.nmt(0x80)
     assert rig.read(0x1003) == 1
-    assert emergencies(rig.sync()) == []  # it is in the history, and not told late
+    assert emergencies(rig.sync()) == []  # in the history, but not sent late
 
 
 def test_the_emergencies_keep_their_inhibit_time() -> None:

@@ -83,7 +83,7 @@ def test_the_canopen_library_finds_configures_and_reads(twin: TwinProcess, bus: 
         assert abort.value.code == 0x06020000
         node.nmt.state = "OPERATIONAL"
         while node.nmt.wait_for_heartbeat(100) != "OPERATIONAL":
-            pass  # it was sent before the drive had heard the command
+            pass  # sent before the drive received the command
     finally:
         assert network.notifier is not None
         network.notifier.stop()

@@ -28,7 +28,7 @@ def node(**keys: Any) -> EncoderNode:
 def test_the_encoder_sends_its_place_after_a_sync_where_the_configuration_has_it() -> None:
     assert node(byte=2, offset=1.0).at_sync(1.5) == [(COB_ID, b"\0\0" + struct.pack("<i", 5000))]
     assert node(byte=2).frame_bytes == 6
-    assert node(type="uint16").at_sync(-1e-4) == [(COB_ID, b"\xff\xff")]  # a counter begins anew
+    assert node(type="uint16").at_sync(-1e-4) == [(COB_ID, b"\xff\xff")]  # the counter wraps around
 
 
 def test_the_encoder_obeys_nmt_and_beats() -> None:
@@ -118,7 +118,7 @@ def test_a_stream_is_a_device_that_goes_with_the_simulator(tmp_path: Path) -> No
     assert heard == b"1,2\n3,4\n"
     port.send(b"x" * 60 + b"\n")
     os.close(reader)
-    for _ in range(200):  # nobody reads: what does not fit is lost
+    for _ in range(200):  # without a reader, excess data is lost
         port.send(b"0123456789\n" * 20)
     port.close()
     assert not device.is_symlink()

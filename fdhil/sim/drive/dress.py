@@ -29,11 +29,11 @@ from fdhil.sim.drive.sheet import Sheet, read_sheet
 _MODES, _TARGET, _INTERPOLATION, _SPEED_UNIT = 0x650200, 0x607A00, 0x60C101, 0x60A900
 _INTERPOLATED = 7
 _VENDORS, _PROFILE, _AXIS_STEP = range(0x2000, 0x6000), range(0x6000, 0x6800), 0x800
-_APART = 1 << 24  # the vendor's values are kept apart from those of the twin's own vendor objects
-# A drive without these has no such service: no heartbeat, no SYNC counter. One without 0x6007 falls into fault when it
-# loses its master, as most do: no file says it.
+_APART = 1 << 24  # storage of the vendor's values, separate from the simulator's own vendor objects
+# A drive without these objects has no heartbeat and no SYNC counter. One without 0x6007 goes to Fault when it loses its
+# master, like most drives: an EDS does not define it.
 _NO_SERVICE = {0x101700: 0, 0x101900: 0}
-# what whoever sets a drive up for this machine must have entered: no default of a file fits it
+# machine-specific objects: preset from the configuration, as no default of a file fits
 _SET_UP = frozenset(
     index << 8 | sub
     for indices, subs in (
@@ -47,7 +47,7 @@ _SET_UP = frozenset(
     for index in indices
     for sub in subs
 )
-# speeds and accelerations count alike: in a speed unit, and that per second
+# speeds and accelerations share a unit: the speed unit, and that per second
 _SPEEDS = frozenset(
     {
         0x606B, 0x606C, 0x606D, 0x606F, 0x607F, 0x6081, 0x6083, 0x6084, 0x6085, 0x6099, 0x609A, 0x60B1, 0x60C5, 0x60C6,
@@ -259,7 +259,7 @@ class _Tailor:
         entry = replace(entry, scale=scale, default=self._default(entry, own, scale))
         if entry.key in _SET_UP:
             return replace(entry, low=None, high=None)
-        # what CiA 301 defines has the limits that it says; real files forbid what their devices must take
+        # CiA 301 objects keep the standard's limits; real files forbid values that their devices must accept
         return replace(entry, low=own.low, high=own.high) if own is not None and entry.index < 0x2000 else entry
 
     def _fit_mode(self, entry: Entry) -> Entry:
