@@ -18,7 +18,7 @@ LIMITS = {
     "uint32": (0, 2**32 - 1),
 }
 _NOISE_BLOCK = 1024
-OFF_RATE = 1.007  # of the nominal rate: the sensor has an RC oscillator
+OFF_RATE = 1.007  # of the nominal rate: the sensor's oscillator is not a quartz
 TILT_M_S2 = 0.3  # share of gravity in a slightly tilted sensor
 KEPT_LINES = 2000
 WITHOUT_SYNC_S = 0.05
