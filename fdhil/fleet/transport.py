@@ -27,7 +27,7 @@ from fdhil.errors import ConnectError
 from fdhil.fleet.message import SUBJECTS
 
 CONSUMER = "collectors"
-CONNECT_S, CLOSE_S = 10, 5.0
+CONNECT_S = 10
 ACKNOWLEDGED_S = 60.0  # unacknowledged messages are then redelivered
 MOST_OUT = 20_000  # limit of unacknowledged messages
 FIRST_RETRY_S, LAST_RETRY_S = 1.0, 60.0

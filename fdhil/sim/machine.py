@@ -112,8 +112,6 @@ class Machine:
             loads[bus] = round(each_sync * rate / bitrate + drives, 4)
         return loads
 
-    # -- frames
-
     def power_on(self) -> list[BusFrame]:
         """Switch the drives on, to pre-operational; all kernels are compiled before the first SYNC."""
         for unit in self.units.values():
@@ -189,8 +187,6 @@ class Machine:
         self._outbox.clear()
         return frames
 
-    # -- the cycle
-
     def _sync(self, bus: str, data: bytes) -> list[Frame]:
         row = self.nc.in_force
         playing = row is not None and row.playing
@@ -261,8 +257,6 @@ class Machine:
     def holds_offset(self) -> bool:
         """Whether a drive holds a nonzero offset of position, speed or torque: its sender is active."""
         return any(unit.drive.dictionary.number(i, 0) for unit in self.units.values() for i in OFFSET_OBJECTS)
-
-    # -- played files
 
     def trace(self, path: Path) -> None:
         self._next_trace = path

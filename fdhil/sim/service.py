@@ -150,8 +150,6 @@ class SimService:
             self.close()
             raise
 
-    # -- opening and closing
-
     def _open(self) -> None:
         for name in self.machine.buses:
             self._buses[name] = attach(name, self.config.bus[name])
@@ -239,8 +237,6 @@ class SimService:
             self._folder.cleanup()
         self._pipe.close()
         self._closed = True
-
-    # -- the loop
 
     def stop(self) -> None:
         """Request the end of the loop; may be called from a signal handler or another thread."""
@@ -351,8 +347,6 @@ class SimService:
             return
         for name in self._buses:
             self._leave(name, [frame for where, frame in frames if where == name])
-
-    # -- panel and files
 
     def _serve_panel(self) -> None:
         """Execute the commands received on the panel's descriptor; its end does not end the machine."""

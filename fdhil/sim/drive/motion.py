@@ -112,8 +112,6 @@ class Motion:
     def bound(self) -> bool:
         return self._power.powered and self._numbers[0x606000] in modes.CYCLIC
 
-    # -- statusword and controlword
-
     @property
     def status_bits(self) -> int:
         """Bits 10, 12 and 13 of the statusword, as the mode defines them; bit 13 in homing only."""
@@ -182,8 +180,6 @@ class Motion:
         if self._target is not None:
             return self._target
         return self._profile.now if self.source in (Source.PROFILE, Source.STOP) else self._position
-
-    # -- the cycle
 
     def begin_cycle(self, actual: Actual) -> Command:
         """Apply the present set-points and return the command of the cycle."""
@@ -300,8 +296,6 @@ class Motion:
         halt = ramp is None and self._numbers[0x604000] & _HALT and self._numbers.get(0x605D00, 1) == 2
         index: int = (Ramp.QUICK_STOP if ramp is Ramp.QUICK_STOP or halt else Ramp.SLOW_DOWN).value
         return index << 8
-
-    # -- homing
 
     def _home(self, actual: Actual) -> None:
         run, limits = self.homing, self._limits

@@ -57,8 +57,6 @@ class CanopenNode(ABC):
         self._lss = lss.LssSlave(node_id, self._identity)
         self._stored = StoredParameters(dictionary)
 
-    # -- hooks of the device
-
     @abstractmethod
     def power_on(self) -> list[Frame]:
         """Boot or reboot; return the boot-up message if it is sent at once."""
@@ -87,8 +85,6 @@ class CanopenNode(ABC):
     @abstractmethod
     def _in_fault(self) -> bool:
         """Whether a fault waits for its reset."""
-
-    # -- life cycle
 
     @property
     def _mute(self) -> bool:
@@ -163,8 +159,6 @@ class CanopenNode(ABC):
             self._leave_operational(self._after_error)
             self._after_error = None
         return frames + self.pdo.on_events(self._now_s)
-
-    # -- frames
 
     def receive(self, can_id: int, data: bytes) -> list[Frame]:
         """Process one frame from the bus and return the answers; a frame without data is a remote frame."""

@@ -147,8 +147,6 @@ class PdoEngine:
                 return []
         return mapped
 
-    # -- reception
-
     def receives(self, can_id: int) -> bool:
         return can_id in self._rpdos
 
@@ -208,8 +206,6 @@ class PdoEngine:
             pdo.last_s = None
         return [pdo.number for pdo in late]
 
-    # -- transmission
-
     def at_sync(self, counter: int | None, now_s: float) -> list[Frame]:
         """Return the TPDOs due at this SYNC: types 1 to 240 every n-th, type 0 when changed, and events."""
         frames: list[Frame] = []
@@ -259,8 +255,6 @@ class PdoEngine:
             frames.append((pdo.cob_id, content))
         elif remaining > 0:
             self._drop[pdo.number] = remaining - 1
-
-    # -- configuration rules
 
     def _register_checks(self) -> None:
         rules = {1: self._check_cob_id, 2: self._check_kind, 3: self._check_invalid, 6: self._check_invalid}

@@ -104,8 +104,6 @@ class RealPhysics(Physics):
         x[cycle.ENCODER] = cycle.encoder_angle(self._p, self._g, x, False)
         self._was_enabled = False
 
-    # -- sensors
-
     def _unpack(self) -> None:
         x = self._x
         self.current_a, self.speed_rad_s, self.angle_rad = x[: cycle.TABLE_SPEED].tolist()
@@ -137,8 +135,6 @@ class RealPhysics(Physics):
             )
             return self._shown_speed
         return speed
-
-    # -- arguments of the kernel
 
     def _loops_vector(self, sync_period_s: float, increments_per_rev: int) -> Float:
         g, reality = self._regulators, self._reality

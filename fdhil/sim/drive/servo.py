@@ -105,8 +105,6 @@ class Drive(CanopenNode):
         """Set the callback that is called after each cycle with the mean voltage of the cycle before it."""
         self._cycle.ended = ended
 
-    # -- life cycle
-
     def power_on(self) -> list[Frame]:
         """Boot or reboot with the power-on values, to pre-operational; return the boot-up message if sent at once.
 
@@ -128,8 +126,6 @@ class Drive(CanopenNode):
         """Cut the supply: no frame is sent or answered, the axis coasts, until :meth:`power_on`."""
         super().power_off()
         self.power.start()
-
-    # -- the cycle
 
     def wall_clock(self, now_s: float, *, alone: bool = True) -> list[Frame]:
         """Run what depends on time: heartbeats both ways, time-outs, event-driven TPDOs, self-clocked motion.
@@ -215,8 +211,6 @@ class Drive(CanopenNode):
         self._control()
         self.feedback.show_state()
 
-    # -- faults and reactions
-
     def trip(self, code: int, detail: bytes = b"") -> None:
         """Enter the fault state with this error code: EMCY with the next frames, reaction by 0x605E."""
         self.dictionary.numbers[0x603F00] = code
@@ -240,8 +234,6 @@ class Drive(CanopenNode):
             reactions = {1: self.power.fault, 2: self.power.disable_voltage, 3: self.power.quick_stop}
             reactions.get(self.dictionary.number(0x6007), lambda: None)()
         self.feedback.show_state()
-
-    # -- interface for tests and for the machine around the drive
 
     def set_parameters(self, **values: float) -> None:
         """Change plant parameters (R, L, K, Jt, ft, Cd at the reference temperature) from the next cycle on.

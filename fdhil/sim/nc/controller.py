@@ -85,8 +85,6 @@ class NcController:
         self._hold = self._stopping = self._leaving = self._given_up = False
         self.override = 1.0
 
-    # -- the panel
-
     def switch(self, on: bool) -> None:
         """Take over the bus and enable the drives; or come to rest, disable them and release the bus."""
         if on and self.phase in (Phase.OFF, Phase.FAULTED):
@@ -153,8 +151,6 @@ class NcController:
             return f"{self._job.file} is being played; stop it first"
         return job.refusal(self.axes, self._period_s)
 
-    # -- the cycle
-
     def begin(self) -> list[BusFrame]:
         """Return the SYNC of this period, one frame per bus; none while the drives are being configured."""
         if self.phase in (Phase.OFF, Phase.CONFIGURE):
@@ -188,8 +184,6 @@ class NcController:
             case Phase.RELEASE:
                 return self._release()
         return self._stream()
-
-    # -- takeover and release
 
     def _take_over(self) -> None:
         self.phase = Phase.CONFIGURE
@@ -283,8 +277,6 @@ class NcController:
         self._stages.clear()
         self.in_force = None
         self.events.append({"event": "nc", "on": False})
-
-    # -- motion
 
     def _start_job(self) -> None:
         assert self._job is not None
