@@ -1,9 +1,11 @@
-"""Falsifies a reported signal as ordered by a fault script."""
+"""Adds white noise to a signal, and falsifies it as ordered by a fault script."""
 
 from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
+
+_NOISE_BLOCK = 1024
 
 
 @dataclass(slots=True)
@@ -45,3 +47,17 @@ class SignalFault:
         elif self._held is None:
             self._held = value
         return value if self._held is None else self._held
+
+
+class WhiteNoise:
+    """White noise, drawn in blocks."""
+
+    def __init__(self, std: float, rng: np.random.Generator) -> None:
+        self._std, self._rng = std, rng
+        self._drawn: list[float] = []
+
+    def draw(self) -> float:
+        """Return the next value."""
+        if not self._drawn:
+            self._drawn = (self._rng.standard_normal(_NOISE_BLOCK) * self._std).tolist()
+        return self._drawn.pop()

@@ -8,6 +8,7 @@ import numpy as np
 from fdhil.config import Accelerometer, MachineConfig, TableEncoder
 from fdhil.sim.drive.servo import Drive
 from fdhil.sim.frame import BusFrame, Frame
+from fdhil.sim.signal_fault import WhiteNoise
 
 OPERATIONAL, STOPPED, PRE_OPERATIONAL = 0x05, 0x04, 0x7F
 HEARTBEAT_S = 1.0
@@ -17,24 +18,12 @@ LIMITS = {
     "int32": (-(2**31), 2**31 - 1),
     "uint32": (0, 2**32 - 1),
 }
-_NOISE_BLOCK = 1024
 OFF_RATE = 1.007  # of the nominal rate: the sensor's oscillator is not a quartz
 TILT_M_S2 = 0.3  # share of gravity in a slightly tilted sensor
 KEPT_LINES = 2000
 WITHOUT_SYNC_S = 0.05
 MOST_CYCLES = 200  # limit of cycles made up at once
 SEED = 406  # added to the machine's seed, so that the other sensors' noise does not change
-
-
-class _Noise:
-    def __init__(self, std: float, rng: np.random.Generator) -> None:
-        self._std, self._rng = std, rng
-        self._drawn: list[float] = []
-
-    def next(self) -> float:
-        if not self._drawn:
-            self._drawn = (self._rng.standard_normal(_NOISE_BLOCK) * self._std).tolist()
-        return self._drawn.pop()
 
 
 class EncoderNode:
@@ -48,7 +37,7 @@ class EncoderNode:
         low, high = LIMITS[settings.type]
         self.frame_bytes = settings.byte + (high - low).bit_length() // 8
         self._settings = settings
-        self._noise = _Noise(noise_um * 1e-3, rng)
+        self._noise = WhiteNoise(noise_um * 1e-3, rng)
         self._due_s = 0.0
 
     def power_on(self) -> list[Frame]:
@@ -75,7 +64,7 @@ class EncoderNode:
             return []
         s = self._settings
         low, high = LIMITS[s.type]
-        count = round((table_mm + self._noise.next() - s.offset) / s.scale)
+        count = round((table_mm + self._noise.draw() - s.offset) / s.scale)
         count = (count - low) % (high - low + 1) + low
         size = (high - low).bit_length() // 8
         return [(self.cob_id, bytes(s.byte) + count.to_bytes(size, "little", signed=low < 0))]
@@ -91,7 +80,7 @@ class TableAccelerometer:
         self._settings = settings
         self._step = 1.0 / (settings.rate_hz * OFF_RATE * period_s)  # cycles
         self._period_s = period_s
-        self._noise = _Noise(noise_m_s2, rng)
+        self._noise = WhiteNoise(noise_m_s2, rng)
         self._cycle = 0
         self._next = self._step
         self._speed = self._begun = 0.0
@@ -112,7 +101,7 @@ class TableAccelerometer:
         s = self._settings
         self._count += 1
         numbers = ["0"] * max(4, s.column, s.count_column)
-        numbers[s.column - 1] = str(round((m_s2 + TILT_M_S2 + self._noise.next()) / s.scale))
+        numbers[s.column - 1] = str(round((m_s2 + TILT_M_S2 + self._noise.draw()) / s.scale))
         if s.count_column:
             numbers[s.count_column - 1] = str(self._count)
         if len(self._lines) < KEPT_LINES:

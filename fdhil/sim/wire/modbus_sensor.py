@@ -18,12 +18,12 @@ from collections import deque
 
 import numpy as np
 
+from fdhil.sim.signal_fault import WhiteNoise
 from fdhil.sim.wire.sensor_faults import SensorFaults
 
 REGISTERS = 116
 BLOCK = 100
 TRIGGER, STATUS, FIRST_SAMPLE = 10, 11, 16
-_NOISE_BLOCK = 1024
 
 
 class VoltageSensor:
@@ -38,8 +38,7 @@ class VoltageSensor:
         self.celsius = 20.0
         self.rate_hz = rate_hz
         self.volts_per_count = max(0.01, round(1.05 * limit_v / 32767, 4))
-        self._noise_v, self._rng = noise_v, rng
-        self._noise: list[float] = []
+        self._noise, self._rng = WhiteNoise(noise_v, rng), rng
         self._lock = threading.Lock()
         self._recent: deque[float] = deque(maxlen=BLOCK)
         self._count = 0  # samples so far
@@ -52,9 +51,7 @@ class VoltageSensor:
         if self._summed < self._cycles:
             return
         mean_v, self._sum_v, self._summed = self._sum_v / self._cycles, 0.0, 0
-        if not self._noise:
-            self._noise = (self._rng.standard_normal(_NOISE_BLOCK) * self._noise_v).tolist()
-        value = self.faults.signal.apply(mean_v + self._noise.pop(), self._rng)
+        value = self.faults.signal.apply(mean_v + self._noise.draw(), self._rng)
         with self._lock:
             self._recent.append(value)
             self._count += 1
