@@ -147,7 +147,7 @@ def cause_of(error: BaseException) -> str:
     if isinstance(error, nats.js.errors.NoStreamResponseError):
         return "the server has no stream yet; start fdhil fleet collect"
     if "uthorization" in text or "ermissions" in text:
-        return f"the server refuses the login ({text}); check user, password_file, certificate and permissions"
+        return f"the server refuses access ({text}); check user, password_file, certificate and permissions"
     if isinstance(error, nats.js.errors.APIError) and error.description:
         return f"the server refuses the request ({error.description})"
     if "SSL" in text or "certificate" in text:

@@ -71,4 +71,4 @@ async def test_no_name_no_text_and_no_time_is_in_it(
     assert {code for row in tables["windows"].to_pylist() for code in row["reasons"] if not code.isalpha()} == set()
 
     code, out, err = fdhil(*map(str, words), capsys=capsys)
-    assert (code, "exists already" in err) == (3, True)
+    assert (code, "already exists" in err) == (3, True)

@@ -78,7 +78,7 @@ async def test_each_tells_its_own_and_only_the_collector_reads(
         with pytest.raises(nats.errors.Error) as refused:  # in the name of another
             async with connected(entering(server, tmp_path, "mill-2"), "fdhil-mill-2", "uplink") as other:
                 await forge(other)
-        assert "it refuses us" in transport.cause_of(refused.value)
+        assert "the server refuses access" in transport.cause_of(refused.value)
     machine.close()
     assert SECRET not in "".join(capfd.readouterr())
 
@@ -99,7 +99,7 @@ async def test_who_has_no_credentials_gets_nothing(server: Server, tmp_path: Pat
     entered = connected(entering(server, tmp_path, "mill-1"), "fdhil-mill-1", "uplink")
     with pytest.raises((nats.errors.Error, OSError)) as error:
         await entered.__aenter__()
-    assert "it refuses us" in transport.cause_of(error.value)
+    assert "the server refuses access" in transport.cause_of(error.value)
 
 
 async def test_where_a_certificate_is_wanted_who_has_none_gets_nothing(tmp_path: Path) -> None:

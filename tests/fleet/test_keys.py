@@ -78,13 +78,13 @@ async def told_and_refused(server: Server, known: NatsServer, foreign: NatsServe
         with pytest.raises(nats.errors.Error):
             await client.request("fdhil.v1.mill-2.records", b"", timeout=1.0)
         await client.flush(60)  # what the server said against it has come by then
-        assert "it refuses us" in transport.cause_of(
+        assert "the server refuses access" in transport.cause_of(
             cast(BaseException, client.last_error)
         )  # a timeout alone would not be it
     for other in (foreign, NatsServer(server=server.url)):
         with pytest.raises(transport.ERRORS) as error:
             await transport.connected(other, "fdhil-mill-1", "uplink").__aenter__()
-        assert "it refuses us" in transport.cause_of(error.value)
+        assert "the server refuses access" in transport.cause_of(error.value)
 
 
 @pytest.mark.debian

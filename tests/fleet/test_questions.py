@@ -129,7 +129,7 @@ async def test_two_machines_of_one_name_are_reported(
     await gather(fleet_of(database, tmp_path), [message for part in messages for message in part])
     document, text = asked(capsys, 0, "status", works)
     (told,) = document["machines"]
-    assert "two machines send under this name" in told["doubt"]
+    assert "two machines use this name" in told["doubt"]
     assert told["missing"] == 0
     assert "give each machine a name of its own" in text
 

@@ -74,7 +74,7 @@ class Shop:
         for _ in range(3):  # on a busy host an answer may come too late, and it looks again after a minute only
             log.unlink(missing_ok=True)
             with running(log, "uplink", self.files[name]) as process:
-                until(lambda: "all that was recorded is sent" in process.said, "it has sent all")
+                until(lambda: "all records are sent" in process.said, "it has sent all")
             if "offers cannot be fetched" not in log.read_text():
                 break
 
@@ -126,7 +126,7 @@ def test_a_change_goes_out_stage_by_stage(collected: Shop) -> None:
     shop.fdhil(0, "offers", "accept", shop.files["mill-1"], "friction", "--by", "Bert")
     shop.uplink("mill-1")
     until(lambda: shop.told("SELECT count(*) FROM fleet.offer_answers") == [(1,)], "the answer has come")
-    assert "nothing was identified with it yet" in shop.opened(1, "--count", 1)["error"]["text"]
+    assert "no parameters were identified with it yet" in shop.opened(1, "--count", 1)["error"]["text"]
 
     machine = Machine(shop.files["mill-1"])  # the restarted daemon
     digest = shop.config("mill-1").digest
@@ -162,14 +162,17 @@ def test_a_change_goes_out_stage_by_stage(collected: Shop) -> None:
 
 def test_a_version_is_one_change_and_only_rises(shop: Shop) -> None:
     shop.opened(0, "--machine", "mill-1")
-    assert "mill-1: not known" in shop.opened(1, "--machine", "mill-1", "--despite", "x")["error"]["text"]
+    assert (
+        "mill-1: no machine with these labels"
+        in shop.opened(1, "--machine", "mill-1", "--despite", "x")["error"]["text"]
+    )
     shop.change.write_text(CHANGE.replace("0.061", "0.07"))
     assert "with other values" in shop.stage(1)["error"]["text"]
     shop.change.write_text(CHANGE.replace("version = 3", "version = 2"))
     assert "set version = 4 in the file" in shop.stage(1)["error"]["text"]
     shop.change.write_text(CHANGE.replace("version = 3", "version = 4").replace("V-800", "V-900"))
     assert shop.stage(0)["left"] == []
-    assert "no machine left" in shop.opened(1)["error"]["text"]
+    assert "no machine with these labels remains" in shop.opened(1)["error"]["text"]
 
 
 def test_where_the_server_is_away_no_stage_is_opened(shop: Shop, tmp_path: Path) -> None:

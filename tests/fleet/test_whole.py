@@ -177,7 +177,7 @@ def test_a_network_that_drops_all_is_waited_for(tmp_path: Path, database: Postgr
             until(lambda: counted(database) == expected, f"the first are there: {collector.said} {uplink.said}")
             network.cut = True
             before, expected = expected, expected + machine.record(20)
-            until(lambda: "it is tried again" in uplink.said, "the uplink gives the connection up")
+            until(lambda: "retrying" in uplink.said, "the uplink gives the connection up")
             assert counted(database) == before
             network.cut = False
             until(lambda: counted(database) == expected, "all are there")
