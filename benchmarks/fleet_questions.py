@@ -62,7 +62,7 @@ ASKED: dict[str, Callable[[Db], object]] = {
     "outliers --by type": lambda db: questions.outliers(db, "type", None),
     "compare --parameter ft": lambda db: questions.compare(db, "ft", "type", None),
     "trend of one axis": lambda db: questions.trend(db, "mill-00007", "X", "ft"),
-    "services": lambda db: questions.services(db),
+    "services": questions.QUERIES["services"],
 }
 
 

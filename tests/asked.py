@@ -1,4 +1,4 @@
-"""Windows whose voltage is of a meter that shows one value and was asked near its instants, each with its time."""
+"""Windows whose voltage comes from a polled meter: each value has its own time, near the sampling instant."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FINE_S, FINE_IN_PERIOD, REACH = 0.002, 5, 2
 
 
 def asked_windows(*, noise: float = 0.005, timely: bool = False) -> list[Window]:
-    """Return rapids asked every 10 ms: ``timely`` at their instants, else up to 4 ms off them either way."""
+    """Return rapids polled every 10 ms: ``timely`` at the instants, else up to 4 ms off in either direction."""
     rng = np.random.default_rng(5)
     return [_asked(window, rng, timely) for window in slow_windows(FINE_S, "instant", noise=noise)]
 

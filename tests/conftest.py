@@ -1,4 +1,4 @@
-"""House rules for every test: warnings are errors (pyproject), and nothing may be left behind."""
+"""Rules for every test: warnings are errors (pyproject), and no thread, descriptor or handler may be left behind."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ settings.load_profile("fixed")
 
 
 def pytest_collection_finish() -> None:
-    """Put what was imported out of the garbage collector's sight: it would walk it thousands of times."""
+    """Exclude the imported modules from garbage collection, which would scan them thousands of times."""
     gc.collect()
     gc.freeze()
     gc.enable()
@@ -48,14 +48,14 @@ def no_thread_left() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def no_signal_caught() -> Iterator[None]:
-    """Fail a test that leaves a descriptor behind to which signals are told: a later one would break a pipe."""
+    """Fail a test that leaves a signal wake-up descriptor behind: a later signal would break a pipe."""
     yield
     assert signal.set_wakeup_fd(-1) == -1, "signals are still told to a descriptor"
 
 
 @pytest.fixture
 def handlers() -> Iterator[None]:
-    """Give back what a guard that is started in this process takes: all signals, and the garbage collector."""
+    """Restore what a guard started in this process changes: signal handlers and the garbage collector."""
     before = {number: signal.getsignal(number) for number in signal.valid_signals()}
     yield
     descriptor = signal.set_wakeup_fd(-1)

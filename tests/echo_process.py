@@ -1,4 +1,4 @@
-"""A child for the tests of bounded processes: reports its request, then ends, hangs, or breaks off as it is asked."""
+"""A child for the tests of bounded processes: reports its request, then ends, hangs or aborts as requested."""
 
 import os
 import sys
@@ -8,7 +8,6 @@ from fdhil.bounded_process import limit_process, receive_request, report
 
 
 def main() -> None:
-    """Answer the one request."""
     limit_process(0, {})
     request = receive_request()
     report({"request": request, "pid": os.getpid()})

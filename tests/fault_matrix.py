@@ -1,7 +1,7 @@
-"""The fault matrix: each fault that may happen, the class that tells it, and what is known to have no test yet.
+"""The fault matrix: each fault that may happen, the class that reports it, and the faults known to have no test yet.
 
-A test proves a row by the marker ``fault("A1", ...)``: the safe reaction happens, and the class is told by its name.
-Of a parametrized test whose case begins with a row's id ("A20 short"), the case counts for that row alone.
+A test proves a row by the marker ``fault("A1", ...)``: the safe reaction happens, and the class is reported by its
+name. A case of a parametrised test whose id begins with a row's id ("A20 short") counts for that row alone.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ TESTS = Path(__file__).parent
 
 @dataclass(frozen=True)
 class Row:
-    """One fault: its id, what happens in a few words, the classes that tell it (none: it is counted or silent)."""
+    """One fault: its id, a short description, the classes that report it (none: it is counted or silent)."""
 
     id: str
     fault: str
@@ -162,7 +162,7 @@ ROWS: dict[str, Row] = {row.id: row for row in map(_row, TEXT.strip().splitlines
 
 @cache
 def marked() -> dict[str, tuple[Path, ...]]:
-    """Return the files with a test of each row, as their text says it: nothing is imported."""
+    """Return the files with a test of each row, found in their text: nothing is imported."""
     found: dict[str, set[Path]] = {}
     for path in TESTS.rglob("*.py"):
         text = path.read_text("utf-8")

@@ -1,10 +1,11 @@
-"""Pytest plugin behind ``make faults``: runs what carries the markers ``fault`` and ``goal`` and tells it row by row.
+"""Pytest plugin behind ``make faults``: runs the tests marked ``fault`` or ``goal`` and reports the results row by row.
 
-``--fault-table PATH`` prints the tables at the end and writes PATH (a page) with its figures beside it (.json);
-``--on-socketcan`` adds what runs on a real SocketCAN interface to figures that are there. A test tells what it saw by
-``record_property``: ``sync_to_zero``, SYNC from the fault to the first frames with zero; ``goal``, a goal's figure.
+``--fault-table PATH`` prints the tables at the end and writes PATH (a page) with its figures next to it (.json);
+``--on-socketcan`` adds results on a real SocketCAN interface to existing figures. A test reports its measurements by
+``record_property``: ``sync_to_zero``, the SYNC count from the fault to the first frames with zero; ``goal``, a goal's
+figure.
 
-``python -m tests.fault_table`` gathers the goals of the studies anew, runs nothing, and writes the page.
+``python -m tests.fault_table`` collects the goals of the studies, runs nothing, and writes the page.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ What was measured last of each, by which command, on which day and commit. What 
 
 
 class FaultTable:
-    """What became of each row's tests and of each goal's."""
+    """Outcomes of the tests of each row and goal."""
 
     def __init__(self, path: Path, real: bool) -> None:
         self.path, self.figures = path, path.with_suffix(".json")
@@ -57,13 +58,13 @@ class FaultTable:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        """Note what each test proves."""
+        """Record what each test proves."""
         for item in items:
             self._rows_of[item.nodeid] = rows_proven(item)
             self._goals_of[item.nodeid] = goals_proven(item)
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Count a test that ran, and one that failed before or after it did."""
+        """Count a completed test, and one that failed in set-up or tear-down."""
         seen = dict(report.user_properties)
         for row in self._rows_of.get(report.nodeid, ()):
             told = self.document["rows"][row]
@@ -96,19 +97,18 @@ class FaultTable:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the options that ask for the tables."""
     parser.addoption("--fault-table", type=Path, help="tell each row of the fault matrix and each goal in PATH")
     parser.addoption("--on-socketcan", action="store_true", help="add this run to what --fault-table wrote before")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Tell the rows where it was asked for."""
+    """Register the table where it was requested."""
     if path := config.getoption("--fault-table"):
         config.pluginmanager.register(FaultTable(path, config.getoption("--on-socketcan")), "fault-table-rows")
 
 
 def rows_proven(item: pytest.Item) -> tuple[str, ...]:
-    """Return the rows of a test; a case of a parametrized one whose id begins with a row's proves that one alone."""
+    """Return the rows of a test; a parametrised case whose id begins with a row's proves that row alone."""
     rows = {row for mark in item.iter_markers("fault") for row in mark.args}
     if unknown := rows - ROWS.keys():
         raise pytest.UsageError(f"{item.nodeid} names {sorted(unknown)}, which the fault matrix does not have")
@@ -125,12 +125,12 @@ def goals_proven(item: pytest.Item) -> tuple[str, ...]:
 
 
 def blank() -> Told:
-    """Return what is told of a row without any test."""
+    """Return the entry of a row without any test."""
     return {"passed": 0, "failed": [], "real_passed": 0, "real_failed": [], "sync_to_zero": []}
 
 
 def gather(document: dict[str, Any], folder: Path) -> None:
-    """Lay what the studies in ``folder`` measured, and R1 of the rows, beside the goals that tests proved."""
+    """Combine the measurements of the studies in ``folder``, and R1 of the rows, with the goals proved by tests."""
     run, proven = document["run"], document["goals"]
     own = {goal: [each for each in told if each["by"] == goals.SOURCE] for goal, told in proven.items() if goal != "R1"}
     figure, met = summary(document["rows"]), everything_survived(document["rows"])
@@ -143,13 +143,13 @@ def gather(document: dict[str, Any], folder: Path) -> None:
 
 
 def everything_survived(rows: Mapping[str, Told]) -> bool:
-    """Whether every row was tested and none failed, enough of them on a real interface."""
+    """Whether every row was tested without failure, enough of them on a real interface."""
     real = sum(told["real_passed"] > 0 for told in rows.values())
     return all(survived(told) == "yes" for told in rows.values()) and real >= LEAST_REAL
 
 
 def survived(told: Told) -> str:
-    """Return yes, no, or that the row was tested on a real interface alone, or not at all."""
+    """Return yes, no, or that the row was tested on a real interface only, or not at all."""
     if told["failed"] or told["real_failed"]:
         return "**no**"
     if told["passed"]:
@@ -158,7 +158,7 @@ def survived(told: Told) -> str:
 
 
 def to_zero(own: Sequence[int], studied: Mapping[str, float] | None) -> str:
-    """Return the median and the worst count of SYNC from fault to zero, empty where nobody counted."""
+    """Return the median and the worst SYNC count from fault to zero, empty where none was counted."""
     if studied is not None:
         return f"{studied['median']:g}, at worst {studied['worst']:g} of {studied['trials']:,}"
     if not own:
@@ -192,7 +192,6 @@ def summary(rows: Mapping[str, Told]) -> str:
 
 
 def page(document: Mapping[str, Any]) -> str:
-    """Return the page that the figures make."""
     run, found = document["run"], document["goals"]
     told = f"{summary(document['rows'])} Measured on {run['date']} at commit {run['commit']}."
     reached = (goals.summary(found), "", *goals.lines(found))
@@ -200,7 +199,6 @@ def page(document: Mapping[str, Any]) -> str:
 
 
 def write(document: Mapping[str, Any], path: Path) -> None:
-    """Write the figures and their page."""
     path.with_suffix(".json").write_text(json.dumps(document, separators=(",", ":")) + "\n", "utf-8")
     path.write_text(page(document), "utf-8")
 
@@ -213,7 +211,6 @@ def provenance() -> dict[str, str]:
 
 
 def main() -> None:
-    """Gather the goals anew."""
     document = json.loads(PAGE.with_suffix(".json").read_text("utf-8"))
     gather(document, PAGE.parent)
     write(document, PAGE)

@@ -1,8 +1,8 @@
-"""The goals R1 to R20 beyond single faults: the bar of each, and what was measured of it last, when and by what.
+"""The goals R1 to R20 beyond single faults: the limit of each, and its latest measurement with date and command.
 
 A study has its goals in its figures, ``"goals": {"R2": {"met": true, "figure": "0 of 1,204 ..."}}``; a test proves one
-by the marker ``goal("R19")`` and tells its figure by ``record_property("goal", "...")``. What neither has is not
-measured, and the table says so.
+by the marker ``goal("R19")`` and reports its figure by ``record_property("goal", "...")``. Goals with neither are
+listed as not measured.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SOURCE = "make faults"
 
 
 def of_studies(folder: Path) -> dict[str, list[dict[str, Any]]]:
-    """Return what the studies' figures say of each goal, with the command, the day and the commit of the study."""
+    """Return the goals of the studies' figures, with command, day and commit of each study."""
     found: dict[str, list[dict[str, Any]]] = {}
     for path in sorted(folder.glob("*.json")):
         document = json.loads(path.read_text("utf-8"))
@@ -56,7 +56,6 @@ def of_studies(folder: Path) -> dict[str, list[dict[str, Any]]]:
 
 
 def _told(document: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
-    """The goals of a study; that of the verdicts follows from its counts."""
     figures = document.get("figures", {})
     if document.get("study") == "verdicts":
         return {"R10": of_verdicts(figures)}
@@ -67,7 +66,7 @@ def _told(document: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
 def of_verdicts(figures: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[str, Any]:
     """Return R10: faulty recordings that were validated, and windows of clean ones that were refused.
 
-    Wrong is what does harm: a fault too small for any parameter may be told as a warning, and the model kept.
+    Only harmful outcomes count: a fault too small for any parameter may cause a warning with the model kept.
     """
     kinds = [(name, kind) for study in figures.values() for name, kind in study.items()]
     bad = [kind for name, kind in kinds if name != "good"]
@@ -84,7 +83,7 @@ def of_verdicts(figures: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[
 
 
 def lines(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> Iterator[str]:
-    """Yield the table in Markdown; a goal is met where all that was measured of it says so."""
+    """Yield the table in Markdown; a goal is met if all its measurements agree."""
     yield "| goal | about | to reach | measured | met | by | on |"
     yield "|---|---|---|---|---|---|---|"
     for identity, (goal, bar) in GOALS.items():

@@ -1,4 +1,4 @@
-"""A command before a command: what it runs heeds the modes of files, also where root runs the tests."""
+"""A command prefix that makes its program respect file modes, also when root runs the tests."""
 
 from __future__ import annotations
 

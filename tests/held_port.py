@@ -1,4 +1,4 @@
-"""A TCP port that nobody is given by chance: for a server that is told its port, or for nobody at all."""
+"""A reserved TCP port: for a server with a configured port, or for none at all."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def held_port() -> Iterator[int]:
-    """Hold a port of the loopback: whoever connects is refused until a server that reuses addresses listens there."""
+    """Reserve a port of the loopback: connections are refused until a server with address reuse listens there."""
     with socket.socket() as holder:
         holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         holder.bind(("127.0.0.1", 0))

@@ -1,4 +1,4 @@
-"""Which TCP ports a process listens at, by the kernel's own tables."""
+"""The TCP ports at which a process listens, from the kernel's tables."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ LISTEN = "0A"
 
 
 def tcp_ports(pid: int) -> set[int]:
-    """Return the TCP ports at which a process listens."""
     sockets = set()
     for descriptor in Path(f"/proc/{pid}/fd").iterdir():
         try:

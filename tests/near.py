@@ -1,8 +1,8 @@
-"""Pytest plugin behind ``make near``: runs the tests nearest to what was changed, for half a minute.
+"""Pytest plugin behind ``make near``: runs the tests nearest to the changes, for half a minute.
 
-Changed is what differs from the last commit, or else what the last commit changed. A test is near by the number of
-imports between it and a changed module, or by its name; a file that is no module counts as its package. A module that
-another one names in a string, as the tables and the command line do, counts as imported.
+Changes are the differences from the last commit, or else those of the last commit. The distance of a test is the number
+of imports between it and a changed module, or given by its name; a file that is not a module counts as its package. A
+module named in a string, as in the tables and the command line, counts as imported.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def measure_distances(changed: Iterable[Path]) -> dict[str, int]:
 
 
 class NearTests:
-    """Collects near tests alone, nearest first, and ends the run in time."""
+    """Collects near tests only, nearest first, and ends the run in time."""
 
     def __init__(self) -> None:
         self._distances = measure_distances(list_changed_files())
@@ -75,7 +75,7 @@ class NearTests:
         return self._distances.get(".".join(path.relative_to(ROOT).with_suffix("").parts))
 
     def pytest_ignore_collect(self, collection_path: Path) -> bool | None:
-        """Leave modules unread that depend on nothing changed."""
+        """Skip modules that depend on nothing changed."""
         is_test = collection_path.name.startswith("test_") and collection_path.suffix == ".py"
         return True if is_test and self._distance(collection_path) is None else None
 
@@ -92,10 +92,8 @@ class NearTests:
     _session: pytest.Session | None = None
 
     def pytest_sessionstart(self, session: pytest.Session) -> None:
-        """Keep what can be stopped."""
         self._session = session
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Begin."""
     config.pluginmanager.register(NearTests())

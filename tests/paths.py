@@ -1,4 +1,4 @@
-"""The bench's path (figure 10 of [DES]) as the NC orders it, made here without the planner."""
+"""The bench's path (figure 10 of [DES]) as commanded by the NC, computed without the planner."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _line(a: tuple[float, float], b: tuple[float, float], step_mm: float) -> Flo
 
 
 def smooth(path: Float, windows_s: tuple[float, ...], dt_s: float) -> Float:
-    """Moving averages, causal, starting from rest at the first row."""
+    """Apply causal moving averages, starting from rest at the first sample."""
     for window in windows_s:
         m = round(window / dt_s)
         total = np.cumsum(np.concatenate([np.repeat(path[:1], m, axis=0), path]), axis=0)
@@ -47,7 +47,6 @@ def _bench_demand(feed_m_min: float, smoothing_s: tuple[float, ...], hold_s: flo
 
 
 def _demand(path: Float, feed_m_min: float, smoothing_s: tuple[float, ...], hold_s: float, dt_s: float) -> Float:
-    """The path (m, 2) run through at constant feed, smoothed per axis, held at its end."""
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     along = np.minimum(np.arange(int(arc[-1] / (feed_m_min / 0.06 * dt_s)) + 2) * feed_m_min / 0.06 * dt_s, arc[-1])
     rows = np.column_stack([np.interp(along, arc, path[:, a]) for a in range(2)])
@@ -56,7 +55,6 @@ def _demand(path: Float, feed_m_min: float, smoothing_s: tuple[float, ...], hold
 
 
 def trajectory(demand: Float, axes: str = "XY", dt_s: float = 0.001) -> Trajectory:
-    """Wrap a demand (n, d) as a reference."""
     n = len(demand)
     return Trajectory(
         dt_s,
@@ -74,7 +72,6 @@ def bench_trajectory(feed_m_min: float, smoothing_s: tuple[float, ...] = (0.060,
 
 
 def rms(values: Float) -> float:
-    """Root mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -100,10 +97,10 @@ def _arc(centre: tuple[float, float], radius: float, begin: float, end: float, s
 
 
 def jerky_demand(feed_m_min: float, acceleration_mm_s2: float = 2000.0, dt_s: float = 0.001) -> Float:
-    """Return (n, 2) in mm: the bench path with steps of acceleration and no smoothing, as LinuxCNC orders it.
+    """Return (n, 2) in mm: the bench path with steps of acceleration and no smoothing, as LinuxCNC commands it.
 
-    Each straight or arc runs a trapezoid of speed; the next one begins where the one before it brakes, each with half
-    of the acceleration, so that corners become parabolas (LinuxCNC's G64 without a tolerance).
+    Each straight or arc follows a trapezoid of speed; the next one begins where the previous one decelerates, each with
+    half of the acceleration, so that corners become parabolas (LinuxCNC's G64 without a tolerance).
     """
     path = _geometry()
     corners = [0, *(int(np.argmin(np.hypot(*(path - c).T))) for c in ((0, 55), (100, 55), (200, 55), (250, 55)))]
@@ -124,7 +121,7 @@ def jerky_demand(feed_m_min: float, acceleration_mm_s2: float = 2000.0, dt_s: fl
 
 
 def _trapezoid_length(time_s: Float, length: float, top: float, rate: float) -> Float:
-    """Length covered by ``time_s`` on a move that accelerates, runs at ``top`` and brakes."""
+    """Return the length covered by ``time_s`` of a move that accelerates, runs at ``top`` and decelerates."""
     ramp, brake = top / rate, length / top
     t = np.clip(time_s, 0.0, brake + ramp)
     up, down = np.minimum(t, ramp), np.maximum(t - brake, 0.0)

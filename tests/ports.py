@@ -1,4 +1,4 @@
-"""Ports for programs that cannot choose one themselves."""
+"""Free ports for programs that cannot choose one themselves."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ BELOW_EPHEMERAL = range(10_000, 30_000)  # whoever asks the kernel for any port 
 
 
 def free_port() -> int:
-    """Return a TCP port of this computer that nobody has, and that is given to nobody who asks for any."""
+    """Return a free TCP port outside the range of automatically assigned ports."""
     while True:
         port = random.SystemRandom().choice(BELOW_EPHEMERAL)
         with suppress(OSError), socket.create_server(("127.0.0.1", port)):

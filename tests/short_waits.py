@@ -1,4 +1,4 @@
-"""Waits for what may come on a bus, shortened for drives that a thread of this process simulates.
+"""Shortens the waiting times of commissioning for drives simulated in this process.
 
 On a real bus commissioning listens for seconds before it sends; a simulated drive answers at once.
 """
@@ -21,6 +21,6 @@ SHORT_WAITS: dict[str, float] = {
 
 
 def shorten_waits(monkeypatch: pytest.MonkeyPatch, others: dict[str, float] | None = None) -> None:
-    """Set ``SHORT_WAITS``, and ``others`` by the same names, for the time of a test."""
+    """Set ``SHORT_WAITS``, and ``others`` by the same names, during a test."""
     for name, value in {**SHORT_WAITS, **(others or {})}.items():
         monkeypatch.setattr(f"fdhil.{name}", value)

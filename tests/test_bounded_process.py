@@ -1,4 +1,4 @@
-"""A child process with bounds: what it reports is taken, and it never outlives whoever asked."""
+"""A bounded child process: its reports are received, and it never outlives its caller."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ CHILD = "tests.echo_process"
 
 
 def has_ended(pid: int) -> bool:
-    """Whether there is no such process any more."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

@@ -1,4 +1,4 @@
-"""A loop that tries again ends when it is told to, whatever its attempt does with the cancellation."""
+"""A retry loop ends when cancelled, whatever its attempt does with the cancellation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fdhil.errors import ConnectError, DeviceError
 
 
 class Attempt:
-    """Something that waits until it is cancelled, and then does as ``ends`` says."""
+    """Waits until it is cancelled, and then acts as ``ends`` says."""
 
     def __init__(self, ends: str) -> None:
         self.ends, self.begun, self.release = ends, asyncio.Event(), asyncio.Event()

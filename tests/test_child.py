@@ -1,4 +1,4 @@
-"""A child process ends with the process that started it, however that one ends."""
+"""A child process ends with its parent, however the parent ends."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ sys.stdin.read()
 
 @pytest.fixture(autouse=True)
 def _hang_up_is_not_ignored() -> Iterator[None]:
-    """Undo what nohup has done, also for what is started here."""
+    """Restore the default of SIGHUP, which nohup changes, also for child processes."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     signal.signal(signal.SIGHUP, before)

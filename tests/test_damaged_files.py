@@ -1,4 +1,4 @@
-"""Files that are read but not kept by the store: damaged or hostile, each is a declared error, never other values."""
+"""Files outside the store: damage or hostile content causes a declared error, never wrong values."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ HOSTILE = {
 
 
 def flips(whole: bytes, most: int, seed: int) -> Iterator[bytes]:
-    """The content with one bit flipped, at places all over it."""
+    """Return the content with single flipped bits at positions all over it."""
     rng = random.Random(seed)
     for byte in range(0, len(whole), max(1, len(whole) // most)):
         flipped = bytearray(whole)
@@ -58,7 +58,7 @@ def test_no_flipped_bit_of_the_guards_settings_is_believed(tmp_path: Path) -> No
 @pytest.mark.parametrize("read", [load, load_model_file])
 @pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE)
 def test_a_hostile_document_is_a_config_error(text: str, read: Callable[[Path], object], tmp_path: Path) -> None:
-    """The guard's settings and a model file: whatever they hold, a sentence of bounded length."""
+    """The guard's settings and a model file: any content gives one sentence of bounded length."""
     path = tmp_path / "document.json"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
@@ -67,7 +67,7 @@ def test_a_hostile_document_is_a_config_error(text: str, read: Callable[[Path], 
 
 
 def test_a_model_file_with_a_flipped_bit_is_numbers_or_a_config_error(tmp_path: Path) -> None:
-    """It is written by hand and carries no digest; what it says is checked all the same."""
+    """It is written by hand and has no digest; its values are checked all the same."""
     path = tmp_path / "model.json"
     values = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
     refused = 0
@@ -94,7 +94,7 @@ def test_a_token_with_a_flipped_bit_arms_nothing_and_is_no_traceback(tmp_path: P
 
 @pytest.mark.usefixtures("long_computation")
 def test_a_checked_program_with_a_flipped_bit_is_checked_again(tmp_path: Path) -> None:
-    """The rows that the guard will get, and what vouches for them."""
+    """The guard's rows and their attestation."""
     rows = bytes(range(256)) * 16
     errors = {"before": {"rms_um": 1.0, "max_um": 2.0}, "after": {"rms_um": 0.1, "max_um": 0.2}}
     blocks = [[512, hashlib.sha256(rows).hexdigest()]]

@@ -1,4 +1,4 @@
-"""What fdhil is built of: each package pinned by its content, and nothing else is installed."""
+"""The dependencies of fdhil: each package is pinned by its hash, and nothing else is installed."""
 
 from __future__ import annotations
 
@@ -40,7 +40,6 @@ def test_every_dependency_is_in_the_lock() -> None:
 
 
 def make_wheel(folder: Path, says: str) -> str:
-    """Write a wheel; return its SHA-256."""
     path = folder / WHEEL
     about = {"METADATA": "Metadata-Version: 2.1\nName: harmless\nVersion: 1.0\n", "RECORD": ""}
     about["WHEEL"] = "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
@@ -54,7 +53,7 @@ def make_wheel(folder: Path, says: str) -> str:
 @pytest.mark.usefixtures("processes")
 @pytest.mark.fault("G14")
 def test_a_package_with_other_content_is_not_installed(tmp_path: Path) -> None:
-    """By the very options of the Makefile and of the unit's instructions."""
+    """With the options of the Makefile and of the unit's instructions."""
     honest = make_wheel(tmp_path, "print('good')")
     (tmp_path / "requirements.lock").write_text(f"harmless==1.0 --hash=sha256:{honest}\n")
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-index"]

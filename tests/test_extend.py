@@ -1,4 +1,4 @@
-"""The examples of the page on how to extend fdhil, put in as it says, pass the tests that it names."""
+"""The examples of the page on extending fdhil, inserted as described, pass the tests that it names."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TABLES = ("DRIVE_PROFILES", "VOLTAGE_SOURCES", "ESTIMATORS", "CORRECTIONS", "EVE
 
 
 def found(pattern: str, section: str) -> tuple[str, ...]:
-    """Return the groups of the one place where the section has the pattern."""
+    """Return the groups of the single match of the pattern in the section."""
     places = list(re.finditer(pattern, section, re.MULTILINE | re.DOTALL))
     assert len(places) == 1, f"{len(places)} places with {pattern}: {section[:60]}"
     return places[0].groups()
@@ -29,7 +29,7 @@ def found(pattern: str, section: str) -> tuple[str, ...]:
 
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
-    """A copy of the package and of its tests, as a user has them."""
+    """A copy of the package and of its tests, as users have them."""
     for folder in ("fdhil", "tests", "studies", "configs"):
         shutil.copytree(ROOT / folder, tmp_path / folder, ignore=HALF_WRITTEN)
     shutil.copy(ROOT / "pyproject.toml", tmp_path)

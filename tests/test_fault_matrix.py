@@ -1,4 +1,4 @@
-"""The fault matrix keeps its tests: a row that had one never loses its last."""
+"""The fault matrix keeps its tests: no row loses its last one."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_no_row_loses_its_last_test() -> None:
 
 
 def test_each_row_is_told_by_the_name_of_its_class() -> None:
-    """A file that proves a row names its class, unless the product tells it otherwise and the matrix says how."""
+    """A file that proves a row names its class, unless the matrix states another report."""
     texts = {path: path.read_text("utf-8") for paths in marked().values() for path in paths}
     silent = [
         f"{row} {name}"

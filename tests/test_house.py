@@ -1,4 +1,4 @@
-"""The package's size: each room stays within the lines that pyproject.toml grants it."""
+"""The size of the package: each room stays within its budget of lines in pyproject.toml."""
 
 from __future__ import annotations
 

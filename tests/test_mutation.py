@@ -1,4 +1,4 @@
-"""The study of mistakes: it makes them, puts them where they are said to be, and is told by a test that fails."""
+"""The mutation study: it creates mutants at the stated locations and detects failing tests."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_a_mistake_replaces_what_others_have_imported() -> None:
 
 @pytest.mark.usefixtures("processes")
 def test_mistakes_are_noticed_by_tests_that_call_the_place(tmp_path: Path) -> None:
-    """The study itself, on a small module: what a test calls and checks is noticed, what none calls is said so."""
+    """The study on a small module: called and checked code is detected, uncalled code is reported."""
     options = ["--modules", "requests", "--every", "12", "--tests", "tests/guard/test_requests.py"]
     command = [sys.executable, "-m", "studies.mutants", *options, "--out", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

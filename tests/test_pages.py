@@ -1,4 +1,4 @@
-"""The pages under docs/ that commands write: each is what its figures say, and other figures make other words."""
+"""The generated pages under docs/: each matches its figures, and other figures change its conclusions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def document(study: str) -> Figures:
 
 
 def prose(page: str) -> str:
-    """Return a page's words without its tables, in one line."""
+    """Return a page's text without its tables, in one line."""
     return " ".join(line for line in page.splitlines() if not line.startswith("|"))
 
 
@@ -55,7 +55,7 @@ def test_the_benchmarks_page_is_what_its_figures_say() -> None:
 
 
 def _least_squares_without_bias(figures: Figures) -> None:
-    """A world in which raw least squares is right and the product's other choices are not."""
+    """Figures in which raw least squares is right and the product's other choices are not."""
     names = figures["methods"]
     for case in figures["cases"]:
         for k in range(len(figures["filters"])):

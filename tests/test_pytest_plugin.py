@@ -1,4 +1,4 @@
-"""The fixture for other people's tests: used from a test suite of its own, as a package's user would."""
+"""The pytest fixture for other projects, used from a separate test suite."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_the_package_tells_pytest_of_it() -> None:
 
 
 def test_machine_that_does_not_get_ready_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The thread that serves it would keep the test run from ending."""
+    """Its thread would prevent the end of the test run."""
     from fdhil.pytest_plugin import FeedDriveBench
 
     def interrupted(_: FeedDriveBench, event: str) -> None:

@@ -1,4 +1,4 @@
-"""The soak's own arithmetic: what it concludes of growth follows from the samples; what is too little is said so."""
+"""The soak's evaluation: conclusions on growth follow from the samples; insufficient data is reported."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ print("after", flush=True); sys.stdin.readline()
 
 
 def samples(folder: Path, grown_mb: float, rounds: int, hour_s: float, emergencies: int) -> None:
-    """Write a run in which the guard grows by so much in a round, and the daemon was started again early."""
+    """Write a run in which the guard grows by this amount per round, and the daemon was restarted early."""
     folder.mkdir()
     (folder / "run.json").write_text(json.dumps(RUN))
     with (folder / "samples.jsonl").open("w") as file:

@@ -1,4 +1,4 @@
-"""The registries: whatever they list can be loaded, and the defaults are listed."""
+"""The registries: every entry can be loaded, and the defaults are listed."""
 
 from __future__ import annotations
 

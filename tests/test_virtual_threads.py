@@ -1,4 +1,4 @@
-"""Threads on virtual time: one at a time, in the order of their deadlines, and without a wait of this computer."""
+"""Threads on virtual time: one at a time, in the order of their deadlines, without real waiting."""
 
 from __future__ import annotations
 

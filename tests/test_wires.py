@@ -1,4 +1,4 @@
-"""The study of spoilt wires, short: no wrong value, every loss counted; and it would notice if it were otherwise."""
+"""A short wire study: no wrong value, every loss counted; violations would be detected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The zoo's machines are independent of what they judge, obey physics, and are examined as a user would."""
+"""The zoo's machines are independent of the code under test, obey physics, and are examined like by a user."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""Sorts tests into tiers by what they request, and fails a test that does more than its tier allows.
+"""Sorts tests into tiers by their fixtures, and fails a test that does more than its tier allows.
 
 A test is of the *system* tier when it requests one of ``SYSTEM_FIXTURES``, itself or through another fixture, or needs
 a Debian package or a CAN interface; all others are of the *fast* tier. ``make test`` runs the fast tier, ``make
-test-system`` the system tier. A fast test starts no process, does not sleep and uses little processor time; what it
-does beyond that is its failure, with the name of the fixture to request.
+test-system`` the system tier. A fast test starts no process, does not sleep and uses little processor time; otherwise
+it fails with the name of the fixture to request.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ WHOLE_MODULE = re.compile(
 
 
 def sampled(cases: Iterable[object], every: int) -> list[ParameterSet]:
-    """Return the cases of a parametrised test; the fast tier takes each ``every``-th, the system tier the others.
+    """Return the cases of a parametrised test; the fast tier runs each ``every``-th, the system tier the others.
 
     A case that is a tuple has a value for each argument.
     """
@@ -44,7 +44,7 @@ def sampled(cases: Iterable[object], every: int) -> list[ParameterSet]:
 
 
 class AuditTrail:
-    """What Python's audit events report of the test that runs, fixtures included: processes started, seconds slept."""
+    """Counts processes started and seconds slept during a test, fixtures included, by Python's audit events."""
 
     def __init__(self) -> None:
         self.processes: list[str] = []
@@ -52,7 +52,6 @@ class AuditTrail:
         sys.addaudithook(self._record)
 
     def clear(self) -> None:
-        """Forget the test before."""
         self.processes.clear()
         self.slept_s, self.start_s = 0.0, time.process_time()
 
@@ -68,22 +67,22 @@ TRAIL = AuditTrail()
 
 @pytest.fixture(scope="session")
 def processes() -> None:
-    """Allow a test to start processes and to wait for them: it is of the system tier."""
+    """Allow a test to start processes and to wait for them (system tier)."""
 
 
 @pytest.fixture(scope="session")
 def long_computation() -> None:
-    """Allow a test to compute for longer than the fast tier can afford: it is of the system tier."""
+    """Allow a test to compute for longer than the fast tier permits (system tier)."""
 
 
 @pytest.fixture(scope="session")
 def real_time() -> None:
-    """Allow a test to wait for a second and more, as for the silence of a bus: it is of the system tier."""
+    """Allow a test to wait for a second or more, as for the silence of a bus (system tier)."""
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of the system tier, before ``-m`` selects."""
+    """Mark the tests of the system tier before ``-m`` selects."""
     for item in items:
         requested = SYSTEM_FIXTURES.intersection(getattr(item, "fixturenames", ()))
         if requested or any(item.get_closest_marker(mark) for mark in SYSTEM_MARKS):
@@ -94,7 +93,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadFileScheduling:
     """Distribute tests by files as ``--dist loadfile`` does, those of the browser together.
 
-    They share one machine of many processes, which every worker would start again for each of their files.
+    They share one machine of many processes, which every worker would otherwise start for each file.
     """
     from xdist.scheduler import LoadFileScheduling
 
@@ -106,7 +105,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadFil
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Leave modules unread that are of the system tier as a whole, where that tier is not wanted: imports cost."""
+    """Skip modules that are entirely of the system tier when that tier is not selected: imports are slow."""
     if config.option.markexpr != "not system" or collection_path.suffix != ".py":
         return None
     return True if WHOLE_MODULE.search(collection_path.read_text("utf-8")) else None
@@ -114,7 +113,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup() -> None:
-    """Begin to observe before the first fixture: one of a module or the session is of the test that needs it first."""
+    """Start observing before the first fixture: a module or session fixture counts for the first test that needs it."""
     TRAIL.clear()
 
 

@@ -105,15 +105,8 @@ def query_database(settings: "Fleet", question: str, **given: str | None) -> dic
     """Return the answer of the database to a question, which is the name of a command."""
     with with_extra():
         from fdhil.fleet import questions, sets
-    functions: Mapping[str, Callable[..., dict[str, Any]]] = {
-        "status": questions.status,
-        "trend": questions.trend,
-        "compare": questions.compare,
-        "outliers": questions.outliers,
-        "services": questions.services,
-    }
     with sets.asking(settings) as db:
-        return functions[question](db, **given)
+        return questions.QUERIES[question](db, **given)
 
 
 def query_and_print(fleet: Path, question: str, as_json: bool, **given: str | None) -> dict[str, Any]:

@@ -1,1 +1,1 @@
-"""Many machines: what each tells (uplink), where it is gathered (collector), and what is asked of all (questions)."""
+"""Collects the records of many machines: sending (uplink), collecting (collector) and evaluating them (questions)."""

@@ -1,14 +1,13 @@
-"""Tells what a re-analysis changed: of each kind, axis and parameter how far it moved, and whose verdict is another."""
+"""Summarises what a re-analysis changed: parameter shifts per axis, and windows whose verdict changed."""
 
-from collections.abc import Mapping
 from typing import Any, LiteralString
 
 from fdhil.errors import StoreError
 from fdhil.fleet.sets import Db
 from fdhil.records import INTERVAL_95, unit_of
 
-MOST_LISTED = 1000  # windows with another verdict, or that could not be read: they are counted all
-# of machines as they told it last; an axis' own label goes before its machine's
+MOST_LISTED = 1000  # limit of listed windows (changed verdict or unreadable); all of them are counted
+# labels as reported last; an axis' own label overrides its machine's
 _LABELLED: LiteralString = """
 WITH of AS MATERIALIZED (
   SELECT r.*, coalesce(m.about->'axis_labels'->r.axis->>%(by)s, m.about->'labels'->>%(by)s, '') AS label
@@ -24,7 +23,7 @@ FROM (SELECT machine, window_name, digest, result#>>'{error,text}' AS error,
 
 
 def _number(value: LiteralString) -> LiteralString:
-    """Return the SQL of a JSON value as a number; NULL for what a machine told that is none."""
+    """Return the SQL that converts a JSON value to a number, NULL for any other JSON type or magnitude."""
     size = f"abs(({value})::numeric)"
     fits = f"jsonb_typeof({value}) = 'number' AND ({size} = 0 OR {size} BETWEEN 1e-100 AND 1e100)"
     return f"CASE WHEN {fits} THEN ({value})::float8 END"
@@ -34,7 +33,7 @@ def _of_type(value: LiteralString, kind: LiteralString, empty: LiteralString) ->
     return f"CASE WHEN jsonb_typeof({value}) = '{kind}' THEN {value} ELSE '{empty}' END"
 
 
-# of windows that are believed before and after; ``off`` 1 is the end of the new 95 % interval
+# windows accepted before and after; ``off`` 1 is the end of the new 95 % interval
 _MOVED: LiteralString = (
     f""", each AS MATERIALIZED (
   SELECT label, axis, b.key AS parameter, {_number("b.value->'value'")} AS before,
@@ -65,27 +64,26 @@ WHERE accepted <> accepted_before OR error IS NOT NULL ORDER BY machine, axis, n
 
 
 def changes(db: Db, revision: int, by: str) -> dict[str, Any]:
-    """Return what a revision changed against what the machines found themselves, in groups of machines by a label.
+    """Return what a revision changed against the machines' own results, grouped by a label of the machines.
 
-    ``digest`` is that of all results in order: the same bits have the same. StoreError where there is no such revision.
+    ``digest`` covers all results in order: equal bits give an equal digest. StoreError for an unknown revision.
     """
-    asked = {"revision": revision, "by": by, "interval": INTERVAL_95, "most": MOST_LISTED}
-    method = db.execute("SELECT method FROM fleet.reanalyses WHERE revision = %(revision)s", asked).fetchone()
+    arguments = {"revision": revision, "by": by, "interval": INTERVAL_95, "most": MOST_LISTED}
+    method = db.execute("SELECT method FROM fleet.reanalyses WHERE revision = %(revision)s", arguments).fetchone()
     if method is None:
-        raise StoreError(f"there is no re-analysis {revision}; fdhil fleet reanalyse makes one", "NoHistory")
-    counts = db.execute(_COUNTS, asked).fetchone()
+        raise StoreError(f"re-analysis {revision} does not exist; run fdhil fleet reanalyse to create one", "NoHistory")
+    counts = db.execute(_COUNTS, arguments).fetchone()
     assert counts is not None
-    moved = db.execute(_LABELLED + _MOVED, asked).fetchall()
+    moved = db.execute(_LABELLED + _MOVED, arguments).fetchall()
     return {
         "revision": revision,
         "method": method["method"],
         **counts,
         "by": by,
         "moved": [row | {"unit": unit_of(row["parameter"])} for row in moved],
-        "verdicts": db.execute(_LABELLED + _VERDICTS, asked).fetchall(),
-        "listed": [_plain(row) for row in db.execute(_LABELLED + _LISTED, asked)],
+        "verdicts": db.execute(_LABELLED + _VERDICTS, arguments).fetchall(),
+        "listed": [
+            row | {"recorded_at": row["recorded_at"].isoformat(timespec="seconds")}
+            for row in db.execute(_LABELLED + _LISTED, arguments)
+        ],
     }
-
-
-def _plain(row: Mapping[str, Any]) -> dict[str, Any]:
-    return dict(row) | {"recorded_at": row["recorded_at"].isoformat(timespec="seconds")}

@@ -1,11 +1,12 @@
-"""Gathers what the machines tell: from JetStream into PostgreSQL and the folder of windows.
+"""Stores the records of the machines: from JetStream into PostgreSQL and the folder of windows.
 
-A message is answered for when it is in the database for good, so that it is given again, to this collector or another,
-where it was not. What is given twice is known by its message id. Any number of collectors work side by side.
+A message is acknowledged once it has been committed to the database; an unacknowledged message is delivered again, to
+this collector or another. Repeated records are recognised by their message id. Any number of collectors run in
+parallel.
 
-Nearly all that comes is new: it is copied straight into the history. Where some of it is there already the database
-says so, nothing of it is written, and all goes by a table of its own that what is known is left out of. While the
-database writes, the next messages are fetched and read.
+Most records are new and are copied straight into the history. If some are there already, the database reports it, the
+transaction is rolled back, and all are copied again through a temporary table that leaves known ones out. While the
+database writes, the next messages are fetched and decoded.
 """
 
 import asyncio
@@ -27,39 +28,32 @@ from fdhil.errors import StoreError
 from fdhil.fleet import migrations, objects
 from fdhil.fleet.message import Record, Unread, decode
 from fdhil.fleet.migrations import NOTE_INCOMING, NOTE_SHIFTS
-from fdhil.fleet.transport import (
-    ERRORS,
-    cause_of,
-    check_credentials,
-    connected,
-    prepare_stream,
-    try_for_good,
-)
+from fdhil.fleet.transport import ERRORS, cause_of, check_credentials, connected, prepare_stream, try_for_good
 
-BATCH = 100  # messages that are committed together
-AHEAD = timedelta(days=1)  # by which a machine's clock may be ahead of the server's
-WAIT_S = 2.0  # for the first of them
+BATCH = 100  # messages per transaction
+AHEAD = timedelta(days=1)  # tolerated lead of a machine's clock over the server's
+WAIT_S = 2.0  # for the first message
 _COLUMNS = "machine, message, recorded_at, store, sequence, axis, kind, stored_at, window_name, record"
 _INCOMING = "CREATE TEMP TABLE IF NOT EXISTS incoming (LIKE fleet.records) ON COMMIT DELETE ROWS"
 _COPY = f"COPY {{}} ({_COLUMNS}) FROM STDIN"
-NULL = "\\N"  # as COPY reads it
-_AT_ONCE = 64  # rows that are handed over together: the database writes them while the next are made
+NULL = "\\N"  # in COPY's format
+_AT_ONCE = 64  # rows per COPY chunk: the database writes them while the next are formatted
 _HEARD = "INSERT INTO fleet.heard AS h (machine, store, records, last_sequence, first_stored_at, last_stored_at)"
-_MORE_HEARD = """
+_ADD_TO_HEARD = """
 ON CONFLICT (machine, store) DO UPDATE SET records = h.records + excluded.records,
   last_sequence = greatest(h.last_sequence, excluded.last_sequence),
   last_stored_at = greatest(h.last_stored_at, excluded.last_stored_at)
 """
 _COUNT = f"""
 {_HEARD} SELECT * FROM unnest(%s::text[], %s::text[], %s::int8[], %s::int8[], %s::timestamptz[], %s::timestamptz[])
-{_MORE_HEARD}
+{_ADD_TO_HEARD}
 """
-# asked when the rows are written: none can be dropped from then on
+# queried after the rows are written: none can be dropped from then on
 _DROPPED = """
 SELECT FROM unnest(%s::text[], %s::text[], %s::int8[], %s::int8[]) AS n (machine, store, first, last)
   JOIN fleet.dropped d USING (machine, store) WHERE d.sequences && int8range(n.first, n.last, '[]') LIMIT 1
 """
-# in one order everywhere, so that two collectors with the same records wait for each other and never in a circle
+# ordered, so that two collectors with the same records cannot deadlock
 _KEEP = f"""
 WITH added AS (
   INSERT INTO fleet.records ({_COLUMNS}) SELECT {_COLUMNS} FROM incoming i
@@ -69,7 +63,7 @@ WITH added AS (
   ON CONFLICT DO NOTHING RETURNING machine, store, sequence, stored_at)
 {_HEARD} SELECT machine, store, count(*) FILTER (WHERE sequence > 0), max(sequence), min(stored_at), max(stored_at)
   FROM added GROUP BY machine, store ORDER BY machine, store
-{_MORE_HEARD}
+{_ADD_TO_HEARD}
 """
 _REFUSED = "INSERT INTO fleet.refused (subject, reason, payload) VALUES (%s, %s, %s)"
 Known = Sequence[tuple[Record, datetime]]
@@ -77,16 +71,16 @@ Aside = Sequence[tuple[str, Unread]]
 
 
 class Received(NamedTuple):
-    """What one message held at one place: a record, or what is none."""
+    """One part of a message: a record, or a part that is not a valid record."""
 
     subject: str
     stored_at: datetime
-    told: Record | Unread
+    content: Record | Unread
 
 
 @dataclass(slots=True)
 class Count:
-    """What a machine's history tells at once: how many numbered records, the first and last number, when they came."""
+    """Summary of a machine's history within a batch: number of records, first and last number, times of arrival."""
 
     first_stored_at: datetime
     last_stored_at: datetime
@@ -96,15 +90,15 @@ class Count:
 
 
 async def collect(fleet: Fleet, ready: Callable[[str], None]) -> NoReturn:
-    """Collect until it is cancelled; a server or database that is not there is tried again, later and later.
+    """Collect until cancelled; while the server or the database is unavailable, retry with growing delays.
 
-    ConnectError where the files of the credentials cannot be used, StoreError where the database's schema is newer or
-    the folder of windows cannot be written.
+    ConnectError where the credential files cannot be used, StoreError where the database's schema is newer or the
+    folder of windows cannot be written.
     """
     check_credentials(fleet.server, "server")
     objects.check_folder(fleet.objects.directory)
     collector = Collector(fleet)
-    ready(f"what machines tell to {fleet.server.server}, into the database '{fleet.database.connection}'")
+    ready(f"records from {fleet.server.server} into the database '{fleet.database.connection}'")
 
     async def attempt() -> str:
         try:
@@ -114,7 +108,7 @@ async def collect(fleet: Fleet, ready: Callable[[str], None]) -> NoReturn:
             ):
                 await collector.run(client, db)
         except psycopg.Error as error:
-            return f"the database: {' '.join(str(error).split())}; check [database] connection, and whether it runs"
+            return f"database: {' '.join(str(error).split())}; check [database] connection and that it is running"
         except StoreError as error:
             if error.code == "SchemaVersion":
                 raise
@@ -122,12 +116,12 @@ async def collect(fleet: Fleet, ready: Callable[[str], None]) -> NoReturn:
         except ERRORS as error:
             return f"{fleet.server.server}: {cause_of(error)}"
 
-    complaint = "nothing is collected: {cause}; it waits at the server, and is tried again"
+    complaint = "no records are collected: {cause}; records wait at the server, retrying"
     await try_for_good(attempt, lambda: collector.kept, complaint)
 
 
 class Collector:
-    """Goes through the stream, over one connection after another; ``kept`` counts the messages since the start."""
+    """Reads the stream over successive connections; ``kept`` counts the messages since the start."""
 
     def __init__(self, fleet: Fleet) -> None:
         self.kept = 0
@@ -139,12 +133,12 @@ class Collector:
         await migrations.bring_up(db)
         await db.execute(_INCOMING)
         reader = await prepare_stream(client.jetstream(), self._fleet.stream)
-        journal.write_line("the server and the database are there")
+        journal.write_line("connected to the server and the database")
         coming = asyncio.ensure_future(_next(reader))
         try:
             while True:
                 messages, received = await coming
-                coming = asyncio.ensure_future(_next(reader))  # while these are written
+                coming = asyncio.ensure_future(_next(reader))  # while this batch is written
                 await self._take(messages, received, db)
                 if client.is_closed:
                     raise ConnectionResetError("the connection has ended")
@@ -152,7 +146,6 @@ class Collector:
             await _give_back(coming)
 
     async def _take(self, messages: Sequence[Msg], received: Sequence[Received], db: psycopg.AsyncConnection) -> None:
-        """Keep what was received in messages, and answer for them."""
         if not messages:
             return
         try:
@@ -165,7 +158,7 @@ class Collector:
         self.kept += len(received)
 
     async def _keep(self, received: Sequence[Received], db: psycopg.AsyncConnection) -> None:
-        """Write all; where the database does not take one, halve until that one is found, and put it aside."""
+        """Store all; if the database rejects a record, bisect to find it and store it as unreadable."""
         try:
             await self._write(received, db)
         except psycopg.DataError as error:
@@ -173,16 +166,17 @@ class Collector:
             if first:
                 await self._keep(first, db)
                 await self._keep(rest, db)
-            elif isinstance(told := rest[0].told, Record):
-                aside = Unread(" ".join(str(error).split()), told.payload)
-                await self._write([rest[0]._replace(told=aside)], db)
+            elif isinstance(record := rest[0].content, Record):
+                aside = Unread(" ".join(str(error).split()), record.payload)
+                await self._write([rest[0]._replace(content=aside)], db)
             else:
                 raise
 
     async def _write(self, received: Sequence[Received], db: psycopg.AsyncConnection) -> None:
-        """Write windows, then records and what is none, in one transaction."""
         known = [
-            (_dated(each.told, each.stored_at), each.stored_at) for each in received if isinstance(each.told, Record)
+            (_dated(each.content, each.stored_at), each.stored_at)
+            for each in received
+            if isinstance(each.content, Record)
         ]
         for record, _ in known:
             if record.window is not None and record.window_name is not None:
@@ -190,7 +184,7 @@ class Collector:
         months = {(record.recorded_at.year, record.recorded_at.month) for record, _ in known} - self._months
         await migrations.add_months(db, months)
         self._months |= months
-        aside = [(each.subject, each.told) for each in received if isinstance(each.told, Unread)]
+        aside = [(each.subject, each.content) for each in received if isinstance(each.content, Unread)]
         if not await _written(known, aside, db):
             async with db.transaction(), db.cursor() as cursor:
                 await _copy(cursor, "incoming", known)
@@ -198,16 +192,16 @@ class Collector:
                 await cursor.execute(NOTE_INCOMING)
                 await _put_aside(cursor, aside)
         for subject, unread in aside:
-            journal.write_line(f"a part of what {subject} told is put aside: {unread.reason}", "minor")
+            journal.write_line(f"part of a message of {subject} was refused and stored apart: {unread.reason}", "minor")
 
 
 def _dated(record: Record, stored_at: datetime) -> Record:
-    """Return a record; one from the future under the time of all such: no clock makes a partition of each month."""
+    """Return a record; one dated in the future gets a common date, so that no clock creates partitions at will."""
     return record if record.recorded_at <= stored_at + AHEAD else record._replace(recorded_at=migrations.FUTURE)
 
 
 async def _written(known: Known, aside: Aside, db: psycopg.AsyncConnection) -> bool:
-    """Write what is new as a whole; False where some of it is known or was dropped, and nothing is written."""
+    """Copy new records in one transaction; return False, with nothing written, if any is known or was dropped."""
     counts = _counted(known)
     numbered = [(*source, each.first, each.last) for source, each in counts.items() if each.records]
     with contextlib.suppress(psycopg.errors.UniqueViolation, psycopg.errors.DeadlockDetected):
@@ -225,7 +219,7 @@ async def _written(known: Known, aside: Aside, db: psycopg.AsyncConnection) -> b
 
 
 def _counted(known: Known) -> dict[tuple[str, str], Count]:
-    """Return what each history of a machine tells, in one order everywhere."""
+    """Return the counts of each history, in one order everywhere, which prevents deadlocks."""
     counts: dict[tuple[str, str], Count] = {}
     for record, stored_at in known:
         count = counts.get((record.machine, record.store))
@@ -241,7 +235,7 @@ def _counted(known: Known) -> dict[tuple[str, str], Count]:
 
 
 def _newest(known: Known) -> list[tuple[str, str, datetime]]:
-    """Return what names the newest set of each axis and shift, in one order everywhere."""
+    """Return the keys of the newest set of each axis and shift, in one order everywhere."""
     newest: dict[tuple[str, str, int], tuple[datetime, int, Record]] = {}
     for record, stored_at in known:
         if record.kind == "parameters" and '"revision"' in record.text:
@@ -272,8 +266,9 @@ async def _next(reader: JetStreamContext.PullSubscription) -> tuple[list[Msg], l
     messages, received = await _fetch(reader), list[Received]()
     try:
         for message in messages:
-            received += _received(message)
-            await asyncio.sleep(0)  # what is written meanwhile goes on
+            stored_at = message.metadata.timestamp
+            received += [Received(message.subject, stored_at, part) for part in decode(message.subject, message.data)]
+            await asyncio.sleep(0)  # let the pending writes proceed
     except asyncio.CancelledError:
         await _refuse(messages)
         raise
@@ -283,12 +278,11 @@ async def _next(reader: JetStreamContext.PullSubscription) -> tuple[list[Msg], l
 async def _fetch(reader: JetStreamContext.PullSubscription) -> list[Msg]:
     try:
         return await reader.fetch(BATCH, timeout=WAIT_S)
-    except TimeoutError:  # the client's own is one, and it does not raise that one alone
+    except TimeoutError:  # the base class too: the client raises both
         return []
 
 
 async def _give_back(coming: asyncio.Future[tuple[list[Msg], list[Received]]]) -> None:
-    """Let another collector have at once what came and is not looked at any more."""
     coming.cancel()
     with contextlib.suppress(asyncio.CancelledError, *ERRORS):
         messages, _ = await coming
@@ -296,21 +290,15 @@ async def _give_back(coming: asyncio.Future[tuple[list[Msg], list[Received]]]) -
 
 
 async def _refuse(messages: Sequence[Msg]) -> None:
-    """Give messages back: another collector may have them at once."""
     for message in messages:
         await message.nak()
 
 
-def _received(message: Msg) -> list[Received]:
-    stored_at = message.metadata.timestamp
-    return [Received(message.subject, stored_at, told) for told in decode(message.subject, message.data)]
-
-
 def _rows(known: Known) -> Iterator[str]:
-    """Yield rows as COPY reads them; what a record says of itself has no character that means something there."""
+    """Yield rows in COPY format; the fields of a record other than its text need no escaping."""
     before, stored = None, ""
     for record, stored_at in known:
-        if stored_at is not before:  # all of a message came at once
+        if stored_at is not before:  # the parts of a message share one time
             before, stored = stored_at, stored_at.isoformat()
         text = record.text.replace("\\", "\\\\").replace("\t", "\\t").replace("\r", "\\r")
         yield (

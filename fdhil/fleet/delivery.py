@@ -1,8 +1,8 @@
-"""Brings offers from the works to the machines, and the machines' answers back: by JetStream, fetched, never pushed.
+"""Delivers offers from the fleet server to the machines, and the machines' answers back, by JetStream.
 
-A stream keeps one message for each machine: all the offers that are open for it. ``fdhil uplink`` asks for that message
-now and then (a direct get, for which its user needs the right to ask for its own subject and no other), lays what is
-signed by a trusted key into its folder, and takes away what the works does not offer any more. It accepts nothing.
+A stream keeps one message per machine with all offers that are open for it. ``fdhil uplink`` fetches that message once
+a minute (a direct get; its user needs permission for its own subject only), stores the offers signed by a trusted key
+in its folder, and removes those that were withdrawn. It never accepts an offer.
 """
 
 import time
@@ -28,11 +28,11 @@ PREFIX = "fdhil.offers.v1"
 FETCH_S = 60.0
 MOST_OPEN = 20  # offers for one machine
 MOST_BYTES = 1 << 30
-TRIES = 5  # where two persons publish at once
+TRIES = 5  # attempts when others publish at the same time
 
 
 def subject_of(machine: str) -> str:
-    """Return the subject whose last message has the offers for a machine."""
+    """Return the subject whose last message contains the offers for a machine."""
     return f"{PREFIX}.{machine}"
 
 
@@ -43,11 +43,11 @@ def parted(message: bytes) -> Iterator[bytes]:
         yield first + b"\n" + second + b"\n"
 
 
-# at the works --------------------------------------------------------------------------------------------------
+# fleet server --------------------------------------------------------------------------------------------------
 
 
 async def prepare(stream: JetStreamContext, replicas: int) -> None:
-    """Make the stream of the offers where there is none; ERRORS."""
+    """Create the stream of the offers if it does not exist; ERRORS."""
     wanted = StreamConfig(
         name=STREAM,
         subjects=[f"{PREFIX}.*"],
@@ -65,12 +65,12 @@ async def prepare(stream: JetStreamContext, replicas: int) -> None:
 
 
 async def publish(stream: JetStreamContext, machine: str, document: bytes, offer: Offer) -> None:
-    """Add an offer to those that are open for a machine, in the place of an older one of its name; ERRORS."""
+    """Add an offer to those open for a machine, replacing an older one of the same name; ERRORS."""
     await _change(stream, machine, offer.name, [document])
 
 
 async def withdraw(stream: JetStreamContext, machine: str, name: str) -> None:
-    """Take the offer of a name from those that are open for a machine; ERRORS."""
+    """Remove the named offer from those open for a machine; ERRORS."""
     await _change(stream, machine, name, [])
 
 
@@ -83,13 +83,15 @@ async def _change(stream: JetStreamContext, machine: str, name: str, new: list[b
             await stream.publish(subject_of(machine), b"".join([*kept, *new]), headers=headers)
             return
         except nats.js.errors.APIError as error:
-            if error.err_code != 10071:  # somebody else has published in between
+            if error.err_code != 10071:  # another publisher was faster
                 raise
-    raise nats.js.errors.Error("others publish offers for this machine all the time; try again")
+    raise nats.js.errors.Error(
+        "other publishers keep changing this machine's offers; the offer was not published, try again"
+    )
 
 
 def _stays(document: bytes, name: str) -> bool:
-    """Whether what is open stays: what is over, or of this name, goes, whoever signed it."""
+    """Whether an open offer is kept: expired ones, and those of this name, are dropped whoever signed them."""
     try:
         other = read(document, {_signer(document)})
     except OfferRefused:
@@ -103,7 +105,7 @@ def _signer(document: bytes) -> str:
 
 
 async def _open_for(stream: JetStreamContext, machine: str) -> tuple[int, bytes]:
-    """Return what is open for a machine, and the number of that message in the stream; ERRORS."""
+    """Return the stream sequence and content of the offers open for a machine; ERRORS."""
     try:
         message = await stream.get_last_msg(STREAM, subject_of(machine), direct=True)
     except nats.js.errors.NotFoundError:
@@ -111,21 +113,21 @@ async def _open_for(stream: JetStreamContext, machine: str) -> tuple[int, bytes]
     return message.seq or 0, message.data or b""
 
 
-# at the machine ------------------------------------------------------------------------------------------------
+# machine -------------------------------------------------------------------------------------------------------
 
 
 class Letterbox:
-    """Fetches the offers for a machine, and tells what its operator answered; nothing without [offers] trust."""
+    """Fetches the offers for a machine and returns its operator's answers; does nothing without [offers] trust."""
 
     def __init__(self, config: MachineConfig) -> None:
         self._config = config
         self._machine = config.works_name
         self._next_s = 0.0
-        self._told = 0
-        self._complained = ""
+        self._reported = 0
+        self._last_complaint = ""
 
     async def look(self, stream: JetStreamContext, store: str) -> list[Message]:
-        """Fetch what is offered, once a minute, and return the answers that are not told yet, as messages."""
+        """Fetch the offers, once a minute, and return the answers not reported yet, as messages."""
         if not self._config.offers.trust or time.monotonic() < self._next_s:
             return []
         self._next_s = time.monotonic() + FETCH_S
@@ -134,48 +136,47 @@ class Letterbox:
             _, message = await _open_for(stream, self._machine)
             self._lay(list(parted(message)))
         except ERRORS as error:
-            complaint = f"no offers can be fetched: {cause_of(error)}; those that lie here stay"
+            complaint = f"offers cannot be fetched: {cause_of(error)}; those already here are kept"
         except StoreError as error:
             complaint = str(error)
-        if complaint and complaint != self._complained:
+        if complaint and complaint != self._last_complaint:
             journal.write_line(complaint, "minor")
-        self._complained = complaint
+        self._last_complaint = complaint
         return [of_answer(asdict(each), self._machine, store) for each in self._answers()]
 
     def told(self, count: int) -> None:
-        """Note that so many answers more are told."""
-        self._told += count
+        self._reported += count
 
     def _answers(self) -> list[Answer]:
         try:
             answers = read_answers(self._config.store.directory)
-            self._told = min(self._told, len(answers))  # the file was begun anew
-            return answers[self._told :]
+            self._reported = min(self._reported, len(answers))  # the file was started again
+            return answers[self._reported :]
         except StoreError as error:
             journal.write_line(str(error), "minor")
             return []
 
     def _lay(self, documents: list[bytes]) -> None:
-        """Make the folder have these documents and no others; StoreError."""
+        """Make the folder contain exactly these documents; StoreError."""
         folder = self._config.offers_directory
         wanted: dict[Path, bytes] = {}
         for document in documents:
             try:
                 offer = read(document, self._config.offers.trust)
             except OfferRefused as error:
-                journal.write_line(f"an offer is not taken in: {error}", "minor")
+                journal.write_line(f"an offer was ignored: {error}", "minor")
                 continue
             wanted[folder / file_name(offer.name, offer.version)] = document
         try:
             make_folder(folder)
-            for gone in lying(folder).keys() - wanted.keys():
-                gone.unlink(missing_ok=True)
+            for obsolete in lying(folder).keys() - wanted.keys():
+                obsolete.unlink(missing_ok=True)
         except OSError as error:
             raise store_error(folder, error) from None
         for path, document in wanted.items():
             if not _is(path, document):
                 write_file(path, document)
-                journal.write_line(f"an offer of the works lies in {path}; see it with fdhil offers list")
+                journal.write_line(f"new offer of the fleet server in {path}; review it with fdhil offers list")
 
 
 def _is(path: Path, document: bytes) -> bool:

@@ -1,4 +1,4 @@
-"""Tells when an axis reaches a maintenance limit: by the rule with which its own machine tells it, over many months."""
+"""Forecasts when an axis reaches a maintenance limit, by the rule of its own machine, over many months."""
 
 import json
 import math
@@ -17,7 +17,7 @@ from fdhil.report.history_trends import of_axis
 from fdhil.store.rows import Stamp, StoredWindow
 
 NEWEST_SETS, APART = 180, "1 day"  # half a year
-TOGETHER = 500  # axes that are looked at and kept together
+TOGETHER = 500  # axes per query
 # ``stored_at`` is never before ``at``, and has an index
 _FIRST: LiteralString = f"""
 SELECT f.* {OF_AXES}, {SERVICED}, LATERAL (SELECT * FROM fleet.parameter_sets s
@@ -40,26 +40,27 @@ Limits = Mapping[str, Mapping[str, Any]]
 def due(db: Db) -> list[dict[str, Any]]:
     """Return the limits that axes have reached or will reach, the earliest first.
 
-    A limit is what [maintenance] of the machine allows from the first set since the axis' newest service. There is no
-    date while a trend is not sure, or was seen for less than three days; none lies farther ahead than five times that.
-    A trend is looked at once a day, as it has one set a day, and when a limit or a service is new; it is kept.
+    A limit is the change that the machine's [maintenance] allows from the first set since the axis' newest service.
+    There is no date while a trend is uncertain or spans less than three days; no date lies further ahead than five
+    times the span. Forecasts are stored and renewed once a day (there is one set a day), and after a new limit or
+    service.
     """
     shares = {row["machine"]: _shares(row["about"]) for row in db.execute("SELECT machine, about FROM fleet.machines")}
     axes = [key for key in axes_of(db) if key[0] in shares]
     last = {(row["machine"], row["axis"]): row for row in db.execute(_LAST, asked(axes))}
-    of = {key: json.dumps([row["day"], row["serviced"], shares[key[0]]]) for key, row in last.items()}
-    limits: dict[Axis, Limits] = {key: row["limits"] for key, row in last.items() if row["made_of"] == of[key]}
+    inputs = {key: json.dumps([row["day"], row["serviced"], shares[key[0]]]) for key, row in last.items()}
+    limits: dict[Axis, Limits] = {key: row["limits"] for key, row in last.items() if row["made_of"] == inputs[key]}
     old = [key for key in last if key not in limits]
     for begin in range(0, len(old), TOGETHER):
         some = old[begin : begin + TOGETHER]
         limits |= (found := _forecasts(db, some, shares))
-        _keep(db, [(*key, of[key], json.dumps(found[key])) for key in some])
-    told = []
+        _keep(db, [(*key, inputs[key], json.dumps(found[key])) for key in some])
+    due_limits = []
     for key, each in limits.items():
         for parameter, limit in each.items():
             place = {"machine": key[0], "axis": key[1], "parameter": parameter, "unit": unit_of(parameter)}
-            told.append(place | {"value": last[key][parameter]} | dict(limit))
-    return sorted(told, key=lambda each: datetime.fromisoformat(each["date"]))
+            due_limits.append(place | {"value": last[key][parameter]} | dict(limit))
+    return sorted(due_limits, key=lambda each: datetime.fromisoformat(each["date"]))
 
 
 def _forecasts(db: Db, axes: Sequence[Axis], shares: Mapping[str, Mapping[str, float]]) -> dict[Axis, Limits]:
@@ -76,19 +77,17 @@ def _forecasts(db: Db, axes: Sequence[Axis], shares: Mapping[str, Mapping[str, f
 
 
 def _keep(db: Db, rows: Sequence[tuple[str, str, str, str]]) -> None:
-    """Keep what was found, where who asks may write."""
     with suppress(psycopg.errors.InsufficientPrivilege, psycopg.errors.ReadOnlySqlTransaction), db.transaction():
         db.execute("SET TRANSACTION READ WRITE")
         db.execute(_KEEP, [list(column) for column in zip(*sorted(rows), strict=True)])
 
 
 def _shares(about: Mapping[str, Any] | None) -> dict[str, float]:
-    """Return by what share each parameter may change: as the machine told it, else as fdhil has it by itself."""
+    """Return the allowed relative change of each parameter: as reported by the machine, else fdhil's defaults."""
     try:
-        told = Maintenance.model_validate((about or {}).get("maintenance", {}))
+        return Maintenance.model_validate((about or {}).get("maintenance", {})).model_dump()
     except ValidationError:
-        told = Maintenance()
-    return told.model_dump()
+        return Maintenance().model_dump()
 
 
 def _as_window(row: Row) -> StoredWindow:

@@ -1,9 +1,9 @@
-"""Writes what machines told without saying whose it is: for a maker, a supplier, a university.
+"""Exports the records anonymously: for a machine builder, a supplier, a university.
 
-A machine's name becomes a keyed digest (HMAC-SHA256) whose key stays at the works: whoever does not have the key cannot
-try names. Times become the age in whole months, since the first record or the newest service. There is no free text, no
-digest of a configuration, no number of a record; of the labels there are those that were asked for. What remains are
-measured figures: whoever has the same figures from elsewhere can find them here.
+A machine's name becomes a keyed digest (HMAC-SHA256); without the key, which stays at the fleet server, names cannot be
+tested. Times become ages in whole months since the first record or the newest service. Free text, configuration digests
+and record numbers are left out; only the requested labels are exported. Measured figures remain: anyone who has the
+same figures from elsewhere can match them.
 """
 
 import hashlib
@@ -24,7 +24,7 @@ NAME_CHARS = 16  # of the digest, 64 bits
 ROWS = 10_000  # at a time
 AGE = "floor(extract(epoch FROM {at} - coalesce(a.serviced_at, a.first_at)) / 2592000)::int AS age_months"
 _FIGURES = ("R", "L", "K", "Jt", "ft", "Cd")
-# of each table: its columns with their types, and the query; their order tells neither when nor whose
+# columns with types and query per table; the row order reveals neither time nor machine
 _AT = "fleet.time_of(t.recorded_at, t.stored_at)"
 _AXES = "LEFT JOIN fleet.axes a USING (machine, axis) ORDER BY md5(%(salt)s || machine), axis, age_months, md5(t::text)"
 TABLES: dict[str, tuple[dict[str, pa.DataType], str]] = {
@@ -63,7 +63,7 @@ ORDER BY md5(%(salt)s || machine), axis, label
 
 
 def key_of(path: Path) -> bytes:
-    """Return the key of a works; made where there is none yet, readable by its owner alone. StoreError."""
+    """Return the key; create it on first use, readable by its owner alone. StoreError."""
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
         with os.fdopen(descriptor, "wb") as made:
@@ -80,29 +80,29 @@ def key_of(path: Path) -> bytes:
     except (OSError, ValueError):
         key, open_to_all = b"", 0
     if len(key) != KEY_BYTES or open_to_all:
-        what = "can be read by others" if open_to_all else "is no key"
-        text = f"{path} {what}, nothing was written; chmod 600 it, or name another file (a new key gives new names)"
+        what = "can be read by others" if open_to_all else "is not a valid key"
+        text = f"{path} {what}; nothing was exported. chmod 600 it, or name another file (new key, new pseudonyms)"
         raise StoreError(text, "BadKey")
     return key
 
 
 def export(
-    db: Db, folder: Path, key: bytes, labels: Sequence[str], tell: Callable[[str], None] = lambda _: None
+    db: Db, folder: Path, key: bytes, labels: Sequence[str], report: Callable[[str], None] = lambda _: None
 ) -> dict[str, Any]:
-    """Write a Parquet file for each table into a new folder and return how many rows each has. StoreError."""
+    """Write a Parquet file per table into a new folder and return the number of rows of each. StoreError."""
     if folder.exists():
-        raise StoreError(f"{folder} exists already, nothing was written; name a new folder", "Exists")
-    beside = folder.with_name(f".{folder.name}.part")
+        raise StoreError(f"{folder} already exists; nothing was exported. Name a new folder", "Exists")
+    partial = folder.with_name(f".{folder.name}.part")
     counts = {}
     given = {"salt": pseudonym(key, "the order of machines"), "labels": list(labels)}
     try:
-        make_folder(beside)
+        make_folder(partial)
         for name, (columns, query) in TABLES.items():
-            counts[name] = _write(db, beside / f"{name}.parquet", columns, query, given, key)
-            tell(f"{name}: {counts[name]} rows")
+            counts[name] = _write(db, partial / f"{name}.parquet", columns, query, given, key)
+            report(f"{name}: {counts[name]} rows")
         columns = {"label": pa.string(), "text": pa.string()}
-        counts["labels"] = _write(db, beside / "labels.parquet", columns, _LABELS, given, key)
-        beside.rename(folder)
+        counts["labels"] = _write(db, partial / "labels.parquet", columns, _LABELS, given, key)
+        partial.rename(folder)
     except OSError as error:
         raise store_error(folder, error) from None
     return {"folder": str(folder), "rows": counts, "labels": list(labels)}
@@ -116,13 +116,12 @@ def _write(
     with db.transaction(), db.cursor(name="export") as rows, pq.ParquetWriter(path, schema) as file:
         rows.execute(query.encode(), given)
         while batch := rows.fetchmany(ROWS):
-            told = [{name: row[name] for name in schema.names} | {"machine": pseudonym(key, row["machine"])}
+            records = [{name: row[name] for name in schema.names} | {"machine": pseudonym(key, row["machine"])}
                     for row in batch]  # fmt: skip
-            file.write_table(pa.Table.from_pylist(told, schema))
-            count += len(told)
+            file.write_table(pa.Table.from_pylist(records, schema))
+            count += len(records)
     return count
 
 
 def pseudonym(key: bytes, machine: str) -> str:
-    """Return the name under which a machine is exported."""
     return hmac.new(key, machine.encode(), hashlib.sha256).hexdigest()[:NAME_CHARS]

@@ -1,6 +1,6 @@
-"""The numbers that the guard holds what it sends to, as a configuration makes them: a larger one lets more through.
+"""Derives the guard's limits from a configuration; a larger limit lets larger offsets through.
 
-Most keys act on them by a way of their own, as the torque constant does on the torque of the feed-forward.
+Most configuration keys act on the limits indirectly, as the torque constant does on the feed-forward torque.
 """
 
 from collections.abc import Mapping
@@ -13,20 +13,20 @@ from fdhil.errors import ConfigError
 
 
 def guard_limits(machine: MachineConfig) -> Mapping[str, float]:
-    """Return all limits of the corrected axes, by words; none where no guard could be started with it."""
+    """Return all limits of the corrected axes, by description; none where no guard could start with it."""
     found: dict[str, float] = {}
     try:
         settings = settings_of(machine, next(iter(machine.bus)), Path(), "")
     except ConfigError:
         return found
     for axis in settings.axes:
-        told = {f"the offset's {name}": value for name, value in asdict(axis.limits).items() if name != "window"}
+        limits = {f"the offset's {name}": value for name, value in asdict(axis.limits).items() if name != "window"}
         if axis.feedforward is not None:
-            told |= {f"the feed-forward's {name}": value for name, value in axis.feedforward.limits._asdict().items()}
-        told |= {
-            "the speed that is plausible": axis.max_speed_mm_s,
-            "the acceleration that is plausible": axis.max_acceleration_mm_s2,
-            "the change of speed that is plausible": axis.speed_step,
+            limits |= {f"the feed-forward's {name}": value for name, value in axis.feedforward.limits._asdict().items()}
+        limits |= {
+            "the highest plausible speed": axis.max_speed_mm_s,
+            "the highest plausible acceleration": axis.max_acceleration_mm_s2,
+            "the highest plausible change of speed": axis.speed_step,
         }
-        found |= {f"axis {axis.name}, {name}": float(value) for name, value in told.items()}
+        found |= {f"axis {axis.name}, {name}": float(value) for name, value in limits.items()}
     return found

@@ -1,13 +1,13 @@
-"""One message: what a machine's history has of some records, in the order in which they were recorded.
+"""Encodes and decodes messages: records of one machine's history, in the order in which they were recorded.
 
-The subject, ``fdhil.v1.MACHINE.records``, says which machine tells: a server lets each publish under its own name
-alone. Of each record there is a line that says what it is, a line of JSON with what the history has of it, and behind
-them its recorded window where that is told. A record has the digest of its row, so that what was sent twice is known
-again. Messages of one machine put together are a message.
+The subject, ``fdhil.v1.MACHINE.records``, names the machine: the server lets each publish under its own name alone.
+Each record is a header line, a line of JSON with its row of the history, and optionally its recorded window. A record
+carries the digest of its row, so that repeated records are recognised. Concatenated messages of one machine form a
+message.
 
-The first line is ``fdhil-record-1 STORE AXIS KIND DIGEST SEQUENCE SECONDS BYTES``: the digest of the machine's history
-file; the axis, or ``-``; the digest of the row; its place in the outbox; when it was recorded (UNIX); and how long the
-window is, or ``-``.
+The header is ``fdhil-record-1 STORE AXIS KIND DIGEST SEQUENCE SECONDS BYTES``: the digest of the machine's history
+file; the axis, or ``-``; the digest of the row; its number in the outbox; when it was recorded (UNIX); and the size of
+the window, or ``-``.
 """
 
 import hashlib
@@ -30,39 +30,39 @@ SUBJECTS = f"{PREFIX}.>"
 ABOUT = "about"
 OFFER = "offer"
 LARGEST_RECORD = 1 << 20  # bytes of JSON
-MOST_DEPTH = 20  # of lists in lists
+MOST_DEPTH = 20  # of nested lists
 _SUBJECT = re.compile(r"fdhil\.v1\.([A-Za-z0-9_-]{1,64})\.records")
 _HEAD = re.compile(
     rb"fdhil-record-1 ([0-9a-f]{32}) ([A-Z]2?|-) ([a-z]{1,20}) ([0-9a-f]{64}) (\d{1,18}) (\d{1,10}\.\d{6})"
     rb" (\d{1,9}|-)\n"
 )
 MANY_DIGITS = 100 * b"0"
-LARGEST_NUMBER = 1e100  # what is reckoned with is squared
+LARGEST_NUMBER = 1e100  # numbers are squared in evaluations
 _ONLY_DIGITS = bytes.maketrans(b"123456789E-", b"000000000e+")
 _JSON_COLUMNS = {"reasons", "parameters", "covariance", "window_ids", "terms", "warnings", "friction", "nc", "gains",
                  "notices", "loops"}  # fmt: skip
-_NOT_TOLD = {"id", "digest", "wall_s", "boot", "monotonic_ns", "told"}
+_NOT_SENT = {"id", "digest", "wall_s", "boot", "monotonic_ns", "told"}
 
 
 class BadMessage(ValueError):
-    """A record that is none of ours, or damaged; it is kept aside."""
+    """A record that is damaged or of another format; it is stored as refused."""
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """What is published: some records of one machine."""
+    """A message to publish: some records of one machine."""
 
     subject: str
     payload: bytes
 
     @property
     def identity(self) -> str:
-        """What makes the same message, sent twice, one."""
+        """The id by which the server recognises a repeated message."""
         return f"{self.subject}:{hashlib.sha256(self.payload).hexdigest()}"
 
 
-class Record(NamedTuple):  # there are thousands a second, and this is made the fastest
-    """What a collector takes out of a message; ``text`` is its JSON, one object, ``payload`` all of it as it came."""
+class Record(NamedTuple):  # thousands are created per second, and this is the fastest type
+    """A decoded record; ``text`` is its JSON, one object, ``payload`` its original bytes."""
 
     machine: str
     store: str
@@ -77,21 +77,21 @@ class Record(NamedTuple):  # there are thousands a second, and this is made the 
 
     @property
     def window_name(self) -> str | None:
-        """The name of the window among the objects: the SHA-256 of its content."""
+        """The name of its window file: the SHA-256 of the content."""
         return None if self.window is None else hashlib.sha256(self.window).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
 class Unread:
-    """A part of a message that is no record, and why."""
+    """A part of a message that is not a valid record, and why."""
 
     reason: str
     payload: bytes
 
 
 def of_entry(entry: Entry, machine: str, store: str, window: bytes | None) -> Message:
-    """Return the message of an entry of the outbox; one whose row is not there any more is of no known time (1970)."""
-    record = {name: _told(name, value) for name, value in entry.row.items() if name not in _NOT_TOLD}
+    """Return the message of an outbox entry; an entry whose row was deleted is dated 1970."""
+    record = {name: _told(name, value) for name, value in entry.row.items() if name not in _NOT_SENT}
     if "id" in entry.row:
         record["number"] = str(entry.row["id"])
     if entry.left_out:
@@ -103,13 +103,13 @@ def of_entry(entry: Entry, machine: str, store: str, window: bytes | None) -> Me
 
 
 def of_machine(about: Mapping[str, Any], machine: str, store: str, wall_s: float) -> Message:
-    """Return the message that says what a machine is."""
+    """Return the message that describes a machine."""
     head = f"{store} - {ABOUT} {digest_of(about, wall_s)} 0 {wall_s:.6f}"
     return _message(machine, head, json.dumps(about), None)
 
 
 def joined(messages: Iterable[Message], most_bytes: int) -> Iterator[tuple[Message, int]]:
-    """Yield messages of one machine put together, none over ``most_bytes`` that is more than one, and of how many."""
+    """Yield messages of one machine joined up to ``most_bytes``, each with the number of messages in it."""
     parts: list[Message] = []
     size = 0
     for message in messages:
@@ -127,13 +127,13 @@ def _together(parts: list[Message]) -> Message:
 
 
 def of_answer(answer: Mapping[str, Any], machine: str, store: str) -> Message:
-    """Return the message that says what was answered to an offer of the works."""
+    """Return the message that reports an operator's answer to an offer."""
     head = f"{store} - {OFFER} {digest_of(answer)} 0 {answer['at_s']:.6f}"
     return _message(machine, head, json.dumps(answer), None)
 
 
 def digest_of(*what: Any) -> str:
-    """Return the SHA-256 of plain JSON."""
+    """Return the SHA-256 of JSON data."""
     return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
 
@@ -143,7 +143,7 @@ def _message(machine: str, head: str, text: str, window: bytes | None) -> Messag
 
 
 def _told(name: str, value: Any) -> str:
-    """Return a column's value as JSON; what is no number is null."""
+    """Return a column's value as JSON; NaN and infinity become null."""
     if name in _JSON_COLUMNS and isinstance(value, str):
         if "NaN" not in value and "Infinity" not in value:
             return value
@@ -160,38 +160,38 @@ def _finite(value: Any) -> Any:
 
 
 def decode(subject: str, payload: bytes) -> list[Record | Unread]:
-    """Return the records of a message, checked so that a database takes them, and what is none."""
+    """Return the valid records of a message, checked so that the database accepts them, and its invalid parts."""
     found = _SUBJECT.fullmatch(subject)
     if found is None:
-        return [Unread("its subject is none of a machine's records", payload)]
-    told: list[Record | Unread] = []
+        return [Unread("its subject is not that of a machine's records", payload)]
+    parts: list[Record | Unread] = []
     at = 0
-    while at < len(payload) or not told:
+    while at < len(payload) or not parts:
         try:
             head, line, end = _next(payload, at)
-        except BadMessage as error:  # where the next one begins is not known
-            return [*told, Unread(str(error), payload[at:])]
+        except BadMessage as error:  # the start of the next record is unknown
+            return [*parts, Unread(str(error), payload[at:])]
         try:
-            told.append(_record(found[1], head, payload[head.end() : line], payload[line + 1 : end], payload[at:end]))
+            parts.append(_record(found[1], head, payload[head.end() : line], payload[line + 1 : end], payload[at:end]))
         except BadMessage as error:
-            told.append(Unread(str(error), payload[at:end]))
+            parts.append(Unread(str(error), payload[at:end]))
         at = end
-    return told
+    return parts
 
 
 def _next(payload: bytes, at: int) -> tuple[re.Match[bytes], int, int]:
-    """Return what the record that begins at ``at`` is, and where its own line and all of it end."""
+    """Return the header match of the record at ``at``, and where its JSON line and the record end."""
     head = _HEAD.match(payload, at)
     if head is None:
-        raise BadMessage(f"it does not begin as a {SCHEMA} does")
+        raise BadMessage(f"it has no {SCHEMA} header")
     line = payload.find(b"\n", head.end())
     if line < 0:
-        raise BadMessage("it is cut off")
+        raise BadMessage("it is truncated")
     if line - at > LARGEST_RECORD:
         raise BadMessage(f"its record is larger than {LARGEST_RECORD >> 10} KiB")
     end = line + 1 + (0 if head[7] == b"-" else int(head[7]))
     if end > len(payload):
-        raise BadMessage("its window is cut off")
+        raise BadMessage("its window is truncated")
     return head, line, end
 
 
@@ -201,13 +201,15 @@ def _record(machine: str, head: re.Match[bytes], line: bytes, window: bytes, pay
     try:
         record = from_json(line, allow_inf_nan=False)
     except ValueError:
-        record = _read(line)  # what is no JSON for one of two is looked at by the other, which says why
+        record = _read(line)  # the second parser decides, and explains the fault
     if not isinstance(record, dict):
-        raise BadMessage("it has no record")
-    if b"\\" in line or line.count(b"[") + line.count(b"{") > MOST_DEPTH:  # else there is nothing to find
+        raise BadMessage("its record is not a JSON object")
+    if b"\\" in line or line.count(b"[") + line.count(b"{") > MOST_DEPTH:  # otherwise nothing can be nested too deep
         _check(_read(line), MOST_DEPTH)
     digits = line.translate(_ONLY_DIGITS)
-    if b"e+000" in digits or b"e000" in digits or MANY_DIGITS in digits:  # a number that no float holds looks like this
+    if (
+        b"e+000" in digits or b"e000" in digits or MANY_DIGITS in digits
+    ):  # a number beyond the range of a float has this form
         _NUMBERS.decode(line.decode())
     if fault := shapes.fault(kind, record):
         raise BadMessage(fault)
@@ -224,18 +226,18 @@ def _read(line: bytes) -> Any:
     except BadMessage:
         raise
     except (ValueError, RecursionError):
-        raise BadMessage("it is no JSON") from None
+        raise BadMessage("it is not valid JSON") from None
 
 
 def _no_number(name: str) -> None:
-    raise BadMessage(f"it holds {name}")
+    raise BadMessage(f"it contains {name}")
 
 
 def _bounded(number: str) -> float:
-    """Return a number to reckon with; PostgreSQL makes no 0 of one that is too small, and refuses it."""
+    """Return a number within bounds; PostgreSQL rejects a nonzero number that underflows."""
     value = float(number)
     if not abs(value) < LARGEST_NUMBER or (value == 0.0 and _IS_SOMETHING.match(number)):
-        raise BadMessage("it holds a number beyond all bounds")
+        raise BadMessage("it contains a number out of range")
     return value
 
 
@@ -255,4 +257,4 @@ def _check(value: Any, depth: int) -> None:
         for each in value:
             _check(each, depth - 1)
     elif isinstance(value, str) and ("\x00" in value or any("\ud800" <= letter <= "\udfff" for letter in value)):
-        raise BadMessage("it holds a character that no database takes")
+        raise BadMessage("it contains a character that the database rejects")

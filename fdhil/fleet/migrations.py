@@ -1,8 +1,8 @@
-"""The tables and views of the history of many machines, in PostgreSQL's schema ``fleet``, and how they come there.
+"""Creates and migrates the tables and views of the fleet's history in PostgreSQL's schema ``fleet``.
 
-``records`` has all that was told, one row a message, partitioned by the month in which it was recorded; a row is known
-again by machine, message and time. Times outside of the years that have partitions are in ``records_other``. Other
-programs read the views.
+``records`` has all received records, one row each, partitioned by the month in which they were recorded; machine,
+message and time identify a row. Records dated outside the partitioned years are in ``records_other``. Other programs
+read the views.
 """
 
 from contextlib import suppress
@@ -15,11 +15,11 @@ from psycopg.rows import tuple_row
 
 from fdhil.errors import StoreError
 
-FIRST_YEAR, LAST_YEAR = 2020, 2099  # of the partitions: a wrong clock makes no others
-FIRST = datetime(FIRST_YEAR, 1, 1, tzinfo=UTC)  # what was recorded before has the time at which it came
-FUTURE = datetime(LAST_YEAR + 1, 1, 1, tzinfo=UTC)  # of what a clock far ahead has dated
-SHIFT_S = 21_600  # of which the newest set stands for all
-LOCK = 7_170_018  # of the advisory lock under which the schema changes
+FIRST_YEAR, LAST_YEAR = 2020, 2099  # range of the partitions: a wrong clock cannot create others
+FIRST = datetime(FIRST_YEAR, 1, 1, tzinfo=UTC)  # records dated earlier get their time of arrival
+FUTURE = datetime(LAST_YEAR + 1, 1, 1, tzinfo=UTC)  # date of records whose clock is far ahead
+SHIFT_S = 21_600  # period that is represented by its newest set
+LOCK = 7_170_018  # advisory lock for schema changes
 _FIRST: LiteralString = """
 CREATE TABLE fleet.records (
   machine text NOT NULL, message text NOT NULL, recorded_at timestamptz NOT NULL, store text NOT NULL,
@@ -72,7 +72,7 @@ CREATE VIEW fleet.acknowledgements AS
     record->>'note' AS note
   FROM fleet.records WHERE kind = 'acknowledgement' AND record ? 'who';
 """
-# a revision belongs to one method; what each of its windows says now is beside what its machine found
+# a revision belongs to one method; each window's new result is listed next to its machine's own
 _REANALYSES: LiteralString = """
 CREATE INDEX records_window ON fleet.records (window_name, machine) WHERE window_name IS NOT NULL;
 CREATE TABLE fleet.reanalyses (revision integer GENERATED ALWAYS AS IDENTITY PRIMARY KEY, digest text NOT NULL UNIQUE,
@@ -89,7 +89,7 @@ CREATE VIEW fleet.reanalysed AS
     a.result#>>'{error,text}' AS error
   FROM fleet.reanalysed_windows a JOIN fleet.windows w USING (machine, window_name);
 """
-# the roll-out: what was offered to whom, stage by stage, and what the machines answered
+# the roll-out: offers by machine and stage, and the machines' answers
 _ROLL_OUT: LiteralString = """
 CREATE TABLE fleet.offers (
   name text NOT NULL, version integer NOT NULL, stage integer NOT NULL, change text NOT NULL, machines text[] NOT NULL,
@@ -101,9 +101,9 @@ CREATE VIEW fleet.offer_answers AS
     record->>'by' AS answered_by, record->>'reason' AS reason, record->>'config_digest' AS config_digest
   FROM fleet.records WHERE kind = 'offer' AND record ? 'answer';
 """
-# of records that are not kept any more, ``kept`` has what is needed for good; ``dropped`` has their numbers, so that
-# none comes back when it is sent again
-_SISTERS: LiteralString = """
+# of deleted records, ``kept`` has those that are still needed; ``dropped`` has the numbers, so that
+# none is stored again when it is sent again
+_SERVICES: LiteralString = """
 CREATE TABLE fleet.services (machine text NOT NULL, axis text NOT NULL, serviced_at timestamptz NOT NULL,
   note text NOT NULL, entered_at timestamptz NOT NULL DEFAULT now(), PRIMARY KEY (machine, axis, serviced_at));
 CREATE TABLE fleet.kept (LIKE fleet.records, PRIMARY KEY (machine, axis, kind));
@@ -145,8 +145,8 @@ CREATE VIEW fleet.loops AS
     record->'unexplained_um' AS unexplained_um, record->'reasons' AS reasons
   FROM fleet.records WHERE kind = 'loops' AND record ? 'structure';
 """
-# of each axis the newest set of every six hours: what is asked of all machines is asked of these, and not of all sets;
-# and when each axis reaches its limits, as it was told last
+# the newest set of each axis and six hours, used by queries over all machines in place of all sets; and the newest
+# forecast of each axis' limits
 _STDS: LiteralString = """
 ARRAY(SELECT CASE WHEN jsonb_typeof(c.v) <> 'number' OR (c.v)::numeric < 0 THEN NULL WHEN (c.v)::numeric < 1e-250 THEN 0
     WHEN (c.v)::numeric < 1e250 THEN sqrt((c.v)::numeric::float8) END
@@ -194,7 +194,7 @@ CREATE OR REPLACE VIEW fleet.newest_parameter_sets AS {KNOWN_AXES}
   SELECT n.* FROM known k, LATERAL (SELECT * FROM fleet.parameter_sets s
     WHERE s.machine = k.machine AND s.axis = k.axis ORDER BY s.stored_at DESC, s.sequence DESC LIMIT 1) n;
 """
-# two machines of one name, or an older copy of a history: numbers come ``repeated``, or of two histories ``in_turn``
+# two machines with one name, or an older copy of a history: numbers are ``repeated``, or two histories come ``in_turn``
 _REPEATED: LiteralString = """
 CREATE OR REPLACE VIEW fleet.machines AS
   SELECT h.machine, sum(h.records)::bigint AS records, max(h.last_stored_at) AS last_stored_at,
@@ -207,13 +207,13 @@ CREATE OR REPLACE VIEW fleet.machines AS
       ROWS BETWEEN UNBOUNDED PRECEDING AND 1 PRECEDING) AS last_before FROM fleet.heard) h
   GROUP BY h.machine;
 """
-# what leads from each version to the next, in order: a new one is added at the end, an old one never changes
-_STEPS: tuple[LiteralString, ...] = (_FIRST, _VIEWS, _REANALYSES, _ROLL_OUT, _SISTERS, _SHIFTS, _REPEATED)
+# the steps from each version to the next, in order: new ones are appended, old ones never change
+_STEPS: tuple[LiteralString, ...] = (_FIRST, _VIEWS, _REANALYSES, _ROLL_OUT, _SERVICES, _SHIFTS, _REPEATED)
 VERSION = len(_STEPS)
 
 
 async def bring_up(db: psycopg.AsyncConnection[Any]) -> None:
-    """Make the schema, or take an older one to the present; all of it or nothing. StoreError when it is a newer one."""
+    """Create the schema or migrate it, in one transaction. StoreError when it is newer than this fdhil."""
     async with db.transaction():
         await db.execute("SELECT pg_advisory_xact_lock(%s)", (LOCK,))
         await db.execute("CREATE SCHEMA IF NOT EXISTS fleet")
@@ -223,7 +223,7 @@ async def bring_up(db: psycopg.AsyncConnection[Any]) -> None:
         ).fetchone()
         version = int(row[0]) if row else 0
         if version > VERSION:
-            text = f"the database has the fleet's schema {version}, this fdhil knows {VERSION}; use a newer fdhil"
+            text = f"the database has fleet schema {version}, this fdhil supports {VERSION}; install a newer fdhil"
             raise StoreError(text, "SchemaVersion")
         for step in _STEPS[version:]:
             await db.execute(step)
@@ -233,7 +233,7 @@ async def bring_up(db: psycopg.AsyncConnection[Any]) -> None:
 
 
 async def add_months(db: psycopg.AsyncConnection, months: set[tuple[int, int]]) -> None:
-    """Make the partitions of these months (year, month) where there are none yet."""
+    """Create the partitions of these months (year, month) where they do not exist."""
     for year, month in sorted(months):
         if not FIRST_YEAR <= year <= LAST_YEAR:
             continue
@@ -242,7 +242,7 @@ async def add_months(db: psycopg.AsyncConnection, months: set[tuple[int, int]]) 
         statement = sql.SQL("CREATE TABLE IF NOT EXISTS {} PARTITION OF fleet.records FOR VALUES FROM ({}) TO ({})")
         async with db.transaction():
             await db.execute("SELECT pg_advisory_xact_lock(%s)", (LOCK,))
-            # a collector that went on while its partition was dropped has left rows of it in ``records_other``
+            # a collector running while its partition was dropped has left rows of it in ``records_other``
             with suppress(psycopg.errors.CheckViolation):
                 async with db.transaction():
                     await db.execute(statement.format(name, datetime(year, month, 1, tzinfo=UTC), end))

@@ -1,4 +1,4 @@
-"""The recorded windows of many machines: one file each, named by the SHA-256 of its content, never changed."""
+"""Stores the recorded windows of many machines: one file each, named by its SHA-256, never changed."""
 
 import os
 import secrets
@@ -9,15 +9,14 @@ from fdhil.store.atomic import make_folder, store_error, write_file
 
 
 def path_of(folder: Path, name: str) -> Path:
-    """Return where the window of that name is."""
     return folder / name[:2] / f"{name}.parquet"
 
 
 def keep(folder: Path, name: str, window: bytes) -> None:
-    """Write a window durably, once; a second writer of the same does no harm. StoreError."""
+    """Write a window durably, once; concurrent writers of the same window are safe. StoreError."""
     path = path_of(folder, name)
     try:
-        os.utime(path)  # it is named anew: whoever removes what no row names leaves it alone
+        os.utime(path)  # mark as used: the removal of unreferenced windows skips it
         return
     except FileNotFoundError:
         pass
@@ -27,15 +26,17 @@ def keep(folder: Path, name: str, window: bytes) -> None:
         make_folder(path.parent)
     except OSError as error:
         raise store_error(path, error) from None
-    # of another collector's half file no byte may come under the name; one that a kill leaves behind goes as a window
-    # that no row names
+    # a unique temporary name: no byte of another collector's partial file may get the final name. A file left by a
+    # killed collector is removed as an unreferenced window
     write_file(path, window, part=path_of(folder, f"{name}-{secrets.token_hex(8)}"))
 
 
 def check_folder(folder: Path) -> None:
-    """Make the folder; StoreError where it cannot be written."""
+    """Create the folder; StoreError where it cannot be written."""
     try:
         make_folder(folder)
         write_file(folder / ".writable", b"")
     except OSError as error:
-        raise StoreError(f"{folder} cannot be made: {error.strerror}; check [objects] directory") from None
+        raise StoreError(
+            f"{folder} cannot be created: {error.strerror}; no records are collected. Check [objects] directory"
+        ) from None

@@ -1,7 +1,7 @@
-"""An offer: a change of configurations that a works has signed, as two lines of text.
+"""Signs and verifies offers: configuration changes signed by the fleet server, as two lines of text.
 
-The first line is the offer as canonical JSON, the second says who signed it and has the signature (Ed25519) over the
-bytes of the first. There is one way to write an offer, so that no byte of it can be changed without being seen.
+The first line is the offer as canonical JSON; the second names the signing key and has the signature (Ed25519) over the
+bytes of the first. An offer has one canonical form, so that any changed byte is detected.
 """
 
 import hashlib
@@ -39,13 +39,13 @@ Machine = Annotated[str, StringConstraints(pattern=MACHINE)]
 
 
 class OfferRefused(FdhilError):
-    """An offer is not accepted, and nothing was changed; the sentence says why."""
+    """An offer is not accepted and nothing was changed; the message says why."""
 
     exit_code = 1
 
 
 class Change(Section):
-    """What is offered, to whom: ``values`` by their keys, ``axis.*`` for each axis that has the ``axis_labels``."""
+    """A proposed change: ``values`` by their keys, ``axis.*`` for each axis that has the ``axis_labels``."""
 
     name: str = Field(pattern=f"^{NAME}$")
     version: int = Field(ge=1, le=999_999_999)
@@ -58,20 +58,19 @@ class Change(Section):
     def _may_be_offered(self) -> Self:
         faults = [f"{path}: {why}" for path in self.values if (why := never(path))]
         if any(path.startswith("axis.*.") for path in self.values) and not self.axis_labels:
-            faults.append("axis_labels: axis.* stands for the axes with these labels; say which")
+            faults.append("axis_labels: axis.* means the axes with these labels; name them")
         if faults:
             raise ValueError("\n".join(faults))
         return self
 
     @property
     def digest(self) -> str:
-        """SHA-256 of what is offered to whom."""
-        told = self.model_dump_json(include=set(Change.model_fields))
-        return hashlib.sha256(told.encode()).hexdigest()
+        """SHA-256 of the change and its addressees."""
+        return hashlib.sha256(self.model_dump_json(include=set(Change.model_fields)).encode()).hexdigest()
 
 
 class Offer(Change):
-    """What is signed: ``machines`` are those of its stage, empty: all with the ``labels``; times are s since 1970."""
+    """The signed content: ``machines`` of its stage, empty: all with the ``labels``; times are s since 1970."""
 
     stage: int = Field(1, ge=1, le=1000)
     machines: tuple[Machine, ...] = Field((), max_length=20_000)
@@ -82,7 +81,7 @@ class Offer(Change):
     @model_validator(mode="after")
     def _is_for_somebody(self) -> Self:
         if not self.machines and not self.labels:
-            raise ValueError("it names neither machines nor labels")
+            raise ValueError("it names no machines and no labels")
         return self
 
     def __str__(self) -> str:
@@ -90,12 +89,11 @@ class Offer(Change):
 
 
 def canonical(offer: Offer) -> bytes:
-    """Return the one line of an offer."""
     return json.dumps(offer.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 def sign(offer: Offer, key: Path) -> bytes:
-    """Return the signed document; ConfigError where the key's file cannot be used or a value cannot be."""
+    """Return the signed document; ConfigError where the key file or a value cannot be used."""
     for path, value in offer.values.items():
         checked_value(path.replace("axis.*.", "axis.X."), value)
     pair = _pair(key)
@@ -107,19 +105,21 @@ def sign(offer: Offer, key: Path) -> bytes:
 
 
 def read(document: bytes, trusted: Collection[str]) -> Offer:
-    """Return the offer of a document that was signed with a trusted key, and not changed since; OfferRefused."""
+    """Return the offer of an unchanged document signed with a trusted key; OfferRefused."""
     line, _, rest = document.partition(b"\n")
     found = _SIGNED.fullmatch(rest.removesuffix(b"\n"))
     if len(document) > LARGEST or found is None or not rest.endswith(b"\n"):
         raise OfferRefused("it is not a valid change file (corrupt or truncated); export it again")
     key = found[1].decode()
     if key not in trusted:
-        text = f"it is signed with {key}, which is no key of [offers] trust"
-        raise OfferRefused(f"{text}; ask the works by another way whether that key is theirs before you list it")
+        text = f"it is signed with {key}, which is not listed in [offers] trust"
+        raise OfferRefused(
+            f"{text}; confirm the key with the fleet server's operator by another channel before you list it"
+        )
     try:
         VerifyKey(key_bytes(key)).verify(_told(line), bytes.fromhex(found[2].decode()))
     except (CryptoError, ValueError):
-        raise OfferRefused("it was changed after it was signed; nothing in it can be believed") from None
+        raise OfferRefused("it was changed after it was signed; do not trust it, ask for a new copy") from None
     return _parsed(line)
 
 
@@ -129,25 +129,25 @@ def _parsed(line: bytes) -> Offer:
     except (ValidationError, RecursionError) as error:
         raise OfferRefused(f"this fdhil cannot read it: {_first(error)}") from None
     if canonical(offer) != line:
-        raise OfferRefused("it is not written as offers are")
+        raise OfferRefused("it is not in the canonical form of an offer; export it again")
     return offer
 
 
 def _first(error: ValidationError | RecursionError) -> str:
     if isinstance(error, RecursionError):
-        return "it is nested without end"
-    told = error.errors(include_url=False, include_input=False)[0]
-    place = ".".join(map(str, told["loc"]))
-    return f"{place}: {told['msg']}".removeprefix(": ").removeprefix("Value error, ").replace("\n", "; ")[:300]
+        return "it is nested too deep"
+    first = error.errors(include_url=False, include_input=False)[0]
+    path = ".".join(map(str, first["loc"]))
+    return f"{path}: {first['msg']}".removeprefix(": ").removeprefix("Value error, ").replace("\n", "; ")[:300]
 
 
 def _told(line: bytes) -> bytes:
-    """Return what the signature is over: no other document of this key is one."""
+    """Return the signed bytes; the prefix keeps signatures of other documents from matching."""
     return SCHEMA.encode() + b"\n" + line
 
 
 def make_key(path: Path) -> str:
-    """Make a key's file, mode 0600, and return the public key; OSError, FileExistsError where there is one."""
+    """Create a key file, mode 0600, and return the public key; OSError, FileExistsError where it exists."""
     seed = nkeys.encode_seed(secrets.token_bytes(32), nkeys.PREFIX_BYTE_OPERATOR)
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     with os.fdopen(descriptor, "wb") as file:
@@ -158,7 +158,7 @@ def make_key(path: Path) -> str:
 
 
 def public_key(path: Path) -> str:
-    """Return the public key that belongs to a key's file; ConfigError."""
+    """Return the public key of a key file; ConfigError."""
     return str(_pair(path).public_key.decode())
 
 
@@ -168,14 +168,14 @@ def _pair(path: Path) -> nkeys.KeyPair:
             mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
             seed = file.read(LARGEST_KEY).strip()
     except OSError as error:
-        raise _key_fault(path, f"cannot be read: {error.strerror}", "fdhil fleet key makes one") from None
+        raise _key_fault(path, f"cannot be read: {error.strerror}", "create one with fdhil fleet key") from None
     if mode & 0o077:
-        raise _key_fault(path, "may be read by others, who could sign in your name", f"chmod 0600 {path}")
+        raise _key_fault(path, "can be read by others, who could sign offers with it", f"run chmod 0600 {path}")
     try:
         pair = nkeys.from_seed(seed)
         key_bytes(pair.public_key.decode())
     except (nkeys.NkeysError, ValueError, TypeError, IndexError):
-        raise _key_fault(path, "is no key to sign with", "fdhil fleet key makes one") from None
+        raise _key_fault(path, "is not a signing key", "create one with fdhil fleet key") from None
     return pair
 
 

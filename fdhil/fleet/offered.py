@@ -1,8 +1,8 @@
-"""What an offer of a works would change at this machine, and the operator's answer to it.
+"""Evaluates what an offer would change on this machine, and records the operator's answer.
 
-Nothing here is done by itself: an offer lies in its folder until an operator accepts or rejects it by name. What is
-accepted is looked at again then; the new configuration takes the old one's place whole, and the old one is kept beside
-it. A daemon that runs goes on with the configuration that it has read.
+Nothing is changed automatically: an offer stays in its folder until an operator accepts or rejects it by name. It is
+evaluated again on acceptance; the new configuration replaces the old one atomically, and the old one is kept as a
+backup next to it. A running daemon continues with the configuration that it has loaded.
 """
 
 import copy
@@ -28,15 +28,15 @@ from fdhil.store.atomic import write_file
 from fdhil.store.offers import Answer, add_answer, lying, newest_accepted, read_answers
 
 CAUSES = {
-    "DiskFull": "the disk is full; free some of it",
-    "ReadOnlyStore": "you may not write in its folder, or the disk is read-only; try with sudo",
+    "DiskFull": "the disk is full; free some space",
+    "ReadOnlyStore": "its folder is not writable, or the disk is read-only; try with sudo",
 }
-AHEAD_S = 86_400.0  # by which the works' clock may be ahead of the machine's
+AHEAD_S = 86_400.0  # tolerated lead of the fleet server's clock
 
 
 @dataclass(frozen=True, slots=True)
 class Changed:
-    """One value that an offer changes here."""
+    """One value that an offer changes on this machine."""
 
     path: str
     old: Any
@@ -46,9 +46,9 @@ class Changed:
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A document as this machine sees it: ``wrong`` says why it cannot be accepted, empty: it can.
+    """A document evaluated on this machine: ``wrong`` says why it cannot be accepted, empty: it can.
 
-    ``text`` and ``config`` are the configuration after it; of no changes, as it is.
+    ``text`` and ``config`` are the configuration after the change; without changes, the present one.
     """
 
     place: Path
@@ -64,13 +64,13 @@ class Judged:
 
     @property
     def loosens(self) -> Sequence[Changed]:
-        """What lets more through than before: keys, and what follows from them for the guard."""
+        """Changes that relax a limit: keys, and the resulting limits of the guard."""
         return [each for each in (*self.changes, *self.of_guard) if each.loosens]
 
 
 @dataclass(frozen=True, slots=True)
 class Present:
-    """The machine as it is now: its file and what that says, its answers so far, the newest version of each offer."""
+    """The machine at present: its configuration file and content, its answers, the newest version of each offer."""
 
     file: Path
     raw: bytes
@@ -81,24 +81,23 @@ class Present:
 
     @property
     def labels(self) -> Mapping[str, str]:
-        """What the machine is compared with others by."""
+        """The labels by which the machine is compared with others."""
         return self.config.uplink.labels if self.config.uplink else {}
 
     def axes(self, labels: Mapping[str, str]) -> list[str]:
         """Return the axes that have all these labels."""
-        told = self.config.uplink.axis_labels if self.config.uplink else {}
-        return [axis for axis in self.config.axis if labels.items() <= dict(told.get(axis, {})).items()]
+        own = self.config.uplink.axis_labels if self.config.uplink else {}
+        return [axis for axis in self.config.axis if labels.items() <= dict(own.get(axis, {})).items()]
 
 
 def present(file: Path, now_s: float | None = None) -> Present:
-    """Return the machine of a configuration; ConfigError, StoreError where its answers cannot be read."""
+    """Load the machine of a configuration; ConfigError, StoreError where its answers cannot be read."""
     config = machine_config.load(file)
     raw, answers = file.read_bytes(), read_answers(config.store.directory)
     return Present(file, raw, config, answers, _newest(config), time.time() if now_s is None else now_s)
 
 
 def _newest(config: MachineConfig) -> Mapping[str, int]:
-    """Return the newest version of each offer that lies here and is believed."""
     newest: dict[str, int] = {}
     for place in lying(config.offers_directory):
         with suppress(OfferRefused, OSError):
@@ -108,72 +107,70 @@ def _newest(config: MachineConfig) -> Mapping[str, int]:
 
 
 def _content(place: Path) -> bytes:
-    """Return what stands in a file, one byte more than an offer has at most; OfferRefused where it is no file."""
-    descriptor = os.open(place, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe would be waited for
+    """Return a file's content, limited to one byte more than an offer may have; OfferRefused for a special file."""
+    descriptor = os.open(place, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # opening a pipe would block
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise OfferRefused("it is no file; have it written again")
+            raise OfferRefused("it is not a regular file; export it again")
         return os.read(descriptor, LARGEST + 1)
     finally:
         os.close(descriptor)
 
 
 def judge(place: Path, machine: Present) -> Judged:
-    """Look at the document of a file; OSError where it cannot be read."""
+    """Evaluate the document of a file; OSError where it cannot be read."""
     judged = Judged(place, "", None, "")
     try:
         document = _content(place)
         judged = replace(judged, document=hashlib.sha256(document).hexdigest())
         offer = read(document, machine.config.offers.trust)
-        judged = replace(judged, offer=offer, answers=[each for each in machine.answers if _is_of(each, offer)])
+        key = (offer.name, offer.version)
+        judged = replace(
+            judged, offer=offer, answers=[each for each in machine.answers if (each.name, each.version) == key]
+        )
         _require_in_force(offer, machine)
         _require_for(offer, machine)
-        weighed = _weighed(judged, offer, machine)
-        _require_same(weighed)
-        return weighed
+        evaluated = _weighed(judged, offer, machine)
+        _require_same(evaluated)
+        return evaluated
     except OfferRefused as error:
         return replace(judged, wrong=str(error))
 
 
 def _require_same(judged: Judged) -> None:
-    """OfferRefused where the version was accepted with other values: a version is one change, at every stage."""
+    """Refuse a version that was accepted with other values: a version is one change, at every stage."""
     accepted = [each for each in judged.answers if each.answer == "accepted"]
     if judged.changes and accepted and judged.document not in [each.document for each in accepted]:
         text = f"{judged.offer} was accepted with other values by {accepted[-1].by}, and a version never changes"
-        raise OfferRefused(f"{text}; ask the works for a newer version, and who signed this one")
-
-
-def _is_of(answer: Answer, offer: Offer) -> bool:
-    return (answer.name, answer.version) == (offer.name, offer.version)
+        raise OfferRefused(f"{text}; ask the fleet server for a newer version, and find out who signed this one")
 
 
 def _require_in_force(offer: Offer, machine: Present) -> None:
-    """OfferRefused where an offer is over, or older than what is known."""
     day = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(offer.expires_s))
     if machine.now_s >= offer.expires_s:
-        raise OfferRefused(f"it was valid until {day}; ask the works for a newer one")
+        raise OfferRefused(f"it expired on {day}; ask the fleet server for a newer one")
     if offer.made_s > machine.now_s + AHEAD_S:
-        raise OfferRefused("it was made later than this PC's clock says that it is; set the clock")
+        raise OfferRefused("it is dated in the future of this PC's clock; set the clock")
     accepted = newest_accepted(machine.answers, offer.name)
     if offer.version < accepted:
-        raise OfferRefused(f"version {accepted} of it was accepted, and an older one never follows")
+        raise OfferRefused(f"version {accepted} was already accepted, and an older version cannot replace it")
     newest = machine.newest.get(offer.name, 0)
     if offer.version < newest:
-        raise OfferRefused(f"the works has offered version {newest} in its place")
+        raise OfferRefused(f"version {newest} of the fleet server replaces it")
 
 
 def _require_for(offer: Offer, machine: Present) -> None:
-    """OfferRefused where an offer is for other machines."""
     name = machine.config.works_name
     if offer.machines and name not in offer.machines:
-        raise OfferRefused(f"stage {offer.stage} of it is for other machines than {name}")
+        raise OfferRefused(f"its stage {offer.stage} is not for {name}")
     for label, text in offer.labels.items():
         if machine.labels.get(label) != text:
-            raise OfferRefused(f"it is for machines whose label {label} is {text!r}; [uplink] labels says what this is")
+            raise OfferRefused(
+                f"it is for machines with label {label} = {text!r}; this machine's labels are in [uplink] labels"
+            )
 
 
 def _weighed(judged: Judged, offer: Offer, machine: Present) -> Judged:
-    """Return what an offer changes; OfferRefused where the configuration would be none, or cannot be edited."""
     values = dict(_values(offer, machine))
     document = copy.deepcopy(toml_document(machine.raw, str(machine.file)))
     for path, value in values.items():
@@ -186,7 +183,7 @@ def _weighed(judged: Judged, offer: Offer, machine: Present) -> Judged:
         if changes:
             text = edited(text, {each.path: values[each.path] for each in changes}, str(offer))
     except ConfigError as error:
-        raise OfferRefused(f"with it the configuration could not be used: {error}") from None
+        raise OfferRefused(f"it would make the configuration invalid: {error}") from None
     except NotEditable as error:
         raise OfferRefused(f"{machine.file} cannot be edited by line: {error}") from None
     doubts = [text for text in unlikely(new) if text not in unlikely(machine.config)]
@@ -195,7 +192,6 @@ def _weighed(judged: Judged, offer: Offer, machine: Present) -> Judged:
 
 
 def _loosened(old: MachineConfig, new: MachineConfig) -> Iterator[Changed]:
-    """Yield the limits of the guard that become larger."""
     before = guard_limits(old)
     for name, value in guard_limits(new).items():
         if name not in before or value > before[name]:
@@ -203,16 +199,15 @@ def _loosened(old: MachineConfig, new: MachineConfig) -> Iterator[Changed]:
 
 
 def _values(offer: Offer, machine: Present) -> Iterator[tuple[str, Any]]:
-    """Yield the keys of this machine with their values; OfferRefused where it has no such axis or table."""
     for path, value in offer.values.items():
         top, _, rest = path.partition(".*.")
         paths = [f"{top}.{axis}.{rest}" for axis in machine.axes(offer.axis_labels)] if rest else [path]
         if not paths:
-            raise OfferRefused("no axis of this machine has the labels that it is for; [uplink] axis_labels has them")
+            raise OfferRefused("no axis of this machine has its labels; the labels are in [uplink] axis_labels")
         for each in paths:
             table = each.rpartition(".")[0]
             if _at(machine.config, table) is None:
-                raise OfferRefused(f"there is no [{table}] here, and only who stands at the machine switches that on")
+                raise OfferRefused(f"this machine has no [{table}], which can only be enabled at the machine")
             yield each, value
 
 
@@ -230,10 +225,10 @@ def _put(document: dict[str, Any], path: str, value: Any) -> None:
 
 
 def accept(place: Path, file: Path, by: str, may_loosen: bool) -> Judged:
-    """Write the configuration that an offer asks for, keep the old one beside it, and note who accepted it.
+    """Write the configuration that an offer proposes, keep the old one as a backup, and record who accepted it.
 
-    OfferRefused; OutputError where the configuration cannot be written: it is as it was. StoreError where the answer
-    cannot be noted; accepted once more it changes nothing, and is noted.
+    OfferRefused; OutputError where the configuration cannot be written: it is unchanged. StoreError where the answer
+    cannot be recorded; accepting again then changes nothing and records it.
     """
     with _alone(file):
         judged = judge(place, present(file))
@@ -241,7 +236,7 @@ def accept(place: Path, file: Path, by: str, may_loosen: bool) -> Judged:
             raise OfferRefused(f"{place.name} is not accepted: {judged.wrong}")
         if judged.loosens and not may_loosen:
             keys = "; ".join(each.path for each in judged.loosens)
-            raise OfferRefused(f"{judged.offer} is not accepted: it loosens {keys}; if that is meant, add --loosens")
+            raise OfferRefused(f"{judged.offer} is not accepted: it loosens {keys}; add --loosens to accept that")
         if judged.changes:
             _replace(file, judged)
         if judged.changes or "accepted" not in [each.answer for each in judged.answers[-1:]]:
@@ -250,9 +245,9 @@ def accept(place: Path, file: Path, by: str, may_loosen: bool) -> Judged:
 
 
 def reject(place: Path, file: Path, by: str, reason: str) -> Judged:
-    """Note who rejected an offer, and why.
+    """Record who rejected an offer, and why.
 
-    OfferRefused where it is none of a works that is trusted, or was accepted and is in force.
+    OfferRefused where it was not signed by a trusted fleet server, or was accepted and is in force.
     """
     with _alone(file):
         machine = present(file)
@@ -261,15 +256,15 @@ def reject(place: Path, file: Path, by: str, reason: str) -> Judged:
             raise OfferRefused(f"{place.name}: {judged.wrong}")
         accepted = [each.by for each in judged.answers[-1:] if each.answer == "accepted"]
         if accepted and _in_force(judged, judged.offer, machine):
-            way_back = f"put the values of before back first; they are in {kept_file(file, judged.offer)}"
-            text = f"{judged.offer} was accepted by {accepted[0]}, and what it changes is in force"
-            raise OfferRefused(f"{text}: it is not rejected; {way_back}")
+            advice = f"restore the previous values first; they are in {kept_file(file, judged.offer)}"
+            text = f"{judged.offer} was accepted by {accepted[0]} and its values are in force"
+            raise OfferRefused(f"{text}: it is not rejected; {advice}")
         _note(judged, machine.config, "rejected", by, reason)
         return judged
 
 
 def _in_force(judged: Judged, offer: Offer, machine: Present) -> bool:
-    """Whether the configuration says already what an offer asks for, whether or not that is over by now."""
+    """Whether the configuration already has the offered values, even if the offer has expired."""
     try:
         return not _weighed(judged, offer, machine).changes
     except OfferRefused:
@@ -277,7 +272,7 @@ def _in_force(judged: Judged, offer: Offer, machine: Present) -> bool:
 
 
 def kept_file(file: Path, offer: Offer) -> Path:
-    """Return where the configuration that was before an offer is kept."""
+    """Return the path of the backup of the configuration before an offer."""
     return file.with_name(f"{file.name}.before-{offer.name}-{offer.version}")
 
 
@@ -289,31 +284,28 @@ def _replace(file: Path, judged: Judged) -> None:
         write_file(kept_file(file, judged.offer), old, like)
         write_file(file, new, like)
     except StoreError as error:
-        stands = (
-            "is as it was" if file.read_bytes() == old else "is the new one, but a power cut may bring the old back"
-        )
+        state = "is unchanged" if file.read_bytes() == old else "is the new one, but may be lost in a power cut"
         cause = CAUSES.get(error.code, str(error))
-        raise OutputError(f"{file} could not be written: {cause}; the configuration {stands}") from None
+        raise OutputError(f"{file} could not be written: {cause}; the configuration {state}") from None
 
 
 def _note(judged: Judged, config: MachineConfig, answer: Literal["accepted", "rejected"], by: str, reason: str) -> None:
     offer = judged.offer
     assert offer is not None
-    told = Answer(
-        offer.name, offer.version, offer.stage, judged.document, answer, by, reason, time.time(), config.digest
-    )
-    add_answer(config.store.directory, told)
+    document = judged.document
+    noted = Answer(offer.name, offer.version, offer.stage, document, answer, by, reason, time.time(), config.digest)
+    add_answer(config.store.directory, noted)
 
 
 @contextmanager
 def _alone(file: Path) -> Iterator[None]:
-    """Hold the configuration's folder, so that of two who answer at once the second sees what the first did."""
+    """Lock the configuration's folder, so that of two concurrent answers the second sees the result of the first."""
     descriptor = os.open(file.resolve().parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            text = f"another command is answering an offer of {file}; wait until it has ended, then try again"
+            text = f"another command is answering an offer for {file}; nothing was changed. Try again when it has ended"
             raise OutputError(text) from None
         yield
     finally:

@@ -1,9 +1,9 @@
-"""Finds the axis that is unlike its sisters: the same axis of machines of one kind, at one temperature and age.
+"""Finds axes that deviate from comparable axes: the same axis of machines of one kind, at one temperature and age.
 
-A parameter's level of an axis is the median of its newest sets, as a part of the sisters' median. A mixed model
-(:mod:`fdhil.fleet.mixed`) tells what temperature and age account for, and how far sisters differ besides; the axis'
-own interval, and what is not known of its temperature, are added. The bounds are such that of a hundred groups without
-an outlier one has an alarm, whatever their number (they were counted with random numbers).
+The level of an axis is the median of its newest values of a parameter, relative to the median of its peers. A mixed
+model (:mod:`fdhil.fleet.mixed`) accounts for temperature and age and estimates the remaining spread; the axis' own
+uncertainty, and that of an unknown temperature, are added. The bounds give a false alarm in one of a hundred groups
+without an outlier, whatever their size (found by simulation).
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,10 +14,10 @@ import numpy as np
 from fdhil.fleet import mixed
 from fdhil.records import Float
 
-LEAST_SISTERS = 5
-LEVEL_SETS = 5  # the newest, of which a level is the median
-WINSOR = 3.0  # deviations: what is farther off is no farther where machines are looked at as a whole
-# from so many sisters on -> the largest deviation of all that is exceeded in one of 100 groups, in deviations
+LEAST_PEERS = 5
+LEVEL_SETS = 5  # newest sets whose median is the level
+WINSOR = 3.0  # limit of the deviations in the correlation between axes of a machine
+# least number of peers, and the largest deviation that one of 100 groups exceeds, in standard deviations
 BOUNDS = (
     (5, 36.0), (6, 9.2), (8, 6.8), (10, 5.9), (12, 5.6), (15, 5.3), (20, 5.0), (30, 4.8), (50, 4.6), (100, 4.4)
 )  # fmt: skip
@@ -25,7 +25,7 @@ BOUNDS = (
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """The newest sets of one parameter of an axis, oldest first: values, temperatures (NaN where unknown), all (n,).
+    """The newest values of one parameter of an axis, oldest first, with temperatures (NaN where unknown), all (n,).
 
     ``ages_months`` (n,) count from the first set, or from the newest service. ``std`` is the standard deviation of the
     newest value.
@@ -41,7 +41,7 @@ class Course:
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """Where an axis stands among its sisters: ``off`` 0.1 is 10 % above what is expected of it, ``score`` in doubts."""
+    """Position of an axis among its peers: ``off`` 0.1 is 10 % above its expected value, ``score`` in deviations."""
 
     machine: str
     axis: str
@@ -53,9 +53,9 @@ class Level:
 
 @dataclass(frozen=True, slots=True)
 class Sisters:
-    """A group: its median, spread as a part of it, slopes as parts per kelvin and month, the score's bound, levels.
+    """A group of comparable axes: median, relative spread, slopes per kelvin and month, bound of the score, levels.
 
-    ``temperature_c`` and ``age_months`` are the usual ones.
+    ``temperature_c`` and ``age_months`` are the medians of the group.
     """
 
     median: float
@@ -69,9 +69,9 @@ class Sisters:
 
 
 def judge(courses: Sequence[Course]) -> Sisters | None:
-    """Return how the axes of a group stand to each other; None where they are too few, or their median is 0."""
+    """Compare the axes of a group; None where they are too few, or their median is 0."""
     courses = [course for course in courses if np.isfinite(course.values[-1])]
-    if len(courses) < LEAST_SISTERS:
+    if len(courses) < LEAST_PEERS:
         return None
     levels = np.array([np.median(course.values[-LEVEL_SETS:]) for course in courses])
     median = float(np.median(levels))
@@ -82,30 +82,30 @@ def judge(courses: Sequence[Course]) -> Sisters | None:
     shared = mixed.shared_slopes([axis for course in courses if (axis := _own(course)) is not None])
     own = np.array([course.std / median if np.isfinite(course.std) else 0.0 for course in courses]) ** 2
     found = mixed.fit(levels / median, apart, own, shared)
-    # a temperature that is not known may be any that others have
+    # an unknown temperature may be any of the others'
     own = own + (unknown**2) @ (found.slopes**2 + found.slope_stds**2)
     scale = np.sqrt(found.spread**2 + found.doubts**2 + own)
     bound = next(bound for least, bound in reversed(BOUNDS) if len(courses) >= least)
-    told = [
+    levels_found = [
         Level(course.machine, course.axis, float(course.values[-1]), float(o), float(o / s), bool(abs(o) > bound * s))
         for course, o, s in zip(courses, found.off, scale, strict=True)
     ]
-    told.sort(key=lambda level: -abs(level.score))
+    levels_found.sort(key=lambda level: -abs(level.score))
     per_k, per_month = map(float, found.slopes)
-    return Sisters(median, found.spread, per_k, per_month, float(usual[0]), float(usual[1]), bound, tuple(told))
+    return Sisters(median, found.spread, per_k, per_month, float(usual[0]), float(usual[1]), bound, tuple(levels_found))
 
 
 def of_machines(groups: Sequence[Sisters]) -> dict[tuple[str, str], float]:
-    """Return by how much each axis is expected to be off, as the other axes of its machine are off.
+    """Return the deviation expected of each axis from the deviations of the other axes of its machine.
 
-    The groups are those of one parameter, one an axis letter. How much axes of one machine have in common is counted
-    over all of them; there, what lies far out has no more say than what lies out.
+    The groups are those of one parameter, one per axis letter. The correlation between the axes of a machine is
+    estimated over all machines, with scores limited to WINSOR.
     """
     scores: dict[str, dict[str, float]] = {}
     for group in groups:
         for level in group.levels:
             scores.setdefault(level.machine, {})[level.axis] = level.score
-    alike = _in_common(list(scores.values()))
+    common = _in_common(list(scores.values()))
     spreads = {
         (level.machine, level.axis): level.off / level.score for g in groups for level in g.levels if level.score
     }
@@ -113,19 +113,19 @@ def of_machines(groups: Sequence[Sisters]) -> dict[tuple[str, str], float]:
     for machine, of_axes in scores.items():
         for axis in of_axes:
             others = [score for other, score in of_axes.items() if other != axis]
-            share = alike * sum(others) / (1 + (len(others) - 1) * alike) if others else 0.0
+            share = common * sum(others) / (1 + (len(others) - 1) * common) if others else 0.0
             expected[machine, axis] = share * spreads.get((machine, axis), 0.0)
     return expected
 
 
 def _in_common(machines: Sequence[Mapping[str, float]]) -> float:
-    """Return the correlation of the axes of a machine, 0 where too few machines have several."""
+    """Return the correlation between the axes of a machine, 0 where too few machines have several."""
     several = [np.clip(list(scores.values()), -WINSOR, WINSOR) for scores in machines if len(scores) > 1]
-    if len(several) < LEAST_SISTERS:
+    if len(several) < LEAST_PEERS:
         return 0.0
-    alike = np.mean([(s.sum() ** 2 - s @ s) / (s.size * (s.size - 1)) for s in several])
+    common = np.mean([(s.sum() ** 2 - s @ s) / (s.size * (s.size - 1)) for s in several])
     whole = np.mean([s @ s / s.size for s in several])
-    return float(np.clip(alike / whole, 0.0, 0.95)) if whole > 0 else 0.0
+    return float(np.clip(common / whole, 0.0, 0.95)) if whole > 0 else 0.0
 
 
 def _newest(values: Float) -> float:
@@ -134,9 +134,9 @@ def _newest(values: Float) -> float:
 
 
 def _filled(at: Float) -> tuple[Float, Float, Float]:
-    """Return the usual temperature and age (2,), how far each axis (n, 2) is from them, and the doubt of that (n, 2).
+    """Return the usual temperature and age (2,), each axis' difference (n, 2) and its uncertainty (n, 2).
 
-    What is not known of an axis is taken for usual, within what is known of others.
+    Unknown covariates are taken as usual, with the spread of the known ones as uncertainty.
     """
     known = np.isfinite(at)
     usual = np.array([np.median(column[k]) if k.any() else np.nan for column, k in zip(at.T, known.T, strict=True)])
@@ -145,9 +145,9 @@ def _filled(at: Float) -> tuple[Float, Float, Float]:
 
 
 def _own(course: Course) -> tuple[Float, Float] | None:
-    """Return an axis' sets as the shared slopes are told by: parts of its median, and its temperatures and ages.
+    """Return an axis' values relative to its median, with temperatures and ages, for the shared slopes.
 
-    Where the temperature is not known nothing is: a spring that warms all of them would be taken for their age.
+    Sets of unknown temperature are left out: otherwise a seasonal warming would be taken for ageing.
     """
     known = np.isfinite(course.values) & np.isfinite(course.ages_months) & np.isfinite(course.temperatures_c)
     usual = float(np.median(course.values))

@@ -1,7 +1,7 @@
-"""Answers what is asked of all machines, from the views of the database; as JSON has it."""
+"""Answers queries about all machines from the views of the database, as JSON data."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,11 +12,9 @@ from fdhil.fleet.services import services
 from fdhil.fleet.sets import MONTH_S, Db, Row, ages_months, axes_of, date_of, known, newest_sets, std_of
 from fdhil.records import INTERVAL_95, PARAMETERS, frozen, unit_of
 
-__all__ = ["compare", "outliers", "services", "status", "trend"]
-
-NEWEST_SETS = 50  # of an axis, where it is compared with others
+NEWEST_SETS = 50  # of an axis in comparisons
 LEAST_TREND = 5  # sets
-TOLD_OF_SISTERS = ("median", "spread", "slope_per_k", "slope_per_month", "temperature_c", "age_months", "bound")
+GROUP_FIGURES = ("median", "spread", "slope_per_k", "slope_per_month", "temperature_c", "age_months", "bound")
 Rows = Sequence[Row]
 _OPEN = """
 SELECT n.machine, count(*) AS open FROM fleet.notices n LEFT JOIN
@@ -27,7 +25,7 @@ WHERE n.severity <> 'info' AND a.number IS NULL GROUP BY n.machine
 
 
 def status(db: Db) -> dict[str, Any]:
-    """Return every machine: when it was heard, what is missing, its newest parameters, open notices; what is due."""
+    """Return the state of every machine: last contact, missing records, newest parameters, open notices; due limits."""
     waiting = {row["machine"]: row["open"] for row in db.execute(_OPEN)}
     newest: dict[str, dict[str, Any]] = {}
     for row in db.execute("SELECT * FROM fleet.newest_parameter_sets"):
@@ -51,15 +49,15 @@ def status(db: Db) -> dict[str, Any]:
 
 
 def _doubt(row: Row) -> str | None:
-    """Return why what was told under a machine's name may not be of one machine; None: nothing shows that."""
+    """Return why the records under a machine's name may come from two machines; None without a sign of that."""
     if not row["repeated"] and not row["in_turn"]:
         return None
-    shown = f"{row['repeated']} records under numbers that were sent before" if row["repeated"] else "two histories"
-    return f"{shown}: two machines send under this name, or an older copy of its history was put back"
+    sign = f"{row['repeated']} records with repeated numbers" if row["repeated"] else "two histories"
+    return f"{sign}: two machines use this name, or an older copy of its history was restored"
 
 
 def trend(db: Db, machine: str, axis: str, parameter: str) -> dict[str, Any]:
-    """Return how a parameter of an axis moved: each set, and the slope per 30 days (the median of all pairs)."""
+    """Return the history of a parameter of an axis: each set, and the slope per 30 days (the median of all pairs)."""
     query = "SELECT * FROM fleet.parameter_sets WHERE machine = %s AND axis = %s ORDER BY stored_at, sequence"
     rows = db.execute(query, (machine, axis)).fetchall()
     points = [
@@ -74,7 +72,7 @@ def trend(db: Db, machine: str, axis: str, parameter: str) -> dict[str, Any]:
 
 
 def _slope(pairs: list[tuple[float, float]]) -> float | None:
-    """Return the median slope of all pairs of the newest 500 (Theil and Sen); None for a few, or for one moment."""
+    """Return the median slope of all pairs of the newest 500 (Theil and Sen); None for too few or one instant."""
     if len(pairs) < LEAST_TREND:
         return None
     at_s, values = np.array(pairs[-500:]).T
@@ -85,7 +83,7 @@ def _slope(pairs: list[tuple[float, float]]) -> float | None:
 
 
 def compare(db: Db, parameter: str, by: str, axis: str | None) -> dict[str, Any]:
-    """Return a parameter of the same axis of all machines, in groups of machines whose label ``by`` is the same."""
+    """Return a parameter of the same axis of all machines, grouped by the label ``by`` of the machines."""
     groups = _groups(db, by, axis)
     return {"parameter": parameter, "unit": unit_of(parameter), "by": by, "groups": _compared(groups, parameter)}
 
@@ -96,29 +94,29 @@ def _compared(groups: Mapping[tuple[str, str], Sequence[Rows]], parameter: str) 
     judged = {key: judge(own) for key, own in courses.items()}
     found = []
     for key, own in courses.items():
-        same = [sisters for (label, _), sisters in judged.items() if label == key[0] and sisters is not None]
+        same = [peers for (label, _), peers in judged.items() if label == key[0] and peers is not None]
         found += [_group(key, own, judged[key], of_machines(same))] if own else []
     return found
 
 
 def _group(
-    key: tuple[str, str], courses: Sequence[Course], sisters: Sisters | None, expected: Mapping[tuple[str, str], float]
+    key: tuple[str, str], courses: Sequence[Course], peers: Sisters | None, expected: Mapping[tuple[str, str], float]
 ) -> dict[str, Any]:
     listed = [
         {"machine": c.machine, "axis": c.axis, "value": c.values[-1], "std": known(c.std)}
         for c in sorted(courses, key=lambda course: float(course.values[-1]))
     ]
-    told = {name: None if sisters is None else known(getattr(sisters, name)) for name in TOLD_OF_SISTERS}
+    figures = {name: None if peers is None else known(getattr(peers, name)) for name in GROUP_FIGURES}
     outliers = [
         {"machine": level.machine, "value": level.value, "off": level.off, "score": known(level.score),
          "off_by_its_other_axes": expected[level.machine, level.axis]}
-        for level in (sisters.levels if sisters is not None else ()) if level.is_outlier
+        for level in (peers.levels if peers is not None else ()) if level.is_outlier
     ]  # fmt: skip
-    return {"label": key[0], "axis": key[1], "sisters": listed, **told, "outliers": outliers}
+    return {"label": key[0], "axis": key[1], "sisters": listed, **figures, "outliers": outliers}
 
 
 def outliers(db: Db, by: str, axis: str | None) -> dict[str, Any]:
-    """Return the axes that are unlike their sisters in a parameter, the farthest first."""
+    """Return the axes that deviate from their peers in a parameter, the largest deviation first."""
     groups, found = _groups(db, by, axis), []
     doubts = {row["machine"]: _doubt(row) for row in db.execute("SELECT * FROM fleet.machines")}
     for parameter in PARAMETERS:
@@ -136,7 +134,6 @@ def outliers(db: Db, by: str, axis: str | None) -> dict[str, Any]:
 
 
 def _groups(db: Db, by: str, axis: str | None) -> dict[tuple[str, str], list[Rows]]:
-    """Return the newest sets of each axis, by the label of its machine (or its own) and its letter."""
     labels = {row["machine"]: row["about"] or {} for row in db.execute("SELECT machine, about FROM fleet.machines")}
     groups: dict[tuple[str, str], list[Rows]] = {}
     for (machine, letter), rows in newest_sets(db, NEWEST_SETS, axes_of(db, axis)).items():
@@ -145,11 +142,11 @@ def _groups(db: Db, by: str, axis: str | None) -> dict[tuple[str, str], list[Row
 
 
 def _course(rows: Rows, parameter: str) -> Course:
-    told = [row for row in rows if row[parameter] is not None]
-    values = frozen([row[parameter] for row in told])
-    at_c = frozen([math.nan if row["temperature_c"] is None else row["temperature_c"] for row in told])
-    last = told[-1]
-    return Course(last["machine"], last["axis"], values, at_c, frozen(ages_months(told)), std_of(last, parameter))
+    known_rows = [row for row in rows if row[parameter] is not None]
+    values = frozen([row[parameter] for row in known_rows])
+    at_c = frozen([math.nan if row["temperature_c"] is None else row["temperature_c"] for row in known_rows])
+    last = known_rows[-1]
+    return Course(last["machine"], last["axis"], values, at_c, frozen(ages_months(known_rows)), std_of(last, parameter))
 
 
 def _label(about: Mapping[str, Any], axis: str, by: str) -> str:
@@ -165,5 +162,15 @@ def _set(row: Mapping[str, Any]) -> dict[str, Any]:
 
 def _figures(row: Mapping[str, Any], parameter: str) -> dict[str, Any]:
     value, half = row[parameter], INTERVAL_95 * std_of(row, parameter)
-    known = value is not None and math.isfinite(half)
-    return {"value": value, "low": value - half if known else None, "high": value + half if known else None}
+    has_interval = value is not None and math.isfinite(half)
+    low, high = (value - half, value + half) if has_interval else (None, None)
+    return {"value": value, "low": low, "high": high}
+
+
+QUERIES: Mapping[str, Callable[..., dict[str, Any]]] = {
+    "status": status,
+    "trend": trend,
+    "compare": compare,
+    "outliers": outliers,
+    "services": services,
+}

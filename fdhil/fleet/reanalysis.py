@@ -1,7 +1,7 @@
-"""Analyses the stored windows of many machines again, by another method or another fdhil, as a revision of its own.
+"""Analyses the stored windows of many machines again, by another method or another fdhil, as a new revision.
 
-What was found before stays as it is. A revision belongs to one method (its settings, the configurations that were
-given, the code): what is done of it is not done twice, so that whoever was killed begins where he was.
+The machines' own results are kept. A revision belongs to one method (its settings, the given configurations, the code);
+completed windows are skipped, so that an interrupted run resumes.
 """
 
 import asyncio
@@ -23,7 +23,7 @@ from fdhil.fleet.window_work import Again, Method, Stored, analyse_again
 from fdhil.fleet.workers import WindowCrew
 
 Progress = Callable[[int, int], None]
-_LOCK = 7_170_019  # with a revision: of the advisory lock of whoever makes it
+_LOCK = 7_170_019  # first key of the advisory lock on a revision
 _OPEN: LiteralString = """
   FROM fleet.windows w WHERE window_name IS NOT NULL
     AND (%(machine)s::text IS NULL OR machine = %(machine)s) AND (%(axis)s::text IS NULL OR axis = %(axis)s)
@@ -41,7 +41,7 @@ DO UPDATE SET digest = excluded.digest, result = excluded.result, done_at = now(
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """Which windows: those recorded in a time, of one machine or all, of one axis or all."""
+    """The windows to analyse: those recorded in a period, of one machine or all, of one axis or all."""
 
     since: datetime | None = None
     until: datetime | None = None
@@ -49,31 +49,32 @@ class Scope:
     axis: str | None = None
 
 
-def unseen(done: int, total: int) -> None:
-    """Tell nobody how far it is."""
+def unseen(done: int, total: int) -> None: ...
 
 
-def reanalyse(fleet: Fleet, method: Method, scope: Scope, crew: WindowCrew, progress: Progress = unseen) -> int:
-    """Analyse what of a scope is not yet done of a method's revision, and return the revision's number.
+def reanalyse(fleet: Fleet, method: Method, scope: Scope, pool: WindowCrew, progress: Progress = unseen) -> int:
+    """Analyse the windows of a scope that a method's revision lacks, and return the number of the revision.
 
-    ``progress`` hears how many windows are done, of how many. ConnectError where the database cannot be entered,
-    StoreError where nothing was collected or another is at the same revision, FdhilError of a worker.
+    ``progress`` receives the number of completed windows and the total. ConnectError where the database cannot be
+    opened, StoreError where nothing was collected or another process works on the same revision, FdhilError of a
+    worker.
     """
     with entered(fleet) as db, entered(fleet) as reader:
         db.execute("SELECT FROM fleet.records LIMIT 1")
         asyncio.run(_bring_up(fleet))
         revision = _revision(db, method)
         if not _one(db, "SELECT pg_try_advisory_lock(%s, %s)", (_LOCK, revision)):
-            raise StoreError(f"revision {revision} is being made by another fdhil fleet reanalyse; let it end", "Busy")
+            raise StoreError(
+                f"another fdhil fleet reanalyse is working on revision {revision}; wait until it ends", "Busy"
+            )
         wanted = asdict(scope) | {"revision": revision}
         total = _one(reader, f"SELECT count(*) FROM (SELECT DISTINCT machine, window_name {_OPEN}) AS open", wanted)
         done = 0
         progress(done, total)
-        crew = replace(
-            crew, per_task=max(1, min(crew.per_task, total // (2 * crew.at_once)))
-        )  # work for all, to the end
+        # small tasks keep all workers busy to the end
+        pool = replace(pool, per_task=max(1, min(pool.per_task, total // (2 * pool.at_once))))
         with closing(_windows(reader, wanted)) as windows:
-            for task, results in crew.spread(partial(analyse_again, method=method), windows):
+            for task, results in pool.spread(partial(analyse_again, method=method), windows):
                 _keep(db, revision, results)
                 done += len(task)
                 progress(done, total)
@@ -86,8 +87,8 @@ async def _bring_up(fleet: Fleet) -> None:
 
 
 def _revision(db: Db, method: Method) -> int:
-    told = (method.digest, Jsonb(method.document()))
-    db.execute("INSERT INTO fleet.reanalyses (digest, method) VALUES (%s, %s) ON CONFLICT DO NOTHING", told)
+    values = (method.digest, Jsonb(method.document()))
+    db.execute("INSERT INTO fleet.reanalyses (digest, method) VALUES (%s, %s) ON CONFLICT DO NOTHING", values)
     return _one(db, "SELECT revision FROM fleet.reanalyses WHERE digest = %s", (method.digest,))
 
 
@@ -98,7 +99,7 @@ def _one(db: Db, query: LiteralString, values: Mapping[str, Any] | Sequence[Any]
 
 
 def _windows(db: Db, wanted: Mapping[str, Any]) -> Generator[Stored]:
-    """Yield what is open, as it was when this began."""
+    """Yield the open windows of the snapshot at the start."""
     with db.transaction(), db.cursor("open") as rows:
         for row in rows.execute(f"SELECT DISTINCT machine, window_name {_OPEN} ORDER BY 1, 2", wanted):
             yield Stored(row["machine"], row["window_name"])

@@ -1,8 +1,8 @@
-"""Lets go of what is older than the works wants to keep: whole months of records, and windows that no row names.
+"""Deletes records and windows older than the retention period: whole months, and windows that no row references.
 
-A month goes when it is old, and when the last that came into it is: what a machine sends late lives as long as the
-rest. Of what goes, the first parameter set of each axis and the newest of what each machine says of itself are kept,
-as ages and limits count from there; and the numbers of the records, so that none comes back or is called missing.
+A month is dropped when it is old and its last record arrived long ago, so that late records live as long as the rest.
+The first parameter set of each axis and the newest description of each machine are kept, as ages and limits refer to
+them; and the numbers of the records, so that none is stored again or reported missing.
 """
 
 import re
@@ -20,11 +20,11 @@ from fdhil.fleet.migrations import LOCK
 from fdhil.fleet.objects import path_of
 from fdhil.fleet.sets import Db
 
-LEAST_AGE_S = 86_400.0  # of a window's file: its row may be on its way
-MOST_FILES = 10_000  # looked up at once
+LEAST_AGE_S = 86_400.0  # of a window file: its row may not be committed yet
+MOST_FILES = 10_000  # per query
 _PARTITION = re.compile(r"records_(\d{4})_(\d\d)")
 _OTHER = "records_other"
-# {of} are the rows that go
+# {of} are the rows to be deleted
 _NOTE_GOING: LiteralString = """
 INSERT INTO fleet.dropped AS d (machine, store, sequences)
   SELECT machine, store, range_agg(int8range(sequence, sequence, '[]')) FROM {of} AS gone WHERE sequence > 0
@@ -49,40 +49,41 @@ DELETE FROM fleet.reanalysed_windows a WHERE NOT EXISTS
 """
 
 
-def retain(db: Db, fleet: Fleet, now: datetime, tell: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Let go of what [retention] does not keep, and return what went. ConfigError where nothing is said there.
+def retain(db: Db, fleet: Fleet, now: datetime, report: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Delete what [retention] does not keep, and return what was deleted. ConfigError where [retention] sets no period.
 
-    What is stopped on its way goes on at the next call. StoreError where a window cannot be removed.
+    An interrupted run is completed by the next one. StoreError where a window cannot be removed.
     """
     limits = fleet.retention
     if limits.record_months is None and limits.window_months is None:
-        advice = "say record_months or window_months there; without them all is kept for good"
-        raise ConfigError("the fleet's config", [ConfigFault("retention", "keeps everything", advice)])
+        advice = "set record_months or window_months; without them everything is kept"
+        raise ConfigError(
+            "the fleet's config", [ConfigFault("retention", "sets no period, nothing was deleted", advice)]
+        )
     months: list[str] = []
     others = forgotten = 0
     if limits.record_months is not None:
         before = months_before(now, limits.record_months)
         months = [name for name in _old(db, before) if _drop(db, name, before)]
         others = _drop_others(db, before)
-        tell(f"{len(months)} months of records went")
+        report(f"{len(months)} months of records deleted")
     if limits.window_months is not None:
         before = months_before(now, limits.window_months)
         query = "UPDATE fleet.records SET window_name = NULL WHERE window_name IS NOT NULL AND stored_at < %s"
         forgotten = db.execute(query, (before,)).rowcount
     db.execute(_FORGET_REANALYSES)
-    removed, freed = _remove_windows(db, fleet.objects.directory, tell)
+    removed, freed = _remove_windows(db, fleet.objects.directory, report)
     return {"months": months, "records_of_wrong_clocks": others, "windows_forgotten": forgotten,
             "files_removed": removed, "bytes_freed": freed}  # fmt: skip
 
 
 def months_before(now: datetime, months: int) -> datetime:
-    """Return the beginning of the month that lies so many before that of ``now``."""
+    """Return the beginning of the month ``months`` before that of ``now``."""
     count = now.year * 12 + now.month - 1 - months
     return datetime(count // 12, count % 12 + 1, 1, tzinfo=UTC)
 
 
 def _old(db: Db, before: datetime) -> list[str]:
-    """Return the partitions of the months before a date, the oldest first."""
     query = """SELECT c.relname AS name FROM pg_inherits i JOIN pg_class c ON c.oid = i.inhrelid
       WHERE i.inhparent = 'fleet.records'::regclass ORDER BY c.relname"""
     names = [str(row["name"]) for row in db.execute(query)]
@@ -91,11 +92,11 @@ def _old(db: Db, before: datetime) -> list[str]:
 
 
 def _drop(db: Db, name: str, before: datetime) -> bool:
-    """Drop a partition whole, unless something came into it since; what is needed of it is kept, all or nothing."""
+    """Drop a whole partition unless a record arrived since; needed rows are kept, in one transaction."""
     table = sql.Identifier("fleet", name)
     with db.transaction():
         db.execute("SELECT pg_advisory_xact_lock(%s)", (LOCK,))
-        db.execute("LOCK TABLE ONLY fleet.records IN ACCESS EXCLUSIVE MODE")  # nothing comes in between
+        db.execute("LOCK TABLE ONLY fleet.records IN ACCESS EXCLUSIVE MODE")  # no record may arrive meanwhile
         newest = sql.SQL("SELECT 1 FROM {} WHERE stored_at >= %s LIMIT 1").format(table)
         if db.execute(newest, (before,)).fetchone() is not None:
             return False
@@ -105,7 +106,7 @@ def _drop(db: Db, name: str, before: datetime) -> bool:
 
 
 def _drop_others(db: Db, before: datetime) -> int:
-    """Remove what wrong clocks told, by when it came; return how much."""
+    """Delete records of wrong clocks by their time of arrival; return their number."""
     table = sql.Identifier("fleet", _OTHER)
     with db.transaction():
         db.execute(sql.SQL("LOCK TABLE {} IN SHARE ROW EXCLUSIVE MODE").format(table))
@@ -119,8 +120,7 @@ def _note(db: Db, going: sql.Composable) -> None:
         db.execute(sql.SQL(statement).format(of=going))
 
 
-def _remove_windows(db: Db, folder: Path, tell: Callable[[str], None]) -> tuple[int, int]:
-    """Remove the files of windows that no row names; return how many, and their bytes. StoreError."""
+def _remove_windows(db: Db, folder: Path, report: Callable[[str], None]) -> tuple[int, int]:
     removed = freed = 0
     until_s = time.time() - LEAST_AGE_S
     for part in sorted(folder.glob("[0-9a-f][0-9a-f]")):
@@ -129,7 +129,7 @@ def _remove_windows(db: Db, folder: Path, tell: Callable[[str], None]) -> tuple[
             for name in _unnamed(db, names[first : first + MOST_FILES]):
                 freed += _remove(path_of(folder, name), until_s)
                 removed += 1
-        tell(f"{part.name} of ff: {removed} windows removed")
+        report(f"folder {part.name} of ff: {removed} windows removed")
     return removed, freed
 
 
@@ -140,13 +140,13 @@ def _unnamed(db: Db, names: Sequence[str]) -> list[str]:
 
 
 def _remove(path: Path, until_s: float) -> int:
-    """Remove a file unless it was written anew meanwhile; return its bytes."""
+    """Remove a file unless it was written again meanwhile; return its size in bytes."""
     try:
         found = path.stat()
         if found.st_mtime >= until_s:
             return 0
         path.unlink()
-    except FileNotFoundError:  # another run of this was faster
+    except FileNotFoundError:  # another run has removed it
         return 0
     except OSError as error:
         raise StoreError(f"{path} cannot be removed: {error.strerror}; check [objects] directory") from None

@@ -1,7 +1,7 @@
-"""Offers a change to machines stage by stage: the first few, then more, when those before them have it and stand well.
+"""Rolls a change out in stages: first to few machines, then to more once the earlier ones use it without problems.
 
-A person opens each stage, and is shown what the machines before have told. Each stage is a document of its own, signed
-for its machines by name.
+A person opens each stage and is shown the responses of the earlier machines. Each stage is a document of its own,
+signed for its machines by name.
 """
 
 import time
@@ -26,7 +26,7 @@ from fdhil.fleet.sets import unreachable
 from fdhil.fleet.transport import ERRORS, cause_of, connected
 
 DAY_S = 86_400
-WAITS = "OfferWaits"  # the notice that an offer lies there: it speaks against none
+WAITS = "OfferWaits"  # the notice of a pending offer: it is no objection
 Db = psycopg.AsyncConnection[DictRow]
 _OFFERED = """
 SELECT o.machine, o.stage, o.opened_at, a.answer, a.reason, a.answered_by, a.recorded_at AS answered_at,
@@ -43,7 +43,7 @@ ORDER BY o.stage, o.machine
 
 
 class ChangeFile(Section):
-    """A change as a person at the works writes it: ``set`` has the tables of a machine's configuration."""
+    """A change as written by a person: ``set`` has the tables of a machine's configuration."""
 
     name: str
     version: int
@@ -55,9 +55,9 @@ class ChangeFile(Section):
 
     @property
     def change(self) -> Mapping[str, Any]:
-        """The same with the values by their keys."""
-        told = {name: getattr(self, name) for name in ("name", "version", "text", "labels", "axis_labels")}
-        return {**told, "values": _flat(self.set)}
+        """The fields of the change, with the values by their keys."""
+        fields = {name: getattr(self, name) for name in ("name", "version", "text", "labels", "axis_labels")}
+        return {**fields, "values": _flat(self.set)}
 
 
 def _flat(tables: Mapping[str, Any], place: str = "") -> dict[str, Any]:
@@ -69,8 +69,6 @@ def _flat(tables: Mapping[str, Any], place: str = "") -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What a machine to which a change was offered has told of it; ``against`` is why no further stage is opened."""
-
     machine: str
     stage: int
     answer: str
@@ -81,19 +79,19 @@ class Told:
 
     @property
     def against(self) -> str:
-        """Why others should not be offered it yet; empty: nothing."""
+        """Why no further stage should be opened; empty: no objection."""
         if self.answer == "rejected":
             return f"rejected by {self.answered_by}: {self.reason}"
         if self.answer != "accepted":
             return "no answer yet"
         if self.notices:
             return f"{self.notices} notices since it was accepted"
-        return "" if self.in_use else "accepted, but nothing was identified with it yet"
+        return "" if self.in_use else "accepted, but no parameters were identified with it yet"
 
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """How far a change is rolled out: the machines that it was offered to, and those that are left."""
+    """The progress of a roll-out: the machines it was offered to, and the remaining ones."""
 
     offered: Sequence[Told]
     left: Sequence[str]
@@ -105,7 +103,7 @@ class Standing:
 
 
 def read_change(path: Path) -> tuple[Change, int]:
-    """Return the change that a file says, and how many days it is valid; ConfigError."""
+    """Return the change defined by a file, and its validity in days; ConfigError."""
     file = load_as(ChangeFile, path, "a change to offer")
     return checked_as(Change, file.change, str(path)), file.valid_days
 
@@ -113,16 +111,17 @@ def read_change(path: Path) -> tuple[Change, int]:
 def offer_of(change: Change, days: int, by: str, stage: int, machines: Sequence[str]) -> Offer:
     """Return the offer of a change to these machines; ConfigError."""
     now_s = int(time.time())
-    told = {**change.model_dump(), "stage": stage, "machines": machines, "by": by}
-    return checked(Offer, {**told, "made_s": now_s, "expires_s": now_s + days * DAY_S}, change.name)
+
+    fields = {**change.model_dump(), "stage": stage, "machines": machines, "by": by}
+    return checked(Offer, {**fields, "made_s": now_s, "expires_s": now_s + days * DAY_S}, change.name)
 
 
 @asynccontextmanager
 async def entered(fleet: Fleet) -> AsyncIterator[Db]:
-    """Enter the database, its tables up to date; ConnectError where it cannot be entered."""
+    """Open the database with its tables up to date; ConnectError where that fails."""
     try:
-        way = fleet.database.connection
-        async with await psycopg.AsyncConnection.connect(way, row_factory=dict_row, autocommit=True) as db:
+        connection = fleet.database.connection
+        async with await psycopg.AsyncConnection.connect(connection, row_factory=dict_row, autocommit=True) as db:
             await migrations.bring_up(db)
             yield db
     except psycopg.Error as error:
@@ -130,13 +129,14 @@ async def entered(fleet: Fleet) -> AsyncIterator[Db]:
 
 
 async def standing(db: Db, change: Change) -> Standing:
-    """Return how far a change is; OfferRefused where its version is another change's, or an old one."""
-    of = {"name": change.name, "version": change.version, "waits": WAITS}
+    """Return the progress of a change; OfferRefused where its version is another change's, or an old one."""
+
+    arguments = {"name": change.name, "version": change.version, "waits": WAITS}
     query = "SELECT version, change FROM fleet.offers WHERE name = %(name)s ORDER BY version DESC LIMIT 1"
-    newest = await (await db.execute(query, of)).fetchone()
+    newest = await (await db.execute(query, arguments)).fetchone()
     if newest is not None:
         _require_new(change, newest["version"], newest["change"])
-    rows = await (await db.execute(_OFFERED, of)).fetchall()
+    rows = await (await db.execute(_OFFERED, arguments)).fetchall()
     offered = [
         Told(
             row["machine"], row["stage"], row["answer"] or "", row["answered_by"] or "", row["reason"] or "",
@@ -146,42 +146,40 @@ async def standing(db: Db, change: Change) -> Standing:
     ]  # fmt: skip
     known = {each.machine for each in offered}
     query = "SELECT machine, about FROM fleet.machines ORDER BY machine"
-    machines = [row for row in await (await db.execute(query)).fetchall() if _has(row["about"], change.labels)]
-    return Standing(offered, [row["machine"] for row in machines if row["machine"] not in known])
+    left = []
+    for row in await (await db.execute(query)).fetchall():
+        labels = (row["about"] or {}).get("labels") or {}
+        if row["machine"] not in known and change.labels.items() <= labels.items():
+            left.append(row["machine"])
+    return Standing(offered, left)
 
 
 def _require_new(change: Change, version: int, digest: str) -> None:
     if change.version < version:
-        text = f"version {version} of {change.name} was offered already, and machines take no older one"
-        raise OfferRefused(f"{text}; give the file version {version + 1}")
+        text = f"version {version} of {change.name} was already offered, and machines accept no older one"
+        raise OfferRefused(f"{text}; set version = {version + 1} in the file")
     if change.version == version and change.digest != digest:
-        text = f"version {version} of {change.name} was offered with other values, labels or words"
-        raise OfferRefused(f"{text}; give the file version {version + 1}")
-
-
-def _has(about: Mapping[str, Any] | None, labels: Mapping[str, str]) -> bool:
-    return labels.items() <= ((about or {}).get("labels") or {}).items()
+        text = f"version {version} of {change.name} was offered with other values, labels or text"
+        raise OfferRefused(f"{text}; set version = {version + 1} in the file")
 
 
 def chosen(found: Standing, count: int | None, names: Sequence[str], despite: str) -> list[str]:
-    """Return the machines of the next stage; OfferRefused where a machine before speaks against it."""
+    """Return the machines of the next stage; OfferRefused where an earlier machine objects."""
     against = [f"{each.machine}: {each.against}" for each in found.offered if each.against]
     if against and not despite:
-        text = "the machines of the stages before do not all have it and stand well"
-        raise OfferRefused(
-            f"{text} ({'; '.join(against[:5])}); wait, or give the reason to go on all the same: --despite"
-        )
+        text = "machines of earlier stages do not use it yet, or have problems"
+        raise OfferRefused(f"{text} ({'; '.join(against[:5])}); wait, or give a reason to proceed: --despite")
     unknown = sorted(set(names) - set(found.left))
     if unknown:
-        raise OfferRefused(f"{', '.join(unknown)}: not known with these labels, or offered it already; see the list")
+        raise OfferRefused(f"{', '.join(unknown)}: no machine with these labels, or already offered; see the list")
     machines = list(dict.fromkeys(names)) or list(found.left[:count])
     if not machines:
-        raise OfferRefused("there is no machine left with these labels")
+        raise OfferRefused("no machine with these labels remains")
     return machines
 
 
 async def open_stage(fleet: Fleet, db: Db, offer: Offer, change: Change, key: Path, despite: str) -> bytes:
-    """Sign an offer, keep it, and publish it to its machines; nothing is kept where that fails. ConnectError."""
+    """Sign an offer, store it and publish it to its machines; nothing is stored where that fails. ConnectError."""
     document = sign(offer, key)
     values = (offer.name, offer.version, offer.stage, change.digest, list(offer.machines), offer.by, despite, document)
     try:
@@ -196,7 +194,9 @@ async def open_stage(fleet: Fleet, db: Db, offer: Offer, change: Change, key: Pa
             for machine in offer.machines:
                 await delivery.publish(stream, machine, document, offer)
     except psycopg.errors.UniqueViolation:
-        fault = ConfigFault(str(offer), f"stage {offer.stage} was opened by somebody else just now", "look again")
+        fault = ConfigFault(
+            str(offer), f"stage {offer.stage} was just opened by another user", "check the roll-out again"
+        )
         raise ConfigError("fleet", [fault]) from None
     except ERRORS as error:
         raise ConnectError("NATS server", f"{cause_of(error)}; the stage was not opened, try again") from None
@@ -211,5 +211,7 @@ async def take_back(fleet: Fleet, found: Standing, name: str) -> list[str]:
             for machine in machines:
                 await delivery.withdraw(client.jetstream(), machine, name)
     except ERRORS as error:
-        raise ConnectError("NATS server", f"{cause_of(error)}; try again, it may lie at some machines yet") from None
+        raise ConnectError(
+            "NATS server", f"{cause_of(error)}; some machines may still have the offer, try again"
+        ) from None
     return machines

@@ -1,4 +1,4 @@
-"""Knows when an axis was serviced, and what that changed."""
+"""Records the services of axes and estimates what each changed."""
 
 import math
 from collections.abc import Sequence
@@ -16,10 +16,10 @@ from fdhil.records import PARAMETERS, Float, unit_of
 MOST_SETS = 20  # on either side of a service, within NEAR
 LEAST_SETS = 2  # on either side
 NEAR = "60 days"
-LEAST_RANGE_K = 2.0  # of temperature, from which on it is told apart from the service
-ENOUGH_FOR_WEAR = 8  # sets, from which on the wear that goes on is told apart from the service
+LEAST_RANGE_K = 2.0  # least range of temperature that separates its effect from the service
+ENOUGH_FOR_WEAR = 8  # least number of sets that separates continuing wear from the service
 DAY_S = 86_400.0
-ROUNDING = 1e-6  # of the interval: nothing but the computer's
+ROUNDING = 1e-6  # of the interval: numerical noise
 _ENTER = """
 INSERT INTO fleet.services (machine, axis, serviced_at, note) VALUES (%s, %s, %s, %s)
 ON CONFLICT (machine, axis, serviced_at) DO UPDATE SET note = excluded.note, entered_at = now()
@@ -43,7 +43,7 @@ FROM fleet.services v WHERE %(machine)s::text IS NULL OR machine = %(machine)s O
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A parameter as it was just ``before`` a service, and the ``size`` of its step there with its deviation."""
+    """A parameter just ``before`` a service, and the ``size`` of its step with the standard deviation."""
 
     before: float
     size: float
@@ -53,7 +53,7 @@ class Step:
 
 
 def enter(db: Db, machine: str, axis: str, at: datetime, note: str) -> dict[str, Any]:
-    """Note a service of an axis, or of a whole machine (axis ''); StoreError where nothing is known of it."""
+    """Record a service of an axis, or of a whole machine (axis ''); StoreError for an unknown one."""
     query = "SELECT 1 FROM fleet.parameter_sets WHERE machine = %s AND (%s = '' OR axis = %s) LIMIT 1"
     if db.execute(query, (machine, axis, axis)).fetchone() is None:
         what = f"axis {axis} of {machine}" if axis else machine
@@ -63,11 +63,11 @@ def enter(db: Db, machine: str, axis: str, at: datetime, note: str) -> dict[str,
 
 
 def remove(db: Db, machine: str, axis: str, at: datetime) -> dict[str, Any]:
-    """Take a service out again; StoreError where there is none of that day."""
+    """Remove a service; StoreError where there is none on that day."""
     query = """DELETE FROM fleet.services WHERE machine = %s AND axis = %s
       AND serviced_at >= %s AND serviced_at < %s + interval '1 day' RETURNING note"""
     if not db.execute(query, (machine, axis, at, at)).fetchall():
-        raise StoreError("there is no service of that day; see fdhil fleet services", "NotKept")
+        raise StoreError("no service is recorded on that day; see fdhil fleet services", "NotKept")
     return {"machine": machine, "axis": axis or None, "serviced_at": date_of(at), "removed": True}
 
 
@@ -81,8 +81,8 @@ def _service(db: Db, row: Row) -> dict[str, Any]:
     given = {"machine": row["machine"], "axis": row["axis"], "at": row["serviced_at"]}
     sets = db.execute(_AROUND, {**given, "last": row["last"], "next": row["next"]}).fetchall()
     changes = []
-    for axis in sorted({told["axis"] for told in sets}):
-        own = [told for told in sets if told["axis"] == axis]
+    for axis in sorted({each["axis"] for each in sets}):
+        own = [each for each in sets if each["axis"] == axis]
         found = ((name, _change(own, name, row["serviced_at"])) for name in PARAMETERS)
         changes += [
             {"axis": axis, "parameter": name, "unit": unit_of(name), **change} for name, change in found if change
@@ -92,7 +92,7 @@ def _service(db: Db, row: Row) -> dict[str, Any]:
 
 
 def _change(rows: Sequence[Row], parameter: str, at: datetime) -> dict[str, Any] | None:
-    """Return what a parameter was before and by how much it is another now, with the 95 % interval of that."""
+    """Return a parameter before the service and its change, with the 95 % interval."""
     rows = [row for row in rows if row[parameter] is not None]
     since_days = np.array([(row["at"] - at).total_seconds() / DAY_S for row in rows])
     if min(np.count_nonzero(since_days >= 0), np.count_nonzero(since_days < 0)) < LEAST_SETS:
@@ -103,15 +103,15 @@ def _change(rows: Sequence[Row], parameter: str, at: datetime) -> dict[str, Any]
     step = step_of(values, stds, since_days, at_c)
     half = student_95(step.freedom) * step.std
     size = step.size if abs(step.size) > ROUNDING * half else 0.0
-    told = {"before": step.before, "change": size, "low": size - half, "high": size + half}
-    return told | {"sure": abs(size) > half, "at_constant_temperature": step.at_constant_temperature}
+    figures = {"before": step.before, "change": size, "low": size - half, "high": size + half}
+    return figures | {"sure": abs(size) > half, "at_constant_temperature": step.at_constant_temperature}
 
 
 def step_of(values: Float, stds: Float, since_days: Float, at_c: Float) -> Step:
-    """Return by how much values (n,) step at day 0 of ``since_days`` (n,).
+    """Estimate the step of values (n,) at day 0 of ``since_days`` (n,).
 
-    The wear that goes on as before is told apart, and what follows the temperature where that is known of all and has
-    moved on both sides. The deviation is what the scatter shows, and at least what the values' own ``stds`` promise.
+    Continuing wear is separated, and so is the effect of temperature where it is known for all values and varies on
+    both sides. The standard deviation is the larger of the scatter and the values' own ``stds``.
     """
     after = since_days >= 0
     columns = [np.ones(after.size), after.astype(np.float64)]
@@ -125,6 +125,6 @@ def step_of(values: Float, stds: Float, since_days: Float, at_c: Float) -> Step:
     theta = inverse @ x.T @ values
     freedom = max(1, after.size - x.shape[1])
     scatter = float(((values - x @ theta) ** 2).sum()) / freedom
-    promised = float(np.nanmean(stds**2)) if np.isfinite(stds).any() else 0.0
-    std = math.sqrt(max(scatter, promised) * inverse[1, 1])
+    expected = float(np.nanmean(stds**2)) if np.isfinite(stds).any() else 0.0
+    std = math.sqrt(max(scatter, expected) * inverse[1, 1])
     return Step(float(theta[0]), float(theta[1]), std, freedom, warmed)

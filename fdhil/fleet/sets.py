@@ -1,4 +1,4 @@
-"""Reads the parameter sets of axes from the database, since the newest service of each, with its age."""
+"""Reads the parameter sets of axes from the database, since the newest service of each, with their ages."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,11 +17,11 @@ from fdhil.records import PARAMETERS
 
 MONTH_S = 30 * 86_400.0
 SHIFT = "6 hours"
-SORTED_MB = 64  # in memory: what is asked looks at all sets
+SORTED_MB = 64  # memory for sorting: queries read all sets
 Db = psycopg.Connection[DictRow]
 Row = Mapping[str, Any]
-Axis = tuple[str, str]  # with its machine before it
-# of what is published again and again the newest of each shift stands for all: a course is weeks, not minutes
+Axis = tuple[str, str]  # machine and axis
+# the newest set of each shift represents it: trends take weeks, not minutes
 _AXES: LiteralString = f"{KNOWN_AXES} SELECT machine, axis FROM known WHERE %(axis)s::text IS NULL OR axis = %(axis)s"
 SERVICED: LiteralString = """
 LATERAL (SELECT max(o.serviced_at) AS serviced_at FROM fleet.services o WHERE o.machine = a.machine
@@ -41,7 +41,7 @@ ORDER BY n.machine, n.axis, n.stored_at, n.sequence
 
 @contextmanager
 def asking(fleet: Fleet) -> Iterator[Db]:
-    """Enter the database, to read; errors as of :func:`entered`."""
+    """Open the database read-only; errors as of :func:`entered`."""
     with entered(fleet) as db:
         db.execute(f"SET work_mem = '{SORTED_MB}MB'")
         db.execute("SET default_transaction_read_only = on")
@@ -50,35 +50,33 @@ def asking(fleet: Fleet) -> Iterator[Db]:
 
 @contextmanager
 def entered(fleet: Fleet) -> Iterator[Db]:
-    """Enter the database. ConnectError where that cannot be done, StoreError where nothing was collected."""
+    """Open the database. ConnectError where that fails, StoreError where nothing was collected."""
     try:
         with psycopg.connect(fleet.database.connection, row_factory=dict_row, autocommit=True) as db:
             yield db
     except (psycopg.errors.UndefinedTable, psycopg.errors.InvalidSchemaName):
-        text = "nothing was collected yet, or by an older fdhil alone: start fdhil fleet collect first"
+        text = "nothing was collected yet, or only by an older fdhil; start fdhil fleet collect first"
         raise StoreError(text, "NoHistory") from None
     except psycopg.Error as error:
         raise unreachable(error) from None
 
 
 def unreachable(error: psycopg.Error) -> ConnectError:
-    """Return what is said of a database that cannot be entered, or does not do what it is asked."""
-    text = f"{' '.join(str(error).split())}; check [database] connection, and whether it runs"
+    text = f"{' '.join(str(error).split())}; check [database] connection and that it is running"
     return ConnectError("PostgreSQL", text)
 
 
 def axes_of(db: Db, axis: str | None = None) -> list[Axis]:
-    """Return the axes, each with its machine, of which there are sets; of one letter alone, or of all."""
+    """Return the axes that have sets, each with its machine; of one letter, or all."""
     return [(row["machine"], row["axis"]) for row in db.execute(_AXES, {"axis": axis})]
 
 
 def asked(axes: Sequence[Axis]) -> dict[str, list[str]]:
-    """Return axes as a query with OF_AXES takes them."""
     return {"machines": [machine for machine, _ in axes], "axes": [axis for _, axis in axes]}
 
 
 def newest_sets(db: Db, most: int, axes: Sequence[Axis], apart: str = SHIFT) -> dict[Axis, list[DictRow]]:
-    """Return the newest sets of axes since the newest service of each, oldest first, one of each time ``apart``."""
+    """Return the newest sets of axes since their newest service, oldest first, one per interval ``apart``."""
     rows = db.execute(_THINNED, {"most": most, "apart": apart, **asked(axes)}).fetchall()
     return {key: list(own) for key, own in groupby(rows, key=lambda row: (row["machine"], row["axis"]))}
 
@@ -89,7 +87,7 @@ def ages_months(rows: Sequence[Row]) -> list[float]:
 
 
 def std_of(row: Row, parameter: str) -> float:
-    """Return a parameter's standard deviation by the covariance as it was told; NaN where there is none."""
+    """Return a parameter's standard deviation from the reported covariance; NaN where there is none."""
     k = PARAMETERS.index(parameter)
     if "stds" in row:
         return math.nan if row["stds"][k] is None else float(row["stds"][k])
@@ -101,10 +99,9 @@ def std_of(row: Row, parameter: str) -> float:
 
 
 def known(value: float) -> float | None:
-    """Return a number as JSON has it: null where there is none."""
+    """Return a number for JSON: None for NaN and infinity."""
     return value if math.isfinite(value) else None
 
 
 def date_of(at: datetime) -> str:
-    """Return a time as JSON has it."""
     return at.isoformat(timespec="seconds")

@@ -1,4 +1,4 @@
-"""What a record must be like so that the views of the database can show it: no machine can make them fail for all."""
+"""Checks that the database's views can show a record: no machine can break the views for all."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 from fdhil.records import PARAMETERS
 
 MOST_ROWS = 100  # of a covariance
-COUNTS: Mapping[str, Mapping[str, int]] = {  # with the largest that the views' type takes
+COUNTS: Mapping[str, Mapping[str, int]] = {  # with the limit of the views' type
     "parameters": {"revision": 1 << 53, "windows": 1 << 53},
     "window": {"number": 1 << 53, "accepted": 1, "direction": 1},
     "notice": {"number": 1 << 53},
@@ -20,18 +20,18 @@ MEASURES: Mapping[str, tuple[str, ...]] = {
 
 
 def fault(kind: str, record: Mapping[str, Any]) -> str:
-    """Return what is wrong with a record of a kind; empty: nothing."""
+    """Return why a record of a kind is invalid; empty: it is valid."""
     for name, largest in COUNTS.get(kind, {}).items():
         if record.get(name) is not None and not _is_count(record[name], largest):
-            return f"its {name} is no whole number of that kind"
+            return f"its {name} is not a valid whole number"
     for name in MEASURES.get(kind, ()):
         if not _is_measure(record.get(name)):
-            return f"its {name} is no number"
+            return f"its {name} is not a number"
     if kind == "parameters" and not _is_matrix(record.get("covariance", [])):
-        return "its covariance is no table of numbers"
+        return "its covariance is not a square matrix of numbers"
     if kind == "acknowledgement":
         notices = record.get("notices", [])
-        return "" if isinstance(notices, list) and all(map(_is_count, notices)) else "its notices are no numbers"
+        return "" if isinstance(notices, list) and all(map(_is_count, notices)) else "its notices are not numbers"
     return _about_fault(record) if kind == "about" else ""
 
 
@@ -53,8 +53,8 @@ def _is_matrix(value: Any) -> bool:
 def _about_fault(record: Mapping[str, Any]) -> str:
     labels, of_axes = record.get("labels", {}), record.get("axis_labels", {})
     if not isinstance(of_axes, dict) or not all(map(_are_labels, (labels, *of_axes.values()))):
-        return "its labels are no texts"
-    return "" if isinstance(record.get("name", ""), str) else "its name is no text"
+        return "its labels are not texts"
+    return "" if isinstance(record.get("name", ""), str) else "its name is not a text"
 
 
 def _are_labels(labels: object) -> bool:

@@ -1,4 +1,4 @@
-"""Spreads work over an executor: this process, further processes, or a cluster; what is done comes as it is done."""
+"""Distributes work over an executor: this process, further processes, or a cluster; yields results as tasks end."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
@@ -12,10 +12,10 @@ Result = TypeVar("Result")
 
 
 class Here(Executor):
-    """Does what it is given in this process, before it returns."""
+    """Runs submitted work in this process, before ``submit`` returns."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Return the future of work that is done; what the work raises is raised here."""
+        """Return the completed future of the work; exceptions of the work are raised here."""
         done: Future[Any] = Future()
         done.set_result(fn(*args, **kwargs))
         return done
@@ -23,11 +23,11 @@ class Here(Executor):
 
 @dataclass(frozen=True)
 class Crew(Generic[Item, Result]):
-    """Who works: an executor, how many items are one task, how many tasks are on their way at once.
+    """A pool of workers: an executor, the items per task, the number of pending tasks.
 
-    Where a task ends with one of the errors ``deadly`` (its worker died, again and again), it is tried in halves; a
-    single item that ends so is tried once more alone, at the end, and then has the result ``lost``. ``tend`` sees to
-    workers that are missing; it is called while nothing ends.
+    A task that ends with one of the errors ``deadly`` (its worker died repeatedly) is retried in halves; a single such
+    item is retried once more alone, at the end, and then gets the result ``lost``. ``tend`` replaces missing workers;
+    it is called while no task ends.
     """
 
     executor: Executor
@@ -62,7 +62,7 @@ class Crew(Generic[Item, Result]):
                         suspects.append(task)
                     continue
                 yield task, results
-        for task in suspects:  # alone: who else was at its worker may have been the one
+        for task in suspects:  # alone: another task on the same worker may have killed it
             yield task, self._alone(work, task)
 
     def _alone(self, work: Callable[[Sequence[Item]], Sequence[Result]], task: list[Item]) -> Sequence[Result]:

@@ -1,7 +1,7 @@
-"""The way to JetStream: a connection that lasts until it breaks, and the stream that all machines publish into.
+"""Connects to JetStream: a connection that lasts until it breaks, and the stream that all machines publish to.
 
-The stream is a queue for one reader, the collectors: what is in the database goes from it. When it is full, the server
-refuses what is new, and the machines keep it.
+The stream is a queue for the collectors: records in the database are removed from it. When it is full, the server
+refuses new records, and the machines keep them.
 """
 
 import asyncio
@@ -27,22 +27,22 @@ from fdhil.errors import ConnectError
 from fdhil.fleet.message import SUBJECTS
 
 CONSUMER = "collectors"
-CONNECT_S, CLOSE_S = 10, 5.0
-ACKNOWLEDGED_S = 60.0  # what a collector has not answered for by then is given to another
-MOST_OUT = 20_000  # messages that collectors have and did not answer for yet
+CONNECT_S = 10
+ACKNOWLEDGED_S = 60.0  # unacknowledged messages are then redelivered
+MOST_OUT = 20_000  # limit of unacknowledged messages
 FIRST_RETRY_S, LAST_RETRY_S = 1.0, 60.0
 _SEED = re.compile(r"^SU[A-Z2-7]{56}\s*$", re.MULTILINE)
-ERRORS = (nats.errors.Error, OSError, TimeoutError)  # of a server that is not there, or does not do what it is asked
+ERRORS = (nats.errors.Error, OSError, TimeoutError)  # of a server that is unavailable or refuses
 
 
 async def try_for_good(
     attempt: Callable[[], Coroutine[Any, Any, str]], done: Callable[[], int], complaint: str
 ) -> NoReturn:
-    """Attempt until it is cancelled, later and later while nothing gets ``done``; a new cause of a failure is told.
+    """Attempt until cancelled, with growing delays while nothing gets ``done``; log each new cause of a failure.
 
-    ``attempt`` returns the cause, ``complaint`` has a place for it.
+    ``attempt`` returns the cause, ``complaint`` is the log line with a field for it.
     """
-    delay_s, told = FIRST_RETRY_S, ""
+    delay_s, logged = FIRST_RETRY_S, ""
     while True:
         before = done()
         try:
@@ -50,22 +50,21 @@ async def try_for_good(
         except GivenUp as error:
             cause = str(error)
         if done() > before:
-            delay_s, told = FIRST_RETRY_S, ""
-        if cause != told:
+            delay_s, logged = FIRST_RETRY_S, ""
+        if cause != logged:
             journal.write_line(complaint.format(cause=cause), "minor")
-        told = cause
+        logged = cause
         await asyncio.sleep(delay_s)
         delay_s = min(LAST_RETRY_S, 2 * delay_s)
 
 
 def check_credentials(settings: NatsServer, section: str) -> None:
-    """Read the files of the credentials; ConnectError names the one that cannot be used."""
+    """Check the credential files; ConnectError names the one that cannot be used."""
     tls_of(settings, "NATS server", section)
     _proof_of(settings, section)
 
 
 def _proof_of(settings: NatsServer, section: str) -> dict[str, Any]:
-    """Return how we prove who we are, as the client wants it; ConnectError."""
     secret = secret_in(settings.credentials_file, "NATS server", f"[{section}] credentials_file")
     if secret is None:
         return {"user": settings.user, "password": password_of(settings, "NATS server", section)}
@@ -73,25 +72,25 @@ def _proof_of(settings: NatsServer, section: str) -> dict[str, Any]:
     try:
         nkeys.from_seed(bytearray(seeds[0].encode()))
     except (IndexError, nkeys.NkeysError, binascii.Error):
-        told = f"[{section}] credentials_file {settings.credentials_file}"
-        cause = f"{told} holds no user's seed; a .creds file does, or the seed alone (SU...)"
+        key = f"[{section}] credentials_file {settings.credentials_file}"
+        cause = f"{key} contains no user seed; name a .creds file or a file with the seed (SU...)"
         raise ConnectError("NATS server", cause) from None
     return {"user_credentials": RawCredentials(secret)} if "-----BEGIN" in secret else {"nkeys_seed_str": secret}
 
 
 @asynccontextmanager
 async def connected(settings: NatsServer, name: str, section: str) -> AsyncIterator[Client]:
-    """Enter the server, or one of its cluster; when the connection breaks it is closed and stays so.
+    """Connect to a server of the cluster; a broken connection is closed and not restored.
 
-    ERRORS when none can be entered; when to try again is not the client's to decide.
+    ERRORS when no server can be reached. Retries are the caller's decision.
     """
     client = Client()
     tls = tls_of(settings, "NATS server", section)
     servers = [server.replace("nats://", "tls://") if tls else server for server in settings.servers]
-    heard: list[Exception] = []
+    errors: list[Exception] = []
 
     async def hear(error: Exception) -> None:
-        heard[:] = [error]
+        errors[:] = [error]
 
     try:
         await client.connect(
@@ -100,7 +99,7 @@ async def connected(settings: NatsServer, name: str, section: str) -> AsyncItera
             **_proof_of(settings, section),
             tls=tls,
             allow_reconnect=False,
-            max_reconnect_attempts=1,  # else one that is not there is tried for two minutes before it is told
+            max_reconnect_attempts=1,  # otherwise an unavailable server is reported after two minutes only
             reconnect_time_wait=0,
             connect_timeout=CONNECT_S,
             error_cb=hear,
@@ -109,9 +108,9 @@ async def connected(settings: NatsServer, name: str, section: str) -> AsyncItera
         )
         yield client
     except nats.errors.NoServersError as error:
-        raise heard[0] if heard else error from None
+        raise errors[0] if errors else error from None
     except nats.errors.TimeoutError:
-        if client.last_error is not None:  # the server has said why it does not answer
+        if client.last_error is not None:  # the server has reported the cause
             raise client.last_error from None
         raise
     finally:
@@ -119,7 +118,7 @@ async def connected(settings: NatsServer, name: str, section: str) -> AsyncItera
 
 
 async def prepare_stream(stream: JetStreamContext, settings: Stream) -> JetStreamContext.PullSubscription:
-    """Make the stream and its reader where there are none, and return the reader; ERRORS."""
+    """Create the stream and its consumer where they do not exist, and return the subscription; ERRORS."""
     wanted = StreamConfig(
         name=settings.name,
         subjects=[SUBJECTS],
@@ -143,14 +142,14 @@ async def prepare_stream(stream: JetStreamContext, settings: Stream) -> JetStrea
 
 
 def cause_of(error: BaseException) -> str:
-    """Return why a server cannot be used, and what to look at."""
+    """Return why a server cannot be used, and what to check."""
     text = str(error) or type(error).__name__
     if isinstance(error, nats.js.errors.NoStreamResponseError):
-        return "it has no stream yet; start fdhil fleet collect"
+        return "the server has no stream yet; start fdhil fleet collect"
     if "uthorization" in text or "ermissions" in text:
-        return f"it refuses us ({text}); check user, password_file and certificate, and what it lets them do"
+        return f"the server refuses access ({text}); check user, password_file, certificate and permissions"
     if isinstance(error, nats.js.errors.APIError) and error.description:
-        return f"it refuses ({error.description})"
+        return f"the server refuses the request ({error.description})"
     if "SSL" in text or "certificate" in text:
         return f"{text}; check tls_ca_file and the name in its certificate"
-    return f"{text}; check server, and whether it runs with JetStream"
+    return f"{text}; check server, and that it runs with JetStream"

@@ -1,8 +1,7 @@
-"""Sends the outbox of one machine to JetStream: at least once, in its order, for as long as it takes.
+"""Sends the outbox of one machine to JetStream: at least once, in order, for as long as it takes.
 
-A process of its own that reads the store and writes nothing but its position: while the server is away the daemon goes
-on as if there were none. One message is on its way at a time, so that none can overtake another; what waits goes
-together, many records in one.
+A separate process that reads the store and writes only its position: the daemon runs independently of the server. One
+message is in flight at a time, so that none overtakes another; waiting records are joined into one message.
 """
 
 import asyncio
@@ -26,26 +25,26 @@ from fdhil.store import WINDOWS_FOLDER
 from fdhil.store.atomic import make_folder
 from fdhil.store.outbox import Entry, OutboxReader, Position, read_position, write_position
 
-BATCH = 500  # entries that are read and noted as sent together
-MESSAGE_BYTES = 60 << 10  # of what goes together; one record may be more, and the smallest stream has room for it
-POLL_S = 1.0  # how often the outbox is looked at while it is empty
-ANSWER_S = 15.0  # for the server to say that it has a message
-HEAD_BYTES = 64 * 1024  # of a message, besides the window
+BATCH = 500  # entries per read and per stored position
+MESSAGE_BYTES = 60 << 10  # of a joined message; a single larger record still fits the smallest stream
+POLL_S = 1.0  # polling interval of an empty outbox
+ANSWER_S = 15.0  # for the server's acknowledgement
+HEAD_BYTES = 64 * 1024  # of a message without its window
 
 
 async def send(config: MachineConfig, ready: Callable[[str], None]) -> NoReturn:
-    """Send until it is cancelled; a server that is not there is tried again, later and later.
+    """Send until cancelled; while the server is unavailable, retry with growing delays.
 
-    ConfigError without [uplink], ConnectError where the files of its credentials cannot be used, StoreError where the
-    position cannot be noted.
+    ConfigError without [uplink], ConnectError where its credential files cannot be used, StoreError where the position
+    cannot be stored.
     """
     settings = config.uplink
     if settings is None:
-        fault = ConfigFault("uplink", "is missing", "a table [uplink] says to which server this machine's records go")
+        fault = ConfigFault("uplink", "is missing", "add a table [uplink] that names the server")
         raise ConfigError(config.machine.name, [fault])
     check_credentials(settings, "uplink")
     sender = Sender(config, settings)
-    ready(f"the records of {config.machine.name}, as {sender.machine}, for the server {settings.server}")
+    ready(f"records of {config.machine.name}, as {sender.machine}, to the server {settings.server}")
 
     async def attempt() -> str:
         try:
@@ -56,12 +55,12 @@ async def send(config: MachineConfig, ready: Callable[[str], None]) -> NoReturn:
         except ERRORS as error:
             return f"{settings.server}: {cause_of(error)}"
 
-    complaint = "nothing is sent: {cause}; what is recorded waits, and it is tried again"
+    complaint = "no records are sent: {cause}; records wait in the outbox, retrying"
     await try_for_good(attempt, lambda: sender.sent, complaint)
 
 
 class Sender:
-    """Goes through the outbox, over one connection after another; ``sent`` counts the entries since the start."""
+    """Sends the outbox over successive connections; ``sent`` counts the entries since the start."""
 
     def __init__(self, config: MachineConfig, settings: Uplink) -> None:
         """StoreError where the folder of the position cannot be made."""
@@ -72,11 +71,11 @@ class Sender:
         self._folder = config.uplink_directory
         self._about = _about(config, settings)
         self._letterbox = Letterbox(config)
-        self._checked: set[tuple[int, int]] = set()  # files whose structure was looked at
+        self._checked: set[tuple[int, int]] = set()  # files whose structure was checked
         try:
             make_folder(self._folder)
         except OSError as error:
-            raise StoreError(f"{self._folder} cannot be made: {error.strerror}; check [uplink] directory") from None
+            raise StoreError(f"{self._folder} cannot be created: {error.strerror}; check [uplink] directory") from None
 
     async def run(self, client: Client) -> NoReturn:
         """Send over one connection until it breaks (ERRORS); StoreError where the history cannot be read."""
@@ -91,14 +90,14 @@ class Sender:
                 await self._send(stream, position, entries, client.max_payload)
                 continue
             if not caught_up:
-                journal.write_line(f"all that was recorded is sent ({self.sent} records since the start)")
+                journal.write_line(f"all records are sent ({self.sent} since the start)")
                 caught_up = True
             if client.is_closed:
                 raise ConnectionResetError("the connection has ended")
             await asyncio.sleep(POLL_S)
 
     async def _next(self, stream: JetStreamContext) -> tuple[Position, list[Entry]]:
-        """Return how far it is, and the entries that follow; what the machine is is told first, where that is new."""
+        """Return the position and the entries after it; a new description of the machine is sent first."""
         with OutboxReader(self._store, self._checked) as reader:
             position = reader.start(read_position(self._folder))
             entries = reader.entries(position.entry, BATCH)
@@ -110,7 +109,7 @@ class Sender:
         return position, entries
 
     async def _send(self, stream: JetStreamContext, position: Position, entries: Sequence[Entry], most: int) -> None:
-        """Send entries in their order, and note how far they are sent, also when one was refused."""
+        """Send entries in order and store the position reached, also when one was refused."""
         messages = (self._message(entry, position.store, most) for entry in entries)
         sent = 0
         try:
@@ -122,14 +121,14 @@ class Sender:
                 self.sent += sent
                 last = entries[sent - 1]
                 position = replace(position, entry=last.number, message=last.message)
-                await asyncio.to_thread(write_position, self._folder, position)  # a disk may take its time
+                await asyncio.to_thread(write_position, self._folder, position)  # a disk may be slow
 
     def _message(self, entry: Entry, store: str, most: int) -> Message:
         window = _window_of(self._store / WINDOWS_FOLDER / Path(entry.row["file"]).name) if entry.with_file else None
         if window is not None and len(window) > most - HEAD_BYTES:
             window = None
         if entry.with_file and window is None:
-            row = {**entry.row, "window_left_out": "no longer kept, or larger than the server takes in one message"}
+            row = {**entry.row, "window_left_out": "no longer kept, or larger than the server's message limit"}
             entry = replace(entry, row=row)
         return of_entry(entry, self.machine, store, window)
 
@@ -137,7 +136,7 @@ class Sender:
 def _window_of(path: Path) -> bytes | None:
     try:
         return path.read_bytes()
-    except OSError:  # the oldest go first
+    except OSError:  # deleted: the oldest windows go first
         return None
 
 

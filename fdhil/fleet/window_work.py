@@ -1,4 +1,4 @@
-"""What a worker does in a re-analysis: reads stored windows and analyses each again; the same bits wherever it runs."""
+"""Defines a worker's task in a re-analysis: read stored windows and analyse each; bit-identical wherever it runs."""
 
 import hashlib
 import json
@@ -20,19 +20,17 @@ from fdhil.records import WindowOutcome
 from fdhil.store.history import described
 from fdhil.store.windows import MAX_FILE_BYTES, decode_window
 
-ROOMS = ("records", "model", "identification", "validation", "pipeline")  # whose code the figures follow from
+ROOMS = ("records", "model", "identification", "validation", "pipeline")  # the code that the results depend on
 LIBRARIES = ("numpy", "scipy", "numba", "pyarrow")
 
 
 class Stored(NamedTuple):
-    """A window of the folder of windows, and whose it is."""
-
     machine: str
     name: str
 
 
 class Again(NamedTuple):
-    """What a window says now: plain JSON in one order, and its SHA-256."""
+    """The new result of a window: JSON in canonical order, and its SHA-256."""
 
     window: Stored
     text: str
@@ -41,8 +39,10 @@ class Again(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """How windows are analysed: the settings, the configurations that are known (by the machine's name in the works),
-    the folder of windows, and the code of whoever asks.
+    """How windows are analysed.
+
+    The settings, the known configurations (by the machine's fleet name), the folder of windows, and the digest of the
+    code that requests the analysis.
     """
 
     settings: Identification
@@ -51,7 +51,7 @@ class Method:
     code: str
 
     def document(self) -> dict[str, Any]:
-        """Return all that the results follow from, as JSON has it."""
+        """Return everything that the results depend on, as JSON data."""
         machines = {
             name: {
                 "sync_period_s": config.machine.sync_period_s,
@@ -64,13 +64,13 @@ class Method:
 
     @property
     def digest(self) -> str:
-        """The SHA-256 of it."""
+        """The SHA-256 of :meth:`document`."""
         return hashlib.sha256(json.dumps(self.document(), sort_keys=True).encode()).hexdigest()
 
 
 @cache
 def code_digest() -> str:
-    """Return the SHA-256 of the code that makes the figures, and of the versions of the libraries under it."""
+    """Return the SHA-256 of the analysing code and of the versions of its libraries."""
     digest = hashlib.sha256(repr([platform.python_version(), *map(version, LIBRARIES)]).encode())
     for path in _sources(Path(fdhil.__file__).parent):
         digest.update(path.name.encode() + hashlib.sha256(path.read_bytes()).digest())
@@ -84,45 +84,42 @@ def _sources(folder: Path) -> Iterator[Path]:
 
 
 def analyse_again(windows: Sequence[Stored], method: Method) -> list[Again]:
-    """Return what each window says now; one that cannot be read has its error as the result.
+    """Analyse each window again; the result of an unreadable window is its error.
 
     FdhilError where this worker cannot do the same work as the others: it has other code, or no folder of windows.
     """
     if method.code != code_digest():
-        text = "has another fdhil, or other versions of its libraries, than the command: install the same on all"
+        text = "has another fdhil, or other library versions, than the command; install the same versions everywhere"
         raise FdhilError(f"the worker on {platform.node()} {text}")
     if not method.folder.is_dir():
-        text = f"does not see {method.folder}: the folder of windows must be there, under the same name, on all"
+        text = f"cannot read {method.folder}; the folder of windows must be mounted at the same path everywhere"
         raise FdhilError(f"the worker on {platform.node()} {text}")
     return [told(window, _result(window, method)) for window in windows]
 
 
 def told(window: Stored, result: Mapping[str, Any]) -> Again:
-    """Return a result as it is kept."""
     text = json.dumps(result, sort_keys=True, allow_nan=False)
     return Again(window, text, hashlib.sha256(text.encode()).hexdigest())
 
 
 def lost(window: Stored) -> Again:
-    """Return the result of a window over which its worker died, each time."""
+    """Return the result of a window whose worker died each time."""
     return told(window, {"error": {"class": "WorkerDied", "text": f"each process that analysed {window.name} died"}})
 
 
 def _result(window: Stored, method: Method) -> dict[str, Any]:
     config = method.machines.get(window.machine)
-    settings = method.settings if config is None else _of_machine(config, method.settings)
+    settings = method.settings
+    if config is not None:
+        settings = config.identification.model_copy(update={"method": settings.method} if settings.method else {})
     try:
         recorded = decode_window(_content(window.name, method.folder), window.name)
         axis = None if config is None else config.axis.get(recorded.axis)
         period_s = None if config is None else config.machine.sync_period_s
         ((outcome,), _) = analyse_windows([recorded], settings, axis, period_s)
     except (FdhilError, MemoryError) as error:
-        return {"error": {"class": type(error).__name__, "text": str(error) or "the memory is used up"}}
+        return {"error": {"class": type(error).__name__, "text": str(error) or "out of memory"}}
     return _document(outcome) | {"configured": axis is not None}
-
-
-def _of_machine(config: MachineConfig, asked: Identification) -> Identification:
-    return config.identification.model_copy(update={"method": asked.method} if asked.method else {})
 
 
 def _content(name: str, folder: Path) -> bytes:
@@ -133,7 +130,7 @@ def _content(name: str, folder: Path) -> bytes:
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}; check [objects] directory") from None
     if hashlib.sha256(content).hexdigest() != name:
-        raise RecordingError(f"{path} is damaged: it is not what its name says; take it from a backup")
+        raise RecordingError(f"{path} is damaged (wrong SHA-256); restore it from a backup")
     return content
 
 

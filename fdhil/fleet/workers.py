@@ -1,4 +1,4 @@
-"""Who analyses: this process, processes of a Dask cluster on this computer, or a Dask cluster that is there already."""
+"""Provides the workers: this process, processes of a local Dask cluster, or an existing Dask cluster."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from fdhil.fleet.window_work import Again, Stored, lost
 if TYPE_CHECKING:
     from distributed import LocalCluster
 
-PER_TASK = 200  # windows: a task costs milliseconds beside the seconds that they take
-TASKS_EACH = 3  # on their way for each worker
+PER_TASK = 200  # windows; their analysis takes seconds, the overhead of a task milliseconds
+TASKS_EACH = 3  # pending tasks per worker
 CONNECT_S = 30
 _SETTINGS: dict[str, object] = {
-    "distributed.scheduler.http.routes": [],  # no pages: nobody is asked who he is there
+    "distributed.scheduler.http.routes": [],  # no pages: they have no login
     "distributed.worker.http.routes": [],
     "distributed.comm.timeouts": {"connect": "60s", "tcp": "300s"},  # computers stall
-    "distributed.deploy.lost-worker-timeout": "60s",  # so long may the start of one in the place of a dead one take
+    "distributed.deploy.lost-worker-timeout": "60s",  # time for the start of a replacement
 }
 WindowCrew = Crew[Stored, Again]
 
 
 @contextmanager
 def workers(scheduler: str | None, count: int, per_task: int = PER_TASK) -> Iterator[WindowCrew]:
-    """Enter a crew: of the cluster behind ``scheduler``, else of ``count`` own processes (0: this process alone).
+    """Open a pool: of the cluster behind ``scheduler``, else of ``count`` local processes (0: this process alone).
 
-    The own processes listen on this computer alone and know each other by a certificate that no file holds: a task is
-    code, and nobody else may give them any. ConnectError where the scheduler cannot be reached or goes away.
+    Local processes listen on this computer alone and authenticate each other by a certificate kept in memory: a task is
+    code, and nobody else may submit any. ConnectError where the scheduler cannot be reached or is lost.
     """
     if scheduler is None and count == 0:
         yield Crew(Here(), per_task, 1)
@@ -42,7 +42,7 @@ def workers(scheduler: str | None, count: int, per_task: int = PER_TASK) -> Iter
     from dask import config
     from distributed import Client, KilledWorker
 
-    for name in ("distributed", "distributed.client"):  # a worker that dies is replaced, what else is wrong is raised
+    for name in ("distributed", "distributed.client"):  # a dead worker is replaced, other errors are raised
         logging.getLogger(name).setLevel(logging.CRITICAL)
     where = f"Dask scheduler {scheduler or 'of this computer'}"
     with config.set(_SETTINGS):
@@ -53,10 +53,10 @@ def workers(scheduler: str | None, count: int, per_task: int = PER_TASK) -> Iter
                 tend = None if own is None else partial(own.scale, count)
                 yield Crew(Cluster(client), per_task, at_once, (KilledWorker,), lost, tend)
         except ModuleNotFoundError as error:
-            text = f"a worker has no {error.name}: install 'fdhil[fleet]' of the same version on all"
+            text = f"a worker lacks {error.name}; install the same version of 'fdhil[fleet]' everywhere"
             raise ConnectError(where, text) from None
         except (CancelledError, TimeoutError, OSError) as error:
-            text = f"it does not answer ({type(error).__name__}); start it, then this again: what is done stays"
+            text = f"it does not respond ({type(error).__name__}); start it and try again: completed windows are kept"
             raise ConnectError(where, text) from None
         finally:
             if own is not None:
@@ -64,16 +64,15 @@ def workers(scheduler: str | None, count: int, per_task: int = PER_TASK) -> Iter
 
 
 class Cluster(Executor):
-    """The workers behind a client.
+    """Runs work on the workers behind a client.
 
-    Dask's own executor never ends a task whose worker died after it was done and before its result was fetched.
+    Dask's own executor never ends a task whose worker died after completion and before its result was fetched.
     """
 
     def __init__(self, client: Any) -> None:
         self.client = client
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Return the future of work that is given to some worker."""
         given = self.client.submit(fn, *args, pure=False, **kwargs)
 
         async def result() -> Any:
@@ -89,7 +88,7 @@ def _own_cluster(count: int) -> LocalCluster:
         n_workers=count,
         threads_per_worker=1,
         security=True,
-        dashboard_address="127.0.0.1:0",  # left out it is 8787, which another may have
+        dashboard_address="127.0.0.1:0",  # the default 8787 may be in use
         scheduler_kwargs={"dashboard": False},
         silence_logs=logging.CRITICAL,
     )

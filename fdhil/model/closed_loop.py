@@ -1,9 +1,9 @@
-"""Simulates the closed loop of one axis: the drive's regulators around the plant, led by a reference on the SYNC grid.
+"""Simulates the closed loop of one axis: the drive's regulators and the plant, driven by a reference on the SYNC grid.
 
-During cycle k the drive interpolates its set-point linearly from r[k] to r[k+1], and the speed that is fed forward from
-(r[k+1]-r[k])/T to (r[k+2]-r[k+1])/T. Beyond its end the reference is held. An offset is added to the reference before
-interpolation. Encoder and set-points are not quantised: against a drive with 65536 increments per revolution that costs
-0.02 to 0.07 um RMS on the bench path, at most half an increment where dry friction keeps what rounding left.
+During cycle k the drive interpolates its set-point linearly from r[k] to r[k+1], and the speed fed forward from
+(r[k+1]-r[k])/T to (r[k+2]-r[k+1])/T. The reference is held beyond its end. An offset is added to the reference before
+interpolation. Encoder and set-points are not quantised: against a drive with 65536 increments per revolution this costs
+0.02 to 0.07 um RMS on the bench path, at most half an increment where dry friction keeps the rounding.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _EMPTY: Float = np.empty(0)
 
 
 class Commands(NamedTuple):
-    """The commands of an axis, (n,) each: reference in mm (its offset included), speed and torque offsets or empty."""
+    """The commands of an axis, (n,) each: reference in mm (offset included), speed and torque offsets or empty."""
 
     reference_mm: Float
     speed_offset_rad_s: Float = _EMPTY
@@ -37,11 +37,11 @@ class Commands(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """The answer of an axis at the SYNC instants t_0 .. t_{n-1}.
+    """The response of an axis at the SYNC instants t_0 .. t_{n-1}.
 
-    ``states`` (k, n) is the whole state at those instants, and ``end`` (STATES,) that after the last cycle: another run
-    may continue from any of them. ``limited`` (n,) is the share of the cycle from that instant on in which the current
-    or voltage limit acts.
+    ``states`` (k, n) is the full state at those instants, and ``end`` (STATES,) the state after the last cycle: another
+    run may continue from any of them. ``limited`` (n,) is the share of the following cycle in which the current or the
+    voltage limit acts.
     """
 
     states: Float
@@ -49,35 +49,35 @@ class Response:
     end: State
     sync_period_s: float
     parted: bool = False
-    """Whether the table is told apart from the motor."""
+    """Whether table and motor are separate masses."""
 
     @property
     def position_mm(self) -> Float:
-        """The place that the drive's encoder tells, (n,): that of the table, unless a resonance parts the two."""
+        """Position reported by the drive's encoder, (n,): the table's, unless a resonance separates the two."""
         return np.asarray(self.states[kernels.POSITION])
 
     @property
     def table_mm(self) -> Float:
-        """The place of the table, (n,), less what a constant load bends."""
+        """Table position, (n,), without the deflection under a constant load."""
         return np.asarray(self.states[kernels.TABLE if self.parted else kernels.POSITION])
 
     @property
     def speed_rad_s(self) -> Float:
-        """The motor's speed, (n,)."""
+        """Motor speed, (n,)."""
         return np.asarray(self.states[kernels.SPEED])
 
     @property
     def current_a(self) -> Float:
-        """The motor's current, (n,)."""
+        """Motor current, (n,)."""
         return np.asarray(self.states[kernels.CURRENT])
 
     @property
     def limited_s(self) -> float:
-        """For how long a limit acts in all."""
+        """Total time in which a limit acts."""
         return float(self.limited.sum() * self.sync_period_s)
 
     def state_at(self, row: int) -> State:
-        """Return the state at the start of a row's cycle."""
+        """Return the state at the start of cycle ``row``."""
         state = np.zeros(kernels.STATES)
         state[: len(self.states)] = self.states[:, row]
         return state
@@ -96,10 +96,11 @@ def simulate(
     first: int = 0,
     rows: int | None = None,
 ) -> Response:
-    """Simulate one axis along ``reference_mm`` (n,) + ``offset_mm`` (n,), from rest at its first row.
+    """Simulate one axis along ``reference_mm`` (n,) + ``offset_mm`` (n,), from rest at its first sample.
 
-    All ``terms`` of the parameters act, but ``speed_delay``, which is the sensor's. ``state`` (of :class:`Response`
-    ``end``) continues a run at row ``first``; ``rows`` stops it early. ValueError for an empty or non-finite reference.
+    All ``terms`` of the parameters act except ``speed_delay``, which belongs to the sensor. ``state`` (``end`` of a
+    :class:`Response`) continues a run at sample ``first``; ``rows`` stops it early. ValueError for an empty or
+    non-finite reference.
     """
     commanded = np.asarray(reference_mm, dtype=np.float64)
     if offset_mm is not None:
@@ -110,22 +111,22 @@ def simulate(
         _EMPTY if torque_offset_nm is None else np.ascontiguousarray(torque_offset_nm, dtype=np.float64),
     )
     if commanded.ndim != 1 or commanded.size == 0 or not np.isfinite(commanded).all():
-        raise ValueError("the reference must be one row of finite positions")
+        raise ValueError("the reference must be a one-dimensional array of finite positions")
     if state is None:
-        # at rest on the reference, not on the offset reference: an offset at row 0 is a step
+        # at rest on the reference without offset: an offset at sample 0 is a step
         state = standing(parameters, axis, float(reference_mm[0]))
     return prepare(parameters, axis, sync_period_s).run(commands, state, first, rows)
 
 
 class Ready(Protocol):
-    """A drive of some structure that may be run again and again."""
+    """A drive of some regulator structure, prepared to be run repeatedly."""
 
     def run(self, commands: Commands, state: State, first: int = 0, rows: int | None = None) -> Response:
-        """Run ``rows`` SYNC cycles (left out: all) from row ``first`` on, as :func:`simulate` does, unchecked."""
+        """Run ``rows`` SYNC cycles (default: all) from sample ``first``, as :func:`simulate` does, without checks."""
 
 
 def prepare(parameters: Parameters, axis: Axis, sync_period_s: float) -> Ready:
-    """Return the drive of an axis ready to be run, for those who run it often."""
+    """Prepare the drive of an axis for repeated runs."""
     drive: Ready = tables.load(tables.REGULATORS, axis.regulators.structure)(parameters, axis, sync_period_s)
     return drive
 
@@ -133,7 +134,7 @@ def prepare(parameters: Parameters, axis: Axis, sync_period_s: float) -> Ready:
 def start(position_mm: float) -> State:
     """Return the state of an axis at rest at ``position_mm``: no current, no speed, all integrals 0."""
     state = np.zeros(kernels.STATES)
-    # what differences and filters remember of the set-point and the position is where the axis stands
+    # the memories of differences and filters start at the position of the axis
     state[[kernels.POSITION, kernels.SET_POINT_BEFORE, kernels.POSITION_BEFORE]] = position_mm
     state[[kernels.FILTERED, kernels.FILTERED + 3, kernels.TABLE]] = position_mm
     return state
@@ -146,12 +147,11 @@ def standing(
     current_a: float | None = None,
     set_point_mm: float | None = None,
 ) -> State:
-    """Return the state of an axis that stands at ``position_mm``, its regulators holding ``current_a`` for long.
+    """Return the state of an axis at standstill at ``position_mm`` whose regulators have settled at ``current_a``.
 
-    Friction may hold it away from its set-point ``set_point_mm`` (left out: there), which has stood as long.
-
-    That current is on the bus at standstill; left out it is what load and ripples need, in the middle of the dry
-    friction's band. The integral that a drive has tells it to the current loop, whose own holds the voltage.
+    Friction may hold it away from its set-point ``set_point_mm`` (default: ``position_mm``). ``current_a`` is the
+    current measured at standstill; by default it is what load and ripples need, the middle of the dry-friction band.
+    The drive's outer integral holds that current, and the integral of the current loop holds the voltage.
     """
     g, state = axis.regulators, start(position_mm)
     if set_point_mm is not None:
@@ -167,7 +167,7 @@ def standing(
         state[kernels.SPEED_INTEGRAL] = held_a
     elif g.structure in ("pid", "linuxcnc_pid") and g.position_ki_per_s2 > 0:
         state[kernels.POSITION_INTEGRAL] = held_a / g.speed_kp
-    if terms.has_spring(parameters):  # what friction takes up at the table has gone through the spring
+    if terms.has_spring(parameters):  # friction at the table bends the spring
         stiffness = terms.spring(parameters)[0] * terms.rad_per_mm(axis)
         state[kernels.TABLE] -= (parameters.K * held_a - pull_nm) / stiffness
     return state
@@ -182,7 +182,7 @@ def simulate_axes(
     speed_offset_rad_s: Mapping[str, Float] | None = None,
     torque_offset_nm: Mapping[str, Float] | None = None,
 ) -> dict[str, Response]:
-    """Simulate several axes at once, one thread each: the kernels run without the interpreter's lock."""
+    """Simulate several axes in parallel, one thread each: the kernels run without the interpreter's lock."""
 
     def one(name: str) -> Response:
         return simulate(
@@ -199,7 +199,7 @@ def simulate_axes(
 
 
 def each_axis(work: Callable[[str], Work], axes: Collection[str]) -> dict[str, Work]:
-    """Return what ``work`` makes of each axis, one thread each."""
+    """Return the result of ``work`` for each axis, one thread each."""
     if len(axes) <= 1:
         return {name: work(name) for name in axes}
     with ThreadPoolExecutor(len(axes)) as pool:

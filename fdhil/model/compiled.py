@@ -1,4 +1,4 @@
-"""Compiles kernels: kept on disk from one start to the next, run without the interpreter's lock."""
+"""Compiles kernels with numba: cached on disk between starts, run without the interpreter's lock."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 
 def compiled(kernel: Kernel) -> Kernel:
-    """Compile a function of plain numbers and arrays, which divides by zero as arrays do; ``py_func`` is its Python."""
+    """Compile a function of plain numbers and arrays; it divides by zero as arrays do. ``py_func`` is its Python."""
     return cast(Kernel, njit(cache=True, nogil=True, error_model="numpy")(kernel))
 
 
 def inlined(kernel: Kernel) -> Kernel:
-    """Compile a function into each kernel that calls it."""
+    """Compile a function that is inlined into each kernel that calls it."""
     return cast(Kernel, njit(cache=True, nogil=True, error_model="numpy", inline="always")(kernel))

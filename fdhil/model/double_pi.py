@@ -1,7 +1,7 @@
 """Double PI: PI on position with speed feed-forward, PI on speed, PI on current.
 
-The position integral (``position_ki_per_s2``) takes away the lag that a drive without full speed feed-forward has at
-constant speed; with dry friction it never quite rests. While the current limit acts both outer integrals stand.
+The position integral (``position_ki_per_s2``) removes the lag that a drive without full speed feed-forward has at
+constant speed; with dry friction it never fully settles. Both outer integrals are frozen while the current limit acts.
 """
 
 from __future__ import annotations

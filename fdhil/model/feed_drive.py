@@ -15,7 +15,7 @@ import numpy as np
 from fdhil.model.compiled import compiled, inlined
 from fdhil.records import Float, Parameters, VoltageSampling, read_only
 
-SUBSTEP_S = 6.25e-5  # stick and slip are decided this often; the linear part needs no substep
+SUBSTEP_S = 6.25e-5  # interval at which stick and slip are decided; the linear part needs no substep
 _SERIES_TERMS = 14
 _SERIES_NORM = 0.4  # below it the series of _SERIES_TERMS terms is exact to the last bit
 
@@ -35,7 +35,7 @@ class Step:
 
 @inlined
 def _product(a: Float, b: Float) -> Float:
-    """Return the product of two (2, 2) matrices: at this size a library call takes ten times longer."""
+    """Return the product of two (2, 2) matrices; at this size a library call takes ten times longer."""
     out = np.empty((2, 2))
     out[0, 0] = a[0, 0] * b[0, 0] + a[0, 1] * b[1, 0]
     out[0, 1] = a[0, 0] * b[0, 1] + a[0, 1] * b[1, 1]
@@ -46,7 +46,7 @@ def _product(a: Float, b: Float) -> Float:
 
 @compiled
 def transition(a: Float, h: float) -> tuple[Float, Float, Float]:
-    """Return phi = exp(A h), its integral over h, and the answer to a ramp from -1/2 to 1/2 (all (2, 2))."""
+    """Return phi = exp(A h), its integral over h, and the response to a ramp from -1/2 to 1/2 (all (2, 2))."""
     norm = np.abs(a).sum() * h
     halvings = 0
     while norm > _SERIES_NORM and halvings < 60:
@@ -87,7 +87,7 @@ def discretise(parameters: Parameters, dt_s: float) -> Step:
 def _simulate(
     a: Float, gains: Float, mean_v: Float, rise_v: Float, dt: float, substeps: int, start: Float
 ) -> tuple[Float, Float]:
-    """Step through the intervals; ``gains`` = [1/L, Cd/Jt, K, Cd]; ``rise_v`` is the rise over each."""
+    """Step through the intervals; ``gains`` = [1/L, Cd/Jt, K, Cd]; ``rise_v`` is the voltage rise over each."""
     n = mean_v.size
     current = np.empty(n)
     speed = np.empty(n)
@@ -120,8 +120,8 @@ def _simulate(
 def interval_shape(voltage_v: Float, sampling: VoltageSampling) -> tuple[Float, Float]:
     """Return mean (n,) and rise (n,) in V of the voltage over each [t_k, t_k + dt).
 
-    Between samples a drive's voltage is nearer to a ramp than to a hold: the rise of an interval mean is half the
-    difference of its neighbours, which leaves the means as measured. Instants are joined by straight lines.
+    Between samples a drive's voltage is closer to a ramp than to a hold. The rise of an interval mean is half the
+    difference of its neighbours, which leaves the means as measured. Instantaneous values are joined by straight lines.
     """
     if voltage_v.size < 2:
         return voltage_v.copy(), np.zeros_like(voltage_v)
@@ -142,9 +142,10 @@ def simulate_plant(
     current0_a: float = 0.0,
     speed0_rad_s: float = 0.0,
 ) -> tuple[Float, Float]:
-    """Simulate [1] and [2] from the voltage (n,) alone; return current_a (n,) and speed_rad_s (n,) at t_0 .. t_{n-1}.
+    """Simulate [1] and [2] from the voltage (n,) alone; return current_a (n,), speed_rad_s (n,) at t_0 .. t_{n-1}.
 
-    Row 0 is the given start. The step is exact while the drive moves or sticks; a stop is decided every ``SUBSTEP_S``.
+    Sample 0 is the given start. The step is exact while the drive moves or sticks; a stop is detected every
+    ``SUBSTEP_S``.
     """
     p = parameters
     mean, rise = interval_shape(np.ascontiguousarray(voltage_v, dtype=np.float64), sampling)

@@ -1,7 +1,7 @@
-"""Compiled kernels run the closed-loop model. Plain numbers in, plain numbers out; no lock is held while they run.
+"""Compiled kernels of the closed-loop model: plain numbers in, plain numbers out, run without the interpreter's lock.
 
-All compiled code of the drives is in this file, whatever their structure: numba's cache of a compiled function is
-renewed when its own file changes, not when that of a function it calls does.
+All compiled code of the drives is in this file, whatever their structure: numba renews its cache of a compiled function
+when the function's own file changes, not when a file that it calls changes.
 """
 
 from __future__ import annotations
@@ -11,30 +11,30 @@ import numpy as np
 from fdhil.model.compiled import compiled, inlined
 from fdhil.records import Float
 
-# places in the state vector: what every drive has, then what structures and options add
+# indices of the state vector: those of every drive, then those that structures and options add
 CURRENT, SPEED, POSITION, SPEED_INTEGRAL, CURRENT_INTEGRAL, CURRENT_DEMAND = range(6)
 POSITION_INTEGRAL, SET_POINT_BEFORE, POSITION_BEFORE, FILTERED, SPEED_FILTERED = 6, 7, 8, 9, 15
 TABLE, TABLE_SPEED = 16, 17  # a table behind a spring
-BRISTLE, NEXT, WAITING = 18, 19, 20  # dry friction that builds up, N.m; the voltages that wait, as a ring
+BRISTLE, NEXT, WAITING = 18, 19, 20  # presliding friction, N.m; ring index and ring of delayed voltages
 MOST_WAITING = 32
 STATES = WAITING + MOST_WAITING
-# what a run records at each SYNC instant: how many of the cycle's steps have a limit acting, the state
+# rows recorded at each SYNC instant: the number of the cycle's steps with a limit acting, then the state
 ROW_LIMITED, ROW_STATE = range(2)
-# places in the gains, see fdhil.model.loops.gains
+# indices of the gains, see fdhil.model.loops.gains
 KV, KFF, SPEED_KP, SPEED_KI, CURRENT_MAX, CURRENT_KP, CURRENT_KI, VOLTAGE_MAX, PERIOD, HALF_STEP_MM = range(10)
 POSITION_KI, ACCELERATION, DECAY, RAD_PER_MM, SPEED_CYCLES_PER_S, SPEED_DECAY, FULL_DEAD_TIME_A = range(10, 17)
-# of LinuxCNC's pid: gains of its terms, output limit (0: none), and as 0 or 1 error-previous-target and a speed loop
+# LinuxCNC's pid: gains of its terms, output limit (0: none), error-previous-target and speed loop as 0 or 1
 DERIVATIVE, FF0, FF2, FF3, DEADBAND_MM, OUTPUT_MAX, PREVIOUS_TARGET, SPEED_LOOP = range(17, 25)
 GAINS = 25
-# places in the terms, see fdhil.model.terms.packed; behind them periods in a turn, amplitude and phase of each ripple
+# indices of the terms, see fdhil.model.terms.packed; then periods per turn, amplitude and phase of each ripple
 LOAD, DRY_POSITIVE, DRY_NEGATIVE, VISCOUS, VISCOUS_POSITIVE, VISCOUS_NEGATIVE, STRIBECK, STRIBECK_SPEED = range(8)
 DEAD_TIME, SPRING, DAMPER, PRESLIDING, RIPPLES = range(8, 13)
-STRIBECK_REACH = 6.0  # times its speed, from where it is less than the last bit of the friction
-# the laws from set-point to current demand
+STRIBECK_REACH = 6.0  # times its speed; beyond it the Stribeck part is below the last bit of the friction
+# control laws from set-point to current demand
 CASCADE, PID, LINUXCNC = range(3)
-# what LinuxCNC's pid remembers besides, in places of the set-point filter that it does not have
+# further memory of LinuxCNC's pid, in elements of the set-point filter that it does not have
 COMMAND_SPEED, COMMAND_ACCELERATION, OUTPUT, OUTPUT_LIMITED = 10, 11, 13, 14
-# rows of the leap, see fdhil.model.leap: what a whole speed cycle does to a table that moves or is held, and its bounds
+# rows of the map over a speed cycle, see fdhil.model.leap, for a moving and for a held table, with its bounds
 LEAP_CURRENT, LEAP_SPEED, LEAP_INTEGRAL, LEAP_WAY, LEAP_TURN, LEAP_VOLTAGE = range(6)
 HELD_CURRENT, HELD_INTEGRAL, HELD_BREAK, HELD_VOLTAGE, LEAP_RESISTANCE = range(6, 11)
 LEAP_ROWS, LEAP_COLUMNS = 11, 5
@@ -42,7 +42,7 @@ LEAP_ROWS, LEAP_COLUMNS = 11, 5
 
 @compiled
 def _seen(speed: float, state: Float, gains: Float) -> float:
-    """Return the speed that the regulators see behind the filter on its feedback, whose memory is in the state."""
+    """Return the speed behind the feedback filter, whose memory is in the state."""
     if gains[SPEED_DECAY] > 0.0:
         speed = gains[SPEED_DECAY] * state[SPEED_FILTERED] + (1.0 - gains[SPEED_DECAY]) * speed
         state[SPEED_FILTERED] = speed
@@ -51,9 +51,9 @@ def _seen(speed: float, state: Float, gains: Float) -> float:
 
 @compiled
 def _cascade(place: float, rate: float, speed: float, state: Float, gains: Float) -> tuple[float, float, float]:
-    """P or PI on position, PI on speed: return the current demand and both integrals if no limit acts.
+    """Compute P or PI on position, PI on speed; return the current demand and both integrals as if no limit acted.
 
-    ``place`` mm and ``rate`` rad/s are the set-point and the speed that is fed forward, ``speed`` rad/s what is seen.
+    ``place`` mm is the set-point, ``rate`` rad/s the speed fed forward, ``speed`` rad/s the filtered speed feedback.
     """
     lag = place - state[POSITION]
     integral = state[POSITION_INTEGRAL] + gains[POSITION_KI] * lag
@@ -64,10 +64,10 @@ def _cascade(place: float, rate: float, speed: float, state: Float, gains: Float
 
 @compiled
 def _pid(place: float, rate: float, turned: float, state: Float, gains: Float) -> tuple[float, float, float]:
-    """PID on position: return the current demand, the speed integral it does not have, and its own integral.
+    """Compute PID on position; return the current demand, a zero speed integral, and the position integral.
 
     The derivative is the difference of Kff times set-point less position over one cycle; ``rate`` rad/s adds to it.
-    ``turned`` rad is the position's part of it, as the filter on the speed feedback lets it through.
+    ``turned`` rad is the change of position after the speed-feedback filter.
     """
     lag = place - state[POSITION]
     integral = state[POSITION_INTEGRAL] + gains[POSITION_KI] * lag
@@ -104,9 +104,9 @@ def _linuxcnc_pid(place: float, state: Float, gains: Float) -> None:
 
 @compiled
 def _driven(speed: float, more: float, state: Float, gains: Float) -> tuple[float, float]:
-    """Return the current demand of a drive that takes the output of LinuxCNC's pid, and its speed integral.
+    """Return current demand and speed integral of a drive that receives the output of LinuxCNC's pid.
 
-    A drive with a speed loop closes it at its own cycle; one without takes the output for a current.
+    A drive with a speed loop closes it at its own cycle; one without uses the output as its current demand.
     """
     wanted = state[OUTPUT] + more
     if gains[SPEED_LOOP] == 0.0:
@@ -117,7 +117,7 @@ def _driven(speed: float, more: float, state: Float, gains: Float) -> tuple[floa
 
 @compiled
 def _filter(place: float, rate: float, bend: float, order: int, decay: float, state: Float) -> None:
-    """Put set-point, speed and acceleration through ``order`` equal first-order filters, in place in the state."""
+    """Filter set-point, speed and acceleration by ``order`` equal first-order filters, in place in the state."""
     for n in range(order):
         at = FILTERED + 3 * n
         place = decay * state[at] + (1.0 - decay) * place
@@ -128,7 +128,6 @@ def _filter(place: float, rate: float, bend: float, order: int, decay: float, st
 
 @inlined
 def _ripple(angle: float, terms: Float) -> float:
-    """Return the torque of all ripples at an angle of the motor."""
     torque = 0.0
     for n in range(RIPPLES, terms.size, 3):
         torque += terms[n + 1] * np.sin(terms[n] * angle + terms[n + 2])
@@ -137,7 +136,7 @@ def _ripple(angle: float, terms: Float) -> float:
 
 @inlined
 def _low_speed(w: float, stribeck: float, stribeck_speed: float) -> float:
-    """Return the dry friction that is there at low speed only."""
+    """Return the part of dry friction that exists at low speed only, N.m."""
     if stribeck == 0.0 or abs(w) > STRIBECK_REACH * stribeck_speed:
         return 0.0
     return float(stribeck * np.exp(-((w / stribeck_speed) ** 2)))
@@ -160,7 +159,7 @@ def torque(speed: Float, angle: Float, terms: Float) -> Float:
 def _stepped(
     step: Float, row: int, i: float, w: float, apart: float, table_w: float, u: float, against: float, dry: float
 ) -> float:
-    """Return what a row of the step of motor and table makes of a state; ``apart`` is motor less table."""
+    """Apply one row of the two-mass step to a state; ``apart`` is motor less table position."""
     moved = step[row, 0] * i + step[row, 1] * w + step[row, 2] * apart + step[row, 3] * table_w
     return float(moved + step[row, 5] * u - step[row, 6] * against - step[row, 7] * dry)
 
@@ -177,13 +176,13 @@ def _current_cycles(
     delay: int,
     state: Float,
 ) -> int:
-    """Run the current loop and the plant for one speed cycle, step by step: return the steps with a limit acting.
+    """Run the current loop and the plant for one speed cycle; return the number of steps with a limit acting.
 
     ``limited``: the current demand is at its limit. The voltage acts ``delay`` steps after it was computed, less the
-    inverter's dead time. Ripples are those of the middle of each step. ``masses`` (2, 5, 8), or None where motor and
-    table are one, is the exact step of both, free and with the table held; the table has the dry friction then.
-    What is None is not compiled. Dry friction with presliding is the force of a bristle (Dahl 1968): as the table moves
-    it builds up to that of sliding, and nothing sticks.
+    inverter's dead time. Ripples are evaluated at the middle of each step. ``masses`` (2, 5, 8), or None for a rigid
+    screw, is the exact step of motor and table, free and with the table held; dry friction then acts on the table.
+    Branches of None arguments are not compiled. Dry friction with presliding is the force of a bristle (Dahl 1968): it
+    builds up with displacement until it reaches sliding friction, and nothing sticks.
     """
     phi_ii, phi_iw, phi_wi, phi_ww, phi_xi, phi_xw = plant[0], plant[1], plant[2], plant[3], plant[4], plant[5]
     i_u, w_u, x_u, i_t, w_t, x_t = plant[6], plant[7], plant[8], plant[9], plant[10], plant[11]
@@ -224,7 +223,7 @@ def _current_cycles(
             push -= against
             if masses is not None:
                 rubbing, push = table_w, spring * (x - table) + damper * w
-        # one friction sign per step: that of the motion, or where the torque will start it
+        # one friction sign per step: that of the motion, or of the motion that the torque will start
         forward = rubbing > 0.0 or (rubbing == 0.0 and push > 0.0)
         if terms is not None:
             dry = (positive if forward else negative) + _low_speed(rubbing, slow, slow_speed)
@@ -250,7 +249,7 @@ def _current_cycles(
             continue
         total = friction - against
         w_next = phi_wi * i + phi_ww * w + w_u * u + w_t * total
-        if w_next * friction > 0.0 and not builds_up:  # the sign changed: the table stops for this step
+        if w_next * friction > 0.0 and not builds_up:  # reversal: the table stops for this step
             x += half_step_mm * w
             w_next = 0.0
         else:
@@ -268,7 +267,7 @@ def _current_cycles(
 
 @compiled
 def _between(values: Float, k: int, part: float) -> float:
-    """Return the value ``part`` of the way from row k to k + 1, held beyond the end."""
+    """Return the value ``part`` of the way from sample k to k + 1; the last value is held beyond the end."""
     last = values.size - 1
     low = values[min(k, last)]
     return float(low + (values[min(k + 1, last)] - low) * part)
@@ -278,9 +277,9 @@ def _between(values: Float, k: int, part: float) -> float:
 def _may_move(
     i: float, w: float, integral: float, demand_a: float, friction: float, unit: float, plant: Float, leap: Float
 ) -> float:
-    """Return the largest voltage that a moving table may be asked for in a speed cycle; inf where it may turn.
+    """Return a bound on the voltage demanded of a moving table in a speed cycle; inf where it may reverse.
 
-    ``friction`` N.m is the torque against the positive direction, ``unit`` its size in what the leap takes for 1.
+    ``friction`` N.m acts against the positive direction; ``unit`` is its size in units of the map's friction.
     """
     net = abs(i - friction / plant[14])
     e, q, ai, aw = abs(demand_a - i), abs(integral - leap[LEAP_RESISTANCE, 0] * i - plant[14] * w), abs(i), abs(w)
@@ -293,9 +292,9 @@ def _may_move(
 
 @inlined
 def _may_hold(i: float, integral: float, demand_a: float, room: float, plant: Float, leap: Float) -> float:
-    """Return the largest voltage that a held table may be asked for; inf where it may break loose.
+    """Return a bound on the voltage demanded of a held table; inf where it may break loose.
 
-    ``room`` N.m is what the motor's torque may change by before it does.
+    ``room`` N.m is the change of motor torque up to which the table stays held.
     """
     ai, e, q = abs(i), abs(demand_a - i), abs(integral - leap[LEAP_RESISTANCE, 0] * i)
     if not plant[14] * (leap[HELD_BREAK, 2] * e + leap[HELD_BREAK, 3] * q) <= room:
@@ -305,14 +304,13 @@ def _may_hold(i: float, integral: float, demand_a: float, room: float, plant: Fl
 
 @inlined
 def _mapped(leap: Float, row: int, i: float, w: float, integral: float, demand_a: float, side: float) -> float:
-    """Return what a row of the leap makes of a state."""
     moved = leap[row, 0] * i + leap[row, 1] * w + leap[row, 2] * integral
     return float(moved + leap[row, 3] * demand_a + leap[row, 4] * side)
 
 
 @inlined
 def _leapable(i: float, w: float, integral: float, demand_a: float, plant: Float, leap: Float) -> tuple[float, float]:
-    """Return the largest voltage of a speed cycle, inf where it is not linear, and the side: 0 for a held table."""
+    """Return a bound on the voltage of a speed cycle (inf: not linear), and the friction sign, 0 for a held table."""
     dry = plant[15]
     if w == 0.0 and dry > 0.0:
         return _may_hold(i, integral, demand_a, dry - plant[14] * abs(i), plant, leap), 0.0
@@ -324,10 +322,10 @@ def _leapable(i: float, w: float, integral: float, demand_a: float, plant: Float
 def _mean_torque(
     i: float, w: float, x: float, half_mm: float, faster: float, plant: Float, rad_per_mm: float, terms: Float
 ) -> float:
-    """Return the mean of the torque against the positive direction over a speed cycle in which the table moves.
+    """Return the mean torque against the positive direction over a speed cycle in which the table moves.
 
-    ``half_mm`` is how far the table goes in half of it at 1 rad/s, ``faster`` by how much 1 N.m speeds it up in that
-    time. A ripple is averaged, the friction is that of the cycle's middle.
+    ``half_mm`` is the travel in half a cycle at 1 rad/s, ``faster`` the speed gained in that time per N.m. Ripples are
+    averaged; friction is evaluated at the middle of the cycle.
     """
     side = 1.0 if w > 0.0 else -1.0
     dry = terms[DRY_POSITIVE] if w > 0.0 else terms[DRY_NEGATIVE]
@@ -347,7 +345,7 @@ def _mean_torque(
 def _leapt(
     i: float, w: float, integral: float, demand_a: float, side: float, held: bool, leap: Float
 ) -> tuple[float, float, float]:
-    """Return current, speed and integral of the current loop after a speed cycle."""
+    """Return current, speed and current integral after a speed cycle."""
     if held:
         return (
             _mapped(leap, HELD_CURRENT, i, w, integral, demand_a, side),
@@ -374,10 +372,10 @@ def _run_leaping(
     state: Float,
     out: Float,
 ) -> None:
-    """Run a cascade without delay and speed offsets as :func:`run` does, in one leap a speed cycle where it is linear.
+    """Run a cascade without delay or speed offsets as :func:`run` does, one map per speed cycle where linear.
 
-    With terms a leap takes the mean of their torque; a constant voltage that is lost comes to a change of the integral.
-    ``out`` (1 + kept, rows) is written. All that a cycle changes is in plain variables: memory would take most of it.
+    With terms, a map uses the mean of their torque; a constant voltage loss becomes a change of the integral. ``out``
+    (1 + kept, rows) is written. The state is kept in local variables: memory access would dominate the run time.
     """
     kept, n_speed, n_current, order, last = shape[1], shape[2], shape[3], shape[4], reference.size - 1
     kv, kff, speed_kp, speed_ki, position_ki = (
@@ -436,7 +434,7 @@ def _run_leaping(
                 lost_v, held = dead_v if i > 0.0 else -dead_v, w == 0.0
                 left, side, may = currents - lost_v, 0.0, np.inf
                 if dead_v != 0.0 and (min(abs(i), abs(demand_a)) < full_a or i * demand_a < 0.0):
-                    pass  # the dead time's effect changes on the way
+                    pass  # the dead-time voltage changes within the cycle
                 elif held:
                     push = plant[14] * i - load - _ripple(rad_per_mm * x, terms)
                     room = min(positive - push, negative + push) + slow
@@ -477,13 +475,13 @@ def run(
     shape: tuple[int, int, int, int, int, int],
     state: Float,
 ) -> Float:
-    """Run SYNC cycles ``first`` .. ``first + rows - 1``; return (1 + kept, rows) as seen at the start of each cycle.
+    """Run SYNC cycles ``first`` .. ``first + rows - 1``; return (1 + kept, rows), sampled at the start of each cycle.
 
     ``reference`` (n,) mm is held beyond its end; ``speed_offset`` rad/s and ``current_offset`` A are (n,) or empty.
     ``plant`` (16,), ``leap`` (LEAP_ROWS, LEAP_COLUMNS) or empty, and ``gains`` (GAINS,): see :mod:`fdhil.model.loops`.
-    ``terms``, None for a plain drive, and ``masses``: see :mod:`fdhil.model.terms`. ``shape``: law, states kept of
-    each row, speed cycles per SYNC cycle, current cycles per speed cycle, order of the set-point filter, current cycles
-    of delay. ``state`` (STATES,) is written.
+    ``terms``, None for a plain drive, and ``masses``: see :mod:`fdhil.model.terms`. ``shape``: law, states recorded per
+    cycle, speed cycles per SYNC cycle, current cycles per speed cycle, order of the set-point filter, current cycles of
+    delay. ``state`` (STATES,) is written.
     """
     law, kept, n_speed, n_current, order, delay = shape
     last = reference.size - 1
@@ -526,7 +524,7 @@ def run(
             if current_offset.size > 0:
                 raw += _between(current_offset, k, part)
             demand_a = min(max(raw, -current_max), current_max)
-            if demand_a == raw:  # all integrals stand while the limit acts
+            if demand_a == raw:  # all integrals are frozen while the limit acts
                 state[SPEED_INTEGRAL], state[POSITION_INTEGRAL] = speed_integral, position_integral
             state[CURRENT_DEMAND] = demand_a
             clipped = demand_a != raw

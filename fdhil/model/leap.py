@@ -1,8 +1,8 @@
-"""Takes a whole speed cycle of the current loop and the plant at once.
+"""Computes a whole speed cycle of the current loop and the plant in one step.
 
-While the current demand is constant, no voltage is clipped and the table neither turns nor breaks loose, the steps of
-the current loop are one linear map. The kernel takes it where bounds on what happens in between prove that it may; all
-else goes step by step.
+While the current demand is constant, no voltage is clipped and the table neither reverses nor breaks loose, the steps
+of the current loop are one linear map. The kernel applies that map only where bounds prove that these conditions hold
+within the cycle; otherwise it steps one current cycle at a time.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from fdhil.model import kernels
 from fdhil.records import Float
 
-_I, _W, _J, _D, _S, _X = range(6)  # current, speed, integral, demand, friction's side, way
+_I, _W, _J, _D, _S, _X = range(6)  # current, speed, integral, demand, friction sign, position
 
 
 @lru_cache(maxsize=64)
@@ -24,7 +24,7 @@ def _leap(plant: tuple[float, ...], kp: float, ki: float, steps: int) -> Float:
     moving = _one_step(np.array(plant[:12]), kp, ki, dry)
     still = np.array([plant[12], *([0.0] * 5), plant[13], *([0.0] * 5)])
     held = _one_step(still, kp, ki, 0.0)
-    held[_W] = held[_X] = 0.0  # nothing turns
+    held[_W] = held[_X] = 0.0  # the motor stands still
     out = np.zeros((kernels.LEAP_ROWS, kernels.LEAP_COLUMNS))
     through = _powers(moving, steps)
     out[kernels.LEAP_CURRENT : kernels.LEAP_WAY + 1] = through[-1, [_I, _W, _J, _X], :5]
@@ -44,17 +44,17 @@ def _leap(plant: tuple[float, ...], kp: float, ki: float, steps: int) -> Float:
 
 
 def leap(plant: Float, kp: float, ki: float, steps: int) -> Float:
-    """Return the kernel's (LEAP_ROWS, LEAP_COLUMNS) for ``steps`` current-loop steps of gains ``kp`` V/A, ``ki`` V/A.
+    """Return the kernel's (LEAP_ROWS, LEAP_COLUMNS) for ``steps`` current-loop steps with gains ``kp`` V/A, ``ki`` V/A.
 
     ``plant`` (16,) is the exact step of :func:`fdhil.model.loops.plant_step`. Maps act on current, speed, integral,
-    demand and the side of the friction; bounds on |current|, |speed|, |demand - current|, |integral - R i - K w|, 1. Of
-    the bound on the speed's change the first is on the current less what the dry friction takes.
+    demand and the sign of the friction. Bounds act on |current|, |speed|, |demand - current|, |integral - R i - K w|,
+    1. The first coefficient of the speed-change bound acts on the current less the share taken by dry friction.
     """
     return _leap(tuple(plant.tolist()), kp, ki, steps)
 
 
 def _one_step(plant: Float, kp: float, ki: float, dry: float) -> Float:
-    """Return (6, 6) one step of [i, w, integral, demand, side, way]."""
+    """Return (6, 6) one step of [i, w, integral, demand, friction sign, position]."""
     step = np.eye(6)
     integral = np.array([-ki, 0.0, 1.0, ki, 0.0, 0.0])
     voltage = integral + np.array([-kp, 0.0, 0.0, kp, 0.0, 0.0])
@@ -77,13 +77,12 @@ def _powers(step: Float, steps: int) -> Float:
 
 
 def _voltages(through: Float, kp: float, ki: float) -> Float:
-    """Return (k, 5) the voltage asked for at each step."""
     error = through[:, _D, :5] - through[:, _I, :5]
     return np.asarray(through[:, _J, :5] + (kp + ki) * error)
 
 
 def _bound(rows: Float, resistance: float, torque_constant: float) -> Float:
-    """Return (5,) the largest of each coefficient, with demand and integral told by how far they are from steady."""
+    """Return (5,) the largest of each coefficient; demand and integral are taken relative to their steady state."""
     i, w, integral, demand, side = rows.T
     apart = np.column_stack(
         [i + demand + resistance * integral, w + torque_constant * integral, demand, integral, side]

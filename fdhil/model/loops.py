@@ -1,8 +1,8 @@
-"""Prepares what every regulator structure shares: the plant's exact step, the kernel's gains, a drive ready to run.
+"""Prepares what all regulator structures share: the plant's exact step, the kernel's gains, the drive to run.
 
 Each PI integrates first: candidate = integral + ki h e, output = clip(kp e + candidate); where the clip acts, the old
-integral is kept. Four options go with every structure: acceleration fed forward as current, a filter on the set-point
-(with the speed and acceleration that are fed forward), one on the speed feedback, and a delay of the current loop.
+integral is kept. Every structure has four options: acceleration fed forward as current, a filter on the set-point (and
+on the speed and acceleration fed forward), a filter on the speed feedback, and a delay of the current loop.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _NO_LEAP = read_only(np.empty((0, kernels.LEAP_COLUMNS)))
 def plant_step(parameters: Parameters, pitch_mm: float, step_s: float) -> Float:
     """Return (16,) the exact step of [i, w, x] under constant voltage and friction torque, [DES] eqs. 1 and 2.
 
-    Order: phi_ii, phi_iw, phi_wi, phi_ww, phi_xi, phi_xw, voltage on i, w, x, torque on i, w, x, then the still
-    motor's decay and voltage gain, K and Cd. x is in mm.
+    Order: phi_ii, phi_iw, phi_wi, phi_ww, phi_xi, phi_xw, voltage on i, w, x, torque on i, w, x, then decay and voltage
+    gain of the motor at standstill, K and Cd. x is in mm.
     """
     p = parameters
     mm_per_rad = pitch_mm / (2 * math.pi)
@@ -80,7 +80,7 @@ def gains(axis: Axis, sync_period_s: float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """One axis ready to be run: what its kernel takes, found once."""
+    """One axis prepared to be run: the arguments of its kernel."""
 
     plant: Float
     leap: Float
@@ -92,7 +92,7 @@ class Drive:
     nominal_k: float
 
     def run(self, commands: Commands, state: State, first: int = 0, rows: int | None = None) -> Response:
-        """Run ``rows`` SYNC cycles (left out: all) from row ``first`` on; ``state`` (STATES,) is not written."""
+        """Run ``rows`` SYNC cycles (default: all) from sample ``first``; ``state`` (STATES,) is not written."""
         end = state.copy()
         torque = commands.torque_offset_nm
         out = kernels.run(
@@ -115,7 +115,7 @@ class Drive:
 
 
 def prepare(law: int, places: int, parameters: Parameters, axis: Axis, sync_period_s: float) -> Drive:
-    """Make an axis ready, with a law of the kernel that uses ``places`` of the state."""
+    """Prepare an axis with a law of the kernel that uses the first ``places`` elements of the state."""
     g = axis.regulators
     n_speed = round(sync_period_s / g.speed_period_s)
     n_current = round(g.speed_period_s / g.current_period_s)
@@ -138,12 +138,12 @@ def prepare(law: int, places: int, parameters: Parameters, axis: Axis, sync_peri
 
 
 def _per_newton_metre(plant: Float) -> Float:
-    """Return the plant with a dry friction of 1 N.m, so that a leap takes any torque."""
+    """Return the plant with 1 N.m of dry friction, so that a map scales with any torque."""
     return np.append(plant[:-1], 1.0)
 
 
 def _kept(places: int, parameters: Parameters, axis: Axis) -> int:
-    """Return how many places of the state a drive uses: those of its structure, then of its options and terms."""
+    """Return how many elements of the state a drive uses: those of its structure, options and terms."""
     g = axis.regulators
     if g.current_delay_cycles:
         return kernels.WAITING + g.current_delay_cycles

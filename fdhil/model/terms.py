@@ -1,4 +1,4 @@
-"""What may join equations [1] and [2] of [DES], see :class:`fdhil.records.Parameters`, as the kernels take it."""
+"""Packs the optional terms of [DES] [1] and [2], see :class:`fdhil.records.Parameters`, for the kernels."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from fdhil.model import kernels
 from fdhil.records import Float, Parameters, read_only
 
 _RIPPLE = re.compile(r"ripple_(?:screw|motor)_(\d+)")
-_SENSORS = ("speed_delay",)  # of what a drive reports, not of what it does
-TABLE_SHARE = 0.5  # of the inertia is behind the spring where nothing else is known
+_SENSORS = ("speed_delay",)  # terms of the reported signals, without effect on the motion
+TABLE_SHARE = 0.5  # default share of the inertia on the table side of the spring
 
 
 def torque(parameters: Parameters, speed_rad_s: Float, angle_rad: Float) -> Float:
@@ -28,38 +28,38 @@ def torque(parameters: Parameters, speed_rad_s: Float, angle_rad: Float) -> Floa
 
 
 def rad_per_mm(axis: Axis) -> float:
-    """Return by what angle the motor turns while the table goes one mm."""
+    """Return the motor angle per mm of table travel."""
     return 2 * math.pi / axis.screw_pitch_mm
 
 
 def full_dead_time_a(axis: Axis) -> float:
-    """Return the current from which on the inverter's dead time takes all its voltage.
+    """Return the current above which the inverter's dead time takes its full voltage.
 
-    It is half of the ripple that switching once in a cycle leaves in the current: below it both transistors conduct in
-    turn, and the losses cancel.
+    It is half of the current ripple caused by switching once per cycle: below it both transistors conduct in turn, and
+    the losses cancel.
     """
     g = axis.regulators
     return g.voltage_limit_v * g.current_period_s / (4 * axis.nominal.L)
 
 
 def dead_time_v(parameters: Parameters, axis: Axis, current_a: float) -> float:
-    """Return the voltage that the dead time takes from what the regulator asks for."""
+    """Return the voltage lost to the dead time."""
     share = max(-1.0, min(1.0, current_a / full_dead_time_a(axis)))
     return parameters.term("dead_time") * share
 
 
 def any_of(parameters: Parameters) -> bool:
-    """Whether a drive needs the kernel's steps with terms: the plain ones are faster."""
+    """Whether a drive needs the kernel's steps with terms; the plain ones are faster."""
     return any(name not in _SENSORS for name, _ in parameters.terms)
 
 
 def has_spring(parameters: Parameters) -> bool:
-    """Whether the table is told apart from the motor."""
+    """Whether motor and table are separate masses."""
     return parameters.term("resonance") > 0.0
 
 
 def builds_up(parameters: Parameters) -> bool:
-    """Return whether dry friction builds up over a way (presliding)."""
+    """Whether dry friction builds up over a displacement (presliding)."""
     return parameters.term("presliding_um") > 0.0
 
 
@@ -94,10 +94,10 @@ def with_resonance(parameters: Parameters, axis: Axis) -> Parameters:
 
 
 def spring(parameters: Parameters) -> tuple[float, float]:
-    """Return stiffness in N.m/rad and damping in N.m.s of what is between motor and table; 0 where they are one.
+    """Return stiffness in N.m/rad and damping in N.m.s between motor and table; 0 where they are one mass.
 
-    ``resonance`` is that of both masses against each other, the motor free: the peak from its torque to its speed. A
-    motor that is held leaves the table sqrt(1 - share) of it; share = ``resonance_share`` of Jt is the table's.
+    ``resonance`` is that of both masses against each other with the motor free: the peak from motor torque to motor
+    speed. With the motor held, the table resonates at sqrt(1 - share) of it; ``resonance_share`` of Jt is the table's.
     """
     share, whole = parameters.term("resonance_share", TABLE_SHARE), 2 * math.pi * parameters.term("resonance")
     reduced = parameters.Jt * share * (1.0 - share)
@@ -106,10 +106,10 @@ def spring(parameters: Parameters) -> tuple[float, float]:
 
 @lru_cache(maxsize=64)
 def masses(parameters: Parameters, pitch_mm: float, step_s: float) -> Float:
-    """Return (2, 5, 8) the exact step of motor and table, moving and with the table held.
+    """Return (2, 5, 8) the exact step of motor and table, free and with the table held.
 
-    Rows: current, speed, place of the motor, speed and place of the table; columns: the same, then voltage, torque on
-    the motor, torque on the table. Places are in mm. Of the viscous friction all is the motor's.
+    Rows: current, speed and position of the motor, speed and position of the table. Columns: the same, then voltage,
+    torque on the motor, torque on the table. Positions are in mm. All viscous friction acts on the motor.
     """
     p = parameters
     share = p.term("resonance_share", TABLE_SHARE)
@@ -127,7 +127,7 @@ def masses(parameters: Parameters, pitch_mm: float, step_s: float) -> Float:
 
 
 def exponential(a: Float) -> Float:
-    """Return exp(a) of a small matrix by Taylor's series, halved until it converges to the last bit."""
+    """Return exp(a) of a small matrix by its Taylor series, scaled so that it converges to the last bit."""
     halvings = max(0, math.ceil(math.log2(max(float(np.abs(a).sum(axis=1).max()), 1e-12) / 0.5)))
     scaled = a / 2.0**halvings
     result = term = np.eye(len(a))

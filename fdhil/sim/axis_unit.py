@@ -1,4 +1,4 @@
-"""Joins one axis' drive with its slide-way and sensor, and offers what a fault can do to them."""
+"""Combines one axis' drive with its slide-way and sensor, and applies faults to them."""
 
 from dataclasses import dataclass, field
 
@@ -8,22 +8,21 @@ from fdhil.sim.frame_faults import FrameFaults
 from fdhil.sim.thermal import SlideWay
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
 
-_GAP_CYCLES = 50  # a longer silence is the end of a stream, not a late frame
-_THERMAL_CYCLES = 100  # the temperature moves slowly: the drive learns of it this often
-_PATIENCE_CYCLES = 3  # a listed RPDO that was missing this often is not waited for any more
+_GAP_CYCLES = 50  # a longer gap is the end of the stream, not a late frame
+_THERMAL_CYCLES = 100  # the temperature changes slowly: update interval
+_PATIENCE_CYCLES = 3  # lockstep stops waiting for an RPDO missing this often
 
 
 @dataclass(slots=True)
 class RpdoStream:
-    """One RPDO, cycle by cycle; ``late`` counts the cycles in which it was missing in a stream that went on."""
+    """Tracks one RPDO per cycle; ``late`` counts the cycles in which it was missing within a running stream."""
 
     active: bool = False
     gap: int = 0
     late: int = 0
 
-    def step(self, heard: bool) -> None:
-        """A cycle ended in which the RPDO was heard or not."""
-        if heard:
+    def step(self, received: bool) -> None:
+        if received:
             self.late += self.gap
             self.active, self.gap = True, 0
         elif self.active:
@@ -39,10 +38,10 @@ class RpdoStream:
 
 @dataclass(slots=True)
 class AxisUnit:
-    """One axis of the machine: its drive and what is mounted around it. It is also what a fault acts on.
+    """One axis of the machine, with its drive and sensor; faults act on it.
 
     ``injected`` holds the machine's foreign frames, sent at every SYNC; ``sync_on`` is False while the NC's SYNC fails
-    on the axis' bus; ``wire`` spoils what goes over that bus.
+    on the axis' bus; ``wire`` has the faults of that bus.
     """
 
     axis: str
@@ -61,7 +60,6 @@ class AxisUnit:
         self.drive.on_cycle(self.cycle_ended)
 
     def power(self, on: bool) -> None:
-        """Cut or restore the drive's supply."""
         if on:
             self.outbox.extend((self.bus, frame) for frame in self.drive.power_on())
         else:
@@ -76,7 +74,7 @@ class AxisUnit:
         """Return why an object of the drive cannot hold a value, "" when it can."""
         entry = self.drive.dictionary.entries.get(index << 8 | sub)
         if entry is None or entry.size is None:
-            return f"the drive has no number {index:04X}:{sub:02X}"
+            return f"the drive has no numeric object {index:04X}:{sub:02X}"
         try:
             entry.encode(value)
         except OverflowError:
@@ -84,7 +82,7 @@ class AxisUnit:
         return ""
 
     def overwrite(self, index: int, sub: int, value: int, on: bool) -> None:
-        """Write an object past all access rules, and give it its value back."""
+        """Overwrite an object regardless of its access rules, or restore its value."""
         drive = self.drive
         if on:
             self._before.setdefault((index, sub), drive.dictionary.shown(drive.dictionary.entry(index, sub)))
@@ -93,7 +91,7 @@ class AxisUnit:
             drive.set_object(index, sub, self._before.pop((index, sub)))
 
     def turn_tpdo(self, number: int) -> None:
-        """Let a TPDO carry its objects in the other order, as after another tool's visit; twice puts it right again."""
+        """Reverse the order of a TPDO's objects, as another tool might; a second call restores it."""
         if number not in self.drive.pdo.numbers("tpdo"):
             return
         index = 0x1A00 + number - 1
@@ -102,7 +100,7 @@ class AxisUnit:
         self.drive.remap(index, [(word >> 16, word >> 8 & 0xFF, word & 0xFF) for word in words])
 
     def cycle_ended(self, voltage_v: float) -> None:
-        """The drive has run a cycle; at its start the voltage's mean of the cycle before was known to the sensor."""
+        """Update slide-way and sensor after a cycle; ``voltage_v`` is the mean over the cycle before it."""
         drive = self.drive
         celsius = self.slide_way.step(drive.physics.speed_rad_s)
         self.sensor.feed(drive.ratings.sign * voltage_v)
@@ -110,7 +108,7 @@ class AxisUnit:
             self.warm(celsius)
 
     def warm(self, celsius: float) -> None:
-        """Set the slide-way's temperature everywhere it is felt."""
+        """Set the slide-way's temperature in plant, drive and sensor."""
         self.slide_way.celsius = celsius
         self.drive.set_temperature(celsius)
         self.sensor.celsius = celsius

@@ -1,6 +1,6 @@
-"""Lists the named faults of the simulated machine: what each acts on, and what its value means.
+"""Lists the named faults of the simulated machine, their targets and the meaning of their values.
 
-A newcomer adds a fault by one line of :data:`FAULTS`; being listed is being tested.
+A new fault is one line of :data:`FAULTS`; every listed fault is tested.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _MODBUS_CODES = frozenset({1, 2, 3, 4, 5, 6, 7, 8, 10, 11})
 
 
 class FaultEntry(BaseModel):
-    """One entry of a script or of the operator's panel; without an ``at_`` key it happens at once."""
+    """One entry of a script or of the operator's panel; without an ``at_`` key it starts at once."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -42,17 +42,17 @@ class FaultEntry(BaseModel):
 
     @property
     def at(self) -> tuple[float | None, int | None, int | None]:
-        """When it happens, by time, SYNC or row."""
+        """When it starts, by time, SYNC or row."""
         return self.at_s, self.at_sync, self.at_row
 
     @property
     def number(self) -> float:
-        """The value, 0 where there is none."""
+        """The value, 0 by default."""
         return 0.0 if self.value is None else self.value
 
     @property
     def share(self) -> float:
-        """Percentage of the frames, or of the answers, that is met."""
+        """Percentage of the frames or answers that it affects."""
         return 100.0 if self.percent is None else self.percent
 
     @field_validator("fault")
@@ -79,9 +79,9 @@ class FaultEntry(BaseModel):
         if kind.value is not None and self.value is None:
             raise ValueError(f"{self.fault} needs a value: {kind.value.meaning}")
         if kind.value is not None and (wrong := kind.value.fault(self.number)):
-            raise ValueError(f"the value of {self.fault} is {kind.value.meaning}: {wrong}")
+            raise ValueError(f"the value of {self.fault} ({kind.value.meaning}) is invalid: {wrong}")
         if self.fault == "object" and self.index is None:
-            raise ValueError("object needs the index (and sub) of what is to be overwritten")
+            raise ValueError("object needs the index (and sub) of the object to overwrite")
         if self.fault in ("frame", "bus_inject") and (self.can_id is None or self.data is None):
             raise ValueError(f"{self.fault} needs can_id and data (hexadecimal)")
         return self
@@ -89,7 +89,7 @@ class FaultEntry(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class FaultKind:
-    """A fault by name: ``apply(unit, entry, on)`` starts it and ends it; a fault with a ``value`` needs one."""
+    """A fault by name: ``apply(unit, entry, on)`` starts and ends it; a fault with a ``value`` needs one."""
 
     apply: Callable[[AxisUnit, FaultEntry, bool], None]
     value: FaultValue | None = None
@@ -97,7 +97,7 @@ class FaultKind:
 
 
 def _attribute(owner: Callable[[AxisUnit], object], name: str, off: Any, value: FaultValue | None = None) -> FaultKind:
-    """A fault that is an attribute of a fault state: set to its value (True without one), reset to ``off``."""
+    """Return a fault that sets an attribute of a fault state to its value (True without one), and back to ``off``."""
 
     def apply(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
         wanted = True if value is None else int(entry.number) if value.whole else entry.number
@@ -154,7 +154,7 @@ def _spoil_answers(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
 
 
 def _frames_of(unit: AxisUnit, entry: FaultEntry) -> FrameFault:
-    """The fault of frames that an entry means: of one COB-ID, else of the axis' drive, else of all."""
+    """Return the frame fault of an entry: for one COB-ID, else for the axis' drive, else for all frames."""
     node = None if entry.axis is None else _ids_of(unit.drive.node_id)
     can_ids = node if entry.can_id is None else frozenset({entry.can_id})
     kind = entry.fault.removeprefix("bus_")
@@ -226,7 +226,7 @@ FAULTS: Mapping[str, FaultKind] = {
     **{
         f"bus_{kind}": FaultKind(_bus_fault, value, needs_axis=False)
         for kind, value in VALUES.items()
-        if kind != "raise"  # that is for whoever holds a bus, not for those who share it
+        if kind != "raise"  # raise concerns the holder of a bus object only
     },
     "bus_down": FaultKind(_bus_down, needs_axis=False),
     "sync_lost": FaultKind(_sync_lost, needs_axis=False),
@@ -236,7 +236,7 @@ FAULTS: Mapping[str, FaultKind] = {
 
 @lru_cache(16)
 def _unknown(name: str) -> str:
-    """Say what a name may have meant; a long script may hold one mistake many times."""
+    """Return the message for an unknown name; cached, as a long script may repeat one mistake."""
     near = difflib.get_close_matches(name, FAULTS, n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
-    return f"{name!r} is none of {', '.join(FAULTS)}{hint}"
+    return f"unknown fault {name!r}{hint}; the faults are {', '.join(FAULTS)}"

@@ -1,13 +1,13 @@
-"""Reads the fault script and plays it: which fault happens when, to which axis, how badly and for how long.
+"""Reads and plays the fault script: which fault starts when, on which axis, with which value and duration.
 
     [[fault]]
     at_s = 2.5                 # or at_sync, counted from the first SYNC; or at_row, from a played file's first row
     axis = "X"
     fault = "load_torque"
-    value = 5.0                # what it means depends on the fault, see fault_kinds
-    duration_s = 0.3           # left out: for good
+    value = 5.0                # its meaning depends on the fault, see fault_kinds
+    duration_s = 0.3           # default: permanent
 
-A wrong entry is a ConfigError that names every fault of the script at once.
+Invalid entries raise one ConfigError that lists all of them.
 """
 
 from collections.abc import Mapping
@@ -22,23 +22,23 @@ from fdhil.sim.fault_kinds import FAULTS, FaultEntry
 
 
 def load(path: Path, axes: tuple[str, ...]) -> list[FaultEntry]:
-    """Read a fault script for a machine with these axes; ConfigError with everything that is wrong with it."""
+    """Read a fault script for a machine with these axes; ConfigError with all errors."""
     document = read_toml(path, "a fault script")
-    faults = [ConfigFault(key, "is no key of a fault script", "[[fault]] is") for key in document if key != "fault"]
+    faults = [ConfigFault(key, "unknown key of a fault script", "use [[fault]]") for key in document if key != "fault"]
     entries: list[FaultEntry] = []
     listed = document.get("fault", [])
-    for place, item in enumerate(listed if isinstance(listed, list) else [listed]):
+    for number, item in enumerate(listed if isinstance(listed, list) else [listed]):
         try:
             entries.append(parse(item, axes))
         except ConfigError as error:
-            faults += [ConfigFault(f"fault[{place}].{f.path}", f.what, f.suggestion) for f in error.faults]
+            faults += [ConfigFault(f"fault[{number}].{f.path}", f.what, f.suggestion) for f in error.faults]
     if faults:
         raise ConfigError(str(path), faults)
     return entries
 
 
 def parse(item: object, axes: tuple[str, ...]) -> FaultEntry:
-    """Check one entry; ConfigError with everything that is wrong with it."""
+    """Check one entry; ConfigError with all errors."""
     try:
         entry = FaultEntry.model_validate(item)
     except ValidationError as error:
@@ -48,7 +48,7 @@ def parse(item: object, axes: tuple[str, ...]) -> FaultEntry:
         ]
         raise ConfigError("fault", faults) from None
     if entry.axis is not None and entry.axis not in axes:
-        raise ConfigError("fault", [ConfigFault("axis", f"there is no axis {entry.axis!r}", f"use {', '.join(axes)}")])
+        raise ConfigError("fault", [ConfigFault("axis", f"unknown axis {entry.axis!r}", f"use {', '.join(axes)}")])
     return entry
 
 
@@ -58,30 +58,29 @@ class FaultSchedule:
     def __init__(self, units: Mapping[str, AxisUnit], period_s: float) -> None:
         self._units, self._period_s = units, period_s
         self._waiting: list[FaultEntry] = []
-        self._running: list[tuple[int, FaultEntry]] = []  # SYNC at which it ends
+        self._running: list[tuple[int, FaultEntry]] = []  # with the SYNC at which it ends
 
     def add(self, entry: FaultEntry) -> None:
-        """Take an entry into the schedule; ConfigError when its object cannot hold its value."""
+        """Add an entry to the schedule; ConfigError when its object cannot hold its value."""
         if entry.fault == "object":
             wrong = self._unit(entry).object_fault(entry.index or 0, entry.sub, int(entry.number))
             if wrong:
-                raise ConfigError("fault", [ConfigFault("object", wrong, "the drive's EDS lists its objects")])
+                raise ConfigError("fault", [ConfigFault("object", wrong, "see the drive's EDS for its objects")])
         self._waiting.append(entry)
 
     @property
     def idle(self) -> bool:
-        """Whether there is nothing to start or to end."""
         return not self._waiting and not self._running
 
     def step(self, tick: int, row: int | None) -> list[FaultEntry]:
-        """Start and end what is due at this SYNC; return what started. ``row`` counts a played file's rows."""
+        """Start and end the faults due at this SYNC; return those started. ``row`` counts a played file's rows."""
         for end, entry in [item for item in self._running if item[0] <= tick]:
             self._running.remove((end, entry))
             self._apply(entry, on=False)
         return self._start([entry for entry in self._waiting if self._is_due(entry, tick, row)], tick)
 
     def at_once(self, tick: int) -> list[FaultEntry]:
-        """Start those that wait for nothing, where no SYNC may ever come; return them."""
+        """Start the entries without a condition, where no SYNC may ever come; return them."""
         return self._start([entry for entry in self._waiting if entry.at == (None, None, None)], tick)
 
     def _start(self, due: list[FaultEntry], tick: int) -> list[FaultEntry]:

@@ -1,4 +1,4 @@
-"""The types of a CAN frame inside the simulated machine."""
+"""Defines the types of a CAN frame inside the simulated machine."""
 
 Frame = tuple[int, bytes]
 BusFrame = tuple[str, Frame]

@@ -1,7 +1,7 @@
-"""Spoils the frames of a CAN bus by a plan: which frames, which way, from which SYNC on, and how. Pure.
+"""Applies planned faults to the frames of a CAN bus: which frames, which direction, from which SYNC, and how. Pure.
 
-Every fault draws from a source of its own for each way, so the same frames in the same order are spoilt alike,
-whatever happens on the other way meanwhile.
+Each fault draws from its own random source per direction, so that the same frames in the same order get the same
+faults, whatever happens in the other direction.
 """
 
 from collections import Counter
@@ -16,7 +16,7 @@ SYNC = 0x80
 _NEVER = float("inf")
 Way = Literal["sent", "received"]
 Passed = tuple[Frame, Any]
-"""A frame that goes on, and what its sender gave along with it (None: it was made up)."""
+"""A passing frame with its sender's reference (None: injected)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,9 +30,9 @@ class FaultValue:
     among: frozenset[int] = frozenset()
 
     def fault(self, value: float) -> str:
-        """Return what is wrong with a value, "" when nothing is."""
+        """Return why a value is invalid, "" when it is valid."""
         if self.whole and value != int(value):
-            return f"{value:g} is no whole number"
+            return f"{value:g} is not a whole number"
         if not self.low <= value <= self.high or (self.among and value not in self.among):
             allowed = ", ".join(map(str, sorted(self.among))) or f"{self.low:g} to {self.high:g}"
             return f"{value:g} is not among {allowed}"
@@ -41,28 +41,28 @@ class FaultValue:
 
 VALUES: Mapping[str, FaultValue | None] = {
     "drop": None,
-    "duplicate": FaultValue("copies beside the frame", 1, 1000, whole=True),
+    "duplicate": FaultValue("additional copies of the frame", 1, 1000, whole=True),
     "reorder": FaultValue("frames of the same way that overtake it", 1, 1000, whole=True),
     "delay": FaultValue("SYNC cycles", 1, 10000, whole=True),
     "late": FaultValue("seconds", 0, 60),
-    "mutate": FaultValue("bits that are turned over", 1, 64, whole=True),
-    "truncate": FaultValue("bytes that are left", 0, 7, whole=True),
-    "extend": FaultValue("bytes that are added, up to 8 in all", 1, 8, whole=True),
+    "mutate": FaultValue("bits that are flipped", 1, 64, whole=True),
+    "truncate": FaultValue("remaining bytes", 0, 7, whole=True),
+    "extend": FaultValue("added bytes, up to 8 in total", 1, 8, whole=True),
     "inject": FaultValue("frames at every SYNC", 1, 1e6, whole=True),
     "raise": FaultValue("error number, such as 105 (ENOBUFS) or 100 (ENETDOWN)", 1, 4095, whole=True),
 }
-"""The faults of frames, and what the value of each means."""
+"""The faults of frames, with the meaning of their values."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameFault:
-    """One entry of a plan; ValueError when it makes no sense.
+    """One entry of a plan; ValueError when it is inconsistent.
 
-    ``can_ids``: the frames it meets, None for all (29 bit identifiers with ``frame.EXTENDED``). ``way``: those that the
-    holder of the bus ``sent`` or ``received``, None for both; an injected frame goes the way named, None: is received.
-    ``from_sync``, ``until_sync``: SYNC frames on this bus, the first is number 0 (-1: from the start, before any SYNC).
-    ``percent`` of the frames that it meets, at most ``times`` of them. ``data`` (and one identifier) are those of what
-    is injected.
+    ``can_ids``: the affected identifiers, None for all (29 bit identifiers with ``frame.EXTENDED``). ``way``: frames
+    that the holder of the bus ``sent`` or ``received``, None for both; an injected frame goes the named way, None: is
+    received. ``from_sync``, ``until_sync``: SYNC frames on this bus, the first is number 0 (-1: from the start, before
+    any SYNC). ``percent`` of the matching frames are affected, at most ``times`` of them. ``data`` (and one identifier)
+    define an injected frame.
     """
 
     kind: str
@@ -77,16 +77,16 @@ class FrameFault:
 
     def __post_init__(self) -> None:
         if self.kind not in VALUES:
-            raise ValueError(f"{self.kind!r} is none of {', '.join(VALUES)}")
+            raise ValueError(f"unknown fault {self.kind!r}; the faults are {', '.join(VALUES)}")
         meaning = VALUES[self.kind]
         if meaning is not None and (wrong := meaning.fault(self.value)):
-            raise ValueError(f"the value of {self.kind} is {meaning.meaning}: {wrong}")
+            raise ValueError(f"the value of {self.kind} ({meaning.meaning}) is invalid: {wrong}")
         if not 0 < self.percent <= 100:
-            raise ValueError(f"{self.percent:g} is no percentage of frames above 0")
+            raise ValueError(f"percent is {self.percent:g}; it must be above 0 and at most 100")
         if len(self.data) > 8:
             raise ValueError("a CAN frame has at most 8 bytes")
         if self.kind == "inject" and (self.can_ids is None or len(self.can_ids) != 1):
-            raise ValueError("inject needs the one identifier of its frame")
+            raise ValueError("inject needs exactly one identifier")
 
 
 class BusRefuses(Exception):
@@ -104,7 +104,6 @@ class _Active:
     met: int = 0
 
     def meets(self, can_id: int, way: Way, sync: int) -> bool:
-        """Whether this frame is to be spoilt now."""
         fault = self.fault
         if (fault.way is not None and way != fault.way) or (fault.can_ids is not None and can_id not in fault.can_ids):
             return False
@@ -130,9 +129,9 @@ class _Held:
 
 
 class FrameFaults:
-    """Carries out a plan. ``sync`` counts the SYNC frames that came by; ``counted`` what was done, by kind and id.
+    """Executes a plan. ``sync`` counts the SYNC frames; ``counted`` the applied faults, by kind and identifier.
 
-    While it is ``down`` nothing passes.
+    While it is ``down`` no frame passes.
     """
 
     def __init__(self, plan: Sequence[FrameFault] = (), seed: int = 0) -> None:
@@ -146,27 +145,27 @@ class FrameFaults:
             self.add(fault)
 
     def add(self, fault: FrameFault) -> None:
-        """Take a fault into the plan; it acts after those that are there."""
+        """Add a fault to the plan; it acts after the present ones."""
         ways: tuple[Way, ...] = ("sent", "received")
         draws = {way: Random(f"{self._seed}:{self._made}:{way}") for way in ways}
         self._made += 1
         self._plan.append(_Active(fault, draws))
 
     def remove(self, fault: FrameFault) -> None:
-        """End a fault; what it holds back comes in its time."""
+        """End a fault; frames that it delays are still released in time."""
         self._plan.remove(next(active for active in self._plan if active.fault == fault))
 
     @property
     def idle(self) -> bool:
-        """Whether every frame passes as it is."""
+        """Whether every frame passes unchanged."""
         return not self._plan and not self._held and not self.down
 
     def total(self, kind: str, *can_ids: int) -> int:
-        """Return how many frames met this kind of fault, of these identifiers or of all."""
+        """Return how many frames were affected by this kind of fault, of these identifiers or of all."""
         return sum(n for (what, i), n in self.counted.items() if what == kind and (not can_ids or i in can_ids))
 
     def take(self, frame: Frame, way: Way, now_s: float, origin: Any = None) -> list[Passed]:
-        """Return what goes on in place of a frame, at once; BusRefuses where an error is planned."""
+        """Return the frames that replace a frame, at once; BusRefuses for a planned error."""
         if self.down:
             self.counted["down", frame[0]] += 1
             return []
@@ -186,18 +185,17 @@ class FrameFaults:
         return passed
 
     def due(self, way: Way, now_s: float) -> list[Passed]:
-        """Return what was held back and goes on now."""
         return self._released(lambda held: held.way == way and (held.sync <= self.sync or held.at_s <= now_s))
 
     def due_s(self) -> float:
-        """Return when :meth:`due` has something by time alone; infinite: nothing waits for time."""
+        """Return when :meth:`due` has a frame by time alone; infinite: never."""
         return min((held.at_s for held in self._held), default=_NEVER)
 
     def _spoilt(self, active: _Active, passed: Passed, way: Way, now_s: float) -> list[Passed]:
         (can_id, data), origin = passed
         fault = active.fault
         swaps = fault.kind == "reorder" and any(held.way == way and held.overtaken < _NEVER for held in self._held)
-        if swaps or not active.meets(can_id, way, self.sync):  # what is overtaken needs frames that pass
+        if swaps or not active.meets(can_id, way, self.sync):  # one reordered frame at a time
             return [passed]
         self.counted[fault.kind, can_id] += 1
         if fault.kind == "raise":
@@ -240,7 +238,7 @@ class FrameFaults:
 
 
 def _held(fault: FrameFault, passed: Passed, way: Way, sync: int, now_s: float) -> _Held | None:
-    """Return what holds a frame back, None for a fault that does not."""
+    """Return the delayed frame of a fault, None for a fault without delay."""
     if fault.kind == "reorder":
         return _Held(passed, way, overtaken=fault.value)
     if fault.kind == "delay":
@@ -249,13 +247,13 @@ def _held(fault: FrameFault, passed: Passed, way: Way, sync: int, now_s: float) 
 
 
 def _changed(fault: FrameFault, data: bytes, draw: Random) -> bytes | None:
-    """Return what a fault makes of a frame's content, None for no frame at all."""
+    """Return the changed content of a frame, None for a dropped frame."""
     value = int(fault.value)
     if fault.kind == "mutate":
-        spoilt = bytearray(data)
+        changed = bytearray(data)
         for bit in draw.sample(range(8 * len(data)), min(value, 8 * len(data))):
-            spoilt[bit // 8] ^= 1 << bit % 8
-        return bytes(spoilt)
+            changed[bit // 8] ^= 1 << bit % 8
+        return bytes(changed)
     if fault.kind == "truncate":
         return data[:value]
     return (data + draw.randbytes(value))[:8] if fault.kind == "extend" else None

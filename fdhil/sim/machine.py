@@ -1,6 +1,6 @@
-"""Moves the simulated machine, sans-I/O: drives, slide-ways, sensors and NC.
+"""Runs the simulated machine, sans-I/O: drives, slide-ways, sensors and NC.
 
-SYNC is the machine's clock. In real time and without its own NC, each drive has a clock of its own besides.
+SYNC is the machine's clock. In real time and without its own NC, each drive also has its own clock.
 """
 
 from collections.abc import Mapping
@@ -31,9 +31,9 @@ OFFSET_OBJECTS = (0x60B0, 0x60B1, 0x60B2)
 
 
 class Machine:
-    """The machine of one configuration. ``events`` collects what it has to tell; ``tick`` counts SYNC periods.
+    """The machine of one configuration. ``events`` collects its events; ``tick`` counts SYNC periods.
 
-    ``wires`` are the faults of its buses, by name: whoever carries its frames lets them pass there.
+    ``wires`` are the faults of its buses, by name: the caller passes all frames through them.
     """
 
     def __init__(self, config: MachineConfig) -> None:
@@ -46,9 +46,7 @@ class Machine:
         self._injected: dict[int, tuple[str, bytes]] = {}
         self.wires = {axis.drive.bus: FrameFaults(seed=config.sim.seed) for axis in config.axis.values()}
         seeds = np.random.SeedSequence(config.sim.seed).spawn(2 * len(config.axis))
-        self.units = {
-            axis: self._unit(axis, seeds[2 * place], seeds[2 * place + 1]) for place, axis in enumerate(config.axis)
-        }
+        self.units = {axis: self._unit(axis, seeds[2 * n], seeds[2 * n + 1]) for n, axis in enumerate(config.axis)}
         self.tables = TableSensors(config)
         self._of_bus: dict[str, list[AxisUnit]] = {}
         for unit in self.units.values():
@@ -97,7 +95,7 @@ class Machine:
         return tuple(self._of_bus)
 
     def describe(self, eds: Mapping[str, Path]) -> dict[str, Any]:
-        """Return what the ready event says of the drives and of the bus load (share of the bit rate)."""
+        """Return the drives and bus loads (share of the bit rate) of the ready event."""
         drives = {}
         for axis, unit in self.units.items():
             drives[axis] = {**description.mapping(unit.drive), "eds": str(eds[axis])}
@@ -109,22 +107,20 @@ class Machine:
         for bus, units in self._of_bus.items():
             bitrate = self.config.bus[bus].bitrate
             drives = sum(description.bus_load(unit.drive, rate, bitrate, stuffed=stuffed) for unit in units)
-            others = [1, *self.tables.frame_bytes(bus)]  # SYNC, and the encoders' places
+            others = [1, *self.tables.frame_bytes(bus)]  # SYNC and the encoders' positions
             each_sync = sum(description.frame_bits(size, stuffed=stuffed) for size in others)
             loads[bus] = round(each_sync * rate / bitrate + drives, 4)
         return loads
 
-    # -- frames
-
     def power_on(self) -> list[BusFrame]:
-        """Switch the drives on; they boot into pre-operational, and no SYNC will find anything still to be compiled."""
+        """Switch the drives on, to pre-operational; all kernels are compiled before the first SYNC."""
         for unit in self.units.values():
             unit.drive.physics.rehearse()
             unit.power(True)
         return self._take_outbox() + self.tables.power_on()
 
     def receive(self, bus: str, frame: Frame) -> list[Frame]:
-        """Take a frame that another party sent and return what the drives of that bus send because of it."""
+        """Process a frame of another party and return the answers of that bus' drives."""
         can_id, data = frame
         if can_id == SYNC:
             return self._sync(bus, data)
@@ -139,7 +135,7 @@ class Machine:
         return answers
 
     def lost(self, bus: str, can_id: int) -> None:
-        """Note a frame that a fault of the bus keeps from the drives for now: lockstep does not wait for it."""
+        """Note a frame that a bus fault keeps from the drives: lockstep does not wait for it."""
         for unit in self._of_bus.get(bus, ()):
             unit.drive.pdo.lost(can_id)
 
@@ -155,7 +151,7 @@ class Machine:
                 continue
             for unit in self._of_bus[bus]:
                 unit.drive.cycle_without_sync()
-            if bus == self._first_bus:  # the SYNC is lost by a fault, whose end must come all the same
+            if bus == self._first_bus:  # a fault suppresses the SYNC; the fault must still end
                 self._run_faults(None)
                 self.tick += 1
         for bus, frame in self.nc.end():
@@ -169,11 +165,11 @@ class Machine:
 
     @property
     def moves_alone(self) -> bool:
-        """Whether a drive moves by its own clock: time is to be told often."""
+        """Whether a drive moves by its own clock, so that timers must run often."""
         return any(unit.drive.moves_alone for unit in self.units.values())
 
     def wall_clock(self, now_s: float) -> list[BusFrame]:
-        """Run what depends on time and not on SYNC: heartbeats and their monitoring, and motion without SYNC."""
+        """Run what depends on time: heartbeats and their monitoring, and motion without SYNC."""
         if not self.nc.on and not self.faults.idle:
             self._tell(self.faults.at_once(self.tick))
         alone = self._realtime and not self.nc.on
@@ -190,8 +186,6 @@ class Machine:
         frames = list(self._outbox)
         self._outbox.clear()
         return frames
-
-    # -- the cycle
 
     def _sync(self, bus: str, data: bytes) -> list[Frame]:
         row = self.nc.in_force
@@ -223,11 +217,11 @@ class Machine:
         if drive.tick == before:
             return frames
         frames += self.tables.at_sync(drive, table_rad_s)
-        heard = drive.pdo.heard_before
-        unit.offsets.step(not heard.isdisjoint(drive.pdo.offset_rpdos))
+        received = drive.pdo.heard_before
+        unit.offsets.step(not received.isdisjoint(drive.pdo.offset_rpdos))
         for key in self._listed:
             if key[0] == unit.axis:
-                self._streams[key].step(key[1] in heard)
+                self._streams[key].step(key[1] in received)
         return frames
 
     def _foreign(self, bus: str) -> list[Frame]:
@@ -252,7 +246,7 @@ class Machine:
             self.events.append({"event": "fault", "sync": self.tick, **entry.model_dump(exclude_none=True)})
 
     def waits(self) -> bool:
-        """Whether an RPDO that belongs into this cycle has not arrived yet (lockstep)."""
+        """Whether an RPDO of this cycle is still missing (lockstep)."""
         if self._listed:
             return any(
                 stream.awaited and number not in self.units[axis].drive.pdo.sent
@@ -261,13 +255,10 @@ class Machine:
         return any(unit.drive.pdo.sent_before - unit.drive.pdo.sent for unit in self.units.values())
 
     def holds_offset(self) -> bool:
-        """Whether a drive was given an offset of position, speed or torque that is not zero: its sender goes on."""
+        """Whether a drive holds a nonzero offset of position, speed or torque: its sender is active."""
         return any(unit.drive.dictionary.number(i, 0) for unit in self.units.values() for i in OFFSET_OBJECTS)
 
-    # -- what was played
-
     def trace(self, path: Path) -> None:
-        """Record the next file that is played."""
         self._next_trace = path
 
     def _record(self, row: Row | None) -> None:
@@ -288,7 +279,6 @@ class Machine:
             self.events.append({"event": "error", "text": str(error)})
 
     def take_events(self) -> list[Event]:
-        """Return what the machine and its NC have to tell since the last time."""
         if self.nc.events:
             self._complete_events()
         events, self.events = self.events, []
@@ -329,7 +319,6 @@ class Machine:
         return str(recorder.path)
 
     def close(self) -> None:
-        """Give up a trace that was not finished."""
         if self._recorder is not None:
             self._recorder.abandon()
             self._recorder = None
@@ -338,6 +327,8 @@ class Machine:
 def _listed_rpdo(text: str, units: Mapping[str, AxisUnit]) -> tuple[str, int]:
     axis, _, number = text.partition(":")
     if axis not in units or number not in map(str, units[axis].drive.pdo.numbers("rpdo")):
-        fault = ConfigFault("sim.lockstep_rpdo", f"{text!r} names no RPDO", "write axis and number, such as X:2")
+        fault = ConfigFault(
+            "sim.lockstep_rpdo", f"{text!r} is not an RPDO of this machine", "write axis and number, such as X:2"
+        )
         raise ConfigError("config", [fault])
     return axis, int(number)

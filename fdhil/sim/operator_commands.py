@@ -1,4 +1,4 @@
-"""Obeys the commands of the operator's panel: one JSON object per line, checked before it acts."""
+"""Executes the commands of the operator's panel: one JSON object per line, validated first."""
 
 import json
 import math
@@ -17,13 +17,13 @@ _LOWEST_C, _HIGHEST_C = -40.0, 150.0
 
 
 class CommandError(FdhilError):
-    """A command of the panel cannot be obeyed."""
+    """A command of the panel cannot be executed."""
 
     exit_code = 2
 
 
 class OperatorCommands:
-    """Obeys the commands of one machine. ``play`` and ``quit`` are the process' affair: it loads files, and it ends."""
+    """Executes the commands of one machine; ``play`` and ``quit`` are callbacks of the process."""
 
     def __init__(self, machine: Machine, play: Callable[[Path], None], quit: Callable[[], None]) -> None:
         self._machine = machine
@@ -43,18 +43,18 @@ class OperatorCommands:
         }
 
     def obey(self, line: str) -> None:
-        """Obey one line; CommandError with what is wrong with it, an empty line is nothing."""
+        """Execute one line; CommandError says why it is invalid; an empty line is ignored."""
         if not line.strip():
             return
         if len(line) > MAX_LINE:
-            raise CommandError("a command of the panel is longer than 64 KiB; give one JSON object per line")
+            raise CommandError("a panel command is longer than 64 KiB and was ignored; send one JSON object per line")
         try:
             command = json.loads(line)
         except (ValueError, RecursionError) as error:
-            raise CommandError(f"a command of the panel is no JSON ({error}); give one JSON object per line") from None
+            raise CommandError(f"a panel command is not valid JSON ({error}); send one JSON object per line") from None
         name = command.pop("command", None) if isinstance(command, dict) else None
         if not isinstance(name, str) or name not in self._commands:
-            raise CommandError(f"the panel has no command {name!r}; it has {', '.join(self._commands)}")
+            raise CommandError(f"unknown panel command {name!r}; the commands are {', '.join(self._commands)}")
         try:
             self._commands[name](command)
         except (ValueError, TypeError) as error:
@@ -69,13 +69,13 @@ class OperatorCommands:
             raise ValueError('"parameters" must be an object such as {"Jt": 0.085}')
         unknown = [name for name in parameters if name not in PARAMETERS]
         if unknown:
-            raise ValueError(f"{', '.join(unknown)} is no parameter of a drive; they are R, L, K, Jt, ft and Cd")
+            raise ValueError(f"unknown parameter {', '.join(unknown)}; the parameters are R, L, K, Jt, ft and Cd")
         unit.drive.set_parameters(**{name: _number(parameters, name) for name in parameters})
 
     def _temperature(self, command: dict[str, Any]) -> None:
         celsius = _number(command, "celsius")
         if not _LOWEST_C <= celsius <= _HIGHEST_C:
-            raise ValueError(f"{celsius:g} degC is no temperature of a slide-way")
+            raise ValueError(f"{celsius:g} degC is out of range ({_LOWEST_C:g} to {_HIGHEST_C:g} degC)")
         for unit in self._units(command):
             unit.warm(celsius)
 
@@ -87,7 +87,7 @@ class OperatorCommands:
         if axis is None and not required:
             return list(units.values())
         if axis not in units:
-            raise ValueError(f"there is no axis {axis!r}; the machine has {', '.join(units)}")
+            raise ValueError(f"unknown axis {axis!r}; the machine has {', '.join(units)}")
         return [units[axis]]
 
 

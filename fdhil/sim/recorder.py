@@ -1,4 +1,4 @@
-"""Records the true motion of a played file: one CSV row per SYNC with the true table, as no sensor could give it."""
+"""Records the true motion of a played file: one CSV row per SYNC, with the true table position."""
 
 import os
 from collections.abc import Sequence
@@ -10,8 +10,8 @@ from fdhil.errors import StoreError
 class Recorder:
     """A CSV of ``time_s`` and per axis reference and table (mm) and offset (um), written row by row.
 
-    The rows go to a temporary name next to ``path``; :meth:`finish` gives them the name. StoreError when the folder
-    cannot be written.
+    The rows go to a temporary file next to ``path``; :meth:`finish` renames it. StoreError when the folder cannot be
+    written.
     """
 
     def __init__(self, path: Path, axes: Sequence[str], period_s: float) -> None:
@@ -19,7 +19,7 @@ class Recorder:
         self._period_s = period_s
         self._rows = 0
         if path.exists() and not path.is_file():
-            raise StoreError(f"the trace {path} is no regular file, which is never replaced: name a file")
+            raise StoreError(f"the trace {path} is not a regular file and is not replaced; name another file")
         self._part = path.with_name(f".{path.name}.{os.getpid()}.part")
         try:
             self._file = self._part.open("w", encoding="ascii", newline="\n")
@@ -29,7 +29,7 @@ class Recorder:
             raise _not_written(path, error) from None
 
     def row(self, values: Sequence[tuple[float, float, float]]) -> None:
-        """Write one row: reference (mm), table (mm) and offset (um) of each axis. StoreError when it cannot be."""
+        """Write one row: reference (mm), table (mm) and offset (um) of each axis. StoreError when that fails."""
         cells = [f"{reference:.9f},{table:.9f},{offset:.6f}" for reference, table, offset in values]
         try:
             self._file.write(f"{self._rows * self._period_s:.9g},{','.join(cells)}\n")
@@ -38,7 +38,7 @@ class Recorder:
         self._rows += 1
 
     def finish(self) -> None:
-        """Close the file and give it its name; StoreError when it cannot be."""
+        """Close the file and rename it; StoreError when that fails."""
         try:
             self._file.close()
             self._part.replace(self.path)
@@ -46,10 +46,9 @@ class Recorder:
             raise _not_written(self.path, error) from None
 
     def abandon(self) -> None:
-        """Close and remove what was written so far."""
         self._file.close()
         self._part.unlink(missing_ok=True)
 
 
 def _not_written(path: Path, error: OSError) -> StoreError:
-    return StoreError(f"the trace {path} cannot be written ({error.strerror or error}): give a folder that can be")
+    return StoreError(f"the trace {path} cannot be written ({error.strerror or error}); choose a writable folder")

@@ -1,9 +1,9 @@
 """Serves the simulated machine in one loop: its buses, the operator's commands and the clock.
 
-In ``realtime`` the NC's SYNC follows the host's monotonic clock, and a late host makes it slip instead of hurrying
-after. In ``lockstep`` the next SYNC goes out as soon as every RPDO that belongs into the cycle has arrived, and an idle
-machine does not run faster than its period. A sender that stops after a zero is waited for briefly; one whose offset is
-in force is waited for as long as it may sleep on a busy host, unless it has left the bus.
+In ``realtime`` the NC's SYNC follows the host's monotonic clock; a late host delays the SYNC, which does not catch up.
+In ``lockstep`` the next SYNC is sent as soon as every RPDO of the cycle has arrived, and an idle machine does not run
+faster than its period. A sender that stops after a zero offset is awaited briefly; one whose offset is in force is
+awaited as long as it may sleep on a busy host, unless it has left the bus.
 """
 
 import math
@@ -36,19 +36,19 @@ from fdhil.sim.wire.stream_port import StreamPort
 Loader = Callable[[Path, MachineConfig], Trajectory]
 Emit = Callable[[dict[str, Any]], None]
 
-WALL_CLOCK_S = 0.004  # how often heartbeats and their time-outs are looked at
+WALL_CLOCK_S = 0.004  # interval of heartbeats and time-outs
 ALONE_S = 0.001  # the same while a drive moves by its own clock
-IDLE_PERIODS = 4  # in lockstep, of a machine that stands: whoever listens is not kept busy for nothing
-LOCKSTEP_WAIT_S = 2.0  # a guard or a SYNC producer may be held up for so long before a machine at rest goes on
-LOCKSTEP_HOLDING_WAIT_S = 8.0  # a listener takes ten seconds without SYNC for a bus that is dead
+IDLE_PERIODS = 4  # SYNC interval of an idle machine in lockstep, to spare the listeners
+LOCKSTEP_WAIT_S = 2.0  # how long a machine at rest waits for a delayed guard or SYNC producer
+LOCKSTEP_HOLDING_WAIT_S = 8.0  # listeners consider a bus dead after ten seconds without SYNC
 _MIN_SPACING = 0.75  # of a period, between two SYNCs after a late one
-_CATCH_UP = 0.95  # of a period, between two SYNCs while a stream's rows pile up
+_CATCH_UP = 0.95  # of a period, between two SYNCs while stream rows pile up
 _MAX_WAIT_S = 0.25
 _STREAM = Path("-")
 
 
 class Pace:
-    """When the next SYNC may go out; all times are monotonic seconds."""
+    """Decides when the next SYNC may be sent; all times are monotonic seconds."""
 
     def __init__(self, period_s: float, *, lockstep: bool) -> None:
         self._period_s, self._lockstep = period_s, lockstep
@@ -58,8 +58,8 @@ class Pace:
     def due_s(self, *, waits: bool, idle: bool, holds: bool = False) -> float:
         """Return the time of the next SYNC.
 
-        ``waits``: an awaited RPDO has not come; ``holds``: an offset is in force, or the program that it is for runs;
-        ``idle``: nothing is played.
+        ``waits``: an awaited RPDO is missing; ``holds``: an offset is in force, or its program runs; ``idle``: nothing
+        is played.
         """
         if self._lockstep and waits:
             return self._last_s + (LOCKSTEP_HOLDING_WAIT_S if holds else LOCKSTEP_WAIT_S)
@@ -68,11 +68,10 @@ class Pace:
         return self._last_s + IDLE_PERIODS * self._period_s if idle else 0.0
 
     def sent(self, now_s: float, *, behind: bool = False) -> None:
-        """A SYNC went out: the next one is a period later on the grid, unless the host is late.
+        """Record a sent SYNC: the next one is a period later on the grid, unless the host is late.
 
-        ``behind`` whoever orders the demand: the grid is a little tighter until the machine has caught up.
-        In lockstep there is no grid: a machine that ran ahead of the clock must not stand still until the clock has
-        caught up.
+        ``behind`` the source of the demand, the grid is a little tighter until the machine has caught up. Lockstep has
+        no grid: a machine ahead of the clock must not wait for it.
         """
         self._last_s = now_s
         spacing_s = self._period_s * (_CATCH_UP if behind else 1.0)
@@ -80,9 +79,9 @@ class Pace:
 
 
 class DriveClock:
-    """The time on which the drives' heartbeats and time-outs run.
+    """The time base of the drives' heartbeats and time-outs.
 
-    When the host was late it passes slower: a drive has no such pauses. In lockstep it passes with SYNC, whoever
+    It slows down when the host was late: a real drive has no such pauses. In lockstep it advances with SYNC, whoever
     produces it, until SYNC has been missing for LOCKSTEP_WAIT_S.
     """
 
@@ -92,7 +91,7 @@ class DriveClock:
         self._sync_s = -math.inf
 
     def at(self, now_s: float, tick: int) -> float:
-        """Return the drives' time, s, at a monotonic time and a count of SYNC."""
+        """Return the drives' time, s, at a monotonic time and a SYNC count."""
         passed_s = now_s - self._read_s if self._read_s else WALL_CLOCK_S
         cycles = tick - self._read_tick
         self._read_s, self._read_tick = now_s, tick
@@ -106,8 +105,8 @@ class DriveClock:
 class SimService:
     """The simulated machine with its ports open. :meth:`run` serves it until :meth:`stop`, then closes everything.
 
-    ``emit`` gets every event, the first one is ``ready``. ``load`` reads what is to be played (a demand CSV or a
-    program). ``panel_fd`` is where commands come from, None for nowhere. ConnectError when a port or bus cannot be had.
+    ``emit`` receives every event, the first one is ``ready``. ``load`` reads a file to play (a demand CSV or a
+    program). ``panel_fd`` is the source of commands, None for none. ConnectError when a port or bus cannot be opened.
     """
 
     def __init__(
@@ -127,15 +126,15 @@ class SimService:
         self._line = b""
         self._stream: DemandStream | None = None
         self._streaming = False
-        self.serving = False  # until then what is to be played is read, which has no end where a pipe has none
+        self.serving = False  # until then the file to play is read, which may be an endless pipe
         self._ending = False
         self._wall_s = 0.0
         self._loads: list[tuple[Path, Future[Trajectory]]] = []
-        self._given: deque[tuple[str, Future[str]]] = deque()
+        self._queued: deque[tuple[str, Future[str]]] = deque()
         self._closed = False
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="ThreadPoolExecutor-sim")
         self._pipe = WakePipe()
-        self._left = 0
+        self._known_leavers = 0
         lockstep = config.sim.pace == "lockstep"
         self._pace = Pace(config.machine.sync_period_s, lockstep=lockstep)
         self._drive_clock = DriveClock(config.machine.sync_period_s, lockstep=lockstep)
@@ -151,16 +150,14 @@ class SimService:
             self.close()
             raise
 
-    # -- opening and closing
-
     def _open(self) -> None:
         for name in self.machine.buses:
             self._buses[name] = attach(name, self.config.bus[name])
             self._buses[name].spoil = partial(self._arrive, name)
         if self.config.sim.modbus:
             units = self.machine.units
-            places = {axis: partial(getattr, unit.drive, "table_mm") for axis, unit in units.items()}
-            sensors = SensorWires(self.config, {axis: unit.sensor for axis, unit in units.items()}, places)
+            positions = {axis: partial(getattr, unit.drive, "table_mm") for axis, unit in units.items()}
+            sensors = SensorWires(self.config, {axis: unit.sensor for axis, unit in units.items()}, positions)
             sensors.start()
             self._sensors = sensors
         for axis in self.machine.tables.accelerometers:
@@ -199,7 +196,7 @@ class SimService:
                 self._take(name, frame)
 
     def ready_event(self) -> dict[str, Any]:
-        """Return the ready event; the EDS files it names are written now."""
+        """Return the ready event and write the EDS files that it names."""
         return {
             "event": "ready",
             "buses": {name: bus.settings for name, bus in self._buses.items()},
@@ -211,7 +208,7 @@ class SimService:
         }
 
     def _write_eds(self) -> dict[str, Path]:
-        """Write them where the machine's run-time files are, if there is such a place, else to a temporary folder."""
+        """Write the EDS files to the run directory if it is writable, else to a temporary folder."""
         run = self.config.store.run_directory
         if run is not None and run.is_dir() and os.access(run, os.W_OK):
             folder = run / "eds"
@@ -224,7 +221,7 @@ class SimService:
         }
 
     def close(self) -> None:
-        """Close every port and end every thread; what is being recorded is given up."""
+        """Close every port and end every thread; an unfinished trace is discarded."""
         self._pool.shutdown(wait=True, cancel_futures=True)
         if self._sensors is not None:
             self._sensors.stop()
@@ -241,23 +238,20 @@ class SimService:
         self._pipe.close()
         self._closed = True
 
-    # -- the loop
-
     def stop(self) -> None:
-        """Ask the loop to end; may be called from a signal handler or another thread."""
+        """Request the end of the loop; may be called from a signal handler or another thread."""
         self._ending = True
         self._pipe.wake()
 
     @property
     def is_joined(self) -> bool:
-        """Whether anybody is on its buses, as far as that shows."""
         return any(bus.is_joined for bus in self._buses.values())
 
     def run(self, play: Path | None = None, trace: Path | None = None) -> None:
-        """Say that it is ready and serve until stopped. ``play`` is played at once, recorded to ``trace``.
+        """Report ready and serve until stopped. ``play`` is played at once, recorded to ``trace``.
 
-        ``-`` is the demand that comes by the panel's descriptor, among the commands, until its end; with its first rows
-        the NC takes the bus.
+        ``-`` is a demand on the panel's descriptor, among the commands, until its end; with its first rows the NC takes
+        the bus.
         """
         try:
             if play == _STREAM:
@@ -289,7 +283,7 @@ class SimService:
             writers += bus.writers()
         timeout_s = self._timeout_s()
         ready, _, _ = select.select(readers, writers, (), timeout_s)
-        if not ready and timeout_s > 0.0:  # it may have been this process that slept: what came meanwhile comes first
+        if not ready and timeout_s > 0.0:  # this process may have slept: handle what arrived meanwhile first
             ready, _, _ = select.select(readers, writers, (), 0.0)
         if ready:
             self._read(ready)
@@ -299,7 +293,7 @@ class SimService:
             self._wall_clock(now_s)
         if self._sync_due_s() <= now_s:
             self._pace.sent(now_s, behind=self._stream is not None and self._stream.late)
-            self._left = self._senders_left()
+            self._known_leavers = self._senders_left()
             self._send(self.machine.cycle())
         for axis, stream in self._streams.items():
             stream.send(self.machine.tables.accelerometers[axis].take())
@@ -326,11 +320,11 @@ class SimService:
         return max(0.0, min(deadlines) - now_s)
 
     def _sync_due_s(self) -> float:
-        """Return when the NC's next cycle may run: never without NC, and not while a bus takes nothing more."""
+        """Return when the NC's next cycle may run: never without NC, nor while a bus is congested."""
         machine = self.machine
         if not machine.nc.on or any(bus.congested for bus in self._buses.values()):
             return float("inf")
-        waits = machine.waits() and self._senders_left() == self._left
+        waits = machine.waits() and self._senders_left() == self._known_leavers
         idle, dry = not machine.nc.busy, False
         if self._stream is not None:
             idle, dry = idle or self._stream.stands, self._stream.runs_dry
@@ -342,7 +336,6 @@ class SimService:
         return sum(bus.senders_left for bus in self._buses.values())
 
     def _wall_clock(self, now_s: float) -> None:
-        """Let the drives' own time pass."""
         frames = self.machine.wall_clock(self._drive_clock.at(now_s, self.machine.tick))
         self._wall_s = now_s + (ALONE_S if self.machine.moves_alone else WALL_CLOCK_S)
         if frames:
@@ -355,17 +348,15 @@ class SimService:
         for name in self._buses:
             self._leave(name, [frame for where, frame in frames if where == name])
 
-    # -- panel and files
-
     def _serve_panel(self) -> None:
-        """Obey what has come on the panel's descriptor; its end is not the machine's end."""
+        """Execute the commands received on the panel's descriptor; its end does not end the machine."""
         if self._panel_fd is None or not select.select([self._panel_fd], (), (), 0)[0]:
             return
         try:
             chunk = os.read(self._panel_fd, 1 << 16)
         except BlockingIOError:
             return
-        except OSError:  # a terminal that is gone
+        except OSError:  # the terminal was closed
             chunk = b""
         *lines, self._line = (self._line + chunk).split(b"\n")
         if not chunk:
@@ -378,7 +369,7 @@ class SimService:
             self._serve_stream(self._stream)
 
     def _serve_stream(self, stream: DemandStream) -> None:
-        """Begin with a stream that has rows enough; with standard input it ends."""
+        """Start a stream once it has enough rows; it ends with standard input."""
         if self._panel_fd is None:
             stream.close()
         if self._streaming:
@@ -388,25 +379,25 @@ class SimService:
             self.machine.nc.switch(True)
             self.machine.nc.play("standard input", stream)
         elif stream.ended:
-            self._emit({"event": "error", "text": "standard input ended before a row of the demand came"})
+            self._emit({"event": "error", "text": "standard input ended before the first row of the demand"})
 
     def command(self, line: str) -> str:
-        """Have the loop obey one command of the panel; returns when it has, or has ended. For other threads.
+        """Execute one panel command in the loop and wait for it. For other threads.
 
-        What is wrong with a command is returned, and is an event too; empty when nothing is.
+        Return why the command is invalid (also an event), "" when it is valid.
         """
-        obeyed: Future[str] = Future()
-        self._given.append((line, obeyed))
+        result: Future[str] = Future()
+        self._queued.append((line, result))
         self._pipe.wake()
-        while not obeyed.done() and not self._closed:
-            wait([obeyed], _MAX_WAIT_S)
-        return obeyed.result() if obeyed.done() else ""
+        while not result.done() and not self._closed:
+            wait([result], _MAX_WAIT_S)
+        return result.result() if result.done() else ""
 
     def _take_given(self) -> None:
-        """Obey what other threads gave: between two turns the machine is whole."""
-        while self._given:
-            line, obeyed = self._given.popleft()
-            obeyed.set_result(self._obey(line))
+        """Execute the commands of other threads between two turns, when the machine is consistent."""
+        while self._queued:
+            line, result = self._queued.popleft()
+            result.set_result(self._obey(line))
 
     def _obey(self, line: str) -> str:
         try:
@@ -420,13 +411,13 @@ class SimService:
         return ""
 
     def _play(self, file: Path) -> None:
-        """Load a file aside, so that the SYNC goes on meanwhile, then play it."""
+        """Load a file in another thread, so that SYNC continues, then play it."""
         future = self._pool.submit(self._load, file, self.config)
         self._loads.append((file, future))
         future.add_done_callback(lambda _: self._pipe.wake())
 
     def _take_loads(self) -> None:
-        """Have the NC play what was read; what follows a stop waits until the axes stand."""
+        """Play the loaded files; after a stop, wait until the axes are at rest."""
         while self._loads and self._loads[0][1].done() and not self.machine.nc.is_stopping:
             file, future = self._loads.pop(0)
             try:

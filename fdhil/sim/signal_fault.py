@@ -1,17 +1,19 @@
-"""Spoils a reported signal as a fault script orders it."""
+"""Adds white noise to a signal, and falsifies it as ordered by a fault script."""
 
 from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
 
+_NOISE_BLOCK = 1024
+
 
 @dataclass(slots=True)
 class SignalFault:
     """Errors of one reported signal, in its own unit; applied in this order.
 
-    ``delay_cycles``: slow. ``gain``, ``offset``: wrong. ``clip``: saturates at +-clip. ``resolution``: coarse.
-    ``garbage``: random values of up to +-``garbage``. ``stuck``: the last value for ever.
+    ``delay_cycles``: delay. ``gain``, ``offset``: scaling. ``clip``: saturation at +-clip. ``resolution``:
+    quantisation. ``garbage``: random values of up to +-``garbage``. ``stuck``: the last value for ever.
     """
 
     delay_cycles: int = 0
@@ -25,7 +27,7 @@ class SignalFault:
     _held: float | None = field(default=None, repr=False, compare=False)
 
     def apply(self, value: float, rng: np.random.Generator) -> float:
-        """Return what is reported for ``value``."""
+        """Return the reported value for ``value``."""
         if self.delay_cycles:
             self._late.append(value)
             value = self._late[0]
@@ -45,3 +47,17 @@ class SignalFault:
         elif self._held is None:
             self._held = value
         return value if self._held is None else self._held
+
+
+class WhiteNoise:
+    """White noise, drawn in blocks."""
+
+    def __init__(self, std: float, rng: np.random.Generator) -> None:
+        self._std, self._rng = std, rng
+        self._drawn: list[float] = []
+
+    def draw(self) -> float:
+        """Return the next value."""
+        if not self._drawn:
+            self._drawn = (self._rng.standard_normal(_NOISE_BLOCK) * self._std).tolist()
+        return self._drawn.pop()

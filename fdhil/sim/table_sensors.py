@@ -1,4 +1,4 @@
-"""Simulates what is mounted at a table: an encoder node on the bus and an accelerometer that streams lines of text."""
+"""Simulates the sensors at a table: an encoder node on the bus and an accelerometer that streams lines of text."""
 
 import math
 from collections.abc import Sequence
@@ -8,6 +8,7 @@ import numpy as np
 from fdhil.config import Accelerometer, MachineConfig, TableEncoder
 from fdhil.sim.drive.servo import Drive
 from fdhil.sim.frame import BusFrame, Frame
+from fdhil.sim.signal_fault import WhiteNoise
 
 OPERATIONAL, STOPPED, PRE_OPERATIONAL = 0x05, 0x04, 0x7F
 HEARTBEAT_S = 1.0
@@ -17,31 +18,16 @@ LIMITS = {
     "int32": (-(2**31), 2**31 - 1),
     "uint32": (0, 2**32 - 1),
 }
-_NOISE_BLOCK = 1024
-OFF_RATE = 1.007  # of the nominal rate: the sensor's oscillator is no quartz
-TILT_M_S2 = 0.3  # what a sensor that is not quite level has of the earth's
+OFF_RATE = 1.007  # of the nominal rate: the sensor's oscillator is not a quartz
+TILT_M_S2 = 0.3  # share of gravity in a slightly tilted sensor
 KEPT_LINES = 2000
 WITHOUT_SYNC_S = 0.05
-MOST_CYCLES = 200  # that are made up for at a time
-SEED = 406  # beside the machine's: the other sensors' noise stays what it is without these
-
-
-class _Noise:
-    """White noise, drawn in blocks."""
-
-    def __init__(self, std: float, rng: np.random.Generator) -> None:
-        self._std, self._rng = std, rng
-        self._drawn: list[float] = []
-
-    def next(self) -> float:
-        """Return the next value."""
-        if not self._drawn:
-            self._drawn = (self._rng.standard_normal(_NOISE_BLOCK) * self._std).tolist()
-        return self._drawn.pop()
+MOST_CYCLES = 200  # limit of cycles made up at once
+SEED = 406  # added to the machine's seed, so that the other sensors' noise does not change
 
 
 class EncoderNode:
-    """A CANopen encoder (CiA 406) whose TPDO carries the table's place at every SYNC; it starts by itself."""
+    """A CANopen encoder (CiA 406) whose TPDO carries the table position at every SYNC; it starts by itself."""
 
     def __init__(self, settings: TableEncoder, noise_um: float, rng: np.random.Generator) -> None:
         assert settings.cob_id is not None
@@ -51,16 +37,14 @@ class EncoderNode:
         low, high = LIMITS[settings.type]
         self.frame_bytes = settings.byte + (high - low).bit_length() // 8
         self._settings = settings
-        self._noise = _Noise(noise_um * 1e-3, rng)
+        self._noise = WhiteNoise(noise_um * 1e-3, rng)
         self._due_s = 0.0
 
     def power_on(self) -> list[Frame]:
-        """Return the boot-up message."""
         self.nmt = OPERATIONAL
         return [(0x700 + self.node_id, b"\0")]
 
     def receive(self, can_id: int, data: bytes) -> list[Frame]:
-        """Obey an NMT command and return what is sent because of it."""
         if can_id != 0 or len(data) != 2 or data[1] not in (0, self.node_id):
             return []
         if data[0] in (0x81, 0x82):
@@ -69,35 +53,34 @@ class EncoderNode:
         return []
 
     def wall_clock(self, now_s: float) -> list[Frame]:
-        """Return the heartbeat when it is due."""
         if now_s < self._due_s:
             return []
         self._due_s = now_s + HEARTBEAT_S
         return [(0x700 + self.node_id, bytes([self.nmt]))]
 
     def at_sync(self, table_mm: float) -> list[Frame]:
-        """Return the TPDO with the place at this SYNC; a count beyond its type begins anew, as counters do."""
+        """Return the TPDO with the position at this SYNC; counts beyond the type wrap around."""
         if self.nmt != OPERATIONAL:
             return []
         s = self._settings
         low, high = LIMITS[s.type]
-        count = round((table_mm + self._noise.next() - s.offset) / s.scale)
+        count = round((table_mm + self._noise.draw() - s.offset) / s.scale)
         count = (count - low) % (high - low + 1) + low
         size = (high - low).bit_length() // 8
         return [(self.cob_id, bytes(s.byte) + count.to_bytes(size, "little", signed=low < 0))]
 
 
 class TableAccelerometer:
-    """An accelerometer that streams a line per sample: the mean of its interval, in counts; :meth:`take` hands it out.
+    """An accelerometer that streams a line per sample: the mean over its interval, in counts.
 
-    It samples by the simulated time and with its own oscillator.
+    It samples in simulated time, with its own oscillator.
     """
 
     def __init__(self, settings: Accelerometer, period_s: float, noise_m_s2: float, rng: np.random.Generator) -> None:
         self._settings = settings
         self._step = 1.0 / (settings.rate_hz * OFF_RATE * period_s)  # cycles
         self._period_s = period_s
-        self._noise = _Noise(noise_m_s2, rng)
+        self._noise = WhiteNoise(noise_m_s2, rng)
         self._cycle = 0
         self._next = self._step
         self._speed = self._begun = 0.0
@@ -105,7 +88,7 @@ class TableAccelerometer:
         self._lines: list[str] = []
 
     def at_sync(self, speed_m_s: float) -> None:
-        """Take the table's speed at a SYNC; between two it is a line."""
+        """Process the table's speed at a SYNC, interpolated linearly between SYNCs."""
         before, self._speed = self._speed, speed_m_s
         self._cycle += 1
         while self._next <= self._cycle:
@@ -118,14 +101,13 @@ class TableAccelerometer:
         s = self._settings
         self._count += 1
         numbers = ["0"] * max(4, s.column, s.count_column)
-        numbers[s.column - 1] = str(round((m_s2 + TILT_M_S2 + self._noise.next()) / s.scale))
+        numbers[s.column - 1] = str(round((m_s2 + TILT_M_S2 + self._noise.draw()) / s.scale))
         if s.count_column:
             numbers[s.count_column - 1] = str(self._count)
         if len(self._lines) < KEPT_LINES:
             self._lines.append(",".join(numbers))
 
     def take(self) -> bytes:
-        """Return the lines since the last time."""
         if not self._lines:
             return b""
         lines, self._lines = self._lines, []
@@ -133,8 +115,6 @@ class TableAccelerometer:
 
 
 class TableSensors:
-    """All sensors at the tables of one machine, by axis."""
-
     def __init__(self, config: MachineConfig) -> None:
         noise, period_s = config.sim.noise, config.machine.sync_period_s
         self._bus = {axis: section.drive.bus for axis, section in config.axis.items()}
@@ -145,8 +125,8 @@ class TableSensors:
         self._synced, self._streamed_s = False, 0.0
         self._encoders: dict[str, EncoderNode] = {}
         self.accelerometers: dict[str, TableAccelerometer] = {}
-        for place, (axis, section) in enumerate(config.axis.items()):
-            seeds = np.random.SeedSequence([config.sim.seed, SEED, place]).spawn(2)
+        for n, (axis, section) in enumerate(config.axis.items()):
+            seeds = np.random.SeedSequence([config.sim.seed, SEED, n]).spawn(2)
             rngs = [np.random.default_rng(seed) for seed in seeds]
             if section.table is not None and section.table.source == "canopen":
                 self._encoders[axis] = EncoderNode(section.table, noise.table_um, rngs[0])
@@ -155,21 +135,19 @@ class TableSensors:
                 self.accelerometers[axis] = TableAccelerometer(settings, period_s, noise.table_m_s2, rngs[1])
 
     def frame_bytes(self, bus: str) -> list[int]:
-        """Return the data bytes of what the encoders of a bus send at every SYNC."""
+        """Return the sizes of the encoder frames of a bus per SYNC, bytes."""
         return [node.frame_bytes for axis, node in self._encoders.items() if self._bus[axis] == bus]
 
     def power_on(self) -> list[BusFrame]:
-        """Return the boot-up messages."""
         return [(self._bus[axis], frame) for axis, node in self._encoders.items() for frame in node.power_on()]
 
     def receive(self, bus: str, frame: Frame) -> list[Frame]:
-        """Take a frame from a bus and return what its encoders send because of it."""
         if frame[0] != 0:
             return []
         return [one for axis, node in self._encoders.items() if self._bus[axis] == bus for one in node.receive(*frame)]
 
     def wall_clock(self, now_s: float, alone: Sequence[Drive]) -> list[BusFrame]:
-        """Return the heartbeats that are due; accelerometers stream on at drives that no SYNC keeps the time of."""
+        """Return the due heartbeats; accelerometers of drives without SYNC keep streaming."""
         if self._synced:
             self._synced, self._streamed_s = False, now_s
         elif now_s - self._streamed_s > WITHOUT_SYNC_S:
@@ -180,7 +158,7 @@ class TableSensors:
         return [(self._bus[axis], one) for axis, node in self._encoders.items() for one in node.wall_clock(now_s)]
 
     def at_sync(self, drive: Drive, table_rad_s: float) -> list[Frame]:
-        """Return what an axis' encoder sends at a SYNC at which its table has this speed."""
+        """Sample an axis at a SYNC with this table speed; return its encoder's frame."""
         self._synced = True
         self._stream(drive.axis, table_rad_s)
         encoder = self._encoders.get(drive.axis)

@@ -1,4 +1,4 @@
-"""Warms a slide-way: one time constant, warmed in proportion to speed ([DES] 3.2: ft and Cd fall as it rises)."""
+"""Simulates a slide-way's temperature: first order, heated by motion ([DES] 3.2: ft and Cd fall with it)."""
 
 from fdhil.config import Thermal
 
@@ -16,7 +16,7 @@ class SlideWay:
         self.celsius = thermal.ambient_c
 
     def step(self, speed_rad_s: float) -> float:
-        """Go one SYNC cycle on at this shaft speed; return the temperature."""
+        """Advance one SYNC cycle at this shaft speed; return the temperature."""
         target = self._ambient_c + self._rise_per_rad_s * abs(speed_rad_s)
         self.celsius += self._part * (target - self.celsius)
         return self.celsius

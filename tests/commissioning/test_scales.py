@@ -13,6 +13,7 @@ from fdhil.commissioning.compare_scales import compare_scales
 from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.master import Master
 from fdhil.config import parse
+from fdhil.sim.drive.servo import Drive
 from tests.bench import bench_document
 from tests.drivers.peer import DrivePeer
 from tests.eds import write_eds
@@ -57,7 +58,7 @@ def test_the_speeds_unit_is_compared(word: int, unit: str | None, ok: bool, says
 def test_the_dc_link_is_compared_where_the_duty_is_multiplied_by_it(
     counts: int, volts: float | None, ok: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fdhil.sim.drive.servo.Drive.wall_clock", lambda *_: [])  # its supply is constant
+    monkeypatch.setattr(Drive, Drive.wall_clock.__name__, lambda *_: [])  # its supply stays as it is set
     found = compared("epos4", tmp_path, {(0x2200, 1): counts}, profile="epos4", dc_link_v=volts).get("DC link")
     assert found is not None
     assert found.ok is ok

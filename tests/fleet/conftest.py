@@ -1,4 +1,4 @@
-"""One PostgreSQL for all tests, empty at the beginning of each."""
+"""One PostgreSQL for all tests, emptied before each."""
 
 from __future__ import annotations
 
@@ -17,6 +17,5 @@ def running_database() -> Iterator[Postgres]:
 
 @pytest.fixture
 def database(running_database: Postgres) -> Postgres:
-    """The database, empty."""
     running_database.ask("DROP SCHEMA IF EXISTS fleet CASCADE")
     return running_database

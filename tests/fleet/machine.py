@@ -1,4 +1,4 @@
-"""A machine that records into its store as the daemon does, with what it is to tell a works."""
+"""A machine that records into its store as the daemon does, with records for the fleet server."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def written(folder: Path, name: str = "mill-1", **uplink: Any) -> Path:
 
 
 class Machine:
-    """What it records is stored at once, through the daemon's own store."""
+    """Stores its records at once, through the daemon's own store."""
 
     def __init__(self, file: Path, keep_unsent: int | None = None, *, quiet: bool = False) -> None:
         self.config: MachineConfig = machine_config.load(file)
@@ -43,7 +43,7 @@ class Machine:
         self._tick = 0
 
     def record(self, count: int, axes: tuple[str, ...] = AXES, parameters: Mapping[str, float] | None = None) -> int:
-        """Record ``count`` rounds of each axis: a window, a set, a skill, and one notice a round; return how many."""
+        """Record ``count`` rounds of each axis: a window, a set, a skill, one notice per round; return the number."""
         changed = Parameters.of(BENCH.as_dict() | dict(parameters or {}))
         outcomes: list[Outcome] = []
         for _ in range(count):
@@ -58,5 +58,4 @@ class Machine:
         return len(outcomes)
 
     def close(self) -> None:
-        """Close the store."""
         self.store.close()

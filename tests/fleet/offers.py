@@ -1,4 +1,4 @@
-"""A works with a key, and a machine whose operator trusts it."""
+"""A fleet server with a signing key, and a machine whose operator trusts it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TOLD: dict[str, Any] = {
 
 
 class Works:
-    """The works: its key, and the offers that it signs."""
+    """The fleet server: its key, and the offers that it signs."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -34,18 +34,17 @@ class Works:
         self.public = make_key(self.key)
 
     def document(self, **changes: Any) -> bytes:
-        """Return a signed offer."""
         return sign(Offer(**(TOLD | changes)), self.key)
 
     def carried(self, **changes: Any) -> Path:
-        """Return the file of a signed offer, as it is carried to a machine."""
+        """Return the file of a signed offer, as carried to a machine."""
         place = self._folder / "carried.offer"
         place.write_bytes(self.document(**changes))
         return place
 
 
 def machine_of(works: Works, folder: Path, *more: str, **uplink: Any) -> Path:
-    """Write the configuration of a machine that trusts the works, with comments in it, and return its file."""
+    """Write the configuration of a machine that trusts the fleet server, with comments, and return its file."""
     told = {"axis_labels": {"X": {"screw": "A"}, "Y": {"screw": "B"}}} | uplink
     file = written(folder, **told)
     text = file.read_text().replace("ft = 0.05", "ft = 0.05  # by the data sheet", 1)

@@ -1,4 +1,4 @@
-"""Rapids of the simulated bench as machines of a works store them, and how a test analyses them again."""
+"""Rapids of the simulated bench in the form stored by the fleet server, and their repeated analysis."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.identification.recorded import windows
 
 
 def stored(folder: Path, machines: int, each: int) -> list[Stored]:
-    """Keep windows of several machines among the objects of a folder."""
+    """Store windows of several machines as window files in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     return [Stored(f"mill-{k}", name) for k in range(machines) for name in _kept(folder, each, 100 * k)]
 
@@ -28,10 +28,10 @@ def _kept(folder: Path, count: int, seed: int) -> Iterator[str]:
 
 
 def method(folder: Path, name: str | None = "least_squares") -> Method:
-    """Return a method whose results take little time."""
+    """Return a method whose results are fast to compute."""
     return Method(Identification(method=name), {}, folder, code_digest())
 
 
 def bits(results: Sequence[Again]) -> list[Again]:
-    """Return results in the order of their windows; their texts are compared byte for byte."""
+    """Return results in the order of their windows, to be compared byte for byte."""
     return sorted(results)

@@ -1,4 +1,4 @@
-"""A real NATS server with JetStream and a real PostgreSQL, as processes of their own on free ports."""
+"""A real NATS server with JetStream and a real PostgreSQL, as separate processes on free ports."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ PATIENCE_S = 180.0
 
 
 def until(holds: Callable[[], bool], what: str) -> None:
-    """Wait until something holds."""
     end = time.monotonic() + PATIENCE_S
     while not holds():
         assert time.monotonic() < end, f"waited in vain until {what}"
@@ -34,20 +33,19 @@ def until(holds: Callable[[], bool], what: str) -> None:
 
 
 def listens(port: int) -> bool:
-    """Whether somebody listens at a port."""
     with socket.socket() as caller:
         return caller.connect_ex(("127.0.0.1", port)) == 0
 
 
 def inside(folder: str) -> list[Path]:
-    """Return what is in a folder of /proc; nothing where its process has ended."""
+    """Return the content of a folder of /proc; nothing if its process has ended."""
     with suppress(OSError):
         return list(Path(folder).iterdir())
     return []
 
 
 def children(pid: int) -> list[int]:
-    """Return the processes that a process has started, and theirs."""
+    """Return the descendants of a process."""
     own: list[int] = []
     for task in inside(f"/proc/{pid}/task"):
         with suppress(OSError):  # ended in between
@@ -72,7 +70,7 @@ def listening(*pids: int) -> set[str]:
 
 
 class NatsServer:
-    """A NATS server that may be killed and started again, with what it kept."""
+    """A NATS server that may be killed and restarted with its stored data."""
 
     def __init__(self, folder: Path, more: str = "") -> None:
         self.port = free_port()
@@ -97,12 +95,11 @@ class NatsServer:
 
 
 def _as_nobody() -> dict[str, int | list[int]]:
-    """PostgreSQL does not run as root."""
     return {"user": 65534, "group": 65534, "extra_groups": []} if os.getuid() == 0 else {}
 
 
 class Postgres:
-    """A PostgreSQL server of its own, reached by a UNIX socket, that may be killed and started again."""
+    """A PostgreSQL server, reached by a UNIX socket, that may be killed and restarted."""
 
     def __init__(self) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix="fdhil-pg-"))
@@ -145,14 +142,13 @@ class Postgres:
             return cursor.fetchall() if cursor.description else []
 
     def stop(self, how: signal.Signals = signal.SIGINT) -> None:
-        """End it; SIGQUIT as a crash would: what was committed is found by its log."""
+        """End it; SIGQUIT simulates a crash: committed data are recovered from its log."""
         if self._process is not None:
             self._process.send_signal(how)
             self._process.wait()
             self._process = None
 
     def remove(self) -> None:
-        """End it and take its files away."""
         self.stop(signal.SIGINT)
         shutil.rmtree(self.folder)
 

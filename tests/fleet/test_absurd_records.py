@@ -1,4 +1,4 @@
-"""No record of one machine, whatever it holds, keeps the questions about all machines from being answered."""
+"""Extreme records of one machine do not break the queries about all machines."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ import pytest
 from fdhil.cli import fleet_view
 from fdhil.fleet.export import KEY_BYTES, export
 from fdhil.fleet.message import Message, digest_of
-from fdhil.fleet.questions import compare, outliers, services, status, trend
+from fdhil.fleet.questions import compare, outliers, status, trend
+from fdhil.fleet.services import services
 from fdhil.fleet.sets import asking, entered
 from tests.fleet.machine import Machine, written
 from tests.fleet.servers import Postgres
@@ -30,7 +31,7 @@ MORE = ("terms", "maintenance", "axis_labels", "temperature_c", "unexplained_um"
 
 
 def absurd(message: Message, machine: str, record: Any, **head: str) -> Message:
-    """Return a message of another machine with another record and other words in its head."""
+    """Return a message of another machine with another record and other header fields."""
     first, _, _ = message.payload.split(b"\n", 2)
     words = first.decode().split()
     words[4], words[7] = digest_of(record, machine), "-"
@@ -41,7 +42,7 @@ def absurd(message: Message, machine: str, record: Any, **head: str) -> Message:
 
 
 def cases(messages: list[Message]) -> Iterator[Message]:
-    """Yield every field of every kind of record with every absurd value, each of a machine of its own."""
+    """Yield every field of every kind of record with every extreme value, each for a separate machine."""
     for message in {m.payload.split(b" ", 4)[3]: m for m in messages}.values():
         record = json.loads(message.payload.split(b"\n", 2)[1])
         for field in (*record, *MORE):

@@ -1,4 +1,4 @@
-"""The daemon and the guard need nothing of what gathers many machines."""
+"""Daemon and guard run without the packages of the fleet extra."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_it_runs_without_the_extra(module: str) -> None:
 
 
 def test_the_uplink_is_light() -> None:
-    """It runs beside an NC: none of the numeric libraries is loaded for it."""
+    """The uplink runs next to an NC: it loads no numeric library."""
     code = (
         "import sys, fdhil.fleet.uplink; print([n for n in ('numba', 'scipy', 'pyarrow', 'can') if n in sys.modules])"
     )

@@ -1,4 +1,4 @@
-"""Three NATS servers that each keep every message: the first of them is killed, and nothing that it took is lost."""
+"""Three replicated NATS servers: killing the leader loses no acknowledged message."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ pytestmark = pytest.mark.debian
 
 
 def cluster(folder: Path) -> list[NatsServer]:
-    """Return three servers of one cluster."""
     ports = [free_port() for _ in range(3)]
     routes = ", ".join(f"nats-route://127.0.0.1:{port}" for port in ports)
     servers = []
@@ -31,7 +30,6 @@ def cluster(folder: Path) -> list[NatsServer]:
 
 
 async def leader(url: str) -> str:
-    """Return which server leads the stream."""
     client = Client()
     await client.connect(url)
     try:

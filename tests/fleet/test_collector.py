@@ -1,4 +1,4 @@
-"""A collector answers for a message when it is in the database, and never before."""
+"""A collector acknowledges a message only after it is in the database."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DIGEST, STORE = "a" * 64, "5" * 32
 
 @dataclass
 class Told:
-    """A message of the stream; ``log`` has what was answered."""
+    """A message of the stream; ``log`` records the answers."""
 
     subject: str
     data: bytes
@@ -44,7 +44,7 @@ class Told:
 
 
 class Reader:
-    """Gives messages once, and then has none."""
+    """Returns its messages once."""
 
     nothing: type[Exception] = nats.errors.TimeoutError
 
@@ -77,12 +77,12 @@ async def test_first_the_database_then_the_answer(collector: Collector, monkeypa
     log: list[str] = []
 
     async def write(self: Collector, received: Sequence[Received], db: object) -> None:
-        assert [each.told.reason for each in received if isinstance(each.told, Unread)] == [
-            "it does not begin as a fdhil-record-1 does"
+        assert [each.content.reason for each in received if isinstance(each.content, Unread)] == [
+            "it has no fdhil-record-1 header"
         ]
         log.append("written")
 
-    monkeypatch.setattr(Collector, "_write", write)
+    monkeypatch.setattr(Collector, Collector._write.__name__, write)
     await take(collector, told(log), Told("fdhil.v1.mill-1.records", b"{\n{}\n", log))
     assert log == ["written", "ack", "ack"]
     assert collector.kept == 2
@@ -96,7 +96,7 @@ async def test_what_is_not_in_the_database_is_given_back(collector: Collector, m
     async def write(self: Collector, received: Sequence[Received], db: object) -> None:
         raise psycopg.OperationalError("the disk is full")
 
-    monkeypatch.setattr(Collector, "_write", write)
+    monkeypatch.setattr(Collector, Collector._write.__name__, write)
     with pytest.raises(psycopg.OperationalError):
         await take(collector, told(log), told(log))
     assert (log, collector.kept) == (["nak", "nak"], 0)
@@ -145,7 +145,7 @@ def test_a_collector_that_is_killed_spoils_no_window_that_another_one_keeps(
         raise KeyboardInterrupt
 
     def other_begins(descriptor: int) -> None:
-        """Let another one begin the same window, and end, between this one's last byte and its rename."""
+        """Let another collector write the same window between this one's last byte and its rename."""
         fsync(descriptor)
         if stat.S_ISREG(os.fstat(descriptor).st_mode):
             with monkeypatch.context() as inner:

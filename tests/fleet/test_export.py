@@ -1,4 +1,4 @@
-"""What is given away does not say whose it is."""
+"""The anonymous export does not identify machines."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_key_is_made_once_and_kept_from_others(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="read by others"):
         key_of(tmp_path / "key")
     (tmp_path / "short").touch(0o600)
-    with pytest.raises(StoreError, match="no key"):
+    with pytest.raises(StoreError, match="not a valid key"):
         key_of(tmp_path / "short")
 
 
@@ -71,4 +71,4 @@ async def test_no_name_no_text_and_no_time_is_in_it(
     assert {code for row in tables["windows"].to_pylist() for code in row["reasons"] if not code.isalpha()} == set()
 
     code, out, err = fdhil(*map(str, words), capsys=capsys)
-    assert (code, "exists already" in err) == (3, True)
+    assert (code, "already exists" in err) == (3, True)

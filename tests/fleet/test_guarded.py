@@ -1,4 +1,4 @@
-"""A server with TLS, passwords and permissions as the document has them: each machine tells its own, no other reads."""
+"""A server with TLS, passwords and documented permissions: machines publish their own records and read none."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SECRET = "canary-51c07"
 
 
 def guard(folder: Path) -> str:
-    """Return the part of the server's configuration that keeps others out."""
+    """Return the access rules of the server's configuration."""
     certify(folder)
     tls = f'tls {{ cert_file: "{folder}/broker.pem", key_file: "{folder}/broker.key" }}\n'
     rights = 'permissions: { publish: ["fdhil.v1.%s.>"], subscribe: ["_INBOX_fdhil-%s.>"] }'
@@ -48,7 +48,7 @@ def entering(server: Server, folder: Path, user: str) -> NatsServer:
 
 
 async def forge(client: Client) -> None:
-    """Publish in the name of mill-1; what the server says against it has come when this ends."""
+    """Publish in the name of mill-1 and wait for the server's error."""
     try:
         await client.jetstream().publish("fdhil.v1.mill-1.records", b"{}", timeout=1.0)
     finally:
@@ -68,7 +68,7 @@ async def test_each_tells_its_own_and_only_the_collector_reads(
         reader = await transport.prepare_stream(collector.jetstream(timeout=60.0), Stream(max_bytes=1 << 26))
         async with connected(settings, "fdhil-mill-1", "uplink") as client:
             sender = Sender(machine.config, settings)
-            stolen = await client.subscribe("fdhil.v1.>")  # what others tell is not its to read
+            stolen = await client.subscribe("fdhil.v1.>")  # it may not read the records of others
             position, entries = await sender._next(client.jetstream())
             await sender._send(client.jetstream(), position, entries, client.max_payload)
             await client.flush()
@@ -78,13 +78,13 @@ async def test_each_tells_its_own_and_only_the_collector_reads(
         with pytest.raises(nats.errors.Error) as refused:  # in the name of another
             async with connected(entering(server, tmp_path, "mill-2"), "fdhil-mill-2", "uplink") as other:
                 await forge(other)
-        assert "it refuses us" in transport.cause_of(refused.value)
+        assert "the server refuses access" in transport.cause_of(refused.value)
     machine.close()
     assert SECRET not in "".join(capfd.readouterr())
 
 
 async def unheard(error: Exception) -> None:
-    """Leave an error to whoever waits for what it ended."""
+    """Ignore an error that the caller has already caused to end the connection."""
 
 
 async def test_who_has_no_credentials_gets_nothing(server: Server, tmp_path: Path) -> None:
@@ -99,7 +99,7 @@ async def test_who_has_no_credentials_gets_nothing(server: Server, tmp_path: Pat
     entered = connected(entering(server, tmp_path, "mill-1"), "fdhil-mill-1", "uplink")
     with pytest.raises((nats.errors.Error, OSError)) as error:
         await entered.__aenter__()
-    assert "it refuses us" in transport.cause_of(error.value)
+    assert "the server refuses access" in transport.cause_of(error.value)
 
 
 async def test_where_a_certificate_is_wanted_who_has_none_gets_nothing(tmp_path: Path) -> None:

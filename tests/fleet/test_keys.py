@@ -1,4 +1,4 @@
-"""Users known by a key: an nkey's seed alone, and a .creds file whose token an operator's account has signed."""
+"""Users with a key: an nkey's seed alone, and a .creds file with a token signed by an operator's account."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.fleet.servers import NatsServer as Server
 
 
 def key_of(prefix: int) -> tuple[str, nkeys.KeyPair]:
-    """Return a new seed and its pair."""
+    """Return a new seed and its key pair."""
     seed = nkeys.encode_seed(secrets.token_bytes(32), prefix)
     return seed.decode(), nkeys.from_seed(bytearray(seed))
 
@@ -31,7 +31,7 @@ def public(pair: nkeys.KeyPair) -> str:
 
 
 def token(subject: nkeys.KeyPair, issuer: nkeys.KeyPair, name: str, claims: dict[str, Any]) -> str:
-    """Return what ``issuer`` says of ``subject``, as NATS wants it signed."""
+    """Return the claims of ``issuer`` about ``subject``, signed in the form of NATS."""
     told: dict[str, Any] = {"iat": 1_800_000_000, "iss": public(issuer), "name": name, "sub": public(subject)}
     told["nats"] = claims | {"version": 2}
     told["jti"] = base64.b32encode(hashlib.sha256(json.dumps(told).encode()).digest()).decode().rstrip("=")
@@ -45,7 +45,7 @@ def _plain(document: dict[str, Any]) -> str:
 
 
 def operated(folder: Path) -> tuple[str, str]:
-    """Return the server's part of an operator with one account, and the .creds file of its user mill-1."""
+    """Return the server configuration of an operator with one account, and the .creds file of its user mill-1."""
     (_, operator), (_, account) = key_of(nkeys.PREFIX_BYTE_OPERATOR), key_of(nkeys.PREFIX_BYTE_ACCOUNT)
     _, system = key_of(nkeys.PREFIX_BYTE_ACCOUNT)
     seed, user = key_of(nkeys.PREFIX_BYTE_USER)
@@ -70,7 +70,7 @@ def entering(server: Server, file: Path, secret: str) -> NatsServer:
 
 
 async def told_and_refused(server: Server, known: NatsServer, foreign: NatsServer) -> None:
-    """Whoever is known tells under its own name; nobody else enters."""
+    """Check that known users publish under their own name and others are refused."""
     async with transport.connected(known, "fdhil-mill-1", "uplink") as client:
         await client.publish("fdhil.v1.mill-1.records", b"")
         await client.flush()
@@ -78,13 +78,13 @@ async def told_and_refused(server: Server, known: NatsServer, foreign: NatsServe
         with pytest.raises(nats.errors.Error):
             await client.request("fdhil.v1.mill-2.records", b"", timeout=1.0)
         await client.flush(60)  # what the server said against it has come by then
-        assert "it refuses us" in transport.cause_of(
+        assert "the server refuses access" in transport.cause_of(
             cast(BaseException, client.last_error)
         )  # a timeout alone would not be it
     for other in (foreign, NatsServer(server=server.url)):
         with pytest.raises(transport.ERRORS) as error:
             await transport.connected(other, "fdhil-mill-1", "uplink").__aenter__()
-        assert "it refuses us" in transport.cause_of(error.value)
+        assert "the server refuses access" in transport.cause_of(error.value)
 
 
 @pytest.mark.debian
@@ -111,7 +111,7 @@ async def test_a_user_whose_token_an_account_has_signed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", ["", "SUAA", "-----BEGIN NATS USER JWT-----\nx\n"])
 def test_a_file_without_a_seed_is_told_before_anything_is_tried(content: str, tmp_path: Path) -> None:
     (tmp_path / "creds").write_text(content)
-    with pytest.raises(ConnectError, match="holds no user's seed"):
+    with pytest.raises(ConnectError, match="contains no user seed"):
         transport.check_credentials(NatsServer(credentials_file=tmp_path / "creds"), "uplink")
     with pytest.raises(ConnectError, match="cannot be used"):
         transport.check_credentials(NatsServer(credentials_file=tmp_path / "none"), "uplink")

@@ -1,4 +1,4 @@
-"""What is recorded is in the outbox with it, in order, bounded; what is wrong with an entry is told."""
+"""Records enter the outbox together with the store, in order and bounded; invalid entries are reported."""
 
 from __future__ import annotations
 
@@ -202,7 +202,7 @@ def test_a_row_that_is_damaged_or_gone_is_told_as_that(machine: Machine) -> None
 
 
 def test_an_uplink_is_not_the_machine(tmp_path: Path) -> None:
-    """Whoever enters one need not commission again."""
+    """Adding an uplink requires no new commissioning."""
     document = bench_document()
     plain = machine_config.parse(document)
     document["uplink"] = {"labels": {"type": "V-800"}}
@@ -229,7 +229,7 @@ def test_a_wrong_uplink_is_refused(uplink: dict[str, Any], told: str) -> None:
 
 @pytest.fixture
 def older(tmp_path: Path) -> Path:
-    """A machine's file, whose store has four rounds that were recorded without [uplink]."""
+    """A machine's file whose store has four rounds recorded without [uplink]."""
     file = written(tmp_path, windows="some", every_window=2)
     machine = Machine(file, quiet=True)
     machine.record(4)

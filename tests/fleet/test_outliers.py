@@ -1,4 +1,4 @@
-"""An axis that is unlike its sisters is found; temperature, age, and mere chance, are not taken for it."""
+"""A deviating axis is found; temperature, age and chance cause no false alarm."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_worn_axis_is_named() -> None:
 
 @pytest.mark.parametrize("count", [6, 8, 12, 30])
 def test_outliers_hide_neither_themselves_nor_each_other(count: int) -> None:
-    """A quarter of the machines is worn, each by another amount."""
+    """A quarter of the machines is worn, each by a different amount."""
     for seed in range(5):
         courses = fleet(np.random.default_rng(seed), count, spread=0.01)
         bad = list(range(count // 4))
@@ -51,14 +51,14 @@ def test_outliers_hide_neither_themselves_nor_each_other(count: int) -> None:
 
 
 def test_of_three_kinds_none_is_taken_for_wrong() -> None:
-    """Screws of three suppliers, ten machines each, alike within a supplier: a label is missing, no axis is worn."""
+    """Screws of three suppliers without a label, ten machines each, equal within a supplier; no axis is worn."""
     rng = np.random.default_rng(11)
     kinds = [single(f"{kind}-{k}", 1 + 0.2 * kind + 0.002 * rng.normal()) for kind in range(3) for k in range(10)]
     assert outliers(kinds) == []
 
 
 def test_a_cold_hall_is_no_outlier() -> None:
-    """25 K colder is 25 % more friction: seen as that only because all of them show the slope."""
+    """25 K less temperature causes 25 % more friction; all machines show the slope."""
     rng = np.random.default_rng(2)
     courses = fleet(rng, spread=0.01)
     cold = courses[0]
@@ -73,7 +73,7 @@ def test_a_cold_hall_is_no_outlier() -> None:
 
 
 def test_an_old_machine_is_no_outlier_among_young_ones() -> None:
-    """What two years more do is told by what each of the others became in its own time."""
+    """The effect of two more years follows from the history of each of the others."""
     rng = np.random.default_rng(6)
     courses = fleet(rng, spread=0.01, per_month=0.01)
     age = frozen(48.0 + np.linspace(0.0, 1.0, SETS))
@@ -87,7 +87,7 @@ def test_an_old_machine_is_no_outlier_among_young_ones() -> None:
 
 
 def test_where_no_temperature_moves_an_unknown_slope_accuses_nobody() -> None:
-    """Each hall has one temperature: what 30 K do is not known, and might be what makes the coldest another."""
+    """Each hall has a constant temperature: the effect of 30 K is unknown and may explain the coldest machine."""
     rng = np.random.default_rng(7)
     courses = [replace(c, temperatures_c=frozen(np.full(SETS, 22.0))) for c in fleet(rng, 8, 0.002, per_k=0.0)]
     courses[0] = worn(replace(courses[0], temperatures_c=frozen(np.full(SETS, -8.0))), 1.3)
@@ -130,7 +130,7 @@ def test_a_machine_with_a_hundred_times_the_sets_does_not_speak_for_all() -> Non
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("kind", sisters.KINDS)
 def test_one_group_in_a_hundred_has_an_alarm_by_chance(kind: str) -> None:
-    """The study counts more of them, and smaller ones."""
+    """The study counts more groups, and smaller ones."""
     for least, _ in BOUNDS[:6:2]:
         alarms = np.count_nonzero(sisters.largest(kind, least, 200, seed=3) > 1)
         assert alarms <= 9, least  # 2 expected; more than 9 once in 20,000
@@ -160,7 +160,7 @@ def test_a_few_machines_are_not_judged_and_equal_ones_are_equal() -> None:
 
 
 def machines(rng: np.random.Generator, in_common: float, count: int = 40) -> list[Sisters]:
-    """The groups of X, Y and Z of machines whose axes have this share of their variance in common."""
+    """Return the groups of X, Y and Z of machines whose axes share this part of their variance."""
     own: Float = np.sqrt(1 - in_common) * rng.normal(size=(count, 3)) + np.sqrt(in_common) * rng.normal(size=(count, 1))
     own[0] = (4.0, 4.0, 4.0)
     names = [f"mill-{k}" for k in range(count)]

@@ -1,4 +1,4 @@
-"""What is asked of all machines: the command line, with a real database behind it."""
+"""Queries about all machines: the command line with a real database."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def works(database: Postgres, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def machines(tmp_path: Path) -> Iterator[list[Machine]]:
-    """Six of one kind, whose fourth has a worn X axis."""
+    """Six machines of one kind; the fourth has a worn X axis."""
     made = []
     for k in range(6):
         labels = {"type": "V-800", "screw": "A"}
@@ -44,7 +44,7 @@ def machines(tmp_path: Path) -> Iterator[list[Machine]]:
 
 
 def asked(capsys: pytest.CaptureFixture[str], code: int, *words: object) -> Any:
-    """Ask with and without --json; return the document and the text."""
+    """Query with and without --json; return the document and the text."""
     found, text, err = fdhil("fleet", *map(str, words), capsys=capsys)
     assert (found, err) == (code, "")
     found, out, err = fdhil("fleet", *map(str, words), "--json", capsys=capsys)
@@ -129,7 +129,7 @@ async def test_two_machines_of_one_name_are_reported(
     await gather(fleet_of(database, tmp_path), [message for part in messages for message in part])
     document, text = asked(capsys, 0, "status", works)
     (told,) = document["machines"]
-    assert "two machines send under this name" in told["doubt"]
+    assert "two machines use this name" in told["doubt"]
     assert told["missing"] == 0
     assert "give each machine a unique name" in text
 
@@ -185,9 +185,9 @@ async def test_a_record_that_the_database_does_not_take_is_put_aside_alone(
     machine.record(2)
     machine.close()
     received = received_of(told_by(machine)[:13])
-    record = received[bad].told
+    record = received[bad].content
     assert isinstance(record, Record)
-    received[bad] = received[bad]._replace(told=record._replace(text='{"text": "\\u0000"}'))
+    received[bad] = received[bad]._replace(content=record._replace(text='{"text": "\\u0000"}'))
     await keep(fleet_of(database, tmp_path), received)
     assert database.ask("SELECT count(*) FROM fleet.records") == [(12,)]
     ((subject, reason, payload),) = database.ask("SELECT subject, reason, payload FROM fleet.refused")

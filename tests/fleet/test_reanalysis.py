@@ -1,4 +1,4 @@
-"""All stored windows again: the command line, with a real database and real workers behind it."""
+"""Re-analysis of stored windows: the command line with a real database and real workers."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ slowly({str(works)!r})
 
 
 def runs(pid: int) -> bool:
-    """Whether a process runs; one that has ended and was not yet asked for does not."""
+    """Whether a process runs; zombies do not."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
@@ -173,7 +173,7 @@ def runs(pid: int) -> bool:
 
 @contextmanager
 def cluster() -> Iterator[tuple[str, subprocess.Popen[bytes], subprocess.Popen[bytes]]]:
-    """Run a Dask scheduler and a worker as a works starts them; yield the address and the two processes."""
+    """Run a Dask scheduler and a worker as a user starts them; yield the address and the two processes."""
     address = f"tcp://127.0.0.1:{free_port()}"
     place = ["--host", "127.0.0.1", "--no-dashboard"]
     words = [
@@ -206,18 +206,18 @@ def test_on_a_cluster_that_is_there_and_goes_away(
         scheduler.kill()
         _, err = again.communicate(timeout=180)
     assert again.returncode == 3
-    assert "what is done stays" in err
+    assert "completed windows are kept" in err
     assert len(err.splitlines()) == 1
 
 
 def slowly(file: str) -> None:
-    """Reanalyse with two workers, a window a task, as a process that will be killed: there is no end of the fourth."""
+    """Reanalyse with two workers, one window per task, in a process to be killed: the fourth task never ends."""
     with workers(None, 2, per_task=1) as crew:
         resumed(Path(file), crew, lambda done, total: time.sleep(600 if done == 4 else 0))
 
 
 def resumed(file: Path, crew: WindowCrew, progress: reanalysis.Progress) -> None:
-    """Do what is left of the revision of the old method."""
+    """Complete the revision of the old method."""
     fleet = load(file)
     method = Method(BEFORE, {}, fleet.objects.directory.resolve(), code_digest())
     reanalysis.reanalyse(fleet, method, reanalysis.Scope(), crew, progress)

@@ -1,4 +1,4 @@
-"""What is too old goes whole; what counts from it, and what comes late or twice, stays right."""
+"""Old months are dropped whole; reference records, late records and repeated records stay correct."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def test_months_are_counted_back_over_the_turn_of_a_year() -> None:
 class TestWithADatabase:
     @pytest.fixture
     def works(self, database: Postgres, tmp_path: Path) -> Fleet:
-        """Records of mid-month are kept for three months, windows for one."""
+        """Keep records for three months and windows for one."""
         kept = Retention(record_months=3, window_months=1)
         return fleet_of(database, tmp_path).model_copy(update={"retention": kept})
 
     @pytest.fixture
     def told(self, tmp_path: Path) -> list[Received]:
-        """What a machine told of itself, and two rounds of each of its axes in each of three months."""
+        """A machine's description, and two rounds of each of its axes in each of three months."""
         machine = Machine(written(tmp_path / "mill", "mill-1"))
         machine.record(6)
         machine.close()
@@ -61,7 +61,7 @@ class TestWithADatabase:
         found = let_go(works)
         assert found["months"] == ["records_2026_01", "records_2026_03"]
         assert partitions(database) == ["records_2026_06", "records_other"]
-        assert machines(database) == before  # how many were heard, none missing, and what the machine is
+        assert machines(database) == before  # number of records, none missing, and the machine's description
         assert before[0][2] == 0
         assert database.ask("SELECT first_at FROM fleet.axes WHERE axis = 'X'") == [(first[1],)]
         kept = database.ask("SELECT axis, kind FROM fleet.kept ORDER BY axis, kind")
@@ -89,7 +89,7 @@ class TestWithADatabase:
     async def test_a_collector_that_knew_the_month_before_it_went_goes_on(
         self, works: Fleet, told: list[Received], database: Postgres
     ) -> None:
-        """Its next record of that month is in records_other; whoever makes the month again is not stopped by it."""
+        """Its next record of that month is in records_other and does not prevent a new partition."""
         await keep(works, told[:4])
         let_go(works)
         database.ask("""INSERT INTO fleet.records SELECT machine, 'late', recorded_at, store, 999, axis, kind, now(),
@@ -114,10 +114,10 @@ class TestWithADatabase:
             objects.keep(works.objects.directory, name, b"window")
             os.utime(objects.path_of(works.objects.directory, name), (1.0, 1.0))
         await keep(works, told)
-        last = told[-1].told
+        last = told[-1].content
         assert isinstance(last, Record)
         for name, at in ((names[0], MONTHS[1]), (names[1], datetime(2026, 5, 10, tzinfo=UTC)), (names[2], NOW)):
-            await keep(works, [told_at(told[-1]._replace(told=last._replace(message=name, window=None)), at)])
+            await keep(works, [told_at(told[-1]._replace(content=last._replace(message=name, window=None)), at)])
             database.ask(f"UPDATE fleet.records SET window_name = '{name}' WHERE message = '{name}'")
         objects.keep(works.objects.directory, names[3], b"window")  # on its way: its row is not there yet
         found = let_go(works)

@@ -1,4 +1,4 @@
-"""The commands of the roll-out, as an operator and a person at the works call them."""
+"""The roll-out commands, as called by an operator and at the fleet server."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def file(works: Works, tmp_path: Path) -> Path:
 
 
 def lay(works: Works, file: Path, **changes: Any) -> MachineConfig:
-    """Lay an offer where the uplink would."""
+    """Place an offer where the uplink would."""
     config = machine_config.load(file)
     config.offers_directory.mkdir(parents=True, exist_ok=True)
     version = changes.get("version", 3)
@@ -105,8 +105,8 @@ def test_a_refused_offer_is_exit_1_and_says_why(works: Works, file: Path, capsys
     lay(works, file, expires_s=NOW - 5)
     code, _, said = fdhil("offers", "accept", file, "friction", "--by", "Bert", capsys=capsys)
     assert code == 1
-    assert "it was valid until" in said
-    assert "cannot be accepted: it was valid until" in fdhil("offers", "list", file, capsys=capsys)[1]
+    assert "it expired on" in said
+    assert "cannot be accepted: it expired on" in fdhil("offers", "list", file, capsys=capsys)[1]
     place = works.carried()
     place.write_bytes(b"junk")
     assert fdhil("offers", "list", file, place, capsys=capsys)[0] == 1
@@ -145,7 +145,7 @@ def test_what_becomes_void_is_said(works: Works, file: Path, capsys: Any) -> Non
 def test_a_machine_that_trusts_nobody_is_told_so(works: Works, file: Path, capsys: Any) -> None:
     lay(works, file)
     file.write_text(file.read_text().partition("# what follows")[0])
-    assert "which is no key of [offers] trust" in fdhil("offers", "list", file, capsys=capsys)[1]
+    assert "which is not listed in [offers] trust" in fdhil("offers", "list", file, capsys=capsys)[1]
     assert OfferWatch(machine_config.load(file)).look() == []
 
 

@@ -1,4 +1,4 @@
-"""Any call of an acceptance fails or is the last: the configuration is the old one or the new one, never half."""
+"""An acceptance is atomic at any failing call: the configuration is the complete old or new one."""
 
 from __future__ import annotations
 
@@ -26,19 +26,17 @@ VERSIONS = (1, 2, 3, 4, 9)
 STATES = (0, *VERSIONS)
 
 
-class Refused(FdhilError):
-    """The command said no."""
+class Refused(FdhilError): ...
 
 
 class Acceptances(Plain):
-    """A machine that accepts one version after another, each by the command itself; a record is a version."""
+    """A machine that accepts successive versions, each by the command itself; a record is a version."""
 
     offers: Path
     first: str  # the configuration before any
 
     @classmethod
     def prepare(cls, folder: Path) -> None:
-        """Sign the offers."""
         works = Works(folder)
         cls.first = machine_of(works, folder / "first").read_text()
         for version in VERSIONS:
@@ -48,7 +46,6 @@ class Acceptances(Plain):
 
     @staticmethod
     def value(version: int) -> float:
-        """Return what a version sets."""
         return 0.05 + version * 0.001
 
     def __init__(self, folder: Path) -> None:
@@ -58,7 +55,6 @@ class Acceptances(Plain):
             write_file(self.file, self.first.encode())
 
     def keep(self, number: int) -> None:
-        """Accept a version."""
         words = ["offers", "accept", self.file, self.offers / f"{number}.offer", "--by", "Bert"]
         said = io.StringIO()
         with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(said):
@@ -69,9 +65,9 @@ class Acceptances(Plain):
             raise Refused(said.getvalue().replace(" (check", "; check"))
 
     def found(self) -> set[int]:
-        """Return the versions that were noted as accepted; AssertionError where a file is none that there ever was.
+        """Return the recorded accepted versions; AssertionError for a file that never existed in this form.
 
-        A kernel that lies of what it wrote leaves one that is none, and is found out when it is read: StoreError.
+        A kernel that falsely confirms a write leaves an invalid file, which is detected when read: StoreError.
         """
         try:
             machine_config.load(self.file)

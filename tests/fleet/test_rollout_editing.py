@@ -1,4 +1,4 @@
-"""Values are changed in the text of a configuration, and all that stands around them stays."""
+"""Values are edited in the text of a configuration, and the text around them is kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""At the machine: what an offer would change, and that nothing but its operator's answer changes it."""
+"""At the machine: the effect of an offer, and that only the operator's answer applies it."""
 
 from __future__ import annotations
 
@@ -73,14 +73,14 @@ def test_a_model_for_a_kind_of_axis_reaches_those_axes_alone(works: Works, file:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"expires_s": NOW - 1}, "it was valid until"),
+        ({"expires_s": NOW - 1}, "it expired on"),
         ({"made_s": NOW + 100_000}, "set the clock"),
-        ({"machines": ("mill-2", "mill-3")}, "for other machines than mill-1"),
-        ({"labels": {"type": "V-900"}}, "label type is 'V-900'"),
+        ({"machines": ("mill-2", "mill-3")}, "its stage 1 is not for mill-1"),
+        ({"labels": {"type": "V-900"}}, "label type = 'V-900'"),
         ({"labels": {"type": "V-800", "site": "Ulm"}}, "label site"),
-        ({"values": {"axis.Z.nominal.ft": 0.06}}, "there is no [axis.Z.nominal] here"),
-        ({"values": {"axis.X.feedforward.max_torque_nm": 1.0}}, "only who stands at the machine switches that on"),
-        ({"values": {"axis.X.correction.max_speed_mm_s": 1e-6}}, "the configuration could not be used"),
+        ({"values": {"axis.Z.nominal.ft": 0.06}}, "this machine has no [axis.Z.nominal]"),
+        ({"values": {"axis.X.feedforward.max_torque_nm": 1.0}}, "which can only be enabled at the machine"),
+        ({"values": {"axis.X.correction.max_speed_mm_s": 1e-6}}, "would make the configuration invalid"),
         ({"values": {"axis.X.regulators.position_ki_per_s2": 5.0}}, "set structure = 'double_pi'"),
     ],
 )
@@ -131,7 +131,7 @@ def test_a_configuration_that_is_a_link_stays_one(works: Works, file: Path, tmp_
 
 def test_an_older_version_never_follows_a_newer_one(works: Works, file: Path) -> None:
     accept(works.carried(), file, "Bert", may_loosen=False)
-    assert "version 3 of it was accepted" in judged(works, file, version=2).wrong
+    assert "version 3 was already accepted" in judged(works, file, version=2).wrong
     assert judged(works, file, version=2, name="other").wrong == ""
     assert judged(works, file, version=4, values={"axis.X.nominal.ft": 0.05}).wrong == ""
     lie = present(file).config.offers_directory
@@ -139,9 +139,9 @@ def test_an_older_version_never_follows_a_newer_one(works: Works, file: Path) ->
     (lie / file_name("friction", 5)).write_bytes(works.document(version=5))
     (lie / file_name("friction", 6)).write_bytes(b"no offer, whatever its name says")
     os.mkfifo(lie / file_name("friction", 7))
-    assert "offered version 5 in its place" in judged(works, file, version=4).wrong
-    assert judge(lie / file_name("friction", 7), present(file)).wrong == "it is no file; have it written again"
-    assert judge(lie, present(file)).wrong == "it is no file; have it written again"
+    assert "version 5 of the fleet server replaces it" in judged(works, file, version=4).wrong
+    assert judge(lie / file_name("friction", 7), present(file)).wrong == "it is not a regular file; export it again"
+    assert judge(lie, present(file)).wrong == "it is not a regular file; export it again"
 
 
 def test_a_version_that_was_accepted_is_not_accepted_with_other_values(works: Works, file: Path) -> None:
@@ -174,15 +174,15 @@ def test_a_loosened_limit_is_named_and_asked_for(works: Works, file: Path) -> No
     ("values", "limit"),
     [
         ({"axis.X.nominal.K": 0.7}, "the feed-forward's torque"),
-        ({"axis.X.nominal.Jt": 0.05}, "the change of speed that is plausible"),
-        ({"axis.X.regulators.current_limit_a": 250.0}, "the change of speed that is plausible"),
-        ({"axis.X.max_acceleration_mm_s2": 5000.0}, "the acceleration that is plausible"),
+        ({"axis.X.nominal.Jt": 0.05}, "the highest plausible change of speed"),
+        ({"axis.X.regulators.current_limit_a": 250.0}, "the highest plausible change of speed"),
+        ({"axis.X.max_acceleration_mm_s2": 5000.0}, "the highest plausible acceleration"),
     ],
 )
 def test_what_loosens_the_guard_by_another_way_is_found(
     values: dict[str, Any], limit: str, works: Works, file: Path
 ) -> None:
-    """No key of the guard is offered, and still it would let more through."""
+    """An offer without any guard key can still loosen a limit of the guard."""
     file.write_text(file.read_text().replace("[axis.X.regulators]", "[axis.X.feedforward]\n\n[axis.X.regulators]"))
     found = judged(works, file, values=values)
     assert f"the guard: axis X, {limit}" in [each.path for each in found.loosens]
@@ -203,11 +203,13 @@ def test_a_rejected_offer_changes_nothing_and_may_be_accepted_later(works: Works
 
 
 def test_what_was_accepted_and_is_in_force_is_not_rejected(works: Works, file: Path) -> None:
-    """Nor when it is over by now; who has put the old values back may say so."""
+    """Also after its expiry; once the old values are restored it may be rejected."""
     before = file.read_bytes()
     done = accept(works.carried(), file, "Bert", may_loosen=False)
     for expires_s in (NOW + 3600, NOW - 1):
-        with pytest.raises(OfferRefused, match=r"accepted by Bert, and .* in force: it is not rejected; put .* before"):
+        with pytest.raises(
+            OfferRefused, match=r"accepted by Bert and .* in force: it is not rejected; restore the previous"
+        ):
             reject(works.carried(expires_s=expires_s), file, "Anna", "no")
     assert done.offer is not None
     file.write_bytes(kept_file(file, done.offer).read_bytes())
@@ -271,7 +273,7 @@ def test_a_full_disk_leaves_the_configuration_as_it_was(
         write_file(path, content, like)
 
     monkeypatch.setattr(offered, "write_file", full)
-    with pytest.raises(OutputError, match="the disk is full; free some of it; the configuration is as it was"):
+    with pytest.raises(OutputError, match="the disk is full; free some space; the configuration is unchanged"):
         accept(works.carried(), file, "Bert", may_loosen=False)
     assert file.read_bytes() == before
     assert read_answers(present(file).config.store.directory) == []

@@ -1,4 +1,4 @@
-"""An offer is believed when a trusted key has signed just these bytes, and it offers what may be offered."""
+"""An offer is accepted only if a trusted key signed exactly these bytes, and its changes are allowed."""
 
 from __future__ import annotations
 
@@ -63,9 +63,9 @@ def test_what_is_cut_off_longer_or_doubled_is_no_offer(works: Works) -> None:
 def test_whoever_is_not_listed_offers_nothing_and_several_keys_may_be(works: Works, tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     other = Works(tmp_path / "other")
-    with pytest.raises(OfferRefused, match="no key of \\[offers\\] trust"):
+    with pytest.raises(OfferRefused, match="not listed in \\[offers\\] trust"):
         read(other.document(), {works.public})
-    with pytest.raises(OfferRefused, match="no key"):
+    with pytest.raises(OfferRefused, match="not listed"):
         read(works.document(), ())
     for signer in (works, other):  # while one key follows another
         assert read(signer.document(), {works.public, other.public}).version == 3
@@ -110,10 +110,10 @@ def test_what_is_signed_but_not_written_as_offers_are_is_refused(works: Works) -
         ({"values": {"offers.trust": "O"}}, "decided at the machine alone"),
         ({"values": {"access.operate": "anna"}}, "decided at the machine alone"),
         ({"values": {"store.directory": "/"}}, "those of this computer"),
-        ({"values": {"axis.*.nominal.ft": 1.0}}, "say which"),
+        ({"values": {"axis.*.nominal.ft": 1.0}}, "name them"),
         ({"values": {"axis.X.nominal.ft": float("nan")}}, "finite"),
         ({"values": {}}, "at least 1"),
-        ({"labels": {}, "machines": ()}, "neither machines nor labels"),
+        ({"labels": {}, "machines": ()}, "no machines and no labels"),
         ({"name": "../../etc"}, "match pattern"),
         ({"version": 0}, "greater than"),
     ],
@@ -130,7 +130,7 @@ def test_a_value_that_no_machine_could_have_is_not_signed(works: Works) -> None:
 
 
 def test_every_key_of_the_configuration_is_decided_upon() -> None:
-    """A section that is new needs a decision: it is named, or a table above it is."""
+    """A new section needs a policy for itself or for a table above it."""
     for table in sections():
         for key, _ in table.keys:
             path = f"{table.path}.{key}"
@@ -158,16 +158,16 @@ def test_a_key_is_its_owner_s_alone(tmp_path: Path) -> None:
     with pytest.raises(FileExistsError):
         make_key(file)
     file.chmod(0o640)
-    with pytest.raises(ConfigError, match="may be read by others"):
+    with pytest.raises(ConfigError, match="can be read by others"):
         sign(Offer(**TOLD), file)
     file.chmod(0o600)
     seed = file.read_bytes()
     users = nkeys.encode_seed(b"7" * 32, nkeys.PREFIX_BYTE_USER)  # that of a server's user
     for wrong in (b"", b"\xff", seed[:20], users, b"A" * 58):
         file.write_bytes(wrong)
-        with pytest.raises(ConfigError, match="is no key to sign with"):
+        with pytest.raises(ConfigError, match="is not a signing key"):
             public_key(file)
-    with pytest.raises(ConfigError, match="fdhil fleet key makes one"):
+    with pytest.raises(ConfigError, match="create one with fdhil fleet key"):
         public_key(tmp_path / "absent")
 
 

@@ -1,4 +1,4 @@
-"""A change from the works to machines and their answers back, stage by stage, with real servers between."""
+"""A roll-out from the fleet server to machines and their answers back, stage by stage, with real servers."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ MACHINES = ("mill-1", "mill-2", "mill-3")
 
 
 class Shop:
-    """A works with its servers and machines, each with its uplink."""
+    """A fleet server with its processes and machines, each with its uplink."""
 
     def __init__(self, folder: Path, database: Postgres, server: NatsServer, capsys: Any) -> None:
         self._folder, self._capsys = folder, capsys
@@ -63,27 +63,26 @@ class Shop:
         return machine_config.load(self.files[name])
 
     def fdhil(self, code: int, *words: object) -> Any:
-        """Run a command of fdhil with --json, and return what it tells."""
+        """Run a command with --json and return its document."""
         done = fdhil(*map(str, words), "--json", capsys=self._capsys)
         assert done[0] == code, done
         return json.loads(done[1])
 
     def uplink(self, name: str) -> None:
-        """Run a machine's uplink until it has fetched and sent what there is."""
+        """Run a machine's uplink until everything is fetched and sent."""
         log = self._folder / f"{name}.log"
         for _ in range(3):  # on a busy host an answer may come too late, and it looks again after a minute only
             log.unlink(missing_ok=True)
             with running(log, "uplink", self.files[name]) as process:
-                until(lambda: "all that was recorded is sent" in process.said, "it has sent all")
-            if "no offers can be fetched" not in log.read_text():
+                until(lambda: "all records are sent" in process.said, "it has sent all")
+            if "offers cannot be fetched" not in log.read_text():
                 break
 
     def lying(self, name: str) -> list[str]:
-        """Return the offers that lie at a machine."""
         return [path.name for path in lying(self.config(name).offers_directory)]
 
     def stage(self, code: int, *options: object) -> Any:
-        """Look at the roll-out, or open a stage with the options."""
+        """Show the roll-out, or open a stage with the options."""
         return self.fdhil(code, "fleet", "stage", self.fleet, self.change, *options)
 
     def opened(self, code: int, *options: object) -> Any:
@@ -106,9 +105,9 @@ async def shop(tmp_path: Path, database: Postgres, capsys: Any) -> AsyncIterator
 
 @pytest.fixture
 def collected(shop: Shop, tmp_path: Path) -> Iterator[Shop]:
-    """The works while its collector runs."""
+    """The fleet server while its collector runs."""
     with running(tmp_path / "collect.log", "fleet", "collect", shop.fleet) as collector:
-        until(lambda: "the server and the database are there" in collector.said, "it collects")
+        until(lambda: "connected to the server and the database" in collector.said, "it collects")
         yield shop
 
 
@@ -127,9 +126,9 @@ def test_a_change_goes_out_stage_by_stage(collected: Shop) -> None:
     shop.fdhil(0, "offers", "accept", shop.files["mill-1"], "friction", "--by", "Bert")
     shop.uplink("mill-1")
     until(lambda: shop.told("SELECT count(*) FROM fleet.offer_answers") == [(1,)], "the answer has come")
-    assert "nothing was identified with it yet" in shop.opened(1, "--count", 1)["error"]["text"]
+    assert "no parameters were identified with it yet" in shop.opened(1, "--count", 1)["error"]["text"]
 
-    machine = Machine(shop.files["mill-1"])  # the daemon, started anew
+    machine = Machine(shop.files["mill-1"])  # the restarted daemon
     digest = shop.config("mill-1").digest
     noticed = Notice("MaintenanceDue", "minor", "Friction rises; look at the lubrication.", "X", 1000)
     lies = Notice("OfferWaits", "minor", "a configuration change is proposed: friction version 4")
@@ -163,14 +162,17 @@ def test_a_change_goes_out_stage_by_stage(collected: Shop) -> None:
 
 def test_a_version_is_one_change_and_only_rises(shop: Shop) -> None:
     shop.opened(0, "--machine", "mill-1")
-    assert "mill-1: not known" in shop.opened(1, "--machine", "mill-1", "--despite", "x")["error"]["text"]
+    assert (
+        "mill-1: no machine with these labels"
+        in shop.opened(1, "--machine", "mill-1", "--despite", "x")["error"]["text"]
+    )
     shop.change.write_text(CHANGE.replace("0.061", "0.07"))
     assert "with other values" in shop.stage(1)["error"]["text"]
     shop.change.write_text(CHANGE.replace("version = 3", "version = 2"))
-    assert "give the file version 4" in shop.stage(1)["error"]["text"]
+    assert "set version = 4 in the file" in shop.stage(1)["error"]["text"]
     shop.change.write_text(CHANGE.replace("version = 3", "version = 4").replace("V-800", "V-900"))
     assert shop.stage(0)["left"] == []
-    assert "no machine left" in shop.opened(1)["error"]["text"]
+    assert "no machine with these labels remains" in shop.opened(1)["error"]["text"]
 
 
 def test_where_the_server_is_away_no_stage_is_opened(shop: Shop, tmp_path: Path) -> None:
@@ -183,7 +185,7 @@ def test_where_the_server_is_away_no_stage_is_opened(shop: Shop, tmp_path: Path)
 
 
 def guarded(folder: Path) -> str:
-    """Return the part of the server's configuration as the document has it."""
+    """Return the documented access rules of the server's configuration."""
     certify(folder)
     tls = f'tls {{ cert_file: "{folder}/broker.pem", key_file: "{folder}/broker.key" }}\n'
     rights = (
@@ -202,7 +204,7 @@ def server(tmp_path: Path) -> Iterator[NatsServer]:
 
 
 async def look(config: MachineConfig, letterbox: Letterbox | None = None, timeout_s: float = 60.0) -> list[str]:
-    """Have a machine's letterbox look, and return which offers lie there then."""
+    """Let a machine fetch offers, and return those present."""
     assert config.uplink is not None
     async with connected(config.uplink, f"fdhil-{config.works_name}", "uplink") as client:
         await (letterbox or Letterbox(config)).look(client.jetstream(timeout=timeout_s), "5" * 32)
@@ -260,4 +262,4 @@ async def test_without_the_right_or_the_stream_what_lies_there_stays(
     for _ in range(2):
         letterbox._next_s = 0.0
         assert await look(config, letterbox, timeout_s=1.0) == ["friction-3.offer"]  # it is never answered
-    assert capfd.readouterr().err.count("no offers can be fetched") == 1
+    assert capfd.readouterr().err.count("offers cannot be fetched") == 1

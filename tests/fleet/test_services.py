@@ -1,4 +1,4 @@
-"""What a service changed is told with its interval; age and limits count from it; what is due is listed."""
+"""Services: effect with interval, restart of age and limits, forecast of due limits."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SERVICED = 20
 
 
 def test_the_interval_of_a_change_holds_it_in_95_of_100() -> None:
-    """Beside wear that goes on, and a temperature that moves."""
+    """With continuing wear and a varying temperature."""
     rng = np.random.default_rng(1)
     days: Float = np.arange(20.0) - 11.5
     held = 0
@@ -49,7 +49,7 @@ def test_a_temperature_that_is_not_known_is_not_told_apart() -> None:
 
 @pytest.fixture
 async def works(database: Postgres, tmp_path: Path) -> Path:
-    """A machine whose X gets 1 % stiffer a day until it is lubricated, and then again."""
+    """A machine whose X axis gets 1 % stiffer per day until it is lubricated, and then again."""
     machine = Machine(written(tmp_path / "mill", "mill-1"))
     for day in range(DAYS):
         since = day if day < SERVICED else day - SERVICED

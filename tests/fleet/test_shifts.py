@@ -1,4 +1,4 @@
-"""What is asked of all machines is asked of the newest set of each shift, and of forecasts that are kept for a day."""
+"""Queries use the newest set of each shift, and forecasts stored for a day."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def works(database: Postgres, tmp_path: Path) -> Fleet:
 
 
 def told(folder: Path, rounds: int, **parameters: float) -> list[Received]:
-    """What a machine told, a round every two hours."""
+    """The records of a machine, a round every two hours."""
     machine = Machine(written(folder, folder.name))
     machine.record(rounds, parameters=parameters)
     machine.close()
@@ -45,7 +45,7 @@ def told(folder: Path, rounds: int, **parameters: float) -> list[Received]:
 async def test_of_each_shift_the_newest_set_is_kept_however_it_comes(
     seed: int, works: Fleet, database: Postgres, tmp_path: Path
 ) -> None:
-    """In any order, in any parts, some of them twice: as the whole history says when it is brought up from an older."""
+    """In any order, in any batches, with repetitions: equal to the result of a migrated history."""
     chance = random.Random(seed)
     received = [each for name in ("mill-1", "mill-2") for each in told(tmp_path / name, 9)]
     while received:
@@ -69,8 +69,10 @@ async def test_of_each_shift_the_newest_set_is_kept_however_it_comes(
 
 async def test_a_set_that_is_none_hides_no_other(works: Fleet, database: Postgres, tmp_path: Path) -> None:
     received = told(tmp_path / "mill-1", 1)
-    sets = [each.told for each in received if isinstance(each.told, Record) and each.told.kind == "parameters"]
-    lost = received[-1]._replace(told=sets[0]._replace(sequence=99, message="f" * 64, text='{"left_out": "damaged"}'))
+    sets = [each.content for each in received if isinstance(each.content, Record) and each.content.kind == "parameters"]
+    lost = received[-1]._replace(
+        content=sets[0]._replace(sequence=99, message="f" * 64, text='{"left_out": "damaged"}')
+    )
     await keep(works, [*received, lost])
     assert {row[5] for row in database.ask(KEPT)} == {each.sequence for each in sets}
 
@@ -90,7 +92,7 @@ async def test_a_forecast_is_made_once_a_day_and_when_a_service_is_new(
         looked.extend(axes)
         return really(db, axes, shares)
 
-    monkeypatch.setattr(forecasts, "_forecasts", looking)
+    monkeypatch.setattr(forecasts, really.__name__, looking)
 
     def asked() -> tuple[list[dict[str, Any]], list[Axis]]:
         looked.clear()

@@ -1,4 +1,4 @@
-"""How work is cut in tasks, and what becomes of a task whose worker dies."""
+"""Work is split into tasks; a task whose worker dies is retried or reported lost."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from fdhil.fleet.spread import Crew, Here
 
 
 class Died(Exception):
-    """As of a worker that is gone."""
+    """The error of a lost worker."""
 
 
 class Elsewhere(Executor):
-    """Ends tasks with their errors, as another process does."""
+    """Ends tasks with their errors, like another process."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         done: Future[Any] = Future()
@@ -28,7 +28,7 @@ class Elsewhere(Executor):
 
 
 class OneWorker(Elsewhere):
-    """Where a task kills the worker, the task before it is lost, too, though its result is not yet fetched."""
+    """When a task kills the worker, the previous task is lost as well if its result was not yet fetched."""
 
     def __init__(self) -> None:
         self._before: Future[Any] = Future()
@@ -42,7 +42,7 @@ class OneWorker(Elsewhere):
 
 
 def doubled(numbers: Sequence[int]) -> list[int]:
-    """Double each, and die over 5 and 6."""
+    """Double each number, and die at 5 and 6."""
     if {5, 6} & set(numbers):
         raise Died
     return [2 * number for number in numbers]

@@ -1,4 +1,4 @@
-"""The study of fleets would notice a record that is lost, doubled or overtaken."""
+"""The fleet study detects lost, duplicated and reordered records."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A server that is not there is told at once, and who waits for it decides when to try again."""
+"""An unavailable server is reported at once; the caller decides when to retry."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The unit of the uplink: a user of its own, and the daemon is left alone."""
+"""The systemd unit of the uplink: a separate user, without access to the daemon."""
 
 from __future__ import annotations
 

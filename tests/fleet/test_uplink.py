@@ -1,4 +1,4 @@
-"""Order and position of what is sent, where the server takes some messages and refuses others."""
+"""Order and position of the sent records, with a server that accepts some messages and refuses others."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.ports import free_port
 
 
 class Stream:
-    """Takes messages as JetStream does, but for those that it is told to refuse; a message id is taken once."""
+    """Accepts messages like JetStream, except those it is told to refuse; a message id is accepted once."""
 
     def __init__(self) -> None:
         self.taken: dict[str, tuple[str, bytes]] = {}
@@ -36,12 +36,12 @@ class Stream:
         self.taken.setdefault(headers["Nats-Msg-Id"], (subject, payload))
 
     def of(self, axis: str) -> list[int]:
-        """Return the sequence of the messages of an axis, in the order in which they were taken."""
+        """Return the sequence numbers of an axis in the order of acceptance."""
         return [record.sequence for record in self.records if record.axis == axis and record.sequence]
 
     @property
     def records(self) -> list[Record]:
-        """What was taken, in that order."""
+        """All accepted records, in that order."""
         told = [told for message in self.taken.values() for told in decode(*message)]
         return [record for record in told if isinstance(record, Record)]
 
@@ -59,7 +59,7 @@ def sender_of(machine: Machine) -> Sender:
 
 
 async def send_all(sender: Sender, stream: Stream, most: int = 1 << 20) -> int:
-    """Send what waits, and return how many entries that were."""
+    """Send all waiting entries and return their number."""
     of_nats = cast(JetStreamContext, stream)
     while True:
         position, entries = await sender._next(of_nats)
@@ -118,7 +118,7 @@ async def test_a_window_that_is_too_large_or_gone_is_told_without_its_file(machi
 
 
 async def test_a_server_that_is_not_there_is_left_to_the_next_attempt() -> None:
-    """The client would try it again for minutes, and say nothing."""
+    """The client itself would retry silently for minutes."""
     both = ",".join(f"nats://127.0.0.1:{free_port()}" for _ in range(2))
     async with asyncio.timeout(60):
         with pytest.raises(ConnectionRefusedError):

@@ -1,4 +1,4 @@
-"""From a machine's store to the database, with real servers between: nothing lost, nothing doubled, order kept."""
+"""From a machine's store to the database with real servers: nothing lost, nothing duplicated, order kept."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.debian
 
 
 def counted(database: Postgres) -> int:
-    """Return how many records of machines the database has; 0 before there are tables."""
+    """Return the number of records in the database; 0 before its tables exist."""
     try:
         return int(database.ask("SELECT count(*) FROM fleet.records WHERE sequence > 0")[0][0])
     except psycopg.errors.UndefinedTable:
@@ -30,7 +30,7 @@ def counted(database: Postgres) -> int:
 
 
 def of_the_works(folder: Path, server: NatsServer, database: Postgres, max_bytes: int = 1 << 26) -> Path:
-    """Write the works' own configuration."""
+    """Write the fleet server's configuration."""
     file = folder / "fleet.toml"
     file.write_text(
         f'[server]\nserver = "{server.url}"\n[stream]\nmax_bytes = {max_bytes}\n'
@@ -40,7 +40,7 @@ def of_the_works(folder: Path, server: NatsServer, database: Postgres, max_bytes
 
 
 class Process:
-    """A command of fdhil."""
+    """A running fdhil command."""
 
     def __init__(self, log: Path, *words: object) -> None:
         self._log = log
@@ -48,27 +48,26 @@ class Process:
         self.start()
 
     def start(self) -> None:
-        """Start it."""
         with self._log.open("ab") as log:
             self._before = log.tell()
             command = [sys.executable, "-m", "fdhil", *self._words]
             self._process = subprocess.Popen(command, stdout=log, stderr=log)
 
     def end(self, how: signal.Signals = signal.SIGTERM) -> int:
-        """End it, once it runs, and return its exit code."""
+        """End it once it runs, and return its exit code."""
         until(lambda: self._log.stat().st_size > self._before, "it runs")
         self._process.send_signal(how)
         return self._process.wait(PATIENCE_S)
 
     @property
     def said(self) -> str:
-        """What it wrote."""
+        """Its output."""
         return self._log.read_text()
 
 
 @contextmanager
 def running(log: Path, *words: object) -> Iterator[Process]:
-    """Run a command until the block is left; it must end as it is asked to."""
+    """Run a command until the block is left; it must end on request."""
     process = Process(log, *words)
     try:
         yield process
@@ -103,7 +102,7 @@ def test_what_a_machine_records_comes_to_the_database_once_and_in_order(tmp_path
 
 
 def test_killed_anywhere_loses_and_doubles_nothing(tmp_path: Path, database: Postgres) -> None:
-    """Uplink, server, database and both collectors are killed in turn while two machines go on recording."""
+    """Uplink, server, database and both collectors are killed in turn while two machines keep recording."""
     with nats(tmp_path) as server:
         works = of_the_works(tmp_path, server, database)
         files = [written(tmp_path / name, name, server=server.url, windows="refused") for name in ("mill-1", "mill-2")]
@@ -146,12 +145,12 @@ def test_killed_anywhere_loses_and_doubles_nothing(tmp_path: Path, database: Pos
 
 
 def test_what_the_server_has_no_room_for_stays_on_the_machine(tmp_path: Path, database: Postgres) -> None:
-    """The stream is full while nobody collects; the rest comes when there is room again."""
+    """The stream is full without a collector; the rest follows when there is room again."""
     with nats(tmp_path) as server:
         file = written(tmp_path / "mill", "mill-1", server=server.url, windows="all")
         works = of_the_works(tmp_path, server, database, max_bytes=1 << 17)
         with running(tmp_path / "first.log", "fleet", "collect", works) as collector:  # makes the stream
-            until(lambda: "the server and the database are there" in collector.said, "the stream is there")
+            until(lambda: "connected to the server and the database" in collector.said, "the stream is there")
         machine = Machine(file)
         expected = machine.record(16)
         log = tmp_path / "uplink.log"
@@ -164,7 +163,7 @@ def test_what_the_server_has_no_room_for_stays_on_the_machine(tmp_path: Path, da
 
 
 def test_a_network_that_drops_all_is_waited_for(tmp_path: Path, database: Postgres) -> None:
-    """The cut tells nobody; what was on its way is sent again, and what was recorded meanwhile follows it."""
+    """The cut is silent; pending records are repeated, and later ones follow."""
     with nats(tmp_path) as server:
         network = Network(server.port)
         file = written(tmp_path / "mill", "mill-1", server=f"nats://127.0.0.1:{network.port}", windows="refused")
@@ -178,7 +177,7 @@ def test_a_network_that_drops_all_is_waited_for(tmp_path: Path, database: Postgr
             until(lambda: counted(database) == expected, f"the first are there: {collector.said} {uplink.said}")
             network.cut = True
             before, expected = expected, expected + machine.record(20)
-            until(lambda: "it is tried again" in uplink.said, "the uplink gives the connection up")
+            until(lambda: "retrying" in uplink.said, "the uplink gives the connection up")
             assert counted(database) == before
             network.cut = False
             until(lambda: counted(database) == expected, "all are there")

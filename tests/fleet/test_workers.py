@@ -1,4 +1,4 @@
-"""Real Dask workers: the same bytes from any number of them, also when one is killed; nobody else gives them work."""
+"""Real Dask workers: identical results from any number, also when one is killed; strangers cannot submit work."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ Work = Callable[[Sequence[Stored]], list[Again]]
 
 
 def analysed(windows: Sequence[Stored], work: Work, count: int) -> list[Again]:
-    """Return what windows say now, by so many processes; a task has two windows."""
+    """Return the results of windows from this number of processes; a task has two windows."""
     with workers(None, count, per_task=2) as crew:
         assert not count or is_closed_to_foreigners(crew)
         return rapids.bits([again for _, results in crew.spread(work, windows) for again in results])
 
 
 def is_closed_to_foreigners(crew: WindowCrew) -> bool:
-    """Whether all listen on this computer alone, and the scheduler ends the talk with one who has no certificate."""
+    """Whether all listen on this computer alone, and the scheduler rejects clients without its certificate."""
     assert isinstance(crew.executor, Cluster)
     scheduler = crew.executor.client.cluster.scheduler.address
     host, port = scheduler.removeprefix("tls://").split(":")
@@ -49,7 +49,7 @@ def is_closed_to_foreigners(crew: WindowCrew) -> bool:
 
 
 def killing(windows: Sequence[Stored], method: Method, victim: Stored, flag: Path) -> list[Again]:
-    """Analyse; the first process that meets a window dies over it, or, where the flag is a folder, each does."""
+    """Analyse; the first process that meets a window dies, or, where the flag is a folder, every one."""
     if victim in windows and not flag.is_file():
         if not flag.is_dir():
             flag.touch()
@@ -59,7 +59,7 @@ def killing(windows: Sequence[Stored], method: Method, victim: Stored, flag: Pat
 
 @pytest.fixture
 def windows(tmp_path: Path) -> list[Stored]:
-    """Ten windows of two machines: one is gone, one is another."""
+    """Ten windows of two machines: one is missing, one is corrupted."""
     folder = tmp_path / "objects"
     kept = rapids.stored(folder, 2, 5)
     (folder / kept[2].name[:2] / f"{kept[2].name}.parquet").unlink()
@@ -110,17 +110,17 @@ def test_a_worker_with_other_code_or_without_the_windows_is_refused(windows: lis
     method = rapids.method(tmp_path / "objects")
     with pytest.raises(FdhilError, match="has another fdhil"):
         analyse_again(windows, Method(method.settings, {}, method.folder, "of another"))
-    with pytest.raises(FdhilError, match="does not see"):
+    with pytest.raises(FdhilError, match="cannot read"):
         analyse_again(windows, rapids.method(tmp_path / "elsewhere"))
 
 
 @pytest.mark.usefixtures("processes")
 def test_a_scheduler_that_is_not_there_is_told(tmp_path: Path) -> None:
-    """In a process of its own: the library leaves a thread behind where it finds no scheduler."""
+    """In a separate process: the library leaves a thread behind when it finds no scheduler."""
     (tmp_path / "fleet.toml").write_text("")
-    quick = "from fdhil.cli.main import main; from fdhil.fleet import workers; workers.CONNECT_S = 2; main()"
+    quick = f"from fdhil.cli.main import main; import {workers.__module__} as pools; pools.CONNECT_S = 2; main()"
     command = [sys.executable, "-c", quick, "fleet", "reanalyse", str(tmp_path / "fleet.toml")]
     told = subprocess.run([*command, "--scheduler", f"tcp://127.0.0.1:{free_port()}"], capture_output=True, text=True)
     assert (told.returncode, told.stdout) == (3, "")
-    assert "does not answer" in told.stderr
+    assert "does not respond" in told.stderr
     assert len(told.stderr.splitlines()) == 1

@@ -1,4 +1,4 @@
-"""What is known is left out, whoever writes it and however often; what is new is there as it came."""
+"""Known records are left out for any number of collectors; new ones are stored unchanged."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def works(database: Postgres, tmp_path: Path) -> Fleet:
 
 @pytest.fixture
 def told(tmp_path: Path) -> list[Received]:
-    """What two machines told, in turn."""
+    """The alternating records of two machines."""
     each = []
     for name in ("mill-1", "mill-2"):
         machine = Machine(written(tmp_path / name, name))
@@ -53,7 +53,7 @@ async def test_of_what_is_partly_known_the_rest_is_added(
 async def test_many_collectors_with_the_same_records_keep_each_once(
     works: Fleet, told: list[Received], database: Postgres
 ) -> None:
-    """Also when they come to each in another order, and each waits for the other."""
+    """Also when they come in different order, and the collectors wait for each other."""
     await keep(works, told[:1])
     await asyncio.gather(*(keep(works, told[::step]) for step in (1, -1, 1, -1)))
     assert len(database.ask(ROWS)) == len(told)
@@ -66,9 +66,9 @@ async def test_many_collectors_with_the_same_records_keep_each_once(
 async def test_a_text_is_in_the_database_as_it_came(
     text: str, works: Fleet, told: list[Received], database: Postgres
 ) -> None:
-    record = told[1].told
+    record = told[1].content
     assert isinstance(record, Record)
     for _ in range(2):  # new, and known
-        await keep(works, [told[0], told[1]._replace(told=record._replace(text=text))])
+        await keep(works, [told[0], told[1]._replace(content=record._replace(text=text))])
     ((found,),) = database.ask(f"SELECT record FROM fleet.records WHERE message = '{record.message}'")
     assert found == json.loads(text)

@@ -1,4 +1,4 @@
-"""A database with the records of many machines in it, brought there by the collector's own hands."""
+"""A database with the records of many machines, stored by the collector itself."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ STORED = datetime(2027, 1, 15, 8, 0, tzinfo=UTC)
 
 
 def fleet_of(database: Postgres, folder: Path) -> Fleet:
-    """Return the works' configuration."""
+    """Return the fleet server's configuration."""
     return Fleet(database=Database(connection=database.connection), objects=Objects(directory=folder / "objects"))
 
 
 def told_by(machine: Machine, with_windows: bool = False) -> list[Message]:
-    """Return what a machine has to tell, as its uplink would send it, with or without recorded windows."""
+    """Return the messages of a machine's uplink, with or without recorded windows."""
     return told_by_store(machine.config, with_windows)
 
 
 def told_by_store(config: MachineConfig, with_windows: bool = False) -> list[Message]:
-    """Return the same of what is in a machine's store."""
+    """Return the messages of a machine's store."""
     settings = config.uplink
     assert settings is not None
     name = settings.name_of(config.machine.name)
@@ -51,12 +51,12 @@ def told_by_store(config: MachineConfig, with_windows: bool = False) -> list[Mes
 
 
 async def gather(fleet: Fleet, messages: Iterable[Message]) -> None:
-    """Bring messages into the database, one a second by the server's clock."""
+    """Collect messages into the database, one per second of the server's clock."""
     await keep(fleet, received_of(messages))
 
 
 def received_of(messages: Iterable[Message]) -> list[Received]:
-    """Return messages as a collector receives them."""
+    """Return messages in the form in which a collector receives them."""
     return [
         Received(message.subject, STORED + timedelta(seconds=k), told)
         for k, message in enumerate(messages)
@@ -65,7 +65,6 @@ def received_of(messages: Iterable[Message]) -> list[Received]:
 
 
 async def keep(fleet: Fleet, received: Sequence[Received]) -> None:
-    """Bring into the database what was received."""
     async with await psycopg.AsyncConnection.connect(fleet.database.connection, autocommit=True) as db:
         await migrations.bring_up(db)
         await db.execute(_INCOMING)
@@ -73,16 +72,16 @@ async def keep(fleet: Fleet, received: Sequence[Received]) -> None:
 
 
 def told_at(received: Received, at: datetime, stored: datetime | None = None) -> Received:
-    """Return what was received as recorded at a time, and stored then or later."""
-    assert isinstance(received.told, Record)
-    return received._replace(stored_at=stored or at, told=received.told._replace(recorded_at=at))
+    """Return a received record with another time of recording, stored then or later."""
+    assert isinstance(received.content, Record)
+    return received._replace(stored_at=stored or at, content=received.content._replace(recorded_at=at))
 
 
 def at_days(machine: Machine, begin: datetime) -> list[Received]:
-    """Return what a machine told, one round of its records each day."""
+    """Return a machine's records, one round per day."""
     received, windows = [], Counter[str]()
     for each in received_of(told_by(machine)):
-        assert isinstance(each.told, Record)
-        windows[each.told.axis] += each.told.kind == "window"
-        received.append(told_at(each, begin + timedelta(days=max(windows[each.told.axis] - 1, 0))))
+        assert isinstance(each.content, Record)
+        windows[each.content.axis] += each.content.kind == "window"
+        received.append(told_at(each, begin + timedelta(days=max(windows[each.content.axis] - 1, 0))))
     return received

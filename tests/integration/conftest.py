@@ -21,6 +21,7 @@ from fdhil.config import MachineConfig
 from fdhil.pipeline import AxisPipeline
 from fdhil.program import load_trajectory
 from fdhil.records import Notice, Outcome
+from fdhil.sim import service as sim_service
 from fdhil.sim.service import LOCKSTEP_HOLDING_WAIT_S, SimService
 from tests.bench import bench_document
 
@@ -122,7 +123,7 @@ def sections() -> dict[str, Any]:
 
 @pytest.fixture
 def bench(transport: str, sections: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    monkeypatch.setattr("fdhil.sim.service.LOCKSTEP_WAIT_S", LOCKSTEP_HOLDING_WAIT_S)
+    monkeypatch.setattr(sim_service, "LOCKSTEP_WAIT_S", LOCKSTEP_HOLDING_WAIT_S)
     document = bench_document() | sections
     TRANSPORTS[transport](document)
     events: queue.Queue[dict[str, Any]] = queue.Queue()

@@ -1,4 +1,4 @@
-"""A machine that has identified its drives already: made once, and copied by each test that arms."""
+"""A machine that has identified its drives: created once, copied by each test that arms."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def identified(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 @pytest.fixture
 def begin(identified: tuple[Path, Path]) -> Iterator[Callable[[], Machine]]:
-    """Begin the life of that machine again: guard and daemon run, and the NC leads the drives."""
+    """Restart that machine: guard and daemon run, and the NC controls the drives."""
     folder, kept = identified
     begun: list[Machine] = []
 

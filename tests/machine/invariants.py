@@ -1,4 +1,4 @@
-"""What must hold on a machine at every SYNC, whatever happens to it; knows nothing of the guard's decisions."""
+"""Invariants of a machine at every SYNC, independent of the guard's decisions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TABLES = ("windows", "revisions", "notices", "skills", "loops")
 
 
 class Judge:
-    """Watches one machine and appends to its ``wrong``; ``counted`` is how much it has judged."""
+    """Checks one machine and appends violations to its ``wrong``; ``counted`` is the number of checks."""
 
     def __init__(self, machine: Machine) -> None:
         self._machine = machine
@@ -39,11 +39,10 @@ class Judge:
         machine.at_foreign_frame = self._foreign_frame
 
     def wrong(self, text: str) -> None:
-        """Report a broken invariant, with the time."""
+        """Report a violated invariant with the time."""
         self._machine.wrong.append(f"{self._machine.clock.now_s():.3f} s: {text}")
 
     def _follow(self) -> None:
-        """Judge a new guard from what the drives hold."""
         guard = self._machine.guard
         if guard is self._guard or guard is None:
             return
@@ -54,7 +53,6 @@ class Judge:
 
     @staticmethod
     def _held(unit: Any) -> int:
-        """The offset that the drive has in force, increments."""
         return int(unit.drive.dictionary.numbers[OFFSET])
 
     @property
@@ -91,7 +89,7 @@ class Judge:
             self._held_since_s = None
 
     def _true_guard(self) -> None:
-        """A guard at rest reports no offset of a drive as less than it is, or as another, once it has read it back."""
+        """Check that an idle guard reports the drive's true offset once it has read it back."""
         guard = self._machine.guard
         if guard is None or guard.state.mode not in AT_REST or guard._silent:
             self._untrue.clear()
@@ -104,7 +102,7 @@ class Judge:
                 self.wrong(f"the guard reports that axis {unit.axis} holds {reported}, it holds {held}")
 
     def status(self) -> dict[str, Any]:
-        """Ask for the daemon's status; what it reports of offsets that may be applied must be true."""
+        """Request the daemon's status; its report of applied offsets must be true."""
         status = self._machine.ask("status")
         self.counted["statuses"] += 1
         now_s = self._machine.clock.now_s()
@@ -114,7 +112,7 @@ class Judge:
         return status
 
     def end(self) -> None:
-        """Judge what is left: the drives at zero, no record lost or doubled, no line of a crash."""
+        """Check the final state: drives at zero, no record lost or duplicated, no traceback in the log."""
         machine = self._machine
         if self._any_held:
             self.wrong(f"in the end the drives hold {machine.held_um()} um")

@@ -1,4 +1,4 @@
-"""One CAN bus in memory: the simulated machine, the guard's socket and the daemon's listener are joined by it."""
+"""A CAN bus in memory that connects the simulated machine, the guard's socket and the daemon's listener."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ MOST_ROWS = 20_000
 
 
 class MemoryBus:
-    """Every frame that was on the bus, in order; ``digest`` is over all of them, ``trace`` is where they are written.
+    """All frames of the bus in order; ``digest`` covers all of them, ``trace`` is the file they are written to.
 
-    ``from_guard`` is called with each frame that the guard sends.
+    ``from_guard`` is called with each frame of the guard.
     """
 
     def __init__(self, name: str, now_s: Callable[[], float], faults: FrameFaults) -> None:
@@ -40,11 +40,10 @@ class MemoryBus:
 
     @property
     def is_down(self) -> bool:
-        """Whether a fault has switched the bus off."""
         return self.faults.down
 
     def put(self, frames: Iterable[tuple[int, bytes]], *, of_guard: bool = False) -> None:
-        """Carry frames to all who listen; the guard does not receive its own."""
+        """Deliver frames to all listeners; the guard does not receive its own."""
         now_s = self.now_s()
         t_ns = round(now_s * 1e9)
         rows = [(t_ns, can_id, data) for can_id, data in frames]
@@ -55,7 +54,6 @@ class MemoryBus:
             self.flush()
 
     def flush(self) -> None:
-        """Hand over to the listener what came since the last time."""
         if not self._rows:
             return
         frames = frames_of(self._rows)
@@ -68,7 +66,7 @@ class MemoryBus:
             self.listener.blocks.append(frames)
 
     def open(self, name: str, settings: config.CanBus, *, filters: Sequence[Filter] = ()) -> BusListener:
-        """Open the bus for listening, as ``CanBus`` does; ConnectError while it is down."""
+        """Open the bus for listening, like ``CanBus``; ConnectError while it is down."""
         if self.is_down:
             raise ConnectError(name, "the interface is down; switch it on")
         self.flush()
@@ -77,7 +75,7 @@ class MemoryBus:
 
 
 class BusListener:
-    """The daemon's end: what the bus carried since it was opened, in blocks."""
+    """The daemon's end: the frames since it was opened, in blocks."""
 
     stamps: Stamps = "kernel"
 
@@ -92,7 +90,6 @@ class BusListener:
         return "the interface is down" if self._bus.is_down else None
 
     def drain(self) -> Frames:
-        """Return what came since the last call."""
         self._bus.flush()
         blocks, self.blocks = self.blocks, []
         frames = passing(np.concatenate(blocks), self._filters) if blocks else frames_of(())
@@ -106,13 +103,12 @@ class BusListener:
         return {"frames": self._count, "ring_overflow": 0, "kernel_drops": 0, "lost": 0}
 
     def close(self) -> None:
-        """Listen no more."""
         if self._bus.listener is self:
             self._bus.listener = None
 
 
 class GuardSocket(CanSocket):
-    """The guard's end: ``inbox`` is what it has not read yet, ``wanted`` are the COB-IDs of its filter."""
+    """The guard's end: ``inbox`` holds unread frames, ``wanted`` are the COB-IDs of its filter."""
 
     def __init__(self, bus: MemoryBus, allowed: Iterable[int], wanted: Iterable[int]) -> None:
         super().__init__(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM), allowed)
@@ -122,7 +118,7 @@ class GuardSocket(CanSocket):
 
     @property
     def is_readable(self) -> bool:
-        """Whether a frame waits, or the end of the bus."""
+        """Whether a frame waits, or the bus has ended."""
         return bool(self.inbox) or self._bus.is_down
 
     def receive(self) -> list[Frame]:
@@ -143,9 +139,9 @@ class GuardSocket(CanSocket):
 
 
 class GuardPoll:
-    """Stands in for ``select.poll`` in the guard: never waits, but tells ``rest`` for how long it would have.
+    """Replaces ``select.poll`` in the guard: never waits, but reports to ``rest`` how long it would have waited.
 
-    Where the bus alone is waited for, by a guard whose loop has failed, ``wait`` lets time pass until a frame comes.
+    For a guard whose loop has failed, which waits for the bus alone, ``wait`` advances time until a frame comes.
     """
 
     def __init__(self, can: GuardSocket, rest: Callable[[float], None], wait: Callable[[float], None]) -> None:
@@ -154,7 +150,7 @@ class GuardPoll:
         self._can_asked = self._clients_asked = False
 
     def register(self, what: object, events: int) -> None:
-        """Look at the bus, or at what has a descriptor."""
+        """Register the bus, or an object with a descriptor."""
         if what is self._can:
             self._can_asked = True
         else:
@@ -162,7 +158,6 @@ class GuardPoll:
             self._clients.register(what, events)  # type: ignore[arg-type] # has fileno()
 
     def poll(self, wait_ms: float) -> list[tuple[int, int]]:
-        """Return who is ready now."""
         if wait_ms > 0 and not self._clients_asked and not self._can.is_readable:
             self._wait(wait_ms * 1e-3)
         ready = self._clients.poll(0) if self._clients_asked else []

@@ -1,4 +1,4 @@
-"""A whole machine on virtual time: what is armed is cut within its prediction, however long it is."""
+"""A complete machine on virtual time: corrected cuts stay within their prediction, for any length."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Begin = Callable[[], Machine]
 
 
 def part(rounds: int) -> str:
-    """Return a program of so many rounds."""
+    """Return a program of this number of rounds."""
     return f"G21 G90 G94\nG4 P0.2\n{ROUND * rounds}G4 P0.2\nM2\n"
 
 
 def cut(machine: Machine, program: str, name: str) -> float:
-    """Let the NC cut a program; return the RMS of the contour error at the table, um."""
+    """Cut a program; return the RMS contour error at the table, um."""
     trace = machine.folder / f"{name}.csv"
     machine.plant.trace(trace)
     machine.play(program, name)
@@ -34,7 +34,7 @@ def cut(machine: Machine, program: str, name: str) -> float:
 
 
 def passed(machine: Machine) -> dict[str, Any]:
-    """Return what the daemon measured of the last pass."""
+    """Return the daemon's measurement of the last pass."""
     machine.run(1.0)
     measured: dict[str, Any] = machine.ask("status")["passes"][-1]
     return measured

@@ -1,4 +1,4 @@
-"""A whole machine on virtual time: whatever is killed, hung or lost in a cut, the drives come to zero in time."""
+"""A complete machine on virtual time: the drives reach zero in time after any kill, hang or loss during a cut."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Begin = Callable[[], Machine]
 
 
 def into_the_cut(machine: Machine, seconds: float = 0.0) -> None:
-    """Arm a part and let the NC play it until an offset is applied, and for so long before that."""
+    """Arm a part and play it until an offset is applied for this time."""
     answer = machine.arm(machine.write(PART, "part.ngc"))
     assert answer["ok"], answer
     machine.play(PART, "part.ngc", wait=False)
@@ -29,7 +29,7 @@ def into_the_cut(machine: Machine, seconds: float = 0.0) -> None:
 
 
 def bound_s(machine: Machine) -> float:
-    """Return how long the ramp to zero may take from the largest offset."""
+    """Return the longest ramp to zero from the largest offset."""
     assert machine.guard is not None
     settings = machine.guard.settings
     return max(ramp_cycles(axis.limits, axis.limits.offset) for axis in settings.axes) * settings.sync_period_s
@@ -41,13 +41,12 @@ def comes_to_zero(machine: Machine, within_s: float) -> None:
 
 
 def rows(machine: Machine) -> list[tuple[object, ...]]:
-    """Return all rows of the history."""
     with closing(sqlite3.connect(machine.config.store.directory / "history.sqlite")) as db:
         return [row for table in TABLES for row in db.execute(f"SELECT * FROM {table} ORDER BY id")]
 
 
 def eventful(machine: Machine) -> Iterable[object]:
-    """Cut, kill, adopt and lose frames; yield all that is to be the same each time."""
+    """Cut, kill, adopt and lose frames; yield everything that must be reproducible."""
     into_the_cut(machine)
     machine.kill("daemon")
     machine.start("daemon")

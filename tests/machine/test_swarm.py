@@ -1,4 +1,4 @@
-"""The swarm repeats a life from its seed, and its judge sees what is wrong."""
+"""The swarm reproduces a run from its seed, and its checker detects violations."""
 
 from __future__ import annotations
 

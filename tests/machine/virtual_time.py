@@ -1,4 +1,4 @@
-"""Time that passes only by being waited for: threads do not exist, and days of time-outs take minutes."""
+"""Virtual time: it advances only by waiting, without threads, so that days of time-outs take minutes."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ FIRST_WALL_S = 1_790_000_000.0
 
 
 class VirtualClock(Clock):
-    """A clock that stands still until it is advanced; ``set_s`` is by how much the wall clock was set since."""
+    """A clock that advances only on request; ``set_s`` is the change of the wall clock since then."""
 
     def __init__(self) -> None:
         self.time_s = 1000.0
         self.set_s = 0.0
 
     def advance(self, until_s: float) -> None:
-        """Let time pass until ``until_s``."""
+        """Advance time to ``until_s``."""
         self.time_s = max(self.time_s, until_s)
 
     def now_s(self) -> float:
@@ -48,20 +48,20 @@ class VirtualClock(Clock):
 
 
 class HastyClock(VirtualClock):
-    """A clock on which nobody sleeps: time passes at once; answers of other threads are waited for as they are."""
+    """A clock without sleep: time advances at once; answers of other threads are awaited in real time."""
 
     def wait_readable(self, connection: socket.socket, seconds: float) -> bool:
         return Clock.wait_readable(self, connection, seconds)
 
 
 class Killed(BaseException):
-    """What a call meets that a killed process would have made."""
+    """Raised by any call of a killed process."""
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):
-    """An event loop on a virtual clock: where it would wait, the clock advances; worker threads are plain calls.
+    """An event loop on a virtual clock: instead of waiting, the clock advances; worker threads are plain calls.
 
-    Signal handlers are called by ``send_signal`` alone. Once ``dead``, nothing that leaves the loop happens any more.
+    Signal handlers are called by ``send_signal`` only. Once ``dead``, the loop has no further effect.
     """
 
     def __init__(self, clock: VirtualClock | None = None) -> None:
@@ -75,11 +75,11 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         return self.clock.now_s()
 
     def monotonic_ns(self) -> int:
-        """Stand in for ``time.monotonic_ns``."""
+        """Replace ``time.monotonic_ns``."""
         return round(self.clock.now_s() * 1e9)
 
     def run_in_executor(self, executor: Any, call: Callable[..., Any], *given: Any) -> asyncio.Future[Any]:  # type: ignore[override]
-        """Make the call now, in this thread."""
+        """Run the call now, in this thread."""
         done = self.create_future()
         try:
             if self.dead:
@@ -92,7 +92,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         return done
 
     async def subprocess_exec(self, protocol_factory: Any, *arguments: Any, **_named: Any) -> Any:
-        """Run the one module that is started as a process, the check of a program, in this process."""
+        """Run the program check, the only module started as a process, in this process."""
         if self.dead or arguments[1:] != ("-m", program_check.__name__):
             raise OSError(11, f"{arguments} cannot be started on virtual time")
         protocol = protocol_factory()
@@ -112,7 +112,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
 
 class _CheckInProcess(asyncio.SubprocessTransport):
-    """The check of a program as a process that answers at once; it is its own pipe to stdin."""
+    """The program check as a process that answers at once; it is its own pipe to stdin."""
 
     def __init__(self, loop: VirtualLoop, protocol: asyncio.SubprocessProtocol) -> None:
         super().__init__()
@@ -129,8 +129,6 @@ class _CheckInProcess(asyncio.SubprocessTransport):
         return self
 
     def write(self, data: bytes) -> None:
-        """Take the request, and answer it."""
-
         def say(answer: Mapping[str, Any]) -> None:
             line = json.dumps(answer).encode() + b"\n"
             self._loop.call_soon(self._protocol.pipe_data_received, 1, line)
@@ -171,7 +169,6 @@ class _Advancing(selectors.DefaultSelector):
 
 
 def run(main: Coroutine[Any, Any, Any], loop: VirtualLoop) -> Any:
-    """Run a coroutine to its end in virtual time."""
     try:
         return loop.run_until_complete(main)
     finally:

@@ -61,9 +61,9 @@ def document(axes: str = "XY", **sections: Any) -> dict[str, Any]:
 
 
 class Machine:
-    """A whole machine on virtual time; ``config`` is a parsed document, ``store`` a store to begin with.
+    """A complete machine on virtual time; ``config`` is a parsed document, ``store`` an initial store.
 
-    ``log`` is the daemon's log, ``journal`` the guard's; ``wrong`` lists each broken invariant with its time.
+    ``log`` is the daemon's log, ``journal`` the guard's; ``wrong`` lists each violated invariant with its time.
     """
 
     def __init__(
@@ -112,14 +112,13 @@ class Machine:
         self.close()
 
     def run(self, seconds: float) -> None:
-        """Let time pass."""
         if self._loop is None:
             self.clock.advance(self.clock.now_s() + seconds)
         else:
             self._complete(asyncio.sleep(seconds))
 
     def run_until(self, reached: Callable[[], bool], seconds: float = 60.0, step_s: float = 0.02) -> None:
-        """Let time pass until something has come about; RuntimeError when it does not in ``seconds``."""
+        """Advance time until a condition holds; RuntimeError when it does not within ``seconds``."""
         end_s = self.clock.now_s() + seconds
         while not reached():
             if self.clock.now_s() >= end_s:
@@ -127,13 +126,13 @@ class Machine:
             self.run(step_s)
 
     def nc(self, on: bool) -> None:
-        """Switch the NC on or off, and wait until it leads the drives, or has let go."""
+        """Switch the NC on or off, and wait until it controls the drives or has released them."""
         seen = len(self.events)
         self.plant.nc.switch(on)
         self.run_until(lambda: any(e["event"] in ("nc", "error") for e in self.events[seen:]), BOOT_S)
 
     def play(self, program: str, name: str = "part.ngc", *, wait: bool = True) -> Path:
-        """Have the NC play a program; ``wait`` for its end."""
+        """Play a program on the NC; ``wait`` for its end."""
         path = self.write(program, name)
         seen = len(self.events)
         self.plant.nc.play(str(path), load_trajectory(path, self.config))
@@ -142,17 +141,16 @@ class Machine:
         return path
 
     def finished(self, since: int) -> bool:
-        """Return whether the NC reported the end of a program, or an error, after so many of its events."""
+        """Return whether the NC reported the end of a program or an error after this number of its events."""
         return any(e["event"] in ("finished", "stopped", "error") for e in self.events[since:])
 
     def write(self, program: str, name: str) -> Path:
-        """Write a program."""
         path = self.folder / name
         path.write_text(program, "utf-8")
         return path
 
     def ask(self, what: str, **fields: Any) -> dict[str, Any]:
-        """Send the daemon a request over its control socket and return the answer, as ``fdhil`` does."""
+        """Send a request to the daemon's control socket and return the answer, as ``fdhil`` does."""
         if self._loop is None:
             raise RuntimeError("no daemon runs")
         answer: dict[str, Any] = self._complete(self._converse({"request": what, **fields}))
@@ -163,12 +161,12 @@ class Machine:
         return self.ask("arm", program=str(program), token=self.token, **fields)
 
     def adopt(self) -> dict[str, Any]:
-        """Have the guard take over what the drives hold and ramp it to zero."""
+        """Let the guard adopt the drives' offsets and ramp them to zero."""
         with GuardClient(self.config.guard_directory, clock=self.clock) as client:
             return client.adopt(self.token)
 
     def attest(self) -> None:
-        """Confirm every drive's record, to the guard and on the disk, as ``fdhil check`` does where nothing differs."""
+        """Attest every drive's record, to the guard and on disk, as ``fdhil check`` does without differences."""
         directory = self.config.store.directory
         marks = {axis: void_mark(directory, axis) for axis in self.config.axis}
         records = {axis: load_record(directory, axis) for axis in self.config.axis}
@@ -185,7 +183,7 @@ class Machine:
         return operator_token(self.config.run_directory)
 
     def fault(self, kind: str, **fields: Any) -> None:
-        """Begin a fault of the simulated machine by its name, as the operator's panel does."""
+        """Start a named fault of the simulated machine, as the operator's panel does."""
         self.plant.faults.add(parse_fault({"fault": kind, **fields}, tuple(self.plant.units)))
 
     # -- processes
@@ -195,7 +193,7 @@ class Machine:
         self._start_daemon() if name == "daemon" else self._start_guard()
 
     def stop(self, name: str) -> None:
-        """End it as SIGTERM does, and wait for its end."""
+        """End a process as SIGTERM does, and wait for its end."""
         if name == "daemon":
             assert self._loop is not None
             assert self._serving is not None
@@ -208,11 +206,11 @@ class Machine:
             self.run_until(lambda: self.guard is None)
 
     def kill(self, name: str) -> None:
-        """End it as SIGKILL does: what is on the disk stays as it is, the other end of each connection sees its end."""
+        """End a process as SIGKILL does: the disk stays as it is, and its connections end."""
         self._kill_daemon() if name == "daemon" else self._kill_guard()
 
     def hang(self, name: str, seconds: float) -> None:
-        """Stop it as SIGSTOP does, and let it go on after so long."""
+        """Stop a process as SIGSTOP does, and resume it after a time."""
         end_s = self.clock.now_s() + seconds
         if name == "guard":
             self._hung_until_s = end_s
@@ -222,7 +220,6 @@ class Machine:
             self.clock.advance(end_s)
 
     def restart(self, name: str) -> None:
-        """End it and start it again."""
         self.stop(name)
         self.start(name)
 
@@ -255,7 +252,7 @@ class Machine:
             self.wrong.append(f"{self.clock.now_s():.3f} s: the daemon ended with {error!r}")
 
     def _kill_daemon(self) -> None:
-        """Keep the disk as it is now, close what the kernel would close, and let nothing of the rest happen."""
+        """Keep the present disk content, close what the kernel would close, and prevent any further effect."""
         assert self._loop is not None
         assert self.service is not None
         loop, kept = self._loop, Path(tempfile.mkdtemp(dir=self.folder))
@@ -282,12 +279,11 @@ class Machine:
             stale.bind(str(left))
 
     def _not_of_daemon(self, folder: str, names: list[str]) -> set[str]:
-        """What a daemon that was killed has not written: sockets and settings of others."""
+        """Return what a killed daemon has not written: sockets and settings of others."""
         run = self.config.run_directory
         return {run.name} if Path(folder) == run.parent and run.name in names else set()
 
     def _start_guard(self) -> None:
-        """Start the guard on the settings that ``fdhil-guard`` makes."""
         assert self.guard is None
         run, name = self.config.guard_directory, corrected_bus(self.config, "machine")
         digest = hashlib.sha256(operator_token(self.config.run_directory).encode()).hexdigest()
@@ -357,7 +353,7 @@ class Machine:
             writer.close()
 
     def pass_until(self, until_s: float) -> None:
-        """Let the machine work until then: its SYNC, the drives' own clocks, and the guard's turns."""
+        """Run the machine until a time: SYNC, the drives' own clocks, and the guard's turns."""
         clock = self.clock
         while (due_s := self._due_s()) <= until_s:
             clock.time_s = max(clock.time_s, due_s)
@@ -365,12 +361,10 @@ class Machine:
         clock.time_s = max(clock.time_s, until_s)
 
     def _due_s(self) -> float:
-        """Return when the next thing is due."""
         due_s = min(self._sync_s, self._wall_s) if self.plant.nc.on else self._wall_s
         return due_s if self.guard is None else min(due_s, max(self._guard_due_s, self._hung_until_s))
 
     def _work(self) -> None:
-        """Do all that is due now."""
         now_s, plant = self.clock.time_s, self.plant
         if now_s >= self._wall_s:
             self._wall_s = now_s + WALL_CLOCK_S
@@ -401,7 +395,7 @@ class Machine:
         self._guard_due_s = self.clock.time_s + max(seconds, 1e-4)
 
     def _pass_for_failed_guard(self, seconds: float) -> None:
-        """Let time pass until a frame comes, for a guard whose loop has failed."""
+        """Advance time until a frame comes, for a guard whose loop has failed."""
         guard, self.guard = self.guard, None
         end_s, can = self.clock.time_s + seconds, self.bus.guard
         while can is not None and not can.is_readable and (due_s := self._due_s()) <= end_s:
@@ -412,7 +406,7 @@ class Machine:
         self.guard = guard
 
     def wait_readable(self, connection: socket.socket, seconds: float) -> bool:
-        """Let the machine work until a connection can be read, at most for so long."""
+        """Run the machine until a connection is readable, at most for a given time."""
         end_s = self.clock.time_s + seconds
         if self.guard is not None:
             self._guard_due_s = self.clock.time_s
@@ -448,7 +442,7 @@ class Machine:
         return True
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send a frame as another node of the bus does."""
+        """Send a frame as another node of the bus."""
         self._arrive([(can_id, data)])
 
     def _arrive(self, frames: list[tuple[int, bytes]], *, of_guard: bool = False) -> None:
@@ -461,15 +455,15 @@ class Machine:
 
     @property
     def guard_state(self) -> str:
-        """The guard's state, ``gone`` where none runs."""
+        """The guard's state, ``gone`` if none runs."""
         return "gone" if self.guard is None else self.guard.state.mode.value
 
     def held_um(self) -> dict[str, float]:
-        """Return the offset that each drive has in force, um."""
+        """Return the offset in force of each drive, um."""
         return {name: unit.drive.offset_mm * 1e3 for name, unit in self.plant.units.items()}
 
     def _commission(self) -> None:
-        """Sign the drives off as they are: their records are what ``fdhil commission`` writes."""
+        """Create the drives' records as ``fdhil commission`` writes them."""
         for name, unit in self.plant.units.items():
             number = unit.drive.dictionary.number
             keys = (0x6007, 0x605A, 0x605E, 0x6065, 0x6085, 0x1017)
@@ -495,7 +489,6 @@ class Machine:
             save_record(record, self.config.store.directory)
 
     def close(self) -> None:
-        """End all that runs."""
         if self._loop is not None:
             self._kill_daemon()
         if self.guard is not None:
@@ -506,7 +499,7 @@ class Machine:
 
 
 class _MachineClock(VirtualClock):
-    """The machine's clock: time passes by the machine's work."""
+    """The machine's clock: time advances by the machine's work."""
 
     def __init__(self, machine: Machine) -> None:
         super().__init__()
@@ -520,7 +513,6 @@ class _MachineClock(VirtualClock):
 
 
 def _cancel_all(loop: VirtualLoop) -> None:
-    """End all tasks of a loop."""
     if tasks := asyncio.all_tasks(loop):
         for task in tasks:
             task.cancel()

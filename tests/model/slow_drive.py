@@ -1,6 +1,6 @@
-"""An independent drive for the tests: plain Python, quantised encoder and set-points, two ways to do the physics.
+"""An independent reference drive: plain Python, quantised encoder and set-points, two physics implementations.
 
-It shares no code with the model: other integration, other order of work, positions in drive increments.
+It shares no code with the model: other integration, other order of computation, positions in drive increments.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ SUBSTEPS = 2
 
 
 class SlowDrive:
-    """One axis with its regulators; ``run`` gives the table's position at each SYNC. Physics by Runge-Kutta."""
+    """One axis with its regulators; ``run`` returns the table position at each SYNC. Physics by Runge-Kutta."""
 
     def __init__(self, parameters: Parameters, axis: Axis, period_s: float, increments: int = 65536) -> None:
         self.p, self.g, self.period = parameters, axis.regulators, period_s
@@ -36,7 +36,6 @@ class SlowDrive:
         self.memory: list[list[float]] = []
 
     def _smooth(self, w: float, theta: float, side: float) -> float:
-        """Every torque against the positive direction but dry friction."""
         p, terms = self.p, dict(self.p.terms)
         angle = theta + self.start * 2 * math.pi / self.pitch
         total = p.term("load") + w * p.term("viscous_positive" if side > 0 else "viscous_negative", p.ft)
@@ -46,7 +45,6 @@ class SlowDrive:
         return total
 
     def _dry(self, w: float, side: float) -> float:
-        """Dry friction, a positive number."""
         p = self.p
         dry = p.term("coulomb_positive" if side > 0 else "coulomb_negative", p.Cd)
         return dry + (p.term("stribeck") * math.exp(-((w / p.term("stribeck_speed", 1.0)) ** 2)))
@@ -88,7 +86,7 @@ class SlowDrive:
         self.i, self.w, self.theta = x[0], (x[1] if x[1] * sign > 0 else 0.0), x[2]
 
     def run(self, demand_mm: list[float]) -> list[float]:
-        """Follow ``demand_mm`` (n,) from rest at its first row; return the positions (n,) in mm."""
+        """Follow ``demand_mm`` (n,) from rest at its first sample; return the positions (n,) in mm."""
         per_mm = self.increments / self.pitch
         targets = [round(mm * per_mm) for mm in demand_mm]
         start = self.start = demand_mm[0]
@@ -112,7 +110,6 @@ class SlowDrive:
         return positions
 
     def _pid_component(self, command: float, measured: float) -> None:
-        """LinuxCNC's pid component as its manual has it, once a servo cycle, angles in radians."""
         g, t = self.g, self.period
         if not self.commands:
             self.commands, self.measured = [command] * 4, measured
@@ -137,7 +134,6 @@ class SlowDrive:
         self.saturated = (wanted > most) - (wanted < -most)
 
     def _filtered(self, signals: list[float]) -> list[float]:
-        """Set-point, speed and acceleration behind the filter: each stage steps towards its input."""
         if self.g.setpoint_filter_s > 0:
             for stage in self.memory:
                 for n, value in enumerate(signals):
@@ -146,14 +142,12 @@ class SlowDrive:
         return signals
 
     def _slowed(self, speed: float) -> float:
-        """The speed behind the filter on its feedback."""
         if self.g.speed_filter_s > 0:
             self.seen += -math.expm1(-self.g.speed_period_s / self.g.speed_filter_s) * (speed - self.seen)
             return self.seen
         return speed
 
     def _cycle(self, place: float, rate: float, acceleration: float, encoder: float) -> None:
-        """One speed cycle, angles in radians."""
         g, h = self.g, self.g.speed_period_s
         lag = place - encoder
         position_sum = self.position_sum + g.position_ki_per_s2 * h * lag
@@ -194,7 +188,7 @@ class SlowDrive:
 
 
 class EventDrive(SlowDrive):
-    """The same regulators around equations [1] and [2] as ``solve_ivp`` has them, standstill found as an event."""
+    """The same regulators around equations [1] and [2], solved by ``solve_ivp`` with standstill as an event."""
 
     def _integrate(self, u: float, h: float) -> None:
         p = self.p
@@ -220,7 +214,7 @@ class EventDrive(SlowDrive):
 
 
 class TwoMassDrive(SlowDrive):
-    """The same regulators around a motor that pulls its table by a spring; dry friction acts on the table."""
+    """The same regulators around a motor that drives its table through a spring; dry friction acts on the table."""
 
     def __init__(self, parameters: Parameters, axis: Axis, period_s: float, increments: int = 65536) -> None:
         super().__init__(parameters, axis, period_s, increments)

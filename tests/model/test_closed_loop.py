@@ -1,4 +1,4 @@
-"""The closed-loop kernel against slow independent physics, and its own laws."""
+"""The closed-loop kernel against independent physics, and its own invariants."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PERIOD = 0.001
 
 
 def random_demand(seed: int, n: int = 450) -> Float:
-    """Moves, reversals and rests, smoothed as an NC does; away from the limits."""
+    """Return moves, reversals and rests, smoothed as by an NC; within the limits."""
     random = np.random.default_rng(seed)
     speeds = np.repeat(random.choice([0.0, 1.0, -1.0], 10) * random.uniform(0, 90, 10), n // 10 + 1)[:n]
     speeds[-110:] = 0.0
@@ -31,7 +31,7 @@ def random_demand(seed: int, n: int = 450) -> Float:
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("seed", range(6))
 def test_agrees_with_independent_physics(seed: int) -> None:
-    """Within 0.6 um of a drive that quantises (dry friction keeps what rounding left), 0.02 um of one that does not."""
+    """Within 0.6 um of a drive with quantisation (dry friction keeps the rounding), 0.02 um of one without."""
     random = np.random.default_rng(100 + seed)
     scaled = [v * random.uniform(0.85, 1.15) for v in NOMINAL.as_dict().values()]
     parameters = Parameters.of(dict(zip(PARAMETERS, scaled, strict=True)))
@@ -55,7 +55,7 @@ def test_agrees_while_a_limit_acts() -> None:
 
 
 def test_starts_at_rest_and_follows_to_rest() -> None:
-    """Row 0 is the start; after the hold the table is at the reference within what dry friction keeps."""
+    """After the hold the table is at the reference within the band of dry friction."""
     demand = random_demand(3)
     response = closed_loop.simulate(NOMINAL, AXIS, PERIOD, demand)
     assert response.position_mm[0] == demand[0]
@@ -64,7 +64,6 @@ def test_starts_at_rest_and_follows_to_rest() -> None:
 
 
 def test_runs_in_pieces_give_the_same_bits() -> None:
-    """A run that continues from a state is the run that was not interrupted."""
     demand = random_demand(4)
     whole = closed_loop.simulate(NOMINAL, AXIS, PERIOD, demand)
     head = closed_loop.simulate(NOMINAL, AXIS, PERIOD, demand, rows=200)
@@ -74,7 +73,7 @@ def test_runs_in_pieces_give_the_same_bits() -> None:
 
 
 def test_offset_enters_the_feed_forward() -> None:
-    """Corrected means simulating r + o."""
+    """The corrected path is the simulation of r + o."""
     demand = random_demand(5)
     offset = smooth(np.random.default_rng(5).normal(0, 0.2, (demand.size, 1)), (0.05, 0.03), PERIOD)[:, 0]
     offset -= offset[0]
@@ -84,7 +83,6 @@ def test_offset_enters_the_feed_forward() -> None:
 
 
 def test_axes_in_threads_give_the_same_bits() -> None:
-    """Two axes at once are two axes one after the other."""
     config = bench_config("XY")
     demands = {"X": random_demand(6), "Y": random_demand(7)}
     models = {"X": NOMINAL, "Y": Parameters(0.5, 0.005, 0.8, 0.085, 0.01, 1.0)}
@@ -97,7 +95,7 @@ def test_axes_in_threads_give_the_same_bits() -> None:
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("structure", ["p_pi_pi", "double_pi"])
 def test_leaps_give_what_steps_give(structure: str, seed: int) -> None:
-    """Speed cycles taken at once are those taken step by step: moving, held, turning, clipped, frictionless."""
+    """For moving, held, reversing, limited and frictionless cycles."""
     random = np.random.default_rng(seed)
     demand = random_demand(seed) + (np.arange(450) > 300) * random.choice([0.0, 3.0])  # a jump clips
     document = bench_document("X")
@@ -125,6 +123,6 @@ def test_leaps_give_what_steps_give(structure: str, seed: int) -> None:
 
 @pytest.mark.parametrize("demand", [[], [0.0, np.nan], [[0.0, 1.0]], [0.0, np.inf]])
 def test_refuses_what_is_no_reference(demand: list[float]) -> None:
-    """An empty, two-dimensional or non-finite reference is an error, not a result."""
+    """For an empty, two-dimensional or non-finite reference."""
     with pytest.raises(ValueError, match="finite positions"):
         closed_loop.simulate(NOMINAL, AXIS, PERIOD, np.array(demand))

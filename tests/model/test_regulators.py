@@ -51,7 +51,6 @@ CASES = list(product(tables.REGULATORS, OPTIONS))
 
 
 def bench(structure: str, **regulators: Any) -> configuration.MachineConfig:
-    """The bench with other regulators."""
     document = bench_document()
     for axis in document["axis"].values():
         given = GAINS[structure] | regulators
@@ -61,19 +60,17 @@ def bench(structure: str, **regulators: Any) -> configuration.MachineConfig:
 
 
 def run(axis: Axis, demand: Float, **more: Any) -> closed_loop.Response:
-    """Simulate the nominal plant."""
     return closed_loop.simulate(Parameters(**axis.nominal.model_dump()), axis, PERIOD, demand, **more)
 
 
 def there_and_back(n: int) -> Float:
-    """A move that reverses and comes to rest, in mm."""
     speed = np.concatenate([np.zeros(5), np.full(n // 3, 30.0), np.full(n // 3, -20.0), np.zeros(n - n // 3 * 2 - 5)])
     return smooth(np.cumsum(speed * PERIOD)[:, None], (0.020, 0.010), PERIOD)[:, 0]
 
 
 @pytest.mark.parametrize(("structure", "option"), CASES)
 def test_contract(structure: str, option: str) -> None:
-    """Starts where it is told, follows to rest, keeps its limits, and continues from any row with the same bits."""
+    """Starts at the given position, follows to rest, respects limits, and continues from any sample bit-identically."""
     axis = bench(structure, **OPTIONS[option]).axis["X"]
     demand = bench_demand(5)[:, 1] + 7.0
     whole = run(axis, demand)
@@ -91,7 +88,7 @@ def test_contract(structure: str, option: str) -> None:
 
 @pytest.mark.parametrize(("structure", "option"), sampled(CASES, every=4))
 def test_agrees_with_independent_physics(structure: str, option: str) -> None:
-    """Move, reversal and rest as a drive of other code makes them."""
+    """For a move, a reversal and rest."""
     axis = bench(structure, **OPTIONS[option]).axis["X"]
     parameters = Parameters(0.53, 0.0047, 0.82, 0.081, 0.04, 4.2)
     demand = there_and_back(120)
@@ -104,7 +101,7 @@ def test_agrees_with_independent_physics(structure: str, option: str) -> None:
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize(("structure", "option"), CASES)
 def test_agrees_with_an_adaptive_solver(structure: str, option: str) -> None:
-    """Within a tenth of 0.5 um of ``solve_ivp`` with the standstill as an event, reversal and rest included."""
+    """Within 0.05 um of ``solve_ivp`` with standstill as an event, reversal and rest included."""
     axis = bench(structure, **OPTIONS[option]).axis["X"]
     parameters = Parameters(0.53, 0.0047, 0.82, 0.081, 0.04, 4.2)
     demand = there_and_back(40)
@@ -114,13 +111,13 @@ def test_agrees_with_an_adaptive_solver(structure: str, option: str) -> None:
 
 
 def into_the_limits() -> Float:
-    """Steps of the demand up and down, in mm: current and voltage limits act, the integrals stand."""
+    """Return demand steps up and down, in mm, that reach current and voltage limits."""
     return np.concatenate([np.zeros(5), np.full(40, 12.0), np.full(30, 4.0)])
 
 
 @pytest.mark.parametrize(("structure", "option"), sampled(CASES, every=4))
 def test_agrees_while_a_limit_acts(structure: str, option: str) -> None:
-    """Within 0.05 um of the independent drive, also while both limits act."""
+    """Within 0.05 um, also while both limits act."""
     axis = bench(structure, **OPTIONS[option]).axis["X"]
     response = run(axis, into_the_limits())
     assert response.limited_s > 0.005
@@ -165,7 +162,7 @@ def test_linuxcncs_pid_agrees_with_independent_physics(regulators: dict[str, Any
     ],
 )
 def test_axis_that_friction_holds_off_its_set_point_stays_there(structure: str, regulators: dict[str, Any]) -> None:
-    """The set-point has stood there for long: no derivative, feed-forward or filter kicks."""
+    """After a long standstill no derivative, feed-forward or filter causes a step."""
     axis = bench(structure, **regulators, speed_ki=0.0).axis["X"]
     parameters, off_mm = Parameters(**axis.nominal.model_dump()), 0.002
     state = closed_loop.standing(parameters, axis, off_mm, 0.0, 0.0)
@@ -174,7 +171,7 @@ def test_axis_that_friction_holds_off_its_set_point_stays_there(structure: str, 
 
 
 def test_the_pid_that_is_a_cascade() -> None:
-    """With full feed-forward a P and PI cascade is a PID, but for when the speed of the demand comes in."""
+    """With full feed-forward a P and PI cascade is a PID, apart from the timing of the speed demand."""
     demand = bench_demand(10)[:, 0]
     cascade = run(bench("p_pi_pi").axis["X"], demand)
     kv, kp, ki = 50.0, 23.562, 1184.35
@@ -184,14 +181,14 @@ def test_the_pid_that_is_a_cascade() -> None:
 
 
 def largest(structure: str = "p_pi_pi", **regulators: Any) -> float:
-    """Largest following error of the bench path's Y axis in um."""
+    """Return the largest following error of the bench path's Y axis in um."""
     demand = bench_demand(10)[:, 1]
     response = run(bench(structure, **regulators).axis["Y"], demand)
     return float(np.abs(response.position_mm - demand).max()) * 1e3
 
 
 def test_options_do_what_they_are_for() -> None:
-    """Torque fed forward and a position integral make errors smaller; a filter larger, two filters larger still."""
+    """Torque feed-forward and a position integral reduce errors; filters increase them."""
     plain = largest()
     assert largest(torque_feedforward=1.0) < 0.5 * plain
     assert largest(setpoint_filter_order=2) == plain
@@ -209,7 +206,7 @@ def test_options_do_what_they_are_for() -> None:
     ],
 )
 def test_a_structure_refuses_what_it_has_not(structure: str, more: dict[str, float], advice: str) -> None:
-    """It would be ignored silently, or make another structure of it."""
+    """Otherwise the option would be ignored silently, or change the structure."""
     with pytest.raises(ConfigError, match=advice):
         bench(structure, **more)
 
@@ -217,9 +214,9 @@ def test_a_structure_refuses_what_it_has_not(structure: str, more: dict[str, flo
 @pytest.mark.parametrize("option", ["plain", "torque", "second order", "all"])
 @pytest.mark.parametrize("structure", tables.REGULATORS)
 def test_the_inverse_works_for_every_structure(structure: str, option: str) -> None:
-    """Its linear part and what it does at rest come from simulated impulses, whatever the regulators are.
+    """Its linear part and its standstill state come from simulated impulses, for any regulators.
 
-    Least is left to gain where a position integral works against an incomplete feed-forward.
+    The gain is smallest where a position integral works against an incomplete feed-forward.
     """
     config = bench(structure, **OPTIONS[option])
     correction = plan(bench_trajectory(10), nominal_models(config), config, "inverse")
@@ -229,7 +226,7 @@ def test_the_inverse_works_for_every_structure(structure: str, option: str) -> N
 
 
 def test_flatness_leaves_the_drives_own_torque_to_it() -> None:
-    """A drive that feeds torque forward itself is not fed it twice."""
+    """A drive with its own torque feed-forward gets no second one."""
     config = bench("p_pi_pi", **OPTIONS["torque"])
     correction = plan(bench_trajectory(10), nominal_models(config), config, "flatness")
     assert correction.refused == ()

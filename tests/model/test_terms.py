@@ -1,4 +1,4 @@
-"""What joins the plain drive: the closed loop with terms against independent physics, and their own laws."""
+"""The optional terms: the closed loop with terms against independent physics, and their own invariants."""
 
 from __future__ import annotations
 
@@ -44,20 +44,18 @@ TERMS: dict[str, dict[str, float]] = {
 
 
 def bench(**regulators: Any) -> Axis:
-    """The bench's X axis with other regulators."""
     document = bench_document("X")
     document["axis"]["X"]["regulators"] |= regulators
     return parse(document).axis["X"]
 
 
 def there_and_back(n: int, smoothed_s: tuple[float, float] = (0.020, 0.010)) -> Float:
-    """A move that reverses and comes to rest, in mm, away from 0."""
     speed = np.concatenate([np.zeros(5), np.full(n // 3, 60.0), np.full(n // 3, -40.0), np.zeros(n - n // 3 * 2 - 5)])
     return 3.0 + smooth(np.cumsum(speed * PERIOD)[:, None], smoothed_s, PERIOD)[:, 0]
 
 
 def loaded(slow: SlowDrive, axis: Axis, demand: Float) -> SlowDrive:
-    """The slow drive with what its regulators hold at rest in the middle of the friction's band."""
+    """Return the reference drive settled at rest in the middle of the friction band."""
     slow.start = float(demand[0])
     pull = slow._smooth(0.0, 0.0, 1.0)
     slow.i = slow.speed_sum = pull / slow.p.K
@@ -69,7 +67,7 @@ def loaded(slow: SlowDrive, axis: Axis, demand: Float) -> SlowDrive:
 
 @pytest.mark.parametrize(("joined", "delay"), sampled(product(TERMS, [0, 3]), every=3))
 def test_agrees_with_independent_physics(joined: str, delay: int) -> None:
-    """Move, reversal and rest, as a drive of other code makes them."""
+    """For a move, a reversal and rest."""
     axis, parameters = bench(current_delay_cycles=delay), PLAIN.changed(**TERMS[joined])
     demand = there_and_back(150)
     response = closed_loop.simulate(parameters, axis, PERIOD, demand)
@@ -81,7 +79,7 @@ def test_agrees_with_independent_physics(joined: str, delay: int) -> None:
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("joined", TERMS)
 def test_agrees_with_an_adaptive_solver(joined: str) -> None:
-    """The same with ``solve_ivp``, the standstill found as an event."""
+    """Against ``solve_ivp`` with standstill as an event."""
     axis, parameters = bench(), PLAIN.changed(**TERMS[joined])
     demand = there_and_back(60)
     response = closed_loop.simulate(parameters, axis, PERIOD, demand)
@@ -92,7 +90,7 @@ def test_agrees_with_an_adaptive_solver(joined: str) -> None:
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("share", [0.3, 0.7])
 def test_a_table_behind_a_spring_agrees_with_independent_physics(share: float) -> None:
-    """Motor and table as a drive of other code makes them; what is left is when in a step the table stops."""
+    """The remaining difference is the instant within a step at which the table stops."""
     axis = bench(current_delay_cycles=1)
     parameters = PLAIN.changed(
         resonance=70.0, resonance_damping=0.03, resonance_share=share, stribeck=0.5, stribeck_speed=8.0
@@ -106,7 +104,7 @@ def test_a_table_behind_a_spring_agrees_with_independent_physics(share: float) -
 
 
 def test_a_stiff_spring_is_none() -> None:
-    """At a resonance far beyond the drive's reach motor and table are one."""
+    """At a resonance far beyond the drive's bandwidth."""
     demand, axis = there_and_back(150), bench()
     stiff = closed_loop.simulate(PLAIN.changed(resonance=3000.0, resonance_damping=0.1), axis, PERIOD, demand)
     one = closed_loop.simulate(PLAIN, axis, PERIOD, demand)
@@ -114,7 +112,7 @@ def test_a_stiff_spring_is_none() -> None:
 
 
 def named(m: real_plant.Mechanics, loops_: real_plant.Loops) -> Parameters:
-    """The same machine by the names of the terms."""
+    """Return the same machine by the names of the terms."""
     return Parameters.of(m.truth()).changed(
         load=m.load_nm,
         coulomb_positive=(1 + m.asymmetry) * m.Cd,
@@ -132,7 +130,7 @@ def named(m: real_plant.Mechanics, loops_: real_plant.Loops) -> Parameters:
 
 
 def ordinary(seed: int) -> tuple[real_plant.Mechanics, real_plant.Loops]:
-    """An ordinary machine; one at 0, drawn ones at other seeds: the bench's, and where friction rules."""
+    """Return an ordinary machine: the bench at seed 0, else a random one, also with dominant friction."""
     if seed == 0:
         return real_plant.ORDINARY_MECHANICS, real_plant.Loops(dead_time_v=2.0)
     base = real_plant.SLOW if seed % 2 else real_plant.Mechanics()
@@ -142,7 +140,7 @@ def ordinary(seed: int) -> tuple[real_plant.Mechanics, real_plant.Loops]:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_agrees_with_the_plant_of_the_studies(seed: int) -> None:
-    """Everything that a machine has at once, from what its regulators hold at rest: within 0.1 um."""
+    """All effects at once, from a settled state: within 0.1 um."""
     mechanics, real = ordinary(seed)
     real = replace(real, speed_filter_s=0.0005, delay_s=2 * real_plant.STEP_S)
     gains = {name: getattr(real, name) for name in ("speed_kp", "speed_ki", "current_kp", "current_ki")}
@@ -159,7 +157,7 @@ def test_agrees_with_the_plant_of_the_studies(seed: int) -> None:
 @pytest.mark.parametrize("structure", ["p_pi_pi", "double_pi", "pid"])
 @pytest.mark.parametrize("share", [-0.9, 0.0, 0.9])
 def test_an_axis_stands_as_long_as_it_is_told_to(structure: str, share: float) -> None:
-    """Whatever current within the band its regulators hold: nothing moves, and the current stays."""
+    """For any holding current within the friction band."""
     more = {"double_pi": {"position_ki_per_s2": 300.0}, "pid": {"position_ki_per_s2": 2500.0, "speed_ki": 0.0}}
     axis = bench(structure=structure, current_delay_cycles=2, speed_filter_s=0.0005, **more.get(structure, {}))
     parameters = PLAIN.changed(**TERMS["all"], resonance=90.0)
@@ -174,7 +172,6 @@ def test_an_axis_stands_as_long_as_it_is_told_to(structure: str, share: float) -
 
 @pytest.mark.parametrize("joined", [*TERMS, "resonance"])
 def test_runs_in_pieces_give_the_same_bits(joined: str) -> None:
-    """A run that continues from a row's state is the run that was not interrupted."""
     axis = bench(current_delay_cycles=5, speed_filter_s=0.0004)
     parameters = PLAIN.changed(**TERMS.get(joined, {"resonance": 80.0}))
     demand = there_and_back(90)
@@ -184,7 +181,6 @@ def test_runs_in_pieces_give_the_same_bits(joined: str) -> None:
 
 
 def test_terms_that_are_nil_are_none() -> None:
-    """The steps with terms are the plain ones where every term is 0."""
     demand, axis = there_and_back(150), bench()
     start, found = closed_loop.start(float(demand[0])), []
     for parameters in (PLAIN, PLAIN.changed(load=0.0)):
@@ -197,14 +193,13 @@ def test_terms_that_are_nil_are_none() -> None:
 
 
 def test_the_speed_delay_is_the_sensors() -> None:
-    """The drive itself is not slower for it: the same bits as without."""
     demand, axis = there_and_back(90), bench()
     late = closed_loop.simulate(PLAIN.changed(speed_delay=0.002), axis, PERIOD, demand)
     assert np.array_equal(late.position_mm, closed_loop.simulate(PLAIN, axis, PERIOD, demand).position_mm)
 
 
 def test_the_torque_is_the_formula() -> None:
-    """Term by term, also at rest, where no dry friction has a side."""
+    """Term by term, also at rest, where dry friction has no sign."""
     p = PLAIN.changed(**TERMS["all"], coulomb_negative=3.0)
     speed, angle = np.array([-20.0, 0.0, 5.0]), np.array([1.0, 2.0, 3.0])
     ripple = 0.3 * np.sin(angle) + 0.2 * np.sin(12 * angle - 1.0)
@@ -216,7 +211,7 @@ def test_the_torque_is_the_formula() -> None:
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("joined", TERMS)
 def test_leaps_give_what_steps_give(joined: str, seed: int) -> None:
-    """Speed cycles taken at once, with the mean of what bends in between, are those taken step by step."""
+    """With the mean of the terms over a speed cycle."""
     random = np.random.default_rng(seed)
     axis = bench(speed_filter_s=0.0005 * (seed == 1), setpoint_filter_s=0.001 * (seed == 2))
     parameters = PLAIN.changed(**TERMS[joined], Jt=PLAIN.Jt * random.uniform(0.7, 1.4))

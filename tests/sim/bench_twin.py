@@ -1,4 +1,4 @@
-"""The bench machine as a twin in this process, and references to play on it."""
+"""The bench machine as a simulator in this process, and references to play on it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def twin_config(axes: str = "XY", *, sim: Mapping[str, Any] | None = None, **axi
 
 
 def smooth(points_mm: Float, widths: tuple[int, ...] = (60, 30)) -> Float:
-    """Return (n, axes) rows that run through the moving averages, as an NC does."""
+    """Return (n, axes) rows smoothed by moving averages, as an NC does."""
     for width in widths:
         padded = np.vstack([np.repeat(points_mm[:1], width - 1, 0), points_mm, np.repeat(points_mm[-1:], width - 1, 0)])
         kernel = np.ones(width) / width
@@ -45,7 +45,6 @@ def corner(speed_mm_s: float = 150.0, side_mm: float = 20.0) -> Float:
 
 
 def trajectory(rows_mm: Float, axes: str = "XY", rapid: bool = False) -> Trajectory:
-    """Return rows (n, axes) as a trajectory."""
     n = len(rows_mm)
     return Trajectory(
         PERIOD_S,
@@ -57,7 +56,7 @@ def trajectory(rows_mm: Float, axes: str = "XY", rapid: bool = False) -> Traject
 
 
 class TwinInHand:
-    """A machine that is moved cycle by cycle; ``wire`` keeps every frame in order, ``events`` what it told."""
+    """A machine advanced cycle by cycle; ``wire`` keeps every frame in order, ``events`` its events."""
 
     def __init__(self, machine_config: MachineConfig) -> None:
         self.machine = Machine(machine_config)
@@ -67,7 +66,6 @@ class TwinInHand:
         self.each_cycle: Callable[[], None] = lambda: None
 
     def run(self, cycles: int) -> None:
-        """Run some cycles of the NC."""
         for _ in range(cycles):
             self.wire += [frame for _, frame in self.machine.cycle()]
             self.events += self.machine.take_events()
@@ -75,7 +73,7 @@ class TwinInHand:
             self.each_cycle()
 
     def run_until(self, event: str, limit: int = 20000) -> dict[str, Any]:
-        """Run until an event of this name comes and return it."""
+        """Run until an event of this name and return it."""
         for _ in range(limit):
             known = len(self.events)
             self.run(1)
@@ -89,16 +87,14 @@ class TwinInHand:
         return self.machine.receive("can0", (can_id, data))
 
     def switch_on(self) -> None:
-        """Let the NC take over."""
         self.machine.nc.switch(True)
         self.run_until("nc")
 
     def play(self, rows_mm: Float, **keys: Any) -> None:
-        """Let the NC play rows."""
         self.machine.nc.play("rows", trajectory(rows_mm, **keys))
 
 
 def targets(wire: list[Frame], node_id: int) -> list[tuple[int, int]]:
-    """Return (controlword, target) of every RPDO1 of a node on the wire."""
+    """Return (controlword, target) of every RPDO1 of a node on the bus."""
     found = [data for can_id, data in wire if can_id == 0x200 + node_id]
     return [(int.from_bytes(d[:2], "little"), int.from_bytes(d[2:], "little", signed=True)) for d in found]

@@ -17,11 +17,11 @@ from fdhil.sim.frame import Frame
 
 
 class DirectBus(can.BusABC):
-    """A python-can bus without a wire: what is sent is answered before `send` returns."""
+    """A python-can bus without a wire: frames are answered before `send` returns."""
 
     def __init__(self, drive: Drive) -> None:
         super().__init__("direct")
-        self._is_shutdown = True  # there is nothing to shut down, and no need to be told so
+        self._is_shutdown = True  # nothing to shut down: no warning
         self.drive = drive
         self.network: canopen.Network | None = None
 
@@ -35,14 +35,14 @@ class DirectBus(can.BusABC):
 
 
 def dictionary(drive: Drive) -> canopen.ObjectDictionary:
-    """The object dictionary that `canopen` reads from the drive's own EDS."""
+    """Return `canopen`'s object dictionary of the drive's own EDS."""
     source = io.StringIO(eds_text(drive))
     source.name = "drive.eds"
     return canopen.import_od(source, drive.node_id)
 
 
 def direct(drive: Drive) -> tuple[Any, DirectBus]:
-    """A remote node (half of its methods are untyped) wired to a drive in the same thread."""
+    """Return a remote node (half of its methods are untyped) connected to a drive in the same thread."""
     bus = DirectBus(drive)
     network = canopen.Network(bus=bus)
     bus.network = network
@@ -51,7 +51,7 @@ def direct(drive: Drive) -> tuple[Any, DirectBus]:
 
 @contextmanager
 def over_virtual_bus(drive: Drive) -> Iterator[Any]:
-    """A remote node on a virtual CAN bus; a thread plays the drive's side of it."""
+    """Return a remote node on a virtual CAN bus; a thread runs the drive's side."""
     channel = f"drive-{id(drive)}"
     wire = can.Bus(interface="virtual", channel=channel)
     running = threading.Event()

@@ -1,4 +1,4 @@
-"""A hub in a thread, as the twin's loop runs it, and the stock client that joins it."""
+"""A hub in a thread, as in the simulator's loop, and the stock client that joins it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fdhil.sim.wire.hub import Hub
 
 
 class HubThread(threading.Thread):
-    """Serves a hub until stopped; ``twin`` is called in the hub's thread with every frame that comes."""
+    """Serves a hub until stopped; ``twin`` is called in the hub's thread with every received frame."""
 
     def __init__(self, hub: Hub, twin: Callable[[Hub, Frame], None] = lambda hub, frame: None) -> None:
         super().__init__(name="hub")
@@ -25,7 +25,6 @@ class HubThread(threading.Thread):
         self._ending = False
 
     def run(self) -> None:
-        """The loop."""
         while not self._ending:
             ready, _, _ = select.select(self.hub.readers(), self.hub.writers(), (), 0.002)
             self.hub.pump(ready, lambda frame: self._twin(self.hub, frame))
@@ -33,7 +32,6 @@ class HubThread(threading.Thread):
             self.hub.flush(time.monotonic())
 
     def stop(self) -> None:
-        """End the loop and close the hub."""
         self._ending = True
         self.join()
         self.hub.close()
@@ -41,7 +39,6 @@ class HubThread(threading.Thread):
 
 @contextmanager
 def serving(hub: Hub, twin: Callable[[Hub, Frame], None] = lambda hub, frame: None) -> Iterator[HubThread]:
-    """Serve a hub for the time of a with block."""
     thread = HubThread(hub, twin)
     thread.start()
     try:
@@ -52,7 +49,6 @@ def serving(hub: Hub, twin: Callable[[Hub, Frame], None] = lambda hub, frame: No
 
 @contextmanager
 def joined(hub: Hub, count: int = 1) -> Iterator[list[can.BusABC]]:
-    """Join stock python-can clients for the time of a with block."""
     buses: list[can.BusABC] = []
     try:
         for _ in range(count):
@@ -64,7 +60,7 @@ def joined(hub: Hub, count: int = 1) -> Iterator[list[can.BusABC]]:
 
 
 def frames_of(bus: can.BusABC, count: int, timeout_s: float = 100.0) -> list[Frame]:
-    """Receive ``count`` frames, fewer when they do not come in time."""
+    """Receive ``count`` frames, fewer on a time-out."""
     frames: list[Frame] = []
     deadline = time.monotonic() + timeout_s
     while len(frames) < count and time.monotonic() < deadline:

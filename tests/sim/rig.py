@@ -1,4 +1,4 @@
-"""A drive on the test's bench: raw frames in and out, no thread, no clock."""
+"""A drive on a test rig: raw frames in and out, no thread, no clock."""
 
 from __future__ import annotations
 
@@ -17,15 +17,13 @@ NO_NOISE = {"voltage_v": 0.0, "current_a": 0.0, "speed_rad_s": 0.0}
 
 
 class Abort(Exception):
-    """The server aborted with this code."""
-
     def __init__(self, code: int) -> None:
         self.code = code
         super().__init__(f"{code:08X}")
 
 
 def machine(axes: str = "X", noise: bool = False, **sim_axis: Any) -> config.MachineConfig:
-    """The bench with its twin's peculiarities; silent sensors unless ``noise``."""
+    """Return the bench with simulator settings; noiseless sensors unless ``noise``."""
     document = bench_document(axes)
     document["sim"] = {"axis": {axes[0]: sim_axis}} | ({} if noise else {"noise": NO_NOISE})
     return config.parse(document)
@@ -41,7 +39,7 @@ class Rig:
 
     @classmethod
     def of(cls, drive: Drive) -> Rig:
-        """Take a drive that is already on."""
+        """Wrap a drive that is already powered on."""
         rig = cls.__new__(cls)
         rig.drive, rig.node, rig.boot = drive, drive.node_id, []
         return rig
@@ -53,12 +51,10 @@ class Rig:
         return self.send(0x000, bytes([command, self.node]))
 
     def write(self, index: int, sub: int, value: int, size: int) -> None:
-        """Expedited download."""
         data = value.to_bytes(size, "little", signed=value < 0).ljust(4, b"\0")
         self.sdo(bytes([0x23 | (4 - size) << 2]) + struct.pack("<HB", index, sub) + data)
 
     def read(self, index: int, sub: int = 0, *, signed: bool = False) -> int:
-        """Expedited upload."""
         answer = self.sdo(bytes([0x40]) + struct.pack("<HB", index, sub) + bytes(4))
         return int.from_bytes(answer[4 : 8 - (answer[0] >> 2 & 3)], "little", signed=signed)
 
@@ -72,14 +68,14 @@ class Rig:
         return self.send(0x080, data)
 
     def cycle(self, target: int, offset: int | None = None, word: int = 0x0F) -> list[Frame]:
-        """One SYNC with its RPDOs in time."""
+        """Run one SYNC with its RPDOs in time."""
         self.send(0x200 + self.node, struct.pack("<Hi", word, target))
         if offset is not None:
             self.send(0x300 + self.node, struct.pack("<i", offset))
         return self.sync()
 
     def enable(self, target: int = 0, mode: int = 8) -> None:
-        """NMT start, mode, 06 07 0F, and enough cycles for the delay to be over."""
+        """Start by NMT, set the mode, 06 07 0F, and wait until the delay is over."""
         self.nmt(0x01)
         self.write(0x6060, 0, mode, 1)
         for word in (0x06, 0x07, 0x0F, 0x0F, 0x0F, 0x0F):
@@ -88,7 +84,7 @@ class Rig:
     def follow(
         self, targets: Iterable[int], offsets: Iterable[int] | None = None
     ) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """Give one target per SYNC; return the true table position (n,) in mm at those SYNCs."""
+        """Send one target per SYNC; return the true table position (n,) in mm at those SYNCs."""
         positions = []
         for target, offset in zip(targets, offsets if offsets is not None else _nothing(), strict=False):
             self.cycle(target, offset)
@@ -106,6 +102,6 @@ def _nothing() -> Iterable[None]:
 
 
 def emergencies(frames: list[Frame], node: int = 1) -> list[int]:
-    """The error codes of the EMCY frames among these, all of 8 bytes."""
+    """Return the error codes of the EMCY frames, all of 8 bytes."""
     assert all(len(data) == 8 for can_id, data in frames if can_id == 0x080 + node)
     return [int.from_bytes(data[:2], "little") for can_id, data in frames if can_id == 0x080 + node]

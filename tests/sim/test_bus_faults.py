@@ -1,4 +1,4 @@
-"""Faults of the simulated machine's bus, by script or panel: every party on the hub meets the same spoilt frames."""
+"""Faults of the simulated bus, by script or panel: all parties on the hub get the same affected frames."""
 
 from __future__ import annotations
 
@@ -36,7 +36,6 @@ def message(can_id: int, data: bytes = b"") -> can.Message:
 
 
 def until(party: can.BusABC, can_id: int, data: bytes | None = None) -> list[can.Message]:
-    """Return what is heard up to a frame."""
     heard: list[can.Message] = []
     for each in party:
         heard.append(each)
@@ -46,7 +45,7 @@ def until(party: can.BusABC, can_id: int, data: bytes | None = None) -> list[can
 
 
 def cycles(bench: FeedDriveBench, party: can.BusABC, count: int) -> list[list[int]]:
-    """Let the NC run so many cycles; return the identifiers that were heard in each."""
+    """Run the NC for this number of cycles; return the identifiers received in each."""
     bench.command("nc", on=True)
     bench.wait_for("nc")
     until(party, 0x80)
@@ -110,7 +109,6 @@ def test_a_bus_that_goes_down_hangs_up_and_takes_everybody_again(bench: FeedDriv
 
 
 def _joins(place: CanBus) -> bool:
-    """Whether frames are heard over a new connection."""
     with contextlib.suppress(ConnectError), bus.CanBus("can0", place) as listening:
         wait_for(lambda: listening.counters()["frames"] > 20 or listening.ended is not None)
         return listening.ended is None

@@ -1,4 +1,4 @@
-"""The twin's drive in a vendor's dress: the EDS as it is found in the field, and what the wire then sees."""
+"""The simulated drive with a vendor's EDS: field variants of the file, and the resulting behaviour on the bus."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def epos4(wear: Callable[[str], Rig]) -> Rig:
 
 
 def remap(rig: Rig, index: int, cob_id: int, kind: int, *mapped: int) -> None:
-    """Set a PDO up as a master does (CiA 301, 7.5.2.36): off, mapping, on."""
+    """Configure a PDO like a master (CiA 301, 7.5.2.36): off, mapping, on."""
     rig.write(index, 1, cob_id | 1 << 31, 4)
     rig.write(index, 2, kind, 1)
     rig.write(index + 0x200, 0, 0, 1)
@@ -158,7 +158,7 @@ ODD = st.sampled_from(
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(LINES | ODD, min_size=1, max_size=60), st.integers(0, 500))
 def test_a_drive_can_wear_whatever_a_file_says(tmp_path: Path, lines: list[str], place: int) -> None:
-    """Or the file is refused in one sentence: a drive in odd clothes still boots, answers and goes with SYNC."""
+    """Otherwise the file is refused in one sentence."""
     whole = eds_text("nanotec").splitlines()
     path = tmp_path / "odd.eds"
     path.write_text("\n".join([*whole[:place], *lines, *whole[place:]]), encoding="utf-8")
@@ -232,7 +232,7 @@ def test_the_default_mapping_is_the_vendors_and_can_be_changed(epos4: Rig) -> No
 
 
 def test_the_vendors_objects_show_the_motor_in_the_vendors_units(epos4: Rig) -> None:
-    """Speed in rpm, current in mA, the duty without its sign, the supply in tenths of a volt."""
+    """Speed in rpm, current in mA, the unsigned duty cycle, the supply in tenths of a volt."""
     epos4.enable()
     drive = epos4.drive
     targets = [round(5.0 * n * 65536 / 1000) for n in range(400)]  # 5 revolutions/s
@@ -260,7 +260,7 @@ def test_a_speed_offset_counts_in_the_vendors_unit(epos4: Rig) -> None:
 
 
 def test_the_unit_of_speed_can_be_changed_and_stored(epos4: Rig) -> None:
-    """0x60A9 in the exponent of ten: a thousandth of a revolution per minute (CiA 303-2)."""
+    """Power of ten in 0x60A9: a thousandth of a revolution per minute (CiA 303-2)."""
     assert epos4.read(0x6081) == 1500
     epos4.write(0x60A9, 0, 0xFDB44700, 4)
     assert epos4.read(0x6081) == 1_500_000
@@ -291,7 +291,7 @@ def test_the_nc_leads_a_drive_by_the_mapping_that_it_has(tmp_path: Path) -> None
     twin.switch_on()
     twin.run(20)
     (error,) = [event["text"] for event in twin.events if event["event"] == "error"]
-    assert error.startswith("drive X has 6064 in no PDO")
+    assert error.startswith("drive X maps 6064 in no PDO")
     rig = Rig.of(twin.machine.units["X"].drive)
     remap(rig, 0x1800, 0x181, 255, 0x60410010)
     remap(rig, 0x1802, 0x381, 2, 0x30D10220, 0x60640020)
@@ -317,7 +317,7 @@ def test_the_eds_it_writes_is_of_what_it_wears(wear: Callable[[str], Rig], sheet
 
 @pytest.mark.parametrize("sheet", [None, *SHEETS])
 def test_the_eds_it_writes_keeps_the_rules(tmp_path: Path, sheet: str | None) -> None:
-    """CiA 306, as strict readers hold it: no DOMAIN has a mapping, each default is in its limits, counts are right."""
+    """CiA 306, read strictly: no DOMAIN is mappable, defaults are within limits, counts are correct."""
     rig = Rig(dressed(write_eds(sheet, tmp_path))) if sheet else Rig()
     eds = configparser.ConfigParser(strict=True, interpolation=None)
     eds.read_string(own_eds_text(rig.drive))

@@ -106,7 +106,7 @@ def test_sync_with_and_without_counter() -> None:
     rig.nmt(0x01)
     assert len(rig.sync(b"\x01")) == 2
     assert emergencies(rig.sync()) == [0x8240]
-    assert rig.sync() == []  # told once
+    assert rig.sync() == []  # reported once
     rig.nmt(0x80)
     rig.write(0x1005, 0, 0x81, 4)
     rig.nmt(0x01)
@@ -213,7 +213,7 @@ def test_temperature_moves_the_friction() -> None:
     rig.drive.set_temperature(30.0)
     assert rig.drive.physics.parameters.ft == 0.0
     for wrong in ({"Jt": 0.0}, {"R": float("nan")}, {"ft": -1.0}):
-        with pytest.raises(ValueError, match="no value of a feed drive"):
+        with pytest.raises(ValueError, match="is unphysical"):
             rig.drive.set_parameters(**wrong)
     with pytest.raises(TypeError):
         rig.drive.set_parameters(mass=1.0)

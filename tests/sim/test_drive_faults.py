@@ -1,4 +1,4 @@
-"""The drive reacts when something goes wrong: lost heartbeats and RPDOs, trips, following error, injected faults."""
+"""The drive's reactions to faults: lost heartbeats and RPDOs, trips, following error, injected faults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The drive follows its set-points: the exact timing, the modes, the ramps, and the bench's path error."""
+"""The drive follows its set-points: exact timing, modes, ramps, and the bench's path error."""
 
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ def profile_rig() -> Rig:
 
 
 def run_to(rig: Rig, target_mm: float, word: int, cycles: int) -> list[int]:
-    """Hand over a target, then run; the demand of each cycle."""
+    """Command a target, then run; return the demand of each cycle."""
     target = round(target_mm * INC_PER_MM)
     demands = []
     for n in range(cycles):
@@ -294,7 +294,7 @@ def test_a_profile_always_lands(target: float) -> None:
 
 
 def bench_path_mm(feed_mm_s: float, smoothing_s: tuple[float, ...]) -> Float:
-    """The bench's path at constant feed, (n, 2), then the NC's moving averages, then half a second of rest."""
+    """Return the bench's path at constant feed, (n, 2), smoothed by the NC's moving averages, then 0.5 s of rest."""
     lengths = np.array([55.0, 100.0, 50 * np.pi, 50.0, 55.0])
     ends = np.concatenate([[0], np.cumsum(lengths)])
     s = np.minimum(np.arange(int(np.ceil(ends[-1] / feed_mm_s * 1e3)) + 1) * feed_mm_s * 1e-3, ends[-1])
@@ -312,7 +312,7 @@ def bench_path_mm(feed_mm_s: float, smoothing_s: tuple[float, ...]) -> Float:
 
 
 def contour_um(reference: Float, actual: Float, half_window: int = 60) -> Float:
-    """Distance (n,) to the polyline of the reference points within +-60 ms: farther ones are farther away here."""
+    """Return the distance (n,) to the reference polyline within +-60 ms: points farther in time are not closer here."""
     error = np.zeros(len(reference))
     for k, point in enumerate(actual):
         near = reference[max(k - half_window, 0) : k + half_window + 1]
@@ -325,7 +325,7 @@ def contour_um(reference: Float, actual: Float, half_window: int = 60) -> Float:
 
 
 def drive_path(path_mm: Float) -> tuple[Float, Float]:
-    """Both axes through frames; reference and true table position (n, 2), each at the same instants."""
+    """Move both axes by frames; return reference and true table position (n, 2), each at the same instants."""
     machine_config = bench_config("XY")
     rigs = [Rig(machine_config, axis) for axis in "XY"]
     increments = np.rint(path_mm * INC_PER_MM).astype(int)

@@ -1,4 +1,4 @@
-"""Faults of frames: each kind does what it says and counts it, over a plan, over any python-can bus, by its seed."""
+"""Frame faults: each kind acts as defined and is counted, over any python-can bus, reproducibly by its seed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.sim.rig import machine
 
 
 def cycles(first: int, last: int) -> list[Frame]:
-    """SYNC k, then a frame that tells k."""
+    """Return SYNC k followed by a frame with k."""
     return [frame for k in range(first, last) for frame in ((0x80, bytes([k % 240 + 1])), (0x181, bytes([k, 0])))]
 
 
@@ -120,10 +120,10 @@ def test_a_share_of_the_frames_is_what_is_asked_for() -> None:
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
-        ({"kind": "los"}, "'los' is none of drop"),
-        ({"kind": "mutate", "value": 65}, "bits that are turned over: 65 is not among"),
-        ({"kind": "delay", "value": 1.5}, "no whole number"),
-        ({"kind": "drop", "percent": 0}, "no percentage"),
+        ({"kind": "los"}, "unknown fault 'los'; the faults are drop"),
+        ({"kind": "mutate", "value": 65}, "bits that are flipped"),
+        ({"kind": "delay", "value": 1.5}, "not a whole number"),
+        ({"kind": "drop", "percent": 0}, "percent is 0"),
         ({"kind": "inject", "data": bytes(9), "can_ids": {1}}, "at most 8"),
         ({"kind": "inject"}, "one identifier"),
     ],
@@ -145,7 +145,7 @@ def test_a_bus_that_is_down_passes_nothing_and_counts_it() -> None:
 
 @pytest.fixture
 def pair() -> Iterator[tuple[FaultBus, can.BusABC]]:
-    """A bus with faults, none planned, and another party on it."""
+    """A bus without planned faults, and another party on it."""
     channel = uuid.uuid4().hex
     with (
         can.Bus(interface="virtual", channel=channel) as other,
@@ -228,7 +228,6 @@ def test_what_is_sent_periodically_goes_through_the_plan(pair: tuple[FaultBus, c
 
 @pytest.mark.usefixtures("real_time")
 def test_a_canopen_network_gets_the_faults_of_its_bus(pair: tuple[FaultBus, can.BusABC]) -> None:
-    """The first answer to an SDO request is lost, the library asks again."""
     bus, other = pair
     drive = Drive("X", machine(), np.random.default_rng(1))
     drive.power_on()
@@ -258,7 +257,6 @@ def test_a_canopen_network_gets_the_faults_of_its_bus(pair: tuple[FaultBus, can.
 
 @pytest.mark.parametrize("kind", VALUES)
 def test_every_kind_counts_what_it_did(kind: str) -> None:
-    """Being listed is being tested."""
     faults = FrameFaults([meet(kind)])
     faults.take((0x80, b"\1"), "received", 0.0)
     with pytest.raises(BusRefuses) if kind == "raise" else nullcontext():

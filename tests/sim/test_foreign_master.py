@@ -1,4 +1,4 @@
-"""A foreign master (`canopen`) uses the running machine as what it stands in for: servo drives, without any SYNC."""
+"""A foreign master (`canopen`) uses the running machine as servo drives, without any SYNC."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TARGET_REACHED, ATTAINED = 1 << 10, 1 << 12
 
 @contextmanager
 def master(folder: Path) -> Iterator[Any]:
-    """The machine and its first node, enabled in no mode."""
+    """Return the machine and its first node, enabled without a mode."""
     with running(load_corner, folder, "realtime", interface="virtual", channel="foreign-master") as twin:
         eds = twin.event("ready")["drives"]["X"]["eds"]
         network = canopen.Network()

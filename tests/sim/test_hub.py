@@ -83,7 +83,7 @@ def test_every_client_hears_the_others_and_not_himself() -> None:
 
 
 def test_the_twin_answers_in_the_order_of_the_frames() -> None:
-    """A burst of SYNC, frame, SYNC in one packet must not show both answers after both questions."""
+    """For SYNC, frame, SYNC in one packet, each answer follows its own request."""
     hub = Hub("can0")
     with (
         serving(hub, lambda hub, frame: hub.send([(0x181, frame[1])]) if frame[0] == 0x80 else None),
@@ -129,7 +129,7 @@ def test_a_client_that_comes_late_to_its_greeting_still_finds_it_alone() -> None
 
 
 def test_nothing_is_lost_to_a_slow_reader() -> None:
-    """20000 frames against a queue of 4 kB: the hub stops taking frames until the slow reader has read."""
+    """20000 frames against a queue of 4 kB: the hub accepts no frames until the slow reader has read."""
     count = 20000
     hub = Hub("can0", queue_bytes=4096)
     with serving(hub), joined(hub, 2) as (slow, fast), socket.create_connection((hub.host, hub.port)) as sender:
@@ -197,7 +197,7 @@ def _until_closed(connection: socket.socket) -> bytes:
 def test_a_port_in_use_is_one_sentence() -> None:
     hub = Hub("can0")
     try:
-        with pytest.raises(ConnectError, match=rf"bus can0: TCP port {hub.port} .* cannot be had"):
+        with pytest.raises(ConnectError, match=rf"bus can0: TCP port {hub.port} .* cannot be opened"):
             Hub("can0", port=hub.port)
     finally:
         hub.close()

@@ -54,7 +54,7 @@ def test_the_trace_has_a_row_per_demand_row_and_300_ms(tmp_path: Path) -> None:
 
 
 def test_an_offset_reaches_the_row_it_was_sent_with(tmp_path: Path) -> None:
-    """A guard that answers SYNC k - 1 with o[k + 2] corrects row k + 2, no earlier and no later."""
+    """A guard that answers SYNC k - 1 with o[k + 2] corrects exactly row k + 2."""
     twin = TwinInHand(twin_config())
     twin.switch_on()
     rows = corner()
@@ -137,7 +137,7 @@ def test_a_listed_rpdo_that_does_not_exist_is_refused(listed: str) -> None:
 
 @pytest.mark.usefixtures("long_computation")
 def test_two_runs_are_equal_bit_by_bit() -> None:
-    """Noise, stick-slip, sensors: nothing but the seed and the SYNCs decides."""
+    """Noise, stick-slip and sensors depend on the seed and the SYNCs only."""
 
     def run(seed: int) -> tuple[list[tuple[int, bytes]], list[int]]:
         noise = {"voltage_v": 0.06, "current_a": 0.05, "speed_rad_s": 0.15}
@@ -214,25 +214,25 @@ def test_the_panel_sets_parameters_and_temperature() -> None:
 @pytest.mark.parametrize(
     ("line", "complaint"),
     [
-        ("nonsense", "no JSON"),
-        ("[" * 60_000, "no JSON"),
-        ("[1]", "no command None"),
-        ('{"command": ["nc"]}', "no command"),
-        ('{"command": "dance"}', "'dance'; it has nc, play"),
+        ("nonsense", "not valid JSON"),
+        ("[" * 60_000, "not valid JSON"),
+        ("[1]", "unknown panel command None"),
+        ('{"command": ["nc"]}', "unknown panel command"),
+        ('{"command": "dance"}', "'dance'; the commands are nc, play"),
         ('{"command": "nc"}', '"on" must be true or false'),
         ('{"command": "nc", "on": 1}', '"on" must be true or false'),
         ('{"command": "play"}', '"file" must be a path'),
         ('{"command": "override", "percent": NaN}', '"percent" must be a number'),
         ('{"command": "override", "percent": -1}', "0 to 150"),
-        ('{"command": "set", "parameters": {"Jt": 1}}', "no axis None"),
+        ('{"command": "set", "parameters": {"Jt": 1}}', "unknown axis None"),
         ('{"command": "set", "axis": "X"}', "must be an object"),
-        ('{"command": "set", "axis": "X", "parameters": {"J": 1}}', "J is no parameter"),
+        ('{"command": "set", "axis": "X", "parameters": {"J": 1}}', "unknown parameter J"),
         ('{"command": "set", "axis": "X", "parameters": {"Jt": -1}}', "Jt = -1"),
-        ('{"command": "temperature", "celsius": 900}', "no temperature"),
-        ('{"command": "temperature", "celsius": 20, "axis": "Q"}', "no axis 'Q'"),
-        ('{"command": "fault", "fault": "meteor"}', "'meteor' is none of"),
+        ('{"command": "temperature", "celsius": 900}', "out of range"),
+        ('{"command": "temperature", "celsius": 20, "axis": "Q"}', "unknown axis 'Q'"),
+        ('{"command": "fault", "fault": "meteor"}', "unknown fault 'meteor'"),
         ('{"command": "fault", "fault": "reboot"}', "needs an axis"),
-        ('{"command": "fault", "fault": "reboot", "axis": "Q"}', "no axis 'Q'"),
+        ('{"command": "fault", "fault": "reboot", "axis": "Q"}', "unknown axis 'Q'"),
         ('{"command": "' + "x" * 70000 + '"}', "longer than 64 KiB"),
     ],
 )
@@ -268,7 +268,6 @@ def test_a_fault_script_acts_at_its_time_and_ends(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_every_fault_ends_without_a_trace(name: str) -> None:
-    """Being listed is being tested: started, run, ended, and the machine is as it was."""
     twin = TwinInHand(twin_config("X"))
     twin.switch_on()
     item = {"axis": "X", "fault": name, "value": 2.0, "duration_s": 0.003, "can_id": 0x555, "data": "01"}
@@ -298,7 +297,7 @@ def test_every_fault_ends_without_a_trace(name: str) -> None:
         ("[[fault]]\naxis='X'\nfault='load_torqe'\nvalue=1", "did you mean 'load_torque'"),
         ("[[fault]]\naxis='X'\nfault='load_torque'", "needs a value: N.m"),
         ("[[fault]]\nfault='reboot'", "needs an axis"),
-        ("[[fault]]\nfault='reboot'\naxis='Q'", "there is no axis 'Q'"),
+        ("[[fault]]\nfault='reboot'\naxis='Q'", "unknown axis 'Q'"),
         ("[[fault]]\nfault='reboot'\naxis='X'\nat_s=1\nat_sync=2", "one of at_s"),
         ("[[fault]]\nfault='reboot'\naxis='X'\nat_s=-1", "greater than or equal"),
         ("[[fault]]\nfault='reboot'\naxis='X'\nwhen=1", "when"),
@@ -306,11 +305,11 @@ def test_every_fault_ends_without_a_trace(name: str) -> None:
         ("[[fault]]\nfault='frame'", "needs can_id"),
         ("[[fault]]\nfault='object'\naxis='X'\nvalue=1", "needs the index"),
         ("[[fault]]\nfault='drop_tpdo'\naxis='X'\nvalue=5", "5 is not among 1 to 4"),
-        ("[[fault]]\nfault='remap'\naxis='X'\nvalue=1.5", "1.5 is no whole number"),
+        ("[[fault]]\nfault='remap'\naxis='X'\nvalue=1.5", "1.5 is not a whole number"),
         ("[[fault]]\nfault='sensor_exception'\naxis='X'\nvalue=9", "9 is not among 1, 2, 3"),
         ("[[fault]]\nfault='frame'\ncan_id=1\ndata='zz'", "hex"),
         ("[[fault]]\nfault='frame'\ncan_id=1\ndata='000102030405060708'", "at most 8"),
-        ("faults = []", "faults: is no key"),
+        ("faults = []", "faults: unknown key"),
         ("[[fault]\n", "is no TOML"),
     ],
 )
@@ -324,8 +323,8 @@ def test_a_wrong_fault_script_is_refused(text: str, complaint: str, tmp_path: Pa
 @pytest.mark.parametrize(
     ("item", "complaint"),
     [
-        ({"index": 0x5FFF, "value": 1}, "no number 5FFF:00"),
-        ({"index": 0x1008, "value": 1}, "no number 1008:00"),
+        ({"index": 0x5FFF, "value": 1}, "no numeric object 5FFF:00"),
+        ({"index": 0x1008, "value": 1}, "no numeric object 1008:00"),
         ({"index": 0x6060, "value": 200}, "200 does not fit 6060:00"),
     ],
 )
@@ -367,7 +366,7 @@ def test_lockstep_runs_when_everything_is_there_and_waits_longer_for_who_holds_a
     assert pace.due_s(waits=True, idle=False) == 12.0
     assert pace.due_s(waits=True, idle=False, holds=True) == 18.0
     assert settings(clock="sync").silence_s > 8.0 + 1.0, "a guard must not take the wait for a dead bus"
-    assert pace.due_s(waits=False, idle=True) == pytest.approx(10.004)  # it stands: nobody is kept busy for nothing
+    assert pace.due_s(waits=False, idle=True) == pytest.approx(10.004)  # idle: listeners are spared
 
 
 def test_a_lockstep_machine_that_ran_ahead_of_the_clock_does_not_stand_still_afterwards() -> None:

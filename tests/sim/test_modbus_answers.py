@@ -1,4 +1,4 @@
-"""Spoilt answers of the simulated Modbus units, over TCP and on a line: no wrong value is taken for the right one."""
+"""Corrupted answers of the simulated Modbus units, over TCP and serial lines: no wrong value is accepted."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ READ = struct.pack(">BHH", 4, 0, 2)
 
 
 class Counted:
-    """Two registers, a number of 32 bits that grows with each reading; 10 may be written."""
+    """Two registers with a 32-bit number that grows with each read; 10 may be written."""
 
     trigger: int | None = 10
 
@@ -112,7 +112,7 @@ def test_units_on_a_line_answer_every_function_as_over_tcp(request_: str, answer
 
 @pytest.fixture
 def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[ModbusPlace, SensorFaults]]:
-    """A unit that is served, where it is and its faults."""
+    """A served unit, with its address and faults."""
     registers = Counted()
     if request.param == "tcp":
         sensor = a_sensor()

@@ -1,4 +1,4 @@
-"""The simulated voltage sensor, read by pymodbus as any client would."""
+"""The simulated voltage sensor, read by pymodbus like any client."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def a_sensor(noise_v: float = 0.0) -> VoltageSensor:
 
 @dataclass
 class Bench:
-    """A sensor that is served, and a client."""
+    """A served sensor and a client."""
 
     sensor: VoltageSensor
     client: ModbusTcpClient
@@ -180,7 +180,7 @@ def test_a_port_in_use_is_one_sentence(bench: Bench) -> None:
 
 
 def test_the_machine_feeds_one_mean_per_sync() -> None:
-    """Sensor and drive tell at a SYNC the mean over the period that it ended."""
+    """At a SYNC, sensor and drive report the mean over the ended period."""
     twin = TwinInHand(twin_config(drive={"sign": -1}))
     twin.switch_on()
     twin.play(corner())

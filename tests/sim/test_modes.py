@@ -1,4 +1,4 @@
-"""The modes besides profile and cyclic position: velocity, torque, homing; windows and limits."""
+"""Modes other than profile and cyclic position: velocity, torque, homing; windows and limits."""
 
 from __future__ import annotations
 

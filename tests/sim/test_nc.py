@@ -1,4 +1,4 @@
-"""The NC: takeover, set-points in time, the rapid to the start, feed hold, override, faults."""
+"""The NC: takeover, set-point timing, rapid to the start, feed hold, override, faults."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def test_stop_brakes_and_gives_up_the_rest() -> None:
 
 
 def test_a_stop_as_a_path_ends_does_not_stop_the_next_one() -> None:
-    """The rest behind a path is shorter than the way to a stop: with it the wish to stop has ended."""
+    """The rest after a path is shorter than the braking distance: the stop ends with the path."""
     twin = TwinInHand(twin_config())
     twin.switch_on()
     rows = corner()
@@ -210,7 +210,7 @@ def test_a_silent_drive_stops_the_path() -> None:
     twin = TwinInHand(twin_config())
     twin.switch_on()
     twin.machine.units["Y"].power(False)
-    assert "drive Y sends no statusword" in twin.run_until("error")["text"]
+    assert "drive Y stopped sending its statusword" in twin.run_until("error")["text"]
 
 
 def test_switching_off_disables_the_drives_and_frees_the_bus() -> None:
@@ -290,7 +290,7 @@ def test_a_player_ends_exactly_on_the_last_row(rate: float) -> None:
 
 
 def _distance_to(rows: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Distance of each point to the polyline of the rows, mm."""
+    """Return the distance of each point to the polyline of the rows, mm."""
     start, way = rows[:-1], np.diff(rows, axis=0)
     length = np.maximum((way**2).sum(axis=1), 1e-18)
     best = np.full(len(points), np.inf)

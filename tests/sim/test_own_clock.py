@@ -1,4 +1,4 @@
-"""The drive's own clock: motion without SYNC, with a SYNC at any period, and one that comes and goes."""
+"""The drive's own clock: motion without SYNC, with a SYNC of any period, and with an intermittent one."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MS = 1e-3
 
 
 def let_pass(rig: Rig, seconds: float, sync_s: float | None = None, step_s: float = 4 * MS) -> list[float]:
-    """Let time pass in steps, with a SYNC every ``sync_s``; return the table's position at each step."""
+    """Advance time in steps, with a SYNC every ``sync_s``; return the table position at each step."""
     sent: list[tuple[int, bytes]] = []
     places = []
     start, now = getattr(rig, "now_s", 0.0), 0.0
@@ -37,7 +37,7 @@ def let_pass(rig: Rig, seconds: float, sync_s: float | None = None, step_s: floa
 
 
 def by_sdo(mode: int, **sim_axis: Any) -> Rig:
-    """A drive that was enabled by SDO alone; nobody sends SYNC."""
+    """Return a drive enabled by SDO alone, without SYNC."""
     rig = Rig(machine(**sim_axis))
     let_pass(rig, 0.004)
     rig.nmt(0x01)
@@ -58,7 +58,7 @@ def go(rig: Rig, target_mm: float, speed_mm_s: float = 100.0) -> None:
 
 @pytest.mark.parametrize("sync_s", [None, 0.5 * MS, 1 * MS, 1.05 * MS, 2 * MS, 7 * MS, 10 * MS, 100 * MS, 1.0])
 def test_a_profile_takes_its_time_at_any_period_of_sync(sync_s: float | None) -> None:
-    """30 mm at 100 mm/s and 1000 mm/s2: 0.1 s up, 0.2 s, 0.1 s down; half the way after 0.2 s."""
+    """30 mm at 100 mm/s and 1000 mm/s2: 0.1 s up, 0.2 s, 0.1 s down; half of the distance after 0.2 s."""
     rig = by_sdo(1)
     if sync_s is not None:
         let_pass(rig, 0.3, sync_s)  # the SYNC runs already
@@ -71,7 +71,7 @@ def test_a_profile_takes_its_time_at_any_period_of_sync(sync_s: float | None) ->
 
 
 def test_a_sync_at_the_drive_s_own_period_leads() -> None:
-    """One cycle per SYNC, although the host tells the time now and then only."""
+    """One cycle per SYNC, although the host updates the time only occasionally."""
     rig = by_sdo(1)
     let_pass(rig, 0.2, 1 * MS)
     go(rig, 30.0)
@@ -173,7 +173,7 @@ def test_the_clock_of_the_machine_s_own_nc_is_the_sync() -> None:
 
 @pytest.mark.parametrize("late_s", [0.01, 0.3])
 def test_a_pause_of_the_sync_is_made_up_for_or_lasts(late_s: float) -> None:
-    """A short one is the host's affair; in a long one the drive's own time goes on."""
+    """A short pause is bridged; in a long one the drive's own time continues."""
     clock = OwnClock(MS)
     now, cycles = 0.0, 0
     for _ in range(500):
@@ -205,7 +205,7 @@ def test_while_the_nc_s_sync_fails_the_axes_go_on_to_their_last_set_point() -> N
 
 
 def test_set_points_that_come_every_tenth_cycle_are_joined_by_straight_lines() -> None:
-    """0x60C2 says so; the speed demand has no stairs, and the set-point acts an interval and the delay late."""
+    """By 0x60C2; the speed demand has no steps, and the set-point acts one interval and the delay late."""
     rig = Rig()
     rig.write(0x60C2, 1, 10, 1)
     rig.write(0x1006, 0, 10_000, 4)

@@ -1,4 +1,4 @@
-"""PDOs: mapping rules, when they are latched and sent, and the codec against the `canopen` library."""
+"""PDOs: mapping rules, latching and sending, and the codec against the `canopen` library."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def ids(frames: list[tuple[int, bytes]]) -> list[int]:
 
 
 def configure(rig: Rig, communication: int, mapping_index: int, cob_id: int, kind: int, entries: list[int]) -> None:
-    """The procedure of CiA 301: invalid, count 0, entries, count, type, valid."""
+    """Follow the procedure of CiA 301: invalid, count 0, entries, count, type, valid."""
     rig.write(communication, 1, cob_id | INVALID, 4)
     rig.write(mapping_index, 0, 0, 1)
     for sub, word in enumerate(entries, 1):
@@ -268,7 +268,7 @@ def test_the_default_mapping_of_two_axes_fits_the_bus() -> None:
 
 
 def test_a_position_offset_and_a_feed_forward_never_load_the_bus_together() -> None:
-    """With the RPDO of speed and torque made valid the larger of both corrections counts: 6 bytes instead of 4."""
+    """With a valid RPDO of speed and torque the larger correction counts: 6 bytes instead of 4."""
     drive = Rig(machine("X")).drive
     alone, alone_worst = bus_load(drive, 1000), bus_load(drive, 1000, stuffed=True)
     drive.set_object(0x1402, 1, 0x401)

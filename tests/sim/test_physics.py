@@ -45,7 +45,7 @@ def oracle_step(p: Parameters, state: Float, u: float, load: float) -> Float:
 
 
 class Oracle:
-    """The three loops and the plant, written a second time from the bench's description."""
+    """The three loops and the plant, implemented independently from the bench's description."""
 
     def __init__(self, p: Parameters) -> None:
         self.p = p
@@ -95,7 +95,7 @@ def command(points: tuple[float, float, float]) -> Command:
 
 
 def rapid_mm(n: int = 70, acceleration: float = 4000.0) -> Float:
-    """A short rapid there and back: 30 ms of acceleration, then twice as much the other way."""
+    """Return a short rapid back and forth: 30 ms of acceleration, then twice as much in the other direction."""
     t = np.arange(n) * 1e-3
     speed = np.where(t < 0.03, acceleration * t, acceleration * (0.03 - 2 * (t - 0.03)))
     return np.asarray(np.cumsum(speed) * 1e-3)
@@ -198,8 +198,8 @@ def test_the_kernel_runs_bit_by_bit_the_same_in_plain_python(monkeypatch: pytest
     for points in reference:
         compiled.cycle(True, command(points))
         compiled_rows.append((compiled.angle_rad, compiled.current_a, compiled.voltage_mean_v))
-    for name in ("run_cycle", "_step", "_coast"):
-        monkeypatch.setattr(physics, name, getattr(physics, name).py_func)
+    for kernel in (physics.run_cycle, physics._step, physics._coast):
+        monkeypatch.setattr(physics, kernel.py_func.__name__, kernel.py_func)
     for points in reference:
         plain.cycle(True, command(points))
         plain_rows.append((plain.angle_rad, plain.current_a, plain.voltage_mean_v))

@@ -1,4 +1,4 @@
-"""The CiA 402 state machine, walked through every transition, and against an independent table of them."""
+"""The CiA 402 state machine: every transition, and random walks against an independent table."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ S = State
 
 
 def state(power: PowerStage) -> State:
-    """The state, looked up anew each time."""
     return power.state
 
 

@@ -1,4 +1,4 @@
-"""What real axes have: against the studies' own plant, an integration by scipy, and what must hold by itself."""
+"""Effects of real axes: against the studies' plant, an integration by scipy, and invariants."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def there_and_back(n: int = 640) -> Float:
 
 
 def cut(physics: Physics, demand_mm: Float, increments: int = INC) -> Float:
-    """Return (n, 5): motor and table in mm, speed and current at the start of each row, mean voltage in it."""
+    """Return (n, 5): motor and table in mm, speed and current at the start of each cycle, mean voltage in it."""
     rows = []
     for points in points_of(demand_mm * increments / INC):
         before = [physics.angle_rad / RAD_PER_MM, physics.table_rad / RAD_PER_MM]
@@ -119,7 +119,7 @@ def test_it_cuts_what_another_plant_with_the_same_effect_cuts(
 
 
 def test_bristles_follow_their_equation() -> None:
-    """One mass on LuGre's bristles, pushed by a swinging load, against scipy's stiff integrator."""
+    """One mass on LuGre bristles under an oscillating load, against scipy's stiff integrator."""
     machine = axis(presliding_um=20.0, static_friction=0.2)
     p = machine._p
     s0 = p[real_cycle.BRISTLES] * PLANT.Cd
@@ -186,7 +186,7 @@ def test_the_drives_direction_turns_the_axis_signs() -> None:
 
 
 def test_the_screw_gives_and_loses_motion() -> None:
-    """A motor encoder stands where it should; the table hangs behind by spring and backlash."""
+    """The motor encoder is at its demand; the table lags by spring and backlash."""
     machine = axis(resonance_hz=60.0, backlash_um=30.0, position_encoder="motor", load_nm=4.0, brake_nm=20.0)
     for points in points_of(np.append(np.linspace(0, 5, 400), np.full(800, 5.0))):
         machine.cycle(True, command(points))

@@ -1,4 +1,4 @@
-"""What real axes have, as the drive's objects tell it: speed, voltage, position, a weight that hangs on the axis."""
+"""Effects of real axes as reported by the drive's objects: speed, voltage, position, gravity load."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def way_mm(n: int = 300) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def told(rig: Rig, *objects: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Move the axis; return what the objects told at each SYNC, (n, objects)."""
+    """Move the axis; return the objects' values at each SYNC, (n, objects)."""
     rows = []
     for target in np.rint(way_mm() * INC_PER_MM).astype(int):
         rig.cycle(int(target))
@@ -96,5 +96,5 @@ def test_warmth_and_a_changed_plant_keep_what_reality_adds() -> None:
     assert rig.drive.physics.parameters.Cd == pytest.approx(4.0)
     rig.drive.set_parameters(Jt=0.09)
     assert rig.drive.physics.parameters.Jt == 0.09
-    with pytest.raises(TypeError, match="load is no parameter"):
+    with pytest.raises(TypeError, match="load: not a parameter"):
         rig.drive.set_parameters(load=1.0)

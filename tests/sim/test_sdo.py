@@ -1,4 +1,4 @@
-"""The SDO server against the `canopen` library's client, and frame by frame where that client is too polite."""
+"""The SDO server against the `canopen` library's client, and frame by frame for invalid requests."""
 
 from __future__ import annotations
 

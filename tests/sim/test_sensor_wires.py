@@ -1,4 +1,4 @@
-"""The simulated sensors on serial lines, read by pymodbus as any master would, and what the simulator says of them."""
+"""The simulated sensors on serial lines, read by pymodbus, and their description by the simulator."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.bench import bench_document
 
 
 def document(folder: Path) -> dict[str, Any]:
-    """X and Y are units of one line, with a thermometer each; no NC."""
+    """Return a configuration with X and Y as units of one line, with a thermometer each; no NC."""
     made = bench_document()
     made["bus"] = {"can0": {"interface": "virtual", "channel": "wires"}}
     line = {"device": str(folder / "line"), "baud_rate": 115200, "parity": "none"}
@@ -56,7 +56,7 @@ def test_units_of_one_line_and_what_is_said_of_them(tmp_path: Path) -> None:
 def test_a_device_that_is_there_is_not_taken_away(tmp_path: Path) -> None:
     there = tmp_path / "ttyUSB0"
     there.write_text("a real one")
-    with pytest.raises(ConnectError, match="name one that is not there yet"):
+    with pytest.raises(ConnectError, match="choose an unused name"):
         SerialLines({str(there): RtuUnits()}).start()
     assert there.read_text() == "a real one"
 

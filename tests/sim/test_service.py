@@ -1,4 +1,4 @@
-"""The twin's loop inside this process: on python-can's virtual bus, with commands and files as a caller gives them."""
+"""The simulator's loop inside this process: on python-can's virtual bus, with a caller's commands and files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The services around the drive, with the `canopen` library as the foreign master: LSS, guarding, blocks, RTR, boot."""
+"""CANopen services of the drive, with the `canopen` library as foreign master: LSS, guarding, blocks, RTR, boot."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def server() -> SdoServer:
 
 
 def send_block(sdo: SdoServer, content: bytes, skip: int = 0) -> list[bytes]:
-    """Send one block, the segment number ``skip`` lost; return what was answered."""
+    """Send one block without the segment number ``skip``; return the answer."""
     parts = [content[n : n + 7].ljust(7, b"\0") for n in range(0, len(content), 7)]
     answers: list[bytes] = []
     for number, part in enumerate(parts, 1):
@@ -175,7 +175,7 @@ class LssBus(can.BusABC):
 
 @pytest.fixture
 def lss(monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Rig, Rig]:
-    monkeypatch.setattr("canopen.lss.time.sleep", lambda _: None)  # nobody here needs a pause
+    monkeypatch.setattr("canopen.lss.time.sleep", lambda _: None)  # no pauses needed
     first, second = Rig(machine("XY"), "X"), Rig(machine("XY"), "Y")
     master: Any = LssBus(first, second).network.lss
     master.RESPONSE_TIMEOUT = 0.001
@@ -321,7 +321,7 @@ def test_nothing_but_heartbeats_leaves_in_nmt_stopped() -> None:
     assert {can_id for can_id, _ in sent} == {0x701}
     rig.nmt(0x80)
     assert rig.read(0x1003) == 1
-    assert emergencies(rig.sync()) == []  # it is in the history, and not told late
+    assert emergencies(rig.sync()) == []  # in the history, but not sent late
 
 
 def test_the_emergencies_keep_their_inhibit_time() -> None:
@@ -392,7 +392,7 @@ def test_objects_that_drives_have() -> None:
 
 
 def test_drives_of_two_machines_have_serial_numbers_of_their_own() -> None:
-    """A record made on another simulator's drive is void on this one."""
+    """A commissioning record of another simulator's drive is invalid here."""
     machines = [parse(bench_document("XY") | {"machine": {"name": name}}) for name in "AB"]
     numbers = [serial_number(machine, axis) for machine in machines for axis in "XY"]
     assert len(set(numbers)) == 4

@@ -83,7 +83,7 @@ def test_the_canopen_library_finds_configures_and_reads(twin: TwinProcess, bus: 
         assert abort.value.code == 0x06020000
         node.nmt.state = "OPERATIONAL"
         while node.nmt.wait_for_heartbeat(100) != "OPERATIONAL":
-            pass  # it was sent before the drive had heard the command
+            pass  # sent before the drive received the command
     finally:
         assert network.notifier is not None
         network.notifier.stop()
@@ -125,7 +125,7 @@ def test_any_modbus_client_reads_the_sensor(twin: TwinProcess) -> None:
 
 def test_panel_mistakes_are_events(twin: TwinProcess, tmp_path: Path) -> None:
     twin.command("dance")
-    assert "no command 'dance'" in twin.event("error")["text"]
+    assert "unknown panel command 'dance'" in twin.event("error")["text"]
     twin.command("play", file=str(tmp_path / "missing.csv"))
     assert "missing.csv" in twin.event("error")["text"]
 
@@ -154,7 +154,7 @@ def test_the_nc_plays_in_real_time_and_no_sync_is_lost(twin: TwinProcess, tmp_pa
 
 @pytest.mark.usefixtures("processes")
 def test_two_lockstep_runs_are_equal_bit_by_bit(tmp_path: Path) -> None:
-    """One in a process of its own, one in this process: nothing but the configuration decides."""
+    """One in a separate process, one in this process."""
     path = write_config(tmp_path, 'pace = "lockstep"')
     demand = write_demand(tmp_path / "corner.csv", corner() + 2.0)
     script = _load_torque(tmp_path)
@@ -183,7 +183,7 @@ def _load_torque(folder: Path) -> Path:
 
 @pytest.mark.usefixtures("processes")
 def test_lockstep_waits_for_a_client_that_answers_every_sync(tmp_path: Path) -> None:
-    """The client may be as slow as it likes: no offset frame comes late."""
+    """No offset frame is late, however slow the client is."""
     path = write_config(tmp_path, 'pace = "lockstep"\nlockstep_rpdo = ["X:2"]')
     demand = write_demand(tmp_path / "corner.csv", corner())
     with TwinProcess(path) as twin, twin.join() as bus:
@@ -221,7 +221,7 @@ def test_machine_whose_operator_has_died_serves_until_its_bus_is_left(tmp_path: 
 
 @pytest.mark.usefixtures("processes")
 def test_lockstep_waits_for_a_client_whose_offset_is_zero_while_a_program_runs(tmp_path: Path) -> None:
-    """A guard is held up while the offset that it sends is still 0: the program does not run on without it."""
+    """Also while the delayed guard's offset is still 0."""
     path = write_config(tmp_path, 'pace = "lockstep"\nlockstep_rpdo = ["X:2"]')
     demand = write_demand(tmp_path / "corner.csv", corner())
     with TwinProcess(path) as twin, twin.join() as bus:
@@ -265,14 +265,13 @@ def test_a_pipe_that_nobody_writes_to_can_be_left(number: signal.Signals, tmp_pa
 
 
 def _catches(pid: int, number: signal.Signals) -> bool:
-    """Whether a process has set a handler of its own for a signal, by what the kernel says."""
     status = Path(f"/proc/{pid}/status").read_text()
     caught = next(line for line in status.splitlines() if line.startswith("SigCgt"))
     return bool(int(caught.split()[1], 16) >> (number - 1) & 1)
 
 
 def answer(bus: can.BusABC, gain: float = 1.0) -> None:
-    """Answer the next demand of X as a correction does: by a function of it, never 0 but for a gain of 0."""
+    """Answer the next demand of X like a correction: by a function of it, zero only for a gain of 0."""
     while (message := bus.recv(100)) is not None and message.arbitration_id != 0x201:
         pass
     assert message is not None
@@ -285,7 +284,7 @@ def answer(bus: can.BusABC, gain: float = 1.0) -> None:
 
 @pytest.fixture
 def failing(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
-    """Run the command in this process; return its exit code and the one thing that it says."""
+    """Run the command in this process; return its exit code and its single message."""
 
     def run(*arguments: object) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["fdhil", "sim", *map(str, arguments)])
@@ -323,7 +322,7 @@ def test_wrong_scripts_and_options_are_exit_code_2(failing: Callable[..., tuple[
     script.write_text("[[fault]]\nfault = 'meteor'\n")
     code, text = failing(path, "--faults", script)
     assert code == 2
-    assert "'meteor' is none of" in text
+    assert "unknown fault 'meteor'" in text
     code, text = failing(path, "--demand", "a.csv", "--program", "b.ngc")
     assert code == 2
     assert "exclude each other" in text

@@ -1,4 +1,4 @@
-"""A demand that comes row by row: the lead, holes, wrong rows, and the NC that plays it."""
+"""A demand that arrives row by row: lead, gaps, invalid rows, and the NC that plays it."""
 
 from __future__ import annotations
 
@@ -94,10 +94,10 @@ def test_a_rest_before_the_first_motion_is_no_longer_than_the_lead() -> None:
 @pytest.mark.parametrize(
     ("lines", "what"),
     [
-        (["time_s,X_mm"], "no column Y_mm; a demand begins with time_s,X_mm,Y_mm"),
-        ([HEAD, "0,1,two"], "'0,1,two' is not 3 finite numbers"),
-        ([HEAD, "0,1,nan"], "not 3 finite numbers"),
-        ([HEAD, "0,1"], "not 3 finite numbers"),
+        (["time_s,X_mm"], "column Y_mm is missing; a demand starts with time_s,X_mm,Y_mm"),
+        ([HEAD, "0,1,two"], "'0,1,two' is not a list of 3 finite numbers"),
+        ([HEAD, "0,1,nan"], "not a list of 3 finite numbers"),
+        ([HEAD, "0,1"], "not a list of 3 finite numbers"),
         ([HEAD, "0.000,0,0", "0.002,0,0"], "the row of 0.002 s follows that of 0 s; rows are one SYNC"),
     ],
 )

@@ -12,7 +12,7 @@ from tests.bench import bench_document
 
 
 def test_other_regulators_are_refused() -> None:
-    """They would be simulated as p_pi_pi silently."""
+    """They would silently be simulated as p_pi_pi."""
     document = bench_document("X")
     document["axis"]["X"]["regulators"] |= {"structure": "pid", "speed_ki": 0.0, "torque_feedforward": 1.0}
     with pytest.raises(ConfigError) as caught:

@@ -1,4 +1,4 @@
-"""The twin's sensors at the table: an encoder node on the bus, an accelerometer that streams, a module on Modbus."""
+"""The simulated table sensors: an encoder node on the bus, a streaming accelerometer, a Modbus module."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def node(**keys: Any) -> EncoderNode:
 def test_the_encoder_sends_its_place_after_a_sync_where_the_configuration_has_it() -> None:
     assert node(byte=2, offset=1.0).at_sync(1.5) == [(COB_ID, b"\0\0" + struct.pack("<i", 5000))]
     assert node(byte=2).frame_bytes == 6
-    assert node(type="uint16").at_sync(-1e-4) == [(COB_ID, b"\xff\xff")]  # a counter begins anew
+    assert node(type="uint16").at_sync(-1e-4) == [(COB_ID, b"\xff\xff")]  # the counter wraps around
 
 
 def test_the_encoder_obeys_nmt_and_beats() -> None:
@@ -46,7 +46,7 @@ def test_the_encoder_obeys_nmt_and_beats() -> None:
 
 
 def sampled(speeds_m_s: np.ndarray[Any, Any], **keys: Any) -> tuple[list[int], np.ndarray[Any, Any]]:
-    """Return counts and accelerations (m/s2) of the lines of a table with these speeds at the SYNCs."""
+    """Return counts and accelerations (m/s2) of the lines for these table speeds at the SYNCs."""
     settings = Accelerometer(**{"device": "/dev/none", "scale": 1e-3, "rate_hz": 800.0} | keys)
     sensor = TableAccelerometer(settings, 1e-3, 0.0, np.random.default_rng(1))
     text = b""
@@ -118,10 +118,10 @@ def test_a_stream_is_a_device_that_goes_with_the_simulator(tmp_path: Path) -> No
     assert heard == b"1,2\n3,4\n"
     port.send(b"x" * 60 + b"\n")
     os.close(reader)
-    for _ in range(200):  # nobody reads: what does not fit is lost
+    for _ in range(200):  # without a reader, excess data is lost
         port.send(b"0123456789\n" * 20)
     port.close()
     assert not device.is_symlink()
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(ConnectError, match="is there already"):
+    with pytest.raises(ConnectError, match="already exists"):
         StreamPort("accelerometer X", str(tmp_path / "file"))

@@ -1,4 +1,4 @@
-"""The simulated machine as the process that users start."""
+"""The simulator as the process that users start."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def write_config(folder: Path, sim: str = "", bus: str = "", axes: str = "XY", v
 
 
 class TwinProcess:
-    """A running ``fdhil sim --json``; leaving the with block ends it and checks that it ended well."""
+    """A running ``fdhil sim --json``; leaving the with block ends it and checks its exit."""
 
     def __init__(self, *arguments: object) -> None:
         self._process = subprocess.Popen(
@@ -58,31 +58,27 @@ class TwinProcess:
             assert (code, stderr) == (0, "")
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
-        """Send a signal unless it has ended; return the exit code and what it said on standard error."""
+        """Send a signal unless it has ended; return the exit code and its standard error."""
         if self._process.poll() is None:
             self.send_signal(number)
         return self.wait()
 
     def send_signal(self, number: int) -> None:
-        """Send a signal."""
         self._process.send_signal(number)
 
     def wait(self) -> tuple[int, str]:
-        """Wait for the end; return the exit code and what was said on standard error."""
+        """Wait for the end; return the exit code and its standard error."""
         _, stderr = self._process.communicate(timeout=PATIENCE_S)
         return self._process.returncode, stderr.decode()
 
     def command(self, name: str, **keys: Any) -> None:
-        """Give a command on the panel."""
         self.send_line(json.dumps({"command": name, **keys}))
 
     def send_line(self, line: str) -> None:
-        """Give it a line on standard input."""
         assert self._process.stdin is not None
         self._process.stdin.write(line.encode() + b"\n")
 
     def close_panel(self) -> None:
-        """End standard input."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         self._process.stdin = None
@@ -97,7 +93,7 @@ class TwinProcess:
         raise AssertionError(f"no {name}: {self.events}")
 
     def happened(self, name: str) -> bool:
-        """Whether an event of this name has come by now; ``events`` keeps them all."""
+        """Whether an event of this name has come; ``events`` keeps them all."""
         assert self._process.stdout is not None
         while b"\n" in self._pending or select.select([self._process.stdout], (), (), 0)[0]:
             self._next(time.monotonic() + PATIENCE_S)
@@ -120,10 +116,8 @@ class TwinProcess:
 
     @property
     def bus_settings(self) -> Mapping[str, Any]:
-        """What ``can.Bus`` needs."""
         settings: Mapping[str, Any] = self.ready["buses"]["can0"]
         return settings
 
     def join(self) -> can.BusABC:
-        """Join the bus with the stock client."""
         return can.Bus(**self.bus_settings)

@@ -1,4 +1,4 @@
-"""Describes a drive to others: its live PDO mapping and the bus load it causes."""
+"""Describes a drive for the ready event: its live PDO mapping and its bus load."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def units(ratings: Ratings) -> dict[int, tuple[str, float]]:
 
 
 def mapping(drive: Drive) -> dict[str, Any]:
-    """Return the drive's entry of the ready event; ``eds`` is filled in by who writes the file."""
+    """Return the drive's entry of the ready event; the caller fills in ``eds``."""
     own = units(drive.ratings)
-    shown = {gauge.entry.key: gauge.unit(drive.ratings.sign) for gauge in drive.dress.gauges}
+    shown = {signal.entry.key: signal.unit(drive.ratings.sign) for signal in drive.dress.gauges}
 
     def unit(entry: Entry) -> tuple[str, float]:
         if entry.key in shown:
@@ -63,12 +63,12 @@ def mapping(drive: Drive) -> dict[str, Any]:
 
 
 def frame_bits(data_bytes: int, *, stuffed: bool = False) -> int:
-    """Bits of a classic data frame with its interframe space; ``stuffed`` adds the most stuff bits there can be."""
+    """Return the bits of a classic data frame with its interframe space; ``stuffed``: with the most stuff bits."""
     return 47 + 8 * data_bytes + ((34 + 8 * data_bytes - 1) // 4 if stuffed else 0)
 
 
 def bus_load(drive: Drive, sync_rate_hz: float, bitrate: int = 1_000_000, *, stuffed: bool = False) -> float:
-    """Return the share of the bus that the drive's PDOs and heartbeat take at this SYNC rate, without the SYNC itself.
+    """Return the share of the bus taken by the drive's PDOs and heartbeat at this SYNC rate, without the SYNC itself.
 
     Event-driven PDOs count as one per SYNC. Of the RPDOs that carry offsets alone only the largest counts: a correction
     sends either a position offset or speed and torque offsets.

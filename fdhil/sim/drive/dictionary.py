@@ -1,4 +1,4 @@
-"""Holds the object dictionary of a CANopen device: typed entries, access rules, values (CiA 301, 7.4)."""
+"""Implements the object dictionary of a CANopen device: typed entries, access rules, values (CiA 301, 7.4)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fdhil.errors import FdhilError
 
 
 class AbortCode(IntEnum):
-    """SDO abort codes that the drive answers (CiA 301, table 22)."""
+    """SDO abort codes that the drive returns (CiA 301, table 22)."""
 
     TOGGLE = 0x05030000
     COMMAND = 0x05040001
@@ -33,7 +33,7 @@ class AbortCode(IntEnum):
 
 
 class TransferAbort(FdhilError):
-    """An access to the object dictionary is refused; ``code`` is what the SDO server answers."""
+    """An access to the object dictionary is refused; ``code`` is the abort code of the SDO server."""
 
     def __init__(self, code: int) -> None:
         self.code = code
@@ -73,7 +73,7 @@ class DataType(IntEnum):
 I8, I16, I32 = DataType.INTEGER8, DataType.INTEGER16, DataType.INTEGER32
 U8, U16, U32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNSIGNED32
 
-# a REAL is kept as the bits that travel
+# a REAL is stored as its bits on the wire
 _BYTES = {
     DataType.BOOLEAN: 1, U8: 1, U16: 2, DataType.UNSIGNED24: 3, U32: 4, DataType.UNSIGNED40: 5, DataType.UNSIGNED48: 6,
     DataType.UNSIGNED56: 7, DataType.UNSIGNED64: 8, DataType.REAL32: 4, DataType.REAL64: 8,
@@ -89,8 +89,8 @@ Value = int | bytes
 class Entry:
     """One sub-index. ``access`` is ro, wo, rw, rww, rwr or const; ``node_relative``: $NODEID in the EDS.
 
-    Its value is kept under ``home``, where that is not its own key, in the drive's own units: ``scale`` of them make
-    one count on the wire, and the number ``renamed[1]`` is ``renamed[0]`` there. ``choice`` are the counts it takes.
+    Its value is stored under ``home`` (default: its own key) in the drive's own units: ``scale`` of them make one count
+    on the wire, and the number ``renamed[1]`` appears as ``renamed[0]``. ``choice`` are the accepted counts.
     """
 
     index: int
@@ -115,28 +115,25 @@ class Entry:
 
     @property
     def place(self) -> int:
-        """Where its value is kept."""
         return self.key if self.home is None else self.home
 
     @property
     def size(self) -> int | None:
-        """Bytes of a number, None for strings and domains."""
+        """Size of a number in bytes, None for strings and domains."""
         return _BYTES.get(self.type)
 
     @property
     def signed(self) -> bool:
-        """Whether it is an INTEGER type."""
         return self.type in SIGNED
 
     def renumbered(self, by: int) -> Entry:
-        """Return it with another node-ID, that many higher."""
+        """Return it with a node-ID that is higher by ``by``."""
         if not self.node_relative or not isinstance(self.default, int):
             return self
         return replace(self, default=self.default + by)
 
     @property
     def limited(self) -> bool:
-        """Whether it takes some numbers of its type only."""
         return (self.low, self.high, self.choice) != (None, None, None)
 
     def encode(self, value: Value) -> bytes:
@@ -148,7 +145,7 @@ class Entry:
         return value.to_bytes(size, "little", signed=self.signed)
 
     def counts(self, number: int) -> int:
-        """Return a kept number as the wire shows it: in the entry's own unit, at most the end of its type's range."""
+        """Convert a stored number to counts on the wire, limited to the range of the type."""
         if self.renamed is not None and number == self.renamed[1]:
             return self.renamed[0]
         counts = number if self.scale == 1.0 else round(number / self.scale)
@@ -157,7 +154,7 @@ class Entry:
         return min(max(counts, low), high)
 
     def number(self, counts: int) -> int:
-        """Return what is kept of a number on the wire."""
+        """Convert counts on the wire to the stored number."""
         if self.renamed is not None and counts == self.renamed[0]:
             return self.renamed[1]
         return counts if self.scale == 1.0 else round(counts * self.scale)
@@ -171,7 +168,7 @@ class Entry:
         return int.from_bytes(data, "little", signed=self.signed)
 
     def check_range(self, value: Value) -> None:
-        """TransferAbort when a number is outside the entry's limits, or none of those that it takes."""
+        """Raise TransferAbort for a number outside the entry's limits or choices."""
         if self.choice is not None and value not in self.choice:
             raise TransferAbort(AbortCode.RANGE)
         if isinstance(value, int) and (
@@ -200,19 +197,19 @@ def var(index: int, name: str, type: DataType, access: str, default: Value = 0, 
 
 
 def record(index: int, name: str, *entries: Entry, kind: int = RECORD, count: Entry | None = None) -> Object:
-    """Return an object with sub-indices; its sub-index 0 is ``count`` or a constant, the highest sub-index."""
+    """Return an object with sub-indices; its sub-index 0 is ``count``, by default a constant, the highest sub-index."""
     if count is None:
         count = Entry(index, 0, "Highest sub-index supported", U8, "const", max(entry.sub for entry in entries))
     return Object(index, name, kind, (count, *entries))
 
 
 class Dictionary:
-    """The entries that the wire sees, keyed ``index << 8 | sub``, and the values the drive works with.
+    """The entries visible on the wire, keyed ``index << 8 | sub``, and their values.
 
-    ``numbers`` and ``texts`` (strings and domains) are kept by each entry's place, for ``within`` too: entries that the
-    drive needs and does not show. ``check`` and ``written`` are called before and after an SDO write of the places they
-    are registered for; ``check`` refuses by raising TransferAbort. ``read_hooks`` give what is computed when it is
-    asked for. ``restored`` are called when the values of a boot are in place.
+    ``numbers`` and ``texts`` (strings and domains) are stored under each entry's key, also for ``within``: entries that
+    the drive uses and does not expose. ``check`` and ``written`` are called before and after an SDO write to the keys
+    they are registered for; ``check`` refuses by raising TransferAbort. ``read_hooks`` compute values on request.
+    ``restored`` are called when the values of a boot are in place.
     """
 
     def __init__(self, objects: tuple[Object, ...], within: tuple[Entry, ...] = ()) -> None:
@@ -226,17 +223,16 @@ class Dictionary:
         self.read_hooks: dict[int, Callable[[], Value]] = {}
         self.restored: list[Callable[[], None]] = []
         self._within = within
-        self.foreign = bool(within)  # values may travel otherwise than they are kept
+        self.foreign = bool(within)  # wire units may differ from stored units
         self.reset(lambda _: True)
 
     def reset(self, which: Callable[[Entry], bool]) -> None:
-        """Give the chosen entries their default values."""
         for entry in (*self._within, *self.entries.values()):
             if which(entry):
                 self._store(entry, entry.default)
 
     def renumber(self, by: int) -> None:
-        """The node-ID has changed: shift the defaults that are relative to it."""
+        """Shift the defaults that are relative to the node-ID by ``by``."""
         self.objects = tuple(replace(o, entries=tuple(e.renumbered(by) for e in o.entries)) for o in self.objects)
         self.entries = {entry.key: entry for item in self.objects for entry in item.entries}
         self._within = tuple(entry.renumbered(by) for entry in self._within)
@@ -248,22 +244,20 @@ class Dictionary:
             self.texts[entry.place] = value
 
     def entry(self, index: int, sub: int) -> Entry:
-        """Return an entry; TransferAbort when there is no such object or sub-index."""
+        """Return an entry; TransferAbort for an unknown object or sub-index."""
         found = self.entries.get(index << 8 | sub)
         if found is None:
             raise TransferAbort(AbortCode.NO_SUB_INDEX if index in self.indices else AbortCode.NO_OBJECT)
         return found
 
     def number(self, index: int, sub: int = 0) -> int:
-        """Return the value of a number."""
         return self.numbers[index << 8 | sub]
 
     def shown(self, entry: Entry) -> int:
-        """Return the value of an entry as the wire shows it."""
         return entry.counts(self.numbers[entry.place])
 
     def read(self, index: int, sub: int) -> bytes:
-        """Return what an SDO upload gives; TransferAbort when it is refused."""
+        """Return the data of an SDO upload; TransferAbort when it is refused."""
         entry = self.entry(index, sub)
         if entry.access == "wo":
             raise TransferAbort(AbortCode.READ_WRITE_ONLY)
@@ -273,14 +267,14 @@ class Dictionary:
         return entry.encode(self.texts[entry.place] if entry.size is None else self.shown(entry))
 
     def writable(self, index: int, sub: int) -> Entry:
-        """Return an entry that an SDO download may write; TransferAbort when it may not."""
+        """Return an entry that an SDO download may write; TransferAbort otherwise."""
         entry = self.entry(index, sub)
         if entry.access in ("ro", "const"):
             raise TransferAbort(AbortCode.WRITE_READ_ONLY)
         return entry
 
     def write(self, index: int, sub: int, data: bytes) -> None:
-        """Do an SDO download; TransferAbort when it is refused."""
+        """Execute an SDO download; TransferAbort when it is refused."""
         entry = self.writable(index, sub)
         value = entry.decode(data)
         entry.check_range(value)

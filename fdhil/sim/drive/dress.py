@@ -1,8 +1,8 @@
-"""Lets the drive wear a vendor's EDS: its objects, types, access, defaults and PDOs, its identity and its units.
+"""Emulates a vendor's drive from its EDS: objects, types, access, defaults, PDOs, identity and units.
 
-The EDS says which objects there are; what the drive does not have is not there. Which of the vendor's objects show
-current, voltage or duty, and in what they count, no EDS says: the tables in ``dresses`` do, by vendor number, written
-from the vendors' documents and not from the profiles that the drivers read.
+The EDS defines the objects; everything else does not exist. Which vendor objects report current, voltage or duty cycle,
+and in which units, is not part of an EDS: the tables in ``vendor_drives`` define it by vendor number. They were written
+from the vendors' documents, not from the profiles that the drivers read.
 """
 
 import tomllib
@@ -29,11 +29,11 @@ from fdhil.sim.drive.sheet import Sheet, read_sheet
 _MODES, _TARGET, _INTERPOLATION, _SPEED_UNIT = 0x650200, 0x607A00, 0x60C101, 0x60A900
 _INTERPOLATED = 7
 _VENDORS, _PROFILE, _AXIS_STEP = range(0x2000, 0x6000), range(0x6000, 0x6800), 0x800
-_APART = 1 << 24  # the vendor's values are kept apart from those of the twin's own vendor objects
-# A drive without these has no such service: no heartbeat, no SYNC counter. One without 0x6007 falls into fault when it
-# loses its master, as most do: no file says it.
+_APART = 1 << 24  # storage of the vendor's values, separate from the simulator's own vendor objects
+# A drive without these objects has no heartbeat and no SYNC counter. One without 0x6007 goes to Fault when it loses its
+# master, like most drives: an EDS does not define it.
 _NO_SERVICE = {0x101700: 0, 0x101900: 0}
-# what whoever sets a drive up for this machine must have entered: no default of a file fits it
+# machine-specific objects: preset from the configuration, as no default of a file fits
 _SET_UP = frozenset(
     index << 8 | sub
     for indices, subs in (
@@ -47,7 +47,7 @@ _SET_UP = frozenset(
     for index in indices
     for sub in subs
 )
-# speeds and accelerations count alike: in a speed unit, and that per second
+# speeds and accelerations share a unit: the speed unit, and that per second
 _SPEEDS = frozenset(
     {
         0x606B, 0x606C, 0x606D, 0x606F, 0x607F, 0x6081, 0x6083, 0x6084, 0x6085, 0x6099, 0x609A, 0x60B1, 0x60C5, 0x60C6,
@@ -63,7 +63,7 @@ _UNITS = {"current_a": "A", "current_share": "", "voltage_v": "V", "dc_link_v": 
 
 @dataclass(frozen=True, slots=True)
 class Gauge:
-    """An object that shows a signal (one of ``_UNITS``), ``per_count`` of its unit; ``magnitude``: without its sign."""
+    """An object that reports a signal (of ``_UNITS``), ``per_count`` of its unit; ``magnitude``: without its sign."""
 
     entry: Entry
     signal: str
@@ -71,22 +71,21 @@ class Gauge:
     magnitude: bool = False
 
     def counts(self, value: float) -> int:
-        """Return what the object shows of a value."""
         return self.entry.counts(round((abs(value) if self.magnitude else value) / self.per_count))
 
     def unit(self, sign: int) -> tuple[str, float]:
-        """Unit and amount per count in the direction of an axis with this sign."""
+        """Return unit and amount per count in the direction of an axis with this sign."""
         sided = not self.magnitude and self.signal != "dc_link_v"
         return _UNITS[self.signal], sign * self.per_count if sided else self.per_count
 
 
 @dataclass(frozen=True, slots=True)
 class Dress:
-    """What the wire sees of a drive; without an EDS its own objects.
+    """The drive as visible on the wire; without an EDS its own objects.
 
-    ``within``: entries that the drive needs and does not show. ``gauges``: what shows a signal in the vendor's way.
-    ``mode``: in which it follows set-points that come with every SYNC; its number is the vendor's where there is no
-    cyclic synchronous position. ``mode_index``: the object that it is written to.
+    ``within``: entries that the drive uses and does not expose. ``gauges``: objects that report a signal in the
+    vendor's units. ``mode``: the mode for set-points at every SYNC; it has the vendor's number where there is no cyclic
+    synchronous position. ``mode_index``: the object to write it to.
     """
 
     objects: tuple[Object, ...]
@@ -102,10 +101,10 @@ class Dress:
 
 @dataclass(frozen=True, slots=True)
 class Tailoring:
-    """A file of ``dresses``: in what a vendor's drives count, and which objects show what is measured.
+    """A file of ``vendor_drives``: a vendor's units, and the objects that report measured signals.
 
-    ``rated_torque_nm``: a count of 0x6076. ``rated_current``: the vendor's own object of it. ``setpoint``: the object
-    and the mode of cyclic set-points, of drives that have no cyclic synchronous position.
+    ``rated_torque_nm``: unit of 0x6076. ``rated_current``: the vendor's own object for it. ``setpoint``: object and
+    mode of cyclic set-points of drives without cyclic synchronous position.
     """
 
     vendor: int = 0
@@ -117,7 +116,7 @@ class Tailoring:
 
 
 def dress(config: MachineConfig, axis: str) -> Dress:
-    """Return what the axis' drive wears; EdsError when its EDS cannot be read."""
+    """Return the emulation for the axis' drive; EdsError when its EDS cannot be read."""
     own = drive_objects(config, axis)
     path = config.sim.axis.get(axis, SimAxis()).eds
     if path is None:
@@ -131,8 +130,8 @@ def dress(config: MachineConfig, axis: str) -> Dress:
 
 @cache
 def tailoring(vendor: int) -> Tailoring:
-    """Return the table of a vendor; of one that has none, plain CiA 402."""
-    for file in sorted(files("fdhil.sim.drive").joinpath("dresses").iterdir(), key=lambda file: file.name):
+    """Return the table of a vendor; plain CiA 402 for a vendor without one."""
+    for file in sorted(files("fdhil.sim.drive").joinpath("vendor_drives").iterdir(), key=lambda file: file.name):
         if file.name.endswith(".toml"):
             said = tomllib.loads(file.read_text("utf-8"))
             if said["vendor"] == vendor:
@@ -141,7 +140,7 @@ def tailoring(vendor: int) -> Tailoring:
 
 
 def increments_per_s(unit: Value, cut: Tailoring, ratings: Ratings) -> float:
-    """Return what a count of the drive's speeds is: by its own unit object, else as the vendor has it."""
+    """Return the unit of the drive's speeds: from 0x60A9 where it is set, else the vendor's."""
     revolutions, increments = _SPEED_UNITS[cut.speed]
     word = unit if isinstance(unit, int) else 0
     kind, per, power = word >> 16 & 0xFF, word >> 8 & 0xFF, (word >> 24 ^ 0x80) - 0x80
@@ -152,7 +151,7 @@ def increments_per_s(unit: Value, cut: Tailoring, ratings: Ratings) -> float:
 
 
 def follow_speed_unit(dictionary: Dictionary, worn: Dress, ratings: Ratings) -> None:
-    """Let the speeds count in what 0x60A9 says from its next writing or the next boot on."""
+    """Rescale the speeds whenever 0x60A9 is written or restored."""
     if not any(entry.place == _SPEED_UNIT for entry in dictionary.entries.values()):
         return
 
@@ -170,7 +169,7 @@ def follow_speed_unit(dictionary: Dictionary, worn: Dress, ratings: Ratings) -> 
 
 @dataclass(frozen=True, slots=True)
 class _Exchange:
-    """Lets the objects of another axis of the device, ``step`` higher, and those of the first change places."""
+    """Swaps the objects of another axis of the device, ``step`` higher, with those of the first."""
 
     step: int
 
@@ -180,7 +179,6 @@ class _Exchange:
         return index + self.step if index in _PROFILE else index
 
     def sheet(self, sheet: Sheet) -> Sheet:
-        """The axis as if it were the first, as which it is fitted."""
         objects = [
             replace(item, index=at, entries=tuple(replace(entry, index=at) for entry in item.entries))
             for item in sheet.objects
@@ -190,7 +188,7 @@ class _Exchange:
         return replace(sheet, objects=tuple(sorted(objects, key=lambda item: item.index)), given=given)
 
     def dress(self, worn: Dress) -> Dress:
-        """The axis where it is again; its values stay where the drive works with them."""
+        """Return the emulation under the indices of its axis; the drive's own values stay in place."""
         if not self.step:
             return worn
         objects = [
@@ -206,8 +204,6 @@ class _Exchange:
 
 
 class _Tailor:
-    """Fits the objects of a sheet on the drive's own."""
-
     def __init__(self, sheet: Sheet, own: tuple[Object, ...], ratings: Ratings, cut: Tailoring, serial: int) -> None:
         self._sheet, self._ratings, self._cut = sheet, ratings, cut
         self._own = {entry.key: entry for item in own for entry in item.entries}
@@ -219,7 +215,7 @@ class _Tailor:
         self._modes = self._offered()
 
     def _stream(self) -> tuple[int | None, int]:
-        """The object of cyclic set-points where it is not 0x607A, and their mode."""
+        """Return the object of cyclic set-points where it is not 0x607A, and their mode."""
         said = self._cut.setpoint
         if said is not None and (said["object"][0] << 8 | said["object"][1]) in self._entries:
             return said["object"][0] << 8 | said["object"][1], said["mode"]
@@ -229,7 +225,7 @@ class _Tailor:
         return (_INTERPOLATION, _INTERPOLATED) if interpolated and _INTERPOLATION in self._entries else (None, 8)
 
     def _offered(self) -> int:
-        """Bits of the modes that it has, as in 0x6502: those of the file, or those that the twin can do."""
+        """Return the mode bits of 0x6502: those of the file, else those of the simulated drive."""
         if _MODES in self._sheet.given:
             bits = self._entries[_MODES].default
             assert isinstance(bits, int)
@@ -263,11 +259,11 @@ class _Tailor:
         entry = replace(entry, scale=scale, default=self._default(entry, own, scale))
         if entry.key in _SET_UP:
             return replace(entry, low=None, high=None)
-        # what CiA 301 defines has the limits that it says; real files forbid what their devices must take
+        # CiA 301 objects keep the standard's limits; real files forbid values that their devices must accept
         return replace(entry, low=own.low, high=own.high) if own is not None and entry.index < 0x2000 else entry
 
     def _fit_mode(self, entry: Entry) -> Entry:
-        """Only what it has can be chosen; its mode of cyclic set-points is the twin's cyclic synchronous position."""
+        """Restrict the modes to those of the EDS; its cyclic mode maps to cyclic synchronous position."""
         modes = {mode for mode in range(1, 33) if self._modes & SUPPORTED_MODES >> mode - 1 & 1}
         renamed = None if self._mode == CYCLIC_POSITION else (self._mode, CYCLIC_POSITION)
         return replace(entry, choice=frozenset(modes | {0} | ({self._mode} if renamed else set())), renamed=renamed)
@@ -298,7 +294,7 @@ class _Tailor:
         return own.default
 
     def _mapped(self, index: int) -> int:
-        """How many objects a PDO maps whose file does not say it: those that it names."""
+        """Return the number of mapped objects of a PDO whose file does not state it."""
         item = next(item for item in self._sheet.objects if item.index == index)
         return sum(1 for entry in item.entries if entry.sub and entry.default)
 
@@ -319,11 +315,9 @@ class _Tailor:
 
 
 def _alike(entry: Entry, own: Entry) -> bool:
-    """Whether both are texts or both integers, so that one can stand for the other."""
     reals = (DataType.REAL32, DataType.REAL64)
     return entry.type not in reals and (entry.size is None) == (own.size is None)
 
 
 def _counts_entries(entry: Entry, entries: Container[int]) -> bool:
-    """Whether it is the sub-index 0 of an array or record."""
     return entry.sub == 0 and entry.key | 1 in entries

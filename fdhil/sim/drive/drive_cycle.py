@@ -1,4 +1,4 @@
-"""Runs a drive's cycles: set-points are taken, all objects sampled, the following error watched, motion integrated."""
+"""Runs a drive's cycles: apply set-points, sample all objects, supervise the following error, integrate the motion."""
 
 from collections.abc import Callable
 
@@ -12,7 +12,7 @@ from fdhil.sim.drive.physics import Loops
 from fdhil.sim.drive.power import PowerStage, State
 from fdhil.sim.drive.sensors import DriveFaults
 
-_CREEP_RAD_S = 1e-6  # slower than this an axis without power stands
+_CREEP_RAD_S = 1e-6  # slower than this an unpowered axis is at standstill
 _NO_LIMIT = 0xFFFF
 
 
@@ -20,7 +20,7 @@ class DriveCycle:
     """One cycle is :meth:`begin`, then :meth:`integrate`; ``tick`` counts them.
 
     ``table_mm`` is the true table position at the start of the cycle, in the axis' direction. ``ended`` is called after
-    each cycle with the mean voltage of the one before it.
+    each cycle with the mean voltage of the cycle before it.
     """
 
     def __init__(
@@ -45,29 +45,27 @@ class DriveCycle:
         self.reset()
 
     def reset(self) -> None:
-        """The drive boots."""
         self._over_window = self._last_offset = 0
 
     @property
     def stands(self) -> bool:
-        """Whether nothing can move: no current flows, and the axis is at rest."""
+        """Whether nothing can move: no current flows, and the axis is at standstill."""
         return not self._power.powered and abs(self._plant.physics.speed_rad_s) < _CREEP_RAD_S
 
     def keep_offset(self) -> None:
-        """With the fault ``ignore_offset`` what was written to 0x60B0 is lost."""
+        """Discard writes to 0x60B0 while the fault ``ignore_offset`` is active."""
         if self._faults.ignore_offset:
             self._numbers[0x60B000] = self._last_offset
         self._last_offset = self._numbers[0x60B000]
 
     def begin(self) -> bool:
-        """Take the set-points as they are and sample all objects; return whether the following error is too large."""
+        """Apply the set-points and sample all objects; return whether the following error is too large."""
         self._motion.begin_cycle(self._feedback.actual)
         tripped = self._is_beyond(self._feedback.sample(self.tick))
         self.table_mm = self._true_table_mm
         return tripped
 
     def integrate(self) -> None:
-        """Let the cycle pass."""
         physics, motion = self._plant.physics, self._motion
         ended_v = physics.voltage_mean_v
         if motion.loops is not self._loops:
@@ -93,11 +91,9 @@ class DriveCycle:
 
     @property
     def _limit_objects(self) -> tuple[int, int]:
-        """Max torque and max current, 0.1 % of the rated ones."""
         return self._numbers.get(0x607200, _NO_LIMIT), self._numbers.get(0x607300, _NO_LIMIT)
 
     def _is_beyond(self, error: int) -> bool:
-        """Whether the following error has stayed beyond 0x6065 for 0x6066 milliseconds."""
         window = self._numbers[0x606500]
         if window == NO_WINDOW or not self._power.powered or abs(error) <= window:
             self._over_window = 0

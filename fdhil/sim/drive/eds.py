@@ -85,7 +85,7 @@ def eds_text(drive: Drive) -> str:
 
 
 def write_eds(drive: Drive, path: Path) -> Path:
-    """Write the drive's EDS to ``path`` and return it."""
+    """Write the drive's EDS to ``path`` and return the path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(eds_text(drive), encoding="utf-8")
     return path

@@ -1,4 +1,4 @@
-"""Handles the errors of a CANopen device: emergency messages, error history, heartbeats both ways, node guarding."""
+"""Implements error handling of CANopen devices: EMCY, error history, heartbeat producer and consumer, node guarding."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ from fdhil.sim.frame import Frame
 
 # error codes (CiA 301 table 26, CiA 402-2)
 NO_ERROR = 0x0000
-HEARTBEAT_LOST = 0x8130  # and a guarding that has ended
+HEARTBEAT_LOST = 0x8130  # also when guarding ends
 PDO_TOO_SHORT = 0x8210
 SYNC_LENGTH = 0x8240
 RPDO_TIMEOUT = 0x8250
@@ -27,7 +27,7 @@ def _register_bits(code: int) -> int:
 
 
 class Emergencies:
-    """The error register, the history 0x1003, and the EMCY frames: ``waiting`` until they are taken."""
+    """Manages the error register, the history 0x1003, and the EMCY frames ``waiting`` to be sent."""
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
@@ -36,7 +36,7 @@ class Emergencies:
         dictionary.read_hooks.update({0x1003 << 8 | n: self._field(n) for n in range(1, ERROR_HISTORY + 1)})
 
     def report(self, code: int, detail: bytes = b"") -> None:
-        """Note an error and queue its frame, 8 bytes: code, error register, 5 bytes of ``detail``."""
+        """Record an error and queue its frame, 8 bytes: code, error register, 5 bytes of ``detail``."""
         values = self._dictionary.numbers
         register = self._dictionary.number(0x1001) | _register_bits(code)
         values[0x1001 << 8] = register
@@ -48,9 +48,9 @@ class Emergencies:
         self._queue(code, register, detail)
 
     def clear(self, *, in_fault: bool = False) -> None:
-        """Errors were reset, or with ``in_fault`` only the communication works again.
+        """Clear all errors, or with ``in_fault`` the communication error alone.
 
-        When the error register becomes 0, queue the frame "error reset" (code 0).
+        When the error register becomes 0, the frame "error reset" (code 0) is queued.
         """
         before = self._dictionary.number(0x1001)
         after = before & ~_COMMUNICATION if in_fault else 0
@@ -59,7 +59,7 @@ class Emergencies:
             self._queue(NO_ERROR, 0, b"")
 
     def take(self, now_s: float) -> list[Frame]:
-        """Return the frames that may leave now: all, or with an inhibit time (0x1015) one after the other."""
+        """Return the frames to send now: all, or with an inhibit time (0x1015) one at a time."""
         inhibit_s = self._dictionary.numbers.get(0x101500, 0) * 1e-4
         if not inhibit_s:
             frames, self.waiting = self.waiting, []
@@ -70,7 +70,6 @@ class Emergencies:
         return [self.waiting.pop(0)]
 
     def drop(self) -> None:
-        """Nothing that waits will be sent."""
         self.waiting = []
 
     def _queue(self, code: int, register: int, detail: bytes) -> None:
@@ -89,7 +88,7 @@ class Emergencies:
 
 
 class HeartbeatConsumer:
-    """Watches the nodes of 0x1016; monitoring of a node starts with its first heartbeat."""
+    """Monitors the nodes of 0x1016; monitoring of a node starts with its first heartbeat."""
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
@@ -101,7 +100,7 @@ class HeartbeatConsumer:
         self.lost: set[int] = set()
 
     def configure(self) -> None:
-        """Take over 0x1016; the monitoring starts anew."""
+        """Apply 0x1016 and restart the monitoring."""
         words = [self._dictionary.number(0x1016, n) for n in range(1, HEARTBEAT_CONSUMERS + 1)]
         self._periods = {word >> 16 & 0x7F: (word & 0xFFFF) * 1e-3 for word in words if word & 0xFFFF and word >> 16}
         self._heard.clear()
@@ -116,7 +115,7 @@ class HeartbeatConsumer:
                 raise TransferAbort(AbortCode.INCOMPATIBLE)
 
     def receive(self, node_id: int, now_s: float) -> bool:
-        """Note a heartbeat; True when the last lost node is back."""
+        """Record a heartbeat; return True when the last lost node is back."""
         if node_id not in self._periods:
             return False
         self._heard[node_id] = now_s
@@ -143,11 +142,11 @@ class HeartbeatProducer:
         dictionary.written[0x1017 << 8] = lambda _: self.restart()
 
     def restart(self) -> None:
-        """The period changed or the device started: the next heartbeat is due at once."""
+        """Make the next heartbeat due at once, after a boot or a change of the period."""
         self._next_s = None
 
     def due(self, now_s: float, state: int) -> list[Frame]:
-        """Return the heartbeat when its time has come."""
+        """Return the heartbeat if it is due."""
         period_s = self._dictionary.number(0x1017) * 1e-3
         if period_s == 0 or (self._next_s is not None and now_s < self._next_s):
             return []
@@ -157,26 +156,25 @@ class HeartbeatProducer:
 
 
 class NodeGuarding:
-    """Answers the guard's remote frames and watches that they go on: 0x100C milliseconds times 0x100D (CiA 301)."""
+    """Answers the guarding requests and monitors their life time: 0x100C milliseconds times 0x100D (CiA 301)."""
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
         self.reset()
 
     def reset(self) -> None:
-        """The node boots: the toggle bit begins anew, and life guarding with the first request."""
+        """Reset the toggle bit; life guarding starts with the next request."""
         self._toggle = 0
         self._asked_s: float | None = None
 
     def request(self, state: int, now_s: float) -> bytes:
-        """Return the answer to a remote frame."""
         self._asked_s = now_s
         answer = bytes([self._toggle | state])
         self._toggle ^= 0x80
         return answer
 
     def expired(self, now_s: float) -> bool:
-        """Whether the guard has just missed its life time."""
+        """Whether the life time has just expired."""
         life_s = self._number(0x100C) * self._number(0x100D) * 1e-3
         if not life_s or self._asked_s is None or now_s - self._asked_s <= life_s:
             return False

@@ -19,7 +19,7 @@ INT16, INT32 = 0x7FFF, 0x7FFFFFFF
 
 
 def clip(value: float, highest: int) -> int:
-    """Round to a signed integer with this highest value; beyond its range the end value."""
+    """Round to a signed integer and limit it to the range with this highest value."""
     whole = round(value)
     if -highest - 1 <= whole <= highest:
         return whole
@@ -27,10 +27,10 @@ def clip(value: float, highest: int) -> int:
 
 
 class Feedback:
-    """Samples a drive's objects and keeps them in ``trace``. ``following_error`` is bit 13 of the statusword.
+    """Samples a drive's objects and stores them in ``trace``. ``following_error`` is bit 13 of the statusword.
 
     ``digital_inputs`` is 0x60FD: bits 0 and 1 limit switches, 2 home, 16 the NC's rapid signal; the machine's own
-    switches come on top.
+    switches are added.
     """
 
     def __init__(
@@ -61,24 +61,24 @@ class Feedback:
 
     @property
     def true_position(self) -> int:
-        """What the position loop closes on, increments."""
+        """Position feedback of the position loop, increments."""
         return round(self._physics.seen.position_rad * self._inc_per_rad) - self._motion.shift
 
     @property
     def inputs(self) -> int:
-        """0x60FD now."""
+        """Present value of 0x60FD."""
         if self._switches is None:
             return self.digital_inputs
         return self.digital_inputs | self._switches.inputs(self.true_position + self._motion.shift)
 
     @property
     def actual(self) -> Actual:
-        """What the drive knows without its sensors' noise."""
+        """The drive's feedback without sensor noise."""
         seen = self._physics.seen
         return Actual(self.true_position, seen.speed_rad_s * self._inc_per_rad, seen.current_a, self.inputs)
 
     def sample(self, tick: int) -> int:
-        """Sample all objects now; the voltage is the mean of the cycle that ended. Returns the following error."""
+        """Sample all objects; the voltage is the mean of the ended cycle. Return the following error."""
         physics, numbers = self._physics, self._numbers
         true_position = self.true_position
         seen = physics.seen
@@ -118,14 +118,13 @@ class Feedback:
             self._numbers[gauge.entry.place] = gauge.counts(signals[gauge.signal])
 
     def _speed_demand(self, position: int) -> int:
-        """Output of the position loop at t_k, increments/s."""
+        """Return the output of the position loop at t_k, increments/s."""
         if self._motion.source is Source.OFF:
             return 0
         p0, _, f0, _, v0, _, _, _ = self._motion.command
         return clip(self._kv * (p0 - position) + self._kff * f0 + v0 * self._inc_per_rad, INT32)
 
     def show_state(self) -> None:
-        """Bring statusword and mode display up to date."""
         word = self._power.state | _VOLTAGE_ENABLED | _REMOTE
         if self._power.powered:
             word |= self._motion.status_bits

@@ -1,7 +1,7 @@
-"""Finds home as CiA 402-2 lists the ways (methods 1 to 6, 17 to 22, 33, 34, 35, 37): switches, the index pulse, here.
+"""Implements the homing methods 1 to 6, 17 to 22, 33, 34, 35 and 37 of CiA 402-2.
 
-Positions are raw here: those of the encoder, before any home offset. A switch is a bit of 0x60FD; the index pulse comes
-once per revolution, at whole ones.
+Positions are raw encoder positions, before any home offset. A switch is a bit of 0x60FD; the index pulse comes once per
+revolution, at multiples of one revolution.
 """
 
 import math
@@ -14,8 +14,6 @@ _WATCHED = {-1: NEGATIVE, 1: POSITIVE}
 
 
 class Homing(Enum):
-    """How far a run is."""
-
     IDLE = auto()
     RUNNING = auto()
     DONE = auto()
@@ -23,7 +21,7 @@ class Homing(Enum):
 
 
 class Leg(NamedTuple):
-    """One move of a search: which way, how fast, and the bit and its state that end it; no bit is the index pulse."""
+    """One move of a search: direction, speed, and the bit and state that end it; no bit: the index pulse."""
 
     direction: int
     fast: bool
@@ -32,14 +30,14 @@ class Leg(NamedTuple):
 
 
 class _Method(NamedTuple):
-    """The last edge of a method: on its way ``direction`` the switch goes to ``state``."""
+    """The final edge of a method: moving in ``direction``, the switch changes to ``state``."""
 
     direction: int
     bit: int
     state: bool
 
 
-# without index pulse; 1 to 6 are the same, then the pulse
+# without index pulse; 1 to 6 are the same, followed by the pulse
 _EDGES = {
     17: _Method(1, NEGATIVE, False),
     18: _Method(-1, POSITIVE, False),
@@ -53,7 +51,7 @@ METHODS = frozenset({*_EDGES, *(method - 16 for method in _EDGES), *_PULSES, 35,
 
 
 def legs(method: int, inputs: int) -> list[Leg]:
-    """Return the moves of a method from a place with these inputs.
+    """Return the moves of a method from a position with these inputs.
 
     >>> [leg.direction for leg in legs(17, 0)], [leg.direction for leg in legs(17, 1)]
     ([-1, 1], [1])
@@ -65,7 +63,7 @@ def legs(method: int, inputs: int) -> list[Leg]:
         return []
     direction, bit, state = edge
     back, last = Leg(-direction, True, bit, not state), Leg(direction, False, bit, state)
-    if bool(inputs >> bit & 1) != state:  # on the side from which the last edge is to be reached
+    if bool(inputs >> bit & 1) != state:  # on the side from which the final edge is approached
         way = [last] if not state else [Leg(direction, True, bit, state), back._replace(fast=False), last]
     else:
         way = [back, last]
@@ -74,7 +72,7 @@ def legs(method: int, inputs: int) -> list[Leg]:
 
 @dataclass(frozen=True, slots=True)
 class Switches:
-    """Where the machine's switches are, raw increments; None where there is none. Home is active from there on."""
+    """Positions of the machine's switches, raw increments; None: not mounted. Home is active beyond its position."""
 
     negative: float | None = None
     positive: float | None = None
@@ -82,11 +80,10 @@ class Switches:
 
     @property
     def mounted(self) -> bool:
-        """Whether there is any."""
         return (self.negative, self.positive, self.home) != (None, None, None)
 
     def inputs(self, raw: float) -> int:
-        """Return the bits of 0x60FD at a place."""
+        """Return the bits of 0x60FD at a position."""
         bits = int(self.negative is not None and raw <= self.negative)
         bits |= (self.positive is not None and raw >= self.positive) << POSITIVE
         return bits | (self.home is not None and raw >= self.home) << HOME
@@ -97,7 +94,7 @@ class Switches:
 
 
 class HomingRun:
-    """One search after the other. ``home`` is the raw position that was found, ``leg`` the move to make now."""
+    """Runs one search at a time. ``home`` is the raw position found, ``leg`` the present move."""
 
     def __init__(self, switches: Switches, increments_per_rev: int) -> None:
         self.switches = switches
@@ -105,14 +102,13 @@ class HomingRun:
         self.reset()
 
     def reset(self) -> None:
-        """Nothing was searched since power-on, or the mode was left."""
         self.state = Homing.IDLE
         self.home = 0.0
         self._legs: list[Leg] = []
         self._before = 0.0
 
     def start(self, method: int, raw: float, inputs: int) -> None:
-        """Begin a search at ``raw``."""
+        """Start a search at ``raw``."""
         self._legs = legs(method, inputs)
         self._before = raw
         self.state = Homing.RUNNING
@@ -122,11 +118,11 @@ class HomingRun:
 
     @property
     def leg(self) -> Leg | None:
-        """The move to make now; None: come to rest."""
+        """The present move; None: come to rest."""
         return self._legs[0] if self._legs else None
 
     def step(self, raw: float, inputs: int) -> None:
-        """A cycle brought the axis to ``raw``: go to the next leg where this one has found what it sought."""
+        """Update the search at position ``raw``; go on to the next move when the present one is complete."""
         leg = self.leg
         if leg is None:
             return
@@ -143,7 +139,7 @@ class HomingRun:
             self._fail()
 
     def rested(self) -> bool:
-        """The axis stands; True when that ends a search that has found home."""
+        """Complete the search at standstill; return True if it has just found home."""
         if self.state is not Homing.RUNNING or self._legs:
             return False
         self.state = Homing.DONE

@@ -1,7 +1,7 @@
-"""Answers the layer setting services (CiA 305): the node-ID given over the bus, by identity or to the only node on it.
+"""Answers the layer setting services (CiA 305): node-ID over the bus, by identity or for the only node.
 
-A new node-ID holds from the next reset of the communication on; stored, also after the supply was cut. The bit rate of
-a simulated bus is nobody's to choose: every standard one is accepted and changes nothing.
+A new node-ID takes effect at the next communication reset and, once stored, survives a power cycle. The bit rate of a
+simulated bus is fixed: every standard rate is accepted and changes nothing.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ _BIT_RATES = frozenset({0, 1, 2, 3, 4, 6, 7, 8})  # indices of table 0; 5 is res
 class LssSlave:
     """The LSS side of a node. ``identity`` gives the four numbers of 0x1018; ``node_id`` is the one in force.
 
-    ``pending`` is the node-ID that the next reset of the communication brings.
+    ``pending`` is the node-ID that takes effect at the next communication reset.
     """
 
     def __init__(self, node_id: int, identity: Callable[[], tuple[int, int, int, int]]) -> None:
@@ -26,18 +26,16 @@ class LssSlave:
         self.reset()
 
     def reset(self) -> None:
-        """The node boots: it waits to be switched to the configuration state."""
         self._configuring = False
         self._selected = 0
         self._identified = 0
         self._scanned = 0
 
     def power_on(self) -> None:
-        """The stored node-ID is in force again."""
         self.pending = self._stored
 
     def receive(self, data: bytes) -> bytes | None:
-        """Take a request and return the answer, None where none is due."""
+        """Process a request and return the answer, None where none is due."""
         if len(data) != 8:
             return None
         command, number = data[0], int.from_bytes(data[1:5], "little")
@@ -55,37 +53,37 @@ class LssSlave:
             return self._configure(command, data)
         return None
 
-    def _select(self, place: int, number: int) -> bytes | None:
-        """Take one of the four numbers of a switch-selective; the last one that fits switches."""
-        fits = place == self._selected and self._identity()[place] == number
-        self._selected = place + 1 if fits else 0
+    def _select(self, number_index: int, number: int) -> bytes | None:
+        """Accept one of the four numbers of a switch-selective; the last matching one selects the node."""
+        fits = number_index == self._selected and self._identity()[number_index] == number
+        self._selected = number_index + 1 if fits else 0
         if self._selected < 4:
             return None
         self._configuring, self._selected = True, 0
         return _answer(_ENTER)
 
-    def _identify(self, place: int, number: int) -> bytes | None:
-        """Take vendor, product, and the bounds of revision and serial number; answer where all of them fit."""
+    def _identify(self, number_index: int, number: int) -> bytes | None:
+        """Accept vendor, product, and the bounds of revision and serial number; answer if all match."""
         vendor, product, revision, serial = self._identity()
         fits = (
             number == vendor, number == product, number <= revision, number >= revision, number <= serial,
             number >= serial,
         )  # fmt: skip
-        self._identified = place + 1 if place == self._identified and fits[place] else 0
+        self._identified = number_index + 1 if number_index == self._identified and fits[number_index] else 0
         if self._identified < 6:
             return None
         self._identified = 0
         return _answer(_FOUND)
 
     def _fastscan(self, number: int, checked: int, sub: int, following: int) -> bytes | None:
-        """Answer where the bits from ``checked`` upward are those of the number that is asked for."""
+        """Answer where the bits from ``checked`` upward match the requested number."""
         if checked == 0x80:
             self._scanned = 0
             return _answer(_FOUND)
         if sub > 3 or checked > 31 or sub != self._scanned or (self._identity()[sub] ^ number) >> checked:
             return None
         self._scanned = following
-        if checked == 0 and following < sub:  # the whole identity fits
+        if checked == 0 and following < sub:  # the whole identity matches
             self._configuring, self._scanned = True, 0
         return _answer(_FOUND)
 

@@ -1,4 +1,4 @@
-"""Names the modes of operation that the drive has (CiA 402-2, object 0x6060)."""
+"""Defines the modes of operation of the drive (CiA 402-2, object 0x6060)."""
 
 PROFILE_POSITION, PROFILE_VELOCITY, PROFILE_TORQUE, HOMING = 1, 3, 4, 6
 CYCLIC_POSITION, CYCLIC_VELOCITY, CYCLIC_TORQUE = 8, 9, 10

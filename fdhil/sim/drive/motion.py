@@ -1,4 +1,4 @@
-"""Chooses the set-point that the loops follow: modes of operation, ramps of the power state machine, the halt bit."""
+"""Selects the set-point of the loops: modes of operation, ramps of the power state machine, the halt bit."""
 
 import math
 from enum import Enum, auto
@@ -17,15 +17,13 @@ from fdhil.sim.drive.speed_and_torque import Actual, SpeedAndTorque
 
 _REST: Command = (0.0,) * 8
 _NEW_SETPOINT, _AT_ONCE, _RELATIVE, _HALT = 0x10, 0x20, 0x40, 0x100
-# target, position offset, velocity offset, torque offset, software limits
+# target, position offset, velocity offset, torque offset, software limits of the cyclic modes
 _cyclic = itemgetter(0x607A00, 0x60B000, 0x60B100, 0x60B200, 0x607D01, 0x607D02)
 _TARGET_REACHED, _MODE_SPECIFIC, _HOMING_ERROR = 1 << 10, 1 << 12, 1 << 13
-_FAR = 1e12  # increments: a search runs until it finds something
+_FAR = 1e12  # increments: a search runs until it finds its mark
 
 
 class Source(Enum):
-    """Where the set-point comes from."""
-
     OFF = auto()
     CYCLIC = auto()
     PROFILE = auto()
@@ -51,10 +49,10 @@ _LOOPS = {
 
 
 class Motion:
-    """Set-point of each cycle, in increments. ``limited``: the software position limit cut it.
+    """Computes the set-point of each cycle, in increments. ``limited``: the software position limit is active.
 
-    ``loops`` are those that ``command`` is for; ``synced``: a SYNC begins the next cycle. ``shift`` is where the
-    drive's zero is, raw increments: homing sets it.
+    ``loops`` are the closed loops that ``command`` addresses; ``synced``: a SYNC begins the next cycle. ``shift`` is
+    the drive's zero, raw increments, set by homing.
     """
 
     def __init__(
@@ -90,7 +88,7 @@ class Motion:
         self.reset(0)
 
     def reset(self, position: int) -> None:
-        """Power-on at ``position`` increments."""
+        """Reset to standstill at ``position`` increments, at power-on."""
         self._numbers[0x607A << 8] = position
         self._preset(Target(position, 0.0, 0.0, 0.0))
         self.source, self.loops, self.command = Source.OFF, Loops.POSITION, _REST
@@ -112,14 +110,11 @@ class Motion:
 
     @property
     def bound(self) -> bool:
-        """Whether the set-points come with the SYNC."""
         return self._power.powered and self._numbers[0x606000] in modes.CYCLIC
-
-    # -- statusword and controlword
 
     @property
     def status_bits(self) -> int:
-        """Bits 10, 12 and 13 of the statusword, as the mode has them; bit 13 in homing alone."""
+        """Bits 10, 12 and 13 of the statusword, as the mode defines them; bit 13 in homing only."""
         halted = self.source is Source.STOP and self._profile.at_rest
         match self.mode:
             case modes.PROFILE_POSITION:
@@ -152,7 +147,7 @@ class Motion:
         return bits | (_TARGET_REACHED if rests else 0)
 
     def control(self, word: int) -> None:
-        """Evaluate bit 4 of a controlword: the handshake of profile position, the start of a homing (CiA 402-2)."""
+        """Evaluate bit 4 of a controlword: profile position handshake, start of a homing (CiA 402-2)."""
         rising = word & _NEW_SETPOINT and not self._last_word & _NEW_SETPOINT
         self._last_word = word
         mode = self.mode
@@ -181,15 +176,13 @@ class Motion:
 
     @property
     def _base(self) -> float:
-        """The place from which a relative target counts: the target before it, else where the axis stands."""
+        """The position to which a relative target is added: the previous target, else the actual demand."""
         if self._target is not None:
             return self._target
         return self._profile.now if self.source in (Source.PROFILE, Source.STOP) else self._position
 
-    # -- the cycle
-
     def begin_cycle(self, actual: Actual) -> Command:
-        """A cycle begins: take the set-points as they are now and return its command."""
+        """Apply the present set-points and return the command of the cycle."""
         self._push(actual)
         source = self._choose()
         self._position = actual.position
@@ -213,7 +206,7 @@ class Motion:
 
     @property
     def demand(self) -> float:
-        """The position demand at the start of the cycle, increments; without a position loop where the axis is."""
+        """The position demand at the start of the cycle, increments; the actual position without a position loop."""
         if self.source is Source.OFF or (self.source is Source.CYCLIC and self.loops is Loops.POSITION):
             now = self.cyclic.now
             return now.position + now.offset
@@ -274,10 +267,10 @@ class Motion:
         if self.source is Source.OFF:
             self._profile.start(actual.position, 0.0)
         elif self.source is Source.CYCLIC and self._loops_before is Loops.POSITION:
-            # the demand that was in force, not where the new cycle's set-point would take it
+            # the demand in force, not that of the new cycle's set-point
             self._profile.start(self.command[1], self.command[3])
         elif self.source in (Source.CYCLIC, Source.VELOCITY, Source.TORQUE):
-            # so far ahead that the position loop asks for the speed that is
+            # so far ahead that the position loop demands the actual speed
             ahead = (1 - self._feedforward) * actual.speed / self._gain
             self._profile.start(actual.position + ahead, actual.speed)
 
@@ -298,13 +291,11 @@ class Motion:
             self._power.at_rest()
 
     def _stop_ramp(self) -> int:
-        """The key of the deceleration: 0x6085 in a quick stop, and in a halt whose option code says so."""
+        """Return the key of the deceleration: 0x6085 for a quick stop or a halt with option code 2."""
         ramp = self._power.ramp
         halt = ramp is None and self._numbers[0x604000] & _HALT and self._numbers.get(0x605D00, 1) == 2
         index: int = (Ramp.QUICK_STOP if ramp is Ramp.QUICK_STOP or halt else Ramp.SLOW_DOWN).value
         return index << 8
-
-    # -- homing
 
     def _home(self, actual: Actual) -> None:
         run, limits = self.homing, self._limits
@@ -321,7 +312,7 @@ class Motion:
             self._set_zero(round(run.home) - self._numbers.get(0x607C00, 0))
 
     def _set_zero(self, shift: int) -> None:
-        """Count from another place: the axis stays where it is and has other coordinates."""
+        """Shift the zero: the axis stays in place and gets new coordinates."""
         self._profile.start(self._profile.now + self.shift - shift, 0.0)
         self._preset(Target(self._profile.now, 0.0, 0.0, 0.0))
         self.shift = shift

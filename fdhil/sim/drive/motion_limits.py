@@ -1,4 +1,4 @@
-"""Reads limits, rates and windows of the drive's own motion; an object that it lacks, or that is 0, limits nothing."""
+"""Reads limits, rates and windows of the drive's own motion; a missing object, or a value of 0, means no limit."""
 
 import math
 from collections.abc import Mapping
@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from fdhil.sim.drive.motion_objects import NO_WINDOW
 from fdhil.sim.drive.objects import Ratings
 
-_REVOLUTIONS_PER_S2 = 100  # of a drive without a word on its accelerations
+_REVOLUTIONS_PER_S2 = 100  # default of a drive without acceleration objects
 
 
 class MotionLimits:
-    """The limits of one drive, in increments and seconds, read from its objects each time."""
+    """The limits of one drive, in increments and seconds, read from its objects on each call."""
 
     def __init__(self, numbers: Mapping[int, int], ratings: Ratings) -> None:
         self._numbers = numbers
@@ -26,7 +26,7 @@ class MotionLimits:
         return self._limit(0x608000) * self._per_rev / 60
 
     def speed(self, wanted: float) -> float:
-        """Return a speed with its sign, cut to 0x607F and 0x6080."""
+        """Limit a signed speed to 0x607F and 0x6080."""
         highest = min(self._limit(0x607F00), self.motor_speed)
         return min(max(wanted, -highest), highest)
 
@@ -35,16 +35,16 @@ class MotionLimits:
         return self.speed(float(self._numbers.get(key, 0)) or math.inf)
 
     def acceleration(self, key: int) -> float:
-        """Return the acceleration of an object such as 0x6083, cut to 0x60C5."""
+        """Return the acceleration of an object such as 0x6083, limited to 0x60C5."""
         return min(float(self._numbers.get(key, 0)) or self._default_rate, self._limit(0x60C500))
 
     def deceleration(self, key: int) -> float:
-        """Return the deceleration of an object such as 0x6084, cut to 0x60C6."""
+        """Return the deceleration of an object such as 0x6084, limited to 0x60C6."""
         return min(float(self._numbers.get(key, 0)) or self._default_rate, self._limit(0x60C600))
 
 
 class Window:
-    """Whether a value has stayed near its target for long enough, as objects such as 0x6067 and 0x6068 say."""
+    """Detects that a value has stayed near its target for a time, as defined by objects such as 0x6067 and 0x6068."""
 
     def __init__(self, numbers: Mapping[int, int], width: int, time: int, period_s: float) -> None:
         self._numbers, self._width, self._time = numbers, width, time
@@ -52,12 +52,11 @@ class Window:
         self._cycles = 0
 
     def step(self, error: float) -> None:
-        """A cycle has this error."""
         inside = abs(error) <= self._numbers.get(self._width, NO_WINDOW)
         self._cycles = self._cycles + 1 if inside else 0
 
     @property
     def reached(self) -> bool:
-        """Whether it is so; a window that a drive lacks is always reached."""
+        """Whether the target is reached; always True for a missing window."""
         wide = self._numbers.get(self._width, NO_WINDOW) == NO_WINDOW
         return wide or (self._cycles > 0 and (self._cycles - 1) * self._period_ms >= self._numbers.get(self._time, 0))

@@ -1,4 +1,4 @@
-"""Lists the objects of the drive's own motion: velocity, torque and homing modes, windows, limits, the motor's type.
+"""Lists the objects of the drive's own motion: velocity, torque and homing modes, windows, limits, motor type.
 
 Profile speeds are in increments/s and accelerations in increments/s2, as everywhere in this drive; 0x6080 is in rpm.
 """
@@ -13,7 +13,7 @@ HERE = 37  # homing method: the current position
 _WINDOW_MM, _WINDOW_MS = 0.01, 10
 _SPEED_WINDOW_RAD_S = 1.0
 _REST_MS = 5
-_HEADROOM = 2.0  # of the highest speed above the axis' own, of the highest acceleration above the quick stop's
+_HEADROOM = 2.0  # of the speed limit over the axis' speed, of the acceleration limit over the quick stop's
 _TORQUE_SLOPE = 10_000  # 0.1 %/s
 
 
@@ -36,7 +36,7 @@ def _windows(axis: Axis, increments_per_mm: float) -> list[Object]:
 
 
 def current_limit(axis: Axis) -> int:
-    """The configured current limit in 0.1 % of the rated current, never below it."""
+    """Return the configured current limit in 0.1 % of the rated current, rounded up."""
     return min(math.ceil(axis.regulators.current_limit_a / axis.drive.rated_current_a * 1e3), 0xFFFF)
 
 

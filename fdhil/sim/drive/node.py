@@ -1,6 +1,6 @@
-"""Makes a device a CANopen node (CiA 301), sans-I/O: NMT, boot-up, SDO, RPDOs, heartbeats, guarding, EMCY, LSS.
+"""Implements a CANopen node (CiA 301), sans-I/O: NMT, boot-up, SDO, RPDOs, heartbeats, guarding, EMCY, LSS.
 
-What the device does with a SYNC, with what it received and with an error is left to who derives from it.
+Subclasses define the reaction to a SYNC, to received data and to an error.
 """
 
 from abc import ABC, abstractmethod
@@ -25,15 +25,15 @@ from fdhil.sim.drive.service_objects import KEEP_STATE
 from fdhil.sim.frame import Frame
 
 OFF, INITIALISING, STOPPED, OPERATIONAL, PRE_OPERATIONAL = -1, 0x00, 0x04, 0x05, 0x7F
-_AFTER_ERROR = {0: PRE_OPERATIONAL, 2: STOPPED}  # 0x1029: the NMT state after a communication error; 1: as it is
+_AFTER_ERROR = {0: PRE_OPERATIONAL, 2: STOPPED}  # 0x1029: the NMT state after a communication error; 1: unchanged
 
-_SDO_PATIENCE_S = 1.0  # a client that was silent for so long within a block has gone: what comes is another's request
+_SDO_PATIENCE_S = 1.0  # a client silent for longer within a block has left: the next request is another client's
 
 
 class CanopenNode(ABC):
     """One node on top of its object dictionary; ``boot_s`` is the time from a reset to the boot-up message.
 
-    ``nmt`` is the NMT state as a heartbeat shows it, -1 while the device is without supply.
+    ``nmt`` is the NMT state as in a heartbeat, -1 while the device has no supply.
     """
 
     def __init__(self, dictionary: Dictionary, node_id: int, faults: DriveFaults, boot_s: float) -> None:
@@ -57,38 +57,34 @@ class CanopenNode(ABC):
         self._lss = lss.LssSlave(node_id, self._identity)
         self._stored = StoredParameters(dictionary)
 
-    # -- what the device does
-
     @abstractmethod
     def power_on(self) -> list[Frame]:
-        """Boot, or boot again; returns the boot-up message, if it comes at once."""
+        """Boot or reboot; return the boot-up message if it is sent at once."""
 
     @abstractmethod
     def _cycle_of_sync(self, counter: int | None) -> list[Frame]:
-        """A SYNC came: do its cycle and return the TPDOs."""
+        """Run the cycle of a SYNC and return the TPDOs."""
 
     @abstractmethod
     def _coast(self) -> None:
-        """A SYNC came that the device does not hear, without supply or not yet booted."""
+        """Run the cycle of a SYNC that the device does not receive: it has no supply or is booting."""
 
     @abstractmethod
     def _received(self) -> None:
-        """An event-driven RPDO has changed the objects."""
+        """Apply objects that an event-driven RPDO has changed."""
 
     @abstractmethod
     def _react(self, code: int) -> None:
-        """A connection is lost, with this error code."""
+        """React to a lost connection with this error code."""
 
     @abstractmethod
     def _abort_connection(self) -> None:
-        """The master has taken the connection away."""
+        """React to the master's release of the connection."""
 
     @property
     @abstractmethod
     def _in_fault(self) -> bool:
         """Whether a fault waits for its reset."""
-
-    # -- life
 
     @property
     def _mute(self) -> bool:
@@ -102,7 +98,7 @@ class CanopenNode(ABC):
         return vendor, product, revision, serial
 
     def power_off(self) -> None:
-        """Cut the supply: no frame is sent or answered; :meth:`power_on` ends it."""
+        """Cut the supply: no frame is sent or answered until :meth:`power_on`."""
         self.nmt = OFF
         self._boot_due_s = None
         self.pdo.stop()
@@ -151,7 +147,7 @@ class CanopenNode(ABC):
             self._connection_lost(RPDO_TIMEOUT, bytes([number]))
 
     def _on_time(self) -> list[Frame]:
-        """Return what is due by now: boot-up, heartbeat, errors, event-driven TPDOs."""
+        """Return the due frames: boot-up, heartbeat, errors, event-driven TPDOs."""
         boot_due = self._boot_due_s is not None and self._now_s >= self._boot_due_s
         frames = self._booted() if boot_due else []
         if self._mute:
@@ -159,15 +155,13 @@ class CanopenNode(ABC):
         frames += self._producer.due(self._now_s, self.nmt)
         self._watch_connections()
         frames += self._take_outgoing()
-        if self._after_error is not None:  # the error is told before the device falls silent
+        if self._after_error is not None:  # the error is sent before the device falls silent
             self._leave_operational(self._after_error)
             self._after_error = None
         return frames + self.pdo.on_events(self._now_s)
 
-    # -- frames
-
     def receive(self, can_id: int, data: bytes) -> list[Frame]:
-        """Take one frame from the bus and return what the drive sends because of it; one without data asks for one."""
+        """Process one frame from the bus and return the answers; a frame without data is a remote frame."""
         if can_id == self._sync_id:
             return self._sync(data)
         if can_id == lss.REQUEST and self.nmt not in (OFF, OPERATIONAL):
@@ -237,7 +231,7 @@ class CanopenNode(ABC):
         return self._take_outgoing()
 
     def _take_outgoing(self) -> list[Frame]:
-        """Return the EMCY frames that may leave now; in NMT stopped none ever does."""
+        """Return the EMCY frames to send now; in NMT state Stopped there are none."""
         if self.nmt == STOPPED or self._mute:
             self._emergencies.drop()
         return self._emergencies.take(self._now_s) if self._emergencies.waiting else []
@@ -248,8 +242,8 @@ class CanopenNode(ABC):
             return []
         counter = data[0] if data else None
         if counter is None and self.dictionary.numbers[0x101900]:
-            told, self._sync_refused = self._sync_refused, True
-            if not told:
+            reported, self._sync_refused = self._sync_refused, True
+            if not reported:
                 self._emergencies.report(SYNC_LENGTH)
             return self._take_outgoing()
         self._sync_refused = False

@@ -1,4 +1,4 @@
-"""Gives SDO writes to the drive their meaning beyond storing the value: rules and actions by object."""
+"""Registers rules and actions for SDO writes to the drive's objects."""
 
 from collections.abc import Callable
 
@@ -14,21 +14,20 @@ _NOT_STORED = frozenset({0x1003, 0x1010, 0x1011, 0x6040, 0x6060, 0x607A, 0x60B0,
 
 
 class StoredParameters:
-    """The non-volatile memory behind 0x1010 and 0x1011: values that a boot starts with instead of the defaults."""
+    """The non-volatile memory behind 0x1010 and 0x1011: power-on values that replace the defaults."""
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
         self._values: dict[Entry, int] = {}
 
     def restore(self, which: Callable[[Entry], bool]) -> None:
-        """Give the chosen entries their defaults, or what was saved."""
         self._dictionary.reset(which)
         self._dictionary.numbers.update({e.place: v for e, v in self._values.items() if which(e)})
         for call in self._dictionary.restored:
             call()
 
     def save(self) -> None:
-        """Keep all parameters; set-points and the controlword are none."""
+        """Save all parameters, without set-points and controlword."""
         self._values = {
             entry: self._dictionary.numbers[entry.place]
             for entry in self._dictionary.entries.values()
@@ -36,7 +35,7 @@ class StoredParameters:
         }
 
     def forget(self) -> None:
-        """Boot with the defaults next time."""
+        """Discard the saved values: the next boot uses the defaults."""
         self._values = {}
 
 
@@ -50,92 +49,60 @@ def register_write_rules(
     on_controlword: Callable[[], None],
     on_communication: Callable[[], None],
 ) -> None:
-    """Attach the rules. ``changeable`` says whether the drive is pre-operational, ``powered`` whether current flows;
-    ``on_controlword`` and ``on_communication`` are called after a write of 0x6040 or 0x6060 and of 0x1005."""
+    """Attach the rules.
 
-    def at_rest(_entry: Entry, _value: int) -> None:
-        if not changeable():
-            raise TransferAbort(AbortCode.DEVICE_STATE)
+    ``changeable`` returns whether the drive is pre-operational, ``powered`` whether current flows; ``on_controlword``
+    and ``on_communication`` are called after a write to 0x6040 or 0x6060 and to 0x1005.
+    """
 
-    def sync_id(entry: Entry, value: int) -> None:
-        at_rest(entry, value)
-        if value & ~0x7FF or value == 0:  # it consumes SYNC and does not produce it
-            raise TransferAbort(AbortCode.RANGE)
+    def accept(valid: Callable[[Entry, int], object], *, when_running: bool = True) -> Callable[[Entry, int], None]:
+        def check(entry: Entry, value: int) -> None:
+            if not when_running and not changeable():
+                raise TransferAbort(AbortCode.DEVICE_STATE)
+            if not valid(entry, value):
+                raise TransferAbort(AbortCode.RANGE)
 
-    def counter_overflow(entry: Entry, value: int) -> None:
-        at_rest(entry, value)
-        if value == 1 or value > 240:
-            raise TransferAbort(AbortCode.RANGE)
+        return check
 
-    def emergency_id(_entry: Entry, value: int) -> None:
-        if value & ~(INVALID | 0x7FF) or value & 0x7FF == 0:
-            raise TransferAbort(AbortCode.RANGE)
+    def execute(signature: int, action: Callable[[], None]) -> Callable[[Entry, int], None]:
+        def check(_entry: Entry, value: int) -> None:
+            if value != signature:
+                raise TransferAbort(AbortCode.NOT_STORED)
+            if powered():  # writing to flash would stall the loops
+                raise TransferAbort(AbortCode.DEVICE_STATE)
+            action()
 
-    def without_power() -> None:
-        if powered():  # writing flash takes longer than the loops can wait
-            raise TransferAbort(AbortCode.DEVICE_STATE)
+        return check
 
-    def save() -> None:
-        without_power()
-        stored.save()
+    def is_supported_mode(_entry: Entry, value: int) -> bool:
+        supported = dictionary.numbers.get(0x650200) or SUPPORTED_MODES
+        return not value or (value in MODES and bool(supported >> (value - 1) & 1))
 
-    def load() -> None:
-        without_power()
-        stored.forget()
-
-    def mode(_entry: Entry, value: int) -> None:
-        offered = dictionary.numbers.get(0x650200) or SUPPORTED_MODES
-        if value and (value not in MODES or not offered >> (value - 1) & 1):
-            raise TransferAbort(AbortCode.RANGE)
-
-    def interpolation_time(entry: Entry, value: int) -> None:
-        cycle = entry.default
-        if entry.low is not None and isinstance(cycle, int) and value % cycle:  # whole cycles of the drive
-            raise TransferAbort(AbortCode.RANGE)
-
-    def homing_method(_entry: Entry, value: int) -> None:
-        if value not in METHODS:
-            raise TransferAbort(AbortCode.RANGE)
-
-    def quick_stop(_entry: Entry, value: int) -> None:
-        if value not in QUICK_STOP_CODES:
-            raise TransferAbort(AbortCode.RANGE)
+    def is_whole_cycles(entry: Entry, value: int) -> bool:
+        return entry.low is None or not isinstance(entry.default, int) or value % entry.default == 0
 
     dictionary.check.update(
         {
-            0x100500: sync_id,
-            0x101001: _signature(_SAVE, save),
-            0x101101: _signature(_LOAD, load),
-            0x101400: emergency_id,
-            0x101900: counter_overflow,
-            0x605A00: quick_stop,
-            0x606000: mode,
-            0x609800: homing_method,
-            0x60C201: interpolation_time,
+            # the drive consumes SYNC and never produces it
+            0x100500: accept(lambda _, value: 0 < value <= 0x7FF, when_running=False),
+            0x101001: execute(_SAVE, stored.save),
+            0x101101: execute(_LOAD, stored.forget),
+            0x101400: accept(lambda _, value: not value & ~(INVALID | 0x7FF) and value & 0x7FF),
+            0x101900: accept(lambda _, value: value != 1 and value <= 240, when_running=False),
+            0x605A00: accept(lambda _, value: value in QUICK_STOP_CODES),
+            0x606000: accept(is_supported_mode),
+            0x609800: accept(lambda _, value: value in METHODS),
+            0x60C201: accept(is_whole_cycles),
         }
     )
     dictionary.written.update(
         {
-            0x100300: lambda _: _clear_history(dictionary),
+            0x100300: lambda _: dictionary.numbers.update({0x1003 << 8 | n: 0 for n in range(ERROR_HISTORY + 1)}),
             0x100500: lambda _: on_communication(),
             0x212100: lambda _: trace.clear(),
             0x604000: lambda _: on_controlword(),
             0x606000: lambda _: on_controlword(),
         }
     )
-    # the capability, whatever was written: parameters are saved on command
+    # reads return the capability: parameters are saved on command
     dictionary.read_hooks.update({0x101001: lambda: 1, 0x101101: lambda: 1, 0x212000: trace.content})
-
-
-def _signature(wanted: int, action: Callable[[], None]) -> Callable[[Entry, int], None]:
-    def check(_entry: Entry, value: int) -> None:
-        if value != wanted:
-            raise TransferAbort(AbortCode.NOT_STORED)
-        action()
-
-    return check
-
-
-def _clear_history(dictionary: Dictionary) -> None:
-    for n in range(ERROR_HISTORY + 1):
-        dictionary.numbers[0x1003 << 8 | n] = 0

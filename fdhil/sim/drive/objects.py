@@ -1,4 +1,4 @@
-"""Lists the objects of the simulated drive: communication profile (CiA 301), drive profile (CiA 402-2), vendor objects.
+"""Lists the objects of the simulated drive: communication (CiA 301), drive profile (CiA 402-2), vendor objects.
 
 Position objects are in increments of the encoder, speeds in increments/s, currents in 0.1 % of 0x6075, torques in 0.1 %
 of 0x6076, the vendor's terminal voltage (0x2101) in 0.02 V: the mean over the SYNC period that ended.
@@ -57,7 +57,6 @@ class Ratings:
 
     @classmethod
     def of(cls, config: MachineConfig, axis: str) -> Ratings:
-        """Read them from the machine's configuration."""
         section = config.axis[axis]
         return cls(
             node_id=config.node_id(axis),
@@ -87,7 +86,7 @@ def drive_objects(config: MachineConfig, axis: str) -> tuple[Object, ...]:
 
 
 def serial_number(config: MachineConfig, axis: str) -> int:
-    """Return a serial number (0x1018:04) that differs between machines of different names, and stays the same."""
+    """Return a stable serial number (0x1018:04) that differs between machines of different names."""
     return zlib.crc32(f"{config.machine.name}/{axis}".encode()) or 1
 
 
@@ -142,10 +141,10 @@ def _pdos(node_id: int) -> list[Object]:
         ("RPDO", 0x1400, 0, RPDO_DEFAULTS),
         ("TPDO", 0x1800, NO_RTR, TPDO_DEFAULTS),
     ):
-        for place, (base, valid, kind, mapped) in enumerate(defaults):
-            name, cob_id = f"{direction} {place + 1}", base + node_id + flags + (0 if valid else INVALID)
-            objects.append(_pdo_communication(first + place, name, cob_id, kind))
-            objects.append(_pdo_mapping(first + 0x200 + place, name, mapped))
+        for n, (base, valid, kind, mapped) in enumerate(defaults):
+            name, cob_id = f"{direction} {n + 1}", base + node_id + flags + (0 if valid else INVALID)
+            objects.append(_pdo_communication(first + n, name, cob_id, kind))
+            objects.append(_pdo_mapping(first + 0x200 + n, name, mapped))
     return objects
 
 
@@ -157,7 +156,7 @@ def _pdo_communication(index: int, name: str, cob_id: int, kind: int) -> Object:
         Entry(index, 5, "Event timer", U16, "rw"),
         Entry(index, 6, "SYNC start value", U8, "rw", 0, low=0, high=240),
     ]
-    if index < 0x1800:  # what is received is neither held back nor started by a SYNC
+    if index < 0x1800:  # an RPDO has no inhibit time and no SYNC start value
         entries = [entry for entry in entries if entry.sub not in (3, 6)]
     return record(index, f"{name} communication parameter", *entries)
 
@@ -235,7 +234,7 @@ def _ratio(index: int, name: str, upper: str, value: int, lower: str) -> Object:
 
 
 def _interpolation(sync_period_s: float) -> Object:
-    """0x60C2: value x 10^exponent seconds; set-points that come every so many SYNC periods of the machine."""
+    """Return 0x60C2 for the machine's SYNC period: value x 10^exponent seconds."""
     exponent = -3
     while exponent > -6 and abs(sync_period_s / 10**exponent - round(sync_period_s / 10**exponent)) > 1e-9:
         exponent -= 1

@@ -1,33 +1,32 @@
-"""Keeps a drive's own time: which cycles a SYNC begins, and which the drive runs by itself.
+"""Keeps a drive's own time and decides which cycles a SYNC begins and which the drive runs itself.
 
-A drive has its own oscillator. A SYNC at about the period that the drive was told (0x60C2; else one cycle) leads it, so
-that a late host does not bend the physics; where there is none, or one at another period, the drive's own time leads.
-Which of the two it is, a phase-locked loop says: its phase goes that period on with every SYNC and is drawn to the own
-time.
+A drive has its own oscillator. A SYNC at about the configured period (0x60C2, else one cycle) leads, so that a late
+host does not distort the physics; without SYNC, or with one of another period, the drive's own time leads. A
+phase-locked loop decides: its phase advances by one period per SYNC and is pulled toward the drive's own time.
 """
 
 import math
 from typing import NamedTuple
 
-_SYNCS = 4  # so many periods of the SYNC the phase may be late in any case
-_MOST_S = 0.6  # of what was missed, this much is run
+_SYNCS = 4  # tolerated delay in SYNC periods
+_MOST_S = 0.6  # limit of the missed time that is made up
 
 
 class _Patience(NamedTuple):
-    """How far a SYNC may be from its period: part of the way to the own time per SYNC, seconds late and early."""
+    """Tolerated phase of a SYNC: the pull toward the own time per SYNC, seconds late and early."""
 
     pull: float
     late_s: float
     early_s: float
 
 
-_FREE = _Patience(1 / 256, 0.015, 0.006)  # some percent
-# where the set-points come with the SYNC: one of 1 ms may really come every 9 ms, or as fast as it likes
+_FREE = _Patience(1 / 256, 0.015, 0.006)  # tolerates a few percent
+# set-points come with the SYNC: a SYNC of 1 ms may come every 9 ms on a busy host, or arbitrarily fast
 _BOUND = _Patience(1 / 64, 0.5, math.inf)
 
 
 class OwnClock:
-    """The time of one drive. It stands, and every SYNC begins a cycle, until it is told; ``leads``: no SYNC does."""
+    """The time of one drive. Until :meth:`due` is called, every SYNC begins a cycle; ``leads``: no SYNC does."""
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
@@ -39,14 +38,14 @@ class OwnClock:
         self.leads = False
 
     def stop(self) -> None:
-        """SYNC is the only clock from now on."""
+        """Make SYNC the only clock."""
         self._now_s = None
         self.leads = False
 
     def due(self, now_s: float, *, bound: bool, cycles: int = 1) -> int:
-        """It is ``now_s``: return how many cycles the drive has to run by itself.
+        """Advance to ``now_s`` and return how many cycles the drive must run without SYNC.
 
-        ``bound``: the set-points come with the SYNC, which is said to come every ``cycles`` cycles.
+        ``bound``: the set-points come with the SYNC, which is configured to come every ``cycles`` cycles.
         """
         if self._now_s is None:
             self._phase_s = self._run_s = now_s
@@ -62,7 +61,7 @@ class OwnClock:
         return missed
 
     def sync(self, cycles: int = 1) -> bool:
-        """A SYNC came that is said to come every so many cycles: return whether it begins them."""
+        """Process a SYNC configured for every ``cycles`` cycles; return whether it begins them."""
         if self._now_s is None:
             return True
         self._phase_s = self._drawn(self._phase_s + cycles * self._period_s, self._now_s)
@@ -77,6 +76,6 @@ class OwnClock:
 
     def _judge(self) -> None:
         assert self._now_s is not None
-        furthest = 2 * self._late_s  # so that a SYNC that comes back is soon believed again
+        furthest = 2 * self._late_s  # so that a returning SYNC soon leads again
         self._phase_s = min(max(self._phase_s, self._now_s - furthest), self._now_s + furthest)
         self.leads = not -self._patience.early_s <= self._now_s - self._phase_s <= self._late_s

@@ -1,6 +1,6 @@
-"""Runs the PDOs of a device (CiA 301, 7.2.2): RPDOs buffered until the SYNC, TPDOs sampled at it, mapping by the rules.
+"""Runs the PDOs of a device (CiA 301, 7.2.2): RPDOs buffered until the SYNC, TPDOs sampled at it, mapping rules.
 
-Communication and mapping parameters may change in pre-operational only, a mapping only while its PDO is invalid and
+Communication and mapping parameters can be changed in pre-operational only, a mapping only while its PDO is invalid and
 its sub-index 0 is 0.
 """
 
@@ -8,19 +8,7 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-from fdhil.sim.drive.dictionary import (
-    I8,
-    I16,
-    I32,
-    U8,
-    U16,
-    U32,
-    AbortCode,
-    DataType,
-    Dictionary,
-    Entry,
-    TransferAbort,
-)
+from fdhil.sim.drive.dictionary import I8, I16, I32, U8, U16, U32, AbortCode, DataType, Dictionary, Entry, TransferAbort
 from fdhil.sim.drive.objects import INVALID, NO_RTR
 from fdhil.sim.frame import Frame
 
@@ -31,7 +19,7 @@ _CODE = {
 # dummy entries that an RPDO may map to skip bytes (CiA 301, 7.4.7.1)
 _DUMMIES = {int(kind): (_CODE[kind], 8 * struct.calcsize(_CODE[kind])) for kind in (I8, I16, I32, U8, U16, U32)}
 _RECEIVED, _SENT = frozenset({"rw", "rww", "wo"}), frozenset({"ro", "rw", "rww", "rwr", "const"})
-# places of the two parameters of the first PDO
+# indices of the two parameters of the first PDO
 _PLACES = {"rpdo": (0x1400, 0x1600), "tpdo": (0x1800, 0x1A00)}
 _MOST_PDOS = 512  # in a direction
 _POSITION_OFFSET = 0x60B000
@@ -44,9 +32,9 @@ _RESTRICTED = (
 
 @dataclass(slots=True)
 class Pdo:
-    """A valid PDO as it runs; ``keys`` are the places of its values, None for a dummy entry.
+    """A valid PDO at run time; ``keys`` are the storage keys of its values, None for a dummy entry.
 
-    ``entries`` is None where the values travel as they are kept.
+    ``entries`` is None where values travel in the units in which they are stored.
     """
 
     number: int
@@ -58,8 +46,8 @@ class Pdo:
     event_s: float = 0.0
     start_value: int = 0
     on_request: bool = False  # TPDO: answers remote frames
-    pending: bytes | None = None  # RPDO: waits for the SYNC
-    sent: bytes | None = None  # TPDO: what the master knows
+    pending: bytes | None = None  # RPDO: data waiting for the SYNC
+    sent: bytes | None = None  # TPDO: content sent last
     count: int = 0
     last_s: float | None = None
     checked: tuple[Entry, ...] = field(default=())
@@ -67,16 +55,16 @@ class Pdo:
 
     @property
     def synchronous(self) -> bool:
-        """Transmission types 0 to 240."""
+        """Whether its transmission type is 0 to 240."""
         return self.kind <= 240
 
 
 class PdoEngine:
-    """All PDOs of one device. ``drop`` maps TPDO numbers to how many frames are still to be lost, -1 for all.
+    """All PDOs of one device. ``drop`` maps TPDO numbers to the number of frames still to be dropped, -1 for all.
 
     ``heard`` has the numbers of the RPDOs received since the last SYNC, ``heard_before`` those of the cycle before;
-    ``sent`` and ``sent_before`` are those and what was lost on the way here, by a fault of the bus. ``offset_rpdos``
-    are those that carry the position offset.
+    ``sent`` and ``sent_before`` also include those lost on the way by a bus fault. ``offset_rpdos`` are those that
+    carry the position offset.
     """
 
     def __init__(self, dictionary: Dictionary, changeable: Callable[[], bool], drop: dict[int, int]) -> None:
@@ -93,7 +81,7 @@ class PdoEngine:
         self._register_checks()
 
     def configure(self) -> None:
-        """Start all PDOs from the object dictionary's parameters: OPERATIONAL was entered or the mapping changed."""
+        """Start all PDOs from the object dictionary, on entering OPERATIONAL or after a mapping change."""
         self._rpdos = {pdo.cob_id: pdo for pdo in self.configured("rpdo")}
         self._tpdos = list(self.configured("tpdo"))
         self.offset_rpdos = frozenset(p.number for p in self._rpdos.values() if _POSITION_OFFSET in p.keys)
@@ -101,13 +89,12 @@ class PdoEngine:
         self.sent, self.sent_before = set(), set()
 
     def stop(self) -> None:
-        """Leave OPERATIONAL."""
         self._rpdos, self._tpdos = {}, []
         self.heard, self.heard_before = set(), set()
         self.sent, self.sent_before = set(), set()
 
     def configured(self, direction: str) -> Iterator[Pdo]:
-        """Yield the PDOs of a direction (``rpdo`` or ``tpdo``) as the dictionary describes them."""
+        """Yield the valid PDOs of a direction (``rpdo`` or ``tpdo``) from the dictionary."""
         communication, mapping = _PLACES[direction]
         sends = direction == "tpdo"
         for number in self.numbers(direction):
@@ -132,25 +119,22 @@ class PdoEngine:
             )
 
     def mapped(self, direction: str, number: int) -> list[Entry]:
-        """Return the objects that a PDO carries."""
         return [entry for entry, _ in self._mapped(_PLACES[direction][1] + number - 1) if entry is not None]
 
     def numbers(self, direction: str) -> Iterator[int]:
-        """Yield the PDOs that the device has: with a COB-ID and a mapping."""
+        """Yield the numbers of the PDOs that the device has, with a COB-ID and a mapping."""
         communication, mapping = _PLACES[direction]
-        shown = (
-            self._dictionary.entries.keys() & self._dictionary.numbers.keys()
-        )  # no texts, and none that is not shown
+        shown = self._dictionary.entries.keys() & self._dictionary.numbers.keys()  # exposed numbers
         for n in range(_MOST_PDOS):
             if communication + n << 8 | 1 in shown and mapping + n << 8 in shown:
                 yield n + 1
 
     def _parameter(self, index: int, sub: int) -> int:
-        """A communication parameter, 0 where the device does not have it."""
+        """Return a communication parameter, 0 where the device does not have it."""
         return self._dictionary.numbers.get(index << 8 | sub, 0)
 
     def _mapped(self, index: int) -> list[tuple[Entry | None, str]]:
-        """The mapped entries with their codes, None for a dummy; nothing where an object is mapped that cannot be."""
+        """Return the mapped entries with their codes, None for a dummy; empty if an object cannot be mapped."""
         mapped: list[tuple[Entry | None, str]] = []
         for sub in range(1, self._dictionary.number(index, 0) + 1):
             word = self._parameter(index, sub)
@@ -163,17 +147,14 @@ class PdoEngine:
                 return []
         return mapped
 
-    # -- reception
-
     def receives(self, can_id: int) -> bool:
-        """Return whether an RPDO has this identifier."""
         return can_id in self._rpdos
 
     def receive(self, can_id: int, data: bytes, now_s: float) -> Pdo | None:
-        """Take an RPDO; the PDO is returned when it is to be applied at once, else it waits for the SYNC.
+        """Receive an RPDO; return it when it is to be applied at once, else it waits for the SYNC.
 
-        LookupError when no RPDO has this identifier, ValueError when the frame is shorter than the mapping; a longer
-        one is used as far as the mapping goes (CiA 301, 7.2.2.5).
+        LookupError for an unknown identifier, ValueError for a frame shorter than the mapping; of a longer one only the
+        mapped part is used (CiA 301, 7.2.2.5).
         """
         pdo = self._rpdos[can_id]
         if len(data) < pdo.codec.size:
@@ -185,12 +166,11 @@ class PdoEngine:
         return None if pdo.synchronous else pdo
 
     def lost(self, can_id: int) -> None:
-        """An RPDO was sent and did not get here."""
+        """Count an RPDO that was sent and lost on the way."""
         if can_id in self._rpdos:
             self.sent.add(self._rpdos[can_id].number)
 
     def latch(self) -> None:
-        """A SYNC: apply what was received since the last one."""
         for pdo in self._rpdos.values():
             if pdo.pending is not None and pdo.synchronous:
                 self.apply(pdo)
@@ -198,7 +178,7 @@ class PdoEngine:
         self.sent_before, self.sent = self.sent, set()
 
     def apply(self, pdo: Pdo) -> None:
-        """Write the received values into the dictionary; a value out of its range is not taken."""
+        """Write the received values into the dictionary, except those out of range."""
         assert pdo.pending is not None
         values: tuple[int, ...] = pdo.codec.unpack(pdo.pending)
         received = {key: value for key, value in zip(pdo.keys, values, strict=True) if key is not None}
@@ -216,7 +196,7 @@ class PdoEngine:
         self._dictionary.numbers.update(received)
 
     def overdue(self, now_s: float) -> list[int]:
-        """Return the RPDOs whose event timer has just run out; monitoring starts with the first frame."""
+        """Return the RPDOs whose event timer has just expired; monitoring starts with the first frame."""
         late = [
             pdo
             for pdo in self._rpdos.values()
@@ -226,10 +206,8 @@ class PdoEngine:
             pdo.last_s = None
         return [pdo.number for pdo in late]
 
-    # -- transmission
-
     def at_sync(self, counter: int | None, now_s: float) -> list[Frame]:
-        """Return the TPDOs that this SYNC asks for: types 1 to 240 every n-th, type 0 when changed, and events."""
+        """Return the TPDOs due at this SYNC: types 1 to 240 every n-th, type 0 when changed, and events."""
         frames: list[Frame] = []
         for pdo in self._tpdos:
             if not 1 <= pdo.kind <= 240:
@@ -246,7 +224,7 @@ class PdoEngine:
         return frames
 
     def on_events(self, now_s: float) -> list[Frame]:
-        """Return the event-driven TPDOs (types 254, 255) that changed or whose event timer ran out."""
+        """Return the event-driven TPDOs (types 254, 255) that changed or whose event timer expired."""
         frames: list[Frame] = []
         for pdo in self._tpdos:
             if pdo.kind > 240:
@@ -254,7 +232,7 @@ class PdoEngine:
         return frames
 
     def requested(self, can_id: int) -> list[Frame]:
-        """Return the TPDO that a remote frame asks for, where bit 30 of its COB-ID lets it."""
+        """Return the TPDO that a remote frame requests, if bit 30 of its COB-ID allows it."""
         return [(can_id, self._content(pdo)) for pdo in self._tpdos if pdo.cob_id == can_id and pdo.on_request]
 
     def _on_event(self, pdo: Pdo, now_s: float, frames: list[Frame]) -> None:
@@ -272,13 +250,11 @@ class PdoEngine:
 
     def _send(self, pdo: Pdo, content: bytes, now_s: float, frames: list[Frame]) -> None:
         pdo.sent, pdo.last_s = content, now_s
-        left = self._drop.get(pdo.number, 0)
-        if left == 0:
+        remaining = self._drop.get(pdo.number, 0)
+        if remaining == 0:
             frames.append((pdo.cob_id, content))
-        elif left > 0:
-            self._drop[pdo.number] = left - 1
-
-    # -- configuration rules
+        elif remaining > 0:
+            self._drop[pdo.number] = remaining - 1
 
     def _register_checks(self) -> None:
         rules = {1: self._check_cob_id, 2: self._check_kind, 3: self._check_invalid, 6: self._check_invalid}
@@ -301,7 +277,7 @@ class PdoEngine:
             raise TransferAbort(AbortCode.DEVICE_STATE)
 
     def _check_invalid(self, entry: Entry, value: int) -> None:
-        """The PDO must be invalid; ``entry`` is of its communication or of its mapping parameter."""
+        """Require an invalid PDO; ``entry`` belongs to its communication or mapping parameter."""
         self._check_state(entry, value)
         if not self._dictionary.number(entry.index & ~0x200, 1) & INVALID:
             raise TransferAbort(AbortCode.DEVICE_STATE)

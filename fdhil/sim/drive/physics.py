@@ -6,8 +6,8 @@ Plant ([DES] eqs. 1 and 2), SI units:
     Jt dw/dt = K i - ft w - Cd sign(w) - Tl        w = 0 sticks while |K i - Tl| <= Cd
 
 Between two steps of the current loop the voltage and the sign of w are constant, so the plant is linear and its step is
-exact (a matrix exponential); a sign change of w stops at w = 0 for that step. Everything runs in the drive's own
-direction; position is the shaft's angle, the table follows it through the backlash.
+exact (a matrix exponential); on a sign change, w stays 0 for that step. All quantities are in the drive's own
+direction; position is the shaft's angle, and the table follows it through the backlash.
 """
 
 import math
@@ -23,11 +23,11 @@ from fdhil.records import PARAMETERS, Float, Parameters
 
 Command = tuple[float, float, float, float, float, float, float, float]
 
-# what regulators other than these would need, this drive does not have
+# the only regulators that this drive implements
 _PLAIN = {"structure": "p_pi_pi", "torque_feedforward": 0.0}
-# places in the state vector
+# indices of the state vector
 CURRENT, SPEED, ANGLE, TABLE, SPEED_INTEGRAL, CURRENT_INTEGRAL = range(6)
-# places in the loops vector
+# indices of the loops vector
 (KV, KFF, KPS, KIS, I_MAX, KPC, KIC, U_MAX, INC_PER_RAD, N_SPEED, N_CURRENT) = range(11)
 # flags that a cycle returns
 CURRENT_LIMIT, VOLTAGE_LIMIT = 1, 2
@@ -36,15 +36,15 @@ CURRENT_LIMIT, VOLTAGE_LIMIT = 1, 2
 def discretise(parameters: Float, step_s: float) -> Float:
     """Return the exact plant step as (5, 5): rows of the matrix exponential of [i, w, theta, u, torque].
 
-    ``parameters`` is (6,) R, L, K, Jt, ft, Cd. The Taylor series converges at once: the step is far below the plant's
-    time constants; it is halved and squared where it is not.
+    ``parameters`` is (6,) R, L, K, Jt, ft, Cd. The step is far below the plant's time constants, so the Taylor series
+    converges quickly; otherwise it is halved and squared.
     """
     R, L, K, Jt, ft, _ = parameters
     a = np.zeros((5, 5))
     a[0, 0], a[0, 1], a[0, 3] = -R / L, -K / L, 1.0 / L
     a[1, 0], a[1, 1], a[1, 4] = K / Jt, -ft / Jt, 1.0 / Jt
     a[2, 1] = 1.0
-    # scaled to rad, A and V the entries differ by orders of magnitude; the largest one bounds the series
+    # in rad, A and V the entries differ by orders of magnitude; the largest one bounds the series
     halvings = max(0, math.ceil(math.log2(np.abs(a).max() * step_s / 0.5)))
     a *= step_s / 2**halvings
     phi = term = np.eye(5)
@@ -117,8 +117,8 @@ def run_cycle(
 
     ``state`` (6,) and ``voltage`` (n,), one value per current step, are written. ``command`` is the set-point at the
     start and end of the cycle (increments), the feed-forward speed at both (increments/s), the speed offset at both
-    (rad/s) and the current offset at both (A); each is interpolated linearly and taken at the speed loop's instants.
-    Each PI integrates first and keeps its old integral where its limit acts.
+    (rad/s) and the current offset at both (A); each is interpolated linearly and sampled by the speed loop. Each PI
+    integrates first and keeps its old integral where its limit acts.
     """
     p0, p1, f0, f1, v0, v1, c0, c1 = command
     n_speed, n_current = int(loops[N_SPEED]), int(loops[N_CURRENT])
@@ -164,7 +164,7 @@ def run_cycle(
 
 
 class Loops(Enum):
-    """The outermost loop that is closed; those within it are closed, too."""
+    """The outermost closed loop; those inside it are closed as well."""
 
     POSITION = auto()
     SPEED = auto()
@@ -183,9 +183,9 @@ def gains_of(gains: Float, loops: Loops) -> Float:
 
 
 class Seen(NamedTuple):
-    """What the drive's own sensors see at a SYNC, without their noise; the position is that of the position loop.
+    """The drive's sensor values at a SYNC, without noise; the position is that of the position loop.
 
-    ``bus`` is the DC bus' voltage as a share of what it has without load.
+    ``bus`` is the DC-link voltage relative to its no-load value.
     """
 
     position_rad: float
@@ -199,7 +199,7 @@ class Physics:
     """One axis' mechanics and loops. Angles in rad, in the drive's own direction.
 
     ``voltage_v`` (n,) holds the terminal voltage of each current step of the last cycle, ``voltage_mean_v`` their mean;
-    ``seen`` is what the drive knows of all that.
+    ``seen`` are the drive's sensor values.
     """
 
     def __init__(
@@ -250,7 +250,7 @@ class Physics:
         self._phi = discretise(self._plant, self.step_s)
 
     def close_loops(self, loops: Loops) -> None:
-        """Close the loops from this one inward; a speed loop that closes goes on from the current that flows."""
+        """Close the loops from this one inward; a closing speed loop continues from the present current."""
         self._loops[: KIS + 1] = gains_of(self._gains, loops)
         self._state[SPEED_INTEGRAL] = 0.0 if loops is Loops.CURRENT else self._state[CURRENT]
 
@@ -260,11 +260,11 @@ class Physics:
 
     @property
     def table_speed_rad_s(self) -> float:
-        """The table's speed, as that of a shaft that it follows."""
+        """The table's speed, as that of the shaft it follows."""
         return self.speed_rad_s
 
     def rehearse(self) -> None:
-        """Run one cycle on a copy of the state: when this returns the kernels are compiled, which takes seconds."""
+        """Run one cycle on a copy of the state to compile the kernels, which takes seconds."""
         self._run(self._state.copy(), self.voltage_v.copy(), False, (0.0,) * 8)
 
     def cycle(self, enabled: bool, command: Command) -> None:
@@ -285,16 +285,16 @@ class Physics:
         self.seen = Seen(self.table_rad, self.speed_rad_s, self.current_a, self.voltage_mean_v)
 
 
-def true_parameters(nominal: Nominal, twin: SimAxis) -> Parameters:
-    """Return the plant's parameters: the nominal values where the twin names none."""
-    named = twin.model_dump(exclude_none=True)
+def true_parameters(nominal: Nominal, sim_axis: SimAxis) -> Parameters:
+    """Return the plant's parameters: those of the simulation section, else the nominal values."""
+    named = sim_axis.model_dump(exclude_none=True)
     return Parameters(**{name: named.get(name, getattr(nominal, name)) for name in PARAMETERS})
 
 
 def check_structure(axis: str, regulators: Regulators) -> None:
-    """Raise ConfigError for regulators that the simulated drive does not have: it would run others silently."""
+    """Raise ConfigError for regulators that the simulated drive does not implement."""
     faults = [
-        ConfigFault(f"axis.{axis}.regulators.{key}", "the simulated drive does not have it", f"leave it at {plain!r}")
+        ConfigFault(f"axis.{axis}.regulators.{key}", "not implemented by the simulated drive", f"leave it at {plain!r}")
         for key, plain in _PLAIN.items()
         if getattr(regulators, key) != plain
     ]

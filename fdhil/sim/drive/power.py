@@ -1,4 +1,4 @@
-"""Steps the power states of CiA 402-2: controlword in, state out, with the option codes for every kind of stop."""
+"""Implements the power state machine of CiA 402-2, with the option codes for every kind of stop."""
 
 from collections.abc import Callable
 from enum import Enum, IntEnum, auto
@@ -18,7 +18,7 @@ class State(IntEnum):
 
 
 class Ramp(Enum):
-    """How the drive comes to rest before it changes its state."""
+    """The deceleration to standstill before a change of state."""
 
     SLOW_DOWN = 0x6084
     QUICK_STOP = 0x6085
@@ -48,7 +48,9 @@ _PLAIN = {
     (_S.QUICK_STOP_ACTIVE, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,
 }
 _POWERED = frozenset({_S.OPERATION_ENABLED, _S.QUICK_STOP_ACTIVE, _S.FAULT_REACTION_ACTIVE})
-QUICK_STOP_CODES = frozenset({0, 1, 2, 5, 6})  # disable, slow-down or quick-stop ramp, both also staying in the state
+QUICK_STOP_CODES = frozenset(
+    {0, 1, 2, 5, 6}
+)  # disable; slow-down or quick-stop ramp; the same, staying in Quick stop active
 
 
 def _decode(word: int) -> _Command | None:
@@ -67,7 +69,7 @@ class PowerStage:
     """The state, and the ramp on the way to the next one.
 
     ``option`` returns the value of an option code object (0x605A, 0x605B, 0x605C, 0x605E). ``powered``: current flows.
-    ``ramp`` is set while the drive must slow down by itself; it calls :meth:`at_rest` when its demand stands still.
+    ``ramp`` is set while the drive must decelerate; it calls :meth:`at_rest` when its demand is at rest.
     """
 
     def __init__(self, option: Callable[[int], int]) -> None:
@@ -77,27 +79,25 @@ class PowerStage:
         self.ramp: Ramp | None = None
         self._after_ramp = State.SWITCH_ON_DISABLED
         self._last_word: int | None = None
-        self._stopped_by_word: int | None = None  # transition 16 needs another word than the one at the quick stop
+        self._stopped_by_word: int | None = None  # transition 16 needs a different word than the quick stop
 
     def start(self) -> None:
-        """Transitions 0 and 1: power-on and self-test."""
+        """Make transitions 0 and 1: power-on and self-test."""
         self._enter(State.SWITCH_ON_DISABLED)
         self._last_word = None
 
     @property
     def faulty(self) -> bool:
-        """Whether a fault waits for its reset."""
         return self.state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
 
     @property
     def follows(self) -> bool:
-        """Whether the drive follows the set-points it is given."""
         return self.state is State.OPERATION_ENABLED and self.ramp is None
 
     def control(self, word: int) -> bool:
-        """Evaluate a controlword (a level: it may be given again and again); True when a fault was reset."""
+        """Evaluate a controlword (level-triggered); return True when a fault was reset."""
         if word == self._last_word and word & 0x8F == 0x0F and self.follows:
-            return False  # the usual case, every cycle
+            return False  # the common case, every cycle
         rising_reset = word & 0x80 and (self._last_word is None or not self._last_word & 0x80)
         self._last_word = word
         if self.state is State.FAULT:
@@ -111,7 +111,7 @@ class PowerStage:
         return False
 
     def _follow(self, command: _Command, word: int) -> bool:
-        """Make one transition; False when the command asks for none."""
+        """Make one transition; return False when the command requests none."""
         target = _PLAIN.get((self.state, command))
         if target is not None:
             self._enter(target)
@@ -129,7 +129,7 @@ class PowerStage:
 
     def _stop_operation(self, command: _Command, word: int) -> None:
         if command is _C.ENABLE:
-            self.ramp = None  # a stop that was under way is taken back
+            self.ramp = None  # cancel a stop in progress
         elif command is _C.QUICK_STOP:
             self.quick_stop(word)
         elif self.ramp is None:
@@ -140,7 +140,7 @@ class PowerStage:
                 self.ramp, self._after_ramp = Ramp.SLOW_DOWN, target
 
     def quick_stop(self, word: int | None = None) -> None:
-        """Transition 11, by controlword or by the abort connection option."""
+        """Make transition 11, by controlword or by the abort connection option."""
         if self.state is not State.OPERATION_ENABLED:
             return
         code = self._option(0x605A)
@@ -153,12 +153,12 @@ class PowerStage:
         self._after_ramp = State.QUICK_STOP_ACTIVE if code >= 5 else State.SWITCH_ON_DISABLED
 
     def disable_voltage(self) -> None:
-        """Transitions 7, 9, 10 and 12 by the drive itself."""
+        """Make transitions 7, 9, 10 and 12 without a controlword."""
         if not self.faulty and self.state is not State.NOT_READY:
             self._enter(State.SWITCH_ON_DISABLED)
 
     def fault(self) -> None:
-        """Transitions 13 and 14: react by 0x605E, at once when no current flows."""
+        """Make transitions 13 and 14: react by 0x605E, at once when no current flows."""
         if self.faulty:
             return
         code = self._option(0x605E)
@@ -170,7 +170,7 @@ class PowerStage:
         self._after_ramp = State.FAULT
 
     def at_rest(self) -> None:
-        """The ramp has brought the demand to rest."""
+        """Complete the ramp: the demand is at rest."""
         if self.ramp is None:
             return
         if self.state is State.QUICK_STOP_ACTIVE and self._after_ramp is State.QUICK_STOP_ACTIVE:

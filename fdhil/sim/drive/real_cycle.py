@@ -1,4 +1,4 @@
-"""Integrates an axis as real machines have it, one SYNC cycle at a time; the compiled part of :mod:`.reality`.
+"""Integrates an axis with the effects of real machines, one SYNC cycle at a time; compiled part of :mod:`.reality`.
 
 Two masses, motor with screw and table, or one where the screw is stiff (x: speeds w and angles a, SI units):
 
@@ -6,13 +6,14 @@ Two masses, motor with screw and table, or one where the screw is stiff (x: spee
     Jm dw/dt   = K i - spring - ripples - friction       spring = k d + c (w - wt), d = a - at beyond the backlash
     Jt' dwt/dt = spring - load - friction
 
-Dry friction sticks, or hangs on bristles z (LuGre: Canudas and others 1995):
+Dry friction sticks, or acts through bristles z (LuGre: Canudas and others 1995):
 
     level   = C (1 +- asymmetry) (1 + ripple sin a) (1 + static exp(-(w/ws)^2))
     F       = level sign(w)      or      s0 z + s1 dz/dt,   dz/dt = w - s0 |w| z / level
 
-Every current cycle is one step of the midpoint rule with the sign of sticking friction held: some 1e-5 of what moves in
-it, far below an increment. The bristles, which are stiff at speed, take half a step before and after it in closed form.
+Each current cycle is one step of the midpoint rule with a constant sign of sticking friction: the error is about 1e-5
+of the motion, far below an increment. The bristles, which are stiff at speed, advance by half a step before and after
+it in closed form.
 """
 
 import math
@@ -24,19 +25,19 @@ from fdhil.records import Float
 from fdhil.sim.drive.physics import CURRENT_LIMIT, VOLTAGE_LIMIT, Command
 
 MOST_DELAY = 32
-# places in the state
+# indices of the state
 (
     CURRENT, SPEED, ANGLE, TABLE_SPEED, TABLE, BRISTLE, TABLE_BRISTLE, SPEED_INTEGRAL, CURRENT_INTEGRAL, SEEN_SPEED,
     ENCODER, BUS, PLACE, RATE, PLACE_2, RATE_2, WAITING,
 ) = range(17)  # fmt: skip
 STATES = WAITING + MOST_DELAY
-# places in the plant: R to K, then inertia, viscous and dry friction of the motor and of the table behind the screw
+# indices of the plant: R to K, then inertia, viscous and dry friction of the motor and of the table behind the screw
 (
     R, L, K, JM, JT, FM, FT, CM, CT, STATIC, STATIC_SPEED, ASYMMETRY, VISCOUS_ASYMMETRY, WAVE, SIGN, BRISTLES,
     BRISTLE_DAMPING, BRAKE, SCREW, SCREW_ORDER, SCREW_PHASE, MOTOR, MOTOR_ORDER, MOTOR_PHASE, STIFFNESS, DAMPER,
     HALF_BACKLASH, DEAD, DEAD_CURRENT, SAG, BUS_PART, PITCH, PITCH_RATE, PLANT,
 ) = range(34)  # fmt: skip
-# places in the loops
+# indices of the loops
 (
     KV, KFF, KPS, KIS, I_MAX, KPC, KIC, U_MAX, INC_PER_RAD, N_SPEED, N_CURRENT, FILTER_PART, FILTER_ORDER,
     SPEED_PART, DELAY, ENCODER_STEP, ON_TABLE, OF_ENCODER, CURRENT_GAIN, CURRENT_OFFSET, LOOPS,
@@ -45,7 +46,7 @@ STATES = WAITING + MOST_DELAY
 
 @numba.njit(cache=True, nogil=True)
 def _level(p: Float, share: float, w: float, a: float, side: float) -> float:
-    """Return the dry friction (N.m) of a body with ``share`` of it that moves to ``side`` with ``w``."""
+    """Return the dry friction (N.m) of a body with ``share`` of it, moving in direction ``side`` at speed ``w``."""
     fades = p[STATIC] * math.exp(-((w / p[STATIC_SPEED]) ** 2)) if p[STATIC] != 0.0 else 0.0
     wave = p[WAVE] * math.sin(p[SIGN] * a) if p[WAVE] != 0.0 else 0.0
     return float(share * (1.0 + side * p[ASYMMETRY]) * (1.0 + wave) * (1.0 + fades))
@@ -59,7 +60,7 @@ def _viscous(p: Float, share: float, w: float) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _hanging(p: Float, share: float, w: float, a: float, z: float, inertia: float) -> float:
-    """Return the friction (N.m) of bristles bent by ``z`` rad; zero where friction sticks instead."""
+    """Return the friction (N.m) of bristles deflected by ``z`` rad; zero where friction sticks instead."""
     if p[BRISTLES] == 0.0 or share == 0.0:
         return 0.0
     s0 = p[BRISTLES] * share
@@ -69,7 +70,7 @@ def _hanging(p: Float, share: float, w: float, a: float, z: float, inertia: floa
 
 @numba.njit(cache=True, nogil=True)
 def _bent(p: Float, share: float, w: float, a: float, z: float, time_s: float) -> float:
-    """Return the bending of the bristles after ``time_s`` at this speed."""
+    """Return the deflection of the bristles after ``time_s`` at this speed."""
     if p[BRISTLES] == 0.0 or share == 0.0 or w == 0.0:
         return z
     end = _level(p, share, w, a, 1.0 if w > 0.0 else -1.0) / (p[BRISTLES] * share)
@@ -79,7 +80,7 @@ def _bent(p: Float, share: float, w: float, a: float, z: float, time_s: float) -
 
 @numba.njit(cache=True, nogil=True)
 def _spring(p: Float, x: Float) -> float:
-    """Return the torque (N.m) that the screw hands from the motor to the table."""
+    """Return the torque (N.m) transmitted by the screw from motor to table."""
     if p[STIFFNESS] == 0.0:
         return 0.0
     bend = x[ANGLE] - x[TABLE]
@@ -91,7 +92,7 @@ def _spring(p: Float, x: Float) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _pushes(p: Float, x: Float, current: float, load: float) -> tuple[float, float]:
-    """Return what drives motor and table (N.m), all but friction that sticks."""
+    """Return the torques on motor and table (N.m) without sticking friction."""
     w, a, spring = x[SPEED], x[ANGLE], _spring(p, x)
     ripples = p[SCREW] * math.sin(p[SCREW_ORDER] * a + p[SCREW_PHASE]) if p[SCREW] != 0.0 else 0.0
     if p[MOTOR] != 0.0:
@@ -107,13 +108,13 @@ def _pushes(p: Float, x: Float, current: float, load: float) -> tuple[float, flo
 
 @numba.njit(cache=True, nogil=True)
 def _held(p: Float, share: float, w: float, a: float, side: float, brake: float) -> float:
-    """Return the friction that sticks (N.m): dry friction without bristles, and a shut brake."""
+    """Return the friction that sticks (N.m): dry friction without bristles, and a closed brake."""
     return brake if p[BRISTLES] != 0.0 else brake + _level(p, share, w, a, side)
 
 
 @numba.njit(cache=True, nogil=True)
 def _side(p: Float, share: float, w: float, a: float, push: float, brake: float) -> float:
-    """Return to which side a body moves or is about to move; 0 where it sticks."""
+    """Return the sign of the present or imminent motion of a body; 0 where it sticks."""
     if w != 0.0:
         return 1.0 if w > 0.0 else -1.0
     side = 1.0 if push > 0.0 else -1.0
@@ -122,7 +123,7 @@ def _side(p: Float, share: float, w: float, a: float, push: float, brake: float)
 
 @numba.njit(cache=True, nogil=True)
 def _acting(p: Float, u: float, current: float) -> float:
-    """Return the voltage at the motor when the inverter is asked for ``u`` (of its bus as it is)."""
+    """Return the motor voltage for an inverter demand ``u``, already scaled by the DC link."""
     return float(u - p[DEAD] * min(max(current / p[DEAD_CURRENT], -1.0), 1.0))
 
 
@@ -130,7 +131,7 @@ def _acting(p: Float, u: float, current: float) -> float:
 def _slopes(
     p: Float, x: Float, u: float, load: float, brake: float, side: float, table_side: float, off: bool, out: Float
 ) -> None:
-    """Fill ``out`` (5,) with the slopes of current, motor speed and angle, table speed and angle."""
+    """Fill ``out`` (5,) with the derivatives of current, motor speed and angle, table speed and angle."""
     current = 0.0 if off else x[CURRENT]
     push, table_push = _pushes(p, x, current, load)
     out[CURRENT] = 0.0 if off else (_acting(p, u, current) - p[R] * current - p[K] * x[SPEED]) / p[L]
@@ -152,7 +153,7 @@ def _bend(p: Float, x: Float, time_s: float) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _step(p: Float, x: Float, u: float, load: float, off: bool, h: float, trial: Float, slope: Float) -> None:
-    """Advance the first seven states by one step under the voltage ``u``; ``trial`` (7,), ``slope`` (5,) are room."""
+    """Advance the first seven states by one step under voltage ``u``; ``trial`` (7,), ``slope`` (5,) are scratch."""
     brake = p[BRAKE] if off else 0.0
     _bend(p, x, 0.5 * h)
     if off:
@@ -181,14 +182,14 @@ def _step(p: Float, x: Float, u: float, load: float, off: bool, h: float, trial:
 
 @numba.njit(cache=True, nogil=True)
 def table_angle(p: Float, x: Float) -> float:
-    """Return where the table is, as an angle of the shaft: the screw's own error counts."""
+    """Return the table position as a shaft angle, including the pitch error."""
     a = x[TABLE]
     return float(a + p[PITCH] * math.sin(a) + p[PITCH_RATE] * a)
 
 
 @numba.njit(cache=True, nogil=True)
 def encoder_angle(p: Float, g: Float, x: Float, on_table: bool) -> float:
-    """Return what the encoder at the table or at the motor tells, rad."""
+    """Return the reading of the encoder at the table or at the motor, rad."""
     angle = table_angle(p, x) if on_table else x[ANGLE]
     step = float(g[ENCODER_STEP])
     return angle if step == 0.0 else float(step * np.rint(angle / step))
@@ -196,7 +197,7 @@ def encoder_angle(p: Float, g: Float, x: Float, on_table: bool) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _current_demand(p: Float, g: Float, x: Float, place: float, rate: float, more: float, current: float) -> float:
-    """Run position and speed loop once; return the current they ask for (A) before its limit acts."""
+    """Run position and speed loop once; return the current demand (A) before its limit."""
     for n in range(int(g[FILTER_ORDER])):
         at = PLACE + 2 * n
         x[at] += g[FILTER_PART] * (place - x[at])
@@ -219,7 +220,7 @@ def _current_demand(p: Float, g: Float, x: Float, place: float, rate: float, mor
 
 @numba.njit(cache=True, nogil=True)
 def _voltage_demand(g: Float, x: Float, wanted: float) -> float:
-    """Run the current loop once; return the voltage it asks for (V) before its limit acts."""
+    """Run the current loop once; return the voltage demand (V) before its limit."""
     error = wanted - (g[CURRENT_GAIN] * x[CURRENT] + g[CURRENT_OFFSET])
     candidate = x[CURRENT_INTEGRAL] + g[KIC] * error
     raw = g[KPC] * error + candidate
@@ -232,11 +233,11 @@ def _voltage_demand(g: Float, x: Float, wanted: float) -> float:
 def run_real_cycle(
     x: Float, g: Float, p: Float, voltage: Float, enabled: bool, command: Command, load: float, h: float
 ) -> tuple[float, float, int]:
-    """Run one SYNC cycle; return the mean voltage at the motor, the mean that was asked for, and the limits that acted.
+    """Run one SYNC cycle; return the mean motor voltage, the mean demanded voltage, and the limits that acted.
 
-    ``x`` (STATES,) and ``voltage`` (n,), the voltage at the motor in each current step, are written. ``g`` (LOOPS,) and
-    ``p`` (PLANT,) are made by :class:`fdhil.sim.drive.reality.RealPhysics`; ``command`` is that of
-    :func:`fdhil.sim.drive.physics.run_cycle`, whose loops these are.
+    ``x`` (STATES,) and ``voltage`` (n,), the motor voltage in each current step, are written. ``g`` (LOOPS,) and ``p``
+    (PLANT,) are packed by :class:`fdhil.sim.drive.reality.RealPhysics`; ``command`` and loops are those of
+    :func:`fdhil.sim.drive.physics.run_cycle`.
     """
     p0, p1, f0, f1, v0, v1, c0, c1 = command
     n_speed, n_current, delay = int(g[N_SPEED]), int(g[N_CURRENT]), int(g[DELAY])

@@ -1,7 +1,7 @@
-"""One axis as real machines have it: friction, weight, ripples, a screw that gives, inverter, encoder and loops.
+"""Models one axis with the effects of real machines: friction, load, ripples, compliance, inverter, encoder, loops.
 
-It takes the place of :class:`fdhil.sim.drive.physics.Physics` where ``[sim.axis.X.reality]`` names an effect, or the
-regulators have a filter or a delay. Everything runs in the drive's own direction.
+It replaces :class:`fdhil.sim.drive.physics.Physics` where ``[sim.axis.X.reality]`` names an effect, or the regulators
+have a filter or a delay. All quantities are in the drive's own direction.
 """
 
 import math
@@ -13,23 +13,23 @@ from fdhil.records import Float, Parameters
 from fdhil.sim.drive import real_cycle as cycle
 from fdhil.sim.drive.physics import CURRENT_LIMIT, VOLTAGE_LIMIT, Command, Loops, Physics, Seen, gains_of
 
-BRISTLE_DAMPING = 1.0  # of the bristles' critical one, halved: they ring once
+BRISTLE_DAMPING = 1.0  # half of the bristles' critical damping: they ring once
 
 
 def real_loops(reality: Reality, regulators: Regulators) -> Regulators:
-    """Return the regulators that the drive really runs."""
+    """Return the regulators with the deviations of the real drive."""
     return regulators.model_copy(update=reality.loops())
 
 
 def is_plain(reality: Reality, regulators: Regulators) -> bool:
-    """Whether the paper's plant and loops are all there is."""
+    """Whether the paper's plant and loops suffice."""
     return reality == Reality() and not (
         regulators.speed_filter_s or regulators.setpoint_filter_s or regulators.current_delay_cycles
     )
 
 
 class RealPhysics(Physics):
-    """One axis' mechanics and loops; ``rad_per_mm`` has the sign of the drive's direction against the axis."""
+    """One axis' mechanics and loops; ``rad_per_mm`` has the sign of the drive's direction relative to the axis."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class RealPhysics(Physics):
         self._reset_loops()
 
     def set_parameters(self, parameters: Parameters) -> None:
-        """Change the plant from the next cycle on; what reality adds stays in its proportion."""
+        """Change the plant from the next cycle on; the added effects keep their proportion."""
         self.parameters = parameters
         self._p = self._plant_vector(parameters)
 
@@ -74,18 +74,16 @@ class RealPhysics(Physics):
 
     @property
     def table_speed_rad_s(self) -> float:
-        """The table's speed, as that of a shaft that it follows."""
         p, angle = self._p, float(self._x[cycle.TABLE])
         return float(self._x[cycle.TABLE_SPEED] * (1.0 + p[cycle.PITCH] * math.cos(angle) + p[cycle.PITCH_RATE]))
 
     def rehearse(self) -> None:
-        """Run one cycle on a copy of the state: when this returns the kernels are compiled."""
         self._run_real(self._x.copy(), self.voltage_v.copy(), False, (0.0,) * 8)
 
     def cycle(self, enabled: bool, command: Command) -> None:
-        """Run one SYNC cycle; ``enabled`` False means that no current flows and the brake is shut."""
+        """Run one SYNC cycle; ``enabled`` False means that no current flows and the brake is closed."""
         if enabled and not self._was_enabled:
-            self._x[[cycle.PLACE, cycle.PLACE_2]] = command[0]  # a filter begins where the set-point is
+            self._x[[cycle.PLACE, cycle.PLACE_2]] = command[0]  # a filter starts at the set-point
         if not enabled:
             self._reset_loops()
         self._was_enabled = enabled
@@ -106,8 +104,6 @@ class RealPhysics(Physics):
         x[cycle.ENCODER] = cycle.encoder_angle(self._p, self._g, x, False)
         self._was_enabled = False
 
-    # -- what the sensors see
-
     def _unpack(self) -> None:
         x = self._x
         self.current_a, self.speed_rad_s, self.angle_rad = x[: cycle.TABLE_SPEED].tolist()
@@ -125,7 +121,7 @@ class RealPhysics(Physics):
         )
 
     def _seen_speed(self, encoder_rad: float) -> float:
-        """Return what 0x606C is made of; to be called once per SYNC."""
+        """Return the speed reported as 0x606C; to be called once per SYNC."""
         reality = self._reality
         speed = self.speed_rad_s
         if reality.speed_object == "loop":
@@ -139,8 +135,6 @@ class RealPhysics(Physics):
             )
             return self._shown_speed
         return speed
-
-    # -- what the kernel takes
 
     def _loops_vector(self, sync_period_s: float, increments_per_rev: int) -> Float:
         g, reality = self._regulators, self._reality
@@ -173,8 +167,8 @@ class RealPhysics(Physics):
         values[cycle.VISCOUS_ASYMMETRY] = direction * reality.viscous_asymmetry
         values[cycle.WAVE], values[cycle.SIGN] = reality.friction_ripple, direction
         if reality.presliding_um:  # the bristles' stiffness, per N.m of dry friction
-            way_rad = abs(self._rad_per_mm) * reality.presliding_um * 1e-3
-            values[cycle.BRISTLES] = (1 + reality.static_friction) / way_rad
+            displacement_rad = abs(self._rad_per_mm) * reality.presliding_um * 1e-3
+            values[cycle.BRISTLES] = (1 + reality.static_friction) / displacement_rad
             values[cycle.BRISTLE_DAMPING] = BRISTLE_DAMPING
         values[cycle.BRAKE] = reality.brake_nm
         values[cycle.SCREW], values[cycle.SCREW_ORDER] = reality.screw_ripple_nm, reality.screw_ripple_order
@@ -190,7 +184,7 @@ class RealPhysics(Physics):
         return values
 
     def _masses(self, parameters: Parameters, values: Float) -> None:
-        """Share inertia and friction between motor and table, and set the spring between them."""
+        """Distribute inertia and friction between motor and table, and set the spring between them."""
         reality = self._reality
         if not reality.resonance_hz:
             values[cycle.JM], values[cycle.FM], values[cycle.CM] = parameters.Jt, parameters.ft, parameters.Cd
@@ -199,12 +193,12 @@ class RealPhysics(Physics):
         values[cycle.JM], values[cycle.JT] = (1 - behind) * parameters.Jt, behind * parameters.Jt
         values[cycle.FM], values[cycle.FT] = (1 - rubs) * parameters.ft, rubs * parameters.ft
         values[cycle.CM], values[cycle.CT] = (1 - rubs) * parameters.Cd, rubs * parameters.Cd
-        reduced = behind * (1 - behind) * parameters.Jt  # both masses swing against each other
+        reduced = behind * (1 - behind) * parameters.Jt  # both masses oscillate against each other
         swing = 2 * math.pi * reality.resonance_hz
         values[cycle.STIFFNESS] = swing**2 * reduced
         values[cycle.DAMPER] = 2 * reality.resonance_damping * swing * reduced
 
 
 def _part(step_s: float, time_constant_s: float) -> float:
-    """Return how much of the way a first-order lag goes in one step; all of it without a time constant."""
+    """Return the step response of a first-order lag after one step; 1 without a time constant."""
     return 1.0 - math.exp(-step_s / time_constant_s) if time_constant_s else 1.0

@@ -1,7 +1,7 @@
 """Answers SDO requests (CiA 301, 7.2.4): expedited, segmented and block transfers both ways, blocks with CRC.
 
-Sans-I/O: a request of 8 bytes in, the answers out. One client, one transfer at a time; a new request to initiate
-drops the transfer that was going on, as the standard has it.
+Sans-I/O: requests of 8 bytes in, answers out. One client, one transfer at a time; a new initiate request drops the
+present transfer, as the standard demands.
 """
 
 import binascii
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from fdhil.sim.drive.dictionary import AbortCode, Dictionary, Entry, TransferAbort
 
-MAX_DOWNLOAD_BYTES = 1 << 16  # no object that can be written is longer
+MAX_DOWNLOAD_BYTES = 1 << 16  # the largest writable object
 BLOCK_SEGMENTS = 127
 
 
@@ -17,7 +17,7 @@ BLOCK_SEGMENTS = 127
 class _Upload:
     index: int
     sub: int
-    data: bytes  # what is still to be sent
+    data: bytes  # data still to be sent
     toggle: int = 0
 
 
@@ -37,8 +37,8 @@ class _BlockUpload:
     data: bytes
     block_size: int
     with_crc: bool
-    position: int = 0  # first byte that the client has not acknowledged
-    sent: int = 0  # segments of the block that is out
+    position: int = 0  # first unacknowledged byte
+    sent: int = 0  # segments of the block in transit
     started: bool = False
     ended: bool = False
 
@@ -50,7 +50,7 @@ class _BlockDownload:
     size: int | None
     with_crc: bool
     data: bytearray = field(default_factory=bytearray)
-    received: int = 0  # segments of this block, in their order
+    received: int = 0  # segments of this block received in order
     complete: bool = False
 
 
@@ -67,17 +67,16 @@ class SdoServer:
         return isinstance(self._transfer, _BlockDownload) and not self._transfer.complete
 
     def reset(self) -> None:
-        """Forget the transfer that is going on."""
         self._transfer = None
 
     def request(self, data: bytes) -> list[bytes]:
-        """Handle one request and return the responses, 8 bytes each; a frame that is not 8 bytes long is ignored."""
+        """Process one request and return the responses, 8 bytes each; frames of another length are ignored."""
         if len(data) != 8:
             return []
         index, sub = int.from_bytes(data[1:3], "little"), data[3]
         goes_on = (data[0] >> 5 in (0, 3, 5) and data[0] & 0xE3 != 0xA0) or data[0] & 0xE1 == 0xC1
         goes_on |= self.in_block
-        if goes_on and self._transfer is not None:  # such a request does not repeat what it is about
+        if goes_on and self._transfer is not None:  # such a request does not repeat index and sub-index
             index, sub = self._transfer.index, self._transfer.sub
         try:
             return self._dispatch(data, index, sub)
@@ -164,7 +163,7 @@ class SdoServer:
         return [_head(0xA4, index, sub) + bytes([BLOCK_SEGMENTS, 0, 0, 0])]
 
     def _block_segment(self, transfer: _BlockDownload, data: bytes) -> list[bytes]:
-        """Take a segment in its order; what is out of it comes again after the block's acknowledge."""
+        """Accept a segment in sequence; others are repeated after the block's acknowledgement."""
         number, last = data[0] & 0x7F, bool(data[0] & 0x80)
         if number == 0:
             raise TransferAbort(AbortCode.SEQUENCE)
@@ -213,9 +212,9 @@ class SdoServer:
         value = self._dictionary.read(index, sub)
         if not 1 <= data[4] <= 127:
             raise TransferAbort(AbortCode.BLOCK_SIZE)
-        if 0 < len(value) <= data[5]:  # the protocol switch threshold: shorter objects go by the plain transfer
+        if 0 < len(value) <= data[5]:  # the protocol switch threshold: shorter objects use the normal transfer
             return self._initiate_upload(index, sub)
-        # a client that asks for no CRC may still check one that is offered: offer it on request alone
+        # a client without CRC may still check an offered one: offer it on request only
         with_crc = bool(data[0] & 4)
         self._transfer = _BlockUpload(index, sub, value, data[4], with_crc)
         return [_head(0xC2 | with_crc << 2, index, sub) + len(value).to_bytes(4, "little")]
@@ -248,7 +247,7 @@ class SdoServer:
 
 
 def _announced(entry: Entry, data: bytes) -> int:
-    """Return the size that a request to initiate a download tells; TransferAbort when the object has another."""
+    """Return the size announced by an initiate download request; TransferAbort if the object has another size."""
     size = int.from_bytes(data[4:8], "little")
     if size > MAX_DOWNLOAD_BYTES or (entry.size is not None and size != entry.size):
         raise TransferAbort(AbortCode.LENGTH)
@@ -256,7 +255,7 @@ def _announced(entry: Entry, data: bytes) -> int:
 
 
 def _turned(transfer: _Upload | _Download, data: bytes) -> int:
-    """Return the toggle bit of a segment's request and expect the other one next."""
+    """Return the toggle bit of a segment request and expect the other one next."""
     toggle = data[0] >> 4 & 1
     if toggle != transfer.toggle:
         raise TransferAbort(AbortCode.TOGGLE)

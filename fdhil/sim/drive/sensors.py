@@ -1,4 +1,4 @@
-"""Reports what the drive's sensors see: with white noise, and with the faults that a test or a fault script orders."""
+"""Simulates the drive's sensors: white noise, and the faults of a test or fault script."""
 
 from dataclasses import dataclass, field
 
@@ -13,12 +13,12 @@ _BLOCK = 1024
 
 @dataclass(slots=True)
 class DriveFaults:
-    """The mutable fault state of one drive; what is left at its default does no harm.
+    """The mutable fault state of one drive; the defaults have no effect.
 
     ``signals`` maps position, speed, current or voltage to a :class:`SignalFault`. ``drop_tpdo`` maps a TPDO number to
-    the frames still to be lost (-1: all). ``ignore_offset``: writes to 0x60B0 are lost. ``offset_scale``: the offset
-    acts this many times. ``not_csp``: 0x6061 shows profile position and the set-points are not followed.
-    ``no_heartbeat_consumer``: 0x1016 does nothing. ``load_torque_nm``: Tl, in the drive's direction.
+    the number of frames still to be dropped (-1: all). ``ignore_offset``: writes to 0x60B0 are lost. ``offset_scale``:
+    factor on the offset. ``not_csp``: 0x6061 shows profile position and set-points are not followed.
+    ``no_heartbeat_consumer``: 0x1016 has no effect. ``load_torque_nm``: Tl, in the drive's direction.
     """
 
     signals: dict[str, SignalFault] = field(default_factory=dict)
@@ -30,7 +30,7 @@ class DriveFaults:
     load_torque_nm: float = 0.0
 
     def signal(self, name: str) -> SignalFault:
-        """Return the fault of a signal, made when there is none yet; KeyError for a name that is not in SIGNALS."""
+        """Return the fault of a signal, created on first use; KeyError for a name not in SIGNALS."""
         if name not in SIGNALS:
             raise KeyError(name)
         return self.signals.setdefault(name, SignalFault())
@@ -46,7 +46,7 @@ class Sensors:
         self._rows: list[list[float]] = []
 
     def read(self, position: float, speed: float, current: float, voltage: float) -> tuple[float, float, float, float]:
-        """Return what is reported: increments, rad/s, A, V."""
+        """Return the reported values: increments, rad/s, A, V."""
         if not self._rows:
             self._rows = (self._rng.standard_normal((_BLOCK, 3)) * self._std).tolist()
         noise = self._rows.pop()

@@ -1,8 +1,8 @@
-"""Lists the communication objects beyond PDO and heartbeat: time stamps, node guarding, what a lost master leads to."""
+"""Lists the communication objects beyond PDO and heartbeat: time stamps, node guarding, error behaviour."""
 
 from fdhil.sim.drive.dictionary import ARRAY, U8, U16, U32, DataType, Entry, Object, record, var
 
-KEEP_STATE = 1  # 0x1029: what the drive does by itself is 0x6007's affair
+KEEP_STATE = 1  # 0x1029: 0x6007 defines the drive's reaction
 
 
 def service_objects() -> list[Object]:

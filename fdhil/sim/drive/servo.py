@@ -1,8 +1,8 @@
 """Simulates a CiA 402 servo drive on a CANopen bus, sans-I/O: frames in, frames out.
 
-At SYNC k the drive latches the RPDOs it received since SYNC k-1, samples all objects at t_k, sends the TPDOs that are
-due, and integrates [t_k, t_k+1). The 0x607A and 0x60B0 latched at SYNC k are what it follows at t_k+delay. Heartbeats
-and time-outs run on the time that :meth:`Drive.wall_clock` is given, and where no SYNC leads so does the motion.
+At SYNC k the drive latches the RPDOs received since SYNC k-1, samples all objects at t_k, sends the due TPDOs, and
+integrates [t_k, t_k+1). It follows the 0x607A and 0x60B0 latched at SYNC k at t_k+delay. Heartbeats and time-outs run
+on the time given to :meth:`Drive.wall_clock`; without a leading SYNC the motion does, too.
 """
 
 from collections.abc import Callable
@@ -34,22 +34,22 @@ _MOST_CYCLES_PER_SYNC = 1000
 class Drive(CanopenNode):
     """One axis' drive with its motor and table.
 
-    ``faults`` may be changed at any time. ``physics`` holds the true current, speed and voltage after the
-    cycle that was integrated. ``nmt`` is the NMT state as a heartbeat shows it, -1 while the drive is without supply.
+    ``faults`` may be changed at any time. ``physics`` holds the true current, speed and voltage after the integrated
+    cycle. ``nmt`` is the NMT state as in a heartbeat, -1 while the drive has no supply.
     """
 
     def __init__(self, axis: str, config: MachineConfig, rng: np.random.Generator) -> None:
         section = config.axis[axis]
         check_structure(axis, section.regulators)
-        twin = config.sim.axis.get(axis, SimAxis())
+        sim_axis = config.sim.axis.get(axis, SimAxis())
         self.axis = axis
         self.ratings = Ratings.of(config, axis)
-        self._plant = AxisPlant(config, axis, twin)
-        real = real_loops(twin.reality, section.regulators)
+        self._plant = AxisPlant(config, axis, sim_axis)
+        real = real_loops(sim_axis.reality, section.regulators)
         self.dress = dress(config, axis)
         objects = Dictionary(self.dress.objects, self.dress.within)
         follow_speed_unit(objects, self.dress, self.ratings)
-        super().__init__(objects, self.ratings.node_id, DriveFaults(), boot_s=twin.boot_s)
+        super().__init__(objects, self.ratings.node_id, DriveFaults(), boot_s=sim_axis.boot_s)
         self.power = PowerStage(self.dictionary.number)
         self.motion = Motion(
             self.dictionary,
@@ -57,9 +57,9 @@ class Drive(CanopenNode):
             self.ratings,
             self.faults,
             CyclicSetpoints(
-                section.drive.setpoint_delay_cycles, config.machine.sync_period_s, twin.offset_in_feedforward
+                section.drive.setpoint_delay_cycles, config.machine.sync_period_s, sim_axis.offset_in_feedforward
             ),
-            switches(twin, self.ratings),
+            switches(sim_axis, self.ratings),
             (real.position_gain_per_s, real.speed_feedforward),
         )
         self.feedback = Feedback(
@@ -69,14 +69,14 @@ class Drive(CanopenNode):
             self.physics,
             self.power,
             self.motion,
-            Sensors(sensor_noise(config, twin), self.faults, rng),
+            Sensors(sensor_noise(config, sim_axis), self.faults, rng),
             self.dress.gauges,
         )
         self._cycle = DriveCycle(
             self.dictionary, self.ratings, self._plant, self.power, self.motion, self.feedback, self.faults
         )
         self._clock = OwnClock(self.ratings.sync_period_s)
-        self._said_period = (0, 0)
+        self._configured_period = (0, 0)
         register_write_rules(
             self.dictionary,
             changeable=self._is_pre_operational,
@@ -94,7 +94,6 @@ class Drive(CanopenNode):
 
     @property
     def tick(self) -> int:
-        """How many cycles there were."""
         return self._cycle.tick
 
     @property
@@ -103,15 +102,13 @@ class Drive(CanopenNode):
         return self._cycle.table_mm
 
     def on_cycle(self, ended: Callable[[float], None]) -> None:
-        """Have ``ended`` called after each cycle, with the mean voltage of the one before it."""
+        """Set the callback that is called after each cycle with the mean voltage of the cycle before it."""
         self._cycle.ended = ended
 
-    # -- life
-
     def power_on(self) -> list[Frame]:
-        """Boot, or boot again: the power-on values, pre-operational; returns the boot-up message, if it comes at once.
+        """Boot or reboot with the power-on values, to pre-operational; return the boot-up message if sent at once.
 
-        The very first time it does: nobody waits for a machine that was switched on before.
+        The first boot sends it at once: the machine is taken as switched on before.
         """
         self._take_node_id()
         self._stored.restore(lambda _: True)
@@ -126,14 +123,12 @@ class Drive(CanopenNode):
         return self._boot_up()
 
     def power_off(self) -> None:
-        """Cut the supply: no frame is sent or answered, the axis coasts; :meth:`power_on` ends it."""
+        """Cut the supply: no frame is sent or answered, the axis coasts, until :meth:`power_on`."""
         super().power_off()
         self.power.start()
 
-    # -- the cycle
-
     def wall_clock(self, now_s: float, *, alone: bool = True) -> list[Frame]:
-        """Run what depends on time and not on SYNC: heartbeats both ways, time-outs, event-driven TPDOs, own motion.
+        """Run what depends on time: heartbeats both ways, time-outs, event-driven TPDOs, self-clocked motion.
 
         ``alone`` is False where SYNC is the only clock of the machine.
         """
@@ -161,11 +156,11 @@ class Drive(CanopenNode):
         return frames + self._take_outgoing() if self._emergencies.waiting else frames
 
     def _cycles_per_sync(self) -> int:
-        """How many cycles of the drive a SYNC is said to come in: 0x60C2, value and power of ten of a second."""
-        said = self.dictionary.numbers.get(0x60C201, 0), self.dictionary.numbers.get(0x60C202, 0)
-        if said != self._said_period:
-            self._said_period = said
-            cycles = said[0] * 10.0 ** said[1] / self.ratings.sync_period_s
+        """Return the configured number of drive cycles per SYNC, from 0x60C2."""
+        period = self.dictionary.numbers.get(0x60C201, 0), self.dictionary.numbers.get(0x60C202, 0)
+        if period != self._configured_period:
+            self._configured_period = period
+            cycles = period[0] * 10.0 ** period[1] / self.ratings.sync_period_s
             self.motion.interpolation.cycles = round(min(max(cycles, 1.0), _MOST_CYCLES_PER_SYNC))
         return self.motion.interpolation.cycles
 
@@ -175,7 +170,6 @@ class Drive(CanopenNode):
 
     @property
     def moves_alone(self) -> bool:
-        """Whether the drive moves by its own clock."""
         return self._clock.leads and not self._cycle.stands
 
     def _move_alone(self, now_s: float, alone: bool) -> None:
@@ -189,7 +183,7 @@ class Drive(CanopenNode):
             self.cycle_without_sync()
 
     def cycle_without_sync(self) -> None:
-        """Run a cycle on what was latched last; a drive that stands needs none."""
+        """Run a cycle on the set-points latched last; skipped at standstill."""
         if self._cycle.stands:
             return
         if not self._mute:
@@ -197,7 +191,7 @@ class Drive(CanopenNode):
         self._cycle.integrate()
 
     def _begin_cycle(self) -> None:
-        """Take the set-points as they are, sample all objects, and supervise."""
+        """Apply the set-points, sample all objects, and supervise."""
         self._cycle.keep_offset()
         self._control()
         if self._cycle.begin():
@@ -217,10 +211,8 @@ class Drive(CanopenNode):
         self._control()
         self.feedback.show_state()
 
-    # -- faults and reactions
-
     def trip(self, code: int, detail: bytes = b"") -> None:
-        """Fall into fault with this error code: EMCY with the next frames, reaction by 0x605E."""
+        """Enter the fault state with this error code: EMCY with the next frames, reaction by 0x605E."""
         self.dictionary.numbers[0x603F00] = code
         self._emergencies.report(code, detail)
         self.power.fault()
@@ -243,27 +235,25 @@ class Drive(CanopenNode):
             reactions.get(self.dictionary.number(0x6007), lambda: None)()
         self.feedback.show_state()
 
-    # -- what a test or the machine around the drive may turn
-
     def set_parameters(self, **values: float) -> None:
         """Change plant parameters (R, L, K, Jt, ft, Cd at the reference temperature) from the next cycle on.
 
-        TypeError for another name, ValueError for a value that no plant has.
+        TypeError for another name, ValueError for an unphysical value.
         """
         self._plant.set_parameters(**values)
 
     def set_temperature(self, celsius: float) -> None:
-        """Set the slide-way's temperature: 0x2110 shows it, ft and Cd follow it."""
+        """Set the slide-way's temperature: 0x2110 reports it, ft and Cd follow it."""
         self.dictionary.numbers[0x211001] = clip(celsius * 100, INT16)
         self._plant.warm(celsius)
 
     def set_object(self, index: int, sub: int, value: int) -> None:
-        """Write an object past all access rules, as another tool or a wrong set-up would have; KeyError if unknown."""
+        """Overwrite an object regardless of its access rules, as another tool might; KeyError if unknown."""
         entry = self.dictionary.entries[index << 8 | sub]
         self.dictionary.numbers[entry.place] = entry.number(value)
 
     def remap(self, index: int, entries: list[tuple[int, int, int]]) -> None:
-        """Change a mapping parameter (0x1600 to 0x1603, 0x1A00 to 0x1A03) past all rules, even in operational."""
+        """Change a mapping parameter (0x1600 to 0x1603, 0x1A00 to 0x1A03) regardless of the rules."""
         self.set_object(index, 0, len(entries))
         for sub, (mapped, mapped_sub, bits) in enumerate(entries, 1):
             self.set_object(index, sub, mapped << 16 | mapped_sub << 8 | bits)

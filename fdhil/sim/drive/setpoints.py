@@ -1,7 +1,7 @@
-"""Computes what the loops follow: the cyclic set-points with their delay, and the drive's own ramps and profiles.
+"""Computes the loops' set-points: the cyclic ones with their delay, and the drive's own ramps and profiles.
 
-The cyclic set-points and the profile give, for the cycle that begins, the demand at its start, at its end and one cycle
-later (increments), because the feed-forward runs linearly from the slope of this cycle to the slope of the next.
+For the beginning cycle, the cyclic set-points and the profile give the demand at its start, at its end and one cycle
+later (increments): the feed-forward runs linearly from the slope of this cycle to that of the next.
 """
 
 import math
@@ -21,7 +21,7 @@ class Target(NamedTuple):
 
 
 class CyclicSetpoints:
-    """The cyclic synchronous position set-points, run ``delay`` SYNC cycles late."""
+    """The set-points of cyclic synchronous position, executed ``delay`` SYNC cycles late."""
 
     def __init__(self, delay: int, sync_period_s: float, offset_in_feedforward: bool) -> None:
         self._delay = delay
@@ -32,11 +32,9 @@ class CyclicSetpoints:
         self.preset(Target(0.0, 0.0, 0.0, 0.0))
 
     def preset(self, target: Target) -> None:
-        """Fill the whole delay with one target."""
         self._queue.extend([target] * (self._delay + 2))
 
     def push(self, target: Target) -> None:
-        """Take what was latched at a SYNC."""
         self._queue.append(target)
 
     @property
@@ -45,10 +43,10 @@ class CyclicSetpoints:
         return self._queue[1]
 
     def command(self) -> Command:
-        """Return the command of the cycle that begins, see :func:`fdhil.sim.drive.physics.run_cycle`.
+        """Return the command of the beginning cycle, see :func:`fdhil.sim.drive.physics.run_cycle`.
 
-        With a delay of one cycle the slope after this cycle is not known yet and is held; without a delay the set-point
-        is a stair, and its slope is that of the step that was just made.
+        With a delay of one cycle the slope after this cycle is unknown and is held. Without a delay the set-point is a
+        staircase, and its slope is that of the last step.
         """
         queue, period = self._queue, self._period_s
         first = queue[1]
@@ -68,7 +66,7 @@ class CyclicSetpoints:
 
 
 class Interpolation:
-    """Spreads set-points that come every ``cycles`` cycles (0x60C2) over these: straight, one interval late."""
+    """Interpolates set-points that come every ``cycles`` cycles (0x60C2) linearly, one interval late."""
 
     def __init__(self) -> None:
         self.cycles = 1
@@ -76,12 +74,11 @@ class Interpolation:
         self._from = self._to = Target(0.0, 0.0, 0.0, 0.0)
 
     def preset(self, target: Target) -> None:
-        """Rest at a target."""
         self._from = self._to = target
         self._step = 0
 
     def next(self, target: Target, *, synced: bool) -> Target:
-        """Return this cycle's set-point; ``target`` is what was received last, ``synced``: a SYNC begins the cycle."""
+        """Return this cycle's set-point; ``target`` was received last, ``synced``: a SYNC begins the cycle."""
         if self.cycles == 1:
             self.preset(target)
             return target
@@ -98,18 +95,17 @@ class Interpolation:
 
 
 class Ramp:
-    """A speed or a torque on its way to a target: ``before`` at the start of a cycle, ``now`` at its end."""
+    """A speed or torque ramp to a target: ``before`` at the start of a cycle, ``now`` at its end."""
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
         self.start(0.0)
 
     def start(self, value: float) -> None:
-        """Go on from a value."""
         self.before = self.now = float(value)
 
     def advance(self, target: float, rising: float, falling: float) -> None:
-        """Go one cycle on; ``rising`` is the rate (1/s) at which the magnitude grows, ``falling`` that of its fall."""
+        """Advance by one cycle; ``rising`` and ``falling`` are the rates (1/s) of a growing and a falling magnitude."""
         self.before = self.now
         grows = abs(target) > abs(self.now) and target * self.now >= 0
         step = (rising if grows else falling) * self._period_s
@@ -117,7 +113,7 @@ class Ramp:
 
 
 class Profile:
-    """The drive's own motion: a trapezoid toward a target, or a ramp to standstill. Increments and seconds."""
+    """The drive's own motion: a trapezoid to a target, or a ramp to standstill. Increments and seconds."""
 
     def __init__(self, sync_period_s: float) -> None:
         self._period_s = sync_period_s
@@ -125,24 +121,23 @@ class Profile:
         self._speed = 0.0
 
     def start(self, position: float, speed: float) -> None:
-        """Go on from a demand and its speed."""
-        position = float(position)  # the compiled cycle knows floats; an int would have it compiled once more
+        position = float(position)  # an int would make numba compile the cycle again
         before = position - speed * self._period_s
         self._points = (before, position, position + speed * self._period_s)
         self._speed = speed
 
     @property
     def at_rest(self) -> bool:
-        """Whether the demand stands still, now and in the cycles already planned."""
+        """Whether the demand is at rest, now and in the cycles already planned."""
         return self._points[0] == self._points[1] == self._points[2]
 
     @property
     def now(self) -> float:
-        """The demand at the cycle that was advanced to last."""
+        """The demand at the present cycle."""
         return self._points[0]
 
     def advance(self, target: float | None, speed: float, acceleration: float, deceleration: float) -> None:
-        """Go one cycle on; without a target the demand slows down to rest."""
+        """Advance by one cycle; without a target the demand decelerates to rest."""
         last = self._points[2]
         if target is None:
             drop = deceleration * self._period_s
@@ -171,7 +166,6 @@ class Profile:
         return following, position + moved
 
     def command(self) -> Command:
-        """Return the command of the cycle that begins."""
         first, second, third = self._points
         return (
             first, second, (second - first) / self._period_s, (third - second) / self._period_s, 0.0, 0.0, 0.0, 0.0,

@@ -10,11 +10,11 @@ from fdhil.sim.drive.objects import Ratings
 from fdhil.sim.drive.physics import Command
 from fdhil.sim.drive.setpoints import Ramp, Target
 
-_FADE = 0.05  # of the highest motor speed: over it a torque fades that would drive the motor beyond
+_FADE = 0.05  # of the motor speed limit: range in which a torque toward it fades
 
 
 class Actual(NamedTuple):
-    """What the drive knows at the start of a cycle: increments, increments/s, A, and the bits of 0x60FD."""
+    """The drive's feedback at the start of a cycle: increments, increments/s, A, and the bits of 0x60FD."""
 
     position: int
     speed: float
@@ -23,7 +23,7 @@ class Actual(NamedTuple):
 
 
 class SpeedAndTorque:
-    """Ramps toward 0x60FF and 0x6071, and the cyclic set-points; ``at_speed`` and ``stands`` watch the actual speed."""
+    """Ramps to 0x60FF and 0x6071, and cyclic set-points; ``at_speed`` and ``stands`` watch the actual speed."""
 
     def __init__(self, numbers: Mapping[int, int], limits: MotionLimits, ratings: Ratings) -> None:
         self._numbers, self._limits = numbers, limits
@@ -35,18 +35,15 @@ class SpeedAndTorque:
         self.stands = Window(numbers, 0x606F00, 0x607000, period_s)
 
     def start(self, actual: Actual) -> None:
-        """Go on from the speed and the torque that are."""
         self._speed.start(actual.speed)
         self._torque.start(actual.current_a / self._amperes)
 
     def watch(self, actual: Actual) -> None:
-        """A cycle begins."""
         self.at_speed.step(actual.speed - self._target_speed)
         self.stands.step(actual.speed)
 
     @property
     def torque_reached(self) -> bool:
-        """Whether the torque ramp is at its target."""
         return self._torque.before == self._torque.now
 
     @property
@@ -54,21 +51,21 @@ class SpeedAndTorque:
         return self._limits.speed(float(self._numbers.get(0x60FF00, 0)))
 
     def velocity(self, actual: Actual) -> Command:
-        """Return the command of profile velocity: the ramp of 0x6083 and 0x6084 toward 0x60FF."""
+        """Return the command of profile velocity: the ramp of 0x6083 and 0x6084 to 0x60FF."""
         ramp, limits = self._speed, self._limits
         ramp.advance(self._target_speed, limits.acceleration(0x608300), limits.deceleration(0x608400))
-        place, scale = float(actual.position), self._rad_per_increment
-        return place, place, 0.0, 0.0, ramp.before * scale, ramp.now * scale, 0.0, 0.0
+        position, scale = float(actual.position), self._rad_per_increment
+        return position, position, 0.0, 0.0, ramp.before * scale, ramp.now * scale, 0.0, 0.0
 
     def torque(self, actual: Actual) -> Command:
-        """Return the command of profile torque: the slope of 0x6087 toward 0x6071."""
+        """Return the command of profile torque: the slope of 0x6087 to 0x6071."""
         slope = float(self._numbers.get(0x608700, 0)) or math.inf
         self._torque.advance(float(self._numbers.get(0x607100, 0)), slope, slope)
-        place, scale = float(actual.position), self._amperes * self._share(actual, self._torque.now)
-        return place, place, 0.0, 0.0, 0.0, 0.0, self._torque.before * scale, self._torque.now * scale
+        position, scale = float(actual.position), self._amperes * self._share(actual, self._torque.now)
+        return position, position, 0.0, 0.0, 0.0, 0.0, self._torque.before * scale, self._torque.now * scale
 
     def target(self, mode: int, actual: Actual) -> Target:
-        """Return what was latched for a cyclic mode with open loops; its position is where the axis is."""
+        """Return the latched set-point of a cyclic mode with open loops, at the actual position."""
         numbers = self._numbers
         torque = numbers.get(0x60B200, 0)
         if mode == modes.CYCLIC_VELOCITY:
@@ -77,19 +74,19 @@ class SpeedAndTorque:
         return Target(actual.position, 0.0, 0.0, (torque + numbers.get(0x607100, 0)) * self._amperes)
 
     def held(self, mode: int, actual: Actual) -> Target:
-        """Return the target that goes on as it is: what a cyclic mode starts from until its first one acts."""
+        """Return the set-point that holds the present motion until the first one of a cyclic mode acts."""
         speed = actual.speed * self._rad_per_increment if mode == modes.CYCLIC_VELOCITY else 0.0
         return Target(actual.position, 0.0, speed, actual.current_a if mode == modes.CYCLIC_TORQUE else 0.0)
 
     def cyclic(self, mode: int, actual: Actual, command: Command) -> Command:
-        """Return a cyclic command without what its open loops do not see."""
-        place, share = float(actual.position), 1.0
+        """Return a cyclic command without the parts of its open loops."""
+        position, share = float(actual.position), 1.0
         if mode == modes.CYCLIC_TORQUE:
             share = self._share(actual, command[7])
-        return place, place, 0.0, 0.0, command[4], command[5], command[6] * share, command[7] * share
+        return position, position, 0.0, 0.0, command[4], command[5], command[6] * share, command[7] * share
 
     def _share(self, actual: Actual, torque: float) -> float:
-        """Return how much of a torque acts: none that drives the motor beyond 0x6080."""
+        """Return the effective share of a torque: it fades to zero toward the motor speed limit 0x6080."""
         highest = self._limits.motor_speed
         if math.isinf(highest) or torque * actual.speed <= 0:
             return 1.0

@@ -1,4 +1,4 @@
-"""Keeps the last cycles as the drive saw them, to be read by SDO block upload (vendor object 0x2120)."""
+"""Records the last cycles of the drive, to be read by SDO block upload (vendor object 0x2120)."""
 
 import struct
 
@@ -8,18 +8,16 @@ ROW = struct.Struct("<Iiiihh")
 
 
 class TraceBuffer:
-    """A ring of the last ``TRACE_CYCLES`` rows."""
+    """A ring buffer of the last ``TRACE_CYCLES`` rows."""
 
     def __init__(self) -> None:
         self._ring = bytearray(TRACE_CYCLES * ROW.size)
         self._rows = 0
 
     def clear(self) -> None:
-        """Forget all rows."""
         self._rows = 0
 
     def append(self, tick: int, demand: int, position: int, speed: int, current: int, voltage: int) -> None:
-        """Record one cycle."""
         offset = self._rows % TRACE_CYCLES * ROW.size
         ROW.pack_into(self._ring, offset, tick & 0xFFFFFFFF, demand, position, speed, current, voltage)
         self._rows += 1

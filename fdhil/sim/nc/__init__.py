@@ -1,1 +1,1 @@
-"""The simulated NC: SYNC producer, NMT master, and the one who streams set-points."""
+"""The simulated NC: SYNC producer, NMT master and source of the set-points."""

@@ -1,7 +1,7 @@
 """Simulates the NC, sans-I/O: it produces SYNC, is the NMT master, enables the drives and streams set-points.
 
-After SYNC k-1 and before SYNC k it sends r[k+delay] by RPDO (controlword, target position), so that the drive, which
-runs its set-point ``delay`` cycles late, follows r[k] at SYNC k. All its times are counted in SYNC cycles.
+Between SYNC k-1 and SYNC k it sends r[k+delay] by RPDO (controlword, target position), so that the drive, which
+executes its set-point ``delay`` cycles late, follows r[k] at SYNC k. All its times are counted in SYNC cycles.
 """
 
 from collections import deque
@@ -22,8 +22,8 @@ from fdhil.sim.nc.stream import DemandStream
 Event = dict[str, Any]
 
 COUNTER_OVERFLOW = 240
-TAIL_S = 0.3  # rest after the last row that still belongs to the played file
-_SETTLE_S = 0.3  # rest between the rapid to the start and the first row
+TAIL_S = 0.3  # rest after the last row, part of the played file
+_SETTLE_S = 0.3  # rest between the rapid and the first row
 _ANSWER_S = 1.0
 _ENABLE_S = 3.0
 _RELEASE_CYCLES = 3
@@ -31,8 +31,6 @@ _MAX_OVERRIDE = 1.5
 
 
 class Phase(Enum):
-    """The NC's hold on the drives."""
-
     OFF = auto()
     CONFIGURE = auto()
     ENABLE = auto()
@@ -42,11 +40,11 @@ class Phase(Enum):
 
 
 class NcController:
-    """The NC of one machine. ``events`` collects what it has to say; who runs it takes them out.
+    """The NC of one machine. ``events`` collects its events; the caller takes them out.
 
-    Each period: send the frames of :meth:`begin`, give it what the drives answer by :meth:`hear`, then send the frames
-    of :meth:`end`. ``wiring`` tells how an axis' drive is mapped; it is asked at each takeover. ``in_force`` is the
-    row r[k] of the SYNC that :meth:`begin` gave last, None while it has none.
+    Each period: send the frames of :meth:`begin`, pass the drives' answers to :meth:`hear`, then send the frames of
+    :meth:`end`. ``wiring`` returns the PDO mapping of an axis' drive; it is called at each takeover. ``in_force`` is
+    the row r[k] of the SYNC that :meth:`begin` returned last, None while there is none.
     """
 
     def __init__(self, config: MachineConfig, wiring: Callable[[str], Wiring]) -> None:
@@ -87,10 +85,8 @@ class NcController:
         self._hold = self._stopping = self._leaving = self._given_up = False
         self.override = 1.0
 
-    # -- the panel
-
     def switch(self, on: bool) -> None:
-        """Take over the bus and enable the drives, or come to rest, disable them and let go."""
+        """Take over the bus and enable the drives; or come to rest, disable them and release the bus."""
         if on and self.phase in (Phase.OFF, Phase.FAULTED):
             self._take_over()
         elif on and self.phase is Phase.READY:
@@ -102,9 +98,9 @@ class NcController:
             self.stop()
 
     def play(self, file: str, demand: Trajectory | DemandStream) -> None:
-        """Go to the demand's start in a rapid, then play it; an event tells what forbids it.
+        """Move to the demand's start in a rapid, then play it; an event reports why it cannot be played.
 
-        A stream is begun once it has rows enough, and may come to an end before.
+        A stream starts once it has enough rows, and may end before.
         """
         job = Job(file, demand)
         if refusal := self._refusal(job):
@@ -116,7 +112,7 @@ class NcController:
             self._start_job()
 
     def stop(self) -> None:
-        """Slow down along the path and give the rest of it up."""
+        """Decelerate along the path and abandon the rest of it."""
         if self._stages:
             self._stopping = True
         elif self._awaits_rows and self.phase is Phase.READY:
@@ -125,7 +121,7 @@ class NcController:
             self._job = None
 
     def feed_hold(self, on: bool) -> None:
-        """Slow down along the path and stay there; go on when it is released."""
+        """Decelerate along the path and hold; continue when it is released."""
         self._hold = on
 
     def set_override(self, percent: float) -> None:
@@ -141,22 +137,19 @@ class NcController:
 
     @property
     def is_stopping(self) -> bool:
-        """Whether it slows down to give the rest of a path up."""
+        """Whether it decelerates to abandon the rest of a path."""
         return self.on and (self._stopping or (self._given_up and self._job is not None))
 
     @property
     def on(self) -> bool:
-        """Whether it has the bus."""
         return self.phase is not Phase.OFF
 
     def _refusal(self, job: Job) -> str:
         if self._leaving or self.phase in (Phase.OFF, Phase.FAULTED, Phase.RELEASE):
-            return "the NC does not have the drives; switch it on first"
+            return "the NC does not control the drives; switch it on first"
         if self._job is not None:
             return f"{self._job.file} is being played; stop it first"
         return job.refusal(self.axes, self._period_s)
-
-    # -- the cycle
 
     def begin(self) -> list[BusFrame]:
         """Return the SYNC of this period, one frame per bus; none while the drives are being configured."""
@@ -171,7 +164,7 @@ class NcController:
         return [(bus, (0x80, bytes([self._counter]))) for bus in self._buses]
 
     def hear(self, bus: str, frame: Frame) -> None:
-        """Take what a drive sent: the TPDOs that it is wired to, SDO answers."""
+        """Process a frame of a drive: the TPDOs it is wired to, SDO answers."""
         can_id, data = frame
         link = self._by_answer.get((bus, can_id))
         if link is not None:
@@ -180,7 +173,7 @@ class NcController:
             self._answer(self._by_node[bus, can_id & 0x7F], data)
 
     def end(self) -> list[BusFrame]:
-        """Return what is sent after this period's SYNC: the set-points of the next one, or the steps of a takeover."""
+        """Return the frames after this period's SYNC: the next set-points, or the steps of a takeover."""
         match self.phase:
             case Phase.OFF:
                 return []
@@ -191,8 +184,6 @@ class NcController:
             case Phase.RELEASE:
                 return self._release()
         return self._stream()
-
-    # -- takeover and release
 
     def _take_over(self) -> None:
         self.phase = Phase.CONFIGURE
@@ -221,7 +212,7 @@ class NcController:
             frames.append(request.frame)
         request.cycles += 1
         if request.cycles * self._period_s > _ANSWER_S:
-            self._give_up(f"drive {request.link.axis} does not answer; check that it is powered")
+            self._give_up(f"drive {request.link.axis} does not respond: the NC stays off. Check its supply")
         return frames
 
     def _start(self) -> list[BusFrame]:
@@ -229,7 +220,7 @@ class NcController:
             link.wiring = self._wiring(link.axis)
             if link.wiring.missing:
                 what = " and ".join(link.wiring.missing)
-                self._give_up(f"drive {link.axis} has {what} in no PDO; set its mapping up (0x1400 to 0x1BFF)")
+                self._give_up(f"drive {link.axis} maps {what} in no PDO: the NC stays off. Map it (0x1400 to 0x1BFF)")
                 return []
         self._by_answer = {(link.bus, pdo.cob_id): link for link in self._links for pdo in link.wiring.answers}
         self.phase, self._waited = Phase.ENABLE, 0
@@ -244,7 +235,9 @@ class NcController:
         self._requests.popleft()
         if data[0] == 0x80 and request.required:
             code = int.from_bytes(data[4:], "little")
-            self._give_up(f"drive {link.axis} refuses {request.index:04X} = {request.value} with SDO abort {code:08X}")
+            self._give_up(
+                f"drive {link.axis} refuses {request.index:04X} = {request.value} with SDO abort {code:08X}: NC off"
+            )
 
     def _give_up(self, text: str) -> None:
         self._complain(text)
@@ -263,8 +256,8 @@ class NcController:
             if self._job is not None:
                 self._start_job()
         elif self._waited * self._period_s > _ENABLE_S:
-            stuck = ", ".join(f"{k.axis} ({k.state.name})" for k in self._links if k.word != ENABLED)
-            self._give_up(f"these drives do not reach Operation enabled: {stuck}; clear the cause and switch the NC on")
+            pending = ", ".join(f"{k.axis} ({k.state.name})" for k in self._links if k.word != ENABLED)
+            self._give_up(f"drives do not reach Operation enabled: {pending}; clear the cause and switch the NC on")
         return frames
 
     def _release(self) -> list[BusFrame]:
@@ -284,8 +277,6 @@ class NcController:
         self._stages.clear()
         self.in_force = None
         self.events.append({"event": "nc", "on": False})
-
-    # -- motion
 
     def _start_job(self) -> None:
         assert self._job is not None
@@ -316,14 +307,14 @@ class NcController:
         self._supervise()
         self._rows.append(self._advance())
         frames: list[BusFrame] = []
-        for place, link in enumerate(self._links):
+        for n, link in enumerate(self._links):
             if self.phase is Phase.FAULTED and link.state is not State.OPERATION_ENABLED:
                 link.word = SHUTDOWN
                 target = link.position or 0
             else:
                 link.word = ENABLED
                 row = self._rows[link.delay - self._delay - 1]
-                target = round(row.position_mm[place] * link.increments_per_mm)
+                target = round(row.position_mm[n] * link.increments_per_mm)
             frames += link.set_point(target)
         return frames
 
@@ -347,7 +338,7 @@ class NcController:
         return Row(self._position, rapid, stage.playing)
 
     def _at_rest(self) -> None:
-        self._stopping = False  # what was to be stopped has ended
+        self._stopping = False  # the stopped path has ended
         if not self._hold and self.phase is Phase.READY:
             self._rate.jump(self.override)
         if self._leaving and not any(row.playing for row in self._rows):
@@ -356,19 +347,19 @@ class NcController:
             self._start_job()
 
     def _supervise(self) -> None:
-        """A drive that is not enabled any more, or silent, makes the path stop."""
+        """Stop the path when a drive leaves Operation enabled or falls silent."""
         if self.phase is Phase.FAULTED:
             return
         for link in self._links:
             if link.silent > link.wiring.patience:
-                why = "sends no statusword any more"
+                why = "stopped sending its statusword"
             elif link.status is None or link.status & 0x6F != State.OPERATION_ENABLED:
-                why = f"left Operation enabled for {link.state.name}"
+                why = f"left Operation enabled ({link.state.name})"
             else:
                 continue
             self.phase = Phase.FAULTED
             self.stop()
-            self._complain(f"drive {link.axis} {why}: the path is stopped; clear the cause and switch the NC on")
+            self._complain(f"drive {link.axis} {why}: the path is stopped. Clear the cause and switch the NC on")
             return
 
     def _report(self, before: Row | None, now: Row | None) -> None:
@@ -392,7 +383,7 @@ class NcController:
 
     @property
     def _awaits_rows(self) -> bool:
-        """Whether a stream is to be played that has not brought rows enough to begin with."""
+        """Whether a stream is to be played that has too few rows to start."""
         return self._job is not None and self._job.awaited and not self._given_up
 
     def _complain(self, text: str) -> None:

@@ -1,4 +1,4 @@
-"""Keeps the NC's view of one drive and makes what is sent to it: set-points, steps to Operation enabled, SDO writes."""
+"""Tracks one drive from the NC's side and builds its frames: set-points, steps to Operation enabled, SDO writes."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def power_state(statusword: int) -> State:
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """The PDOs by which the NC leads a drive, and its ``mode`` of cyclic set-points with the object it is written to.
+    """The PDOs by which the NC controls a drive, and its cyclic ``mode`` with the object to write it to.
 
-    ``missing`` are the objects that the NC needs and no valid PDO carries. A drive is silent that sends no statusword
-    for ``patience`` SYNCs; one that sends it by event never is.
+    ``missing`` are the required objects that no valid PDO carries. A drive counts as silent without a statusword for
+    ``patience`` SYNCs; one that sends it by event never does.
     """
 
     setpoints: tuple[Pdo, ...] = ()
@@ -52,7 +52,7 @@ class Wiring:
 
     @classmethod
     def of(cls, rpdos: Iterable[Pdo], tpdos: Iterable[Pdo], mode: int, mode_index: int) -> Wiring:
-        """Choose among a drive's PDOs: as few as do, and none that carries an offset where another does."""
+        """Choose among a drive's PDOs: as few as possible, without offsets where another PDO suffices."""
         received = sorted(rpdos, key=lambda pdo: (CONTROLWORD not in pdo.keys, not _OFFSETS.isdisjoint(pdo.keys)))
         received.sort(key=lambda pdo: not {CONTROLWORD, TARGET}.issubset(pdo.keys))
         sent = list(tpdos)
@@ -74,7 +74,7 @@ class Wiring:
 
 @dataclass(slots=True)
 class DriveLink:
-    """One drive as the NC sees it, by the PDOs it was wired to, and the controlword it was given last.
+    """One drive as seen by the NC, with the PDOs it was wired to, and the last controlword.
 
     ``increments_per_mm`` has the sign of the axis; ``silent`` counts the SYNCs since the last statusword.
     """
@@ -92,11 +92,10 @@ class DriveLink:
 
     @property
     def state(self) -> State:
-        """The power state that its last statusword shows."""
         return State.NOT_READY if self.status is None else power_state(self.status)
 
     def set_point(self, target: int) -> list[BusFrame]:
-        """Controlword and target position; what else those RPDOs carry stays at rest."""
+        """Return controlword and target position; other objects in those RPDOs stay zero."""
         values = {CONTROLWORD: self.word, TARGET: target, MODE: self.wiring.mode}
         return [
             (self.bus, (pdo.cob_id, pdo.codec.pack(*[0 if key is None else values.get(key, 0) for key in pdo.keys])))
@@ -104,7 +103,7 @@ class DriveLink:
         ]
 
     def hear(self, can_id: int, data: bytes) -> None:
-        """Take a TPDO; one that is shorter than its mapping says nothing."""
+        """Process a TPDO; one shorter than its mapping is ignored."""
         for pdo in self.wiring.answers:
             if pdo.cob_id != can_id or len(data) < pdo.codec.size:
                 continue
@@ -115,7 +114,7 @@ class DriveLink:
                     self.position = value
 
     def walk(self) -> list[BusFrame]:
-        """One step toward Operation enabled, with the actual position as target."""
+        """Return one step toward Operation enabled, with the actual position as target."""
         if self.position is None:
             return []
         if self.state is State.FAULT:  # a reset is a rising edge
@@ -127,7 +126,7 @@ class DriveLink:
 
 @dataclass(slots=True)
 class SdoWrite:
-    """An SDO write of one byte that awaits its answer; ``required`` tells whether an abort matters."""
+    """An SDO write of one byte that awaits its answer; ``required``: an abort ends the takeover."""
 
     link: DriveLink
     index: int

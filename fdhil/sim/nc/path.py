@@ -1,4 +1,4 @@
-"""Moves the NC along a path on the SYNC grid: in a rapid to its start, then through its rows at a variable rate."""
+"""Moves the NC along a path on the SYNC grid: a rapid to its start, then its rows at a variable rate."""
 
 import math
 from collections import deque
@@ -15,7 +15,7 @@ NEGLIGIBLE_MM = 1e-9  # far below an increment of any drive
 
 
 class Row(NamedTuple):
-    """The command for one SYNC: position (mm per axis), whether it is a rapid, whether a played file's row."""
+    """The command for one SYNC: position (mm per axis), whether it is a rapid, whether it belongs to a played file."""
 
     position_mm: list[float]
     rapid: bool
@@ -32,17 +32,16 @@ def rapid_rows(
 ) -> Float:
     """Return the rows (n, axes) of a straight rapid: a trapezoid in time, smoothed by causal moving averages.
 
-    The axis that needs longest sets the pace; the first row is the start, the last one the end. Empty (0, axes) when
-    there is no way to go.
+    The slowest axis sets the pace; the first row is the start, the last one the end. Empty (0, axes) without motion.
     """
     start, end = np.asarray(start_mm, dtype=float), np.asarray(end_mm, dtype=float)
-    way = np.abs(end - start)
-    moving = way > NEGLIGIBLE_MM
+    distance = np.abs(end - start)
+    moving = distance > NEGLIGIBLE_MM
     if not moving.any():
         return np.empty((0, start.size))
-    speed = float(np.min(np.asarray(speed_mm_s)[moving] / way[moving]))  # parts of the way per second
-    acceleration = float(np.min(np.asarray(acceleration_mm_s2)[moving] / way[moving]))
-    speed = min(speed, math.sqrt(acceleration))  # a way too short for the rapid speed: a triangle
+    speed = float(np.min(np.asarray(speed_mm_s)[moving] / distance[moving]))  # shares of the path per second
+    acceleration = float(np.min(np.asarray(acceleration_mm_s2)[moving] / distance[moving]))
+    speed = min(speed, math.sqrt(acceleration))  # a path too short for the rapid speed: a triangle
     ramp_s, total_s = speed / acceleration, 1 / speed + speed / acceleration
     t = np.arange(math.ceil(total_s / period_s) + 1) * period_s
     t = np.minimum(t, total_s)
@@ -59,9 +58,9 @@ def rapid_rows(
 
 
 class PathRate:
-    """The path's rate, 1 for 100 %: follows a target with limited slope and rounded ends, for override and feed hold.
+    """The path's rate, 1 for 100 %: follows a target with limited, rounded slope, for override and feed hold.
 
-    ``slope_per_s`` bounds its change, so that a machine in rapid never brakes harder than its acceleration.
+    ``slope_per_s`` limits its change, so that a machine in rapid never exceeds its acceleration.
     """
 
     def __init__(self, slope_per_s: float, period_s: float) -> None:
@@ -73,12 +72,12 @@ class PathRate:
         self.value = 1.0
 
     def jump(self, value: float) -> None:
-        """Take a value at once: the path stands still."""
+        """Set the rate at once, while the path is at rest."""
         self._linear = self.value = value
         self._window.extend([value] * len(self._window))
 
     def step(self, target: float) -> float:
-        """Go one cycle toward ``target`` and return the rate."""
+        """Advance one cycle toward ``target`` and return the rate."""
         if self._linear == target and self._settled > len(self._window):
             return self.value
         self._settled = self._settled + 1 if self._linear == target else 0
@@ -91,7 +90,7 @@ class PathRate:
 
 
 class RowPlayer:
-    """Plays rows (n, axes) at a rate: whole rows exactly, between them a cubic through the neighbours."""
+    """Plays rows (n, axes) at a rate: whole rows exactly, with cubic interpolation between them."""
 
     def __init__(self, rows: Float, rapid: Bool) -> None:
         self._rows = np.ascontiguousarray(rows, dtype=float)
@@ -101,11 +100,10 @@ class RowPlayer:
 
     @property
     def ended(self) -> bool:
-        """Whether every row has been played."""
         return self._at > self._last
 
     def step(self, rate: float) -> tuple[list[float], bool]:
-        """Return the position (mm per axis) and whether it is a rapid, then go on by ``rate`` rows."""
+        """Return the position (mm per axis) and whether it is a rapid, then advance by ``rate`` rows."""
         at = min(self._at, float(self._last))
         row = int(at)
         part = at - row
@@ -125,19 +123,16 @@ class RowPlayer:
 
 @dataclass(slots=True)
 class Pause:
-    """Rest for a number of cycles."""
-
     cycles: int
 
     @property
     def ended(self) -> bool:
-        """Whether it is over."""
         return self.cycles <= 0
 
 
 @dataclass(slots=True)
 class Stage:
-    """Something to do along the path: a motion or a rest, and whether it is part of the played file."""
+    """A part of the path: a motion or a rest, and whether it belongs to the played file."""
 
     motion: RowPlayer | DemandStream | Pause
     playing: bool = False
@@ -145,18 +140,18 @@ class Stage:
 
 @dataclass(slots=True)
 class Job:
-    """A file that is to be played, and the demand that it holds or that comes by it."""
+    """A file to be played, with its demand or the stream that brings it."""
 
     file: str
     demand: Trajectory | DemandStream
 
     @property
     def rows(self) -> int | None:
-        """How many rows it has, None where only its end will tell."""
+        """The number of rows, None for a stream."""
         return None if isinstance(self.demand, DemandStream) else self.demand.time_s.size
 
     def refusal(self, axes: Sequence[str], period_s: float) -> str:
-        """Say why a machine with these axes and this SYNC period cannot play it, "" where it can."""
+        """Return why a machine with these axes and this SYNC period cannot play it, "" where it can."""
         if isinstance(self.demand, DemandStream):
             return ""
         if unknown := [axis for axis in self.demand.axes if axis not in axes]:
@@ -167,11 +162,10 @@ class Job:
 
     @property
     def awaited(self) -> bool:
-        """Whether it has not brought the rows yet to begin with."""
         return isinstance(self.demand, DemandStream) and not self.demand.rows and not self.demand.ended
 
     def finished(self, played: int, stopped: bool) -> dict[str, Any]:
-        """Return the event of its end: ``played`` rows, with the rest after it, until it was over or given up."""
+        """Return the event of its end: ``played`` rows, including the rest after it, until it ended or was stopped."""
         if isinstance(self.demand, DemandStream):
             what = {"rows": self.demand.rows, "starved": self.demand.starved}
         else:

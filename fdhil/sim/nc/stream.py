@@ -1,28 +1,29 @@
-"""Takes a demand row by row while another NC orders it, and hands it out one row per SYNC.
+"""Receives a demand row by row from another NC and returns one row per SYNC.
 
-The rows come on another clock than the SYNC, in lumps: a short lead is kept, so that a late lump is no jerk.
+The rows arrive on another clock than the SYNC, in bursts: a short lead is buffered, so that a late burst causes no
+jerk.
 """
 
 import math
 from collections import deque
 from collections.abc import Sequence
 
-LEAD_S = 0.25  # rows kept before the first is played, and again after a hole
-LONG_REST_S = 0.5  # what is left of a longer rest is left out while rows pile up
-FULL_ROWS = 20_000  # no more is read while so many wait
+LEAD_S = 0.25  # buffered before the first row is played, and again after a gap
+LONG_REST_S = 0.5  # a longer rest is shortened while rows pile up
+FULL_ROWS = 20_000  # reading pauses while so many rows wait
 _STEP_TOLERANCE = 0.01  # of the SYNC period, between two rows
 _ROUNDING_S = 1.1e-6  # times may be written with 6 decimals
 
 
 class StreamError(ValueError):
-    """A row of the stream that cannot be played: what is wrong with it, and what the rows must be."""
+    """A row of the stream cannot be played; the message says why, and what is expected."""
 
 
 class DemandStream:
     """A demand ``time_s,X_mm,Y_mm`` that arrives by :meth:`take` and is played by :meth:`step`, until :meth:`close`.
 
-    Without a row it holds still where it is: before the first, where rows come late, and at the end. ``rows`` counts
-    those played; ``starved`` those that were missing in the midst of a motion.
+    Without a row it holds its position: before the first, where rows are late, and at the end. ``rows`` counts the
+    played rows; ``starved`` those missing during a motion.
     """
 
     def __init__(self, axes: Sequence[str], period_s: float) -> None:
@@ -38,9 +39,9 @@ class DemandStream:
         self._long_rest, self._rested = math.ceil(LONG_REST_S / period_s), 0
 
     def take(self, line: str) -> None:
-        """Take one line: first the names of the columns, then rows; StreamError when it cannot be played.
+        """Receive one line: first the column names, then rows; StreamError when it cannot be played.
 
-        That ends the stream: what follows is not looked at, for there would be a jump.
+        An error ends the stream: later lines are ignored, as they would cause a jump.
         """
         if self._closed or not line.strip():
             return
@@ -59,7 +60,7 @@ class DemandStream:
         except ValueError:
             numbers = []
         if len(numbers) != self._width or not all(map(math.isfinite, numbers)):
-            raise StreamError(f"the row {','.join(cells)[:60]!r} is not {self._width} finite numbers")
+            raise StreamError(f"the row {','.join(cells)[:60]!r} is not a list of {self._width} finite numbers")
         self._check_time(numbers[self._columns[0]])
         self._waiting.append([numbers[k] for k in self._columns[1:]])
         if not self._here:
@@ -68,7 +69,7 @@ class DemandStream:
     def _name_columns(self, cells: list[str]) -> None:
         names, wanted = [cell.strip() for cell in cells], ["time_s", *(f"{axis}_mm" for axis in self._axes)]
         if absent := [name for name in wanted if name not in names]:
-            raise StreamError(f"there is no column {', '.join(absent)}; a demand begins with {','.join(wanted)}")
+            raise StreamError(f"column {', '.join(absent)} is missing; a demand starts with {','.join(wanted)}")
         self._columns, self._width = [names.index(name) for name in wanted], len(names)
 
     def _check_time(self, time_s: float) -> None:
@@ -80,12 +81,12 @@ class DemandStream:
             )
 
     def _forget_the_past(self) -> None:
-        """Before the first row is played, a machine that stands need not be shown standing for longer than the lead."""
+        """Limit the standstill before the first row to the lead."""
         if len(self._waiting) > self._lead and self._waiting[0] == self._waiting[1]:
             self._waiting.popleft()
 
     def close(self) -> None:
-        """No more rows come; what is waiting is still played."""
+        """End the input; buffered rows are still played."""
         self._closed = True
 
     @property
@@ -94,38 +95,36 @@ class DemandStream:
 
     @property
     def start_mm(self) -> list[float] | None:
-        """The first row, once enough rows are there to begin with."""
+        """The first row, once enough rows are there to start."""
         return self._waiting[0] if self._enough else None
 
     @property
     def stands(self) -> bool:
-        """Whether it holds still until more rows come."""
+        """Whether it holds its position until more rows come."""
         return not self._closed and not self._flows and not self._enough
 
     @property
     def runs_dry(self) -> bool:
-        """Whether the next row is due, and is not there."""
         return self._flows and not self._waiting and not self._closed
 
     @property
     def full(self) -> bool:
-        """Whether so many rows wait that no more should be read."""
+        """Whether so many rows are buffered that reading should pause."""
         return len(self._waiting) >= FULL_ROWS
 
     @property
     def late(self) -> bool:
-        """Whether more rows wait than the lead: the machine is behind who orders them."""
+        """Whether more rows wait than the lead: the machine is behind the source."""
         return len(self._waiting) > self._lead
 
     @property
     def ended(self) -> bool:
-        """Whether all rows have been played."""
         return self._closed and not self._waiting
 
     def step(self, rate: float) -> tuple[list[float], bool]:
-        """Return the next row (mm per axis) or where it holds still; ``rate`` is the other NC's affair, and not used.
+        """Return the next row (mm per axis) or the held position; ``rate`` is ignored, it belongs to the other NC.
 
-        Which rows are rapids the demand does not tell: none is.
+        The demand does not mark rapids; the second value is always False.
         """
         self._flows = bool(self._waiting) and (self._flows or self._enough)
         if self._flows:

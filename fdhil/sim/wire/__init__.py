@@ -1,1 +1,1 @@
-"""The wires of the simulated machine: the CAN hub on TCP, other ways onto a bus, the Modbus sensor."""
+"""The connections of the simulated machine: the CAN hub on TCP, other bus interfaces, the Modbus sensors."""

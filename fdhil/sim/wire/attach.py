@@ -1,6 +1,6 @@
-"""Attaches the twin to a CAN bus: its own TCP hub, the kernel's SocketCAN, python-can's ``virtual``.
+"""Attaches the simulator to a CAN bus: its own TCP hub, the kernel's SocketCAN, python-can's ``virtual``.
 
-All three offer the same methods to the twin's loop; this is the only module of the twin that imports ``can``.
+All three offer the same methods to the simulator's loop; no other module of it but the fault bus imports ``can``.
 """
 
 import errno
@@ -26,27 +26,29 @@ _ERROR_FRAME, _REMOTE_FRAME = 1 << 29, 1 << 30
 
 
 def attach(name: str, bus: CanBus) -> Attachment:
-    """Attach to the bus ``[bus.name]``; ConnectError when it cannot be had."""
+    """Attach to the bus ``[bus.name]``; ConnectError when that fails."""
     if bus.interface == "socketcand":
         return Hub(bus.channel, bus.host, bus.port)
     if bus.interface == "socketcan":
         return SocketCan(name, bus)
     if bus.interface == "virtual":
         return VirtualBus(bus)
-    text = f"the simulated drives cannot be behind a {bus.interface} adapter; set interface to socketcand or socketcan"
+    text = (
+        f"the simulated drives do not support the interface {bus.interface}; set interface to socketcand or socketcan"
+    )
     raise ConnectError(f"bus {name}", text)
 
 
 def _no_bus(name: str, bus: CanBus, error: OSError) -> ConnectError:
     return ConnectError(
         f"bus {name}",
-        f"socketcan {bus.channel} cannot be opened ({error.strerror or error}): bring it up (ip link set {bus.channel} "
+        f"socketcan {bus.channel} cannot be opened ({error.strerror or error}); bring it up (ip link set {bus.channel} "
         "up), or use the socketcand interface, which needs no CAN in the kernel",
     )
 
 
 class _Joined(Attachment):
-    """A bus that is not the twin's own: it has told everybody already, and nobody can be sent away."""
+    """A bus that others operate: frames are already distributed, and no client can be disconnected."""
 
     def relay(self, frame: Frame, sender: object) -> None: ...
 
@@ -72,24 +74,24 @@ class SocketCan(_Joined):
 
     @property
     def congested(self) -> bool:
-        """Whether the kernel's transmit queue is full: the bus itself sets the pace then."""
+        """Whether the kernel's transmit queue is full: the bus itself then sets the pace."""
         return bool(self._out)
 
     def readers(self) -> Sequence[Selectable]:
         return [self._socket]
 
     def deadline_s(self) -> float | None:
-        """Soon while frames wait: a full transmit queue does not show in ``select``."""
+        """Return a near deadline while frames wait: ``select`` does not show a full transmit queue."""
         return time.monotonic() + _RETRY_S if self._out else None
 
     def pump(self, ready: Sequence[object], handler: Handler) -> None:
-        """Give every frame that has come to ``handler``: a remote frame as one without data, no error frames."""
+        """Pass every received frame to ``handler``: remote frames without data, no error frames."""
         if self._socket not in ready:
             return
         for _ in range(_FRAMES_PER_TURN):
             try:
                 can_id, length, data = _CAN_FRAME.unpack(self._socket.recv(_CAN_FRAME.size))
-            except OSError:  # nothing more, or the interface went down
+            except OSError:  # no more frames, or the interface went down
                 return
             if not can_id & _ERROR_FRAME:
                 content = b"" if can_id & _REMOTE_FRAME else data[:length]
@@ -98,11 +100,11 @@ class SocketCan(_Joined):
 
     def send(self, frames: Sequence[Frame]) -> None:
         self._out.extend(frames)
-        while len(self._out) > _MAX_WAITING:  # nobody acknowledges: the bus is off or alone
+        while len(self._out) > _MAX_WAITING:  # no node acknowledges: the bus is off or has no other node
             self._out.popleft()
 
     def flush(self, now_s: float) -> None:
-        """Send what is queued; what a full transmit queue refuses stays for the next time."""
+        """Send the queued frames; those that a full transmit queue refuses stay queued."""
         while self._out:
             can_id, data = self._out[0]
             try:
@@ -117,7 +119,7 @@ class SocketCan(_Joined):
 
 
 class VirtualBus(_Joined):
-    """python-can's ``virtual`` bus inside this process; a thread wakes the loop for what comes."""
+    """python-can's ``virtual`` bus inside this process; a thread wakes the loop for received frames."""
 
     def __init__(self, bus: CanBus) -> None:
         import can
@@ -158,7 +160,7 @@ class VirtualBus(_Joined):
         self._bus.shutdown()
 
     def _receive(self) -> None:
-        """Take frames from the bus, which has no descriptor, and wake the loop, until told to end."""
+        """Receive frames from the bus, which has no descriptor, and wake the loop, until stopped."""
         while not self._ending:
             message = self._bus.recv(0.1)
             if message is not None:

@@ -1,4 +1,4 @@
-"""Describes a CAN bus as the twin's loop sees it, and the pipe by which another thread wakes that loop."""
+"""Defines the interface between a CAN bus and the simulator's loop, and the pipe that wakes that loop."""
 
 import os
 from abc import ABC, abstractmethod
@@ -10,11 +10,11 @@ from fdhil.sim.frame import Frame
 
 Handler = Callable[[Frame], None]
 Spoil = Callable[[Frame, object], Iterable[tuple[Frame, object]]]
-"""What really comes in place of a frame, each with who sent it."""
+"""Return the frames that replace a frame, each with its sender."""
 
 
 class Selectable(Protocol):
-    """Anything that ``select`` takes."""
+    """Anything that ``select`` accepts."""
 
     def fileno(self) -> int:
         """The file descriptor."""
@@ -22,10 +22,10 @@ class Selectable(Protocol):
 
 
 class Attachment(ABC):
-    """A bus to which the twin is attached; the defaults are those of one that takes everything at once.
+    """A bus to which the simulator is attached; the defaults suit a bus that accepts all frames at once.
 
     ``settings`` are the arguments with which ``can.Bus`` joins. ``senders_left`` counts the parties that left after
-    they had sent frames, as far as the bus can tell. ``spoil`` stands between the others and the twin.
+    sending frames, as far as the bus can detect it. ``spoil`` filters the frames of other parties.
     """
 
     settings: dict[str, str | int]
@@ -34,45 +34,45 @@ class Attachment(ABC):
 
     @property
     def congested(self) -> bool:
-        """Whether the bus takes no more for the moment."""
+        """Whether the bus accepts no more frames for the moment."""
         return False
 
     @property
     def is_joined(self) -> bool:
-        """Whether anybody else is on the bus; True where that does not show."""
+        """Whether another party is on the bus; True where that is not visible."""
         return True
 
     @abstractmethod
     def readers(self) -> Sequence[Selectable]:
-        """Return those to select for reading."""
+        """Return the objects to select for reading."""
 
     def writers(self) -> Sequence[Selectable]:
-        """Return those to select for writing."""
+        """Return the objects to select for writing."""
         return ()
 
     def deadline_s(self) -> float | None:
-        """Monotonic time at which :meth:`flush` is due although nothing is ready."""
+        """Return the monotonic time at which :meth:`flush` is due although nothing is ready."""
         return None
 
     @abstractmethod
     def pump(self, ready: Sequence[object], handler: Handler) -> None:
-        """Give every frame that the other parties sent to ``handler``."""
+        """Pass every frame of the other parties to ``handler``."""
 
     @abstractmethod
     def relay(self, frame: Frame, sender: object) -> None:
-        """Let the others hear what one of them sent; nothing where the bus has done so by itself."""
+        """Pass a frame of one party on to the others, unless the bus has done so."""
 
     @abstractmethod
     def hang_up(self) -> None:
-        """Let go of everybody, where that can be done; they may join anew."""
+        """Disconnect all clients, where possible; they may reconnect."""
 
     @abstractmethod
     def send(self, frames: Sequence[Frame]) -> None:
-        """Queue frames to everybody."""
+        """Queue frames for all parties."""
 
     @abstractmethod
     def flush(self, now_s: float) -> None:
-        """Send what is queued as far as the bus takes it; ``now_s`` is monotonic."""
+        """Send the queued frames as far as the bus accepts them; ``now_s`` is monotonic."""
 
     @abstractmethod
     def close(self) -> None:
@@ -88,21 +88,18 @@ class WakePipe:
             os.set_blocking(end, False)
 
     def fileno(self) -> int:
-        """The end that becomes readable."""
         return self._ends[0]
 
     def wake(self) -> None:
-        """Make it readable; when it is full of calls already, or has just been closed, nothing is lost."""
+        """Make it readable; a full or just closed pipe is ignored."""
         with suppress(OSError):
             os.write(self._ends[1], b"\0")
 
     def clear(self) -> None:
-        """Take the calls out of it."""
         with suppress(BlockingIOError):
             os.read(self._ends[0], 4096)
 
     def close(self) -> None:
-        """Close both ends."""
-        ends, self._ends = self._ends, (-1, -1)  # what is opened next has their numbers: a late wake is not for it
+        ends, self._ends = self._ends, (-1, -1)  # their numbers may be reused: a late wake must not reach another file
         for end in ends:
             os.close(end)

@@ -1,9 +1,9 @@
-"""A python-can bus that spoils what goes over another one, by a plan: give it to ``canopen.Network`` or any program.
+"""A python-can bus that applies planned faults to another bus; use it with ``canopen.Network`` or any program.
 
 plan = [FrameFault("drop", can_ids={0x181}, way="received", percent=5, from_sync=1000)]
 bus = FaultBus(can.Bus(interface="virtual", channel="test"), plan, seed=1)
 ...
-assert bus.faults.total("drop") == what_my_program_says_it_lost
+assert bus.faults.total("drop") == frames_my_program_missed
 """
 
 import os
@@ -18,14 +18,14 @@ from fdhil.sim.frame import EXTENDED, Frame
 from fdhil.sim.frame_faults import BusRefuses, FrameFault, FrameFaults, Passed
 
 _ERROR, _REMOTE = 1 << 29, 1 << 30
-_LOOK_S = 0.02  # so often a receiver that waits looks for what is made up or late
+_LOOK_S = 0.02  # polling interval for injected and delayed frames
 
 
 class FaultBus(can.BusABC):
-    """Wraps ``bus``, which is shut down with it. ``faults`` counts what was done, and faults may be added meanwhile.
+    """Wraps ``bus``, which is shut down with it. ``faults`` counts the applied faults; faults may be added any time.
 
-    A planned error is a ``can.CanOperationError`` with its number, out of ``send`` or ``recv``. What is sent
-    periodically goes through the plan, too.
+    A planned error is a ``can.CanOperationError`` with its number, raised by ``send`` or ``recv``. Periodic messages go
+    through the plan, too.
     """
 
     def __init__(self, bus: can.BusABC, plan: Sequence[FrameFault] = (), seed: int = 0) -> None:
@@ -37,7 +37,7 @@ class FaultBus(can.BusABC):
         super().__init__(channel=self.channel_info)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send what the plan makes of a message."""
+        """Send the message as changed by the plan."""
         now_s = time.monotonic()
         with self._lock:
             passed = self._planned(msg, sent=True, now_s=now_s) + self.faults.due("sent", now_s)
@@ -72,7 +72,6 @@ class FaultBus(can.BusABC):
             raise can.CanOperationError(os.strerror(error.number), error.number) from None
 
     def shutdown(self) -> None:
-        """Leave the bus."""
         super().shutdown()
         self._bus.shutdown()
 

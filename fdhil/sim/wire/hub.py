@@ -1,12 +1,12 @@
-"""Serves a CAN bus on TCP in the text protocol of socketcand, so that any python-can program joins the bus.
+"""Serves a CAN bus on TCP in the text protocol of socketcand, so that any python-can program can join the bus.
 
     client -> hub   < open can0 >   < rawmode >   < echo >   < send 181 2 a ff >
     hub -> client   < hi >          < ok >        < ok >     < frame 181 1700000000.000000 0AFF >
 
-What a client sends reaches every other client and the twin; nobody hears himself, as on SocketCAN. Every frame is
-padded with blanks inside its brackets to 64 bytes: python-can reads 1024 bytes at a time, so a whole number of frames
-fits and none is torn. Nothing is lost: each client has a queue, and while one queue is full the hub takes no frames
-from anyone and says so (:attr:`Hub.congested`); a client that reads nothing for ``STALL_S`` is then disconnected.
+A client's frames reach every other client and the simulator, but not the client itself, as on SocketCAN. Every frame is
+padded with blanks inside its brackets to 64 bytes: python-can reads 1024 bytes at a time, so that no frame is split.
+Nothing is lost: each client has a queue, and while one queue is full the hub accepts no frames from anyone and reports
+it (:attr:`Hub.congested`); a client that reads nothing for ``STALL_S`` is then disconnected.
 """
 
 import errno
@@ -57,7 +57,7 @@ def decode_send(command: bytes) -> Frame | None:
 
 @dataclass(slots=True, eq=False)
 class _Client:
-    """One connection; ``raw`` once it hears frames."""
+    """One connection; ``raw`` once it receives frames."""
 
     socket: socket.socket
     inbox: bytearray = field(default_factory=bytearray)
@@ -70,11 +70,11 @@ class _Client:
 
 
 class Hub(Attachment):
-    """The bus ``channel`` on a TCP port of ``host``, port 0 for any free one; ConnectError when it cannot be had.
+    """The bus ``channel`` on a TCP port of ``host``, port 0 for any free one; ConnectError when it cannot be opened.
 
     Not thread-safe: one loop selects on :meth:`readers` and :meth:`writers`, calls :meth:`pump`, then :meth:`flush`.
-    ``lost_clients`` counts those that were disconnected because they read nothing, ``senders_left`` those that are gone
-    after they had sent frames, ``malformed`` what was no command.
+    ``lost_clients`` counts the clients disconnected because they read nothing, ``senders_left`` those that left after
+    sending frames, ``malformed`` the invalid commands.
     """
 
     def __init__(self, channel: str, host: str = "127.0.0.1", port: int = 0, queue_bytes: int = QUEUE_BYTES) -> None:
@@ -92,7 +92,7 @@ class Hub(Attachment):
             self._listener.close()
             raise ConnectError(
                 f"bus {channel}",
-                f"TCP port {port} of {host} cannot be had ({error.strerror or error}): end the program that holds it, "
+                f"TCP port {port} of {host} cannot be opened ({error.strerror or error}); end its program, "
                 "or set another port (0 lets the simulator choose one)",
             ) from None
         self._listener.setblocking(False)
@@ -101,7 +101,7 @@ class Hub(Attachment):
 
     @property
     def congested(self) -> bool:
-        """Whether a client's queue is full: produce nothing more until it has been read."""
+        """Whether a client's queue is full: no more frames may be produced until it has been read."""
         return any(len(client.outbox) > self._queue_bytes for client in self._clients)
 
     @property
@@ -110,18 +110,17 @@ class Hub(Attachment):
 
     @property
     def clients(self) -> int:
-        """How many clients hear the bus."""
         return sum(client.raw for client in self._clients)
 
     def readers(self) -> list[socket.socket]:
         return [self._listener] if self.congested else [self._listener, *(c.socket for c in self._clients)]
 
     def writers(self) -> list[socket.socket]:
-        """Sockets to select for writing: those whose queue could not be sent at once."""
+        """Return the sockets to select for writing: those with data in the queue."""
         return [client.socket for client in self._clients if client.outbox]
 
     def pump(self, ready: Sequence[object], handler: Handler) -> None:
-        """Read the sockets among ``ready``; each frame goes to the other clients, then to ``handler``, in turn."""
+        """Read the sockets among ``ready``; each frame goes to the other clients, then to ``handler``, in order."""
         if self._listener in ready:
             self._accept()
         for client in tuple(self._clients):
@@ -137,7 +136,6 @@ class Hub(Attachment):
             client.gone = True
 
     def send(self, frames: Sequence[Frame], sender: object = None) -> None:
-        """Queue frames to every client but the sender."""
         if not self._clients:
             return
         text = encode(frames, time.time())
@@ -165,7 +163,7 @@ class Hub(Attachment):
     def _accept(self) -> None:
         try:
             connection, _ = self._listener.accept()
-        except OSError as error:  # the client has already gone, or no descriptor is left
+        except OSError as error:  # the client has left already, or descriptors are exhausted
             if error.errno not in _ONE_MORE and error.errno not in (errno.ECONNABORTED, errno.EMFILE):
                 raise
             return
@@ -178,7 +176,7 @@ class Hub(Attachment):
     def _read(self, client: _Client, handler: Handler) -> None:
         try:
             chunk = client.socket.recv(_CHUNK)
-            # the stock client leaves Nagle on: without the acknowledgement its next frame waits for 40 ms
+            # the stock client leaves Nagle on: without a quick acknowledgement its next frame is delayed by 40 ms
             client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
         except OSError as error:
             client.gone = error.errno not in _ONE_MORE
@@ -191,7 +189,7 @@ class Hub(Attachment):
         client.inbox = bytearray(rest)
         for command in commands:
             self._command(client, command, handler)
-        if len(client.inbox) > _MAX_COMMAND:  # whatever this is, it does not speak the protocol
+        if len(client.inbox) > _MAX_COMMAND:  # not a client of this protocol
             self.malformed += 1
             client.gone = True
 
@@ -210,7 +208,7 @@ class Hub(Attachment):
             self._greet(client, [word.decode("ascii", "replace") for word in command.split()[1:]])
 
     def _greet(self, client: _Client, words: list[str]) -> None:
-        """Answer what leads to raw mode; the answers stand before any frame in the queue."""
+        """Answer the commands that lead to raw mode; the answers precede any frame in the queue."""
         answer = b"< ok >"
         if words == ["open", self.channel] and not client.opened:
             client.opened = True
@@ -230,10 +228,10 @@ class Hub(Attachment):
         client.outbox += answer
 
     def _fence(self, client: _Client) -> None:
-        """Keep the frames out of the recv that takes the last greeting, however late the client comes to it.
+        """Keep the frames out of the recv that reads the last greeting, however late the client calls it.
 
-        The stock client takes each greeting with one recv and wants nothing else in it. A recv never reads across
-        the mark of urgent data (RFC 6093), and the urgent byte itself does not appear in the stream.
+        The stock client reads each greeting with one recv and expects nothing else in it. A recv never reads across the
+        mark of urgent data (RFC 6093), and the urgent byte itself does not appear in the stream.
         """
         with suppress(OSError):
             client.socket.send(b" ", socket.MSG_OOB)

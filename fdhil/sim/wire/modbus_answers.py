@@ -1,4 +1,4 @@
-"""What a simulated Modbus unit answers, over TCP and on a serial line alike, and how its faults spoil that. Pure.
+"""Builds the answers of a simulated Modbus unit, over TCP and serial lines alike, and applies their faults. Pure.
 
 Source: MODBUS application protocol V1.1b3, 6.3, 6.4, 6.6, 6.12 and 7.
 """
@@ -15,7 +15,7 @@ _MOST_REGISTERS = 125
 _ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS, _ILLEGAL_VALUE = 1, 2, 3
 
 Seal = Callable[[int, bytes], bytes]
-"""Makes the frame of a unit's answer, as it goes over the wire."""
+"""Return the frame of a unit's answer on the wire."""
 
 
 def answer(registers: RegisterMap, faults: SensorFaults, body: bytes) -> bytes:
@@ -53,7 +53,7 @@ def _refusal(function: int, code: int) -> bytes:
 
 
 def spoilt(faults: SensorFaults, seal: Seal, unit: int, body: bytes) -> list[bytes]:
-    """Return the pieces in which an answer goes over the wire, with a pause between them; [] for none at all."""
+    """Return the pieces of an answer, to be sent with a pause between them; [] for no answer."""
     before, faults.before = faults.before, (seal, unit, body)
     if faults.silent:
         return []
@@ -70,7 +70,7 @@ def spoilt(faults: SensorFaults, seal: Seal, unit: int, body: bytes) -> list[byt
 
 
 def _torn(unit: int, body: bytes, before: bytes) -> tuple[int, bytes]:
-    """Every second register is still that of the answer before: the words of one number are of two moments."""
+    """Take every second register from the previous answer: the words of a number are of two instants."""
     if body[0] not in _READS or len(before) != len(body):
         return unit, body
     words = [before[at : at + 2] if at // 2 % 2 else body[at : at + 2] for at in range(2, len(body), 2)]

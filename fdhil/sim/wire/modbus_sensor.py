@@ -1,4 +1,4 @@
-"""The separate voltage sensor of an axis, with a small sample memory that can be latched.
+"""Simulates the separate voltage sensor of an axis, with a small sample memory that can be latched.
 
 Its own registers, 16 bit, 32 bit values in two with the high word first, the same as input (fc 4) and holding ones (3):
 
@@ -18,49 +18,46 @@ from collections import deque
 
 import numpy as np
 
+from fdhil.sim.signal_fault import WhiteNoise
 from fdhil.sim.wire.sensor_faults import SensorFaults
 
 REGISTERS = 116
 BLOCK = 100
 TRIGGER, STATUS, FIRST_SAMPLE = 10, 11, 16
-_NOISE_BLOCK = 1024
 
 
 class VoltageSensor:
-    """Registers and sample memory of one sensor; :meth:`feed` and the reading thread may run at the same time."""
+    """Registers and sample memory of one sensor; :meth:`feed` and the reading thread may run concurrently."""
 
     def __init__(
         self, rate_hz: float, limit_v: float, noise_v: float, rng: np.random.Generator, cycles: int = 1
     ) -> None:
-        """Make a sensor of which a sample is the mean over ``cycles`` means that it is fed."""
+        """Create a sensor whose samples are means over ``cycles`` fed values."""
         self.faults = SensorFaults()
         self._cycles, self._sum_v, self._summed = cycles, 0.0, 0
         self.celsius = 20.0
         self.rate_hz = rate_hz
         self.volts_per_count = max(0.01, round(1.05 * limit_v / 32767, 4))
-        self._noise_v, self._rng = noise_v, rng
-        self._noise: list[float] = []
+        self._noise, self._rng = WhiteNoise(noise_v, rng), rng
         self._lock = threading.Lock()
         self._recent: deque[float] = deque(maxlen=BLOCK)
         self._count = 0  # samples so far
-        self._latched = 0  # samples that were latched or lost
+        self._latched = 0  # samples latched or lost
         self._block = [0] * (REGISTERS - STATUS)
 
     def feed(self, mean_v: float) -> None:
-        """Take the mean terminal voltage of one cycle; the last of a sample's cycles makes the sample."""
+        """Add the mean terminal voltage of one cycle; the last cycle of a sample completes it."""
         self._sum_v, self._summed = self._sum_v + mean_v, self._summed + 1
         if self._summed < self._cycles:
             return
         mean_v, self._sum_v, self._summed = self._sum_v / self._cycles, 0.0, 0
-        if not self._noise:
-            self._noise = (self._rng.standard_normal(_NOISE_BLOCK) * self._noise_v).tolist()
-        value = self.faults.signal.apply(mean_v + self._noise.pop(), self._rng)
+        value = self.faults.signal.apply(mean_v + self._noise.draw(), self._rng)
         with self._lock:
             self._recent.append(value)
             self._count += 1
 
     def latch(self) -> None:
-        """Put the newest samples that were not latched before into the block, at most 100."""
+        """Copy the newest samples not latched before into the block, at most 100."""
         with self._lock:
             fresh = self._count - self._latched
             number = min(fresh, len(self._recent))
@@ -73,7 +70,6 @@ class VoltageSensor:
         self._block = header + counts + [0] * (BLOCK - number)
 
     def registers(self) -> list[int]:
-        """Return all registers as they read now."""
         with self._lock:
             newest, count = (self._recent[-1] if self._recent else 0.0), max(self._count - 1, 0)
         head = struct.pack(">fIfff", newest, count & 0xFFFFFFFF, self.rate_hz, self.volts_per_count, self.celsius)
@@ -82,11 +78,10 @@ class VoltageSensor:
     trigger: int | None = TRIGGER
 
     def words(self) -> dict[int, int]:
-        """Return all registers by address."""
         return dict(enumerate(self.registers()))
 
     def newest(self, number: int) -> tuple[int, list[float]]:
-        """Return how many samples there were so far, and at most ``number`` of the newest, the oldest first."""
+        """Return the number of samples so far, and up to ``number`` of the newest, the oldest first."""
         with self._lock:
             return self._count, list(self._recent)[-number:]
 

@@ -1,4 +1,4 @@
-"""Serves simulated sensors by Modbus TCP, in a thread of their own.
+"""Serves simulated sensors by Modbus TCP, in their own thread.
 
 Source: MODBUS messaging on TCP/IP implementation guide V1.0b, 3.1.
 """
@@ -29,7 +29,7 @@ _Conversation = Callable[[asyncio.StreamReader, asyncio.StreamWriter, _Units], A
 class SensorServers:
     """The Modbus TCP servers of a machine, in one thread; ``ports`` by axis once :meth:`start` has returned.
 
-    Any unit identifier is answered, as TCP sensors do, but behind a gateway.
+    Any unit identifier is answered, as TCP sensors do, except behind a gateway.
     """
 
     def __init__(
@@ -40,9 +40,9 @@ class SensorServers:
         units: Mapping[str, int] | None = None,
         over_rtu: frozenset[str] = frozenset(),
     ) -> None:
-        """Serve the sensors that have an address, each with the registers of ``maps`` in place of its own.
+        """Serve the sensors that have an address, with the registers of ``maps`` in place of their own.
 
-        Those with one address are behind a gateway: each answers to its own number of ``units`` only. Those of
+        Sensors that share an address are behind a gateway: each answers to its own number of ``units`` only. Those of
         ``over_rtu`` are behind a serial server, which passes RTU frames.
         """
         self._over_rtu = over_rtu
@@ -54,7 +54,7 @@ class SensorServers:
         self.ports: dict[str, int] = {}
 
     def start(self) -> None:
-        """Open every port; ConnectError when one cannot be had."""
+        """Open every port; ConnectError when one cannot be opened."""
         self._thread.start()
         try:
             asyncio.run_coroutine_threadsafe(self._open(), self._loop).result()
@@ -63,7 +63,6 @@ class SensorServers:
             raise
 
     def stop(self) -> None:
-        """Close every port and end the thread."""
         asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
@@ -79,14 +78,13 @@ class SensorServers:
             self.ports |= dict.fromkeys(axes, port)
 
     def _gateways(self) -> list[list[str]]:
-        """Return the axes by the server that they share; a port that is yet to be chosen is nobody else's."""
+        """Return the axes by shared server; port 0 is never shared."""
         shared: dict[tuple[str, int | str], list[str]] = {}
         for axis, (host, port) in self._addresses.items():
             shared.setdefault((host, port or axis), []).append(axis)
         return list(shared.values())
 
     async def _serve(self, axes: list[str]) -> int:
-        """Serve the units of one address and return its port; ConnectError."""
         host, port = self._addresses[axes[0]]
         units = {
             self._units[axis] if len(axes) > 1 else ANY_UNIT: (self._maps[axis], self._sensors[axis].faults)
@@ -100,7 +98,7 @@ class SensorServers:
         except OSError:
             raise ConnectError(
                 f"voltage sensor {axes[0]}",
-                f"TCP port {port} of {host} cannot be had: end the program that holds it, or set "
+                f"TCP port {port} of {host} cannot be opened; end the program that uses it, or set "
                 f"axis.{axes[0]}.voltage.port to another one (0 lets the simulator choose one)",
             ) from None
         self._servers.append(server)
@@ -113,7 +111,7 @@ class SensorServers:
         try:
             await converse(reader, writer, units)
         except (asyncio.IncompleteReadError, OSError, asyncio.CancelledError):
-            return  # it has gone, or this machine ends
+            return  # the client has left, or the simulator stops
         finally:
             writer.close()
 
@@ -127,7 +125,7 @@ class SensorServers:
 
 
 async def _pass_frames(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, units: _Units) -> None:
-    """Pass what comes to units on a serial line, and what they answer back, until the client leaves."""
+    """Pass requests to units on a serial line, and their answers back, until the client leaves."""
     line = RtuUnits()
     line.units = dict(units)
     while data := await reader.read(_MOST_BYTES):
@@ -135,14 +133,18 @@ async def _pass_frames(reader: asyncio.StreamReader, writer: asyncio.StreamWrite
         if (due_s := line.due_s()) < float("inf"):
             await asyncio.sleep(due_s - time.monotonic())
             pieces = line.tell()
-        for place, piece in enumerate(pieces):
-            await asyncio.sleep(_PIECES_S if place else 0.0)
-            writer.write(piece)
-            await writer.drain()
+        await _write_pieces(writer, pieces)
+
+
+async def _write_pieces(writer: asyncio.StreamWriter, pieces: list[bytes]) -> None:
+    for n, piece in enumerate(pieces):
+        await asyncio.sleep(_PIECES_S if n else 0.0)
+        writer.write(piece)
+        await writer.drain()
 
 
 async def _converse(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, units: _Units) -> None:
-    """Answer the requests of one client, one after the other, until it leaves or speaks no Modbus."""
+    """Answer the requests of one client in order, until it leaves or violates the protocol."""
     while True:
         transaction, protocol, size, unit = _HEADER.unpack(await reader.readexactly(_HEADER.size))
         if protocol != 0 or not 2 <= size <= _MOST_BYTES:
@@ -156,10 +158,7 @@ async def _converse(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, 
             registers, faults = served
             await asyncio.sleep(faults.slow_s)
             pieces = spoilt(faults, seal, unit, answer(registers, faults, request))
-        for place, piece in enumerate(pieces):
-            await asyncio.sleep(_PIECES_S if place else 0.0)
-            writer.write(piece)
-            await writer.drain()
+        await _write_pieces(writer, pieces)
 
 
 def _framing(transaction: int) -> Seal:

@@ -1,6 +1,6 @@
-"""What the registers of the simulated sensors hold: words by address, for whichever server they are read through.
+"""Builds the register contents of the simulated sensors: words by address, for any server.
 
-Written from the keys of the configuration as a maker of such a device would: numbers are packed here with ``struct``.
+Written from the configuration keys as a device maker would: numbers are packed here with ``struct``.
 """
 
 import math
@@ -20,7 +20,7 @@ class Samples(Protocol):
     celsius: float
 
     def newest(self, number: int) -> tuple[int, list[float]]:
-        """Return how many samples there were so far, and at most ``number`` of the newest (V), the oldest first."""
+        """Return the number of samples so far, and up to ``number`` of the newest (V), the oldest first."""
 
 
 class RegisterMap(Protocol):
@@ -29,14 +29,14 @@ class RegisterMap(Protocol):
     trigger: int | None
 
     def words(self) -> dict[int, int]:
-        """Return all registers as they read now, by address."""
+        """Return the present content of all registers, by address."""
 
     def latch(self) -> None:
-        """The trigger was written."""
+        """Latch the samples: the trigger was written."""
 
 
 def packed(value: float, kind: str, word_order: str, byte_order: str = "big") -> list[int]:
-    """Return a number as registers; a whole number stops at the ends of its type, as a converter does."""
+    """Return a number as registers; an integer saturates at the ends of its type, as in a converter."""
     if not kind.startswith("float"):
         bits = 8 * struct.calcsize(_FORMATS[kind])
         low, high = (0, 2**bits - 1) if kind.startswith("u") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
@@ -47,7 +47,7 @@ def packed(value: float, kind: str, word_order: str, byte_order: str = "big") ->
 
 
 def _placed(address: int, words: list[int]) -> dict[int, int]:
-    return {address + place: word for place, word in enumerate(words)}
+    return {address + n: word for n, word in enumerate(words)}
 
 
 class OneValue:
@@ -59,17 +59,16 @@ class OneValue:
         self._settings, self._kind, self._read = settings, kind, read
 
     def words(self) -> dict[int, int]:
-        """Return the registers of the number."""
         settings = self._settings
         raw = (self._read() - settings.offset) / settings.scale
         return _placed(settings.address, packed(raw, self._kind, settings.word_order, settings.byte_order))
 
     def latch(self) -> None:
-        """There is nothing to latch."""
+        """Do nothing: there are no samples to latch."""
 
 
 class Block:
-    """A device that keeps its newest samples by number, at the registers of ``[axis.X.voltage.block]``."""
+    """A device that keeps its newest samples with a counter, at the registers of ``[axis.X.voltage.block]``."""
 
     def __init__(self, settings: Voltage, block: VoltageBlock, kind: str, samples: Samples) -> None:
         self.trigger = block.trigger_address
@@ -77,7 +76,7 @@ class Block:
         self._latched: dict[int, int] | None = None
 
     def words(self) -> dict[int, int]:
-        """Return the registers of samples, count and number."""
+        """Return the registers of samples, counter and number of samples."""
         if self.trigger is None:
             return self._now()
         if self._latched is None:
@@ -85,45 +84,42 @@ class Block:
         return {**(self._latched or {}), self.trigger: 0}
 
     def latch(self) -> None:
-        """Put the newest samples into the block."""
         self._latched = self._now()
 
     def _now(self) -> dict[int, int]:
         settings, block = self._settings, self._block
         count, volts = self._samples.newest(block.samples)
-        held = volts[::-1] if block.newest_first else volts
-        raw = [(v - settings.offset) / settings.scale for v in held]
+        ordered = volts[::-1] if block.newest_first else volts
+        raw = [(v - settings.offset) / settings.scale for v in ordered]
         numbers = [word for v in raw for word in packed(v, self._kind, settings.word_order, settings.byte_order)]
         size = block.samples * struct.calcsize(_FORMATS[self._kind]) // 2
         words = _placed(settings.address, numbers + [0] * (size - len(numbers)))
-        told = (count - 1 if block.counter_of == "newest" else count - len(volts)) % (1 << 32)
-        told %= 1 << 8 * struct.calcsize(_FORMATS[block.counter_type])
-        number = packed(told, block.counter_type, settings.word_order, settings.byte_order)
-        words |= _placed(block.counter_address, number)
+        number = (count - 1 if block.counter_of == "newest" else count - len(volts)) % (1 << 32)
+        number %= 1 << 8 * struct.calcsize(_FORMATS[block.counter_type])
+        counter = packed(number, block.counter_type, settings.word_order, settings.byte_order)
+        words |= _placed(block.counter_address, counter)
         if block.count_address is not None:
             words[block.count_address] = len(volts)
-        return dict.fromkeys(range(min(words), max(words)), 0) | words  # one request reads them all
+        return dict.fromkeys(range(min(words), max(words)), 0) | words  # gaps read as 0: one request reads all
 
 
 class Joined:
-    """Several maps in one unit; where two have a register the later one's is read."""
+    """Several maps in one unit; a later map overrides the registers of an earlier one."""
 
     def __init__(self, *maps: RegisterMap) -> None:
         self._maps = maps
         self.trigger = next((one.trigger for one in maps if one.trigger is not None), None)
 
     def words(self) -> dict[int, int]:
-        """Return all registers."""
         return {address: word for one in self._maps for address, word in one.words().items()}
 
     def latch(self) -> None:
-        """Latch them all."""
         for one in self._maps:
             one.latch()
 
 
 def map_of(settings: Voltage, own: RegisterMap, samples: Samples) -> RegisterMap:
-    """Return the registers that a voltage sensor with these settings has; ``own`` are those that fdhil invented."""
+    """Return the registers of a voltage sensor with these settings; ``own`` are those of fdhil's own sensor."""
     if settings.source != "modbus" or settings.type is None:
         return own
     if settings.block is not None:
@@ -132,5 +128,4 @@ def map_of(settings: Voltage, own: RegisterMap, samples: Samples) -> RegisterMap
 
 
 def thermometer_map(settings: Thermometer, samples: Samples) -> RegisterMap:
-    """Return the registers of a thermometer."""
     return OneValue(settings, settings.type, lambda: samples.celsius)

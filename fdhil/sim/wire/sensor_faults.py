@@ -1,4 +1,4 @@
-"""What can be wrong with a simulated sensor, whichever wire it is on."""
+"""Defines the faults of a simulated sensor, on any connection."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,9 +11,12 @@ Answered = tuple[Callable[[int, bytes], bytes], int, bytes]
 
 @dataclass(slots=True)
 class SensorFaults:
-    """Errors of a sensor: ``silent`` answers nothing, ``slow_s`` answers late, ``exception`` answers every
-    request with this code, ``signal`` spoils the samples (V), ``answers`` which percentage of its answers is spoilt
-    how. ``before`` is the answer before: how it was framed, its unit, function and data."""
+    """Errors of a sensor.
+
+    ``silent``: no answers. ``slow_s``: late answers. ``exception``: this code in every answer. ``signal``: errors of
+    the samples (V). ``answers``: the percentage of answers with each kind of fault. ``before``: the previous answer,
+    with its framing, unit, function and data.
+    """
 
     silent: bool = False
     slow_s: float = 0.0

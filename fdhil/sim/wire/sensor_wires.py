@@ -1,4 +1,4 @@
-"""Connects the sensors of the simulated machine as its configuration has them: Modbus TCP and RTU, lines of text."""
+"""Connects the sensors of the simulated machine as configured: Modbus TCP and RTU, lines of text."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -12,20 +12,20 @@ from fdhil.sim.wire.serial_lines import Party, RtuUnits, SerialLines, TextInstru
 
 
 class SensorWires:
-    """All sensors of a machine; ``ready`` says by axis where each voltage sensor is, once :meth:`start` has returned.
+    """All sensors of a machine; ``ready`` has the connection of each voltage sensor once :meth:`start` has returned.
 
-    A drive's axis whose voltage comes from the drive has a sensor on Modbus TCP all the same. A thermometer, or a table
-    encoder on Modbus, is served where its device is: on a serial line, or within the unit of the voltage sensor at the
-    same address. ``places`` tell where the tables are, mm.
+    An axis whose voltage comes from its drive has a sensor on Modbus TCP as well. A thermometer, or a table encoder on
+    Modbus, is served where its device is: on a serial line, or within the unit of the voltage sensor at the same
+    address. ``positions`` return the table positions, mm.
     """
 
     def __init__(
         self,
         config: MachineConfig,
         sensors: Mapping[str, VoltageSensor],
-        places: Mapping[str, Callable[[], float]] | None = None,
+        positions: Mapping[str, Callable[[], float]] | None = None,
     ) -> None:
-        self._config, self._sensors, self._places = config, sensors, places or {}
+        self._config, self._sensors, self._positions = config, sensors, positions or {}
         self._parties: dict[str, Party] = {}
         maps, addresses = {}, {}
         for axis, sensor in sensors.items():
@@ -44,7 +44,7 @@ class SensorWires:
                 registers = Joined(registers, thermometer_map(thermometer, sensor))
             there = table is not None and (table.host, table.port) == (voltage.host, voltage.port)
             if table is not None and there and table.source == "modbus" and not table.device:
-                registers = Joined(registers, OneValue(table, table.type, self._places[axis]))
+                registers = Joined(registers, OneValue(table, table.type, self._positions[axis]))
             maps[axis], addresses[axis] = registers, (voltage.host, voltage.port)
         units = {axis: config.axis[axis].voltage.unit for axis in addresses}
         over_rtu = frozenset(axis for axis in addresses if config.axis[axis].voltage.is_rtu)
@@ -54,24 +54,24 @@ class SensorWires:
 
     def _on_a_line(self, axis: str, settings: Any) -> None:
         sensor = self._sensors[axis]
-        is_warmth = isinstance(settings, Thermometer)
+        is_thermometer = isinstance(settings, Thermometer)
         if settings.source == "serial":
-            read = (lambda: sensor.celsius) if is_warmth else (lambda: (sensor.newest(1)[1] or [0.0])[0])
+            read = (lambda: sensor.celsius) if is_thermometer else (lambda: (sensor.newest(1)[1] or [0.0])[0])
             self._parties[settings.device] = TextInstrument(settings, read, sensor.faults)
             return
         party = self._parties.setdefault(settings.device, RtuUnits())
-        assert isinstance(party, RtuUnits)  # the configuration has text alone on its device
+        assert isinstance(party, RtuUnits)  # the configuration allows no other sensor on a text device
         registers: RegisterMap
         if isinstance(settings, TableEncoder):
-            registers = OneValue(settings, settings.type, self._places[axis])
+            registers = OneValue(settings, settings.type, self._positions[axis])
         else:
-            registers = thermometer_map(settings, sensor) if is_warmth else map_of(settings, sensor, sensor)
+            registers = thermometer_map(settings, sensor) if is_thermometer else map_of(settings, sensor, sensor)
         if settings.unit in party.units:
             registers = Joined(party.units[settings.unit][0], registers)
         party.units[settings.unit] = registers, sensor.faults
 
     def start(self) -> None:
-        """Open every port and device; ConnectError when one cannot be had."""
+        """Open every port and device; ConnectError when one cannot be opened."""
         self._tcp.start()
         try:
             if self._lines is not None:
@@ -91,7 +91,6 @@ class SensorWires:
                 self.ready[axis] = {"device": voltage.device, "unit": voltage.unit}
 
     def stop(self) -> None:
-        """Close every port and take the devices away."""
         if self._lines is not None:
             self._lines.stop()
         self._tcp.stop()

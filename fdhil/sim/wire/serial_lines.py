@@ -1,7 +1,7 @@
-"""Serves simulated sensors on pseudo terminals: Modbus RTU units on one line, or an instrument that tells lines.
+"""Serves simulated sensors on pseudo terminals: Modbus RTU units on one line, or an instrument that sends lines.
 
-``device`` of the configuration becomes a link to the pseudo terminal, so that a program opens it as it would open an
-adapter. The lines are served in a thread of their own.
+The configured ``device`` becomes a link to the pseudo terminal, so that a program opens it like an adapter. The lines
+are served in their own thread.
 """
 
 from __future__ import annotations
@@ -30,35 +30,35 @@ from fdhil.sim.wire.sensor_faults import SensorFaults
 _REQUEST, _SHORTEST, _LONGEST = 8, 4, 256
 _TURN_S = 0.25
 _PIECES_S = 0.005
-_FRAME_END_S = 0.02  # so long a silence ends a frame, whatever of it has come
+_FRAME_END_S = 0.02  # a pause of this length ends a frame
 
 
 class Party(Protocol):
-    """What is connected to a line."""
+    """A participant on a serial line."""
 
     def take(self, data: bytes) -> list[bytes]:
-        """Take what came and return the pieces of what is answered; none while there is nothing to say."""
+        """Process received bytes and return the pieces of the answer, if any."""
 
     def due_s(self) -> float:
-        """Return when (monotonic) it tells something by itself; infinite: never."""
+        """Return when (monotonic) it sends something unprompted; infinite: never."""
 
     def tell(self) -> list[bytes]:
-        """Return the pieces of what it tells by itself now."""
+        """Return the pieces that it sends unprompted now."""
 
 
 class RtuUnits:
-    """Modbus RTU units by number; each answers as one on Modbus TCP does, as its faults allow."""
+    """Modbus RTU units by number; each answers like one on Modbus TCP, subject to its faults."""
 
     def __init__(self) -> None:
         self.units: dict[int, tuple[RegisterMap, SensorFaults]] = {}
-        self._begun = b""
+        self._buffer = b""
         self._last_s = 0.0
         self._late: deque[tuple[float, list[bytes]]] = deque()
 
     def take(self, data: bytes) -> list[bytes]:
-        """Answer a whole request; what another unit is asked is not heard."""
+        """Answer a complete request; requests to other units are ignored."""
         now_s = time.monotonic()
-        self._begun = data if now_s - self._last_s > _FRAME_END_S else self._begun + data
+        self._buffer = data if now_s - self._last_s > _FRAME_END_S else self._buffer + data
         self._last_s = now_s
         request = self._whole_request()
         if not request or request[0] not in self.units:
@@ -71,21 +71,19 @@ class RtuUnits:
         return []
 
     def _whole_request(self) -> bytes:
-        """Return a request that has come whole, with whichever function; empty while there is none."""
-        for size in (_REQUEST, len(self._begun)):
-            request = self._begun[:size]
+        """Return a complete request with any function; empty while there is none."""
+        for size in (_REQUEST, len(self._buffer)):
+            request = self._buffer[:size]
             if len(request) == size >= _SHORTEST and _sealed(request[:-2]) == request:
-                self._begun = self._begun[size:]
+                self._buffer = self._buffer[size:]
                 return request
-        self._begun = self._begun[-_LONGEST:]
+        self._buffer = self._buffer[-_LONGEST:]
         return b""
 
     def due_s(self) -> float:
-        """Return when an answer that is late comes."""
         return self._late[0][0] if self._late else float("inf")
 
     def tell(self) -> list[bytes]:
-        """Return the answer that was late."""
         return self._late.popleft()[1] if self._late else []
 
 
@@ -98,28 +96,26 @@ def _sealed(frame: bytes) -> bytes:
 
 
 class TextInstrument:
-    """An instrument that tells its value in a line: when it is asked, or every period by itself."""
+    """An instrument that sends its value as a line: on request, or periodically."""
 
     def __init__(self, settings: Voltage | Thermometer, read: Reading, faults: SensorFaults) -> None:
         self._settings, self._read, self._faults = settings, read, faults
         self._query = settings.query.encode()
-        self._heard = b""
+        self._buffer = b""
         self._next_s = float("inf") if settings.query else time.monotonic()
 
     def take(self, data: bytes) -> list[bytes]:
-        """Answer each whole question."""
         if not self._query:
             return []
-        *questions, self._heard = (self._heard + data).split(self._query)
+        *questions, self._buffer = (self._buffer + data).split(self._query)
         return [line for _ in questions for line in self.tell()]
 
     def due_s(self) -> float:
-        """Return when the next line is due."""
         return self._next_s
 
     def tell(self) -> list[bytes]:
         """Return a line; nothing while it is silent."""
-        while not self._query and self._next_s <= time.monotonic():  # what a busy computer missed is not told
+        while not self._query and self._next_s <= time.monotonic():  # lines missed on a busy host are skipped
             self._next_s += self._settings.period_s
         if self._faults.silent:
             return []
@@ -128,13 +124,13 @@ class TextInstrument:
 
 
 class Reading(Protocol):
-    """Returns what an instrument measures now."""
+    """Returns the present value of an instrument."""
 
     def __call__(self) -> float: ...
 
 
 class _Terminal:
-    """One line: a pseudo terminal that ``device`` leads to."""
+    """One line: a pseudo terminal linked as ``device``."""
 
     def __init__(self, device: str, party: Party) -> None:
         self.party = party
@@ -144,13 +140,15 @@ class _Terminal:
         os.set_blocking(self.fd, False)
         try:
             if self._link.is_symlink() and not self._link.exists():
-                self._link.unlink()  # of a simulator that was killed
+                self._link.unlink()  # left by a killed simulator
             self._link.symlink_to(os.ttyname(self._far))
         except OSError as error:
             os.close(self.fd)
             os.close(self._far)
-            text = f"{device} cannot be made ({error.strerror}): the simulator makes the device that the config names; "
-            raise ConnectError("serial sensor", text + "name one that is not there yet, in a folder that is") from None
+            text = (
+                f"{device} cannot be created ({error.strerror}); the simulator creates the device named in the config: "
+            )
+            raise ConnectError("serial sensor", text + "choose an unused name in an existing folder") from None
 
     def read(self) -> None:
         with contextlib.suppress(OSError):
@@ -160,7 +158,7 @@ class _Terminal:
         for place, piece in enumerate(pieces):
             if place:
                 time.sleep(_PIECES_S)
-            with contextlib.suppress(OSError):  # nobody reads: what does not fit is lost, as on a line
+            with contextlib.suppress(OSError):  # without a reader, excess data is lost, as on a real line
                 os.write(self.fd, piece)
 
     def close(self) -> None:
@@ -171,7 +169,7 @@ class _Terminal:
 
 
 class SerialLines:
-    """The serial lines of a machine, in one thread, by the device that leads to each."""
+    """The serial lines of a machine, in one thread, by device."""
 
     def __init__(self, parties: Mapping[str, Party]) -> None:
         self._parties = parties
@@ -180,7 +178,7 @@ class SerialLines:
         self._thread = threading.Thread(target=self._run, name="sim-serial", daemon=True)
 
     def start(self) -> None:
-        """Make every device; ConnectError when one cannot be made."""
+        """Create every device; ConnectError when one cannot be created."""
         self._pipe = WakePipe()
         try:
             for device, party in self._parties.items():
@@ -191,7 +189,6 @@ class SerialLines:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread and take the devices away."""
         self._ending = True
         self._pipe.wake()
         self._thread.join()

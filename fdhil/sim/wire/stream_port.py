@@ -1,4 +1,4 @@
-"""Serves a stream of text as a serial device: a pseudo terminal, under the name that the configuration gives it."""
+"""Serves a stream of text as a serial device: a pseudo terminal with the configured name."""
 
 import contextlib
 import os
@@ -9,13 +9,13 @@ from fdhil.errors import ConnectError
 
 
 class StreamPort:
-    """A pseudo terminal behind the link ``device``; what nobody reads is lost, as on a wire."""
+    """A pseudo terminal behind the link ``device``; unread data is lost, as on a wire."""
 
     def __init__(self, name: str, device: str) -> None:
-        """Make it; ConnectError when something else has that name, or the folder cannot be written."""
+        """Create it; ConnectError when the name is in use, or the folder cannot be written."""
         self._link = Path(device)
         if self._link.exists() and not self._link.is_symlink():
-            raise ConnectError(name, f"{device} is there already: give another device, the simulator makes that one")
+            raise ConnectError(name, f"{device} already exists; choose another name, the simulator creates the device")
         self._ours, self._theirs = os.openpty()
         tty.setraw(self._theirs)
         os.set_blocking(self._ours, False)
@@ -26,11 +26,11 @@ class StreamPort:
         except OSError as error:
             self.close()
             raise ConnectError(
-                name, f"{device} cannot be made ({error.strerror}): name it in a folder of yours"
+                name, f"{device} cannot be created ({error.strerror}); choose a writable folder"
             ) from None
 
     def send(self, data: bytes) -> None:
-        """Send what there is room for; a line that does not fit is lost whole."""
+        """Send as many whole lines as fit; the rest is lost."""
         for line in data.splitlines(keepends=True):
             try:
                 os.write(self._ours, line)
@@ -38,7 +38,6 @@ class StreamPort:
                 return
 
     def close(self) -> None:
-        """Close it and take its name away."""
         if self._link.is_symlink() and str(self._link.readlink()) == self.path:
             self._link.unlink()
         for descriptor in (self._ours, self._theirs):
