@@ -1,6 +1,6 @@
 """``fdhil uplink`` sends the records of a machine; ``fdhil fleet`` collects and compares those of all machines."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path

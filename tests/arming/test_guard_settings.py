@@ -88,7 +88,9 @@ def test_what_the_guard_sends_is_nobody_elses(tmp_path: Path, monkeypatch: pytes
 
     encoder = TableEncoder(source="canopen", cob_id=sent)
     with_encoder = drives | {"Y": drives["Y"].model_copy(update={"table": encoder})}
-    with pytest.raises(ConfigError, match=rf"axis.Y.table.cob_id: COB-ID {sent:03X}, with which the guard sends offsets"):
+    with pytest.raises(
+        ConfigError, match=rf"axis.Y.table.cob_id: COB-ID {sent:03X}, with which the guard sends offsets"
+    ):
         settings_of(config.model_copy(update={"axis": with_encoder}), "can0", tmp_path, "")
 
     def other(drive: Drive) -> DriveProfile:

@@ -15,7 +15,9 @@ from fdhil.store.history import History
 from fdhil.store.rows import Stamp
 from tests.bench import bench_document
 
-DIFFER = Reason("LoopsDiffer", "the configured regulators leave 34 um", "write the identified values to the configuration")
+DIFFER = Reason(
+    "LoopsDiffer", "the configured regulators leave 34 um", "write the identified values to the configuration"
+)
 
 
 def loops(*warnings: Reason) -> LoopEstimate:
