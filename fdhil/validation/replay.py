@@ -130,13 +130,15 @@ def replay_setpoints(window: Window, parameters: Parameters, axis: Axis, sync_pe
         return None
     parameters = completed(parameters, Parameters(**axis.nominal.model_dump()))
     # before the rest the axis may still settle from the move before
-    signals = [
+    demand_mm, position_mm = (
         np.concatenate([np.full(rest.start, np.nan), values[rest.start :]])
         for values in (window.demand_mm, window.position_mm)
-    ]
+    )
     held_a = _mean(window.current_a[rest][: round(STANDSTILL_S / window.dt_s)])
     try:
-        replayed = replay(*signals, parameters, axis, sync_period_s, window.offset_mm, standstill_a=held_a)
+        replayed = replay(
+            demand_mm, position_mm, parameters, axis, sync_period_s, window.offset_mm, standstill_a=held_a
+        )
     except ValueError:  # too few complete rows, or no valid drive
         return None
     return replayed.during(*moving_range(window)) if np.isfinite(replayed.difference_um).all() else None

@@ -191,4 +191,4 @@ def test_the_daemon_remembers_of_the_offers_those_alone_that_lie_there(works: Wo
             old.unlink()
         (config.offers_directory / f"other-{number}.offer").touch()
         assert [each.text for each in watch.look()] == [f"a configuration change is proposed: other version {number}"]
-    assert len(watch._told) == 1
+    assert len(watch._reported) == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,8 @@ SETTINGS = Identification()
 
 def test_a_check_is_passed_over_for_one_that_comes_before_it() -> None:
     before: list[str] = []
-    for check in (*SIGNAL_CHECKS, *FIT_CHECKS):
+    checks: tuple[Check[Any], ...] = (*SIGNAL_CHECKS, *FIT_CHECKS)
+    for check in checks:
         assert set(check.unless) <= set(before)
         assert check.name not in before
         before.append(check.name)

@@ -50,7 +50,7 @@ def _again() -> Session:
     """Return a copy of the session with its published values; constant parts are shared."""
     session, node = copy.copy(BORN), copy.copy(BORN.node)
     session.node, session._notices = node, {}
-    node._aliases, node._told = dict(node._aliases), {device: dict(told) for device, told in node._told.items()}
+    node._aliases, node._sent = dict(node._aliases), {device: dict(sent) for device, sent in node._sent.items()}
     return session
 
 
