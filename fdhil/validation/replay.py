@@ -139,8 +139,6 @@ def replay_setpoints(window: Window, parameters: Parameters, axis: Axis, sync_pe
         replayed = replay(
             demand_mm, position_mm, parameters, axis, sync_period_s, window.offset_mm, standstill_a=held_a
         )
-            demand_mm, position_mm, parameters, axis, sync_period_s, window.offset_mm, standstill_a=held_a
-        )
     except ValueError:  # too few complete rows, or no valid drive
         return None
     return replayed.during(*moving_range(window)) if np.isfinite(replayed.difference_um).all() else None
