@@ -43,7 +43,8 @@ class Nominal(Section):
 
 
 class CorrectionLimits(Section):
-    """[axis.X.correction]: what the guard lets through. Without this section writing is off."""
+    """[axis.X.correction]: limits of the offsets that the guard lets through. Without this section no offset is
+    sent."""
 
     max_offset_um: Positive = Field(50.0, le=CEILING_OFFSET_UM, description="largest offset")
     max_speed_mm_s: Positive = Field(2.0, le=CEILING_SPEED_MM_S, description="largest rate of the offset")
@@ -53,7 +54,8 @@ class CorrectionLimits(Section):
 
 
 class SetPointLimits(Section):
-    """[axis.X.setpoints]: the set-points that fdhil play may send in the place of an NC. Without this section: none."""
+    """[axis.X.setpoints]: limits of the set-points that fdhil play may send in place of an NC. Without this section it
+    sends none."""
 
     travel_mm: tuple[Finite, Finite] = Field(description="lowest and highest position, braking included")
     max_speed_mm_s: Positive | None = Field(None, description="largest speed; left out: the axis maximum")
@@ -70,7 +72,8 @@ class SetPointLimits(Section):
 
 
 class FeedforwardLimits(Section):
-    """[axis.X.feedforward]: what the guard lets the on-line feed-forward send. Without this section it is off."""
+    """[axis.X.feedforward]: limits of the on-line feed-forward that the guard lets through. Without this section it is
+    off."""
 
     max_torque_nm: Positive = Field(40.0, description="largest torque offset (0x60B2)")
     max_torque_rate_nm_s: Positive = Field(20e3, description="largest rate of the torque offset")
@@ -113,7 +116,7 @@ class HalPins(Section):
 
 
 def _content(path: Path) -> bytes:
-    """Return a file's bytes, as many as a profile or an EDS may have: one that has more is refused when it is read."""
+    """Read at most as many bytes as a profile or an EDS may have; a larger file is refused when it is parsed."""
     with path.open("rb") as file:
         return file.read(MOST_FILE_BYTES)
 
@@ -124,7 +127,7 @@ class Drive(Section):
     _files: str = PrivateAttr("")
 
     def placed(self, folder: Path) -> Drive:
-        """Return it with the paths of its files taken from ``folder``, and these files' digest."""
+        """Return a copy with its file paths resolved against ``folder``, and the digest of these files."""
         own = [] if self.profile in tables.DRIVE_PROFILES else [folder / self.profile]
         eds = [] if self.eds is None else [folder / self.eds]
         changes: dict[str, Any] = {"profile": str(own[0]) if own else self.profile, "eds": eds[0] if eds else None}
@@ -136,7 +139,7 @@ class Drive(Section):
     @model_validator(mode="before")
     @classmethod
     def _hal_defaults(cls, given: Any) -> Any:
-        """Fill in what HAL leaves no choice of: its profile, and set-points that act in their own cycle."""
+        """Fill in what HAL fixes: its profile, and set-points that act in their own cycle."""
         if isinstance(given, dict) and given.get("source", "hal" if "hal" in given else "") == "hal":
             return {
                 "source": "hal",
@@ -157,7 +160,7 @@ class Drive(Section):
 
     @property
     def files_digest(self) -> str:
-        """Of what its own profile and its EDS say, a part of what the configuration means; empty without such files."""
+        """SHA-256 of the drive's own profile and EDS, part of the configuration's digest; empty without such files."""
         return self._files
 
     source: Literal["canopen", "hal"] = Field(
@@ -201,9 +204,9 @@ class Drive(Section):
 
 
 class Axis(Section):
-    """[axis.X]; [axis.X2] is the second drive of a gantry axis and takes the keys of [axis.X] that it has not.
+    """[axis.X]; [axis.X2] is the second drive of a gantry axis and inherits the keys of [axis.X] that it does not set.
 
-    A rotary axis is written in degrees, as rapid_speed_deg_s for rapid_speed_mm_s; its um are those at radius_mm.
+    A rotary axis is written in degrees, as rapid_speed_deg_s for rapid_speed_mm_s; its um are measured at radius_mm.
     """
 
     unit: Literal["mm", "deg"] = Field("mm", description="deg: a rotary axis, whose keys have deg in place of mm")
@@ -246,7 +249,7 @@ class Axis(Section):
 
     @property
     def largest_difference_um(self) -> float:
-        """How far the two drives of a gantry axis may be apart."""
+        """Largest allowed difference between the two drives of a gantry axis."""
         return self.max_difference_um or 500.0
 
     @property
@@ -255,7 +258,7 @@ class Axis(Section):
         return 1.0 if self.radius_mm is None or self.unit == "mm" else mm_per_degree(self.radius_mm)
 
     def shown(self, mm: float, per: str = "", form: str = ".4g") -> str:
-        """Return a position, speed ("/s") or acceleration ("/s2") in the axis' unit."""
+        """Format a position, speed ("/s") or acceleration ("/s2") in the axis' unit."""
         return f"{mm / self.mm_per_unit:{form}} {self.unit}{per}"
 
     def shown_key(self, key: str) -> str:
@@ -269,7 +272,7 @@ class Axis(Section):
 
     @property
     def scaling(self) -> Scaling:
-        """Between millimetres and the drive's increments."""
+        """Conversion between millimetres and the drive's increments."""
         return Scaling(self.drive.increments_per_rev, self.screw_pitch_mm, self.drive.sign)
 
     @property

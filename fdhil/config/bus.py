@@ -1,4 +1,4 @@
-"""[bus.NAME]: a CAN bus and the way onto it."""
+"""[bus.NAME]: a CAN bus and how it is reached."""
 
 from __future__ import annotations
 
@@ -67,12 +67,12 @@ class CanBus(Section):
 
     @property
     def may_send(self) -> bool:
-        """Whether fdhil can send here: an adapter of python-can is listened to, and no more."""
+        """Whether fdhil can send here: python-can adapters are opened for listening only."""
         return self.interface in OWN_WAYS
 
     @property
     def place(self) -> tuple[str, ...] | None:
-        """Where it leads to, as far as the file tells; None where that is still to be chosen (port 0)."""
+        """The bus it leads to; None where the simulator still has to choose the port (port 0)."""
         if self.interface != "socketcand":
             return (self.interface, self.channel)
         return (self.interface, self.channel, self.host, str(self.port)) if self.port else None

@@ -1,4 +1,4 @@
-"""[nc], [g0], [identification]: what the NC does with a program, and what is made of its rapids."""
+"""[nc], [g0], [identification]: how the NC executes a program, and how its rapids are used."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fdhil.config.section import NotNegative, Positive, Section, one_of
 
 
 class Nc(Section):
-    """[nc]: what the numerical controller makes of a program."""
+    """[nc]: how the numerical controller executes a program."""
 
     profile: Literal["fir", "trapezoidal", "jerk_limited", "linuxcnc"] = Field(
         "fir", description="fir: smoothed feed; trapezoidal, jerk_limited: look-ahead; linuxcnc: as its own planner"
@@ -71,7 +71,7 @@ class G0(Section):
 
 
 class Correction(Section):
-    """[correction]: what is done beyond the plan of a correction."""
+    """[correction]: learning in addition to the planned correction."""
 
     learning: bool = Field(
         False, description="learn from the measured error of each pass what no model holds, for the next pass"
@@ -79,7 +79,7 @@ class Correction(Section):
 
 
 class Identification(Section):
-    """[identification]"""
+    """[identification]: how the parameters are estimated."""
 
     method: Annotated[str, one_of(tables.ESTIMATORS)] | None = Field(
         None, description=f"{', '.join(tables.ESTIMATORS)}; left out: the best there is"
@@ -100,5 +100,5 @@ class Identification(Section):
     )
 
     def tolerance_for(self, following_um: float) -> float:
-        """Return the RMS (um) at the table that a model may leave of a rapid with this RMS of its following error."""
+        """Return the largest accepted RMS residual (um at the table) of a rapid whose following error has this RMS."""
         return self.tolerance_um or TOLERANCE_SHARE * following_um

@@ -66,7 +66,6 @@ def _set(lines: list[str], outer: Sequence[str], key: str, value: str, note: str
 
 
 def _table(lines: Sequence[str], outer: Sequence[str]) -> tuple[int | None, int]:
-    """Return the lines of a table, from behind its header to the next one; None where it has no header."""
     headers = list(_headers(lines))
     for (at, names), (after, _) in zip(headers, [*headers[1:], (len(lines), ())], strict=False):
         if names == tuple(outer):
@@ -92,7 +91,6 @@ def _names(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _behind(rest: str) -> str:
-    """Return the comment behind a value, with the blanks before it."""
     for found in re.finditer(r"\s*#", rest):
         try:
             tomllib.loads(f"v = {rest[: found.start()]}")

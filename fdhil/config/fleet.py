@@ -1,4 +1,4 @@
-"""The configuration of what gathers the history of many machines: a file of its own, on a server of the works."""
+"""The configuration of a fleet server, which collects the history of many machines."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ NAME = r"^[A-Za-z0-9_-]{1,64}$"
 
 
 class Server(NatsServer):
-    """[server]: the NATS server whose JetStream carries what the machines tell."""
+    """[server]: the NATS server whose JetStream carries the machines' records."""
 
 
 class Stream(Section):
-    """[stream]: what the server keeps until it is in the database; it is made at the first start."""
+    """[stream]: what the server keeps until it is in the database; created at the first start."""
 
     name: str = Field("fdhil", pattern=NAME, description="name of the stream")
     replicas: int = Field(1, ge=1, le=5, description="servers of the cluster that keep each message")
@@ -56,7 +56,7 @@ class Objects(Section):
 
 
 class Retention(Section):
-    """[retention]: for how long fdhil fleet retain keeps what was told; without a number: for good."""
+    """[retention]: how long fdhil fleet retain keeps records and windows; without a number they are kept for ever."""
 
     record_months: int | None = Field(None, ge=1, le=1200, description="whole months of records before this one")
     window_months: int | None = Field(
@@ -76,7 +76,7 @@ class Fleet(Section):
 
 
 def load(path: Path) -> Fleet:
-    """Read the configuration of a fleet; ConfigError with every fault, its path and a suggestion."""
+    """Read a fleet server's configuration; ConfigError with every fault, its path and a suggestion."""
     fleet = load_as(Fleet, path, "a fleet's config")
     objects = fleet.objects.model_copy(update={"directory": path.parent / fleet.objects.directory})
     placed = {"server": fleet.server.placed(path.parent), "web": fleet.web.placed(path.parent)}

@@ -1,6 +1,7 @@
-"""What a works may offer to change in a machine's configuration, what it never may, and which change loosens a limit.
+"""Policy for configuration changes proposed by a fleet server: allowed keys, forbidden keys, changes that loosen a
+limit.
 
-This is the one place. A key that neither table names is refused, too.
+A key that is in neither table is refused.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ NEVER: Mapping[str, str] = {
 
 
 def never(path: str) -> str:
-    """Return why a key, as ``axis.X.drive.sign``, is never taken from afar; empty where it may be."""
+    """Explain why a key, as ``axis.X.drive.sign``, cannot be changed remotely; empty where it can."""
     if _rule(path) is not None:
         return ""
     parts = _pattern(path).split(".")
@@ -65,7 +66,7 @@ def never(path: str) -> str:
 
 
 def loosens(path: str, old: Any, new: Any) -> bool:
-    """Whether a change lets more through than before; where that cannot be told it does."""
+    """Return whether a change loosens a limit, or may do so."""
     if not _rule(path) or old == new:
         return False
     return old is None or new is None or new > old

@@ -1,4 +1,4 @@
-"""The whole file, and what must fit together in it."""
+"""The whole machine configuration, and the checks across its sections."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _OF_A_MOVE = ("rapid_speed_mm_s", "max_acceleration_mm_s2", "max_jerk_mm_s3")
 
 
 class Machine(Section):
-    """[machine]"""
+    """[machine]: the machine's name and SYNC period."""
 
     name: ShownName = Field(min_length=1, max_length=64, description="what the reports call this machine")
     sync_period_s: Positive = Field(0.001, ge=1e-4, le=0.02, description="period of the SYNC message on the CAN bus")
@@ -92,7 +92,6 @@ class MachineConfig(Section):
         return self
 
     def _gantry_faults(self) -> Iterator[str]:
-        """Yield what both drives of a gantry axis must have in common, and what one of them lacks."""
         for name in filter(is_second_drive, self.axis):
             first, second = self.axis[name[0]], self.axis[name]
             for key in ("unit", "radius_mm", "screw_pitch_mm", *_OF_A_MOVE):
@@ -107,7 +106,6 @@ class MachineConfig(Section):
                 yield f"axis.{name}.correction: both drives of axis {name[0]} are corrected, or neither; give both"
 
     def _node_faults(self) -> Iterator[str]:
-        """Yield what would make two senders of one COB-ID."""
         if self.play.node_id == self.guard.node_id:
             yield "play.node_id: it is the guard's node_id; both send a heartbeat"
         drives = {self.node_id(name): name for name in self.axis}
@@ -127,7 +125,6 @@ class MachineConfig(Section):
                 yield f"bus.{name}: it leads to the same place as [bus.{places[bus.place]}]; keep one of them"
 
     def _line_users(self) -> Iterator[LineUser]:
-        """Yield the sensors on serial devices."""
         for name, axis in self.axis.items():
             yield from filter(None, [line_user(f"axis.{name}.voltage", axis.voltage)])
             if axis.temperature is not None:
@@ -151,39 +148,39 @@ class MachineConfig(Section):
 
     @property
     def mm_per_degree(self) -> dict[str, float]:
-        """The length of arc of one degree at the radius of each rotary axis."""
+        """Arc length of one degree at the radius of each rotary axis, mm."""
         return {name: axis.mm_per_unit for name, axis in self.axis.items() if axis.unit == "deg"}
 
     @property
     def run_directory(self) -> Path:
-        """The folder of the daemon's socket and token."""
+        """Folder of the daemon's socket and token."""
         return self.store.run_directory or self.store.directory / "run"
 
     @property
     def guard_directory(self) -> Path:
-        """The folder of the guard's socket: its own, or the daemon's."""
+        """Folder of the guard's socket: its own, or the daemon's."""
         return self.guard.run_directory or self.run_directory
 
     @property
     def uplink_directory(self) -> Path:
-        """The folder in which fdhil uplink notes how far it is."""
+        """Folder in which fdhil uplink stores its progress."""
         return (self.uplink and self.uplink.directory) or self.store.directory / "uplink"
 
     @property
     def offers_directory(self) -> Path:
-        """The folder of the offers that fdhil uplink fetched."""
+        """Folder of the proposed configuration changes that fdhil uplink fetched."""
         return self.offers.directory or self.uplink_directory / "offers"
 
     @property
     def works_name(self) -> str:
-        """This machine's name in the works, also where nothing is sent there."""
+        """This machine's name in the plant, also where no uplink is configured."""
         return (self.uplink or Uplink()).name_of(self.machine.name)
 
     @property
     def digest(self) -> str:
-        """SHA-256 of what the configuration says of the machine (not of its text), 16 hexadecimal digits.
+        """SHA-256 of the machine's settings (not of the text), 16 hexadecimal digits.
 
-        Who may look at it, and over which network, is not the machine: a change there voids no record.
+        Access and network settings are excluded: changing them invalidates no record.
         """
         files = "".join(axis.drive.files_digest for axis in self.axis.values())
         # of a linear axis as before there were others, so that no record is void

@@ -1,4 +1,4 @@
-"""[nc_source.modbus_coil], [nc_source.mtconnect], [nc_source.opcua]: where and how an NC is asked what it does."""
+"""[nc_source.modbus_coil], [nc_source.mtconnect], [nc_source.opcua]: where and how the NC is polled."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _number(description: str) -> int | None:
 
 
 class ModbusNc(ModbusPlace):
-    """[nc_source.modbus_coil]: an NC or its PLC that shows what it does in coils or registers."""
+    """[nc_source.modbus_coil]: an NC or its PLC that shows its state in coils or registers."""
 
     port: int = Field(502, ge=1, le=65535, description="modbus: TCP port")
     bits: Literal["coils", "discrete_inputs", "holding_registers", "input_registers"] = Field(
@@ -53,7 +53,7 @@ class ModbusNc(ModbusPlace):
     renewed_s: NotNegative = Field(0.02, le=5, description="how often the NC renews what it shows: its PLC's cycle")
 
     def places(self) -> Mapping[str, tuple[int, int, int | None]]:
-        """Return function, address and bit in a register (None for coils and numbers) of what is asked for."""
+        """Return function, address and bit (None for coils and numbers) of each configured signal."""
         found: dict[str, tuple[int, int, int | None]] = {}
         for name in ("rapid", "hold", "feed", "arc"):
             if (place := getattr(self, name)) is not None:
@@ -65,7 +65,7 @@ class ModbusNc(ModbusPlace):
         return found
 
     def requests(self) -> Mapping[int, tuple[int, int]]:
-        """Return by function the first address that is read and how many, with one request each."""
+        """Return first address and count of the one read request per function."""
         spans: dict[int, list[int]] = {}
         for function, address, _ in self.places().values():
             spans.setdefault(function, []).append(address)
@@ -73,7 +73,7 @@ class ModbusNc(ModbusPlace):
 
     @property
     def registers(self) -> int:
-        """How many registers' worth of data an NC is asked for each time."""
+        """Data read in each poll, in registers."""
         asked = self.requests().items()
         return sum(count if function in NUMBERS_ARE.values() else (count + 15) // 16 for function, (_, count) in asked)
 
@@ -103,21 +103,21 @@ class ModbusNc(ModbusPlace):
 
 
 class Asked(Section):
-    """An NC that is asked over the network, and translated by a profile."""
+    """An NC that is polled over the network and translated by a profile."""
 
     period_s: Positive = Field(0.1, ge=5e-3, le=5, description="how often it is asked, or tells what is new")
     renewed_s: NotNegative = Field(0.1, le=5, description="how often the agent or server renews what it shows")
     profile: str = Field("", description="how the NC shows what it does")
 
     def placed(self, folder: Path) -> Self:
-        """Return it with the paths of its files taken from ``folder``."""
+        """Return a copy with its file paths resolved against ``folder``."""
         changes: dict[str, Any] = {key: folder / value for key, value in self if isinstance(value, Path)}
         own = self.profile not in tables.NC_PROFILES
         return self.model_copy(update=changes | ({"profile": str(folder / self.profile)} if own else {}))
 
 
 class MtConnectNc(Asked):
-    """[nc_source.mtconnect]: an MTConnect agent beside the NC."""
+    """[nc_source.mtconnect]: an MTConnect agent of the NC."""
 
     url: str = Field("http://127.0.0.1:5000", pattern=r"^http://[^/\s]+(/\S*)?$", description="the agent")
     device: str = Field("", description="name or uuid of the device; left out: the agent has one alone")

@@ -1,4 +1,4 @@
-"""[nc_source]: where an NC tells what it does, one section for each entry of ``tables.NC_SOURCES``."""
+"""[nc_source]: where the NC reports its state, one section for each entry of ``tables.NC_SOURCES``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class LinuxCncBridge(Section):
 
 
 class NcSource(Section):
-    """[nc_source]: where the NC tells what it does, if [g0] source is the name of an NC's interface."""
+    """[nc_source]: where the NC reports its state, if [g0] source names an NC interface."""
 
     silence_s: Positive = Field(
         2.0, ge=0.05, le=60, description="an NC that says nothing for so long is not heard: its moves are unknown"
@@ -39,5 +39,5 @@ class NcSource(Section):
         return self
 
     def placed(self, folder: Path) -> Self:
-        """Return it with the paths of its files taken from ``folder``."""
+        """Return a copy with its file paths resolved against ``folder``."""
         return self.model_copy(update={"mtconnect": self.mtconnect.placed(folder), "opcua": self.opcua.placed(folder)})

@@ -1,4 +1,4 @@
-"""[offers]: whose signed offers an operator of this machine may accept."""
+"""[offers]: whose signed configuration changes an operator of this machine may accept."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _OF_THE_WORKS = 14 << 3  # the first byte of such a key, an O in its text, so th
 
 
 def key_bytes(text: str) -> bytes:
-    """Return the 32 bytes of a public key (Ed25519) in NATS' notation; ValueError where it is none of a works."""
+    """Return the 32 bytes of an Ed25519 public key in NATS notation; ValueError where it is not a plant's key."""
     try:
         raw = base64.b32decode(text)
     except binascii.Error:
@@ -31,7 +31,7 @@ def _is_key(text: str) -> str:
 
 
 class Offers(SectionWithFiles):
-    """[offers]: signed changes of this file that a works offers (needs the extra fleet); each is accepted by hand."""
+    """[offers]: signed configuration changes proposed by a plant (needs the extra fleet); each is accepted by hand."""
 
     trust: tuple[Annotated[str, AfterValidator(_is_key)], ...] = Field(
         (), max_length=20, description="public keys of a works whose offers may be accepted; left out: none"

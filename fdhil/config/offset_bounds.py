@@ -1,4 +1,4 @@
-"""Offset limits per SYNC follow from [axis.X.correction]: the one derivation, for the planner and for the guard."""
+"""Derives the offset limits per SYNC from [axis.X.correction], for the planner and for the guard."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class OffsetBounds:
 
     @staticmethod
     def given(axis: Axis, sync_period_s: float) -> OffsetBounds:
-        """Return the limits as they stand in the configuration; ValueError when writing is off."""
+        """Convert the configured limits to increments; ValueError when writing is off."""
         if axis.correction is None:
             raise ValueError("writing is off for this axis")
         own, scale = axis.correction, axis.scaling.increments_per_mm
@@ -44,7 +44,8 @@ class OffsetBounds:
 
     @staticmethod
     def of(axis: Axis, sync_period_s: float) -> OffsetBounds:
-        """Return what an offset may do: the given limits within the axis' share, lowered until zero is near enough.
+        """Return the effective limits: the configured ones within the axis' share, lowered until an offset can be
+        removed in time.
 
         ValueError when writing is off (no ``[axis.X.correction]``).
         """
@@ -64,17 +65,17 @@ class OffsetBounds:
 
     @property
     def too_coarse(self) -> bool:
-        """Whether an increment is more than twice what a limit allows in one cycle."""
+        """Whether one increment is more than twice what a limit allows in one cycle."""
         return min(self.offset, self.rate, self.acceleration) < LEAST_INCREMENTS
 
     def time_to_safe_s(self, sync_period_s: float) -> float:
-        """Return how long it takes at most from a fault to zero: n_detect + 1 + L/S + 3 S/A cycles."""
+        """Return the longest time from a fault to zero: n_detect + 1 + L/S + 3 S/A cycles."""
         offset, rate, acceleration, _, _ = self.whole
         return (DETECTION_CYCLES + 1 - (-offset // rate) - 3 * (-rate // acceleration)) * sync_period_s
 
     @property
     def whole(self) -> tuple[int, int, int, int, int]:
-        """The same in whole increments, rounded down but to one: what the guard holds every frame to."""
+        """The limits in whole increments, rounded down but at least one, as the guard enforces them on every frame."""
         offset, rate, acceleration = map(_whole, (self.offset, self.rate, self.acceleration))
         return offset, rate, acceleration, math.floor(self.variation + _ULPS), self.window
 
@@ -85,7 +86,7 @@ def _whole(increments: float) -> int:
 
 
 def limit_faults(axis: Axis, sync_period_s: float) -> list[str]:
-    """Say why the given limits cannot be kept: the increments are too coarse, or the way to zero is too long."""
+    """Explain why the configured limits cannot be kept: increments too coarse, or ramp to zero too long."""
     if axis.correction is None:
         return []
     if axis.unit == "deg":
@@ -110,13 +111,12 @@ def limit_faults(axis: Axis, sync_period_s: float) -> list[str]:
 
 
 def share_fault(axis: Axis, sync_period_s: float) -> str | None:
-    """Say why an axis so slow cannot be corrected: its share of speed or acceleration is less than one increment."""
+    """Explain why so slow an axis cannot be corrected: its share of speed or acceleration is below one increment."""
     limits = OffsetBounds.of(axis, sync_period_s)
     return _too_coarse(axis, limits) if limits.too_coarse else None
 
 
 def _too_coarse(axis: Axis, limits: OffsetBounds) -> str:
-    """Name the finest limit that is less than one increment, and the resolution that would do for all."""
     name, finest = min(
         ("max_offset_um", limits.offset),
         ("max_speed_mm_s", limits.rate),

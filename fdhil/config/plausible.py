@@ -1,7 +1,8 @@
-"""Relations tell whether an axis' numbers can be of one machine, and slips which unit was mistaken where they cannot.
+"""Checks that the numbers of an axis fit one machine, and identifies a key that was typed in the wrong unit.
 
-Each relation between keys has a range in which ordinary feed drives lie, with room to spare, and one beyond which no
-drive lies. Outside the second the configuration is refused; between both it is used and the doubt is told.
+Each relation between keys has an ordinary range, wide enough for usual feed drives, and a possible range, beyond which
+no drive exists. Outside the possible range the configuration is refused; outside the ordinary one it is used with a
+warning.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ Numbers = Mapping[str, float]
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """A figure that follows from some ``keys``: what it ``is``, its ordinary range, and the range of the possible."""
+    """A figure derived from some ``keys``: its description, its ordinary range, and its possible range."""
 
     keys: tuple[str, ...]
     text: str
@@ -30,7 +31,7 @@ class Relation:
 
 @dataclass(frozen=True, slots=True)
 class Slip:
-    """A unit in which a key is often typed by mistake: ``factor`` takes the number to the key's own unit."""
+    """A unit in which a key is often typed by mistake: ``factor`` converts the number to the key's own unit."""
 
     key: str
     factor: float
@@ -39,7 +40,7 @@ class Slip:
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """What cannot be, or is unlikely, about an axis; ``key`` is the one to look at first."""
+    """An impossible or unlikely figure of an axis; ``key`` is the one to check first."""
 
     key: str
     text: str
@@ -91,7 +92,7 @@ MOST_NAMED = 2
 
 
 def doubts(axis: Axis) -> list[Doubt]:
-    """Return what is wrong with an axis' numbers together, the impossible first; empty for an ordinary machine."""
+    """Return what is implausible about an axis' numbers, the impossible first; empty for an ordinary machine."""
     numbers = _numbers(axis)
     broken = [relation for relation in RELATIONS if not _within(relation.figure(numbers), relation.ordinary)]
     if not broken:
@@ -117,7 +118,6 @@ def _doubt(axis: Axis, relation: Relation, numbers: Numbers, mended: list[Slip])
 
 
 def _listed(axis: Axis, relation: Relation, numbers: Numbers) -> str:
-    """Return the numbers as they are written for the axis."""
     shown = {key: axis.shown_key(key) for key in relation.keys}
     factor = {key: 1.0 if shown[key] == key else axis.mm_per_unit for key in relation.keys}
     return ", ".join(f"{shown[key].rpartition('.')[2]} = {numbers[key] / factor[key]:g}" for key in relation.keys)
@@ -128,7 +128,7 @@ def _spaced(unit: str) -> str:
 
 
 def _mends(slip: Slip, numbers: Numbers, broken: list[Relation]) -> bool:
-    """Return whether the number in that unit makes the whole axis ordinary, and is of what is broken."""
+    """Return whether reading the number in that unit makes every relation ordinary and explains all broken ones."""
     if not all(slip.key in relation.keys for relation in broken):
         return False
     tried = {**numbers, slip.key: numbers[slip.key] * slip.factor}
@@ -140,7 +140,6 @@ def _within(figure: float, bounds: tuple[float, float]) -> bool:
 
 
 def _numbers(axis: Axis) -> dict[str, float]:
-    """Return the numbers of an axis by their key within it."""
     return {key: attrgetter(key)(axis) for relation in RELATIONS for key in relation.keys}
 
 

@@ -1,4 +1,4 @@
-"""[publish]: what other programs are told, or may read, and from where."""
+"""[publish]: what other programs can read, or are sent, and from where."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from fdhil.config.web import is_loopback
 
 
 class Publisher(SectionWithFiles):
-    """What all ways of publishing share."""
+    """Keys that all publishers share."""
 
     period_s: Positive = Field(1.0, ge=0.1, le=3600, description="how often the daemon is asked for what is new")
 
 
 class OpcUaServer(Publisher):
-    """[publish.opcua]: an OPC UA server of what the daemon knows (fdhil publish opcua, needs the extra opcua)."""
+    """[publish.opcua]: an OPC UA server of the daemon's data (fdhil publish opcua, needs the extra opcua)."""
 
     host: str = Field("127.0.0.1", min_length=1, description="address that it listens at; 0.0.0.0 is every one")
     port: int = Field(4840, ge=0, le=65535, description="TCP port; 0 takes a free one and tells it")
@@ -87,7 +87,7 @@ TOPIC_PART = r"^[^/+#\x00-\x1f]*$"  # what may stand between two slashes of a to
 
 
 class MqttBroker(Publisher, Credentials):
-    """[publish.mqtt]: an MQTT broker that is told in Sparkplug B (fdhil publish mqtt, needs the extra mqtt)."""
+    """[publish.mqtt]: an MQTT broker that receives Sparkplug B (fdhil publish mqtt, needs the extra mqtt)."""
 
     host: str = Field("127.0.0.1", min_length=1, description="the broker")
     port: int = Field(1883, ge=1, le=65535, description="its TCP port; with TLS it is mostly 8883")
@@ -99,7 +99,8 @@ class MqttBroker(Publisher, Credentials):
     keepalive_s: Positive = Field(30.0, ge=1, le=3600, description="half again as long, and the broker tells our death")
 
     def node_name(self, machine: str) -> str:
-        """Return the edge node: what is set, else the machine's name without what a topic cannot have."""
+        """Return the edge node: the configured one, else the machine's name without characters that a topic cannot
+        have."""
         return self.node or re.sub(r"[/+#\x00-\x1f]", "_", machine)
 
     @model_validator(mode="after")
@@ -132,7 +133,7 @@ class MtConnectAdapter(Publisher):
 
 
 class Publish(Section):
-    """[publish]: what fdhil publish tells; nothing listens and nothing is sent until that command is started."""
+    """[publish]: what fdhil publish publishes; nothing listens and nothing is sent until that command is started."""
 
     opcua: OpcUaServer = OpcUaServer()
     mqtt: MqttBroker = MqttBroker()
@@ -140,5 +141,5 @@ class Publish(Section):
     prometheus: PrometheusMetrics = PrometheusMetrics()
 
     def placed(self, folder: Path) -> Self:
-        """Return it with the paths of its files taken from ``folder``."""
+        """Return a copy with its file paths resolved against ``folder``."""
         return self.model_copy(update={key: each.placed(folder) for key, each in self if isinstance(each, Publisher)})

@@ -1,4 +1,4 @@
-"""TOML becomes a checked configuration: all faults at once, each with its path and a suggestion."""
+"""Loads and validates TOML configurations; all faults are reported at once, each with its path and a suggestion."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ OUT_OF_RANGE = {"greater_than", "greater_than_equal", "less_than", "less_than_eq
 def load(path: Path) -> MachineConfig:
     """Read a machine configuration; ConfigError with every fault, its path and a suggestion.
 
-    What is possible but unlikely is told on stderr.
+    Possible but unlikely values are logged as warnings.
     """
     config = parse(read_toml(path, "a machine config"), str(path), path.parent)
     for sentence in unlikely(config):
@@ -43,9 +43,9 @@ def load(path: Path) -> MachineConfig:
 
 
 def load_places(path: Path) -> MachineConfig:
-    """Read a configuration to take an offset away; of one with faults the places of sockets and store are enough.
+    """Read a configuration in order to remove an offset; of an invalid one the paths of sockets and store suffice.
 
-    ConfigError where there are no such places either.
+    ConfigError where these paths do not exist either.
     """
     try:
         return load(path)
@@ -67,7 +67,8 @@ def load_places(path: Path) -> MachineConfig:
 
 
 def read_toml(path: Path, what: str, advice: str = "check the path") -> dict[str, Any]:
-    """Return the tables of a TOML file that is ``what``; ConfigError when it cannot be read, is too large or none."""
+    """Read the tables of a TOML file, called ``what`` in errors; ConfigError when it is unreadable, too large or
+    invalid."""
     try:
         with path.open("rb") as file:
             raw = file.read(MAX_CONFIG_BYTES + 1)
@@ -80,7 +81,7 @@ def read_toml(path: Path, what: str, advice: str = "check the path") -> dict[str
 
 
 def toml_document(raw: bytes, source: str) -> dict[str, Any]:
-    """Return the tables of a TOML file; ConfigError when it is none, also for one that is nested without end."""
+    """Parse TOML; ConfigError when it is invalid or nested too deeply."""
     try:
         if any(line.count(b".") > MOST_DOTS for line in raw.splitlines()):  # a key of n parts takes n^2 to read
             raise RecursionError
@@ -97,7 +98,7 @@ def toml_document(raw: bytes, source: str) -> dict[str, Any]:
 
 
 def _placed(said: str) -> tuple[str, str]:
-    """Part what the library says from where, which is never cut short."""
+    """Separate the library's message from its location, which is never shortened."""
     found = re.search(r" \(at [^()]{1,60}\)$", said)
     return (said[: found.start()], found[0]) if found else (said, "")
 
@@ -105,9 +106,9 @@ def _placed(said: str) -> tuple[str, str]:
 def parse(
     document: Mapping[str, Any], source: str = "config", folder: Path = Path(), *, made_up: bool = False
 ) -> MachineConfig:
-    """Check a parsed TOML document; relative paths are taken from ``folder``.
+    """Validate a parsed TOML document; relative paths are resolved against ``folder``.
 
-    ``made_up``: its axes need not be those of a machine that can be.
+    ``made_up``: skip the plausibility checks, for machines that cannot exist.
     """
     units: list[ConfigFault] = []
     rotary = rotary_axes(document)
@@ -159,12 +160,12 @@ def _as_written(fault: ConfigFault, rotary: Mapping[str, float]) -> ConfigFault:
 
 
 def load_as(whole: type[S], path: Path, what: str) -> S:
-    """Read another file than a machine's, whose tables are those of ``whole``; ConfigError with every fault."""
+    """Read another file than a machine's, with the tables of ``whole``; ConfigError with every fault."""
     return checked_as(whole, read_toml(path, what), str(path))
 
 
 def checked_as(whole: type[S], tables: Mapping[str, Any], source: str) -> S:
-    """Check the tables of another file than a machine's, as ``load_as`` does; ConfigError with every fault."""
+    """Validate the tables of another file than a machine's; ConfigError with every fault."""
     try:
         return whole.model_validate(tables)
     except ValidationError as error:
@@ -172,7 +173,7 @@ def checked_as(whole: type[S], tables: Mapping[str, Any], source: str) -> S:
 
 
 def unlikely(config: MachineConfig) -> list[str]:
-    """Return a sentence for everything about the axes that can be, but hardly is."""
+    """Return a sentence for each value of an axis that is possible but unlikely."""
     found = [(name, doubt) for name, axis in config.axis.items() for doubt in doubts(axis)]
     told = [f"axis.{name}.{doubt.key} is unlikely: {doubt.text}" for name, doubt in found]
     text = 'is that of a rotary axis and not used; give unit = "deg" too, or leave it out'
@@ -185,7 +186,7 @@ def unlikely(config: MachineConfig) -> list[str]:
 
 
 def checked(section: type[S], values: Mapping[str, Any], path: str) -> S:
-    """Check the values of one table, ``path`` in the file, without the rest of it; ConfigError."""
+    """Validate the values of one table, ``path`` in the file, on its own; ConfigError."""
     try:
         return section.model_validate(values)
     except ValidationError as error:
@@ -193,7 +194,7 @@ def checked(section: type[S], values: Mapping[str, Any], path: str) -> S:
 
 
 def checked_value(path: str, value: Any) -> Any:
-    """Check the value of one key, as ``axis.X.nominal.R``, and return it as it is used; ConfigError."""
+    """Validate the value of one key, as ``axis.X.nominal.R``, and return it converted; ConfigError."""
     field, (*outer, key) = field_at(path), path.split(".")
     if field is None:
         near = _near_key(_section(tuple(outer)), key)
@@ -241,7 +242,6 @@ def _short(text: str) -> str:
 
 
 def _shown(value: Any) -> str:
-    """Return a value as it is shown in a fault; no file can make it long."""
     try:
         return _short(repr(value))
     except ValueError:
@@ -249,7 +249,6 @@ def _shown(value: Any) -> str:
 
 
 def _bounds(section: type[Section], loc: tuple[int | str, ...]) -> str:
-    """Return the range that a key's number must have, as the models state it; empty when they state none."""
     names = [str(key) for key in loc if str(key) in section.model_fields]
     if not names:
         return ""
@@ -269,7 +268,6 @@ def _constraints(of: Any) -> Iterator[Any]:
 
 
 def _section(loc: tuple[int | str, ...], whole: type[Section] = MachineConfig) -> type[Section]:
-    """Follow a path of keys through the models as far as it leads."""
     section = whole
     for key in loc:
         field = section.model_fields.get(str(key))

@@ -1,4 +1,4 @@
-"""[sim.axis.X.reality]: what real axes have and the paper's plant has not; all of it is off until it is named."""
+"""[sim.axis.X.reality]: effects of real axes that the paper's plant lacks; each is off until it is set."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Share = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
 
 
 class Reality(Section):
-    """[sim.axis.X.reality]: what a real axis has besides the paper's plant, each effect off until it is named."""
+    """[sim.axis.X.reality]: effects of a real axis beyond the paper's plant, each off until it is set."""
 
     static_friction: Annotated[float, Field(ge=-0.95, le=5.0)] = Field(
         0.0,
@@ -97,7 +97,7 @@ class Reality(Section):
     current_delay_cycles: int | None = Field(None, ge=0, le=32, description="what the drive runs")
 
     def loops(self) -> dict[str, float]:
-        """Return the regulators' settings that are named here, by their key."""
+        """Return the regulator settings that are set here, by their key."""
         named = {key: getattr(self, key) for key in LOOPS}
         return {key: value for key, value in named.items() if value is not None}
 

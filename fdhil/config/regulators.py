@@ -56,7 +56,7 @@ class Regulators(Section):
 
     @model_validator(mode="after")
     def _integrals(self) -> Regulators:
-        """Refuse a gain that the structure would ignore silently, and one whose lack makes it another structure."""
+        """Refuse a gain that the structure would ignore silently, and a missing one that makes it another structure."""
         if self.structure == "p_pi_pi" and self.position_ki_per_s2:
             raise ValueError("structure p_pi_pi has no position_ki_per_s2; set structure = 'double_pi'")
         if self.structure == "double_pi" and not self.position_ki_per_s2:
@@ -74,7 +74,6 @@ class Regulators(Section):
         return self
 
     def _of_linuxcnc(self) -> list[str]:
-        """Return the keys of structure linuxcnc_pid that are not at their defaults."""
         fields = type(self).model_fields.items()
         own = [key for key, field in fields if (field.description or "").startswith("linuxcnc_pid:")]
         return [key for key in own if getattr(self, key) != type(self).model_fields[key].default]

@@ -1,4 +1,4 @@
-"""All tables of the file share their base class and the kinds of number and name."""
+"""Base class of all configuration tables, and their kinds of number and name."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def is_second_drive(axis: str) -> bool:
 
 
 def _check_types(plan: Any, of: type[BaseModel]) -> None:
-    """Put the check of the type where the plan of ``of`` reads a number or a switch; other tables have theirs."""
+    """Insert the type check where the schema of ``of`` reads a number or a switch; other tables have their own."""
     if isinstance(plan, list | tuple):
         for part in plan:
             _check_types(part, of)
@@ -72,32 +72,32 @@ def _switch(value: Any) -> Any:
 
 
 class Section(BaseModel):
-    """A table of the TOML file: frozen, and a key it does not know is a fault.
+    """A table of the TOML file: frozen, and an unknown key is a fault.
 
-    Numbers and switches are taken as TOML writes them: no text for either, no true for 1, no 1 for true. (The library
-    is told to be strict of nothing: a path, or a word of several, is always text.)
+    Numbers and switches must have their TOML type: no text for either, no true for 1, no 1 for true. (Pydantic's strict
+    mode is not used: a path, or a word of several, is always text.)
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: type[BaseModel], handler: GetCoreSchemaHandler, /) -> CoreSchema:
-        """Return the library's plan of the checks, with those of a number's and a switch's type before the others."""
+        """Return the library's schema with the type checks of numbers and switches before all others."""
         plan = handler(source)
         _check_types(handler.resolve_ref_schema(plan), cls)
         return plan
 
 
 class SectionWithFiles(Section):
-    """A table in which a path is taken from the folder of the file that says it."""
+    """A table whose paths are relative to the folder of its file."""
 
     def placed(self, folder: Path) -> Self:
-        """Return it with the paths of its files taken from ``folder``."""
+        """Return a copy with its file paths resolved against ``folder``."""
         return self.model_copy(update={key: folder / value for key, value in self if isinstance(value, Path)})
 
 
 def one_of(table: Mapping[str, str], or_suffix: str | None = None) -> AfterValidator:
-    """Return the check that a name is of a table, or a path that ends in ``or_suffix``."""
+    """Return the validator of a name from a table, or of a path that ends in ``or_suffix``."""
 
     def check(name: str) -> str:
         if name not in table and not (or_suffix and name.endswith(or_suffix)):

@@ -1,7 +1,4 @@
-"""[axis.X.voltage], [axis.X.temperature]: sensors of their own, on Modbus (TCP or RTU) or on a serial line.
-
-What kinds of sensor have in common is a class here: where a device is, and how its value is read.
-"""
+"""[axis.X.voltage], [axis.X.temperature]: separate sensors on Modbus (TCP or RTU) or on a serial line."""
 
 from __future__ import annotations
 
@@ -40,13 +37,13 @@ def _regular(pattern: str) -> str:
 
 
 class Sourced(Section):
-    """Which kind of sensor it is."""
+    """The kind of sensor."""
 
     source: str = Field("modbus", description="modbus, serial")
 
 
 class SerialPlace(Section):
-    """A serial line, and how it is set."""
+    """A serial line and its settings."""
 
     device: str = Field(NO_DEVICE, description="the serial device, as /dev/ttyUSB0 or /dev/serial/by-id/...")
     baud_rate: Annotated[int, AfterValidator(_of_a_line)] = Field(
@@ -90,7 +87,7 @@ class ModbusPlace(SerialPlace):
 
 
 def unit_remark(path: str, place: ModbusPlace) -> str:
-    """Return a sentence about a unit number that the standard reserves; empty for another."""
+    """Return a sentence about a unit number that the standard reserves; empty for any other."""
     if not place.is_rtu or place.unit <= LAST_UNIT:
         return ""
     text = f"{path}.unit = {place.unit} is not one of 1 to {LAST_UNIT}, which units on a serial line have: keep it only"
@@ -128,7 +125,7 @@ class TextValue(Section):
 
 
 class Scaled(Section):
-    """From a value as it is read to one in the unit of the key."""
+    """Linear conversion from a reading to the unit of the key."""
 
     scale: Finite = Field(1.0, description="what a value is multiplied with; negative where the wires are swapped")
     offset: Finite = Field(0.0, description="what is added then")
@@ -141,7 +138,7 @@ def _worth_something(value: Scaled) -> None:
 
 class VoltageBlock(Section):
     """[axis.X.voltage.block]: where a Modbus device keeps its newest samples by number: voltage.address is the first
-    of them, voltage.type what each is. Without this section a device shows one value, its newest."""
+    sample, voltage.type the type of each. Without this section a device shows one value, its newest."""
 
     samples: int = Field(32, ge=1, le=124, description="samples in the block")
     rate_hz: Positive = Field(1000.0, ge=0.1, le=1e6, description="samples in a second")
@@ -191,7 +188,6 @@ class Voltage(Scaled, TextValue, ModbusValue, ModbusPlace, Sourced):
     @model_validator(mode="before")
     @classmethod
     def _as_it_shows(cls, given: Any) -> Any:
-        """Fill in what follows from the keys that are given."""
         if not isinstance(given, Mapping):
             return given
         filled = dict(given)
@@ -213,12 +209,12 @@ class Voltage(Scaled, TextValue, ModbusValue, ModbusPlace, Sourced):
 
     @property
     def separate(self) -> bool:
-        """Whether a sensor of its own tells the voltage; else the drive does, with its other samples."""
+        """Whether a separate sensor measures the voltage; otherwise the drive sends it with its samples."""
         return self.source != tables.DRIVE_VOLTAGE
 
 
 class Thermometer(Scaled, TextValue, ModbusValue, ModbusPlace, Sourced):
-    """[axis.X.temperature]: the slide-way's thermometer. Without this section drift is told by time alone."""
+    """[axis.X.temperature]: the slide-way's thermometer. Without this section drift is tracked over time only."""
 
     source: Literal["modbus", "serial"] = Field("modbus", description="modbus, serial")
     port: int = Field(502, ge=1, le=65535, description="modbus: TCP port")
@@ -238,7 +234,7 @@ MOST_REGISTERS = 125  # of one request
 
 
 def block_registers(voltage: Voltage) -> tuple[int, int]:
-    """Return the first register of the request that reads a device's block, and how many it reads."""
+    """Return first register and number of registers of the request that reads a device's block."""
     block, kind = voltage.block, voltage.type
     assert block is not None
     assert kind is not None
@@ -251,9 +247,9 @@ def block_registers(voltage: Voltage) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True)
 class LineUser:
-    """A sensor on a serial device; ``registers`` are read every ``period_s``, 0 where it is not asked for a value.
+    """A sensor on a serial device; ``registers`` are read every ``period_s``, 0 where it is not polled for a value.
 
-    ``alone``: it tells lines of text, and can have no other beside it.
+    ``alone``: it sends lines of text and cannot share its device.
     """
 
     path: str
@@ -264,14 +260,14 @@ class LineUser:
 
     @property
     def share(self) -> float:
-        """Which share of its line's time it takes."""
+        """Share of its line's time that it takes."""
         bits = 1 + 8 + (self.place.parity != "none") + self.place.stop_bits
         characters = _REQUEST_CHARACTERS + _ANSWER_CHARACTERS + 2 * self.registers + _SILENT_CHARACTERS
         return characters * bits / self.place.baud_rate / self.period_s if self.registers else 0.0
 
 
 def line_user(path: str, sensor: Voltage | Thermometer) -> LineUser | None:
-    """Return what a sensor takes of a serial device; None where it has none."""
+    """Return a sensor's use of a serial device; None where it has none."""
     if not sensor.device or sensor.source == tables.DRIVE_VOLTAGE:
         return None
     asked = sensor.source == "modbus" and getattr(sensor, "block", None) is None and sensor.type is not None
@@ -284,7 +280,7 @@ _REQUEST_CHARACTERS, _ANSWER_CHARACTERS, _SILENT_CHARACTERS = 8, 5, 7.0
 
 
 def line_faults(users: Iterable[LineUser]) -> Iterator[str]:
-    """Yield what cannot be of sensors on one serial device: other settings, text beside others, too much to ask."""
+    """Yield conflicts of sensors on one serial device: different settings, text next to others, too much polling."""
     lines: dict[str, list[LineUser]] = {}
     for user in users:
         lines.setdefault(user.place.device, []).append(user)

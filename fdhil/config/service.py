@@ -1,4 +1,4 @@
-"""[store], [guard], [access], [play], [maintenance]: what the daemon, the guard and fdhil play run on."""
+"""[store], [guard], [access], [play], [maintenance]: settings of the daemon, the guard and fdhil play."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fdhil.config.section import Positive, Section
 
 
 class Store(Section):
-    """[store]"""
+    """[store]: recordings and history."""
 
     directory: Path = Field(Path("fdhil-data"), description="recordings and history; relative to the config's folder")
     run_directory: Path | None = Field(None, description="sockets and token; left out: <directory>/run")
@@ -38,7 +38,7 @@ class Guard(Section):
 
 
 class Access(Section):
-    """[access]: who may talk to daemon and guard, besides their own users and root. Users of this computer, by name."""
+    """[access]: which users of this computer may talk to daemon and guard, besides their own users and root."""
 
     watch: tuple[str, ...] = Field((), description="users who may read, listen and disarm, at the guard too")
     operate: tuple[str, ...] = Field(
@@ -48,7 +48,7 @@ class Access(Section):
 
 
 class Play(Section):
-    """[play]: fdhil in the place of an NC on a test bench (fdhil play)."""
+    """[play]: fdhil in place of an NC on a test bench (fdhil play)."""
 
     node_id: int = Field(101, ge=1, le=127, description="the node-ID of its heartbeat, which the drives watch")
     heartbeat_s: Positive = Field(
@@ -57,7 +57,7 @@ class Play(Section):
 
 
 class Maintenance(Section):
-    """[maintenance]: relative change of a parameter from its first published value that raises an alarm."""
+    """[maintenance]: relative change of a parameter since its first published value that raises an alarm."""
 
     R: Positive = Field(0.3, ge=1e-3, le=100, description="relative change")
     L: Positive = Field(0.3, ge=1e-3, le=100, description="relative change")

@@ -13,7 +13,7 @@ from fdhil.config.section import AxisName, Finite, NotNegative, Positive, Sectio
 
 
 class Noise(Section):
-    """[sim.noise]: standard deviations of the twin's white sensor noise."""
+    """[sim.noise]: standard deviations of the simulator's white sensor noise."""
 
     voltage_v: NotNegative = Field(0.06, description="terminal voltage")
     current_a: NotNegative = Field(0.05, description="motor current")
@@ -23,7 +23,7 @@ class Noise(Section):
 
 
 class SimAxis(Section):
-    """[sim.axis.X]: what the simulated drive really is; what is left out is the nominal value."""
+    """[sim.axis.X]: true values of the simulated drive; a key that is left out has the nominal value."""
 
     R: Positive | None = Field(None, ge=1e-9, le=1e6, description="ohm")
     L: Positive | None = Field(None, ge=1e-9, le=1e6, description="H")

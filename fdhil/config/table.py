@@ -1,4 +1,4 @@
-"""[axis.X.table], [axis.X.accelerometer]: sensors at the table, which see what the motor's encoder cannot."""
+"""[axis.X.table], [axis.X.accelerometer]: sensors at the table, which measure what the motor's encoder cannot."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ IN_A_FRAME = {"int16": 16, "uint16": 16, "int32": 32, "uint32": 32}  # bits
 
 
 class TableEncoder(Scaled, ModbusValue, ModbusPlace):
-    """[axis.X.table]: an encoder at the table. Without this section what the screw hides is not seen.
+    """[axis.X.table]: an encoder at the table. Without this section the errors of the screw are not measured.
 
-    In a TPDO of the axis' bus that is sent after every SYNC it sees how the table swings; asked over Modbus, a few
-    times a second, it tells where the table stands.
+    In a TPDO of the axis' bus that is sent after every SYNC it measures the table's oscillation; polled over Modbus, a
+    few times a second, it measures the table's position.
     """
 
     source: Literal["canopen", "modbus"] = Field(

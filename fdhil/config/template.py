@@ -1,6 +1,6 @@
-"""Writes a configuration as a commented file: the whole template, or a machine's values with all that belongs to them.
+"""Writes configurations as commented files: the whole template, or a machine's values.
 
-The words are the descriptions and docstrings of the models, so that they stand in one place.
+The comments are the descriptions and docstrings of the models.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ WIDTH = 118
 
 @dataclass(frozen=True)
 class Table:
-    """A table of the configuration file: its path, what it is, whether it may be left out, and its own keys."""
+    """A table of the configuration file: its path, its section, whether it is optional, and its own keys."""
 
     path: str
     section: type[Section]
@@ -76,7 +76,7 @@ class Table:
 
     @property
     def meaning(self) -> str:
-        """The section's own words, without the name in front."""
+        """The section's description, without its name in front."""
         words = re.sub(r"^\[.*?\](: )?", "", inspect.getdoc(self.section) or "")
         return words[:1].upper() + words[1:]
 
@@ -112,10 +112,10 @@ def template() -> str:
 
 
 def filled(document: Mapping[str, Any], sources: Mapping[str, str], head: str = "") -> str:
-    """Return ``document`` (nested tables of values) as a commented file, with the source of each value behind it.
+    """Return ``document`` (nested tables of values) as a commented file, with the source of each value next to it.
 
-    A table comes with the comments and defaults of its other keys; of the second axis and bus on, with its values
-    alone. ``sources`` has the full path of a key, as ``axis.X.nominal.R``.
+    A table includes the comments and defaults of its other keys; from the second axis and bus on, only its values.
+    ``sources`` has the full path of a key, as ``axis.X.nominal.R``.
     """
     lines, left = _comment(head), []
     for table, first in _named(document):
@@ -138,7 +138,8 @@ def filled(document: Mapping[str, Any], sources: Mapping[str, str], head: str = 
 
 
 def _named(document: Mapping[str, Any]) -> Iterator[tuple[Table, bool]]:
-    """Yield the tables by the document's own names; whether it is of the first axis or bus, or of anything else."""
+    """Yield the tables under the document's own names, and whether they are to be commented: not from the second axis
+    or bus on."""
     tables = list(sections())
     for top, of_top in groupby(tables, lambda table: next((t for t in _OWN if table.path.startswith(t)), "")):
         group = list(of_top)
@@ -176,7 +177,6 @@ def _comment(words: str) -> list[str]:
 
 
 def _example(path: str, key: str, field: FieldInfo) -> Any:
-    """Return what the template shows; KeyError where a key has neither a default nor an example."""
     value = default(field)
     if value is not None:
         return value
@@ -191,7 +191,7 @@ def default(field: FieldInfo) -> Any:
 
 
 def toml(value: Any) -> str:
-    """Return a value as TOML has it."""
+    """Format a value as TOML."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple | list):

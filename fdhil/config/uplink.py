@@ -1,4 +1,4 @@
-"""[uplink]: what a machine tells the history of a works, and over which server."""
+"""[uplink]: what a machine sends to the plant's fleet server, and how."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Labels = Mapping[LabelName, Label]
 
 
 class NatsServer(Credentials):
-    """What is needed to reach a NATS server."""
+    """Keys for the connection to a NATS server."""
 
     server: str = Field(
         "nats://127.0.0.1:4222",
@@ -34,7 +34,7 @@ class NatsServer(Credentials):
 
     @property
     def servers(self) -> tuple[str, ...]:
-        """Each server of the cluster."""
+        """The servers of the cluster."""
         return tuple(self.server.split(","))
 
     @model_validator(mode="after")
@@ -46,7 +46,7 @@ class NatsServer(Credentials):
 
 
 class Uplink(NatsServer):
-    """[uplink]: what fdhil uplink sends to the history of many machines (needs the extra fleet); left out: nothing."""
+    """[uplink]: what fdhil uplink sends to the fleet server (needs the extra fleet); left out: nothing."""
 
     machine: str = Field(
         "",
@@ -71,5 +71,6 @@ class Uplink(NatsServer):
     )
 
     def name_of(self, machine: str) -> str:
-        """Return this machine's name in the works: what is set, else ``machine`` without what a subject cannot have."""
+        """Return this machine's name in the plant: the configured one, else ``machine`` without characters that a NATS
+        subject cannot have."""
         return self.machine or re.sub(r"[^A-Za-z0-9_-]", "_", machine)[:64]

@@ -1,4 +1,4 @@
-"""[web]: what a browser may see and do, and from where."""
+"""[web]: what a browser may show and do, and from where."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ class Web(SectionWithFiles):
 
     @property
     def on_loopback(self) -> bool:
-        """Whether the host is this computer alone."""
+        """Whether the host is this computer only."""
         return is_loopback(self.host)
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host, a name or an address, is this computer alone."""
+    """Return whether a host, a name or an address, is this computer only."""
     if host == "localhost":
         return True
     try:

@@ -1,4 +1,4 @@
-"""Drains one bus, decodes it, and opens it again when it ended."""
+"""Receives and decodes one bus, and reconnects it."""
 
 import asyncio
 from collections import Counter
@@ -25,7 +25,7 @@ STAMPS_COST: Mapping[Stamps, str] = {
 
 
 class BusSource:
-    """One bus: drains the ring, decodes, and opens it again when it ended."""
+    """One bus: drains the ring, decodes the frames, and reconnects after a failure."""
 
     def __init__(self, name: str, config: MachineConfig, open_bus: OpenBus = CanBus) -> None:
         self.name = name
@@ -66,11 +66,12 @@ class BusSource:
         return [*out, *self._stamping(bus), *self._overflow(bus), *self._silence(bus, now_ns)]
 
     def hear_nc(self, state: NcState) -> list[MoveEvent]:
-        """Take what the NC says; return the moves that are known by now."""
+        """Take a state of the NC; return the moves that can be classified by now."""
         return [event for source in self._events for event in source.feed(state)]
 
     def _stamping(self, bus: ListenedBus) -> list[Notice]:
-        """Say once what the time stamps of this way onto the bus are worth, where that is less than the kernel's."""
+        """Report once how accurate the time stamps of this bus interface are, where they are worse than the
+        kernel's."""
         cost = STAMPS_COST.get(bus.stamps)
         if cost is None or self._stamping_told or not bus.counters()["frames"]:
             return []
@@ -100,7 +101,7 @@ class BusSource:
         return [Notice("BusSilent", "info", f"Bus {self.name} is heard again.")] if was and not silent else []
 
     async def run(self, take: Take) -> None:
-        """Run for ever; a bus that ended is opened again with growing pauses."""
+        """Run for ever; reconnect with growing pauses."""
         pause = BACK_OFF_S[0]
         while True:
             await asyncio.sleep(DRAIN_S)
@@ -115,7 +116,6 @@ class BusSource:
             take(Notice("BusDown", "info", f"Bus {self.name} is back."))
 
     async def _reopen(self, pause: float) -> float:
-        """Wait until the bus can be opened; the SYNC count begins anew."""
         self.close()
         while self._bus is None:
             await asyncio.sleep(pause)
@@ -129,7 +129,7 @@ class BusSource:
         return pause
 
     def counters(self) -> dict[str, int]:
-        """Frames received and lost on this bus."""
+        """Return the frames received and lost on this bus."""
         own = self._bus.counters() if self._bus else {"frames": 0, "ring_overflow": 0, "kernel_drops": 0, "lost": 0}
         decoded = self.decoder.counters()
         own = {key: count + self._before[key] for key, count in own.items()}
@@ -137,7 +137,7 @@ class BusSource:
         return own | decoded
 
     def close(self) -> None:
-        """Close the bus; its frames, and those that were lost, stay counted."""
+        """Close the bus; its counters are kept."""
         if self._bus is not None:
             self._before.update(self._bus.counters())
             self._bus.close()

@@ -1,8 +1,8 @@
-"""Asks a sensor that shows one value, its newest, again and again, and says when each value was true.
+"""Polls a sensor that shows one value, its newest, and determines when each value was true.
 
-A sensor that is asked is asked on a grid of instants, so that its values are a signal with a rate; one that tells by
-itself keeps its own rate. A value that was not to be had in time is a hole in the count and is never put in another's
-place.
+A polled sensor is read on a schedule, so that its values form a signal with a rate; a free-running one keeps its own
+rate.
+A value that did not come in time is a gap in the count and is never replaced by another.
 """
 
 import asyncio
@@ -35,8 +35,8 @@ NEAR_S = 0.02
 
 
 class Meter(Protocol):
-    """A sensor that shows one value. ``asked_ns`` and ``answered_ns`` (host-monotonic) enclose when the last one was
-    true, but for what its own filter takes; ``tells_by_itself`` where it is not asked."""
+    """A sensor that shows one value. ``asked_ns`` and ``answered_ns`` (host-monotonic) enclose the time at which the
+    last one was true, apart from its filter; ``tells_by_itself`` where it is not polled."""
 
     asked_ns: int
     answered_ns: int
@@ -50,12 +50,12 @@ class Meter(Protocol):
         """Return its newest value, scaled; DeviceError."""
 
     def doubt(self, shown: str) -> str:
-        """Return what is to be told of a value that cannot be: where it stands, and what to compare."""
+        """Describe an implausible value: where it was read, and what to compare."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Value:
-    """A value, its number, and when it was read at the earliest and at the latest (host-monotonic ns)."""
+    """A value, its number, and the earliest and latest time of its reading (host-monotonic ns)."""
 
     number: int
     volts: float
@@ -64,7 +64,7 @@ class _Value:
 
 
 class MeterVoltage:
-    """The voltage of one axis as a ``meter`` shows it."""
+    """The voltage of one axis from a ``meter``."""
 
     def __init__(self, axis: str, config: MachineConfig, meter: Meter) -> None:
         section = config.axis[axis]
@@ -95,11 +95,11 @@ class MeterVoltage:
 
     @property
     def lost(self) -> int:
-        """How many values there should be and are not."""
+        """Number of missing values."""
         return self._holes + self._grid.missed + self._told.missed
 
     async def poll(self, ticks: TickClock) -> list[VoltageSamples | Notice]:
-        """Ask for some values, one after the other, and return those that can be placed; DeviceError when none came."""
+        """Read some values, one after the other, and return those whose time is settled; DeviceError when none came."""
         came = False
         for left in range(self._together - 1, -1, -1):
             try:
@@ -114,7 +114,7 @@ class MeterVoltage:
         return [*self._too_slow(), *self._placed(ticks)]
 
     async def reading(self) -> str:
-        """Ask once, for people."""
+        """Read once and format the value."""
         return f"{await self._volts():.2f} V at {1e9 / self._grid.period_ns:g} Hz"
 
     async def _ask(self, ticks: TickClock) -> _Value:
@@ -131,7 +131,7 @@ class MeterVoltage:
         return _Value(number, volts, self._meter.asked_ns, self._meter.answered_ns)
 
     async def _hear(self) -> _Value:
-        """Wait for the next value that is told; one that cannot be read is a hole."""
+        """Wait for the next value of a free-running sensor; an unreadable one is a gap."""
         self._asked += 1
         try:
             volts = await self._volts()
@@ -149,7 +149,6 @@ class MeterVoltage:
         return volts
 
     def _too_slow(self) -> list[Notice]:
-        """Tell once that the sensor cannot be asked as often as the config has it."""
         due = self._asked + self._grid.missed + self._told.missed
         if self._told_holes or due < TOLD_AFTER or self.lost < LOST_SHARE * due:
             return []
@@ -162,7 +161,7 @@ class MeterVoltage:
         return [Notice("SampleTiming", "minor", text, self.axis)]
 
     def _placed(self, ticks: TickClock) -> list[VoltageSamples]:
-        """Return the values whose place among the SYNCs is known by now; those read too far from theirs are holes."""
+        """Return the values whose time is settled by now; those read too far from their instant are gaps."""
         counter, t_ns, error_ns, volts = [], [], [], []
         while self._waiting and (not ticks.running or ticks.covers(self._waiting[0].answered_ns + SETTLED_NS)):
             one = self._waiting.popleft()
@@ -184,19 +183,19 @@ class MeterVoltage:
         return [VoltageSamples(self.name, self.axis, *placed, frozen(np.array(volts)), rate_hz, on_grid)]
 
     def _when(self, one: _Value, ticks: TickClock) -> tuple[float, float, float]:
-        """Return when (host ns) a value was true but for the meter's filter, how late that is, and how far off."""
+        """Return the host time (ns) of a value, its delay, and its uncertainty, without the meter's filter."""
         if self._meter.tells_by_itself:
             return one.answered_ns, 0.0, SYNC_LATENESS_NS
         return self._grid.read_at(one.number, one.asked_ns, one.answered_ns, ticks)
 
     def _in_time(self, late_ns: float, off_ns: float) -> bool:
-        """Whether a value can stand for its instant: a mean must lie there, an instant only keeps the order."""
+        """Return whether a value can stand for its instant: a mean must lie there, an instant only keeps the order."""
         allowed_ns = TIMELY_NS if self._mean else IN_ORDER * self._grid.period_ns
         return off_ns <= TIMELY_NS and abs(late_ns) <= allowed_ns
 
 
 def _turn(axis: str, config: MachineConfig) -> float:
-    """Return by which share of its period a sensor is asked later, so that those on one line take turns."""
+    """Return the share of its period by which a sensor is polled later, so that those on one line take turns."""
     own = config.axis[axis].voltage
     where = {name: section.voltage for name, section in config.axis.items() if section.voltage.separate}
     peers = [name for name, v in where.items() if (v.device, v.host, v.port) == (own.device, own.host, own.port)]

@@ -1,4 +1,4 @@
-"""Reads a slide-way's thermometer now and then, behind Modbus or on a serial line."""
+"""Polls a slide-way's thermometer, behind Modbus or on a serial line."""
 
 import asyncio
 
@@ -35,7 +35,8 @@ class SlidewayThermometer:
         return self._meter.link
 
     async def poll(self, ticks: TickClock) -> list[Temperature]:
-        """Rest for the period and read once; errors of the link pass through, ProtocolError for no temperature."""
+        """Wait for the period and read once; errors of the link pass through, ProtocolError for an impossible
+        temperature."""
         if not self._meter.tells_by_itself:
             await asyncio.sleep(self._period_s)
         celsius = await self._celsius()
@@ -43,7 +44,7 @@ class SlidewayThermometer:
         return [Temperature(self.axis, ticks.newest_tick, celsius, "slideway")]
 
     async def reading(self) -> str:
-        """Read once, for people."""
+        """Read once and format the value."""
         return f"{await self._celsius():.2f} degC"
 
     async def _celsius(self) -> float:

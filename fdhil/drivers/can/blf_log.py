@@ -66,7 +66,7 @@ def _frame(message: can.Message, start_ns: int, of_socketcan: bool) -> LoggedFra
 
 
 def write(path: Path, frames: Iterable[LoggedFrame], header: LogHeader) -> None:
-    """Write a log; the names of buses become numbers."""
+    """Write a log; bus names become numbers."""
     start_ns = header.start_ns if header.start_ns >= _DATED_S * 1_000_000_000 else 0
     writer = can.BLFWriter(path)
     writer.start_timestamp = 0.0  # offsets are exact where no seconds since 1970 are in them

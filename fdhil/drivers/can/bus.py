@@ -1,6 +1,6 @@
-"""Listens to one CAN bus: a receive thread only appends to a ring, and its reader drains that in blocks.
+"""Receives from one CAN bus: a thread only appends to a ring, and the reader drains that in blocks.
 
-There is nothing here that sends: what does is in ``fdhil.commissioning.transmit``, which no other room may import.
+Nothing here sends: ``fdhil.commissioning.transmit`` does, which no other package may import.
 """
 
 import threading
@@ -22,17 +22,17 @@ HOLD_BACK_S = 0.001
 
 
 class ListenedBus(Protocol):
-    """A bus as its reader needs it: frames in blocks."""
+    """A bus as its reader sees it: frames in blocks."""
 
     last_frame_ns: int
 
     @property
     def ended(self) -> str | None:
-        """Why no more frames come; None while they may."""
+        """Why no more frames come; None while the bus is alive."""
 
     @property
     def stamps(self) -> Stamps:
-        """Who stamped the newest frames."""
+        """Source of the newest frames' time stamps."""
 
     def drain(self) -> Frames:
         """Return all frames received since the last call that pass the filters, in order of arrival."""
@@ -48,13 +48,13 @@ class OpenBus(Protocol):
     """Opens a bus for listening; ConnectError with cause and next action."""
 
     def __call__(self, name: str, settings: config.CanBus, *, filters: Sequence[Filter] = ()) -> ListenedBus:
-        """Return the open bus, which receives."""
+        """Return the open, receiving bus."""
 
 
 class CanBus:
-    """A bus that is listened to; a context manager.
+    """A bus that is received from; a context manager.
 
-    ``ended`` tells why the receive thread stopped (None while it runs).
+    ``ended`` is the reason why the receive thread stopped (None while it runs).
     """
 
     batch_s = BATCH_S
@@ -85,11 +85,11 @@ class CanBus:
 
     @property
     def stamps(self) -> Stamps:
-        """Who stamped the newest frames."""
+        """Source of the newest frames' time stamps."""
         return self._port.stamps
 
     def _receive(self) -> None:
-        """The receive thread: nothing but appending; its end is reported, never swallowed."""
+        """Run the receive thread, which only appends; its end is reported, never swallowed."""
         try:
             while not self._stopping.is_set():
                 if self._port.holds_back and 2 * self._ring.room < self._ring_frames:
@@ -108,7 +108,7 @@ class CanBus:
         return frames
 
     def counters(self) -> dict[str, int]:
-        """Frames received, and lost in the ring and in the kernel."""
+        """Return the frames received, and lost in the ring and in the kernel."""
         lost = self._ring.overflowed + self._port.kernel_drops
         return {
             "frames": self._ring.received,

@@ -1,4 +1,4 @@
-"""Logs of ``candump -l`` and ``-L`` (can-utils): the lines of the black box too."""
+"""Reads and writes logs of ``candump -l`` and ``-L`` (can-utils); the black box uses this format too."""
 
 import re
 from collections import Counter
@@ -64,7 +64,7 @@ def format_frame(frame: LoggedFrame, header: LogHeader) -> str:
 
 
 def shown_id(can_id: int) -> str:
-    """Return an identifier with the flags of SocketCAN as candump writes it.
+    """Format an identifier with the flags of SocketCAN as candump does.
 
     >>> shown_id(0x181), shown_id(REMOTE_FLAG | 0x701), shown_id(EXTENDED_FLAG | 0x123), shown_id(ERROR_FLAG | 4)
     ('181', '701', '00000123', '20000004')
@@ -81,7 +81,7 @@ def _content(frame: LoggedFrame) -> str:
 
 
 def read(path: Path, _skipped: Counter[str]) -> Iterator[LoggedFrame]:
-    """Yield the frames of a log; RecordingError names the first line that is none."""
+    """Yield the frames of a log; RecordingError names the first invalid line."""
     for number, line in lines_of(path, "ascii"):
         if not line.strip():
             continue
@@ -99,6 +99,6 @@ def _advice(line: str, error: Exception) -> str:
 
 
 def write(path: Path, frames: Iterable[LoggedFrame], header: LogHeader) -> None:
-    """Write a log as ``candump -l`` does; R and T stand behind the frames where the log distinguishes them."""
+    """Write a log as ``candump -l`` does; frames are marked R and T where the log distinguishes them."""
     with path.open("w", encoding="ascii", errors="replace") as file:
         file.writelines(format_frame(frame, header) for frame in frames)

@@ -1,4 +1,4 @@
-"""Tells what the CAN controller says in error frames (linux/can/error.h). Pure: no clock, no I/O."""
+"""Translates the CAN controller's error frames (linux/can/error.h) into notices. Pure: no clock, no I/O."""
 
 from typing import Literal
 
@@ -113,7 +113,7 @@ def _damage(kinds: int) -> str:
 
 
 class ErrorWatch:
-    """Tells each code when it first comes, and once it is over; a flood is counted, not repeated."""
+    """Reports each error code when it first occurs, and when it has ended; repeated frames are only counted."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -140,7 +140,8 @@ class ErrorWatch:
         return True
 
     def _follow(self, frames: Frames) -> None:
-        """Follow the controller's state: bus-off lasts until it hears again, error-passive until it says so."""
+        """Track the controller: bus-off lasts until a frame is received, error-passive until it reports
+        error-active."""
         error = frames["id"] & ERROR_FLAG != 0
         of_class = np.where(error, frames["id"], 0)
         detail = np.where(of_class & ERROR_CONTROLLER, frames["data"] >> np.uint64(8), 0)

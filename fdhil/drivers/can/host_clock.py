@@ -1,12 +1,12 @@
-"""Brings time stamps of other clocks onto the host's monotonic one."""
+"""Converts time stamps of other clocks to the host's monotonic clock."""
 
 import time
 from collections import deque
 
 
 class WallClock:
-    """The wall clock against the monotonic one; two readings are never taken at quite the same instant, so a small
-    change is followed slowly, and one of more than 2 ms is a clock that was set."""
+    """The wall clock against the monotonic one; the two are never read at quite the same instant, so small
+    changes are followed slowly, and a change of more than 2 ms means that the clock was set."""
 
     _SET_NS = 2_000_000
     _SHARE = 64
@@ -35,17 +35,17 @@ class WallClock:
 
 
 def monotonic_ns(wall_ns: int, wall_ahead_ns: int) -> int:
-    """Return a wall-clock stamp on the monotonic clock; now, when the wall clock was set since the stamp."""
+    """Convert a wall-clock stamp to the monotonic clock; return now, when the wall clock was set since the stamp."""
     now_ns, stamp_ns = time.monotonic_ns(), wall_ns - wall_ahead_ns
     return stamp_ns if now_ns - 1_000_000_000 < stamp_ns <= now_ns + 5_000_000 else now_ns
 
 
 class DistantClock:
-    """A clock elsewhere (of a CAN controller, of a hub) against the monotonic one, by the quickest reading of a while.
+    """A remote clock (of a CAN controller, of a hub) against the monotonic one, by its quickest recent reading.
 
-    No reading comes before it was sent, so the one that seems to be furthest ahead was the quickest. Readings older
-    than ``window_s`` are forgotten: two crystals drift apart by up to 0.1 ms a second. A clock that was set, or begins
-    anew, counts from there.
+    No reading arrives before it was sent, so the one that seems furthest ahead was the quickest. Readings older than
+    ``window_s`` are dropped: two crystals drift apart by up to 0.1 ms a second. A clock that was set, or restarts,
+    counts from there.
     """
 
     _SET_BACK_NS = 1_000_000_000
@@ -55,7 +55,7 @@ class DistantClock:
         self._readings: deque[tuple[int, int]] = deque()  # (when, ahead), each later one less ahead
 
     def ahead_ns(self, stamp_ns: int, now_ns: int) -> int:
-        """Take a reading; return by how much the distant clock is ahead."""
+        """Add a reading; return by how much the remote clock is ahead."""
         ahead, kept = stamp_ns - now_ns, self._readings
         if kept and ahead < kept[0][1] - self._SET_BACK_NS:
             kept.clear()

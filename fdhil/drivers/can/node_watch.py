@@ -1,7 +1,7 @@
-"""Watches a node by what it says: EMCY, boot-up, heartbeat, NMT state. Pure: ``now_ns`` comes from the caller.
+"""Monitors a node by its EMCY, boot-up, heartbeat and NMT state. Pure: ``now_ns`` comes from the caller.
 
-The frames are read here and not by the canopen library, which drops an EMCY shorter than 8 bytes, never notices a
-heartbeat that stops, and believes an NMT command as soon as it is sent.
+The canopen library is not used here: it drops an EMCY shorter than 8 bytes, never notices that a heartbeat stopped, and
+assumes that an NMT command took effect as soon as it was sent.
 """
 
 from itertools import pairwise
@@ -23,7 +23,7 @@ _NMT_STATES = frozenset(int(state) for state in Nmt)
 
 
 class NodeWatch:
-    """Watches one node; ``feed`` returns edge-triggered notices."""
+    """Monitors one node; reports each change once."""
 
     def __init__(self, axis: str, node_id: int) -> None:
         self._axis = axis
@@ -55,7 +55,6 @@ class NodeWatch:
         return Notice(code, severity, f"Drive {self._axis} {text}", self._axis)
 
     def _emergency(self, length: int, data: int) -> list[Notice]:
-        """One notice per code; a flood is counted, not repeated."""
         self.emcy_count += 1
         code = data & 0xFFFF if length >= 2 else 0x1000
         if code >> 8 == 0:
@@ -85,7 +84,8 @@ class NodeWatch:
         return notices
 
     def _after_an_outage(self, t_ns: int) -> list[Notice]:
-        """Say that the heartbeat is back once it has been regular for a while: an outage is two lines."""
+        """Report recovery only after the heartbeat has been regular for a while, so that an outage gives two
+        notices."""
         if self._back_since_ns is None or t_ns - self._beats[-1] > self._longest_gap_ns():
             self._back_since_ns, self._beats = t_ns, []
             return []
@@ -95,11 +95,12 @@ class NodeWatch:
         return [self._notice("HeartbeatLost", "info", "sends its heartbeat again.")]
 
     def _longest_gap_ns(self) -> int:
-        """Three learned periods and 0.1 s; the period is the longest of those heard, some may have come in a burst."""
+        """Return three learned periods and 0.1 s; the period is the longest received one, since some may arrive in a
+        burst."""
         return 3 * self._period_ns + 100_000_000
 
     def _silence(self, now_ns: int) -> list[Notice]:
-        """Tell a heartbeat that stops; a drive that sends none, or only when the NC asks it to, is not judged."""
+        """Report a heartbeat that stopped; a node that sends none, or only when guarded by the NC, is not judged."""
         if self._lost or self._guarded or len(self._beats) <= _HEARTBEATS_TO_LEARN:
             return []
         self._period_ns = max(b - a for a, b in pairwise(self._beats))

@@ -1,4 +1,4 @@
-"""Listens through python-can: to adapters that have no SocketCAN driver, and to the bus inside one process."""
+"""Receives through python-can: from adapters without a SocketCAN driver, and from the bus inside one process."""
 
 import logging
 import sys
@@ -44,10 +44,11 @@ logging.getLogger("can").addHandler(logging.NullHandler())
 
 
 class PythonCanPort:
-    """An adapter that python-can opens, for listening.
+    """An adapter opened by python-can, for listening.
 
-    The stamps are those of the adapter's own clock, of unknown beginning, brought onto the host's by the quickest
-    frames; or the library's own, taken when a frame was read. What the adapter or its driver lost nobody counts.
+    The stamps are those of the adapter's clock, whose zero is unknown, converted to the host's by the quickest frames;
+    or
+    the library's own, taken when a frame was read. Frames lost by the adapter or its driver are not counted.
     """
 
     holds_back = False
@@ -78,7 +79,7 @@ class PythonCanPort:
             wait = 0.0
 
     def close(self) -> None:
-        """Give the adapter back; one that is gone cannot be told so."""
+        """Release the adapter, if it is still there."""
         try:
             self._bus.shutdown()
         except _BROKEN:
@@ -86,7 +87,7 @@ class PythonCanPort:
 
 
 def arguments(settings: config.CanBus) -> dict[str, Any]:
-    """Return what python-can is asked for; ``options`` of the config come last."""
+    """Return the arguments of ``can.Bus``; the configured ``options`` take precedence."""
     channel: str | int = int(settings.channel) if settings.channel.isdecimal() else settings.channel
     quiet = LISTEN_ONLY.get(settings.interface, {}) if settings.listen_only else {}
     asked = {"interface": settings.interface, "channel": channel, "bitrate": settings.bitrate}
@@ -94,7 +95,7 @@ def arguments(settings: config.CanBus) -> dict[str, Any]:
 
 
 def append(ring: FrameRing, message: can.Message, stamp_ns: int) -> None:
-    """Put a message of the library into the ring."""
+    """Append a message of the library to the ring."""
     can_id = message.arbitration_id | (EXTENDED_FLAG if message.is_extended_id else 0)
     can_id |= (ERROR_FLAG if message.is_error_frame else 0) | (REMOTE_FLAG if message.is_remote_frame else 0)
     data = bytes(min(message.dlc, 8)) if message.is_remote_frame else bytes(message.data[:8])  # its DLC is kept
@@ -111,7 +112,7 @@ def _one_line(error: BaseException) -> str:
 
 
 class VirtualPort:
-    """python-can's bus inside one process; the sender's stamps are the wall clock's."""
+    """python-can's bus inside one process; stamps are the sender's wall clock."""
 
     stamps: Stamps = "sender"
     holds_back = False
@@ -126,7 +127,7 @@ class VirtualPort:
             raise ConnectError(name, f"the virtual bus {settings.channel} cannot be opened ({error})") from None
 
     def receive(self, ring: FrameRing, timeout_s: float) -> None:
-        """Append one frame, and all others that wait; the stamps become monotonic ones."""
+        """Append one frame, and all others that wait, with monotonic stamps."""
         wait: float = timeout_s
         wall_ahead_ns = self._wall_clock.ahead_ns()
         for _ in range(FRAMES_PER_TURN):

@@ -1,9 +1,8 @@
-"""Reads and writes objects of one node by the canopen library's SDO client, within bounds of size and time.
+"""Reads and writes objects of one node through the canopen library's SDO client, with limits on size and time.
 
-The library has no limit on size or duration, and takes a late answer to an earlier request of the same object for the
-answer to the present one. So after a time-out, and after an answer to something else (what another program asked for
-a moment ago), the line is left quiet until nothing more can come, and then the object is read twice: two equal answers,
-or an error.
+The library limits neither size nor duration, and takes a late answer to an earlier request of the same object for the
+answer to the present one. So after a time-out, and after an answer to another request (another program's, perhaps), the
+channel stays quiet until no late answer can come, and the object is then read twice: two equal answers, or an error.
 """
 
 import logging
@@ -38,9 +37,9 @@ def _name(index: int, sub: int) -> str:
 
 
 class SdoLink:
-    """The SDO channel of one node. ``deliver`` is called by whoever reads the bus, all else by one other thread.
+    """The SDO channel of one node. ``deliver`` is called by the bus reader, everything else by one other thread.
 
-    ``send`` puts a frame on the bus; ``patience``: how many times as long as a real drive this one may take.
+    ``send`` puts a frame on the bus; ``patience`` multiplies the time-outs, for a slow simulated drive.
     """
 
     def __init__(self, device: str, node_id: int, send: Callable[[int, bytes], None], patience: float = 1.0) -> None:
@@ -62,7 +61,7 @@ class SdoLink:
         self._send(can_id, bytes(data))
 
     def deliver(self, data: bytes) -> None:
-        """Hand over a response frame of this node; one that is not 8 bytes long is no SDO."""
+        """Hand over a response frame of this node; one that is not 8 bytes long is no SDO frame."""
         if len(data) == 8:
             if data[0] >> 5 == _UPLOAD_BEGINS:
                 self._sized = bool(data[0] & _SIZE_GIVEN) or not data[0] & _EXPEDITED
@@ -82,7 +81,8 @@ class SdoLink:
             return second
 
     def read_size(self, index: int, sub: int = 0) -> int | None:
-        """Return how many bytes an object has; None where the drive's answer does not say it (CiA 301, 7.2.4.3.5)."""
+        """Return the size of an object in bytes; None where the drive's answer does not state it (CiA 301,
+        7.2.4.3.5)."""
         data = self.read(index, sub)
         return len(data) if self._sized else None
 
@@ -91,7 +91,7 @@ class SdoLink:
         return int.from_bytes(self.read(index, sub), "little", signed=signed)
 
     def write_int(self, index: int, sub: int, value: int, length: int) -> None:
-        """Write an integer of ``length`` bytes; after a time-out the object tells whether it arrived.
+        """Write an integer of ``length`` bytes; after a time-out, read back whether it arrived.
 
         TypeError when ``value`` is no integer, ValueError when it does not fit.
         """
@@ -109,7 +109,6 @@ class SdoLink:
             self._guarded(index, sub, lambda: self._client.download(index, sub, data))
 
     def _be_quiet(self) -> None:
-        """Wait until no late answer can come any more, and forget those that came."""
         time.sleep(QUIET_S)
         self._client.responses = queue.Queue()
         self._late = False
@@ -138,7 +137,7 @@ class SdoLink:
         raise SdoTooLarge(self.device, text)
 
     def _guarded(self, index: int, sub: int, call: Any) -> Any:
-        """Run a call of the library and translate its errors into one sentence each; quiet first after a time-out."""
+        """Call the library and translate its errors into one sentence each; after a time-out wait for silence first."""
         if self._late:
             self._be_quiet()
         try:

@@ -1,8 +1,7 @@
-"""Reads the socketcand text protocol of a CAN hub.
+"""Receives the socketcand text protocol of a CAN hub.
 
-python-can's client costs 28 us a frame (22 % of a core at 7,800 frames/s, measured), spins without end when the hub
-closes the connection and cannot tell it from silence; reading what has come in one piece and splitting it costs about
-2 us a frame.
+python-can's client costs 28 us a frame (22 % of a core at 7,800 frames/s, measured), spins for ever when the hub closes
+the connection and cannot distinguish that from silence; reading in large pieces and splitting costs about 2 us a frame.
 """
 
 import socket
@@ -23,7 +22,7 @@ MAX_CHUNK_BYTES = 1 << 18
 
 
 class HubClock:
-    """The hub's clock against ours; one that sends no clock at all has none."""
+    """The hub's clock against ours; some hubs send no time stamps."""
 
     _WINDOW_S = 10.0
 
@@ -84,7 +83,7 @@ class SocketcandPort:
             raise ConnectError(self._name, f"{otherwise}; check host, port and channel")
 
     def receive(self, ring: FrameRing, timeout_s: float) -> None:
-        """Read what has come in one piece and split it; the hub's stamps become host-monotonic ones."""
+        """Read what has arrived and split it into frames with host-monotonic stamps."""
         self._socket.settimeout(timeout_s)
         try:
             chunk = self._socket.recv(min(MAX_CHUNK_BYTES, ring.room * MIN_LINE_BYTES))

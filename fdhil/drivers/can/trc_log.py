@@ -1,4 +1,4 @@
-"""PEAK's TRC logs: versions 1.0 to 2.1 are read, 2.1 is written.
+"""Reads PEAK's TRC logs, versions 1.0 to 2.1, and writes 2.1.
 
 Source: PEAK CAN TRC file format, 2020-07-27. Start times are taken as UTC, as python-can writes them.
 """
@@ -37,8 +37,6 @@ _WARNING_ID = "FFFFFFFF"
 
 
 class _Head:
-    """What the lines that begin with a semicolon say."""
-
     def __init__(self) -> None:
         self.columns: Sequence[str] = ()
         self.start_ns: int | None = None
@@ -46,7 +44,7 @@ class _Head:
         self._version = "1.0"
 
     def take(self, line: str) -> None:
-        """Take in one line; InvalidOperation for a start that is no number."""
+        """Read one header line; InvalidOperation for an invalid start time."""
         self.names |= dict(named_by(line))
         key, _, value = line.partition("=")
         if key == ";$FILEVERSION":
@@ -58,7 +56,7 @@ class _Head:
             self.columns = value.strip().split(",")
 
     def complete(self) -> Sequence[str]:
-        """Return the columns; ValueError where neither head nor version names them."""
+        """Return the columns; ValueError where neither header nor version names them."""
         columns = self.columns or _COLUMNS.get(self._version, "").split(",")
         if not {"O", "I", "D"} <= set(columns) or not {"l", "L"} & set(columns):
             raise ValueError(f"columns of version {self._version} are not known")
@@ -117,7 +115,7 @@ def _dlc(row: Mapping[str, str], fd: int | None) -> int:
 
 
 def write(path: Path, frames: Iterable[LoggedFrame], header: LogHeader) -> None:
-    """Write a log of version 2.1. Error frames have no row that holds what SocketCAN says of them: none may come."""
+    """Write a log of version 2.1, which cannot hold error frames."""
     days = Decimal(header.start_ns) / _DAY_NS + _EPOCH_DAYS
     date = datetime.fromtimestamp(header.start_ns // 1_000_000_000, UTC)
     lines = [";$FILEVERSION=2.1", f";$STARTTIME={days:.15f}", ";$COLUMNS=N,O,T,B,I,d,R,L,D", ";"]

@@ -1,6 +1,6 @@
-"""Tells what fdhil can and cannot do with a device, by its EDS and a profile: each point with its reason.
+"""Determines what fdhil can do with a device, by its EDS and a profile: each capability with its reason.
 
-An EDS is what the maker says. ``perhaps`` is what it does not settle, and a drive does.
+An EDS is the vendor's statement. ``perhaps`` means that only the drive itself can settle it.
 """
 
 import re
@@ -35,7 +35,7 @@ _SET_UP = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Ability:
-    """One thing that fdhil does with a drive, whether it can with this one, why, and what helps (may be empty)."""
+    """One capability: whether fdhil has it with this drive, why, and advice (may be empty)."""
 
     what: str
     answer: Answer
@@ -44,7 +44,7 @@ class Ability:
 
 
 def abilities(device: Device, profile: DriveProfile) -> list[Ability]:
-    """Return what can be done with the device by this profile, in the order in which one thing needs the other."""
+    """Return the capabilities with this profile, each after those it depends on."""
     if not device.is_drive:
         kind = (device.default(Object.DEVICE_TYPE) or 0) & 0xFFFF
         why = f"its device type is profile {kind or 'none'}, or it has no control- and statusword (6040, 6041)"
@@ -63,7 +63,7 @@ def abilities(device: Device, profile: DriveProfile) -> list[Ability]:
 
 
 def suggest_profile(device: Device) -> str:
-    """Return the packaged profile of the device's maker that fits its objects best, ``cia402`` where none is his."""
+    """Return the packaged profile of the device's vendor that fits its objects best, else ``cia402``."""
     named = [name for name in tables.DRIVE_PROFILES if name not in (GENERIC, _TWIN) and _is_of(device, name)]
     return min(named, key=lambda name: len(missing(device, read_profile(name))), default=GENERIC)
 
@@ -77,7 +77,7 @@ def _is_of(device: Device, name: str) -> bool:
 
 
 def missing(device: Device, profile: DriveProfile) -> list[ObjectKey]:
-    """Return the objects that the profile maps and the device does not have, or not in that size."""
+    """Return the objects that the profile maps and the device lacks, or has in another size."""
     entries = [entry for spec in (*profile.rpdos, *profile.tpdos) for entry in spec.entries]
     found = {(entry.index, entry.sub): device.find((entry.index, entry.sub)) for entry in entries}
     bits = {(entry.index, entry.sub): entry.bits for entry in entries}
@@ -85,7 +85,7 @@ def missing(device: Device, profile: DriveProfile) -> list[ObjectKey]:
 
 
 def named_alike(device: Device, what: Literal["voltage", "dc_link", "current"]) -> list[DeviceObject]:
-    """Return the maker's objects whose names sound like a motor voltage (or duty), the DC link or the current."""
+    """Return the vendor's objects whose names suggest a motor voltage (or duty), the DC link or the current."""
     pattern = {"voltage": _VOLTAGE, "dc_link": _DC_LINK, "current": _CURRENT}[what]
     own = [
         at
@@ -98,7 +98,7 @@ def named_alike(device: Device, what: Literal["voltage", "dc_link", "current"]) 
 
 
 def shown(key: ObjectKey) -> str:
-    """Return an object as 6064:00."""
+    """Format an object as 6064:00."""
     return f"{key[0]:04X}:{key[1]:02X}"
 
 
@@ -115,7 +115,6 @@ def _listen(device: Device, profile: DriveProfile) -> Iterator[Ability]:
 
 
 def _mapped(device: Device, profile: DriveProfile) -> Ability:
-    """Whether its PDOs are, or can be made, what the profile has."""
     differ = [spec.name for spec in profile.rpdos if not _same(spec, device.rpdos)]
     differ += [spec.name for spec in profile.tpdos if not _same(spec, device.tpdos)]
     if not differ:
@@ -137,7 +136,6 @@ def _same(spec: PdoSpec, places: Sequence[PdoPlace]) -> bool:
 
 
 def _stuck(spec: PdoSpec, places: Sequence[PdoPlace]) -> bool:
-    """Whether a PDO is not the profile's and cannot be made so."""
     place = _place_of(spec, places)
     if place is None or (place.fixed and place.mapped != _words(spec)):
         return True
@@ -154,7 +152,6 @@ def _words(spec: PdoSpec) -> tuple[int, ...]:
 
 
 def _voltage(device: Device, profile: DriveProfile) -> Ability:
-    """Where the terminal voltage comes from, which R and L need."""
     what, keys = "voltage", profile.voltage_objects
     if keys:
         if not profile.duty_per_count:
@@ -183,7 +180,6 @@ def _names(found: Sequence[DeviceObject]) -> str:
 
 
 def _demand(device: Device, profile: DriveProfile) -> Ability:
-    """Whether an NC can stream set-points that are then predicted."""
     what = "follow an NC"
     at = profile.find_rpdo(profile.target)
     if at is None:
@@ -226,7 +222,6 @@ def _feedforward(device: Device, profile: DriveProfile) -> Ability:
 
 
 def _safety(device: Device, profile: DriveProfile) -> Iterator[Ability]:
-    """Whether it stops by itself when nobody talks to it."""
     code, listens = (
         device.find((int(Object.ABORT_CONNECTION_OPTION), 0)),
         device.find((int(Object.CONSUMER_HEARTBEAT), 1)),
@@ -251,7 +246,6 @@ def _safety(device: Device, profile: DriveProfile) -> Iterator[Ability]:
 
 
 def _scale(device: Device) -> Iterator[Ability]:
-    """What of the configuration `check` can compare with the drive."""
     places = {
         "increments_per_rev": (Object.FEED_CONSTANT, Object.POSITION_ENCODER_RESOLUTION),
         "rated_current_a": (Object.RATED_CURRENT,),

@@ -1,4 +1,4 @@
-"""Reads what the drives did from a candump log of their buses, such as a black box, as the daemon heard it."""
+"""Decodes a candump log, such as a black box, into the drives' samples, as the daemon would have."""
 
 import contextlib
 import io
@@ -18,9 +18,9 @@ BLOCK_FRAMES = 4096
 
 
 def samples_of_log(log: bytes, config: MachineConfig) -> dict[str, AxisSamples]:
-    """Return by axis what was sampled in a log. RecordingError when it is no log of candump, or has no frame.
+    """Return the samples of each axis in a log; RecordingError when it is no candump log, or has no frame.
 
-    A SYNC of which no sample came is not there: nothing is made up.
+    A SYNC without a sample is left out: nothing is interpolated.
     """
     blocks: dict[str, list[AxisSamples]] = {axis: [] for axis in config.axis}
     for bus, frames in _frames(log).items():

@@ -1,4 +1,4 @@
-"""Says what an EDS or DCF file offers, as plain records: the device's identity, its objects and its PDOs."""
+"""Describes what an EDS or DCF file offers: the device's identity, its objects and its PDOs."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ NODE_ID = "$NODEID"
 
 @dataclass(frozen=True, slots=True)
 class DeviceObject:
-    """One variable of the dictionary; ``bits`` 0: it is no integer. ``default`` None: the file gives none.
+    """One variable of the dictionary; ``bits`` 0: not an integer. ``default`` None: not given in the file.
 
-    ``relative``: the default contains the node-ID. ``doubt`` says of a default that it can be read in no or two ways.
+    ``relative``: the default contains the node-ID. ``doubt`` explains a default that is invalid or ambiguous.
     """
 
     key: ObjectKey
@@ -34,7 +34,7 @@ class DeviceObject:
 
     @property
     def fixed(self) -> bool:
-        """Whether it cannot be written."""
+        """Whether it is read-only."""
         return self.access in ("ro", "const")
 
     @property
@@ -49,7 +49,7 @@ class DeviceObject:
 
     @property
     def perhaps_in_tpdo(self) -> bool:
-        """Whether a TPDO might carry it: many drives take more than the ``rww`` of their file says."""
+        """Whether a TPDO might carry it: many drives accept more than the ``rww`` of their file."""
         return self.mappable and self.bits > 0 and self.access == "rww"
 
 
@@ -57,8 +57,9 @@ class DeviceObject:
 class PdoPlace:
     """One PDO of the device: its number, default COB-ID less the node-ID, and how many objects it can map.
 
-    ``mapped`` are the default mapping words; ``fixed``: they cannot be written. ``cob_base`` None: the file gives none,
-    or one that belongs to a node it does not name. ``cob_fixed``, ``kind_fixed``: COB-ID and transmission type stay.
+    ``mapped`` are the default mapping words, read-only if ``fixed``. ``cob_base`` None: not given, or it belongs to a
+    node
+    that the file does not name. ``cob_fixed``, ``kind_fixed``: COB-ID and transmission type are read-only.
     """
 
     number: int
@@ -74,7 +75,7 @@ class PdoPlace:
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """What a file says of its device; numbers are 0 where it does not say them."""
+    """Content of a device's file; numbers are 0 where it does not give them."""
 
     file: str
     vendor_name: str
@@ -87,7 +88,7 @@ class Device:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What the file writes so that it can be read in two ways, a sentence each."""
+        """Ambiguous or invalid numbers of the file, a sentence each."""
         return tuple(found.doubt for found in self.objects.values() if found.doubt)
 
     def find(self, key: ObjectKey) -> DeviceObject | None:
@@ -100,13 +101,13 @@ class Device:
         return None if found is None else found.default
 
     def entry(self, key: ObjectKey) -> tuple[int, int, int, bool] | None:
-        """Return an object as a mapping entry; None where it is none."""
+        """Return an object as a mapping entry; None where it is missing or not an integer."""
         found = self.find(key)
         return None if found is None or not found.bits else (*key, found.bits, found.signed)
 
     @property
     def axes(self) -> tuple[int, ...]:
-        """The logical axes of CiA 402 that it has a controlword for: its objects lie 0x800 higher for each."""
+        """The logical axes of CiA 402 with a controlword: their objects lie 0x800 higher for each."""
         words = {axis: (Object.CONTROLWORD + (axis - 1) * LOGICAL_AXIS_STEP, 0) for axis in LOGICAL_AXES}
         return tuple(axis for axis, key in words.items() if key in self.objects)
 
@@ -196,7 +197,7 @@ def _pdos(
 
 
 def _cob_base(cob: DeviceObject, own: int | None) -> int | None:
-    """Return a COB-ID less the node-ID that it contains; None where none is given, or it is an unknown node's."""
+    """Return a COB-ID less the node-ID that it contains; None where none is given, or the node is unknown."""
     number = (cob.default or 0) & COB_ID_BITS
     if not number or (cob.default or 0) & EXTENDED:
         return None

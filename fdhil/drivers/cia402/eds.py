@@ -100,15 +100,12 @@ def parse_eds(raw: bytes, name: str, node_id: int | None = None) -> ObjectDictio
 
 
 def _read(sections: Sequence[_Section], node_id: int | None) -> ObjectDictionary:
-    """Hand the sections to the library; one of ``_LIBRARY_ERRORS`` when it cannot read them."""
     source = io.StringIO("".join(section.text() for section in sections))
     source.name = "clean.eds"
     return import_od(source, node_id)
 
 
 def _first_unreadable(sections: Sequence[_Section], node_id: int | None) -> int:
-    """Return the section that makes the file unreadable: the last of the fewest that the library cannot read."""
-
     def fails(count: int) -> bool:
         try:
             _read(sections[:count], node_id)
@@ -120,7 +117,6 @@ def _first_unreadable(sections: Sequence[_Section], node_id: int | None) -> int:
 
 
 def _sections(raw: bytes, name: str) -> list[_Section]:
-    """Read and mend all sections; one that comes twice is merged, the later key counts."""
     if len(raw) > MAX_BYTES:
         raise EdsError(name, f"it is larger than {MAX_BYTES >> 20} MiB; this is no EDS file")
     sections: dict[str, _Section] = {}
@@ -160,13 +156,11 @@ def _title(found: str) -> str:
 
 
 def _line_of(title: str, sections: Mapping[str, _Section]) -> int:
-    """The line of a section, or of the object that it was made of."""
     found = sections.get(title) or sections.get(title[:4]) or sections.get("DeviceInfo")
     return found.line if found else 1
 
 
 def _lines(raw: bytes, name: str) -> Iterator[tuple[int, str]]:
-    """Yield (line number, text) of every line that says something."""
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -202,7 +196,6 @@ def _store(section: _Section, key: str, value: str, line: int, name: str) -> Non
 
 
 def _complete(sections: dict[str, _Section], name: str) -> list[_Section]:
-    """Drop what the library stumbles over, fill in what it insists on, and put objects before their sub-objects."""
     for title in [t for t in sections if t.lower() in ("comments", "") or is_list(t)]:
         del sections[title]
     sections.setdefault("DeviceInfo", _Section("DeviceInfo", 1))
@@ -227,7 +220,6 @@ def _complete(sections: dict[str, _Section], name: str) -> list[_Section]:
 
 
 def _commissioning(section: _Section, name: str) -> dict[str, str]:
-    """The node-ID and bit rate of a DCF; EdsError for a node-ID that is none, or can be read in two ways."""
     found: dict[str, str] = {}
     for key, text in section.values.items():
         number = read_number(text)
@@ -245,10 +237,6 @@ def _commissioning(section: _Section, name: str) -> dict[str, str]:
 
 
 def _complete_values(section: _Section, name: str) -> None:
-    """Write the numbers of an object as the library reads them; EdsError where a PDO's can be read in no or two ways.
-
-    Any other number that is written in octal or decimal stays as it is: whoever needs it names both.
-    """
     of_pdo = int(section.name[:4], 16) in _PDO_SET_UP
     for key in _VALUE_KEYS:
         text = section.values.get(key, "")
@@ -267,7 +255,6 @@ def _complete_values(section: _Section, name: str) -> None:
 
 
 def _require_one_reading(where: str, text: str, name: str) -> None:
-    """EdsError where a number with a leading zero is another in octal than in decimal."""
     if (octal := octal_reading(text)) is not None:
         readings = f"as octal {octal:#x}, as decimal {read_expression(text)[0]:#x}"  # type: ignore[index] # it is one
         raise EdsError(name, f"{where} is {text[:40]!r}: {readings}; write it without the leading zero, or with 0x")

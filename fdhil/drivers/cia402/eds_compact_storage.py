@@ -47,7 +47,6 @@ def written_out(sections: Mapping[str, Keys], most: int) -> Mapping[str, Keys]:
 def _sub_objects(
     sections: Mapping[str, Keys], title: str, keys: Keys, count: int
 ) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield the sub-objects of an object with CompactSubObj: all as the object says, each with its own name."""
     names = next((names for at, names in sections.items() if at.lower() == f"{title}name".lower()), {})
     shared = {key: keys[key] for key in ("DataType", "AccessType", "PDOMapping", "DefaultValue") if key in keys}
     shared |= {key: keys[key] for key in ("LowLimit", "HighLimit") if key in keys}
@@ -59,7 +58,6 @@ def _sub_objects(
 
 
 def _compact_pdos(sections: Mapping[str, Keys]) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield the parameters of the PDOs that CompactPDO and the numbers of PDOs in [DeviceInfo] stand for."""
     device: Keys = sections.get("DeviceInfo", {})
     mask = read_number(device.get("CompactPDO", "")) or 0
     granularity = read_number(device.get("Granularity", "")) or 0

@@ -1,7 +1,7 @@
 """Reads drive profiles: packaged ones by name, the user's own from a TOML file, the generic one from an EDS.
 
-A file may begin with ``base = "epos4"``: what it does not say is then that profile's. A table or list that it gives
-(``rpdos``, ``tpdos``) takes the place of the other's as a whole.
+A file may begin with ``base = "epos4"``: other keys are then inherited from that profile. A table or list
+(``rpdos``, ``tpdos``) replaces the inherited one as a whole.
 """
 
 import tomllib
@@ -33,8 +33,8 @@ _KINDS: Mapping[str, TypeAdapter[Any]] = {
 def load_profile(drive: Drive) -> DriveProfile:
     """Return the profile that ``[axis.X.drive]`` names, for that axis of its device.
 
-    ConfigError when its file cannot be read, or says what no profile can, or maps less than must be heard. A process
-    reads a file once: what is changed on disk counts from its next start.
+    ConfigError when its file is unreadable or invalid, or maps too little. A process reads a file once: changes on disk
+    take effect at its next start.
     """
     profile = read_profile(drive.profile, drive.eds)
     if drive.source == "hal" and drive.hal is not None and drive.hal.voltage is None:
@@ -53,13 +53,13 @@ def load_profile(drive: Drive) -> DriveProfile:
 
 
 def require_offset(profile: DriveProfile, axis: str) -> None:
-    """ConfigError where the drive takes no offset: what to do instead."""
+    """Raise ConfigError with advice where the drive takes no offset."""
     if not profile.takes_offset:
         raise _fault("config", f"axis.{axis}.drive.profile", no_offset(profile), NO_OFFSET_ADVICE)
 
 
 def no_offset(profile: DriveProfile) -> str:
-    """Return why nothing can be added to the set-points of this drive."""
+    """Explain why nothing can be added to the set-points of this drive."""
     if profile.find_rpdo(profile.offset) is not None and profile.unshown:
         unseen = ", ".join(f"{index:04X}:{sub:02X}" for index, sub in profile.unshown)
         return f"profile {profile.name} maps {unseen} into no TPDO, and no offset is sent that cannot be seen"
@@ -69,9 +69,9 @@ def no_offset(profile: DriveProfile) -> str:
 
 @cache
 def read_profile(name: str, eds: Path | None = None) -> DriveProfile:
-    """Return a packaged or own profile by its name or path, also one that maps too little; ConfigError, EdsError.
+    """Return a profile by its packaged name or path, complete or not; ConfigError, EdsError.
 
-    With the drive's EDS it maps what that offers, and no more.
+    With the drive's EDS it is reduced to what that offers.
     """
     document, title = _document(name), name if name in tables.DRIVE_PROFILES else Path(name).stem
     if "tpdos" not in document and "rpdos" not in document:
@@ -85,7 +85,7 @@ def read_profile(name: str, eds: Path | None = None) -> DriveProfile:
 
 
 def _mapped(document: Mapping[str, Any], name: str, eds: Path | None) -> dict[str, Any]:
-    """Return a profile that names no PDOs with those that its EDS offers; ConfigError without an EDS."""
+    """Add the PDOs that the EDS offers to a profile without PDOs; ConfigError without an EDS."""
     if eds is None:
         advice = "give drive.eds, the file that the drive's maker has for it"
         raise _fault(name, "tpdos", "are not in this profile, and there is no EDS to take them from", advice)
@@ -105,7 +105,6 @@ def _mapped(document: Mapping[str, Any], name: str, eds: Path | None) -> dict[st
 
 
 def _document(name: str, depth: int = 0) -> dict[str, Any]:
-    """Read the file of a profile, and those it is based on."""
     if depth > MOST_BASES:
         raise _fault(name, "base", "its bases have no end", "base it on a packaged profile")
     document = _toml(name)
@@ -128,7 +127,7 @@ def _toml(name: str) -> dict[str, Any]:
 
 
 def profile_of(document: Mapping[str, Any], name: str, source: str) -> DriveProfile:
-    """Build a profile from the tables of its file; ConfigError with every fault and its place."""
+    """Build a profile from the tables of its file; ConfigError with every fault and its location."""
     faults: list[ConfigFault] = []
     values: dict[str, Any] = {}
     known = {field.name for field in fields(DriveProfile)} - {"name"}
@@ -162,7 +161,6 @@ def _pdos(given: Any, kind: str, faults: list[ConfigFault]) -> tuple[PdoSpec, ..
 
 
 def _pdo(table: Mapping[str, Any]) -> PdoSpec:
-    """Lay the entries (index, sub-index, bits, signed) out; the PDO's number is the digits at the end of its name."""
     if unknown := table.keys() - _PDO_KEYS:
         raise ValueError(f"{', '.join(sorted(unknown))} is no key of a PDO")
     name = str(table["name"])
@@ -186,10 +184,11 @@ def _entry(given: Sequence[Any]) -> tuple[int, int, int, bool]:
 
 
 def _of_axis(profile: DriveProfile, number: int) -> DriveProfile:
-    """Return the profile of the ``number``-th axis of one device, made of that of the first.
+    """Return the profile of a device's ``number``-th axis, derived from that of the first.
 
-    Its objects are 0x800 higher (CiA 402-2), its PDOs 64 higher (CiA 402-3), and their COB-IDs those of the node-ID
-    that many higher, which the device must be set to: CiA 301 has no default for them.
+    Its objects are 0x800 higher (CiA 402-2), its PDOs 64 higher (CiA 402-3), and their COB-IDs those of a node-ID that
+    much
+    higher, which the device must be set to: CiA 301 has no default for them.
     """
     places = [field.name for field in fields(profile) if isinstance(getattr(profile, field.name), tuple)]
     keys = [name for name in places if name not in ("rpdos", "tpdos", "notes", "strict_abort_options")]

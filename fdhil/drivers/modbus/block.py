@@ -1,4 +1,4 @@
-"""Reads a voltage sensor that keeps its newest samples by number, at the registers that the configuration names."""
+"""Reads a voltage sensor that numbers its newest samples, at the configured registers."""
 
 import math
 
@@ -25,12 +25,12 @@ class BlockVoltage(ModbusVoltage):
         self._newest: int | None = None
 
     async def latch(self) -> None:
-        """Have the newest samples put into the registers, where the sensor must be told."""
+        """Trigger the sensor to store its newest samples in the registers, where it needs that."""
         if self._map.trigger_address is not None:
             await self.link.write(self._map.trigger_address, 1)
 
     async def block(self) -> SensorBlock:
-        """Read samples and count with one request; ProtocolError when they cannot be."""
+        """Read samples and count with one request; ProtocolError when they are implausible."""
         settings, block = self._settings, self._map
         registers = await self.link.read(settings.function, self._first, self._registers)
 
@@ -60,7 +60,7 @@ class BlockVoltage(ModbusVoltage):
         return SensorBlock(newest, block.rate_hz, math.nan, False, newest + 1 - held, frozen(volts), shown)
 
     def _unwrapped(self, newest: int) -> int:
-        """Go on counting where the sensor's count begins anew at 0; one that fell otherwise was restarted."""
+        """Continue the count where the sensor's wraps to 0; any other decrease is a restart."""
         if self._newest is not None:
             ahead = (newest - self._newest) % self._modulus
             newest = self._newest + ahead if ahead < self._modulus // 2 else newest

@@ -1,4 +1,4 @@
-"""A value in the registers of a Modbus unit: its newest, whenever it is asked."""
+"""Reads one value, the newest, from the registers of a Modbus unit."""
 
 import math
 
@@ -9,7 +9,8 @@ from fdhil.errors import ProtocolError
 
 
 class ModbusMeter:
-    """One value of a unit, of type ``kind``, read with one request so that it is not torn; no right one is ``most``."""
+    """One value of a unit, of type ``kind``, read with one request so that it is not torn; valid values are below
+    ``most``."""
 
     tells_by_itself = False
 
@@ -23,7 +24,7 @@ class ModbusMeter:
         self._registers: list[int] = []
 
     async def value(self) -> float:
-        """Return the value, scaled; DeviceError of the link, ProtocolError for what is no number."""
+        """Return the value, scaled; DeviceError of the link, ProtocolError for NaN and the like."""
         where = self._where
         registers = await self.link.read(where.function, where.address, registers_of(self._kind))
         self._registers = registers
@@ -34,7 +35,7 @@ class ModbusMeter:
         return where.scale * raw + where.offset
 
     def doubt(self, shown: str) -> str:
-        """Return what is to be told of a value that cannot be."""
+        """Describe an implausible value: where it was read, and what to compare."""
         where = self._where
         text = f"register {where.address} gives {shown} as {self._kind}"
         text += other_orders(self._registers, self._kind, where, self._most)

@@ -1,10 +1,10 @@
-"""A serial line with Modbus RTU units: one request at a time, silent intervals kept, late and foreign answers told.
+"""A serial line with Modbus RTU units: one request at a time, silent intervals, late and foreign answers detected.
 
-An answer names its unit and function but not what was asked. So what comes unasked is thrown away before the next
-request, and after a request that was not answered in time the line is heard for as long again before anybody asks. An
-answer that is later still is told by its shape: while one is owed, nothing of the same shape is asked before the unit
-has answered a probe of another shape (:mod:`fdhil.drivers.modbus.owed_answers`).
-Noise, or a piece, is no answer: ours may still come, and must not be taken for that of the next request.
+An answer names its unit and function but not its request. So unrequested bytes are discarded before each request, and
+after a request that was not answered in time the line is monitored for as long again. An answer that is later still is
+recognised by its shape: while one is outstanding, no request of the same shape is sent before the unit has answered a
+probe of another shape (:mod:`fdhil.drivers.modbus.owed_answers`).
+Noise, or a fragment, is not an answer: the real one may still come, and must not be taken for the next request's.
 """
 
 import asyncio
@@ -66,13 +66,13 @@ class RtuLine:
         return self._port.is_open
 
     async def connect(self, name: str, timeout_s: float) -> None:
-        """Open the device where it is not; ConnectError."""
+        """Open the device if it is not; ConnectError."""
         async with self._turn:
             if not self._port.is_open:
                 await self._port.connect(name, timeout_s)
 
     async def ask(self, request: Request) -> Answer:
-        """Ask and return the answer; what came damaged is asked for again, what did not come is not."""
+        """Send the request and return the answer; it is repeated after a damaged answer, not after a missing one."""
         async with self._turn:
             for left in range(RETRIES, -1, -1):
                 try:
@@ -92,7 +92,7 @@ class RtuLine:
         return await self._transact(request)
 
     async def _resynchronise(self, request: Request) -> None:
-        """Have the unit answer what no late answer can be taken for; DeviceTimeout while it does not."""
+        """Have the unit answer a probe of unmistakable shape; DeviceTimeout while it does not."""
         probe = self._owed.probe_for(request)
         if probe is not None:
             with contextlib.suppress(ModbusRefused):
@@ -104,7 +104,6 @@ class RtuLine:
             raise no_answer(request, self._advice)
 
     async def _transact(self, request: Request) -> Answer:
-        """Ask and return the answer, which settles what the unit was asked before."""
         await self._fall_silent()
         body = struct.pack(">BHH", request.function, request.address, request.value)
         frame = framed(request.unit, body)
@@ -122,7 +121,7 @@ class RtuLine:
         return Answer(registers, min(asked_ns, answered_ns), answered_ns)
 
     async def _late_answers(self, name: str) -> None:
-        """Hear the line after a request that was not answered, until the late answer is through or time is up."""
+        """Receive after an unanswered request, until the late answer has come or time is up."""
         stale, data = bool(self._port.discard()), b""
         self._owed.forget(time.monotonic_ns())
         while self._owed and time.monotonic_ns() < self._late_until_ns:
@@ -133,7 +132,7 @@ class RtuLine:
         self.counted["ModbusStale"] += stale or bool(data)
 
     async def _fall_silent(self) -> None:
-        """Wait until nothing was on the line for 3.5 characters, and forget what was."""
+        """Wait until the line was silent for 3.5 characters, and discard what was received."""
         while True:
             last_ns = max(self._busy_until_ns, self._port.last_ns)
             left_ns = last_ns + round(self.silence_s * 1e9) - time.monotonic_ns()
@@ -143,9 +142,9 @@ class RtuLine:
         self._port.discard()
 
     async def _answer(self, request: Request, asked_ns: int, echo: bytes) -> tuple[bytes, int]:
-        """Return the answer and when its first character came; DamagedAnswer, DeviceTimeout.
+        """Return the answer and the arrival of its first character; DamagedAnswer, DeviceTimeout.
 
-        ``echo``: what an adapter may hear of the request itself, and is no answer.
+        ``echo``: the request as an adapter may receive it back, which is skipped.
         """
         port, unit, function, count = self._port, request.unit, request.function, request.count
         data, first_ns = b"", 0

@@ -1,8 +1,10 @@
-"""A Modbus TCP connection through pymodbus: our own deadline, one error per fault.
+"""A Modbus TCP connection through pymodbus, with its own deadline and one error per fault.
 
-pymodbus repeats a request by itself (12 s of silence by default), logs every fault at ERROR and closes the line after
-a few silent requests; none of it suits a sensor that is asked 20 times a second, so ``retries`` is 0 and its logger is
-quiet, and what an answer must be is checked here.
+pymodbus repeats requests by itself (12 s of silence by default), logs every fault at ERROR and closes the line after a
+few
+unanswered requests; none of it suits a sensor that is polled 20 times a second, so ``retries`` is 0, its logger is
+quiet,
+and answers are validated here.
 """
 
 import asyncio
@@ -41,7 +43,7 @@ class _Nonsense(ModbusException):
 
 
 class _OtherUnit(ModbusException):
-    """Another unit than the one that was asked answered the request; ``unit`` is its number."""
+    """Another unit than the addressed one answered; ``unit`` is its number."""
 
     def __init__(self, unit: int) -> None:
         super().__init__(f"unit {unit}")
@@ -62,11 +64,11 @@ class TcpLine:
 
     @property
     def connected(self) -> bool:
-        """Whether the TCP connection stands."""
+        """Whether the TCP connection is established."""
         return self._client is not None and bool(self._client.connected)
 
     async def connect(self, name: str, timeout_s: float) -> None:
-        """Connect where it does not stand; ConnectError when nobody answers there."""
+        """Connect if not yet connected; ConnectError when the device cannot be reached."""
         async with self._turn:
             if self.connected:
                 return
@@ -87,7 +89,7 @@ class TcpLine:
                 raise ConnectError(name, text)
 
     async def ask(self, request: Request) -> Answer:
-        """Ask and return the answer; DeviceError."""
+        """Send the request and return the answer; DeviceError."""
         async with self._turn:
             asked_ns = time.monotonic_ns()
             answer = await self.answered(self._call(request), request)
@@ -165,7 +167,7 @@ class TcpLine:
 
 
 def _end_waiting_at_nonsense(client: AsyncModbusTcpClient) -> None:
-    """Have bytes that the library cannot read end the waiting: it raises in the loop, which tells a traceback."""
+    """Fail the pending request when bytes come that the library cannot read: it raises in the event loop instead."""
     wire = client.ctx
     read = wire.callback_data
 
@@ -182,7 +184,7 @@ def _end_waiting_at_nonsense(client: AsyncModbusTcpClient) -> None:
 
 
 def _refuse_other_units(client: AsyncModbusTcpClient) -> None:
-    """Have an answer under another unit's number end the waiting: the library skips it, and waits on in vain.
+    """Fail the pending request when another unit answers it: the library skips the answer and waits for ever.
 
     Its transaction number shows that it answers this request.
     """

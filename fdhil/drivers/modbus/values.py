@@ -1,4 +1,4 @@
-"""Numbers in 16 bit registers. Pure."""
+"""Decodes numbers in 16-bit registers. Pure."""
 
 import itertools
 import math
@@ -18,7 +18,7 @@ CODES = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32"
 
 
 def registers_of(kind: str) -> int:
-    """Return how many registers one number takes.
+    """Return the number of registers of one number.
 
     >>> registers_of("float64")
     4
@@ -27,7 +27,7 @@ def registers_of(kind: str) -> int:
 
 
 def numbers(registers: Sequence[int], kind: str, word_order: WordOrder = "big", byte_order: WordOrder = "big") -> Float:
-    """Return the numbers (n,) of this type that the registers hold one after the other.
+    """Decode consecutive numbers (n,) of this type.
 
     >>> float(numbers([0x0000, 0x4248], "float32", "little")[0])
     50.0
@@ -43,7 +43,7 @@ def numbers(registers: Sequence[int], kind: str, word_order: WordOrder = "big", 
 
 
 def float32(registers: Sequence[int], at: int = 0) -> float:
-    """Return the float32 in two registers, high word first.
+    """Decode the float32 in two registers, high word first.
 
     >>> float32([0x4248, 0x0000])
     50.0
@@ -52,12 +52,12 @@ def float32(registers: Sequence[int], at: int = 0) -> float:
 
 
 def uint32(registers: Sequence[int], at: int = 0) -> int:
-    """Return the unsigned integer in two registers, high word first."""
+    """Decode the unsigned integer in two registers, high word first."""
     return registers[at] << 16 | registers[at + 1]
 
 
 class ValuePlace(Protocol):
-    """Where a value is and what it means: the keys of :class:`fdhil.config.sensors.ModbusValue` and ``scale``."""
+    """Location and scale of a value: the keys of :class:`fdhil.config.sensors.ModbusValue` and ``scale``."""
 
     @property
     def function(self) -> int: ...
@@ -74,9 +74,9 @@ class ValuePlace(Protocol):
 
 
 def other_orders(registers: Sequence[int], kind: str, where: ValuePlace, most: float = LIKELY[1]) -> str:
-    """Return what the first value of the registers would be in another order of words and bytes, for a message.
+    """Describe, for a message, the first value in other word and byte orders.
 
-    Only what an instrument can show is named: 0, or between ``LIKELY[0]`` and ``most``, scaled.
+    Only plausible values are named: 0, or between ``LIKELY[0]`` and ``most``, scaled.
     """
     found = []
     first = registers[: registers_of(kind)]

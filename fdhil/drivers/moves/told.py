@@ -1,9 +1,12 @@
-"""Tells G0 by what the NC itself says: the kind of a move comes from the NC, its edges from the demand. Pure.
+"""Detects G0 by the NC's own reports: the NC gives the kind of a move, the demand its edges. Pure.
 
-The demand shows exactly when an axis moves, to and fro; what the NC says is known to the accuracy of its source. So a
-move in one direction is of the kind that the NC says within it, and where it says two the demand's slowest row between
-them parts them. An NC that tells its own set-points is laid on the bus by them, exact to a cycle; any other by the
-clocks. A move in which the NC was not heard is UNKNOWN, and no rapid.
+The demand shows exactly when an axis moves back and forth; the NC's reports are as accurate in time as their source. So
+a
+move in one direction has the kind that the NC reports within it, and where it reports two, they are divided at the
+slowest
+sample of the demand between them. An NC that reports its own set-points is aligned by them, exact to a cycle; any other
+by
+the clocks. A move without a report of the NC is UNKNOWN, and not used as a rapid.
 """
 
 import math
@@ -28,7 +31,7 @@ NEXT = 1.5  # ticks between two states that are those of neighbouring cycles
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """What the NC said, and the ticks between which that was so."""
+    """A state of the NC, and the ticks between which it was valid."""
 
     low: float
     high: float
@@ -36,7 +39,7 @@ class Said:
 
 
 class ToldG0:
-    """Feeds on samples, arrivals of SYNC and the NC's states, and says RAPID, FEED, ARC, UNKNOWN and REST."""
+    """Classifies moves by samples, SYNC arrivals and NC states as RAPID, FEED, ARC, UNKNOWN and REST."""
 
     needs_input = False
     least_share = 0.0
@@ -56,7 +59,8 @@ class ToldG0:
         self._kind = MoveKind.REST
 
     def feed(self, record: AxisSamples | InputSamples | TickTimes | NcState) -> list[MoveEvent]:
-        """Take a block of samples, arrivals of SYNC, or what the NC says; return the moves that are known by now."""
+        """Take a block of samples, SYNC arrivals, or a state of the NC; return the moves that can be classified by
+        now."""
         if isinstance(record, TickTimes):
             self._clock.add(record)
         elif isinstance(record, NcState):
@@ -79,7 +83,7 @@ class ToldG0:
             yield from self._tell(self._waiting.popleft())
 
     def _place_new(self) -> None:
-        """Place what the NC said by the clocks, once the SYNCs of that time have come."""
+        """Locate the NC's states by the clocks, once the SYNCs of that time have arrived."""
         while self._new:
             state = self._new[0]
             begin_ns, end_ns = state.stamp_ns - state.error_ns, state.stamp_ns + state.error_ns
@@ -99,7 +103,7 @@ class ToldG0:
         return last is not None and state.nc_tick is not None and state.nc_tick < last
 
     def _where(self, said: Said) -> Said | None:
-        """Return what was said at the ticks that its set-points tell, else the clocks; None while they tell none."""
+        """Locate a state by its set-points, else by the clocks; None while they are not aligned."""
         if not self._alignment.possible(said.state):
             return said
         if self._alignment.offset is None or said.state.nc_tick is None:
@@ -125,7 +129,7 @@ class ToldG0:
             yield MoveEvent(self._axis, MoveKind.REST, stretch.end, self._source)
 
     def _about(self, stretch: Stretch) -> list[Said]:
-        """Return what the NC said in a stretch, and the last before it: that still held; older ones are forgotten."""
+        """Return the states in a segment and the last before it, which was still valid; drop older ones."""
         placed = [found for found in map(self._where, self._said) if found is not None]
         found = _of_a_piece(placed, stretch.begin - self._after_hold, stretch.end)
         while found and self._said[0].state is not found[0].state:
@@ -133,7 +137,7 @@ class ToldG0:
         return found
 
     def _pieces(self, stretch: Stretch, said: Sequence[Said]) -> Iterator[tuple[int, MoveKind]]:
-        """Yield from which tick on a stretch is of which kind; at its first tick the axis does not move yet."""
+        """Yield from which tick on a segment has which kind; at its first tick the axis does not move yet."""
         within = [each for each in said if each.low > stretch.begin and each.high <= stretch.end]
         sure = [each for each in within if each.state.motion in MOVING]
         if not sure:
@@ -150,19 +154,19 @@ class ToldG0:
 
 
 def _of_a_piece(said: Sequence[Said], begin: int, end: int) -> list[Said]:
-    """Return what was said between two ticks, and the last before them, which still held."""
+    """Return the states between two ticks, and the last before them, which was still valid."""
     before = [each for each in said if each.high < begin]
     return [*before[-1:], *(each for each in said if each.high >= begin and each.low <= end)]
 
 
 def _held(said: Sequence[Said]) -> bool | None:
-    """Return whether a feed hold was on; None where that was not told."""
+    """Return whether a feed hold was on; None where that is unknown."""
     holds = [each.state.held for each in said if each.state.feed_hold is not None or each.state.held]
     return any(holds) if holds else None
 
 
 def _move(said: Sequence[Said], begin: int, kind: MoveKind, held: bool | None) -> NcMove:
-    """Return what was said of a move, all of it together; its line is the first that was said while it ran."""
+    """Summarise the states of a move; its line is the first one reported while it ran."""
     states = [each.state for each in said]
     own = [each.state for each in said if each.low > begin and each.state.motion is kind]
     overrides = [override for state in states if (override := _override(state, kind)) is not None]

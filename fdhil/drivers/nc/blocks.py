@@ -1,11 +1,11 @@
-"""Tells the kind of a move from the text of its block, as an NC shows it. Pure.
+"""Determines the kind of a move from the text of its block, as an NC shows it. Pure.
 
-A G word of motion is modal: a block without one moves as the block before it. Any motion but G0 ends what G0 ordered,
-and so does a word that is not known to order none: threads (G32, G33), probing (G31, G38), splines, cycles and calls
-are never rapids. What an interface shows may leave blocks out, and then the kind is unknown until a block has a word of
-its own.
+A G word of motion is modal: a block without one moves as the block before it. Any motion but G0 ends a G0, and so does
+a
+word whose motion is unknown: threads (G32, G33), probing (G31, G38), splines, cycles and calls are never rapids. An
+interface may skip blocks, and then the kind is unknown until a block has a word of its own.
 Sources: ISO 6983-1 (G00 to G03); LinuxCNC's modal groups; Fanuc's lathe codes of system A, in which G90, G92 and G94
-with axis words cut; for Klartext the maker's user's manuals: FMAX holds for its block alone.
+with axis words cut; for Klartext the vendor's user's manuals: FMAX is valid in its block only.
 """
 
 import re
@@ -38,14 +38,14 @@ _ONCE = frozenset({28, 29, 30, 31, 37})  # move in their block alone: home, skip
 
 
 class BlockReader(Protocol):
-    """Follows the blocks that an NC shows."""
+    """Tracks the blocks that an NC shows."""
 
     def kind(self, text: str, line: int | None) -> MoveKind | None:
-        """Return what the block at this source line moves as, None where it does not show."""
+        """Return how the block at this source line moves, None where that is unknown."""
 
 
 class IsoBlocks:
-    """Blocks of ISO 6983: the last G0, G1, G2 or G3 holds, as far as the blocks follow each other."""
+    """Blocks of ISO 6983: the last G0, G1, G2 or G3 is valid as long as no block is skipped."""
 
     def __init__(self) -> None:
         self._held: MoveKind | None = None
@@ -53,7 +53,7 @@ class IsoBlocks:
         self._text = ""
 
     def kind(self, text: str, line: int | None) -> MoveKind | None:
-        """Return what the block moves as; None without a word of its own where blocks may have been left out."""
+        """Return how the block moves; None without a word of its own where blocks may have been skipped."""
         code = _COMMENT.sub(" ", text)
         words = [(int(word[1]), bool((word[2] or "").strip(".0"))) for word in _G.finditer(code)]
         told = {G_WORDS.get(number) for number, form in words if number in G_WORDS and not form}
@@ -71,7 +71,7 @@ class IsoBlocks:
 
 
 def _orders_another(words: Sequence[tuple[int, bool]], code: str, straight: bool) -> bool:
-    """Return whether a block has a word that orders, or may order, another motion than G0 to G3.
+    """Return whether a block commands, or may command, another motion than G0 to G3.
 
     ``words`` are its G codes, and whether each has a digit behind its point; ``straight``: it has one of G0 to G3, with
     which G90, G92 and G94 cut nothing.
@@ -85,10 +85,10 @@ def _orders_another(words: Sequence[tuple[int, bool]], code: str, straight: bool
 
 
 class KlartextBlocks:
-    """Blocks of Heidenhain's Klartext: a straight line with FMAX is a rapid, and each block tells for itself."""
+    """Blocks of Heidenhain's Klartext: a straight line with FMAX is a rapid; no word is modal."""
 
     def kind(self, text: str, line: int | None) -> MoveKind | None:
-        """Return what the block moves as, None for one that is no line and no arc."""
+        """Return how the block moves, None where it is neither line nor arc."""
         block = _COMMENT.sub(" ", text) + " "
         if not _STRAIGHT.match(block):
             return MoveKind.ARC if _ARC.match(block) and not _RAPID.search(block) else None

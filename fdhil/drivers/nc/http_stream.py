@@ -1,4 +1,4 @@
-"""Gets a document, or a stream of documents, over HTTP/1.1: as much of it as an MTConnect agent needs.
+"""Gets a document, or a stream of documents, over HTTP/1.1, to the extent that an MTConnect agent needs.
 
 Sources: RFC 9112 (messages, chunked), RFC 2046 5.1 (multipart); MTConnect Standard Part 1 (multipart/x-mixed-replace).
 """
@@ -19,7 +19,7 @@ _STATUS = re.compile(rb"HTTP/1\.[01] (\d{3})")
 
 
 class Response:
-    """An answer whose head has come; the rest is read as it is asked for."""
+    """An answer whose head has arrived; the body is read on demand."""
 
     def __init__(self, name: str, reader: asyncio.StreamReader) -> None:
         self._name, self._reader = name, reader
@@ -89,7 +89,7 @@ class Response:
         return bool(self._left)
 
     async def document(self) -> bytes:
-        """Return the whole body; ProtocolError for one that is too large."""
+        """Return the whole body; ProtocolError if it is too large."""
         whole = b""
         try:
             while came := await self.some():
@@ -115,7 +115,7 @@ class Parts:
         self._rest = b""
 
     def feed(self, came: bytes) -> list[bytes]:
-        """Take the next bytes; return the parts that are whole with them. ProtocolError for what is no part."""
+        """Add bytes; return the completed parts. ProtocolError for invalid ones."""
         self._rest += came
         parts = []
         while (part := self._next()) is not None:
@@ -149,7 +149,7 @@ class Parts:
 
 @asynccontextmanager
 async def get(name: str, url: str, timeout_s: float) -> AsyncIterator[Response]:
-    """Ask for a document; its head has come when this is entered. ConnectError, DeviceTimeout, ProtocolError."""
+    """Request a document; its head has arrived on entry. ConnectError, DeviceTimeout, ProtocolError."""
     parts = urlsplit(url)
     host, port = parts.hostname or "", parts.port or 80
     target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")

@@ -1,7 +1,9 @@
-"""Listens to LinuxCNC by its bridge (fdhil/bridges/linuxcnc.py): JSON lines over TCP, exact to a servo cycle.
+"""Receives LinuxCNC's state through its bridge (fdhil/bridges/linuxcnc.py): JSON lines over TCP, exact to a servo
+cycle.
 
-The first line tells what the bridge is, each later one the state in one servo cycle: a change of it with the cycle
-before, and a few in between. ``cycle`` is the count of the servo thread and ``mm`` its set-points.
+The first line identifies the bridge, each later one is the state in one servo cycle: a change of it with the cycle
+before,
+and a few in between. ``cycle`` is the count of the servo thread and ``mm`` its set-points.
 """
 
 import asyncio
@@ -74,7 +76,7 @@ class LinuxCnc:
         self._reader = self._writer = None
 
     async def read(self) -> Sequence[NcState]:
-        """Return the next states; those that have come already come together."""
+        """Return the next states; those that have already arrived are returned together."""
         states = [self._state(await self._next())]
         while self._waiting:
             states.append(self._state(await self._next()))
@@ -136,7 +138,7 @@ class LinuxCnc:
             ) from None
 
     def _demand_mm(self, places: Mapping[str, Any]) -> dict[str, float]:
-        """Return the places of the machine's drives: both of a gantry axis at one, degrees as lengths of arc."""
+        """Return the positions of the machine's drives: the same for both of a gantry axis, degrees as arc lengths."""
         found = {str(axis): _finite(place) for axis, place in places.items()}
         found |= {name: found[name[0]] for name in self._axes if name[0] in found}
         return {name: place * self._mm_per_degree.get(name, 1.0) for name, place in found.items()}

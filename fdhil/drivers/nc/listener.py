@@ -1,4 +1,4 @@
-"""Listens to the NC for ever: enters its source, hands its states over, and begins anew when it is lost."""
+"""Receives the NC's states for ever: connects its source, hands its states over, and reconnects it."""
 
 import asyncio
 import time
@@ -16,7 +16,7 @@ EFFECT = "Which moves are rapids is not known meanwhile, and none is used. It is
 
 
 class NcListener:
-    """The NC of a machine, by its source of ``tables.NC_SOURCES``; ``counters`` tells what was heard."""
+    """The NC of a machine, by its source of ``tables.NC_SOURCES``; ``counters`` counts states and failures."""
 
     def __init__(self, config: MachineConfig) -> None:
         self._source = load_nc_source(config.g0.source)(config)
@@ -25,7 +25,7 @@ class NcListener:
         self._silent = False
 
     async def run(self, take: Callable[[NcState | Notice], None]) -> None:
-        """Hand states over for ever; an NC that is not heard is UNKNOWN from then on, and told once."""
+        """Hand states over for ever; a silent NC is UNKNOWN from then on, and reported once."""
         pause_s = BACK_OFF_S[0]
         while True:
             before = self._states
@@ -60,5 +60,5 @@ class NcListener:
             take(Notice(CODE, "MAJOR", f"{error}{'' if str(error).endswith('?') else '.'} {EFFECT}"))
 
     def counters(self) -> dict[str, int]:
-        """States that were told, and how often the NC was lost or not reached."""
+        """Return the states received, and how often the NC was lost or not reached."""
         return {"states": self._states, "failures": self._failures}

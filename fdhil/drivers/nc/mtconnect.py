@@ -1,7 +1,8 @@
-"""Listens to an NC by its MTConnect agent: what it is now, then every change of it, as a stream over HTTP.
+"""Receives an NC's state from its MTConnect agent: the current state, then every change, as a stream over HTTP.
 
-The agent sends what is new every ``period_s``, and an empty document when nothing is: what a document tells is no older
-than the one before it. The agent's own stamps part what one document tells; its clock is not compared with ours.
+The agent sends changes every ``period_s``, and an empty document when there are none: a document is no older than the
+one
+before it. The agent's stamps separate the changes within a document; its clock is not compared with ours.
 """
 
 import asyncio
@@ -62,7 +63,7 @@ class MtConnect:
         await self._open.aclose()
 
     async def _current(self) -> tuple[Streams, int, int]:
-        """Return what the NC does now, with when it was asked for and had come."""
+        """Return the current state with the times of request and answer."""
         asked_ns = time.monotonic_ns()
         try:
             async with asyncio.timeout(ANSWER_S), get(self.name, f"{self._place}/current", ANSWER_S) as response:
@@ -90,7 +91,7 @@ class MtConnect:
         return response
 
     def _choose(self, streams: Streams) -> None:
-        """Find the profile's signals among the data items; ProtocolError with what is not there."""
+        """Find the profile's signals among the data items; ProtocolError names missing ones."""
         components = chosen(streams.components, self._settings.device, self._settings.path, self.name)
         found = {name: items_at(components, signal.at) for name, signal in self._profile.signals.items()}
         lacking = [
@@ -115,7 +116,7 @@ class MtConnect:
         return self._translator.state(self._shown, self._stamp_ns, error_ns)
 
     async def read(self) -> Sequence[NcState]:
-        """Return what the next document tells; DeviceError."""
+        """Return the states of the next document; DeviceError."""
         while not self._waiting:
             came = await self._response.some()
             if not came:
@@ -126,7 +127,7 @@ class MtConnect:
         return states
 
     def _states(self, streams: Streams) -> Iterator[NcState]:
-        """Yield a state for each instant of a document, and one for a document in which nothing is new."""
+        """Yield a state for each instant of a document, and one for a document without changes."""
         if streams.instance != self._instance:
             raise ProtocolError(self.name, "the agent was started anew; it is asked from the beginning")
         came_ns = time.monotonic_ns()

@@ -1,7 +1,8 @@
-"""Asks an NC what it does by its OPC UA server: every signal of the profile with one Read request.
+"""Polls an NC's state from its OPC UA server: every signal of the profile with one Read request.
 
-asyncua reconnects by itself only if it is told to, which it is not: the listener enters a source anew. Its logger is
-quiet, for what it logs is told by the errors here.
+asyncua's automatic reconnection stays off: the listener reconnects. Its logger is quiet, since the errors here report
+the
+same.
 """
 
 import asyncio
@@ -93,7 +94,7 @@ class OpcUa:
         return found
 
     async def read(self) -> Sequence[NcState]:
-        """Rest until it is time, ask, and return the state; DeviceError."""
+        """Wait for the period, poll, and return the state; DeviceError."""
         await asyncio.sleep(max(0.0, self._next_s - time.monotonic()))
         self._next_s = max(time.monotonic(), self._next_s + self._settings.period_s)
         asked_ns = time.monotonic_ns()
@@ -124,9 +125,9 @@ class OpcUa:
 
 @contextlib.asynccontextmanager
 async def _within(seconds: float) -> AsyncIterator[None]:
-    """Limit the time as asyncio.timeout does, also where the end comes together with an answer.
+    """Limit the time as asyncio.timeout does, also where it expires together with an answer.
 
-    asyncua is cancelled by a class of its own then, which Python 3.11 takes for somebody else's cancellation.
+    asyncua is then cancelled by its own exception class, which Python 3.11 takes for somebody else's cancellation.
     """
     async with asyncio.timeout(seconds):
         try:
@@ -136,7 +137,7 @@ async def _within(seconds: float) -> AsyncIterator[None]:
 
 
 def _shown(value: ua.DataValue) -> Shown:
-    """Return a value that is good; None for one that is not, and for what is no number and no text."""
+    """Return a good value; None for a bad one, and for what is neither number nor text."""
     if value.Value is None or (value.StatusCode is not None and not value.StatusCode.is_good()):
         return None
     plain: Any = value.Value.Value

@@ -1,4 +1,4 @@
-"""Finds the nodes of a server by what a profile says of their places."""
+"""Finds the nodes of a server by the places in a profile."""
 
 from collections.abc import Iterable, Mapping
 
@@ -13,7 +13,7 @@ PATH = "Objects/"
 
 
 class _Browser:
-    """Looks into nodes, into each once."""
+    """Browses nodes, each once."""
 
     def __init__(self, client: Client) -> None:
         self._client = client
@@ -46,7 +46,7 @@ def _named(references: Iterable[ua.ReferenceDescription]) -> Iterable[tuple[str,
 
 
 def check_places(places: Mapping[str, str], source: str) -> None:
-    """ConfigError with every place that is neither a node id nor a path."""
+    """Raise ConfigError with every place that is neither a node id nor a path."""
     faults = []
     for name, at in places.items():
         try:
@@ -60,7 +60,7 @@ def check_places(places: Mapping[str, str], source: str) -> None:
 
 
 async def find_nodes(client: Client, places: Mapping[str, str]) -> dict[str, ua.NodeId]:
-    """Return the node of each place that there is: a node id, one with ``nsu=URI;`` in front, or a path of browse
+    """Return the node of each existing place: a node id, one with ``nsu=URI;`` in front, or a path of browse
     names from ``Objects/`` on."""
     browser, found = _Browser(client), {}
     spaces = await client.get_namespace_array() if any(at.startswith(NAMED) for at in places.values()) else []

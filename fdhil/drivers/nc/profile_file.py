@@ -51,7 +51,7 @@ class _File(_Table):
 
 
 def read_nc_profile(name: str, interface: str) -> NcProfile:
-    """Return a packaged profile by its name, or a user's own by its path; ConfigError with all that is wrong."""
+    """Return a packaged profile by its name, or a user's own by its path; ConfigError with every fault."""
     profile = profile_of(_document(name), name)
     if profile.interface != interface:
         raise _faults(name, [("interface", f"is for {profile.interface}, and is used for {interface}")])

@@ -1,4 +1,4 @@
-"""Reads an instrument that tells its value in lines of text over a serial line: asked, or by itself."""
+"""Reads an instrument that sends its value in lines of text over a serial line: on request, or by itself."""
 
 import re
 import time
@@ -16,7 +16,7 @@ SHOWN = 40  # characters of a line in a message
 
 
 class TextPlace(Protocol):
-    """What an instrument is asked and where its number is: the keys of :class:`fdhil.config.sensors.TextValue`."""
+    """Query and pattern of an instrument: the keys of :class:`fdhil.config.sensors.TextValue`."""
 
     @property
     def query(self) -> str: ...
@@ -48,7 +48,7 @@ class SerialLink:
         self.port.open(self.name)
 
     def fault_code(self, error: DeviceError) -> str | None:
-        """Return the class under which ``error`` is told."""
+        """Return the notice code of ``error``."""
         if isinstance(error, DeviceTimeout):
             return "SerialTimeout"
         return "SerialPortGone" if isinstance(error, ConnectError) else "SerialShape"
@@ -73,7 +73,7 @@ class TextMeter:
         self._line = ""
 
     async def value(self) -> float:
-        """Return the next number that is told, scaled; DeviceTimeout, ConnectError, ProtocolError for another text."""
+        """Return the next number, scaled; DeviceTimeout, ConnectError, ProtocolError for a line without one."""
         asked_ns = self._ask() if self._text.query else 0
         line = await self._lines.next_line(time.monotonic_ns() + round(self._wait_s * 1e9))
         if line is None:
@@ -85,7 +85,7 @@ class TextMeter:
         return self._number_in(line.text)
 
     def _ask(self) -> int:
-        """Ask, and return when the question was through; an answer that came too late is forgotten before."""
+        """Send the query and return when it was through; an answer that came too late is discarded before."""
         query = self._text.query.encode()
         self._lines.discard()
         return self.link.port.send(self.name, query) + self.link.port.wire_ns(len(query))
@@ -103,12 +103,12 @@ class TextMeter:
         return self._text.scale * raw + self._text.offset
 
     def doubt(self, shown: str) -> str:
-        """Return what is to be told of a value that cannot be."""
+        """Describe an implausible value."""
         return f"the line {self._line[:SHOWN]!r} gives {shown}; compare pattern, scale and unit with the instrument"
 
 
 def serial_voltage(axis: str, config: MachineConfig) -> MeterVoltage:
-    """Return the voltage source ``serial``."""
+    """Create the voltage source ``serial``."""
     settings = config.axis[axis].voltage
     meter = TextMeter(f"voltage sensor {axis}", settings, settings, settings.period_s)
     return MeterVoltage(axis, config, meter)

@@ -1,4 +1,4 @@
-"""Lines of text that come over a serial port, each with the time at which its end had come."""
+"""Splits the bytes of a serial port into lines, each with the arrival time of its end."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -11,14 +11,14 @@ LONGEST = 512  # characters; what is longer without an end is no line of an inst
 
 @dataclass(frozen=True, slots=True)
 class TextLine:
-    """A line without its end; its last character had come at ``t_ns`` (host-monotonic) at the latest."""
+    """A line without its end; its last character had arrived by ``t_ns`` (host-monotonic)."""
 
     text: str
     t_ns: int
 
 
 class LineReader:
-    """Cuts what a port receives into lines; carriage return, line feed and both end one. ``name`` is for messages."""
+    """Splits received bytes into lines; carriage return, line feed and both end one. ``name`` is for messages."""
 
     def __init__(self, port: SerialPort, name: str) -> None:
         self._port = port
@@ -50,7 +50,7 @@ class LineReader:
             self._begun, self.overlong = b"", self.overlong + 1
 
     def discard(self) -> None:
-        """Forget what has come so far."""
+        """Discard everything received so far."""
         self._port.discard()
         self._lines.clear()
         self._begun = b""

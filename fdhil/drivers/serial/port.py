@@ -1,4 +1,4 @@
-"""A serial port as a stream of bytes. The one place that knows pyserial."""
+"""A serial port as a stream of bytes; the only module that uses pyserial."""
 
 import asyncio
 import os
@@ -16,9 +16,9 @@ _PARITY = {"even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD, "none": serial.
 
 
 class SerialPort(ByteStream):
-    """An open device; nobody else may open it meanwhile. ``name`` is the sensor's, for messages.
+    """A device opened exclusively. ``name`` is the sensor's, for messages.
 
-    A pseudo terminal knows neither rate nor parity: ``wire_ns`` is 0 there.
+    A pseudo terminal has neither rate nor parity: ``wire_ns`` is 0 there.
     """
 
     def __init__(self, place: SerialPlace) -> None:
@@ -34,19 +34,19 @@ class SerialPort(ByteStream):
 
     @property
     def is_open(self) -> bool:
-        """Whether the device is open and has not gone away."""
+        """Whether the device is open and still there."""
         return self._serial is not None and not self._gone
 
     def wire_ns(self, count: int) -> int:
-        """How long ``count`` characters take on the wire."""
+        """Return the time that ``count`` characters take on the wire."""
         return 0 if self._is_pty else super().wire_ns(count)
 
     async def connect(self, name: str, timeout_s: float) -> None:
-        """Open the device: it is there at once or not at all."""
+        """Open the device at once."""
         self.open(name)
 
     def open(self, name: str) -> None:
-        """Open the device; ConnectError when it is not there, may not be used, or another program has it."""
+        """Open the device; ConnectError when it is missing, not permitted, or used by another program."""
         self.close()
         self._is_pty = os.path.realpath(self.device).startswith("/dev/pts/")
         try:
@@ -92,7 +92,8 @@ class SerialPort(ByteStream):
         self._stop_reading()
 
     def send(self, name: str, data: bytes) -> int:
-        """Write at once and return when (host-monotonic ns); ConnectError when the device is gone or takes nothing."""
+        """Write at once and return when (host-monotonic ns); ConnectError when the device is gone or accepts
+        nothing."""
         port = self._held(name)
         try:
             written = os.write(port.fileno(), data)

@@ -1,4 +1,4 @@
-"""The port of a serial server: it passes the bytes of its serial line over TCP, as they are."""
+"""Connects to a serial server, which passes the bytes of its serial line over TCP unchanged."""
 
 import asyncio
 import time
@@ -12,7 +12,7 @@ CHARACTER_S = 11 / 19200  # what its serial line is set to is unknown here
 
 
 class ServerPort(ByteStream, asyncio.Protocol):
-    """A TCP connection to a serial server. When the bytes are on its serial line is unknown: ``wire_ns`` is 0."""
+    """A TCP connection to a serial server. The times on its serial line are unknown: ``wire_ns`` is 0."""
 
     character_s = CHARACTER_S
 
@@ -24,7 +24,7 @@ class ServerPort(ByteStream, asyncio.Protocol):
 
     @property
     def is_open(self) -> bool:
-        """Whether the connection stands."""
+        """Whether the connection is established."""
         return self._transport is not None and not self._gone
 
     def wire_ns(self, count: int) -> int:
@@ -32,7 +32,7 @@ class ServerPort(ByteStream, asyncio.Protocol):
         return 0
 
     async def connect(self, name: str, timeout_s: float) -> None:
-        """Connect; ConnectError when nobody answers there."""
+        """Connect; ConnectError when the server cannot be reached."""
         self.close()
         try:
             async with asyncio.timeout(timeout_s + CONNECT_S):
@@ -42,15 +42,15 @@ class ServerPort(ByteStream, asyncio.Protocol):
             raise ConnectError(name, text) from None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take the connection."""
+        """Store the connection."""
         self._transport = cast("asyncio.WriteTransport", transport)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes."""
+        """Store received bytes."""
         self._take(data)
 
     def connection_lost(self, error: Exception | None) -> None:
-        """Note that the server ended the connection."""
+        """Note that the server closed the connection."""
         if self._transport is not None:
             self._end(str(error) if error else "the server ended it")
 

@@ -22,7 +22,7 @@ _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
 class SerialStream:
-    """The connection to a device that talks by itself."""
+    """The connection to a free-running device."""
 
     wire = "serial"
 
@@ -38,12 +38,12 @@ class SerialStream:
         return self._port.is_open
 
     async def connect(self) -> None:
-        """Open the port; ConnectError when it cannot be had."""
+        """Open the port; ConnectError."""
         self._port.open(self.name)
         self._heard_ns = time.monotonic_ns()
 
     async def lines(self) -> list[TextLine]:
-        """Return the lines that have come; DeviceTimeout when none has for a second, ConnectError."""
+        """Return the received lines; DeviceTimeout after a second without any, ConnectError."""
         found = []
         while (line := await self._reader.next_line(time.monotonic_ns())) is not None:
             found.append(line)
@@ -57,7 +57,7 @@ class SerialStream:
         return found
 
     def fault_code(self, error: DeviceError) -> str | None:
-        """Return the class under which ``error`` is told."""
+        """Return the notice code of ``error``."""
         if isinstance(error, DeviceTimeout):
             return "TableSilent"
         return "SerialPortGone" if isinstance(error, ConnectError) else "SerialShape"
@@ -68,7 +68,7 @@ class SerialStream:
 
 
 class StreamedAccelerometer:
-    """The accelerometer of one axis: ``samples`` came, ``lost`` are missing by the sensor's own count."""
+    """The accelerometer of one axis: ``samples`` received, ``lost`` by the sensor's own count."""
 
     def __init__(self, axis: str, settings: Accelerometer, period_s: float) -> None:
         self.axis = axis
@@ -84,11 +84,11 @@ class StreamedAccelerometer:
         self._told: int | None = None
 
     async def poll(self, ticks: TickClock) -> list[TableSamples | Notice]:
-        """Return what has come since the last time; errors of the link pass, ProtocolError where none is a sample."""
+        """Return new samples; errors of the link pass, ProtocolError where no line is a sample."""
         return self.accept(await self.link.lines(), ticks)
 
     async def reading(self) -> str:
-        """Return the newest sample, for people."""
+        """Wait for a sample and format it."""
         until_ns = time.monotonic_ns() + SILENCE_NS
         while not (found := await self.link.lines()):
             if time.monotonic_ns() > until_ns:
@@ -96,7 +96,7 @@ class StreamedAccelerometer:
         return f"{self._numbers(found[-1].text)[1]:.2f} m/s2"
 
     def accept(self, lines: list[TextLine], ticks: TickClock) -> list[TableSamples | Notice]:
-        """Place lines on the SYNC count. Pure but for this object's own memory."""
+        """Place lines on the SYNC count. Pure but for this object's own state."""
         lost_before = self.lost
         for line in lines:
             try:
@@ -119,7 +119,7 @@ class StreamedAccelerometer:
         return out
 
     def _numbers(self, text: str) -> tuple[int | None, float]:
-        """Return count and value of a line; ProtocolError where it has none."""
+        """Return count and value of a line; ProtocolError where they are missing."""
         s = self._settings
         numbers = _NUMBER.findall(text)
         if len(numbers) < max(s.column, s.count_column):
@@ -130,7 +130,7 @@ class StreamedAccelerometer:
         return count, float(numbers[s.column - 1]) * s.scale
 
     def _counted(self, told: int | None, value: float) -> tuple[int, float]:
-        """Return the count without its beginnings anew; a count of another kind begins another stream."""
+        """Unwrap the count; an implausible step begins another stream."""
         before = self._newest
         step = 1 if told is None or self._told is None else _step(self._told, told)
         if before is None or not 1 <= step <= LARGEST_GAP:
@@ -145,7 +145,6 @@ class StreamedAccelerometer:
         return self._newest, value
 
     def _placed(self) -> list[TableSamples]:
-        """Return the samples that wait as one record, once it is known where they are."""
         line = self._arrivals.line()
         if line is None or not self._held:
             return []
@@ -161,6 +160,6 @@ class StreamedAccelerometer:
 
 
 def _step(before: int, told: int) -> int:
-    """Return by how much a count rose, which may have begun anew at the next place where counts do."""
+    """Return the increase of a count, which may have wrapped at the next power that devices use."""
     wrap = next((w for w in WRAPS if w > before), WRAPS[-1])
     return told - before if told > before else told - before + wrap

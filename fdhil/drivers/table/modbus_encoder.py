@@ -1,4 +1,4 @@
-"""Asks an encoder at the table behind Modbus: an SSI or EnDat module, which tells where the table stands."""
+"""Polls an encoder at the table behind Modbus, such as an SSI or EnDat module, for the table's position."""
 
 import asyncio
 
@@ -29,7 +29,7 @@ class ModbusEncoder:
         return self._meter.link
 
     async def poll(self, ticks: TickClock) -> list[TableSamples]:
-        """Rest for the period and read once; it was read between question and answer. Errors of the link pass."""
+        """Wait for the period and read once; the value belongs between request and answer. Errors of the link pass."""
         await asyncio.sleep(self._period_s)
         value = await self._meter.value()
         self.samples += 1
@@ -45,5 +45,5 @@ class ModbusEncoder:
         return [TableSamples(self.axis, "table_mm", tick, (between[1] - between[0]) / 2, frozen([value]))]
 
     async def reading(self) -> str:
-        """Read once, for people."""
+        """Read once and format the value."""
         return f"{await self._meter.value():.4f} mm"

@@ -1,4 +1,4 @@
-"""Decodes the TPDO of an encoder at the table: a second axis' place, or that of an encoder node. Pure."""
+"""Decodes the TPDO of an encoder at the table: of a second axis, or of an encoder node. Pure."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ SILENT_TICKS = 3000  # of SYNC without that TPDO: then it is told
 
 
 class TpdoEncoder:
-    """The table encoder of one axis; ``feed`` takes ticked frames of its bus, ``short`` counts those too short."""
+    """The table encoder of one axis; ``short`` counts frames that are too short."""
 
     def __init__(self, axis: str, settings: TableEncoder) -> None:
         assert settings.cob_id is not None  # the configuration has seen to it
@@ -28,7 +28,7 @@ class TpdoEncoder:
         self._silent = False
 
     def feed(self, ticked: Ticked) -> list[TableSamples | Notice]:
-        """Return the samples of a block, and what must be told. Of two frames after one SYNC neither is sure."""
+        """Return the samples of a block, and notices. Two frames after one SYNC are ambiguous, and neither is used."""
         out: list[TableSamples | Notice] = []
         mine = (ticked.can_id == self.cob_id).nonzero()[0]
         long_enough = ticked.length[mine].astype(np.int64) * 8 >= self._entry.bit_offset + self._entry.bits
