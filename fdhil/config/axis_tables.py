@@ -1,9 +1,8 @@
 """Completes the [axis.*] tables of a document: angles become lengths at the radius, a second drive inherits keys.
 
 A rotary axis (``unit = "deg"``) is written in degrees: each key has ``deg`` where the models have ``mm``, and may have
-``mdeg`` where they have ``um``. It is then treated as a linear axis of the rim at ``radius_mm``: 1 degree is
-pi / 180 radius_mm. [axis.Y2] is the second drive of the gantry axis Y and inherits the keys of [axis.Y] that it does
-not set.
+``mdeg`` where they have ``um``. It is then treated as a linear axis of the rim at ``radius_mm``: 1 degree is pi / 180
+radius_mm. [axis.Y2] is the second drive of the gantry axis Y and inherits the keys of [axis.Y] that it does not set.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The users file: names, roles and scrypt hashes of passwords.
 
-Parameters of scrypt: N = 2^15, r = 8, p = 1 (32 MiB, about 0.1 s), after RFC 7914 and OWASP's password storage
-cheat sheet. The file is written atomically and is readable by its owner and group only.
+Parameters of scrypt: N = 2^15, r = 8, p = 1 (32 MiB, about 0.1 s), after RFC 7914 and OWASP's password storage cheat
+sheet. The file is written atomically and is readable by its owner and group only.
 """
 
 from __future__ import annotations

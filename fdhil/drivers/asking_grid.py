@@ -52,8 +52,7 @@ class AskingGrid:
 
     def read_at(self, number: int, asked_ns: int, answered_ns: int, ticks: TickClock) -> tuple[float, float, float]:
         """Return the host time (ns) of a value that was read between request and answer, its delay against the
-        scheduled
-        instant, and the uncertainty of both (ns)."""
+        scheduled instant, and the uncertainty of both (ns)."""
         between = ticks.bounds(asked_ns, answered_ns) if self._by_sync else None
         if between is None:
             middle = (asked_ns + answered_ns) / 2

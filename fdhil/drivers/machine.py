@@ -1,12 +1,10 @@
 """Opens all buses, sensors and event sources of a configuration as one source of records.
 
 At the start every bus and sensor must be reachable, else one ConnectError names all that are not. A silent bus is
-reported
-and still received from: with the NC off, drives without a heartbeat are silent, and so may be the NC's own interface.
-Later
-nothing ends the source: a lost bus or sensor is a notice and a gap, and is reconnected with growing pauses. Nothing is
-queued here: data wait in the bus' ring and in the sensor, which count what they discard. An exception inside a source
-leaves ``run`` unchanged.
+reported and still received from: with the NC off, drives without a heartbeat are silent, and so may be the NC's own
+interface. Later nothing ends the source: a lost bus or sensor is a notice and a gap, and is reconnected with growing
+pauses. Nothing is queued here: data wait in the bus' ring and in the sensor, which count what they discard. An
+exception inside a source leaves ``run`` unchanged.
 """
 
 import asyncio

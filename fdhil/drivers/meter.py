@@ -1,8 +1,7 @@
 """Polls a sensor that shows one value, its newest, and determines when each value was true.
 
 A polled sensor is read on a schedule, so that its values form a signal with a rate; a free-running one keeps its own
-rate.
-A value that did not come in time is a gap in the count and is never replaced by another.
+rate. A value that did not come in time is a gap in the count and is never replaced by another.
 """
 
 import asyncio

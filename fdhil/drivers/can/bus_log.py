@@ -24,8 +24,7 @@ BUS_NAMES = "names of buses"
 @dataclass(frozen=True, slots=True)
 class ConvertedLog:
     """A log in another format. ``frames`` are in ``content``; ``left_out`` counts frames that the format cannot hold,
-    ``reduced``
-    those that lost a part, by kind; ``buses`` has the number (candump: the name) of each bus of the log."""
+    ``reduced`` those that lost a part, by kind; ``buses`` has the number (candump: the name) of each bus of the log."""
 
     content: bytes
     frames: int
@@ -72,8 +71,8 @@ class _Survey:
 
     @property
     def keeps_fine_times(self) -> bool:
-        """Whether nine digits are written: only where they were read, since most readers of candump logs take
-        the digits for microseconds, however many there are."""
+        """Whether nine digits are written: only where they were read, since most readers of candump logs take the
+        digits for microseconds, however many there are."""
         return self.source == self.format_name == "candump"
 
     def header(self) -> LogHeader:

@@ -1,8 +1,8 @@
 """Holds CAN frames in bulk, in a preallocated ring between receive thread and decoder.
 
 A frame is 24 bytes: ``t_ns`` host-monotonic receive stamp, ``id`` with the flags of SocketCAN (0x20000000 error,
-0x40000000 remote, 0x80000000 extended), ``dlc`` and ``data`` as a little-endian 64 bit word, so that a block is
-decoded with shifts and masks instead of a loop.
+0x40000000 remote, 0x80000000 extended), ``dlc`` and ``data`` as a little-endian 64 bit word, so that a block is decoded
+with shifts and masks instead of a loop.
 """
 
 import mmap

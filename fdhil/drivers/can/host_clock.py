@@ -5,8 +5,8 @@ from collections import deque
 
 
 class WallClock:
-    """The wall clock against the monotonic one; the two are never read at quite the same instant, so small
-    changes are followed slowly, and a change of more than 2 ms means that the clock was set."""
+    """The wall clock against the monotonic one; the two are never read at quite the same instant, so small changes are
+    followed slowly, and a change of more than 2 ms means that the clock was set."""
 
     _SET_NS = 2_000_000
     _SHARE = 64

@@ -31,8 +31,7 @@ class LoggedFrame:
     """A frame at ``t_ns`` (since 1970, or the log's own zero) on ``bus``; ``can_id`` has the flags of SocketCAN.
 
     ``dlc`` is the data length code; of a remote frame the requested length. ``fd`` are the flags of a CAN FD frame,
-    None
-    for a classic one. ``sent`` is None where the log does not distinguish sent from received frames.
+    None for a classic one. ``sent`` is None where the log does not distinguish sent from received frames.
     """
 
     t_ns: int

@@ -47,8 +47,7 @@ class PythonCanPort:
     """An adapter opened by python-can, for listening.
 
     The stamps are those of the adapter's clock, whose zero is unknown, converted to the host's by the quickest frames;
-    or
-    the library's own, taken when a frame was read. Frames lost by the adapter or its driver are not counted.
+    or the library's own, taken when a frame was read. Frames lost by the adapter or its driver are not counted.
     """
 
     holds_back = False

@@ -1,10 +1,9 @@
 """Assigns frames to SYNC ticks: each gets the tick of the last SYNC before it. Pure: no clock, no I/O.
 
 With a counter byte (0x1019, 1 to at most 240) lost SYNCs are counted and the grid stays correct; without one a lost
-SYNC
-cannot be detected, and each SYNC is one tick. Arrival times are used only to distinguish 1 from 241 periods, and to
-detect at once a counter that wraps before 240. After a silence longer than ``LONGEST_SILENCE_S`` the grid restarts: the
-counter then fits any time, so the tick is advanced by that much and no more, however long the NC was off.
+SYNC cannot be detected, and each SYNC is one tick. Arrival times are used only to distinguish 1 from 241 periods, and
+to detect at once a counter that wraps before 240. After a silence longer than ``LONGEST_SILENCE_S`` the grid restarts:
+the counter then fits any time, so the tick is advanced by that much and no more, however long the NC was off.
 """
 
 from dataclasses import dataclass
@@ -175,8 +174,7 @@ class SyncGrid:
         """Return the full turns of the counter that were not received.
 
         The elapsed time must fit a whole number of turns within 2 %; a simulated machine that was paused fits none. The
-        turns
-        of one block are limited to the longest silence, or one for each SYNC.
+        turns of one block are limited to the longest silence, or one for each SYNC.
         """
         if not self._realtime or self._last_ns is None:
             return 0

@@ -2,8 +2,7 @@
 
 With counters: two series alternate. A single producer that loses frames, restarts, or counts to another overflow value
 breaks its series but never returns to the former one. Without counters: SYNC comes twice a period, alternately early
-and
-late. A single producer of half the period comes evenly; that fault is detected by its rate.
+and late. A single producer of half the period comes evenly; that fault is detected by its rate.
 """
 
 from collections import deque

@@ -48,9 +48,8 @@ class TickClock:
         """Return fractional ticks that enclose the span with certainty; None when SYNC does not run at that time.
 
         A stamp is never early but often late, when the computer was busy. So the stamps give the SYNCs that had come
-        for
-        certain; how many may have come follows from the earliest instants that the later stamps allow. A span that ends
-        after the newest SYNC is extrapolated at the period, as long as SYNC is not overdue.
+        for certain; how many may have come follows from the earliest instants that the later stamps allow. A span that
+        ends after the newest SYNC is extrapolated at the period, as long as SYNC is not overdue.
         """
         if not self.running or from_ns < self._t_ns[0] or to_ns - self._t_ns[-1] > _STALE_TICKS * self.period_ns:
             return None

@@ -58,8 +58,7 @@ class PdoPlace:
     """One PDO of the device: its number, default COB-ID less the node-ID, and how many objects it can map.
 
     ``mapped`` are the default mapping words, read-only if ``fixed``. ``cob_base`` None: not given, or it belongs to a
-    node
-    that the file does not name. ``cob_fixed``, ``kind_fixed``: COB-ID and transmission type are read-only.
+    node that the file does not name. ``cob_fixed``, ``kind_fixed``: COB-ID and transmission type are read-only.
     """
 
     number: int

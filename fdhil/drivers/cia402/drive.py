@@ -4,8 +4,7 @@ A sample of tick k is made of the TPDOs received after SYNC k and before SYNC k+
 (0x607A) that was latched ``setpoint_delay_cycles`` before SYNC k, since the drive delays its set-point; the offset in
 force o[k] comes from the sniffed 0x60B0 in the same way. A voltage that is the mean of the period before its SYNC
 belongs to sample k-1. Samples are released two ticks late, when all their frames are there; a sample with a missing
-frame
-is left out: a gap in ``tick``, counted in ``lost``.
+frame is left out: a gap in ``tick``, counted in ``lost``.
 """
 
 from collections.abc import Mapping, Sequence

@@ -111,8 +111,7 @@ class Dense:
     """A PDO on every tick of [first, first + n): data ``words`` (n,), ``present`` (n,) and ``ambiguous`` (n,).
 
     Of equal frames in one tick the first is used; different ones are ambiguous (one may be late, or another
-    producer's),
-    so none is used. ``count`` (n,) is the number received.
+    producer's), so none is used. ``count`` (n,) is the number received.
     """
 
     words: Words

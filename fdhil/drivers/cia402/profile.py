@@ -1,9 +1,8 @@
 """Describes a drive model as data: its PDOs, the objects of its signals, and their units.
 
 A new vendor is a TOML file with the names of :class:`DriveProfile` (``profile_file`` reads it). An object that no PDO
-of
-the profile carries is not used: without ``offset`` (0x60B0) the drive is recorded but never corrected on line; without
-``voltage`` a separate sensor is needed.
+of the profile carries is not used: without ``offset`` (0x60B0) the drive is recorded but never corrected on line;
+without ``voltage`` a separate sensor is needed.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ class PdoSpec:
     """One PDO: its COB-ID is ``cob_base`` + node-ID; it comes with every ``every_sync``-th SYNC.
 
     ``number`` is its position in the communication parameters (1 -> 0x1400/0x1800), in a profile's file the digits at
-    the
-    end of its name ("RPDO1"). ``valid`` is False when bit 31 of the default COB-ID is set: mapped, but not exchanged.
+    the end of its name ("RPDO1"). ``valid`` is False when bit 31 of the default COB-ID is set: mapped, but not
+    exchanged.
     """
 
     name: str
@@ -56,10 +55,10 @@ class DriveProfile:
     ``current_factor`` how many of these one count is. ``voltage`` is the TPDO object of the terminal voltage:
     ``voltage_v_per_count`` is its scale, or, where it is the duty of the PWM, ``duty_per_count`` is its scale in shares
     of the DC link, which is in a TPDO (``dc_link``, ``dc_link_v_per_count``) or else in the configuration
-    (``drive.dc_link_v``). ``voltage_magnitude``: it is unsigned, and gets the sign of R i + K w.
-    ``mode`` is the one in which set-points are streamed to ``target``. ``strict_abort_options`` are the values of
-    0x6007 that stop the drive when communication is lost. ``vendor_id`` and ``product_code`` None: any.
-    ``logical_axis`` is the axis of a device with several of them. ``notes`` are shown when the profile is chosen.
+    (``drive.dc_link_v``). ``voltage_magnitude``: it is unsigned, and gets the sign of R i + K w. ``mode`` is the one in
+    which set-points are streamed to ``target``. ``strict_abort_options`` are the values of 0x6007 that stop the drive
+    when communication is lost. ``vendor_id`` and ``product_code`` None: any. ``logical_axis`` is the axis of a device
+    with several of them. ``notes`` are shown when the profile is chosen.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Reads drive profiles: packaged ones by name, the user's own from a TOML file, the generic one from an EDS.
 
-A file may begin with ``base = "epos4"``: other keys are then inherited from that profile. A table or list
-(``rpdos``, ``tpdos``) replaces the inherited one as a whole.
+A file may begin with ``base = "epos4"``: other keys are then inherited from that profile. A table or list (``rpdos``,
+``tpdos``) replaces the inherited one as a whole.
 """
 
 import tomllib
@@ -187,8 +187,7 @@ def _of_axis(profile: DriveProfile, number: int) -> DriveProfile:
     """Return the profile of a device's ``number``-th axis, derived from that of the first.
 
     Its objects are 0x800 higher (CiA 402-2), its PDOs 64 higher (CiA 402-3), and their COB-IDs those of a node-ID that
-    much
-    higher, which the device must be set to: CiA 301 has no default for them.
+    much higher, which the device must be set to: CiA 301 has no default for them.
     """
     places = [field.name for field in fields(profile) if isinstance(getattr(profile, field.name), tuple)]
     keys = [name for name in places if name not in ("rpdos", "tpdos", "notes", "strict_abort_options")]

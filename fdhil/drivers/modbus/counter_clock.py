@@ -2,12 +2,9 @@
 
 Each query shows that sample ``counter`` had just been completed at some instant between request and answer. All queries
 together leave a narrow band of lines counter -> time, whose middle is the estimate; slow queries constrain little and
-do no
-harm (the idea of Klipper's clock synchronisation, with intervals instead of a regression, because delays are one-sided
-and
-not normal). The timeline may be the host's clock in ns or the SYNC count: a paused simulated machine stops both its
-SYNC
-and its sensor, and only the SYNC count stays valid.
+do no harm (the idea of Klipper's clock synchronisation, with intervals instead of a regression, because delays are
+one-sided and not normal). The timeline may be the host's clock in ns or the SYNC count: a paused simulated machine
+stops both its SYNC and its sensor, and only the SYNC count stays valid.
 """
 
 from collections import deque
@@ -66,8 +63,7 @@ class CounterClock:
 
     def _rate(self, counter: Int, asked: Float, answered: Float) -> tuple[float, float]:
         """Return the slope through the quickest half of the queries, limited to quartz tolerance about the nominal
-        step, and
-        twice its standard error over the span of all queries."""
+        step, and twice its standard error over the span of all queries."""
         span = float(counter[-1] - counter[0])
         nominal = self._step, self._step * RATE_TOLERANCE * span
         if counter.size < _SLOPE_QUERIES:

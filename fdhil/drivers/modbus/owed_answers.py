@@ -1,8 +1,7 @@
 """Tracks answers of RTU units that may still come after their requests were given up. Pure.
 
 An RTU answer names its unit and function, not its request, so a late answer fits the next request of the same shape,
-and
-every later answer is then taken for the one before. A unit answers in order: its answer to one request settles all
+and every later answer is then taken for the one before. A unit answers in order: its answer to one request settles all
 requests before it.
 """
 

@@ -1,10 +1,8 @@
 """A Modbus TCP connection through pymodbus, with its own deadline and one error per fault.
 
 pymodbus repeats requests by itself (12 s of silence by default), logs every fault at ERROR and closes the line after a
-few
-unanswered requests; none of it suits a sensor that is polled 20 times a second, so ``retries`` is 0, its logger is
-quiet,
-and answers are validated here.
+few unanswered requests; none of it suits a sensor that is polled 20 times a second, so ``retries`` is 0, its logger is
+quiet, and answers are validated here.
 """
 
 import asyncio

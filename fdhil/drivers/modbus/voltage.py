@@ -1,10 +1,10 @@
 """Reads a voltage sensor on Modbus TCP that samples by itself and delivers its samples in blocks.
 
-Register map (16 bit words, big-endian, the same for input and holding registers): 0-1 newest voltage float32, 2-3
-its sample counter uint32, 4-5 sample rate Hz float32, 6-7 volts per count of the block float32, 8-9 slide-way
-temperature degC float32, 10 trigger, 11 status, 12-13 counter of the block's first sample uint32, 14 samples in the
-block, 16..115 the samples int16. Writing 1 to the trigger latches the newest samples that were not latched before.
-Everything is then read with one request, so that no value is torn.
+Register map (16 bit words, big-endian, the same for input and holding registers): 0-1 newest voltage float32, 2-3 its
+sample counter uint32, 4-5 sample rate Hz float32, 6-7 volts per count of the block float32, 8-9 slide-way temperature
+degC float32, 10 trigger, 11 status, 12-13 counter of the block's first sample uint32, 14 samples in the block, 16..115
+the samples int16. Writing 1 to the trigger latches the newest samples that were not latched before. Everything is then
+read with one request, so that no value is torn.
 
 A sensor with another register map is a subclass of :class:`ModbusVoltage` that reads a :class:`SensorBlock`.
 """
@@ -77,8 +77,7 @@ class ModbusVoltage:
     """The voltage source ``modbus`` of one axis; ``poll`` reads once and returns new samples.
 
     A subclass implements ``latch`` and ``block`` for its register map, and ``example_registers``, the input registers
-    from 0
-    on of a unit that answers, which the contract test serves.
+    from 0 on of a unit that answers, which the contract test serves.
     """
 
     example_registers: ClassVar[Sequence[int]] = ()
@@ -213,8 +212,7 @@ class ModbusVoltage:
 
     def _times(self, counter: np.ndarray, ticks: TickClock) -> tuple[np.ndarray, float]:
         """Return the host time at which each sample begins, through the SYNC count if there is one, so that delays
-        common
-        to SYNC and sensor cancel."""
+        common to SYNC and sensor cancel."""
         line = self.line
         if line is not None and ticks.running:
             fraction = line.start + line.step * (counter - line.origin)

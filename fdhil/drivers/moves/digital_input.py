@@ -1,8 +1,7 @@
 """Detects G0 by the NC's own signal: a bit of the drive's digital inputs (0x60FD). Pure.
 
 The input comes in a slower TPDO than the samples, so an edge is known to that TPDO's period: the beginning is the tick
-of
-the sample before the edge, the end the tick of the first sample after it.
+of the sample before the edge, the end the tick of the first sample after it.
 """
 
 from fdhil.config import MachineConfig

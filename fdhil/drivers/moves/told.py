@@ -1,12 +1,9 @@
 """Detects G0 by the NC's own reports: the NC gives the kind of a move, the demand its edges. Pure.
 
 The demand shows exactly when an axis moves back and forth; the NC's reports are as accurate in time as their source. So
-a
-move in one direction has the kind that the NC reports within it, and where it reports two, they are divided at the
-slowest
-sample of the demand between them. An NC that reports its own set-points is aligned by them, exact to a cycle; any other
-by
-the clocks. A move without a report of the NC is UNKNOWN, and not used as a rapid.
+a move in one direction has the kind that the NC reports within it, and where it reports two, they are divided at the
+slowest sample of the demand between them. An NC that reports its own set-points is aligned by them, exact to a cycle;
+any other by the clocks. A move without a report of the NC is UNKNOWN, and not used as a rapid.
 """
 
 import math

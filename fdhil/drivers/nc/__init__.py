@@ -1,8 +1,7 @@
 """Reads the state of an NC through an interface of its own; ``tables.NC_SOURCES`` lists the interfaces.
 
 A source only reads: nothing it sends may change anything in the NC. It neither retries nor detects silence: its
-listener
-(:mod:`fdhil.drivers.nc.listener`) disconnects, reports the NC as UNKNOWN, and reconnects with growing pauses.
+listener (:mod:`fdhil.drivers.nc.listener`) disconnects, reports the NC as UNKNOWN, and reconnects with growing pauses.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,8 +32,7 @@ class NcSource(Protocol):
         invalid.
 
         A polling source waits for its period here, a subscribed one until something comes. A healthy NC sends something
-        at
-        least twice within ``nc_source.silence_s``, also while nothing changes.
+        at least twice within ``nc_source.silence_s``, also while nothing changes.
         """
 
 

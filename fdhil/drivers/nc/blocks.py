@@ -1,8 +1,7 @@
 """Determines the kind of a move from the text of its block, as an NC shows it. Pure.
 
 A G word of motion is modal: a block without one moves as the block before it. Any motion but G0 ends a G0, and so does
-a
-word whose motion is unknown: threads (G32, G33), probing (G31, G38), splines, cycles and calls are never rapids. An
+a word whose motion is unknown: threads (G32, G33), probing (G31, G38), splines, cycles and calls are never rapids. An
 interface may skip blocks, and then the kind is unknown until a block has a word of its own.
 Sources: ISO 6983-1 (G00 to G03); LinuxCNC's modal groups; Fanuc's lathe codes of system A, in which G90, G92 and G94
 with axis words cut; for Klartext the vendor's user's manuals: FMAX is valid in its block only.

@@ -2,8 +2,7 @@
 cycle.
 
 The first line identifies the bridge, each later one is the state in one servo cycle: a change of it with the cycle
-before,
-and a few in between. ``cycle`` is the count of the servo thread and ``mm`` its set-points.
+before, and a few in between. ``cycle`` is the count of the servo thread and ``mm`` its set-points.
 """
 
 import asyncio

@@ -1,8 +1,7 @@
 """Receives an NC's state from its MTConnect agent: the current state, then every change, as a stream over HTTP.
 
 The agent sends changes every ``period_s``, and an empty document when there are none: a document is no older than the
-one
-before it. The agent's stamps separate the changes within a document; its clock is not compared with ours.
+one before it. The agent's stamps separate the changes within a document; its clock is not compared with ours.
 """
 
 import asyncio

@@ -1,8 +1,7 @@
 """Polls an NC's state from its OPC UA server: every signal of the profile with one Read request.
 
 asyncua's automatic reconnection stays off: the listener reconnects. Its logger is quiet, since the errors here report
-the
-same.
+the same.
 """
 
 import asyncio

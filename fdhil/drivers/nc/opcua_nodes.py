@@ -60,8 +60,8 @@ def check_places(places: Mapping[str, str], source: str) -> None:
 
 
 async def find_nodes(client: Client, places: Mapping[str, str]) -> dict[str, ua.NodeId]:
-    """Return the node of each existing place: a node id, one with ``nsu=URI;`` in front, or a path of browse
-    names from ``Objects/`` on."""
+    """Return the node of each existing place: a node id, one with ``nsu=URI;`` in front, or a path of browse names from
+    ``Objects/`` on."""
     browser, found = _Browser(client), {}
     spaces = await client.get_namespace_array() if any(at.startswith(NAMED) for at in places.values()) else []
     for name, at in places.items():

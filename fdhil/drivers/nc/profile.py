@@ -1,8 +1,8 @@
 """Translates the values of an NC's interface into its state, by the rules of a profile. Pure.
 
 A profile names signals, their places, and rules: the first rule that is met gives the motion. A rule that needs a
-missing
-value is neither met nor skipped: the motion is then UNKNOWN, so that a missing "feed hold" never results in a "rapid".
+missing value is neither met nor skipped: the motion is then UNKNOWN, so that a missing "feed hold" never results in a
+"rapid".
 """
 
 import math
@@ -29,8 +29,7 @@ class Signal:
     """One value: ``at`` is its place in the interface's own notation, ``scale`` converts it to the unit of NcState.
 
     ``bit`` is taken of an integer, ``item`` of an array. ``reads``: the value itself, or the motion of the block whose
-    text it
-    is. An ``optional`` one may be absent.
+    text it is. An ``optional`` one may be absent.
     """
 
     name: str

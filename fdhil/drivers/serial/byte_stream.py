@@ -20,8 +20,8 @@ class Chunk:
 
 
 class ByteStream(ABC):
-    """A line that is open or not; ``last_ns`` (host-monotonic) is when bytes came last, ``dropped`` counts
-    discarded ones."""
+    """A line that is open or not; ``last_ns`` (host-monotonic) is when bytes came last, ``dropped`` counts discarded
+    ones."""
 
     where: str
     character_s: float
