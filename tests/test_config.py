@@ -40,7 +40,7 @@ def test_all_faults_are_told_at_once() -> None:
     document["g0"] = {"source": "infered"}
     text = faults(document)
     assert "axis.X.screw_pitch_mm: is missing (table travel per motor revolution)" in text
-    assert "axis.X.nominal.Jtt: is no key of this section (did you mean 'Jt'?)" in text
+    assert "axis.X.nominal.Jtt: is not a key of this section (did you mean 'Jt'?)" in text
     assert "axis.Y.nominal.R: " in text
     assert "nan" in text
     assert "axis.Y.correction.max_offset_um: " in text
@@ -150,7 +150,7 @@ def test_one_bus_by_two_names_is_refused() -> None:
     place = {"interface": "socketcand", "host": "127.0.0.1", "port": 29536}
     document = bench_document() | {"bus": {"can0": place, "can1": place}}
     document["axis"]["Y"]["drive"] = {"node_id": 1, "bus": "can1"}
-    assert "bus.can1: it leads to the same place as [bus.can0]" in faults(document)
+    assert "bus.can1: it is the same bus as [bus.can0]" in faults(document)
     document["bus"]["can1"] = {**place, "channel": "can1"}
     config.parse(document)
 
@@ -247,7 +247,7 @@ def test_every_number_of_every_section_has_a_range() -> None:
         ('[machine]\nsync_period_s = "' + "9" * 5000 + '"', "machine.sync_period_s: "),
         ("[store]\nkeep_windows = 0x" + "f" * 5000, "store.keep_windows: "),
         ("[machine]\n" + "".join(f"k{n} = 1\n" for n in range(20_000)), "more faults (mend these first)"),
-        (("x" * 100_000) + " = 1", "is no key of this section"),
+        (("x" * 100_000) + " = 1", "is not a key of this section"),
         ("a" + ".a" * 100_000 + " = 1", "nested deeper"),
         (("a" + ".a" * 90 + " = 1\n") + ("[b" + ".b" * 90 + "]\n") * 1000, "is no TOML"),
     ],

@@ -136,7 +136,7 @@ def test_digest_knows_the_unit_and_the_radius_but_not_the_watched_difference() -
         (lambda axis: axis.update({"Y3": {}}), "axis.Y3"),
         (
             lambda axis: axis["Y"].update(setpoints={"travel_mm": [0.0, 9.0]}),
-            "axis.Y.setpoints: fdhil sends set-points to no drive of a gantry axis: one alone would skew the beam",
+            "axis.Y.setpoints: fdhil plays no set-points on a gantry axis: moving one drive would skew the beam",
         ),
     ],
 )

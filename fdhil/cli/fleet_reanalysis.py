@@ -30,7 +30,7 @@ DAY = click.DateTime(["%Y-%m-%d", "%Y-%m-%dT%H:%M:%S"])
 @click.option("--until", type=DAY, help="Windows before this day (UTC) only.")
 @click.option("--machine", help="One machine only, by its name in the works.")
 @click.option("--axis", help="One axis letter only.")
-@click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Estimator; left out: the best there is.")
+@click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Estimator; left out: the best one.")
 @click.option("--config", "configs", type=FILE, multiple=True, help="A machine's configuration; may be given often.")
 @click.option("--scheduler", help="A Dask scheduler (tcp://... or tls://...); left out: processes of this computer.")
 @click.option(

@@ -35,7 +35,7 @@ UNREADABLE = 3
 @click.command(cls=Writing)
 @click.argument("recordings", nargs=-1, required=True, type=FILE, metavar="RECORDING...")
 @click.option("--config", "config_path", type=FILE, help="Machine configuration (TOML).")
-@click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Estimator; left out: the best there is.")
+@click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Estimator; left out: the best one.")
 @click.option(
     "--write-model",
     "model",

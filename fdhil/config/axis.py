@@ -60,7 +60,7 @@ class SetPointLimits(Section):
     travel_mm: tuple[Finite, Finite] = Field(description="lowest and highest position, braking included")
     max_speed_mm_s: Positive | None = Field(None, description="largest speed; left out: the axis maximum")
     max_acceleration_mm_s2: Positive | None = Field(
-        None, ge=1e-2, le=1e6, description="largest acceleration, that of a stop too; left out: that of G0"
+        None, ge=1e-2, le=1e6, description="largest acceleration, also for stopping; left out: that of G0"
     )
 
     @field_validator("travel_mm")
@@ -95,23 +95,25 @@ class HalPins(Section):
     torque: HalPin | None = Field(None, description="where there is no current: motor torque, divided by nominal.K")
     voltage: HalPin | None = Field(None, description="motor voltage, or the duty of the PWM; left out: without voltage")
     enabled: HalPin | None = Field(None, description="true while the drive is enabled; left out: motion.motion-enabled")
-    position_mm_per_unit: Positive = Field(1.0, description="of command and feedback: 25.4 where they are in inch")
+    position_mm_per_unit: Positive = Field(
+        1.0, description="scale of command and feedback: 25.4 where they are in inch"
+    )
     speed_mm_s_per_unit: HalScale = Field(1.0, description="speed of the table per unit of the pin")
     current_a_per_unit: HalScale = Field(1.0, description="current per unit of the pin")
     torque_nm_per_unit: HalScale = Field(1.0, description="torque per unit of the pin")
     voltage_v_per_unit: HalScale = Field(1.0, description="voltage per unit of the pin; of a duty: the bus voltage")
     voltage_is: Literal["measured", "commanded"] = Field(
-        "measured", description="measured: the mean of the cycle before; commanded: acts in the cycle that begins"
+        "measured", description="measured: the mean of the previous cycle; commanded: acts in the next cycle"
     )
 
     @model_validator(mode="after")
     def _has_current(self) -> HalPins:
         if self.current is None and self.torque is None:
-            raise ValueError("name the pin of the current or that of the torque: without both nothing is identified")
+            raise ValueError("neither current nor torque has a pin, so nothing can be identified; name one of them")
         for key in ("speed", "current", "torque", "voltage"):
             if not any(k.startswith(f"{key}_") and getattr(self, k) == 0 for k in type(self).model_fields):
                 continue
-            raise ValueError(f"the scale of {key} is 0: every value would be 0")
+            raise ValueError(f"the scale of {key} is 0, so every value would be 0; give the unit of one count")
         return self
 
 
@@ -164,10 +166,10 @@ class Drive(Section):
         return self._files
 
     source: Literal["canopen", "hal"] = Field(
-        "canopen", description="hal: LinuxCNC's HAL pins (drive.hal), by the bridge that LinuxCNC runs"
+        "canopen", description="hal: LinuxCNC's HAL pins (drive.hal), through the bridge that LinuxCNC loads"
     )
     hal: HalPins | None = None
-    bus: str = Field("can0", description="the [bus.*] it is on")
+    bus: str = Field("can0", description="name of its [bus.*]")
     node_id: int | None = Field(
         None, ge=1, le=127, description="CANopen node-ID; left out: 1 for the first axis, 2 for the next"
     )
@@ -178,15 +180,15 @@ class Drive(Section):
     )
     eds: Path | None = Field(None, description="the drive's EDS or DCF file, from this file's folder")
     logical_axis: int = Field(
-        1, ge=1, le=8, description="which axis of a device with several: its objects are 0x800 higher for each"
+        1, ge=1, le=8, description="axis number in a device with several: its objects are 0x800 higher for each"
     )
     increments_per_rev: int = Field(
         65536, ge=4, le=2**31 - 1, description="encoder and set-point increments per revolution"
     )
     speed_unit: SpeedUnit | None = Field(
-        None, description="what 0x606C counts in, where the drive was set to another unit (0x60A9) than its profile's"
+        None, description="unit of 0x606C, where the drive was set to another one (0x60A9) than its profile's"
     )
-    sign: Literal[1, -1] = Field(1, description="-1 where the drive counts against the axis")
+    sign: Literal[1, -1] = Field(1, description="-1 where the drive counts in the opposite direction")
     rated_current_a: Positive = Field(50.0, ge=1e-3, le=1e5, description="0x6075; 0x6078 counts in 0.1 % of it")
     rated_torque_nm: Positive = Field(
         1.0, ge=1e-4, le=1e6, description="0x6076, where the profile takes the current from the torque (0x6077)"
@@ -195,7 +197,7 @@ class Drive(Section):
         None, ge=1.0, le=2000.0, description="DC link, where the profile takes the voltage from the duty of the PWM"
     )
     setpoint_delay_cycles: int = Field(
-        2, ge=0, le=16, description="SYNC cycles by which the drive runs its set-point late"
+        2, ge=0, le=16, description="SYNC cycles by which the drive delays its set-point"
     )
     following_error_window_mm: Positive = Field(10.0, ge=1e-3, le=1e4, description="0x6065: beyond it the drive faults")
     speed_limit_mm_s: Positive | None = Field(
@@ -226,15 +228,15 @@ class Axis(Section):
         None,
         ge=5.0,
         le=2000.0,
-        description="resonance of motor and table against each other, the motor free to turn, as the drive's frequency "
-        "response has it; left out: sought where replays of rapids leave much, else the table is where the motor is",
+        description="resonance of motor against table with the motor free to turn, as in the drive's frequency "
+        "response; left out: searched for where replayed rapids leave large residuals, else the table is assumed rigid",
     )
     resonance_damping: NotNegative = Field(0.03, le=0.7, description="damping ratio of that resonance")
     max_difference_um: Positive | None = Field(
-        None, le=1e4, description="of a gantry axis: how far its two drives may be apart; left out: 500"
+        None, le=1e4, description="of a gantry axis: largest difference between its two drives; left out: 500"
     )
     guessed: tuple[Literal["R", "L", "K", "Jt", "ft", "Cd"], ...] = Field(
-        (), description="keys of nominal that nobody knows: no identified value is compared with them"
+        (), description="keys of nominal that are guesses: identified values are not compared with them"
     )
     nominal: Nominal
     regulators: Regulators

@@ -55,7 +55,7 @@ def complete(document: Mapping[str, Any], faults: list[ConfigFault]) -> dict[str
         first = axes.get(name[0])
         if first is None:
             text = f"is the second drive of axis {name[0]}, which is missing"
-            faults.append(ConfigFault(f"axis.{name}", text, f"give [axis.{name[0]}], or name the section so"))
+            faults.append(ConfigFault(f"axis.{name}", text, f"add [axis.{name[0]}], or rename this section"))
             del axes[name]
         elif isinstance(first, Mapping) and isinstance(axes[name], Mapping):
             faults += _sensor_faults(name, first, axes[name])
@@ -112,7 +112,7 @@ def _lengths(table: Any, factor: float, path: str, faults: list[ConfigFault]) ->
             encoder = path.endswith(".table") and key in _OF_THE_TABLE_ENCODER
             found[key] = _scaled(value, factor) if encoder else value
         elif name in table:
-            faults.append(ConfigFault(f"{path}.{key}", f"is given as {name} too", "keep one of them"))
+            faults.append(ConfigFault(f"{path}.{key}", f"duplicates {name}", "keep one of them"))
         else:
             found[name] = _scaled(value, factor)
     if path.endswith(".table"):

@@ -45,24 +45,25 @@ class CanBus(Section):
     host: str = Field("127.0.0.1", description="socketcand: address of the hub")
     port: int = Field(0, ge=0, le=65535, description="socketcand: TCP port of the hub; 0 lets the simulator choose one")
     bitrate: int = Field(
-        1_000_000, ge=10_000, le=1_000_000, description="bit/s, for the bus load; an adapter of python-can is set to it"
+        1_000_000, ge=10_000, le=1_000_000, description="bit/s, for the bus load; a python-can adapter is set to it"
     )
     frames: Literal["all", "drives"] = Field(
         "all",
-        description="drives: SYNC, NMT and the drives' frames alone are taken; bus load and black box lack others",
+        description="drives: only SYNC, NMT and the drives' frames are received; bus load and black box lack "
+        "the others",
     )
     listen_only: bool = Field(
         True,
-        description="python-can: acknowledge nothing, so that a wrong bit rate disturbs nobody, where it can be told",
+        description="python-can: never acknowledge, so that a wrong bit rate does not disturb the bus, where supported",
     )
     offset_lead_cycles: int = Field(
         0,
         ge=0,
         le=200,
-        description="by how many cycles offsets are sent ahead: HAL (streamer) 20 or more, CANopen 0",
+        description="cycles by which offsets are sent ahead: HAL (streamer) 20 or more, CANopen 0",
     )
     options: Mapping[str, bool | Whole | Finite | str] = Field(
-        {}, description="python-can: what its interface takes besides, e.g. { tty_baudrate = 3000000 }"
+        {}, description="python-can: further arguments of its interface, e.g. { tty_baudrate = 3000000 }"
     )
 
     @property

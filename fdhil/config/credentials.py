@@ -18,24 +18,26 @@ from fdhil.errors import ConnectError
 class Credentials(SectionWithFiles):
     """Keys for user, password and TLS files, shared by all sections that connect to a server."""
 
-    user: str | None = Field(None, min_length=1, description="the server's user; left out: none, or by the certificate")
+    user: str | None = Field(None, min_length=1, description="user on the server; left out: none, or the certificate's")
     password_file: Path | None = Field(None, description="file with the user's password, mode 0600")
     tls_ca_file: Path | None = Field(
         None,
-        description="who signs the server's certificate (PEM), to encrypt and to check it; left out: neither; "
-        "/etc/ssl/certs/ca-certificates.crt is whom Debian trusts",
+        description="CA of the server's certificate (PEM), to encrypt and to verify it; left out: neither; "
+        "Debian's CAs are in /etc/ssl/certs/ca-certificates.crt",
     )
-    tls_certificate_file: Path | None = Field(None, description="our own certificate (PEM), where the server wants one")
+    tls_certificate_file: Path | None = Field(
+        None, description="client certificate (PEM), where the server requires one"
+    )
     tls_key_file: Path | None = Field(None, description="its private key (PEM, without a password), mode 0600")
 
     @model_validator(mode="after")
     def _belong_together(self) -> Self:
         if (self.tls_certificate_file is None) != (self.tls_key_file is None):
-            raise ValueError("tls_certificate_file: it comes with its tls_key_file, and the key with its certificate")
+            raise ValueError("tls_certificate_file: certificate and tls_key_file must be given together")
         if self.tls_certificate_file is not None and self.tls_ca_file is None:
-            raise ValueError("tls_certificate_file: it needs a tls_ca_file; without one TLS is not spoken")
+            raise ValueError("tls_certificate_file: it needs a tls_ca_file; without one TLS is off")
         if (self.user is None) != (self.password_file is None):
-            raise ValueError("user: a user comes with the password_file, and the file with its user")
+            raise ValueError("user: user and password_file must be given together")
         return self
 
 

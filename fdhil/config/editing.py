@@ -36,7 +36,7 @@ def edited(text: str, values: Mapping[str, Any], note: str) -> str:
     except ValueError:
         same = False
     if not same:
-        raise NotEditable(f"it has {', '.join(values)} where no line of its own table says so; change them by hand")
+        raise NotEditable(f"it sets {', '.join(values)} in a form that cannot be edited; change them by hand")
     return out
 
 
@@ -44,7 +44,7 @@ def _put(document: dict[str, Any], outer: Sequence[str], key: str, value: Any) -
     for name in outer:
         document = document.setdefault(name, {})
         if not isinstance(document, dict):
-            raise NotEditable(f"its {name} is no table; change it by hand")
+            raise NotEditable(f"its {name} is not a table; change it by hand")
     document[key] = list(value) if isinstance(value, tuple) else value
 
 

@@ -23,12 +23,15 @@ class Stream(Section):
     """[stream]: what the server keeps until it is in the database; created at the first start."""
 
     name: str = Field("fdhil", pattern=NAME, description="name of the stream")
-    replicas: int = Field(1, ge=1, le=5, description="servers of the cluster that keep each message")
+    replicas: int = Field(1, ge=1, le=5, description="replicas of each message in the cluster")
     max_bytes: int = Field(
-        10 << 30, ge=1 << 16, le=1 << 50, description="room for what waits; when it is used up the machines keep theirs"
+        10 << 30,
+        ge=1 << 16,
+        le=1 << 50,
+        description="space for waiting messages; when it is full the machines keep theirs",
     )
     duplicate_window_s: float = Field(
-        600.0, ge=1, le=86_400, description="how long the server itself knows a message again; the database always does"
+        600.0, ge=1, le=86_400, description="how long the server recognises duplicates; the database always does"
     )
 
 
@@ -43,7 +46,9 @@ class Database(Section):
     @classmethod
     def _without_a_password(cls, text: str) -> str:
         if re.search(r"\bpassword\s*=|//[^/@]*:[^/@]*@", text):
-            raise ValueError("must not hold a password: name a passfile, or use ~/.pgpass or the server's peer login")
+            raise ValueError(
+                "must not contain a password: name a passfile, or use ~/.pgpass or the server's peer login"
+            )
         return text
 
 
@@ -51,16 +56,17 @@ class Objects(Section):
     """[objects]: the recorded windows, one file each, named by their content."""
 
     directory: Path = Field(
-        Path("fdhil-windows"), description="their folder, which all collectors share; relative to this file's folder"
+        Path("fdhil-windows"),
+        description="folder of the windows, shared by all collectors; relative to this file's folder",
     )
 
 
 class Retention(Section):
     """[retention]: how long fdhil fleet retain keeps records and windows; without a number they are kept for ever."""
 
-    record_months: int | None = Field(None, ge=1, le=1200, description="whole months of records before this one")
+    record_months: int | None = Field(None, ge=1, le=1200, description="months of records kept before the present one")
     window_months: int | None = Field(
-        None, ge=1, le=1200, description="months of recorded windows; what was found in them stays with the records"
+        None, ge=1, le=1200, description="months of recorded windows kept; their results stay in the records"
     )
 
 

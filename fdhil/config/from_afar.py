@@ -32,10 +32,10 @@ FROM_AFAR: Mapping[str, bool] = {
     "nc.settle_s": False,
     "nc.end_rest_s": False,
 }
-_BUILT = "how this machine is built and wired is known at the machine alone"
-_SENDING = "what sends set-points or a heartbeat is set up at the machine alone"
-_TRUST = "who may ask, listen, log in and be trusted is decided at the machine alone"
-_FILES = "files, sockets and budgets are those of this computer"
+_BUILT = "the construction and wiring of this machine are configured at the machine only"
+_SENDING = "senders of set-points and heartbeats are configured at the machine only"
+_TRUST = "access and trust are configured at the machine only"
+_FILES = "files, sockets and limits of this computer are configured at the machine only"
 NEVER: Mapping[str, str] = {
     "machine": _BUILT,
     "axis": _BUILT,
@@ -52,7 +52,7 @@ NEVER: Mapping[str, str] = {
     "publish": _TRUST,
     "uplink": _TRUST,
     "offers": _TRUST,
-    "sim": "the simulated machine belongs to who simulates it",
+    "sim": "the simulated machine is configured where it is simulated",
 }
 
 
@@ -62,7 +62,7 @@ def never(path: str) -> str:
         return ""
     parts = _pattern(path).split(".")
     tables = (".".join(parts[:count]) for count in range(len(parts), 0, -1))
-    return next((NEVER[table] for table in tables if table in NEVER), "no offer may change it")
+    return next((NEVER[table] for table in tables if table in NEVER), "no remote change of it is allowed")
 
 
 def loosens(path: str, old: Any, new: Any) -> bool:

@@ -32,7 +32,7 @@ _OF_A_MOVE = ("rapid_speed_mm_s", "max_acceleration_mm_s2", "max_jerk_mm_s3")
 class Machine(Section):
     """[machine]: the machine's name and SYNC period."""
 
-    name: ShownName = Field(min_length=1, max_length=64, description="what the reports call this machine")
+    name: ShownName = Field(min_length=1, max_length=64, description="name of this machine in reports")
     sync_period_s: Positive = Field(0.001, ge=1e-4, le=0.02, description="period of the SYNC message on the CAN bus")
 
 
@@ -98,8 +98,8 @@ class MachineConfig(Section):
                 if getattr(first, key) != getattr(second, key):
                     yield f"axis.{name}.{first.shown_key(key)}: differs from axis.{name[0]}, and both move one beam"
             if first.setpoints is not None or second.setpoints is not None:
-                text = "fdhil sends set-points to no drive of a gantry axis: one alone would skew the beam"
-                yield f"axis.{name[0]}.setpoints: {text}; leave the section out"
+                text = "fdhil plays no set-points on a gantry axis: moving one drive would skew the beam"
+                yield f"axis.{name[0]}.setpoints: {text}; remove the section"
             if first.drive.bus != second.drive.bus:
                 yield f"axis.{name}.drive.bus: both drives of axis {name[0]} are on one bus, whose SYNC they share"
             if (first.correction is None) != (second.correction is None):
@@ -107,7 +107,7 @@ class MachineConfig(Section):
 
     def _node_faults(self) -> Iterator[str]:
         if self.play.node_id == self.guard.node_id:
-            yield "play.node_id: it is the guard's node_id; both send a heartbeat"
+            yield "play.node_id: equals guard.node_id, and both send a heartbeat; give them different ones"
         drives = {self.node_id(name): name for name in self.axis}
         for section, node_id in (("guard", self.guard.node_id), ("play", self.play.node_id)):
             if node_id in drives:
@@ -117,12 +117,12 @@ class MachineConfig(Section):
         for name, axis in self.axis.items():
             other = ids.setdefault((axis.drive.bus, self.node_id(name) + axis.drive.logical_axis), name)
             if other != name:
-                text = f"two drives of one bus have the same node_id; {other} and {name} need one each"
+                text = f"drives {other} and {name} have the same node_id on one bus; give them different ones"
                 yield f"axis.{name}.drive.node_id: {text}"
         places: dict[tuple[str, ...], str] = {}
         for name, bus in self.bus.items():
             if bus.place is not None and places.setdefault(bus.place, name) != name:
-                yield f"bus.{name}: it leads to the same place as [bus.{places[bus.place]}]; keep one of them"
+                yield f"bus.{name}: it is the same bus as [bus.{places[bus.place]}]; keep one of them"
 
     def _line_users(self) -> Iterator[LineUser]:
         for name, axis in self.axis.items():
@@ -140,7 +140,9 @@ class MachineConfig(Section):
 
     def _listening(self, bus: str) -> str:
         interface = self.bus[bus].interface
-        return f"bus {bus} is only listened to ({interface}); use SocketCAN there, or leave this section out"
+        return (
+            f"bus {bus} is receive-only ({interface}), so no offset can be sent; use SocketCAN, or remove this section"
+        )
 
     def node_id(self, axis: str) -> int:
         """Return the CANopen node-ID of an axis' drive."""

@@ -14,7 +14,7 @@ from fdhil.config.section import Positive, Section
 class LinuxCncBridge(Section):
     """[nc_source.linuxcnc]: the bridge that LinuxCNC's HAL file loads."""
 
-    host: str = Field("127.0.0.1", min_length=1, description="the computer of LinuxCNC, if it is another")
+    host: str = Field("127.0.0.1", min_length=1, description="the computer of LinuxCNC, if it is not this one")
     port: int = Field(5571, ge=1, le=65535, description="TCP port of the bridge")
 
 
@@ -22,7 +22,7 @@ class NcSource(Section):
     """[nc_source]: where the NC reports its state, if [g0] source names an NC interface."""
 
     silence_s: Positive = Field(
-        2.0, ge=0.05, le=60, description="an NC that says nothing for so long is not heard: its moves are unknown"
+        2.0, ge=0.05, le=60, description="an NC that is silent for so long is lost: its moves are unknown"
     )
     linuxcnc: LinuxCncBridge = LinuxCncBridge()
     modbus_coil: ModbusNc = ModbusNc()

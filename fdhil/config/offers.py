@@ -21,7 +21,9 @@ def key_bytes(text: str) -> bytes:
     except binascii.Error:
         raw = b""
     if len(raw) != 35 or raw[0] != _OF_THE_WORKS or binascii.crc_hqx(raw[:33], 0) != int.from_bytes(raw[33:], "little"):
-        raise ValueError("is no key of a works, or was mistyped: `fdhil fleet key` there tells it, an O and 55 letters")
+        raise ValueError(
+            "is not a plant's public key (an O and 55 letters), or was mistyped: run `fdhil fleet key` there to show it"
+        )
     return raw[1:33]
 
 
@@ -34,8 +36,11 @@ class Offers(SectionWithFiles):
     """[offers]: signed configuration changes proposed by a plant (needs the extra fleet); each is accepted by hand."""
 
     trust: tuple[Annotated[str, AfterValidator(_is_key)], ...] = Field(
-        (), max_length=20, description="public keys of a works whose offers may be accepted; left out: none"
+        (),
+        max_length=20,
+        description="public keys of plants whose configuration changes may be accepted; left out: none",
     )
     directory: Path | None = Field(
-        None, description="where fdhil uplink puts the offers that it fetched; left out: offers in the uplink's folder"
+        None,
+        description="where fdhil uplink stores fetched configuration changes; left out: offers in the uplink's folder",
     )

@@ -97,7 +97,7 @@ def limit_faults(axis: Axis, sync_period_s: float) -> list[str]:
             ("max_acceleration_deg_s2", own.max_acceleration_mm_s2 / per_deg, CEILING_ACCELERATION_MM_S2),
         ):
             if value > most * (1 + 1e-9):
-                return [f"{key} is {value:.4g}; of a rotary axis at most {most:g} is sent, whatever its radius"]
+                return [f"{key} is {value:.4g}; a rotary axis is limited to {most:g}, whatever its radius"]
     limits = OffsetBounds.given(axis, sync_period_s)
     if limits.too_coarse:
         return [_too_coarse(axis, limits)]
@@ -126,5 +126,5 @@ def _too_coarse(axis: Axis, limits: OffsetBounds) -> str:
     per_turn = axis.drive.increments_per_rev
     text = f"{per_turn:,} increments per turn are too coarse: {name} is {finest:.2g} of an increment per SYNC cycle"
     if not finest * 2**31 > per_turn:
-        return f"{text}, and no resolution would do (raise {name}, or sync_period_s)"
+        return f"{text}, and no resolution suffices (raise {name}, or sync_period_s)"
     return f"{text} (set the drive to {math.ceil(per_turn / finest - 1e-6):,} or more per turn, or raise {name})"

@@ -47,5 +47,5 @@ class PositionRange:
         unit, here, last = self.unit, position_mm / self.mm_per_unit, self.last_mm(position_mm) / self.mm_per_unit
         text = f"axis {self.axis} at {here:.10g} {unit}: the set-point with its largest offset exceeds 32 bits"
         text += f" of increments ({abs(self.per_mm) * self.mm_per_unit:.10g} per {unit}); the last position that fits"
-        text += f" is {last:.10g} {unit}; move the work, or set the drive to coarser increments"
+        text += f" is {last:.10g} {unit}; move the workpiece, or set the drive to coarser increments"
         return text

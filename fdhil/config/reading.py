@@ -90,11 +90,11 @@ def toml_document(raw: bytes, source: str) -> dict[str, Any]:
         what = "is nested deeper than any config"
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
-        what = f"is no TOML: it is no text in UTF-8 (at line {line})"
+        what = f"is not valid TOML: it is not UTF-8 text (at line {line})"
     except ValueError as error:  # no TOML, or a number of thousands of digits
         said, place = _placed(str(error))
-        what = f"is no TOML: {_short(said)}{place}"
-    raise ConfigError(source, [ConfigFault("file", what, "check the line it names")])
+        what = f"is not valid TOML: {_short(said)}{place}"
+    raise ConfigError(source, [ConfigFault("file", what, "check that line")])
 
 
 def _placed(said: str) -> tuple[str, str]:
@@ -176,7 +176,7 @@ def unlikely(config: MachineConfig) -> list[str]:
     """Return a sentence for each value of an axis that is possible but unlikely."""
     found = [(name, doubt) for name, axis in config.axis.items() for doubt in doubts(axis)]
     told = [f"axis.{name}.{doubt.key} is unlikely: {doubt.text}" for name, doubt in found]
-    text = 'is that of a rotary axis and not used; give unit = "deg" too, or leave it out'
+    text = 'is only used by a rotary axis; add unit = "deg", or remove it'
     flat = [name for name, axis in config.axis.items() if axis.unit == "mm" and axis.radius_mm is not None]
     told += [f"axis.{name}.radius_mm {text}" for name in flat]
     sections = ("voltage", "temperature", "table")
@@ -198,7 +198,7 @@ def checked_value(path: str, value: Any) -> Any:
     field, (*outer, key) = field_at(path), path.split(".")
     if field is None:
         near = _near_key(_section(tuple(outer)), key)
-        raise ConfigError(path, [ConfigFault(path, "is no key of this section", near)])
+        raise ConfigError(path, [ConfigFault(path, "is not a key of this section", near)])
     kind: Any = Annotated[(field.annotation, *field.metadata)] if field.metadata else field.annotation
     try:
         return TypeAdapter(kind).validate_python(value)
@@ -218,7 +218,7 @@ def _faults(
         field = section.model_fields.get(key)
         meaning = field.description or "" if field else ""
         if item["type"] == "extra_forbidden":
-            faults.append(ConfigFault(path, "is no key of this section", _near_key(section, key)))
+            faults.append(ConfigFault(path, "is not a key of this section", _near_key(section, key)))
         elif item["type"] == "missing":
             faults.append(ConfigFault(path, "is missing", meaning))
         elif item["type"] == "value_error" and not loc:
@@ -233,7 +233,7 @@ def _faults(
             shown = f", not {_shown(item['input'])}" if isinstance(item["input"], str | int | float | bool) else ""
             faults.append(ConfigFault(path, item["msg"].removeprefix("Value error, ") + shown, meaning))
     if len(items) > MOST_FAULTS:
-        faults.append(ConfigFault("file", f"has {len(items) - MOST_FAULTS} more faults", "mend these first"))
+        faults.append(ConfigFault("file", f"has {len(items) - MOST_FAULTS} more faults", "fix these first"))
     return faults
 
 

@@ -37,14 +37,16 @@ class Regulators(Section):
     setpoint_filter_s: NotNegative = Field(
         0.0, le=1.0, description="time constant of a filter on the set-point; 0: none"
     )
-    setpoint_filter_order: Literal[1, 2] = Field(1, description="first-order, or two equal ones behind each other")
+    setpoint_filter_order: Literal[1, 2] = Field(
+        1, description="first order, or two equal first-order filters in series"
+    )
     speed_filter_s: NotNegative = Field(
         0.0, le=0.1, description="time constant of a first-order filter on the speed feedback; 0: none"
     )
     current_delay_cycles: int = Field(0, ge=0, le=32, description="current cycles until a computed voltage acts")
 
     pid_output: Literal["speed", "current"] = Field(
-        "speed", description="linuxcnc_pid: what the drive makes of the output: a speed, or speed_kp times it a current"
+        "speed", description="linuxcnc_pid: meaning of the output: a speed, or speed_kp times it a current"
     )
     position_derivative: NotNegative = Field(0.0, description="linuxcnc_pid: Dgain")
     position_feedforward_per_s: NotNegative = Field(0.0, description="linuxcnc_pid: FF0, 1/s")
@@ -52,7 +54,9 @@ class Regulators(Section):
     jerk_feedforward_s2: NotNegative = Field(0.0, description="linuxcnc_pid: FF3, s2")
     deadband_mm: NotNegative = Field(0.0, le=10.0, description="linuxcnc_pid: dead band of the error")
     output_limit_mm_s: NotNegative = Field(0.0, description="linuxcnc_pid: maxoutput, as table speed; 0: none")
-    error_previous_target: bool = Field(True, description="linuxcnc_pid: error against the command of the cycle before")
+    error_previous_target: bool = Field(
+        True, description="linuxcnc_pid: error against the command of the previous cycle"
+    )
 
     @model_validator(mode="after")
     def _integrals(self) -> Regulators:
@@ -60,7 +64,7 @@ class Regulators(Section):
         if self.structure == "p_pi_pi" and self.position_ki_per_s2:
             raise ValueError("structure p_pi_pi has no position_ki_per_s2; set structure = 'double_pi'")
         if self.structure == "double_pi" and not self.position_ki_per_s2:
-            raise ValueError("structure double_pi needs position_ki_per_s2; without it, it is p_pi_pi")
+            raise ValueError("structure double_pi needs position_ki_per_s2; without it, use structure = 'p_pi_pi'")
         no_speed_loop = self.structure == "pid" or (self.structure == "linuxcnc_pid" and self.pid_output == "current")
         if no_speed_loop and self.speed_ki:
             text = f"structure {self.structure} has no speed_ki"

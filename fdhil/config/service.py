@@ -25,7 +25,7 @@ class Store(Section):
 class Guard(Section):
     """[guard]: the process that owns the transmit socket."""
 
-    node_id: int = Field(100, ge=1, le=127, description="the node-ID of fdhil's own heartbeat")
+    node_id: int = Field(100, ge=1, le=127, description="node-ID of the guard's heartbeat")
     heartbeat_s: Positive = Field(0.020, ge=0.001, le=1.0, description="period of that heartbeat while armed")
     clock: Literal["monotonic", "sync"] = Field(
         "monotonic",
@@ -33,14 +33,14 @@ class Guard(Section):
     )
     run_directory: Path | None = Field(None, description="the guard's socket and settings; left out: that of [store]")
     daemon_user: str | None = Field(
-        None, description="the daemon's user, where the guard runs under one of its own; left out: the same user"
+        None, description="the daemon's user, where the guard runs as another one; left out: the same user"
     )
 
 
 class Access(Section):
     """[access]: which users of this computer may talk to daemon and guard, besides their own users and root."""
 
-    watch: tuple[str, ...] = Field((), description="users who may read, listen and disarm, at the guard too")
+    watch: tuple[str, ...] = Field((), description="users who may read, subscribe and disarm, also at the guard")
     operate: tuple[str, ...] = Field(
         (),
         description="users who may also acknowledge, and arm by the operator's token; fdhil-web: to act from a browser",
@@ -50,7 +50,7 @@ class Access(Section):
 class Play(Section):
     """[play]: fdhil in place of an NC on a test bench (fdhil play)."""
 
-    node_id: int = Field(101, ge=1, le=127, description="the node-ID of its heartbeat, which the drives watch")
+    node_id: int = Field(101, ge=1, le=127, description="node-ID of its heartbeat, which the drives monitor")
     heartbeat_s: Positive = Field(
         0.020, ge=0.001, le=1.0, description="period of that heartbeat; a drive that misses three of them stops"
     )

@@ -18,7 +18,7 @@ class Noise(Section):
     voltage_v: NotNegative = Field(0.06, description="terminal voltage")
     current_a: NotNegative = Field(0.05, description="motor current")
     speed_rad_s: NotNegative = Field(0.15, description="shaft speed")
-    table_um: NotNegative = Field(0.05, description="place of the encoder at the table, where there is one")
+    table_um: NotNegative = Field(0.05, description="position of the encoder at the table, if there is one")
     table_m_s2: NotNegative = Field(0.05, description="acceleration of the accelerometer at the table")
 
 
@@ -35,18 +35,18 @@ class SimAxis(Section):
     Cd_per_kelvin: Finite = Field(0.0, description="relative change of Cd per kelvin of slide-way temperature")
     backlash_um: NotNegative = Field(0.0, description="lost motion between screw and table")
     start_mm: Finite = Field(0.0, description="position at power-on")
-    offset_in_feedforward: bool = Field(True, description="whether 0x60B0 is seen by the speed feed-forward")
+    offset_in_feedforward: bool = Field(True, description="whether the speed feed-forward includes 0x60B0")
     eds: Path | None = Field(
-        None, description="EDS or DCF file that the simulated drive wears, from the config's folder; left out: its own"
+        None,
+        description="EDS or DCF file of a vendor's drive to emulate, from the config's folder; left out: the "
+        "simulator's own drive",
     )
-    boot_s: NotNegative = Field(
-        0.0, le=60.0, description="from a reset, or the supply's return, to the boot-up message"
-    )
+    boot_s: NotNegative = Field(0.0, le=60.0, description="time from a reset or power-on to the boot-up message")
     limit_switches_mm: tuple[Finite, Finite] | None = Field(
         None, description="where the limit switches are, for homing; left out: there are none"
     )
     home_switch_mm: Finite | None = Field(
-        None, description="from where on, in the drive's positive direction, the home switch is active"
+        None, description="position from which, in the drive's positive direction, the home switch is active"
     )
     reality: Reality = Reality()
 
@@ -70,10 +70,10 @@ class Sim(Section):
     seed: int = Field(1, ge=0, le=2**63 - 1, description="seed of the sensor noise")
     nc: bool = Field(False, description="whether the simulated NC is switched on at start")
     lockstep_rpdo: tuple[str, ...] = Field(
-        (), description="lockstep: RPDOs to wait for, such as X:2; left out: those heard in the cycle before"
+        (), description="lockstep: RPDOs to wait for, such as X:2; left out: those received in the previous cycle"
     )
     modbus: bool = Field(True, description="serve a Modbus voltage sensor per axis")
-    modbus_cycles: int = Field(1, ge=1, le=100, description="SYNC cycles over which one of its samples is the mean")
+    modbus_cycles: int = Field(1, ge=1, le=100, description="SYNC cycles averaged in one of its samples")
     noise: Noise = Noise()
     thermal: Thermal = Thermal()
     axis: Mapping[AxisName, SimAxis] = Field(default_factory=dict)

@@ -97,10 +97,10 @@ def sections(section: type[Section] = MachineConfig, path: str = "", optional: b
 def template() -> str:
     """Return the commented machine configuration: required keys set, everything else commented out."""
     lines = [
-        "# A machine for fdhil. The lines without a # in front are required: put your machine's values there.",
-        "# A line that begins with # and no space is a setting at its default, or an example where it has none.",
-        "# To change it, take the # away. The comment above each line says what it is.",
-        "# A key that fdhil does not know is refused, with a suggestion.",
+        "# A machine for fdhil. Lines without a leading # are required: enter your machine's values there.",
+        "# A line that begins with # and no space is a setting at its default, or an example if it has none.",
+        "# To change it, remove the #. The comment above each line explains it.",
+        "# Unknown keys are refused, with a suggestion.",
     ]
     for table in sections():
         lines += ["", *_heading(table)]
@@ -132,7 +132,7 @@ def filled(document: Mapping[str, Any], sources: Mapping[str, str], head: str = 
             elif first:
                 lines += [*_comment(field.description or ""), f"#{key} = {toml(_example(table.path, key, field))}"]
     text = "\n".join(
-        [*lines, "", *_comment(f"Further tables, which docs/reference/config.md explains: {', '.join(left)}")]
+        [*lines, "", *_comment(f"Further tables, explained in docs/reference/config.md: {', '.join(left)}")]
     )
     return text + "\n"
 

@@ -54,7 +54,7 @@ def hashed(password: str, role: Role) -> User:
 
 
 NOBODY = User(role="watch", salt=base64.b64encode(bytes(16)).decode(), scrypt=base64.b64encode(bytes(32)).decode())
-"""Stands for a user that there is not, so that a wrong name takes as long as a wrong password."""
+"""Stands for an unknown user, so that a wrong name takes as long as a wrong password."""
 
 
 def matches(user: User | None, password: str) -> bool:
@@ -69,7 +69,7 @@ def read_users(path: Path) -> Mapping[str, User]:
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError as error:
-        raise _fault(path, f"cannot be read: {error.strerror}", "make it with fdhil web-user CONFIG NAME") from None
+        raise _fault(path, f"cannot be read: {error.strerror}", "create it with fdhil web-user CONFIG NAME") from None
     with os.fdopen(descriptor, "rb") as file:
         if stat.S_IMODE(os.fstat(descriptor).st_mode) & 0o007:
             raise _fault(path, "is open to every user of this computer", f"chmod 0640 {path}")
@@ -78,7 +78,7 @@ def read_users(path: Path) -> Mapping[str, User]:
         return Users.model_validate_json(raw).users
     except ValidationError:  # its message would show what stands in the file
         raise _fault(
-            path, "is no users file", "move it away, then make it anew with fdhil web-user CONFIG NAME"
+            path, "is not a users file", "move it away, then create it again with fdhil web-user CONFIG NAME"
         ) from None
 
 
@@ -106,7 +106,7 @@ class UsersFile:
         try:
             return self._users().get(name)
         except ConfigError as error:
-            logging.getLogger("fdhil").error("nobody may log in: %s", error)
+            logging.getLogger("fdhil").error("no user can log in: %s", error)
             return None
 
 

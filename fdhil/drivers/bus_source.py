@@ -19,8 +19,8 @@ from fdhil.records import AxisSamples, MoveEvent, NcState, Notice, TickTimes
 DRAIN_S = 0.05
 SILENCE_S = 2.0
 STAMPS_COST: Mapping[Stamps, str] = {
-    "adapter": "the adapter's own clock, and are late by what its quickest frames are: about 1 ms over USB",
-    "host": "this program when it reads them: some 10 ms late and in bursts, more on a busy computer",
+    "adapter": "the adapter's own clock, with an unknown delay of about 1 ms over USB",
+    "host": "this program when it reads them, some 10 ms late and in bursts, more on a busy computer",
 }
 
 
@@ -77,16 +77,24 @@ class BusSource:
             return []
         self._stamping_told = True
         text = (
-            f"Frames of bus {self.name} are stamped by {cost}. Samples follow SYNC and lose nothing; a voltage sensor"
+            f"Frames of bus {self.name} are stamped by {cost}. Samples follow SYNC and are not affected; "
+            "values of a separate"
         )
-        return [Notice("CoarseStamps", "info", f"{text} of its own is placed no better, so that L is less certain.")]
+        return [
+            Notice(
+                "CoarseStamps", "info", f"{text} voltage sensor are placed less accurately, so that L is less certain."
+            )
+        ]
 
     def _overflow(self, bus: ListenedBus) -> list[Notice]:
         lost = bus.counters()["lost"]
         if lost <= self._overflow_told:
             return []
         new, self._overflow_told = lost - self._overflow_told, lost
-        text = f"{new} frames of bus {self.name} were not read in time; the computer is overloaded."
+        text = (
+            f"{new} frames of bus {self.name} were not read in time and are lost; the computer is "
+            "overloaded: reduce its load."
+        )
         return [Notice("RxOverflow", "minor", text)]
 
     def _silence(self, bus: ListenedBus, now_ns: int) -> list[Notice]:
@@ -94,11 +102,13 @@ class BusSource:
         was, self._silent = self._silent, silent
         if silent and not was:
             text = (
-                f"Nothing is heard on bus {self.name}: so it is while the NC is off and no drive sends a heartbeat "
-                "(0x1017); else check the drives' supply, the wiring and the bit rate. fdhil scan asks the drives."
+                f"No frame is received on bus {self.name}: this is normal while the NC is off and no drive "
+                "sends a heartbeat "
+                "(0x1017); otherwise check the drives' supply, the wiring and the bit rate. fdhil scan queries "
+                "the drives."
             )
             return [Notice("BusSilent", "MAJOR", text)]
-        return [Notice("BusSilent", "info", f"Bus {self.name} is heard again.")] if was and not silent else []
+        return [Notice("BusSilent", "info", f"Bus {self.name} is active again.")] if was and not silent else []
 
     async def run(self, take: Take) -> None:
         """Run for ever; reconnect with growing pauses."""
@@ -111,7 +121,13 @@ class BusSource:
                 pause = BACK_OFF_S[0]
                 continue
             reason = self._bus.ended
-            take(Notice("BusDown", "MAJOR", f"Bus {self.name}: {reason}; it is tried again until it is back."))
+            take(
+                Notice(
+                    "BusDown",
+                    "MAJOR",
+                    f"Bus {self.name}: {reason}; nothing is received until it is reconnected, which is retried.",
+                )
+            )
             pause = await self._reopen(pause)
             take(Notice("BusDown", "info", f"Bus {self.name} is back."))
 

@@ -73,9 +73,10 @@ class DemandRecorder:
     def __init__(self, config: MachineConfig, rest_s: float) -> None:
         buses = list(dict.fromkeys(axis.drive.bus for axis in config.axis.values()))
         if len(buses) > 1:
-            what = f"the axes are on {', '.join(buses)}, whose cycles have no common count"
+            what = f"the axes are on {', '.join(buses)}, whose SYNC cycles have no common count"
             raise ConfigError(
-                config.machine.name, [ConfigFault("axis", what, "record each bus with a config of its axes")]
+                config.machine.name,
+                [ConfigFault("axis", what, "record each bus with a separate configuration of its axes")],
             )
         self._dt_s, self._mm_per_degree = config.machine.sync_period_s, config.mm_per_degree
         self._rest_rows = math.ceil(rest_s / self._dt_s)

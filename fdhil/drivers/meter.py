@@ -154,9 +154,9 @@ class MeterVoltage:
         self._told_holes = True
         took_ms = (self._meter.answered_ns - self._meter.asked_ns) / 1e6
         text = f"Of {due} values of the {self.name} {self.lost} did not come in time (an "
-        text += f"answer takes {took_ms:.1f} ms): they are holes in what is identified; set "
-        text += f"axis.{self.axis}.voltage.period_s above {self._grid.period_ns / 1e9:g}, or give this computer less "
-        text += "else to do."
+        text += f"answer takes {took_ms:.1f} ms): they are gaps in the recorded voltage; set "
+        text += f"axis.{self.axis}.voltage.period_s above {self._grid.period_ns / 1e9:g}, or reduce this "
+        text += "computer's load."
         return [Notice("SampleTiming", "minor", text, self.axis)]
 
     def _placed(self, ticks: TickClock) -> list[VoltageSamples]:

@@ -19,7 +19,7 @@ from fdhil.records import AxisSamples, MoveEvent, NcState, Notice, TableSamples,
 
 Record = AxisSamples | VoltageSamples | TableSamples | TickTimes | MoveEvent | Temperature | NcState | Notice
 Take = Callable[[Record], None]
-"""Takes a source's records; it never waits, for nothing may hold a source up."""
+"""Takes a source's records without blocking."""
 
 POLL_S = 0.05
 BACK_OFF_S = (0.1, 5.0)

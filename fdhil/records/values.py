@@ -31,7 +31,7 @@ UNITS: Mapping[str, str] = {
     "friction_at_rapid": "N.m",  # Cd + ft w at the rapid speed
 }
 
-# what may join the six; of a ripple's name the number is its periods in a turn of the motor
+# what may join the six; of a ripple's name the number is its periods per revolution of the motor
 _TERMS: Mapping[str, str] = {
     r"load": "N.m",
     r"coulomb_(positive|negative)": "N.m",

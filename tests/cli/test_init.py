@@ -158,7 +158,7 @@ def test_an_unknown_answer_is_refused_with_a_suggestion(fdhil: Said, tmp_path: P
     axis = SHEET | RAPID | {"drive": SHEET["drive"] | {"increments_per_rev": 65536}, "screw_pich_mm": 5.0}
     code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", written(tmp_path, axis={"X": axis}), "--offline")
     assert code == 2
-    assert "axis.X.screw_pich_mm: is no key of this section (did you mean 'screw_pitch_mm'?)" in err
+    assert "axis.X.screw_pich_mm: is not a key of this section (did you mean 'screw_pitch_mm'?)" in err
 
 
 @pytest.mark.parametrize(

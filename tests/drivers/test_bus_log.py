@@ -287,11 +287,11 @@ def test_screen_form_of_candump_is_named(line: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("(12.000100) can0 080#0", "a line that is no frame"),
+        ("(12.000100) can0 080#0", "a line that is not a frame"),
         ("(12.000100) can0 080#010203040506070809", "9 bytes|no frame|larger"),
         ("(12.000100) can0 080##0010203040506070809", "9 bytes in a CAN FD frame, which has 0 to 8, 12"),
         ("(12.000100) can0 8FF#", "identifier 8FF is too large"),
-        ("(12.000", "a line that is no frame"),
+        ("(12.000", "a line that is not a frame"),
     ],
 )
 def test_damaged_line_is_refused_with_its_number(line: str, said: str, tmp_path: Path) -> None:
@@ -357,7 +357,7 @@ def test_decimal_asc_without_a_date_is_read_and_that_is_told(tmp_path: Path) -> 
     (tmp_path / "bus.asc").write_text("base dec  timestamps absolute\n   0.5 1  385             Rx   d 2 16 255\n")
     told = converted_log(tmp_path / "bus.asc", "asc", "candump")
     assert told.content == b"(0.500000) can0 181#10FF\n"
-    assert told.reduced == {"the date, which cannot be read": 1}
+    assert told.reduced == {"the date, which is unreadable": 1}
 
 
 def test_trigger_date_counts_only_where_the_times_begin_there(tmp_path: Path) -> None:
@@ -401,8 +401,8 @@ def test_trc_of_every_version_is_read(version: str, tmp_path: Path) -> None:
         f"({start + 1}.842{part}) can0 20000080#0000000000000000\n"
         f"({start + 1}.844{part}) can0 18FF1234#R3\n"
     )
-    assert told.left_out == {"rows that are not CAN frames": 1}
-    assert told.reduced == ({} if dated else {"the date, which is not in the head": 1})
+    assert told.left_out == {"lines that are not CAN frames": 1}
+    assert told.reduced == ({} if dated else {"the date, which is not in the header": 1})
 
 
 def test_flags_of_fd_are_those_of_peak(tmp_path: Path) -> None:

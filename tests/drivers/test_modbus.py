@@ -86,7 +86,7 @@ async def test_a_sensor_that_stands_still_is_noticed_once() -> None:
         ("other function", ProtocolError, "function 1 is answered where 6 was asked"),
         ("nan", ProtocolError, "sample rate of nan Hz"),
         ("too many", ProtocolError, "101 samples"),
-        ("hang up", ConnectError, "is gone; check its supply and cable, and that it serves so many clients"),
+        ("hang up", ConnectError, "is gone; check its supply and cable, and its limit of clients"),
     ],
 )
 async def test_each_misbehaviour_is_one_error(mode: str, error: type[DeviceError], says: str) -> None:

@@ -41,7 +41,7 @@ def test_tpdos_that_never_come_are_told_and_not_lost(silent: tuple[int, ...], se
     assert notice.severity == severity
     assert notice.text == (
         f"Drive X (node-ID 1) never sent {named} though SYNC runs; "
-        "compare its mapping, COB-IDs and transmission types by fdhil check."
+        "compare its mapping, COB-IDs and transmission types with fdhil check."
     )
     assert decoder.counters()["pdo_lost"] == 0
     assert sum(each.lost for each in samples) == 0
@@ -84,7 +84,7 @@ def test_a_tpdo_that_is_sent_on_change_alone_is_told_and_not_lost() -> None:
     ]
     assert told == [
         "Drive X sends TPDO1 (181) with few of the SYNCs, and its samples have holes; "
-        "set the transmission type (0x1800:02) to 1, or see whether it still is Operational."
+        "set the transmission type (0x1800:02) to 1, or check that it is still Operational."
     ]
     assert decoder.counters()["pdo_lost"] < 1000
 

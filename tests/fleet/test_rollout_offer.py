@@ -134,7 +134,7 @@ def test_every_key_of_the_configuration_is_decided_upon() -> None:
     for table in sections():
         for key, _ in table.keys:
             path = f"{table.path}.{key}"
-            assert never(path) != "no offer may change it", path
+            assert never(path) != "no remote change of it is allowed", path
     assert all(never(path.replace("*", "X")) for path in NEVER)
     assert not any(never(path.replace("axis.*", "axis.Z")) for path in FROM_AFAR)
     assert never("nothing.of_the_kind")

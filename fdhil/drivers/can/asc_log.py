@@ -26,7 +26,7 @@ from fdhil.drivers.can.logged_frame import (
 from fdhil.errors import RecordingError
 
 OTHER_EVENTS = "events that are not CAN frames"
-NO_DATE = "the date, which cannot be read"
+NO_DATE = "the date, which is unreadable"
 _EVENT = re.compile(r"\s*(\d+\.\d+)\s+(\S.*)")
 _HEAD = re.compile(
     r"\s*(?://\s*fdhil: start (?P<start>\d+\.\d+)|date\s+(?P<date>.+)"

@@ -23,7 +23,7 @@ from fdhil.drivers.can.logged_frame import (
 from fdhil.errors import RecordingError
 
 OTHER_OBJECTS = "objects that are not CAN frames"
-NO_DATE = "the date, which is not in the head"
+NO_DATE = "the date, which is not in the header"
 _DATED_S = 631152000  # python-can has no date before 1990 in a head: times count from 1970 then
 _APPLICATION = 8  # byte of the head that names the program: others have a frame's identifier in an error frame
 _UNREADABLE = (BLFParseError, ValueError, LookupError, EOFError, TypeError, OSError, struct.error, zlib.error)
@@ -45,7 +45,7 @@ def read(path: Path, skipped: Counter[str]) -> Iterator[LoggedFrame]:
             skipped[OTHER_OBJECTS] += max(0, reader.object_count - frames)
     except _UNREADABLE as error:
         what = (str(error).splitlines() or [type(error).__name__])[0][:200]
-        raise RecordingError(f"{path} is no BLF log that can be read ({what}); copy it again") from None
+        raise RecordingError(f"{path} is not a readable BLF log ({what}); copy it again") from None
 
 
 def _frame(message: can.Message, start_ns: int, of_socketcan: bool) -> LoggedFrame:

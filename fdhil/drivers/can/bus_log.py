@@ -89,8 +89,8 @@ def converted_log(path: Path, source: str, target: str) -> ConvertedLog:
     for frame in _frames(path, source, skipped):
         survey.add(frame)
     if not survey.frames:
-        lost = "".join(f"; {count} {what}, which {target} does not have" for what, count in survey.left_out.items())
-        raise RecordingError(f"{path} has no frame{lost}: it is no log of a bus, or nothing was on it")
+        lost = "".join(f"; {count} {what}, which {target} cannot hold" for what, count in survey.left_out.items())
+        raise RecordingError(f"{path} has no frame{lost}: it is not a bus log, or the bus was silent")
     header = survey.header()
     with TemporaryDirectory() as folder:
         part = Path(folder) / "log"
@@ -115,7 +115,7 @@ def _frames(path: Path, format_name: str, skipped: Counter[str]) -> Iterator[Log
     try:
         yield from _module(format_name).read(path, skipped)
     except OSError as error:
-        raise RecordingError(f"{path} cannot be read ({error.strerror}); check the file and its rights") from None
+        raise RecordingError(f"{path} cannot be read ({error.strerror}); check the file and its permissions") from None
 
 
 def _module(format_name: str) -> Any:

@@ -33,7 +33,7 @@ def parse_line(line: str) -> LoggedFrame:
     """Return the frame of a line; ValueError when there is none."""
     match = _LINE.fullmatch(line.strip())
     if match is None:
-        raise ValueError("a line that is no frame")
+        raise ValueError("a line that is not a frame")
     name, asked, flags, raw = match["id"], match["asked"], match["fd"], match["raw"]
     data = b"" if asked is not None else bytes.fromhex(match["data"])
     fd = None if flags is None else int(flags, 16)
@@ -93,9 +93,9 @@ def read(path: Path, _skipped: Counter[str]) -> Iterator[LoggedFrame]:
 
 def _advice(line: str, error: Exception) -> str:
     if _SCREEN.match(_COLOUR.sub("", line).strip()):
-        text = "this is what candump shows on the screen, not its log; record with candump -l, or with "
+        text = "this is candump's screen output, not its log; record with candump -l, or with "
         return text + "candump -L can0 > bus.log"
-    return f"{error}, so the log cannot be read; copy it again, or take out what is not of candump -l"
+    return f"{error}, so the log cannot be read; copy it again, or remove what candump -l did not write"
 
 
 def write(path: Path, frames: Iterable[LoggedFrame], header: LogHeader) -> None:

@@ -27,7 +27,7 @@ _RECOVERED = {
     "BusOff": "The CAN controller is back on the bus.",
     "ErrorPassive": "The CAN controller is error-active again.",
     "BusErrors": "No frame was damaged for 10 s.",
-    "NotAcknowledged": "No frame was left without acknowledgement for 10 s.",
+    "NotAcknowledged": "Every frame was acknowledged for 10 s.",
     "TransceiverFault": "The CAN transceiver has reported no fault for 10 s.",
 }
 
@@ -37,19 +37,19 @@ _WHOLE: tuple[tuple[int, str, Severity, str], ...] = (
         ERROR_BUS_OFF,
         "BusOff",
         "MAJOR",
-        "The CAN controller went bus-off, an offset in a drive cannot be changed; check the wiring and bit rate.",
+        "The CAN controller went bus-off: offsets in the drives cannot be changed; check the wiring and bit rate.",
     ),
     (
         ERROR_RESTARTED,
         "BusRestarted",
         "MAJOR",
-        "The CAN controller was restarted; what the drives hold must be read before anything is written.",
+        "The CAN controller was restarted; the offsets in the drives must be read back before anything is written.",
     ),
     (
         ERROR_TRANSCEIVER,
         "TransceiverFault",
         "MAJOR",
-        "The CAN transceiver reports a fault of the line, frames may be lost; check the cable for breaks and shorts.",
+        "The CAN transceiver reports a line fault: frames may be lost; check the cable for breaks and shorts.",
     ),
     (
         ERROR_NO_ACKNOWLEDGE,
@@ -63,7 +63,7 @@ _OF_CONTROLLER: tuple[tuple[int, str, Severity, str], ...] = (
         CONTROLLER_PASSIVE,
         "ErrorPassive",
         "MAJOR",
-        "The CAN controller is error-passive, frames may be lost; check termination, shield and bit rate.",
+        "The CAN controller is error-passive: frames may be lost; check termination, shield and bit rate.",
     ),
     (
         CONTROLLER_WARNING,
@@ -75,7 +75,7 @@ _OF_CONTROLLER: tuple[tuple[int, str, Severity, str], ...] = (
         CONTROLLER_OVERFLOW,
         "RxOverflow",
         "minor",
-        "The CAN controller's own buffer overflowed, frames were lost that nobody counts; the computer is overloaded.",
+        "The CAN controller's buffer overflowed: an unknown number of frames was lost; reduce the computer's load.",
     ),
 )
 

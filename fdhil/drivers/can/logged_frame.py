@@ -139,11 +139,11 @@ def lines_of(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
                 if not (line := file.readline(_MOST_CHARACTERS)):
                     return
                 if len(line) == _MOST_CHARACTERS:
-                    text = f"line {number} has {_MOST_CHARACTERS} characters and more"
-                    raise RecordingError(f"{path}, {text}: it is no log of a bus; copy it again")
+                    text = f"line {number} has {_MOST_CHARACTERS} characters or more"
+                    raise RecordingError(f"{path}, {text}: it is not a bus log; copy it again")
                 yield number, line
     except OSError as error:
-        raise RecordingError(f"{path} cannot be read ({error.strerror}); check the file and its rights") from None
+        raise RecordingError(f"{path} cannot be read ({error.strerror}); check the file and its permissions") from None
 
 
 def decimal_ns(seconds: str) -> int:

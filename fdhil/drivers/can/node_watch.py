@@ -59,7 +59,7 @@ class NodeWatch:
         code = data & 0xFFFF if length >= 2 else 0x1000
         if code >> 8 == 0:
             self._codes.clear()
-            return [self._notice("DriveEmergency", "info", "reports that its error is gone.")]
+            return [self._notice("DriveEmergency", "info", "reports no error any more.")]
         if code in self._codes or len(self._codes) >= _MAX_EMCY_CODES:
             return []
         self._codes.add(code)
@@ -72,10 +72,10 @@ class NodeWatch:
         if state == Nmt.BOOT_UP:
             self.boots += 1
             self._beats, self._back_since_ns = [], None  # an outage that seemed to end begins anew
-            text = "booted, its offset and set-up are unknown; check its supply and commission it again."
+            text = "rebooted: its offset and set-up are unknown; check its supply and commission it again."
             notices.append(self._notice("NodeRebooted", "MAJOR", text))
         elif self.nmt is Nmt.OPERATIONAL and state != Nmt.OPERATIONAL:
-            text = "left the NMT state Operational, it takes no set-points; see what the NC did."
+            text = "left the NMT state Operational: it accepts no set-points; check the NC."
             notices.append(self._notice("NmtStateWrong", "MAJOR", text))
         if self._lost:
             notices += self._after_an_outage(t_ns)
@@ -107,5 +107,5 @@ class NodeWatch:
         if now_ns - self._beats[-1] <= self._longest_gap_ns():
             return []
         self._lost = True
-        text = "sends no heartbeat any more and may be dead; check its supply and the bus."
+        text = "no longer sends its heartbeat and may be dead; check its supply and the bus."
         return [self._notice("HeartbeatLost", "MAJOR", text)]

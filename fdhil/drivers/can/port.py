@@ -5,10 +5,10 @@ from typing import Literal, Protocol
 from fdhil.drivers.can.frames import FrameRing
 
 Stamps = Literal["hardware", "kernel", "hub", "sender", "adapter", "host"]
-"""Who stamps the frames: controller, kernel, hub, sender, the adapter's firmware, this program when it reads them."""
+"""Source of time stamps: controller, kernel, hub, sender, the adapter's firmware, this program when it reads."""
 
 Filter = tuple[int, int]
-"""An identifier with its flags and the mask of the bits that must be the same."""
+"""An identifier with its flags, and the mask of the bits that must match."""
 
 
 class BusEnded(Exception):

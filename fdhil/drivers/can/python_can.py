@@ -70,7 +70,7 @@ class PythonCanPort:
             try:
                 message = self._bus.recv(wait)
             except _BROKEN as error:
-                raise BusEnded(f"{self._what} is gone, or sent what is no frame ({_one_line(error)})") from None
+                raise BusEnded(f"{self._what} is gone, or sent an invalid frame ({_one_line(error)})") from None
             if message is None:
                 return
             now_ns, stamp_ns = time.monotonic_ns(), round(message.timestamp * 1e9)

@@ -76,7 +76,9 @@ class SdoLink:
                 raise
             first, second = self._upload(index, sub), self._upload(index, sub)
             if first != second:
-                text = f"{_name(index, sub)} gave two answers after a time-out; check that one master asks"
+                text = (
+                    f"{_name(index, sub)} gave two answers after a time-out; check that only one master sends requests"
+                )
                 raise ProtocolError(self.device, text) from None
             return second
 
@@ -133,7 +135,7 @@ class SdoLink:
                     text = f"{_name(index, sub)} was not finished after {DEADLINE_S:g} s; check the bus load"
                     raise SdoTooLarge(self.device, text)
             self._client.abort(_MEMORY_ABORT)
-        text = f"{_name(index, sub)} is longer than {MAX_BYTES} bytes; this is no object of a healthy drive"
+        text = f"{_name(index, sub)} is longer than {MAX_BYTES} bytes; no object of a working drive is; check the drive"
         raise SdoTooLarge(self.device, text)
 
     def _guarded(self, index: int, sub: int, call: Any) -> Any:
@@ -152,6 +154,6 @@ class SdoLink:
                 text = f"{_name(index, sub)} was not answered; check the drive's supply and its node-ID"
                 raise SdoTimeout(self.device, text) from None
             self._late = True
-            text = f"{_name(index, sub)} was answered wrongly ({error}); check that one master asks"
+            text = f"{_name(index, sub)} got a wrong answer ({error}); check that only one master sends requests"
             kind = SdoToggle if "toggle" in str(error).lower() else ProtocolError
             raise kind(self.device, text) from None

@@ -138,5 +138,5 @@ class SocketCanPort:
 
 def _advice(error: OSError, settings: config.CanBus) -> str:
     if error.errno == errno.ENODEV:
-        return "plug the adapter in, or take a name that ip link shows"
+        return "plug the adapter in, or choose a name that ip link shows"
     return f"bring it up: ip link set {settings.channel} up type can bitrate {settings.bitrate}"

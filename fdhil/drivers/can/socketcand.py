@@ -61,7 +61,7 @@ class SocketcandPort:
             raise ConnectError(name, text) from None
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._expect(b"< hi >", f"{where} is no socketcand hub")
+            self._expect(b"< hi >", f"{where} is not a socketcand hub")
             self._socket.sendall(f"< open {settings.channel} >".encode("ascii"))
             self._expect(b"< ok >", f"the hub {where} has no bus {settings.channel}")
             self._socket.sendall(b"< rawmode >")
@@ -90,7 +90,7 @@ class SocketcandPort:
         except TimeoutError:
             return
         except OSError as error:
-            raise BusEnded(f"the connection to the CAN hub broke ({error.strerror})") from None
+            raise BusEnded(f"the connection to the CAN hub failed ({error.strerror})") from None
         if not chunk:
             raise BusEnded("the CAN hub ended the connection")
         self._split(chunk, ring, time.monotonic_ns())

@@ -192,5 +192,5 @@ class SyncGrid:
         was, self._collision = self._collision, self._producers.two
         if not self._collision or was:
             return ()
-        text = "Two nodes send SYNC, the sampling grid cannot be trusted; leave one SYNC producer on the bus."
+        text = "Two nodes send SYNC: the sampling grid is invalid; leave only one SYNC producer on the bus."
         return (Notice("SyncCollision", "MAJOR", text, tick=self._last_tick),)

@@ -26,8 +26,8 @@ from fdhil.drivers.can.logged_frame import (
 )
 from fdhil.errors import RecordingError
 
-OTHER_ROWS = "rows that are not CAN frames"
-NO_DATE = "the date, which is not in the head"
+OTHER_ROWS = "lines that are not CAN frames"
+NO_DATE = "the date, which is not in the header"
 _COLUMNS = {"1.0": "N,O,I,L,D", "1.1": "N,O,d,I,L,D", "1.2": "N,O,B,d,I,L,D", "1.3": "N,O,B,d,I,R,L,D"}
 _FD_TYPES = {"FD": 0, "FB": RATE_SWITCH, "FE": ERROR_STATE, "BI": RATE_SWITCH | ERROR_STATE}
 _TYPE_OF_FD = {flags: name for name, flags in _FD_TYPES.items()}
@@ -59,7 +59,7 @@ class _Head:
         """Return the columns; ValueError where neither header nor version names them."""
         columns = self.columns or _COLUMNS.get(self._version, "").split(",")
         if not {"O", "I", "D"} <= set(columns) or not {"l", "L"} & set(columns):
-            raise ValueError(f"columns of version {self._version} are not known")
+            raise ValueError(f"columns of version {self._version} are unknown")
         return columns
 
 

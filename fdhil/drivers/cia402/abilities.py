@@ -48,7 +48,7 @@ def abilities(device: Device, profile: DriveProfile) -> list[Ability]:
     if not device.is_drive:
         kind = (device.default(Object.DEVICE_TYPE) or 0) & 0xFFFF
         why = f"its device type is profile {kind or 'none'}, or it has no control- and statusword (6040, 6041)"
-        return [Ability("listen", "no", why, "it is no CiA 402 drive; read it as a sensor, if it is one")]
+        return [Ability("listen", "no", why, "it is not a CiA 402 drive; configure it as a sensor, if it is one")]
     return [
         *_listen(device, profile),
         _mapped(device, profile),
@@ -105,11 +105,11 @@ def shown(key: ObjectKey) -> str:
 def _listen(device: Device, profile: DriveProfile) -> Iterator[Ability]:
     if profile.unheard:
         what = ", ".join(f"{name} ({shown(getattr(profile, name))})" for name in profile.unheard)
-        advice = "name the maker's object of it in a profile of your own, with base = 'cia402'"
-        yield Ability("listen", "no", f"no TPDO of every SYNC can carry its {what}", advice)
+        advice = "name the vendor's object for it in your own profile, with base = 'cia402'"
+        yield Ability("listen", "no", f"no TPDO with every SYNC can carry its {what}", advice)
         return
     if device.find((SYNC_ID, 0)) is None and not any(place.kind in SYNC_TYPES for place in device.tpdos):
-        yield Ability("listen", "perhaps", "its EDS has no SYNC (1005): its TPDOs may come by a timer alone")
+        yield Ability("listen", "perhaps", "its EDS has no SYNC (1005): its TPDOs may be sent by a timer only")
     else:
         yield Ability("listen", "yes", "position, speed, current and statusword can come with every SYNC")
 
@@ -122,9 +122,9 @@ def _mapped(device: Device, profile: DriveProfile) -> Ability:
     specs = [*((spec, device.rpdos) for spec in profile.rpdos), *((spec, device.tpdos) for spec in profile.tpdos)]
     stuck = [spec.name for spec, places in specs if spec.name in differ and _stuck(spec, places)]
     if stuck:
-        why = f"it has no {', '.join(stuck)}, or of another mapping, COB-ID or type that is fixed"
-        return Ability("mapping", "no", why, "choose profile 'cia402', which takes what the EDS offers")
-    why = f"{', '.join(differ)} must be set up: the defaults are others"
+        why = f"it has no {', '.join(stuck)}, or one whose mapping, COB-ID or type differs and is fixed"
+        return Ability("mapping", "no", why, "choose profile 'cia402', which uses what the EDS offers")
+    why = f"{', '.join(differ)} must be set up: the defaults differ"
     return Ability("mapping", "yes", why, "`fdhil commission --set-pdos`, or the drive's own tool")
 
 
@@ -161,16 +161,15 @@ def _voltage(device: Device, profile: DriveProfile) -> Ability:
         return Ability(what, "yes", why, "check it once against a meter")
     if profile.voltage is not None:
         why = (
-            f"it has no {shown(profile.voltage)} that a TPDO could carry: K, Jt and friction are found, R and L are not"
+            f"it has no {shown(profile.voltage)} that a TPDO could carry: K, Jt and friction can be "
+            "identified, R and L cannot"
         )
         return Ability(what, "no", why, SENSOR)
     alike = [at for at in named_alike(device, "voltage") if at.in_tpdo or at.perhaps_in_tpdo]
     if alike:
-        why = f"the profile takes none, but by its name {_names(alike)} may be one"
-        return Ability(
-            what, "perhaps", why, "measure its scale, and give voltage and its unit in a profile of your own"
-        )
-    why = "no object that a TPDO can carry is a motor voltage: K, Jt and friction are found, R and L are not"
+        why = f"the profile has none, but by its name {_names(alike)} may be one"
+        return Ability(what, "perhaps", why, "measure its scale, and set voltage and its unit in your own profile")
+    why = "no object that a TPDO can carry is a motor voltage: K, Jt and friction can be identified, R and L cannot"
     return Ability(what, "no", why, SENSOR)
 
 
@@ -183,18 +182,16 @@ def _demand(device: Device, profile: DriveProfile) -> Ability:
     what = "follow an NC"
     at = profile.find_rpdo(profile.target)
     if at is None:
-        return Ability(
-            what, "no", f"no RPDO carries its target ({shown(profile.target)})", "it can be identified alone"
-        )
+        return Ability(what, "no", f"no RPDO carries its target ({shown(profile.target)})", "it can only be identified")
     modes = device.default(Object.SUPPORTED_MODES)
     if profile.mode < 1:
-        return Ability(what, "perhaps", f"set-points are streamed in the maker's mode {profile.mode}")
+        return Ability(what, "perhaps", f"set-points are streamed in the vendor's mode {profile.mode}")
     if modes is None:
-        return Ability(what, "perhaps", "its EDS does not say its modes (6502); ask the drive with `fdhil check`")
+        return Ability(what, "perhaps", "its EDS does not list its modes (6502); query the drive with `fdhil check`")
     if modes >> (profile.mode - 1) & 1:
         return Ability(what, "yes", f"set-points are streamed to {shown(profile.target)} (6502 = {modes:08X})")
     why = f"it has no mode {profile.mode} (6502 = {modes:08X}): set-points cannot be streamed"
-    return Ability(what, "no", why, "it can be identified, its path is not the NC's")
+    return Ability(what, "no", why, "it can be identified, but not corrected")
 
 
 def _correct(device: Device, profile: DriveProfile) -> Iterator[Ability]:
@@ -204,13 +201,19 @@ def _correct(device: Device, profile: DriveProfile) -> Iterator[Ability]:
         why = "it has no position offset (60B0)" if offset is None else "no RPDO can carry its 60B0"
         yield Ability(what, "no", why, advice)
     elif profile.unshown:
-        why = f"no TPDO shows its {', '.join(map(shown, profile.unshown))}, and no offset is sent that cannot be seen"
+        why = (
+            f"no TPDO shows its {', '.join(map(shown, profile.unshown))}, and offsets are only sent where "
+            "they can be read back"
+        )
         yield Ability(what, "no", why, advice)
     elif not offset.in_tpdo:
-        why = "its EDS gives 60B0 to RPDOs alone (rww): whether a TPDO takes it for the read-back, only the drive tells"
-        yield Ability(what, "perhaps", why, "`fdhil commission --set-pdos` tries it and says so")
+        why = (
+            "its EDS allows 60B0 in RPDOs only (rww): whether a TPDO accepts it for the read-back, only a "
+            "test on the drive shows"
+        )
+        yield Ability(what, "perhaps", why, "`fdhil commission --set-pdos` tests and reports it")
     else:
-        yield Ability(what, "yes", "60B0 has an RPDO of its own, and is read back")
+        yield Ability(what, "yes", "60B0 has a separate RPDO, and is read back")
 
 
 def _feedforward(device: Device, profile: DriveProfile) -> Ability:
@@ -218,7 +221,7 @@ def _feedforward(device: Device, profile: DriveProfile) -> Ability:
     found = profile.find_rpdo(profile.speed_offset)
     if found is None or any(device.find(key) is None for key in keys) or len(found[0].entries) != len(keys):
         return Ability("feed-forward", "no", "no RPDO carries its speed and torque offset (60B1, 60B2) alone")
-    return Ability("feed-forward", "yes", "60B1 and 60B2 have an RPDO of their own")
+    return Ability("feed-forward", "yes", "60B1 and 60B2 have a separate RPDO")
 
 
 def _safety(device: Device, profile: DriveProfile) -> Iterator[Ability]:
@@ -228,17 +231,17 @@ def _safety(device: Device, profile: DriveProfile) -> Iterator[Ability]:
     )
     if code is None or listens is None:
         lacking = "abort option (6007)" if code is None else "consumer heartbeat (1016)"
-        advice = "commissioning proves whether it stops; else it is not armed"
+        advice = "commissioning tests whether it stops; otherwise it is not armed"
         yield Ability("stop alone", "perhaps", f"its EDS has no {lacking}", advice)
     else:
         values = " or ".join(map(str, profile.strict_abort_options))
         yield Ability("stop alone", "yes", f"6007 = {values} and 1016 make it stop when the heartbeat is lost")
     if device.find((int(Object.PRODUCER_HEARTBEAT), 0)) is None:
-        yield Ability("heartbeat", "no", "it sends none (1017): only its PDOs show that it lives")
+        yield Ability("heartbeat", "no", "it sends none (1017): only its PDOs show that it is alive")
         return
     period_ms = device.default(Object.PRODUCER_HEARTBEAT)
     if period_ms is None:
-        yield Ability("heartbeat", "yes", "its EDS does not say its period (1017)", "set it to 100")
+        yield Ability("heartbeat", "yes", "its EDS does not give its period (1017)", "set it to 100")
     elif not period_ms:
         yield Ability("heartbeat", "yes", "1017 is 0 by default", "set it to 100")
     else:
@@ -257,10 +260,10 @@ def _scale(device: Device) -> Iterator[Ability]:
     if compared:
         yield Ability("compare scales", "yes", f"check compares {', '.join(compared)}")
     if own:
-        yield Ability("compare other scales", "no", f"the drive does not tell {', '.join(own)}: take care with them")
+        yield Ability("compare other scales", "no", f"the drive does not report {', '.join(own)}: verify them yourself")
 
 
 def _rapids(device: Device, profile: DriveProfile) -> Ability:
     if profile.find_tpdo(profile.digital_inputs) is None or device.find(profile.digital_inputs) is None:
         return Ability("rapid signal", "no", "no TPDO carries its inputs (60FD): rapids are inferred from the motion")
-    return Ability("rapid signal", "yes", "a bit of 60FD can tell G0; without one it is inferred")
+    return Ability("rapid signal", "yes", "a bit of 60FD can signal G0; without one it is inferred")

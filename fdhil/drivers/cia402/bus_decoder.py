@@ -59,7 +59,7 @@ class BusDecoder:
         silent = self._last_sync_ns is not None and now_ns - self._last_sync_ns > _SYNC_SILENCE_NS
         was, self._sync_lost = self._sync_lost, silent
         if silent and not was:
-            text = "SYNC stopped, nothing is sampled; start the NC or see whether it still runs the bus."
+            text = "SYNC stopped: nothing is sampled; start the NC, or check that it still runs the bus."
             return [Notice("SyncLost", "MAJOR", text)]
         return [Notice("SyncLost", "info", "SYNC is back.")] if was and not silent else []
 

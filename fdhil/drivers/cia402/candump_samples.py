@@ -35,7 +35,7 @@ def samples_of_log(log: bytes, config: MachineConfig) -> dict[str, AxisSamples]:
 
 def _frames(log: bytes) -> dict[str, Frames]:
     if len(log) > LARGEST_LOG:
-        raise RecordingError(f"the log has more than {LARGEST_LOG >> 20} MiB, nothing of it is read; cut it")
+        raise RecordingError(f"the log has more than {LARGEST_LOG >> 20} MiB, it is not read; shorten it")
     rows: dict[str, list[tuple[int, int, bytes]]] = {}
     for line in io.StringIO(log.decode("ascii", "replace")):
         with contextlib.suppress(ValueError, IndexError):  # a line that was cut is no frame
@@ -43,7 +43,7 @@ def _frames(log: bytes) -> dict[str, Frames]:
             if frame.fd is None:
                 rows.setdefault(frame.bus, []).append((frame.t_ns, frame.can_id, frame.data))
     if not rows:
-        raise RecordingError("this is no log of candump, or nothing was on the bus")
+        raise RecordingError("this is not a candump log, or the bus was silent")
     return {bus: frames_of(found) for bus, found in rows.items()}
 
 

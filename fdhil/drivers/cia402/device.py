@@ -152,8 +152,8 @@ def _objects(dictionary: Any) -> Iterable[DeviceObject]:
             octal = octal_reading(written) if bits else None
             if octal is not None or (value is None and NODE_ID in written):  # of no node: as of node 0
                 value = (read_expression(written) or (None, False))[0]
-            doubt = "" if octal is None else f": taken as {value}, it is {octal} if octal is meant"
-            doubt = ", which is no number: taken as not given" if bits and written and value is None else doubt
+            doubt = "" if octal is None else f": read as {value}, but it is {octal} if octal is meant"
+            doubt = ", which is not a number: ignored" if bits and written and value is None else doubt
             yield DeviceObject(
                 key=(index, sub),
                 name=entry.name if entry.name == variable.name else f"{entry.name}: {variable.name}",

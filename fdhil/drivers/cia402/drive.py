@@ -209,8 +209,8 @@ class Cia402Decoder:
             names = ", ".join(f"{queue.spec.name} ({queue.cob_id:03X})" for queue in rare)
             kinds = ", ".join(f"0x{0x1800 + queue.spec.number - 1:04X}:02" for queue in rare)
             text = (
-                f"Drive {self.axis} sends {names} with few of the SYNCs, and its samples have holes; "
-                f"set the transmission type ({kinds}) to 1, or see whether it still is Operational."
+                f"Drive {self.axis} sends {names} with few of the SYNCs, so its samples have gaps; "
+                f"set the transmission type ({kinds}) to 1, or check that it is still Operational."
             )
             self._tell("PdoIrregular", "MAJOR", text)
 
@@ -219,8 +219,9 @@ class Cia402Decoder:
         if names:
             self.counters.late += sum(counts.values())
             text = (
-                f"Drive {self.axis} sent {names} later than the next SYNC; it cannot be told from that one's, so the "
-                "samples of both are left out. See whether the bus is too busy, or the drive too slow for this period."
+                f"Drive {self.axis} sent {names} after the next SYNC; it cannot be distinguished from that "
+                "cycle's, so the "
+                "samples of both are discarded. Check the bus load, and whether the drive is too slow for this period."
             )
             self._tell("LateFrame", "minor", text)
 
@@ -228,7 +229,10 @@ class Cia402Decoder:
         clean = np.flatnonzero(~ambiguous)
         self._foreign_run = ambiguous.size - 1 - int(clean[-1]) if clean.size else self._foreign_run + ambiguous.size
         if self._foreign_run >= _FOREIGN_TICKS:
-            text = f"Two nodes send as drive {self.axis} (node-ID {self.node_id}); give each node its own node-ID."
+            text = (
+                f"Two nodes send as drive {self.axis} (node-ID {self.node_id}): its samples are ambiguous; "
+                "give each node its own node-ID."
+            )
             self._tell("ForeignProducer", "MAJOR", text)
 
     def _record(
@@ -312,18 +316,19 @@ class Cia402Decoder:
             if self._mismatches == _MISMATCHES:
                 text = (
                     f"Drive {self.axis} follows another demand than the sniffed one, by {int(difference[-1])} "
-                    "increments, its samples cannot be trusted; check setpoint_delay_cycles and who sends set-points."
+                    "increments: its samples are not reliable; check setpoint_delay_cycles, and that only one "
+                    "master sends set-points."
                 )
                 self._notices.append(Notice("DemandMismatch", "MAJOR", text, self.axis))
 
     def _length_notices(self) -> None:
         if self.counters.short >= 3:
             text = (
-                f"Drive {self.axis} sends PDOs shorter than its mapping, they are not used; check the drive's mapping."
+                f"Drive {self.axis} sends PDOs shorter than its mapping: they are discarded; check the drive's mapping."
             )
             self._tell("PdoLength", "MAJOR", text)
         if self.counters.long:
-            text = f"Drive {self.axis} sends PDOs longer than its mapping; commission it again."
+            text = f"Drive {self.axis} sends PDOs longer than its mapping: the rest is ignored; commission it again."
             self._tell("PdoMapping", "minor", text)
 
     def _tell(self, code: str, severity: Literal["minor", "MAJOR"], text: str) -> None:

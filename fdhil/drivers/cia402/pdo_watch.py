@@ -36,9 +36,9 @@ class PdoWatch:
         self._told = True
         names = ", ".join(f"{name} ({can_id:03X})" for can_id, name in self._missing.items())
         if nmt in (None, Nmt.OPERATIONAL):
-            advice = "compare its mapping, COB-IDs and transmission types by fdhil check"
+            advice = "compare its mapping, COB-IDs and transmission types with fdhil check"
         else:
             advice = f"its NMT state is {nmt.name.lower().replace('_', '-')}: let the NC start it"
-        text = f"Drive {self._axis} (node-ID {self._node_id}) never sent {names} though SYNC runs; {advice}."
+        text = f"Drive {self._axis} (node-ID {self._node_id}) has not sent {names} since SYNC runs; {advice}."
         serious = any(name in self._needed for name in self._missing.values())
         return [Notice("PdoMissing", "MAJOR" if serious else "minor", text, self._axis)]

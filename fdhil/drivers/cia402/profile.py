@@ -18,7 +18,7 @@ from fdhil.config import Axis, SpeedUnit
 ObjectKey = tuple[int, int]
 """Index and sub-index."""
 LOGICAL_AXIS_PDOS = 64
-"""The PDOs of the next axis of one device lie so much higher (CiA 402-3)."""
+"""Distance between the PDO numbers of two axes of one device (CiA 402-3)."""
 
 
 @dataclass(frozen=True, slots=True)

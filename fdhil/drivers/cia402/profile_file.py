@@ -40,14 +40,14 @@ def load_profile(drive: Drive) -> DriveProfile:
     if drive.source == "hal" and drive.hal is not None and drive.hal.voltage is None:
         profile = replace(profile, voltage=None)
     if deaf := profile.unheard:
-        what = f"no TPDO of every SYNC carries its {', '.join(deaf)}"
+        what = f"no TPDO with every SYNC carries its {', '.join(deaf)}"
         raise _fault(
-            profile.name, "tpdos", what, "`fdhil eds` tells what the drive has; base a profile of your own on it"
+            profile.name, "tpdos", what, "`fdhil eds` shows what the drive offers; write your own profile by it"
         )
     if drive.logical_axis == profile.logical_axis:
         return profile
     if profile.logical_axis != 1:
-        what = f"it is of axis {profile.logical_axis} of its device, the configuration has {drive.logical_axis}"
+        what = f"it is for axis {profile.logical_axis} of its device, but the configuration has {drive.logical_axis}"
         raise _fault(profile.name, "logical_axis", what, "make both the same")
     return _of_axis(profile, drive.logical_axis)
 
@@ -62,7 +62,9 @@ def no_offset(profile: DriveProfile) -> str:
     """Explain why nothing can be added to the set-points of this drive."""
     if profile.find_rpdo(profile.offset) is not None and profile.unshown:
         unseen = ", ".join(f"{index:04X}:{sub:02X}" for index, sub in profile.unshown)
-        return f"profile {profile.name} maps {unseen} into no TPDO, and no offset is sent that cannot be seen"
+        return (
+            f"profile {profile.name} maps {unseen} into no TPDO, and offsets are only sent where they can be read back"
+        )
     index, sub = profile.offset
     return f"profile {profile.name} maps no offset ({index:04X}:{sub:02X}) into a valid RPDO: none can be sent"
 
@@ -87,8 +89,8 @@ def read_profile(name: str, eds: Path | None = None) -> DriveProfile:
 def _mapped(document: Mapping[str, Any], name: str, eds: Path | None) -> dict[str, Any]:
     """Add the PDOs that the EDS offers to a profile without PDOs; ConfigError without an EDS."""
     if eds is None:
-        advice = "give drive.eds, the file that the drive's maker has for it"
-        raise _fault(name, "tpdos", "are not in this profile, and there is no EDS to take them from", advice)
+        advice = "set drive.eds to the vendor's file for the drive"
+        raise _fault(name, "tpdos", "are missing in this profile, and there is no EDS to derive them from", advice)
     device = read_device(eds)
     told: dict[str, Any] = {"vendor_id": device.vendor_id or None}
     if unit := speed_unit_of(device.default(Object.VELOCITY_UNIT)):
@@ -106,13 +108,15 @@ def _mapped(document: Mapping[str, Any], name: str, eds: Path | None) -> dict[st
 
 def _document(name: str, depth: int = 0) -> dict[str, Any]:
     if depth > MOST_BASES:
-        raise _fault(name, "base", "its bases have no end", "base it on a packaged profile")
+        raise _fault(name, "base", "is nested too deeply, or circular", "base it on a packaged profile")
     document = _toml(name)
     base = document.pop("base", None)
     if base is None:
         return document
     if not isinstance(base, str) or (base not in tables.DRIVE_PROFILES and not base.endswith(".toml")):
-        raise _fault(name, "base", f"is no profile: {str(base)[:60]!r}", f"one of {', '.join(tables.DRIVE_PROFILES)}")
+        raise _fault(
+            name, "base", f"is not a profile: {str(base)[:60]!r}", f"one of {', '.join(tables.DRIVE_PROFILES)}"
+        )
     if base.endswith(".toml"):
         base = str(Path(name).parent / base)
     return _document(base, depth + 1) | document
@@ -133,7 +137,7 @@ def profile_of(document: Mapping[str, Any], name: str, source: str) -> DriveProf
     known = {field.name for field in fields(DriveProfile)} - {"name"}
     for key, given in document.items():
         if key not in known:
-            faults.append(ConfigFault(key, "is no key of a profile", f"one of {', '.join(sorted(known))}"))
+            faults.append(ConfigFault(key, "is not a key of a profile", f"one of {', '.join(sorted(known))}"))
         elif key not in ("rpdos", "tpdos"):
             try:
                 values[key] = _KINDS[key].validate_python(given)
@@ -162,7 +166,7 @@ def _pdos(given: Any, kind: str, faults: list[ConfigFault]) -> tuple[PdoSpec, ..
 
 def _pdo(table: Mapping[str, Any]) -> PdoSpec:
     if unknown := table.keys() - _PDO_KEYS:
-        raise ValueError(f"{', '.join(sorted(unknown))} is no key of a PDO")
+        raise ValueError(f"{', '.join(sorted(unknown))} is not a key of a PDO")
     name = str(table["name"])
     digits = name.removeprefix(name.rstrip("0123456789"))
     if not digits or not 1 <= int(digits) <= 512:
@@ -179,7 +183,7 @@ def _pdo(table: Mapping[str, Any]) -> PdoSpec:
 def _entry(given: Sequence[Any]) -> tuple[int, int, int, bool]:
     index, sub, bits, signed = given
     if not 1 <= index <= 0xFFFF or not 0 <= sub <= 0xFF or not 1 <= bits <= 64 or type(signed) is not bool:
-        raise ValueError(f"{list(given)} is no [index, sub-index, bits, signed]")
+        raise ValueError(f"{list(given)} is not [index, sub-index, bits, signed]")
     return int(index), int(sub), int(bits), signed
 
 

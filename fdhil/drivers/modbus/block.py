@@ -39,7 +39,7 @@ class BlockVoltage(ModbusVoltage):
 
         held = block.samples if block.count_address is None else words(block.count_address, 1)[0]
         if held > block.samples:
-            text = f"register {block.count_address} tells {held} samples in a block of {block.samples}"
+            text = f"register {block.count_address} gives {held} samples in a block of {block.samples}"
             raise ProtocolError(self.name, f"{text}; compare voltage.block with the sensor's register map")
         raw = numbers(words(settings.address, held * registers_of(self._kind)), self._kind, *self._orders)
         raw = raw[::-1] if block.newest_first else raw

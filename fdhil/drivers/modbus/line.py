@@ -22,7 +22,7 @@ EXCEPTIONS = {
 }
 ADVICE = {
     **dict.fromkeys((1, 2, 3), "compare the register map with the config"),
-    **dict.fromkeys((5, 6), "ask it less often"),
+    **dict.fromkeys((5, 6), "poll it less often"),
     10: "check the gateway's own settings",
     11: "check unit, and the line behind the gateway",
 }
@@ -34,7 +34,7 @@ class ModbusRefused(ProtocolError):
     def __init__(self, device: str, address: int, code: int) -> None:
         self.code = code
         what = EXCEPTIONS.get(code, f"exception {code}")
-        advice = ADVICE.get(code, "check the device: the fault is its own")
+        advice = ADVICE.get(code, "check the device itself")
         super().__init__(device, f"register {address} is refused ({what}); {advice}")
 
 

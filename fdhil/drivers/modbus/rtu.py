@@ -90,17 +90,20 @@ def fault_in(data: bytes, unit: int, function: int, count: int) -> tuple[str, st
         return "ModbusUnit", foreign_unit(data[0], unit)
     wanted = data_bytes(function, count)
     if whole and data[1] == function and function in _READS and data[2] != wanted:
-        return "ModbusShape", f"{data[2]} bytes came for {wanted} asked; check that one client asks at a time"
+        return "ModbusShape", f"{data[2]} bytes came instead of {wanted}; check that only one client sends requests"
     if len(data) >= answer_bytes(function, count) and data[:2] == bytes([unit, function]):
-        return "ModbusCrc", "an answer came damaged; check shield, termination and the baud rate of the line"
-    text = f"{len(data)} bytes came that are no answer; check baud rate, parity and that one client asks at a time"
+        return "ModbusCrc", "a damaged answer came; check shield, termination and the baud rate of the line"
+    text = (
+        f"{len(data)} bytes came that are not an answer; check baud rate, parity and that only one client "
+        "sends requests"
+    )
     return "ModbusShape", text
 
 
 def foreign_unit(answering: int, asked: int) -> str:
     """Describe an answer of a unit that was not addressed."""
-    text = f"unit {answering} answers where unit {asked} was asked; give unit = {answering}"
-    return f"{text} where that is the device, or check that no two have one number"
+    text = f"unit {answering} answered instead of unit {asked}; set unit = {answering}"
+    return f"{text} if that is the device, or check that no two have the same number"
 
 
 def _whole_frame(data: bytes) -> bool:

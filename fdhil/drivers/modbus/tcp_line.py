@@ -93,16 +93,14 @@ class TcpLine:
             answer = await self.answered(self._call(request), request)
             answered_ns = time.monotonic_ns()
         if answer.function_code != request.function:
-            text = (
-                f"function {answer.function_code} is answered where {request.function} was asked; compare host and port"
-            )
+            text = f"function {answer.function_code} was answered instead of {request.function}; compare host and port"
             raise DamagedAnswer(request.name, "ModbusShape", text)
         came = answer.bits if request.function in BIT_READS else answer.registers
         registers = tuple(map(int, came)) if request.count else ()
         spare = -request.count % 8 if request.function in BIT_READS else 0  # bits come in whole bytes
         if len(registers) != request.count + spare:
             what = "bits" if request.function in BIT_READS else "registers"
-            text = f"{len(registers)} {what} came for {request.count} asked; check that one client asks at a time"
+            text = f"{len(registers)} {what} came instead of {request.count}; check that only one client sends requests"
             raise DamagedAnswer(request.name, "ModbusShape", text)
         return Answer(registers[: request.count], asked_ns, answered_ns)
 
@@ -132,7 +130,7 @@ class TcpLine:
             raise DamagedAnswer(request.name, "ModbusUnit", foreign_unit(error.unit, request.unit)) from None
         except _Nonsense:
             self.close()
-            text = "what came is no answer of Modbus TCP, the connection is made anew; compare host and port"
+            text = "the answer is not Modbus TCP: the connection is restarted; compare host and port"
             raise DamagedAnswer(request.name, "ModbusShape", text) from None
         except ModbusException as error:
             raise self._silent(request) from error
@@ -146,7 +144,7 @@ class TcpLine:
 
     def _gone(self, request: Request) -> ConnectError:
         text = f"the connection to the Modbus device {self._where} is gone"
-        text += "; check its supply and cable, and that it serves so many clients"
+        text += "; check its supply and cable, and its limit of clients"
         return ConnectError(request.name, text)
 
     def _silent(self, request: Request) -> DeviceError:

@@ -67,7 +67,7 @@ def parse_block(name: str, registers: Sequence[int]) -> SensorBlock:
         (f"a block that ends after the newest sample ({first} + {count} > {newest} + 1)", first + count <= newest + 1),
     ):
         if not ok:
-            raise ProtocolError(name, f"the sensor reports {what}; compare its register map with the driver's")
+            raise ProtocolError(name, f"the sensor reports {what}; compare its register map with the configuration")
     samples = np.array(registers[FIRST_SAMPLE : FIRST_SAMPLE + count], np.uint16).view(np.int16)
     volts = frozen(samples * volts_per_count)
     return SensorBlock(newest, rate_hz, celsius, registers[11] == STATUS_LOST, first, volts, float32(registers))
@@ -131,7 +131,7 @@ class ModbusVoltage:
         """Place a block on the timelines. Pure but for this object's own state."""
         out: list[VoltageSamples | Temperature | Notice] = []
         if self._torn(block, asked_ns):
-            text = f"The {self.name} gave a count whose words are of two moments; this answer is left out."
+            text = f"The {self.name} gave a torn count (its words are from different times): this answer is discarded."
             return [Notice("RegisterTear", "minor", text, self.axis)]
         self._clocks(block, asked_ns, answered_ns, ticks)
         block = self._unseen(block)
@@ -186,11 +186,11 @@ class ModbusVoltage:
         if self._next is not None and block.volts.size and block.first > self._next:
             missing = block.first - self._next
             self.lost += missing
-            text = f"The {self.name} lost {missing} samples, the moves in them are not identified; poll it more often."
+            text = f"The {self.name} lost {missing} samples: moves in them are not identified; poll it more often."
             notices.append(Notice("SampleTiming", "minor", text, self.axis))
         self._still = 0 if block.volts.size else self._still + 1
         if self._still == STUCK_POLLS:
-            text = f"The {self.name} answers but samples no more; see whether it is in an error state."
+            text = f"The {self.name} answers but no longer samples; check whether it is in an error state."
             notices.append(Notice("StuckValue", "MAJOR", text, self.axis))
         if block.volts.size:
             self._next = block.first + block.volts.size

@@ -34,7 +34,7 @@ class Response:
         lines = (await self._until(b"\r\n\r\n")).split(b"\r\n")
         found = _STATUS.match(lines[0])
         if found is None:
-            raise ProtocolError(self._name, f"answers {lines[0][:40]!r}, which is no HTTP; compare host and port")
+            raise ProtocolError(self._name, f"answers {lines[0][:40]!r}, which is not HTTP; compare host and port")
         self.status = int(found[1])
         for line in lines[1:]:
             key, _, value = line.decode("latin-1").partition(":")
@@ -83,7 +83,7 @@ class Response:
         except ValueError:
             self._left = -1
         if not 0 <= self._left <= MOST_BYTES:
-            raise ProtocolError(self._name, f"announces a piece of {size[:20]!r} bytes; is a proxy in between?")
+            raise ProtocolError(self._name, f"announces a chunk of {size[:20]!r} bytes; is a proxy in between?")
         if not self._left:
             self._chunked = False
         return bool(self._left)
@@ -109,7 +109,7 @@ class Parts:
         self._name = name
         found = re.search(r'boundary="?([^";,\s]{1,200})"?', content_type)
         if not content_type.lower().startswith("multipart/") or found is None:
-            text = f"answers with {content_type[:60]!r} where a stream was asked for; does a proxy break it?"
+            text = f"answers with {content_type[:60]!r} instead of a stream; is a proxy in between?"
             raise ProtocolError(name, text)
         self._mark = b"--" + found[1].encode().removeprefix(b"--")
         self._rest = b""
@@ -168,7 +168,7 @@ async def get(name: str, url: str, timeout_s: float) -> AsyncIterator[Response]:
             text = f"{host}:{port} does not answer within {timeout_s:g} s; is it switched on and the agent running?"
             raise DeviceTimeout(name, text) if writer else ConnectError(name, text) from None
         except OSError as error:
-            text = f"nobody answers at {host}:{port} ({error}); start the agent, or correct url"
+            text = f"{host}:{port} cannot be reached ({error}); start the agent, or correct url"
             raise ConnectError(name, text) from None
         yield response
     finally:

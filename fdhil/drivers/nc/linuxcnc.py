@@ -53,14 +53,14 @@ class LinuxCnc:
                 self._reader, self._writer = await asyncio.open_connection(host, port)
         except (OSError, TimeoutError) as error:
             cause = "no answer" if isinstance(error, TimeoutError) else error
-            text = f"nobody answers ({cause}); load the bridge in LinuxCNC's HAL file and start LinuxCNC"
+            text = f"it cannot be reached ({cause}); load the bridge in LinuxCNC's HAL file and start LinuxCNC"
             raise ConnectError(self.name, text) from None
         try:
             async with asyncio.timeout(self._silence_s):
                 self._greet(await self._next())
         except TimeoutError:
             self._disconnect()
-            raise ProtocolError(self.name, "what answers there says nothing: it is not the bridge; see port") from None
+            raise ProtocolError(self.name, "the server there sends nothing: it is not the bridge; check port") from None
         except DeviceError:
             self._disconnect()
             raise
@@ -87,7 +87,7 @@ class LinuxCnc:
         line = self._waiting.popleft()
         told = decode_line(line)
         if told is None:
-            raise ProtocolError(self.name, f"said {line[:60]!r}, which is no state; is this port the bridge's?")
+            raise ProtocolError(self.name, f"sent {line[:60]!r}, which is not a state; is this the bridge's port?")
         return told
 
     async def _receive(self) -> None:
@@ -101,12 +101,14 @@ class LinuxCnc:
         *lines, self._rest = (self._rest + came).split(b"\n")
         self._waiting.extend(lines)
         if len(self._rest) > MOST_BYTES:
-            raise ProtocolError(self.name, "sends no lines of text; is this port the bridge's?")
+            raise ProtocolError(self.name, "sends no lines of text; is this the bridge's port?")
 
     def _greet(self, told: Mapping[str, Any]) -> None:
         period_s = told.get("servo_period_s")
         if told.get("schema") != SCHEMA or not isinstance(period_s, float) or not 1e-5 < period_s < 1.0:
-            raise ProtocolError(self.name, f"is no bridge of this fdhil ({SCHEMA}); load the bridge that came with it")
+            raise ProtocolError(
+                self.name, f"is not a bridge of this fdhil ({SCHEMA}); load the bridge that came with it"
+            )
         self._period_s = period_s
 
     def _state(self, told: Mapping[str, Any]) -> NcState:
@@ -151,12 +153,12 @@ def _maybe(told: Mapping[str, Any], key: str, kind: Any) -> Any:
 def _whole(value: Any) -> int:
     number = int(value)
     if abs(number) > LARGEST:
-        raise ValueError("a number of more than 18 digits")
+        raise ValueError("a number with more than 18 digits")
     return number
 
 
 def _finite(value: Any) -> float:
     number = float(value)
     if not math.isfinite(number):
-        raise ValueError(f"{value!r} is no number")
+        raise ValueError(f"{value!r} is not a number")
     return number

@@ -12,7 +12,7 @@ from fdhil.records import MoveKind, NcState, Notice
 
 BACK_OFF_S = (0.1, 5.0)
 CODE = "NcSilent"
-EFFECT = "Which moves are rapids is not known meanwhile, and none is used. It is tried again until it answers."
+EFFECT = "Rapid moves cannot be recognised meanwhile; none is used for identification. The connection is retried."
 
 
 class NcListener:
@@ -43,14 +43,14 @@ class NcListener:
                     async with asyncio.timeout(self._silence_s):
                         states = await source.read()
                 except TimeoutError:
-                    text = f"said nothing for {self._silence_s:g} s; is the NC switched on and its interface running?"
+                    text = f"sent nothing for {self._silence_s:g} s; is the NC switched on and its interface running?"
                     raise DeviceTimeout(source.name, text) from None
                 for state in states:
                     take(state)
                 self._states += len(states)
                 if states and self._silent:
                     self._silent = False
-                    take(Notice(CODE, "info", f"{source.name} is heard again."))
+                    take(Notice(CODE, "info", f"{source.name} answers again."))
 
     def _lost(self, error: DeviceError, take: Callable[[NcState | Notice], None]) -> None:
         self._failures += 1

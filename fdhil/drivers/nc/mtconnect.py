@@ -97,7 +97,7 @@ class MtConnect:
             signal.at for name, signal in self._profile.signals.items() if found[name] is None and not signal.optional
         ]
         if lacking:
-            text = f"tells no {', no '.join(lacking)}; compare the profile with its /current"
+            text = f"does not report {', '.join(lacking)}; compare the profile with its /current"
             raise ProtocolError(self.name, f"{text}, and see docs/how-to/g0-over-the-network.md")
         self._signals = {item: name for name, item in found.items() if item is not None}
         self._instance = streams.instance
@@ -119,7 +119,9 @@ class MtConnect:
         while not self._waiting:
             came = await self._response.some()
             if not came:
-                raise ProtocolError(self.name, "it ended the stream; is the agent restarted, or a proxy in between?")
+                raise ProtocolError(
+                    self.name, "it ended the stream; was the agent restarted, or is a proxy in between?"
+                )
             for document in self._parts.feed(came):
                 self._waiting += self._states(read_streams(document, self.name))
         states, self._waiting = self._waiting, []
@@ -128,7 +130,7 @@ class MtConnect:
     def _states(self, streams: Streams) -> Iterator[NcState]:
         """Yield a state for each instant of a document, and one for a document without changes."""
         if streams.instance != self._instance:
-            raise ProtocolError(self.name, "the agent was started anew; it is asked from the beginning")
+            raise ProtocolError(self.name, "the agent was restarted; it is read from the beginning")
         came_ns = time.monotonic_ns()
         since_ns, self._came_ns = (
             self._came_ns - self._way_ns,

@@ -52,11 +52,11 @@ class Streams:
 def read_streams(document: bytes, name: str) -> Streams:
     """Parse a document of the agent ``name``; ProtocolError for an error document and for an invalid one."""
     if b"<!DOCTYPE" in document or b"<!ENTITY" in document:
-        raise ProtocolError(name, "sends XML with declarations of its own, which no agent does; compare url")
+        raise ProtocolError(name, "sends XML with DTD declarations, which no agent does; compare url")
     try:
         root = ElementTree.fromstring(document)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise ProtocolError(name, f"answers no MTConnect document ({error}); compare url") from None
+        raise ProtocolError(name, f"does not answer with an MTConnect document ({error}); compare url") from None
     if _local(root) == "MTConnectError":
         raise ProtocolError(name, f"refuses: {_refusal(root)}; compare url, device and path with its /probe")
     header = next((child for child in root if _local(child) == "Header"), None)
@@ -65,7 +65,7 @@ def read_streams(document: bytes, name: str) -> Streams:
     try:
         follows, size = int(header.get("nextSequence", "")), int(header.get("bufferSize", "0"))
     except ValueError:
-        raise ProtocolError(name, "tells no nextSequence in its header; it is too old an agent") from None
+        raise ProtocolError(name, "sends no nextSequence in its header; the agent is too old") from None
     return Streams(header.get("instanceId", ""), follows, size, tuple(_components(root, name)))
 
 
@@ -90,7 +90,7 @@ def _observations(stream: ElementTree.Element, name: str) -> Iterator[Observatio
             try:
                 sequence = int(each.get("sequence", ""))
             except ValueError:
-                raise ProtocolError(name, f"tells a {_local(each)[:40]} without a sequence number") from None
+                raise ProtocolError(name, f"sends a {_local(each)[:40]} without a sequence number") from None
             text = (each.text or "").strip()
             sub_type = each.get("subType", "")
             element = f"{_local(each)}:{sub_type}" if sub_type else _local(each)

@@ -27,7 +27,7 @@ from fdhil.records import NcState
 logging.getLogger("asyncua").setLevel(logging.CRITICAL)
 LOST = (OSError, EOFError, UaError)
 NONSENSE = (struct.error, ValueError, TypeError, KeyError, AttributeError, IndexError)
-"""What asyncua lets through when bytes come that are no OPC UA."""
+"""Errors of asyncua for bytes that are not OPC UA."""
 _NOT_THERE = (ua.StatusCodes.BadNodeIdUnknown, ua.StatusCodes.BadNodeIdInvalid, ua.StatusCodes.BadAttributeIdInvalid)
 
 
@@ -58,7 +58,9 @@ class OpcUa:
             raise ConnectError(self.name, text) from None
         except LOST as error:
             await self._disconnect()
-            text = f"cannot be entered ({_words(error)}); compare url, user, certificate and the server's own settings"
+            text = (
+                f"cannot be connected ({_words(error)}); compare url, user, certificate and the server's own settings"
+            )
             raise ConnectError(self.name, text) from None
         except NONSENSE as error:
             await self._disconnect()
@@ -88,7 +90,9 @@ class OpcUa:
                 del found[name]
         lacking = [signal.at for name, signal in signals.items() if name not in found and not signal.optional]
         if lacking:
-            text = f"has no {', no '.join(lacking)}; compare the profile {self._settings.profile} with a browser of it"
+            text = (
+                f"has no {', no '.join(lacking)}; compare the profile {self._settings.profile} with an OPC UA browser"
+            )
             raise ProtocolError(self.name, text)
         return found
 
@@ -100,7 +104,7 @@ class OpcUa:
         values = await self._values()
         shown = {name: _shown(value) for name, value in zip(self._nodes, values, strict=True)}
         if all(value is None for value in shown.values()):
-            text = f"shows no value ({_status(values[0])}); is the NC behind it switched on?"
+            text = f"has no value ({_status(values[0])}); is the NC behind it switched on?"
             raise ProtocolError(self.name, text)
         stamp_ns, error_ns = between(asked_ns, time.monotonic_ns(), self._settings.renewed_s)
         return [self._translator.state(shown, stamp_ns, error_ns)]
@@ -116,9 +120,9 @@ class OpcUa:
         except LOST as error:
             raise ConnectError(self.name, f"is lost ({_words(error)}); is the server still running?") from None
         except NONSENSE as error:
-            raise ProtocolError(self.name, f"answers nonsense ({_words(error)}); compare url") from None
+            raise ProtocolError(self.name, f"sends an invalid answer ({_words(error)}); compare url") from None
         if len(values) != len(self._nodes):
-            raise ProtocolError(self.name, f"answers {len(values)} values for {len(self._nodes)} that were asked for")
+            raise ProtocolError(self.name, f"answered {len(values)} values instead of {len(self._nodes)}")
         return values
 
 

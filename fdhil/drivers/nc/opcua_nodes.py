@@ -54,7 +54,7 @@ def check_places(places: Mapping[str, str], source: str) -> None:
                 ua.NodeId.from_string(at.partition(";")[2] if at.startswith(NAMED) else at)
         except (UaError, ValueError):
             advice = "'ns=2;s=NAME', 'nsu=URI;s=NAME' or 'Objects/NAME/NAME'"
-            faults.append(ConfigFault(f"signals.{name}.at", f"{at[:60]!r} is no place of OPC UA", advice))
+            faults.append(ConfigFault(f"signals.{name}.at", f"{at[:60]!r} is not an OPC UA node or path", advice))
     if faults:
         raise ConfigError(f"NC profile {source}", faults)
 

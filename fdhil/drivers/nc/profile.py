@@ -16,7 +16,7 @@ from fdhil.errors import ProtocolError
 from fdhil.records import MoveKind, NcState
 
 Shown = bool | int | float | str | tuple[Any, ...] | None
-"""A value as an interface shows it; None: it shows none."""
+"""A value of an interface; None: missing."""
 LARGEST_FEED_MM_MIN = 1e7
 LARGEST_OVERRIDE = 10.0
 LARGEST_COUNT = 10**9 - 1
@@ -120,7 +120,7 @@ class Translator:
         try:
             return FIELDS[name](value)
         except (ValueError, TypeError, OverflowError):
-            text = f"tells {str(value)[:40]!r} as {name}; compare its place and its scale in the profile with the NC"
+            text = f"reports {str(value)[:40]!r} as {name}; compare its place and scale in the profile with the NC"
             raise ProtocolError(self._name, text) from None
 
 
@@ -166,7 +166,7 @@ def _counted(least: int) -> Callable[[Shown], int | None]:
             return int(found[1]) if found and least <= int(found[1]) <= LARGEST_COUNT else None
         number = _number(value)
         if number is None or number != round(number):
-            raise ValueError(f"{value!r} is no whole number")
+            raise ValueError(f"{value!r} is not a whole number")
         return int(number) if least <= number <= LARGEST_COUNT else None
 
     return check
@@ -180,7 +180,7 @@ def _yes(value: Shown) -> bool:
 
 def _text(value: Shown) -> str | None:
     if not isinstance(value, str):
-        raise TypeError(f"{value!r} is no text")
+        raise TypeError(f"{value!r} is not a text")
     return value.strip()[:TEXT] or None
 
 
@@ -194,4 +194,4 @@ FIELDS: Mapping[str, Callable[[Shown], Any]] = {
     "tool": _counted(0),
     "program": _text,
 }
-"""The signals that are fields of NcState, and how each is read; every other one serves the rules alone."""
+"""Signals that are fields of NcState, with their parsers; all others are only used by the rules."""

@@ -66,11 +66,11 @@ class SerialPort(ByteStream):
 
     def _why(self, error: Exception) -> str:
         if not Path(self.device).exists():
-            return f"there is no serial device {self.device}; plug the adapter in, or correct device"
+            return f"serial device {self.device} does not exist; plug the adapter in, or correct device"
         if not os.access(self.device, os.R_OK | os.W_OK):
-            return f"the serial device {self.device} may not be used; add the user to the group dialout"
+            return f"the serial device {self.device} is not permitted; add the user to the group dialout"
         if isinstance(error, serial.SerialException) and "lock" in str(error):
-            return f"the serial device {self.device} is used by another program; end it (fdhil run holds it, too)"
+            return f"the serial device {self.device} is used by another program; end that (fdhil run uses it, too)"
         return f"the serial device {self.device} cannot be opened ({error}); check that it is a serial line"
 
     def _read(self) -> None:
@@ -101,7 +101,7 @@ class SerialPort(ByteStream):
             self._end(error.strerror or str(error))
             raise self._lost(name) from error
         if written != len(data):
-            self._end("it takes no more bytes")
+            self._end("it accepts no more bytes")
             raise self._lost(name)
         return time.monotonic_ns()
 

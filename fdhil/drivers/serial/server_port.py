@@ -52,7 +52,7 @@ class ServerPort(ByteStream, asyncio.Protocol):
     def connection_lost(self, error: Exception | None) -> None:
         """Note that the server closed the connection."""
         if self._transport is not None:
-            self._end(str(error) if error else "the server ended it")
+            self._end(str(error) if error else "the server closed it")
 
     def send(self, name: str, data: bytes) -> int:
         """Write at once and return when (host-monotonic ns); ConnectError when the connection is gone."""

@@ -114,7 +114,7 @@ class StreamedAccelerometer:
                 self._arrivals.add(count, sum(between) / 2)
         out: list[TableSamples | Notice] = [*self._placed()]
         if self.lost > lost_before:
-            text = f"The {self.name} lost {self.lost - lost_before} samples, moves in them are seen without it."
+            text = f"The {self.name} lost {self.lost - lost_before} samples: moves in them are analysed without it."
             out.append(Notice("SampleTiming", "minor", text, self.axis))
         return out
 
@@ -124,7 +124,7 @@ class StreamedAccelerometer:
         numbers = _NUMBER.findall(text)
         if len(numbers) < max(s.column, s.count_column):
             wanted = max(s.column, s.count_column)
-            told = f"the line {text[:40]!r} has {len(numbers)} numbers, and number {wanted} is asked for"
+            told = f"the line {text[:40]!r} has {len(numbers)} numbers, but column {wanted} is configured"
             raise ProtocolError(self.name, f"{told}; compare column and count_column with what the sensor sends")
         count = int(float(numbers[s.count_column - 1])) if s.count_column else None
         return count, float(numbers[s.column - 1]) * s.scale

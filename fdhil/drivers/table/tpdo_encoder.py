@@ -50,12 +50,13 @@ class TpdoEncoder:
         was, self._silent = self._silent, last_tick - self._heard_at > SILENT_TICKS
         if self._silent and not was:
             text = (
-                f"No TPDO {self.cob_id:#x} with the place of table {self.axis} comes, its compliance is not seen; "
+                f"No TPDO {self.cob_id:#x} with the position of table {self.axis} is received: its compliance "
+                "cannot be identified; "
                 "check that its node is started, that the TPDO is synchronous, and cob_id."
             )
             return [Notice("TableSilent", "minor", text, self.axis)]
         return (
-            [Notice("TableSilent", "info", "The table encoder is heard.", self.axis)]
+            [Notice("TableSilent", "info", "The table encoder sends again.", self.axis)]
             if was and not self._silent
             else []
         )

@@ -169,12 +169,14 @@ def test_default_that_is_no_number_is_noted(written: str, tmp_path: Path) -> Non
     text = eds_text(SERVO).replace("[1017]", f"[1017]\nParameterValue={written}")
     device = device_of(text, tmp_path)
     assert device.default(0x1017) is None
-    assert device.doubts == (f"1017:00 is written {written}, which is no number: taken as not given",)
+    assert device.doubts == (f"1017:00 is written {written}, which is not a number: ignored",)
 
 
 def test_heartbeat_that_the_file_does_not_give_is_not_zero(tmp_path: Path) -> None:
     variables = [each for each in SERVO if each[0] != 0x1017] + [(0x1017, 0, U16, "rw", 0, None)]
-    assert answers(eds_text(variables), tmp_path, "a.eds")["heartbeat"] == "yes: its EDS does not say its period (1017)"
+    assert (
+        answers(eds_text(variables), tmp_path, "a.eds")["heartbeat"] == "yes: its EDS does not give its period (1017)"
+    )
 
 
 # compact storage
@@ -256,7 +258,7 @@ def fixed_mapping(kind_access: str) -> list[Variable]:
 def test_fixed_mapping_of_writable_type_is_set_to_every_sync(tmp_path: Path) -> None:
     found = answers(eds_text(fixed_mapping("rw")), tmp_path, "a.eds")
     assert found["listen"].startswith("yes")
-    assert found["mapping"] == "yes: RPDO1, TPDO1, TPDO2 must be set up: the defaults are others"
+    assert found["mapping"] == "yes: RPDO1, TPDO1, TPDO2 must be set up: the defaults differ"
 
 
 def test_fixed_mapping_of_fixed_type_is_not_listened_to(tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ def test_what_a_file_says_is_a_part_of_the_configuration(tmp_path: Path) -> None
 
 WRONG = {
     "title = 3\n" + PDOS: "title: Input should be a valid string",
-    "speed_units = 'rpm'\n" + PDOS: "speed_units: is no key of a profile",
+    "speed_units = 'rpm'\n" + PDOS: "speed_units: is not a key of a profile",
     "speed_unit = 'm/s'\n" + PDOS: "speed_unit: Input should be",
     PDOS.replace("0x606C, 0, 32", "0x606C, 0, 33"): "tpdos.1: a PDO holds 64 bits, not 65",
     PDOS.replace("0x6064, 0, 32, true", "0x6064, 0, 32"): "tpdos.1: not enough values",
@@ -80,12 +80,12 @@ WRONG = {
     PDOS.replace("TPDO2", "TPDO"): "tpdos.2: its name 'TPDO' does not end in the number",
     PDOS.replace("cob_base = 0x280\n", ""): "tpdos.2: has no 'cob_base'",
     PDOS.replace("cob_base = 0x280", "cob_base = 0x80"): "cob_base not from",
-    PDOS.replace("cob_base = 0x280", "cob_bas = 0x280"): "cob_bas is no key of a PDO",
+    PDOS.replace("cob_base = 0x280", "cob_bas = 0x280"): "cob_bas is not a key of a PDO",
     PDOS.replace("0x6078", "0x6077"): "no TPDO of every SYNC carries its current",
     PDOS.replace("[[tpdos]]", "[[tpods]]"): "tpods: is no key",
     "rpdos = 3\n": "tpdos: is missing",
     "base = 'epos5'": "base: is no profile: 'epos5'",
-    "base = 'own.toml'": "its bases have no end",
+    "base = 'own.toml'": "is nested too deeply, or circular",
     "logical_axis = 2\n" + PDOS: "logical_axis: it is of axis 2 of its device, the configuration has 1",
     "base = 3": "base: is no profile",
     "a = ": "is no TOML",

@@ -127,7 +127,7 @@ async def test_a_namespace_may_be_given_by_its_name(tmp_path: Path) -> None:
         with pytest.raises(ProtocolError, match="has no nsu=nobody"):
             await once(config_of(**{**peer.settings, "profile": str(own)}))
     own.write_text(own.read_text().replace("nsu=nobody;s=", ""))
-    with pytest.raises(ConfigError, match=r"signals\.status\.at: '/Channel.*' is no place of OPC UA"):
+    with pytest.raises(ConfigError, match=r"signals\.status\.at: '/Channel.*' is not an OPC UA node or path"):
         OpcUa(config_of(profile=str(own)))
 
 
