@@ -116,7 +116,7 @@ def test_limits_that_cannot_be_ramped_down_in_time_are_refused() -> None:
         (10_000, (50.0, 2.0, 2000.0), ""),
         (65_536, (50.0, 2.0, 250.0), ""),
         (100, (50.0, 20.0, 2000.0), "set the drive to 10,000 or more per turn"),
-        (65_536, (50.0, 1e-9, 2000.0), "no resolution would do"),
+        (65_536, (50.0, 1e-9, 2000.0), "no resolution suffices"),
     ],
 )
 def test_increments_too_coarse_for_the_limits_are_refused(
@@ -136,7 +136,7 @@ def test_increments_too_coarse_for_the_limits_are_refused(
 def test_two_drives_with_one_node_id_are_refused() -> None:
     document = bench_document()
     document["axis"]["X"]["drive"] = {"node_id": 2}
-    assert "two drives of one bus have the same node_id" in faults(document)
+    assert "have the same node_id on one bus" in faults(document)
 
 
 @pytest.mark.parametrize("section", ["guard", "play"])
@@ -162,8 +162,8 @@ def test_the_mark_that_an_editor_puts_before_a_text_is_no_part_of_it() -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (b"[machine\n", "is no TOML"),
-        (b"\xff\xfe", "is no TOML"),
+        (b"[machine\n", "is not valid TOML"),
+        (b"\xff\xfe", "is not valid TOML"),
         (b"#" * 300_000, "larger than 256 KiB"),
         (b"", "machine"),
     ],
@@ -241,15 +241,15 @@ def test_every_number_of_every_section_has_a_range() -> None:
     [
         ("a = " + "[" * 100_000, "nested deeper"),
         ("a = " + "{b=" * 60_000, "nested deeper"),
-        ("a = " + "9" * 5000, "is no TOML"),
+        ("a = " + "9" * 5000, "is not valid TOML"),
         ("[machine]\nsync_period_s = 0x" + "f" * 5000, "machine.sync_period_s: "),
         ('[machine]\nname = "' + "x" * 200_000 + '"', "machine.name: "),
         ('[machine]\nsync_period_s = "' + "9" * 5000 + '"', "machine.sync_period_s: "),
         ("[store]\nkeep_windows = 0x" + "f" * 5000, "store.keep_windows: "),
-        ("[machine]\n" + "".join(f"k{n} = 1\n" for n in range(20_000)), "more faults (mend these first)"),
+        ("[machine]\n" + "".join(f"k{n} = 1\n" for n in range(20_000)), "more faults (fix these first)"),
         (("x" * 100_000) + " = 1", "is not a key of this section"),
         ("a" + ".a" * 100_000 + " = 1", "nested deeper"),
-        (("a" + ".a" * 90 + " = 1\n") + ("[b" + ".b" * 90 + "]\n") * 1000, "is no TOML"),
+        (("a" + ".a" * 90 + " = 1\n") + ("[b" + ".b" * 90 + "]\n") * 1000, "is not valid TOML"),
     ],
     ids=lambda text: text[:24],
 )

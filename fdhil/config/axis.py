@@ -43,8 +43,7 @@ class Nominal(Section):
 
 
 class CorrectionLimits(Section):
-    """[axis.X.correction]: limits of the offsets that the guard lets through. Without this section no offset is
-    sent."""
+    """[axis.X.correction]: limits of the offsets at the guard. Without this section no offset is sent."""
 
     max_offset_um: Positive = Field(50.0, le=CEILING_OFFSET_UM, description="largest offset")
     max_speed_mm_s: Positive = Field(2.0, le=CEILING_SPEED_MM_S, description="largest rate of the offset")
@@ -54,8 +53,7 @@ class CorrectionLimits(Section):
 
 
 class SetPointLimits(Section):
-    """[axis.X.setpoints]: limits of the set-points that fdhil play may send in place of an NC. Without this section it
-    sends none."""
+    """[axis.X.setpoints]: limits of the set-points of fdhil play. Without this section it sends none."""
 
     travel_mm: tuple[Finite, Finite] = Field(description="lowest and highest position, braking included")
     max_speed_mm_s: Positive | None = Field(None, description="largest speed; left out: the axis maximum")
@@ -72,8 +70,7 @@ class SetPointLimits(Section):
 
 
 class FeedforwardLimits(Section):
-    """[axis.X.feedforward]: limits of the on-line feed-forward that the guard lets through. Without this section it is
-    off."""
+    """[axis.X.feedforward]: limits of the on-line feed-forward at the guard. Without this section it is off."""
 
     max_torque_nm: Positive = Field(40.0, description="largest torque offset (0x60B2)")
     max_torque_rate_nm_s: Positive = Field(20e3, description="largest rate of the torque offset")

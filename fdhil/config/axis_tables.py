@@ -48,8 +48,7 @@ def _is_number(value: Any) -> bool:
 
 
 def complete(document: Mapping[str, Any], faults: list[ConfigFault]) -> dict[str, Any]:
-    """Return the document as the models need it; faults (both units given, mm of a rotary axis) are added to
-    ``faults``."""
+    """Return the document as the models need it; invalid units are added to ``faults``."""
     axes = {**_table(document.get("axis"))}
     for name in filter(is_second_drive, [*axes]):
         first = axes.get(name[0])

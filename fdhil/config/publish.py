@@ -104,8 +104,7 @@ class MqttBroker(Publisher, Credentials):
     )
 
     def node_name(self, machine: str) -> str:
-        """Return the edge node: the configured one, else the machine's name without characters that a topic cannot
-        have."""
+        """Return the edge node: the configured one, else the machine's name as a topic can hold it."""
         return self.node or re.sub(r"[/+#\x00-\x1f]", "_", machine)
 
     @model_validator(mode="after")

@@ -67,8 +67,7 @@ def load_places(path: Path) -> MachineConfig:
 
 
 def read_toml(path: Path, what: str, advice: str = "check the path") -> dict[str, Any]:
-    """Read the tables of a TOML file, called ``what`` in errors; ConfigError when it is unreadable, too large or
-    invalid."""
+    """Read a TOML file, called ``what`` in errors; ConfigError when it is unreadable, too large or invalid."""
     try:
         with path.open("rb") as file:
             raw = file.read(MAX_CONFIG_BYTES + 1)

@@ -138,8 +138,7 @@ def filled(document: Mapping[str, Any], sources: Mapping[str, str], head: str = 
 
 
 def _named(document: Mapping[str, Any]) -> Iterator[tuple[Table, bool]]:
-    """Yield the tables under the document's own names, and whether they are to be commented: not from the second axis
-    or bus on."""
+    """Yield the tables under the document's names, and whether to comment them (first axis and bus only)."""
     tables = list(sections())
     for top, of_top in groupby(tables, lambda table: next((t for t in _OWN if table.path.startswith(t)), "")):
         group = list(of_top)

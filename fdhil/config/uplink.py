@@ -74,6 +74,5 @@ class Uplink(NatsServer):
     )
 
     def name_of(self, machine: str) -> str:
-        """Return this machine's name in the plant: the configured one, else ``machine`` without characters that a NATS
-        subject cannot have."""
+        """Return this machine's name in the plant: the configured one, else ``machine`` as a subject can hold it."""
         return self.machine or re.sub(r"[^A-Za-z0-9_-]", "_", machine)[:64]

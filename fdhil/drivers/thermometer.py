@@ -35,8 +35,7 @@ class SlidewayThermometer:
         return self._meter.link
 
     async def poll(self, ticks: TickClock) -> list[Temperature]:
-        """Wait for the period and read once; errors of the link pass through, ProtocolError for an impossible
-        temperature."""
+        """Wait for the period and read once; ProtocolError for an impossible temperature, and errors of the link."""
         if not self._meter.tells_by_itself:
             await asyncio.sleep(self._period_s)
         celsius = await self._celsius()

@@ -97,7 +97,7 @@ def test_error_frames_keep_their_class_where_the_format_has_one(tmp_path: Path) 
     assert out.read_text().count("ErrorFrame") == 3
     assert told.reduced == {"class and data of error frames": 2}
     assert through(ERRORS, "asc", tmp_path).count("20000080#0000000000000000") == 3
-    with pytest.raises(RecordingError, match="3 error frames, which trc does not have"):
+    with pytest.raises(RecordingError, match="3 error frames, which trc cannot hold"):
         convert(ERRORS, "trc", tmp_path)
 
 
@@ -280,7 +280,7 @@ SCREENS = (
 
 @pytest.mark.parametrize("line", SCREENS)
 def test_screen_form_of_candump_is_named(line: str, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"line 1: this is what candump shows on the screen.*candump -l"):
+    with pytest.raises(RecordingError, match=r"line 1: this is candump's screen output.*candump -l"):
         convert(line + "\n", "asc", tmp_path)
 
 
@@ -305,7 +305,7 @@ def test_file_of_holes_is_refused_without_reading_it(name: str, tmp_path: Path) 
     log = tmp_path / f"bus{suffix(name)}"
     log.touch()
     os.truncate(log, 1 << 40)
-    with pytest.raises(RecordingError, match=r"no log of a bus|no BLF log"):
+    with pytest.raises(RecordingError, match=r"not a bus log|not a readable BLF log"):
         converted_log(log, name, "candump")
 
 

@@ -81,7 +81,7 @@ async def test_unit_that_answers_under_another_number_is_named() -> None:
         link = link_to(peer, unit=3, timeout_s=0.4)
         await link.connect()
         peer.spoil = [lambda frame: [framed(9, frame[1:-2])]] * 9
-        with pytest.raises(ProtocolError, match=r"unit 9 answers where unit 3 was asked; give unit = 9") as caught:
+        with pytest.raises(ProtocolError, match=r"unit 9 answered instead of unit 3; set unit = 9") as caught:
             await link.read_input(0, 1)
         assert link.fault_code(caught.value) == "ModbusUnit"
         assert link.line.counted["ModbusUnit"] == 1

@@ -135,7 +135,7 @@ def test_unit_number_that_the_standard_reserves_is_used_with_a_remark() -> None:
     for place, remarks in (({"device": "/dev/ttyUSB0"}, 1), ({"port": 502, "framing": "rtu"}, 1), ({"port": 502}, 0)):
         voltage = {"source": "modbus", "type": "uint16", "unit": 248, "period_s": 0.5, **place}
         made = parse({"machine": {"name": "bench"}, "axis": {"X": bench_axis(corrected=False, voltage=voltage)}})
-        told = [text for text in unlikely(made) if "axis.X.voltage.unit = 248 is not one of 1 to 247" in text]
+        told = [text for text in unlikely(made) if "axis.X.voltage.unit = 248 is outside 1 to 247" in text]
         assert len(told) == remarks
 
 
@@ -357,16 +357,16 @@ LINE = {"source": "modbus", "device": "/dev/ttyUSB0", "type": "float32"}
 @pytest.mark.parametrize(
     ("axes", "says"),
     [
-        ({"X": {"source": "serial"}}, "a sensor on a serial line has one"),
+        ({"X": {"source": "serial"}}, "name the sensor's serial device"),
         ({"X": {**LINE, "unit": 0}}, "from 1 to 247"),
         ({"X": {**LINE, "baud_rate": 9601}}, "must be one of 1200"),
-        ({"X": {**LINE, "scale": 0.0}}, "must be worth something"),
-        ({"X": {**LINE, "pattern": "([0-9]+"}}, "no regular expression"),
+        ({"X": {**LINE, "scale": 0.0}}, "must not be 0"),
+        ({"X": {**LINE, "pattern": "([0-9]+"}}, "not a regular expression"),
         ({"X": {**LINE, "pattern": "[0-9]+"}}, "must have one group"),
         ({"X": {**LINE, "type": "float16"}}, "float32"),
-        ({"X": {**LINE, "block": {"counter_address": 300}}}, "which no request reads"),
+        ({"X": {**LINE, "block": {"counter_address": 300}}}, "the most that one request reads"),
         ({"X": LINE, "Y": {**LINE, "unit": 2, "parity": "none"}}, "axis.X.voltage sets the same device"),
-        ({"X": LINE, "Y": {**LINE, "source": "serial"}}, "is alone on its device"),
+        ({"X": LINE, "Y": {**LINE, "source": "serial"}}, "cannot share its device"),
         ({"X": {**LINE, "baud_rate": 9600}}, "of the time of /dev/ttyUSB0 at 9600 baud"),
     ],
 )

@@ -83,7 +83,7 @@ def test_a_tpdo_that_is_sent_on_change_alone_is_told_and_not_lost() -> None:
         if isinstance(each, Notice)
     ]
     assert told == [
-        "Drive X sends TPDO1 (181) with few of the SYNCs, and its samples have holes; "
+        "Drive X sends TPDO1 (181) with few of the SYNCs, so its samples have gaps; "
         "set the transmission type (0x1800:02) to 1, or check that it is still Operational."
     ]
     assert decoder.counters()["pdo_lost"] < 1000

@@ -110,7 +110,7 @@ def test_an_adapter_that_talks_nonsense_or_goes_is_an_end_not_silence(adapter: S
         adapter.say("t1zz0")
         wait_for(lambda: bus.ended is not None)
         assert bus.ended is not None
-        assert "is gone, or sent what is no frame" in bus.ended
+        assert "is gone, or sent an invalid frame" in bus.ended
     gone = SerialAdapter()
     with CanBus("can0", settings_of(gone)) as bus:
         gone.close()
@@ -192,7 +192,7 @@ def test_nothing_is_ever_sent_through_them(interface: str) -> None:
 
 def test_a_correction_on_a_bus_that_is_only_listened_to_is_refused() -> None:
     document = bench_document("X") | {"bus": {"can0": {"interface": "pcan", "channel": "PCAN_USBBUS1"}}}
-    with pytest.raises(ConfigError, match=r"axis\.X\.correction: bus can0 is only listened to \(pcan\)"):
+    with pytest.raises(ConfigError, match=r"axis\.X\.correction: bus can0 is receive-only \(pcan\)"):
         parse(document)
     del document["axis"]["X"]["correction"]
     assert not parse(document).bus["can0"].may_send

@@ -245,7 +245,7 @@ async def test_an_adapter_that_is_pulled_out_is_gone_until_it_is_back(tmp_path: 
         with pytest.raises(ConnectError, match=f"the serial device {adapter} is gone"):
             await asking
         assert not link.connected
-        with pytest.raises(DeviceError, match="there is no serial device"):
+        with pytest.raises(DeviceError, match="serial device"):
             await link.connect()
         link.close()
 

@@ -60,7 +60,7 @@ def test_an_answer_to_what_another_program_asked_is_not_taken(monkeypatch: pytes
     node.waiting = [b"\x60\x16\x10\x01" + bytes(4)]  # a download's, of a program that has ended
     assert link.read_int(0x1018, 2) == 7
     link = SdoLink("drive X", 1, lambda can_id, data: link.deliver(b"\x60\x16\x10\x01" + bytes(4)))
-    with pytest.raises(ProtocolError, match="answered wrongly"):
+    with pytest.raises(ProtocolError, match="got a wrong answer"):
         link.read_int(0x1018, 2)
 
 
@@ -101,7 +101,7 @@ class SegmentedNode:
 @pytest.mark.parametrize(
     ("node", "says", "code", "error"),
     [
-        (SegmentedNode(toggles=False), "was answered wrongly .*toggle", 0x05030000, SdoToggle),
+        (SegmentedNode(toggles=False), "got a wrong answer .*toggle", 0x05030000, SdoToggle),
         (SegmentedNode(toggles=True), "is longer than 65536 bytes", 0x05040005, SdoTooLarge),
         (SegmentedNode(toggles=True, declares=1 << 30), "is longer than 65536 bytes", 0x05040005, SdoTooLarge),
     ],

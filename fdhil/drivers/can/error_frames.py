@@ -140,8 +140,7 @@ class ErrorWatch:
         return True
 
     def _follow(self, frames: Frames) -> None:
-        """Track the controller: bus-off lasts until a frame is received, error-passive until it reports
-        error-active."""
+        """Track the controller: bus-off ends with a received frame, error-passive when it reports so."""
         error = frames["id"] & ERROR_FLAG != 0
         of_class = np.where(error, frames["id"], 0)
         detail = np.where(of_class & ERROR_CONTROLLER, frames["data"] >> np.uint64(8), 0)

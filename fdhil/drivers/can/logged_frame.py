@@ -131,8 +131,7 @@ def reason_of(error: Exception) -> str:
 
 
 def lines_of(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
-    """Yield the lines of a log with their numbers; RecordingError for an overlong line, as of a file without line
-    ends."""
+    """Yield the lines of a log with their numbers; RecordingError for an overlong line."""
     try:
         with path.open(encoding=encoding, errors="replace") as file:
             for number in itertools.count(1):

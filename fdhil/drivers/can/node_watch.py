@@ -84,8 +84,7 @@ class NodeWatch:
         return notices
 
     def _after_an_outage(self, t_ns: int) -> list[Notice]:
-        """Report recovery only after the heartbeat has been regular for a while, so that an outage gives two
-        notices."""
+        """Report recovery only after a regular heartbeat for a while, so that an outage gives two notices."""
         if self._back_since_ns is None or t_ns - self._beats[-1] > self._longest_gap_ns():
             self._back_since_ns, self._beats = t_ns, []
             return []
@@ -95,8 +94,7 @@ class NodeWatch:
         return [self._notice("HeartbeatLost", "info", "sends its heartbeat again.")]
 
     def _longest_gap_ns(self) -> int:
-        """Return three learned periods and 0.1 s; the period is the longest received one, since some may arrive in a
-        burst."""
+        """Return three learned periods and 0.1 s; the longest period counts, since some arrive in a burst."""
         return 3 * self._period_ns + 100_000_000
 
     def _silence(self, now_ns: int) -> list[Notice]:

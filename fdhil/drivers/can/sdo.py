@@ -83,8 +83,7 @@ class SdoLink:
             return second
 
     def read_size(self, index: int, sub: int = 0) -> int | None:
-        """Return the size of an object in bytes; None where the drive's answer does not state it (CiA 301,
-        7.2.4.3.5)."""
+        """Return the size of an object in bytes; None where the answer does not state it (CiA 301, 7.2.4.3.5)."""
         data = self.read(index, sub)
         return len(data) if self._sized else None
 

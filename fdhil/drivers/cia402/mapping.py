@@ -54,8 +54,7 @@ def suggest_tpdos(device: Device, fast: Iterable[ObjectKey], slow: Iterable[Obje
 
 
 def offered(device: Device, pdos: Sequence[PdoSpec], *, sent: bool) -> list[PdoSpec]:
-    """Return a profile's PDOs reduced to objects that the device has, in the device's sizes; empty ones are left
-    out."""
+    """Return a profile's PDOs, reduced to the device's objects in their sizes; empty ones are left out."""
     found = []
     for spec in pdos:
         keys = [(entry.index, entry.sub) for entry in spec.entries]

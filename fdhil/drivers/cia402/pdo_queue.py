@@ -120,8 +120,7 @@ class Dense:
     count: Int
 
     def certain(self, between: Int) -> Bool:
-        """Return the ticks (n,) whose frame surely belongs to them, ``between`` (n,) periods before the next received
-        SYNC."""
+        """Return the ticks (n,) whose frame surely is theirs; the next SYNC came ``between`` (n,) periods later."""
         return self.present & ((between <= 1) | (self.count >= between))
 
     def balance(self, due: Int) -> tuple[Int, Int, Int]:
@@ -155,8 +154,7 @@ def dense(queue: PdoQueue, first: int, stop: int) -> Dense:
 
 @dataclass(frozen=True, slots=True)
 class SetpointRows:
-    """A set-point on samples [first, stop): ``value`` (n,), whether it is ``certain`` (n,), and the number of lost
-    frames."""
+    """A set-point on samples [first, stop): ``value`` (n,), ``certain`` (n,), and the number of lost frames."""
 
     value: Int
     certain: Bool
@@ -205,8 +203,7 @@ class Setpoint:
         return SetpointRows(value, certain, lost)
 
     def _latched(self) -> tuple[Int, Words, Bool, Bool]:
-        """Return tick and word of the last frame of each tick, whether its frames differed, and whether there were
-        several."""
+        """Return tick and last word of each tick, whether its frames differed, and whether there were several."""
         tick, data = self.queue.tick, self.queue.data
         if tick.size == 0:
             return tick, data, np.empty(0, np.bool_), np.empty(0, np.bool_)

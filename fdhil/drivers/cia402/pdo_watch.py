@@ -39,6 +39,6 @@ class PdoWatch:
             advice = "compare its mapping, COB-IDs and transmission types with fdhil check"
         else:
             advice = f"its NMT state is {nmt.name.lower().replace('_', '-')}: let the NC start it"
-        text = f"Drive {self._axis} (node-ID {self._node_id}) has not sent {names} since SYNC runs; {advice}."
+        text = f"Drive {self._axis} (node-ID {self._node_id}) never sent {names} though SYNC runs; {advice}."
         serious = any(name in self._needed for name in self._missing.values())
         return [Notice("PdoMissing", "MAJOR" if serious else "minor", text, self._axis)]

@@ -140,8 +140,7 @@ class DriveProfile:
         return axis.drive.sign * self.speed_factor * per_unit
 
     def current_a_per_count(self, axis: Axis) -> float:
-        """Return the scale of the current object, including the axis' sign; a torque is divided by the data sheet's
-        K."""
+        """Return the scale of the current object, with the axis' sign; a torque is divided by the data sheet's K."""
         per_unit = {
             "permille_of_rated": axis.drive.rated_current_a / 1000,
             "share_of_rated": axis.drive.rated_current_a,

@@ -9,8 +9,7 @@ from fdhil.errors import ProtocolError
 
 
 class ModbusMeter:
-    """One value of a unit, of type ``kind``, read with one request so that it is not torn; valid values are below
-    ``most``."""
+    """One value of a unit, of type ``kind``, read with one request; valid values are below ``most``."""
 
     tells_by_itself = False
 

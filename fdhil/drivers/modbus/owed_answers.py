@@ -43,8 +43,7 @@ class OwedAnswers:
         return False
 
     def settle_unit(self, unit: int, *, certain: bool = True) -> None:
-        """Drop all requests of a unit, which answered the newest. Not ``certain``: it may have answered the one
-        before."""
+        """Drop all requests of a unit, which answered the newest, or, if not ``certain``, the one before."""
         own = [owed for owed in self._owed if owed[0].unit == unit]
         kept = own[-1:] if not certain and len(own) > 1 else []
         self._owed = [owed for owed in self._owed if owed[0].unit != unit] + kept

@@ -56,8 +56,7 @@ class ToldG0:
         self._kind = MoveKind.REST
 
     def feed(self, record: AxisSamples | InputSamples | TickTimes | NcState) -> list[MoveEvent]:
-        """Take a block of samples, SYNC arrivals, or a state of the NC; return the moves that can be classified by
-        now."""
+        """Take samples, SYNC arrivals, or a state of the NC; return the moves that can be classified by now."""
         if isinstance(record, TickTimes):
             self._clock.add(record)
         elif isinstance(record, NcState):

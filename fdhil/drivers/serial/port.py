@@ -92,8 +92,7 @@ class SerialPort(ByteStream):
         self._stop_reading()
 
     def send(self, name: str, data: bytes) -> int:
-        """Write at once and return when (host-monotonic ns); ConnectError when the device is gone or accepts
-        nothing."""
+        """Write at once and return when (host-monotonic ns); ConnectError."""
         port = self._held(name)
         try:
             written = os.write(port.fileno(), data)

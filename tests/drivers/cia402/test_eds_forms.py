@@ -263,4 +263,4 @@ def test_fixed_mapping_of_writable_type_is_set_to_every_sync(tmp_path: Path) -> 
 
 def test_fixed_mapping_of_fixed_type_is_not_listened_to(tmp_path: Path) -> None:
     found = answers(eds_text(fixed_mapping("ro")), tmp_path, "a.eds")
-    assert found["listen"].startswith("no: no TPDO of every SYNC can carry its position")
+    assert found["listen"].startswith("no: no TPDO with every SYNC can carry its position")

@@ -81,15 +81,15 @@ WRONG = {
     PDOS.replace("cob_base = 0x280\n", ""): "tpdos.2: has no 'cob_base'",
     PDOS.replace("cob_base = 0x280", "cob_base = 0x80"): "cob_base not from",
     PDOS.replace("cob_base = 0x280", "cob_bas = 0x280"): "cob_bas is not a key of a PDO",
-    PDOS.replace("0x6078", "0x6077"): "no TPDO of every SYNC carries its current",
-    PDOS.replace("[[tpdos]]", "[[tpods]]"): "tpods: is no key",
+    PDOS.replace("0x6078", "0x6077"): "no TPDO with every SYNC carries its current",
+    PDOS.replace("[[tpdos]]", "[[tpods]]"): "tpods: is not a key",
     "rpdos = 3\n": "tpdos: is missing",
-    "base = 'epos5'": "base: is no profile: 'epos5'",
+    "base = 'epos5'": "base: is not a profile: 'epos5'",
     "base = 'own.toml'": "is nested too deeply, or circular",
-    "logical_axis = 2\n" + PDOS: "logical_axis: it is of axis 2 of its device, the configuration has 1",
-    "base = 3": "base: is no profile",
-    "a = ": "is no TOML",
-    "title = 'no PDOs'": "there is no EDS to take them from",
+    "logical_axis = 2\n" + PDOS: "logical_axis: it is for axis 2 of its device, but the configuration has 1",
+    "base = 3": "base: is not a profile",
+    "a = ": "is not valid TOML",
+    "title = 'no PDOs'": "there is no EDS to derive them from",
 }
 
 

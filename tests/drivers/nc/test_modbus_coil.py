@@ -117,7 +117,7 @@ def test_whatever_is_answered_a_device_error_or_a_state_comes_of_it(body: bytes)
     ("keys", "text"),
     [
         ({"rapid": "3.1"}, "coils have no bits"),
-        ({"bits": "holding_registers", "rapid": "3"}, "say which bit"),
+        ({"bits": "holding_registers", "rapid": "3"}, "register without a bit"),
         ({"bits": "holding_registers", "rapid": "3.16"}, "at 15"),
         ({"rapid": "70000"}, "65535"),
         ({"rapid": "0", "hold": "2500"}, "too far apart"),
