@@ -189,12 +189,12 @@ def test_the_daemon_waits_for_a_foreign_drive_that_says_nothing(hub: Hub, machin
     with slave("slave.js", hub, DRIVE) as peer, joined(hub) as (master,):
         peer.event("ready")
         with Process("daemon", ["fdhil", "run", str(machine)], log) as daemon:
-            _wait(daemon, lambda: "BusSilent: Nothing is heard on bus can0" in log.read_text())
+            _wait(daemon, lambda: "BusSilent: No frame is received on bus can0" in log.read_text())
             master.send(can.Message(arbitration_id=0, data=[1, NODE], is_extended_id=False))
 
             def heard_again() -> bool:
                 master.send(can.Message(arbitration_id=0x80, is_extended_id=False))
-                return "BusSilent: Bus can0 is heard again" in log.read_text()
+                return "BusSilent: Bus can0 is active again" in log.read_text()
 
             _wait(daemon, heard_again)
             assert daemon.stop() == 0

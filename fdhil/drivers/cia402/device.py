@@ -1,18 +1,16 @@
 """Describes what an EDS or DCF file offers: the device's identity, its objects and its PDOs."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from fdhil.cia402 import LOGICAL_AXES, LOGICAL_AXIS_STEP, Object
-from fdhil.drivers.cia402.eds_numbers import octal_reading, read_expression
 from fdhil.drivers.cia402.profile import ObjectKey
+from fdhil.eds import INTEGER_TYPES, EdsFile, read_eds, read_expression, read_octal
 
 MOST_PDOS = 512
 COB_ID_BITS, EXTENDED = 0x7FF, 1 << 29
 DRIVE = 402
-NODE_ID = "$NODEID"
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,50 +118,44 @@ class Device:
 
 def read_device(path: Path) -> Device:
     """Read an EDS or DCF file; EdsError when it cannot be read. A DCF's values count as its defaults."""
-    from fdhil.drivers.cia402.eds import load_eds  # late: most profiles need no EDS, and its library loads slowly
-
-    dictionary = load_eds(path)
-    own = dictionary.node_id  # of a DCF: its absolute COB-IDs are of this node (CiA 306)
-    told = dictionary.device_information
-    objects = {found.key: found for found in _objects(dictionary)}
-    identity = [objects.get((int(Object.IDENTITY), sub)) for sub in (1, 2)]
-    vendor, product = (0 if found is None else found.default or 0 for found in identity)
+    file = read_eds(path)
+    objects = {found.key: found for found in _objects(file)}
+    vendor, product = (objects.get((int(Object.IDENTITY), sub)) for sub in (1, 2))
     return Device(
         file=path.name,
-        vendor_name=str(told.vendor_name or ""),
-        product_name=str(told.product_name or ""),
-        vendor_id=int(told.vendor_number or 0) or vendor,
-        product_code=int(told.product_number or 0) or product,
+        vendor_name=file.vendor_name,
+        product_name=file.product_name,
+        vendor_id=file.vendor_number or (vendor.default if vendor else 0) or 0,
+        product_code=file.product_number or (product.default if product else 0) or 0,
         objects=objects,
-        rpdos=_pdos(objects, Object.RPDO_PARAMETER, Object.RPDO_MAPPING, own),
-        tpdos=_pdos(objects, Object.TPDO_PARAMETER, Object.TPDO_MAPPING, own),
+        rpdos=_pdos(objects, Object.RPDO_PARAMETER, Object.RPDO_MAPPING, file.node_id),
+        tpdos=_pdos(objects, Object.TPDO_PARAMETER, Object.TPDO_MAPPING, file.node_id),
     )
 
 
-def _objects(dictionary: Any) -> Iterable[DeviceObject]:
-    from fdhil.drivers.cia402.eds import INTEGERS
-
-    for index in dictionary:
-        entry = dictionary[index]
-        for sub, variable in getattr(entry, "subindices", {0: entry}).items():
-            bits, signed = INTEGERS.get(variable.data_type, (0, False))
-            written = getattr(variable, "value_raw", None) or getattr(variable, "default_raw", None) or ""
-            value = variable.value if getattr(variable, "value_raw", None) else variable.default
-            octal = octal_reading(written) if bits else None
-            if octal is not None or (value is None and NODE_ID in written):  # of no node: as of node 0
-                value = (read_expression(written) or (None, False))[0]
-            doubt = "" if octal is None else f": read as {value}, but it is {octal} if octal is meant"
-            doubt = ", which is not a number: ignored" if bits and written and value is None else doubt
+def _objects(file: EdsFile) -> Iterator[DeviceObject]:
+    for item in file.objects:
+        for entry in item.entries:
+            bits, signed = INTEGER_TYPES.get(entry.data_type, (0, False))
+            written = entry.default if bits or not entry.data_type else ""
+            number, relative = read_expression(written) or (None, False)
+            doubt = ""
+            if written and number is None:
+                doubt = ", which is not a number: ignored"
+            elif (octal := read_octal(written)) is not None:
+                doubt = f": read as {number}, but it is {octal} if octal is meant"
+            elif number is not None and relative:  # an EDS of no node: as of node 0
+                number += file.node_id or 0
             yield DeviceObject(
-                key=(index, sub),
-                name=entry.name if entry.name == variable.name else f"{entry.name}: {variable.name}",
+                key=(entry.index, entry.sub),
+                name=item.name if item.name == entry.name else f"{item.name}: {entry.name}",
                 bits=bits,
                 signed=signed,
-                access=str(variable.access_type).lower(),
-                mappable=bool(variable.pdo_mappable),
-                default=value if isinstance(value, int) else None,
-                relative=NODE_ID in written,
-                doubt=f"{index:04X}:{sub:02X} is written {written[:40]}{doubt}" if doubt else "",
+                access=entry.access,
+                mappable=entry.mappable,
+                default=number,
+                relative=relative,
+                doubt=f"{entry.index:04X}:{entry.sub:02X} is written {written[:40]}{doubt}" if doubt else "",
             )
 
 

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from fdhil.drivers.cia402.abilities import abilities
 from fdhil.drivers.cia402.device import Device, PdoPlace, read_device
-from fdhil.drivers.cia402.eds import MAX_SECTIONS, parse_eds
-from fdhil.drivers.cia402.eds_numbers import read_expression
 from fdhil.drivers.cia402.profile_file import read_profile
+from fdhil.eds import MAX_SECTIONS, parse_eds, read_expression
 from fdhil.errors import EdsError
 from fdhil.sim.drive.sheet import read_sheet
 from tests.drivers.cia402.eds_text import COMMON, CURRENT, SERVO, U16, U32, Variable, eds_text, pdos
@@ -78,7 +77,7 @@ def test_a_dcf_of_an_impossible_node_is_refused() -> None:
 
 @pytest.mark.parametrize("second", ["NodeID=6", "[DeviceCommissioning]\nNodeId=0x06", "NODEID=0"])
 def test_a_dcf_of_two_nodes_is_refused(second: str) -> None:
-    with pytest.raises(EdsError, match="and '5' in a line above: its COB-IDs are of one of these nodes"):
+    with pytest.raises(EdsError, match="and '5' in a line above: its COB-IDs belong to one of these nodes"):
         parse_eds(as_dcf(5, f"[DeviceComissioning]\nNodeID=5\n{second}").encode(), "a.dcf")
     parse_eds(as_dcf(5, "[DeviceComissioning]\nNodeID=5\nNodeID=0x05").encode(), "a.dcf")
 
