@@ -48,7 +48,7 @@ class CorrectionLimits(Section):
     max_offset_um: Positive = Field(50.0, le=CEILING_OFFSET_UM, description="largest offset")
     max_speed_mm_s: Positive = Field(2.0, le=CEILING_SPEED_MM_S, description="largest rate of the offset")
     max_acceleration_mm_s2: Positive = Field(
-        250.0, le=CEILING_ACCELERATION_MM_S2, description="largest acceleration of the offset"
+        250.0, le=CEILING_ACCELERATION_MM_S2, description="its largest acceleration"
     )
 
 
@@ -92,9 +92,7 @@ class HalPins(Section):
     torque: HalPin | None = Field(None, description="where there is no current: motor torque, divided by nominal.K")
     voltage: HalPin | None = Field(None, description="motor voltage, or the duty of the PWM; left out: without voltage")
     enabled: HalPin | None = Field(None, description="true while the drive is enabled; left out: motion.motion-enabled")
-    position_mm_per_unit: Positive = Field(
-        1.0, description="scale of command and feedback: 25.4 where they are in inch"
-    )
+    position_mm_per_unit: Positive = Field(1.0, description="of command and feedback: 25.4 where they are in inch")
     speed_mm_s_per_unit: HalScale = Field(1.0, description="speed of the table per unit of the pin")
     current_a_per_unit: HalScale = Field(1.0, description="current per unit of the pin")
     torque_nm_per_unit: HalScale = Field(1.0, description="torque per unit of the pin")
@@ -163,12 +161,12 @@ class Drive(Section):
         return self._files
 
     source: Literal["canopen", "hal"] = Field(
-        "canopen", description="hal: LinuxCNC's HAL pins (drive.hal), through the bridge that LinuxCNC loads"
+        "canopen", description="hal: LinuxCNC's HAL pins (drive.hal), through its bridge"
     )
     hal: HalPins | None = None
     bus: str = Field("can0", description="name of its [bus.*]")
     node_id: int | None = Field(
-        None, ge=1, le=127, description="CANopen node-ID; left out: 1 for the first axis, 2 for the next"
+        None, ge=1, le=127, description="node-ID; left out: 1 for the first axis, 2 for the next"
     )
     profile: Annotated[str, one_of(tables.DRIVE_PROFILES, or_suffix=".toml")] = Field(
         "fdhil_twin",
@@ -176,29 +174,23 @@ class Drive(Section):
         "or the path of a TOML file, from this file's folder",
     )
     eds: Path | None = Field(None, description="the drive's EDS or DCF file, from this file's folder")
-    logical_axis: int = Field(
-        1, ge=1, le=8, description="axis number in a device with several: its objects are 0x800 higher for each"
-    )
+    logical_axis: int = Field(1, ge=1, le=8, description="axis of a device with several: 0x800 higher objects for each")
     increments_per_rev: int = Field(
-        65536, ge=4, le=2**31 - 1, description="encoder and set-point increments per revolution"
+        65536, ge=4, le=2**31 - 1, description="increments per revolution, of encoder and set-point"
     )
-    speed_unit: SpeedUnit | None = Field(
-        None, description="unit of 0x606C, where the drive was set to another one (0x60A9) than its profile's"
-    )
+    speed_unit: SpeedUnit | None = Field(None, description="unit of 0x606C, where it is not the profile's (0x60A9)")
     sign: Literal[1, -1] = Field(1, description="-1 where the drive counts in the opposite direction")
     rated_current_a: Positive = Field(50.0, ge=1e-3, le=1e5, description="0x6075; 0x6078 counts in 0.1 % of it")
     rated_torque_nm: Positive = Field(
-        1.0, ge=1e-4, le=1e6, description="0x6076, where the profile takes the current from the torque (0x6077)"
+        1.0, ge=1e-4, le=1e6, description="0x6076, where current is derived from torque (0x6077)"
     )
     dc_link_v: Positive | None = Field(
-        None, ge=1.0, le=2000.0, description="DC link, where the profile takes the voltage from the duty of the PWM"
+        None, ge=1.0, le=2000.0, description="where the profile derives the voltage from the duty"
     )
-    setpoint_delay_cycles: int = Field(
-        2, ge=0, le=16, description="SYNC cycles by which the drive delays its set-point"
-    )
+    setpoint_delay_cycles: int = Field(2, ge=0, le=16, description="SYNC cycles by which it delays its set-point")
     following_error_window_mm: Positive = Field(10.0, ge=1e-3, le=1e4, description="0x6065: beyond it the drive faults")
     speed_limit_mm_s: Positive | None = Field(
-        None, ge=1e-3, le=1e5, description="the axis maximum; left out: the rapid speed"
+        None, ge=1e-3, le=1e5, description="axis maximum; left out: the rapid speed"
     )
 
 
@@ -210,7 +202,7 @@ class Axis(Section):
 
     unit: Literal["mm", "deg"] = Field("mm", description="deg: a rotary axis, whose keys have deg in place of mm")
     radius_mm: Positive | None = Field(
-        None, ge=10.0, le=1e4, description="of a rotary axis: the radius at which its angles count as path error"
+        None, ge=10.0, le=1e4, description="rotary axis: radius at which angles count as path error"
     )
     screw_pitch_mm: Positive = Field(ge=1e-3, le=1e4, description="table travel per motor revolution")
     rapid_speed_mm_s: Positive = Field(ge=1e-3, le=1e5, description="speed of G0")
@@ -230,7 +222,7 @@ class Axis(Section):
     )
     resonance_damping: NotNegative = Field(0.03, le=0.7, description="damping ratio of that resonance")
     max_difference_um: Positive | None = Field(
-        None, le=1e4, description="of a gantry axis: largest difference between its two drives; left out: 500"
+        None, le=1e4, description="gantry: largest difference of its drives; left out: 500"
     )
     guessed: tuple[Literal["R", "L", "K", "Jt", "ft", "Cd"], ...] = Field(
         (), description="keys of nominal that are guesses: identified values are not compared with them"

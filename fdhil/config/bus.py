@@ -39,28 +39,21 @@ class CanBus(Section):
         description="socketcand is a hub, virtual one process; from slcan on: python-can, for listening only",
     )
     channel: str = Field(
-        "can0",
-        description="socketcan: the network interface; socketcand: the bus behind the hub; else python-can's channel",
+        "can0", description="socketcan: network interface; socketcand: bus behind the hub; else python-can's"
     )
     host: str = Field("127.0.0.1", description="socketcand: address of the hub")
     port: int = Field(0, ge=0, le=65535, description="socketcand: TCP port of the hub; 0 lets the simulator choose one")
-    bitrate: int = Field(
-        1_000_000, ge=10_000, le=1_000_000, description="bit/s, for the bus load; a python-can adapter is set to it"
-    )
+    bitrate: int = Field(1_000_000, ge=10_000, le=1_000_000, description="bit/s, for bus load and python-can adapters")
     frames: Literal["all", "drives"] = Field(
         "all",
         description="drives: only SYNC, NMT and the drives' frames are received; bus load and black box lack "
         "the others",
     )
     listen_only: bool = Field(
-        True,
-        description="python-can: never acknowledge, so that a wrong bit rate does not disturb the bus, where supported",
+        True, description="python-can: never acknowledge, so as not to disturb the bus, where supported"
     )
     offset_lead_cycles: int = Field(
-        0,
-        ge=0,
-        le=200,
-        description="cycles by which offsets are sent ahead: HAL (streamer) 20 or more, CANopen 0",
+        0, ge=0, le=200, description="cycles by which offsets are sent ahead: HAL 20 or more, CANopen 0"
     )
     options: Mapping[str, bool | Whole | Finite | str] = Field(
         {}, description="python-can: further arguments of its interface, e.g. { tty_baudrate = 3000000 }"

@@ -31,7 +31,7 @@ class Nc(Section):
     rapid_stop: bool = Field(True, description="look-ahead: stop between rapid and feed; fir always does")
     settle_s: NotNegative = Field(0.0, le=10, description="rest that the NC adds at an exact stop")
     end_rest_s: NotNegative = Field(
-        0.5, le=10, description="rest after the last motion, so that the drives' settling counts as path error"
+        0.5, le=10, description="rest after the last motion, so that settling counts as error"
     )
     dwell_unit: Literal["s", "ms", "ms_without_point"] = Field(
         "s", description="P of a dwell (G4, G82, G86, G89): s as LinuxCNC, ms, or ms_without_point (Haas, Fanuc: P500)"
@@ -46,12 +46,8 @@ class Nc(Section):
         description="rotary axes whose absolute words are within one turn and turn by their sign (LinuxCNC: "
         "[AXIS_A] WRAPPED_ROTARY)",
     )
-    max_blocks: int = Field(
-        10_000_000, ge=1, le=10**12, description="blocks a program may execute before it is refused"
-    )
-    max_repeated_blocks: int = Field(
-        500_000, ge=1, le=10**12, description="of these, blocks repeated by loops and calls"
-    )
+    max_blocks: int = Field(10_000_000, ge=1, le=10**12, description="blocks that a program may execute")
+    max_repeated_blocks: int = Field(500_000, ge=1, le=10**12, description="of these, repeated by loops and calls")
     max_call_depth: int = Field(50, ge=1, le=200, description="nesting of calls before a program is refused")
 
 
@@ -82,9 +78,7 @@ class Identification(Section):
     method: Annotated[str, one_of(tables.ESTIMATORS)] | None = Field(
         None, description=f"{', '.join(tables.ESTIMATORS)}; left out: the best one"
     )
-    lowpass_hz: Positive = Field(
-        40.0, ge=0.01, le=1e5, description="least_squares: corner of the zero-phase low-pass on every signal"
-    )
+    lowpass_hz: Positive = Field(40.0, ge=0.01, le=1e5, description="least_squares: corner of the zero-phase low-pass")
     tolerance_um: Positive | None = Field(
         None,
         le=1e4,

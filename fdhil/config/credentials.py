@@ -25,9 +25,7 @@ class Credentials(SectionWithFiles):
         description="CA of the server's certificate (PEM), to encrypt and to verify it; left out: neither; "
         "Debian's CAs are in /etc/ssl/certs/ca-certificates.crt",
     )
-    tls_certificate_file: Path | None = Field(
-        None, description="client certificate (PEM), where the server requires one"
-    )
+    tls_certificate_file: Path | None = Field(None, description="client certificate (PEM), where required")
     tls_key_file: Path | None = Field(None, description="its private key (PEM, without a password), mode 0600")
 
     @model_validator(mode="after")

@@ -25,22 +25,15 @@ class Stream(Section):
     name: str = Field("fdhil", pattern=NAME, description="name of the stream")
     replicas: int = Field(1, ge=1, le=5, description="replicas of each message in the cluster")
     max_bytes: int = Field(
-        10 << 30,
-        ge=1 << 16,
-        le=1 << 50,
-        description="space for waiting messages; when it is full the machines keep theirs",
+        10 << 30, ge=1 << 16, le=1 << 50, description="space for waiting messages; when full, machines keep theirs"
     )
-    duplicate_window_s: float = Field(
-        600.0, ge=1, le=86_400, description="how long the server recognises duplicates; the database always does"
-    )
+    duplicate_window_s: float = Field(600.0, ge=1, le=86_400, description="how long the server recognises duplicates")
 
 
 class Database(Section):
     """[database]: the PostgreSQL database of the history."""
 
-    connection: str = Field(
-        "dbname=fdhil", max_length=1000, description="libpq's connection string; the password is in a file (~/.pgpass)"
-    )
+    connection: str = Field("dbname=fdhil", max_length=1000, description="libpq's connection string, without password")
 
     @field_validator("connection")
     @classmethod
@@ -56,8 +49,7 @@ class Objects(Section):
     """[objects]: the recorded windows, one file each, named by their content."""
 
     directory: Path = Field(
-        Path("fdhil-windows"),
-        description="folder of the windows, shared by all collectors; relative to this file's folder",
+        Path("fdhil-windows"), description="their folder, shared by all collectors; relative to this file's"
     )
 
 
@@ -66,7 +58,7 @@ class Retention(Section):
 
     record_months: int | None = Field(None, ge=1, le=1200, description="months of records kept before the present one")
     window_months: int | None = Field(
-        None, ge=1, le=1200, description="months of recorded windows kept; their results stay in the records"
+        None, ge=1, le=1200, description="months of recorded windows kept; their results stay"
     )
 
 

@@ -137,13 +137,9 @@ class OpcUaNc(Asked):
     timeout_s: Positive = Field(2.0, ge=0.05, le=60, description="longest time for an answer")
     user: str | None = Field(None, min_length=1, description="the server's user; left out: anonymous")
     password_file: Path | None = Field(None, description="file with the user's password, mode 0600")
-    certificate: Path | None = Field(
-        None, description="fdhil's own certificate, to sign and encrypt (Basic256Sha256); left out: neither"
-    )
+    certificate: Path | None = Field(None, description="fdhil's certificate, to sign and encrypt (Basic256Sha256)")
     private_key: Path | None = Field(None, description="private key of that certificate, mode 0600")
-    server_certificate: Path | None = Field(
-        None, description="the server's certificate; left out: the one it presents is accepted"
-    )
+    server_certificate: Path | None = Field(None, description="the server's certificate; left out: any is accepted")
 
     @model_validator(mode="after")
     def _complete(self) -> Self:

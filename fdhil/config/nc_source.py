@@ -21,9 +21,7 @@ class LinuxCncBridge(Section):
 class NcSource(Section):
     """[nc_source]: where the NC reports its state, if [g0] source names an NC interface."""
 
-    silence_s: Positive = Field(
-        2.0, ge=0.05, le=60, description="an NC that is silent for so long is lost: its moves are unknown"
-    )
+    silence_s: Positive = Field(2.0, ge=0.05, le=60, description="after so long a silence the NC's moves are unknown")
     linuxcnc: LinuxCncBridge = LinuxCncBridge()
     modbus_coil: ModbusNc = ModbusNc()
     mtconnect: MtConnectNc = MtConnectNc()

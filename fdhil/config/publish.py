@@ -24,16 +24,14 @@ class OpcUaServer(Publisher):
 
     host: str = Field("127.0.0.1", min_length=1, description="address to listen on; 0.0.0.0 for all")
     port: int = Field(4840, ge=0, le=65535, description="TCP port; 0 chooses a free one and reports it")
-    certificate_file: Path | None = Field(
-        None, description="the server's certificate, to sign and encrypt (Basic256Sha256); left out: neither"
-    )
+    certificate_file: Path | None = Field(None, description="certificate, to sign and encrypt (Basic256Sha256)")
     private_key_file: Path | None = Field(None, description="private key of that certificate, mode 0600")
     trusted_clients: Path | None = Field(
         None,
         description="folder of certificates (.der, .pem) of permitted clients; left out: any client with a password",
     )
     users_file: Path | None = Field(
-        None, description="users file (written by fdhil web-user); left out: anyone on this computer, without a login"
+        None, description="users file (fdhil web-user); left out: anyone on this computer, without login"
     )
 
     manufacturer: str = Field("", description="the machine's manufacturer, for its Identification")
@@ -59,17 +57,12 @@ class PrometheusMetrics(Publisher):
 
     host: str = Field("127.0.0.1", min_length=1, description="address to listen on; 0.0.0.0 for all")
     port: int = Field(9837, ge=0, le=65535, description="TCP port; 0 chooses a free one and reports it")
-    allowed_hosts: tuple[str, ...] = Field(
-        (), description="further host names under which it may be requested, besides localhost and the host above"
-    )
+    allowed_hosts: tuple[str, ...] = Field((), description="further permitted host names, besides localhost and host")
     tls_certificate_file: Path | None = Field(None, description="certificate chain (PEM), for https")
     tls_key_file: Path | None = Field(None, description="its private key (PEM), readable by its user only")
-    tls_client_ca_file: Path | None = Field(
-        None, description="CA of the clients' certificates (PEM); left out: no certificate is required"
-    )
+    tls_client_ca_file: Path | None = Field(None, description="CA of client certificates (PEM); left out: not required")
     unprotected: bool = Field(
-        False,
-        description="listen beyond this computer without client certificates: anyone on that network can read",
+        False, description="listen beyond this computer without client certificates: anyone can read"
     )
 
     @model_validator(mode="after")
@@ -93,9 +86,7 @@ class MqttBroker(Publisher, Credentials):
     port: int = Field(1883, ge=1, le=65535, description="TCP port; with TLS usually 8883")
     group: str = Field("fdhil", min_length=1, pattern=TOPIC_PART, description="Sparkplug's group: a plant, a hall")
     node: str = Field("", pattern=TOPIC_PART, description="Sparkplug's edge node; left out: the machine's name")
-    primary_host: str = Field(
-        "", pattern=TOPIC_PART, description="host application that must be online; left out: none"
-    )
+    primary_host: str = Field("", pattern=TOPIC_PART, description="host application that must be online, if any")
     keepalive_s: Positive = Field(
         30.0,
         ge=1,
@@ -121,13 +112,8 @@ class MtConnectAdapter(Publisher):
 
     host: str = Field("127.0.0.1", min_length=1, description="address to listen on; 0.0.0.0 for all")
     port: int = Field(7878, ge=0, le=65535, description="TCP port; 0 chooses a free one and reports it")
-    device_uuid: str = Field(
-        "", pattern=r"^[A-Za-z0-9._:-]*$", description="the device's uuid; left out: derived from the machine's name"
-    )
-    unprotected: bool = Field(
-        False,
-        description="listen beyond this computer: SHDR has neither passwords nor encryption, anyone there can read",
-    )
+    device_uuid: str = Field("", pattern=r"^[A-Za-z0-9._:-]*$", description="left out: derived from the machine's name")
+    unprotected: bool = Field(False, description="listen beyond this computer: SHDR has no protection, anyone can read")
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

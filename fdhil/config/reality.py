@@ -15,16 +15,13 @@ class Reality(Section):
     """[sim.axis.X.reality]: effects of a real axis beyond the paper's plant, each off until it is set."""
 
     static_friction: Annotated[float, Field(ge=-0.95, le=5.0)] = Field(
-        0.0,
-        description="share of Cd added at standstill, decaying with speed; negative: friction increases with speed",
+        0.0, description="share of Cd added at standstill, decaying with speed; negative: friction increases with speed"
     )
     static_speed_rad_s: Positive = Field(10.0, ge=1e-3, le=1e4, description="speed ws of its decay, exp(-(w/ws)^2)")
     presliding_um: NotNegative = Field(
-        0.0, le=1e3, description="table travel over which dry friction builds up (LuGre's bristles); 0: none"
+        0.0, le=1e3, description="table travel over which dry friction builds up (LuGre); 0: none"
     )
-    friction_asymmetry: Share = Field(
-        0.0, description="share by which dry friction is larger in the positive direction"
-    )
+    friction_asymmetry: Share = Field(0.0, description="share by which Cd is larger in the positive direction")
     viscous_asymmetry: Share = Field(0.0, description="share by which ft is larger in the positive direction")
     friction_ripple: Share = Field(0.0, description="share of dry friction that varies once per revolution")
     load_nm: Finite = Field(0.0, description="constant torque against the positive direction: weight, counterweight")
@@ -37,21 +34,17 @@ class Reality(Section):
     motor_ripple_phase_rad: Finite = Field(0.0, description="its phase where the axis is at 0 mm")
 
     resonance_hz: NotNegative = Field(
-        0.0, le=500.0, description="resonance of motor against table on the screw's stiffness; 0: rigid"
+        0.0, le=500.0, description="motor against table on the screw's stiffness; 0: rigid"
     )
     resonance_damping: Annotated[float, Field(ge=0.0, le=1.0)] = Field(0.02, description="its damping ratio")
     table_inertia: Annotated[float, Field(ge=0.05, le=0.95)] = Field(
-        0.6, description="share of Jt behind that compliance; the weight acts there"
+        0.6, description="share of Jt behind that compliance"
     )
-    table_friction: Annotated[float, Field(ge=0.0, le=1.0)] = Field(
-        1.0, description="share of ft and Cd behind that compliance"
-    )
+    table_friction: Annotated[float, Field(ge=0.0, le=1.0)] = Field(1.0, description="share of ft and Cd behind it")
     position_encoder: Literal["table", "motor"] = Field(
         "table", description="encoder of the position loop: a scale at the table, or the motor's shaft"
     )
-    pitch_error_um: NotNegative = Field(
-        0.0, le=1e3, description="amplitude of the screw's error once per revolution, table against shaft"
-    )
+    pitch_error_um: NotNegative = Field(0.0, le=1e3, description="amplitude of the screw's error once per revolution")
     pitch_error_um_per_m: Finite = Field(0.0, ge=-1e3, le=1e3, description="growth of the screw's error with position")
 
     dead_time_v: NotNegative = Field(0.0, description="voltage loss by the inverter's dead time, against the current")
@@ -60,9 +53,7 @@ class Reality(Section):
         0.0, description="share by which the DC bus and the output voltages drop at bus_power_kw"
     )
     bus_power_kw: Positive = Field(10.0, ge=1e-3, le=1e4, description="electric power of the axis for that drop")
-    bus_time_constant_s: NotNegative = Field(
-        0.002, le=10.0, description="time constant of the bus' capacitors; 0: none"
-    )
+    bus_time_constant_s: NotNegative = Field(0.002, le=10.0, description="time constant of its capacitors; 0: none")
     voltage_object: Literal["terminals", "command"] = Field(
         "terminals", description="content of 0x2101: the voltage at the motor, or the current loop's command"
     )
@@ -76,7 +67,7 @@ class Reality(Section):
         description="0x606C: the shaft with white noise, the encoder's difference over a SYNC period, the loop's speed",
     )
     speed_object_filter_s: NotNegative = Field(
-        0.0, le=1.0, description="time constant of a first-order filter on 0x606C, by SYNC; 0: none"
+        0.0, le=1.0, description="first-order filter on 0x606C, by SYNC; 0: none"
     )
     speed_feedback: Literal["shaft", "difference"] = Field(
         "shaft", description="feedback of the speed loop: the shaft, or the encoder's difference over its cycle"

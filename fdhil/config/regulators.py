@@ -18,10 +18,10 @@ class Regulators(Section):
     )
     position_gain_per_s: Positive = Field(ge=1e-2, le=1e5, description="Kv of the position loop, 1/s")
     speed_feedforward: Annotated[float, Field(ge=0, le=1.5)] = Field(
-        1.0, description="share of the demand's speed fed forward"
+        1.0, description="fed-forward share of the demand's speed"
     )
     speed_kp: Positive = Field(
-        description="proportional gain of the speed loop, A.s/rad; pid: derivative gain, and factor of the other two"
+        description="proportional gain of the speed loop, A.s/rad; pid: derivative gain, factor of the others"
     )
     speed_ki: NotNegative = Field(description="integral gain of the speed loop, A/rad")
     speed_period_s: Positive = Field(0.00025, ge=1e-6, le=0.02, description="cycle of the speed loop")
@@ -34,15 +34,9 @@ class Regulators(Section):
     torque_feedforward: Annotated[float, Field(ge=0, le=1.5)] = Field(
         0.0, description="share of the nominal inertia's current fed forward"
     )
-    setpoint_filter_s: NotNegative = Field(
-        0.0, le=1.0, description="time constant of a filter on the set-point; 0: none"
-    )
-    setpoint_filter_order: Literal[1, 2] = Field(
-        1, description="first order, or two equal first-order filters in series"
-    )
-    speed_filter_s: NotNegative = Field(
-        0.0, le=0.1, description="time constant of a first-order filter on the speed feedback; 0: none"
-    )
+    setpoint_filter_s: NotNegative = Field(0.0, le=1.0, description="time constant of a set-point filter; 0: none")
+    setpoint_filter_order: Literal[1, 2] = Field(1, description="first order, or two equal ones in series")
+    speed_filter_s: NotNegative = Field(0.0, le=0.1, description="first-order filter on the speed feedback; 0: none")
     current_delay_cycles: int = Field(0, ge=0, le=32, description="current cycles until a computed voltage acts")
 
     pid_output: Literal["speed", "current"] = Field(
@@ -54,9 +48,7 @@ class Regulators(Section):
     jerk_feedforward_s2: NotNegative = Field(0.0, description="linuxcnc_pid: FF3, s2")
     deadband_mm: NotNegative = Field(0.0, le=10.0, description="linuxcnc_pid: dead band of the error")
     output_limit_mm_s: NotNegative = Field(0.0, description="linuxcnc_pid: maxoutput, as table speed; 0: none")
-    error_previous_target: bool = Field(
-        True, description="linuxcnc_pid: error against the command of the previous cycle"
-    )
+    error_previous_target: bool = Field(True, description="linuxcnc_pid: error against the previous command")
 
     @model_validator(mode="after")
     def _integrals(self) -> Regulators:

@@ -50,7 +50,7 @@ class SerialPlace(Section):
         19200, ge=BAUD_RATES[0], le=BAUD_RATES[-1], description="serial: bits per second"
     )
     parity: Literal["even", "odd", "none"] = Field(
-        "even", description="serial: usually even for Modbus devices, none for others"
+        "even", description="serial: even for most Modbus devices, else none"
     )
     stop_bits: Literal[1, 2] = Field(1, description="serial: stop bits; Modbus uses 2 without parity")
     timeout_s: Positive = Field(0.5, ge=1e-3, le=60, description="longest time for an answer")
@@ -59,20 +59,13 @@ class SerialPlace(Section):
 class ModbusPlace(SerialPlace):
     """A Modbus unit: RTU on a serial device, else TCP."""
 
-    device: str = Field(
-        NO_DEVICE, description="serial: the device, as /dev/ttyUSB0, for Modbus RTU or text; left out: Modbus TCP"
-    )
+    device: str = Field(NO_DEVICE, description="serial: device, as /dev/ttyUSB0, for RTU or text; left out: Modbus TCP")
     host: str = Field("127.0.0.1", description="modbus: address of the device")
     port: int = Field(0, ge=0, le=65535, description="modbus: TCP port; 0 lets the simulator choose one")
     framing: Literal["tcp", "rtu"] = Field(
-        "tcp", description="modbus: rtu for a transparent serial server, which passes RTU frames over TCP"
+        "tcp", description="modbus: rtu for a serial server that passes RTU frames over TCP"
     )
-    unit: int = Field(
-        1,
-        ge=0,
-        le=255,
-        description="modbus: unit identifier; on a serial line 1 to 247, or what a single device there answers to",
-    )
+    unit: int = Field(1, ge=0, le=255, description="modbus: unit identifier; on a serial line 1 to 247")
 
     @property
     def is_rtu(self) -> bool:
@@ -100,13 +93,9 @@ class ModbusValue(Section):
     """A value in the registers of a Modbus unit."""
 
     function: Literal[3, 4] = Field(4, description="modbus: 4 reads input registers, 3 holding registers")
-    address: int = Field(
-        0, ge=0, le=65535, description="modbus: first register, counted from 0 (register 30001 or 40001 is 0)"
-    )
+    address: int = Field(0, ge=0, le=65535, description="modbus: first register, from 0 (register 30001 or 40001)")
     type: ValueType = Field("float32", description="modbus: int16, uint16, int32, uint32, float32, float64")
-    word_order: Literal["big", "little"] = Field(
-        "big", description="modbus: big has the high word of a value first, little the low word"
-    )
+    word_order: Literal["big", "little"] = Field("big", description="modbus: big has the high word of a value first")
     byte_order: Literal["big", "little"] = Field(
         "big", description="modbus: order of the two bytes of each register; big is the standard, little is swapped"
     )
@@ -116,13 +105,10 @@ class TextValue(Section):
     """A number in a line of text of an instrument on a serial line."""
 
     query: str = Field(
-        "",
-        max_length=200,
-        description="serial: query of an instrument, as 'READ?\\n'; left out: it sends lines by itself",
+        "", max_length=200, description="serial: query, as 'READ?\\n'; left out: it sends lines by itself"
     )
     pattern: Annotated[str, AfterValidator(_regular)] = Field(
-        "",
-        description="serial: position of the value in a line, as 'U=([-+.0-9]+)'; left out: its first number",
+        "", description="serial: position of the value in a line, as 'U=([-+.0-9]+)'; left out: its first number"
     )
 
 
@@ -144,19 +130,17 @@ class VoltageBlock(Section):
 
     samples: int = Field(32, ge=1, le=124, description="samples in the block")
     rate_hz: Positive = Field(1000.0, ge=0.1, le=1e6, description="samples per second")
-    counter_address: int = Field(
-        40, ge=0, le=65534, description="register of the sample count (at most 125 registers together with the block)"
-    )
+    counter_address: int = Field(40, ge=0, le=65534, description="register of the sample count, near the block")
     counter_type: Literal["uint16", "uint32"] = Field("uint32", description="type of that count: uint16, uint32")
     counter_of: Literal["newest", "oldest"] = Field(
         "newest", description="newest: the count is the number of the block's newest sample; oldest: of its oldest"
     )
     count_address: int | None = Field(
-        None, ge=0, le=65535, description="register of the number of samples; left out: the block is always full"
+        None, ge=0, le=65535, description="register of the number of samples; left out: always full"
     )
     newest_first: bool = Field(False, description="true if the block's first sample is its newest")
     trigger_address: int | None = Field(
-        None, ge=0, le=65535, description="register to which 1 is written to fill the block with new samples"
+        None, ge=0, le=65535, description="write 1 here to fill the block with new samples"
     )
 
 
@@ -181,7 +165,7 @@ class Voltage(Scaled, TextValue, ModbusValue, ModbusPlace, Sourced):
         "simulated sensor",
     )
     period_s: Positive = Field(
-        0.02, ge=1e-3, le=10.0, description="how often a single-value sensor is polled, or sends by itself"
+        0.02, ge=1e-3, le=10.0, description="how often a single-value sensor is polled, or sends"
     )
     delay_s: NotNegative = Field(0.0, le=10.0, description="delay of that value by its filter")
     renewed_s: NotNegative = Field(0.0, le=10.0, description="how often the sensor updates it; 0: at each poll")

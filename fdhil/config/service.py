@@ -16,8 +16,7 @@ class Store(Section):
     directory: Path = Field(Path("fdhil-data"), description="recordings and history; relative to the config's folder")
     run_directory: Path | None = Field(None, description="sockets and token; left out: <directory>/run")
     commissioning_key: Path | None = Field(
-        None,
-        description="key that seals the commissioning records, mode 0600; left out: <directory>/commissioning.key",
+        None, description="key that seals the commissioning records, mode 0600; left out: <directory>/commissioning.key"
     )
     keep_windows: int = Field(10_000, ge=1, le=10_000_000, description="recorded windows kept; the oldest go first")
 
@@ -32,9 +31,7 @@ class Guard(Section):
         description="sync: time is SYNC count x period, for a simulated machine that does not run in real time",
     )
     run_directory: Path | None = Field(None, description="the guard's socket and settings; left out: that of [store]")
-    daemon_user: str | None = Field(
-        None, description="the daemon's user, where the guard runs as another one; left out: the same user"
-    )
+    daemon_user: str | None = Field(None, description="the daemon's user, where the guard runs as another one")
 
 
 class Access(Section):
@@ -51,9 +48,7 @@ class Play(Section):
     """[play]: fdhil in place of an NC on a test bench (fdhil play)."""
 
     node_id: int = Field(101, ge=1, le=127, description="node-ID of its heartbeat, which the drives monitor")
-    heartbeat_s: Positive = Field(
-        0.020, ge=0.001, le=1.0, description="period of that heartbeat; a drive that misses three of them stops"
-    )
+    heartbeat_s: Positive = Field(0.020, ge=0.001, le=1.0, description="its period; a drive that misses three stops")
 
 
 class Maintenance(Section):

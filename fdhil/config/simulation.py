@@ -43,10 +43,10 @@ class SimAxis(Section):
     )
     boot_s: NotNegative = Field(0.0, le=60.0, description="time from a reset or power-on to the boot-up message")
     limit_switches_mm: tuple[Finite, Finite] | None = Field(
-        None, description="where the limit switches are, for homing; left out: there are none"
+        None, description="limit switches for homing; left out: none"
     )
     home_switch_mm: Finite | None = Field(
-        None, description="position from which, in the drive's positive direction, the home switch is active"
+        None, description="from here on in positive direction the home switch is active"
     )
     reality: Reality = Reality()
 
@@ -54,9 +54,7 @@ class SimAxis(Section):
 class Thermal(Section):
     """[sim.thermal]: the slide-ways warm with the work of friction and cool toward the ambient."""
 
-    ambient_c: Finite = Field(
-        20.0, ge=-50, le=200, description="ambient and start temperature, the reference of ft and Cd"
-    )
+    ambient_c: Finite = Field(20.0, ge=-50, le=200, description="ambient and start temperature, reference of ft and Cd")
     rise_c: NotNegative = Field(2.0, le=200, description="rise in steady shuttling at rapid speed")
     time_constant_s: Positive = Field(600.0, description="time constant of that rise")
 
@@ -64,13 +62,11 @@ class Thermal(Section):
 class Sim(Section):
     """[sim]: the simulated machine; a real machine's config needs none of it."""
 
-    pace: Literal["realtime", "lockstep"] = Field(
-        "realtime", description="lockstep: as fast as the bus answers, repeatable"
-    )
+    pace: Literal["realtime", "lockstep"] = Field("realtime", description="lockstep: as fast as the bus, repeatable")
     seed: int = Field(1, ge=0, le=2**63 - 1, description="seed of the sensor noise")
     nc: bool = Field(False, description="whether the simulated NC is switched on at start")
     lockstep_rpdo: tuple[str, ...] = Field(
-        (), description="lockstep: RPDOs to wait for, such as X:2; left out: those received in the previous cycle"
+        (), description="lockstep: RPDOs to wait for, as X:2; left out: those of the previous cycle"
     )
     modbus: bool = Field(True, description="serve a Modbus voltage sensor per axis")
     modbus_cycles: int = Field(1, ge=1, le=100, description="SYNC cycles averaged in one of its samples")

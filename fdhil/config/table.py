@@ -58,14 +58,12 @@ class Accelerometer(SerialPlace):
 
     device: str = Field(min_length=1, description="the serial device, as /dev/ttyACM0 or /dev/serial/by-id/...")
     baud_rate: int = Field(
-        115200, ge=1200, le=4_000_000, description="serial: bits per second; without effect on a USB port"
+        115200, ge=1200, le=4_000_000, description="serial: bits per second; no effect on a USB port"
     )
     parity: Literal["even", "odd", "none"] = Field("none", description="serial: parity")
     rate_hz: Positive = Field(800.0, ge=50, le=5000, description="nominal samples per second")
     column: int = Field(2, ge=1, le=16, description="column of the acceleration along the axis in a line")
-    count_column: int = Field(
-        1, ge=0, le=16, description="column of the sample count; 0: none, then lost lines are not detected"
-    )
+    count_column: int = Field(1, ge=0, le=16, description="column of the sample count; 0: none, losses undetected")
     scale: Finite = Field(0.03825, description="m/s2 per count; negative where it points in the opposite direction")
     late_s: float = Field(0.0, ge=0.0, le=0.1, description="delay of its filter and transmission")
 

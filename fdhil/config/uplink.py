@@ -29,7 +29,7 @@ class NatsServer(Credentials):
     )
 
     credentials_file: Path | None = Field(
-        None, description="used instead of user and password: NATS' .creds file, or the seed of an nkey; mode 0600"
+        None, description="instead of user and password: NATS' .creds file, or an nkey's seed; mode 0600"
     )
 
     @property
@@ -60,17 +60,12 @@ class Uplink(NatsServer):
     )
     every_window: int = Field(10, ge=1, le=1_000_000, description="with windows = some: every n-th window of an axis")
     keep_unsent: int = Field(
-        500_000, ge=1_000, le=100_000_000, description="records kept while they cannot be sent; the oldest go first"
+        500_000, ge=1_000, le=100_000_000, description="records kept while unsent; the oldest go first"
     )
-    directory: Path | None = Field(
-        None, description="where fdhil uplink stores its progress; left out: <store directory>/uplink"
-    )
-    labels: Labels = Field(
-        default_factory=dict,
-        description="labels for comparing machines, as type, plant, lubricant: any names and texts",
-    )
+    directory: Path | None = Field(None, description="progress of fdhil uplink; left out: <store directory>/uplink")
+    labels: Labels = Field(default_factory=dict, description="for comparing machines, as type, plant, lubricant")
     axis_labels: Mapping[AxisName, Labels] = Field(
-        default_factory=dict, description="labels of single axes, as screw or motor, by axis letter"
+        default_factory=dict, description="labels of axes, as screw or motor"
     )
 
     def name_of(self, machine: str) -> str:

@@ -16,24 +16,20 @@ class Web(SectionWithFiles):
 
     host: str = Field("127.0.0.1", min_length=1, description="address to listen on; 0.0.0.0 for all")
     port: int = Field(8437, ge=0, le=65535, description="TCP port; 0 chooses a free one and reports it")
-    allowed_hosts: tuple[str, ...] = Field(
-        (), description="further host names for browsers, besides localhost and the host above"
-    )
+    allowed_hosts: tuple[str, ...] = Field((), description="further permitted host names, besides localhost and host")
     allowed_origins: tuple[str, ...] = Field(
         (), description="origins of other servers whose scripts may call it, as https://panel.example; left out: none"
     )
     users_file: Path | None = Field(
-        None, description="users file (written by fdhil web-user); left out: anyone on this computer may read"
+        None, description="users file (fdhil web-user); left out: anyone on this computer may read"
     )
     tls_certificate_file: Path | None = Field(None, description="certificate chain (PEM), for https")
     tls_key_file: Path | None = Field(None, description="its private key (PEM), readable by its user only")
     acting: bool = Field(False, description="whether users with the role operate may arm and acknowledge in a browser")
     programs_directory: Path | None = Field(
-        None, description="folder of the NC programs that may be armed from a browser; left out: none"
+        None, description="folder of programs that browsers may arm; left out: none"
     )
-    unprotected: bool = Field(
-        False, description="listen beyond this computer without TLS or users: anyone on that network can read"
-    )
+    unprotected: bool = Field(False, description="listen beyond this computer without TLS or users: anyone can read")
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

@@ -60,11 +60,7 @@ class CanBus:
     batch_s = BATCH_S
 
     def __init__(
-        self,
-        name: str,
-        settings: config.CanBus,
-        ring_frames: int = DEFAULT_RING_FRAMES,
-        filters: Sequence[Filter] = (),
+        self, name: str, settings: config.CanBus, ring_frames: int = DEFAULT_RING_FRAMES, filters: Sequence[Filter] = ()
     ) -> None:
         self.name = name
         self.ended: str | None = None

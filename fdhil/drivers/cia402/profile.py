@@ -178,11 +178,7 @@ def speed_unit_of(word: int | None) -> SpeedUnit | None:
     >>> speed_unit_of(0x00B44700), speed_unit_of(0xFDB44700), speed_unit_of(0x00B50300)
     ('rpm', 'millirpm', 'increments_per_s')
     """
-    units: dict[int | None, SpeedUnit] = {
-        0x00B44700: "rpm",
-        0xFDB44700: "millirpm",
-        0x00B50300: "increments_per_s",
-    }
+    units: dict[int | None, SpeedUnit] = {0x00B44700: "rpm", 0xFDB44700: "millirpm", 0x00B50300: "increments_per_s"}
     return units.get(word)
 
 
