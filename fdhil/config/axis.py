@@ -240,7 +240,6 @@ class Axis(Section):
 
     @property
     def largest_difference_um(self) -> float:
-        """Largest allowed difference between the two drives of a gantry axis."""
         return self.max_difference_um or 500.0
 
     @property
@@ -258,7 +257,6 @@ class Axis(Section):
 
     @property
     def jerk_mm_s3(self) -> float:
-        """Largest jerk."""
         return self.max_jerk_mm_s3 or self.max_acceleration_mm_s2 / 0.025
 
     @property
@@ -268,7 +266,6 @@ class Axis(Section):
 
     @property
     def top_speed_mm_s(self) -> float:
-        """The axis maximum."""
         return self.drive.speed_limit_mm_s or self.rapid_speed_mm_s
 
     @property

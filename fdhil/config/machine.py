@@ -145,7 +145,6 @@ class MachineConfig(Section):
         )
 
     def node_id(self, axis: str) -> int:
-        """Return the CANopen node-ID of an axis' drive."""
         return self.axis[axis].drive.node_id or list(self.axis).index(axis) + 1
 
     @property
@@ -155,7 +154,6 @@ class MachineConfig(Section):
 
     @property
     def run_directory(self) -> Path:
-        """Folder of the daemon's socket and token."""
         return self.store.run_directory or self.store.directory / "run"
 
     @property

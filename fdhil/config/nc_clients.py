@@ -108,7 +108,6 @@ class Asked(Section):
     profile: str = Field("", description="profile of the NC's signals")
 
     def placed(self, folder: Path) -> Self:
-        """Return a copy with its file paths resolved against ``folder``."""
         changes: dict[str, Any] = {key: folder / value for key, value in self if isinstance(value, Path)}
         own = self.profile not in tables.NC_PROFILES
         return self.model_copy(update=changes | ({"profile": str(folder / self.profile)} if own else {}))

@@ -37,5 +37,4 @@ class NcSource(Section):
         return self
 
     def placed(self, folder: Path) -> Self:
-        """Return a copy with its file paths resolved against ``folder``."""
         return self.model_copy(update={"mtconnect": self.mtconnect.placed(folder), "opcua": self.opcua.placed(folder)})

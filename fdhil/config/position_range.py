@@ -43,7 +43,6 @@ class PositionRange:
         return math.trunc(end / self.per_mm * _SHOWN) / _SHOWN
 
     def fault(self, position_mm: float) -> str:
-        """Describe why a position does not fit, and what to do."""
         unit, here, last = self.unit, position_mm / self.mm_per_unit, self.last_mm(position_mm) / self.mm_per_unit
         text = f"axis {self.axis} at {here:.10g} {unit}: the set-point with its largest offset exceeds 32 bits"
         text += f" of increments ({abs(self.per_mm) * self.mm_per_unit:.10g} per {unit}); the last position that fits"

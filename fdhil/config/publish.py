@@ -131,5 +131,4 @@ class Publish(Section):
     prometheus: PrometheusMetrics = PrometheusMetrics()
 
     def placed(self, folder: Path) -> Self:
-        """Return a copy with its file paths resolved against ``folder``."""
         return self.model_copy(update={key: each.placed(folder) for key, each in self if isinstance(each, Publisher)})

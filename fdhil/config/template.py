@@ -190,7 +190,6 @@ def default(field: FieldInfo) -> Any:
 
 
 def toml(value: Any) -> str:
-    """Format a value as TOML."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple | list):

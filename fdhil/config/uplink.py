@@ -34,7 +34,6 @@ class NatsServer(Credentials):
 
     @property
     def servers(self) -> tuple[str, ...]:
-        """The servers of the cluster."""
         return tuple(self.server.split(","))
 
     @model_validator(mode="after")

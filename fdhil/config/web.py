@@ -41,7 +41,6 @@ class Web(SectionWithFiles):
 
     @property
     def on_loopback(self) -> bool:
-        """Whether the host is this computer only."""
         return is_loopback(self.host)
 
 

@@ -48,7 +48,6 @@ class BusSource:
         self._bus = self._open_bus(self.name, settings, filters=filters)
 
     def step(self, now_ns: int) -> list[Record]:
-        """Drain and decode once."""
         bus = self._bus
         if bus is None:
             return []

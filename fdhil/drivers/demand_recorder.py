@@ -98,7 +98,6 @@ class DemandRecorder:
 
     @property
     def moving(self) -> bool:
-        """Whether any axis has moved."""
         return any(axis.moved_first is not None for axis in self._axes.values())
 
     @property

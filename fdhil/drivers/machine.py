@@ -89,7 +89,6 @@ class MachineSource:
         return {name: candump(name, bus.history.frames()) for name, bus in self._buses.items()}
 
     async def close(self) -> None:
-        """Release buses and sensors."""
         for sensor in self._sensors.values():
             sensor.close()
         await asyncio.gather(*(asyncio.to_thread(bus.close) for bus in self._buses.values()))

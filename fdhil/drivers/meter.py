@@ -89,12 +89,10 @@ class MeterVoltage:
 
     @property
     def link(self) -> Link:
-        """The meter's connection."""
         return self._meter.link
 
     @property
     def lost(self) -> int:
-        """Number of missing values."""
         return self._holes + self._grid.missed + self._told.missed
 
     async def poll(self, ticks: TickClock) -> list[VoltageSamples | Notice]:
@@ -113,7 +111,6 @@ class MeterVoltage:
         return [*self._too_slow(), *self._placed(ticks)]
 
     async def reading(self) -> str:
-        """Read once and format the value."""
         return f"{await self._volts():.2f} V at {1e9 / self._grid.period_ns:g} Hz"
 
     async def _ask(self, ticks: TickClock) -> _Value:

@@ -105,5 +105,4 @@ class SensorSource:
         return own | (dict(link.counted) if isinstance(link, ModbusLink) else {})
 
     def close(self) -> None:
-        """End the connection."""
         self.sensor.link.close()

@@ -31,7 +31,6 @@ class SlidewayThermometer:
 
     @property
     def link(self) -> Link:
-        """Its connection."""
         return self._meter.link
 
     async def poll(self, ticks: TickClock) -> list[Temperature]:
@@ -43,7 +42,6 @@ class SlidewayThermometer:
         return [Temperature(self.axis, ticks.newest_tick, celsius, "slideway")]
 
     async def reading(self) -> str:
-        """Read once and format the value."""
         return f"{await self._celsius():.2f} degC"
 
     async def _celsius(self) -> float:

@@ -24,7 +24,6 @@ class ToldCount:
         self.missed = 0
 
     def number(self, t_ns: int) -> int:
-        """Return the number of a value that came at ``t_ns``."""
         if self._last_ns is not None and t_ns - self._last_ns >= (1 - LATE) * self._period_ns:
             self._settle(self._last_ns)
         self._number += 1

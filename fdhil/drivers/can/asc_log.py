@@ -77,7 +77,6 @@ class _Head:
         self._from_trigger = False
 
     def take(self, line: str) -> None:
-        """Read one line of the header."""
         self.names |= dict(named_by(line))
         match = _HEAD.match(line)
         if match is None:

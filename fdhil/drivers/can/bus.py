@@ -81,7 +81,6 @@ class CanBus:
 
     @property
     def stamps(self) -> Stamps:
-        """Source of the newest frames' time stamps."""
         return self._port.stamps
 
     def _receive(self) -> None:
@@ -97,14 +96,12 @@ class CanBus:
             self.ended = str(end)
 
     def drain(self) -> Frames:
-        """Return all frames received since the last call that pass the filters, in order of arrival."""
         frames = passing(self._ring.drain(), self._filters)  # not every way onto a bus has filters of its own
         if frames.size:
             self.last_frame_ns = int(frames["t_ns"][-1])
         return frames
 
     def counters(self) -> dict[str, int]:
-        """Return the frames received, and lost in the ring and in the kernel."""
         lost = self._ring.overflowed + self._port.kernel_drops
         return {
             "frames": self._ring.received,
@@ -114,7 +111,6 @@ class CanBus:
         }
 
     def close(self) -> None:
-        """Stop the receive thread and release the bus."""
         self._stopping.set()
         self._thread.join(timeout=20 * POLL_S)
         self._port.close()

@@ -53,7 +53,6 @@ class _Survey:
     reduced: Counter[str] = field(default_factory=Counter)
 
     def add(self, frame: LoggedFrame) -> None:
-        """Add one frame."""
         if _is_left_out(frame, self.format_name):
             self.left_out[ERROR_FRAMES] += 1
             return
@@ -76,7 +75,6 @@ class _Survey:
         return self.source == self.format_name == "candump"
 
     def header(self) -> LogHeader:
-        """Return the header of the log to be written."""
         start_ns = self.first_ns // _MILLISECOND_NS * _MILLISECOND_NS
         shows_received = self.is_sent or self.source == "candump"
         digits = 9 if self.is_fine and self.keeps_fine_times else 6

@@ -30,7 +30,7 @@ _RAW_FLAGS = REMOTE_FLAG | EXTENDED_FLAG  # black boxes of former versions have 
 
 
 def parse_line(line: str) -> LoggedFrame:
-    """Return the frame of a line; ValueError when there is none."""
+    """Parse one line; ValueError when it is not a frame."""
     match = _LINE.fullmatch(line.strip())
     if match is None:
         raise ValueError("a line that is not a frame")
@@ -55,7 +55,6 @@ def _flagged(can_id: int, is_long: bool) -> int:
 
 
 def format_frame(frame: LoggedFrame, header: LogHeader) -> str:
-    """Return the line of a frame."""
     second, fraction = divmod(frame.t_ns if header.digits == 9 else micros(frame.t_ns), 10**header.digits)
     stamp = f"({second}.{fraction:0{header.digits}d})"
     raw = f"_{frame.dlc:X}" if frame.fd is None and frame.dlc > CLASSIC_BYTES else ""

@@ -24,7 +24,6 @@ class FrameHistory:
         self._newest, self._filled = np.empty(0, FRAME), CHUNK_FRAMES
 
     def add(self, frames: Frames) -> None:
-        """Add a block."""
         if not frames.size:
             return
         oldest_ns = int(frames["t_ns"][-1]) - self._kept_ns

@@ -60,7 +60,6 @@ class FrameRing:
 
     @property
     def room(self) -> int:
-        """Number of free slots."""
         return self._capacity - (self._written - self._read)
 
     def append(self, t_ns: int, can_id: int, data: bytes) -> None:

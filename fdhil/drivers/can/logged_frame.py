@@ -57,12 +57,10 @@ class LoggedFrame:
 
     @property
     def is_error(self) -> bool:
-        """Whether it is an error frame."""
         return bool(self.can_id & ERROR_FLAG)
 
     @property
     def is_remote(self) -> bool:
-        """Whether it is a remote frame."""
         return bool(self.can_id & REMOTE_FLAG)
 
     @property
@@ -72,7 +70,6 @@ class LoggedFrame:
 
 
 def error_frame(t_ns: int, bus: str, sent: bool | None = None) -> LoggedFrame:
-    """Return an error frame without details."""
     return LoggedFrame(t_ns, bus, BUS_ERROR, CLASSIC_BYTES, bytes(CLASSIC_BYTES), sent=sent)
 
 
@@ -123,7 +120,6 @@ def named_by(line: str) -> Iterator[tuple[int, str]]:
 
 
 def reason_of(error: Exception) -> str:
-    """Explain an exception raised while a line was parsed."""
     text = str(error)
     if text.startswith("invalid literal for int()"):  # Python's own words
         return f"{text.rpartition(': ')[2][:40]} where a number belongs (record with numbers, not names)"
@@ -156,5 +152,4 @@ def decimal_ns(seconds: str) -> int:
 
 
 def micros(ns: int) -> int:
-    """Round to whole microseconds."""
     return (ns + 500) // 1000

@@ -64,7 +64,6 @@ class PythonCanPort:
             raise ConnectError(name, f"{self._what} cannot be opened ({_one_line(error)}); {advice}") from None
 
     def receive(self, ring: FrameRing, timeout_s: float) -> None:
-        """Append one frame, and all others that wait."""
         wait: float = timeout_s
         for _ in range(FRAMES_PER_TURN):
             try:
@@ -78,7 +77,6 @@ class PythonCanPort:
             wait = 0.0
 
     def close(self) -> None:
-        """Release the adapter, if it is still there."""
         try:
             self._bus.shutdown()
         except _BROKEN:
@@ -94,7 +92,6 @@ def arguments(settings: config.CanBus) -> dict[str, Any]:
 
 
 def append(ring: FrameRing, message: can.Message, stamp_ns: int) -> None:
-    """Append a message of the library to the ring."""
     can_id = message.arbitration_id | (EXTENDED_FLAG if message.is_extended_id else 0)
     can_id |= (ERROR_FLAG if message.is_error_frame else 0) | (REMOTE_FLAG if message.is_remote_frame else 0)
     data = bytes(min(message.dlc, 8)) if message.is_remote_frame else bytes(message.data[:8])  # its DLC is kept
@@ -126,7 +123,6 @@ class VirtualPort:
             raise ConnectError(name, f"the virtual bus {settings.channel} cannot be opened ({error})") from None
 
     def receive(self, ring: FrameRing, timeout_s: float) -> None:
-        """Append one frame, and all others that wait, with monotonic stamps."""
         wait: float = timeout_s
         wall_ahead_ns = self._wall_clock.ahead_ns()
         for _ in range(FRAMES_PER_TURN):
@@ -137,5 +133,4 @@ class VirtualPort:
             wait = 0.0
 
     def close(self) -> None:
-        """Leave the channel."""
         self._bus.shutdown()

@@ -88,7 +88,6 @@ class SdoLink:
         return len(data) if self._sized else None
 
     def read_int(self, index: int, sub: int = 0, *, signed: bool = False) -> int:
-        """Read an integer object, little-endian."""
         return int.from_bytes(self.read(index, sub), "little", signed=signed)
 
     def write_int(self, index: int, sub: int, value: int, length: int) -> None:

@@ -89,7 +89,6 @@ class SocketCanPort:
         return bool(_IFREQ.unpack(fcntl.ioctl(self._socket, SIOCGIFFLAGS, asked))[1] & IFF_UP)
 
     def receive(self, ring: FrameRing, timeout_s: float) -> None:
-        """Append all waiting frames, with monotonic stamps."""
         if not select.select([self._socket], [], [], timeout_s)[0]:
             return
         wall_ahead_ns = self._wall_clock.ahead_ns()
@@ -132,7 +131,6 @@ class SocketCanPort:
             self.kernel_drops += ahead
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
 
 

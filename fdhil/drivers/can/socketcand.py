@@ -83,7 +83,6 @@ class SocketcandPort:
             raise ConnectError(self._name, f"{otherwise}; check host, port and channel")
 
     def receive(self, ring: FrameRing, timeout_s: float) -> None:
-        """Read what has arrived and split it into frames with host-monotonic stamps."""
         self._socket.settimeout(timeout_s)
         try:
             chunk = self._socket.recv(min(MAX_CHUNK_BYTES, ring.room * MIN_LINE_BYTES))
@@ -116,5 +115,4 @@ class SocketcandPort:
                 self.malformed += 1
 
     def close(self) -> None:
-        """End the connection."""
         self._socket.close()

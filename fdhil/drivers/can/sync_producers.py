@@ -46,12 +46,10 @@ class SyncProducers:
         self._returned.append(same or (returns and not goes_on))
 
     def stamped(self, stamps_ns: Int) -> None:
-        """Note the arrival times of SYNCs."""
         self._stamps_ns.extend(stamps_ns.tolist())
 
     @property
     def two(self) -> bool:
-        """Whether two nodes send SYNC."""
         if len(self._returned) < HISTORY:
             return False
         return sum(self._returned) > HISTORY // 3 or (self._newest is None and self._early_and_late())

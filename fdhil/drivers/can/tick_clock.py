@@ -28,7 +28,6 @@ class TickClock:
 
     @property
     def running(self) -> bool:
-        """Whether there is a SYNC count."""
         return self._tick.size > 1
 
     @property

@@ -32,7 +32,6 @@ class DeviceObject:
 
     @property
     def fixed(self) -> bool:
-        """Whether it is read-only."""
         return self.access in ("ro", "const")
 
     @property

@@ -119,7 +119,6 @@ class Cia402Decoder:
 
     @property
     def cob_ids(self) -> frozenset[int]:
-        """The COB-IDs of this drive's PDOs, by its profile."""
         return frozenset(spec.cob_base + self.node_id for spec in (*self.profile.tpdos, *self.profile.rpdos))
 
     def feed(self, ticked: Ticked) -> list[AxisSamples | InputSamples | Notice]:

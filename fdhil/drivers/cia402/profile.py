@@ -39,7 +39,7 @@ class PdoSpec:
 
     @property
     def length(self) -> int:
-        """Data bytes of a complete frame."""
+        """Bytes of a complete frame."""
         return pdo_length(self.entries)
 
     def entry(self, key: ObjectKey) -> PdoEntry | None:

@@ -25,7 +25,6 @@ class BlockVoltage(ModbusVoltage):
         self._newest: int | None = None
 
     async def latch(self) -> None:
-        """Trigger the sensor to store its newest samples in the registers, where it needs that."""
         if self._map.trigger_address is not None:
             await self.link.write(self._map.trigger_address, 1)
 

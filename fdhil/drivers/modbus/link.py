@@ -33,13 +33,11 @@ class ModbusLink:
         return self.line.counted
 
     async def connect(self) -> None:
-        """Connect the line if necessary; ConnectError when the device cannot be reached."""
         self.line.users.add(self)
         await self.line.connect(self.name, self._timeout_s)
 
     @property
     def connected(self) -> bool:
-        """Whether the line is established and used by this unit."""
         return self in self.line.users and self.line.connected
 
     async def read_input(self, address: int, count: int) -> list[int]:
@@ -54,7 +52,6 @@ class ModbusLink:
         return list((await self._ask(function, address, count)).registers)
 
     async def write(self, address: int, value: int) -> None:
-        """Write one holding register."""
         await self._ask(WRITE_REGISTER, address, value)
 
     async def _ask(self, function: int, address: int, value: int) -> Answer:

@@ -23,7 +23,6 @@ class ModbusMeter:
         self._registers: list[int] = []
 
     async def value(self) -> float:
-        """Return the value, scaled; DeviceError of the link, ProtocolError for NaN and the like."""
         where = self._where
         registers = await self.link.read(where.function, where.address, registers_of(self._kind))
         self._registers = registers
@@ -34,7 +33,6 @@ class ModbusMeter:
         return where.scale * raw + where.offset
 
     def doubt(self, shown: str) -> str:
-        """Describe an implausible value: where it was read, and what to compare."""
         where = self._where
         text = f"register {where.address} gives {shown} as {self._kind}"
         text += other_orders(self._registers, self._kind, where, self._most)

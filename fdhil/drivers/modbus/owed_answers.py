@@ -22,11 +22,9 @@ class OwedAnswers:
         self._owed: list[tuple[Request, int]] = []
 
     def __bool__(self) -> bool:
-        """Return whether there are any."""
         return bool(self._owed)
 
     def add(self, request: Request, now_ns: int) -> None:
-        """Add a request."""
         self._owed.append((request, now_ns + round((FORGOTTEN_S + 2 * request.timeout_s) * 1e9)))
 
     def forget(self, now_ns: int) -> None:

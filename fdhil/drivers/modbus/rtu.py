@@ -101,7 +101,6 @@ def fault_in(data: bytes, unit: int, function: int, count: int) -> tuple[str, st
 
 
 def foreign_unit(answering: int, asked: int) -> str:
-    """Describe an answer of a unit that was not addressed."""
     text = f"unit {answering} answered instead of unit {asked}; set unit = {answering}"
     return f"{text} if that is the device, or check that no two have the same number"
 

@@ -62,11 +62,9 @@ class RtuLine:
 
     @property
     def connected(self) -> bool:
-        """Whether the device is open."""
         return self._port.is_open
 
     async def connect(self, name: str, timeout_s: float) -> None:
-        """Open the device if it is not; ConnectError."""
         async with self._turn:
             if not self._port.is_open:
                 await self._port.connect(name, timeout_s)
@@ -182,5 +180,4 @@ class RtuLine:
                 raise noise or foreign or no_answer(request, self._advice)
 
     def close(self) -> None:
-        """Release the device."""
         self._port.close()

@@ -62,11 +62,9 @@ class TcpLine:
 
     @property
     def connected(self) -> bool:
-        """Whether the TCP connection is established."""
         return self._client is not None and bool(self._client.connected)
 
     async def connect(self, name: str, timeout_s: float) -> None:
-        """Connect if not yet connected; ConnectError when the device cannot be reached."""
         async with self._turn:
             if self.connected:
                 return
@@ -87,7 +85,6 @@ class TcpLine:
                 raise ConnectError(name, text)
 
     async def ask(self, request: Request) -> Answer:
-        """Send the request and return the answer; DeviceError."""
         async with self._turn:
             asked_ns = time.monotonic_ns()
             answer = await self.answered(self._call(request), request)
@@ -156,7 +153,6 @@ class TcpLine:
         return no_answer(request, SILENT_ADVICE)
 
     def close(self) -> None:
-        """End the connection."""
         if self._client is not None:
             self._client.close()
             self._client = None

@@ -26,6 +26,5 @@ class EventSource(Protocol):
 
 
 def load_event_source(name: str) -> type[EventSource]:
-    """Return the source that ``tables.EVENT_SOURCES`` lists under ``name``."""
     source: type[EventSource] = tables.load(tables.EVENT_SOURCES, name)
     return source

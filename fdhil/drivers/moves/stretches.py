@@ -38,7 +38,6 @@ class Stretches:
 
     @property
     def newest(self) -> int | None:
-        """The newest tick."""
         return int(self._kept[-1][0][-1]) if self._kept else None
 
     def feed(self, samples: AxisSamples) -> list[Stretch]:

@@ -38,7 +38,6 @@ class ModbusCoil:
         self._link.close()
 
     async def read(self) -> Sequence[NcState]:
-        """Wait for the period, poll, and return the state; DeviceError."""
         await asyncio.sleep(max(0.0, self._next_s - time.monotonic()))
         self._next_s = max(time.monotonic(), self._next_s + self._period_s)
         answers: dict[int, Sequence[int]] = {}

@@ -97,7 +97,6 @@ class OpcUa:
         return found
 
     async def read(self) -> Sequence[NcState]:
-        """Wait for the period, poll, and return the state; DeviceError."""
         await asyncio.sleep(max(0.0, self._next_s - time.monotonic()))
         self._next_s = max(time.monotonic(), self._next_s + self._settings.period_s)
         asked_ns = time.monotonic_ns()

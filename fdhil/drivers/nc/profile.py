@@ -50,7 +50,6 @@ class Condition:
     at_most: float = math.inf
 
     def holds(self, value: Shown) -> bool:
-        """Return whether a value meets the condition."""
         if self.values:
             return any(each in self.values for each in (value if isinstance(value, tuple) else (value,)))
         number = _number(value)

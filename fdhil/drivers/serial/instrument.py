@@ -40,21 +40,17 @@ class SerialLink:
 
     @property
     def connected(self) -> bool:
-        """Whether the device is open."""
         return self.port.is_open
 
     async def connect(self) -> None:
-        """Open the device; ConnectError."""
         self.port.open(self.name)
 
     def fault_code(self, error: DeviceError) -> str | None:
-        """Return the notice code of ``error``."""
         if isinstance(error, DeviceTimeout):
             return "SerialTimeout"
         return "SerialPortGone" if isinstance(error, ConnectError) else "SerialShape"
 
     def close(self) -> None:
-        """Release the device."""
         self.port.close()
 
 
@@ -103,12 +99,10 @@ class TextMeter:
         return self._text.scale * raw + self._text.offset
 
     def doubt(self, shown: str) -> str:
-        """Describe an implausible value."""
         return f"the line {self._line[:SHOWN]!r} gives {shown}; compare pattern, scale and unit with the instrument"
 
 
 def serial_voltage(axis: str, config: MachineConfig) -> MeterVoltage:
-    """Create the voltage source ``serial``."""
     settings = config.axis[axis].voltage
     meter = TextMeter(f"voltage sensor {axis}", settings, settings, settings.period_s)
     return MeterVoltage(axis, config, meter)

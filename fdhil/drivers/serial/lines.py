@@ -50,7 +50,6 @@ class LineReader:
             self._begun, self.overlong = b"", self.overlong + 1
 
     def discard(self) -> None:
-        """Discard everything received so far."""
         self._port.discard()
         self._lines.clear()
         self._begun = b""

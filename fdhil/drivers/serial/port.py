@@ -34,15 +34,12 @@ class SerialPort(ByteStream):
 
     @property
     def is_open(self) -> bool:
-        """Whether the device is open and still there."""
         return self._serial is not None and not self._gone
 
     def wire_ns(self, count: int) -> int:
-        """Return the time that ``count`` characters take on the wire."""
         return 0 if self._is_pty else super().wire_ns(count)
 
     async def connect(self, name: str, timeout_s: float) -> None:
-        """Open the device at once."""
         self.open(name)
 
     def open(self, name: str) -> None:
@@ -92,7 +89,6 @@ class SerialPort(ByteStream):
         self._stop_reading()
 
     def send(self, name: str, data: bytes) -> int:
-        """Write at once and return when (host-monotonic ns); ConnectError."""
         port = self._held(name)
         try:
             written = os.write(port.fileno(), data)
@@ -114,7 +110,6 @@ class SerialPort(ByteStream):
             self._loop.remove_reader(self._serial.fileno())
 
     def close(self) -> None:
-        """Close the device."""
         if self._serial is not None:
             if not self._gone:
                 self._stop_reading()

@@ -24,7 +24,6 @@ class ServerPort(ByteStream, asyncio.Protocol):
 
     @property
     def is_open(self) -> bool:
-        """Whether the connection is established."""
         return self._transport is not None and not self._gone
 
     def wire_ns(self, count: int) -> int:
@@ -32,7 +31,6 @@ class ServerPort(ByteStream, asyncio.Protocol):
         return 0
 
     async def connect(self, name: str, timeout_s: float) -> None:
-        """Connect; ConnectError when the server cannot be reached."""
         self.close()
         try:
             async with asyncio.timeout(timeout_s + CONNECT_S):
@@ -42,27 +40,22 @@ class ServerPort(ByteStream, asyncio.Protocol):
             raise ConnectError(name, text) from None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Store the connection."""
         self._transport = cast("asyncio.WriteTransport", transport)
 
     def data_received(self, data: bytes) -> None:
-        """Store received bytes."""
         self._take(data)
 
     def connection_lost(self, error: Exception | None) -> None:
-        """Note that the server closed the connection."""
         if self._transport is not None:
             self._end(str(error) if error else "the server closed it")
 
     def send(self, name: str, data: bytes) -> int:
-        """Write at once and return when (host-monotonic ns); ConnectError when the connection is gone."""
         if self._transport is None or self._gone:
             raise self._lost(name)
         self._transport.write(data)
         return time.monotonic_ns()
 
     def close(self) -> None:
-        """End the connection."""
         transport, self._transport, self._gone = self._transport, None, ""
         if transport is not None:
             transport.close()

@@ -34,11 +34,9 @@ class SerialStream:
 
     @property
     def connected(self) -> bool:
-        """Whether the port is open."""
         return self._port.is_open
 
     async def connect(self) -> None:
-        """Open the port; ConnectError."""
         self._port.open(self.name)
         self._heard_ns = time.monotonic_ns()
 
@@ -57,13 +55,11 @@ class SerialStream:
         return found
 
     def fault_code(self, error: DeviceError) -> str | None:
-        """Return the notice code of ``error``."""
         if isinstance(error, DeviceTimeout):
             return "TableSilent"
         return "SerialPortGone" if isinstance(error, ConnectError) else "SerialShape"
 
     def close(self) -> None:
-        """Close the port."""
         self._port.close()
 
 
@@ -88,7 +84,6 @@ class StreamedAccelerometer:
         return self.accept(await self.link.lines(), ticks)
 
     async def reading(self) -> str:
-        """Wait for a sample and format it."""
         until_ns = time.monotonic_ns() + SILENCE_NS
         while not (found := await self.link.lines()):
             if time.monotonic_ns() > until_ns:

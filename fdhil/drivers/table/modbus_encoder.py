@@ -25,7 +25,6 @@ class ModbusEncoder:
 
     @property
     def link(self) -> ModbusLink:
-        """The module's connection."""
         return self._meter.link
 
     async def poll(self, ticks: TickClock) -> list[TableSamples]:
@@ -45,5 +44,4 @@ class ModbusEncoder:
         return [TableSamples(self.axis, "table_mm", tick, (between[1] - between[0]) / 2, frozen([value]))]
 
     async def reading(self) -> str:
-        """Read once and format the value."""
         return f"{await self._meter.value():.4f} mm"
