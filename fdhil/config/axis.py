@@ -17,8 +17,8 @@ from fdhil.config.section import Finite, NotNegative, Positive, Section, one_of
 from fdhil.config.sensors import Thermometer, Voltage
 from fdhil.config.table import Accelerometer, TableEncoder
 
-# the built-in ceilings of what may ever be added to a set-point; a config can only lower them
-MOST_FILE_BYTES = 4 << 20  # more than an EDS or a profile may have
+# built-in ceilings of all offsets; a config can only lower them
+MOST_FILE_BYTES = 4 << 20  # larger than any EDS or profile
 CEILING_OFFSET_UM = 250.0
 CEILING_SPEED_MM_S = 20.0
 CEILING_ACCELERATION_MM_S2 = 2000.0

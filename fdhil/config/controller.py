@@ -51,7 +51,7 @@ class Nc(Section):
     max_call_depth: int = Field(50, ge=1, le=200, description="nesting of calls before a program is refused")
 
 
-# of the following error: on two machines with 90 real effects it parts what gains from what does not
+# of the following error: separates useful from useless models on two machines with 90 real effects
 TOLERANCE_SHARE = 0.05
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-# key, or all keys of a table -> whether a larger value lets more through than before
+# key, or all keys of a table -> whether a larger value loosens a limit
 FROM_AFAR: Mapping[str, bool] = {
     "axis.*.nominal.*": False,
     "axis.*.regulators.*": False,

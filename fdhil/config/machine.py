@@ -73,7 +73,7 @@ class MachineConfig(Section):
                 faults.append(f"bus.{axis.drive.bus}.offset_lead_cycles: must be {text}")
             faults += [f"axis.{name}.regulators.{fault}" for fault in period_faults(axis.regulators, period)]
             limits = [f"axis.{name}.correction: {fault}" for fault in limit_faults(axis, period)]
-            # a number in another unit makes limits wrong too, and says so better
+            # a wrong unit also breaks limits, and explains the fault better
             found = [] if (info.context or {}).get("made_up") else doubts(axis)
             faults += [f"axis.{name}.{doubt.key}: {doubt.text}" for doubt in found if limits or not doubt.possible]
             faults += limits
@@ -112,7 +112,7 @@ class MachineConfig(Section):
         for section, node_id in (("guard", self.guard.node_id), ("play", self.play.node_id)):
             if node_id in drives:
                 yield f"{section}.node_id: it is that of drive {drives[node_id]}; both send a heartbeat"
-        # the PDOs of a device's second axis are those of the next node-ID
+        # a device's second axis uses the PDOs of the next node-ID
         ids: dict[tuple[str, int], str] = {}
         for name, axis in self.axis.items():
             other = ids.setdefault((axis.drive.bus, self.node_id(name) + axis.drive.logical_axis), name)
@@ -183,7 +183,7 @@ class MachineConfig(Section):
         Access and network settings are excluded: changing them invalidates no record.
         """
         files = "".join(axis.drive.files_digest for axis in self.axis.values())
-        # of a linear axis as before there were others, so that no record is void
+        # unchanged for linear axes, so that existing records stay valid
         rotary = {"unit", "radius_mm"}
         linear = {
             n: {"max_difference_um", "guessed", *(rotary if axis.unit == "mm" else ())} for n, axis in self.axis.items()

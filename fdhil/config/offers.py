@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field
 
 from fdhil.config.section import SectionWithFiles
 
-_OF_THE_WORKS = 14 << 3  # the first byte of such a key, an O in its text, so that no user's key of a server is one
+_OF_THE_WORKS = 14 << 3  # first byte of a plant's key, an O in its text; NATS user keys begin otherwise
 
 
 def key_bytes(text: str) -> bytes:

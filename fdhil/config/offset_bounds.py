@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 
 from fdhil.config.axis import CEILING_ACCELERATION_MM_S2, CEILING_OFFSET_UM, CEILING_SPEED_MM_S, Axis
 
-AXIS_SPEED_SHARE = 0.10  # an offset never takes more than this of the axis' own speed
+AXIS_SPEED_SHARE = 0.10  # largest share of the axis' speed for an offset
 AXIS_ACCELERATION_SHARE = 0.50
 VARIATION_MM = 3.0
 VARIATION_S = 1.0
 TIME_TO_SAFE_S = 0.120
-BRAKING_S = 0.020  # of an axis whose share is little; its braking counts three times
+BRAKING_S = 0.020  # of a slow axis; braking counts three times
 DETECTION_CYCLES = 3
-LEAST_INCREMENTS = 0.5  # what is less would be more than doubled by the one increment that can be sent
-_ULPS = 1e-9  # so that 20 mm/s of 50 per mm are one increment, and not one less
+LEAST_INCREMENTS = 0.5  # one increment would more than double a smaller value
+_ULPS = 1e-9  # against rounding: 20 mm/s at 50 per mm are one increment
 
 
 @dataclass(frozen=True, slots=True)

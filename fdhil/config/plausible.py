@@ -71,7 +71,7 @@ RELATIONS = (
              lambda n: n["nominal.R"] * n["regulators.current_limit_a"] / n["regulators.voltage_limit_v"],
              (1e-4, 5.0), (1e-6, 50.0)),
 )  # fmt: skip
-SLIPS = (  # the more frequent first
+SLIPS = (  # most frequent first
     Slip("nominal.L", 1e-3, "mH"),
     Slip("nominal.L", 1e-6, "uH"),
     Slip("nominal.R", 1e-3, "mohm"),
@@ -97,11 +97,11 @@ def doubts(axis: Axis) -> list[Doubt]:
     broken = [relation for relation in RELATIONS if not _within(relation.figure(numbers), relation.ordinary)]
     if not broken:
         return []
-    slips = [slip for slip in SLIPS if axis.shown_key(slip.key) == slip.key]  # angles are not mistaken for lengths
+    slips = [slip for slip in SLIPS if axis.shown_key(slip.key) == slip.key]  # angles are not confused with lengths
     mended = [slip for slip in slips if _mends(slip, numbers, broken)]
     found = [_doubt(axis, relation, numbers, mended) for relation in broken]
     found.sort(key=lambda doubt: doubt.possible)
-    return found[:1] if mended else found  # one wrong unit has many consequences
+    return found[:1] if mended else found  # one wrong unit breaks many relations
 
 
 def _doubt(axis: Axis, relation: Relation, numbers: Numbers, mended: list[Slip]) -> Doubt:

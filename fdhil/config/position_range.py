@@ -9,7 +9,7 @@ from fdhil.cia402 import target_range
 from fdhil.config.axis import Axis
 from fdhil.config.offset_bounds import OffsetBounds
 
-_SHOWN = 1e4  # parts of a millimetre
+_SHOWN = 1e4  # resolution of shown positions, 1/mm
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,7 +76,7 @@ class PrometheusMetrics(Publisher):
         return self
 
 
-TOPIC_PART = r"^[^/+#\x00-\x1f]*$"  # what may stand between two slashes of a topic
+TOPIC_PART = r"^[^/+#\x00-\x1f]*$"  # characters between two slashes of a topic
 
 
 class MqttBroker(Publisher, Credentials):

@@ -38,7 +38,7 @@ def load(path: Path) -> MachineConfig:
     """
     config = parse(read_toml(path, "a machine config"), str(path), path.parent)
     for sentence in unlikely(config):
-        logging.getLogger("fdhil").warning("%s: %s", path, sentence)  # nobody else may be there to tell: on stderr
+        logging.getLogger("fdhil").warning("%s: %s", path, sentence)  # on stderr, since no other recipient may exist
     return config
 
 
@@ -82,7 +82,7 @@ def read_toml(path: Path, what: str, advice: str = "check the path") -> dict[str
 def toml_document(raw: bytes, source: str) -> dict[str, Any]:
     """Parse TOML; ConfigError when it is invalid or nested too deeply."""
     try:
-        if any(line.count(b".") > MOST_DOTS for line in raw.splitlines()):  # a key of n parts takes n^2 to read
+        if any(line.count(b".") > MOST_DOTS for line in raw.splitlines()):  # parsing a key of n parts takes n^2
             raise RecursionError
         return tomllib.loads(raw.decode("utf-8-sig"))
     except RecursionError:
@@ -90,7 +90,7 @@ def toml_document(raw: bytes, source: str) -> dict[str, Any]:
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
         what = f"is not valid TOML: it is not UTF-8 text (at line {line})"
-    except ValueError as error:  # no TOML, or a number of thousands of digits
+    except ValueError as error:  # invalid TOML, or a number of thousands of digits
         said, place = _placed(str(error))
         what = f"is not valid TOML: {_short(said)}{place}"
     raise ConfigError(source, [ConfigFault("file", what, "check that line")])
@@ -270,7 +270,7 @@ def _section(loc: tuple[int | str, ...], whole: type[Section] = MachineConfig) -
     section = whole
     for key in loc:
         field = section.model_fields.get(str(key))
-        if field is None:  # a name chosen by the user: axis.X, bus.can0
+        if field is None:  # a user's name: axis.X, bus.can0
             continue
         inner = [a for a in _arguments(field.annotation) if isinstance(a, type) and issubclass(a, Section)]
         if not inner:

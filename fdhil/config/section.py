@@ -11,12 +11,12 @@ from typing import Annotated, Any, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-# no quantity of a machine lies beyond, in the units used here; a key states its own range where that is narrower
+# limits of every quantity, in the units used here; a key may have a narrower range
 SMALLEST, LARGEST = 1e-12, 1e9
 
 
 def _of_a_machine(value: float) -> float:
-    # no ge and le: those of a key would not narrow these but take their place, or lose theirs
+    # not by ge and le: those of a key would replace these instead of narrowing them
     if value != 0 and not SMALLEST <= abs(value) <= LARGEST:
         raise ValueError(f"must be from {SMALLEST:g} to {LARGEST:g}")
     return value
@@ -33,7 +33,7 @@ def _without_controls(name: str) -> str:
     return name
 
 
-ShownName = Annotated[str, AfterValidator(_without_controls)]  # on terminals, pages and in other programs
+ShownName = Annotated[str, AfterValidator(_without_controls)]  # shown on terminals, pages and in other programs
 AXIS_PATTERN = "[A-Z]2?"  # Y2 is the second drive of the gantry axis Y
 AxisName = Annotated[str, Field(pattern=f"^{AXIS_PATTERN}$")]
 

@@ -24,7 +24,7 @@ from fdhil.config.axis_tables import linear
 from fdhil.config.machine import MachineConfig
 from fdhil.config.section import Section
 
-EXAMPLES: Mapping[str, Any] = {  # of keys without a default: the bench machine
+EXAMPLES: Mapping[str, Any] = {  # for keys without a default: the bench machine
     "machine.name": "my machine",
     "screw_pitch_mm": 20.0, "rapid_speed_mm_s": 500.0, "max_acceleration_mm_s2": 4000.0, "max_jerk_mm_s3": 160000.0,
     "resonance_hz": 80.0, "radius_mm": 100.0, "max_difference_um": 500.0,
@@ -60,8 +60,8 @@ EXAMPLES: Mapping[str, Any] = {  # of keys without a default: the bench machine
     "torque": "lcec.0.x.torque", "axis.X.drive.hal.voltage": "pwmgen.0.value", "enabled": "joint.0.amp-enable-out",
     "axis.X.voltage.type": "float32", "count_address": 42, "trigger_address": 43,
 }  # fmt: skip
-NAMES = {"axis": "X", "bus": "can0"}  # the user's own names in the template
-_OWN = ("axis.", "bus.", "sim.axis.")  # below these are names
+NAMES = {"axis": "X", "bus": "can0"}  # names in the template
+_OWN = ("axis.", "bus.", "sim.axis.")  # tables of named entries
 WIDTH = 118
 
 

@@ -76,7 +76,7 @@ def read_users(path: Path) -> Mapping[str, User]:
         raw = file.read(MAX_FILE + 1)
     try:
         return Users.model_validate_json(raw).users
-    except ValidationError:  # its message would show what stands in the file
+    except ValidationError:  # its message would show the content of the file
         raise _fault(
             path, "is not a users file", "move it away, then create it again with fdhil web-user CONFIG NAME"
         ) from None

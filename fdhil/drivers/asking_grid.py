@@ -10,7 +10,7 @@ import numpy as np
 
 from fdhil.drivers.can.tick_clock import TickClock
 
-SYNC_ENDED_NS = 500_000_000  # after so long a silence it does not run
+SYNC_ENDED_NS = 500_000_000  # silence after which SYNC counts as stopped
 PACE_TICKS = 500
 
 

@@ -21,13 +21,13 @@ from fdhil.drivers.told_count import ToldCount
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 from fdhil.records import Notice, VoltageSamples, frozen, frozen_ints
 
-GATHER_S = 0.05  # values are handed over together, as often as other sensors are asked
-SYNC_LATENESS_NS = 200_000  # how late the stamp of a SYNC may be on a busy computer
-BEYOND_LIMIT = 4.0  # no terminal voltage is so many times what the drive can give
+GATHER_S = 0.05  # values are handed over together, as often as other sensors are polled
+SYNC_LATENESS_NS = 200_000  # delay of a SYNC's stamp on a busy computer
+BEYOND_LIMIT = 4.0  # multiple of the drive's voltage that no terminal voltage reaches
 TOLD_AFTER = 200  # values
 LOST_SHARE = 0.1
-TIMELY_NS = 2_000_000  # the voltage of a drive that accelerates changes by 1 V in each ms: so well it must be known
-SETTLED_NS = 50_000_000  # so many later SYNCs have shown which stamps around an answer were late
+TIMELY_NS = 2_000_000  # an accelerating drive's voltage changes by 1 V per ms, which limits the error
+SETTLED_NS = 50_000_000  # later SYNCs that are needed to recognise late stamps around an answer
 IN_ORDER = 0.4  # of a period
 MOST_WAITING = 1000
 NEAR_S = 0.02
@@ -78,7 +78,7 @@ class MeterVoltage:
         self._late_ns = (settings.delay_s + settings.renewed_s / 2) * 1e9
         self._mean = settings.sampling == "interval_mean"
         if self._mean:
-            self._late_ns += self._grid.period_ns  # a sample is placed where its interval begins
+            self._late_ns += self._grid.period_ns  # a sample is placed at the beginning of its interval
         self._renewed_ns = settings.renewed_s * 1e9
         self._together = math.ceil(GATHER_S / settings.period_s) + 1
         self._waiting: deque[_Value] = deque(maxlen=MOST_WAITING)
@@ -117,7 +117,7 @@ class MeterVoltage:
         number, due_ns = self._grid.next_instant(time.monotonic_ns(), ticks)
         while (left_s := (due_ns - time.monotonic_ns()) / 1e9) > 0:
             await asyncio.sleep(min(left_s, NEAR_S))
-            due_ns = self._grid.host_ns(number, ticks)  # SYNCs that came meanwhile tell it better
+            due_ns = self._grid.host_ns(number, ticks)  # more accurate by the SYNCs that arrived meanwhile
         self._asked += 1
         try:
             volts = await self._volts()
@@ -140,7 +140,7 @@ class MeterVoltage:
 
     async def _volts(self) -> float:
         volts = await self._meter.value()
-        if not abs(volts) <= self._limit_v:  # nor is it NaN
+        if not abs(volts) <= self._limit_v:  # also refuses NaN
             raise ProtocolError(self.name, self._meter.doubt(f"{volts:g} V"))
         return volts
 

@@ -46,6 +46,6 @@ class SlidewayThermometer:
 
     async def _celsius(self) -> float:
         celsius = await self._meter.value()
-        if not PLAUSIBLE_C[0] < celsius < PLAUSIBLE_C[1]:  # nor is it NaN
+        if not PLAUSIBLE_C[0] < celsius < PLAUSIBLE_C[1]:  # also refuses NaN
             raise ProtocolError(self.name, self._meter.doubt(f"{celsius:g} degC"))
         return celsius

@@ -7,7 +7,7 @@ came in time, and if it is late all the same, others before it were lost.
 from collections import deque
 
 LATE = 0.6  # of a period
-KEPT = 64  # values that came, of which the earliest for its number came in time
+KEPT = 64  # values, of which the earliest for its number came in time
 
 
 class ToldCount:

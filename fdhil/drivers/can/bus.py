@@ -15,8 +15,8 @@ from fdhil.drivers.can.port import BusEnded, Filter, Port, Stamps
 from fdhil.drivers.can.ports import open_port
 
 POLL_S = 0.05
-# frames are read ten milliseconds at a time: a thread that wakes for every one costs more than all the decoding, the
-# stamps come from the kernel or the hub, and even a receive buffer that may not be enlarged holds three times as many
+# frames are read every 10 ms: a thread that wakes for each one costs more than all the decoding, the
+# stamps come from the kernel or the hub, and even the smallest receive buffer holds three times as many
 BATCH_S = 0.010
 HOLD_BACK_S = 0.001
 
@@ -88,7 +88,7 @@ class CanBus:
         try:
             while not self._stopping.is_set():
                 if self._port.holds_back and 2 * self._ring.room < self._ring_frames:
-                    time.sleep(HOLD_BACK_S)  # what is not read waits in the hub
+                    time.sleep(HOLD_BACK_S)  # unread frames wait in the hub
                     continue
                 self._port.receive(self._ring, POLL_S)
                 time.sleep(self.batch_s)
@@ -96,7 +96,7 @@ class CanBus:
             self.ended = str(end)
 
     def drain(self) -> Frames:
-        frames = passing(self._ring.drain(), self._filters)  # not every way onto a bus has filters of its own
+        frames = passing(self._ring.drain(), self._filters)  # some bus interfaces have no filters
         if frames.size:
             self.last_frame_ns = int(frames["t_ns"][-1])
         return frames

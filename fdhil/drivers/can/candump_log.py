@@ -26,7 +26,7 @@ _LINE = re.compile(
 )
 _SCREEN = re.compile(r"(\(.{1,40}\))?\s*\S+\s+([RT]X [B-] [E-]\s+)?[0-9A-F]{3,8}\s+\[\d+\]", re.ASCII)
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
-_RAW_FLAGS = REMOTE_FLAG | EXTENDED_FLAG  # black boxes of former versions have them
+_RAW_FLAGS = REMOTE_FLAG | EXTENDED_FLAG  # in black boxes of former versions
 
 
 def parse_line(line: str) -> LoggedFrame:

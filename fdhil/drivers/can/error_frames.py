@@ -22,7 +22,7 @@ CONTROLLER_PASSIVE = 0x10 | 0x20
 CONTROLLER_ACTIVE = 0x40
 # data[2] of a protocol error
 _DAMAGE = {0x01: "bit", 0x02: "form", 0x04: "stuff", 0x08: "dominant bit", 0x10: "recessive bit", 0x20: "overload"}
-_QUIET_NS = 10_000_000_000  # until what no longer comes is over: until then it is one and the same
+_QUIET_NS = 10_000_000_000  # without repetition until a condition has ended
 _RECOVERED = {
     "BusOff": "The CAN controller is back on the bus.",
     "ErrorPassive": "The CAN controller is error-active again.",
@@ -96,7 +96,7 @@ def error_notices(frames: Frames) -> list[Notice]:
     if classes & (ERROR_PROTOCOL | ERROR_BUS):
         found.append(("BusErrors", "minor", _damage(_detail(errors, ERROR_PROTOCOL, 2))))
     notices: dict[str, Notice] = {}
-    for code, severity, text in found:  # of one code the gravest comes first
+    for code, severity, text in found:  # the gravest of a code comes first
         notices.setdefault(code, Notice(code, severity, text))
     return list(notices.values())
 

@@ -20,7 +20,7 @@ class FrameHistory:
 
     def __init__(self, kept_s: float = KEPT_S) -> None:
         self._kept_ns = round(kept_s * 1e9)
-        self._chunks: deque[Frames] = deque()  # of each the part that is filled
+        self._chunks: deque[Frames] = deque()  # filled part of each
         self._newest, self._filled = np.empty(0, FRAME), CHUNK_FRAMES
 
     def add(self, frames: Frames) -> None:
@@ -52,7 +52,7 @@ class FrameHistory:
 
 def candump(bus: str, frames: Frames) -> str:
     """Format frames as a ``candump -l`` log, which ``canplayer`` and others read; stamps are monotonic."""
-    pieces = range(0, frames.size, CHUNK_FRAMES)  # an object for each line of ten seconds would be many at a time
+    pieces = range(0, frames.size, CHUNK_FRAMES)  # limits the number of line objects
     return "".join(_lines(bus, frames[begin : begin + CHUNK_FRAMES]) for begin in pieces)
 
 

@@ -70,7 +70,7 @@ class FrameRing:
             return
         place = written % self._capacity * FRAME.itemsize
         _PACK.pack_into(self._buffer, place, t_ns, can_id, len(data), data)
-        self._written = written + 1  # last: the reader sees a slot only when it is whole
+        self._written = written + 1  # last, so that the reader only sees complete slots
 
     def drain(self) -> Frames:
         """Return a copy of all waiting frames, oldest first (reader's side only)."""

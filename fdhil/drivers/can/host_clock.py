@@ -19,7 +19,7 @@ class WallClock:
         """Return by how much the wall clock is ahead now."""
         spread, ahead = min(self._reading() for _ in range(3))
         if self._ahead_ns is not None and spread > self._SPREAD_NS:
-            return self._ahead_ns  # we were interrupted between the clocks: the reading says nothing
+            return self._ahead_ns  # interrupted between the clocks: the reading is useless
         if self._ahead_ns is None or abs(ahead - self._ahead_ns) > self._SET_NS:
             self._ahead_ns = ahead
         else:
@@ -52,7 +52,7 @@ class DistantClock:
 
     def __init__(self, window_s: float) -> None:
         self._window_ns = round(window_s * 1e9)
-        self._readings: deque[tuple[int, int]] = deque()  # (when, ahead), each later one less ahead
+        self._readings: deque[tuple[int, int]] = deque()  # (time, ahead), in descending order of ahead
 
     def ahead_ns(self, stamp_ns: int, now_ns: int) -> int:
         """Add a reading; return by how much the remote clock is ahead."""

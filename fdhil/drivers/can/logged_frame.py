@@ -10,7 +10,7 @@ from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
 from fdhil.errors import RecordingError
 
 IDENTIFIER_MASK = 0x1FFFFFFF
-BUS_ERROR = ERROR_FLAG | 0x80  # what an error frame without a class is, as can-utils has it
+BUS_ERROR = ERROR_FLAG | 0x80  # an error frame without a class, as in can-utils
 RATE_SWITCH, ERROR_STATE = 1, 2  # the flags of CAN FD that candump writes
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # by DLC
 CLASSIC_BYTES = 8

@@ -15,10 +15,10 @@ from fdhil.records import Notice
 
 _MAX_EMCY_CODES = 32
 _HEARTBEATS_TO_LEARN = 3
-_BACK_NS = 2_000_000_000  # of regular heartbeats after which an outage is over: until then it is one and the same
-# what a node itself sends in CiA 301's predefined set: EMCY, TPDO1 to 4, SDO answers, heartbeat
+_BACK_NS = 2_000_000_000  # of regular heartbeats until an outage has ended
+# COB-IDs that a node sends by CiA 301's predefined set: EMCY, TPDO1 to 4, SDO answers, heartbeat
 _OWN_COB_IDS = (0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700)
-_TOGGLE = 0x80  # of an answer to node guarding; in a heartbeat it is always 0
+_TOGGLE = 0x80  # toggle bit of node guarding; always 0 in a heartbeat
 _NMT_STATES = frozenset(int(state) for state in Nmt)
 
 
@@ -71,7 +71,7 @@ class NodeWatch:
         notices = []
         if state == Nmt.BOOT_UP:
             self.boots += 1
-            self._beats, self._back_since_ns = [], None  # an outage that seemed to end begins anew
+            self._beats, self._back_since_ns = [], None  # an outage that seemed to end continues
             text = "rebooted: its offset and set-up are unknown; check its supply and commission it again."
             notices.append(self._notice("NodeRebooted", "MAJOR", text))
         elif self.nmt is Nmt.OPERATIONAL and state != Nmt.OPERATIONAL:

@@ -14,7 +14,7 @@ from fdhil.errors import ConnectError
 
 if "asammdf" in sys.modules:
     import can
-else:  # python-can would import it for MF4 logs, which costs each process half a second and 100 MB
+else:  # python-can imports it for MF4 logs, which costs half a second and 100 MB
     sys.modules["asammdf"] = None  # type: ignore[assignment] # so that its import fails
     try:
         import can
@@ -23,10 +23,10 @@ else:  # python-can would import it for MF4 logs, which costs each process half 
 
 FRAMES_PER_TURN = 4096
 CLOCK_WINDOW_S = 2.0
-# what an interface of the library raises without its driver, its Python package, its device or the right options
+# errors of an interface without its driver, Python package, device or correct options
 _CANNOT_OPEN = (can.CanError, OSError, ImportError, ValueError, TypeError, NameError, AttributeError)
 _BROKEN = (can.CanError, OSError, ValueError, LookupError)
-# how an interface is told to acknowledge nothing; one that is not listed cannot be told
+# options against acknowledging; interfaces that are not listed have none
 LISTEN_ONLY: Mapping[str, Mapping[str, Any]] = {
     "slcan": {"listen_only": True},
     "pcan": {"state": can.BusState.PASSIVE},
@@ -39,7 +39,7 @@ LISTEN_ONLY: Mapping[str, Mapping[str, Any]] = {
 # the library stamps their frames itself, when it reads them
 _WITHOUT_CLOCK = ("slcan", "robotell", "seeedstudio")
 
-# what the library logs when it looks for drivers is no news of ours: a port that cannot be opened says why
+# the library logs its search for drivers; the error of a port that cannot be opened suffices
 logging.getLogger("can").addHandler(logging.NullHandler())
 
 
@@ -94,7 +94,7 @@ def arguments(settings: config.CanBus) -> dict[str, Any]:
 def append(ring: FrameRing, message: can.Message, stamp_ns: int) -> None:
     can_id = message.arbitration_id | (EXTENDED_FLAG if message.is_extended_id else 0)
     can_id |= (ERROR_FLAG if message.is_error_frame else 0) | (REMOTE_FLAG if message.is_remote_frame else 0)
-    data = bytes(min(message.dlc, 8)) if message.is_remote_frame else bytes(message.data[:8])  # its DLC is kept
+    data = bytes(min(message.dlc, 8)) if message.is_remote_frame else bytes(message.data[:8])  # keeps the DLC
     ring.append(stamp_ns, can_id, data)
 
 

@@ -47,7 +47,7 @@ class SdoLink:
         self.device = device
         self.response_id = COB_SDO_RESPONSE + node_id
         self._send = send
-        # the library's own functions are not annotated
+        # the library has no annotations
         client: Any = SdoClient
         dictionary: Any = ObjectDictionary
         self._client = client(COB_SDO_REQUEST + node_id, self.response_id, dictionary())
@@ -95,7 +95,7 @@ class SdoLink:
 
         TypeError when ``value`` is no integer, ValueError when it does not fit.
         """
-        number = operator.index(value)  # the library would cut 1.7 to 1 without a word
+        number = operator.index(value)  # the library would silently truncate 1.7
         if not -(1 << 8 * length - 1) <= number < 1 << 8 * length:
             raise ValueError(f"{number} does not fit {length} bytes")
         data = (number & (1 << 8 * length) - 1).to_bytes(length, "little")
@@ -121,7 +121,7 @@ class SdoLink:
         deadline = time.monotonic() + DEADLINE_S * self._patience
         data = bytearray()
         with self._client.open(index, sub, "rb", buffering=0) as stream:
-            size = stream.size or 0  # a drive may announce it
+            size = stream.size or 0  # some drives announce it
             while size <= MAX_BYTES:
                 part = stream.read(7)
                 if not part:

@@ -73,7 +73,7 @@ class SocketCanPort:
     def _configure(self, filters: Sequence[Filter]) -> None:
         raw = self._socket
         raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        with contextlib.suppress(PermissionError):  # needs CAP_NET_ADMIN; the capped size stays in force without it
+        with contextlib.suppress(PermissionError):  # without CAP_NET_ADMIN the capped size stays
             raw.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
         raw.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
         raw.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPING, STAMPING)

@@ -45,7 +45,7 @@ class SocketcandPort:
 
     stamps: Stamps = "hub"
     holds_back = True
-    kernel_drops = 0  # TCP loses nothing; what the hub dropped it must say itself
+    kernel_drops = 0  # TCP loses nothing; the hub's own losses are unknown
 
     def __init__(self, name: str, settings: config.CanBus, _filters: Sequence[Filter] = ()) -> None:
         self._name = name

@@ -17,8 +17,8 @@ from fdhil.drivers.can.sync_producers import SyncProducers
 from fdhil.records import Int, Notice, TickTimes
 
 COUNTER_RANGE = 240
-LONGEST_SILENCE_S = 60.0  # twice as far as a window reaches back: none has rows from both sides
-_SHORT_RANGE = 16  # a counter that begins again so soon cannot tell back from forth
+LONGEST_SILENCE_S = 60.0  # twice the reach of a window: none has samples from both sides
+_SHORT_RANGE = 16  # with so short a counter, backward and forward are indistinguishable
 _STEADY = 0.25  # of a period
 _UNCOUNTED = 8  # SYNCs without a counter, one after the other, until the producer with one is gone
 
@@ -50,7 +50,7 @@ class SyncGrid:
         self._last_tick = -1
         self._last_counter: int | None = None
         self._last_ns: int | None = None
-        self._suspect: int | None = None  # the counter of a SYNC that went backwards
+        self._suspect: int | None = None  # counter of a SYNC that went backwards
         self._range = COUNTER_RANGE
         self._wrapped_at: int | None = None
         self._uncounted_run = 0
@@ -62,7 +62,7 @@ class SyncGrid:
 
     def feed(self, frames: Frames) -> Ticked:
         """Give every frame its tick; a SYNC has the tick that it starts."""
-        # contiguous columns: they are compared and shifted once per PDO
+        # contiguous: compared and shifted once per PDO
         can_id, length, data = (np.ascontiguousarray(frames[name]) for name in ("id", "dlc", "data"))
         where = np.flatnonzero(can_id == COB_SYNC)
         before = self._last_tick
@@ -145,7 +145,7 @@ class SyncGrid:
             return
         elapsed = (t_ns - self._last_ns) / self._period_ns if self._realtime and self._last_ns is not None else 0.0
         if abs(elapsed - (1 - last) % self._range) < _STEADY and last != self._range:
-            return  # the end of the turn was lost: so long it takes to go as far as it went before
+            return  # the end of the turn was lost: the elapsed time fits the former range
         if 0.0 < elapsed < 1.5 or last == self._wrapped_at:
             self._range = last
         self._wrapped_at = last
@@ -153,7 +153,7 @@ class SyncGrid:
     def _uncounted(self, counter: int | None, t_ns: int) -> int:
         self._uncounted_run = self._uncounted_run + 1 if counter is None else 0
         if counter is None and self._last_counter is not None and self._uncounted_run < _UNCOUNTED:
-            # a second producer without a counter beside the one that counts
+            # a second producer without a counter next to the one that counts
             self.out_of_order += 1
             return -1
         if counter is None:

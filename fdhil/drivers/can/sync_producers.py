@@ -12,7 +12,7 @@ import numpy as np
 from fdhil.records import Int
 
 HISTORY = 32
-_EVEN = 0.1  # of a period: a difference between the two intervals that jitter alone may make
+_EVEN = 0.1  # of a period: difference of the two intervals that jitter may cause
 _SURE = 4.0  # standard errors
 
 
@@ -22,7 +22,7 @@ class SyncProducers:
     def __init__(self, sync_period_s: float, realtime: bool) -> None:
         self._period_ns = sync_period_s * 1e9
         self._realtime = realtime
-        self._newest: int | None = None  # counter of the series that went on last
+        self._newest: int | None = None  # counter of the series that continued last
         self._other: int | None = None  # and of the one before
         self._returned: deque[bool] = deque(maxlen=HISTORY)
         self._stamps_ns: deque[int] = deque(maxlen=HISTORY + 1)

@@ -6,7 +6,7 @@ from fdhil.records import Float, Int, TickTimes
 
 KEPT_TICKS = 8192
 _STALE_TICKS = 50.0
-_LATE_TICKS = 512  # stamps that are late for longer than that are taken for a SYNC that was late
+_LATE_TICKS = 512  # longer delays count as a delayed SYNC
 
 
 class TickClock:

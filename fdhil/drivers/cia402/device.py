@@ -193,4 +193,4 @@ def _cob_base(cob: DeviceObject, own: int | None) -> int | None:
         return None
     if cob.relative or own is not None:
         return number - (own or 0) if number >= (own or 0) else None
-    return None if number & 0x7F else number  # without a node-ID: it was left out of the file
+    return None if number & 0x7F else number  # without a node-ID, or with one that the file does not name

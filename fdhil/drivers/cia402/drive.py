@@ -22,7 +22,7 @@ from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.records import AxisSamples, Bool, Float, Int, Notice, frozen, frozen_ints
 
 _FOREIGN_TICKS = 8
-_OUTAGE = 16  # SYNCs missed in one go: the producer may have begun anew, and nobody knows what the drive heard
+_OUTAGE = 16  # SYNCs missed at once: the producer may have restarted, and what the drive received is unknown
 _MISMATCHES = 3
 _READ_BACK_TOLERANCE = 2  # increments: two roundings
 

@@ -172,9 +172,9 @@ class Setpoint:
         self.held: int | None = None
         self._entry = entry
         self._streaming = False
-        self._held_crowded = False  # several frames came in its tick: the SYNC between them was lost
+        self._held_crowded = False  # several frames in its tick: the SYNC between them was lost
         self.shift = delay + 1  # a frame after SYNC j is latched at SYNC j+1 and in force ``delay`` cycles later
-        self._reach = delay + 2  # a gap is looked across as far as is known when its row leaves
+        self._reach = delay + 2  # a gap is bridged as far as frames are there when its sample is released
 
     def rows(self, first: int, stop: int) -> SetpointRows | None:
         """Return the set-point in force on samples [first, stop); None while it is unknown."""

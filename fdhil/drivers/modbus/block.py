@@ -51,7 +51,7 @@ class BlockVoltage(ModbusVoltage):
         count = registers_of(block.counter_type)
         told = int(numbers(words(block.counter_address, count), block.counter_type, *self._orders)[0])
         newest = self._unwrapped(told + (held - 1 if block.counter_of == "oldest" else 0))
-        if block.count_address is not None and newest + 1 < held:  # it had begun anew before it was first asked
+        if block.count_address is not None and newest + 1 < held:  # it had wrapped before the first poll
             self._newest = newest = newest + self._modulus
         held = min(held, newest + 1)  # fewer, just switched on
         volts = volts[volts.size - held :]

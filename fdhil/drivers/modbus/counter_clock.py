@@ -57,7 +57,7 @@ class CounterClock:
         origin = int(counter[-1])
         step, slope_error = self._rate(counter, asked, answered)
         begun = step * (counter - origin)
-        # sample c is complete at start + step (c - origin + 1), and c + 1 is not yet
+        # sample c is complete at start + step (c - origin + 1), sample c + 1 is not
         low, high = _agreed(asked - begun - 2 * step, answered - begun - step)
         return Line(origin, (low + high) / 2, step, max((high - low) / 2, step * 1e-3) + slope_error)
 

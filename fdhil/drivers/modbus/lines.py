@@ -19,7 +19,7 @@ def line_to(place: ModbusPlace) -> Line:
         if place.device
         else (place.host, place.port, place.framing)
     )
-    key = (_running_loop(), where)  # a line waits within one event loop
+    key = (_running_loop(), where)  # a line belongs to one event loop
     line = _IN_USE.get(key)
     if line is None:
         line = RtuLine(place) if place.is_rtu else TcpLine(place.host, place.port)

@@ -8,7 +8,7 @@ from fdhil.drivers.modbus.lines import line_to
 from fdhil.drivers.modbus.rtu import READ_INPUT, WRITE_REGISTER
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
 
-PLAUSIBLE_C = (-50.0, 150.0)  # of a slide-way; NaN is outside, too
+PLAUSIBLE_C = (-50.0, 150.0)  # of a slide-way; NaN fails the comparison, too
 
 
 class ModbusLink:

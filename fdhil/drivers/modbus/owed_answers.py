@@ -10,7 +10,7 @@ from dataclasses import replace
 from fdhil.drivers.modbus.line import Request
 from fdhil.drivers.modbus.rtu import BIT_READS, READ_HOLDING, WRITE_REGISTER, data_bytes, find_answer
 
-FORGOTTEN_S = 10.0  # an answer that is so late comes no more
+FORGOTTEN_S = 10.0  # later answers do not occur
 _MOST_COUNT = 120
 _END = 1 << 16
 

@@ -34,12 +34,12 @@ from fdhil.drivers.serial.server_port import ServerPort
 
 RETRIES = 2
 SILENT_CHARACTERS = 3.5
-SILENT_ABOVE_19200_S = 1.75e-3  # fixed there, "MODBUS over serial line" 2.5.1.1
+SILENT_ABOVE_19200_S = 1.75e-3  # constant by "MODBUS over serial line" 2.5.1.1
 FASTEST_BY_CHARACTERS = 19200
-NETWORK_S = 0.2  # and so far where a serial server packs them
-ADAPTER_S = 0.02  # bytes of one frame may come so far apart: a USB adapter hands them over every 16 ms
+NETWORK_S = 0.2  # gap between bytes of a serial server
+ADAPTER_S = 0.02  # gap between bytes of one frame: a USB adapter delivers every 16 ms
 _REQUEST_BYTES = 8
-MOST_BYTES = 512  # two frames of the longest: what is kept of what is no answer
+MOST_BYTES = 512  # two longest frames: kept of invalid bytes
 
 
 class RtuLine:
@@ -76,7 +76,7 @@ class RtuLine:
                 try:
                     return await self._exchange(request)
                 except DamagedAnswer as error:
-                    if error.kind == "ModbusUnit":  # counted when it came, and waited out
+                    if error.kind == "ModbusUnit":  # already counted, and waited for
                         raise
                     self.counted[error.kind] += 1
                     if not left:
@@ -107,7 +107,7 @@ class RtuLine:
         frame = framed(request.unit, body)
         sent_ns = self._port.send(request.name, frame)
         self._busy_until_ns = asked_ns = sent_ns + self._port.wire_ns(_REQUEST_BYTES)
-        self._owed.add(request, sent_ns)  # whoever asked may be stopped before it is answered
+        self._owed.add(request, sent_ns)  # the caller may be cancelled before the answer
         self._late_until_ns = asked_ns + round(2 * request.timeout_s * 1e9)
         echo = b"" if request.function == WRITE_REGISTER else frame
         answer, answered_ns = await self._answer(request, asked_ns, echo)
@@ -157,7 +157,7 @@ class RtuLine:
             if chunk is not None:
                 first_ns = first_ns or chunk.t_ns - port.wire_ns(len(chunk.data))
                 data = (data + chunk.data).removeprefix(echo)
-                # what began so early that it was all there before was looked at then: a line may babble for long
+                # earlier bytes were already searched: the line may babble for long
                 found = find_answer(data[-(len(chunk.data) + wanted) :], unit, function, count)
                 if found is not None:
                     return found, first_ns
@@ -166,9 +166,9 @@ class RtuLine:
             if data:
                 damaged = DamagedAnswer(request.name, *fault_in(data, unit, function, count))
                 if self._owed.settle(data):
-                    self.counted["ModbusStale"] += 1  # ours is still to come
+                    self.counted["ModbusStale"] += 1  # our answer is still to come
                 elif damaged.kind == "ModbusUnit":
-                    self.counted[damaged.kind] += 1  # it may have been asked by another master: ours may still come
+                    self.counted[damaged.kind] += 1  # another master may have asked: ours may still come
                     foreign = damaged
                 elif is_damaged(data, unit, function, count):
                     self._owed.settle_unit(unit, certain=False)

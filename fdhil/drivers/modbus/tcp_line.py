@@ -28,10 +28,10 @@ from fdhil.drivers.modbus.rtu import (
 )
 from fdhil.errors import ConnectError, DeviceError
 
-CONNECT_S = 2.0  # beyond the time an answer may take
+CONNECT_S = 2.0  # in addition to the answer's time-out
 SILENT_ADVICE = "check the device and its line; a serial server that passes RTU frames needs framing = 'rtu'"
-ANY_UNIT = 0  # of a device that is not behind a gateway
-LIBRARYS_OWN_S = 100.0  # its one time-out for everything is longer than any of ours
+ANY_UNIT = 0  # of a device without a gateway
+LIBRARYS_OWN_S = 100.0  # its only time-out, longer than any of ours
 
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
@@ -94,7 +94,7 @@ class TcpLine:
             raise DamagedAnswer(request.name, "ModbusShape", text)
         came = answer.bits if request.function in BIT_READS else answer.registers
         registers = tuple(map(int, came)) if request.count else ()
-        spare = -request.count % 8 if request.function in BIT_READS else 0  # bits come in whole bytes
+        spare = -request.count % 8 if request.function in BIT_READS else 0  # bits are padded to whole bytes
         if len(registers) != request.count + spare:
             what = "bits" if request.function in BIT_READS else "registers"
             text = f"{len(registers)} {what} came instead of {request.count}; check that only one client sends requests"
@@ -133,7 +133,7 @@ class TcpLine:
             raise self._silent(request) from error
         task = asyncio.current_task()
         if task is not None and task.cancelling():
-            # the library waits by wait_for, which in Python 3.11 forgets a cancellation that meets the answer
+            # the library uses wait_for, which in Python 3.11 loses a cancellation that meets the answer
             raise asyncio.CancelledError
         if answer.isError():
             raise ModbusRefused(request.name, request.address, int(answer.exception_code))
@@ -145,10 +145,10 @@ class TcpLine:
         return ConnectError(request.name, text)
 
     def _silent(self, request: Request) -> DeviceError:
-        if not self.connected:  # the device ended it, which the library does not tell who waits
+        if not self.connected:  # closed by the device, which the library does not report to the waiting task
             self.close()
             return self._gone(request)
-        # a late answer must not be taken for the next one's: the connection is made anew
+        # a late answer must not be taken for the next one's: reconnect
         self.close()
         return no_answer(request, SILENT_ADVICE)
 
@@ -169,10 +169,10 @@ def _end_waiting_at_nonsense(client: AsyncModbusTcpClient) -> None:
         except ModbusException as error:
             if not wire.response_future.done():
                 wire.response_future.set_exception(_Nonsense(str(error)))
-                wire.response_future.exception()  # nobody may wait any more
+                wire.response_future.exception()  # retrieved, since no task may be waiting any more
             return len(data)
 
-    wire.callback_data = taken  # type: ignore[method-assign] # the library has no place for it
+    wire.callback_data = taken  # type: ignore[method-assign] # the library has no hook for it
 
 
 def _refuse_other_units(client: AsyncModbusTcpClient) -> None:
@@ -188,7 +188,7 @@ def _refuse_other_units(client: AsyncModbusTcpClient) -> None:
         is_ours = body and transaction == wire.request_transaction_id
         if is_ours and unit != wire.request_dev_id != ANY_UNIT and not wire.response_future.done():
             wire.response_future.set_exception(_OtherUnit(unit))
-            wire.response_future.exception()  # nobody may wait any more
+            wire.response_future.exception()  # retrieved, since no task may be waiting any more
         return size, unit, transaction, body
 
-    framer.decode = decoded  # type: ignore[method-assign, assignment] # the library has no place for it
+    framer.decode = decoded  # type: ignore[method-assign, assignment] # the library has no hook for it

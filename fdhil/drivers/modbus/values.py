@@ -12,8 +12,8 @@ from fdhil.records import Float
 
 WordOrder = Literal["big", "little"]
 ORDERS: tuple[WordOrder, ...] = ("big", "little")
-SMALLEST = 1e-30  # a float below is one whose words or type are others
-LIKELY = (1e-6, 1e6)  # what instruments show, in their own unit
+SMALLEST = 1e-30  # smaller floats have wrong words or type
+LIKELY = (1e-6, 1e6)  # range of instruments, in their own unit
 CODES = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f", "float64": ">d"}
 
 

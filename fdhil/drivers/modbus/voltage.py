@@ -33,11 +33,11 @@ BLOCK_SAMPLES = 100
 ALL_REGISTERS = FIRST_SAMPLE + BLOCK_SAMPLES
 STATUS_LOST = 2
 STUCK_POLLS = 20
-TEAR = 1 << 16  # the lower word of a count is of another moment than the upper one
-_TEAR_SLACK_S = 0.2  # by which a count may be off from what has passed, and still show that it is torn
+TEAR = 1 << 16  # the lower word of a count was read at another time than the upper one
+_TEAR_SLACK_S = 0.2  # tolerance between count and elapsed time for recognising a torn count
 _SETTLE_STEPS = 8
 _SETTLE_STEP_S = 0.01
-_SETTLED_NS = 50_000_000  # a query is placed when so many later SYNCs have shown which stamps around it were late
+_SETTLED_NS = 50_000_000  # later SYNCs that are needed to recognise late stamps around a query
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ class ModbusVoltage:
         await self.latch()
         block = await self.block()
         asked_ns, answered_ns = self.link.asked_ns, self.link.answered_ns
-        for _ in range(_SETTLE_STEPS):  # the SYNCs around the query must have been drained before it can be placed
+        for _ in range(_SETTLE_STEPS):  # the SYNCs around the query must have been drained
             if not ticks.running or ticks.covers(answered_ns):
                 break
             await asyncio.sleep(_SETTLE_STEP_S)
@@ -218,5 +218,5 @@ class ModbusVoltage:
             fraction = line.start + line.step * (counter - line.origin)
             return ticks.time_ns(fraction), line.error * ticks.period_ns + SYNC_LATENESS_NS
         host = self._host_clock.line() if self._host_clock else None
-        assert host is not None  # accept() has just added a query
+        assert host is not None  # accept() has added a query
         return host.start + host.step * (counter - host.origin), host.error

@@ -12,12 +12,12 @@ import numpy as np
 
 from fdhil.records import Float, Int, NcState
 
-GROUP = 16  # set-points that are laid on the bus together
+GROUP = 16  # set-points that are aligned together
 LONGEST_GROUP_S = 2.0
-LEAD_S, LAG_S = 0.2, 6.0  # by which the bus may seem to be ahead, and may lag behind
+LEAD_S, LAG_S = 0.2, 6.0  # limits of the apparent lead and lag of the bus
 KEPT_S = LAG_S + 2 * LONGEST_GROUP_S
 MOST_GROUPS = 50
-ROUNDING = 1.2  # increments between two set-points that were rounded each
+ROUNDING = 1.2  # increments between two rounded set-points
 SAME_PERIOD = 1e-3
 
 
@@ -58,7 +58,7 @@ class DemandAlignment:
         before, self._before = self._before, None if place is None else (cycle, place)
         if place is None or before is None:
             return
-        if cycle <= before[0]:  # the NC was started anew
+        if cycle <= before[0]:  # the NC was restarted
             self.offset, self._open = None, _Group()
             self._waiting.clear()
             return

@@ -18,18 +18,18 @@ class InferredG0:
     """Classifies moves of an axis' samples as RAPID, FEED and REST."""
 
     needs_input = False
-    least_share = 0.9  # an NC's override of 100 % is above it, any feed is below
+    least_share = 0.9  # above every feed, below an override of 100 %
 
     def __init__(self, axis: str, config: MachineConfig) -> None:
         settings = config.axis[axis]
         self._axis = axis
         self._period_s = config.machine.sync_period_s
         self._rapid_mm_s = self.least_share * settings.rapid_speed_mm_s
-        # one increment per cycle is the rounding of the set-point, not a motion
+        # one increment per cycle is rounding of the set-point, not motion
         rounding = 2 / settings.scaling.increments_per_mm / self._period_s
         self._rest_mm_s = max(REST_SHARE * settings.rapid_speed_mm_s, rounding)
         self._last: tuple[int, float] | None = None
-        self._start: int | None = None  # tick at which the present move began
+        self._start: int | None = None  # first tick of the present move
         self._kind: MoveKind | None = None
         self._still_since: int | None = None
 

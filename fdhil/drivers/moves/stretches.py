@@ -7,8 +7,8 @@ import numpy as np
 
 from fdhil.records import AxisSamples, Float, Int
 
-REST_S = 0.010  # a demand that stands for so long has ended the move
-LONG_S = 10.0  # a move that is longer is told in parts
+REST_S = 0.010  # a demand at standstill for so long has ended the move
+LONG_S = 10.0  # a longer move is reported in parts
 KEPT_S = 45.0
 
 
@@ -32,7 +32,7 @@ class Stretches:
     def clear(self) -> None:
         """Drop everything: the SYNC count restarted."""
         self._kept: deque[tuple[Int, Float]] = deque()
-        self._side = 0  # of the stretch that is open
+        self._side = 0  # of the open segment
         self._begin = 0
         self._still: int | None = None
 

@@ -19,11 +19,11 @@ from fdhil.drivers.moves.alignment import DemandAlignment
 from fdhil.drivers.moves.stretches import Stretch, Stretches
 from fdhil.records import AxisSamples, MoveEvent, MoveKind, NcMove, NcState, TickTimes
 
-PATIENCE_S = 1.0  # beyond the NC's own silence, until a move of which it said nothing is UNKNOWN
-AFTER_HOLD_S = 0.25  # of standstill that a rapid needs: one that goes on sooner after a hold is none
+PATIENCE_S = 1.0  # beyond the NC's own silence, until a move without a report is UNKNOWN
+AFTER_HOLD_S = 0.25  # of standstill before a rapid: one that continues sooner after a hold is not used
 MOST_STATES = 20_000
 MOVING = (MoveKind.RAPID, MoveKind.FEED, MoveKind.ARC, MoveKind.UNKNOWN)
-NEXT = 1.5  # ticks between two states that are those of neighbouring cycles
+NEXT = 1.5  # ticks between states of neighbouring cycles
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class ToldG0:
         self._clock = TickClock(period_s)
         self._alignment = DemandAlignment(axis, period_s, increment_mm)
         self._moving = Stretches(period_s, 2 * increment_mm)
-        self._new: deque[NcState] = deque(maxlen=MOST_STATES)  # whose tick is not yet known
+        self._new: deque[NcState] = deque(maxlen=MOST_STATES)  # states without a tick yet
         self._said: deque[Said] = deque(maxlen=MOST_STATES)
         self._waiting: deque[Stretch] = deque()
         self._kind = MoveKind.REST
@@ -67,7 +67,7 @@ class ToldG0:
 
     def _heard(self, samples: AxisSamples) -> Iterator[MoveEvent]:
         newest = self._moving.newest
-        if newest is not None and samples.tick[0] <= newest:  # the SYNC count began anew
+        if newest is not None and samples.tick[0] <= newest:  # the SYNC count restarted
             self._moving.clear()
             self._alignment.clear()
             self._said.clear()
@@ -84,7 +84,7 @@ class ToldG0:
             state = self._new[0]
             begin_ns, end_ns = state.stamp_ns - state.error_ns, state.stamp_ns + state.error_ns
             bounds = self._clock.bounds(begin_ns, end_ns)
-            is_last = not any(later.stamp_ns < begin_ns for later in self._new)  # else its time stamp is wrong
+            is_last = not any(later.stamp_ns < begin_ns for later in self._new)  # otherwise its time stamp is wrong
             if bounds is None and is_last and not self._clock.is_past(begin_ns):
                 return
             self._new.popleft()

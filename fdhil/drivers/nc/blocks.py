@@ -24,7 +24,7 @@ _OTHERWISE = re.compile(
     re.IGNORECASE,
 )
 _AXIS = re.compile(r"(?<![A-Z_$])[XYZUVWABC]\s*[-+=.\[#\d]", re.IGNORECASE)
-# codes that order no motion, those of a lathe apart that do with axis words
+# codes without motion, except the lathe codes that cut with axis words
 _NEUTRAL = frozenset({
     4, 7, 8, 9, 10, 11, *range(15, 24), 25, 26, *range(40, 45), 49, *range(50, 60), 61, 62, 64, 67, 68, 69,
     *range(90, 100), 450, 451, *range(500, 604), *range(641, 647), 700, 710,
@@ -33,7 +33,7 @@ _NEUTRAL_FORMS = frozenset(
     {10, 12, 13, 15, 28, 30, *range(40, 45), 49, 50, 51, 52, 53, 54, 59, 61, 64, 68, 69, 90, 91, 92, 96}
 )
 _CUT_WITH_AXES = frozenset({90, 92, 94})
-_ONCE = frozenset({28, 29, 30, 31, 37})  # move in their block alone: home, skip, tool length
+_ONCE = frozenset({28, 29, 30, 31, 37})  # move in their block only: home, skip, tool length
 
 
 class BlockReader(Protocol):
@@ -48,7 +48,7 @@ class IsoBlocks:
 
     def __init__(self) -> None:
         self._held: MoveKind | None = None
-        self._line: int | None = None  # up to which no block was left out
+        self._line: int | None = None  # last line of an unbroken sequence
         self._text = ""
 
     def kind(self, text: str, line: int | None) -> MoveKind | None:
@@ -63,7 +63,7 @@ class IsoBlocks:
             self._held = told.pop() if len(told) == 1 else None
         elif not follows:
             self._held = None
-        # a line may be told before its block: far from the last one, with the text as before
+        # a line may arrive before its block: far from the last one, with the former text
         self._line = line if follows or text != self._text else None
         self._text = text
         return None if any(number in _ONCE and not form for number, form in words) else self._held

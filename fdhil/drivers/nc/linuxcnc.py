@@ -24,7 +24,7 @@ CONNECT_S = 2.0
 HERE = ("127.0.0.1", "localhost", "::1")
 DISTANT_WINDOW_S = 60.0
 LARGEST = 1 << 60  # of what is counted: ns for 36 years
-NETWORK_NS = 5_000_000  # by which the quickest line of a while may be late
+NETWORK_NS = 5_000_000  # delay of the quickest recent line
 
 
 class LinuxCnc:
@@ -39,10 +39,10 @@ class LinuxCnc:
         self._reader: asyncio.StreamReader | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._period_s = 0.0
-        # another computer has a monotonic clock of its own
+        # another computer has its own monotonic clock
         self._distant = None if settings.host in HERE else DistantClock(DISTANT_WINDOW_S)
         self._waiting: deque[bytes] = deque()  # lines
-        self._rest = b""  # the beginning of a line
+        self._rest = b""  # incomplete last line
 
     async def __aenter__(self) -> Self:
         host, port = self._place

@@ -85,7 +85,7 @@ class MtConnect:
         response = await self._open.enter_async_context(get(self.name, url, ANSWER_S))
         if response.status != 200 or "xml" in response.headers.get("content-type", ""):
             async with asyncio.timeout(ANSWER_S):
-                read_streams(await response.document(), self.name)  # it says what it refuses
+                read_streams(await response.document(), self.name)  # its error names the cause
             raise ProtocolError(self.name, f"refuses a stream (HTTP {response.status}); compare url")
         return response
 

@@ -1,6 +1,6 @@
 """Bounds the time at which a polled value was true. Pure."""
 
-LEAST_ERROR_NS = 1000  # no clock of a computer is read more exactly
+LEAST_ERROR_NS = 1000  # resolution of the computer's clock
 
 
 def between(asked_ns: int, answered_ns: int, renewed_s: float) -> tuple[int, int]:

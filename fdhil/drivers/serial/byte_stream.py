@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from fdhil.errors import ConnectError
 
-MOST_KEPT = 1 << 16  # bytes that nobody has asked for; the oldest are let go
+MOST_KEPT = 1 << 16  # unread bytes; the oldest are discarded
 
 
 @dataclass(frozen=True, slots=True)

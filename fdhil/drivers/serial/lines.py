@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from fdhil.drivers.serial.byte_stream import Chunk
 from fdhil.drivers.serial.port import SerialPort
 
-LONGEST = 512  # characters; what is longer without an end is no line of an instrument
+LONGEST = 512  # characters; a longer line is not from an instrument
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class LineReader:
             text = line.decode("ascii", "replace").strip()
             if len(line) > LONGEST:
                 self.overlong += 1
-            elif text:  # what came after it in the same read was on the wire after it
+            elif text:  # later bytes of the same read were on the wire after it
                 self._lines.append(TextLine(text, chunk.t_ns - self._port.wire_ns(left)))
         if len(self._begun) > LONGEST:
             self._begun, self.overlong = b"", self.overlong + 1

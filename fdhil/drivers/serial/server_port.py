@@ -7,8 +7,8 @@ from typing import cast
 from fdhil.drivers.serial.byte_stream import ByteStream
 from fdhil.errors import ConnectError
 
-CONNECT_S = 2.0  # beyond the time that an answer may take
-CHARACTER_S = 11 / 19200  # what its serial line is set to is unknown here
+CONNECT_S = 2.0  # in addition to the answer's time-out
+CHARACTER_S = 11 / 19200  # the settings of its serial line are unknown
 
 
 class ServerPort(ByteStream, asyncio.Protocol):

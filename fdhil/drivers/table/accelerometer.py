@@ -15,9 +15,9 @@ from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 from fdhil.records import Notice, TableSamples, frozen
 
 SILENCE_NS = 1_000_000_000
-SETTLED_NS = 50_000_000  # an arrival is placed when so many later SYNCs have shown which stamps about it were late
-WRAPS = (1 << 8, 1 << 16, 1 << 24, 1 << 32)  # where counts of devices begin anew
-LARGEST_GAP = 5000  # samples that may be lost in one go; a larger step is another count
+SETTLED_NS = 50_000_000  # later SYNCs that are needed to recognise late stamps around an arrival
+WRAPS = (1 << 8, 1 << 16, 1 << 24, 1 << 32)  # where devices' counts wrap
+LARGEST_GAP = 5000  # samples that may be lost at once; a larger step is another count
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
@@ -96,7 +96,7 @@ class StreamedAccelerometer:
         for line in lines:
             try:
                 told = self._numbers(line.text)
-            except ProtocolError:  # the first line was under way when the port was opened; others are damaged
+            except ProtocolError:  # the first line may be incomplete; others are damaged
                 if line is lines[-1] and len(lines) > 1 and not self._held:
                     raise
                 continue

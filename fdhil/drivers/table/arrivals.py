@@ -15,7 +15,7 @@ KEPT = 400
 LEAST_FOR_RATE = 20  # arrivals
 LEAST_SPAN_S = 0.5
 RATE_TOLERANCE = 0.06  # of the nominal rate
-EARLIEST = 10.0  # percent of the arrivals that are taken for undelayed
+EARLIEST = 10.0  # percent of the arrivals that count as undelayed
 
 
 class Arrivals:

@@ -8,7 +8,7 @@ from fdhil.drivers.modbus.link import ModbusLink
 from fdhil.drivers.modbus.meter import ModbusMeter
 from fdhil.records import TableSamples, frozen
 
-SETTLE_STEPS, SETTLE_STEP_S = 8, 0.01  # until the SYNCs about the answer have been drained
+SETTLE_STEPS, SETTLE_STEP_S = 8, 0.01  # wait until the SYNCs around the answer have been drained
 
 
 class ModbusEncoder:

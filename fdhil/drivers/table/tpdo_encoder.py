@@ -9,14 +9,14 @@ from fdhil.drivers.can.sync_grid import Ticked
 from fdhil.drivers.cia402.pdo_queue import decode
 from fdhil.records import Notice, TableSamples, frozen
 
-SILENT_TICKS = 3000  # of SYNC without that TPDO: then it is told
+SILENT_TICKS = 3000  # of SYNC without that TPDO until it is reported
 
 
 class TpdoEncoder:
     """The table encoder of one axis; ``short`` counts frames that are too short."""
 
     def __init__(self, axis: str, settings: TableEncoder) -> None:
-        assert settings.cob_id is not None  # the configuration has seen to it
+        assert settings.cob_id is not None  # checked by the configuration
         self.axis = axis
         self.short = 0
         self._settings = settings
