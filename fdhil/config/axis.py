@@ -129,8 +129,8 @@ class Drive(Section):
         eds = [] if self.eds is None else [folder / self.eds]
         changes: dict[str, Any] = {"profile": str(own[0]) if own else self.profile, "eds": eds[0] if eds else None}
         drive = self.model_copy(update=changes)
-        told = b"".join(_content(path) for path in (*own, *eds) if path.is_file())
-        drive._files = hashlib.sha256(told).hexdigest() if own or eds else ""
+        content = b"".join(_content(path) for path in (*own, *eds) if path.is_file())
+        drive._files = hashlib.sha256(content).hexdigest() if own or eds else ""
         return drive
 
     @model_validator(mode="before")

@@ -20,7 +20,7 @@ class NotEditable(ValueError):
 def edited(text: str, values: Mapping[str, Any], note: str) -> str:
     """Return the text with these values, as ``axis.X.nominal.ft``, ``note`` above each; NotEditable.
 
-    What comes out is read again, and must say what was said before, with these values and nothing else changed.
+    The result is parsed again, and must equal the former document with only these values changed.
     """
     wanted = tomllib.loads(text)
     end = "\r\n" if "\r\n" in text else "\n"
@@ -55,9 +55,9 @@ def _set(lines: list[str], outer: Sequence[str], key: str, value: str, note: str
         return
     own = re.compile(rf"(\s*{re.escape(key)}\s*=\s*)(.*)")
     shown = re.compile(rf"#{re.escape(key)}\s*=")  # as the template has it: at its default
-    told = next(((at, found) for at in range(first, last) if (found := own.fullmatch(lines[at]))), None)
-    if told is not None:
-        at, found = told
+    present = next(((at, found) for at in range(first, last) if (found := own.fullmatch(lines[at]))), None)
+    if present is not None:
+        at, found = present
         lines[at] = found[1] + value + _behind(found[2])
     else:
         at = next((at + 1 for at in range(first, last) if shown.match(lines[at])), first)

@@ -85,8 +85,10 @@ class MachineConfig(Section):
         faults += line_faults(self._line_users())
         faults += self._node_faults()
         faults += [f"sim.axis.{name}: there is no [axis.{name}]" for name in self.sim.axis if name not in self.axis]
-        told = self.uplink.axis_labels if self.uplink is not None else ()
-        faults += [f"uplink.axis_labels.{name}: there is no [axis.{name}]" for name in told if name not in self.axis]
+        labelled = self.uplink.axis_labels if self.uplink is not None else ()
+        faults += [
+            f"uplink.axis_labels.{name}: there is no [axis.{name}]" for name in labelled if name not in self.axis
+        ]
         if faults:
             raise ValueError("\n".join(faults))
         return self
@@ -191,5 +193,5 @@ class MachineConfig(Section):
         unused: dict[str, Any] = {**dict.fromkeys(BESIDE_THE_MACHINE, True), "axis": linear}
         if not self.nc.wrapped_axes:
             unused["nc"] = {"wrapped_axes"}
-        told = self.model_dump_json(exclude=unused)
-        return hashlib.sha256(f"{told}{files}".encode()).hexdigest()[:16]
+        settings = self.model_dump_json(exclude=unused)
+        return hashlib.sha256(f"{settings}{files}".encode()).hexdigest()[:16]

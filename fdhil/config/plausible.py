@@ -98,13 +98,13 @@ def doubts(axis: Axis) -> list[Doubt]:
     if not broken:
         return []
     slips = [slip for slip in SLIPS if axis.shown_key(slip.key) == slip.key]  # angles are not confused with lengths
-    mended = [slip for slip in slips if _mends(slip, numbers, broken)]
-    found = [_doubt(axis, relation, numbers, mended) for relation in broken]
+    mistakes = [slip for slip in slips if _mends(slip, numbers, broken)]
+    found = [_doubt(axis, relation, numbers, mistakes) for relation in broken]
     found.sort(key=lambda doubt: doubt.possible)
-    return found[:1] if mended else found  # one wrong unit breaks many relations
+    return found[:1] if mistakes else found  # one wrong unit breaks many relations
 
 
-def _doubt(axis: Axis, relation: Relation, numbers: Numbers, mended: list[Slip]) -> Doubt:
+def _doubt(axis: Axis, relation: Relation, numbers: Numbers, mistakes: list[Slip]) -> Doubt:
     figure = relation.figure(numbers)
     possible = _within(figure, relation.possible)
     low, high = relation.ordinary
@@ -112,9 +112,9 @@ def _doubt(axis: Axis, relation: Relation, numbers: Numbers, mended: list[Slip])
     text = f"{_listed(axis, relation, numbers)}: {relation.text} is {figure:.3g}{_spaced(relation.unit)}, "
     text += f"feed drives have {bounds}{_spaced(relation.unit)}"
     guesses = [f"{slip.key} = {numbers[slip.key] * slip.factor:.4g} ({numbers[slip.key]:g} {slip.unit})"
-               for slip in mended[:MOST_NAMED]]  # fmt: skip
+               for slip in mistakes[:MOST_NAMED]]  # fmt: skip
     text += f"; did you mean {' or '.join(guesses)}?" if guesses else "; check the units of these keys"
-    return Doubt(axis.shown_key(mended[0].key if mended else relation.keys[0]), text, possible)
+    return Doubt(axis.shown_key(mistakes[0].key if mistakes else relation.keys[0]), text, possible)
 
 
 def _listed(axis: Axis, relation: Relation, numbers: Numbers) -> str:

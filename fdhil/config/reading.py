@@ -91,15 +91,15 @@ def toml_document(raw: bytes, source: str) -> dict[str, Any]:
         line = raw.count(b"\n", 0, error.start) + 1
         what = f"is not valid TOML: it is not UTF-8 text (at line {line})"
     except ValueError as error:  # invalid TOML, or a number of thousands of digits
-        said, place = _placed(str(error))
-        what = f"is not valid TOML: {_short(said)}{place}"
+        cause, place = _placed(str(error))
+        what = f"is not valid TOML: {_short(cause)}{place}"
     raise ConfigError(source, [ConfigFault("file", what, "check that line")])
 
 
-def _placed(said: str) -> tuple[str, str]:
+def _placed(message: str) -> tuple[str, str]:
     """Separate the library's message from its location, which is never shortened."""
-    found = re.search(r" \(at [^()]{1,60}\)$", said)
-    return (said[: found.start()], found[0]) if found else (said, "")
+    found = re.search(r" \(at [^()]{1,60}\)$", message)
+    return (message[: found.start()], found[0]) if found else (message, "")
 
 
 def parse(
@@ -120,11 +120,11 @@ def parse(
     if units:
         raise ConfigError(source, units)
     store, guard = _placed_store(config.store, folder), _placed_guard(config.guard, folder)
-    worn = {
+    simulated = {
         name: axis.model_copy(update={"eds": folder / axis.eds if axis.eds else None})
         for name, axis in config.sim.axis.items()
     }
-    sim = config.sim.model_copy(update={"axis": worn})
+    sim = config.sim.model_copy(update={"axis": simulated})
     axes = {name: axis.model_copy(update={"drive": axis.drive.placed(folder)}) for name, axis in config.axis.items()}
     nc_source = config.nc_source.placed(folder)
     placed: dict[str, Any] = {"store": store, "guard": guard, "axis": axes, "sim": sim, "nc_source": nc_source}
@@ -174,14 +174,14 @@ def checked_as(whole: type[S], tables: Mapping[str, Any], source: str) -> S:
 def unlikely(config: MachineConfig) -> list[str]:
     """Return a sentence for each value of an axis that is possible but unlikely."""
     found = [(name, doubt) for name, axis in config.axis.items() for doubt in doubts(axis)]
-    told = [f"axis.{name}.{doubt.key} is unlikely: {doubt.text}" for name, doubt in found]
+    sentences = [f"axis.{name}.{doubt.key} is unlikely: {doubt.text}" for name, doubt in found]
     text = 'is only used by a rotary axis; add unit = "deg", or remove it'
     flat = [name for name, axis in config.axis.items() if axis.unit == "mm" and axis.radius_mm is not None]
-    told += [f"axis.{name}.radius_mm {text}" for name in flat]
+    sentences += [f"axis.{name}.radius_mm {text}" for name in flat]
     sections = ("voltage", "temperature", "table")
     places = [(f"axis.{name}.{key}", getattr(axis, key)) for name, axis in config.axis.items() for key in sections]
     places.append(("nc_source.modbus_coil", config.nc_source.modbus_coil))
-    return told + [remark for path, place in places if place is not None and (remark := unit_remark(path, place))]
+    return sentences + [remark for path, place in places if place is not None and (remark := unit_remark(path, place))]
 
 
 def checked(section: type[S], values: Mapping[str, Any], path: str) -> S:
@@ -252,9 +252,9 @@ def _bounds(section: type[Section], loc: tuple[int | str, ...]) -> str:
     if not names:
         return ""
     field = section.model_fields[names[-1]]
-    told = [*_constraints(field), *_constraints(field.annotation)]
-    low = max((bound for item in told if (bound := getattr(item, "ge", None)) is not None), default=None)
-    high = min((bound for item in told if (bound := getattr(item, "le", None)) is not None), default=LARGEST)
+    constraints = [*_constraints(field), *_constraints(field.annotation)]
+    low = max((bound for item in constraints if (bound := getattr(item, "ge", None)) is not None), default=None)
+    high = min((bound for item in constraints if (bound := getattr(item, "le", None)) is not None), default=LARGEST)
     return f"above 0 and at most {high:g}" if low is None else f"from {low:g} to {high:g}"
 
 

@@ -161,9 +161,9 @@ def _at(document: Mapping[str, Any], path: str) -> Mapping[str, Any] | None:
 
 def _line(key: str, value: Any, source: str) -> list[str]:
     text = f"{key} = {toml(value)}"
-    said = _comment(source)
-    whole = "  ".join([text, *said])
-    return [whole] if len(said) < 2 and len(whole) <= WIDTH else [*said, text]
+    comment = _comment(source)
+    whole = "  ".join([text, *comment])
+    return [whole] if len(comment) < 2 and len(whole) <= WIDTH else [*comment, text]
 
 
 def _heading(table: Table) -> list[str]:

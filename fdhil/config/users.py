@@ -113,8 +113,8 @@ class UsersFile:
 def write_users(path: Path, users: Mapping[str, User]) -> None:
     """Replace the file atomically, with its former mode and owner, or 0600; OSError."""
     text = json.dumps({"users": {name: user.model_dump() for name, user in users.items()}}, indent=1) + "\n"
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     try:
         with os.fdopen(descriptor, "w") as file:
             if path.exists():
@@ -125,9 +125,9 @@ def write_users(path: Path, users: Mapping[str, User]) -> None:
             file.write(text)
             file.flush()
             os.fsync(descriptor)
-        beside.replace(path)
+        temporary.replace(path)
     except OSError:
-        beside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 

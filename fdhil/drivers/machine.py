@@ -61,15 +61,15 @@ class MachineSource:
                 for sensor in self._sensors.values():
                     sources.create_task(sensor.run(take))
                 if self._nc is not None:
-                    sources.create_task(self._nc.run(lambda told: self._hear_nc(told, take)))
+                    sources.create_task(self._nc.run(lambda record: self._hear_nc(record, take)))
         except ExceptionGroup as group:
             raise group.exceptions[0] from group
 
-    def _hear_nc(self, told: NcState | Notice, take: Take) -> None:
-        take(told)
-        if isinstance(told, NcState):
+    def _hear_nc(self, record: NcState | Notice, take: Take) -> None:
+        take(record)
+        if isinstance(record, NcState):
             for bus in self._buses.values():
-                for event in bus.hear_nc(told):
+                for event in bus.hear_nc(record):
                     take(event)
 
     def counters(self) -> dict[str, int]:

@@ -133,8 +133,8 @@ class ErrorWatch:
         return [*fresh, *self._over(now_ns)]
 
     def _is_news(self, notice: Notice) -> bool:
-        told = self._told.get(notice.code)
-        if told is not None and (told.severity == "MAJOR" or notice.severity == "minor"):
+        reported = self._told.get(notice.code)
+        if reported is not None and (reported.severity == "MAJOR" or notice.severity == "minor"):
             return False
         self._told[notice.code] = notice
         return True

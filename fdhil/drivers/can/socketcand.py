@@ -78,8 +78,8 @@ class SocketcandPort:
             if not chunk or len(self._rest) > MAX_LINE_BYTES:
                 raise ConnectError(self._name, f"{otherwise}; check host, port and channel")
             self._rest += chunk
-        said, _, self._rest = self._rest.partition(b">")
-        if said.strip() + b" >" != answer and said.strip() + b">" != answer:
+        reply, _, self._rest = self._rest.partition(b">")
+        if reply.strip() + b" >" != answer and reply.strip() + b">" != answer:
             raise ConnectError(self._name, f"{otherwise}; check host, port and channel")
 
     def receive(self, ring: FrameRing, timeout_s: float) -> None:

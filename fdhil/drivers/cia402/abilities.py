@@ -93,8 +93,8 @@ def named_alike(device: Device, what: Literal["voltage", "dc_link", "current"]) 
         if at.bits and (0x2000 <= key[0] < 0x6000 or key[0] in (0x6078, 0x6079))
     ]
     readable = [at for at in own if at.key[1] or (at.key[0], 1) not in device.objects]
-    said = {at.key: at.name.replace("_", " ") for at in readable if at.access in ("ro", "rwr", "rww", "const")}
-    return [at for at in readable if (name := said.get(at.key)) and pattern.search(name) and not _SET_UP.search(name)]
+    names = {at.key: at.name.replace("_", " ") for at in readable if at.access in ("ro", "rwr", "rww", "const")}
+    return [at for at in readable if (name := names.get(at.key)) and pattern.search(name) and not _SET_UP.search(name)]
 
 
 def shown(key: ObjectKey) -> str:
@@ -254,9 +254,11 @@ def _scale(device: Device) -> Iterator[Ability]:
         "rated_current_a": (Object.RATED_CURRENT,),
         "rated_torque_nm": (Object.RATED_TORQUE,),
     }
-    told = {key: [i for i in indices if device.find((i, 0)) or device.find((i, 1))] for key, indices in places.items()}
-    compared = [f"{key} ({', '.join(f'{i:04X}' for i in found)})" for key, found in told.items() if found]
-    own = [key for key, found in told.items() if not found]
+    reported = {
+        key: [i for i in indices if device.find((i, 0)) or device.find((i, 1))] for key, indices in places.items()
+    }
+    compared = [f"{key} ({', '.join(f'{i:04X}' for i in found)})" for key, found in reported.items() if found]
+    own = [key for key, found in reported.items() if not found]
     if compared:
         yield Ability("compare scales", "yes", f"check compares {', '.join(compared)}")
     if own:

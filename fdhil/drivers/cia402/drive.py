@@ -139,8 +139,8 @@ class Cia402Decoder:
         if tick.size:
             out.append(InputSamples(self.axis, frozen_ints(tick), frozen_ints(inputs)))
         self._forget(stop)
-        told, self._notices = self._notices, []
-        return [*out, *told]
+        notices, self._notices = self._notices, []
+        return [*out, *notices]
 
     def _forget(self, row: int) -> None:
         for queue in self._queues.values():
@@ -151,22 +151,22 @@ class Cia402Decoder:
 
     def _heard(self, first: int, stop: int) -> Bool:
         mine = self._syncs[self._syncs.searchsorted(first) : self._syncs.searchsorted(stop)]
-        heard = np.zeros(stop - first, np.bool_)
-        heard[mine - first] = True
-        return heard
+        received = np.zeros(stop - first, np.bool_)
+        received[mine - first] = True
+        return received
 
     def _samples(
         self, first: int, stop: int, demand: SetpointRows | None, offset: SetpointRows | None
     ) -> list[AxisSamples]:
         """Return samples [first, stop); nothing while the demand is unknown."""
-        heard = self._heard(first, stop)
+        received = self._heard(first, stop)
         grids = {name: dense(self._queues[name], first, stop + 1) for name in self.required}
         between = self._between(first, stop + 1)
         lost = self._count(grids, between, first)
         if demand is None:
             return []
-        lost += demand.lost + int(np.count_nonzero(~heard))
-        certain = demand.certain & heard
+        lost += demand.lost + int(np.count_nonzero(~received))
+        certain = demand.certain & received
         for key, (name, _) in self._places.items():
             back = self._voltage.rows_back if key in self._voltage.keys else 0
             certain &= grids[name].certain(between)[back : back + stop - first]

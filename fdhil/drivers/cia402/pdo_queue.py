@@ -129,9 +129,9 @@ class Dense:
         A late frame came after the next received SYNC: one too few before it, one too many behind it.
         """
         missing, spare = np.maximum(due - self.count, 0), np.where(due > 0, np.maximum(self.count - due, 0), 0)
-        heard = np.flatnonzero(due > 0)
+        received = np.flatnonzero(due > 0)
         late = np.zeros(due.size, np.int64)
-        late[heard[:-1]] = (missing[heard[:-1]] > 0) & (spare[heard[1:]] > 0)
+        late[received[:-1]] = (missing[received[:-1]] > 0) & (spare[received[1:]] > 0)
         return (missing - late)[:-1], late[:-1], spare[:-1]
 
 

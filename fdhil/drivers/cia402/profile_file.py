@@ -92,18 +92,18 @@ def _mapped(document: Mapping[str, Any], name: str, eds: Path | None) -> dict[st
         advice = "set drive.eds to the vendor's file for the drive"
         raise _fault(name, "tpdos", "are missing in this profile, and there is no EDS to derive them from", advice)
     device = read_device(eds)
-    told: dict[str, Any] = {"vendor_id": device.vendor_id or None}
+    defaults: dict[str, Any] = {"vendor_id": device.vendor_id or None}
     if unit := speed_unit_of(device.default(Object.VELOCITY_UNIT)):
-        told["speed_unit"] = unit
+        defaults["speed_unit"] = unit
     if not device.find((0x6078, 0)) and "current" not in document:
-        told |= {"current": (0x6077, 0), "current_unit": "permille_of_rated_torque"}
-    said = told | dict(document)
-    bare = profile_of(said | {"rpdos": (), "tpdos": ()}, name, name)
+        defaults |= {"current": (0x6077, 0), "current_unit": "permille_of_rated_torque"}
+    complete = defaults | dict(document)
+    bare = profile_of(complete | {"rpdos": (), "tpdos": ()}, name, name)
     fast = (bare.position, bare.speed, bare.statusword, bare.current, bare.voltage, bare.dc_link)
     slow = (bare.position_demand, bare.offset, (int(Object.MODE_DISPLAY), 0), bare.digital_inputs)
     rpdos = suggest_rpdos(device, bare.target, bare.offset, (bare.speed_offset, bare.torque_offset))
     tpdos = suggest_tpdos(device, [key for key in fast if key is not None], slow)
-    return said | {"rpdos": rpdos, "tpdos": tpdos}
+    return complete | {"rpdos": rpdos, "tpdos": tpdos}
 
 
 def _document(name: str, depth: int = 0) -> dict[str, Any]:

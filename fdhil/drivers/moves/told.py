@@ -98,48 +98,48 @@ class ToldG0:
         last = self._said[-1].state.nc_tick if self._said else None
         return last is not None and state.nc_tick is not None and state.nc_tick < last
 
-    def _where(self, said: Said) -> Said | None:
+    def _where(self, timed: Said) -> Said | None:
         """Locate a state by its set-points, else by the clocks; None while they are not aligned."""
-        if not self._alignment.possible(said.state):
-            return said
-        if self._alignment.offset is None or said.state.nc_tick is None:
+        if not self._alignment.possible(timed.state):
+            return timed
+        if self._alignment.offset is None or timed.state.nc_tick is None:
             return None
-        tick = said.state.nc_tick + self._alignment.offset
-        return Said(tick, tick, said.state)
+        tick = timed.state.nc_tick + self._alignment.offset
+        return Said(tick, tick, timed.state)
 
-    def _is_known(self, stretch: Stretch, newest: int) -> bool:
+    def _is_known(self, segment: Stretch, newest: int) -> bool:
         last = self._where(self._said[-1]) if self._said else None
-        return (last is not None and last.low > stretch.end) or newest - stretch.end > self._patience
+        return (last is not None and last.low > segment.end) or newest - segment.end > self._patience
 
-    def _tell(self, stretch: Stretch) -> Iterator[MoveEvent]:
-        said = self._about(stretch)
-        pieces = list(self._pieces(stretch, said))
-        for (begin, kind), (end, _) in pairwise([*pieces, (stretch.end, MoveKind.REST)]):
-            held = _held(_of_a_piece(said, begin - self._after_hold, end))
-            told = _move(_of_a_piece(said, begin, end), begin, kind, held)
+    def _tell(self, segment: Stretch) -> Iterator[MoveEvent]:
+        states = self._about(segment)
+        pieces = list(self._pieces(segment, states))
+        for (begin, kind), (end, _) in pairwise([*pieces, (segment.end, MoveKind.REST)]):
+            held = _held(_of_a_piece(states, begin - self._after_hold, end))
+            move = _move(_of_a_piece(states, begin, end), begin, kind, held)
             if kind is not self._kind:
-                yield MoveEvent(self._axis, kind, begin, self._source, told)
+                yield MoveEvent(self._axis, kind, begin, self._source, move)
             self._kind = kind
-        if not stretch.goes_on:
+        if not segment.goes_on:
             self._kind = MoveKind.REST
-            yield MoveEvent(self._axis, MoveKind.REST, stretch.end, self._source)
+            yield MoveEvent(self._axis, MoveKind.REST, segment.end, self._source)
 
-    def _about(self, stretch: Stretch) -> list[Said]:
+    def _about(self, segment: Stretch) -> list[Said]:
         """Return the states in a segment and the last before it, which was still valid; drop older ones."""
         placed = [found for found in map(self._where, self._said) if found is not None]
-        found = _of_a_piece(placed, stretch.begin - self._after_hold, stretch.end)
+        found = _of_a_piece(placed, segment.begin - self._after_hold, segment.end)
         while found and self._said[0].state is not found[0].state:
             self._said.popleft()
         return found
 
-    def _pieces(self, stretch: Stretch, said: Sequence[Said]) -> Iterator[tuple[int, MoveKind]]:
+    def _pieces(self, segment: Stretch, states: Sequence[Said]) -> Iterator[tuple[int, MoveKind]]:
         """Yield from which tick on a segment has which kind; at its first tick the axis does not move yet."""
-        within = [each for each in said if each.low > stretch.begin and each.high <= stretch.end]
+        within = [each for each in states if each.low > segment.begin and each.high <= segment.end]
         sure = [each for each in within if each.state.motion in MOVING]
         if not sure:
-            yield stretch.begin, MoveKind.UNKNOWN
+            yield segment.begin, MoveKind.UNKNOWN
             return
-        yield stretch.begin, sure[0].state.motion
+        yield segment.begin, sure[0].state.motion
         for one, other in pairwise(sure):
             if one.state.motion is other.state.motion:
                 continue
@@ -149,22 +149,22 @@ class ToldG0:
                 yield self._moving.slowest(math.floor(one.low), math.ceil(other.high)), other.state.motion
 
 
-def _of_a_piece(said: Sequence[Said], begin: int, end: int) -> list[Said]:
+def _of_a_piece(states: Sequence[Said], begin: int, end: int) -> list[Said]:
     """Return the states between two ticks, and the last before them, which was still valid."""
-    before = [each for each in said if each.high < begin]
-    return [*before[-1:], *(each for each in said if each.high >= begin and each.low <= end)]
+    before = [each for each in states if each.high < begin]
+    return [*before[-1:], *(each for each in states if each.high >= begin and each.low <= end)]
 
 
-def _held(said: Sequence[Said]) -> bool | None:
+def _held(states: Sequence[Said]) -> bool | None:
     """Return whether a feed hold was on; None where that is unknown."""
-    holds = [each.state.held for each in said if each.state.feed_hold is not None or each.state.held]
+    holds = [each.state.held for each in states if each.state.feed_hold is not None or each.state.held]
     return any(holds) if holds else None
 
 
-def _move(said: Sequence[Said], begin: int, kind: MoveKind, held: bool | None) -> NcMove:
+def _move(timed: Sequence[Said], begin: int, kind: MoveKind, held: bool | None) -> NcMove:
     """Summarise the states of a move; its line is the first one reported while it ran."""
-    states = [each.state for each in said]
-    own = [each.state for each in said if each.low > begin and each.state.motion is kind]
+    states = [each.state for each in timed]
+    own = [each.state for each in timed if each.low > begin and each.state.motion is kind]
     overrides = [override for state in states if (override := _override(state, kind)) is not None]
     return NcMove(
         line=next((state.line for state in own if state.line is not None), None),

@@ -55,12 +55,12 @@ class IsoBlocks:
         """Return how the block moves; None without a word of its own where blocks may have been skipped."""
         code = _COMMENT.sub(" ", text)
         words = [(int(word[1]), bool((word[2] or "").strip(".0"))) for word in _G.finditer(code)]
-        told = {G_WORDS.get(number) for number, form in words if number in G_WORDS and not form}
+        motions = {G_WORDS.get(number) for number, form in words if number in G_WORDS and not form}
         follows = line is not None and self._line is not None and 0 <= line - self._line <= 1
-        if _orders_another(words, code, bool(told)):
+        if _orders_another(words, code, bool(motions)):
             self._held = None
-        elif told:
-            self._held = told.pop() if len(told) == 1 else None
+        elif motions:
+            self._held = motions.pop() if len(motions) == 1 else None
         elif not follows:
             self._held = None
         # a line may arrive before its block: far from the last one, with the former text

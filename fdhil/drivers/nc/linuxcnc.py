@@ -85,10 +85,10 @@ class LinuxCnc:
         while not self._waiting:
             await self._receive()
         line = self._waiting.popleft()
-        told = decode_line(line)
-        if told is None:
+        message = decode_line(line)
+        if message is None:
             raise ProtocolError(self.name, f"sent {line[:60]!r}, which is not a state; is this the bridge's port?")
-        return told
+        return message
 
     async def _receive(self) -> None:
         assert self._reader is not None
@@ -103,34 +103,34 @@ class LinuxCnc:
         if len(self._rest) > MOST_BYTES:
             raise ProtocolError(self.name, "sends no lines of text; is this the bridge's port?")
 
-    def _greet(self, told: Mapping[str, Any]) -> None:
-        period_s = told.get("servo_period_s")
-        if told.get("schema") != SCHEMA or not isinstance(period_s, float) or not 1e-5 < period_s < 1.0:
+    def _greet(self, message: Mapping[str, Any]) -> None:
+        period_s = message.get("servo_period_s")
+        if message.get("schema") != SCHEMA or not isinstance(period_s, float) or not 1e-5 < period_s < 1.0:
             raise ProtocolError(
                 self.name, f"is not a bridge of this fdhil ({SCHEMA}); load the bridge that came with it"
             )
         self._period_s = period_s
 
-    def _state(self, told: Mapping[str, Any]) -> NcState:
+    def _state(self, message: Mapping[str, Any]) -> NcState:
         try:
-            stamp_ns, error_ns = _whole(told["stamp_ns"]), _whole(told["error_ns"])
+            stamp_ns, error_ns = _whole(message["stamp_ns"]), _whole(message["error_ns"])
             if self._distant is not None:
                 stamp_ns -= self._distant.ahead_ns(stamp_ns, time.monotonic_ns())
                 error_ns += NETWORK_NS
             return NcState(
                 stamp_ns=stamp_ns,
                 error_ns=error_ns,
-                motion=MoveKind(told["motion"]),
-                line=_maybe(told, "line", _whole),
-                programmed_feed_mm_min=_maybe(told, "programmed_feed_mm_min", _finite),
-                feed_mm_min=_maybe(told, "feed_mm_min", _finite),
-                feed_override=_maybe(told, "feed_override", _finite),
-                rapid_override=_maybe(told, "rapid_override", _finite),
-                feed_hold=_maybe(told, "feed_hold", bool),
-                tool=_maybe(told, "tool", _whole),
-                program=_maybe(told, "program", str),
-                demand_mm=self._demand_mm(told["mm"]),
-                nc_tick=_whole(told["cycle"]),
+                motion=MoveKind(message["motion"]),
+                line=_maybe(message, "line", _whole),
+                programmed_feed_mm_min=_maybe(message, "programmed_feed_mm_min", _finite),
+                feed_mm_min=_maybe(message, "feed_mm_min", _finite),
+                feed_override=_maybe(message, "feed_override", _finite),
+                rapid_override=_maybe(message, "rapid_override", _finite),
+                feed_hold=_maybe(message, "feed_hold", bool),
+                tool=_maybe(message, "tool", _whole),
+                program=_maybe(message, "program", str),
+                demand_mm=self._demand_mm(message["mm"]),
+                nc_tick=_whole(message["cycle"]),
                 nc_period_s=self._period_s,
             )
         except (KeyError, ValueError, TypeError, AttributeError, OverflowError) as error:
@@ -145,8 +145,8 @@ class LinuxCnc:
         return {name: place * self._mm_per_degree.get(name, 1.0) for name, place in found.items()}
 
 
-def _maybe(told: Mapping[str, Any], key: str, kind: Any) -> Any:
-    value = told.get(key)
+def _maybe(message: Mapping[str, Any], key: str, kind: Any) -> Any:
+    value = message.get(key)
     return None if value is None else kind(value)
 
 

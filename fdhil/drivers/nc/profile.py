@@ -65,10 +65,10 @@ class Rule:
 
     def holds(self, values: Mapping[str, Shown]) -> bool | None:
         """Return whether it is met; None where that depends on a missing value."""
-        told = {name: values.get(name) for name in self.when}
-        if any(value is not None and not self.when[name].holds(value) for name, value in told.items()):
+        needed = {name: values.get(name) for name in self.when}
+        if any(value is not None and not self.when[name].holds(value) for name, value in needed.items()):
             return False
-        return None if None in told.values() else True
+        return None if None in needed.values() else True
 
 
 @dataclass(frozen=True, slots=True)

@@ -95,12 +95,12 @@ class StreamedAccelerometer:
         lost_before = self.lost
         for line in lines:
             try:
-                told = self._numbers(line.text)
+                sample = self._numbers(line.text)
             except ProtocolError:  # the first line may be incomplete; others are damaged
                 if line is lines[-1] and len(lines) > 1 and not self._held:
                     raise
                 continue
-            self._held.append(self._counted(*told))
+            self._held.append(self._counted(*sample))
             self.samples += 1
             self._waiting.append((self._held[-1][0], line.t_ns))
         while self._waiting and ticks.covers(self._waiting[0][1] + SETTLED_NS):
@@ -119,24 +119,24 @@ class StreamedAccelerometer:
         numbers = _NUMBER.findall(text)
         if len(numbers) < max(s.column, s.count_column):
             wanted = max(s.column, s.count_column)
-            told = f"the line {text[:40]!r} has {len(numbers)} numbers, but column {wanted} is configured"
-            raise ProtocolError(self.name, f"{told}; compare column and count_column with what the sensor sends")
+            cause = f"the line {text[:40]!r} has {len(numbers)} numbers, but column {wanted} is configured"
+            raise ProtocolError(self.name, f"{cause}; compare column and count_column with what the sensor sends")
         count = int(float(numbers[s.count_column - 1])) if s.count_column else None
         return count, float(numbers[s.column - 1]) * s.scale
 
-    def _counted(self, told: int | None, value: float) -> tuple[int, float]:
+    def _counted(self, count: int | None, value: float) -> tuple[int, float]:
         """Unwrap the count; an implausible step begins another stream."""
         before = self._newest
-        step = 1 if told is None or self._told is None else _step(self._told, told)
+        step = 1 if count is None or self._told is None else _step(self._told, count)
         if before is None or not 1 <= step <= LARGEST_GAP:
             self._held.clear()
             self._waiting.clear()
             self._arrivals = Arrivals(self._settings.rate_hz, self._period_s)
-            self._newest = told or 0
+            self._newest = count or 0
         else:
             self.lost += step - 1
             self._newest = before + step
-        self._told = told
+        self._told = count
         return self._newest, value
 
     def _placed(self) -> list[TableSamples]:
@@ -154,7 +154,7 @@ class StreamedAccelerometer:
         ]
 
 
-def _step(before: int, told: int) -> int:
+def _step(before: int, count: int) -> int:
     """Return the increase of a count, which may have wrapped at the next power that devices use."""
     wrap = next((w for w in WRAPS if w > before), WRAPS[-1])
-    return told - before if told > before else told - before + wrap
+    return count - before if count > before else count - before + wrap
