@@ -25,9 +25,9 @@ class SlidewayThermometer:
         self._period_s = settings.period_s
         self._meter: Meter
         if settings.source == "serial":
-            self._meter = TextMeter(self.name, settings, settings, settings.period_s)
+            self._meter = TextMeter(self.name, settings)
         else:
-            self._meter = ModbusMeter(self.name, settings, settings, settings.type, PLAUSIBLE_C[1])
+            self._meter = ModbusMeter(self.name, settings, PLAUSIBLE_C[1])
 
     @property
     def link(self) -> Link:

@@ -2,23 +2,21 @@
 
 import math
 
-from fdhil.config.sensors import ModbusPlace, ValueType
 from fdhil.drivers.modbus.link import ModbusLink
-from fdhil.drivers.modbus.values import LIKELY, SMALLEST, ValuePlace, numbers, other_orders, registers_of
+from fdhil.drivers.modbus.values import LIKELY, SMALLEST, RegisterSensor, numbers, other_orders, registers_of
 from fdhil.errors import ProtocolError
 
 
 class ModbusMeter:
-    """One value of a unit, of type ``kind``, read with one request; valid values are below ``most``."""
+    """One value of a unit, read with one request so that it is not torn; valid values are below ``most``."""
 
     tells_by_itself = False
 
-    def __init__(
-        self, name: str, place: ModbusPlace, where: ValuePlace, kind: ValueType, most: float = LIKELY[1]
-    ) -> None:
+    def __init__(self, name: str, settings: RegisterSensor, most: float = LIKELY[1]) -> None:
+        assert settings.type is not None
         self.name = name
-        self.link = ModbusLink(name, place)
-        self._where, self._kind, self._most = where, kind, most
+        self.link = ModbusLink(name, settings)
+        self._where, self._kind, self._most = settings, settings.type, most
         self.asked_ns = self.answered_ns = 0
         self._registers: list[int] = []
 

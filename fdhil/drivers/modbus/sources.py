@@ -15,4 +15,4 @@ def modbus_voltage(axis: str, config: MachineConfig) -> ModbusVoltage | MeterVol
     if settings.block is not None:
         return BlockVoltage(axis, config)
     most = BEYOND_LIMIT * config.axis[axis].regulators.voltage_limit_v
-    return MeterVoltage(axis, config, ModbusMeter(f"voltage sensor {axis}", settings, settings, settings.type, most))
+    return MeterVoltage(axis, config, ModbusMeter(f"voltage sensor {axis}", settings, most))

@@ -4,13 +4,15 @@ import itertools
 import math
 import struct
 from collections.abc import Sequence
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
+from fdhil.config import TableEncoder, Thermometer, Voltage
 from fdhil.records import Float
 
 WordOrder = Literal["big", "little"]
+RegisterSensor = Voltage | Thermometer | TableEncoder
 ORDERS: tuple[WordOrder, ...] = ("big", "little")
 SMALLEST = 1e-30  # smaller floats have wrong words or type
 LIKELY = (1e-6, 1e6)  # range of instruments, in their own unit
@@ -56,24 +58,7 @@ def uint32(registers: Sequence[int], at: int = 0) -> int:
     return registers[at] << 16 | registers[at + 1]
 
 
-class ValuePlace(Protocol):
-    """Location and scale of a value: the keys of :class:`fdhil.config.sensors.ModbusValue` and ``scale``."""
-
-    @property
-    def function(self) -> int: ...
-    @property
-    def address(self) -> int: ...
-    @property
-    def word_order(self) -> WordOrder: ...
-    @property
-    def byte_order(self) -> WordOrder: ...
-    @property
-    def scale(self) -> float: ...
-    @property
-    def offset(self) -> float: ...
-
-
-def other_orders(registers: Sequence[int], kind: str, where: ValuePlace, most: float = LIKELY[1]) -> str:
+def other_orders(registers: Sequence[int], kind: str, where: RegisterSensor, most: float = LIKELY[1]) -> str:
     """Describe, for a message, the first value in other word and byte orders.
 
     Only plausible values are named: 0, or between ``LIKELY[0]`` and ``most``, scaled.

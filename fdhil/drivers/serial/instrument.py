@@ -2,9 +2,8 @@
 
 import re
 import time
-from typing import Protocol
 
-from fdhil.config import MachineConfig
+from fdhil.config import MachineConfig, Thermometer, Voltage
 from fdhil.config.sensors import SerialPlace
 from fdhil.drivers.meter import MeterVoltage
 from fdhil.drivers.serial.lines import LineReader
@@ -15,23 +14,11 @@ FIRST_NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
 SHOWN = 40  # characters of a line in a message
 
 
-class TextPlace(Protocol):
-    """Query and pattern of an instrument: the keys of :class:`fdhil.config.sensors.TextValue`."""
-
-    @property
-    def query(self) -> str: ...
-    @property
-    def pattern(self) -> str: ...
-    @property
-    def scale(self) -> float: ...
-    @property
-    def offset(self) -> float: ...
-
-
 class SerialLink:
-    """The serial line to one instrument; ``name`` is used in messages."""
+    """The serial line to one device; ``name`` is used in messages."""
 
     wire = "serial"
+    timeout_code = "SerialTimeout"
 
     def __init__(self, name: str, place: SerialPlace) -> None:
         self.name = name
@@ -47,7 +34,7 @@ class SerialLink:
 
     def fault_code(self, error: DeviceError) -> str | None:
         if isinstance(error, DeviceTimeout):
-            return "SerialTimeout"
+            return self.timeout_code
         return "SerialPortGone" if isinstance(error, ConnectError) else "SerialShape"
 
     def close(self) -> None:
@@ -57,14 +44,14 @@ class SerialLink:
 class TextMeter:
     """One number of an instrument's line."""
 
-    def __init__(self, name: str, place: SerialPlace, text: TextPlace, period_s: float) -> None:
+    def __init__(self, name: str, settings: Voltage | Thermometer) -> None:
         self.name = name
-        self.link = SerialLink(name, place)
+        self.link = SerialLink(name, settings)
         self._lines = LineReader(self.link.port, name)
-        self._text, self._timeout_s = text, place.timeout_s
-        self._number = re.compile(text.pattern or FIRST_NUMBER)
-        self.tells_by_itself = not text.query
-        self._wait_s = place.timeout_s + (period_s if self.tells_by_itself else 0.0)
+        self._text = settings
+        self._number = re.compile(settings.pattern or FIRST_NUMBER)
+        self.tells_by_itself = not settings.query
+        self._wait_s = settings.timeout_s + (settings.period_s if self.tells_by_itself else 0.0)
         self.asked_ns = self.answered_ns = 0
         self._line = ""
 
@@ -103,6 +90,4 @@ class TextMeter:
 
 
 def serial_voltage(axis: str, config: MachineConfig) -> MeterVoltage:
-    settings = config.axis[axis].voltage
-    meter = TextMeter(f"voltage sensor {axis}", settings, settings, settings.period_s)
-    return MeterVoltage(axis, config, meter)
+    return MeterVoltage(axis, config, TextMeter(f"voltage sensor {axis}", config.axis[axis].voltage))

@@ -8,10 +8,10 @@ import numpy as np
 
 from fdhil.config import Accelerometer
 from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.serial.instrument import SerialLink
 from fdhil.drivers.serial.lines import LineReader, TextLine
-from fdhil.drivers.serial.port import SerialPort
 from fdhil.drivers.table.arrivals import Arrivals
-from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
+from fdhil.errors import DeviceTimeout, ProtocolError
 from fdhil.records import Notice, TableSamples, frozen
 
 SILENCE_NS = 1_000_000_000
@@ -21,23 +21,19 @@ LARGEST_GAP = 5000  # samples that may be lost at once; a larger step is another
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
-class SerialStream:
-    """The connection to a free-running device."""
+class SerialStream(SerialLink):
+    """The serial line to a free-running device."""
 
-    wire = "serial"
+    timeout_code = "TableSilent"
 
     def __init__(self, name: str, settings: Accelerometer) -> None:
-        self.name, self.place = name, settings.device
-        self._port = SerialPort(settings)
-        self._reader = LineReader(self._port, name)
+        super().__init__(name, settings)
+        self.place = settings.device
+        self._reader = LineReader(self.port, name)
         self._heard_ns = 0
 
-    @property
-    def connected(self) -> bool:
-        return self._port.is_open
-
     async def connect(self) -> None:
-        self._port.open(self.name)
+        await super().connect()
         self._heard_ns = time.monotonic_ns()
 
     async def lines(self) -> list[TextLine]:
@@ -53,14 +49,6 @@ class SerialStream:
                 self.name, f"nothing comes from {self.place}; check that the sensor streams, and its rate"
             )
         return found
-
-    def fault_code(self, error: DeviceError) -> str | None:
-        if isinstance(error, DeviceTimeout):
-            return "TableSilent"
-        return "SerialPortGone" if isinstance(error, ConnectError) else "SerialShape"
-
-    def close(self) -> None:
-        self._port.close()
 
 
 class StreamedAccelerometer:

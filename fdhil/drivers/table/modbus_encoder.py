@@ -20,7 +20,7 @@ class ModbusEncoder:
         self.axis = axis
         self.name = f"table encoder {axis}"
         self.samples = 0
-        self._meter = ModbusMeter(self.name, settings, settings, settings.type)
+        self._meter = ModbusMeter(self.name, settings)
         self._period_s = settings.period_s
 
     @property
