@@ -136,7 +136,6 @@ class Drive(Section):
     @model_validator(mode="before")
     @classmethod
     def _hal_defaults(cls, given: Any) -> Any:
-        """Fill in what HAL fixes: its profile, and set-points that act in their own cycle."""
         if isinstance(given, dict) and given.get("source", "hal" if "hal" in given else "") == "hal":
             return {
                 "source": "hal",

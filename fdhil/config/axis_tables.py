@@ -78,7 +78,6 @@ def _table(value: Any) -> Mapping[str, Any]:
 
 
 def _taken_over(first: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge the keys of the second drive with those of the first, without its node-ID and sensors."""
     taken = {key: value for key, value in first.items() if key not in _OWN_SENSORS}
     for key, value in own.items():
         below = taken.get(key)
@@ -120,7 +119,6 @@ def _lengths(table: Any, factor: float, path: str, faults: list[ConfigFault]) ->
 
 
 def _scaled(value: Any, factor: float) -> Any:
-    """Multiply a number or a list of numbers; anything else is left for the models to refuse."""
     if isinstance(value, list | tuple):
         return [_scaled(item, factor) for item in value]
     return value * factor if _is_number(value) else value

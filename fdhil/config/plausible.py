@@ -128,7 +128,6 @@ def _spaced(unit: str) -> str:
 
 
 def _mends(slip: Slip, numbers: Numbers, broken: list[Relation]) -> bool:
-    """Return whether reading the number in that unit makes every relation ordinary and explains all broken ones."""
     if not all(slip.key in relation.keys for relation in broken):
         return False
     tried = {**numbers, slip.key: numbers[slip.key] * slip.factor}

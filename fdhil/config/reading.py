@@ -149,7 +149,6 @@ def _placed_guard(guard: Guard, folder: Path) -> Guard:
 
 
 def _as_written(fault: ConfigFault, rotary: Mapping[str, float]) -> ConfigFault:
-    """Return a fault of a rotary axis with the key that its file has; numbers in it are lengths at the radius."""
     parts = fault.path.removeprefix("sim.").split(".")
     key = angular(parts[-1])
     if parts[0] != "axis" or len(parts) < 3 or parts[1] not in rotary or not (key != parts[-1] or "_um" in key):

@@ -52,7 +52,6 @@ class Regulators(Section):
 
     @model_validator(mode="after")
     def _integrals(self) -> Regulators:
-        """Refuse a gain that the structure would ignore silently, and a missing one that makes it another structure."""
         if self.structure == "p_pi_pi" and self.position_ki_per_s2:
             raise ValueError("structure p_pi_pi has no position_ki_per_s2; set structure = 'double_pi'")
         if self.structure == "double_pi" and not self.position_ki_per_s2:

@@ -69,7 +69,6 @@ class BusSource:
         return [event for source in self._events for event in source.feed(state)]
 
     def _stamping(self, bus: ListenedBus) -> list[Notice]:
-        """Report once how accurate the time stamps are, where they are worse than the kernel's."""
         cost = STAMPS_COST.get(bus.stamps)
         if cost is None or self._stamping_told or not bus.counters()["frames"]:
             return []

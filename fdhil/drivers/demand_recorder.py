@@ -40,8 +40,6 @@ class RecordedDemand:
 
 @dataclass(slots=True)
 class _Sniffed:
-    """One axis: blocks of ticks and demands; before any motion only the newest block."""
-
     ticks: list[Int]
     demands: list[Float]
     newest: int = -1

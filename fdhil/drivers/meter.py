@@ -54,8 +54,6 @@ class Meter(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class _Value:
-    """A value, its number, and the earliest and latest time of its reading (host-monotonic ns)."""
-
     number: int
     volts: float
     asked_ns: int
@@ -127,7 +125,6 @@ class MeterVoltage:
         return _Value(number, volts, self._meter.asked_ns, self._meter.answered_ns)
 
     async def _hear(self) -> _Value:
-        """Wait for the next value of a free-running sensor; an unreadable one is a gap."""
         self._asked += 1
         try:
             volts = await self._volts()

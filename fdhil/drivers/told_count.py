@@ -31,7 +31,6 @@ class ToldCount:
         return self._number
 
     def _settle(self, t_ns: int) -> None:
-        """Correct the number of the newest value, which came at ``t_ns`` and in time."""
         ahead = t_ns - self._number * self._period_ns
         behind = (ahead - min(self._early)) / self._period_ns if self._early else 0.0
         if abs(behind) > LATE:

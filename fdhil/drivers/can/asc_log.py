@@ -130,7 +130,6 @@ def read(path: Path, skipped: Counter[str]) -> Iterator[LoggedFrame]:
 
 
 def _frame(words: Sequence[str], t_ns: int, head: _Head) -> LoggedFrame | None:
-    """Return the frame of an event, None for another event; ValueError, IndexError for a damaged one."""
     is_fd = words[0] == "CANFD"
     words = words[1:] if is_fd else words
     if not words[0].isdecimal() or len(words) < 2:
@@ -158,7 +157,6 @@ def _classic_frame(words: Sequence[str], t_ns: int, bus: str, can_id: int, base:
 
 
 def _fd_frame(words: Sequence[str], t_ns: int, bus: str, can_id: int, base: int, sent: bool) -> LoggedFrame:
-    """Parse a CANFD event, which is a classic frame where its flags are unset."""
     words = words if words[0] in ("0", "1") else words[1:]  # a symbolic name
     dlc, length = int(words[2], 16), int(words[3])
     data, rest = bytes(int(word, base) for word in words[4 : 4 + length]), words[4 + length :]

@@ -84,7 +84,6 @@ class CanBus:
         return self._port.stamps
 
     def _receive(self) -> None:
-        """Run the receive thread, which only appends; its end is reported, never swallowed."""
         try:
             while not self._stopping.is_set():
                 if self._port.holds_back and 2 * self._ring.room < self._ring_frames:

@@ -40,8 +40,6 @@ class ConvertedLog:
 
 @dataclass(slots=True)
 class _Survey:
-    """Properties of all frames of a log, and what the target format cannot hold of them."""
-
     source: str
     format_name: str
     frames: int = 0

@@ -84,7 +84,6 @@ class NodeWatch:
         return notices
 
     def _after_an_outage(self, t_ns: int) -> list[Notice]:
-        """Report recovery only after a regular heartbeat for a while, so that an outage gives two notices."""
         if self._back_since_ns is None or t_ns - self._beats[-1] > self._longest_gap_ns():
             self._back_since_ns, self._beats = t_ns, []
             return []

@@ -137,7 +137,6 @@ class SdoLink:
         raise SdoTooLarge(self.device, text)
 
     def _guarded(self, index: int, sub: int, call: Any) -> Any:
-        """Call the library and translate its errors into one sentence each; after a time-out wait for silence first."""
         if self._late:
             self._be_quiet()
         try:

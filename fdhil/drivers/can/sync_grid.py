@@ -80,7 +80,7 @@ class SyncGrid:
         return Ticked(can_id, length, data, tick, TickTimes(ticks, stamps), self._last_tick, notices)
 
     def _ticks(self, syncs: Frames) -> Int:
-        """Return the tick of every SYNC; -1 for a duplicate or one out of order."""
+        """Return the tick of every SYNC, -1 for a duplicate or one out of order."""
         counters = (syncs["data"] & np.uint64(0xFF)).astype(np.int64)
         counted = syncs["dlc"] > 0
         regular = np.arange(1, syncs.size + 1) + self._last_tick
@@ -115,7 +115,6 @@ class SyncGrid:
         self._producers.regular(syncs.size, counter)
 
     def _step(self, counter: int | None, t_ns: int) -> int:
-        """Return the tick of one SYNC of an irregular block, or -1."""
         self._producers.irregular(counter, self._range)
         if counter is None or self._last_counter is None:
             return self._uncounted(counter, t_ns)

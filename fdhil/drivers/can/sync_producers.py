@@ -55,7 +55,6 @@ class SyncProducers:
         return sum(self._returned) > HISTORY // 3 or (self._newest is None and self._early_and_late())
 
     def _early_and_late(self) -> bool:
-        """Return whether each period contains two SYNCs that are not half a period apart."""
         if not self._realtime or len(self._stamps_ns) <= HISTORY:
             return False
         steps = np.diff(np.array(self._stamps_ns, dtype=np.int64)) / self._period_ns

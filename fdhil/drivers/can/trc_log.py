@@ -108,7 +108,6 @@ def _frame(line: str, columns: Sequence[str], head: _Head) -> LoggedFrame | None
 
 
 def _dlc(row: Mapping[str, str], fd: int | None) -> int:
-    """Return the data length code; column l has a length instead."""
     if "L" in row:
         return int(row["L"])
     return fd_dlc(int(row["l"])) if fd is not None else int(row["l"])

@@ -158,7 +158,6 @@ class Cia402Decoder:
     def _samples(
         self, first: int, stop: int, demand: SetpointRows | None, offset: SetpointRows | None
     ) -> list[AxisSamples]:
-        """Return samples [first, stop); nothing while the demand is unknown."""
         received = self._heard(first, stop)
         grids = {name: dense(self._queues[name], first, stop + 1) for name in self.required}
         between = self._between(first, stop + 1)
@@ -270,7 +269,6 @@ class Cia402Decoder:
         )
 
     def _shown(self, key: ObjectKey, first: int, stop: int) -> tuple[Int, Int]:
-        """Return ticks and values of an object in a slower TPDO; empty when the profile does not map it."""
         if key not in self._shown_places:
             return np.empty(0, np.int64), np.empty(0, np.int64)
         name, entry = self._shown_places[key]

@@ -89,7 +89,6 @@ def _has_cob_id(place: PdoPlace, bases: Sequence[int]) -> bool:
 
 
 def _cob_base(place: PdoPlace, bases: Sequence[int]) -> int:
-    """Return CiA 301's default for the first four PDOs, else the device's own."""
     return bases[place.number - 1] if place.number <= len(bases) else place.cob_base or 0
 
 

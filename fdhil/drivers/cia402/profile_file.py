@@ -87,7 +87,6 @@ def read_profile(name: str, eds: Path | None = None) -> DriveProfile:
 
 
 def _mapped(document: Mapping[str, Any], name: str, eds: Path | None) -> dict[str, Any]:
-    """Add the PDOs that the EDS offers to a profile without PDOs; ConfigError without an EDS."""
     if eds is None:
         advice = "set drive.eds to the vendor's file for the drive"
         raise _fault(name, "tpdos", "are missing in this profile, and there is no EDS to derive them from", advice)

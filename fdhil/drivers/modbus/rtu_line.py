@@ -119,7 +119,6 @@ class RtuLine:
         return Answer(registers, min(asked_ns, answered_ns), answered_ns)
 
     async def _late_answers(self, name: str) -> None:
-        """Receive after an unanswered request, until the late answer has come or time is up."""
         stale, data = bool(self._port.discard()), b""
         self._owed.forget(time.monotonic_ns())
         while self._owed and time.monotonic_ns() < self._late_until_ns:
@@ -130,7 +129,6 @@ class RtuLine:
         self.counted["ModbusStale"] += stale or bool(data)
 
     async def _fall_silent(self) -> None:
-        """Wait until the line was silent for 3.5 characters, and discard what was received."""
         while True:
             last_ns = max(self._busy_until_ns, self._port.last_ns)
             left_ns = last_ns + round(self.silence_s * 1e9) - time.monotonic_ns()

@@ -41,8 +41,6 @@ class _Nonsense(ModbusException):
 
 
 class _OtherUnit(ModbusException):
-    """Another unit than the addressed one answered; ``unit`` is its number."""
-
     def __init__(self, unit: int) -> None:
         super().__init__(f"unit {unit}")
         self.unit = unit

@@ -175,7 +175,6 @@ class ModbusVoltage:
         return self._tick_clock.line() if self._tick_clock else None
 
     def _unseen(self, block: SensorBlock) -> SensorBlock:
-        """Drop samples that came before; a count that decreased is a restarted sensor."""
         if self._next is None or block.newest + 1 < self._next:
             return block
         known = min(max(0, self._next - block.first), block.volts.size)

@@ -23,8 +23,6 @@ SAME_PERIOD = 1e-3
 
 @dataclass(slots=True)
 class _Group:
-    """Set-points of the moving axis, and the offsets that remain to be tried."""
-
     cycle: list[int] = field(default_factory=list)
     demand_mm: list[float] = field(default_factory=list)
     next_offset: int = 0
@@ -100,7 +98,6 @@ class DemandAlignment:
             self._try(group)
 
     def _try(self, group: _Group) -> None:
-        """Try the offsets that the received demand covers, the smallest first."""
         cycle, demand = np.array(group.cycle), np.array(group.demand_mm)
         newest = self._first_tick + self._bus.size - 1 - group.cycle[-1]
         if self.offset is not None:

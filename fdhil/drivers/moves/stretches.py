@@ -62,7 +62,6 @@ class Stretches:
         return found
 
     def _piece(self, side: int, begin: int, end: int) -> list[Stretch]:
-        """Process a piece that moves in one direction, or stands still (0), between two ticks."""
         if side == 0:
             if self._side and self._still is None:
                 self._still = begin

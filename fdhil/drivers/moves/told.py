@@ -79,7 +79,6 @@ class ToldG0:
             yield from self._tell(self._waiting.popleft())
 
     def _place_new(self) -> None:
-        """Locate the NC's states by the clocks, once the SYNCs of that time have arrived."""
         while self._new:
             state = self._new[0]
             begin_ns, end_ns = state.stamp_ns - state.error_ns, state.stamp_ns + state.error_ns
@@ -150,13 +149,11 @@ class ToldG0:
 
 
 def _of_a_piece(states: Sequence[Said], begin: int, end: int) -> list[Said]:
-    """Return the states between two ticks, and the last before them, which was still valid."""
     before = [each for each in states if each.high < begin]
     return [*before[-1:], *(each for each in states if each.high >= begin and each.low <= end)]
 
 
 def _held(states: Sequence[Said]) -> bool | None:
-    """Return whether a feed hold was on; None where that is unknown."""
     holds = [each.state.held for each in states if each.state.feed_hold is not None or each.state.held]
     return any(holds) if holds else None
 

@@ -62,7 +62,6 @@ class MtConnect:
         await self._open.aclose()
 
     async def _current(self) -> tuple[Streams, int, int]:
-        """Return the current state with the times of request and answer."""
         asked_ns = time.monotonic_ns()
         try:
             async with asyncio.timeout(ANSWER_S), get(self.name, f"{self._place}/current", ANSWER_S) as response:
@@ -90,7 +89,6 @@ class MtConnect:
         return response
 
     def _choose(self, streams: Streams) -> None:
-        """Find the profile's signals among the data items; ProtocolError names missing ones."""
         components = chosen(streams.components, self._settings.device, self._settings.path, self.name)
         found = {name: items_at(components, signal.at) for name, signal in self._profile.signals.items()}
         lacking = [
@@ -128,7 +126,6 @@ class MtConnect:
         return states
 
     def _states(self, streams: Streams) -> Iterator[NcState]:
-        """Yield a state for each instant of a document, and one for a document without changes."""
         if streams.instance != self._instance:
             raise ProtocolError(self.name, "the agent was restarted; it is read from the beginning")
         came_ns = time.monotonic_ns()

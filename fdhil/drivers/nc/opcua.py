@@ -139,7 +139,6 @@ async def _within(seconds: float) -> AsyncIterator[None]:
 
 
 def _shown(value: ua.DataValue) -> Shown:
-    """Return a good value; None for a bad one, and for what is neither number nor text."""
     if value.Value is None or (value.StatusCode is not None and not value.StatusCode.is_good()):
         return None
     plain: Any = value.Value.Value

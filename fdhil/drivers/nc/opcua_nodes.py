@@ -13,8 +13,6 @@ PATH = "Objects/"
 
 
 class _Browser:
-    """Browses nodes, each once."""
-
     def __init__(self, client: Client) -> None:
         self._client = client
         self._below: dict[ua.NodeId, list[tuple[str, ua.NodeId]]] = {}

@@ -113,7 +113,6 @@ class Translator:
         return NcState(stamp_ns, error_ns, self._profile.motion(values), **fields)
 
     def _field(self, name: str, value: Shown) -> Any:
-        """Convert a field of NcState; a missing value, and a number that means none, is None."""
         if value is None:
             return None
         try:
@@ -136,7 +135,6 @@ def _taken(signal: Signal, shown: Shown) -> Shown:
 
 
 def _number(value: Shown) -> float | None:
-    """Return a number, also of a text; None where it is none."""
     if isinstance(value, tuple) or value is None:
         return None
     try:

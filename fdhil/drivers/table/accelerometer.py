@@ -102,7 +102,6 @@ class StreamedAccelerometer:
         return out
 
     def _numbers(self, text: str) -> tuple[int | None, float]:
-        """Return count and value of a line; ProtocolError where they are missing."""
         s = self._settings
         numbers = _NUMBER.findall(text)
         if len(numbers) < max(s.column, s.count_column):
@@ -113,7 +112,6 @@ class StreamedAccelerometer:
         return count, float(numbers[s.column - 1]) * s.scale
 
     def _counted(self, count: int | None, value: float) -> tuple[int, float]:
-        """Unwrap the count; an implausible step begins another stream."""
         before = self._newest
         step = 1 if count is None or self._told is None else _step(self._told, count)
         if before is None or not 1 <= step <= LARGEST_GAP:

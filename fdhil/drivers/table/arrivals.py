@@ -45,7 +45,6 @@ class Arrivals:
         return Line(origin, float(earliest), step, float(usual - earliest) + step / 2)
 
     def _step(self, counter: np.ndarray, tick: np.ndarray) -> float:
-        """Return the ticks per sample: the slope through the earlier half of the arrivals."""
         if counter.size < LEAST_FOR_RATE or tick[-1] - tick[0] < self._least_span:
             return self._nominal
         slope, _ = np.polyfit(counter, tick, 1)
