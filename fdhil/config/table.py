@@ -53,7 +53,7 @@ class TableEncoder(Scaled, ModbusValue, ModbusPlace):
 class Accelerometer(SerialPlace):
     """[axis.X.accelerometer]: an accelerometer at the table that streams a line of text per sample.
 
-    ADXL345 boards, as printers have them, do; the defaults are of one that sends ``count,x,y,z`` in counts of 3.9 mg.
+    ADXL345 boards of 3D printers do this; the defaults fit one that sends ``count,x,y,z`` in counts of 3.9 mg.
     """
 
     device: str = Field(min_length=1, description="the serial device, as /dev/ttyACM0 or /dev/serial/by-id/...")

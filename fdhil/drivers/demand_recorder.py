@@ -63,7 +63,7 @@ class _Sniffed:
 
 
 class DemandRecorder:
-    """Collects the records of a machine; ``done`` once all axes have rested ``rest_s`` after a motion.
+    """Collects the records of a machine; ``is_done`` once all axes have rested ``rest_s`` after a motion.
 
     ConfigError when the axes are on several buses, whose SYNC cycles have no common count.
     """

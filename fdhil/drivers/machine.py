@@ -25,7 +25,7 @@ __all__ = ["MachineSource", "Record", "open_machine"]
 
 
 class MachineSource:
-    """All sources of a machine; ``run`` hands over their records, ``counters`` returns their counts."""
+    """All sources of a machine; ``run`` hands over their records, ``read_counters`` returns their counts."""
 
     def __init__(self, config: MachineConfig, open_bus: OpenBus = CanBus) -> None:
         used = dict.fromkeys(axis.drive.bus for axis in config.axis.values())

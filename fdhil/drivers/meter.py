@@ -35,7 +35,7 @@ NEAR_S = 0.02
 
 class Meter(Protocol):
     """A sensor that shows one value. ``asked_ns`` and ``answered_ns`` (host-monotonic) enclose the time at which the
-    last one was true, apart from its filter; ``tells_by_itself`` where it is not polled."""
+    last one was true, apart from its filter; ``is_free_running`` where it is not polled."""
 
     asked_ns: int
     answered_ns: int

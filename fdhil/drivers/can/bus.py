@@ -54,7 +54,7 @@ class OpenBus(Protocol):
 class CanBus:
     """A bus that is received from; a context manager.
 
-    ``ended`` is the reason why the receive thread stopped (None while it runs).
+    ``end_reason`` is the reason why the receive thread stopped (None while it runs).
     """
 
     batch_s = BATCH_S

@@ -42,7 +42,7 @@ class FrameHistory:
         return frames[self._filled - begin :]
 
     def frames(self) -> Frames:
-        """Return the kept frames, oldest first; may be called from another thread than ``add``."""
+        """Return the kept frames, oldest first; may be called from another thread than ``add_frames``."""
         kept = np.concatenate([np.empty(0, FRAME), *list(self._chunks)])
         if not kept.size:
             return kept

@@ -41,8 +41,8 @@ class FrameRing:
     """A ring of frames between one writer (the receive thread) and one reader.
 
     Nothing is allocated while it runs. It lies on separate memory pages, since a reconnected bus has a new ring in
-    another thread. When the reader is late the newest frames are discarded and counted in ``overflowed``: the gap has a
-    known size, and no frame is torn.
+    another thread. When the reader is late the newest frames are discarded and counted in ``overflow_count``:
+    the gap has a known size, and no frame is torn.
     """
 
     def __init__(self, capacity: int = DEFAULT_RING_FRAMES) -> None:

@@ -37,7 +37,7 @@ def _name(index: int, sub: int) -> str:
 
 
 class SdoLink:
-    """The SDO channel of one node. ``deliver`` is called by the bus reader, everything else by one other thread.
+    """The SDO channel of one node. ``deliver_response`` is called by the bus reader, all else by one other thread.
 
     ``send`` puts a frame on the bus; ``patience`` multiplies the time-outs, for a slow simulated drive.
     """

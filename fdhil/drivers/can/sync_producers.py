@@ -17,7 +17,7 @@ _SURE = 4.0  # standard errors
 
 
 class SyncProducers:
-    """Monitors the SYNC of one bus; ``two`` is evaluated after each block."""
+    """Monitors the SYNC of one bus; ``has_two_producers`` is evaluated after each block."""
 
     def __init__(self, sync_period_s: float, realtime: bool) -> None:
         self._period_ns = sync_period_s * 1e9

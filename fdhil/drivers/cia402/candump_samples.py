@@ -38,7 +38,7 @@ def _frames(log: bytes) -> dict[str, Frames]:
         raise RecordingError(f"the log has more than {LARGEST_LOG >> 20} MiB, it is not read; shorten it")
     rows: dict[str, list[tuple[int, int, bytes]]] = {}
     for line in io.StringIO(log.decode("ascii", "replace")):
-        with contextlib.suppress(ValueError, IndexError):  # a line that was cut is no frame
+        with contextlib.suppress(ValueError, IndexError):  # skips truncated lines
             frame = parse_line(line)
             if frame.fd is None:
                 rows.setdefault(frame.bus, []).append((frame.t_ns, frame.can_id, frame.data))

@@ -1,7 +1,7 @@
 """Describes a drive model as data: its PDOs, the objects of its signals, and their units.
 
-A new vendor is a TOML file with the names of :class:`DriveProfile` (``profile_file`` reads it). An object that no PDO
-of the profile carries is not used: without ``offset`` (0x60B0) the drive is recorded but never corrected on line;
+A new vendor is a TOML file with the names of :class:`DriveProfile` (``drive_profile_file`` reads it). An object that no
+PDO of the profile carries is not used: without ``offset`` (0x60B0) the drive is recorded but never corrected on line;
 without ``voltage`` a separate sensor is needed.
 """
 

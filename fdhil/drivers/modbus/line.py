@@ -81,7 +81,7 @@ def no_answer(request: Request, advice: str = "check the device and its line") -
 
 class Line(Protocol):
     """A line to units: one request at a time, whoever the client. ``users`` are the units that need the line;
-    ``counted`` counts recovered faults by code."""
+    ``fault_counts`` counts recovered faults by code."""
 
     place: str
     users: MutableSet[object]

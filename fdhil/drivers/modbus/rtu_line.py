@@ -3,8 +3,8 @@
 An answer names its unit and function but not its request. So unrequested bytes are discarded before each request, and
 after a request that was not answered in time the line is monitored for as long again. An answer that is later still is
 recognised by its shape: while one is outstanding, no request of the same shape is sent before the unit has answered a
-probe of another shape (:mod:`fdhil.drivers.modbus.owed_answers`). Noise, or a fragment, is not an answer: the real one
-may still come, and must not be taken for the next request's.
+probe of another shape (:mod:`fdhil.drivers.modbus.outstanding_answers`). Noise, or a fragment, is not an answer:
+the real one may still come, and must not be taken for the next request's.
 """
 
 import asyncio

@@ -1,7 +1,7 @@
 """Reads the state of an NC through an interface of its own; ``tables.NC_SOURCES`` lists the interfaces.
 
 A source only reads: nothing it sends may change anything in the NC. It neither retries nor detects silence: its
-listener (:mod:`fdhil.drivers.nc.listener`) disconnects, reports the NC as UNKNOWN, and reconnects with growing pauses.
+listener (:mod:`fdhil.drivers.nc.nc_listener`) disconnects, reports the NC as UNKNOWN, and retries with growing pauses.
 """
 
 from collections.abc import Callable, Sequence

@@ -16,7 +16,7 @@ EFFECT = "Rapid moves cannot be recognised meanwhile; none is used for identific
 
 
 class NcListener:
-    """The NC of a machine, by its source of ``tables.NC_SOURCES``; ``counters`` counts states and failures."""
+    """The NC of a machine, by its source of ``tables.NC_SOURCES``; ``read_counters`` counts states and failures."""
 
     def __init__(self, config: MachineConfig) -> None:
         self._source = load_nc_source(config.g0.source)(config)

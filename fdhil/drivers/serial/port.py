@@ -18,7 +18,7 @@ _PARITY = {"even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD, "none": serial.
 class SerialPort(ByteStream):
     """A device opened exclusively. ``name`` is the sensor's, for messages.
 
-    A pseudo terminal has neither rate nor parity: ``wire_ns`` is 0 there.
+    A pseudo terminal has neither rate nor parity: ``compute_wire_ns`` is 0 there.
     """
 
     def __init__(self, place: SerialPlace) -> None:

@@ -12,7 +12,7 @@ CHARACTER_S = 11 / 19200  # the settings of its serial line are unknown
 
 
 class ServerPort(ByteStream, asyncio.Protocol):
-    """A TCP connection to a serial server. The times on its serial line are unknown: ``wire_ns`` is 0."""
+    """A TCP connection to a serial server. The times on its serial line are unknown: ``compute_wire_ns`` is 0."""
 
     character_s = CHARACTER_S
 
