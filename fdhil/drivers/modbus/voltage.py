@@ -76,8 +76,8 @@ def parse_block(name: str, registers: Sequence[int]) -> SensorBlock:
 class ModbusVoltage:
     """The voltage source ``modbus`` of one axis; ``poll_samples`` reads once and returns new samples.
 
-    A subclass implements ``latch_samples`` and ``read_block`` for its register map, and ``example_registers``, the input
-    registers from 0 on of a unit that answers, which the contract test serves.
+    A subclass implements ``latch_samples`` and ``read_block`` for its register map, and ``example_registers``, the
+    input registers from 0 on of a unit that answers, which the contract test serves.
     """
 
     example_registers: ClassVar[Sequence[int]] = ()
