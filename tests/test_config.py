@@ -1,4 +1,4 @@
-"""The machine configuration: every fault at once, each with its path and a suggestion."""
+"""The machine configuration: all faults are reported at once, each with its path and a suggestion."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_limits_that_cannot_be_ramped_down_in_time_are_refused() -> None:
 def test_increments_too_coarse_for_the_limits_are_refused(
     per_turn: int, limits: tuple[float, float, float], told: str
 ) -> None:
-    """With the resolution that would do: rounded up to one increment per SYNC they would be other limits."""
+    """The message gives the required resolution; rounded up to one increment per SYNC the limits would differ."""
     document = bench_document("X")
     names = ("max_offset_um", "max_speed_mm_s", "max_acceleration_mm_s2")
     document["axis"]["X"]["correction"] = dict(zip(names, limits, strict=True))
@@ -146,7 +146,7 @@ def test_a_heartbeat_of_ours_under_a_drives_node_id_is_refused(section: str) -> 
 
 
 def test_one_bus_by_two_names_is_refused() -> None:
-    """Every SYNC would be sent twice on it, and two drives of one node-ID would pass."""
+    """Every SYNC would be sent twice, and two drives with the same node-ID would be accepted."""
     place = {"interface": "socketcand", "host": "127.0.0.1", "port": 29536}
     document = bench_document() | {"bus": {"can0": place, "can1": place}}
     document["axis"]["Y"]["drive"] = {"node_id": 1, "bus": "can1"}
@@ -214,7 +214,7 @@ def test_a_number_out_of_its_range_is_told_with_the_range(section: str, key: str
 
 
 def test_every_number_of_every_section_has_a_range() -> None:
-    """Whatever the file says, the number that is used is finite and of a size that a machine may have."""
+    """Whatever the file contains, each number is finite and within what a machine can have."""
     open_ended = []
 
     def walk(section: type[config.Section], place: str) -> None:

@@ -151,7 +151,7 @@ def test_what_cannot_be_is_refused_with_its_key(change: Change, expected: str) -
 @pytest.mark.parametrize("value", [None, True, "x", [], {}, [1, 2], {"a": 1}, float("nan"), float("inf"), -1, 10**400])
 @pytest.mark.parametrize("key", ["axis", "unit", "radius_mm", "rapid_speed_deg_s", "correction", "drive", "sim"])
 def test_wrong_kind_of_value_is_a_fault_of_the_configuration(key: str, value: object) -> None:
-    """None: the key is missing. The conversion of angles leaves to the models what only they can refuse."""
+    """None: the key is missing. The conversion of angles leaves other faults to the models."""
     document = rotary_and_gantry_document()
     document["sim"] = {"axis": {"A": {}}}
     tables = [document] if key in ("axis", "sim") else [document["axis"]["A"], document["axis"]["Y"]]

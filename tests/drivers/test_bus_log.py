@@ -1,4 +1,4 @@
-"""A bus log keeps its frames through every file format; what a format cannot hold is counted."""
+"""A bus log keeps its frames through every file format; frames that a format cannot hold are counted."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def suffix(name: str) -> str:
 
 
 def convert(text: str, target: str, folder: Path, source: str = "candump") -> tuple[Path, ConvertedLog]:
-    """Write a log, convert it, and return the file that came of it."""
+    """Write a log, convert it, and return the converted file."""
     log, out = folder / f"in{suffix(source)}", folder / f"out{suffix(target)}"
     log.write_text(text)
     told = converted_log(log, source, target)
@@ -238,7 +238,7 @@ def frames(draw: st.DrawFn) -> LoggedFrame:
 
 
 def expected_of(frame: LoggedFrame, name: str) -> LoggedFrame | None:
-    """Return what must come back of a frame from a format."""
+    """Return what reading a frame back from a format must give."""
     if frame.can_id & ERROR_FLAG:
         if name == "trc":
             return None
@@ -361,7 +361,7 @@ def test_decimal_asc_without_a_date_is_read_and_that_is_told(tmp_path: Path) -> 
 
 
 def test_trigger_date_counts_only_where_the_times_begin_there(tmp_path: Path) -> None:
-    """Python-can has the time of conversion in the date line, CANoe the trigger's in the block of a later trigger."""
+    """Python-can writes the time of conversion in the date line, CANoe the trigger's in a later trigger block."""
     head = "date Wed May 01 09:00:00.000 2024\nbase hex  timestamps absolute\ninternal events logged\n"
     block = "Begin Triggerblock Wed May 01 10:00:00.249 2024\n"
     (tmp_path / "bus.asc").write_text(head + block + " 0.000000 Start of measurement\n 1.0 1 80 Rx d 0\n")
@@ -406,7 +406,7 @@ def test_trc_of_every_version_is_read(version: str, tmp_path: Path) -> None:
 
 
 def test_flags_of_fd_are_those_of_peak(tmp_path: Path) -> None:
-    """FE has the error state alone, BI both: python-can 4.6 has them the other way round."""
+    """FE is the error state alone, BI is both; python-can 4.6 has them swapped."""
     out, _ = convert("".join(f"(12.00000{k}) can0 181##{k}01\n" for k in range(4)), "trc", tmp_path)
     assert [line.split()[2] for line in out.read_text().splitlines() if line[0] != ";"] == ["FD", "FB", "FE", "BI"]
 

@@ -1,4 +1,4 @@
-"""A black box is read as the daemon heard the bus; what is no log, or half of one, is said."""
+"""A black box is read as the daemon read the bus; a file that is no log, or half of one, is reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Error frames become notices: each kind when it begins, and once it is over."""
+"""Error frames become notices: one when an error begins, one when it has ended."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sensors that are a few lines of configuration, read from simulated ones that are served by the same lines."""
+"""Sensors defined by a few lines of configuration, read from simulated ones served from the same configuration."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TYPES = {"int16": 0.01, "uint16": 0.01, "int32": 1e-4, "uint32": 1e-4, "float32"
 
 
 class Shop:
-    """The simulated sensors of a machine, served, and the drivers that its configuration gives."""
+    """The simulated sensors of a machine, and the drivers created from its configuration."""
 
     def __init__(self, document: dict[str, Any]) -> None:
         self.document = document
@@ -42,7 +42,7 @@ class Shop:
         self.wires = SensorWires(made, self.memory)
 
     def config(self) -> MachineConfig:
-        """The configuration with the ports that were chosen."""
+        """Return the configuration with the ports used."""
         for axis, place in self.wires.ready.items():
             self.document["axis"][axis]["voltage"] |= place
         return parse(self.document)
@@ -318,7 +318,7 @@ async def test_nothing_that_is_no_number_gets_through() -> None:
 
 @pytest.mark.fault("B5")
 async def test_an_adapter_that_is_pulled_out_and_put_back_is_used_again(tmp_path: Path) -> None:
-    """Without a restart; the pause between tries grows, and both edges are told once."""
+    """Without a restart; the pause between attempts grows, and each change has one notice."""
     settings = {"source": "modbus", "type": "float32", "device": str(tmp_path / "meter")}
     found: asyncio.Queue[Record] = asyncio.Queue()
 

@@ -1,4 +1,4 @@
-"""The voltage sensor on Modbus: blocks, clocks, and each way in which it can misbehave."""
+"""The voltage sensor on Modbus: blocks, clocks, and every fault that it can have."""
 
 from __future__ import annotations
 
@@ -294,7 +294,7 @@ def test_samples_are_placed_by_way_of_the_sync_count() -> None:
 
 
 def test_samples_that_come_again_are_taken_once() -> None:
-    """A sensor without a latch shows the newest samples, whether or not they were read before."""
+    """A sensor without a latch returns the newest samples, whether or not they were read before."""
     sensor, ticks = ModbusVoltage("X", config(1)), TickClock(0.001)
     taken: list[int] = []
     for poll, newest in enumerate([39, 39, 59, 139, 9]):  # the count fell: the sensor was restarted

@@ -1,4 +1,4 @@
-"""TPDOs that never come: told by name, and not counted as lost frames."""
+"""TPDOs that are never received: reported by name, and not counted as lost frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TPDO1, TPDO2, TPDO3, TPDO4 = 0x181, 0x281, 0x381, 0x481
 
 
 def decoded(rows: list[Row]) -> tuple[BusDecoder, list[Notice], list[AxisSamples]]:
-    """Feed a bus half a second at a time; return its decoder, what was told of TPDOs, and the samples."""
+    """Feed a bus half a second at a time; return its decoder, the notices about TPDOs, and the samples."""
     decoder = BusDecoder("can0", machine())
     out = []
     for start in range(0, len(rows), 2000):
@@ -72,7 +72,7 @@ def test_frames_of_a_tpdo_that_comes_are_lost_as_ever() -> None:
 
 
 def test_a_tpdo_that_is_sent_on_change_alone_is_told_and_not_lost() -> None:
-    """What most drives come with: transmission type 255."""
+    """The default of most drives: transmission type 255."""
     seldom = {LATE.time_ns(k, 0.1) for k in range(0, LATE.n, 37)}
     rows = [(t, i, d) for t, i, d in LATE.rows() if i != TPDO1 or t in seldom]
     decoder = BusDecoder("can0", machine())

@@ -1,4 +1,4 @@
-"""Modbus RTU on a pseudo terminal: frames, silent intervals, units on one line, and each way to spoil an answer."""
+"""Modbus RTU on a pseudo terminal: frames, silent intervals, several units on one line, and damaged answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sensors at the table: a TPDO's place on its tick, a stream of lines on the SYNC count, a module that is asked."""
+"""Sensors at the table: a value of a TPDO, a stream of lines on the SYNC count, a Modbus device that is read."""
 
 from __future__ import annotations
 

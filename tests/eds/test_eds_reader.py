@@ -1,4 +1,4 @@
-"""EDS files with every quirk seen in the field are read; what cannot be read is one error class with the line."""
+"""EDS files with every irregularity found in the field are read; unreadable ones raise one error with the line."""
 
 from __future__ import annotations
 
