@@ -110,7 +110,7 @@ def test_rotary_axis_and_gantry_of_linuxcnc_need_a_radius_and_two_node_ids(fdhil
     arguments = ("init", file, "--from-linuxcnc", tmp_path / "mill.ini", "--offline", "--answers")
     code, _, err = fdhil(*arguments, written(tmp_path, axis=axes | {"A": sheet}))
     assert code == 2
-    assert "axis.A.radius_mm: is not known: of a rotary axis: the radius at which its angles count" in err
+    assert "axis.A.radius_mm: is not known: rotary axis: radius at which angles count" in err
     assert not file.exists()
     code, _, err = fdhil(*arguments, written(tmp_path, axis=axes))
     assert code == 0, err

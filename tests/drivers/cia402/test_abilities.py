@@ -1,4 +1,4 @@
-"""What fdhil can do with a drive is told from its EDS: with the reason, the advice, and an exit code."""
+"""What fdhil can do with a drive is decided from its EDS: with the reason, the advice, and an exit code."""
 
 from __future__ import annotations
 

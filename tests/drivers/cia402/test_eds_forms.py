@@ -1,4 +1,4 @@
-"""Every form that CiA 306 gives an EDS or DCF says the same of the device: node-IDs, compact storage, numbers."""
+"""Every form that CiA 306 allows for an EDS or DCF gives the same device: node-IDs, compact storage, numbers."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def bases(device: Device) -> tuple[list[int | None], list[int | None]]:
 
 
 def answers(text: str, folder: Path, name: str) -> dict[str, str]:
-    """Return what ``fdhil eds`` says of a file, by its points."""
+    """Return the points that ``fdhil eds`` prints for a file."""
     device = device_of(text, folder, name)
     return {
         each.what: f"{each.answer}: {each.why}" for each in abilities(device, read_profile("cia402", folder / name))
@@ -40,7 +40,7 @@ def answers(text: str, folder: Path, name: str) -> dict[str, str]:
 
 
 def as_dcf(node: int, commissioning: str) -> str:
-    """Return the servo's EDS as a DCF: each PDO has the absolute COB-ID that it has on that node."""
+    """Return the servo's EDS as a DCF: each PDO has its absolute COB-ID for that node."""
     lines = []
     for line in eds_text(SERVO).splitlines():
         lines.append(line)

@@ -1,4 +1,4 @@
-"""An NC that shows what it does in coils or registers: what is asked for, what it means, and what can go wrong."""
+"""An NC with its state in coils or registers: the requests, the meaning of the answers, and the faults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An MTConnect agent's documents: by HTTP as agents send it, in the order of the NC, and what is no such document."""
+"""An MTConnect agent's documents: by HTTP as agents send it, in the NC's order, and invalid documents."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def config_of(**keys: Any) -> MachineConfig:
 
 
 async def heard(source: MtConnect, count: int) -> list[NcState]:
-    """Read until so many states have come."""
+    """Read until this many states were received."""
     states: list[NcState] = []
     async with asyncio.timeout(300):
         while len(states) < count:

@@ -1,4 +1,4 @@
-"""What an NC shows becomes what it does, by the rules of a profile: packaged ones, a user's own, and wrong values."""
+"""Values of an NC become its state by the rules of a profile: packaged ones, a user's own, and wrong values."""
 
 from __future__ import annotations
 
