@@ -245,7 +245,7 @@ def target_range(offset: int) -> tuple[int, int]:
 class Scaling:
     """Between an axis' millimetres and its drive's position increments.
 
-    ``sign`` is -1 where the drive counts against the axis.
+    ``sign`` is -1 where the drive counts in the opposite direction.
     """
 
     increments_per_rev: int

@@ -1,4 +1,4 @@
-"""The machine configuration: every fault at once, each with its path and a suggestion."""
+"""The machine configuration: all faults are reported at once, each with its path and a suggestion."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_all_faults_are_told_at_once() -> None:
     document["g0"] = {"source": "infered"}
     text = faults(document)
     assert "axis.X.screw_pitch_mm: is missing (table travel per motor revolution)" in text
-    assert "axis.X.nominal.Jtt: is no key of this section (did you mean 'Jt'?)" in text
+    assert "axis.X.nominal.Jtt: is not a key of this section (did you mean 'Jt'?)" in text
     assert "axis.Y.nominal.R: " in text
     assert "nan" in text
     assert "axis.Y.correction.max_offset_um: " in text
@@ -116,13 +116,13 @@ def test_limits_that_cannot_be_ramped_down_in_time_are_refused() -> None:
         (10_000, (50.0, 2.0, 2000.0), ""),
         (65_536, (50.0, 2.0, 250.0), ""),
         (100, (50.0, 20.0, 2000.0), "set the drive to 10,000 or more per turn"),
-        (65_536, (50.0, 1e-9, 2000.0), "no resolution would do"),
+        (65_536, (50.0, 1e-9, 2000.0), "no resolution suffices"),
     ],
 )
 def test_increments_too_coarse_for_the_limits_are_refused(
     per_turn: int, limits: tuple[float, float, float], told: str
 ) -> None:
-    """With the resolution that would do: rounded up to one increment per SYNC they would be other limits."""
+    """The message gives the required resolution; rounded up to one increment per SYNC the limits would differ."""
     document = bench_document("X")
     names = ("max_offset_um", "max_speed_mm_s", "max_acceleration_mm_s2")
     document["axis"]["X"]["correction"] = dict(zip(names, limits, strict=True))
@@ -136,7 +136,7 @@ def test_increments_too_coarse_for_the_limits_are_refused(
 def test_two_drives_with_one_node_id_are_refused() -> None:
     document = bench_document()
     document["axis"]["X"]["drive"] = {"node_id": 2}
-    assert "two drives of one bus have the same node_id" in faults(document)
+    assert "have the same node_id on one bus" in faults(document)
 
 
 @pytest.mark.parametrize("section", ["guard", "play"])
@@ -146,11 +146,11 @@ def test_a_heartbeat_of_ours_under_a_drives_node_id_is_refused(section: str) -> 
 
 
 def test_one_bus_by_two_names_is_refused() -> None:
-    """Every SYNC would be sent twice on it, and two drives of one node-ID would pass."""
+    """Every SYNC would be sent twice, and two drives with the same node-ID would be accepted."""
     place = {"interface": "socketcand", "host": "127.0.0.1", "port": 29536}
     document = bench_document() | {"bus": {"can0": place, "can1": place}}
     document["axis"]["Y"]["drive"] = {"node_id": 1, "bus": "can1"}
-    assert "bus.can1: it leads to the same place as [bus.can0]" in faults(document)
+    assert "bus.can1: it is the same bus as [bus.can0]" in faults(document)
     document["bus"]["can1"] = {**place, "channel": "can1"}
     config.parse(document)
 
@@ -162,8 +162,8 @@ def test_the_mark_that_an_editor_puts_before_a_text_is_no_part_of_it() -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (b"[machine\n", "is no TOML"),
-        (b"\xff\xfe", "is no TOML"),
+        (b"[machine\n", "is not valid TOML"),
+        (b"\xff\xfe", "is not valid TOML"),
         (b"#" * 300_000, "larger than 256 KiB"),
         (b"", "machine"),
     ],
@@ -214,7 +214,7 @@ def test_a_number_out_of_its_range_is_told_with_the_range(section: str, key: str
 
 
 def test_every_number_of_every_section_has_a_range() -> None:
-    """Whatever the file says, the number that is used is finite and of a size that a machine may have."""
+    """Whatever the file contains, each number is finite and within what a machine can have."""
     open_ended = []
 
     def walk(section: type[config.Section], place: str) -> None:
@@ -241,15 +241,15 @@ def test_every_number_of_every_section_has_a_range() -> None:
     [
         ("a = " + "[" * 100_000, "nested deeper"),
         ("a = " + "{b=" * 60_000, "nested deeper"),
-        ("a = " + "9" * 5000, "is no TOML"),
+        ("a = " + "9" * 5000, "is not valid TOML"),
         ("[machine]\nsync_period_s = 0x" + "f" * 5000, "machine.sync_period_s: "),
         ('[machine]\nname = "' + "x" * 200_000 + '"', "machine.name: "),
         ('[machine]\nsync_period_s = "' + "9" * 5000 + '"', "machine.sync_period_s: "),
         ("[store]\nkeep_windows = 0x" + "f" * 5000, "store.keep_windows: "),
-        ("[machine]\n" + "".join(f"k{n} = 1\n" for n in range(20_000)), "more faults (mend these first)"),
-        (("x" * 100_000) + " = 1", "is no key of this section"),
+        ("[machine]\n" + "".join(f"k{n} = 1\n" for n in range(20_000)), "more faults (fix these first)"),
+        (("x" * 100_000) + " = 1", "is not a key of this section"),
         ("a" + ".a" * 100_000 + " = 1", "nested deeper"),
-        (("a" + ".a" * 90 + " = 1\n") + ("[b" + ".b" * 90 + "]\n") * 1000, "is no TOML"),
+        (("a" + ".a" * 90 + " = 1\n") + ("[b" + ".b" * 90 + "]\n") * 1000, "is not valid TOML"),
     ],
     ids=lambda text: text[:24],
 )

@@ -109,21 +109,21 @@ def test_digest_knows_the_unit_and_the_radius_but_not_the_watched_difference() -
         ),
         (
             lambda axis: axis["A"].update(radius_mm=20.0, correction={"max_offset_um": 200.0}),
-            "axis.A.correction: max_offset_mdeg is 573; of a rotary axis at most 250 is sent, whatever its radius",
+            "axis.A.correction: max_offset_mdeg is 573; a rotary axis is limited to 250, whatever its radius",
         ),
         (
             lambda axis: axis["A"]["correction"].update(max_offset_um=20.0),
-            "axis.A.correction.max_offset_mdeg: is given as max_offset_um too (keep one of them)",
+            "axis.A.correction.max_offset_mdeg: duplicates max_offset_um (keep one of them)",
         ),
         (lambda axis: axis["A"].update(unit="mm"), 'axis.A.unit: is "mm", and keys are in degrees (give unit = "deg")'),
         (lambda axis: axis["X"].update(unit="deg"), "axis.X.unit: programs give X in mm; name a rotary axis A, B or C"),
         (lambda axis: axis["X"].update(unit="inch"), "axis.X.unit: Input should be 'mm' or 'deg'"),
-        (lambda axis: axis.pop("Y"), "axis.Y2: is the second drive of axis Y, which is missing (give [axis.Y]"),
+        (lambda axis: axis.pop("Y"), "axis.Y2: is the second drive of axis Y, which is missing (add [axis.Y]"),
         (lambda axis: axis["Y2"].update(screw_pitch_mm=10.0), "axis.Y2.screw_pitch_mm: differs from axis.Y"),
         (lambda axis: axis["Y2"].update(rapid_speed_mm_s=400.0), "axis.Y2.rapid_speed_mm_s: differs from axis.Y"),
         (
             lambda axis: axis["Y2"]["drive"].update(node_id=2),
-            "axis.Y2.drive.node_id: two drives of one bus have the same node_id; Y and Y2 need one each",
+            "axis.Y2.drive.node_id: drives Y and Y2 have the same node_id on one bus; give them different ones",
         ),
         (
             lambda axis: axis["Y"].update(voltage={"source": "modbus", "port": 502}),
@@ -136,7 +136,7 @@ def test_digest_knows_the_unit_and_the_radius_but_not_the_watched_difference() -
         (lambda axis: axis.update({"Y3": {}}), "axis.Y3"),
         (
             lambda axis: axis["Y"].update(setpoints={"travel_mm": [0.0, 9.0]}),
-            "axis.Y.setpoints: fdhil sends set-points to no drive of a gantry axis: one alone would skew the beam",
+            "axis.Y.setpoints: fdhil plays no set-points on a gantry axis: moving one drive would skew the beam",
         ),
     ],
 )
@@ -151,7 +151,7 @@ def test_what_cannot_be_is_refused_with_its_key(change: Change, expected: str) -
 @pytest.mark.parametrize("value", [None, True, "x", [], {}, [1, 2], {"a": 1}, float("nan"), float("inf"), -1, 10**400])
 @pytest.mark.parametrize("key", ["axis", "unit", "radius_mm", "rapid_speed_deg_s", "correction", "drive", "sim"])
 def test_wrong_kind_of_value_is_a_fault_of_the_configuration(key: str, value: object) -> None:
-    """None: the key is missing. The conversion of angles leaves to the models what only they can refuse."""
+    """None: the key is missing. The conversion of angles leaves other faults to the models."""
     document = rotary_and_gantry_document()
     document["sim"] = {"axis": {"A": {}}}
     tables = [document] if key in ("axis", "sim") else [document["axis"]["A"], document["axis"]["Y"]]
@@ -180,7 +180,7 @@ def test_radius_of_a_linear_axis_is_questioned_and_not_used() -> None:
     assert read.axis["X"].mm_per_unit == 1.0
     assert read.digest == config.parse(bench_document("X")).digest
     (sentence,) = config.unlikely(read)
-    assert sentence.startswith("axis.X.radius_mm is that of a rotary axis and not used")
+    assert sentence.startswith("axis.X.radius_mm is only used by a rotary axis")
 
 
 def test_both_drives_of_a_gantry_axis_share_a_bus() -> None:

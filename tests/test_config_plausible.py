@@ -1,4 +1,4 @@
-"""Numbers that no machine has are refused with the unit that was likely meant; ordinary machines never are."""
+"""Implausible numbers are refused with the unit that was likely meant; ordinary machines never are."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def document(**changes: Any) -> dict[str, Any]:
 
 
 def put(axis: dict[str, Any], key: str, factor: float) -> float:
-    """Multiply a key of an axis' table, return what it was."""
+    """Multiply a key of an axis' table and return the old value."""
     *path, last = key.split(".")
     for part in path:
         axis = axis[part]
@@ -40,7 +40,7 @@ def put(axis: dict[str, Any], key: str, factor: float) -> float:
 
 
 def said(made: dict[str, Any]) -> str:
-    """What is told of a configuration, refused or not; empty for an ordinary one."""
+    """Return the messages about a configuration, refused or not; empty for an ordinary one."""
     try:
         return " ".join(config.unlikely(config.parse(made)))
     except ConfigError as error:
@@ -76,7 +76,7 @@ def test_an_inductance_in_millihenry_is_refused_in_one_sentence() -> None:
 
 @st.composite
 def machines(draw: st.DrawFn) -> dict[str, Any]:
-    """Ordinary feed drives by what their makers choose: rotary motors with screws, racks or gears, 24 V to 800 V."""
+    """Ordinary feed drives in vendors' typical sizes: rotary motors with screws, racks or gears, 24 V to 800 V."""
 
     def between(low: float, high: float) -> float:
         return math.exp(draw(st.floats(math.log(low), math.log(high))))

@@ -17,7 +17,7 @@ from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import CanBus, MachineConfig
 from fdhil.drivers.can.frames import Frames
 from fdhil.drivers.can.sdo import SdoLink
-from fdhil.drivers.cia402.eds import load_eds
+from fdhil.eds import read_eds
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, EdsError, ForeignMaster, ProtocolError
 
 ANSWER_S = 0.3
@@ -214,9 +214,9 @@ def read_descriptions(places: Sequence[Path]) -> tuple[list[Description], list[E
     for path in files:
         if path in places or path.suffix.lower() in (".eds", ".dcf"):
             try:
-                device = load_eds(path).device_information
+                file = read_eds(path)
             except EdsError as error:
                 faults.append(error)
             else:
-                found.append(Description(path, device.vendor_number, device.product_number, device.revision_number))
+                found.append(Description(path, file.vendor_number, file.product_number, file.revision_number))
     return found, faults

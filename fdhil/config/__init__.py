@@ -1,6 +1,6 @@
 """The machine configuration: TOML -> frozen pydantic models, one module per part of the file.
 
-``load`` reports all faults at once, each with its path and a suggestion. Every key is explained in
+``load_config`` reports all faults at once, each with its path and a suggestion. Every key is explained in
 ``configs/machine-template.toml``; the ``description`` of each field here is where that text comes from.
 """
 

@@ -17,8 +17,8 @@ from fdhil.config.section import Finite, NotNegative, Positive, Section, one_of
 from fdhil.config.sensors import Thermometer, Voltage
 from fdhil.config.table import Accelerometer, TableEncoder
 
-# the built-in ceilings of what may ever be added to a set-point; a config can only lower them
-MOST_FILE_BYTES = 4 << 20  # more than an EDS or a profile may have
+# built-in ceilings of all offsets; a config can only lower them
+MOST_FILE_BYTES = 4 << 20  # larger than any EDS or profile
 CEILING_OFFSET_UM = 250.0
 CEILING_SPEED_MM_S = 20.0
 CEILING_ACCELERATION_MM_S2 = 2000.0
@@ -43,22 +43,22 @@ class Nominal(Section):
 
 
 class CorrectionLimits(Section):
-    """[axis.X.correction]: what the guard lets through. Without this section writing is off."""
+    """[axis.X.correction]: limits of the offsets at the guard. Without this section no offset is sent."""
 
     max_offset_um: Positive = Field(50.0, le=CEILING_OFFSET_UM, description="largest offset")
     max_speed_mm_s: Positive = Field(2.0, le=CEILING_SPEED_MM_S, description="largest rate of the offset")
     max_acceleration_mm_s2: Positive = Field(
-        250.0, le=CEILING_ACCELERATION_MM_S2, description="largest acceleration of the offset"
+        250.0, le=CEILING_ACCELERATION_MM_S2, description="its largest acceleration"
     )
 
 
 class SetPointLimits(Section):
-    """[axis.X.setpoints]: the set-points that fdhil play may send in the place of an NC. Without this section: none."""
+    """[axis.X.setpoints]: limits of the set-points of fdhil play. Without this section it sends none."""
 
     travel_mm: tuple[Finite, Finite] = Field(description="lowest and highest position, braking included")
     max_speed_mm_s: Positive | None = Field(None, description="largest speed; left out: the axis maximum")
     max_acceleration_mm_s2: Positive | None = Field(
-        None, ge=1e-2, le=1e6, description="largest acceleration, that of a stop too; left out: that of G0"
+        None, ge=1e-2, le=1e6, description="largest acceleration, also for stopping; left out: that of G0"
     )
 
     @field_validator("travel_mm")
@@ -70,7 +70,7 @@ class SetPointLimits(Section):
 
 
 class FeedforwardLimits(Section):
-    """[axis.X.feedforward]: what the guard lets the on-line feed-forward send. Without this section it is off."""
+    """[axis.X.feedforward]: limits of the on-line feed-forward at the guard. Without this section it is off."""
 
     max_torque_nm: Positive = Field(40.0, description="largest torque offset (0x60B2)")
     max_torque_rate_nm_s: Positive = Field(20e3, description="largest rate of the torque offset")
@@ -98,22 +98,22 @@ class HalPins(Section):
     torque_nm_per_unit: HalScale = Field(1.0, description="torque per unit of the pin")
     voltage_v_per_unit: HalScale = Field(1.0, description="voltage per unit of the pin; of a duty: the bus voltage")
     voltage_is: Literal["measured", "commanded"] = Field(
-        "measured", description="measured: the mean of the cycle before; commanded: acts in the cycle that begins"
+        "measured", description="measured: the mean of the previous cycle; commanded: acts in the next cycle"
     )
 
     @model_validator(mode="after")
     def _has_current(self) -> HalPins:
         if self.current is None and self.torque is None:
-            raise ValueError("name the pin of the current or that of the torque: without both nothing is identified")
+            raise ValueError("neither current nor torque has a pin, so nothing can be identified; name one of them")
         for key in ("speed", "current", "torque", "voltage"):
             if not any(k.startswith(f"{key}_") and getattr(self, k) == 0 for k in type(self).model_fields):
                 continue
-            raise ValueError(f"the scale of {key} is 0: every value would be 0")
+            raise ValueError(f"the scale of {key} is 0, so every value would be 0; give the unit of one count")
         return self
 
 
 def _content(path: Path) -> bytes:
-    """Return a file's bytes, as many as a profile or an EDS may have: one that has more is refused when it is read."""
+    """Read at most as many bytes as a profile or an EDS may have; a larger file is refused when it is parsed."""
     with path.open("rb") as file:
         return file.read(MOST_FILE_BYTES)
 
@@ -124,19 +124,18 @@ class Drive(Section):
     _files: str = PrivateAttr("")
 
     def placed(self, folder: Path) -> Drive:
-        """Return it with the paths of its files taken from ``folder``, and these files' digest."""
+        """Return a copy with its file paths resolved against ``folder``, and the digest of these files."""
         own = [] if self.profile in tables.DRIVE_PROFILES else [folder / self.profile]
         eds = [] if self.eds is None else [folder / self.eds]
         changes: dict[str, Any] = {"profile": str(own[0]) if own else self.profile, "eds": eds[0] if eds else None}
         drive = self.model_copy(update=changes)
-        told = b"".join(_content(path) for path in (*own, *eds) if path.is_file())
-        drive._files = hashlib.sha256(told).hexdigest() if own or eds else ""
+        content = b"".join(_content(path) for path in (*own, *eds) if path.is_file())
+        drive._files = hashlib.sha256(content).hexdigest() if own or eds else ""
         return drive
 
     @model_validator(mode="before")
     @classmethod
     def _hal_defaults(cls, given: Any) -> Any:
-        """Fill in what HAL leaves no choice of: its profile, and set-points that act in their own cycle."""
         if isinstance(given, dict) and given.get("source", "hal" if "hal" in given else "") == "hal":
             return {
                 "source": "hal",
@@ -157,16 +156,16 @@ class Drive(Section):
 
     @property
     def files_digest(self) -> str:
-        """Of what its own profile and its EDS say, a part of what the configuration means; empty without such files."""
+        """SHA-256 of the drive's own profile and EDS, part of the configuration's digest; empty without such files."""
         return self._files
 
     source: Literal["canopen", "hal"] = Field(
-        "canopen", description="hal: LinuxCNC's HAL pins (drive.hal), by the bridge that LinuxCNC runs"
+        "canopen", description="hal: LinuxCNC's HAL pins (drive.hal), through its bridge"
     )
     hal: HalPins | None = None
-    bus: str = Field("can0", description="the [bus.*] it is on")
+    bus: str = Field("can0", description="name of its [bus.*]")
     node_id: int | None = Field(
-        None, ge=1, le=127, description="CANopen node-ID; left out: 1 for the first axis, 2 for the next"
+        None, ge=1, le=127, description="node-ID; left out: 1 for the first axis, 2 for the next"
     )
     profile: Annotated[str, one_of(tables.DRIVE_PROFILES, or_suffix=".toml")] = Field(
         "fdhil_twin",
@@ -174,41 +173,35 @@ class Drive(Section):
         "or the path of a TOML file, from this file's folder",
     )
     eds: Path | None = Field(None, description="the drive's EDS or DCF file, from this file's folder")
-    logical_axis: int = Field(
-        1, ge=1, le=8, description="which axis of a device with several: its objects are 0x800 higher for each"
-    )
+    logical_axis: int = Field(1, ge=1, le=8, description="axis of a device with several: 0x800 higher objects for each")
     increments_per_rev: int = Field(
-        65536, ge=4, le=2**31 - 1, description="encoder and set-point increments per revolution"
+        65536, ge=4, le=2**31 - 1, description="increments per revolution, of encoder and set-point"
     )
-    speed_unit: SpeedUnit | None = Field(
-        None, description="what 0x606C counts in, where the drive was set to another unit (0x60A9) than its profile's"
-    )
-    sign: Literal[1, -1] = Field(1, description="-1 where the drive counts against the axis")
+    speed_unit: SpeedUnit | None = Field(None, description="unit of 0x606C, where it is not the profile's (0x60A9)")
+    sign: Literal[1, -1] = Field(1, description="-1 where the drive counts in the opposite direction")
     rated_current_a: Positive = Field(50.0, ge=1e-3, le=1e5, description="0x6075; 0x6078 counts in 0.1 % of it")
     rated_torque_nm: Positive = Field(
-        1.0, ge=1e-4, le=1e6, description="0x6076, where the profile takes the current from the torque (0x6077)"
+        1.0, ge=1e-4, le=1e6, description="0x6076, where current is derived from torque (0x6077)"
     )
     dc_link_v: Positive | None = Field(
-        None, ge=1.0, le=2000.0, description="DC link, where the profile takes the voltage from the duty of the PWM"
+        None, ge=1.0, le=2000.0, description="where the profile derives the voltage from the duty"
     )
-    setpoint_delay_cycles: int = Field(
-        2, ge=0, le=16, description="SYNC cycles by which the drive runs its set-point late"
-    )
+    setpoint_delay_cycles: int = Field(2, ge=0, le=16, description="SYNC cycles by which it delays its set-point")
     following_error_window_mm: Positive = Field(10.0, ge=1e-3, le=1e4, description="0x6065: beyond it the drive faults")
     speed_limit_mm_s: Positive | None = Field(
-        None, ge=1e-3, le=1e5, description="the axis maximum; left out: the rapid speed"
+        None, ge=1e-3, le=1e5, description="axis maximum; left out: the rapid speed"
     )
 
 
 class Axis(Section):
-    """[axis.X]; [axis.X2] is the second drive of a gantry axis and takes the keys of [axis.X] that it has not.
+    """[axis.X]; [axis.X2] is the second drive of a gantry axis and inherits the keys of [axis.X] that it does not set.
 
-    A rotary axis is written in degrees, as rapid_speed_deg_s for rapid_speed_mm_s; its um are those at radius_mm.
+    A rotary axis is written in degrees, as rapid_speed_deg_s for rapid_speed_mm_s; its um are measured at radius_mm.
     """
 
     unit: Literal["mm", "deg"] = Field("mm", description="deg: a rotary axis, whose keys have deg in place of mm")
     radius_mm: Positive | None = Field(
-        None, ge=10.0, le=1e4, description="of a rotary axis: the radius at which its angles count as path error"
+        None, ge=10.0, le=1e4, description="rotary axis: radius at which angles count as path error"
     )
     screw_pitch_mm: Positive = Field(ge=1e-3, le=1e4, description="table travel per motor revolution")
     rapid_speed_mm_s: Positive = Field(ge=1e-3, le=1e5, description="speed of G0")
@@ -223,15 +216,15 @@ class Axis(Section):
         None,
         ge=5.0,
         le=2000.0,
-        description="resonance of motor and table against each other, the motor free to turn, as the drive's frequency "
-        "response has it; left out: sought where replays of rapids leave much, else the table is where the motor is",
+        description="resonance of motor against table with the motor free to turn, as in the drive's frequency "
+        "response; left out: searched for where replayed rapids leave large residuals, else the table is assumed rigid",
     )
     resonance_damping: NotNegative = Field(0.03, le=0.7, description="damping ratio of that resonance")
     max_difference_um: Positive | None = Field(
-        None, le=1e4, description="of a gantry axis: how far its two drives may be apart; left out: 500"
+        None, le=1e4, description="gantry: largest difference of its drives; left out: 500"
     )
     guessed: tuple[Literal["R", "L", "K", "Jt", "ft", "Cd"], ...] = Field(
-        (), description="keys of nominal that nobody knows: no identified value is compared with them"
+        (), description="keys of nominal that are guesses: identified values are not compared with them"
     )
     nominal: Nominal
     regulators: Regulators
@@ -246,7 +239,6 @@ class Axis(Section):
 
     @property
     def largest_difference_um(self) -> float:
-        """How far the two drives of a gantry axis may be apart."""
         return self.max_difference_um or 500.0
 
     @property
@@ -255,7 +247,7 @@ class Axis(Section):
         return 1.0 if self.radius_mm is None or self.unit == "mm" else mm_per_degree(self.radius_mm)
 
     def shown(self, mm: float, per: str = "", form: str = ".4g") -> str:
-        """Return a position, speed ("/s") or acceleration ("/s2") in the axis' unit."""
+        """Format a position, speed ("/s") or acceleration ("/s2") in the axis' unit."""
         return f"{mm / self.mm_per_unit:{form}} {self.unit}{per}"
 
     def shown_key(self, key: str) -> str:
@@ -264,17 +256,15 @@ class Axis(Section):
 
     @property
     def jerk_mm_s3(self) -> float:
-        """Largest jerk."""
         return self.max_jerk_mm_s3 or self.max_acceleration_mm_s2 / 0.025
 
     @property
     def scaling(self) -> Scaling:
-        """Between millimetres and the drive's increments."""
+        """Conversion between millimetres and the drive's increments."""
         return Scaling(self.drive.increments_per_rev, self.screw_pitch_mm, self.drive.sign)
 
     @property
     def top_speed_mm_s(self) -> float:
-        """The axis maximum."""
         return self.drive.speed_limit_mm_s or self.rapid_speed_mm_s
 
     @property

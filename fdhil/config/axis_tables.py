@@ -1,8 +1,8 @@
-"""Completes the [axis.*] tables of a document: angles become lengths at the radius, a second drive takes over keys.
+"""Completes the [axis.*] tables of a document: angles become lengths at the radius, a second drive inherits keys.
 
 A rotary axis (``unit = "deg"``) is written in degrees: each key has ``deg`` where the models have ``mm``, and may have
-``mdeg`` where they have ``um``. From here on such an axis is a linear one of the rim at ``radius_mm``: 1 degree is
-pi / 180 radius_mm. [axis.Y2] is the second drive of the gantry axis Y and takes the keys of [axis.Y] that it has not.
+``mdeg`` where they have ``um``. It is then treated as a linear axis of the rim at ``radius_mm``: 1 degree is pi / 180
+radius_mm. [axis.Y2] is the second drive of the gantry axis Y and inherits the keys of [axis.Y] that it does not set.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ def mm_per_degree(radius_mm: float) -> float:
 
 
 def angular(key: str) -> str:
-    """Return the name of a key of a rotary axis, as ``rapid_speed_deg_s``, for that of the models."""
+    """Convert a model's key to that of a rotary axis: ``rapid_speed_mm_s`` to ``rapid_speed_deg_s``."""
     return key if key == "radius_mm" else key.replace("_mm", "_deg")
 
 
 def linear(key: str) -> str:
-    """Return the name that the models have for a key of a rotary axis; 1 mdeg is as many um as 1 deg is mm."""
+    """Convert a key of a rotary axis to that of the models; 1 mdeg is as many um as 1 deg is mm."""
     return key.replace("_mdeg", "_um").replace("_deg", "_mm")
 
 
 def rotary_axes(document: Mapping[str, Any]) -> dict[str, float]:
-    """Return mm per degree of each axis that is written in degrees; 1 where its radius is invalid."""
+    """Return mm per degree of each axis written in degrees; 1 where its radius is invalid."""
     axes = {name: _table(axis) for name, axis in _table(document.get("axis")).items()}
     rotary = {name: axis for name, axis in axes.items() if axis.get("unit") == "deg" or any("_deg" in k for k in axis)}
     radii = {name: axis.get("radius_mm") for name, axis in rotary.items()}
@@ -44,18 +44,17 @@ def rotary_axes(document: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _is_number(value: Any) -> bool:
-    """Whether a value is a number that the models do not refuse anyway."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
 
 
 def complete(document: Mapping[str, Any], faults: list[ConfigFault]) -> dict[str, Any]:
-    """Return the document as the models have it; ``faults`` gets what cannot be: both units, mm of a rotary axis."""
+    """Return the document as the models need it; invalid units are added to ``faults``."""
     axes = {**_table(document.get("axis"))}
     for name in filter(is_second_drive, [*axes]):
         first = axes.get(name[0])
         if first is None:
             text = f"is the second drive of axis {name[0]}, which is missing"
-            faults.append(ConfigFault(f"axis.{name}", text, f"give [axis.{name[0]}], or name the section so"))
+            faults.append(ConfigFault(f"axis.{name}", text, f"add [axis.{name[0]}], or rename this section"))
             del axes[name]
         elif isinstance(first, Mapping) and isinstance(axes[name], Mapping):
             faults += _sensor_faults(name, first, axes[name])
@@ -79,7 +78,6 @@ def _table(value: Any) -> Mapping[str, Any]:
 
 
 def _taken_over(first: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the tables of a second drive: its own keys, and those of the first but its node-ID and its sensors."""
     taken = {key: value for key, value in first.items() if key not in _OWN_SENSORS}
     for key, value in own.items():
         below = taken.get(key)
@@ -98,7 +96,6 @@ def _sensor_faults(name: str, first: Mapping[str, Any], own: Mapping[str, Any]) 
 
 
 def _lengths(table: Any, factor: float, path: str, faults: list[ConfigFault]) -> Any:
-    """Return a table of a rotary axis with its angles as lengths at the radius."""
     if not isinstance(table, Mapping):
         return table
     found: dict[str, Any] = {}
@@ -113,7 +110,7 @@ def _lengths(table: Any, factor: float, path: str, faults: list[ConfigFault]) ->
             encoder = path.endswith(".table") and key in _OF_THE_TABLE_ENCODER
             found[key] = _scaled(value, factor) if encoder else value
         elif name in table:
-            faults.append(ConfigFault(f"{path}.{key}", f"is given as {name} too", "keep one of them"))
+            faults.append(ConfigFault(f"{path}.{key}", f"duplicates {name}", "keep one of them"))
         else:
             found[name] = _scaled(value, factor)
     if path.endswith(".table"):
@@ -122,7 +119,6 @@ def _lengths(table: Any, factor: float, path: str, faults: list[ConfigFault]) ->
 
 
 def _scaled(value: Any, factor: float) -> Any:
-    """Return a number, or a list of them, times ``factor``; anything else is left for the models to refuse."""
     if isinstance(value, list | tuple):
         return [_scaled(item, factor) for item in value]
     return value * factor if _is_number(value) else value

@@ -1,4 +1,4 @@
-"""[bus.NAME]: a CAN bus and the way onto it."""
+"""[bus.NAME]: a CAN bus and how it is reached."""
 
 from __future__ import annotations
 
@@ -39,40 +39,34 @@ class CanBus(Section):
         description="socketcand is a hub, virtual one process; from slcan on: python-can, for listening only",
     )
     channel: str = Field(
-        "can0",
-        description="socketcan: the network interface; socketcand: the bus behind the hub; else python-can's channel",
+        "can0", description="socketcan: network interface; socketcand: bus behind the hub; else python-can's"
     )
     host: str = Field("127.0.0.1", description="socketcand: address of the hub")
     port: int = Field(0, ge=0, le=65535, description="socketcand: TCP port of the hub; 0 lets the simulator choose one")
-    bitrate: int = Field(
-        1_000_000, ge=10_000, le=1_000_000, description="bit/s, for the bus load; an adapter of python-can is set to it"
-    )
+    bitrate: int = Field(1_000_000, ge=10_000, le=1_000_000, description="bit/s, for bus load and python-can adapters")
     frames: Literal["all", "drives"] = Field(
         "all",
-        description="drives: SYNC, NMT and the drives' frames alone are taken; bus load and black box lack others",
+        description="drives: only SYNC, NMT and the drives' frames are received; bus load and black box lack "
+        "the others",
     )
     listen_only: bool = Field(
-        True,
-        description="python-can: acknowledge nothing, so that a wrong bit rate disturbs nobody, where it can be told",
+        True, description="python-can: never acknowledge, so as not to disturb the bus, where supported"
     )
     offset_lead_cycles: int = Field(
-        0,
-        ge=0,
-        le=200,
-        description="by how many cycles offsets are sent ahead: HAL (streamer) 20 or more, CANopen 0",
+        0, ge=0, le=200, description="cycles by which offsets are sent ahead: HAL 20 or more, CANopen 0"
     )
     options: Mapping[str, bool | Whole | Finite | str] = Field(
-        {}, description="python-can: what its interface takes besides, e.g. { tty_baudrate = 3000000 }"
+        {}, description="python-can: further arguments of its interface, e.g. { tty_baudrate = 3000000 }"
     )
 
     @property
     def may_send(self) -> bool:
-        """Whether fdhil can send here: an adapter of python-can is listened to, and no more."""
+        """Whether fdhil can send here: python-can adapters are opened for listening only."""
         return self.interface in OWN_WAYS
 
     @property
     def place(self) -> tuple[str, ...] | None:
-        """Where it leads to, as far as the file tells; None where that is still to be chosen (port 0)."""
+        """The bus it leads to; None where the simulator still has to choose the port (port 0)."""
         if self.interface != "socketcand":
             return (self.interface, self.channel)
         return (self.interface, self.channel, self.host, str(self.port)) if self.port else None

@@ -1,6 +1,6 @@
-"""What a client of a server needs to prove who it is, and to know whom it talks to: keys, and the files they name.
+"""Credentials with which a client authenticates to a server and verifies it: keys, and the files that they name.
 
-The files are read each time a server is entered, and are in no message.
+The files are read at every connection, and their contents appear in no message.
 """
 
 from __future__ import annotations
@@ -16,36 +16,36 @@ from fdhil.errors import ConnectError
 
 
 class Credentials(SectionWithFiles):
-    """The keys that name user and files, for each section of a server that is entered."""
+    """Keys for user, password and TLS files, shared by all sections that connect to a server."""
 
-    user: str | None = Field(None, min_length=1, description="the server's user; left out: none, or by the certificate")
+    user: str | None = Field(None, min_length=1, description="user on the server; left out: none, or the certificate's")
     password_file: Path | None = Field(None, description="file with the user's password, mode 0600")
     tls_ca_file: Path | None = Field(
         None,
-        description="who signs the server's certificate (PEM), to encrypt and to check it; left out: neither; "
-        "/etc/ssl/certs/ca-certificates.crt is whom Debian trusts",
+        description="CA of the server's certificate (PEM), to encrypt and to verify it; left out: neither; "
+        "Debian's CAs are in /etc/ssl/certs/ca-certificates.crt",
     )
-    tls_certificate_file: Path | None = Field(None, description="our own certificate (PEM), where the server wants one")
+    tls_certificate_file: Path | None = Field(None, description="client certificate (PEM), where required")
     tls_key_file: Path | None = Field(None, description="its private key (PEM, without a password), mode 0600")
 
     @model_validator(mode="after")
     def _belong_together(self) -> Self:
         if (self.tls_certificate_file is None) != (self.tls_key_file is None):
-            raise ValueError("tls_certificate_file: it comes with its tls_key_file, and the key with its certificate")
+            raise ValueError("tls_certificate_file: certificate and tls_key_file must be given together")
         if self.tls_certificate_file is not None and self.tls_ca_file is None:
-            raise ValueError("tls_certificate_file: it needs a tls_ca_file; without one TLS is not spoken")
+            raise ValueError("tls_certificate_file: it needs a tls_ca_file; without one TLS is off")
         if (self.user is None) != (self.password_file is None):
-            raise ValueError("user: a user comes with the password_file, and the file with its user")
+            raise ValueError("user: user and password_file must be given together")
         return self
 
 
 def password_of(settings: Credentials, server: str, section: str) -> str | None:
-    """Return the user's password; ConnectError where its file cannot be read."""
+    """Read the user's password; ConnectError where its file cannot be read."""
     return secret_in(settings.password_file, server, f"[{section}] password_file")
 
 
 def secret_in(path: Path | None, server: str, key: str) -> str | None:
-    """Return what is in a file, None where none is named; ConnectError where it cannot be read."""
+    """Read a secret file, None where none is named; ConnectError where it cannot be read."""
     try:
         return None if path is None else path.read_text("utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
@@ -54,7 +54,7 @@ def secret_in(path: Path | None, server: str, key: str) -> str | None:
 
 
 def tls_of(settings: Credentials, server: str, section: str) -> ssl.SSLContext | None:
-    """Return how TLS is spoken, the server's certificate checked; ConnectError with the file that cannot be used."""
+    """Create the TLS context that verifies the server, None without a CA file; ConnectError names an unusable file."""
     if settings.tls_ca_file is None:
         return None
     try:

@@ -20,7 +20,7 @@ class NotEditable(ValueError):
 def edited(text: str, values: Mapping[str, Any], note: str) -> str:
     """Return the text with these values, as ``axis.X.nominal.ft``, ``note`` above each; NotEditable.
 
-    What comes out is read again, and must say what was said before, with these values and nothing else changed.
+    The result is parsed again, and must equal the former document with only these values changed.
     """
     wanted = tomllib.loads(text)
     end = "\r\n" if "\r\n" in text else "\n"
@@ -36,7 +36,7 @@ def edited(text: str, values: Mapping[str, Any], note: str) -> str:
     except ValueError:
         same = False
     if not same:
-        raise NotEditable(f"it has {', '.join(values)} where no line of its own table says so; change them by hand")
+        raise NotEditable(f"it sets {', '.join(values)} in a form that cannot be edited; change them by hand")
     return out
 
 
@@ -44,7 +44,7 @@ def _put(document: dict[str, Any], outer: Sequence[str], key: str, value: Any) -
     for name in outer:
         document = document.setdefault(name, {})
         if not isinstance(document, dict):
-            raise NotEditable(f"its {name} is no table; change it by hand")
+            raise NotEditable(f"its {name} is not a table; change it by hand")
     document[key] = list(value) if isinstance(value, tuple) else value
 
 
@@ -55,9 +55,9 @@ def _set(lines: list[str], outer: Sequence[str], key: str, value: str, note: str
         return
     own = re.compile(rf"(\s*{re.escape(key)}\s*=\s*)(.*)")
     shown = re.compile(rf"#{re.escape(key)}\s*=")  # as the template has it: at its default
-    told = next(((at, found) for at in range(first, last) if (found := own.fullmatch(lines[at]))), None)
-    if told is not None:
-        at, found = told
+    present = next(((at, found) for at in range(first, last) if (found := own.fullmatch(lines[at]))), None)
+    if present is not None:
+        at, found = present
         lines[at] = found[1] + value + _behind(found[2])
     else:
         at = next((at + 1 for at in range(first, last) if shown.match(lines[at])), first)
@@ -66,7 +66,6 @@ def _set(lines: list[str], outer: Sequence[str], key: str, value: str, note: str
 
 
 def _table(lines: Sequence[str], outer: Sequence[str]) -> tuple[int | None, int]:
-    """Return the lines of a table, from behind its header to the next one; None where it has no header."""
     headers = list(_headers(lines))
     for (at, names), (after, _) in zip(headers, [*headers[1:], (len(lines), ())], strict=False):
         if names == tuple(outer):
@@ -92,7 +91,6 @@ def _names(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _behind(rest: str) -> str:
-    """Return the comment behind a value, with the blanks before it."""
     for found in re.finditer(r"\s*#", rest):
         try:
             tomllib.loads(f"v = {rest[: found.start()]}")

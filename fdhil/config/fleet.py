@@ -1,4 +1,4 @@
-"""The configuration of what gathers the history of many machines: a file of its own, on a server of the works."""
+"""The configuration of a fleet server, which collects the history of many machines."""
 
 from __future__ import annotations
 
@@ -16,34 +16,32 @@ NAME = r"^[A-Za-z0-9_-]{1,64}$"
 
 
 class Server(NatsServer):
-    """[server]: the NATS server whose JetStream carries what the machines tell."""
+    """[server]: the NATS server whose JetStream carries the machines' records."""
 
 
 class Stream(Section):
-    """[stream]: what the server keeps until it is in the database; it is made at the first start."""
+    """[stream]: what the server keeps until it is in the database; created at the first start."""
 
     name: str = Field("fdhil", pattern=NAME, description="name of the stream")
-    replicas: int = Field(1, ge=1, le=5, description="servers of the cluster that keep each message")
+    replicas: int = Field(1, ge=1, le=5, description="replicas of each message in the cluster")
     max_bytes: int = Field(
-        10 << 30, ge=1 << 16, le=1 << 50, description="room for what waits; when it is used up the machines keep theirs"
+        10 << 30, ge=1 << 16, le=1 << 50, description="space for waiting messages; when full, machines keep theirs"
     )
-    duplicate_window_s: float = Field(
-        600.0, ge=1, le=86_400, description="how long the server itself knows a message again; the database always does"
-    )
+    duplicate_window_s: float = Field(600.0, ge=1, le=86_400, description="how long the server recognises duplicates")
 
 
 class Database(Section):
     """[database]: the PostgreSQL database of the history."""
 
-    connection: str = Field(
-        "dbname=fdhil", max_length=1000, description="libpq's connection string; the password is in a file (~/.pgpass)"
-    )
+    connection: str = Field("dbname=fdhil", max_length=1000, description="libpq's connection string, without password")
 
     @field_validator("connection")
     @classmethod
     def _without_a_password(cls, text: str) -> str:
         if re.search(r"\bpassword\s*=|//[^/@]*:[^/@]*@", text):
-            raise ValueError("must not hold a password: name a passfile, or use ~/.pgpass or the server's peer login")
+            raise ValueError(
+                "must not contain a password: name a passfile, or use ~/.pgpass or the server's peer login"
+            )
         return text
 
 
@@ -51,16 +49,16 @@ class Objects(Section):
     """[objects]: the recorded windows, one file each, named by their content."""
 
     directory: Path = Field(
-        Path("fdhil-windows"), description="their folder, which all collectors share; relative to this file's folder"
+        Path("fdhil-windows"), description="their folder, shared by all collectors; relative to this file's"
     )
 
 
 class Retention(Section):
-    """[retention]: for how long fdhil fleet retain keeps what was told; without a number: for good."""
+    """[retention]: how long fdhil fleet retain keeps records and windows; without a number they are kept for ever."""
 
-    record_months: int | None = Field(None, ge=1, le=1200, description="whole months of records before this one")
+    record_months: int | None = Field(None, ge=1, le=1200, description="months of records kept before the present one")
     window_months: int | None = Field(
-        None, ge=1, le=1200, description="months of recorded windows; what was found in them stays with the records"
+        None, ge=1, le=1200, description="months of recorded windows kept; their results stay"
     )
 
 
@@ -76,7 +74,7 @@ class Fleet(Section):
 
 
 def load(path: Path) -> Fleet:
-    """Read the configuration of a fleet; ConfigError with every fault, its path and a suggestion."""
+    """Read a fleet server's configuration; ConfigError with every fault, its path and a suggestion."""
     fleet = load_as(Fleet, path, "a fleet's config")
     objects = fleet.objects.model_copy(update={"directory": path.parent / fleet.objects.directory})
     placed = {"server": fleet.server.placed(path.parent), "web": fleet.web.placed(path.parent)}

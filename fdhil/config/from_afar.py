@@ -1,6 +1,7 @@
-"""What a works may offer to change in a machine's configuration, what it never may, and which change loosens a limit.
+"""Policy for configuration changes proposed by a fleet server: allowed keys, forbidden keys, changes that loosen a
+limit.
 
-This is the one place. A key that neither table names is refused, too.
+A key that is in neither table is refused.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-# key, or all keys of a table -> whether a larger value lets more through than before
+# key, or all keys of a table -> whether a larger value loosens a limit
 FROM_AFAR: Mapping[str, bool] = {
     "axis.*.nominal.*": False,
     "axis.*.regulators.*": False,
@@ -31,10 +32,10 @@ FROM_AFAR: Mapping[str, bool] = {
     "nc.settle_s": False,
     "nc.end_rest_s": False,
 }
-_BUILT = "how this machine is built and wired is known at the machine alone"
-_SENDING = "what sends set-points or a heartbeat is set up at the machine alone"
-_TRUST = "who may ask, listen, log in and be trusted is decided at the machine alone"
-_FILES = "files, sockets and budgets are those of this computer"
+_BUILT = "the construction and wiring of this machine are configured at the machine only"
+_SENDING = "senders of set-points and heartbeats are configured at the machine only"
+_TRUST = "access and trust are configured at the machine only"
+_FILES = "files, sockets and limits of this computer are configured at the machine only"
 NEVER: Mapping[str, str] = {
     "machine": _BUILT,
     "axis": _BUILT,
@@ -51,21 +52,21 @@ NEVER: Mapping[str, str] = {
     "publish": _TRUST,
     "uplink": _TRUST,
     "offers": _TRUST,
-    "sim": "the simulated machine belongs to who simulates it",
+    "sim": "the simulated machine is configured where it is simulated",
 }
 
 
 def never(path: str) -> str:
-    """Return why a key, as ``axis.X.drive.sign``, is never taken from afar; empty where it may be."""
+    """Explain why a key, as ``axis.X.drive.sign``, cannot be changed remotely; empty where it can."""
     if _rule(path) is not None:
         return ""
     parts = _pattern(path).split(".")
     tables = (".".join(parts[:count]) for count in range(len(parts), 0, -1))
-    return next((NEVER[table] for table in tables if table in NEVER), "no offer may change it")
+    return next((NEVER[table] for table in tables if table in NEVER), "no remote change of it is allowed")
 
 
 def loosens(path: str, old: Any, new: Any) -> bool:
-    """Whether a change lets more through than before; where that cannot be told it does."""
+    """Return whether a change loosens a limit, or may do so."""
     if not _rule(path) or old == new:
         return False
     return old is None or new is None or new > old

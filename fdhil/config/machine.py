@@ -1,4 +1,4 @@
-"""The whole file, and what must fit together in it."""
+"""The whole machine configuration, and the checks across its sections."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _OF_A_MOVE = ("rapid_speed_mm_s", "max_acceleration_mm_s2", "max_jerk_mm_s3")
 
 
 class Machine(Section):
-    """[machine]"""
+    """[machine]: the machine's name and SYNC period."""
 
-    name: ShownName = Field(min_length=1, max_length=64, description="what the reports call this machine")
+    name: ShownName = Field(min_length=1, max_length=64, description="name of this machine in reports")
     sync_period_s: Positive = Field(0.001, ge=1e-4, le=0.02, description="period of the SYNC message on the CAN bus")
 
 
@@ -73,7 +73,7 @@ class MachineConfig(Section):
                 faults.append(f"bus.{axis.drive.bus}.offset_lead_cycles: must be {text}")
             faults += [f"axis.{name}.regulators.{fault}" for fault in period_faults(axis.regulators, period)]
             limits = [f"axis.{name}.correction: {fault}" for fault in limit_faults(axis, period)]
-            # a number in another unit makes limits wrong too, and says so better
+            # a wrong unit also breaks limits, and explains the fault better
             found = [] if (info.context or {}).get("made_up") else doubts(axis)
             faults += [f"axis.{name}.{doubt.key}: {doubt.text}" for doubt in found if limits or not doubt.possible]
             faults += limits
@@ -85,49 +85,48 @@ class MachineConfig(Section):
         faults += line_faults(self._line_users())
         faults += self._node_faults()
         faults += [f"sim.axis.{name}: there is no [axis.{name}]" for name in self.sim.axis if name not in self.axis]
-        told = self.uplink.axis_labels if self.uplink is not None else ()
-        faults += [f"uplink.axis_labels.{name}: there is no [axis.{name}]" for name in told if name not in self.axis]
+        labelled = self.uplink.axis_labels if self.uplink is not None else ()
+        faults += [
+            f"uplink.axis_labels.{name}: there is no [axis.{name}]" for name in labelled if name not in self.axis
+        ]
         if faults:
             raise ValueError("\n".join(faults))
         return self
 
     def _gantry_faults(self) -> Iterator[str]:
-        """Yield what both drives of a gantry axis must have in common, and what one of them lacks."""
         for name in filter(is_second_drive, self.axis):
             first, second = self.axis[name[0]], self.axis[name]
             for key in ("unit", "radius_mm", "screw_pitch_mm", *_OF_A_MOVE):
                 if getattr(first, key) != getattr(second, key):
                     yield f"axis.{name}.{first.shown_key(key)}: differs from axis.{name[0]}, and both move one beam"
             if first.setpoints is not None or second.setpoints is not None:
-                text = "fdhil sends set-points to no drive of a gantry axis: one alone would skew the beam"
-                yield f"axis.{name[0]}.setpoints: {text}; leave the section out"
+                text = "fdhil plays no set-points on a gantry axis: moving one drive would skew the beam"
+                yield f"axis.{name[0]}.setpoints: {text}; remove the section"
             if first.drive.bus != second.drive.bus:
                 yield f"axis.{name}.drive.bus: both drives of axis {name[0]} are on one bus, whose SYNC they share"
             if (first.correction is None) != (second.correction is None):
                 yield f"axis.{name}.correction: both drives of axis {name[0]} are corrected, or neither; give both"
 
     def _node_faults(self) -> Iterator[str]:
-        """Yield what would make two senders of one COB-ID."""
         if self.play.node_id == self.guard.node_id:
-            yield "play.node_id: it is the guard's node_id; both send a heartbeat"
+            yield "play.node_id: equals guard.node_id, and both send a heartbeat; give them different ones"
         drives = {self.node_id(name): name for name in self.axis}
         for section, node_id in (("guard", self.guard.node_id), ("play", self.play.node_id)):
             if node_id in drives:
                 yield f"{section}.node_id: it is that of drive {drives[node_id]}; both send a heartbeat"
-        # the PDOs of a device's second axis are those of the next node-ID
+        # a device's second axis uses the PDOs of the next node-ID
         ids: dict[tuple[str, int], str] = {}
         for name, axis in self.axis.items():
             other = ids.setdefault((axis.drive.bus, self.node_id(name) + axis.drive.logical_axis), name)
             if other != name:
-                text = f"two drives of one bus have the same node_id; {other} and {name} need one each"
+                text = f"drives {other} and {name} have the same node_id on one bus; give them different ones"
                 yield f"axis.{name}.drive.node_id: {text}"
         places: dict[tuple[str, ...], str] = {}
         for name, bus in self.bus.items():
             if bus.place is not None and places.setdefault(bus.place, name) != name:
-                yield f"bus.{name}: it leads to the same place as [bus.{places[bus.place]}]; keep one of them"
+                yield f"bus.{name}: it is the same bus as [bus.{places[bus.place]}]; keep one of them"
 
     def _line_users(self) -> Iterator[LineUser]:
-        """Yield the sensors on serial devices."""
         for name, axis in self.axis.items():
             yield from filter(None, [line_user(f"axis.{name}.voltage", axis.voltage)])
             if axis.temperature is not None:
@@ -143,50 +142,50 @@ class MachineConfig(Section):
 
     def _listening(self, bus: str) -> str:
         interface = self.bus[bus].interface
-        return f"bus {bus} is only listened to ({interface}); use SocketCAN there, or leave this section out"
+        return (
+            f"bus {bus} is receive-only ({interface}), so no offset can be sent; use SocketCAN, or remove this section"
+        )
 
     def node_id(self, axis: str) -> int:
-        """Return the CANopen node-ID of an axis' drive."""
         return self.axis[axis].drive.node_id or list(self.axis).index(axis) + 1
 
     @property
     def mm_per_degree(self) -> dict[str, float]:
-        """The length of arc of one degree at the radius of each rotary axis."""
+        """Arc length of one degree at the radius of each rotary axis, mm."""
         return {name: axis.mm_per_unit for name, axis in self.axis.items() if axis.unit == "deg"}
 
     @property
     def run_directory(self) -> Path:
-        """The folder of the daemon's socket and token."""
         return self.store.run_directory or self.store.directory / "run"
 
     @property
     def guard_directory(self) -> Path:
-        """The folder of the guard's socket: its own, or the daemon's."""
+        """Folder of the guard's socket: its own, or the daemon's."""
         return self.guard.run_directory or self.run_directory
 
     @property
     def uplink_directory(self) -> Path:
-        """The folder in which fdhil uplink notes how far it is."""
+        """Folder in which fdhil uplink stores its progress."""
         return (self.uplink and self.uplink.directory) or self.store.directory / "uplink"
 
     @property
     def offers_directory(self) -> Path:
-        """The folder of the offers that fdhil uplink fetched."""
+        """Folder of the proposed configuration changes that fdhil uplink fetched."""
         return self.offers.directory or self.uplink_directory / "offers"
 
     @property
     def works_name(self) -> str:
-        """This machine's name in the works, also where nothing is sent there."""
+        """This machine's name in the plant, also where no uplink is configured."""
         return (self.uplink or Uplink()).name_of(self.machine.name)
 
     @property
     def digest(self) -> str:
-        """SHA-256 of what the configuration says of the machine (not of its text), 16 hexadecimal digits.
+        """SHA-256 of the machine's settings (not of the text), 16 hexadecimal digits.
 
-        Who may look at it, and over which network, is not the machine: a change there voids no record.
+        Access and network settings are excluded: changing them invalidates no record.
         """
         files = "".join(axis.drive.files_digest for axis in self.axis.values())
-        # of a linear axis as before there were others, so that no record is void
+        # unchanged for linear axes, so that existing records stay valid
         rotary = {"unit", "radius_mm"}
         linear = {
             n: {"max_difference_um", "guessed", *(rotary if axis.unit == "mm" else ())} for n, axis in self.axis.items()
@@ -194,5 +193,5 @@ class MachineConfig(Section):
         unused: dict[str, Any] = {**dict.fromkeys(BESIDE_THE_MACHINE, True), "axis": linear}
         if not self.nc.wrapped_axes:
             unused["nc"] = {"wrapped_axes"}
-        told = self.model_dump_json(exclude=unused)
-        return hashlib.sha256(f"{told}{files}".encode()).hexdigest()[:16]
+        settings = self.model_dump_json(exclude=unused)
+        return hashlib.sha256(f"{settings}{files}".encode()).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""[nc_source.modbus_coil], [nc_source.mtconnect], [nc_source.opcua]: where and how an NC is asked what it does."""
+"""[nc_source.modbus_coil], [nc_source.mtconnect], [nc_source.opcua]: where and how the NC is polled."""
 
 from __future__ import annotations
 
@@ -19,41 +19,39 @@ NUMBERS_ARE = {"holding_registers": 3, "input_registers": 4}
 
 
 def _bit(description: str) -> Place | None:
-    place: Place | None = Field(None, description=f"{description}; left out: the NC does not tell it")
+    place: Place | None = Field(None, description=f"{description}; left out: not available")
     return place
 
 
 def _number(description: str) -> int | None:
-    place: int | None = Field(
-        None, ge=0, le=65535, description=f"register of {description}; left out: the NC does not tell it"
-    )
+    place: int | None = Field(None, ge=0, le=65535, description=f"register of {description}; left out: not available")
     return place
 
 
 class ModbusNc(ModbusPlace):
-    """[nc_source.modbus_coil]: an NC or its PLC that shows what it does in coils or registers."""
+    """[nc_source.modbus_coil]: an NC or its PLC that shows its state in coils or registers."""
 
     port: int = Field(502, ge=1, le=65535, description="modbus: TCP port")
     bits: Literal["coils", "discrete_inputs", "holding_registers", "input_registers"] = Field(
-        "coils", description="where the bits below are: coils, discrete_inputs, holding_registers, input_registers"
+        "coils", description="location of the bits below: coils, discrete_inputs, holding_registers, input_registers"
     )
     rapid: Place = Field("0", description="the bit that is set during G0: address from 0, in registers '12.3' is bit 3")
     hold: Place | None = _bit("the bit of a feed hold")
-    feed: Place | None = _bit("the bit that is set during G1; with it, neither this bit nor another is rest")
+    feed: Place | None = _bit("the bit that is set during G1; with it, no bit set means rest")
     arc: Place | None = _bit("the bit that is set during G2 and G3")
     numbers: Literal["holding_registers", "input_registers"] = Field(
-        "holding_registers", description="where the numbers below are, whole and without a sign, one register each"
+        "holding_registers", description="location of the numbers below: unsigned integers, one register each"
     )
     line: int | None = _number("the program's line")
     feed_override: int | None = _number("the feed override")
     rapid_override: int | None = _number("the rapid override")
     tool: int | None = _number("the tool's number")
-    override_scale: Positive = Field(0.01, ge=1e-6, le=1, description="what 1 of an override means; 0.01 is per cent")
-    period_s: Positive = Field(0.02, ge=1e-3, le=5, description="how often it is asked")
-    renewed_s: NotNegative = Field(0.02, le=5, description="how often the NC renews what it shows: its PLC's cycle")
+    override_scale: Positive = Field(0.01, ge=1e-6, le=1, description="scale of the overrides; 0.01 for percent")
+    period_s: Positive = Field(0.02, ge=1e-3, le=5, description="how often it is polled")
+    renewed_s: NotNegative = Field(0.02, le=5, description="how often the NC updates its values: its PLC's cycle")
 
     def places(self) -> Mapping[str, tuple[int, int, int | None]]:
-        """Return function, address and bit in a register (None for coils and numbers) of what is asked for."""
+        """Return function, address and bit (None for coils and numbers) of each configured signal."""
         found: dict[str, tuple[int, int, int | None]] = {}
         for name in ("rapid", "hold", "feed", "arc"):
             if (place := getattr(self, name)) is not None:
@@ -65,7 +63,7 @@ class ModbusNc(ModbusPlace):
         return found
 
     def requests(self) -> Mapping[int, tuple[int, int]]:
-        """Return by function the first address that is read and how many, with one request each."""
+        """Return first address and count of the one read request per function."""
         spans: dict[int, list[int]] = {}
         for function, address, _ in self.places().values():
             spans.setdefault(function, []).append(address)
@@ -73,7 +71,7 @@ class ModbusNc(ModbusPlace):
 
     @property
     def registers(self) -> int:
-        """How many registers' worth of data an NC is asked for each time."""
+        """Data read in each poll, in registers."""
         asked = self.requests().items()
         return sum(count if function in NUMBERS_ARE.values() else (count + 15) // 16 for function, (_, count) in asked)
 
@@ -91,7 +89,7 @@ class ModbusNc(ModbusPlace):
                 yield f"{name}: addresses end at 65535, the bits of a register at 15"
             elif function == BITS_ARE[self.bits] and name in ("rapid", "hold", "feed", "arc"):
                 if in_registers and bit is None:
-                    yield f"{name}: names a register; say which bit of it, as '{address}.0'"
+                    yield f"{name}: is a register without a bit; give one, as '{address}.0'"
                 elif not in_registers and bit is not None:
                     yield f"{name}: {self.bits} have no bits; give their address alone, or bits = 'holding_registers'"
 
@@ -103,25 +101,24 @@ class ModbusNc(ModbusPlace):
 
 
 class Asked(Section):
-    """An NC that is asked over the network, and translated by a profile."""
+    """An NC that is polled over the network and translated by a profile."""
 
-    period_s: Positive = Field(0.1, ge=5e-3, le=5, description="how often it is asked, or tells what is new")
-    renewed_s: NotNegative = Field(0.1, le=5, description="how often the agent or server renews what it shows")
-    profile: str = Field("", description="how the NC shows what it does")
+    period_s: Positive = Field(0.1, ge=5e-3, le=5, description="how often it is polled, or sends changes")
+    renewed_s: NotNegative = Field(0.1, le=5, description="how often the agent or server updates its values")
+    profile: str = Field("", description="profile of the NC's signals")
 
     def placed(self, folder: Path) -> Self:
-        """Return it with the paths of its files taken from ``folder``."""
         changes: dict[str, Any] = {key: folder / value for key, value in self if isinstance(value, Path)}
         own = self.profile not in tables.NC_PROFILES
         return self.model_copy(update=changes | ({"profile": str(folder / self.profile)} if own else {}))
 
 
 class MtConnectNc(Asked):
-    """[nc_source.mtconnect]: an MTConnect agent beside the NC."""
+    """[nc_source.mtconnect]: an MTConnect agent of the NC."""
 
     url: str = Field("http://127.0.0.1:5000", pattern=r"^http://[^/\s]+(/\S*)?$", description="the agent")
-    device: str = Field("", description="name or uuid of the device; left out: the agent has one alone")
-    path: str = Field("", description="name or componentId of the path; left out: the device has one alone")
+    device: str = Field("", description="name or uuid of the device; left out: the agent has only one")
+    path: str = Field("", description="name or componentId of the path; left out: the device has only one")
     profile: Annotated[str, one_of(tables.NC_PROFILES, or_suffix=".toml")] = Field(
         "mtconnect", description="mtconnect, or the path of a TOML file, from this file's folder"
     )
@@ -133,24 +130,22 @@ class OpcUaNc(Asked):
     url: str = Field("opc.tcp://127.0.0.1:4840", pattern=r"^opc\.tcp://\S+$", description="the server's end point")
     profile: Annotated[str, one_of(tables.NC_PROFILES, or_suffix=".toml")] = Field(
         "opc40502",
-        description="how the NC shows what it does: siemens, heidenhain, beckhoff, opc40502 (the CNC companion "
+        description="profile of the NC's signals: siemens, heidenhain, beckhoff, opc40502 (the CNC companion "
         "specification), or the path of a TOML file, from this file's folder",
     )
-    timeout_s: Positive = Field(2.0, ge=0.05, le=60, description="how long an answer may take")
+    timeout_s: Positive = Field(2.0, ge=0.05, le=60, description="longest time for an answer")
     user: str | None = Field(None, min_length=1, description="the server's user; left out: anonymous")
     password_file: Path | None = Field(None, description="file with the user's password, mode 0600")
-    certificate: Path | None = Field(
-        None, description="fdhil's own certificate, to sign and encrypt (Basic256Sha256); left out: neither"
-    )
-    private_key: Path | None = Field(None, description="the key of that certificate, mode 0600")
-    server_certificate: Path | None = Field(None, description="the server's; left out: the one that it shows is taken")
+    certificate: Path | None = Field(None, description="fdhil's certificate, to sign and encrypt (Basic256Sha256)")
+    private_key: Path | None = Field(None, description="private key of that certificate, mode 0600")
+    server_certificate: Path | None = Field(None, description="the server's certificate; left out: any is accepted")
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
         if (self.certificate is None) != (self.private_key is None):
-            raise ValueError("certificate: it comes with its private_key, and the key with its certificate")
+            raise ValueError("certificate: certificate and private_key must be given together")
         if self.server_certificate is not None and self.certificate is None:
-            raise ValueError("server_certificate: it is of use with a certificate and private_key of our own alone")
+            raise ValueError("server_certificate: it needs a certificate and a private_key")
         if (self.user is None) != (self.password_file is None):
-            raise ValueError("user: a user comes with the password_file, and the file with its user")
+            raise ValueError("user: user and password_file must be given together")
         return self

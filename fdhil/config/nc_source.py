@@ -1,4 +1,4 @@
-"""[nc_source]: where an NC tells what it does, one section for each entry of ``tables.NC_SOURCES``."""
+"""[nc_source]: where the NC reports its state, one section for each entry of ``tables.NC_SOURCES``."""
 
 from __future__ import annotations
 
@@ -14,16 +14,14 @@ from fdhil.config.section import Positive, Section
 class LinuxCncBridge(Section):
     """[nc_source.linuxcnc]: the bridge that LinuxCNC's HAL file loads."""
 
-    host: str = Field("127.0.0.1", min_length=1, description="the computer of LinuxCNC, if it is another")
+    host: str = Field("127.0.0.1", min_length=1, description="the computer of LinuxCNC, if it is not this one")
     port: int = Field(5571, ge=1, le=65535, description="TCP port of the bridge")
 
 
 class NcSource(Section):
-    """[nc_source]: where the NC tells what it does, if [g0] source is the name of an NC's interface."""
+    """[nc_source]: where the NC reports its state, if [g0] source names an NC interface."""
 
-    silence_s: Positive = Field(
-        2.0, ge=0.05, le=60, description="an NC that says nothing for so long is not heard: its moves are unknown"
-    )
+    silence_s: Positive = Field(2.0, ge=0.05, le=60, description="after so long a silence the NC's moves are unknown")
     linuxcnc: LinuxCncBridge = LinuxCncBridge()
     modbus_coil: ModbusNc = ModbusNc()
     mtconnect: MtConnectNc = MtConnectNc()
@@ -39,5 +37,4 @@ class NcSource(Section):
         return self
 
     def placed(self, folder: Path) -> Self:
-        """Return it with the paths of its files taken from ``folder``."""
         return self.model_copy(update={"mtconnect": self.mtconnect.placed(folder), "opcua": self.opcua.placed(folder)})

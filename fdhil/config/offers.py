@@ -1,4 +1,4 @@
-"""[offers]: whose signed offers an operator of this machine may accept."""
+"""[offers]: whose signed configuration changes an operator of this machine may accept."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ from pydantic import AfterValidator, Field
 
 from fdhil.config.section import SectionWithFiles
 
-_OF_THE_WORKS = 14 << 3  # the first byte of such a key, an O in its text, so that no user's key of a server is one
+_OF_THE_WORKS = 14 << 3  # first byte of a plant's key, an O in its text; NATS user keys begin otherwise
 
 
 def key_bytes(text: str) -> bytes:
-    """Return the 32 bytes of a public key (Ed25519) in NATS' notation; ValueError where it is none of a works."""
+    """Return the 32 bytes of an Ed25519 public key in NATS notation; ValueError where it is not a plant's key."""
     try:
         raw = base64.b32decode(text)
     except binascii.Error:
         raw = b""
     if len(raw) != 35 or raw[0] != _OF_THE_WORKS or binascii.crc_hqx(raw[:33], 0) != int.from_bytes(raw[33:], "little"):
-        raise ValueError("is no key of a works, or was mistyped: `fdhil fleet key` there tells it, an O and 55 letters")
+        raise ValueError(
+            "is not a plant's public key (an O and 55 letters), or was mistyped: run `fdhil fleet key` there to show it"
+        )
     return raw[1:33]
 
 
@@ -31,11 +33,14 @@ def _is_key(text: str) -> str:
 
 
 class Offers(SectionWithFiles):
-    """[offers]: signed changes of this file that a works offers (needs the extra fleet); each is accepted by hand."""
+    """[offers]: signed configuration changes proposed by a plant (needs the extra fleet); each is accepted by hand."""
 
     trust: tuple[Annotated[str, AfterValidator(_is_key)], ...] = Field(
-        (), max_length=20, description="public keys of a works whose offers may be accepted; left out: none"
+        (),
+        max_length=20,
+        description="public keys of plants whose configuration changes may be accepted; left out: none",
     )
     directory: Path | None = Field(
-        None, description="where fdhil uplink puts the offers that it fetched; left out: offers in the uplink's folder"
+        None,
+        description="where fdhil uplink stores fetched configuration changes; left out: offers in the uplink's folder",
     )

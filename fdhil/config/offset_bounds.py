@@ -1,4 +1,4 @@
-"""Offset limits per SYNC follow from [axis.X.correction]: the one derivation, for the planner and for the guard."""
+"""Derives the offset limits per SYNC from [axis.X.correction], for the planner and for the guard."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 
 from fdhil.config.axis import CEILING_ACCELERATION_MM_S2, CEILING_OFFSET_UM, CEILING_SPEED_MM_S, Axis
 
-AXIS_SPEED_SHARE = 0.10  # an offset never takes more than this of the axis' own speed
+AXIS_SPEED_SHARE = 0.10  # largest share of the axis' speed for an offset
 AXIS_ACCELERATION_SHARE = 0.50
 VARIATION_MM = 3.0
 VARIATION_S = 1.0
 TIME_TO_SAFE_S = 0.120
-BRAKING_S = 0.020  # of an axis whose share is little; its braking counts three times
+BRAKING_S = 0.020  # of a slow axis; braking counts three times
 DETECTION_CYCLES = 3
-LEAST_INCREMENTS = 0.5  # what is less would be more than doubled by the one increment that can be sent
-_ULPS = 1e-9  # so that 20 mm/s of 50 per mm are one increment, and not one less
+LEAST_INCREMENTS = 0.5  # one increment would more than double a smaller value
+_ULPS = 1e-9  # against rounding: 20 mm/s at 50 per mm are one increment
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class OffsetBounds:
 
     @staticmethod
     def given(axis: Axis, sync_period_s: float) -> OffsetBounds:
-        """Return the limits as they stand in the configuration; ValueError when writing is off."""
+        """Convert the configured limits to increments; ValueError when writing is off."""
         if axis.correction is None:
             raise ValueError("writing is off for this axis")
         own, scale = axis.correction, axis.scaling.increments_per_mm
@@ -44,7 +44,8 @@ class OffsetBounds:
 
     @staticmethod
     def of(axis: Axis, sync_period_s: float) -> OffsetBounds:
-        """Return what an offset may do: the given limits within the axis' share, lowered until zero is near enough.
+        """Return the effective limits: the configured ones within the axis' share, lowered until an offset can be
+        removed in time.
 
         ValueError when writing is off (no ``[axis.X.correction]``).
         """
@@ -68,13 +69,13 @@ class OffsetBounds:
         return self.offset < 1.0 - _ULPS or min(self.rate, self.acceleration) < LEAST_INCREMENTS
 
     def time_to_safe_s(self, sync_period_s: float) -> float:
-        """Return how long it takes at most from a fault to zero: n_detect + 1 + L/S + 3 S/A cycles."""
+        """Return the longest time from a fault to zero: n_detect + 1 + L/S + 3 S/A cycles."""
         offset, rate, acceleration, _, _ = self.whole
         return (DETECTION_CYCLES + 1 - (-offset // rate) - 3 * (-rate // acceleration)) * sync_period_s
 
     @property
     def whole(self) -> tuple[int, int, int, int, int]:
-        """The same in whole increments, rounded down but to one: what the guard holds every frame to."""
+        """The limits in whole increments, rounded down but at least one, as the guard enforces them on every frame."""
         offset, rate, acceleration = map(_whole, (self.offset, self.rate, self.acceleration))
         return offset, rate, acceleration, math.floor(self.variation + _ULPS), self.window
 
@@ -85,7 +86,7 @@ def _whole(increments: float) -> int:
 
 
 def limit_faults(axis: Axis, sync_period_s: float) -> list[str]:
-    """Say why the given limits cannot be kept: the increments are too coarse, or the way to zero is too long."""
+    """Explain why the configured limits cannot be kept: increments too coarse, or ramp to zero too long."""
     if axis.correction is None:
         return []
     if axis.unit == "deg":
@@ -96,7 +97,7 @@ def limit_faults(axis: Axis, sync_period_s: float) -> list[str]:
             ("max_acceleration_deg_s2", own.max_acceleration_mm_s2 / per_deg, CEILING_ACCELERATION_MM_S2),
         ):
             if value > most * (1 + 1e-9):
-                return [f"{key} is {value:.4g}; of a rotary axis at most {most:g} is sent, whatever its radius"]
+                return [f"{key} is {value:.4g}; a rotary axis is limited to {most:g}, whatever its radius"]
     limits = OffsetBounds.given(axis, sync_period_s)
     if limits.too_coarse:
         return [_too_coarse(axis, limits)]
@@ -110,13 +111,12 @@ def limit_faults(axis: Axis, sync_period_s: float) -> list[str]:
 
 
 def share_fault(axis: Axis, sync_period_s: float) -> str | None:
-    """Say why an axis so slow cannot be corrected: its share of speed or acceleration is less than one increment."""
+    """Explain why so slow an axis cannot be corrected: its share of speed or acceleration is below one increment."""
     limits = OffsetBounds.of(axis, sync_period_s)
     return _too_coarse(axis, limits) if limits.too_coarse else None
 
 
 def _too_coarse(axis: Axis, limits: OffsetBounds) -> str:
-    """Name the finest limit that is less than one increment, and the resolution that would do for all."""
     name, finest = min(
         ("max_offset_um", limits.offset),
         ("max_speed_mm_s", limits.rate),
@@ -126,5 +126,5 @@ def _too_coarse(axis: Axis, limits: OffsetBounds) -> str:
     per_turn = axis.drive.increments_per_rev
     text = f"{per_turn:,} increments per turn are too coarse: {name} is {finest:.2g} of an increment per SYNC cycle"
     if not finest * 2**31 > per_turn:
-        return f"{text}, and no resolution would do (raise {name}, or sync_period_s)"
+        return f"{text}, and no resolution suffices (raise {name}, or sync_period_s)"
     return f"{text} (set the drive to {math.ceil(per_turn / finest - 1e-6):,} or more per turn, or raise {name})"

@@ -1,7 +1,8 @@
-"""Relations tell whether an axis' numbers can be of one machine, and slips which unit was mistaken where they cannot.
+"""Checks that the numbers of an axis fit one machine, and identifies a key that was typed in the wrong unit.
 
-Each relation between keys has a range in which ordinary feed drives lie, with room to spare, and one beyond which no
-drive lies. Outside the second the configuration is refused; between both it is used and the doubt is told.
+Each relation between keys has an ordinary range, wide enough for usual feed drives, and a possible range, beyond which
+no drive exists. Outside the possible range the configuration is refused; outside the ordinary one it is used with a
+warning.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ Numbers = Mapping[str, float]
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """A figure that follows from some ``keys``: what it ``is``, its ordinary range, and the range of the possible."""
+    """A figure derived from some ``keys``: its description, its ordinary range, and its possible range."""
 
     keys: tuple[str, ...]
     text: str
@@ -30,7 +31,7 @@ class Relation:
 
 @dataclass(frozen=True, slots=True)
 class Slip:
-    """A unit in which a key is often typed by mistake: ``factor`` takes the number to the key's own unit."""
+    """A unit in which a key is often typed by mistake: ``factor`` converts the number to the key's own unit."""
 
     key: str
     factor: float
@@ -39,7 +40,7 @@ class Slip:
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """What cannot be, or is unlikely, about an axis; ``key`` is the one to look at first."""
+    """An impossible or unlikely figure of an axis; ``key`` is the one to check first."""
 
     key: str
     text: str
@@ -70,7 +71,7 @@ RELATIONS = (
              lambda n: n["nominal.R"] * n["regulators.current_limit_a"] / n["regulators.voltage_limit_v"],
              (1e-4, 5.0), (1e-6, 50.0)),
 )  # fmt: skip
-SLIPS = (  # the more frequent first
+SLIPS = (  # most frequent first
     Slip("nominal.L", 1e-3, "mH"),
     Slip("nominal.L", 1e-6, "uH"),
     Slip("nominal.R", 1e-3, "mohm"),
@@ -91,19 +92,19 @@ MOST_NAMED = 2
 
 
 def doubts(axis: Axis) -> list[Doubt]:
-    """Return what is wrong with an axis' numbers together, the impossible first; empty for an ordinary machine."""
+    """Return what is implausible about an axis' numbers, the impossible first; empty for an ordinary machine."""
     numbers = _numbers(axis)
     broken = [relation for relation in RELATIONS if not _within(relation.figure(numbers), relation.ordinary)]
     if not broken:
         return []
-    slips = [slip for slip in SLIPS if axis.shown_key(slip.key) == slip.key]  # angles are not mistaken for lengths
-    mended = [slip for slip in slips if _mends(slip, numbers, broken)]
-    found = [_doubt(axis, relation, numbers, mended) for relation in broken]
+    slips = [slip for slip in SLIPS if axis.shown_key(slip.key) == slip.key]  # angles are not confused with lengths
+    mistakes = [slip for slip in slips if _mends(slip, numbers, broken)]
+    found = [_doubt(axis, relation, numbers, mistakes) for relation in broken]
     found.sort(key=lambda doubt: doubt.possible)
-    return found[:1] if mended else found  # one wrong unit has many consequences
+    return found[:1] if mistakes else found  # one wrong unit breaks many relations
 
 
-def _doubt(axis: Axis, relation: Relation, numbers: Numbers, mended: list[Slip]) -> Doubt:
+def _doubt(axis: Axis, relation: Relation, numbers: Numbers, mistakes: list[Slip]) -> Doubt:
     figure = relation.figure(numbers)
     possible = _within(figure, relation.possible)
     low, high = relation.ordinary
@@ -111,13 +112,12 @@ def _doubt(axis: Axis, relation: Relation, numbers: Numbers, mended: list[Slip])
     text = f"{_listed(axis, relation, numbers)}: {relation.text} is {figure:.3g}{_spaced(relation.unit)}, "
     text += f"feed drives have {bounds}{_spaced(relation.unit)}"
     guesses = [f"{slip.key} = {numbers[slip.key] * slip.factor:.4g} ({numbers[slip.key]:g} {slip.unit})"
-               for slip in mended[:MOST_NAMED]]  # fmt: skip
+               for slip in mistakes[:MOST_NAMED]]  # fmt: skip
     text += f"; did you mean {' or '.join(guesses)}?" if guesses else "; check the units of these keys"
-    return Doubt(axis.shown_key(mended[0].key if mended else relation.keys[0]), text, possible)
+    return Doubt(axis.shown_key(mistakes[0].key if mistakes else relation.keys[0]), text, possible)
 
 
 def _listed(axis: Axis, relation: Relation, numbers: Numbers) -> str:
-    """Return the numbers as they are written for the axis."""
     shown = {key: axis.shown_key(key) for key in relation.keys}
     factor = {key: 1.0 if shown[key] == key else axis.mm_per_unit for key in relation.keys}
     return ", ".join(f"{shown[key].rpartition('.')[2]} = {numbers[key] / factor[key]:g}" for key in relation.keys)
@@ -128,7 +128,6 @@ def _spaced(unit: str) -> str:
 
 
 def _mends(slip: Slip, numbers: Numbers, broken: list[Relation]) -> bool:
-    """Return whether the number in that unit makes the whole axis ordinary, and is of what is broken."""
     if not all(slip.key in relation.keys for relation in broken):
         return False
     tried = {**numbers, slip.key: numbers[slip.key] * slip.factor}
@@ -140,7 +139,6 @@ def _within(figure: float, bounds: tuple[float, float]) -> bool:
 
 
 def _numbers(axis: Axis) -> dict[str, float]:
-    """Return the numbers of an axis by their key within it."""
     return {key: attrgetter(key)(axis) for relation in RELATIONS for key in relation.keys}
 
 

@@ -1,4 +1,4 @@
-"""The positions that an axis can be ordered to: set-points are 32 bits, and the largest offset is added to them."""
+"""The positions that an axis can be commanded to: set-points have 32 bits, and the largest offset is added to them."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from fdhil.cia402 import target_range
 from fdhil.config.axis import Axis
 from fdhil.config.offset_bounds import OffsetBounds
 
-_SHOWN = 1e4  # parts of a millimetre
+_SHOWN = 1e4  # resolution of shown positions, 1/mm
 
 
 @dataclass(frozen=True, slots=True)
 class PositionRange:
     """The set-points of one axis in increments, from ``low`` to ``high``; ``per_mm`` has the sign of the drive.
 
-    ``unit`` of ``mm_per_unit`` is what people give the axis in.
+    ``unit`` of ``mm_per_unit`` is the unit in which the axis is shown.
     """
 
     axis: str
@@ -34,18 +34,17 @@ class PositionRange:
         return PositionRange(name, *target_range(most), per_mm, axis.unit, axis.mm_per_unit)
 
     def fits(self, position_mm: float) -> bool:
-        """Return whether the set-point of a finite position, and each offset on top of it, fit into 32 bits."""
+        """Return whether the set-point of a finite position, with any allowed offset, fits into 32 bits."""
         return self.low <= round(position_mm * self.per_mm) <= self.high
 
     def last_mm(self, position_mm: float) -> float:
-        """Return the last position that fits on the way to one that does not, rounded to zero."""
+        """Return the last position that fits on the way to one that does not, rounded towards zero."""
         end = self.high if position_mm * self.per_mm > 0.0 else self.low
         return math.trunc(end / self.per_mm * _SHOWN) / _SHOWN
 
     def fault(self, position_mm: float) -> str:
-        """Return what is wrong with a position that does not fit, and what to do."""
         unit, here, last = self.unit, position_mm / self.mm_per_unit, self.last_mm(position_mm) / self.mm_per_unit
         text = f"axis {self.axis} at {here:.10g} {unit}: the set-point with its largest offset exceeds 32 bits"
         text += f" of increments ({abs(self.per_mm) * self.mm_per_unit:.10g} per {unit}); the last position that fits"
-        text += f" is {last:.10g} {unit}; move the work, or set the drive to coarser increments"
+        text += f" is {last:.10g} {unit}; move the workpiece, or set the drive to coarser increments"
         return text

@@ -1,4 +1,4 @@
-"""TOML becomes a checked configuration: all faults at once, each with its path and a suggestion."""
+"""Loads and validates TOML configurations; all faults are reported at once, each with its path and a suggestion."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ OUT_OF_RANGE = {"greater_than", "greater_than_equal", "less_than", "less_than_eq
 def load(path: Path) -> MachineConfig:
     """Read a machine configuration; ConfigError with every fault, its path and a suggestion.
 
-    What is possible but unlikely is told on stderr.
+    Possible but unlikely values are logged as warnings.
     """
     config = parse(read_toml(path, "a machine config"), str(path), path.parent)
     for sentence in unlikely(config):
-        logging.getLogger("fdhil").warning("%s: %s", path, sentence)  # nobody else may be there to tell: on stderr
+        logging.getLogger("fdhil").warning("%s: %s", path, sentence)  # on stderr, since no other recipient may exist
     return config
 
 
 def load_places(path: Path) -> MachineConfig:
-    """Read a configuration to take an offset away; of one with faults the places of sockets and store are enough.
+    """Read a configuration in order to remove an offset; of an invalid one the paths of sockets and store suffice.
 
-    ConfigError where there are no such places either.
+    ConfigError where these paths do not exist either.
     """
     try:
         return load(path)
@@ -67,7 +67,7 @@ def load_places(path: Path) -> MachineConfig:
 
 
 def read_toml(path: Path, what: str, advice: str = "check the path") -> dict[str, Any]:
-    """Return the tables of a TOML file that is ``what``; ConfigError when it cannot be read, is too large or none."""
+    """Read a TOML file, called ``what`` in errors; ConfigError when it is unreadable, too large or invalid."""
     try:
         with path.open("rb") as file:
             raw = file.read(MAX_CONFIG_BYTES + 1)
@@ -80,34 +80,34 @@ def read_toml(path: Path, what: str, advice: str = "check the path") -> dict[str
 
 
 def toml_document(raw: bytes, source: str) -> dict[str, Any]:
-    """Return the tables of a TOML file; ConfigError when it is none, also for one that is nested without end."""
+    """Parse TOML; ConfigError when it is invalid or nested too deeply."""
     try:
-        if any(line.count(b".") > MOST_DOTS for line in raw.splitlines()):  # a key of n parts takes n^2 to read
+        if any(line.count(b".") > MOST_DOTS for line in raw.splitlines()):  # parsing a key of n parts takes n^2
             raise RecursionError
         return tomllib.loads(raw.decode("utf-8-sig"))
     except RecursionError:
         what = "is nested deeper than any config"
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
-        what = f"is no TOML: it is no text in UTF-8 (at line {line})"
-    except ValueError as error:  # no TOML, or a number of thousands of digits
-        said, place = _placed(str(error))
-        what = f"is no TOML: {_short(said)}{place}"
-    raise ConfigError(source, [ConfigFault("file", what, "check the line it names")])
+        what = f"is not valid TOML: it is not UTF-8 text (at line {line})"
+    except ValueError as error:  # invalid TOML, or a number of thousands of digits
+        cause, place = _placed(str(error))
+        what = f"is not valid TOML: {_short(cause)}{place}"
+    raise ConfigError(source, [ConfigFault("file", what, "check that line")])
 
 
-def _placed(said: str) -> tuple[str, str]:
-    """Part what the library says from where, which is never cut short."""
-    found = re.search(r" \(at [^()]{1,60}\)$", said)
-    return (said[: found.start()], found[0]) if found else (said, "")
+def _placed(message: str) -> tuple[str, str]:
+    """Separate the library's message from its location, which is never shortened."""
+    found = re.search(r" \(at [^()]{1,60}\)$", message)
+    return (message[: found.start()], found[0]) if found else (message, "")
 
 
 def parse(
     document: Mapping[str, Any], source: str = "config", folder: Path = Path(), *, made_up: bool = False
 ) -> MachineConfig:
-    """Check a parsed TOML document; relative paths are taken from ``folder``.
+    """Validate a parsed TOML document; relative paths are resolved against ``folder``.
 
-    ``made_up``: its axes need not be those of a machine that can be.
+    ``made_up``: skip the plausibility checks, for machines that cannot exist.
     """
     units: list[ConfigFault] = []
     rotary = rotary_axes(document)
@@ -120,11 +120,11 @@ def parse(
     if units:
         raise ConfigError(source, units)
     store, guard = _placed_store(config.store, folder), _placed_guard(config.guard, folder)
-    worn = {
+    simulated = {
         name: axis.model_copy(update={"eds": folder / axis.eds if axis.eds else None})
         for name, axis in config.sim.axis.items()
     }
-    sim = config.sim.model_copy(update={"axis": worn})
+    sim = config.sim.model_copy(update={"axis": simulated})
     axes = {name: axis.model_copy(update={"drive": axis.drive.placed(folder)}) for name, axis in config.axis.items()}
     nc_source = config.nc_source.placed(folder)
     placed: dict[str, Any] = {"store": store, "guard": guard, "axis": axes, "sim": sim, "nc_source": nc_source}
@@ -149,7 +149,6 @@ def _placed_guard(guard: Guard, folder: Path) -> Guard:
 
 
 def _as_written(fault: ConfigFault, rotary: Mapping[str, float]) -> ConfigFault:
-    """Return a fault of a rotary axis with the key that its file has; numbers in it are lengths at the radius."""
     parts = fault.path.removeprefix("sim.").split(".")
     key = angular(parts[-1])
     if parts[0] != "axis" or len(parts) < 3 or parts[1] not in rotary or not (key != parts[-1] or "_um" in key):
@@ -159,12 +158,12 @@ def _as_written(fault: ConfigFault, rotary: Mapping[str, float]) -> ConfigFault:
 
 
 def load_as(whole: type[S], path: Path, what: str) -> S:
-    """Read another file than a machine's, whose tables are those of ``whole``; ConfigError with every fault."""
+    """Read another file than a machine's, with the tables of ``whole``; ConfigError with every fault."""
     return checked_as(whole, read_toml(path, what), str(path))
 
 
 def checked_as(whole: type[S], tables: Mapping[str, Any], source: str) -> S:
-    """Check the tables of another file than a machine's, as ``load_as`` does; ConfigError with every fault."""
+    """Validate the tables of another file than a machine's; ConfigError with every fault."""
     try:
         return whole.model_validate(tables)
     except ValidationError as error:
@@ -172,20 +171,20 @@ def checked_as(whole: type[S], tables: Mapping[str, Any], source: str) -> S:
 
 
 def unlikely(config: MachineConfig) -> list[str]:
-    """Return a sentence for everything about the axes that can be, but hardly is."""
+    """Return a sentence for each value of an axis that is possible but unlikely."""
     found = [(name, doubt) for name, axis in config.axis.items() for doubt in doubts(axis)]
-    told = [f"axis.{name}.{doubt.key} is unlikely: {doubt.text}" for name, doubt in found]
-    text = 'is that of a rotary axis and not used; give unit = "deg" too, or leave it out'
+    sentences = [f"axis.{name}.{doubt.key} is unlikely: {doubt.text}" for name, doubt in found]
+    text = 'is only used by a rotary axis; add unit = "deg", or remove it'
     flat = [name for name, axis in config.axis.items() if axis.unit == "mm" and axis.radius_mm is not None]
-    told += [f"axis.{name}.radius_mm {text}" for name in flat]
+    sentences += [f"axis.{name}.radius_mm {text}" for name in flat]
     sections = ("voltage", "temperature", "table")
     places = [(f"axis.{name}.{key}", getattr(axis, key)) for name, axis in config.axis.items() for key in sections]
     places.append(("nc_source.modbus_coil", config.nc_source.modbus_coil))
-    return told + [remark for path, place in places if place is not None and (remark := unit_remark(path, place))]
+    return sentences + [remark for path, place in places if place is not None and (remark := unit_remark(path, place))]
 
 
 def checked(section: type[S], values: Mapping[str, Any], path: str) -> S:
-    """Check the values of one table, ``path`` in the file, without the rest of it; ConfigError."""
+    """Validate the values of one table, ``path`` in the file, on its own; ConfigError."""
     try:
         return section.model_validate(values)
     except ValidationError as error:
@@ -193,11 +192,11 @@ def checked(section: type[S], values: Mapping[str, Any], path: str) -> S:
 
 
 def checked_value(path: str, value: Any) -> Any:
-    """Check the value of one key, as ``axis.X.nominal.R``, and return it as it is used; ConfigError."""
+    """Validate the value of one key, as ``axis.X.nominal.R``, and return it converted; ConfigError."""
     field, (*outer, key) = field_at(path), path.split(".")
     if field is None:
         near = _near_key(_section(tuple(outer)), key)
-        raise ConfigError(path, [ConfigFault(path, "is no key of this section", near)])
+        raise ConfigError(path, [ConfigFault(path, "is not a key of this section", near)])
     kind: Any = Annotated[(field.annotation, *field.metadata)] if field.metadata else field.annotation
     try:
         return TypeAdapter(kind).validate_python(value)
@@ -217,7 +216,7 @@ def _faults(
         field = section.model_fields.get(key)
         meaning = field.description or "" if field else ""
         if item["type"] == "extra_forbidden":
-            faults.append(ConfigFault(path, "is no key of this section", _near_key(section, key)))
+            faults.append(ConfigFault(path, "is not a key of this section", _near_key(section, key)))
         elif item["type"] == "missing":
             faults.append(ConfigFault(path, "is missing", meaning))
         elif item["type"] == "value_error" and not loc:
@@ -232,7 +231,7 @@ def _faults(
             shown = f", not {_shown(item['input'])}" if isinstance(item["input"], str | int | float | bool) else ""
             faults.append(ConfigFault(path, item["msg"].removeprefix("Value error, ") + shown, meaning))
     if len(items) > MOST_FAULTS:
-        faults.append(ConfigFault("file", f"has {len(items) - MOST_FAULTS} more faults", "mend these first"))
+        faults.append(ConfigFault("file", f"has {len(items) - MOST_FAULTS} more faults", "fix these first"))
     return faults
 
 
@@ -241,7 +240,6 @@ def _short(text: str) -> str:
 
 
 def _shown(value: Any) -> str:
-    """Return a value as it is shown in a fault; no file can make it long."""
     try:
         return _short(repr(value))
     except ValueError:
@@ -249,14 +247,13 @@ def _shown(value: Any) -> str:
 
 
 def _bounds(section: type[Section], loc: tuple[int | str, ...]) -> str:
-    """Return the range that a key's number must have, as the models state it; empty when they state none."""
     names = [str(key) for key in loc if str(key) in section.model_fields]
     if not names:
         return ""
     field = section.model_fields[names[-1]]
-    told = [*_constraints(field), *_constraints(field.annotation)]
-    low = max((bound for item in told if (bound := getattr(item, "ge", None)) is not None), default=None)
-    high = min((bound for item in told if (bound := getattr(item, "le", None)) is not None), default=LARGEST)
+    constraints = [*_constraints(field), *_constraints(field.annotation)]
+    low = max((bound for item in constraints if (bound := getattr(item, "ge", None)) is not None), default=None)
+    high = min((bound for item in constraints if (bound := getattr(item, "le", None)) is not None), default=LARGEST)
     return f"above 0 and at most {high:g}" if low is None else f"from {low:g} to {high:g}"
 
 
@@ -269,11 +266,10 @@ def _constraints(of: Any) -> Iterator[Any]:
 
 
 def _section(loc: tuple[int | str, ...], whole: type[Section] = MachineConfig) -> type[Section]:
-    """Follow a path of keys through the models as far as it leads."""
     section = whole
     for key in loc:
         field = section.model_fields.get(str(key))
-        if field is None:  # a name chosen by the user: axis.X, bus.can0
+        if field is None:  # a user's name: axis.X, bus.can0
             continue
         inner = [a for a in _arguments(field.annotation) if isinstance(a, type) and issubclass(a, Section)]
         if not inner:

@@ -18,10 +18,10 @@ class Regulators(Section):
     )
     position_gain_per_s: Positive = Field(ge=1e-2, le=1e5, description="Kv of the position loop, 1/s")
     speed_feedforward: Annotated[float, Field(ge=0, le=1.5)] = Field(
-        1.0, description="share of the demand's speed fed forward"
+        1.0, description="fed-forward share of the demand's speed"
     )
     speed_kp: Positive = Field(
-        description="proportional gain of the speed loop, A.s/rad; pid: derivative gain, and factor of the other two"
+        description="proportional gain of the speed loop, A.s/rad; pid: derivative gain, factor of the others"
     )
     speed_ki: NotNegative = Field(description="integral gain of the speed loop, A/rad")
     speed_period_s: Positive = Field(0.00025, ge=1e-6, le=0.02, description="cycle of the speed loop")
@@ -34,17 +34,13 @@ class Regulators(Section):
     torque_feedforward: Annotated[float, Field(ge=0, le=1.5)] = Field(
         0.0, description="share of the nominal inertia's current fed forward"
     )
-    setpoint_filter_s: NotNegative = Field(
-        0.0, le=1.0, description="time constant of a filter on the set-point; 0: none"
-    )
-    setpoint_filter_order: Literal[1, 2] = Field(1, description="first-order, or two equal ones behind each other")
-    speed_filter_s: NotNegative = Field(
-        0.0, le=0.1, description="time constant of a first-order filter on the speed feedback; 0: none"
-    )
+    setpoint_filter_s: NotNegative = Field(0.0, le=1.0, description="time constant of a set-point filter; 0: none")
+    setpoint_filter_order: Literal[1, 2] = Field(1, description="first order, or two equal ones in series")
+    speed_filter_s: NotNegative = Field(0.0, le=0.1, description="first-order filter on the speed feedback; 0: none")
     current_delay_cycles: int = Field(0, ge=0, le=32, description="current cycles until a computed voltage acts")
 
     pid_output: Literal["speed", "current"] = Field(
-        "speed", description="linuxcnc_pid: what the drive makes of the output: a speed, or speed_kp times it a current"
+        "speed", description="linuxcnc_pid: meaning of the output: a speed, or speed_kp times it a current"
     )
     position_derivative: NotNegative = Field(0.0, description="linuxcnc_pid: Dgain")
     position_feedforward_per_s: NotNegative = Field(0.0, description="linuxcnc_pid: FF0, 1/s")
@@ -52,15 +48,14 @@ class Regulators(Section):
     jerk_feedforward_s2: NotNegative = Field(0.0, description="linuxcnc_pid: FF3, s2")
     deadband_mm: NotNegative = Field(0.0, le=10.0, description="linuxcnc_pid: dead band of the error")
     output_limit_mm_s: NotNegative = Field(0.0, description="linuxcnc_pid: maxoutput, as table speed; 0: none")
-    error_previous_target: bool = Field(True, description="linuxcnc_pid: error against the command of the cycle before")
+    error_previous_target: bool = Field(True, description="linuxcnc_pid: error against the previous command")
 
     @model_validator(mode="after")
     def _integrals(self) -> Regulators:
-        """Refuse a gain that the structure would ignore silently, and one whose lack makes it another structure."""
         if self.structure == "p_pi_pi" and self.position_ki_per_s2:
             raise ValueError("structure p_pi_pi has no position_ki_per_s2; set structure = 'double_pi'")
         if self.structure == "double_pi" and not self.position_ki_per_s2:
-            raise ValueError("structure double_pi needs position_ki_per_s2; without it, it is p_pi_pi")
+            raise ValueError("structure double_pi needs position_ki_per_s2; without it, use structure = 'p_pi_pi'")
         no_speed_loop = self.structure == "pid" or (self.structure == "linuxcnc_pid" and self.pid_output == "current")
         if no_speed_loop and self.speed_ki:
             text = f"structure {self.structure} has no speed_ki"
@@ -74,7 +69,6 @@ class Regulators(Section):
         return self
 
     def _of_linuxcnc(self) -> list[str]:
-        """Return the keys of structure linuxcnc_pid that are not at their defaults."""
         fields = type(self).model_fields.items()
         own = [key for key, field in fields if (field.description or "").startswith("linuxcnc_pid:")]
         return [key for key in own if getattr(self, key) != type(self).model_fields[key].default]

@@ -1,4 +1,4 @@
-"""All tables of the file share their base class and the kinds of number and name."""
+"""Base class of all configuration tables, and their kinds of number and name."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import Annotated, Any, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-# no quantity of a machine lies beyond, in the units used here; a key states its own range where that is narrower
+# limits of every quantity, in the units used here; a key may have a narrower range
 SMALLEST, LARGEST = 1e-12, 1e9
 
 
 def _of_a_machine(value: float) -> float:
-    # no ge and le: those of a key would not narrow these but take their place, or lose theirs
+    # not by ge and le: those of a key would replace these instead of narrowing them
     if value != 0 and not SMALLEST <= abs(value) <= LARGEST:
         raise ValueError(f"must be from {SMALLEST:g} to {LARGEST:g}")
     return value
@@ -33,7 +33,7 @@ def _without_controls(name: str) -> str:
     return name
 
 
-ShownName = Annotated[str, AfterValidator(_without_controls)]  # on terminals, pages and in other programs
+ShownName = Annotated[str, AfterValidator(_without_controls)]  # shown on terminals, pages and in other programs
 AXIS_PATTERN = "[A-Z]2?"  # Y2 is the second drive of the gantry axis Y
 AxisName = Annotated[str, Field(pattern=f"^{AXIS_PATTERN}$")]
 
@@ -44,7 +44,7 @@ def is_second_drive(axis: str) -> bool:
 
 
 def _check_types(plan: Any, of: type[BaseModel]) -> None:
-    """Put the check of the type where the plan of ``of`` reads a number or a switch; other tables have theirs."""
+    """Insert the type check where the schema of ``of`` reads a number or a switch; other tables have their own."""
     if isinstance(plan, list | tuple):
         for part in plan:
             _check_types(part, of)
@@ -72,32 +72,32 @@ def _switch(value: Any) -> Any:
 
 
 class Section(BaseModel):
-    """A table of the TOML file: frozen, and a key it does not know is a fault.
+    """A table of the TOML file: frozen, and an unknown key is a fault.
 
-    Numbers and switches are taken as TOML writes them: no text for either, no true for 1, no 1 for true. (The library
-    is told to be strict of nothing: a path, or a word of several, is always text.)
+    Numbers and switches must have their TOML type: no text for either, no true for 1, no 1 for true. (Pydantic's strict
+    mode is not used: a path, or a word of several, is always text.)
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: type[BaseModel], handler: GetCoreSchemaHandler, /) -> CoreSchema:
-        """Return the library's plan of the checks, with those of a number's and a switch's type before the others."""
+        """Return the library's schema with the type checks of numbers and switches before all others."""
         plan = handler(source)
         _check_types(handler.resolve_ref_schema(plan), cls)
         return plan
 
 
 class SectionWithFiles(Section):
-    """A table in which a path is taken from the folder of the file that says it."""
+    """A table whose paths are relative to the folder of its file."""
 
     def placed(self, folder: Path) -> Self:
-        """Return it with the paths of its files taken from ``folder``."""
+        """Return a copy with its file paths resolved against ``folder``."""
         return self.model_copy(update={key: folder / value for key, value in self if isinstance(value, Path)})
 
 
 def one_of(table: Mapping[str, str], or_suffix: str | None = None) -> AfterValidator:
-    """Return the check that a name is of a table, or a path that ends in ``or_suffix``."""
+    """Return the validator of a name from a table, or of a path that ends in ``or_suffix``."""
 
     def check(name: str) -> str:
         if name not in table and not (or_suffix and name.endswith(or_suffix)):

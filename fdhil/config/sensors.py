@@ -1,7 +1,4 @@
-"""[axis.X.voltage], [axis.X.temperature]: sensors of their own, on Modbus (TCP or RTU) or on a serial line.
-
-What kinds of sensor have in common is a class here: where a device is, and how its value is read.
-"""
+"""[axis.X.voltage], [axis.X.temperature]: separate sensors on Modbus (TCP or RTU) or on a serial line."""
 
 from __future__ import annotations
 
@@ -33,49 +30,42 @@ def _regular(pattern: str) -> str:
     try:
         groups = re.compile(pattern).groups
     except re.error as error:
-        raise ValueError(f"is no regular expression ({error})") from None
+        raise ValueError(f"is not a regular expression ({error})") from None
     if groups != 1:
         raise ValueError("must have one group, around the number, as in 'U=([-+.0-9]+)'")
     return pattern
 
 
 class Sourced(Section):
-    """Which kind of sensor it is."""
+    """The kind of sensor."""
 
     source: str = Field("modbus", description="modbus, serial")
 
 
 class SerialPlace(Section):
-    """A serial line, and how it is set."""
+    """A serial line and its settings."""
 
     device: str = Field(NO_DEVICE, description="the serial device, as /dev/ttyUSB0 or /dev/serial/by-id/...")
     baud_rate: Annotated[int, AfterValidator(_of_a_line)] = Field(
         19200, ge=BAUD_RATES[0], le=BAUD_RATES[-1], description="serial: bits per second"
     )
     parity: Literal["even", "odd", "none"] = Field(
-        "even", description="serial: even is what Modbus devices have, none what others have"
+        "even", description="serial: even for most Modbus devices, else none"
     )
-    stop_bits: Literal[1, 2] = Field(1, description="serial: stop bits; Modbus has 2 where there is no parity")
-    timeout_s: Positive = Field(0.5, ge=1e-3, le=60, description="how long an answer may take")
+    stop_bits: Literal[1, 2] = Field(1, description="serial: stop bits; Modbus uses 2 without parity")
+    timeout_s: Positive = Field(0.5, ge=1e-3, le=60, description="longest time for an answer")
 
 
 class ModbusPlace(SerialPlace):
     """A Modbus unit: RTU on a serial device, else TCP."""
 
-    device: str = Field(
-        NO_DEVICE, description="serial: the device, as /dev/ttyUSB0, for Modbus RTU or text; left out: Modbus TCP"
-    )
+    device: str = Field(NO_DEVICE, description="serial: device, as /dev/ttyUSB0, for RTU or text; left out: Modbus TCP")
     host: str = Field("127.0.0.1", description="modbus: address of the device")
     port: int = Field(0, ge=0, le=65535, description="modbus: TCP port; 0 lets the simulator choose one")
     framing: Literal["tcp", "rtu"] = Field(
-        "tcp", description="modbus: rtu for a transparent serial server, which passes RTU frames over TCP"
+        "tcp", description="modbus: rtu for a serial server that passes RTU frames over TCP"
     )
-    unit: int = Field(
-        1,
-        ge=0,
-        le=255,
-        description="modbus: unit identifier; on a serial line 1 to 247, or what a device alone there is asked by",
-    )
+    unit: int = Field(1, ge=0, le=255, description="modbus: unit identifier; on a serial line 1 to 247")
 
     @property
     def is_rtu(self) -> bool:
@@ -85,15 +75,17 @@ class ModbusPlace(SerialPlace):
     @model_validator(mode="after")
     def _answers(self) -> ModbusPlace:
         if self.is_rtu and self.unit == 0:
-            raise ValueError("unit: a unit on a serial line has a number from 1 to 247; 0 asks all, and none answers")
+            raise ValueError("unit: must be from 1 to 247 on a serial line; 0 is the broadcast, which no unit answers")
         return self
 
 
 def unit_remark(path: str, place: ModbusPlace) -> str:
-    """Return a sentence about a unit number that the standard reserves; empty for another."""
+    """Return a sentence about a unit number that the standard reserves; empty for any other."""
     if not place.is_rtu or place.unit <= LAST_UNIT:
         return ""
-    text = f"{path}.unit = {place.unit} is not one of 1 to {LAST_UNIT}, which units on a serial line have: keep it only"
+    text = (
+        f"{path}.unit = {place.unit} is outside 1 to {LAST_UNIT}, the numbers of units on a serial line: keep it only"
+    )
     return f"{text} where the device's manual names it, and the device is alone on its line (as a PZEM-017 at 248)"
 
 
@@ -101,15 +93,11 @@ class ModbusValue(Section):
     """A value in the registers of a Modbus unit."""
 
     function: Literal[3, 4] = Field(4, description="modbus: 4 reads input registers, 3 holding registers")
-    address: int = Field(
-        0, ge=0, le=65535, description="modbus: first register, counted from 0 (register 30001 or 40001 is 0)"
-    )
+    address: int = Field(0, ge=0, le=65535, description="modbus: first register, from 0 (register 30001 or 40001)")
     type: ValueType = Field("float32", description="modbus: int16, uint16, int32, uint32, float32, float64")
-    word_order: Literal["big", "little"] = Field(
-        "big", description="modbus: big has the high word of a value in its first register, little the low word"
-    )
+    word_order: Literal["big", "little"] = Field("big", description="modbus: big has the high word of a value first")
     byte_order: Literal["big", "little"] = Field(
-        "big", description="modbus: of the two bytes of each register; big is Modbus' own, little has them swapped"
+        "big", description="modbus: order of the two bytes of each register; big is the standard, little is swapped"
     )
 
 
@@ -117,47 +105,42 @@ class TextValue(Section):
     """A number in a line of text of an instrument on a serial line."""
 
     query: str = Field(
-        "",
-        max_length=200,
-        description="serial: what an instrument is asked with, as 'READ?\\n'; left out: it tells lines by itself",
+        "", max_length=200, description="serial: query, as 'READ?\\n'; left out: it sends lines by itself"
     )
     pattern: Annotated[str, AfterValidator(_regular)] = Field(
-        "",
-        description="serial: where a line has the value, as 'U=([-+.0-9]+)'; left out: its first number",
+        "", description="serial: position of the value in a line, as 'U=([-+.0-9]+)'; left out: its first number"
     )
 
 
 class Scaled(Section):
-    """From a value as it is read to one in the unit of the key."""
+    """Linear conversion from a reading to the unit of the key."""
 
-    scale: Finite = Field(1.0, description="what a value is multiplied with; negative where the wires are swapped")
-    offset: Finite = Field(0.0, description="what is added then")
+    scale: Finite = Field(1.0, description="factor of the reading; negative where the wires are swapped")
+    offset: Finite = Field(0.0, description="added after scaling")
 
 
 def _worth_something(value: Scaled) -> None:
     if value.scale == 0:
-        raise ValueError("scale: what is read must be worth something; give the unit's worth of one count")
+        raise ValueError("scale: must not be 0; give the amount of one count in the key's unit")
 
 
 class VoltageBlock(Section):
     """[axis.X.voltage.block]: where a Modbus device keeps its newest samples by number: voltage.address is the first
-    of them, voltage.type what each is. Without this section a device shows one value, its newest."""
+    sample, voltage.type the type of each. Without this section a device shows one value, its newest."""
 
     samples: int = Field(32, ge=1, le=124, description="samples in the block")
-    rate_hz: Positive = Field(1000.0, ge=0.1, le=1e6, description="samples in a second")
-    counter_address: int = Field(
-        40, ge=0, le=65534, description="register of the count of samples (with the block in at most 125 registers)"
-    )
-    counter_type: Literal["uint16", "uint32"] = Field("uint32", description="of that count: uint16, uint32")
+    rate_hz: Positive = Field(1000.0, ge=0.1, le=1e6, description="samples per second")
+    counter_address: int = Field(40, ge=0, le=65534, description="register of the sample count, near the block")
+    counter_type: Literal["uint16", "uint32"] = Field("uint32", description="type of that count: uint16, uint32")
     counter_of: Literal["newest", "oldest"] = Field(
         "newest", description="newest: the count is the number of the block's newest sample; oldest: of its oldest"
     )
     count_address: int | None = Field(
-        None, ge=0, le=65535, description="register of how many samples there are; left out: the block is always full"
+        None, ge=0, le=65535, description="register of the number of samples; left out: always full"
     )
-    newest_first: bool = Field(False, description="whether the block's first sample is its newest")
+    newest_first: bool = Field(False, description="true if the block's first sample is its newest")
     trigger_address: int | None = Field(
-        None, ge=0, le=65535, description="register to which 1 is written to have new samples put into the block"
+        None, ge=0, le=65535, description="write 1 here to fill the block with new samples"
     )
 
 
@@ -173,7 +156,7 @@ class Voltage(Scaled, TextValue, ModbusValue, ModbusPlace, Sourced):
     )
     sampling: Literal["interval_mean", "instant"] = Field(
         "interval_mean",
-        description="a value is the mean since the last one, or an instant; left out for one value alone: an instant",
+        description="a value is the mean since the last one, or instantaneous; left out for a single value: instant",
     )
     type: ValueType | None = Field(  # type: ignore[assignment]
         None,
@@ -182,16 +165,15 @@ class Voltage(Scaled, TextValue, ModbusValue, ModbusPlace, Sourced):
         "simulated sensor",
     )
     period_s: Positive = Field(
-        0.02, ge=1e-3, le=10.0, description="how often a sensor that shows one value is asked, or tells by itself"
+        0.02, ge=1e-3, le=10.0, description="how often a single-value sensor is polled, or sends"
     )
-    delay_s: NotNegative = Field(0.0, le=10.0, description="how late that value is, for its filter")
-    renewed_s: NotNegative = Field(0.0, le=10.0, description="how often the sensor renews it; 0: whenever it is asked")
+    delay_s: NotNegative = Field(0.0, le=10.0, description="delay of that value by its filter")
+    renewed_s: NotNegative = Field(0.0, le=10.0, description="how often the sensor updates it; 0: at each poll")
     block: VoltageBlock | None = None
 
     @model_validator(mode="before")
     @classmethod
     def _as_it_shows(cls, given: Any) -> Any:
-        """Fill in what follows from the keys that are given."""
         if not isinstance(given, Mapping):
             return given
         filled = dict(given)
@@ -206,30 +188,33 @@ class Voltage(Scaled, TextValue, ModbusValue, ModbusPlace, Sourced):
     def _complete(self) -> Voltage:
         _worth_something(self)
         if self.source == "serial" and not self.device:
-            raise ValueError("device: a sensor on a serial line has one, as device = '/dev/ttyUSB0'")
+            raise ValueError("device: is missing: name the sensor's serial device, as device = '/dev/ttyUSB0'")
         if self.block is not None and block_registers(self)[1] > MOST_REGISTERS:
-            raise ValueError("block: its samples and its count lie in more than 125 registers, which no request reads")
+            raise ValueError(
+                "block: samples and count span more than 125 registers, the most that one request reads; move "
+                "them together"
+            )
         return self
 
     @property
     def separate(self) -> bool:
-        """Whether a sensor of its own tells the voltage; else the drive does, with its other samples."""
+        """Whether a separate sensor measures the voltage; otherwise the drive sends it with its samples."""
         return self.source != tables.DRIVE_VOLTAGE
 
 
 class Thermometer(Scaled, TextValue, ModbusValue, ModbusPlace, Sourced):
-    """[axis.X.temperature]: the slide-way's thermometer. Without this section drift is told by time alone."""
+    """[axis.X.temperature]: the slide-way's thermometer. Without this section drift is tracked over time only."""
 
     source: Literal["modbus", "serial"] = Field("modbus", description="modbus, serial")
     port: int = Field(502, ge=1, le=65535, description="modbus: TCP port")
     address: int = Field(8, ge=0, le=65535, description="modbus: first register, counted from 0")
-    period_s: Positive = Field(1.0, ge=1e-2, le=3600, description="how often it is asked")
+    period_s: Positive = Field(1.0, ge=1e-2, le=3600, description="how often it is polled")
 
     @model_validator(mode="after")
     def _complete(self) -> Thermometer:
         _worth_something(self)
         if self.source == "serial" and not self.device:
-            raise ValueError("device: a thermometer on a serial line has one, as device = '/dev/ttyUSB0'")
+            raise ValueError("device: is missing: name the thermometer's serial device, as device = '/dev/ttyUSB0'")
         return self
 
 
@@ -238,7 +223,7 @@ MOST_REGISTERS = 125  # of one request
 
 
 def block_registers(voltage: Voltage) -> tuple[int, int]:
-    """Return the first register of the request that reads a device's block, and how many it reads."""
+    """Return first register and number of registers of the request that reads a device's block."""
     block, kind = voltage.block, voltage.type
     assert block is not None
     assert kind is not None
@@ -251,9 +236,9 @@ def block_registers(voltage: Voltage) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True)
 class LineUser:
-    """A sensor on a serial device; ``registers`` are read every ``period_s``, 0 where it is not asked for a value.
+    """A sensor on a serial device; ``registers`` are read every ``period_s``, 0 where it is not polled for a value.
 
-    ``alone``: it tells lines of text, and can have no other beside it.
+    ``alone``: it sends lines of text and cannot share its device.
     """
 
     path: str
@@ -264,14 +249,14 @@ class LineUser:
 
     @property
     def share(self) -> float:
-        """Which share of its line's time it takes."""
+        """Share of its line's time that it takes."""
         bits = 1 + 8 + (self.place.parity != "none") + self.place.stop_bits
         characters = _REQUEST_CHARACTERS + _ANSWER_CHARACTERS + 2 * self.registers + _SILENT_CHARACTERS
         return characters * bits / self.place.baud_rate / self.period_s if self.registers else 0.0
 
 
 def line_user(path: str, sensor: Voltage | Thermometer) -> LineUser | None:
-    """Return what a sensor takes of a serial device; None where it has none."""
+    """Return a sensor's use of a serial device; None where it has none."""
     if not sensor.device or sensor.source == tables.DRIVE_VOLTAGE:
         return None
     asked = sensor.source == "modbus" and getattr(sensor, "block", None) is None and sensor.type is not None
@@ -284,7 +269,7 @@ _REQUEST_CHARACTERS, _ANSWER_CHARACTERS, _SILENT_CHARACTERS = 8, 5, 7.0
 
 
 def line_faults(users: Iterable[LineUser]) -> Iterator[str]:
-    """Yield what cannot be of sensors on one serial device: other settings, text beside others, too much to ask."""
+    """Yield conflicts of sensors on one serial device: different settings, text next to others, too much polling."""
     lines: dict[str, list[LineUser]] = {}
     for user in users:
         lines.setdefault(user.place.device, []).append(user)
@@ -296,8 +281,9 @@ def line_faults(users: Iterable[LineUser]) -> Iterator[str]:
                 if getattr(other.place, key) != wanted:
                     yield f"{other.path}.{key}: {first.path} sets the same device {device} to {wanted}"
             if first.alone or other.alone:
-                yield f"{other.path}.device: {first.path} has {device}, and what tells by text is alone on its device"
+                text = f"{first.path} has {device}, and a text instrument cannot share its device; give it another one"
+                yield f"{other.path}.device: {text}"
         share = sum(user.share for user in members)
         if share > 1.0:
             text = f"{', '.join(user.path for user in members)} take {share:.0%} of the time of {device}"
-            yield f"{first.path}.period_s: {text} at {first.place.baud_rate} baud; ask more rarely or raise baud_rate"
+            yield f"{first.path}.period_s: {text} at {first.place.baud_rate} baud; poll less often or raise baud_rate"

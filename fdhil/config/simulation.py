@@ -13,17 +13,17 @@ from fdhil.config.section import AxisName, Finite, NotNegative, Positive, Sectio
 
 
 class Noise(Section):
-    """[sim.noise]: standard deviations of the twin's white sensor noise."""
+    """[sim.noise]: standard deviations of the simulator's white sensor noise."""
 
     voltage_v: NotNegative = Field(0.06, description="terminal voltage")
     current_a: NotNegative = Field(0.05, description="motor current")
     speed_rad_s: NotNegative = Field(0.15, description="shaft speed")
-    table_um: NotNegative = Field(0.05, description="place of the encoder at the table, where there is one")
+    table_um: NotNegative = Field(0.05, description="position of the encoder at the table, if there is one")
     table_m_s2: NotNegative = Field(0.05, description="acceleration of the accelerometer at the table")
 
 
 class SimAxis(Section):
-    """[sim.axis.X]: what the simulated drive really is; what is left out is the nominal value."""
+    """[sim.axis.X]: true values of the simulated drive; a key that is left out has the nominal value."""
 
     R: Positive | None = Field(None, ge=1e-9, le=1e6, description="ohm")
     L: Positive | None = Field(None, ge=1e-9, le=1e6, description="H")
@@ -35,18 +35,18 @@ class SimAxis(Section):
     Cd_per_kelvin: Finite = Field(0.0, description="relative change of Cd per kelvin of slide-way temperature")
     backlash_um: NotNegative = Field(0.0, description="lost motion between screw and table")
     start_mm: Finite = Field(0.0, description="position at power-on")
-    offset_in_feedforward: bool = Field(True, description="whether 0x60B0 is seen by the speed feed-forward")
+    offset_in_feedforward: bool = Field(True, description="whether the speed feed-forward includes 0x60B0")
     eds: Path | None = Field(
-        None, description="EDS or DCF file that the simulated drive wears, from the config's folder; left out: its own"
+        None,
+        description="EDS or DCF file of a vendor's drive to emulate, from the config's folder; left out: the "
+        "simulator's own drive",
     )
-    boot_s: NotNegative = Field(
-        0.0, le=60.0, description="from a reset, or the supply's return, to the boot-up message"
-    )
+    boot_s: NotNegative = Field(0.0, le=60.0, description="time from a reset or power-on to the boot-up message")
     limit_switches_mm: tuple[Finite, Finite] | None = Field(
-        None, description="where the limit switches are, for homing; left out: there are none"
+        None, description="limit switches for homing; left out: none"
     )
     home_switch_mm: Finite | None = Field(
-        None, description="from where on, in the drive's positive direction, the home switch is active"
+        None, description="from here on in positive direction the home switch is active"
     )
     reality: Reality = Reality()
 
@@ -54,9 +54,7 @@ class SimAxis(Section):
 class Thermal(Section):
     """[sim.thermal]: the slide-ways warm with the work of friction and cool toward the ambient."""
 
-    ambient_c: Finite = Field(
-        20.0, ge=-50, le=200, description="ambient and start temperature, the reference of ft and Cd"
-    )
+    ambient_c: Finite = Field(20.0, ge=-50, le=200, description="ambient and start temperature, reference of ft and Cd")
     rise_c: NotNegative = Field(2.0, le=200, description="rise in steady shuttling at rapid speed")
     time_constant_s: Positive = Field(600.0, description="time constant of that rise")
 
@@ -64,16 +62,14 @@ class Thermal(Section):
 class Sim(Section):
     """[sim]: the simulated machine; a real machine's config needs none of it."""
 
-    pace: Literal["realtime", "lockstep"] = Field(
-        "realtime", description="lockstep: as fast as the bus answers, repeatable"
-    )
+    pace: Literal["realtime", "lockstep"] = Field("realtime", description="lockstep: as fast as the bus, repeatable")
     seed: int = Field(1, ge=0, le=2**63 - 1, description="seed of the sensor noise")
     nc: bool = Field(False, description="whether the simulated NC is switched on at start")
     lockstep_rpdo: tuple[str, ...] = Field(
-        (), description="lockstep: RPDOs to wait for, such as X:2; left out: those heard in the cycle before"
+        (), description="lockstep: RPDOs to wait for, as X:2; left out: those of the previous cycle"
     )
     modbus: bool = Field(True, description="serve a Modbus voltage sensor per axis")
-    modbus_cycles: int = Field(1, ge=1, le=100, description="SYNC cycles over which one of its samples is the mean")
+    modbus_cycles: int = Field(1, ge=1, le=100, description="SYNC cycles averaged in one of its samples")
     noise: Noise = Noise()
     thermal: Thermal = Thermal()
     axis: Mapping[AxisName, SimAxis] = Field(default_factory=dict)

@@ -1,6 +1,6 @@
-"""Writes a configuration as a commented file: the whole template, or a machine's values with all that belongs to them.
+"""Writes configurations as commented files: the whole template, or a machine's values.
 
-The words are the descriptions and docstrings of the models, so that they stand in one place.
+The comments are the descriptions and docstrings of the models.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from fdhil.config.axis_tables import linear
 from fdhil.config.machine import MachineConfig
 from fdhil.config.section import Section
 
-EXAMPLES: Mapping[str, Any] = {  # of keys without a default: the bench machine
+EXAMPLES: Mapping[str, Any] = {  # for keys without a default: the bench machine
     "machine.name": "my machine",
     "screw_pitch_mm": 20.0, "rapid_speed_mm_s": 500.0, "max_acceleration_mm_s2": 4000.0, "max_jerk_mm_s3": 160000.0,
     "resonance_hz": 80.0, "radius_mm": 100.0, "max_difference_um": 500.0,
@@ -60,14 +60,14 @@ EXAMPLES: Mapping[str, Any] = {  # of keys without a default: the bench machine
     "torque": "lcec.0.x.torque", "axis.X.drive.hal.voltage": "pwmgen.0.value", "enabled": "joint.0.amp-enable-out",
     "axis.X.voltage.type": "float32", "count_address": 42, "trigger_address": 43,
 }  # fmt: skip
-NAMES = {"axis": "X", "bus": "can0"}  # the user's own names in the template
-_OWN = ("axis.", "bus.", "sim.axis.")  # below these are names
+NAMES = {"axis": "X", "bus": "can0"}  # names in the template
+_OWN = ("axis.", "bus.", "sim.axis.")  # tables of named entries
 WIDTH = 118
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of the configuration file: its path, what it is, whether it may be left out, and its own keys."""
+    """A table of the configuration file: its path, its section, whether it is optional, and its own keys."""
 
     path: str
     section: type[Section]
@@ -76,7 +76,7 @@ class Table:
 
     @property
     def meaning(self) -> str:
-        """The section's own words, without the name in front."""
+        """The section's description, without its name in front."""
         words = re.sub(r"^\[.*?\](: )?", "", inspect.getdoc(self.section) or "")
         return words[:1].upper() + words[1:]
 
@@ -97,10 +97,10 @@ def sections(section: type[Section] = MachineConfig, path: str = "", optional: b
 def template() -> str:
     """Return the commented machine configuration: required keys set, everything else commented out."""
     lines = [
-        "# A machine for fdhil. The lines without a # in front are required: put your machine's values there.",
-        "# A line that begins with # and no space is a setting at its default, or an example where it has none.",
-        "# To change it, take the # away. The comment above each line says what it is.",
-        "# A key that fdhil does not know is refused, with a suggestion.",
+        "# A machine for fdhil. Lines without a leading # are required: enter your machine's values there.",
+        "# A line that begins with # and no space is a setting at its default, or an example if it has none.",
+        "# To change it, remove the #. The comment above each line explains it.",
+        "# Unknown keys are refused, with a suggestion.",
     ]
     for table in sections():
         lines += ["", *_heading(table)]
@@ -112,10 +112,10 @@ def template() -> str:
 
 
 def filled(document: Mapping[str, Any], sources: Mapping[str, str], head: str = "") -> str:
-    """Return ``document`` (nested tables of values) as a commented file, with the source of each value behind it.
+    """Return ``document`` (nested tables of values) as a commented file, with the source of each value next to it.
 
-    A table comes with the comments and defaults of its other keys; of the second axis and bus on, with its values
-    alone. ``sources`` has the full path of a key, as ``axis.X.nominal.R``.
+    A table includes the comments and defaults of its other keys; from the second axis and bus on, only its values.
+    ``sources`` has the full path of a key, as ``axis.X.nominal.R``.
     """
     lines, left = _comment(head), []
     for table, first in _named(document):
@@ -132,13 +132,13 @@ def filled(document: Mapping[str, Any], sources: Mapping[str, str], head: str = 
             elif first:
                 lines += [*_comment(field.description or ""), f"#{key} = {toml(_example(table.path, key, field))}"]
     text = "\n".join(
-        [*lines, "", *_comment(f"Further tables, which docs/reference/config.md explains: {', '.join(left)}")]
+        [*lines, "", *_comment(f"Further tables, explained in docs/reference/config.md: {', '.join(left)}")]
     )
     return text + "\n"
 
 
 def _named(document: Mapping[str, Any]) -> Iterator[tuple[Table, bool]]:
-    """Yield the tables by the document's own names; whether it is of the first axis or bus, or of anything else."""
+    """Yield the tables under the document's names, and whether to comment them (first axis and bus only)."""
     tables = list(sections())
     for top, of_top in groupby(tables, lambda table: next((t for t in _OWN if table.path.startswith(t)), "")):
         group = list(of_top)
@@ -161,9 +161,9 @@ def _at(document: Mapping[str, Any], path: str) -> Mapping[str, Any] | None:
 
 def _line(key: str, value: Any, source: str) -> list[str]:
     text = f"{key} = {toml(value)}"
-    said = _comment(source)
-    whole = "  ".join([text, *said])
-    return [whole] if len(said) < 2 and len(whole) <= WIDTH else [*said, text]
+    comment = _comment(source)
+    whole = "  ".join([text, *comment])
+    return [whole] if len(comment) < 2 and len(whole) <= WIDTH else [*comment, text]
 
 
 def _heading(table: Table) -> list[str]:
@@ -176,7 +176,6 @@ def _comment(words: str) -> list[str]:
 
 
 def _example(path: str, key: str, field: FieldInfo) -> Any:
-    """Return what the template shows; KeyError where a key has neither a default nor an example."""
     value = default(field)
     if value is not None:
         return value
@@ -191,7 +190,6 @@ def default(field: FieldInfo) -> Any:
 
 
 def toml(value: Any) -> str:
-    """Return a value as TOML has it."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple | list):

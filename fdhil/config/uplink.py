@@ -1,4 +1,4 @@
-"""[uplink]: what a machine tells the history of a works, and over which server."""
+"""[uplink]: what a machine sends to the plant's fleet server, and how."""
 
 from __future__ import annotations
 
@@ -20,56 +20,53 @@ Labels = Mapping[LabelName, Label]
 
 
 class NatsServer(Credentials):
-    """What is needed to reach a NATS server."""
+    """Keys for the connection to a NATS server."""
 
     server: str = Field(
         "nats://127.0.0.1:4222",
         pattern=r"^(nats|tls)://[^/@,\s]+(,(nats|tls)://[^/@,\s]+)*$",
-        description="the NATS server with JetStream; several of one cluster with commas: each try enters one of them",
+        description="the NATS server with JetStream; servers of one cluster are separated by commas and tried in turn",
     )
 
     credentials_file: Path | None = Field(
-        None, description="goes before user and password: NATS' own .creds file, or the seed of an nkey; mode 0600"
+        None, description="instead of user and password: NATS' .creds file, or an nkey's seed; mode 0600"
     )
 
     @property
     def servers(self) -> tuple[str, ...]:
-        """Each server of the cluster."""
         return tuple(self.server.split(","))
 
     @model_validator(mode="after")
     def _encrypted(self) -> Self:
         hosts = [urlsplit(server).hostname or "" for server in self.servers]
         if self.tls_ca_file is None and not all(map(is_loopback, hosts)):
-            raise ValueError("server: beyond this computer it needs a tls_ca_file; else all could be read on the way")
+            raise ValueError(
+                "server: beyond this computer it needs a tls_ca_file; else everything would be sent in clear text"
+            )
         return self
 
 
 class Uplink(NatsServer):
-    """[uplink]: what fdhil uplink sends to the history of many machines (needs the extra fleet); left out: nothing."""
+    """[uplink]: what fdhil uplink sends to the fleet server (needs the extra fleet); left out: nothing."""
 
     machine: str = Field(
         "",
         pattern=r"^([A-Za-z0-9_-]{1,64})?$",
-        description="this machine's name there; left out: made of [machine] name",
+        description="this machine's name in the plant; left out: derived from [machine] name",
     )
     windows: Literal["all", "refused", "some", "none"] = Field(
-        "refused", description="which recorded windows are sent whole; what was found in them is told of each"
+        "refused", description="which recorded windows are sent whole; the results of every window are always sent"
     )
-    every_window: int = Field(10, ge=1, le=1_000_000, description="with windows = some: every so many-th of an axis")
+    every_window: int = Field(10, ge=1, le=1_000_000, description="with windows = some: every n-th window of an axis")
     keep_unsent: int = Field(
-        500_000, ge=1_000, le=100_000_000, description="records kept while they cannot be sent; the oldest go first"
+        500_000, ge=1_000, le=100_000_000, description="records kept while unsent; the oldest go first"
     )
-    directory: Path | None = Field(
-        None, description="where fdhil uplink notes how far it is; left out: <store directory>/uplink"
-    )
-    labels: Labels = Field(
-        default_factory=dict, description="what to compare machines by, as type, works, lubricant: any names and texts"
-    )
+    directory: Path | None = Field(None, description="progress of fdhil uplink; left out: <store directory>/uplink")
+    labels: Labels = Field(default_factory=dict, description="for comparing machines, as type, plant, lubricant")
     axis_labels: Mapping[AxisName, Labels] = Field(
-        default_factory=dict, description="the same of single axes, as screw or motor, by the axis' letter"
+        default_factory=dict, description="labels of axes, as screw or motor"
     )
 
     def name_of(self, machine: str) -> str:
-        """Return this machine's name in the works: what is set, else ``machine`` without what a subject cannot have."""
+        """Return this machine's name in the plant: the configured one, else ``machine`` as a subject can hold it."""
         return self.machine or re.sub(r"[^A-Za-z0-9_-]", "_", machine)[:64]

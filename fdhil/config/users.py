@@ -1,7 +1,7 @@
-"""Who may log in: a file of names, roles and scrypt hashes of passwords, and the checking of them.
+"""The users file: names, roles and scrypt hashes of passwords.
 
-Parameters of scrypt: N = 2^15, r = 8, p = 1 (32 MiB, about 0.1 s), after RFC 7914 and OWASP's password storage
-cheat sheet. The file is written whole and is readable by its owner and group alone.
+Parameters of scrypt: N = 2^15, r = 8, p = 1 (32 MiB, about 0.1 s), after RFC 7914 and OWASP's password storage cheat
+sheet. The file is written atomically and is readable by its owner and group only.
 """
 
 from __future__ import annotations
@@ -41,49 +41,49 @@ class User(BaseModel):
 
 
 class Users(BaseModel):
-    """The file."""
+    """The content of the file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     users: Mapping[UserName, User] = {}
 
 
 def hashed(password: str, role: Role) -> User:
-    """Return a user with this password, under a salt of its own."""
+    """Return a user with this password, under a new salt."""
     salt = secrets.token_bytes(16)
     return User(role=role, salt=_text(salt), scrypt=_text(_scrypt(password, salt)))
 
 
 NOBODY = User(role="watch", salt=base64.b64encode(bytes(16)).decode(), scrypt=base64.b64encode(bytes(32)).decode())
-"""Stands for a user that there is not, so that a wrong name takes as long as a wrong password."""
+"""Stands for an unknown user, so that a wrong name takes as long as a wrong password."""
 
 
 def matches(user: User | None, password: str) -> bool:
-    """Whether the password is the user's (blocking, a tenth of a second whatever the answer)."""
+    """Return whether the password is the user's (blocking, 0.1 s whatever the answer)."""
     against = user or NOBODY
     found = _scrypt(password, base64.b64decode(against.salt))
     return hmac.compare_digest(found, base64.b64decode(against.scrypt)) and user is not None
 
 
 def read_users(path: Path) -> Mapping[str, User]:
-    """Return who may log in; ConfigError where the file cannot be read, is none, or is open to others."""
+    """Read the users file; ConfigError where it is unreadable, invalid, or open to others."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError as error:
-        raise _fault(path, f"cannot be read: {error.strerror}", "make it with fdhil web-user CONFIG NAME") from None
+        raise _fault(path, f"cannot be read: {error.strerror}", "create it with fdhil web-user CONFIG NAME") from None
     with os.fdopen(descriptor, "rb") as file:
         if stat.S_IMODE(os.fstat(descriptor).st_mode) & 0o007:
             raise _fault(path, "is open to every user of this computer", f"chmod 0640 {path}")
         raw = file.read(MAX_FILE + 1)
     try:
         return Users.model_validate_json(raw).users
-    except ValidationError:  # its message would show what stands in the file
+    except ValidationError:  # its message would show the content of the file
         raise _fault(
-            path, "is no users file", "move it away, then make it anew with fdhil web-user CONFIG NAME"
+            path, "is not a users file", "move it away, then create it again with fdhil web-user CONFIG NAME"
         ) from None
 
 
 class UsersFile:
-    """The users of a file, which is read again when it is another one: who was removed may do nothing from then on."""
+    """A users file that is read again when it changes, so that a removed user loses access at once."""
 
     def __init__(self, path: Path) -> None:
         """Read the file, so that a faulty one is reported at the start; ConfigError."""
@@ -102,19 +102,19 @@ class UsersFile:
         return self._read[1]
 
     def user(self, name: str) -> User | None:
-        """Return a user; None for one that there is not, or when the file cannot be read any more."""
+        """Return a user; None for an unknown one, or when the file can no longer be read."""
         try:
             return self._users().get(name)
         except ConfigError as error:
-            logging.getLogger("fdhil").error("nobody may log in: %s", error)
+            logging.getLogger("fdhil").error("no user can log in: %s", error)
             return None
 
 
 def write_users(path: Path, users: Mapping[str, User]) -> None:
-    """Write the file whole, with the mode and owner that it had, or 0600; OSError."""
+    """Replace the file atomically, with its former mode and owner, or 0600; OSError."""
     text = json.dumps({"users": {name: user.model_dump() for name, user in users.items()}}, indent=1) + "\n"
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     try:
         with os.fdopen(descriptor, "w") as file:
             if path.exists():
@@ -125,9 +125,9 @@ def write_users(path: Path, users: Mapping[str, User]) -> None:
             file.write(text)
             file.flush()
             os.fsync(descriptor)
-        beside.replace(path)
+        temporary.replace(path)
     except OSError:
-        beside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 

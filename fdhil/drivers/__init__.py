@@ -1,4 +1,4 @@
-"""Listens to the machine's wires and makes records of them: buses, drives, sensors, event sources."""
+"""Receives from the machine's buses and sensors and turns it into records."""
 
 from fdhil.drivers.machine import MachineSource, Record, open_machine
 

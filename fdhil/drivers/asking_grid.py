@@ -1,7 +1,7 @@
-"""Says when a sensor that shows one value is asked, and how far from that instant its answer may be. Pure.
+"""Schedules the polls of a sensor that shows one value, and bounds the time of each reading. Pure.
 
-The instants are whole multiples of the period on the SYNC count, so that the values are a signal on the drive's clock;
-without SYNC they are so on this computer's clock.
+Polls lie at whole multiples of the period on the SYNC count, so that the values form a signal on the drive's clock;
+without SYNC they follow this computer's clock.
 """
 
 import math
@@ -10,14 +10,14 @@ import numpy as np
 
 from fdhil.drivers.can.tick_clock import TickClock
 
-SYNC_ENDED_NS = 500_000_000  # after so long a silence it does not run
+SYNC_ENDED_NS = 500_000_000  # silence after which SYNC counts as stopped
 PACE_TICKS = 500
 
 
 class AskingGrid:
-    """Instants ``period_s`` apart, numbered; ``missed`` counts those at which nobody was asked.
+    """Numbered polls ``period_s`` apart; ``missed`` counts those that were not made.
 
-    ``phase`` (of a period) has them so much later: sensors on one line are asked in turn.
+    ``phase``, a share of the period, delays them: sensors on one line are polled in turn.
     """
 
     def __init__(self, period_s: float, sync_period_s: float, phase: float = 0.0) -> None:
@@ -29,7 +29,7 @@ class AskingGrid:
         self.missed = 0
 
     def next_instant(self, now_ns: int, ticks: TickClock) -> tuple[int, float]:
-        """Return number and host time (ns) of the next instant."""
+        """Return number and host time (ns) of the next poll."""
         by_sync = ticks.running and ticks.covers(now_ns - SYNC_ENDED_NS)
         newest, newest_ns, step_ns = _pace(ticks)
         periods = (newest + (now_ns - newest_ns) / step_ns) / self._ticks if by_sync else now_ns / self.period_ns
@@ -43,7 +43,7 @@ class AskingGrid:
         return number, self.host_ns(number, ticks)
 
     def host_ns(self, number: int, ticks: TickClock) -> float:
-        """Return the host time of an instant, one that is to come by the pace at which the SYNCs came."""
+        """Return the host time (ns) of a poll; a future one is extrapolated from the pace of SYNC."""
         if not self._by_sync:
             return (number + self._phase) * self.period_ns
         tick = (number + self._phase) * self._ticks
@@ -51,8 +51,8 @@ class AskingGrid:
         return newest_ns + (tick - newest) * step_ns if tick > newest else float(ticks.time_ns(np.array([tick]))[0])
 
     def read_at(self, number: int, asked_ns: int, answered_ns: int, ticks: TickClock) -> tuple[float, float, float]:
-        """Return when (host ns) a value was true that was read between question and answer, by how much that is later
-        than the instant of its number, and how far off both may be."""
+        """Return the host time (ns) of a value that was read between request and answer, its delay against the
+        scheduled instant, and the uncertainty of both (ns)."""
         between = ticks.bounds(asked_ns, answered_ns) if self._by_sync else None
         if between is None:
             middle = (asked_ns + answered_ns) / 2
@@ -63,7 +63,7 @@ class AskingGrid:
 
 
 def _pace(ticks: TickClock) -> tuple[int, float, float]:
-    """Return the newest tick, when it came, and the ns from one to the next: a simulated machine may be slower."""
+    """Return the newest tick, its host time, and the ns per tick: a simulated machine may run slower than nominal."""
     newest = ticks.newest_tick
     if not ticks.running:
         return newest, 0.0, ticks.period_ns

@@ -1,4 +1,4 @@
-"""Drains one bus, decodes it, and opens it again when it ended."""
+"""Receives and decodes one bus, and reconnects it."""
 
 import asyncio
 from collections import Counter
@@ -19,13 +19,13 @@ from fdhil.records import AxisSamples, MoveEvent, NcState, Notice, TickTimes
 DRAIN_S = 0.05
 SILENCE_S = 2.0
 STAMPS_COST: Mapping[Stamps, str] = {
-    "adapter": "the adapter's own clock, and are late by what its quickest frames are: about 1 ms over USB",
-    "host": "this program when it reads them: some 10 ms late and in bursts, more on a busy computer",
+    "adapter": "the adapter's own clock, with an unknown delay of about 1 ms over USB",
+    "host": "this program when it reads them, some 10 ms late and in bursts, more on a busy computer",
 }
 
 
 class BusSource:
-    """One bus: drains the ring, decodes, and opens it again when it ended."""
+    """One bus: drains the ring, decodes the frames, and reconnects after a failure."""
 
     def __init__(self, name: str, config: MachineConfig, open_bus: OpenBus = CanBus) -> None:
         self.name = name
@@ -48,7 +48,6 @@ class BusSource:
         self._bus = self._open_bus(self.name, settings, filters=filters)
 
     def step(self, now_ns: int) -> list[Record]:
-        """Drain and decode once."""
         bus = self._bus
         if bus is None:
             return []
@@ -66,26 +65,33 @@ class BusSource:
         return [*out, *self._stamping(bus), *self._overflow(bus), *self._silence(bus, now_ns)]
 
     def hear_nc(self, state: NcState) -> list[MoveEvent]:
-        """Take what the NC says; return the moves that are known by now."""
+        """Take a state of the NC; return the moves that can be classified by now."""
         return [event for source in self._events for event in source.feed(state)]
 
     def _stamping(self, bus: ListenedBus) -> list[Notice]:
-        """Say once what the time stamps of this way onto the bus are worth, where that is less than the kernel's."""
         cost = STAMPS_COST.get(bus.stamps)
         if cost is None or self._stamping_told or not bus.counters()["frames"]:
             return []
         self._stamping_told = True
         text = (
-            f"Frames of bus {self.name} are stamped by {cost}. Samples follow SYNC and lose nothing; a voltage sensor"
+            f"Frames of bus {self.name} are stamped by {cost}. Samples follow SYNC and are not affected; "
+            "values of a separate"
         )
-        return [Notice("CoarseStamps", "info", f"{text} of its own is placed no better, so that L is less certain.")]
+        return [
+            Notice(
+                "CoarseStamps", "info", f"{text} voltage sensor are placed less accurately, so that L is less certain."
+            )
+        ]
 
     def _overflow(self, bus: ListenedBus) -> list[Notice]:
         lost = bus.counters()["lost"]
         if lost <= self._overflow_told:
             return []
         new, self._overflow_told = lost - self._overflow_told, lost
-        text = f"{new} frames of bus {self.name} were not read in time; the computer is overloaded."
+        text = (
+            f"{new} frames of bus {self.name} were not read in time and are lost; the computer is "
+            "overloaded: reduce its load."
+        )
         return [Notice("RxOverflow", "minor", text)]
 
     def _silence(self, bus: ListenedBus, now_ns: int) -> list[Notice]:
@@ -93,14 +99,16 @@ class BusSource:
         was, self._silent = self._silent, silent
         if silent and not was:
             text = (
-                f"Nothing is heard on bus {self.name}: so it is while the NC is off and no drive sends a heartbeat "
-                "(0x1017); else check the drives' supply, the wiring and the bit rate. fdhil scan asks the drives."
+                f"No frame is received on bus {self.name}: this is normal while the NC is off and no drive "
+                "sends a heartbeat "
+                "(0x1017); otherwise check the drives' supply, the wiring and the bit rate. fdhil scan queries "
+                "the drives."
             )
             return [Notice("BusSilent", "MAJOR", text)]
-        return [Notice("BusSilent", "info", f"Bus {self.name} is heard again.")] if was and not silent else []
+        return [Notice("BusSilent", "info", f"Bus {self.name} is active again.")] if was and not silent else []
 
     async def run(self, take: Take) -> None:
-        """Run for ever; a bus that ended is opened again with growing pauses."""
+        """Run for ever; reconnect with growing pauses."""
         pause = BACK_OFF_S[0]
         while True:
             await asyncio.sleep(DRAIN_S)
@@ -110,12 +118,17 @@ class BusSource:
                 pause = BACK_OFF_S[0]
                 continue
             reason = self._bus.ended
-            take(Notice("BusDown", "MAJOR", f"Bus {self.name}: {reason}; it is tried again until it is back."))
+            take(
+                Notice(
+                    "BusDown",
+                    "MAJOR",
+                    f"Bus {self.name}: {reason}; nothing is received until it is reconnected, which is retried.",
+                )
+            )
             pause = await self._reopen(pause)
             take(Notice("BusDown", "info", f"Bus {self.name} is back."))
 
     async def _reopen(self, pause: float) -> float:
-        """Wait until the bus can be opened; the SYNC count begins anew."""
         self.close()
         while self._bus is None:
             await asyncio.sleep(pause)
@@ -129,7 +142,7 @@ class BusSource:
         return pause
 
     def counters(self) -> dict[str, int]:
-        """Frames received and lost on this bus."""
+        """Return the frames received and lost on this bus."""
         own = self._bus.counters() if self._bus else {"frames": 0, "ring_overflow": 0, "kernel_drops": 0, "lost": 0}
         decoded = self.decoder.counters()
         own = {key: count + self._before[key] for key, count in own.items()}
@@ -137,7 +150,7 @@ class BusSource:
         return own | decoded
 
     def close(self) -> None:
-        """Close the bus; its frames, and those that were lost, stay counted."""
+        """Close the bus; its counters are kept."""
         if self._bus is not None:
             self._before.update(self._bus.counters())
             self._bus.close()

@@ -1,6 +1,6 @@
-"""Records the demand of an air cut as it is sniffed: r[k] of every axis, from the first motion to the last.
+"""Records the sniffed demand of an air cut: r[k] of every axis, from the first motion to the last.
 
-Pure: records in, a demand out. What was lost stays a gap; nothing is interpolated.
+Pure: records in, a demand out. Lost samples stay gaps; nothing is interpolated.
 """
 
 import math
@@ -17,7 +17,7 @@ _SPOILING = ("DemandMismatch", "BusDown", "SyncCollision", "RxOverflow", "Foreig
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Rows [first, stop) of an axis' demand that were lost."""
+    """Lost samples [first, stop) of an axis' demand."""
 
     axis: str
     first: int
@@ -26,7 +26,7 @@ class Gap:
 
 @dataclass(frozen=True, slots=True)
 class RecordedDemand:
-    """A demand with NaN in the rows that were lost, its gaps, and what else speaks against trusting it."""
+    """A demand with NaN in lost samples, its gaps, and other reasons not to trust it."""
 
     reference: Trajectory
     gaps: tuple[Gap, ...]
@@ -34,14 +34,12 @@ class RecordedDemand:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing was lost and nothing speaks against it."""
+        """Whether it has no gap and no reason for doubt."""
         return not self.gaps and not self.doubts
 
 
 @dataclass(slots=True)
 class _Sniffed:
-    """One axis: blocks of ticks and demands; before any motion the newest block alone."""
-
     ticks: list[Int]
     demands: list[Float]
     newest: int = -1
@@ -65,17 +63,18 @@ class _Sniffed:
 
 
 class DemandRecorder:
-    """Fed with the records of a machine; ``done`` once all axes have rested ``rest_s`` after a motion.
+    """Collects the records of a machine; ``is_done`` once all axes have rested ``rest_s`` after a motion.
 
-    ConfigError when the axes are on several buses, whose SYNC cycles cannot be told to be the same.
+    ConfigError when the axes are on several buses, whose SYNC cycles have no common count.
     """
 
     def __init__(self, config: MachineConfig, rest_s: float) -> None:
         buses = list(dict.fromkeys(axis.drive.bus for axis in config.axis.values()))
         if len(buses) > 1:
-            what = f"the axes are on {', '.join(buses)}, whose cycles have no common count"
+            what = f"the axes are on {', '.join(buses)}, whose SYNC cycles have no common count"
             raise ConfigError(
-                config.machine.name, [ConfigFault("axis", what, "record each bus with a config of its axes")]
+                config.machine.name,
+                [ConfigFault("axis", what, "record each bus with a separate configuration of its axes")],
             )
         self._dt_s, self._mm_per_degree = config.machine.sync_period_s, config.mm_per_degree
         self._rest_rows = math.ceil(rest_s / self._dt_s)
@@ -84,7 +83,7 @@ class DemandRecorder:
         self._doubts: dict[str, str] = {}
 
     def feed(self, record: object) -> None:
-        """Take a record of the machine; what is no sample and no warning does not matter here."""
+        """Add a record; only samples and warnings matter here."""
         if isinstance(record, AxisSamples):
             self._axes[record.axis].add(record, self.moving)
         elif isinstance(record, Notice) and record.code in _SPOILING and record.severity != "info":
@@ -92,23 +91,22 @@ class DemandRecorder:
 
     @property
     def heard(self) -> bool:
-        """Whether the demand of every axis is known."""
+        """Whether the demand of every axis has been received."""
         return all(axis.newest >= 0 for axis in self._axes.values())
 
     @property
     def moving(self) -> bool:
-        """Whether any axis has moved."""
         return any(axis.moved_first is not None for axis in self._axes.values())
 
     @property
     def done(self) -> bool:
-        """Whether a motion has ended for as long as was asked; a demand that cannot be trusted any more ends too."""
+        """Whether a motion has ended for the requested rest; a lost bus ends it too."""
         last = [axis.moved_last for axis in self._axes.values() if axis.moved_last is not None]
         newest = min(axis.newest for axis in self._axes.values())
         return "BusDown" in self._doubts or (bool(last) and newest >= max(last) + self._rest_rows)
 
     def demand(self) -> RecordedDemand | None:
-        """Return what was heard, from the row before the first motion to the rest after the last, if any."""
+        """Return the demand from the sample before the first motion to the rest after the last, if any."""
         firsts = [axis.moved_first for axis in self._axes.values() if axis.moved_first is not None]
         lasts = [axis.moved_last for axis in self._axes.values() if axis.moved_last is not None]
         if not firsts:

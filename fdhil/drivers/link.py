@@ -1,4 +1,4 @@
-"""What the connection to a sensor that is a device of its own must be able to do."""
+"""The interface of a connection to a separate sensor."""
 
 from typing import Protocol
 
@@ -6,20 +6,20 @@ from fdhil.errors import DeviceError
 
 
 class Link(Protocol):
-    """The connection to a sensor; ``wire`` names its kind, ``place`` tells people where it leads."""
+    """The connection to a sensor; ``wire`` names its kind, ``place`` describes its endpoint in messages."""
 
     wire: str
     place: str
 
     @property
     def connected(self) -> bool:
-        """Whether it stands."""
+        """Whether it is established."""
 
     async def connect(self) -> None:
-        """Connect where it does not stand; ConnectError when nobody answers there."""
+        """Connect if not yet connected; ConnectError when the sensor cannot be reached."""
 
     def fault_code(self, error: DeviceError) -> str | None:
-        """Return the class under which ``error`` is told; None for what passes by itself."""
+        """Return the notice code of ``error``; None for a transient one."""
 
     def close(self) -> None:
         """End the connection."""

@@ -1,11 +1,10 @@
-"""Opens the whole machine as one source of records: buses, sensors and event sources of a configuration.
+"""Opens all buses, sensors and event sources of a configuration as one source of records.
 
-At the start every bus and sensor must be there, else one ConnectError names all that are not. A bus on which nothing
-is heard is told, and listened to all the same: with the NC off, drives that send no heartbeat are silent, and so is an
-interface of the NC's own. Later nothing
-ends the source: a bus or a sensor that goes away is a notice and a gap, and is tried again with growing pauses. Nothing
-is queued here: what came waits in the bus' ring and in the sensor, both of which count what they had no room for, and a
-fault of a source's own leaves ``run`` as the exception that it is.
+At the start every bus and sensor must be reachable, else one ConnectError names all that are not. A silent bus is
+reported and still received from: with the NC off, drives without a heartbeat are silent, and so may be the NC's own
+interface. Later nothing ends the source: a lost bus or sensor is a notice and a gap, and is reconnected with growing
+pauses. Nothing is queued here: data wait in the bus' ring and in the sensor, which count what they discard. An
+exception inside a source leaves ``run`` unchanged.
 """
 
 import asyncio
@@ -26,7 +25,7 @@ __all__ = ["MachineSource", "Record", "open_machine"]
 
 
 class MachineSource:
-    """All sources of a machine; ``run`` hands over what they say, ``counters`` tells what they counted."""
+    """All sources of a machine; ``run`` hands over their records, ``read_counters`` returns their counts."""
 
     def __init__(self, config: MachineConfig, open_bus: OpenBus = CanBus) -> None:
         used = dict.fromkeys(axis.drive.bus for axis in config.axis.values())
@@ -40,7 +39,7 @@ class MachineSource:
         self._nc = NcListener(config) if config.g0.source in tables.NC_SOURCES else None
 
     async def open(self) -> None:
-        """Reach every device; ConnectError with all that cannot be reached."""
+        """Connect every device; ConnectError with all that cannot be reached."""
         results = await asyncio.gather(
             *(asyncio.to_thread(bus.open) for bus in self._buses.values()),
             *(source.sensor.link.connect() for source in self._sensors.values()),
@@ -54,7 +53,7 @@ class MachineSource:
             raise ConnectError("machine", "; ".join(str(fault) for fault in faults)) if len(faults) > 1 else faults[0]
 
     async def run(self, take: Take) -> None:
-        """Hand every record over for ever; an exception in one source ends all of them, and goes on to the caller."""
+        """Hand every record over for ever; an exception in one source ends all of them and is raised to the caller."""
         try:
             async with asyncio.TaskGroup() as sources:
                 for bus in self._buses.values():
@@ -62,20 +61,19 @@ class MachineSource:
                 for sensor in self._sensors.values():
                     sources.create_task(sensor.run(take))
                 if self._nc is not None:
-                    sources.create_task(self._nc.run(lambda told: self._hear_nc(told, take)))
+                    sources.create_task(self._nc.run(lambda record: self._hear_nc(record, take)))
         except ExceptionGroup as group:
             raise group.exceptions[0] from group
 
-    def _hear_nc(self, told: NcState | Notice, take: Take) -> None:
-        """Hand over what the NC says, then the moves that are known by it."""
-        take(told)
-        if isinstance(told, NcState):
+    def _hear_nc(self, record: NcState | Notice, take: Take) -> None:
+        take(record)
+        if isinstance(record, NcState):
             for bus in self._buses.values():
-                for event in bus.hear_nc(told):
+                for event in bus.hear_nc(record):
                     take(event)
 
     def counters(self) -> dict[str, int]:
-        """Frames received and lost over all, and per bus and sensor with its name in front."""
+        """Return the frames received and lost in total, and per bus and sensor with its name in front."""
         buses = {name: bus.counters() for name, bus in self._buses.items()}
         flat = {"frames": sum(c["frames"] for c in buses.values()), "lost": sum(c["lost"] for c in buses.values())}
         for name, counted in buses.items():
@@ -91,7 +89,6 @@ class MachineSource:
         return {name: candump(name, bus.history.frames()) for name, bus in self._buses.items()}
 
     async def close(self) -> None:
-        """Release buses and sensors."""
         for sensor in self._sensors.values():
             sensor.close()
         await asyncio.gather(*(asyncio.to_thread(bus.close) for bus in self._buses.values()))
@@ -99,7 +96,7 @@ class MachineSource:
 
 @asynccontextmanager
 async def open_machine(config: MachineConfig, open_bus: OpenBus = CanBus) -> AsyncIterator[MachineSource]:
-    """Open all that the configuration names; ConnectError (exit code 3) when something is not there."""
+    """Open everything that the configuration names; ConnectError (exit code 3) when a device cannot be reached."""
     source = MachineSource(config, open_bus)
     try:
         await source.open()

@@ -1,8 +1,7 @@
-"""Asks a sensor that shows one value, its newest, again and again, and says when each value was true.
+"""Polls a sensor that shows one value, its newest, and determines when each value was true.
 
-A sensor that is asked is asked on a grid of instants, so that its values are a signal with a rate; one that tells by
-itself keeps its own rate. A value that was not to be had in time is a hole in the count and is never put in another's
-place.
+A polled sensor is read on a schedule, so that its values form a signal with a rate; a free-running one keeps its own
+rate. A value that did not come in time is a gap in the count and is never replaced by another.
 """
 
 import asyncio
@@ -22,21 +21,21 @@ from fdhil.drivers.told_count import ToldCount
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 from fdhil.records import Notice, VoltageSamples, frozen, frozen_ints
 
-GATHER_S = 0.05  # values are handed over together, as often as other sensors are asked
-SYNC_LATENESS_NS = 200_000  # how late the stamp of a SYNC may be on a busy computer
-BEYOND_LIMIT = 4.0  # no terminal voltage is so many times what the drive can give
+GATHER_S = 0.05  # values are handed over together, as often as other sensors are polled
+SYNC_LATENESS_NS = 200_000  # delay of a SYNC's stamp on a busy computer
+BEYOND_LIMIT = 4.0  # multiple of the drive's voltage that no terminal voltage reaches
 TOLD_AFTER = 200  # values
 LOST_SHARE = 0.1
-TIMELY_NS = 2_000_000  # the voltage of a drive that accelerates changes by 1 V in each ms: so well it must be known
-SETTLED_NS = 50_000_000  # so many later SYNCs have shown which stamps around an answer were late
+TIMELY_NS = 2_000_000  # an accelerating drive's voltage changes by 1 V per ms, which limits the error
+SETTLED_NS = 50_000_000  # later SYNCs that are needed to recognise late stamps around an answer
 IN_ORDER = 0.4  # of a period
 MOST_WAITING = 1000
 NEAR_S = 0.02
 
 
 class Meter(Protocol):
-    """A sensor that shows one value. ``asked_ns`` and ``answered_ns`` (host-monotonic) enclose when the last one was
-    true, but for what its own filter takes; ``tells_by_itself`` where it is not asked."""
+    """A sensor that shows one value. ``asked_ns`` and ``answered_ns`` (host-monotonic) enclose the time at which the
+    last one was true, apart from its filter; ``is_free_running`` where it is not polled."""
 
     asked_ns: int
     answered_ns: int
@@ -50,13 +49,11 @@ class Meter(Protocol):
         """Return its newest value, scaled; DeviceError."""
 
     def doubt(self, shown: str) -> str:
-        """Return what is to be told of a value that cannot be: where it stands, and what to compare."""
+        """Describe an implausible value: where it was read, and what to compare."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Value:
-    """A value, its number, and when it was read at the earliest and at the latest (host-monotonic ns)."""
-
     number: int
     volts: float
     asked_ns: int
@@ -64,7 +61,7 @@ class _Value:
 
 
 class MeterVoltage:
-    """The voltage of one axis as a ``meter`` shows it."""
+    """The voltage of one axis from a ``meter``."""
 
     def __init__(self, axis: str, config: MachineConfig, meter: Meter) -> None:
         section = config.axis[axis]
@@ -79,7 +76,7 @@ class MeterVoltage:
         self._late_ns = (settings.delay_s + settings.renewed_s / 2) * 1e9
         self._mean = settings.sampling == "interval_mean"
         if self._mean:
-            self._late_ns += self._grid.period_ns  # a sample is placed where its interval begins
+            self._late_ns += self._grid.period_ns  # a sample is placed at the beginning of its interval
         self._renewed_ns = settings.renewed_s * 1e9
         self._together = math.ceil(GATHER_S / settings.period_s) + 1
         self._waiting: deque[_Value] = deque(maxlen=MOST_WAITING)
@@ -90,16 +87,14 @@ class MeterVoltage:
 
     @property
     def link(self) -> Link:
-        """The meter's connection."""
         return self._meter.link
 
     @property
     def lost(self) -> int:
-        """How many values there should be and are not."""
         return self._holes + self._grid.missed + self._told.missed
 
     async def poll(self, ticks: TickClock) -> list[VoltageSamples | Notice]:
-        """Ask for some values, one after the other, and return those that can be placed; DeviceError when none came."""
+        """Read some values, one after the other, and return those whose time is settled; DeviceError when none came."""
         came = False
         for left in range(self._together - 1, -1, -1):
             try:
@@ -114,14 +109,13 @@ class MeterVoltage:
         return [*self._too_slow(), *self._placed(ticks)]
 
     async def reading(self) -> str:
-        """Ask once, for people."""
         return f"{await self._volts():.2f} V at {1e9 / self._grid.period_ns:g} Hz"
 
     async def _ask(self, ticks: TickClock) -> _Value:
         number, due_ns = self._grid.next_instant(time.monotonic_ns(), ticks)
         while (left_s := (due_ns - time.monotonic_ns()) / 1e9) > 0:
             await asyncio.sleep(min(left_s, NEAR_S))
-            due_ns = self._grid.host_ns(number, ticks)  # SYNCs that came meanwhile tell it better
+            due_ns = self._grid.host_ns(number, ticks)  # more accurate by the SYNCs that arrived meanwhile
         self._asked += 1
         try:
             volts = await self._volts()
@@ -131,7 +125,6 @@ class MeterVoltage:
         return _Value(number, volts, self._meter.asked_ns, self._meter.answered_ns)
 
     async def _hear(self) -> _Value:
-        """Wait for the next value that is told; one that cannot be read is a hole."""
         self._asked += 1
         try:
             volts = await self._volts()
@@ -144,25 +137,24 @@ class MeterVoltage:
 
     async def _volts(self) -> float:
         volts = await self._meter.value()
-        if not abs(volts) <= self._limit_v:  # nor is it NaN
+        if not abs(volts) <= self._limit_v:  # also refuses NaN
             raise ProtocolError(self.name, self._meter.doubt(f"{volts:g} V"))
         return volts
 
     def _too_slow(self) -> list[Notice]:
-        """Tell once that the sensor cannot be asked as often as the config has it."""
         due = self._asked + self._grid.missed + self._told.missed
         if self._told_holes or due < TOLD_AFTER or self.lost < LOST_SHARE * due:
             return []
         self._told_holes = True
         took_ms = (self._meter.answered_ns - self._meter.asked_ns) / 1e6
         text = f"Of {due} values of the {self.name} {self.lost} did not come in time (an "
-        text += f"answer takes {took_ms:.1f} ms): they are holes in what is identified; set "
-        text += f"axis.{self.axis}.voltage.period_s above {self._grid.period_ns / 1e9:g}, or give this computer less "
-        text += "else to do."
+        text += f"answer takes {took_ms:.1f} ms): they are gaps in the recorded voltage; set "
+        text += f"axis.{self.axis}.voltage.period_s above {self._grid.period_ns / 1e9:g}, or reduce this "
+        text += "computer's load."
         return [Notice("SampleTiming", "minor", text, self.axis)]
 
     def _placed(self, ticks: TickClock) -> list[VoltageSamples]:
-        """Return the values whose place among the SYNCs is known by now; those read too far from theirs are holes."""
+        """Return the values whose time is settled by now; those read too far from their instant are gaps."""
         counter, t_ns, error_ns, volts = [], [], [], []
         while self._waiting and (not ticks.running or ticks.covers(self._waiting[0].answered_ns + SETTLED_NS)):
             one = self._waiting.popleft()
@@ -184,19 +176,19 @@ class MeterVoltage:
         return [VoltageSamples(self.name, self.axis, *placed, frozen(np.array(volts)), rate_hz, on_grid)]
 
     def _when(self, one: _Value, ticks: TickClock) -> tuple[float, float, float]:
-        """Return when (host ns) a value was true but for the meter's filter, how late that is, and how far off."""
+        """Return the host time (ns) of a value, its delay, and its uncertainty, without the meter's filter."""
         if self._meter.tells_by_itself:
             return one.answered_ns, 0.0, SYNC_LATENESS_NS
         return self._grid.read_at(one.number, one.asked_ns, one.answered_ns, ticks)
 
     def _in_time(self, late_ns: float, off_ns: float) -> bool:
-        """Whether a value can stand for its instant: a mean must lie there, an instant only keeps the order."""
+        """Return whether a value can stand for its instant: a mean must lie there, an instant only keeps the order."""
         allowed_ns = TIMELY_NS if self._mean else IN_ORDER * self._grid.period_ns
         return off_ns <= TIMELY_NS and abs(late_ns) <= allowed_ns
 
 
 def _turn(axis: str, config: MachineConfig) -> float:
-    """Return by which share of its period a sensor is asked later, so that those on one line take turns."""
+    """Return the share of its period by which a sensor is polled later, so that those on one line take turns."""
     own = config.axis[axis].voltage
     where = {name: section.voltage for name, section in config.axis.items() if section.voltage.separate}
     peers = [name for name, v in where.items() if (v.device, v.host, v.port) == (own.device, own.host, own.port)]

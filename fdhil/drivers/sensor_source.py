@@ -1,4 +1,4 @@
-"""Polls a sensor that is a device of its own, and connects it again when it went away."""
+"""Polls a separate sensor, and reconnects it."""
 
 import asyncio
 import time
@@ -19,7 +19,7 @@ from fdhil.records import AxisSamples, MoveEvent, NcState, Notice, TableSamples,
 
 Record = AxisSamples | VoltageSamples | TableSamples | TickTimes | MoveEvent | Temperature | NcState | Notice
 Take = Callable[[Record], None]
-"""Takes a source's records; it never waits, for nothing may hold a source up."""
+"""Takes a source's records without blocking."""
 
 POLL_S = 0.05
 BACK_OFF_S = (0.1, 5.0)
@@ -38,14 +38,14 @@ class Sensor(Protocol):
         """Its connection."""
 
     async def poll(self, ticks: TickClock) -> Sequence[Record]:
-        """Ask once and return what is new; DeviceError."""
+        """Poll once and return new records; DeviceError."""
 
     async def reading(self) -> str:
-        """Only read, so that a running daemon misses nothing, and return what people are shown; DeviceError."""
+        """Read without side effects on a running daemon, and return the formatted value; DeviceError."""
 
 
 def sensors_of(axis: str, config: MachineConfig) -> dict[str, Sensor]:
-    """Return the sensors of their own that an axis has, by what they tell."""
+    """Create the separate sensors of an axis, by what they measure."""
     settings, found = config.axis[axis], {}
     if settings.voltage.separate:
         found["voltage"] = tables.load(tables.VOLTAGE_SOURCES, settings.voltage.source)(axis, config)
@@ -59,7 +59,7 @@ def sensors_of(axis: str, config: MachineConfig) -> dict[str, Sensor]:
 
 
 class SensorSource:
-    """One sensor: polled for ever."""
+    """One sensor, polled for ever."""
 
     def __init__(self, sensor: Sensor, ticks: TickClock) -> None:
         self.sensor = sensor
@@ -68,7 +68,7 @@ class SensorSource:
         self._told: set[str] = set()
 
     async def run(self, take: Take) -> None:
-        """Poll for ever; a fault is a notice once, its end another."""
+        """Poll for ever; a fault is one notice, its end another."""
         pause = BACK_OFF_S[0]
         while True:
             begun = time.monotonic()
@@ -99,11 +99,10 @@ class SensorSource:
             take(Notice(code, "MAJOR", str(error), self.sensor.axis))
 
     def counters(self) -> dict[str, int]:
-        """Samples received and lost, failed polls, and what the line got over by itself."""
+        """Return samples received and lost, failed polls, and recovered faults of the line."""
         own = {"samples": self.sensor.samples, "lost": self.sensor.lost, "failures": self._failures}
         link = self.sensor.link
         return own | (dict(link.counted) if isinstance(link, ModbusLink) else {})
 
     def close(self) -> None:
-        """End the connection."""
         self.sensor.link.close()

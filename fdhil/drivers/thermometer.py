@@ -1,4 +1,4 @@
-"""Reads a slide-way's thermometer now and then, behind Modbus or on a serial line."""
+"""Polls a slide-way's thermometer, behind Modbus or on a serial line."""
 
 import asyncio
 
@@ -25,17 +25,16 @@ class SlidewayThermometer:
         self._period_s = settings.period_s
         self._meter: Meter
         if settings.source == "serial":
-            self._meter = TextMeter(self.name, settings, settings, settings.period_s)
+            self._meter = TextMeter(self.name, settings)
         else:
-            self._meter = ModbusMeter(self.name, settings, settings, settings.type, PLAUSIBLE_C[1])
+            self._meter = ModbusMeter(self.name, settings, PLAUSIBLE_C[1])
 
     @property
     def link(self) -> Link:
-        """Its connection."""
         return self._meter.link
 
     async def poll(self, ticks: TickClock) -> list[Temperature]:
-        """Rest for the period and read once; errors of the link pass through, ProtocolError for no temperature."""
+        """Wait for the period and read once; ProtocolError for an impossible temperature, and errors of the link."""
         if not self._meter.tells_by_itself:
             await asyncio.sleep(self._period_s)
         celsius = await self._celsius()
@@ -43,11 +42,10 @@ class SlidewayThermometer:
         return [Temperature(self.axis, ticks.newest_tick, celsius, "slideway")]
 
     async def reading(self) -> str:
-        """Read once, for people."""
         return f"{await self._celsius():.2f} degC"
 
     async def _celsius(self) -> float:
         celsius = await self._meter.value()
-        if not PLAUSIBLE_C[0] < celsius < PLAUSIBLE_C[1]:  # nor is it NaN
+        if not PLAUSIBLE_C[0] < celsius < PLAUSIBLE_C[1]:  # also refuses NaN
             raise ProtocolError(self.name, self._meter.doubt(f"{celsius:g} degC"))
         return celsius

@@ -1,20 +1,20 @@
-"""Numbers the values of an instrument that tells one each period by itself, from when they came. Pure.
+"""Numbers the values of a free-running instrument by their arrival. Pure.
 
-A value may come late, with those behind it close on its heels: none is missing then. One behind which nothing follows
-at once came in time, and if it is late all the same, others before it were lost.
+A value may come late, with the following ones close behind it: none is missing then. One that is not closely followed
+came in time, and if it is late all the same, others before it were lost.
 """
 
 from collections import deque
 
 LATE = 0.6  # of a period
 IN_TIME = 0.45  # of a period, to the next value; with LATE more than 1, by more than two clocks drift apart
-KEPT = 64  # values that came, of which the earliest for its number came in time
+KEPT = 64  # values, of which the earliest for its number came in time
 
 
 class ToldCount:
-    """Counts values ``period_s`` apart; ``missed`` counts those that were lost.
+    """Counts values ``period_s`` apart; ``missed`` counts lost ones.
 
-    Where that was mistaken the count is set back: a number may then come again.
+    A wrong count is set back: a number may then occur again.
     """
 
     def __init__(self, period_s: float) -> None:
@@ -33,7 +33,6 @@ class ToldCount:
         return self._number
 
     def _settle(self, t_ns: int) -> None:
-        """The newest value came at ``t_ns`` and in time: see whether its number is right."""
         ahead = t_ns - self._number * self._period_ns
         behind = (ahead - min(self._early)) / self._period_ns if self._early else 0.0
         if abs(behind) > LATE:

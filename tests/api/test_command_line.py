@@ -53,7 +53,7 @@ def test_question_mark_leaves_a_map_that_is_there_as_it_is(trace: Path) -> None:
     written = trace.with_suffix(".columns.toml")
     written.write_text("# mine")
     result = invoke("identify", trace, "--columns", "?")
-    assert "left as it is" in str(result.exception)
+    assert "is not overwritten" in str(result.exception)
     assert written.read_text() == "# mine"
 
 

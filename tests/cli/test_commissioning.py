@@ -165,7 +165,7 @@ def test_an_eds_that_is_none_is_told(fdhil: Said, bench: Bench) -> None:
     wrong.write_text("no eds")
     code, out, err = fdhil("scan", bench.config(), "--eds", wrong)
     assert (code, out) == (3, "")
-    assert "wrong.eds: line 1: it has no object at all" in err
+    assert "wrong.eds: line 1: it has no object" in err
 
 
 @pytest.mark.usefixtures("real_time")

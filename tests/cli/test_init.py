@@ -108,7 +108,7 @@ def test_rotary_axis_and_gantry_of_linuxcnc_need_a_radius_and_two_node_ids(fdhil
     arguments = ("init", file, "--from-linuxcnc", tmp_path / "mill.ini", "--offline", "--answers")
     code, _, err = fdhil(*arguments, written(tmp_path, axis=axes | {"A": sheet}))
     assert code == 2
-    assert "axis.A.radius_mm: is unknown: of a rotary axis: the radius at which its angles count" in err
+    assert "axis.A.radius_mm: is unknown: rotary axis: radius at which angles count" in err
     assert not file.exists()
     code, _, err = fdhil(*arguments, written(tmp_path, axis=axes))
     assert code == 0, err
@@ -156,7 +156,7 @@ def test_an_unknown_answer_is_refused_with_a_suggestion(fdhil: Said, tmp_path: P
     axis = SHEET | RAPID | {"drive": SHEET["drive"] | {"increments_per_rev": 65536}, "screw_pich_mm": 5.0}
     code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", written(tmp_path, axis={"X": axis}), "--offline")
     assert code == 2
-    assert "axis.X.screw_pich_mm: is no key of this section (did you mean 'screw_pitch_mm'?)" in err
+    assert "axis.X.screw_pich_mm: is not a key of this section (did you mean 'screw_pitch_mm'?)" in err
 
 
 @pytest.mark.parametrize(

@@ -174,7 +174,7 @@ def test_every_command_has_json_and_refuses_what_it_does_not_know(command: str, 
     [
         ("absent.toml", "No such file"),
         ("folder.toml", "directory"),
-        ("junk.toml", "no TOML"),
+        ("junk.toml", "is not valid TOML"),
         ("empty.toml", "missing"),
         ("loop.toml", "symbolic links"),
         ("key.toml", "did you mean 'screw_pitch_mm'?"),

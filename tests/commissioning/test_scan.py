@@ -141,7 +141,7 @@ def test_eds_files_are_read_and_others_are_left(tmp_path: Path) -> None:
     (tmp_path / "readme.txt").write_text("nothing")
     found, faults = read_descriptions([tmp_path])
     assert [(d.path.name, d.fits(WHO)) for d in found] == [("good.eds", "exact")]
-    text = f"{tmp_path}/bad.dcf: line 1: it has no object at all; this is no EDS file"
+    text = f"{tmp_path}/bad.dcf: line 1: it has no object; this is not an EDS file"
     assert [str(fault) for fault in faults] == [text]
 
 

@@ -252,7 +252,7 @@ def test_the_command_shows_the_audit_and_whether_it_was_changed(tmp_path: Path) 
         )
     shown = CliRunner().invoke(cli, ["audit", str(config)], standalone_mode=False)
     assert shown.return_value == 0
-    assert "fdhil-web for anna  arm a.ngc (asked)" in shown.output
+    assert "fdhil-web for anna  arm a.ngc (requested)" in shown.output
     assert "2 entries, all intact" in shown.output
     path = folder / audit.FILE_NAME
     path.write_text(path.read_text().replace("a.ngc", "c.ngc"))

@@ -19,7 +19,7 @@ from tests.daemon.machine import Machine, config_of
 from tests.daemon.test_service import _quick_start, serving, status_when  # noqa: F401 (a fixture)
 from tests.store.made import STAMP
 
-DOWN = Notice("BusDown", "MAJOR", "Bus can0: gone; it is tried again until it is back.")
+DOWN = Notice("BusDown", "MAJOR", "Bus can0: gone; nothing is received until it is reconnected, which is retried.")
 BACK = Notice("BusDown", "info", "Bus can0 is back.")
 DUE = Notice("MaintenanceDue", "minor", "ft will reach its limit soon; plan it.", "X")
 

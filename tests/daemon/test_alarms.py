@@ -82,15 +82,15 @@ def test_active_alarms_are_in_front_of_graver_ones_that_are_gone() -> None:
 @pytest.mark.parametrize(
     ("ends", "left"),
     [
-        (Notice("BusSilent", "info", "Bus can0 is heard again."), ["can1"]),
-        (Notice("BusSilent", "info", "Bus can1 is heard again."), ["can0"]),
-        (Notice("BusSilent", "info", "Bus can2 is heard again."), ["can0", "can1"]),
+        (Notice("BusSilent", "info", "Bus can0 is active again."), ["can1"]),
+        (Notice("BusSilent", "info", "Bus can1 is active again."), ["can0"]),
+        (Notice("BusSilent", "info", "Bus can2 is active again."), ["can0", "can1"]),
     ],
 )
 def test_end_of_one_bus_leaves_the_alarm_of_another(ends: Notice, left: list[str]) -> None:
-    silent = [Notice("BusSilent", "MAJOR", f"Nothing is heard on bus {bus}: so it is.") for bus in ("can0", "can1")]
+    silent = [Notice("BusSilent", "MAJOR", f"No frame is received on bus {bus}: so it is.") for bus in ("can0", "can1")]
     alarms = documents(table(*silent, ends))
-    assert sorted(alarm["text"].split()[5].strip(":") for alarm in alarms if alarm["state"] == "active") == left
+    assert sorted(alarm["text"].split()[6].strip(":") for alarm in alarms if alarm["state"] == "active") == left
 
 
 def test_parameter_that_is_back_leaves_the_alarm_of_another_parameter() -> None:

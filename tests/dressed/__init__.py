@@ -1,1 +1,1 @@
-"""Every packaged drive profile against the twin in the dress of that drive."""
+"""Every packaged drive profile against a simulated drive with the vendor's EDS."""

@@ -1,4 +1,4 @@
-"""A cut on drives of every make: corrected on line by the offset, or by the demand that the NC is given."""
+"""A cut on drives of every vendor: corrected on line by the offset, or by a corrected demand given to the NC."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DELAY = 2
 
 
 def played(twin: TwinInHand, demand: Trajectory, path: Float, offset_um: dict[str, Float] | None = None) -> float:
-    """Let the NC play a demand, offsets in time with it; return the contour error (RMS, um) to the path (n, 2)."""
+    """Run a demand on the NC with the offsets of each cycle; return the contour error (RMS, um) to the path (n, 2)."""
     table: list[list[float]] = []
     senders = []
     if offset_um:

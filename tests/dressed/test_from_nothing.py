@@ -1,7 +1,4 @@
-"""From nothing to a corrected move, with drives of every make: init by answers, check, commission, arm, move.
-
-The machine is one; what fdhil knows of it is the file that init made. What the drive does not tell is answered.
-"""
+"""Complete set-up with drives of every vendor: init, check, commissioning, arming and a corrected move."""
 
 from __future__ import annotations
 
@@ -57,7 +54,7 @@ KNOWN = {
 
 
 def answers_of(outfit: Outfit, machine: MachineConfig) -> dict[str, Any]:
-    """What the drives cannot tell of this machine."""
+    """Return the answers to the questions that the drives cannot answer."""
     axis = machine.axis["X"]
     bus = machine.bus["can0"]
     drive = {key: value for key, value in outfit.drive.items() if key == "logical_axis"}
@@ -79,7 +76,7 @@ def answers_of(outfit: Outfit, machine: MachineConfig) -> dict[str, Any]:
 
 
 def made(outfit: Outfit, machine: MachineConfig, folder: Path, capsys: Capture) -> MachineConfig:
-    """Run init until it has all it needs; what it misses it names, and is told."""
+    """Run init, check which keys it reports as missing, and run it again with them."""
     file, answers = folder / "machine.toml", answers_of(outfit, machine)
     given = folder / "answers.toml"
     given.write_text(to_toml(answers))
@@ -99,12 +96,12 @@ def made(outfit: Outfit, machine: MachineConfig, folder: Path, capsys: Capture) 
 
 @pytest.fixture(autouse=True)
 def sooner(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A scan asks as fast as a drive in this process hears."""
+    """Shorten the SDO time-outs: a drive in this process answers at once."""
     monkeypatch.setattr("fdhil.commissioning.scan.PACE_S", 1e-4)
 
 
 class Guarded:
-    """The machine with the guard's core beside it, as its process runs it: one decision after each SYNC."""
+    """The machine with the guard's core in this process: one decision after each SYNC, as in the guard's process."""
 
     def __init__(self, twin: TwinInHand, config: MachineConfig, folder: Path, path: CorrectedPath) -> None:
         self.settings = settings_of(config, "can0", folder, "")
@@ -116,7 +113,7 @@ class Guarded:
         twin.each_cycle = self.turn
 
     def turn(self) -> None:
-        """Hear the frames of one cycle; its SYNC is the first of them."""
+        """Take the frames of one cycle, the SYNC first."""
         for can_id, data in self.twin.wire[self.heard :]:
             if can_id == 0x080:
                 self._decide(data)
@@ -145,7 +142,7 @@ def to_and_fro() -> Trajectory:
 
 
 def planned(config: MachineConfig, demand: Trajectory) -> Float:
-    """The offset (n,) um that the file's model asks for."""
+    """Return the offset (n,) um that the model in the file demands."""
     models = {axis: Parameters(**settings.nominal.model_dump()) for axis, settings in config.axis.items()}
     found = correction.plan(demand, models, config, "inverse")
     assert not found.refused
@@ -153,7 +150,7 @@ def planned(config: MachineConfig, demand: Trajectory) -> Float:
 
 
 def off_path_um(twin: TwinInHand, demand: Trajectory) -> float:
-    """Let the NC play, and return by how much the table leaves the demand at most, the constant delay aside."""
+    """Run the move; return the largest deviation of the table from the demand, without the constant delay."""
     begin = len(twin.table)
     twin.machine.nc.play("move", demand)
     twin.run_until("finished")
@@ -163,7 +160,7 @@ def off_path_um(twin: TwinInHand, demand: Trajectory) -> float:
 
 
 def corrected_on_line(machine: MachineConfig, config: MachineConfig, folder: Path) -> None:
-    """Commission over the bus, then arm the guard on the machine, and move."""
+    """Commission over the bus, then arm the guard on the machine and run the move."""
     save_record(commission(config, "X"), config.store.directory)
     demand = to_and_fro()
     offset_um = planned(config, demand)
@@ -183,7 +180,7 @@ def corrected_on_line(machine: MachineConfig, config: MachineConfig, folder: Pat
 
 
 def corrected_by_the_demand(config: MachineConfig) -> None:
-    """A drive without an offset is refused where one would be sent; the NC is given the corrected demand instead."""
+    """A drive without an offset object is refused for on-line correction; the NC gets the corrected demand."""
     with pytest.raises(DriveFault, match="corrected demand"):
         commission(config, "X")
     assert np.abs(planned(config, to_and_fro())).max() > 10
@@ -203,7 +200,7 @@ def test_the_simulated_drive_needs_least(tmp_path: Path, capsys: Capture) -> Non
 
 
 def walked_through(outfit: Outfit, machine: MachineConfig, folder: Path, capsys: Capture) -> None:
-    """Init, check, commission, arm and move; a drive that takes no offset gets the corrected demand."""
+    """Init, check, commission, arm and move; a drive without an offset object gets the corrected demand."""
     config = made(outfit, machine, folder, capsys)
     drive = config.axis["X"].drive
     assert (drive.profile, drive.logical_axis) == (outfit.profile, machine.axis["X"].drive.logical_axis)

@@ -1,4 +1,4 @@
-"""What the daemon hears of drives of every make: the same motion, in whatever units it comes, and its drive."""
+"""What the daemon reads from drives of every vendor: the same motion in each vendor's units, and its model."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ IDENTIFIED = [o for o in OUTFITS if o.name in ("epos4", "nanotec", "trinamic", "
 
 
 def heard(twin: TwinInHand, rounds: int, way_mm: float, folder: Path) -> list[AxisSamples | TickTimes]:
-    """Let the NC go there and back in rapids; return the records that the frames make."""
+    """Run rapids out and back on the NC; return the records decoded from the frames."""
     config = twin.machine.config
     program = folder / "rapids.ngc"
     program.write_text("G21 G90 G94\n" + f"G0 X{way_mm:g}\nG4 P0.3\nG0 X0\nG4 P0.3\n" * rounds + "M2\n", "utf-8")
@@ -67,7 +67,7 @@ def test_the_same_motion_is_heard_of_every_drive(outfit: Outfit, tmp_path: Path)
 
 @pytest.mark.parametrize("outfit", IDENTIFIED, ids=lambda outfit: outfit.name)
 def test_the_drive_is_identified(outfit: Outfit, tmp_path: Path) -> None:
-    """Also where the voltage is a duty without a sign, speed comes in rpm and current in 16 bits."""
+    """Also with the voltage as an unsigned duty, speed in rpm and current in 16 bits."""
     config = dressed(outfit, tmp_path, noise=True)
     records = heard(started(config), 1, 900.0 if outfit.narrow else 300.0, tmp_path)
     pipeline, moves = AxisPipeline("X", config), InferredG0("X", config)

@@ -1,4 +1,4 @@
-"""Scan, check and commissioning of drives of every make, over a bus."""
+"""Scan, check and commissioning of drives of every vendor over a bus."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def quick(virtual_threads: object, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @contextmanager
 def on_a_bus(outfit: Outfit, folder: Path) -> Iterator[tuple[DrivePeer, MachineConfig]]:
-    """A drive of this make, set up over the bus by another maker's library."""
+    """A drive of this vendor, set up over the bus by an independent CANopen library."""
     channel = uuid.uuid4().hex
     config = dressed(outfit, folder, bus={"can0": {"interface": "virtual", "channel": channel}})
     with DrivePeer(config) as peer:

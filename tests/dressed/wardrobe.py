@@ -1,4 +1,4 @@
-"""What the tests of this folder share: which profile goes with which sheet, and how a drive's tool sets it up."""
+"""Shared by the tests of this folder: which profile belongs to which EDS, and the set-up by the vendor's tool."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Write = Callable[[int, int, int, int], None]
 
 @dataclass(frozen=True)
 class Outfit:
-    """A profile with the sheet of a drive that it is for; ``drive`` are more keys of [axis.X.drive]."""
+    """A profile with the EDS of a drive that it is for; ``drive`` holds further keys of [axis.X.drive]."""
 
     profile: str
     sheet: str
@@ -38,7 +38,6 @@ class Outfit:
 
     @property
     def name(self) -> str:
-        """The name of a test's case."""
         return self.profile if self.profile == self.sheet else f"{self.profile}-{self.sheet}"
 
 
@@ -63,12 +62,12 @@ GENTLE_MM_S2 = 400.0
 
 
 def node_of(outfit: Outfit, place: int) -> dict[str, int]:
-    """Return the node-ID of a device with two axes: its second one has the PDO identifiers of the node after it."""
+    """Return the node-ID of a device with two axes: its second axis has the PDO identifiers of the next node."""
     return {"node_id": 1 + 2 * place} if "logical_axis" in outfit.drive else {}
 
 
 def dressed(outfit: Outfit, folder: Path, axes: str = "X", *, noise: bool = False, **sections: Any) -> MachineConfig:
-    """Return the bench with drives of this make, simulated in their dress."""
+    """Return the bench with drives of this vendor, simulated from their EDS."""
     eds = write_eds(outfit.sheet, folder)
     drive = {"profile": outfit.profile, **outfit.drive} | ({"eds": str(eds)} if outfit.profile == "cia402" else {})
     rapid: dict[str, Any] = {"max_acceleration_mm_s2": GENTLE_MM_S2} if outfit.narrow else {}
@@ -92,7 +91,7 @@ def started(config: MachineConfig) -> TwinInHand:
 
 
 def set_up(config: MachineConfig, axis: str, has: Callable[[int], bool], write: Write) -> None:
-    """Map the PDOs as the profile has them, as the drive's tool does, and turn what watches it on."""
+    """Map the PDOs as the profile has them, as the vendor's tool does, and enable the drive's SYNC monitoring."""
     profile, node_id = load_profile(config.axis[axis].drive), config.node_id(axis)
     for base, specs in ((0x1400, profile.rpdos), (0x1800, profile.tpdos)):
         for number in (*range(1, 5), *range(65, 69)):
@@ -108,7 +107,7 @@ def set_up(config: MachineConfig, axis: str, has: Callable[[int], bool], write: 
 
 
 def _map(index: int, spec: PdoSpec | None, node_id: int, write: Write) -> None:
-    """CiA 301, 7.5.2.36: off, mapping, on."""
+    """CiA 301, 7.5.2.36: disable, map, enable."""
     cob_id = (0x200 if index < 0x1800 else 0x180) + 0x100 * (index & 3) + node_id if spec is None else 0
     if spec is not None:
         cob_id = spec.cob_base + node_id

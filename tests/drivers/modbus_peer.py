@@ -1,4 +1,4 @@
-"""A Modbus TCP voltage sensor made of plain frames, so that it can misbehave at will."""
+"""A Modbus TCP voltage sensor that builds its own frames, so that it can produce every fault."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class SensorPeer:
 
     @property
     def newest(self) -> int:
-        """Counter of the newest complete sample."""
+        """Return the counter of the newest complete sample."""
         if self.frozen_at is not None:
             return self.frozen_at
         return int((time.monotonic() - self.start) * self.rate_hz) - 1

@@ -1,4 +1,4 @@
-"""A simulated drive as a peer on a bus inside this process: a thread that takes and gives frames."""
+"""A simulated drive on a bus inside this process: a thread that exchanges frames."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class DrivePeer:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def _run(self) -> None:
-        """A drive has no pauses: where the computer was late, its own time passes slower."""
+        """The drive's time never jumps: when the computer was late, it continues more slowly."""
         drive_s, last_s = 0.0, time.monotonic()
         while not self._stopping.is_set():
             message = self._bus.recv(0.001)
@@ -37,7 +37,7 @@ class DrivePeer:
                 self._send(self.take(message.arbitration_id, bytes(message.data)))
 
     def take(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
-        """Give one frame to the drive and return what it says to that."""
+        """Give one frame to the drive and return its answers."""
         return self.drive.receive(can_id, data)
 
     def _send(self, frames: list[tuple[int, bytes]]) -> None:

@@ -1,7 +1,4 @@
-"""The far end of a serial line, on a pseudo terminal: Modbus RTU units, or an instrument that tells by lines of text.
-
-Whatever leaves it can be spoilt on the way. Its checksum is pymodbus', not ours.
-"""
+"""The far end of a serial line on a pseudo terminal: Modbus RTU units, or an instrument that sends lines of text."""
 
 from __future__ import annotations
 
@@ -35,7 +32,7 @@ def framed(unit: int, body: bytes) -> bytes:
 
 
 async def until(condition: Callable[[], object]) -> None:
-    """Let others run until something is so; a minute of that is a fault."""
+    """Wait until a condition holds; fail after a minute."""
     for _ in range(12_000):
         if condition():
             return
@@ -44,21 +41,21 @@ async def until(condition: Callable[[], object]) -> None:
 
 
 class PatientLoop(asyncio.SelectorEventLoop):
-    """A loop in whose time a computer that is held up loses none: from one look to the next it is at most 20 ms."""
+    """A loop whose time advances at most 20 ms per iteration, so that a delayed computer causes no time-out."""
 
     def __init__(self) -> None:
         super().__init__(_OftenLooking())
         self._now_s, self._seen_s = 0.0, time.monotonic()
 
     def time(self) -> float:
-        """The loop's time, s."""
+        """Return the loop's time, s."""
         seen_s = time.monotonic()
         self._now_s += min(seen_s - self._seen_s, 2 * LOOK_S)
         self._seen_s = seen_s
         return self._now_s
 
     def monotonic_ns(self) -> int:
-        """Stand in for ``time.monotonic_ns``."""
+        """Replace ``time.monotonic_ns``."""
         return round(self.time() * 1e9)
 
 
@@ -68,7 +65,7 @@ class _OftenLooking(selectors.DefaultSelector):
 
 
 def patiently(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
-    """Run a test, and the serial line in it, by the time of a patient loop: what is silent is still given up soon."""
+    """Run a test and its serial line in the time of a patient loop; missing answers still time out soon."""
 
     @wraps(test)
     def run(*given: Any, **named: Any) -> None:
@@ -85,7 +82,7 @@ def patiently(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., N
 
 
 class SerialPeer:
-    """The master's side of a pseudo terminal; ``device`` is what a program opens."""
+    """The master's side of a pseudo terminal; a program opens ``device``."""
 
     def __init__(self) -> None:
         self.fd, self._far = os.openpty()
@@ -107,15 +104,15 @@ class SerialPeer:
             self.heard.set()
 
     def take(self, data: bytes) -> None:
-        """Do something with what came."""
+        """Handle the bytes received."""
 
     def put(self, data: bytes) -> None:
-        """Put bytes on the line."""
+        """Send bytes on the line."""
         self.left_ns.append(time.monotonic_ns())
         os.write(self.fd, data)
 
     def unplug(self) -> None:
-        """Take the adapter away."""
+        """Close the line as if the adapter were unplugged."""
         if not self._closed:
             asyncio.get_running_loop().remove_reader(self.fd)
             os.close(self.fd)
@@ -137,7 +134,7 @@ class RtuPeer(SerialPeer):
         self.written: list[tuple[int, int]] = []
 
     def take(self, data: bytes) -> None:
-        """Answer as the unit that is asked."""
+        """Answer as the addressed unit."""
         unit = data[0]
         if unit not in self.units:
             return

@@ -1,4 +1,4 @@
-"""A bus log keeps its frames through every file format; what a format cannot hold is counted."""
+"""A bus log keeps its frames through every file format; frames that a format cannot hold are counted."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def suffix(name: str) -> str:
 
 
 def convert(text: str, target: str, folder: Path, source: str = "candump") -> tuple[Path, ConvertedLog]:
-    """Write a log, convert it, and return the file that came of it."""
+    """Write a log, convert it, and return the converted file."""
     log, out = folder / f"in{suffix(source)}", folder / f"out{suffix(target)}"
     log.write_text(text)
     told = converted_log(log, source, target)
@@ -84,7 +84,7 @@ def test_command_reports_what_is_in_the_file_and_what_is_not(tmp_path: Path, cap
     found = json.loads(told)
     assert (code, found["frames"], found["left_out"], found["reduced"]) == (0, 13, {"error frames": 3}, {})
     assert found["buses"] == {"can0": 1, "can1": 2}
-    assert "3 error frames: not in" in err
+    assert "3 error frames: omitted from" in err
     rows = [line for line in out.read_text().splitlines() if not line.startswith(";")]
     assert len(rows) == 13
 
@@ -97,7 +97,7 @@ def test_error_frames_keep_their_class_where_the_format_has_one(tmp_path: Path) 
     assert out.read_text().count("ErrorFrame") == 3
     assert told.reduced == {"class and data of error frames": 2}
     assert through(ERRORS, "asc", tmp_path).count("20000080#0000000000000000") == 3
-    with pytest.raises(RecordingError, match="3 error frames, which trc does not have"):
+    with pytest.raises(RecordingError, match="3 error frames, which trc cannot hold"):
         convert(ERRORS, "trc", tmp_path)
 
 
@@ -238,7 +238,7 @@ def frames(draw: st.DrawFn) -> LoggedFrame:
 
 
 def expected_of(frame: LoggedFrame, name: str) -> LoggedFrame | None:
-    """Return what must come back of a frame from a format."""
+    """Return what reading a frame back from a format must give."""
     if frame.can_id & ERROR_FLAG:
         if name == "trc":
             return None
@@ -280,18 +280,18 @@ SCREENS = (
 
 @pytest.mark.parametrize("line", SCREENS)
 def test_screen_form_of_candump_is_named(line: str, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"line 1: this is what candump shows on the screen.*candump -l"):
+    with pytest.raises(RecordingError, match=r"line 1: this is candump's screen output.*candump -l"):
         convert(line + "\n", "asc", tmp_path)
 
 
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("(12.000100) can0 080#0", "a line that is no frame"),
+        ("(12.000100) can0 080#0", "a line that is not a frame"),
         ("(12.000100) can0 080#010203040506070809", "9 bytes|no frame|larger"),
         ("(12.000100) can0 080##0010203040506070809", "9 bytes in a CAN FD frame, which has 0 to 8, 12"),
         ("(12.000100) can0 8FF#", "identifier 8FF is too large"),
-        ("(12.000", "a line that is no frame"),
+        ("(12.000", "a line that is not a frame"),
     ],
 )
 def test_damaged_line_is_refused_with_its_number(line: str, said: str, tmp_path: Path) -> None:
@@ -305,7 +305,7 @@ def test_file_of_holes_is_refused_without_reading_it(name: str, tmp_path: Path) 
     log = tmp_path / f"bus{suffix(name)}"
     log.touch()
     os.truncate(log, 1 << 40)
-    with pytest.raises(RecordingError, match=r"no log of a bus|no BLF log"):
+    with pytest.raises(RecordingError, match=r"not a bus log|not a readable BLF log"):
         converted_log(log, name, "candump")
 
 
@@ -357,11 +357,11 @@ def test_decimal_asc_without_a_date_is_read_and_that_is_told(tmp_path: Path) -> 
     (tmp_path / "bus.asc").write_text("base dec  timestamps absolute\n   0.5 1  385             Rx   d 2 16 255\n")
     told = converted_log(tmp_path / "bus.asc", "asc", "candump")
     assert told.content == b"(0.500000) can0 181#10FF\n"
-    assert told.reduced == {"the date, which cannot be read": 1}
+    assert told.reduced == {"the date, which is unreadable": 1}
 
 
 def test_trigger_date_counts_only_where_the_times_begin_there(tmp_path: Path) -> None:
-    """Python-can has the time of conversion in the date line, CANoe the trigger's in the block of a later trigger."""
+    """Python-can writes the time of conversion in the date line, CANoe the trigger's in a later trigger block."""
     head = "date Wed May 01 09:00:00.000 2024\nbase hex  timestamps absolute\ninternal events logged\n"
     block = "Begin Triggerblock Wed May 01 10:00:00.249 2024\n"
     (tmp_path / "bus.asc").write_text(head + block + " 0.000000 Start of measurement\n 1.0 1 80 Rx d 0\n")
@@ -401,12 +401,12 @@ def test_trc_of_every_version_is_read(version: str, tmp_path: Path) -> None:
         f"({start + 1}.842{part}) can0 20000080#0000000000000000\n"
         f"({start + 1}.844{part}) can0 18FF1234#R3\n"
     )
-    assert told.left_out == {"rows that are not CAN frames": 1}
-    assert told.reduced == ({} if dated else {"the date, which is not in the head": 1})
+    assert told.left_out == {"lines that are not CAN frames": 1}
+    assert told.reduced == ({} if dated else {"the date, which is not in the header": 1})
 
 
 def test_flags_of_fd_are_those_of_peak(tmp_path: Path) -> None:
-    """FE has the error state alone, BI both: python-can 4.6 has them the other way round."""
+    """FE is the error state alone, BI is both; python-can 4.6 has them swapped."""
     out, _ = convert("".join(f"(12.00000{k}) can0 181##{k}01\n" for k in range(4)), "trc", tmp_path)
     assert [line.split()[2] for line in out.read_text().splitlines() if line[0] != ";"] == ["FD", "FB", "FE", "BI"]
 

@@ -1,4 +1,4 @@
-"""The SYNC grid and what nodes say about themselves."""
+"""The SYNC grid, and heartbeats, boot-ups and emergencies of the nodes."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_the_syncs_of_a_silence_are_counted(missed: int) -> None:
 
 @pytest.mark.parametrize("hours", [0.05, 16, 24 * 365 * 170])
 def test_a_longer_silence_is_a_new_beginning(hours: float) -> None:
-    """An NC that was off overnight left out 60 million rows, all of which were made at once."""
+    """An NC that was off overnight caused 60 million missing rows, all created at once."""
     grid, begin = SyncGrid(0.001), round(hours * 3_600_000)
     before = grid.feed(frames_of(syncs([0, 1]))).syncs.tick
     after = grid.feed(frames_of(syncs(list(range(begin, begin + 50))))).syncs.tick
@@ -62,7 +62,7 @@ def test_a_longer_silence_is_a_new_beginning(hours: float) -> None:
 
 @pytest.mark.parametrize("block", [1, 500])
 def test_what_a_block_leaves_out_is_bounded_however_its_clock_jumps(block: int) -> None:
-    """Each SYNC seems to come hours after the one before it."""
+    """Each SYNC appears to come hours after the previous one."""
     grid = SyncGrid(0.001)
     rows = [(k * 10_000_000 * MS, 0x80, bytes([k % 240 + 1])) for k in range(500)]
     fed = [grid.feed(frames_of(rows[start : start + block])) for start in range(0, 500, block)]
@@ -82,7 +82,7 @@ def test_a_simulated_machine_that_was_held_up_misses_nothing() -> None:
 
 @pytest.mark.fault("A6")
 def test_a_turn_whose_end_is_lost_again_and_again_is_no_shorter_one() -> None:
-    """Then every later row would be one too early."""
+    """Otherwise every later row would be one too early."""
     grid = SyncGrid(0.001)
     heard = [k for k in range(1000) if k not in (239, 479, 718, 719)]
     got = np.concatenate([grid.feed(frames_of(syncs([k]))).syncs.tick for k in heard])
@@ -125,12 +125,12 @@ def test_two_producers_are_noticed_once() -> None:
 
 
 def uncounted(steps_ns: list[int]) -> list[Row]:
-    """SYNCs without a counter, these steps apart."""
+    """Return SYNCs without a counter with these intervals."""
     return [(int(t), 0x80, b"") for t in np.cumsum(steps_ns)]
 
 
 def noticed(rows: list[Row], realtime: bool = True, block: int = 7) -> list[str]:
-    """Return the notices of a grid that is fed some SYNCs at a time."""
+    """Return the notices of a grid that gets some SYNCs at a time."""
     grid = SyncGrid(0.001, realtime)
     blocks = [rows[start : start + block] for start in range(0, len(rows), block)]
     return [notice.code for each in blocks for notice in grid.feed(frames_of(each)).notices]
@@ -147,7 +147,7 @@ def test_two_producers_without_counters_are_noticed_by_their_rhythm(early_us: in
 @pytest.mark.parametrize("period_us", [250, 500, 700, 1000, 1400, 4000])
 @pytest.mark.parametrize("jitter_us", [0, 60])
 def test_one_producer_of_another_period_is_no_second_one(period_us: int, jitter_us: int) -> None:
-    """Its rate is told as such: the daemon says which period it has."""
+    """Its rate has a notice of its own, with the period measured."""
     random = np.random.default_rng(period_us)
     steps = [period_us * 1000 + int(random.normal(0, jitter_us * 1000)) for _ in range(2000)]
     assert noticed(uncounted(steps)) == []
@@ -170,7 +170,7 @@ def test_syncs_that_are_lost_are_no_second_producer(every: int) -> None:
 @pytest.mark.parametrize("overflow", [2, 3, 10, 100, 200, 239, 240])
 @pytest.mark.parametrize("block", [1, 50])
 def test_a_counter_may_go_up_to_any_number(overflow: int, block: int) -> None:
-    """A master of another make counts to what it likes; no SYNC is missed, doubled or taken for another's."""
+    """Masters by others choose the overflow; no SYNC is counted as missing, duplicate or of a second producer."""
     grid = SyncGrid(0.001)
     rows: list[Row] = [(10**15 + k * MS, 0x80, bytes([(k + 1) % overflow + 1])) for k in range(1000)]
     taken = [grid.feed(frames_of(rows[start : start + block])) for start in range(0, 1000, block)]
@@ -181,7 +181,7 @@ def test_a_counter_may_go_up_to_any_number(overflow: int, block: int) -> None:
 
 @pytest.mark.parametrize("overflow", [10, 200])
 def test_an_unsteady_counter_is_known_after_its_second_turn(overflow: int) -> None:
-    """A master on a busy computer: time tells nothing, the counter does."""
+    """With a master on a busy computer the intervals are useless, the counter is not."""
     random = np.random.default_rng(overflow)
     grid = SyncGrid(0.001)
     times = np.cumsum(random.integers(MS // 10, 8 * MS, 1000))
@@ -243,7 +243,7 @@ def test_a_heartbeat_that_stops_is_noticed_and_its_return_too() -> None:
 
 
 def test_a_heartbeat_that_comes_and_goes_is_one_outage() -> None:
-    """Four at 20 ms each second, for half a minute: two lines, not two a second."""
+    """Four at 20 ms each second for half a minute: two notices, not two a second."""
     watch = NodeWatch("X", 1)
     told = []
     for t in range(0, 30_000, 1000):
@@ -255,7 +255,7 @@ def test_a_heartbeat_that_comes_and_goes_is_one_outage() -> None:
 
 
 def test_a_boot_after_the_first_heartbeats_is_the_same_outage() -> None:
-    """A supply that comes back by turns: the daemon once ended at the boot-up."""
+    """After a power-up with heartbeats before the boot-up message the daemon once ended."""
     watch = NodeWatch("X", 1)
     watch.feed(frames_of(beats([0, 100, 200, 300])), 300 * MS)
     told = watch.feed(frames_of([]), 2000 * MS)

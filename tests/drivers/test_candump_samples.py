@@ -1,4 +1,4 @@
-"""A black box is read as the daemon heard the bus; what is no log, or half of one, is said."""
+"""A black box is read as the daemon read the bus; a file that is no log, or half of one, is reported."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_frames_of_other_kinds_give_no_samples(frame: str) -> None:
 
 @pytest.mark.parametrize(
     ("log", "said"),
-    [(b"", "no log of candump"), (b"PK\x03\x04 something else\n", "no log of candump"), (b"x" * 200, "more than")],
+    [(b"", "not a candump log"), (b"PK\x03\x04 something else\n", "not a candump log"), (b"x" * 200, "more than")],
 )
 def test_what_is_no_log_is_said(log: bytes, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(candump_samples, "LARGEST_LOG", 100)

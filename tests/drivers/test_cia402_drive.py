@@ -1,4 +1,4 @@
-"""The decoder puts every signal on the row it belongs to, and counts what is lost."""
+"""The decoder puts every signal in the correct row and counts the lost ones."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def test_a_target_that_stands_still_is_not_lost_with_a_sync() -> None:
 
 
 def test_a_frame_that_is_left_beside_a_lost_sync_is_not_taken_for_another_rows() -> None:
-    """SYNC 30 and the TPDO of tick 29 are lost: what came after SYNC 29 is of tick 30."""
+    """SYNC 30 and the TPDO of tick 29 are lost: the frame after SYNC 29 belongs to tick 30."""
     wire = Wire(n=60)
     lost = (wire.sync(30), *wire.tpdos(29)[:2])
     got, _, decoder = decode_all([frames_of([row for row in wire.rows() if row not in lost])])
@@ -177,7 +177,7 @@ def test_a_duplicate_is_no_second_sample() -> None:
 @pytest.mark.fault("A13")
 @pytest.mark.parametrize("still", [False, True])
 def test_a_frame_that_comes_after_the_next_sync_is_told_and_its_rows_are_holes(still: bool) -> None:
-    """``still``: it is equal to the next one, so that one is as good as it."""
+    """``still``: at standstill consecutive frames are equal, so no value is wrong."""
     wire = Wire(n=60)
     rows = wire.rows()
     mine = [i for i, row in enumerate(rows) if row[1] == 0x181]

@@ -1,4 +1,4 @@
-"""The recorder of an air cut: what is kept, what counts as lost, when it is done."""
+"""The recorder of an air cut: what it keeps, what it counts as lost, when it is complete."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def samples(axis: str, demand: Float, ticks: Sequence[int]) -> AxisSamples:
 
 
 def feed(recorder: DemandRecorder, lost: Sequence[int] = (), until: int = PATH.size) -> None:
-    """Blocks of 40 rows of X and of Y, which lacks the rows ``lost``."""
+    """Feed blocks of 40 rows of X and of Y, which lacks the rows ``lost``."""
     for first in range(0, until, 40):
         if recorder.done:
             return

@@ -1,4 +1,4 @@
-"""Error frames become notices: each kind when it begins, and once it is over."""
+"""Error frames become notices: one when an error begins, one when it has ended."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def codes(watch: ErrorWatch, now_s: float, *rows: tuple[int, int, bytes]) -> lis
     [
         (error(0, 0x008, 0, 0, 0x04 | 0x02), ("BusErrors", "minor"), "(form, stuff errors)"),
         (error(0, 0x088), ("BusErrors", "minor"), "damaged and sent again"),
-        (error(0, 0x004, 0, 0x01), ("RxOverflow", "minor"), "nobody counts"),
+        (error(0, 0x004, 0, 0x01), ("RxOverflow", "minor"), "unknown number of frames"),
         (error(0, 0x010, 0, 0, 0, 0, 0x04), ("TransceiverFault", "MAJOR"), "breaks and shorts"),
         (error(0, 0x020), ("NotAcknowledged", "minor"), "acknowledged by no node"),
     ],

@@ -1,4 +1,4 @@
-"""Every listed source of G0 events keeps the contract; each finds the rapids that it can know of."""
+"""Every listed source of G0 events meets the contract and finds the rapids that it can detect."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_contract(name: str) -> None:
 
 @pytest.mark.parametrize("name", tables.EVENT_SOURCES)
 def test_every_listed_source_tells_a_rapid_in_its_own_name(name: str) -> None:
-    """Demand, signal and the NC's words come in blocks: a rapid to and fro, with the bit set and told meanwhile."""
+    """Demand, signal and NC messages come in blocks: a rapid out and back, with the bit set and the messages sent."""
     config = machine(g0={"source": name})
     source = load_event_source(name)("X", config)
     there = move(400, 500)

@@ -1,4 +1,4 @@
-"""The ring loses nothing silently."""
+"""The ring loses no frame without counting it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ HEAP_BYTES = 64_000  # of objects; the frames themselves are twenty times that
 
 
 def flood(first: int, count: int) -> Frames:
-    """Return so many frames a millisecond apart, each with its number as data."""
+    """Return this many frames a millisecond apart, each with its number as data."""
     frames = np.zeros(count, FRAME)
     frames["data"] = np.arange(first, first + count)
     frames["t_ns"] = frames["data"] * PERIOD_NS

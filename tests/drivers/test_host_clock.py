@@ -1,4 +1,4 @@
-"""Clocks elsewhere are brought onto the host's: drift, late readings, clocks that are set."""
+"""Times of other clocks are converted to the host's clock: drift, late readings, clocks that are set."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_a_clock_that_was_set_counts_from_there() -> None:
 
 
 def listening() -> SocketCanPort:
-    """A port without its socket: what the kernel's messages mean."""
+    """A port without its socket, to test how the kernel's messages are read."""
     port = SocketCanPort.__new__(SocketCanPort)
     port.stamps, port.kernel_drops = "kernel", 0
     port._wall_clock, port._controller = WallClock(), DistantClock(2.0)
@@ -53,7 +53,7 @@ def stamped(kernel_ns: int, controller_ns: int) -> list[tuple[int, int, bytes]]:
 
 
 def test_stamps_of_the_controller_are_taken_where_there_are_some(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One period apart as the controller saw them, however late the kernel was told."""
+    """One period apart by the controller's clock, however late the kernel stamped them."""
     monkeypatch.setattr(socketcan, "monotonic_ns", lambda wall_ns, ahead_ns: wall_ns - ahead_ns)
     port = listening()
     late = [0, 3 * MS, 2 * MS, 1 * MS, 0, 7 * MS]

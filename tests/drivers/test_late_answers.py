@@ -1,4 +1,4 @@
-"""Modbus RTU answers that come after their request was given up are never taken for those of later requests."""
+"""Modbus RTU answers that arrive after their time-out are never taken as answers to later requests."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ async def test_unit_that_answers_under_another_number_is_named() -> None:
         link = link_to(peer, unit=3, timeout_s=0.4)
         await link.connect()
         peer.spoil = [lambda frame: [framed(9, frame[1:-2])]] * 9
-        with pytest.raises(ProtocolError, match=r"unit 9 answers where unit 3 was asked; give unit = 9") as caught:
+        with pytest.raises(ProtocolError, match=r"unit 9 answered instead of unit 3; set unit = 9") as caught:
             await link.read_input(0, 1)
         assert link.fault_code(caught.value) == "ModbusUnit"
         assert link.line.counted["ModbusUnit"] == 1
@@ -89,7 +89,7 @@ async def test_unit_that_answers_under_another_number_is_named() -> None:
 
 
 class SlowUnit:
-    """Stands for a port with one unit behind it, in a time of its own: it answers in order, as late as it likes."""
+    """Replaces a port with one unit, in simulated time: it answers in order, with any delay."""
 
     is_open, character_s = True, 1e-4
 
@@ -136,7 +136,7 @@ def at_once(asking: Coroutine[None, None, Answer]) -> Answer:
 
 
 def asked(delays: list[float | None], requests: list[tuple[int, int]]) -> list[tuple[int, ...] | None]:
-    """Return what each request (address, count) got from a unit that takes these times; None for an error."""
+    """Return the result of each request (address, count) for these answer times; None for an error."""
     unit, line = SlowUnit(delays), RtuLine(ModbusPlace(device="/dev/none"))
     line._port, line.silence_s = unit, 0.0  # type: ignore[assignment] # stands for it
     got: list[tuple[int, ...] | None] = []

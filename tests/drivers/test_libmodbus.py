@@ -1,4 +1,4 @@
-"""Against libmodbus, in C, over TCP and over a serial line: fdhil asks its units, its master asks the twin's."""
+"""Against libmodbus in C, over TCP and a serial line: fdhil reads its units, its master reads the simulated ones."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def peer(program: Path, *arguments: str) -> Iterator[str]:
-    """Run it and yield the line that it says once it serves."""
+    """Run the peer and yield the line that it prints once it serves."""
     with subprocess.Popen([program, *arguments], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         try:
@@ -55,7 +55,7 @@ def peer(program: Path, *arguments: str) -> Iterator[str]:
 
 
 class Cable:
-    """A line to which several programs are connected: what one sends all others hear, as on RS-485."""
+    """A line with several programs: all others receive what one sends, as on RS-485."""
 
     def __init__(self, ends: int) -> None:
         self._pairs = [os.openpty() for _ in range(ends)]

@@ -1,4 +1,4 @@
-"""A machine's sources run together: what ends one of them ends all, and is never lost."""
+"""A machine's sources run together: an error in one of them ends all and is always reported."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ async def test_the_exception_that_ends_a_source_leaves_the_machine(monkeypatch: 
 
 
 async def test_a_taker_that_fails_is_told_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """More records than any queue would have held: there is none in which a failure could wait, or be dropped."""
+    """More records than any queue could hold: an error must not wait in a queue or be dropped."""
 
     async def run(bus: BusSource, take: Take) -> None:
         while True:
@@ -92,7 +92,7 @@ def test_silence_from_the_start_is_told_and_so_is_its_end() -> None:
 
 
 class FailingAtTheEnd:
-    """An NC, and a sensor, whose connection fails while the cancellation closes it."""
+    """An NC and a sensor whose connections fail while the cancellation closes them."""
 
     name, axis, samples, lost, connected = "peer", "X", 0, 0, True
 
@@ -121,7 +121,7 @@ class FailingAtTheEnd:
         return self
 
     def fault_code(self, _: object) -> None:
-        """Nothing that anybody is told."""
+        """Has no effect."""
 
 
 @pytest.mark.parametrize("what", ["nc", "sensor"])

@@ -1,4 +1,4 @@
-"""When sensors that show one value are asked, and what number a value has that is told. Pure, but for no clock."""
+"""Request times of sensors that hold one value, and the numbers of the values received. No I/O except the clock."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MS = 1_000_000
 
 
 def ticks_until(last: int, *, held_up_ms: int = 0) -> TickClock:
-    """SYNCs 1 ms apart from 0 ns on; the producer was held up after tick 100."""
+    """Return SYNCs 1 ms apart from 0 ns on; the producer was delayed after tick 100."""
     clock = TickClock(0.001)
     tick = np.arange(last + 1)
     clock.add(TickTimes(tick, tick * MS + np.where(tick > 100, held_up_ms * MS, 0)))
@@ -68,7 +68,7 @@ def test_without_sync_the_computers_clock_does() -> None:
     held_up=st.booleans(),
 )
 def test_values_keep_their_numbers_late_or_lost(drift: float, late: list[float], lost: set[int], held_up: bool) -> None:
-    """Either this computer was late by some values, all until then with it, or values were lost."""
+    """Either this computer was late, with all values received since, or values were lost."""
     count, last, right = ToldCount(0.01), 0.0, []
     for k, delay in enumerate(late):
         if k in lost and not held_up:

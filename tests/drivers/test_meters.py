@@ -1,4 +1,4 @@
-"""Sensors that are a few lines of configuration, read from simulated ones that are served by the same lines."""
+"""Sensors defined by a few lines of configuration, read from simulated ones served from the same configuration."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TYPES = {"int16": 0.01, "uint16": 0.01, "int32": 1e-4, "uint32": 1e-4, "float32"
 
 
 class Shop:
-    """The simulated sensors of a machine, served, and the drivers that its configuration gives."""
+    """The simulated sensors of a machine, and the drivers created from its configuration."""
 
     def __init__(self, document: dict[str, Any]) -> None:
         self.document = document
@@ -42,7 +42,7 @@ class Shop:
         self.wires = SensorWires(made, self.memory)
 
     def config(self) -> MachineConfig:
-        """The configuration with the ports that were chosen."""
+        """Return the configuration with the ports used."""
         for axis, place in self.wires.ready.items():
             self.document["axis"][axis]["voltage"] |= place
         return parse(self.document)
@@ -135,7 +135,7 @@ def test_unit_number_that_the_standard_reserves_is_used_with_a_remark() -> None:
     for place, remarks in (({"device": "/dev/ttyUSB0"}, 1), ({"port": 502, "framing": "rtu"}, 1), ({"port": 502}, 0)):
         voltage = {"source": "modbus", "type": "uint16", "unit": 248, "period_s": 0.5, **place}
         made = parse({"machine": {"name": "bench"}, "axis": {"X": bench_axis(corrected=False, voltage=voltage)}})
-        told = [text for text in unlikely(made) if "axis.X.voltage.unit = 248 is not one of 1 to 247" in text]
+        told = [text for text in unlikely(made) if "axis.X.voltage.unit = 248 is outside 1 to 247" in text]
         assert len(told) == remarks
 
 
@@ -318,7 +318,7 @@ async def test_nothing_that_is_no_number_gets_through() -> None:
 
 @pytest.mark.fault("B5")
 async def test_an_adapter_that_is_pulled_out_and_put_back_is_used_again(tmp_path: Path) -> None:
-    """Without a restart; the pause between tries grows, and both edges are told once."""
+    """Without a restart; the pause between attempts grows, and each change has one notice."""
     settings = {"source": "modbus", "type": "float32", "device": str(tmp_path / "meter")}
     found: asyncio.Queue[Record] = asyncio.Queue()
 
@@ -357,16 +357,16 @@ LINE = {"source": "modbus", "device": "/dev/ttyUSB0", "type": "float32"}
 @pytest.mark.parametrize(
     ("axes", "says"),
     [
-        ({"X": {"source": "serial"}}, "a sensor on a serial line has one"),
+        ({"X": {"source": "serial"}}, "name the sensor's serial device"),
         ({"X": {**LINE, "unit": 0}}, "from 1 to 247"),
         ({"X": {**LINE, "baud_rate": 9601}}, "must be one of 1200"),
-        ({"X": {**LINE, "scale": 0.0}}, "must be worth something"),
-        ({"X": {**LINE, "pattern": "([0-9]+"}}, "no regular expression"),
+        ({"X": {**LINE, "scale": 0.0}}, "must not be 0"),
+        ({"X": {**LINE, "pattern": "([0-9]+"}}, "not a regular expression"),
         ({"X": {**LINE, "pattern": "[0-9]+"}}, "must have one group"),
         ({"X": {**LINE, "type": "float16"}}, "float32"),
-        ({"X": {**LINE, "block": {"counter_address": 300}}}, "which no request reads"),
+        ({"X": {**LINE, "block": {"counter_address": 300}}}, "the most that one request reads"),
         ({"X": LINE, "Y": {**LINE, "unit": 2, "parity": "none"}}, "axis.X.voltage sets the same device"),
-        ({"X": LINE, "Y": {**LINE, "source": "serial"}}, "is alone on its device"),
+        ({"X": LINE, "Y": {**LINE, "source": "serial"}}, "cannot share its device"),
         ({"X": {**LINE, "baud_rate": 9600}}, "of the time of /dev/ttyUSB0 at 9600 baud"),
     ],
 )

@@ -1,4 +1,4 @@
-"""The voltage sensor on Modbus: blocks, clocks, and each way in which it can misbehave."""
+"""The voltage sensor on Modbus: blocks, clocks, and every fault that it can have."""
 
 from __future__ import annotations
 
@@ -80,13 +80,13 @@ async def test_a_sensor_that_stands_still_is_noticed_once() -> None:
     [
         ("silent", DeviceTimeout, "was not answered within 0.2 s"),
         ("exception", ProtocolError, "illegal register address"),
-        ("busy", ProtocolError, "is refused (busy); ask it less often"),
+        ("busy", ProtocolError, "is refused (busy); poll it less often"),
         ("short", DeviceError, ""),
-        ("nonsense", ProtocolError, "what came is no answer of Modbus TCP"),
-        ("other function", ProtocolError, "function 1 is answered where 6 was asked"),
+        ("nonsense", ProtocolError, "the answer is not Modbus TCP"),
+        ("other function", ProtocolError, "function 1 was answered instead of 6"),
         ("nan", ProtocolError, "sample rate of nan Hz"),
         ("too many", ProtocolError, "101 samples"),
-        ("hang up", ConnectError, "is gone; check its supply and cable, and that it serves so many clients"),
+        ("hang up", ConnectError, "is gone; check its supply and cable, and its limit of clients"),
     ],
 )
 async def test_each_misbehaviour_is_one_error(mode: str, error: type[DeviceError], says: str) -> None:
@@ -102,7 +102,7 @@ async def test_each_misbehaviour_is_one_error(mode: str, error: type[DeviceError
 
 @pytest.mark.parametrize(
     ("code", "says"),
-    [(2, "compare the register map"), (4, "its own"), (11, "check unit, and the line behind the gateway")],
+    [(2, "compare the register map"), (4, "the device itself"), (11, "check unit, and the line behind the gateway")],
 )
 def test_exception_of_a_unit_or_gateway_has_its_own_advice(code: int, says: str) -> None:
     assert says in str(ModbusRefused("voltage sensor X", 0, code))
@@ -116,7 +116,7 @@ async def test_unit_that_answers_under_another_number_is_named(other: int) -> No
         await link.connect()
         for asked in (1, 2):
             with pytest.raises(
-                ProtocolError, match=f"unit {other} answers where unit 3 was asked; give unit = {other}"
+                ProtocolError, match=f"unit {other} answered instead of unit 3; set unit = {other}"
             ) as caught:
                 await link.read(3, 0, 1)
             assert link.fault_code(caught.value) == "ModbusUnit"
@@ -294,7 +294,7 @@ def test_samples_are_placed_by_way_of_the_sync_count() -> None:
 
 
 def test_samples_that_come_again_are_taken_once() -> None:
-    """A sensor without a latch shows the newest samples, whether or not they were read before."""
+    """A sensor without a latch returns the newest samples, whether or not they were read before."""
     sensor, ticks = ModbusVoltage("X", config(1)), TickClock(0.001)
     taken: list[int] = []
     for poll, newest in enumerate([39, 39, 59, 139, 9]):  # the count fell: the sensor was restarted

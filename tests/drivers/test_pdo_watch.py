@@ -1,4 +1,4 @@
-"""TPDOs that never come: told by name, and not counted as lost frames."""
+"""TPDOs that are never received: reported by name, and not counted as lost frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TPDO1, TPDO2, TPDO3, TPDO4 = 0x181, 0x281, 0x381, 0x481
 
 
 def decoded(rows: list[Row]) -> tuple[BusDecoder, list[Notice], list[AxisSamples]]:
-    """Feed a bus half a second at a time; return its decoder, what was told of TPDOs, and the samples."""
+    """Feed a bus half a second at a time; return its decoder, the notices about TPDOs, and the samples."""
     decoder = BusDecoder("can0", machine())
     out = []
     for start in range(0, len(rows), 2000):
@@ -41,7 +41,7 @@ def test_tpdos_that_never_come_are_told_and_not_lost(silent: tuple[int, ...], se
     assert notice.severity == severity
     assert notice.text == (
         f"Drive X (node-ID 1) never sent {named} though SYNC runs; "
-        "compare its mapping, COB-IDs and transmission types by fdhil check."
+        "compare its mapping, COB-IDs and transmission types with fdhil check."
     )
     assert decoder.counters()["pdo_lost"] == 0
     assert sum(each.lost for each in samples) == 0
@@ -72,7 +72,7 @@ def test_frames_of_a_tpdo_that_comes_are_lost_as_ever() -> None:
 
 
 def test_a_tpdo_that_is_sent_on_change_alone_is_told_and_not_lost() -> None:
-    """What most drives come with: transmission type 255."""
+    """The default of most drives: transmission type 255."""
     seldom = {LATE.time_ns(k, 0.1) for k in range(0, LATE.n, 37)}
     rows = [(t, i, d) for t, i, d in LATE.rows() if i != TPDO1 or t in seldom]
     decoder = BusDecoder("can0", machine())
@@ -83,8 +83,8 @@ def test_a_tpdo_that_is_sent_on_change_alone_is_told_and_not_lost() -> None:
         if isinstance(each, Notice)
     ]
     assert told == [
-        "Drive X sends TPDO1 (181) with few of the SYNCs, and its samples have holes; "
-        "set the transmission type (0x1800:02) to 1, or see whether it still is Operational."
+        "Drive X sends TPDO1 (181) with few of the SYNCs, so its samples have gaps; "
+        "set the transmission type (0x1800:02) to 1, or check that it is still Operational."
     ]
     assert decoder.counters()["pdo_lost"] < 1000
 

@@ -1,4 +1,4 @@
-"""Ways onto a bus: the socketcand reader against a hub of plain sockets, its clock, and what happens at the end."""
+"""Connections to a bus: the socketcand reader against a hub of plain sockets, its clock, and its end."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.held_port import held_port
 
 
 class MiniHub:
-    """One bus, one client: greets, then sends what it is told; ``commands`` is what the client sent."""
+    """One bus, one client: sends a greeting, then the frames given; ``commands`` are the client's."""
 
     def __init__(self, greetings: tuple[bytes, ...] = (b"< hi >", b"< ok >", b"< ok >")) -> None:
         self._server = socket.create_server(("127.0.0.1", 0))

@@ -1,4 +1,4 @@
-"""What every listed drive profile must say, so that a drive of that kind can be heard, judged and corrected."""
+"""What every listed drive profile must define, so that such a drive can be read, identified and corrected."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_what_must_be_heard_is_in_a_tpdo(profile: DriveProfile) -> None:
 
 
 def test_the_offset_can_be_sent_and_read_back(profile: DriveProfile) -> None:
-    """The NC's target and our offset never share an RPDO: who sends one would overwrite the other."""
+    """The NC's target and the offset never share an RPDO: each sender would overwrite the other's value."""
     target, offset = profile.find_rpdo(profile.target), profile.find_rpdo(profile.offset)
     assert target is not None
     assert profile.takes_offset == (offset is not None)
@@ -67,7 +67,7 @@ def test_no_pdo_is_longer_than_a_frame_or_overlaps(profile: DriveProfile) -> Non
 
 
 def test_what_may_be_negative_is_signed(profile: DriveProfile) -> None:
-    """Read unsigned, a current of -1 count would be 65.5 times the rated one; a duty without a sign is told as such."""
+    """Read as unsigned, a current of -1 count would be 65.5 times the rated one; an unsigned duty is marked as such."""
     set_points = (profile.target, profile.offset, profile.speed_offset, profile.torque_offset)
     signals = [profile.position, profile.position_demand, profile.speed, profile.current]
     signals += [] if profile.voltage is None or profile.voltage_magnitude else [profile.voltage]

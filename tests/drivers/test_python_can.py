@@ -1,4 +1,4 @@
-"""Adapters that python-can opens are listened to: a serial one on a pty, and what is said where there is none."""
+"""Adapters of python-can are received from: a serial one on a pseudo terminal, and the message where none exists."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ADAPTERS = [name for name in get_args(BusSettings.model_fields["interface"].anno
 
 
 class SerialAdapter:
-    """The far end of a serial line with an adapter on it that speaks the slcan protocol."""
+    """The far end of a serial line with an adapter that uses the slcan protocol."""
 
     def __init__(self) -> None:
         self.end, self.line = os.openpty()
@@ -46,7 +46,7 @@ class SerialAdapter:
         os.write(self.end, "".join(line + "\r" for line in lines).encode())
 
     def heard(self, last: str) -> str:
-        """Return what was said to the adapter up to a line; a terminal hands it over in as many parts as it likes."""
+        """Return what the adapter received up to a line end; a terminal may split it anywhere."""
         said = ""
         while last + "\r" not in said:
             assert select.select([self.end], [], [], 100)[0], said
@@ -110,7 +110,7 @@ def test_an_adapter_that_talks_nonsense_or_goes_is_an_end_not_silence(adapter: S
         adapter.say("t1zz0")
         wait_for(lambda: bus.ended is not None)
         assert bus.ended is not None
-        assert "is gone, or sent what is no frame" in bus.ended
+        assert "is gone, or sent an invalid frame" in bus.ended
     gone = SerialAdapter()
     with CanBus("can0", settings_of(gone)) as bus:
         gone.close()
@@ -125,7 +125,7 @@ def slcan(can_id: int, data: bytes) -> str:
 def test_a_drive_is_sampled_through_it_as_through_any_bus(
     adapter: SerialAdapter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Stamps in bursts cost no sample, and make no second SYNC producer of one."""
+    """Time stamps in bursts lose no sample and cause no notice of a second SYNC producer."""
     monkeypatch.setattr("fdhil.drivers.cia402.bus_decoder._SYNC_SILENCE_NS", 300e9)  # a host that is held up
     monkeypatch.setattr("fdhil.drivers.bus_source.SILENCE_S", 300.0)
     wire = Wire(n=400, counter=False)
@@ -151,7 +151,7 @@ def test_a_drive_is_sampled_through_it_as_through_any_bus(
 
 
 def rows_of(records: Iterable[object]) -> npt.NDArray[np.float64]:
-    """Tick, demand, position, speed and current of all samples, a column each."""
+    """Return tick, demand, position, speed and current of all samples, a column each."""
     samples = [record for record in records if isinstance(record, AxisSamples)]
     return np.hstack([np.stack([s.tick, s.demand_mm, s.position_mm, s.speed_rad_s, s.current_a]) for s in samples])
 
@@ -192,7 +192,7 @@ def test_nothing_is_ever_sent_through_them(interface: str) -> None:
 
 def test_a_correction_on_a_bus_that_is_only_listened_to_is_refused() -> None:
     document = bench_document("X") | {"bus": {"can0": {"interface": "pcan", "channel": "PCAN_USBBUS1"}}}
-    with pytest.raises(ConfigError, match=r"axis\.X\.correction: bus can0 is only listened to \(pcan\)"):
+    with pytest.raises(ConfigError, match=r"axis\.X\.correction: bus can0 is receive-only \(pcan\)"):
         parse(document)
     del document["axis"]["X"]["correction"]
     assert not parse(document).bus["can0"].may_send

@@ -1,4 +1,4 @@
-"""The SDO channel after a time-out: an answer that comes too late is never taken for that of the next request."""
+"""The SDO channel after a time-out: a late answer is never taken as the answer to the next request."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from fdhil.errors import ProtocolError, SdoAbort, SdoTimeout, SdoToggle, SdoTooL
 
 
 class SlowNode:
-    """A node that answers 0x1016 only once everybody has given up, and all else at once with 7."""
+    """A node that answers 0x1016 only after every time-out, and everything else at once with 7."""
 
     def __init__(self) -> None:
         self.link: Any = None
         self.waiting: list[bytes] = []
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Take a request; what waits arrives before the answer to it."""
+        """Take a request; late answers are sent before the answer to it."""
         assert can_id == 0x601
         if data[0] == 0x80:  # an abort has no answer
             return
@@ -32,7 +32,7 @@ class SlowNode:
         self.link.deliver(answer)
 
     def arrive(self, _seconds: float = 0.0) -> None:
-        """The late answers come."""
+        """Deliver the late answers."""
         for answer in self.waiting:
             self.link.deliver(answer)
         self.waiting = []
@@ -60,7 +60,7 @@ def test_an_answer_to_what_another_program_asked_is_not_taken(monkeypatch: pytes
     node.waiting = [b"\x60\x16\x10\x01" + bytes(4)]  # a download's, of a program that has ended
     assert link.read_int(0x1018, 2) == 7
     link = SdoLink("drive X", 1, lambda can_id, data: link.deliver(b"\x60\x16\x10\x01" + bytes(4)))
-    with pytest.raises(ProtocolError, match="answered wrongly"):
+    with pytest.raises(ProtocolError, match="got a wrong answer"):
         link.read_int(0x1018, 2)
 
 
@@ -68,7 +68,7 @@ def test_an_answer_to_what_another_program_asked_is_not_taken(monkeypatch: pytes
     ("command", "size"), [(0x4B, 2), (0x43, 4), (0x4F, 1), (0x42, None)], ids=["two", "four", "one", "not told"]
 )
 def test_size_of_an_object_is_what_the_drive_says(command: int, size: int | None) -> None:
-    """CiA 301, 7.2.4.3.5: an expedited answer need not say how many of its four bytes are data."""
+    """CiA 301, 7.2.4.3.5: an expedited answer need not give how many of its four bytes are data."""
 
     def send(_can_id: int, data: bytes) -> None:
         link.deliver(bytes([command]) + data[1:4] + bytes(4))
@@ -78,7 +78,7 @@ def test_size_of_an_object_is_what_the_drive_says(command: int, size: int | None
 
 
 class SegmentedNode:
-    """A node that answers an upload in segments without end, or each with a wrong toggle bit."""
+    """A node that answers an upload with endless segments, or with a wrong toggle bit in each."""
 
     def __init__(self, toggles: bool, declares: int = 0) -> None:
         self.link: Any = None
@@ -101,7 +101,7 @@ class SegmentedNode:
 @pytest.mark.parametrize(
     ("node", "says", "code", "error"),
     [
-        (SegmentedNode(toggles=False), "was answered wrongly .*toggle", 0x05030000, SdoToggle),
+        (SegmentedNode(toggles=False), "got a wrong answer .*toggle", 0x05030000, SdoToggle),
         (SegmentedNode(toggles=True), "is longer than 65536 bytes", 0x05040005, SdoTooLarge),
         (SegmentedNode(toggles=True, declares=1 << 30), "is longer than 65536 bytes", 0x05040005, SdoTooLarge),
     ],

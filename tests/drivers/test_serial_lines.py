@@ -1,4 +1,4 @@
-"""Lines of text over a pseudo terminal, in whatever pieces they come."""
+"""Lines of text over a pseudo terminal, split at any place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sensors at the table: a TPDO's place on its tick, a stream of lines on the SYNC count, a module that is asked."""
+"""Sensors at the table: a value of a TPDO, a stream of lines on the SYNC count, a Modbus device that is read."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def test_the_line_under_way_at_the_start_is_left_out_and_other_text_is_told() ->
     sensor = streamed()
     sensor.accept([TextLine("23", 0), *lines([24, 25])], clock())
     assert sensor.samples == 2
-    with pytest.raises(ProtocolError, match="has 0 numbers, and number 2 is asked for; compare column"):
+    with pytest.raises(ProtocolError, match="has 0 numbers, but column 2 is configured; compare column"):
         streamed().accept([TextLine("booting", 0), TextLine("hello world", MS)], clock())
 
 
@@ -173,7 +173,7 @@ async def test_it_is_read_from_a_serial_device(tmp_path: Path, monkeypatch: pyte
 async def test_silence_and_a_missing_device_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.drivers.table.accelerometer.SILENCE_NS", 1)
     sensor = streamed()
-    with pytest.raises(ConnectError, match="no serial device /dev/none"):
+    with pytest.raises(ConnectError, match="serial device /dev/none does not exist"):
         await sensor.link.connect()
     ours, theirs = os.openpty()
     tty.setraw(theirs)
@@ -209,10 +209,10 @@ async def test_a_module_on_modbus_is_placed_between_question_and_answer() -> Non
 @pytest.mark.parametrize(
     ("keys", "text"),
     [
-        ({}, "cob_id: is needed"),
-        ({"cob_id": 0x2A0, "byte": 5}, "byte: int32 from byte 5 on reaches beyond"),
+        ({}, "cob_id: is missing"),
+        ({"cob_id": 0x2A0, "byte": 5}, "byte: int32 from byte 5 on exceeds"),
         ({"cob_id": 0x2A0, "type": "float32"}, "type: a TPDO carries"),
-        ({"cob_id": 0x2A0, "scale": 0.0}, "scale: a count must be worth something"),
+        ({"cob_id": 0x2A0, "scale": 0.0}, "scale: must not be 0"),
     ],
 )
 def test_a_table_encoder_that_cannot_be_is_refused(keys: dict[str, object], text: str) -> None:

@@ -1,4 +1,4 @@
-"""The thermometer: a float32 in two registers, from a peer that can misbehave."""
+"""The thermometer: a float32 in two registers, from a sensor that can fail in every way."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The drivers against the simulated machine in a process of its own, over its hub and its Modbus sensors."""
+"""The drivers against the simulated machine in its own process, over its hub and its Modbus sensors."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def rapid(folder: Path) -> Path:
 
 
 async def gather(source: MachineSource, until: Callable[[list[Record]], bool], seconds: float = 300) -> list[Record]:
-    """Return the records of a source, from now on, up to the one with which it is enough."""
+    """Return the records of a source from now on, up to the one that meets the condition."""
     records: list[Record] = []
     enough = asyncio.Event()
 
@@ -177,7 +177,7 @@ async def test_the_voltage_sensor_is_read_and_its_silence_told(twin: Twin) -> No
 
 
 async def test_a_machine_that_is_switched_off_is_told_and_not_fatal(twin: Twin) -> None:
-    """The last one: it ends the process that the others share."""
+    """Must be the last test: it ends the process that the others share."""
     twin.tell(command="nc", on=True)
     async with open_machine(twin.config()) as source:
         await gather(source, lambda rs: any(isinstance(r, AxisSamples) for r in rs))

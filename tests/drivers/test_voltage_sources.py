@@ -1,4 +1,4 @@
-"""What every listed voltage source must do; being listed is being tested."""
+"""The contract of every listed voltage source; listing a source makes these tests run on it."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def config_of(name: str, port: int = 1, device: str = "/dev/fdhil-none") -> Mach
 
 @asynccontextmanager
 async def peer_of(name: str) -> AsyncIterator[tuple[SensorPeer | None, MachineConfig]]:
-    """Serve a sensor for the source: what its class names as an example, or the peer's own registers; or lines."""
+    """Serve a sensor for the source: its class's example, the default registers, or lines of text."""
     if name in TEXT:
         line = Teller()
         try:
@@ -50,7 +50,7 @@ async def peer_of(name: str) -> AsyncIterator[tuple[SensorPeer | None, MachineCo
 
 
 class Teller(SerialPeer):
-    """Tells a line every 20 ms."""
+    """Sends a line every 20 ms."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -64,14 +64,14 @@ class Teller(SerialPeer):
             await asyncio.sleep(max(0.0, due_s - time.monotonic()))
 
     def unplug(self) -> None:
-        """End telling, too."""
+        """Also stop sending."""
         self._task.cancel()
         super().unplug()
 
 
 @pytest.mark.parametrize("name", tables.VOLTAGE_SOURCES)
 def test_the_voltage_comes_from_one_place_alone(name: str) -> None:
-    """``drive`` is an object in a TPDO; every other is a sensor of its own, which the machine reaches and polls."""
+    """``drive`` is an object in a TPDO; every other source is a sensor of its own that the machine polls."""
     config = config_of(name)
     profile = load_profile(config.axis["X"].drive)
     source = tables.load(tables.VOLTAGE_SOURCES, name)("X", config)
@@ -86,7 +86,7 @@ def test_the_voltage_comes_from_one_place_alone(name: str) -> None:
 
 @pytest.mark.parametrize("name", SEPARATE)
 async def test_a_sensor_is_polled_and_read(name: str) -> None:
-    """What it reads is finite, in order and counted; to be read for people takes nothing from a daemon."""
+    """Its values are finite, in order and counted; a reading for display takes no sample from the daemon."""
     async with peer_of(name) as (peer, config):
         sensor = sensors_of("X", config)["voltage"]
         await sensor.link.connect()

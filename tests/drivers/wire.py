@@ -1,4 +1,4 @@
-"""A machine made of frames: what the wire shows when drives follow a demand two cycles late."""
+"""The frames of a machine whose drives follow a demand two cycles late."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def machine(
 
 @dataclass
 class Wire:
-    """Frames of one drive over ``n`` SYNCs; row k of every signal is what the drive has at SYNC k."""
+    """Frames of one drive over ``n`` SYNCs; row k of every signal is the drive's value at SYNC k."""
 
     n: int = 200
     node_id: int = 1
@@ -82,7 +82,7 @@ class Wire:
         return out
 
     def targets(self, k: int) -> list[Row]:
-        """What is sent after SYNC k is latched at SYNC k+1: r[k+1+delay]."""
+        """Return the targets: those sent after SYNC k are latched at SYNC k+1: r[k+1+delay]."""
         node, row = self.node_id, k + 1 + self.delay
         return [
             (self.time_ns(k, 0.5), 0x200 + node, struct.pack("<Hi", 0x0F, self.reference[row])),

@@ -1,10 +1,4 @@
-"""Small data sheets of foreign drives: the objects that matter of each, as the vendor's file or manual has them.
-
-A sheet is a text file with an object to a line: index[:sub], type, access, ``map`` where it can be mapped,
-``=default``. A ``PDO`` line is both parameters of one: index, access of the mapping, COB-ID, transmission type, room
-for so many objects, mapped objects.
-:func:`eds_text` makes the EDS of it that a vendor would ship.
-"""
+"""Small EDS files of other vendors' drives: the relevant objects of each, as in the vendor's file or manual."""
 
 from __future__ import annotations
 

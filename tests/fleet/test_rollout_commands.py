@@ -169,8 +169,8 @@ def test_the_daemon_tells_of_an_offer_once_until_it_is_answered(works: Works, fi
     ("old", "new", "words"),
     [
         ('name = "friction"', 'name = "Friction!"', "name"),
-        ("ft = 0.061", "friction = 1.0", "no key"),
-        ("[set.maintenance]", "[set.guard]", "set up at the machine alone"),
+        ("ft = 0.061", "friction = 1.0", "not a key"),
+        ("[set.maintenance]", "[set.guard]", "configured at the machine only"),
         ("[set.maintenance]", "[sets]", "sets"),
         ("version = 3", "", "version"),
     ],

@@ -104,12 +104,12 @@ def test_what_is_signed_but_not_written_as_offers_are_is_refused(works: Works) -
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"values": {"guard.node_id": 5}}, "set up at the machine alone"),
-        ({"values": {"axis.X.drive.sign": -1}}, "known at the machine alone"),
-        ({"values": {"axis.X.setpoints.max_speed_mm_s": 5.0}}, "set up at the machine alone"),
-        ({"values": {"offers.trust": "O"}}, "decided at the machine alone"),
-        ({"values": {"access.operate": "anna"}}, "decided at the machine alone"),
-        ({"values": {"store.directory": "/"}}, "those of this computer"),
+        ({"values": {"guard.node_id": 5}}, "senders of set-points and heartbeats"),
+        ({"values": {"axis.X.drive.sign": -1}}, "construction and wiring"),
+        ({"values": {"axis.X.setpoints.max_speed_mm_s": 5.0}}, "senders of set-points and heartbeats"),
+        ({"values": {"offers.trust": "O"}}, "access and trust"),
+        ({"values": {"access.operate": "anna"}}, "access and trust"),
+        ({"values": {"store.directory": "/"}}, "files, sockets and limits"),
         ({"values": {"axis.*.nominal.ft": 1.0}}, "name them"),
         ({"values": {"axis.X.nominal.ft": float("nan")}}, "finite"),
         ({"values": {}}, "at least 1"),
@@ -134,7 +134,7 @@ def test_every_key_of_the_configuration_is_decided_upon() -> None:
     for table in sections():
         for key, _ in table.keys:
             path = f"{table.path}.{key}"
-            assert never(path) != "no offer may change it", path
+            assert never(path) != "no remote change of it is allowed", path
     assert all(never(path.replace("*", "X")) for path in NEVER)
     assert not any(never(path.replace("axis.*", "axis.Z")) for path in FROM_AFAR)
     assert never("nothing.of_the_kind")
@@ -178,5 +178,5 @@ def test_a_mistyped_key_is_found_in_the_configuration(tmp_path: Path) -> None:
         with pytest.raises(ValidationError, match="mistyped"):
             Offers(trust=(wrong,))
     user = nkeys.from_seed(nkeys.encode_seed(b"7" * 32, nkeys.PREFIX_BYTE_USER)).public_key.decode()
-    with pytest.raises(ValidationError, match="no key of a works"):
+    with pytest.raises(ValidationError, match="not a plant's public key"):
         Offers(trust=(user,))

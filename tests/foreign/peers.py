@@ -1,4 +1,4 @@
-"""CANopen devices and masters of other makes, as processes on a hub."""
+"""CANopen devices and masters by others, as processes on a hub."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""A CANopen master made with the canopen library: a process of its own, no code of fdhil in it.
-
-It starts a drive, produces SYNC without a counter and enables the drive where it stands. It waits for the drive's
-answer to each SYNC: drive and master are processes that a busy computer holds up.
-"""
+"""A CANopen master made with the canopen library: a process of its own without any code of fdhil."""
 
 from __future__ import annotations
 

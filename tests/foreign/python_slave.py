@@ -1,4 +1,4 @@
-"""A CANopen slave made with the canopen library's LocalNode: a process of its own, no code of fdhil in it."""
+"""A CANopen slave made with the canopen library's LocalNode: a process of its own without any code of fdhil."""
 
 from __future__ import annotations
 

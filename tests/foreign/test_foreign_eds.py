@@ -1,4 +1,4 @@
-"""The EDS that the simulated drive writes, of itself and of what it wears, as another CANopen stack reads it."""
+"""The EDS written by the simulated drive, also with a vendor's EDS, as another CANopen stack reads it."""
 
 from __future__ import annotations
 

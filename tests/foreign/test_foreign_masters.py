@@ -1,4 +1,4 @@
-"""Masters of other makes run the simulated drive: what listens beside them is right, and nothing is sent."""
+"""Masters by others run the simulated drive: the daemon's readings are right, and it sends nothing."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAKES = [pytest.param("master.js", marks=pytest.mark.debian), "python_master.py"
 
 @pytest.fixture
 def twin(tmp_path: Path) -> Iterator[tuple[TwinProcess, Path]]:
-    """A simulated drive without an NC, and the configuration of who listens to it."""
+    """A simulated drive without an NC, and the configuration of the machine that listens to it."""
     path = write_config(tmp_path, bus='interface = "socketcand"\nport = 0', axes="X", sim="nc = false")
     text = path.read_text().replace("sync_period_s = 0.001", f"sync_period_s = {PERIOD_MS / 1e3}")
     path.write_text('[guard]\nclock = "sync"\n' + text)  # time is the SYNC count
@@ -34,7 +34,7 @@ def twin(tmp_path: Path) -> Iterator[tuple[TwinProcess, Path]]:
 
 
 def master(make: str, twin: TwinProcess) -> ForeignProcess:
-    """SYNC with a counter that goes up to 10, where the make counts at all."""
+    """SYNC with a counter up to 10, where the master has a counter."""
     settings = {"node": twin.ready["drives"]["X"]["node_id"], "own_node": 100, "period_ms": PERIOD_MS, "overflow": 10}
     return ForeignProcess(make, twin.bus_settings, **settings)
 

@@ -1,4 +1,4 @@
-"""Slaves of other makes: found, compared and refused for the right reason, and listened to beside a master."""
+"""Slaves by others: found, compared, refused for the right reason, and received beside a master."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ MAKES = [pytest.param("slave.js", marks=pytest.mark.debian), "python_slave.py"]
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorter waits than on a real machine where nothing comes, longer ones where something does."""
+    """Shorter waits than on a real machine where nothing is sent, longer ones where something is."""
     monkeypatch.setattr("fdhil.commissioning.scan.LISTEN_S", 0.4)
     monkeypatch.setattr("fdhil.commissioning.config_check.LISTEN_S", 0.4)
     monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.4)
@@ -66,7 +66,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 def until_it_answers(
     scanner: BusScanner, answering: Callable[[BusScanner], set[int]] = BusScanner.answering
 ) -> set[int]:
-    """Ask all nodes until the drive has answered, which is on the bus for certain."""
+    """Scan all nodes until the drive has answered; it is certainly on the bus."""
     while not (found := answering(scanner)):
         pass
     return found
@@ -80,7 +80,7 @@ def hub() -> Iterator[Hub]:
 
 @pytest.fixture
 def machine(hub: Hub, tmp_path: Path) -> Path:
-    """The configuration of a machine whose only drive is the foreign one."""
+    """The configuration of a machine whose only drive is the slave under test."""
     return configuration(tmp_path, f'interface = "socketcand"\nport = {hub.port}')
 
 
@@ -96,7 +96,7 @@ def slave(make: str, hub: Hub, settings: dict[str, Any]) -> ForeignProcess:
 
 
 def assert_compared(machine: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """It is found, each point of it is compared or told as not there, and a commissioning is refused."""
+    """Check that it is found, each point is compared or reported as absent, and commissioning is refused."""
     code, out, err = fdhil("scan", machine, "--json", capsys=capsys)
     assert (code, err) == (0, "")
     (node,) = json.loads(out)["buses"][0]["nodes"]
@@ -146,7 +146,7 @@ def test_a_foreign_module_is_told_to_be_no_drive(
 def test_a_foreign_drive_without_the_profiles_tpdos_is_told_and_loses_nothing(
     make: str, hub: Hub, machine: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Beside a master that starts it: TPDO1 is the profile's, TPDO2 is too short, the others never come."""
+    """With a master that starts it: TPDO1 is the profile's, TPDO2 is too short, the others are never sent."""
     monkeypatch.setattr("fdhil.drivers.cia402.pdo_watch.PATIENCE_S", 0.2)
     source = BusSource("can0", machine_config.load(machine))
     with slave(make, hub, DRIVE) as peer, joined(hub) as (master,):
@@ -184,17 +184,17 @@ def test_a_foreign_drive_is_found_and_compared_on_the_kernels_own_bus(
 
 @pytest.mark.debian
 def test_the_daemon_waits_for_a_foreign_drive_that_says_nothing(hub: Hub, machine: Path, tmp_path: Path) -> None:
-    """With the NC off a drive without a heartbeat is silent: the daemon listens on, and hears it when the NC comes."""
+    """With the NC off, a drive without a heartbeat is silent: the daemon waits and samples once the NC starts."""
     log = tmp_path / "daemon.log"
     with slave("slave.js", hub, DRIVE) as peer, joined(hub) as (master,):
         peer.event("ready")
         with Process("daemon", ["fdhil", "run", str(machine)], log) as daemon:
-            _wait(daemon, lambda: "BusSilent: Nothing is heard on bus can0" in log.read_text())
+            _wait(daemon, lambda: "BusSilent: No frame is received on bus can0" in log.read_text())
             master.send(can.Message(arbitration_id=0, data=[1, NODE], is_extended_id=False))
 
             def heard_again() -> bool:
                 master.send(can.Message(arbitration_id=0x80, is_extended_id=False))
-                return "BusSilent: Bus can0 is heard again" in log.read_text()
+                return "BusSilent: Bus can0 is active again" in log.read_text()
 
             _wait(daemon, heard_again)
             assert daemon.stop() == 0

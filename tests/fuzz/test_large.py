@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fdhil.drivers.cia402.eds import MAX_OBJECTS, MAX_SECTIONS
+from fdhil.eds import MAX_OBJECTS, MAX_SECTIONS
 from tests.fuzz.targets import target_of
 from tests.fuzz.tasting import judged
 

@@ -74,7 +74,7 @@ def test_a_long_program_is_refused_by_the_line_that_no_drive_can_follow(begin: B
     machine = begin()
     answer = machine.arm(machine.write("\n".join(lines) + "\n", "hard.ngc"))
     assert answer["code"] == "DemandTooHigh", answer
-    assert re.search(r"line 3[67], at \d+\.\d+ s: axis [XY] has", answer["text"]), answer
+    assert re.search(r"line 3[67], at \d+\.\d+ s: axis [XY] is at", answer["text"]), answer
     assert answer["text"].endswith("no offset can help"), answer
     assert answer["advice"].startswith("lower the feed"), answer
 

@@ -95,7 +95,7 @@ def test_terms_and_loops_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("loops", "message"),
     [
-        ({"speed_k": 21.0}, "axis.X.regulators.speed_k: is no key of this section (did you mean 'speed_kp'?)"),
+        ({"speed_k": 21.0}, "axis.X.regulators.speed_k: is not a key of this section (did you mean 'speed_kp'?)"),
         ({"speed_kp": "fast"}, "axis.X.regulators.speed_kp"),
         ({"structure": "double_pi"}, "double_pi needs position_ki_per_s2"),
     ],

@@ -285,9 +285,9 @@ def test_credentials_that_cannot_be_used_are_named(tmp_path: Path) -> None:
     ("settings", "words"),
     [
         ({"host": "broker", "user": "u", "password_file": "p"}, "it needs a tls_ca_file"),
-        ({"user": "u"}, "a user comes with the password_file"),
+        ({"user": "u"}, "user and password_file must be given together"),
         ({"tls_certificate_file": "c", "tls_key_file": "k"}, "it needs a tls_ca_file"),
-        ({"tls_ca_file": "ca", "tls_key_file": "k"}, "comes with its tls_key_file"),
+        ({"tls_ca_file": "ca", "tls_key_file": "k"}, "tls_key_file must be given together"),
         ({"group": "a/b"}, "pattern"),
         ({"node": "mill+"}, "pattern"),
     ],

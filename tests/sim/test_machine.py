@@ -310,7 +310,7 @@ def test_every_fault_ends_without_a_trace(name: str) -> None:
         ("[[fault]]\nfault='frame'\ncan_id=1\ndata='zz'", "hex"),
         ("[[fault]]\nfault='frame'\ncan_id=1\ndata='000102030405060708'", "at most 8"),
         ("faults = []", "faults: unknown key"),
-        ("[[fault]\n", "is no TOML"),
+        ("[[fault]\n", "is not valid TOML"),
     ],
 )
 def test_a_wrong_fault_script_is_refused(text: str, complaint: str, tmp_path: Path) -> None:

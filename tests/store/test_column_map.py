@@ -109,7 +109,7 @@ def test_a_speed_of_the_table_needs_the_pitch_alone(tmp_path: Path) -> None:
         ('unit = "mA"', 'unit = "furlong"', "columns.current_A.unit"),
         ('axis = "X"\n', "", "headers.axis"),
         ("position_m = ", "position_mm = ", "position_mm"),
-        ("[columns]", "[columns", "no TOML"),
+        ("[columns]", "[columns", "is not valid TOML"),
         ('current_A = { name = "Strom", unit = "mA" }\n', "", "columns.current_A"),
     ],
 )

@@ -71,7 +71,7 @@ def test_a_faulty_users_file_is_told_without_its_content(tmp_path: Path, text: s
     path = tmp_path / "users"
     path.write_text(text)
     path.chmod(0o600)
-    with pytest.raises(ConfigError, match="is no users file") as told:
+    with pytest.raises(ConfigError, match="is not a users file") as told:
         Access(path)
     assert "c2VjcmV0" not in str(told.value)
 

@@ -50,7 +50,7 @@ def test_beyond_this_computer_it_takes_tls_and_users_or_a_word(host: str) -> Non
 
 
 def test_what_belongs_together_is_refused_alone(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="belong together"):
+    with pytest.raises(ConfigError, match="must be given together"):
         config_of(tmp_path, web={"tls_key_file": "k"})
     with pytest.raises(ConfigError, match="acting needs a users_file"):
         config_of(tmp_path, web={"acting": True})

@@ -1,1 +1,1 @@
-"""Listens to a CAN bus: ways onto it, its frames in bulk, the SYNC grid, SDO, and the watch over its nodes."""
+"""Receives from a CAN bus: bus interfaces, frames in bulk, SYNC grid, SDO, node monitoring."""

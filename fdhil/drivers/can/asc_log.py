@@ -26,7 +26,7 @@ from fdhil.drivers.can.logged_frame import (
 from fdhil.errors import RecordingError
 
 OTHER_EVENTS = "events that are not CAN frames"
-NO_DATE = "the date, which cannot be read"
+NO_DATE = "the date, which is unreadable"
 _EVENT = re.compile(r"\s*(\d+\.\d+)\s+(\S.*)")
 _HEAD = re.compile(
     r"\s*(?://\s*fdhil: start (?P<start>\d+\.\d+)|date\s+(?P<date>.+)"
@@ -48,7 +48,7 @@ _REMOTE, _FD, _RATE_SWITCH, _ERROR_STATE = 1 << 4, 1 << 12, 1 << 13, 1 << 14  # 
 
 
 def date_ns(text: str) -> int | None:
-    """Return a date of a head, local time, in ns since 1970; None where it is none.
+    """Parse a header's date, local time, into ns since 1970; None where it is invalid.
 
     >>> date_ns("Wed May  1 10:00:00 2024") == date_ns("Mit Mai 1 10:00:00.000 am 2024")
     True
@@ -67,8 +67,6 @@ def date_ns(text: str) -> int | None:
 
 
 class _Head:
-    """What the lines before the events say of them."""
-
     def __init__(self) -> None:
         self.names: dict[int, str] = {}
         self.base = 16
@@ -79,7 +77,6 @@ class _Head:
         self._from_trigger = False
 
     def take(self, line: str) -> None:
-        """Take in one line."""
         self.names |= dict(named_by(line))
         match = _HEAD.match(line)
         if match is None:
@@ -95,12 +92,12 @@ class _Head:
             self._trigger_ns = date_ns(match["trigger"])
 
     def begin_measurement(self) -> None:
-        """Take the trigger's date: the times count from there."""
+        """Count times from the trigger's date."""
         self._from_trigger = True
 
     @property
     def start_ns(self) -> int | None:
-        """Since 1970; None where no date can be read."""
+        """Start time, ns since 1970; None where no date can be read."""
         dates = [self._exact_ns, self._date_ns, self._trigger_ns]
         if self._from_trigger:
             dates.insert(1, self._trigger_ns)
@@ -133,7 +130,6 @@ def read(path: Path, skipped: Counter[str]) -> Iterator[LoggedFrame]:
 
 
 def _frame(words: Sequence[str], t_ns: int, head: _Head) -> LoggedFrame | None:
-    """Return the frame of an event, None where it is another event; ValueError, IndexError where it is damaged."""
     is_fd = words[0] == "CANFD"
     words = words[1:] if is_fd else words
     if not words[0].isdecimal() or len(words) < 2:
@@ -161,7 +157,6 @@ def _classic_frame(words: Sequence[str], t_ns: int, bus: str, can_id: int, base:
 
 
 def _fd_frame(words: Sequence[str], t_ns: int, bus: str, can_id: int, base: int, sent: bool) -> LoggedFrame:
-    """Return the frame of a CANFD event: a classic one too, where its flags say so."""
     words = words if words[0] in ("0", "1") else words[1:]  # a symbolic name
     dlc, length = int(words[2], 16), int(words[3])
     data, rest = bytes(int(word, base) for word in words[4 : 4 + length]), words[4 + length :]
@@ -173,7 +168,7 @@ def _fd_frame(words: Sequence[str], t_ns: int, bus: str, can_id: int, base: int,
 
 
 def write(path: Path, frames: Iterable[LoggedFrame], header: LogHeader) -> None:
-    """Write a log; its times are absolute, and count from the date in its head."""
+    """Write a log with absolute times, counted from the date in its header."""
     start = datetime.fromtimestamp(header.start_ns // 1_000_000_000, UTC).astimezone()
     month = next(name for name, number in _MONTHS.items() if number == start.month)
     day = _DAYS[start.weekday()]

@@ -23,9 +23,9 @@ from fdhil.drivers.can.logged_frame import (
 from fdhil.errors import RecordingError
 
 OTHER_OBJECTS = "objects that are not CAN frames"
-NO_DATE = "the date, which is not in the head"
-_DATED_S = 631152000  # python-can has no date before 1990 in a head: times count from 1970 then
-_APPLICATION = 8  # byte of the head that names the program: others have a frame's identifier in an error frame
+NO_DATE = "the date, which is not in the header"
+_DATED_S = 631152000  # python-can cannot write a date before 1990: times count from 1970 then
+_APPLICATION = 8  # header byte that names the program: others store an identifier in error frames
 _UNREADABLE = (BLFParseError, ValueError, LookupError, EOFError, TypeError, OSError, struct.error, zlib.error)
 
 
@@ -38,14 +38,14 @@ def read(path: Path, skipped: Counter[str]) -> Iterator[LoggedFrame]:
             file.seek(0)
             reader = can.BLFReader(file)
             start_ns = round(reader.start_timestamp * 1e3) * 1_000_000
-            reader.start_timestamp = 0.0  # a float of seconds since 1970 has no microseconds to spare
+            reader.start_timestamp = 0.0  # a float of seconds since 1970 loses microseconds
             for message in reader:
                 frames += 1
                 yield _frame(message, start_ns, of_socketcan)
             skipped[OTHER_OBJECTS] += max(0, reader.object_count - frames)
     except _UNREADABLE as error:
         what = (str(error).splitlines() or [type(error).__name__])[0][:200]
-        raise RecordingError(f"{path} is no BLF log that can be read ({what}); copy it again") from None
+        raise RecordingError(f"{path} is not a readable BLF log ({what}); copy it again") from None
 
 
 def _frame(message: can.Message, start_ns: int, of_socketcan: bool) -> LoggedFrame:
@@ -66,10 +66,10 @@ def _frame(message: can.Message, start_ns: int, of_socketcan: bool) -> LoggedFra
 
 
 def write(path: Path, frames: Iterable[LoggedFrame], header: LogHeader) -> None:
-    """Write a log; the names of buses become numbers."""
+    """Write a log; bus names become numbers."""
     start_ns = header.start_ns if header.start_ns >= _DATED_S * 1_000_000_000 else 0
     writer = can.BLFWriter(path)
-    writer.start_timestamp = 0.0  # offsets are exact where no seconds since 1970 are in them
+    writer.start_timestamp = 0.0  # offsets without seconds since 1970 are exact
     try:
         for frame in frames:
             writer.on_message_received(_message(frame, start_ns, header.buses[frame.bus]))

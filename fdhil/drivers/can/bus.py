@@ -1,6 +1,6 @@
-"""Listens to one CAN bus: a receive thread only appends to a ring, and its reader drains that in blocks.
+"""Receives from one CAN bus: a thread only appends to a ring, and the reader drains that in blocks.
 
-There is nothing here that sends: what does is in ``fdhil.commissioning.transmit``, which no other room may import.
+Nothing here sends: ``fdhil.commissioning.transmit`` does, which no other package may import.
 """
 
 import threading
@@ -15,24 +15,24 @@ from fdhil.drivers.can.port import BusEnded, Filter, Port, Stamps
 from fdhil.drivers.can.ports import open_port
 
 POLL_S = 0.05
-# frames are read ten milliseconds at a time: a thread that wakes for every one costs more than all the decoding, the
-# stamps come from the kernel or the hub, and even a receive buffer that may not be enlarged holds three times as many
+# frames are read every 10 ms: a thread that wakes for each one costs more than all the decoding, the
+# stamps come from the kernel or the hub, and even the smallest receive buffer holds three times as many
 BATCH_S = 0.010
 HOLD_BACK_S = 0.001
 
 
 class ListenedBus(Protocol):
-    """A bus as its reader needs it: frames in blocks."""
+    """A bus as its reader sees it: frames in blocks."""
 
     last_frame_ns: int
 
     @property
     def ended(self) -> str | None:
-        """Why no more frames come; None while they may."""
+        """Why no more frames come; None while the bus is alive."""
 
     @property
     def stamps(self) -> Stamps:
-        """Who stamped the newest frames."""
+        """Source of the newest frames' time stamps."""
 
     def drain(self) -> Frames:
         """Return all frames received since the last call that pass the filters, in order of arrival."""
@@ -48,23 +48,19 @@ class OpenBus(Protocol):
     """Opens a bus for listening; ConnectError with cause and next action."""
 
     def __call__(self, name: str, settings: config.CanBus, *, filters: Sequence[Filter] = ()) -> ListenedBus:
-        """Return the open bus, which receives."""
+        """Return the open, receiving bus."""
 
 
 class CanBus:
-    """A bus that is listened to; a context manager.
+    """A bus that is received from; a context manager.
 
-    ``ended`` tells why the receive thread stopped (None while it runs).
+    ``end_reason`` is the reason why the receive thread stopped (None while it runs).
     """
 
     batch_s = BATCH_S
 
     def __init__(
-        self,
-        name: str,
-        settings: config.CanBus,
-        ring_frames: int = DEFAULT_RING_FRAMES,
-        filters: Sequence[Filter] = (),
+        self, name: str, settings: config.CanBus, ring_frames: int = DEFAULT_RING_FRAMES, filters: Sequence[Filter] = ()
     ) -> None:
         self.name = name
         self.ended: str | None = None
@@ -85,15 +81,13 @@ class CanBus:
 
     @property
     def stamps(self) -> Stamps:
-        """Who stamped the newest frames."""
         return self._port.stamps
 
     def _receive(self) -> None:
-        """The receive thread: nothing but appending; its end is reported, never swallowed."""
         try:
             while not self._stopping.is_set():
                 if self._port.holds_back and 2 * self._ring.room < self._ring_frames:
-                    time.sleep(HOLD_BACK_S)  # what is not read waits in the hub
+                    time.sleep(HOLD_BACK_S)  # unread frames wait in the hub
                     continue
                 self._port.receive(self._ring, POLL_S)
                 time.sleep(self.batch_s)
@@ -101,14 +95,12 @@ class CanBus:
             self.ended = str(end)
 
     def drain(self) -> Frames:
-        """Return all frames received since the last call that pass the filters, in order of arrival."""
-        frames = passing(self._ring.drain(), self._filters)  # not every way onto a bus has filters of its own
+        frames = passing(self._ring.drain(), self._filters)  # some bus interfaces have no filters
         if frames.size:
             self.last_frame_ns = int(frames["t_ns"][-1])
         return frames
 
     def counters(self) -> dict[str, int]:
-        """Frames received, and lost in the ring and in the kernel."""
         lost = self._ring.overflowed + self._port.kernel_drops
         return {
             "frames": self._ring.received,
@@ -118,7 +110,6 @@ class CanBus:
         }
 
     def close(self) -> None:
-        """Stop the receive thread and release the bus."""
         self._stopping.set()
         self._thread.join(timeout=20 * POLL_S)
         self._port.close()

@@ -1,6 +1,6 @@
-"""Logs of all frames of a bus, from one program's format to another's: candump, BLF, ASC, TRC.
+"""Converts logs of all frames of a bus between formats: candump, BLF, ASC, TRC.
 
-A log is read twice, so that its head is known before its first frame is written and none of it is held.
+A log is read twice, so that the header is known before the first frame is written and no frame need be kept.
 """
 
 from collections import Counter
@@ -23,8 +23,8 @@ BUS_NAMES = "names of buses"
 
 @dataclass(frozen=True, slots=True)
 class ConvertedLog:
-    """A log in another format. ``frames`` are in ``content``; ``left_out`` counts what is not, ``reduced`` what lost a
-    part, both by what it is; ``buses`` has the number (candump: the name) of each bus of the log."""
+    """A log in another format. ``frames`` are in ``content``; ``left_out`` counts frames that the format cannot hold,
+    ``reduced`` those that lost a part, by kind; ``buses`` has the number (candump: the name) of each bus of the log."""
 
     content: bytes
     frames: int
@@ -33,15 +33,13 @@ class ConvertedLog:
     buses: Mapping[str, int | str]
 
     def report(self) -> dict[str, Any]:
-        """Return what ``--json`` tells of it."""
+        """Return the fields of the ``--json`` report."""
         names = ("frames", "left_out", "reduced", "buses")
         return {name: getattr(self, name) for name in names}
 
 
 @dataclass(slots=True)
 class _Survey:
-    """What the frames of a log have in common, and what ``format_name`` does not have of them."""
-
     source: str
     format_name: str
     frames: int = 0
@@ -53,7 +51,6 @@ class _Survey:
     reduced: Counter[str] = field(default_factory=Counter)
 
     def add(self, frame: LoggedFrame) -> None:
-        """Take in one frame."""
         if _is_left_out(frame, self.format_name):
             self.left_out[ERROR_FRAMES] += 1
             return
@@ -71,12 +68,11 @@ class _Survey:
 
     @property
     def keeps_fine_times(self) -> bool:
-        """Whether nine digits are written: only where they were read, since most programs that read candump's logs
-        take the digits for microseconds, however many there are."""
+        """Whether nine digits are written: only where they were read, since most readers of candump logs take the
+        digits for microseconds, however many there are."""
         return self.source == self.format_name == "candump"
 
     def header(self) -> LogHeader:
-        """Return the head of the log that is written."""
         start_ns = self.first_ns // _MILLISECOND_NS * _MILLISECOND_NS
         shows_received = self.is_sent or self.source == "candump"
         digits = 9 if self.is_fine and self.keeps_fine_times else 6
@@ -84,13 +80,13 @@ class _Survey:
 
 
 def converted_log(path: Path, source: str, target: str) -> ConvertedLog:
-    """Return a log of format ``source`` in the format ``target``; RecordingError when it is none."""
+    """Convert a log from the format ``source`` to ``target``; RecordingError when it is invalid."""
     survey, skipped = _Survey(source, target), Counter[str]()
     for frame in _frames(path, source, skipped):
         survey.add(frame)
     if not survey.frames:
-        lost = "".join(f"; {count} {what}, which {target} does not have" for what, count in survey.left_out.items())
-        raise RecordingError(f"{path} has no frame{lost}: it is no log of a bus, or nothing was on it")
+        lost = "".join(f"; {count} {what}, which {target} cannot hold" for what, count in survey.left_out.items())
+        raise RecordingError(f"{path} has no frame{lost}: it is not a bus log, or the bus was silent")
     header = survey.header()
     with TemporaryDirectory() as folder:
         part = Path(folder) / "log"
@@ -115,7 +111,7 @@ def _frames(path: Path, format_name: str, skipped: Counter[str]) -> Iterator[Log
     try:
         yield from _module(format_name).read(path, skipped)
     except OSError as error:
-        raise RecordingError(f"{path} cannot be read ({error.strerror}); check the file and its rights") from None
+        raise RecordingError(f"{path} cannot be read ({error.strerror}); check the file and its permissions") from None
 
 
 def _module(format_name: str) -> Any:

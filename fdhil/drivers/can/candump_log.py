@@ -1,4 +1,4 @@
-"""Logs of ``candump -l`` and ``-L`` (can-utils): the lines of the black box too."""
+"""Reads and writes logs of ``candump -l`` and ``-L`` (can-utils); the black box uses this format too."""
 
 import re
 from collections import Counter
@@ -26,14 +26,14 @@ _LINE = re.compile(
 )
 _SCREEN = re.compile(r"(\(.{1,40}\))?\s*\S+\s+([RT]X [B-] [E-]\s+)?[0-9A-F]{3,8}\s+\[\d+\]", re.ASCII)
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
-_RAW_FLAGS = REMOTE_FLAG | EXTENDED_FLAG  # black boxes of former versions have them
+_RAW_FLAGS = REMOTE_FLAG | EXTENDED_FLAG  # in black boxes of former versions
 
 
 def parse_line(line: str) -> LoggedFrame:
-    """Return the frame of a line; ValueError when there is none."""
+    """Parse one line; ValueError when it is not a frame."""
     match = _LINE.fullmatch(line.strip())
     if match is None:
-        raise ValueError("a line that is no frame")
+        raise ValueError("a line that is not a frame")
     name, asked, flags, raw = match["id"], match["asked"], match["fd"], match["raw"]
     data = b"" if asked is not None else bytes.fromhex(match["data"])
     fd = None if flags is None else int(flags, 16)
@@ -55,7 +55,6 @@ def _flagged(can_id: int, is_long: bool) -> int:
 
 
 def format_frame(frame: LoggedFrame, header: LogHeader) -> str:
-    """Return the line of a frame."""
     second, fraction = divmod(frame.t_ns if header.digits == 9 else micros(frame.t_ns), 10**header.digits)
     stamp = f"({second}.{fraction:0{header.digits}d})"
     raw = f"_{frame.dlc:X}" if frame.fd is None and frame.dlc > CLASSIC_BYTES else ""
@@ -64,7 +63,7 @@ def format_frame(frame: LoggedFrame, header: LogHeader) -> str:
 
 
 def shown_id(can_id: int) -> str:
-    """Return an identifier with the flags of SocketCAN as candump writes it.
+    """Format an identifier with the flags of SocketCAN as candump does.
 
     >>> shown_id(0x181), shown_id(REMOTE_FLAG | 0x701), shown_id(EXTENDED_FLAG | 0x123), shown_id(ERROR_FLAG | 4)
     ('181', '701', '00000123', '20000004')
@@ -81,7 +80,7 @@ def _content(frame: LoggedFrame) -> str:
 
 
 def read(path: Path, _skipped: Counter[str]) -> Iterator[LoggedFrame]:
-    """Yield the frames of a log; RecordingError names the first line that is none."""
+    """Yield the frames of a log; RecordingError names the first invalid line."""
     for number, line in lines_of(path, "ascii"):
         if not line.strip():
             continue
@@ -93,12 +92,12 @@ def read(path: Path, _skipped: Counter[str]) -> Iterator[LoggedFrame]:
 
 def _advice(line: str, error: Exception) -> str:
     if _SCREEN.match(_COLOUR.sub("", line).strip()):
-        text = "this is what candump shows on the screen, not its log; record with candump -l, or with "
+        text = "this is candump's screen output, not its log; record with candump -l, or with "
         return text + "candump -L can0 > bus.log"
-    return f"{error}, so the log cannot be read; copy it again, or take out what is not of candump -l"
+    return f"{error}, so the log cannot be read; copy it again, or remove what candump -l did not write"
 
 
 def write(path: Path, frames: Iterable[LoggedFrame], header: LogHeader) -> None:
-    """Write a log as ``candump -l`` does; R and T stand behind the frames where the log distinguishes them."""
+    """Write a log as ``candump -l`` does; frames are marked R and T where the log distinguishes them."""
     with path.open("w", encoding="ascii", errors="replace") as file:
         file.writelines(format_frame(frame, header) for frame in frames)

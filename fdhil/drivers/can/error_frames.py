@@ -1,4 +1,4 @@
-"""Tells what the CAN controller says in error frames (linux/can/error.h). Pure: no clock, no I/O."""
+"""Translates the CAN controller's error frames (linux/can/error.h) into notices. Pure: no clock, no I/O."""
 
 from typing import Literal
 
@@ -22,12 +22,12 @@ CONTROLLER_PASSIVE = 0x10 | 0x20
 CONTROLLER_ACTIVE = 0x40
 # data[2] of a protocol error
 _DAMAGE = {0x01: "bit", 0x02: "form", 0x04: "stuff", 0x08: "dominant bit", 0x10: "recessive bit", 0x20: "overload"}
-_QUIET_NS = 10_000_000_000  # until what no longer comes is over: until then it is one and the same
+_QUIET_NS = 10_000_000_000  # without repetition until a condition has ended
 _RECOVERED = {
     "BusOff": "The CAN controller is back on the bus.",
     "ErrorPassive": "The CAN controller is error-active again.",
     "BusErrors": "No frame was damaged for 10 s.",
-    "NotAcknowledged": "No frame was left without acknowledgement for 10 s.",
+    "NotAcknowledged": "Every frame was acknowledged for 10 s.",
     "TransceiverFault": "The CAN transceiver has reported no fault for 10 s.",
 }
 
@@ -37,19 +37,19 @@ _WHOLE: tuple[tuple[int, str, Severity, str], ...] = (
         ERROR_BUS_OFF,
         "BusOff",
         "MAJOR",
-        "The CAN controller went bus-off, an offset in a drive cannot be changed; check the wiring and bit rate.",
+        "The CAN controller went bus-off: offsets in the drives cannot be changed; check the wiring and bit rate.",
     ),
     (
         ERROR_RESTARTED,
         "BusRestarted",
         "MAJOR",
-        "The CAN controller was restarted; what the drives hold must be read before anything is written.",
+        "The CAN controller was restarted; the offsets in the drives must be read back before anything is written.",
     ),
     (
         ERROR_TRANSCEIVER,
         "TransceiverFault",
         "MAJOR",
-        "The CAN transceiver reports a fault of the line, frames may be lost; check the cable for breaks and shorts.",
+        "The CAN transceiver reports a line fault: frames may be lost; check the cable for breaks and shorts.",
     ),
     (
         ERROR_NO_ACKNOWLEDGE,
@@ -63,7 +63,7 @@ _OF_CONTROLLER: tuple[tuple[int, str, Severity, str], ...] = (
         CONTROLLER_PASSIVE,
         "ErrorPassive",
         "MAJOR",
-        "The CAN controller is error-passive, frames may be lost; check termination, shield and bit rate.",
+        "The CAN controller is error-passive: frames may be lost; check termination, shield and bit rate.",
     ),
     (
         CONTROLLER_WARNING,
@@ -75,7 +75,7 @@ _OF_CONTROLLER: tuple[tuple[int, str, Severity, str], ...] = (
         CONTROLLER_OVERFLOW,
         "RxOverflow",
         "minor",
-        "The CAN controller's own buffer overflowed, frames were lost that nobody counts; the computer is overloaded.",
+        "The CAN controller's buffer overflowed: an unknown number of frames was lost; reduce the computer's load.",
     ),
 )
 
@@ -96,7 +96,7 @@ def error_notices(frames: Frames) -> list[Notice]:
     if classes & (ERROR_PROTOCOL | ERROR_BUS):
         found.append(("BusErrors", "minor", _damage(_detail(errors, ERROR_PROTOCOL, 2))))
     notices: dict[str, Notice] = {}
-    for code, severity, text in found:  # of one code the gravest comes first
+    for code, severity, text in found:  # the gravest of a code comes first
         notices.setdefault(code, Notice(code, severity, text))
     return list(notices.values())
 
@@ -113,7 +113,7 @@ def _damage(kinds: int) -> str:
 
 
 class ErrorWatch:
-    """Tells each code when it first comes, and once it is over; a flood is counted, not repeated."""
+    """Reports each error code when it first occurs, and when it has ended; repeated frames are only counted."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -133,14 +133,14 @@ class ErrorWatch:
         return [*fresh, *self._over(now_ns)]
 
     def _is_news(self, notice: Notice) -> bool:
-        told = self._told.get(notice.code)
-        if told is not None and (told.severity == "MAJOR" or notice.severity == "minor"):
+        reported = self._told.get(notice.code)
+        if reported is not None and (reported.severity == "MAJOR" or notice.severity == "minor"):
             return False
         self._told[notice.code] = notice
         return True
 
     def _follow(self, frames: Frames) -> None:
-        """Follow the controller's state: bus-off lasts until it hears again, error-passive until it says so."""
+        """Track the controller: bus-off ends with a received frame, error-passive when it reports so."""
         error = frames["id"] & ERROR_FLAG != 0
         of_class = np.where(error, frames["id"], 0)
         detail = np.where(of_class & ERROR_CONTROLLER, frames["data"] >> np.uint64(8), 0)

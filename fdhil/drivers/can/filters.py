@@ -1,4 +1,4 @@
-"""Says which frames of a bus are needed, as filters for the kernel or an adapter, and drops the others of a block."""
+"""Builds frame filters for the kernel or an adapter, and applies them to a block."""
 
 from collections.abc import Iterable, Sequence
 
@@ -12,8 +12,8 @@ _COB_ID = 0x7FF
 
 
 def drive_filters(node_ids: Iterable[int], cob_ids: Iterable[int]) -> list[Filter]:
-    """Return filters for NMT, SYNC and TIME, for all that the predefined connection set gives these nodes, SDO and
-    EMCY included (a black box without them would tell little), and for ``cob_ids`` besides.
+    """Return filters for NMT, SYNC and TIME, for the whole predefined connection set of these nodes (SDO and EMCY
+    included, for the black box), and for ``cob_ids``.
 
     >>> [(hex(wanted), hex(mask)) for wanted, mask in drive_filters([5], [0x185, 0x33])]
     [('0x0', '0x8000007f'), ('0x5', '0x8000007f'), ('0x33', '0x800007ff')]
@@ -24,7 +24,7 @@ def drive_filters(node_ids: Iterable[int], cob_ids: Iterable[int]) -> list[Filte
 
 
 def passing(frames: Frames, filters: Sequence[Filter]) -> Frames:
-    """Return the frames that pass a filter, and the error frames; all of them without filters."""
+    """Return the frames that pass a filter, and all error frames; without filters, all frames."""
     if not filters:
         return frames
     can_id = frames["id"]

@@ -1,4 +1,4 @@
-"""Keeps the last seconds of all frames of a bus, as they came, for the black box."""
+"""Keeps the last seconds of all frames of a bus for the black box."""
 
 from collections import deque
 
@@ -12,19 +12,18 @@ CHUNK_FRAMES = 1 << 13
 
 
 class FrameHistory:
-    """The frames of the last ``kept_s`` (by receive stamp), copied into chunks on pages of their own.
+    """The frames of the last ``kept_s`` (by receive stamp), copied into chunks of memory pages.
 
-    A chunk goes whole once all of its frames are older. Blocks as they come are of any size: those of a flood of
-    frames would leave the heap full of holes that nothing else fills.
+    A chunk is released once all of its frames are older. The received blocks have any size: keeping those of a frame
+    flood would fragment the heap.
     """
 
     def __init__(self, kept_s: float = KEPT_S) -> None:
         self._kept_ns = round(kept_s * 1e9)
-        self._chunks: deque[Frames] = deque()  # of each the part that is filled
+        self._chunks: deque[Frames] = deque()  # filled part of each
         self._newest, self._filled = np.empty(0, FRAME), CHUNK_FRAMES
 
     def add(self, frames: Frames) -> None:
-        """Keep a block."""
         if not frames.size:
             return
         oldest_ns = int(frames["t_ns"][-1]) - self._kept_ns
@@ -34,7 +33,6 @@ class FrameHistory:
             self._chunks.popleft()
 
     def _fill(self, frames: Frames) -> Frames:
-        """Copy what finds room in the newest chunk, a new one where that is full; return the rest."""
         if self._filled == CHUNK_FRAMES:
             self._newest, self._filled = np.frombuffer(pages_for(CHUNK_FRAMES), FRAME), 0
             self._chunks.append(self._newest[:0])
@@ -44,7 +42,7 @@ class FrameHistory:
         return frames[self._filled - begin :]
 
     def frames(self) -> Frames:
-        """Return what is kept, oldest first; may be called from another thread than ``add``."""
+        """Return the kept frames, oldest first; may be called from another thread than ``add_frames``."""
         kept = np.concatenate([np.empty(0, FRAME), *list(self._chunks)])
         if not kept.size:
             return kept
@@ -53,8 +51,8 @@ class FrameHistory:
 
 
 def candump(bus: str, frames: Frames) -> str:
-    """Return frames as lines of a ``candump -l`` log, which ``canplayer`` and others read; stamps are monotonic."""
-    pieces = range(0, frames.size, CHUNK_FRAMES)  # an object for each line of ten seconds would be many at a time
+    """Format frames as a ``candump -l`` log, which ``canplayer`` and others read; stamps are monotonic."""
+    pieces = range(0, frames.size, CHUNK_FRAMES)  # limits the number of line objects
     return "".join(_lines(bus, frames[begin : begin + CHUNK_FRAMES]) for begin in pieces)
 
 

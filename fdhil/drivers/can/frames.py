@@ -1,8 +1,8 @@
 """Holds CAN frames in bulk, in a preallocated ring between receive thread and decoder.
 
 A frame is 24 bytes: ``t_ns`` host-monotonic receive stamp, ``id`` with the flags of SocketCAN (0x20000000 error,
-0x40000000 remote, 0x80000000 extended), ``dlc`` and ``data`` as a little-endian 64 bit word, so that a block is
-decoded with shifts and masks instead of a loop.
+0x40000000 remote, 0x80000000 extended), ``dlc`` and ``data`` as a little-endian 64 bit word, so that a block is decoded
+with shifts and masks instead of a loop.
 """
 
 import mmap
@@ -24,15 +24,15 @@ DEFAULT_RING_FRAMES = 1 << 16
 
 
 def frames_of(rows: Iterable[tuple[int, int, bytes]]) -> Frames:
-    """Return frames from (t_ns, id, data) rows; data longer than 8 bytes is cut."""
+    """Pack (t_ns, id, data) tuples into frames; data longer than 8 bytes is cut."""
     raw = b"".join(_PACK.pack(t_ns, can_id, min(len(data), 8), data) for t_ns, can_id, data in rows)
     return np.frombuffer(raw, FRAME)
 
 
 def pages_for(frames: int) -> mmap.mmap:
-    """Return zeroed memory for so many frames on pages of its own: they go back as soon as nobody holds it.
+    """Return zeroed memory for this many frames on separate pages, which are returned to the system when released.
 
-    What is set free on the heap of a thread stays with that thread, and may be full of holes.
+    Memory freed on a thread's heap stays with that thread, often fragmented.
     """
     return mmap.mmap(-1, frames * FRAME.itemsize, flags=mmap.MAP_PRIVATE)
 
@@ -40,9 +40,9 @@ def pages_for(frames: int) -> mmap.mmap:
 class FrameRing:
     """A ring of frames between one writer (the receive thread) and one reader.
 
-    Slots are reused, nothing is allocated while it runs; they are on pages of their own, since a bus that is opened
-    again has a new ring, each time in another thread. When the reader is late the newest frames are refused and
-    counted in ``overflowed``: a hole with a known size, never a torn frame.
+    Nothing is allocated while it runs. It lies on separate memory pages, since a reconnected bus has a new ring in
+    another thread. When the reader is late the newest frames are discarded and counted in ``overflow_count``:
+    the gap has a known size, and no frame is torn.
     """
 
     def __init__(self, capacity: int = DEFAULT_RING_FRAMES) -> None:
@@ -55,12 +55,11 @@ class FrameRing:
 
     @property
     def received(self) -> int:
-        """Frames that came in since the start, those that found no room included."""
+        """Frames received since the start, including discarded ones."""
         return self._written + self.overflowed
 
     @property
     def room(self) -> int:
-        """Frames that still find room."""
         return self._capacity - (self._written - self._read)
 
     def append(self, t_ns: int, can_id: int, data: bytes) -> None:
@@ -71,10 +70,10 @@ class FrameRing:
             return
         place = written % self._capacity * FRAME.itemsize
         _PACK.pack_into(self._buffer, place, t_ns, can_id, len(data), data)
-        self._written = written + 1  # last: the reader sees a slot only when it is whole
+        self._written = written + 1  # last, so that the reader only sees complete slots
 
     def drain(self) -> Frames:
-        """Return a copy of all frames that wait, oldest first (reader's side only)."""
+        """Return a copy of all waiting frames, oldest first (reader's side only)."""
         start, stop = self._read, self._written
         first, last = start % self._capacity, stop % self._capacity
         if start == stop:

@@ -1,4 +1,4 @@
-"""A frame of a bus log, whatever the file format, and what is common to the formats."""
+"""A frame of a bus log in any file format, and functions common to the formats."""
 
 import itertools
 import re
@@ -10,7 +10,7 @@ from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
 from fdhil.errors import RecordingError
 
 IDENTIFIER_MASK = 0x1FFFFFFF
-BUS_ERROR = ERROR_FLAG | 0x80  # what an error frame without a class is, as can-utils has it
+BUS_ERROR = ERROR_FLAG | 0x80  # an error frame without a class, as in can-utils
 RATE_SWITCH, ERROR_STATE = 1, 2  # the flags of CAN FD that candump writes
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # by DLC
 CLASSIC_BYTES = 8
@@ -20,7 +20,7 @@ _BY_NUMBER = re.compile(r"can(0|[1-9]\d{0,2})")
 
 
 def fd_dlc(count: int) -> int:
-    """Return the data length code of a CAN FD frame; ValueError where none has so many bytes."""
+    """Return the data length code of a CAN FD frame; ValueError for an impossible byte count."""
     if count not in FD_LENGTHS:
         raise ValueError(f"{count} bytes in a CAN FD frame, which has 0 to 8, 12, 16, 20, 24, 32, 48 or 64")
     return FD_LENGTHS.index(count)
@@ -30,8 +30,8 @@ def fd_dlc(count: int) -> int:
 class LoggedFrame:
     """A frame at ``t_ns`` (since 1970, or the log's own zero) on ``bus``; ``can_id`` has the flags of SocketCAN.
 
-    ``dlc`` is the data length code; of a remote frame the length that is requested. ``fd`` are the flags of a CAN FD
-    frame, None for a classic one. ``sent`` is None where the log does not distinguish sent from received frames.
+    ``dlc`` is the data length code; of a remote frame the requested length. ``fd`` are the flags of a CAN FD frame,
+    None for a classic one. ``sent`` is None where the log does not distinguish sent from received frames.
     """
 
     t_ns: int
@@ -52,17 +52,15 @@ class LoggedFrame:
 
     @property
     def identifier(self) -> int:
-        """The identifier without flags; of an error frame its class."""
+        """Identifier without flags; class of an error frame."""
         return self.can_id & IDENTIFIER_MASK
 
     @property
     def is_error(self) -> bool:
-        """Whether it is an error frame."""
         return bool(self.can_id & ERROR_FLAG)
 
     @property
     def is_remote(self) -> bool:
-        """Whether it is a remote frame."""
         return bool(self.can_id & REMOTE_FLAG)
 
     @property
@@ -72,13 +70,12 @@ class LoggedFrame:
 
 
 def error_frame(t_ns: int, bus: str, sent: bool | None = None) -> LoggedFrame:
-    """Return an error frame of which nothing else is known."""
     return LoggedFrame(t_ns, bus, BUS_ERROR, CLASSIC_BYTES, bytes(CLASSIC_BYTES), sent=sent)
 
 
 @dataclass(frozen=True, slots=True)
 class LogHeader:
-    """What a log's head has: ``start_ns`` is whole milliseconds and not after any frame; ``buses`` numbers from 1."""
+    """Header of a log: ``start_ns`` is whole milliseconds and not after any frame; ``buses`` are numbered from 1."""
 
     start_ns: int
     buses: Mapping[str, int]
@@ -87,7 +84,7 @@ class LogHeader:
 
 
 def number_buses(names: Iterable[str]) -> dict[str, int]:
-    """Return a number from 1 for each bus: ``can0`` is 1, as in can-utils; other names take the free numbers.
+    """Number the buses from 1: ``can0`` is 1, as in can-utils; other names get the free numbers.
 
     >>> number_buses(["vcan0", "can1", "can0"])
     {'can1': 2, 'can0': 1, 'vcan0': 3}
@@ -104,7 +101,7 @@ def number_buses(names: Iterable[str]) -> dict[str, int]:
 
 
 def bus_name(number: int) -> str:
-    """Return the name of a bus that a log numbers from 1; 0 is what some programs write for none."""
+    """Return the name of a bus by its number from 1; some programs write 0 for an unknown bus."""
     return f"can{number - 1}" if number > 0 else "can"
 
 
@@ -112,18 +109,17 @@ _REMARK = re.compile(r"\W*fdhil: bus (\d+) is (\S+)")
 
 
 def name_remarks(header: LogHeader) -> list[str]:
-    """Return the remarks that name those buses which their number does not name."""
+    """Return remarks with the names of those buses that their number does not imply."""
     return [f"fdhil: bus {number} is {name}" for name, number in header.buses.items() if bus_name(number) != name]
 
 
 def named_by(line: str) -> Iterator[tuple[int, str]]:
-    """Yield number and name of a bus where a line is such a remark."""
+    """Yield number and name of a bus if the line is such a remark."""
     if (match := _REMARK.match(line)) is not None:
         yield int(match[1]), match[2]
 
 
 def reason_of(error: Exception) -> str:
-    """Return why a line cannot be read, of what reading its numbers raised."""
     text = str(error)
     if text.startswith("invalid literal for int()"):  # Python's own words
         return f"{text.rpartition(': ')[2][:40]} where a number belongs (record with numbers, not names)"
@@ -131,22 +127,22 @@ def reason_of(error: Exception) -> str:
 
 
 def lines_of(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
-    """Yield the lines of a log with their numbers; RecordingError for one that no log has: it may never end."""
+    """Yield the lines of a log with their numbers; RecordingError for an overlong line."""
     try:
         with path.open(encoding=encoding, errors="replace") as file:
             for number in itertools.count(1):
                 if not (line := file.readline(_MOST_CHARACTERS)):
                     return
                 if len(line) == _MOST_CHARACTERS:
-                    text = f"line {number} has {_MOST_CHARACTERS} characters and more"
-                    raise RecordingError(f"{path}, {text}: it is no log of a bus; copy it again")
+                    text = f"line {number} has {_MOST_CHARACTERS} characters or more"
+                    raise RecordingError(f"{path}, {text}: it is not a bus log; copy it again")
                 yield number, line
     except OSError as error:
-        raise RecordingError(f"{path} cannot be read ({error.strerror}); check the file and its rights") from None
+        raise RecordingError(f"{path} cannot be read ({error.strerror}); check the file and its permissions") from None
 
 
 def decimal_ns(seconds: str) -> int:
-    """Return a decimal number of seconds in ns, exactly.
+    """Convert a decimal number of seconds to ns, exactly.
 
     >>> decimal_ns("1714557600.249713")
     1714557600249713000
@@ -156,5 +152,4 @@ def decimal_ns(seconds: str) -> int:
 
 
 def micros(ns: int) -> int:
-    """Return whole microseconds, rounded."""
     return (ns + 500) // 1000

@@ -1,7 +1,7 @@
-"""Watches a node by what it says: EMCY, boot-up, heartbeat, NMT state. Pure: ``now_ns`` comes from the caller.
+"""Monitors a node by its EMCY, boot-up, heartbeat and NMT state. Pure: ``now_ns`` comes from the caller.
 
-The frames are read here and not by the canopen library, which drops an EMCY shorter than 8 bytes, never notices a
-heartbeat that stops, and believes an NMT command as soon as it is sent.
+The canopen library is not used here: it drops an EMCY shorter than 8 bytes, never notices that a heartbeat stopped, and
+assumes that an NMT command took effect as soon as it was sent.
 """
 
 from itertools import pairwise
@@ -15,15 +15,15 @@ from fdhil.records import Notice
 
 _MAX_EMCY_CODES = 32
 _HEARTBEATS_TO_LEARN = 3
-_BACK_NS = 2_000_000_000  # of regular heartbeats after which an outage is over: until then it is one and the same
-# what a node itself sends in CiA 301's predefined set: EMCY, TPDO1 to 4, SDO answers, heartbeat
+_BACK_NS = 2_000_000_000  # of regular heartbeats until an outage has ended
+# COB-IDs that a node sends by CiA 301's predefined set: EMCY, TPDO1 to 4, SDO answers, heartbeat
 _OWN_COB_IDS = (0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700)
-_TOGGLE = 0x80  # of an answer to node guarding; in a heartbeat it is always 0
+_TOGGLE = 0x80  # toggle bit of node guarding; always 0 in a heartbeat
 _NMT_STATES = frozenset(int(state) for state in Nmt)
 
 
 class NodeWatch:
-    """Watches one node; ``feed`` returns edge-triggered notices."""
+    """Monitors one node; reports each change once."""
 
     def __init__(self, axis: str, node_id: int) -> None:
         self._axis = axis
@@ -55,12 +55,11 @@ class NodeWatch:
         return Notice(code, severity, f"Drive {self._axis} {text}", self._axis)
 
     def _emergency(self, length: int, data: int) -> list[Notice]:
-        """One notice per code; a flood is counted, not repeated."""
         self.emcy_count += 1
         code = data & 0xFFFF if length >= 2 else 0x1000
         if code >> 8 == 0:
             self._codes.clear()
-            return [self._notice("DriveEmergency", "info", "reports that its error is gone.")]
+            return [self._notice("DriveEmergency", "info", "reports no error any more.")]
         if code in self._codes or len(self._codes) >= _MAX_EMCY_CODES:
             return []
         self._codes.add(code)
@@ -72,11 +71,11 @@ class NodeWatch:
         notices = []
         if state == Nmt.BOOT_UP:
             self.boots += 1
-            self._beats, self._back_since_ns = [], None  # an outage that seemed to end begins anew
-            text = "booted, its offset and set-up are unknown; check its supply and commission it again."
+            self._beats, self._back_since_ns = [], None  # an outage that seemed to end continues
+            text = "rebooted: its offset and set-up are unknown; check its supply and commission it again."
             notices.append(self._notice("NodeRebooted", "MAJOR", text))
         elif self.nmt is Nmt.OPERATIONAL and state != Nmt.OPERATIONAL:
-            text = "left the NMT state Operational, it takes no set-points; see what the NC did."
+            text = "left the NMT state Operational: it accepts no set-points; check the NC."
             notices.append(self._notice("NmtStateWrong", "MAJOR", text))
         if self._lost:
             notices += self._after_an_outage(t_ns)
@@ -85,7 +84,6 @@ class NodeWatch:
         return notices
 
     def _after_an_outage(self, t_ns: int) -> list[Notice]:
-        """Say that the heartbeat is back once it has been regular for a while: an outage is two lines."""
         if self._back_since_ns is None or t_ns - self._beats[-1] > self._longest_gap_ns():
             self._back_since_ns, self._beats = t_ns, []
             return []
@@ -95,16 +93,16 @@ class NodeWatch:
         return [self._notice("HeartbeatLost", "info", "sends its heartbeat again.")]
 
     def _longest_gap_ns(self) -> int:
-        """Three learned periods and 0.1 s; the period is the longest of those heard, some may have come in a burst."""
+        """Return three learned periods and 0.1 s; the longest period counts, since some arrive in a burst."""
         return 3 * self._period_ns + 100_000_000
 
     def _silence(self, now_ns: int) -> list[Notice]:
-        """Tell a heartbeat that stops; a drive that sends none, or only when the NC asks it to, is not judged."""
+        """Report a heartbeat that stopped; a node that sends none, or only when guarded by the NC, is not judged."""
         if self._lost or self._guarded or len(self._beats) <= _HEARTBEATS_TO_LEARN:
             return []
         self._period_ns = max(b - a for a, b in pairwise(self._beats))
         if now_ns - self._beats[-1] <= self._longest_gap_ns():
             return []
         self._lost = True
-        text = "sends no heartbeat any more and may be dead; check its supply and the bus."
+        text = "no longer sends its heartbeat and may be dead; check its supply and the bus."
         return [self._notice("HeartbeatLost", "MAJOR", text)]

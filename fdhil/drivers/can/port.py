@@ -1,34 +1,34 @@
-"""What a way onto a CAN bus is, as the receive thread needs it."""
+"""The interface of a receive port, as the receive thread uses it."""
 
 from typing import Literal, Protocol
 
 from fdhil.drivers.can.frames import FrameRing
 
 Stamps = Literal["hardware", "kernel", "hub", "sender", "adapter", "host"]
-"""Who stamps the frames: controller, kernel, hub, sender, the adapter's firmware, this program when it reads them."""
+"""Source of time stamps: controller, kernel, hub, sender, the adapter's firmware, this program when it reads."""
 
 Filter = tuple[int, int]
-"""An identifier with its flags and the mask of the bits that must be the same."""
+"""An identifier with its flags, and the mask of the bits that must match."""
 
 
 class BusEnded(Exception):
-    """The bus under a port is gone; ``str`` says why. Internal to the receive thread."""
+    """The bus of a port is gone; ``str`` is the reason. Internal to the receive thread."""
 
 
 class Port(Protocol):
-    """A way onto a bus, as its receive thread needs it."""
+    """Receives from a bus, for the receive thread."""
 
     @property
     def stamps(self) -> Stamps:
-        """Who stamped the newest frames."""
+        """Source of the newest frames' time stamps."""
 
     @property
     def holds_back(self) -> bool:
-        """Whether what is not read waits at the sender, so that nothing is lost by reading late."""
+        """Whether unread frames wait at the sender, so that reading late loses nothing."""
 
     @property
     def kernel_drops(self) -> int:
-        """Frames the kernel dropped because they were not read in time."""
+        """Frames that the kernel dropped because they were not read in time."""
 
     def receive(self, ring: FrameRing, timeout_s: float) -> None:
         """Append what arrives within ``timeout_s`` to ``ring``; BusEnded when the bus is gone."""

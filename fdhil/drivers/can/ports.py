@@ -1,4 +1,4 @@
-"""Opens the way onto a bus that ``[bus.NAME] interface`` names, for listening."""
+"""Opens the receive port that ``[bus.NAME] interface`` names."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -16,5 +16,5 @@ PORTS: Mapping[str, Callable[[str, config.CanBus, Sequence[Filter]], Port]] = {
 
 
 def open_port(name: str, settings: config.CanBus, filters: Sequence[Filter] = ()) -> Port:
-    """Return an open port; ConnectError with cause and next action. What has no port of ours python-can opens."""
+    """Return an open port; ConnectError with cause and next action. Interfaces without a port here use python-can."""
     return PORTS.get(settings.interface, PythonCanPort)(name, settings, filters)

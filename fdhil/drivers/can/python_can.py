@@ -1,4 +1,4 @@
-"""Listens through python-can: to adapters that have no SocketCAN driver, and to the bus inside one process."""
+"""Receives through python-can: from adapters without a SocketCAN driver, and from the bus inside one process."""
 
 import logging
 import sys
@@ -14,7 +14,7 @@ from fdhil.errors import ConnectError
 
 if "asammdf" in sys.modules:
     import can
-else:  # python-can would import it for MF4 logs, which costs each process half a second and 100 MB
+else:  # python-can imports it for MF4 logs, which costs half a second and 100 MB
     sys.modules["asammdf"] = None  # type: ignore[assignment] # so that its import fails
     try:
         import can
@@ -23,10 +23,10 @@ else:  # python-can would import it for MF4 logs, which costs each process half 
 
 FRAMES_PER_TURN = 4096
 CLOCK_WINDOW_S = 2.0
-# what an interface of the library raises without its driver, its Python package, its device or the right options
+# errors of an interface without its driver, Python package, device or correct options
 _CANNOT_OPEN = (can.CanError, OSError, ImportError, ValueError, TypeError, NameError, AttributeError)
 _BROKEN = (can.CanError, OSError, ValueError, LookupError)
-# how an interface is told to acknowledge nothing; one that is not listed cannot be told
+# options against acknowledging; interfaces that are not listed have none
 LISTEN_ONLY: Mapping[str, Mapping[str, Any]] = {
     "slcan": {"listen_only": True},
     "pcan": {"state": can.BusState.PASSIVE},
@@ -39,15 +39,15 @@ LISTEN_ONLY: Mapping[str, Mapping[str, Any]] = {
 # the library stamps their frames itself, when it reads them
 _WITHOUT_CLOCK = ("slcan", "robotell", "seeedstudio")
 
-# what the library logs when it looks for drivers is no news of ours: a port that cannot be opened says why
+# the library logs its search for drivers; the error of a port that cannot be opened suffices
 logging.getLogger("can").addHandler(logging.NullHandler())
 
 
 class PythonCanPort:
-    """An adapter that python-can opens, for listening.
+    """An adapter opened by python-can, for listening.
 
-    The stamps are those of the adapter's own clock, of unknown beginning, brought onto the host's by the quickest
-    frames; or the library's own, taken when a frame was read. What the adapter or its driver lost nobody counts.
+    The stamps are those of the adapter's clock, whose zero is unknown, converted to the host's by the quickest frames;
+    or the library's own, taken when a frame was read. Frames lost by the adapter or its driver are not counted.
     """
 
     holds_back = False
@@ -64,13 +64,12 @@ class PythonCanPort:
             raise ConnectError(name, f"{self._what} cannot be opened ({_one_line(error)}); {advice}") from None
 
     def receive(self, ring: FrameRing, timeout_s: float) -> None:
-        """Append one frame, and all others that wait."""
         wait: float = timeout_s
         for _ in range(FRAMES_PER_TURN):
             try:
                 message = self._bus.recv(wait)
             except _BROKEN as error:
-                raise BusEnded(f"{self._what} is gone, or sent what is no frame ({_one_line(error)})") from None
+                raise BusEnded(f"{self._what} is gone, or sent an invalid frame ({_one_line(error)})") from None
             if message is None:
                 return
             now_ns, stamp_ns = time.monotonic_ns(), round(message.timestamp * 1e9)
@@ -78,7 +77,6 @@ class PythonCanPort:
             wait = 0.0
 
     def close(self) -> None:
-        """Give the adapter back; one that is gone cannot be told so."""
         try:
             self._bus.shutdown()
         except _BROKEN:
@@ -86,7 +84,7 @@ class PythonCanPort:
 
 
 def arguments(settings: config.CanBus) -> dict[str, Any]:
-    """Return what python-can is asked for; ``options`` of the config come last."""
+    """Return the arguments of ``can.Bus``; the configured ``options`` take precedence."""
     channel: str | int = int(settings.channel) if settings.channel.isdecimal() else settings.channel
     quiet = LISTEN_ONLY.get(settings.interface, {}) if settings.listen_only else {}
     asked = {"interface": settings.interface, "channel": channel, "bitrate": settings.bitrate}
@@ -94,10 +92,9 @@ def arguments(settings: config.CanBus) -> dict[str, Any]:
 
 
 def append(ring: FrameRing, message: can.Message, stamp_ns: int) -> None:
-    """Put a message of the library into the ring."""
     can_id = message.arbitration_id | (EXTENDED_FLAG if message.is_extended_id else 0)
     can_id |= (ERROR_FLAG if message.is_error_frame else 0) | (REMOTE_FLAG if message.is_remote_frame else 0)
-    data = bytes(min(message.dlc, 8)) if message.is_remote_frame else bytes(message.data[:8])  # its DLC is kept
+    data = bytes(min(message.dlc, 8)) if message.is_remote_frame else bytes(message.data[:8])  # keeps the DLC
     ring.append(stamp_ns, can_id, data)
 
 
@@ -111,7 +108,7 @@ def _one_line(error: BaseException) -> str:
 
 
 class VirtualPort:
-    """python-can's bus inside one process; the sender's stamps are the wall clock's."""
+    """python-can's bus inside one process; stamps are the sender's wall clock."""
 
     stamps: Stamps = "sender"
     holds_back = False
@@ -126,7 +123,6 @@ class VirtualPort:
             raise ConnectError(name, f"the virtual bus {settings.channel} cannot be opened ({error})") from None
 
     def receive(self, ring: FrameRing, timeout_s: float) -> None:
-        """Append one frame, and all others that wait; the stamps become monotonic ones."""
         wait: float = timeout_s
         wall_ahead_ns = self._wall_clock.ahead_ns()
         for _ in range(FRAMES_PER_TURN):
@@ -137,5 +133,4 @@ class VirtualPort:
             wait = 0.0
 
     def close(self) -> None:
-        """Leave the channel."""
         self._bus.shutdown()

@@ -1,9 +1,8 @@
-"""Reads and writes objects of one node by the canopen library's SDO client, within bounds of size and time.
+"""Reads and writes objects of one node through the canopen library's SDO client, with limits on size and time.
 
-The library has no limit on size or duration, and takes a late answer to an earlier request of the same object for the
-answer to the present one. So after a time-out, and after an answer to something else (what another program asked for
-a moment ago), the line is left quiet until nothing more can come, and then the object is read twice: two equal answers,
-or an error.
+The library limits neither size nor duration, and takes a late answer to an earlier request of the same object for the
+answer to the present one. So after a time-out, and after an answer to another request (another program's, perhaps), the
+channel stays quiet until no late answer can come, and the object is then read twice: two equal answers, or an error.
 """
 
 import logging
@@ -38,9 +37,9 @@ def _name(index: int, sub: int) -> str:
 
 
 class SdoLink:
-    """The SDO channel of one node. ``deliver`` is called by whoever reads the bus, all else by one other thread.
+    """The SDO channel of one node. ``deliver_response`` is called by the bus reader, all else by one other thread.
 
-    ``send`` puts a frame on the bus; ``patience``: how many times as long as a real drive this one may take.
+    ``send`` puts a frame on the bus; ``patience`` multiplies the time-outs, for a slow simulated drive.
     """
 
     def __init__(self, device: str, node_id: int, send: Callable[[int, bytes], None], patience: float = 1.0) -> None:
@@ -48,7 +47,7 @@ class SdoLink:
         self.device = device
         self.response_id = COB_SDO_RESPONSE + node_id
         self._send = send
-        # the library's own functions are not annotated
+        # the library has no annotations
         client: Any = SdoClient
         dictionary: Any = ObjectDictionary
         self._client = client(COB_SDO_REQUEST + node_id, self.response_id, dictionary())
@@ -62,7 +61,7 @@ class SdoLink:
         self._send(can_id, bytes(data))
 
     def deliver(self, data: bytes) -> None:
-        """Hand over a response frame of this node; one that is not 8 bytes long is no SDO."""
+        """Hand over a response frame of this node; one that is not 8 bytes long is no SDO frame."""
         if len(data) == 8:
             if data[0] >> 5 == _UPLOAD_BEGINS:
                 self._sized = bool(data[0] & _SIZE_GIVEN) or not data[0] & _EXPEDITED
@@ -77,25 +76,26 @@ class SdoLink:
                 raise
             first, second = self._upload(index, sub), self._upload(index, sub)
             if first != second:
-                text = f"{_name(index, sub)} gave two answers after a time-out; check that one master asks"
+                text = (
+                    f"{_name(index, sub)} gave two answers after a time-out; check that only one master sends requests"
+                )
                 raise ProtocolError(self.device, text) from None
             return second
 
     def read_size(self, index: int, sub: int = 0) -> int | None:
-        """Return how many bytes an object has; None where the drive's answer does not say it (CiA 301, 7.2.4.3.5)."""
+        """Return the size of an object in bytes; None where the answer does not state it (CiA 301, 7.2.4.3.5)."""
         data = self.read(index, sub)
         return len(data) if self._sized else None
 
     def read_int(self, index: int, sub: int = 0, *, signed: bool = False) -> int:
-        """Read an integer object, little-endian."""
         return int.from_bytes(self.read(index, sub), "little", signed=signed)
 
     def write_int(self, index: int, sub: int, value: int, length: int) -> None:
-        """Write an integer of ``length`` bytes; after a time-out the object tells whether it arrived.
+        """Write an integer of ``length`` bytes; after a time-out, read back whether it arrived.
 
         TypeError when ``value`` is no integer, ValueError when it does not fit.
         """
-        number = operator.index(value)  # the library would cut 1.7 to 1 without a word
+        number = operator.index(value)  # the library would silently truncate 1.7
         if not -(1 << 8 * length - 1) <= number < 1 << 8 * length:
             raise ValueError(f"{number} does not fit {length} bytes")
         data = (number & (1 << 8 * length) - 1).to_bytes(length, "little")
@@ -109,7 +109,6 @@ class SdoLink:
             self._guarded(index, sub, lambda: self._client.download(index, sub, data))
 
     def _be_quiet(self) -> None:
-        """Wait until no late answer can come any more, and forget those that came."""
         time.sleep(QUIET_S)
         self._client.responses = queue.Queue()
         self._late = False
@@ -122,7 +121,7 @@ class SdoLink:
         deadline = time.monotonic() + DEADLINE_S * self._patience
         data = bytearray()
         with self._client.open(index, sub, "rb", buffering=0) as stream:
-            size = stream.size or 0  # a drive may announce it
+            size = stream.size or 0  # some drives announce it
             while size <= MAX_BYTES:
                 part = stream.read(7)
                 if not part:
@@ -134,11 +133,10 @@ class SdoLink:
                     text = f"{_name(index, sub)} was not finished after {DEADLINE_S:g} s; check the bus load"
                     raise SdoTooLarge(self.device, text)
             self._client.abort(_MEMORY_ABORT)
-        text = f"{_name(index, sub)} is longer than {MAX_BYTES} bytes; this is no object of a healthy drive"
+        text = f"{_name(index, sub)} is longer than {MAX_BYTES} bytes; no object of a working drive is; check the drive"
         raise SdoTooLarge(self.device, text)
 
     def _guarded(self, index: int, sub: int, call: Any) -> Any:
-        """Run a call of the library and translate its errors into one sentence each; quiet first after a time-out."""
         if self._late:
             self._be_quiet()
         try:
@@ -153,6 +151,6 @@ class SdoLink:
                 text = f"{_name(index, sub)} was not answered; check the drive's supply and its node-ID"
                 raise SdoTimeout(self.device, text) from None
             self._late = True
-            text = f"{_name(index, sub)} was answered wrongly ({error}); check that one master asks"
+            text = f"{_name(index, sub)} got a wrong answer ({error}); check that only one master sends requests"
             kind = SdoToggle if "toggle" in str(error).lower() else ProtocolError
             raise kind(self.device, text) from None

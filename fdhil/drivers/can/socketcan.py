@@ -1,6 +1,6 @@
-"""Listens to a network interface of the kernel (SocketCAN) by a raw socket of the standard library.
+"""Receives from a network interface of the kernel (SocketCAN) through a raw socket of the standard library.
 
-python-can neither counts the kernel's drops nor enlarges the receive buffer, and its stamps are the wall clock's alone.
+python-can neither counts the kernel's drops nor enlarges the receive buffer, and its stamps are wall-clock only.
 """
 
 import contextlib
@@ -39,9 +39,9 @@ _IFREQ = struct.Struct("@16sH22x")
 
 
 class SocketCanPort:
-    """A raw CAN socket on a network interface: stamps of controller or kernel, error frames, exact drop count.
+    """A raw CAN socket: stamps of controller or kernel, error frames, exact drop count.
 
-    ``filters`` are the kernel's: what passes none of them never reaches this process; error frames always do.
+    ``filters`` are applied by the kernel: other frames never reach this process; error frames always do.
     """
 
     holds_back = False
@@ -73,7 +73,7 @@ class SocketCanPort:
     def _configure(self, filters: Sequence[Filter]) -> None:
         raw = self._socket
         raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        with contextlib.suppress(PermissionError):  # needs CAP_NET_ADMIN; the capped size stays in force without it
+        with contextlib.suppress(PermissionError):  # without CAP_NET_ADMIN the capped size stays
             raw.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
         raw.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
         raw.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPING, STAMPING)
@@ -84,12 +84,11 @@ class SocketCanPort:
         raw.setblocking(False)
 
     def _is_up(self) -> bool:
-        """Whether the interface is up: a socket binds to one that is down too, and hears nothing."""
+        """Return whether the interface is up: a socket also binds to one that is down, and then receives nothing."""
         asked = _IFREQ.pack(self._channel.encode()[:15], 0)
         return bool(_IFREQ.unpack(fcntl.ioctl(self._socket, SIOCGIFFLAGS, asked))[1] & IFF_UP)
 
     def receive(self, ring: FrameRing, timeout_s: float) -> None:
-        """Read all that waits; the stamps become monotonic ones at once."""
         if not select.select([self._socket], [], [], timeout_s)[0]:
             return
         wall_ahead_ns = self._wall_clock.ahead_ns()
@@ -117,26 +116,25 @@ class SocketCanPort:
         return time.monotonic_ns() if stamp_ns is None else stamp_ns
 
     def _of_controller(self, hard_ns: int, kernel_ns: int) -> int:
-        """Bring a stamp of the controller's own clock onto the host's: the kernel's stamp is never before it."""
+        """Convert a stamp of the controller's clock; the kernel's stamp is never earlier."""
         self.stamps = "hardware"
         return hard_ns - self._controller.ahead_ns(hard_ns, kernel_ns)
 
     def _count_drops(self) -> None:
-        """Ask for the drops so far: with the frames the count comes only as far as the last one that found room."""
+        """Query the drop count: the count that comes with frames only reaches up to the last frame that was stored."""
         self._dropped(_SK_MEMINFO.unpack(self._socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _SK_MEMINFO.size))[-1])
 
     def _dropped(self, count: int) -> None:
-        """Take the kernel's count, which is of 32 bits; one that was taken before it came is older."""
+        """Add the kernel's 32-bit count; an older count than the last one is ignored."""
         ahead = (count - self.kernel_drops) & 0xFFFFFFFF
         if ahead < 1 << 31:
             self.kernel_drops += ahead
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
 
 
 def _advice(error: OSError, settings: config.CanBus) -> str:
     if error.errno == errno.ENODEV:
-        return "plug the adapter in, or take a name that ip link shows"
+        return "plug the adapter in, or choose a name that ip link shows"
     return f"bring it up: ip link set {settings.channel} up type can bitrate {settings.bitrate}"

@@ -1,8 +1,7 @@
-"""Reads the socketcand text protocol of a CAN hub.
+"""Receives the socketcand text protocol of a CAN hub.
 
-python-can's client costs 28 us a frame (22 % of a core at 7,800 frames/s, measured), spins without end when the hub
-closes the connection and cannot tell it from silence; reading what has come in one piece and splitting it costs about
-2 us a frame.
+python-can's client costs 28 us a frame (22 % of a core at 7,800 frames/s, measured), spins for ever when the hub closes
+the connection and cannot distinguish that from silence; reading in large pieces and splitting costs about 2 us a frame.
 """
 
 import socket
@@ -23,7 +22,7 @@ MAX_CHUNK_BYTES = 1 << 18
 
 
 class HubClock:
-    """The hub's clock against ours; one that sends no clock at all has none."""
+    """The hub's clock against ours; some hubs send no time stamps."""
 
     _WINDOW_S = 10.0
 
@@ -46,7 +45,7 @@ class SocketcandPort:
 
     stamps: Stamps = "hub"
     holds_back = True
-    kernel_drops = 0  # TCP loses nothing; what the hub dropped it must say itself
+    kernel_drops = 0  # TCP loses nothing; the hub's own losses are unknown
 
     def __init__(self, name: str, settings: config.CanBus, _filters: Sequence[Filter] = ()) -> None:
         self._name = name
@@ -62,7 +61,7 @@ class SocketcandPort:
             raise ConnectError(name, text) from None
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._expect(b"< hi >", f"{where} is no socketcand hub")
+            self._expect(b"< hi >", f"{where} is not a socketcand hub")
             self._socket.sendall(f"< open {settings.channel} >".encode("ascii"))
             self._expect(b"< ok >", f"the hub {where} has no bus {settings.channel}")
             self._socket.sendall(b"< rawmode >")
@@ -79,19 +78,18 @@ class SocketcandPort:
             if not chunk or len(self._rest) > MAX_LINE_BYTES:
                 raise ConnectError(self._name, f"{otherwise}; check host, port and channel")
             self._rest += chunk
-        said, _, self._rest = self._rest.partition(b">")
-        if said.strip() + b" >" != answer and said.strip() + b">" != answer:
+        reply, _, self._rest = self._rest.partition(b">")
+        if reply.strip() + b" >" != answer and reply.strip() + b">" != answer:
             raise ConnectError(self._name, f"{otherwise}; check host, port and channel")
 
     def receive(self, ring: FrameRing, timeout_s: float) -> None:
-        """Read what has come in one piece and split it; the hub's stamps become host-monotonic ones."""
         self._socket.settimeout(timeout_s)
         try:
             chunk = self._socket.recv(min(MAX_CHUNK_BYTES, ring.room * MIN_LINE_BYTES))
         except TimeoutError:
             return
         except OSError as error:
-            raise BusEnded(f"the connection to the CAN hub broke ({error.strerror})") from None
+            raise BusEnded(f"the connection to the CAN hub failed ({error.strerror})") from None
         if not chunk:
             raise BusEnded("the CAN hub ended the connection")
         self._split(chunk, ring, time.monotonic_ns())
@@ -117,5 +115,4 @@ class SocketcandPort:
                 self.malformed += 1
 
     def close(self) -> None:
-        """End the connection."""
         self._socket.close()

@@ -1,10 +1,9 @@
-"""Lays frames on the SYNC grid: each gets the tick of the last SYNC before it. Pure: no clock, no I/O.
+"""Assigns frames to SYNC ticks: each gets the tick of the last SYNC before it. Pure: no clock, no I/O.
 
-With a counter byte (0x1019, 1 to at most 240) lost SYNCs are counted and the grid stays right; without one a lost SYNC
-cannot be seen, and each SYNC is one tick. Arrival times serve two purposes only: to tell 1 from 241 periods, and to
-see at once where a counter begins again that does not go up to 240. What comes after a silence longer than
-``LONGEST_SILENCE_S`` is a new beginning: by then the counter fits any time, so it stands that far behind, and no
-farther, however long the NC was off and wherever a clock jumped.
+With a counter byte (0x1019, 1 to at most 240) lost SYNCs are counted and the grid stays correct; without one a lost
+SYNC cannot be detected, and each SYNC is one tick. Arrival times are used only to distinguish 1 from 241 periods, and
+to detect at once a counter that wraps before 240. After a silence longer than ``LONGEST_SILENCE_S`` the grid restarts:
+the counter then fits any time, so the tick is advanced by that much and no more, however long the NC was off.
 """
 
 from dataclasses import dataclass
@@ -18,8 +17,8 @@ from fdhil.drivers.can.sync_producers import SyncProducers
 from fdhil.records import Int, Notice, TickTimes
 
 COUNTER_RANGE = 240
-LONGEST_SILENCE_S = 60.0  # twice as far as a window reaches back: none has rows from both sides
-_SHORT_RANGE = 16  # a counter that begins again so soon cannot tell back from forth
+LONGEST_SILENCE_S = 60.0  # twice the reach of a window: none has samples from both sides
+_SHORT_RANGE = 16  # with so short a counter, backward and forward are indistinguishable
 _STEADY = 0.25  # of a period
 _UNCOUNTED = 8  # SYNCs without a counter, one after the other, until the producer with one is gone
 
@@ -41,7 +40,7 @@ class Ticked:
 
 
 class SyncGrid:
-    """Counts SYNC cycles of one bus from 0 at the first SYNC seen."""
+    """Counts SYNC cycles of one bus from 0 at the first received SYNC."""
 
     def __init__(self, sync_period_s: float, realtime: bool = True) -> None:
         self._period_ns = sync_period_s * 1e9
@@ -51,7 +50,7 @@ class SyncGrid:
         self._last_tick = -1
         self._last_counter: int | None = None
         self._last_ns: int | None = None
-        self._suspect: int | None = None  # the counter of a SYNC that went backwards
+        self._suspect: int | None = None  # counter of a SYNC that went backwards
         self._range = COUNTER_RANGE
         self._wrapped_at: int | None = None
         self._uncounted_run = 0
@@ -62,8 +61,8 @@ class SyncGrid:
         self.out_of_order = 0
 
     def feed(self, frames: Frames) -> Ticked:
-        """Give every frame its tick; a SYNC itself has the tick it starts."""
-        # contiguous columns: they are compared and shifted once per PDO
+        """Give every frame its tick; a SYNC has the tick that it starts."""
+        # contiguous: compared and shifted once per PDO
         can_id, length, data = (np.ascontiguousarray(frames[name]) for name in ("id", "dlc", "data"))
         where = np.flatnonzero(can_id == COB_SYNC)
         before = self._last_tick
@@ -81,7 +80,7 @@ class SyncGrid:
         return Ticked(can_id, length, data, tick, TickTimes(ticks, stamps), self._last_tick, notices)
 
     def _ticks(self, syncs: Frames) -> Int:
-        """Tick of every SYNC; -1 for one that is a duplicate or out of order."""
+        """Return the tick of every SYNC, -1 for a duplicate or one out of order."""
         counters = (syncs["data"] & np.uint64(0xFF)).astype(np.int64)
         counted = syncs["dlc"] > 0
         regular = np.arange(1, syncs.size + 1) + self._last_tick
@@ -102,13 +101,12 @@ class SyncGrid:
         return np.array(ticks, np.int64)
 
     def _long_pause(self, syncs: Frames) -> bool:
-        """Whether a whole turn of the counter may have gone by between two of these SYNCs."""
+        """Return whether the counter may have wrapped fully between two of these SYNCs."""
         before = syncs["t_ns"][0] if self._last_ns is None else self._last_ns
         stamps = np.concatenate([[before], syncs["t_ns"]])
         return self._realtime and bool(np.diff(stamps).max() > self._range // 2 * self._period_ns)
 
     def _finish(self, ticks: Int, counter: int | None, syncs: Frames) -> None:
-        """Take a block without any irregularity."""
         self._last_tick = int(ticks[-1])
         self._last_counter = counter
         self._last_ns = int(syncs["t_ns"][-1])
@@ -117,7 +115,6 @@ class SyncGrid:
         self._producers.regular(syncs.size, counter)
 
     def _step(self, counter: int | None, t_ns: int) -> int:
-        """One SYNC of an irregular block; returns its tick or -1."""
         self._producers.irregular(counter, self._range)
         if counter is None or self._last_counter is None:
             return self._uncounted(counter, t_ns)
@@ -139,7 +136,7 @@ class SyncGrid:
         return self._advance(ahead, counter, t_ns)
 
     def _learn_range(self, counter: int, t_ns: int) -> None:
-        """Where the counter begins again at 1 it went as far as 0x1019 says: by time or at the second turn."""
+        """Learn the counter's range (0x1019) from where it wraps to 1: by time, or at the second wrap."""
         last = self._last_counter
         if counter > self._range:
             self._range = COUNTER_RANGE
@@ -147,7 +144,7 @@ class SyncGrid:
             return
         elapsed = (t_ns - self._last_ns) / self._period_ns if self._realtime and self._last_ns is not None else 0.0
         if abs(elapsed - (1 - last) % self._range) < _STEADY and last != self._range:
-            return  # the end of the turn was lost: so long it takes to go as far as it went before
+            return  # the end of the turn was lost: the elapsed time fits the former range
         if 0.0 < elapsed < 1.5 or last == self._wrapped_at:
             self._range = last
         self._wrapped_at = last
@@ -155,7 +152,7 @@ class SyncGrid:
     def _uncounted(self, counter: int | None, t_ns: int) -> int:
         self._uncounted_run = self._uncounted_run + 1 if counter is None else 0
         if counter is None and self._last_counter is not None and self._uncounted_run < _UNCOUNTED:
-            # a second producer without a counter beside the one that counts
+            # a second producer without a counter next to the one that counts
             self.out_of_order += 1
             return -1
         if counter is None:
@@ -169,14 +166,14 @@ class SyncGrid:
         return self._last_tick
 
     def _continues(self, counter: int) -> bool:
-        """A counter that went backwards and counts on from there was restarted by its producer."""
+        """Return whether a counter that went backwards counts on from there: its producer was restarted."""
         return self._suspect is not None and (counter - self._suspect) % self._range == 1
 
     def _whole_turns(self, ahead: int, t_ns: int) -> int:
-        """Whole turns of the counter that went by unheard.
+        """Return the full turns of the counter that were not received.
 
-        The elapsed time must fit a whole number of turns within 2 %: a simulated machine that was held up and then
-        goes on where it was fits none. All of a block's are no more than the longest silence, or one for each SYNC.
+        The elapsed time must fit a whole number of turns within 2 %; a simulated machine that was paused fits none. The
+        turns of one block are limited to the longest silence, or one for each SYNC.
         """
         if not self._realtime or self._last_ns is None:
             return 0
@@ -194,5 +191,5 @@ class SyncGrid:
         was, self._collision = self._collision, self._producers.two
         if not self._collision or was:
             return ()
-        text = "Two nodes send SYNC, the sampling grid cannot be trusted; leave one SYNC producer on the bus."
+        text = "Two nodes send SYNC: the sampling grid is invalid; leave only one SYNC producer on the bus."
         return (Notice("SyncCollision", "MAJOR", text, tick=self._last_tick),)

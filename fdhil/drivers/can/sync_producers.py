@@ -1,8 +1,8 @@
-"""Tells whether two nodes send SYNC, by what only two can do. Pure.
+"""Detects two SYNC producers on one bus. Pure.
 
-With counters: two series go on in turn. A single producer that is lost now and then, starts again, or counts to another
-overflow value breaks its series, but never returns to the one it left. Without counters: SYNC comes twice a period,
-early and late in turn. A single producer of half the period comes evenly; that is another fault, told by its rate.
+With counters: two series alternate. A single producer that loses frames, restarts, or counts to another overflow value
+breaks its series but never returns to the former one. Without counters: SYNC comes twice a period, alternately early
+and late. A single producer of half the period comes evenly; that fault is detected by its rate.
 """
 
 from collections import deque
@@ -12,28 +12,28 @@ import numpy as np
 from fdhil.records import Int
 
 HISTORY = 32
-_EVEN = 0.1  # of a period: a difference between the two intervals that jitter alone may make
+_EVEN = 0.1  # of a period: difference of the two intervals that jitter may cause
 _SURE = 4.0  # standard errors
 
 
 class SyncProducers:
-    """Watches the SYNC of one bus; ``two`` is asked after each block."""
+    """Monitors the SYNC of one bus; ``has_two_producers`` is evaluated after each block."""
 
     def __init__(self, sync_period_s: float, realtime: bool) -> None:
         self._period_ns = sync_period_s * 1e9
         self._realtime = realtime
-        self._newest: int | None = None  # counter of the series that went on last
+        self._newest: int | None = None  # counter of the series that continued last
         self._other: int | None = None  # and of the one before
         self._returned: deque[bool] = deque(maxlen=HISTORY)
         self._stamps_ns: deque[int] = deque(maxlen=HISTORY + 1)
 
     def regular(self, count: int, newest: int | None) -> None:
-        """Note that a block of SYNC went on with its series (None: has no counter)."""
+        """Note that a block of SYNC continued its series (None: without counter)."""
         self._newest = newest
         self._returned.extend([False] * min(count, HISTORY))
 
     def irregular(self, counter: int | None, overflow: int) -> None:
-        """Note one SYNC of a block that does not: whether it goes on with the series before the newest one."""
+        """Note one SYNC of an irregular block, and whether it continues the series before the newest one."""
         if counter is None:
             self._returned.append(self._newest is not None)
             return
@@ -46,18 +46,15 @@ class SyncProducers:
         self._returned.append(same or (returns and not goes_on))
 
     def stamped(self, stamps_ns: Int) -> None:
-        """Note when the SYNCs came."""
         self._stamps_ns.extend(stamps_ns.tolist())
 
     @property
     def two(self) -> bool:
-        """Whether two nodes send SYNC."""
         if len(self._returned) < HISTORY:
             return False
         return sum(self._returned) > HISTORY // 3 or (self._newest is None and self._early_and_late())
 
     def _early_and_late(self) -> bool:
-        """Whether each period holds two SYNCs that are apart by other than half of it."""
         if not self._realtime or len(self._stamps_ns) <= HISTORY:
             return False
         steps = np.diff(np.array(self._stamps_ns, dtype=np.int64)) / self._period_ns

@@ -1,4 +1,4 @@
-"""Tells host time by the SYNC count and back, from the arrivals of SYNC. Pure."""
+"""Converts between host time and SYNC count, by the arrivals of SYNC. Pure."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ from fdhil.records import Float, Int, TickTimes
 
 KEPT_TICKS = 8192
 _STALE_TICKS = 50.0
-_LATE_TICKS = 512  # stamps that are late for longer than that are taken for a SYNC that was late
+_LATE_TICKS = 512  # longer delays count as a delayed SYNC
 
 
 class TickClock:
-    """The newest arrivals of SYNC; between two of them time is linear, so a producer that was held up bends nothing."""
+    """The newest arrivals of SYNC; between two of them time is linear, so a delayed producer distorts nothing."""
 
     def __init__(self, sync_period_s: float) -> None:
         self.period_ns = sync_period_s * 1e9
@@ -18,7 +18,7 @@ class TickClock:
         self._t_ns = np.empty(0, np.int64)
 
     def add(self, times: TickTimes) -> None:
-        """Append arrivals; a count that began anew forgets the old one."""
+        """Append arrivals; a restarted count discards the old ones."""
         if times.tick.size == 0:
             return
         if self._tick.size and times.tick[0] <= self._tick[-1]:
@@ -28,7 +28,6 @@ class TickClock:
 
     @property
     def running(self) -> bool:
-        """Whether there is a SYNC count at all."""
         return self._tick.size > 1
 
     @property
@@ -37,19 +36,19 @@ class TickClock:
         return int(self._tick[-1]) if self._tick.size else 0
 
     def covers(self, t_ns: int) -> bool:
-        """Whether SYNCs up to host time ``t_ns`` are known."""
+        """Return whether SYNCs up to host time ``t_ns`` have arrived."""
         return self._t_ns.size > 0 and int(self._t_ns[-1]) >= t_ns
 
     def is_past(self, t_ns: int) -> bool:
-        """Whether host time ``t_ns`` is before every SYNC that is still known."""
+        """Return whether host time ``t_ns`` is before every SYNC that is still stored."""
         return self.running and t_ns < int(self._t_ns[0])
 
     def bounds(self, from_ns: int, to_ns: int) -> tuple[float, float] | None:
-        """Return fractional ticks that surely enclose the span; None when SYNC does not run at that time.
+        """Return fractional ticks that enclose the span with certainty; None when SYNC does not run at that time.
 
-        A stamp is never too early but often late, when the computer was. So the stamps alone tell how many SYNCs had
-        come for sure; how many may have come is told by the earliest instants that the later stamps allow. A span
-        that ends after the newest SYNC is carried on at the period, as far as the SYNC is not overdue.
+        A stamp is never early but often late, when the computer was busy. So the stamps give the SYNCs that had come
+        for certain; how many may have come follows from the earliest instants that the later stamps allow. A span that
+        ends after the newest SYNC is extrapolated at the period, as long as SYNC is not overdue.
         """
         if not self.running or from_ns < self._t_ns[0] or to_ns - self._t_ns[-1] > _STALE_TICKS * self.period_ns:
             return None
@@ -60,16 +59,16 @@ class TickClock:
         )
 
     def _earliest(self, tick: Int, t_ns: Int) -> tuple[Float, float]:
-        """Return the earliest instants (n,) of these SYNCs, and the period: none comes sooner than that after another.
+        """Return the earliest possible instants (n,) of these SYNCs, and the period.
 
-        A simulated machine may run ahead of the clock: its own period then counts.
+        A simulated machine may run faster than nominal: its own period then counts.
         """
         steps = np.diff(t_ns) / np.diff(tick)
         period_ns = min(self.period_ns, float(np.median(steps))) if steps.size else self.period_ns
         return np.minimum.accumulate((t_ns - tick * period_ns)[::-1])[::-1] + tick * period_ns, period_ns
 
     def time_ns(self, tick: Float) -> Float:
-        """Return the host time (n,) of fractional ticks (n,), carried on at the nominal period at both ends."""
+        """Return the host time (n,) of fractional ticks (n,), extrapolated at the nominal period at both ends."""
         inside = np.interp(tick, self._tick, self._t_ns)
         before = np.minimum(tick - self._tick[0], 0) * self.period_ns
         after = np.maximum(tick - self._tick[-1], 0) * self.period_ns

@@ -1,4 +1,4 @@
-"""PEAK's TRC logs: versions 1.0 to 2.1 are read, 2.1 is written.
+"""Reads PEAK's TRC logs, versions 1.0 to 2.1, and writes 2.1.
 
 Source: PEAK CAN TRC file format, 2020-07-27. Start times are taken as UTC, as python-can writes them.
 """
@@ -26,8 +26,8 @@ from fdhil.drivers.can.logged_frame import (
 )
 from fdhil.errors import RecordingError
 
-OTHER_ROWS = "rows that are not CAN frames"
-NO_DATE = "the date, which is not in the head"
+OTHER_ROWS = "lines that are not CAN frames"
+NO_DATE = "the date, which is not in the header"
 _COLUMNS = {"1.0": "N,O,I,L,D", "1.1": "N,O,d,I,L,D", "1.2": "N,O,B,d,I,L,D", "1.3": "N,O,B,d,I,R,L,D"}
 _FD_TYPES = {"FD": 0, "FB": RATE_SWITCH, "FE": ERROR_STATE, "BI": RATE_SWITCH | ERROR_STATE}
 _TYPE_OF_FD = {flags: name for name, flags in _FD_TYPES.items()}
@@ -37,8 +37,6 @@ _WARNING_ID = "FFFFFFFF"
 
 
 class _Head:
-    """What the lines that begin with a semicolon say."""
-
     def __init__(self) -> None:
         self.columns: Sequence[str] = ()
         self.start_ns: int | None = None
@@ -46,7 +44,7 @@ class _Head:
         self._version = "1.0"
 
     def take(self, line: str) -> None:
-        """Take in one line; InvalidOperation for a start that is no number."""
+        """Read one header line; InvalidOperation for an invalid start time."""
         self.names |= dict(named_by(line))
         key, _, value = line.partition("=")
         if key == ";$FILEVERSION":
@@ -58,10 +56,10 @@ class _Head:
             self.columns = value.strip().split(",")
 
     def complete(self) -> Sequence[str]:
-        """Return the columns; ValueError where neither head nor version names them."""
+        """Return the columns; ValueError where neither header nor version names them."""
         columns = self.columns or _COLUMNS.get(self._version, "").split(",")
         if not {"O", "I", "D"} <= set(columns) or not {"l", "L"} & set(columns):
-            raise ValueError(f"columns of version {self._version} are not known")
+            raise ValueError(f"columns of version {self._version} are unknown")
         return columns
 
 
@@ -110,14 +108,13 @@ def _frame(line: str, columns: Sequence[str], head: _Head) -> LoggedFrame | None
 
 
 def _dlc(row: Mapping[str, str], fd: int | None) -> int:
-    """Return the data length code; column l has a length instead."""
     if "L" in row:
         return int(row["L"])
     return fd_dlc(int(row["l"])) if fd is not None else int(row["l"])
 
 
 def write(path: Path, frames: Iterable[LoggedFrame], header: LogHeader) -> None:
-    """Write a log of version 2.1. Error frames have no row that holds what SocketCAN says of them: none may come."""
+    """Write a log of version 2.1, which cannot hold error frames."""
     days = Decimal(header.start_ns) / _DAY_NS + _EPOCH_DAYS
     date = datetime.fromtimestamp(header.start_ns // 1_000_000_000, UTC)
     lines = [";$FILEVERSION=2.1", f";$STARTTIME={days:.15f}", ";$COLUMNS=N,O,T,B,I,d,R,L,D", ";"]

@@ -1,1 +1,1 @@
-"""Decodes the PDOs of CiA 402 drives into samples, by their profiles; reads their EDS."""
+"""Decodes the PDOs of CiA 402 drives into samples, by their profiles."""

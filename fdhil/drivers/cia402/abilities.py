@@ -1,6 +1,6 @@
-"""Tells what fdhil can and cannot do with a device, by its EDS and a profile: each point with its reason.
+"""Determines what fdhil can do with a device, by its EDS and a profile: each capability with its reason.
 
-An EDS is what the maker says. ``perhaps`` is what it does not settle, and a drive does.
+An EDS is the vendor's statement. ``perhaps`` means that only the drive itself can settle it.
 """
 
 import re
@@ -35,7 +35,7 @@ _SET_UP = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Ability:
-    """One thing that fdhil does with a drive, whether it can with this one, why, and what helps (may be empty)."""
+    """One capability: whether fdhil has it with this drive, why, and advice (may be empty)."""
 
     what: str
     answer: Answer
@@ -44,11 +44,11 @@ class Ability:
 
 
 def abilities(device: Device, profile: DriveProfile) -> list[Ability]:
-    """Return what can be done with the device by this profile, in the order in which one thing needs the other."""
+    """Return the capabilities with this profile, each after those it depends on."""
     if not device.is_drive:
         kind = (device.default(Object.DEVICE_TYPE) or 0) & 0xFFFF
         why = f"its device type is profile {kind or 'none'}, or it has no control- and statusword (6040, 6041)"
-        return [Ability("listen", "no", why, "it is no CiA 402 drive; read it as a sensor, if it is one")]
+        return [Ability("listen", "no", why, "it is not a CiA 402 drive; configure it as a sensor, if it is one")]
     return [
         *_listen(device, profile),
         _mapped(device, profile),
@@ -63,7 +63,7 @@ def abilities(device: Device, profile: DriveProfile) -> list[Ability]:
 
 
 def suggest_profile(device: Device) -> str:
-    """Return the packaged profile of the device's maker that fits its objects best, ``cia402`` where none is his."""
+    """Return the packaged profile of the device's vendor that fits its objects best, else ``cia402``."""
     named = [name for name in tables.DRIVE_PROFILES if name not in (GENERIC, _TWIN) and _is_of(device, name)]
     return min(named, key=lambda name: len(missing(device, read_profile(name))), default=GENERIC)
 
@@ -77,7 +77,7 @@ def _is_of(device: Device, name: str) -> bool:
 
 
 def missing(device: Device, profile: DriveProfile) -> list[ObjectKey]:
-    """Return the objects that the profile maps and the device does not have, or not in that size."""
+    """Return the objects that the profile maps and the device lacks, or has in another size."""
     entries = [entry for spec in (*profile.rpdos, *profile.tpdos) for entry in spec.entries]
     found = {(entry.index, entry.sub): device.find((entry.index, entry.sub)) for entry in entries}
     bits = {(entry.index, entry.sub): entry.bits for entry in entries}
@@ -85,7 +85,7 @@ def missing(device: Device, profile: DriveProfile) -> list[ObjectKey]:
 
 
 def named_alike(device: Device, what: Literal["voltage", "dc_link", "current"]) -> list[DeviceObject]:
-    """Return the maker's objects whose names sound like a motor voltage (or duty), the DC link or the current."""
+    """Return the vendor's objects whose names suggest a motor voltage (or duty), the DC link or the current."""
     pattern = {"voltage": _VOLTAGE, "dc_link": _DC_LINK, "current": _CURRENT}[what]
     own = [
         at
@@ -93,29 +93,28 @@ def named_alike(device: Device, what: Literal["voltage", "dc_link", "current"]) 
         if at.bits and (0x2000 <= key[0] < 0x6000 or key[0] in (0x6078, 0x6079))
     ]
     readable = [at for at in own if at.key[1] or (at.key[0], 1) not in device.objects]
-    said = {at.key: at.name.replace("_", " ") for at in readable if at.access in ("ro", "rwr", "rww", "const")}
-    return [at for at in readable if (name := said.get(at.key)) and pattern.search(name) and not _SET_UP.search(name)]
+    names = {at.key: at.name.replace("_", " ") for at in readable if at.access in ("ro", "rwr", "rww", "const")}
+    return [at for at in readable if (name := names.get(at.key)) and pattern.search(name) and not _SET_UP.search(name)]
 
 
 def shown(key: ObjectKey) -> str:
-    """Return an object as 6064:00."""
+    """Format an object as 6064:00."""
     return f"{key[0]:04X}:{key[1]:02X}"
 
 
 def _listen(device: Device, profile: DriveProfile) -> Iterator[Ability]:
     if profile.unheard:
         what = ", ".join(f"{name} ({shown(getattr(profile, name))})" for name in profile.unheard)
-        advice = "name the maker's object of it in a profile of your own, with base = 'cia402'"
-        yield Ability("listen", "no", f"no TPDO of every SYNC can carry its {what}", advice)
+        advice = "name the vendor's object for it in your own profile, with base = 'cia402'"
+        yield Ability("listen", "no", f"no TPDO with every SYNC can carry its {what}", advice)
         return
     if device.find((SYNC_ID, 0)) is None and not any(place.kind in SYNC_TYPES for place in device.tpdos):
-        yield Ability("listen", "perhaps", "its EDS has no SYNC (1005): its TPDOs may come by a timer alone")
+        yield Ability("listen", "perhaps", "its EDS has no SYNC (1005): its TPDOs may be sent by a timer only")
     else:
         yield Ability("listen", "yes", "position, speed, current and statusword can come with every SYNC")
 
 
 def _mapped(device: Device, profile: DriveProfile) -> Ability:
-    """Whether its PDOs are, or can be made, what the profile has."""
     differ = [spec.name for spec in profile.rpdos if not _same(spec, device.rpdos)]
     differ += [spec.name for spec in profile.tpdos if not _same(spec, device.tpdos)]
     if not differ:
@@ -123,9 +122,9 @@ def _mapped(device: Device, profile: DriveProfile) -> Ability:
     specs = [*((spec, device.rpdos) for spec in profile.rpdos), *((spec, device.tpdos) for spec in profile.tpdos)]
     stuck = [spec.name for spec, places in specs if spec.name in differ and _stuck(spec, places)]
     if stuck:
-        why = f"it has no {', '.join(stuck)}, or of another mapping, COB-ID or type that is fixed"
-        return Ability("mapping", "no", why, "choose profile 'cia402', which takes what the EDS offers")
-    why = f"{', '.join(differ)} must be set up: the defaults are others"
+        why = f"it has no {', '.join(stuck)}, or one whose mapping, COB-ID or type differs and is fixed"
+        return Ability("mapping", "no", why, "choose profile 'cia402', which uses what the EDS offers")
+    why = f"{', '.join(differ)} must be set up: the defaults differ"
     return Ability("mapping", "yes", why, "`fdhil commission --set-pdos`, or the drive's own tool")
 
 
@@ -137,7 +136,6 @@ def _same(spec: PdoSpec, places: Sequence[PdoPlace]) -> bool:
 
 
 def _stuck(spec: PdoSpec, places: Sequence[PdoPlace]) -> bool:
-    """Whether a PDO is not the profile's and cannot be made so."""
     place = _place_of(spec, places)
     if place is None or (place.fixed and place.mapped != _words(spec)):
         return True
@@ -154,7 +152,6 @@ def _words(spec: PdoSpec) -> tuple[int, ...]:
 
 
 def _voltage(device: Device, profile: DriveProfile) -> Ability:
-    """Where the terminal voltage comes from, which R and L need."""
     what, keys = "voltage", profile.voltage_objects
     if keys:
         if not profile.duty_per_count:
@@ -164,16 +161,15 @@ def _voltage(device: Device, profile: DriveProfile) -> Ability:
         return Ability(what, "yes", why, "check it once against a meter")
     if profile.voltage is not None:
         why = (
-            f"it has no {shown(profile.voltage)} that a TPDO could carry: K, Jt and friction are found, R and L are not"
+            f"it has no {shown(profile.voltage)} that a TPDO could carry: K, Jt and friction can be "
+            "identified, R and L cannot"
         )
         return Ability(what, "no", why, SENSOR)
     alike = [at for at in named_alike(device, "voltage") if at.in_tpdo or at.perhaps_in_tpdo]
     if alike:
-        why = f"the profile takes none, but by its name {_names(alike)} may be one"
-        return Ability(
-            what, "perhaps", why, "measure its scale, and give voltage and its unit in a profile of your own"
-        )
-    why = "no object that a TPDO can carry is a motor voltage: K, Jt and friction are found, R and L are not"
+        why = f"the profile has none, but by its name {_names(alike)} may be one"
+        return Ability(what, "perhaps", why, "measure its scale, and set voltage and its unit in your own profile")
+    why = "no object that a TPDO can carry is a motor voltage: K, Jt and friction can be identified, R and L cannot"
     return Ability(what, "no", why, SENSOR)
 
 
@@ -183,22 +179,19 @@ def _names(found: Sequence[DeviceObject]) -> str:
 
 
 def _demand(device: Device, profile: DriveProfile) -> Ability:
-    """Whether an NC can stream set-points that are then predicted."""
     what = "follow an NC"
     at = profile.find_rpdo(profile.target)
     if at is None:
-        return Ability(
-            what, "no", f"no RPDO carries its target ({shown(profile.target)})", "it can be identified alone"
-        )
+        return Ability(what, "no", f"no RPDO carries its target ({shown(profile.target)})", "it can only be identified")
     modes = device.default(Object.SUPPORTED_MODES)
     if profile.mode < 1:
-        return Ability(what, "perhaps", f"set-points are streamed in the maker's mode {profile.mode}")
+        return Ability(what, "perhaps", f"set-points are streamed in the vendor's mode {profile.mode}")
     if modes is None:
-        return Ability(what, "perhaps", "its EDS does not say its modes (6502); ask the drive with `fdhil check`")
+        return Ability(what, "perhaps", "its EDS does not list its modes (6502); query the drive with `fdhil check`")
     if modes >> (profile.mode - 1) & 1:
         return Ability(what, "yes", f"set-points are streamed to {shown(profile.target)} (6502 = {modes:08X})")
     why = f"it has no mode {profile.mode} (6502 = {modes:08X}): set-points cannot be streamed"
-    return Ability(what, "no", why, "it can be identified, its path is not the NC's")
+    return Ability(what, "no", why, "it can be identified, but not corrected")
 
 
 def _correct(device: Device, profile: DriveProfile) -> Iterator[Ability]:
@@ -208,13 +201,19 @@ def _correct(device: Device, profile: DriveProfile) -> Iterator[Ability]:
         why = "it has no position offset (60B0)" if offset is None else "no RPDO can carry its 60B0"
         yield Ability(what, "no", why, advice)
     elif profile.unshown:
-        why = f"no TPDO shows its {', '.join(map(shown, profile.unshown))}, and no offset is sent that cannot be seen"
+        why = (
+            f"no TPDO shows its {', '.join(map(shown, profile.unshown))}, and offsets are only sent where "
+            "they can be read back"
+        )
         yield Ability(what, "no", why, advice)
     elif not offset.in_tpdo:
-        why = "its EDS gives 60B0 to RPDOs alone (rww): whether a TPDO takes it for the read-back, only the drive tells"
-        yield Ability(what, "perhaps", why, "`fdhil commission --set-pdos` tries it and says so")
+        why = (
+            "its EDS allows 60B0 in RPDOs only (rww): whether a TPDO accepts it for the read-back, only a "
+            "test on the drive shows"
+        )
+        yield Ability(what, "perhaps", why, "`fdhil commission --set-pdos` tests and reports it")
     else:
-        yield Ability(what, "yes", "60B0 has an RPDO of its own, and is read back")
+        yield Ability(what, "yes", "60B0 has a separate RPDO, and is read back")
 
 
 def _feedforward(device: Device, profile: DriveProfile) -> Ability:
@@ -222,28 +221,27 @@ def _feedforward(device: Device, profile: DriveProfile) -> Ability:
     found = profile.find_rpdo(profile.speed_offset)
     if found is None or any(device.find(key) is None for key in keys) or len(found[0].entries) != len(keys):
         return Ability("feed-forward", "no", "no RPDO carries its speed and torque offset (60B1, 60B2) alone")
-    return Ability("feed-forward", "yes", "60B1 and 60B2 have an RPDO of their own")
+    return Ability("feed-forward", "yes", "60B1 and 60B2 have a separate RPDO")
 
 
 def _safety(device: Device, profile: DriveProfile) -> Iterator[Ability]:
-    """Whether it stops by itself when nobody talks to it."""
     code, listens = (
         device.find((int(Object.ABORT_CONNECTION_OPTION), 0)),
         device.find((int(Object.CONSUMER_HEARTBEAT), 1)),
     )
     if code is None or listens is None:
         lacking = "abort option (6007)" if code is None else "consumer heartbeat (1016)"
-        advice = "commissioning proves whether it stops; else it is not armed"
+        advice = "commissioning tests whether it stops; otherwise it is not armed"
         yield Ability("stop alone", "perhaps", f"its EDS has no {lacking}", advice)
     else:
         values = " or ".join(map(str, profile.strict_abort_options))
         yield Ability("stop alone", "yes", f"6007 = {values} and 1016 make it stop when the heartbeat is lost")
     if device.find((int(Object.PRODUCER_HEARTBEAT), 0)) is None:
-        yield Ability("heartbeat", "no", "it sends none (1017): only its PDOs show that it lives")
+        yield Ability("heartbeat", "no", "it sends none (1017): only its PDOs show that it is alive")
         return
     period_ms = device.default(Object.PRODUCER_HEARTBEAT)
     if period_ms is None:
-        yield Ability("heartbeat", "yes", "its EDS does not say its period (1017)", "set it to 100")
+        yield Ability("heartbeat", "yes", "its EDS does not give its period (1017)", "set it to 100")
     elif not period_ms:
         yield Ability("heartbeat", "yes", "1017 is 0 by default", "set it to 100")
     else:
@@ -251,22 +249,23 @@ def _safety(device: Device, profile: DriveProfile) -> Iterator[Ability]:
 
 
 def _scale(device: Device) -> Iterator[Ability]:
-    """What of the configuration `check` can compare with the drive."""
     places = {
         "increments_per_rev": (Object.FEED_CONSTANT, Object.POSITION_ENCODER_RESOLUTION),
         "rated_current_a": (Object.RATED_CURRENT,),
         "rated_torque_nm": (Object.RATED_TORQUE,),
     }
-    told = {key: [i for i in indices if device.find((i, 0)) or device.find((i, 1))] for key, indices in places.items()}
-    compared = [f"{key} ({', '.join(f'{i:04X}' for i in found)})" for key, found in told.items() if found]
-    own = [key for key, found in told.items() if not found]
+    reported = {
+        key: [i for i in indices if device.find((i, 0)) or device.find((i, 1))] for key, indices in places.items()
+    }
+    compared = [f"{key} ({', '.join(f'{i:04X}' for i in found)})" for key, found in reported.items() if found]
+    own = [key for key, found in reported.items() if not found]
     if compared:
         yield Ability("compare scales", "yes", f"check compares {', '.join(compared)}")
     if own:
-        yield Ability("compare other scales", "no", f"the drive does not tell {', '.join(own)}: take care with them")
+        yield Ability("compare other scales", "no", f"the drive does not report {', '.join(own)}: verify them yourself")
 
 
 def _rapids(device: Device, profile: DriveProfile) -> Ability:
     if profile.find_tpdo(profile.digital_inputs) is None or device.find(profile.digital_inputs) is None:
         return Ability("rapid signal", "no", "no TPDO carries its inputs (60FD): rapids are inferred from the motion")
-    return Ability("rapid signal", "yes", "a bit of 60FD can tell G0; without one it is inferred")
+    return Ability("rapid signal", "yes", "a bit of 60FD can signal G0; without one it is inferred")

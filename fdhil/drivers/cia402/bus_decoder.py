@@ -1,4 +1,4 @@
-"""Decodes one bus: its SYNC grid, its drives' samples and the watch over its nodes. Pure: no clock, no I/O."""
+"""Decodes one bus: its SYNC grid, its drives' samples and the state of its nodes. Pure: no clock, no I/O."""
 
 from fdhil.cia402 import COB_HEARTBEAT
 from fdhil.config import MachineConfig
@@ -37,7 +37,7 @@ class BusDecoder:
         self._sync_lost = False
 
     def feed(self, frames: Frames, now_ns: int) -> list[TickTimes | AxisSamples | InputSamples | TableSamples | Notice]:
-        """Take a block of frames; return times of the ticks, samples, inputs and notices."""
+        """Decode a block of frames; return tick times, samples, inputs and notices."""
         ticked = self.grid.feed(frames)
         out: list[TickTimes | AxisSamples | InputSamples | TableSamples | Notice] = [
             *self._errors.feed(frames, now_ns),
@@ -59,18 +59,18 @@ class BusDecoder:
         silent = self._last_sync_ns is not None and now_ns - self._last_sync_ns > _SYNC_SILENCE_NS
         was, self._sync_lost = self._sync_lost, silent
         if silent and not was:
-            text = "SYNC stopped, nothing is sampled; start the NC or see whether it still runs the bus."
+            text = "SYNC stopped: nothing is sampled; start the NC, or check that it still runs the bus."
             return [Notice("SyncLost", "MAJOR", text)]
         return [Notice("SyncLost", "info", "SYNC is back.")] if was and not silent else []
 
     def filters(self) -> list[Filter]:
-        """Return filters for the frames that are needed here, the guard's heartbeat among them."""
+        """Return filters for the needed frames, the guard's heartbeat included."""
         pdos = {cob_id for decoder in self.decoders.values() for cob_id in decoder.cob_ids}
         pdos |= {encoder.cob_id for encoder in self.tables}
         return drive_filters([decoder.node_id for decoder in self.decoders.values()], pdos | {self._guard_heartbeat})
 
     def counters(self) -> dict[str, int]:
-        """Count what was missed, duplicated or discarded on this bus, and the frames each drive sent."""
+        """Return counts of missed, duplicated and discarded frames, and the frames each drive sent."""
         counters = [decoder.counters for decoder in self.decoders.values()]
         return {
             "error_frames": self._errors.count,

@@ -1,4 +1,4 @@
-"""Reads what the drives did from a candump log of their buses, such as a black box, as the daemon heard it."""
+"""Decodes a candump log, such as a black box, into the drives' samples, as the daemon would have."""
 
 import contextlib
 import io
@@ -18,9 +18,9 @@ BLOCK_FRAMES = 4096
 
 
 def samples_of_log(log: bytes, config: MachineConfig) -> dict[str, AxisSamples]:
-    """Return by axis what was sampled in a log. RecordingError when it is no log of candump, or has no frame.
+    """Return the samples of each axis in a log; RecordingError when it is no candump log, or has no frame.
 
-    A SYNC of which no sample came is not there: nothing is made up.
+    A SYNC without a sample is left out: nothing is interpolated.
     """
     blocks: dict[str, list[AxisSamples]] = {axis: [] for axis in config.axis}
     for bus, frames in _frames(log).items():
@@ -35,15 +35,15 @@ def samples_of_log(log: bytes, config: MachineConfig) -> dict[str, AxisSamples]:
 
 def _frames(log: bytes) -> dict[str, Frames]:
     if len(log) > LARGEST_LOG:
-        raise RecordingError(f"the log has more than {LARGEST_LOG >> 20} MiB, nothing of it is read; cut it")
+        raise RecordingError(f"the log has more than {LARGEST_LOG >> 20} MiB, it is not read; shorten it")
     rows: dict[str, list[tuple[int, int, bytes]]] = {}
     for line in io.StringIO(log.decode("ascii", "replace")):
-        with contextlib.suppress(ValueError, IndexError):  # a line that was cut is no frame
+        with contextlib.suppress(ValueError, IndexError):  # skips truncated lines
             frame = parse_line(line)
             if frame.fd is None:
                 rows.setdefault(frame.bus, []).append((frame.t_ns, frame.can_id, frame.data))
     if not rows:
-        raise RecordingError("this is no log of candump, or nothing was on the bus")
+        raise RecordingError("this is not a candump log, or the bus was silent")
     return {bus: frames_of(found) for bus, found in rows.items()}
 
 

@@ -1,25 +1,23 @@
-"""Says what an EDS or DCF file offers, as plain records: the device's identity, its objects and its PDOs."""
+"""Describes what an EDS or DCF file offers: the device's identity, its objects and its PDOs."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from fdhil.cia402 import LOGICAL_AXES, LOGICAL_AXIS_STEP, Object
-from fdhil.drivers.cia402.eds_numbers import octal_reading, read_expression
 from fdhil.drivers.cia402.profile import ObjectKey
+from fdhil.eds import INTEGER_TYPES, EdsFile, read_eds, read_expression, read_octal
 
 MOST_PDOS = 512
 COB_ID_BITS, EXTENDED = 0x7FF, 1 << 29
 DRIVE = 402
-NODE_ID = "$NODEID"
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceObject:
-    """One variable of the dictionary; ``bits`` 0: it is no integer. ``default`` None: the file gives none.
+    """One variable of the dictionary; ``bits`` 0: not an integer. ``default`` None: not given in the file.
 
-    ``relative``: the default contains the node-ID. ``doubt`` says of a default that it can be read in no or two ways.
+    ``relative``: the default contains the node-ID. ``doubt`` explains a default that is invalid or ambiguous.
     """
 
     key: ObjectKey
@@ -34,7 +32,6 @@ class DeviceObject:
 
     @property
     def fixed(self) -> bool:
-        """Whether it cannot be written."""
         return self.access in ("ro", "const")
 
     @property
@@ -49,7 +46,7 @@ class DeviceObject:
 
     @property
     def perhaps_in_tpdo(self) -> bool:
-        """Whether a TPDO might carry it: many drives take more than the ``rww`` of their file says."""
+        """Whether a TPDO might carry it: many drives accept more than the ``rww`` of their file."""
         return self.mappable and self.bits > 0 and self.access == "rww"
 
 
@@ -57,8 +54,8 @@ class DeviceObject:
 class PdoPlace:
     """One PDO of the device: its number, default COB-ID less the node-ID, and how many objects it can map.
 
-    ``mapped`` are the default mapping words; ``fixed``: they cannot be written. ``cob_base`` None: the file gives none,
-    or one that belongs to a node it does not name. ``cob_fixed``, ``kind_fixed``: COB-ID and transmission type stay.
+    ``mapped`` are the default mapping words, read-only if ``fixed``. ``cob_base`` None: not given, or it belongs to a
+    node that the file does not name. ``cob_fixed``, ``kind_fixed``: COB-ID and transmission type are read-only.
     """
 
     number: int
@@ -74,7 +71,7 @@ class PdoPlace:
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """What a file says of its device; numbers are 0 where it does not say them."""
+    """Content of a device's file; numbers are 0 where it does not give them."""
 
     file: str
     vendor_name: str
@@ -87,7 +84,7 @@ class Device:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What the file writes so that it can be read in two ways, a sentence each."""
+        """Ambiguous or invalid numbers of the file, a sentence each."""
         return tuple(found.doubt for found in self.objects.values() if found.doubt)
 
     def find(self, key: ObjectKey) -> DeviceObject | None:
@@ -100,13 +97,13 @@ class Device:
         return None if found is None else found.default
 
     def entry(self, key: ObjectKey) -> tuple[int, int, int, bool] | None:
-        """Return an object as a mapping entry; None where it is none."""
+        """Return an object as a mapping entry; None where it is missing or not an integer."""
         found = self.find(key)
         return None if found is None or not found.bits else (*key, found.bits, found.signed)
 
     @property
     def axes(self) -> tuple[int, ...]:
-        """The logical axes of CiA 402 that it has a controlword for: its objects lie 0x800 higher for each."""
+        """The logical axes of CiA 402 with a controlword: their objects lie 0x800 higher for each."""
         words = {axis: (Object.CONTROLWORD + (axis - 1) * LOGICAL_AXIS_STEP, 0) for axis in LOGICAL_AXES}
         return tuple(axis for axis, key in words.items() if key in self.objects)
 
@@ -120,50 +117,44 @@ class Device:
 
 def read_device(path: Path) -> Device:
     """Read an EDS or DCF file; EdsError when it cannot be read. A DCF's values count as its defaults."""
-    from fdhil.drivers.cia402.eds import load_eds  # late: most profiles need no EDS, and its library loads slowly
-
-    dictionary = load_eds(path)
-    own = dictionary.node_id  # of a DCF: its absolute COB-IDs are of this node (CiA 306)
-    told = dictionary.device_information
-    objects = {found.key: found for found in _objects(dictionary)}
-    identity = [objects.get((int(Object.IDENTITY), sub)) for sub in (1, 2)]
-    vendor, product = (0 if found is None else found.default or 0 for found in identity)
+    file = read_eds(path)
+    objects = {found.key: found for found in _objects(file)}
+    vendor, product = (objects.get((int(Object.IDENTITY), sub)) for sub in (1, 2))
     return Device(
         file=path.name,
-        vendor_name=str(told.vendor_name or ""),
-        product_name=str(told.product_name or ""),
-        vendor_id=int(told.vendor_number or 0) or vendor,
-        product_code=int(told.product_number or 0) or product,
+        vendor_name=file.vendor_name,
+        product_name=file.product_name,
+        vendor_id=file.vendor_number or (vendor.default if vendor else 0) or 0,
+        product_code=file.product_number or (product.default if product else 0) or 0,
         objects=objects,
-        rpdos=_pdos(objects, Object.RPDO_PARAMETER, Object.RPDO_MAPPING, own),
-        tpdos=_pdos(objects, Object.TPDO_PARAMETER, Object.TPDO_MAPPING, own),
+        rpdos=_pdos(objects, Object.RPDO_PARAMETER, Object.RPDO_MAPPING, file.node_id),
+        tpdos=_pdos(objects, Object.TPDO_PARAMETER, Object.TPDO_MAPPING, file.node_id),
     )
 
 
-def _objects(dictionary: Any) -> Iterable[DeviceObject]:
-    from fdhil.drivers.cia402.eds import INTEGERS
-
-    for index in dictionary:
-        entry = dictionary[index]
-        for sub, variable in getattr(entry, "subindices", {0: entry}).items():
-            bits, signed = INTEGERS.get(variable.data_type, (0, False))
-            written = getattr(variable, "value_raw", None) or getattr(variable, "default_raw", None) or ""
-            value = variable.value if getattr(variable, "value_raw", None) else variable.default
-            octal = octal_reading(written) if bits else None
-            if octal is not None or (value is None and NODE_ID in written):  # of no node: as of node 0
-                value = (read_expression(written) or (None, False))[0]
-            doubt = "" if octal is None else f": taken as {value}, it is {octal} if octal is meant"
-            doubt = ", which is no number: taken as not given" if bits and written and value is None else doubt
+def _objects(file: EdsFile) -> Iterator[DeviceObject]:
+    for item in file.objects:
+        for entry in item.entries:
+            bits, signed = INTEGER_TYPES.get(entry.data_type, (0, False))
+            written = entry.default if bits or not entry.data_type else ""
+            number, relative = read_expression(written) or (None, False)
+            doubt = ""
+            if written and number is None:
+                doubt = ", which is not a number: ignored"
+            elif (octal := read_octal(written)) is not None:
+                doubt = f": read as {number}, but it is {octal} if octal is meant"
+            elif number is not None and relative:  # an EDS of no node: as of node 0
+                number += file.node_id or 0
             yield DeviceObject(
-                key=(index, sub),
-                name=entry.name if entry.name == variable.name else f"{entry.name}: {variable.name}",
+                key=(entry.index, entry.sub),
+                name=item.name if item.name == entry.name else f"{item.name}: {entry.name}",
                 bits=bits,
                 signed=signed,
-                access=str(variable.access_type).lower(),
-                mappable=bool(variable.pdo_mappable),
-                default=value if isinstance(value, int) else None,
-                relative=NODE_ID in written,
-                doubt=f"{index:04X}:{sub:02X} is written {written[:40]}{doubt}" if doubt else "",
+                access=entry.access,
+                mappable=entry.mappable,
+                default=number,
+                relative=relative,
+                doubt=f"{entry.index:04X}:{entry.sub:02X} is written {written[:40]}{doubt}" if doubt else "",
             )
 
 
@@ -196,10 +187,10 @@ def _pdos(
 
 
 def _cob_base(cob: DeviceObject, own: int | None) -> int | None:
-    """Return a COB-ID less the node-ID that it contains; None where none is given, or it is an unknown node's."""
+    """Return a COB-ID less the node-ID that it contains; None where none is given, or the node is unknown."""
     number = (cob.default or 0) & COB_ID_BITS
     if not number or (cob.default or 0) & EXTENDED:
         return None
     if cob.relative or own is not None:
         return number - (own or 0) if number >= (own or 0) else None
-    return None if number & 0x7F else number  # without a node-ID: it was left out of the file
+    return None if number & 0x7F else number  # without a node-ID, or with one that the file does not name

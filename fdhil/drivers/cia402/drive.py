@@ -1,10 +1,10 @@
-"""Decodes one CiA 402 drive: frames on the SYNC grid become an axis' samples. Pure: no clock, no I/O.
+"""Decodes the PDOs of one CiA 402 drive: frames on the SYNC grid become an axis' samples. Pure: no clock, no I/O.
 
 A sample of tick k is made of the TPDOs received after SYNC k and before SYNC k+1. The demand r[k] is the target
-(0x607A) that was latched ``setpoint_delay_cycles`` before SYNC k, since the drive runs its set-point late; the offset
-in force o[k] comes from the sniffed 0x60B0 in the same way. A voltage that is the mean of the period before its SYNC
-belongs to row k-1. Rows leave two ticks late, when all they need is there; a row of which a frame is missing is left
-out: a hole in ``tick``, counted in ``lost``.
+(0x607A) that was latched ``setpoint_delay_cycles`` before SYNC k, since the drive delays its set-point; the offset in
+force o[k] comes from the sniffed 0x60B0 in the same way. A voltage that is the mean of the period before its SYNC
+belongs to sample k-1. Samples are released two ticks late, when all their frames are there; a sample with a missing
+frame is left out: a gap in ``tick``, counted in ``lost``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.records import AxisSamples, Bool, Float, Int, Notice, frozen, frozen_ints
 
 _FOREIGN_TICKS = 8
-_OUTAGE = 16  # SYNCs missed in one go: the producer may have begun anew, and nobody knows what the drive heard
+_OUTAGE = 16  # SYNCs missed at once: the producer may have restarted, and what the drive received is unknown
 _MISMATCHES = 3
 _READ_BACK_TOLERANCE = 2  # increments: two roundings
 
@@ -40,7 +40,7 @@ class VoltageObject:
     """The voltage source ``drive``: a vendor object of the profile, decoded with the other TPDOs.
 
     ``keys`` are the objects whose product it is, ``key`` the first of them; None: the profile has none, the DC link is
-    not known, or a sensor of its own tells the voltage.
+    unknown, or a separate sensor measures the voltage.
     """
 
     def __init__(self, axis: str, config: MachineConfig, profile: DriveProfile | None = None) -> None:
@@ -54,9 +54,9 @@ class VoltageObject:
         self._nominal = settings.nominal
 
     def volts(self, counts: Sequence[Int], current_a: Float, speed_rad_s: Float) -> Float:
-        """Return the voltage (n,) of the objects' counts, each (n,).
+        """Convert the objects' counts, each (n,), to a voltage (n,).
 
-        One without a sign gets that of R i + K w, by the data sheet: it can be wrong only where the voltage is small.
+        A magnitude gets the sign of R i + K w by the data sheet: this can be wrong only where the voltage is small.
         """
         product = np.prod(counts, axis=0)
         if not self._magnitude:
@@ -66,18 +66,16 @@ class VoltageObject:
 
 
 def _as_shown(row: Int, shown: Int, n: int) -> SetpointRows:
-    """The demand (n,) on the rows (m,) on which the drive showed it (m,)."""
+    """Return the demand (n,) with the values (m,) that the drive sent for the samples ``row`` (m,)."""
     value, certain = np.zeros(n, np.int64), np.zeros(n, np.bool_)
     value[row], certain[row] = shown, True
     return SetpointRows(value, certain, 0)
 
 
 class Cia402Decoder:
-    """Decodes one axis; ``feed`` takes ticked frames of its bus, ``counters`` tells what was lost.
+    """Decodes one axis; ``counters`` counts lost frames, ``required`` names the TPDOs of which every sample is made.
 
-    ``required`` names the TPDOs of which every sample is made.
-
-    ValueError when the profile maps a needed object in no PDO.
+    ValueError when the profile maps a required object in no PDO.
     """
 
     def __init__(self, axis: str, config: MachineConfig, profile: DriveProfile | None = None) -> None:
@@ -121,11 +119,10 @@ class Cia402Decoder:
 
     @property
     def cob_ids(self) -> frozenset[int]:
-        """The PDOs of this drive, by its profile."""
         return frozenset(spec.cob_base + self.node_id for spec in (*self.profile.tpdos, *self.profile.rpdos))
 
     def feed(self, ticked: Ticked) -> list[AxisSamples | InputSamples | Notice]:
-        """Take a block of ticked frames; return the rows that became complete, and what must be told."""
+        """Decode a block of frames with ticks; return the samples that became complete, and notices."""
         for queue in (*self._queues.values(), *(setpoint.queue for setpoint in self._setpoints)):
             queue.add(ticked, self.counters)
         self._syncs = np.concatenate([self._syncs, ticked.syncs.tick])
@@ -142,8 +139,8 @@ class Cia402Decoder:
         if tick.size:
             out.append(InputSamples(self.axis, frozen_ints(tick), frozen_ints(inputs)))
         self._forget(stop)
-        told, self._notices = self._notices, []
-        return [*out, *told]
+        notices, self._notices = self._notices, []
+        return [*out, *notices]
 
     def _forget(self, row: int) -> None:
         for queue in self._queues.values():
@@ -154,22 +151,21 @@ class Cia402Decoder:
 
     def _heard(self, first: int, stop: int) -> Bool:
         mine = self._syncs[self._syncs.searchsorted(first) : self._syncs.searchsorted(stop)]
-        heard = np.zeros(stop - first, np.bool_)
-        heard[mine - first] = True
-        return heard
+        received = np.zeros(stop - first, np.bool_)
+        received[mine - first] = True
+        return received
 
     def _samples(
         self, first: int, stop: int, demand: SetpointRows | None, offset: SetpointRows | None
     ) -> list[AxisSamples]:
-        """Rows [first, stop); nothing while the demand is not known."""
-        heard = self._heard(first, stop)
+        received = self._heard(first, stop)
         grids = {name: dense(self._queues[name], first, stop + 1) for name in self.required}
         between = self._between(first, stop + 1)
         lost = self._count(grids, between, first)
         if demand is None:
             return []
-        lost += demand.lost + int(np.count_nonzero(~heard))
-        certain = demand.certain & heard
+        lost += demand.lost + int(np.count_nonzero(~received))
+        certain = demand.certain & received
         for key, (name, _) in self._places.items():
             back = self._voltage.rows_back if key in self._voltage.keys else 0
             certain &= grids[name].certain(between)[back : back + stop - first]
@@ -179,7 +175,7 @@ class Cia402Decoder:
         return [self._record(np.flatnonzero(certain), first, grids, demand, offset, lost)]
 
     def _between(self, first: int, stop: int) -> Int:
-        """How many periods it is from each SYNC of ticks [first, stop) to the next one heard; 0 for one not heard."""
+        """Return the periods from each SYNC of ticks [first, stop) to the next received one; 0 for a missing SYNC."""
         low, high = self._syncs.searchsorted((first, stop))
         steps = np.diff(self._syncs[low : high + 1])
         between = np.zeros(stop - first, np.int64)
@@ -187,9 +183,9 @@ class Cia402Decoder:
         return between
 
     def _count(self, grids: Mapping[str, Dense], between: Int, first: int) -> int:
-        """Count what is wrong with the frames of the rows' own ticks; returns the number lost.
+        """Count irregular frames of the samples' own ticks; return the number lost.
 
-        A SYNC that was lost on the way here was heard by the drive: so many frames are due as SYNCs were sent.
+        A SYNC that was lost on the way here did reach the drive: one frame is due for each SYNC that was sent.
         """
         due = np.where(between > _OUTAGE, 1, between)
         balances = {name: grid.balance(due) for name, grid in grids.items()}
@@ -211,8 +207,8 @@ class Cia402Decoder:
             names = ", ".join(f"{queue.spec.name} ({queue.cob_id:03X})" for queue in rare)
             kinds = ", ".join(f"0x{0x1800 + queue.spec.number - 1:04X}:02" for queue in rare)
             text = (
-                f"Drive {self.axis} sends {names} with few of the SYNCs, and its samples have holes; "
-                f"set the transmission type ({kinds}) to 1, or see whether it still is Operational."
+                f"Drive {self.axis} sends {names} with few of the SYNCs, so its samples have gaps; "
+                f"set the transmission type ({kinds}) to 1, or check that it is still Operational."
             )
             self._tell("PdoIrregular", "MAJOR", text)
 
@@ -221,8 +217,9 @@ class Cia402Decoder:
         if names:
             self.counters.late += sum(counts.values())
             text = (
-                f"Drive {self.axis} sent {names} later than the next SYNC; it cannot be told from that one's, so the "
-                "samples of both are left out. See whether the bus is too busy, or the drive too slow for this period."
+                f"Drive {self.axis} sent {names} after the next SYNC; it cannot be distinguished from that "
+                "cycle's, so the "
+                "samples of both are discarded. Check the bus load, and whether the drive is too slow for this period."
             )
             self._tell("LateFrame", "minor", text)
 
@@ -230,7 +227,10 @@ class Cia402Decoder:
         clean = np.flatnonzero(~ambiguous)
         self._foreign_run = ambiguous.size - 1 - int(clean[-1]) if clean.size else self._foreign_run + ambiguous.size
         if self._foreign_run >= _FOREIGN_TICKS:
-            text = f"Two nodes send as drive {self.axis} (node-ID {self.node_id}); give each node its own node-ID."
+            text = (
+                f"Two nodes send as drive {self.axis} (node-ID {self.node_id}): its samples are ambiguous; "
+                "give each node its own node-ID."
+            )
             self._tell("ForeignProducer", "MAJOR", text)
 
     def _record(
@@ -269,7 +269,6 @@ class Cia402Decoder:
         )
 
     def _shown(self, key: ObjectKey, first: int, stop: int) -> tuple[Int, Int]:
-        """Ticks and values of a slower TPDO's object; empty when the profile maps it nowhere."""
         if key not in self._shown_places:
             return np.empty(0, np.int64), np.empty(0, np.int64)
         name, entry = self._shown_places[key]
@@ -277,7 +276,8 @@ class Cia402Decoder:
         return tick, decode(entry, words)
 
     def _read_back_offset(self, first: int, stop: int) -> SetpointRows | None:
-        """The offset in force on rows [first, stop): sniffed, else what the drive shows; None: none, or unknown.
+        """Return the offset in force on [first, stop): sniffed, else read back from the drive; None: unknown or not
+        supported.
 
         0x60B0 at SYNC k is what was latched there, so it is in force at k + delay.
         """
@@ -291,9 +291,9 @@ class Cia402Decoder:
         return self._offset.rows(first, stop)
 
     def _read_back_demand(self, first: int, stop: int, offset: SetpointRows | None) -> SetpointRows | None:
-        """The demand on rows [first, stop): sniffed and checked against what the drive shows, else what it shows.
+        """Return the demand on [first, stop): sniffed and compared with the drive's own, else the drive's own.
 
-        0x6062 at SYNC k is r[k] + o[k]. A drive that makes its own path (profile position) may show it with every SYNC.
+        0x6062 at SYNC k is r[k] + o[k]. A drive that plans its own path (profile position) may send it with every SYNC.
         """
         tick, shown = self._shown(self.profile.position_demand, first, stop)
         base = shown - (offset.value[tick - first] if offset is not None else 0)
@@ -313,18 +313,19 @@ class Cia402Decoder:
             if self._mismatches == _MISMATCHES:
                 text = (
                     f"Drive {self.axis} follows another demand than the sniffed one, by {int(difference[-1])} "
-                    "increments, its samples cannot be trusted; check setpoint_delay_cycles and who sends set-points."
+                    "increments: its samples are not reliable; check setpoint_delay_cycles, and that only one "
+                    "master sends set-points."
                 )
                 self._notices.append(Notice("DemandMismatch", "MAJOR", text, self.axis))
 
     def _length_notices(self) -> None:
         if self.counters.short >= 3:
             text = (
-                f"Drive {self.axis} sends PDOs shorter than its mapping, they are not used; check the drive's mapping."
+                f"Drive {self.axis} sends PDOs shorter than its mapping: they are discarded; check the drive's mapping."
             )
             self._tell("PdoLength", "MAJOR", text)
         if self.counters.long:
-            text = f"Drive {self.axis} sends PDOs longer than its mapping; commission it again."
+            text = f"Drive {self.axis} sends PDOs longer than its mapping: the rest is ignored; commission it again."
             self._tell("PdoMapping", "minor", text)
 
     def _tell(self, code: str, severity: Literal["minor", "MAJOR"], text: str) -> None:

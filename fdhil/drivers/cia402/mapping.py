@@ -1,7 +1,7 @@
-"""Suggests PDOs for a device by its EDS: what must be heard with every SYNC, what now and then, what is sent.
+"""Suggests PDOs for a device by its EDS: fast TPDOs with every SYNC, slow TPDOs, and RPDOs.
 
-The PDOs lie as the packaged profiles have them: position and speed first, then statusword, current and voltage; demand
-and offset in a slower one. Where the device's mapping is fixed, its own is taken as it is.
+The layout is that of the packaged profiles: position and speed first, then statusword, current and voltage; demand and
+offset in a slower one. A device's fixed mapping is adopted as it is.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -18,7 +18,7 @@ Entry = tuple[int, int, int, bool]
 
 
 def suggest_rpdos(device: Device, target: ObjectKey, offset: ObjectKey, fed: Sequence[ObjectKey]) -> list[PdoSpec]:
-    """Return RPDOs: controlword and target, the offset in one of its own, speed and torque offset not exchanged."""
+    """Return RPDOs: controlword and target, the offset in a separate one, speed and torque offset disabled."""
     groups = [[(int(Object.CONTROLWORD), 0), target], [offset], list(fed)]
     places = [place for place in device.rpdos if _has_cob_id(place, COB_RPDO)]
     found: list[PdoSpec] = []
@@ -35,7 +35,7 @@ def suggest_rpdos(device: Device, target: ObjectKey, offset: ObjectKey, fed: Seq
 
 
 def suggest_tpdos(device: Device, fast: Iterable[ObjectKey], slow: Iterable[ObjectKey]) -> list[PdoSpec]:
-    """Return TPDOs that carry ``fast`` with every SYNC and ``slow`` now and then, as far as there is room."""
+    """Return TPDOs with ``fast`` at every SYNC and ``slow`` at every tenth, as far as they fit."""
     places, fast = [place for place in device.tpdos if _has_cob_id(place, COB_TPDO)], list(fast)
     if places and all(place.fixed for place in places):
         kept = [_fixed(device, place, "TPDO", COB_TPDO, fast) for place in places]
@@ -54,7 +54,7 @@ def suggest_tpdos(device: Device, fast: Iterable[ObjectKey], slow: Iterable[Obje
 
 
 def offered(device: Device, pdos: Sequence[PdoSpec], *, sent: bool) -> list[PdoSpec]:
-    """Return a profile's PDOs with what the device has of them, in the device's sizes; an empty one is left out."""
+    """Return a profile's PDOs, reduced to the device's objects in their sizes; empty ones are left out."""
     found = []
     for spec in pdos:
         keys = [(entry.index, entry.sub) for entry in spec.entries]
@@ -85,21 +85,19 @@ def _spec(place: PdoPlace, kind: str, bases: Sequence[int], entries: Sequence[En
 
 
 def _has_cob_id(place: PdoPlace, bases: Sequence[int]) -> bool:
-    """Whether there is a COB-ID for it: CiA 301 has defaults for the first four only."""
     return place.number <= len(bases) or bool(place.cob_base)
 
 
 def _cob_base(place: PdoPlace, bases: Sequence[int]) -> int:
-    """The default of CiA 301 for the first four, else the device's own."""
     return bases[place.number - 1] if place.number <= len(bases) else place.cob_base or 0
 
 
 def _fixed(
     device: Device, place: PdoPlace, kind: str, bases: Sequence[int], fast: Collection[ObjectKey] = ()
 ) -> PdoSpec | None:
-    """The device's own mapping; None where a word of it is no object of the device's.
+    """Return the device's own mapping; None where it maps an unknown object.
 
-    Its transmission type is set where that can be written: to every SYNC for what is ``fast``, and for set-points.
+    Its transmission type is set where that is writable: to every SYNC for ``fast`` objects and set-points.
     """
     entries = [device.entry((word >> 16, word >> 8 & 0xFF)) for word in place.mapped]
     whole = [entry for entry in entries if entry is not None]

@@ -1,4 +1,4 @@
-"""Lays the frames of a PDO on a dense grid of ticks, and follows sniffed set-points. Pure numpy, no loop per frame."""
+"""Lays the frames of a PDO on a dense grid of ticks, and tracks sniffed set-points. Pure numpy, no loop per frame."""
 
 from dataclasses import dataclass, field
 
@@ -26,7 +26,7 @@ def decode(entry: PdoEntry, data: Words) -> Int:
 
 @dataclass(slots=True)
 class DecoderCounters:
-    """The counts of a decoder: frames lost, too short, too long, duplicated, late, and ambiguous ones it put aside."""
+    """Counts of a decoder: frames lost, too short, too long, duplicated, late, and ambiguous."""
 
     lost: int = 0
     short: int = 0
@@ -38,10 +38,10 @@ class DecoderCounters:
 
 @dataclass(slots=True)
 class PdoQueue:
-    """Frames of one PDO that wait until their ticks are complete; ``tick`` (m,) never falls.
+    """Frames of one PDO that wait until their ticks are complete; ``tick`` (m,) never decreases.
 
-    ``first_tick`` is that of the first whole one ever, None before it. ``synchronous``: not missing in most of the
-    newest ``JUDGED_TICKS`` SYNCs; else it is sent on change, by a timer, or no more.
+    ``first_tick`` is that of the first complete frame, None before it. ``synchronous``: present in most of the newest
+    ``JUDGED_TICKS`` SYNCs; otherwise it is sent on change, by a timer, or no more.
     """
 
     spec: PdoSpec
@@ -58,7 +58,7 @@ class PdoQueue:
         self.length = self.spec.length
 
     def add(self, ticked: Ticked, counters: DecoderCounters) -> None:
-        """Take this PDO's frames from a block; a short one is discarded, of a long one the mapped bytes are used."""
+        """Add this PDO's frames of a block; a short one is discarded, of a long one the mapped bytes are used."""
         mine = (ticked.can_id == self.cob_id).nonzero()[0]
         if mine.size == 0:
             return
@@ -74,9 +74,9 @@ class PdoQueue:
         self.data = np.concatenate([self.data, ticked.data[mine]])
 
     def lost(self, missing: Int, due: Int, first: int) -> int:
-        """Return the frames lost on rows (n,) from tick ``first`` on: those ``missing`` of so many that were ``due``.
+        """Return the frames lost on samples (n,) from tick ``first`` on: those ``missing`` of the ``due`` ones.
 
-        None is lost before the first one ever, nor while it is not sent with SYNC.
+        None counts as lost before the first received frame, nor while the PDO is not synchronous.
         """
         if self.first_tick is None:
             return 0
@@ -89,7 +89,7 @@ class PdoQueue:
         return gone if self.synchronous else 0
 
     def forget(self, before_tick: int) -> None:
-        """Drop what is older than ``before_tick``."""
+        """Drop frames older than ``before_tick``."""
         start = int(np.searchsorted(self.tick, before_tick))
         if start:
             self.tick, self.data = self.tick[start:], self.data[start:]
@@ -110,8 +110,8 @@ class PdoQueue:
 class Dense:
     """A PDO on every tick of [first, first + n): data ``words`` (n,), ``present`` (n,) and ``ambiguous`` (n,).
 
-    Of equal frames in one tick the first is used; different ones cannot be told apart (one may be late, one may be
-    another producer's), so none is. ``count`` (n,) is how many came.
+    Of equal frames in one tick the first is used; different ones are ambiguous (one may be late, or another
+    producer's), so none is used. ``count`` (n,) is the number received.
     """
 
     words: Words
@@ -120,23 +120,23 @@ class Dense:
     count: Int
 
     def certain(self, between: Int) -> Bool:
-        """Ticks (n,) whose frame is theirs, so many periods ``between`` (n,) it and the next SYNC that was heard."""
+        """Return the ticks (n,) whose frame surely is theirs; the next SYNC came ``between`` (n,) periods later."""
         return self.present & ((between <= 1) | (self.count >= between))
 
     def balance(self, due: Int) -> tuple[Int, Int, Int]:
-        """Return how many are missing, late and to spare, each (n - 1,), where so many were ``due`` (n,).
+        """Return the numbers of missing, late and surplus frames, each (n - 1,), where ``due`` (n,) were expected.
 
-        A late one came after the next SYNC that was heard: too few before it, too many behind it.
+        A late frame came after the next received SYNC: one too few before it, one too many behind it.
         """
         missing, spare = np.maximum(due - self.count, 0), np.where(due > 0, np.maximum(self.count - due, 0), 0)
-        heard = np.flatnonzero(due > 0)
+        received = np.flatnonzero(due > 0)
         late = np.zeros(due.size, np.int64)
-        late[heard[:-1]] = (missing[heard[:-1]] > 0) & (spare[heard[1:]] > 0)
+        late[received[:-1]] = (missing[received[:-1]] > 0) & (spare[received[1:]] > 0)
         return (missing - late)[:-1], late[:-1], spare[:-1]
 
 
 def dense(queue: PdoQueue, first: int, stop: int) -> Dense:
-    """Lay the queue's frames of ticks [first, stop) out on the grid."""
+    """Lay the queue's frames of ticks [first, stop) on the grid."""
     n = stop - first
     regular = queue.gapless(first, stop)
     if regular is not None:
@@ -154,7 +154,7 @@ def dense(queue: PdoQueue, first: int, stop: int) -> Dense:
 
 @dataclass(frozen=True, slots=True)
 class SetpointRows:
-    """A set-point on rows [first, stop): ``value`` (n,), whether it is ``certain`` (n,), frames that must be lost."""
+    """A set-point on samples [first, stop): ``value`` (n,), ``certain`` (n,), and the number of lost frames."""
 
     value: Int
     certain: Bool
@@ -164,7 +164,7 @@ class SetpointRows:
 class Setpoint:
     """A sniffed set-point: latched at each SYNC, held while none comes, uncertain where one may have been lost.
 
-    ``held`` is the value in force before the frames in the queue, None while it is not known.
+    ``held`` is the value in force before the frames in the queue, None while it is unknown.
     """
 
     def __init__(self, queue: PdoQueue, entry: PdoEntry, delay: int) -> None:
@@ -172,12 +172,12 @@ class Setpoint:
         self.held: int | None = None
         self._entry = entry
         self._streaming = False
-        self._held_crowded = False  # several frames came in its tick: the SYNC between them was lost
+        self._held_crowded = False  # several frames in its tick: the SYNC between them was lost
         self.shift = delay + 1  # a frame after SYNC j is latched at SYNC j+1 and in force ``delay`` cycles later
-        self._reach = delay + 2  # a gap is looked across as far as is known when its row leaves
+        self._reach = delay + 2  # a gap is bridged as far as frames are there when its sample is released
 
     def rows(self, first: int, stop: int) -> SetpointRows | None:
-        """Return the set-point in force on rows [first, stop); None while nothing is known of it."""
+        """Return the set-point in force on samples [first, stop); None while it is unknown."""
         regular = self.queue.gapless(first - self.shift, stop - self.shift)
         if regular is not None:
             return SetpointRows(decode(self._entry, regular), np.ones(stop - first, np.bool_), 0)
@@ -203,7 +203,7 @@ class Setpoint:
         return SetpointRows(value, certain, lost)
 
     def _latched(self) -> tuple[Int, Words, Bool, Bool]:
-        """Tick and word of the last frame of each tick, whether different ones came in it, and whether several."""
+        """Return tick and last word of each tick, whether its frames differed, and whether there were several."""
         tick, data = self.queue.tick, self.queue.data
         if tick.size == 0:
             return tick, data, np.empty(0, np.bool_), np.empty(0, np.bool_)
@@ -215,7 +215,7 @@ class Setpoint:
         return tick[last], data[last], doubtful, np.diff(last, prepend=-1) > 1
 
     def forget(self, row: int) -> None:
-        """Drop the frames that no row from ``row`` on needs, but hold the newest of them."""
+        """Drop frames that no sample from ``row`` on needs; the newest of them is held."""
         keep = row - self.shift
         count = int(np.searchsorted(self.queue.tick, keep))
         if count:

@@ -1,4 +1,4 @@
-"""Watches for TPDOs that never come though SYNC runs: they are told by name, and are not lost frames. Pure."""
+"""Detects TPDOs that never arrive though SYNC runs; they are reported by name and do not count as lost. Pure."""
 
 from collections.abc import Collection
 
@@ -13,7 +13,7 @@ PATIENCE_S = 10.0  # of SYNC: an NC may run it for a while before it starts its 
 
 
 class PdoWatch:
-    """Watches the TPDOs of one drive; ``needed`` are the names of those without which it has no samples."""
+    """Monitors the TPDOs of one drive; ``needed`` names those without which it has no samples."""
 
     def __init__(
         self, axis: str, node_id: int, tpdos: Collection[PdoSpec], needed: Collection[str], period_s: float
@@ -24,7 +24,7 @@ class PdoWatch:
         self._told = False
 
     def feed(self, ticked: Ticked, nmt: Nmt | None) -> list[Notice]:
-        """Take a block of frames and the drive's NMT state, None while it is not known."""
+        """Take a block of frames and the drive's NMT state, None while it is unknown."""
         if not self._missing:
             return []
         for can_id in np.intersect1d(ticked.can_id, list(self._missing)).tolist():
@@ -36,7 +36,7 @@ class PdoWatch:
         self._told = True
         names = ", ".join(f"{name} ({can_id:03X})" for can_id, name in self._missing.items())
         if nmt in (None, Nmt.OPERATIONAL):
-            advice = "compare its mapping, COB-IDs and transmission types by fdhil check"
+            advice = "compare its mapping, COB-IDs and transmission types with fdhil check"
         else:
             advice = f"its NMT state is {nmt.name.lower().replace('_', '-')}: let the NC start it"
         text = f"Drive {self._axis} (node-ID {self._node_id}) never sent {names} though SYNC runs; {advice}."

@@ -1,8 +1,8 @@
-"""Describes a drive model as data: its PDOs, which object carries which signal, and in which unit.
+"""Describes a drive model as data: its PDOs, the objects of its signals, and their units.
 
-A new vendor is a TOML file with the names of :class:`DriveProfile` (``profile_file`` reads it). What no PDO of the
-profile carries, the drive is not heard to have: without ``offset`` (0x60B0) it is listened to and never corrected on
-line, without ``voltage`` a sensor tells it, or nobody.
+A new vendor is a TOML file with the names of :class:`DriveProfile` (``drive_profile_file`` reads it). An object that no
+PDO of the profile carries is not used: without ``offset`` (0x60B0) the drive is recorded but never corrected on line;
+without ``voltage`` a separate sensor is needed.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from fdhil.config import Axis, SpeedUnit
 ObjectKey = tuple[int, int]
 """Index and sub-index."""
 LOGICAL_AXIS_PDOS = 64
-"""The PDOs of the next axis of one device lie so much higher (CiA 402-3)."""
+"""Distance between the PDO numbers of two axes of one device (CiA 402-3)."""
 
 
 @dataclass(frozen=True, slots=True)
 class PdoSpec:
     """One PDO: its COB-ID is ``cob_base`` + node-ID; it comes with every ``every_sync``-th SYNC.
 
-    ``number`` is its place in the communication parameters (1 -> 0x1400/0x1800), in a profile's file the digits at the
-    end of its name ("RPDO1"). ``valid`` is False when the drive's
-    default has bit 31 of the COB-ID set: mapped, but not exchanged.
+    ``number`` is its position in the communication parameters (1 -> 0x1400/0x1800), in a profile's file the digits at
+    the end of its name ("RPDO1"). ``valid`` is False when bit 31 of the default COB-ID is set: mapped, but not
+    exchanged.
     """
 
     name: str
@@ -39,7 +39,7 @@ class PdoSpec:
 
     @property
     def length(self) -> int:
-        """Data bytes of a complete frame."""
+        """Bytes of a complete frame."""
         return pdo_length(self.entries)
 
     def entry(self, key: ObjectKey) -> PdoEntry | None:
@@ -51,14 +51,14 @@ class PdoSpec:
 class DriveProfile:
     """A drive model: mapping, signals and units.
 
-    ``speed_unit`` and ``current_unit`` say what the speed and the current object count in, ``speed_factor`` and
+    ``speed_unit`` and ``current_unit`` are the units of the speed and the current object, ``speed_factor`` and
     ``current_factor`` how many of these one count is. ``voltage`` is the TPDO object of the terminal voltage:
     ``voltage_v_per_count`` is its scale, or, where it is the duty of the PWM, ``duty_per_count`` is its scale in shares
-    of the DC link, which a TPDO tells (``dc_link``, ``dc_link_v_per_count``) or else the configuration
-    (``drive.dc_link_v``). ``voltage_magnitude``: it has no sign of its own, that of R i + K w is taken.
-    ``mode`` is the one in which set-points are streamed to ``target``. ``strict_abort_options`` are the values of
-    0x6007 that stop the drive when communication is lost. ``vendor_id`` and ``product_code`` None: any.
-    ``logical_axis`` is the axis of a device with several of them. ``notes`` are told to whoever chooses the profile.
+    of the DC link, which is in a TPDO (``dc_link``, ``dc_link_v_per_count``) or else in the configuration
+    (``drive.dc_link_v``). ``voltage_magnitude``: it is unsigned, and gets the sign of R i + K w. ``mode`` is the one in
+    which set-points are streamed to ``target``. ``strict_abort_options`` are the values of 0x6007 that stop the drive
+    when communication is lost. ``vendor_id`` and ``product_code`` None: any. ``logical_axis`` is the axis of a device
+    with several of them. ``notes`` are shown when the profile is chosen.
     """
 
     name: str
@@ -102,13 +102,13 @@ class DriveProfile:
 
     @property
     def takes_offset(self) -> bool:
-        """Whether an offset can be sent to it, and be seen; else a correction can only go through the NC."""
+        """Whether an offset can be sent and read back; otherwise a correction can only go through the NC."""
         found = self.find_rpdo(self.offset)
         return found is not None and found[0].valid and not self.unshown
 
     @property
     def unshown(self) -> tuple[ObjectKey, ...]:
-        """What no TPDO carries of offset, mode and demand: nothing is sent whose effect is not seen."""
+        """Those of offset, mode and demand that no TPDO carries: nothing is sent whose effect cannot be read back."""
         keys = (self.offset, (self.object_index(Object.MODE_DISPLAY), 0), self.position_demand)
         return tuple(key for key in keys if self.find_tpdo(key) is None)
 
@@ -121,17 +121,17 @@ class DriveProfile:
         return _find(self.rpdos, key)
 
     def object_index(self, index: int) -> int:
-        """Return where the object ``index`` of CiA 402 is on this axis of its device."""
+        """Return the index of CiA 402's object ``index`` on this axis of its device."""
         return index + (self.logical_axis - 1) * LOGICAL_AXIS_STEP if 0x6000 <= index < 0x6800 else index
 
     def with_feedforward(self) -> DriveProfile:
-        """Return the profile of a drive whose RPDO of speed and torque offset is exchanged."""
+        """Return the profile with the RPDO of speed and torque offset enabled."""
         found = self.find_rpdo(self.speed_offset)
         rpdos = tuple(replace(spec, valid=True) if found and spec is found[0] else spec for spec in self.rpdos)
         return replace(self, rpdos=rpdos)
 
     def speed_rad_s_per_count(self, axis: Axis) -> float:
-        """Scale of the speed object, the axis' sign included."""
+        """Return the scale of the speed object, including the axis' sign."""
         per_unit = {
             "increments_per_s": 2 * math.pi / axis.drive.increments_per_rev,
             "rpm": 2 * math.pi / 60,
@@ -140,7 +140,7 @@ class DriveProfile:
         return axis.drive.sign * self.speed_factor * per_unit
 
     def current_a_per_count(self, axis: Axis) -> float:
-        """Scale of the current object, the axis' sign included; a torque is divided by the data sheet's K."""
+        """Return the scale of the current object, with the axis' sign; a torque is divided by the data sheet's K."""
         per_unit = {
             "permille_of_rated": axis.drive.rated_current_a / 1000,
             "share_of_rated": axis.drive.rated_current_a,
@@ -150,7 +150,8 @@ class DriveProfile:
         return axis.drive.sign * self.current_factor * per_unit
 
     def terminal_v_per_count(self, axis: Axis) -> float:
-        """Scale of the voltage object, the axis' sign included; 0 where the drive does not tell its voltage.
+        """Return the scale of the voltage object, including the axis' sign; 0 where the drive does not send its
+        voltage.
 
         Where a TPDO carries the DC link it is the scale of the product of both objects' counts.
         """
@@ -161,7 +162,7 @@ class DriveProfile:
 
     @property
     def voltage_objects(self) -> tuple[ObjectKey, ...]:
-        """The TPDO objects whose product is the terminal voltage; empty where the drive does not tell it."""
+        """The TPDO objects whose product is the terminal voltage; empty where the drive does not send it."""
         if self.voltage is None or self.find_tpdo(self.voltage) is None:
             return ()
         return (self.voltage, self.dc_link) if self.dc_link is not None and self._link_is_heard else (self.voltage,)
@@ -172,16 +173,12 @@ class DriveProfile:
 
 
 def speed_unit_of(word: int | None) -> SpeedUnit | None:
-    """Return the unit that 0x60A9 names: prefix, numerator and denominator of CiA 303-2; None for any other.
+    """Decode the unit in 0x60A9: prefix, numerator and denominator of CiA 303-2; None for any other.
 
     >>> speed_unit_of(0x00B44700), speed_unit_of(0xFDB44700), speed_unit_of(0x00B50300)
     ('rpm', 'millirpm', 'increments_per_s')
     """
-    units: dict[int | None, SpeedUnit] = {
-        0x00B44700: "rpm",
-        0xFDB44700: "millirpm",
-        0x00B50300: "increments_per_s",
-    }
+    units: dict[int | None, SpeedUnit] = {0x00B44700: "rpm", 0xFDB44700: "millirpm", 0x00B50300: "increments_per_s"}
     return units.get(word)
 
 

@@ -1,7 +1,7 @@
 """Reads drive profiles: packaged ones by name, the user's own from a TOML file, the generic one from an EDS.
 
-A file may begin with ``base = "epos4"``: what it does not say is then that profile's. A table or list that it gives
-(``rpdos``, ``tpdos``) takes the place of the other's as a whole.
+A file may begin with ``base = "epos4"``: other keys are then inherited from that profile. A table or list (``rpdos``,
+``tpdos``) replaces the inherited one as a whole.
 """
 
 import tomllib
@@ -33,45 +33,47 @@ _KINDS: Mapping[str, TypeAdapter[Any]] = {
 def load_profile(drive: Drive) -> DriveProfile:
     """Return the profile that ``[axis.X.drive]`` names, for that axis of its device.
 
-    ConfigError when its file cannot be read, or says what no profile can, or maps less than must be heard. A process
-    reads a file once: what is changed on disk counts from its next start.
+    ConfigError when its file is unreadable or invalid, or maps too little. A process reads a file once: changes on disk
+    take effect at its next start.
     """
     profile = read_profile(drive.profile, drive.eds)
     if drive.source == "hal" and drive.hal is not None and drive.hal.voltage is None:
         profile = replace(profile, voltage=None)
     if deaf := profile.unheard:
-        what = f"no TPDO of every SYNC carries its {', '.join(deaf)}"
+        what = f"no TPDO with every SYNC carries its {', '.join(deaf)}"
         raise _fault(
-            profile.name, "tpdos", what, "`fdhil eds` tells what the drive has; base a profile of your own on it"
+            profile.name, "tpdos", what, "`fdhil eds` shows what the drive offers; write your own profile by it"
         )
     if drive.logical_axis == profile.logical_axis:
         return profile
     if profile.logical_axis != 1:
-        what = f"it is of axis {profile.logical_axis} of its device, the configuration has {drive.logical_axis}"
+        what = f"it is for axis {profile.logical_axis} of its device, but the configuration has {drive.logical_axis}"
         raise _fault(profile.name, "logical_axis", what, "make both the same")
     return _of_axis(profile, drive.logical_axis)
 
 
 def require_offset(profile: DriveProfile, axis: str) -> None:
-    """ConfigError where the drive takes no offset: what to do instead."""
+    """Raise ConfigError with advice where the drive takes no offset."""
     if not profile.takes_offset:
         raise _fault("config", f"axis.{axis}.drive.profile", no_offset(profile), NO_OFFSET_ADVICE)
 
 
 def no_offset(profile: DriveProfile) -> str:
-    """Return why nothing can be added to the set-points of this drive."""
+    """Explain why nothing can be added to the set-points of this drive."""
     if profile.find_rpdo(profile.offset) is not None and profile.unshown:
         unseen = ", ".join(f"{index:04X}:{sub:02X}" for index, sub in profile.unshown)
-        return f"profile {profile.name} maps {unseen} into no TPDO, and no offset is sent that cannot be seen"
+        return (
+            f"profile {profile.name} maps {unseen} into no TPDO, and offsets are only sent where they can be read back"
+        )
     index, sub = profile.offset
     return f"profile {profile.name} maps no offset ({index:04X}:{sub:02X}) into a valid RPDO: none can be sent"
 
 
 @cache
 def read_profile(name: str, eds: Path | None = None) -> DriveProfile:
-    """Return a packaged or own profile by its name or path, also one that maps too little; ConfigError, EdsError.
+    """Return a profile by its packaged name or path, complete or not; ConfigError, EdsError.
 
-    With the drive's EDS it maps what that offers, and no more.
+    With the drive's EDS it is reduced to what that offers.
     """
     document, title = _document(name), name if name in tables.DRIVE_PROFILES else Path(name).stem
     if "tpdos" not in document and "rpdos" not in document:
@@ -85,35 +87,35 @@ def read_profile(name: str, eds: Path | None = None) -> DriveProfile:
 
 
 def _mapped(document: Mapping[str, Any], name: str, eds: Path | None) -> dict[str, Any]:
-    """Return a profile that names no PDOs with those that its EDS offers; ConfigError without an EDS."""
     if eds is None:
-        advice = "give drive.eds, the file that the drive's maker has for it"
-        raise _fault(name, "tpdos", "are not in this profile, and there is no EDS to take them from", advice)
+        advice = "set drive.eds to the vendor's file for the drive"
+        raise _fault(name, "tpdos", "are missing in this profile, and there is no EDS to derive them from", advice)
     device = read_device(eds)
-    told: dict[str, Any] = {"vendor_id": device.vendor_id or None}
+    defaults: dict[str, Any] = {"vendor_id": device.vendor_id or None}
     if unit := speed_unit_of(device.default(Object.VELOCITY_UNIT)):
-        told["speed_unit"] = unit
+        defaults["speed_unit"] = unit
     if not device.find((0x6078, 0)) and "current" not in document:
-        told |= {"current": (0x6077, 0), "current_unit": "permille_of_rated_torque"}
-    said = told | dict(document)
-    bare = profile_of(said | {"rpdos": (), "tpdos": ()}, name, name)
+        defaults |= {"current": (0x6077, 0), "current_unit": "permille_of_rated_torque"}
+    complete = defaults | dict(document)
+    bare = profile_of(complete | {"rpdos": (), "tpdos": ()}, name, name)
     fast = (bare.position, bare.speed, bare.statusword, bare.current, bare.voltage, bare.dc_link)
     slow = (bare.position_demand, bare.offset, (int(Object.MODE_DISPLAY), 0), bare.digital_inputs)
     rpdos = suggest_rpdos(device, bare.target, bare.offset, (bare.speed_offset, bare.torque_offset))
     tpdos = suggest_tpdos(device, [key for key in fast if key is not None], slow)
-    return said | {"rpdos": rpdos, "tpdos": tpdos}
+    return complete | {"rpdos": rpdos, "tpdos": tpdos}
 
 
 def _document(name: str, depth: int = 0) -> dict[str, Any]:
-    """Read the file of a profile, and those it is based on."""
     if depth > MOST_BASES:
-        raise _fault(name, "base", "its bases have no end", "base it on a packaged profile")
+        raise _fault(name, "base", "is nested too deeply, or circular", "base it on a packaged profile")
     document = _toml(name)
     base = document.pop("base", None)
     if base is None:
         return document
     if not isinstance(base, str) or (base not in tables.DRIVE_PROFILES and not base.endswith(".toml")):
-        raise _fault(name, "base", f"is no profile: {str(base)[:60]!r}", f"one of {', '.join(tables.DRIVE_PROFILES)}")
+        raise _fault(
+            name, "base", f"is not a profile: {str(base)[:60]!r}", f"one of {', '.join(tables.DRIVE_PROFILES)}"
+        )
     if base.endswith(".toml"):
         base = str(Path(name).parent / base)
     return _document(base, depth + 1) | document
@@ -128,13 +130,13 @@ def _toml(name: str) -> dict[str, Any]:
 
 
 def profile_of(document: Mapping[str, Any], name: str, source: str) -> DriveProfile:
-    """Build a profile from the tables of its file; ConfigError with every fault and its place."""
+    """Build a profile from the tables of its file; ConfigError with every fault and its location."""
     faults: list[ConfigFault] = []
     values: dict[str, Any] = {}
     known = {field.name for field in fields(DriveProfile)} - {"name"}
     for key, given in document.items():
         if key not in known:
-            faults.append(ConfigFault(key, "is no key of a profile", f"one of {', '.join(sorted(known))}"))
+            faults.append(ConfigFault(key, "is not a key of a profile", f"one of {', '.join(sorted(known))}"))
         elif key not in ("rpdos", "tpdos"):
             try:
                 values[key] = _KINDS[key].validate_python(given)
@@ -162,9 +164,8 @@ def _pdos(given: Any, kind: str, faults: list[ConfigFault]) -> tuple[PdoSpec, ..
 
 
 def _pdo(table: Mapping[str, Any]) -> PdoSpec:
-    """Lay the entries (index, sub-index, bits, signed) out; the PDO's number is the digits at the end of its name."""
     if unknown := table.keys() - _PDO_KEYS:
-        raise ValueError(f"{', '.join(sorted(unknown))} is no key of a PDO")
+        raise ValueError(f"{', '.join(sorted(unknown))} is not a key of a PDO")
     name = str(table["name"])
     digits = name.removeprefix(name.rstrip("0123456789"))
     if not digits or not 1 <= int(digits) <= 512:
@@ -181,15 +182,15 @@ def _pdo(table: Mapping[str, Any]) -> PdoSpec:
 def _entry(given: Sequence[Any]) -> tuple[int, int, int, bool]:
     index, sub, bits, signed = given
     if not 1 <= index <= 0xFFFF or not 0 <= sub <= 0xFF or not 1 <= bits <= 64 or type(signed) is not bool:
-        raise ValueError(f"{list(given)} is no [index, sub-index, bits, signed]")
+        raise ValueError(f"{list(given)} is not [index, sub-index, bits, signed]")
     return int(index), int(sub), int(bits), signed
 
 
 def _of_axis(profile: DriveProfile, number: int) -> DriveProfile:
-    """Return the profile of the ``number``-th axis of one device, made of that of the first.
+    """Return the profile of a device's ``number``-th axis, derived from that of the first.
 
-    Its objects are 0x800 higher (CiA 402-2), its PDOs 64 higher (CiA 402-3), and their COB-IDs those of the node-ID
-    that many higher, which the device must be set to: CiA 301 has no default for them.
+    Its objects are 0x800 higher (CiA 402-2), its PDOs 64 higher (CiA 402-3), and their COB-IDs those of a node-ID that
+    much higher, which the device must be set to: CiA 301 has no default for them.
     """
     places = [field.name for field in fields(profile) if isinstance(getattr(profile, field.name), tuple)]
     keys = [name for name in places if name not in ("rpdos", "tpdos", "notes", "strict_abort_options")]

@@ -1,4 +1,4 @@
-"""Reads a voltage sensor that keeps its newest samples by number, at the registers that the configuration names."""
+"""Reads a voltage sensor that numbers its newest samples, at the configured registers."""
 
 import math
 
@@ -25,23 +25,22 @@ class BlockVoltage(ModbusVoltage):
         self._newest: int | None = None
 
     async def latch(self) -> None:
-        """Have the newest samples put into the registers, where the sensor must be told."""
         if self._map.trigger_address is not None:
             await self.link.write(self._map.trigger_address, 1)
 
     async def block(self) -> SensorBlock:
-        """Read samples and count with one request; ProtocolError when they cannot be."""
+        """Read samples and count with one request; ProtocolError when they are implausible."""
         settings, block = self._settings, self._map
         registers = await self.link.read(settings.function, self._first, self._registers)
 
         def words(address: int, count: int) -> list[int]:
             return registers[address - self._first : address - self._first + count]
 
-        held = block.samples if block.count_address is None else words(block.count_address, 1)[0]
-        if held > block.samples:
-            text = f"register {block.count_address} tells {held} samples in a block of {block.samples}"
+        available = block.samples if block.count_address is None else words(block.count_address, 1)[0]
+        if available > block.samples:
+            text = f"register {block.count_address} gives {available} samples in a block of {block.samples}"
             raise ProtocolError(self.name, f"{text}; compare voltage.block with the sensor's register map")
-        raw = numbers(words(settings.address, held * registers_of(self._kind)), self._kind, *self._orders)
+        raw = numbers(words(settings.address, available * registers_of(self._kind)), self._kind, *self._orders)
         raw = raw[::-1] if block.newest_first else raw
         volts = settings.scale * raw + settings.offset
         if not all(math.isfinite(v) and abs(v) <= self.limit_v for v in volts):
@@ -50,17 +49,17 @@ class BlockVoltage(ModbusVoltage):
             text += "; compare type, word_order, byte_order and scale with its register map"
             raise ProtocolError(self.name, text)
         count = registers_of(block.counter_type)
-        told = int(numbers(words(block.counter_address, count), block.counter_type, *self._orders)[0])
-        newest = self._unwrapped(told + (held - 1 if block.counter_of == "oldest" else 0))
-        if block.count_address is not None and newest + 1 < held:  # it had begun anew before it was first asked
+        counted = int(numbers(words(block.counter_address, count), block.counter_type, *self._orders)[0])
+        newest = self._unwrapped(counted + (available - 1 if block.counter_of == "oldest" else 0))
+        if block.count_address is not None and newest + 1 < available:  # it had wrapped before the first poll
             self._newest = newest = newest + self._modulus
-        held = min(held, newest + 1)  # fewer, just switched on
-        volts = volts[volts.size - held :]
-        shown = float(volts[-1]) if held else 0.0
-        return SensorBlock(newest, block.rate_hz, math.nan, False, newest + 1 - held, frozen(volts), shown)
+        available = min(available, newest + 1)  # fewer, just switched on
+        volts = volts[volts.size - available :]
+        shown = float(volts[-1]) if available else 0.0
+        return SensorBlock(newest, block.rate_hz, math.nan, False, newest + 1 - available, frozen(volts), shown)
 
     def _unwrapped(self, newest: int) -> int:
-        """Go on counting where the sensor's count begins anew at 0; one that fell otherwise was restarted."""
+        """Continue the count where the sensor's wraps to 0; any other decrease is a restart."""
         if self._newest is not None:
             ahead = (newest - self._newest) % self._modulus
             newest = self._newest + ahead if ahead < self._modulus // 2 else newest

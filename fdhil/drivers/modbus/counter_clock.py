@@ -1,10 +1,10 @@
 """Places the samples of a free-running counter on a timeline, from bounds. Pure.
 
-Each query tells that sample ``counter`` had just been completed at some instant between asking and answer. So all
-queries together leave a narrow band of lines counter -> time, and its middle is the estimate; slow queries bound little
-and do no harm (the idea of Klipper's clock synchronisation, with intervals instead of a regression, because delays are
-one-sided and not normal). The timeline may be the host's clock in ns or the SYNC count:
-a simulated machine that is held up stops both its SYNC and its sensor, and only the SYNC count stays true.
+Each query shows that sample ``counter`` had just been completed at some instant between request and answer. All queries
+together leave a narrow band of lines counter -> time, whose middle is the estimate; slow queries constrain little and
+do no harm (the idea of Klipper's clock synchronisation, with intervals instead of a regression, because delays are
+one-sided and not normal). The timeline may be the host's clock in ns or the SYNC count: a paused simulated machine
+stops both its SYNC and its sensor, and only the SYNC count stays valid.
 """
 
 from collections import deque
@@ -34,7 +34,7 @@ class Line:
 
 
 class CounterClock:
-    """Gathers queries; ``step`` is the nominal length of one sample on the timeline."""
+    """Collects queries; ``step`` is the nominal length of one sample on the timeline."""
 
     def __init__(self, step: float) -> None:
         self._step = step
@@ -43,27 +43,27 @@ class CounterClock:
     def add(self, counter: int, asked: float, answered: float) -> None:
         """Add one query: ``counter`` is the newest complete sample, ``asked`` <= ``answered`` lie on the timeline.
 
-        A counter that fell means that the sensor was restarted: what was known of it is forgotten.
+        A counter that decreased means that the sensor was restarted: earlier queries are dropped.
         """
         if self._queries and counter < self._queries[-1][0]:
             self._queries.clear()
         self._queries.append((counter, asked, answered))
 
     def line(self) -> Line | None:
-        """Return the middle of the band that most queries agree on, None before the first query."""
+        """Return the middle of the band on which most queries agree, None before the first query."""
         if not self._queries:
             return None
         counter, asked, answered = (np.array(column) for column in zip(*self._queries, strict=True))
         origin = int(counter[-1])
         step, slope_error = self._rate(counter, asked, answered)
         begun = step * (counter - origin)
-        # sample c is complete at start + step (c - origin + 1), and c + 1 is not yet
+        # sample c is complete at start + step (c - origin + 1), sample c + 1 is not
         low, high = _agreed(asked - begun - 2 * step, answered - begun - step)
         return Line(origin, (low + high) / 2, step, max((high - low) / 2, step * 1e-3) + slope_error)
 
     def _rate(self, counter: Int, asked: Float, answered: Float) -> tuple[float, float]:
-        """Slope through the quickest half of the queries, kept within quartz tolerance of the nominal step, and twice
-        its standard error over the span of all queries."""
+        """Return the slope through the quickest half of the queries, limited to quartz tolerance about the nominal
+        step, and twice its standard error over the span of all queries."""
         span = float(counter[-1] - counter[0])
         nominal = self._step, self._step * RATE_TOLERANCE * span
         if counter.size < _SLOPE_QUERIES:
@@ -84,9 +84,9 @@ class CounterClock:
 
 
 def _agreed(low: Float, high: Float) -> tuple[float, float]:
-    """Return the smallest span that lies in the most of the intervals [low, high] (n,): Marzullo's algorithm.
+    """Return the smallest span common to the most of the intervals [low, high] (n,): Marzullo's algorithm.
 
-    A few queries that lie (a stamp that was late because the computer was) are outvoted instead of believed.
+    A few wrong queries (a stamp that was late because the computer was busy) are outvoted.
     """
     edges = np.concatenate([low, high])
     change = np.concatenate([np.ones(low.size), -np.ones(high.size)])

@@ -1,4 +1,4 @@
-"""What a line to one or more Modbus units is, what it is asked, and what can go wrong with the answer."""
+"""The interface of a line to one or more Modbus units: requests, answers and faults."""
 
 from collections import Counter
 from collections.abc import MutableSet
@@ -22,7 +22,7 @@ EXCEPTIONS = {
 }
 ADVICE = {
     **dict.fromkeys((1, 2, 3), "compare the register map with the config"),
-    **dict.fromkeys((5, 6), "ask it less often"),
+    **dict.fromkeys((5, 6), "poll it less often"),
     10: "check the gateway's own settings",
     11: "check unit, and the line behind the gateway",
 }
@@ -34,12 +34,12 @@ class ModbusRefused(ProtocolError):
     def __init__(self, device: str, address: int, code: int) -> None:
         self.code = code
         what = EXCEPTIONS.get(code, f"exception {code}")
-        advice = ADVICE.get(code, "check the device: the fault is its own")
+        advice = ADVICE.get(code, "check the device itself")
         super().__init__(device, f"register {address} is refused ({what}); {advice}")
 
 
 class DamagedAnswer(ProtocolError):
-    """What came is not the answer; ``kind`` is the class that the operator sees."""
+    """An invalid answer; ``kind`` is the notice code."""
 
     def __init__(self, device: str, kind: str, text: str) -> None:
         self.kind = kind
@@ -59,7 +59,7 @@ class Request:
 
     @property
     def count(self) -> int:
-        """How many bits or registers the answer must have."""
+        """Number of bits or registers in the answer."""
         return 0 if self.function == WRITE_REGISTER else self.value
 
 
@@ -80,8 +80,8 @@ def no_answer(request: Request, advice: str = "check the device and its line") -
 
 
 class Line(Protocol):
-    """A way to units: one request at a time, whoever asks. ``users`` are the links that want it to stand; ``counted``
-    counts the faults by class that it got over by itself."""
+    """A line to units: one request at a time, whoever the client. ``users`` are the units that need the line;
+    ``fault_counts`` counts recovered faults by code."""
 
     place: str
     users: MutableSet[object]
@@ -89,13 +89,13 @@ class Line(Protocol):
 
     @property
     def connected(self) -> bool:
-        """Whether it stands."""
+        """Whether it is established."""
 
     async def connect(self, name: str, timeout_s: float) -> None:
-        """Connect where it does not stand; ConnectError with what ``name`` lacks."""
+        """Connect if not yet connected; ConnectError names the sensor ``name``."""
 
     async def ask(self, request: Request) -> Answer:
-        """Wait for the line, ask and return the answer; DeviceError."""
+        """Wait for the line, send the request and return the answer; DeviceError."""
 
     def close(self) -> None:
         """End the connection."""

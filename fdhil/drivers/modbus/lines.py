@@ -1,4 +1,4 @@
-"""One line per device: two sensors on it must wait for each other, wherever they were made."""
+"""Shares one line per device: two sensors on it must wait for each other, wherever they were created."""
 
 import asyncio
 from collections.abc import Hashable
@@ -13,13 +13,13 @@ _IN_USE: WeakValueDictionary[Hashable, Line] = WeakValueDictionary()
 
 
 def line_to(place: ModbusPlace) -> Line:
-    """Return the line to a device: the one that is in use, else a new one, not yet connected."""
+    """Return the line to a device: the existing one, else a new one, not yet connected."""
     where = (
         (place.device, place.baud_rate, place.parity, place.stop_bits)
         if place.device
         else (place.host, place.port, place.framing)
     )
-    key = (_running_loop(), where)  # a line waits within one event loop
+    key = (_running_loop(), where)  # a line belongs to one event loop
     line = _IN_USE.get(key)
     if line is None:
         line = RtuLine(place) if place.is_rtu else TcpLine(place.host, place.port)

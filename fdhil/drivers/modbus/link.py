@@ -1,4 +1,4 @@
-"""Asks one Modbus unit, over TCP or over the serial line that it shares with others."""
+"""Communicates with one Modbus unit, over TCP or over the serial line that it shares with others."""
 
 from collections.abc import Mapping
 
@@ -8,13 +8,13 @@ from fdhil.drivers.modbus.lines import line_to
 from fdhil.drivers.modbus.rtu import READ_INPUT, WRITE_REGISTER
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
 
-PLAUSIBLE_C = (-50.0, 150.0)  # of a slide-way; NaN is outside, too
+PLAUSIBLE_C = (-50.0, 150.0)  # of a slide-way; NaN fails the comparison, too
 
 
 class ModbusLink:
     """A connection to one unit; ``name`` is used in messages. ``line`` is shared with others on the same device.
 
-    ``asked_ns`` and ``answered_ns`` enclose the instant at which the unit last read its registers for an answer.
+    ``asked_ns`` and ``answered_ns`` enclose the time at which the unit last read its registers.
     """
 
     wire = "modbus"
@@ -29,17 +29,15 @@ class ModbusLink:
 
     @property
     def counted(self) -> Mapping[str, int]:
-        """The faults by class that the line got over, whoever asked."""
+        """Recovered faults of the line by code, for all its users."""
         return self.line.counted
 
     async def connect(self) -> None:
-        """Connect where the line does not stand; ConnectError when nobody answers there."""
         self.line.users.add(self)
         await self.line.connect(self.name, self._timeout_s)
 
     @property
     def connected(self) -> bool:
-        """Whether the line stands and is used by this link."""
         return self in self.line.users and self.line.connected
 
     async def read_input(self, address: int, count: int) -> list[int]:
@@ -54,7 +52,6 @@ class ModbusLink:
         return list((await self._ask(function, address, count)).registers)
 
     async def write(self, address: int, value: int) -> None:
-        """Write one holding register."""
         await self._ask(WRITE_REGISTER, address, value)
 
     async def _ask(self, function: int, address: int, value: int) -> Answer:
@@ -64,7 +61,7 @@ class ModbusLink:
         return answer
 
     def fault_code(self, error: DeviceError) -> str | None:
-        """Return the class under which ``error`` is told; None for a unit that is only busy."""
+        """Return the notice code of ``error``; None for a unit that is only busy."""
         if isinstance(error, ModbusRefused):
             return None if error.code == BUSY else "ModbusException"
         if isinstance(error, DamagedAnswer):
@@ -74,7 +71,7 @@ class ModbusLink:
         return "ModbusPortGone" if isinstance(error, ConnectError) else "ModbusShape"
 
     def close(self) -> None:
-        """End the connection, where no other sensor uses the line."""
+        """Close the connection, where no other sensor uses the line."""
         self.line.users.discard(self)
         if not self.line.users:
             self.line.close()

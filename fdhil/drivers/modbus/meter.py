@@ -1,29 +1,26 @@
-"""A value in the registers of a Modbus unit: its newest, whenever it is asked."""
+"""Reads one value, the newest, from the registers of a Modbus unit."""
 
 import math
 
-from fdhil.config.sensors import ModbusPlace, ValueType
 from fdhil.drivers.modbus.link import ModbusLink
-from fdhil.drivers.modbus.values import LIKELY, SMALLEST, ValuePlace, numbers, other_orders, registers_of
+from fdhil.drivers.modbus.values import LIKELY, SMALLEST, RegisterSensor, numbers, other_orders, registers_of
 from fdhil.errors import ProtocolError
 
 
 class ModbusMeter:
-    """One value of a unit, of type ``kind``, read with one request so that it is not torn; no right one is ``most``."""
+    """One value of a unit, read with one request so that it is not torn; valid values are below ``most``."""
 
     tells_by_itself = False
 
-    def __init__(
-        self, name: str, place: ModbusPlace, where: ValuePlace, kind: ValueType, most: float = LIKELY[1]
-    ) -> None:
+    def __init__(self, name: str, settings: RegisterSensor, most: float = LIKELY[1]) -> None:
+        assert settings.type is not None
         self.name = name
-        self.link = ModbusLink(name, place)
-        self._where, self._kind, self._most = where, kind, most
+        self.link = ModbusLink(name, settings)
+        self._where, self._kind, self._most = settings, settings.type, most
         self.asked_ns = self.answered_ns = 0
         self._registers: list[int] = []
 
     async def value(self) -> float:
-        """Return the value, scaled; DeviceError of the link, ProtocolError for what is no number."""
         where = self._where
         registers = await self.link.read(where.function, where.address, registers_of(self._kind))
         self._registers = registers
@@ -34,7 +31,6 @@ class ModbusMeter:
         return where.scale * raw + where.offset
 
     def doubt(self, shown: str) -> str:
-        """Return what is to be told of a value that cannot be."""
         where = self._where
         text = f"register {where.address} gives {shown} as {self._kind}"
         text += other_orders(self._registers, self._kind, where, self._most)

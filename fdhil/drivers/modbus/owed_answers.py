@@ -1,7 +1,7 @@
-"""Which answers of RTU units may still come, after their requests were given up. Pure.
+"""Tracks answers of RTU units that may still come after their requests were given up. Pure.
 
 An RTU answer names its unit and function, not its request, so a late answer fits the next request of the same shape,
-and then each answer is taken for the one before. A unit answers in order: what it answers to one request settles all
+and every later answer is then taken for the one before. A unit answers in order: its answer to one request settles all
 requests before it.
 """
 
@@ -10,31 +10,29 @@ from dataclasses import replace
 from fdhil.drivers.modbus.line import Request
 from fdhil.drivers.modbus.rtu import BIT_READS, READ_HOLDING, WRITE_REGISTER, data_bytes, find_answer
 
-FORGOTTEN_S = 10.0  # an answer that is so late comes no more
+FORGOTTEN_S = 10.0  # later answers do not occur
 _MOST_COUNT = 120
 _END = 1 << 16
 
 
 class OwedAnswers:
-    """The requests that may still be answered, the oldest first: one is added as it is sent."""
+    """The requests that may still be answered, the oldest first; each is added as it is sent."""
 
     def __init__(self) -> None:
         self._owed: list[tuple[Request, int]] = []
 
     def __bool__(self) -> bool:
-        """Whether there are any."""
         return bool(self._owed)
 
     def add(self, request: Request, now_ns: int) -> None:
-        """Add a request."""
         self._owed.append((request, now_ns + round((FORGOTTEN_S + 2 * request.timeout_s) * 1e9)))
 
     def forget(self, now_ns: int) -> None:
-        """Drop those whose answer comes no more."""
+        """Drop requests whose answer can no longer come."""
         self._owed = [(request, until_ns) for request, until_ns in self._owed if until_ns > now_ns]
 
     def settle(self, data: bytes) -> bool:
-        """Drop what the bytes answer, and what the same unit was asked before; return whether they answer any."""
+        """Drop the request that the bytes answer, and the same unit's earlier ones; return whether there was one."""
         for place, (request, _) in enumerate(self._owed):
             if find_answer(data, request.unit, request.function, request.count) is not None:
                 kept = [owed for k, owed in enumerate(self._owed) if k > place or owed[0].unit != request.unit]
@@ -43,19 +41,19 @@ class OwedAnswers:
         return False
 
     def settle_unit(self, unit: int, *, certain: bool = True) -> None:
-        """Drop all of a unit: it answered the newest. Not ``certain``: its answer may have been to one before that."""
+        """Drop all requests of a unit, which answered the newest, or, if not ``certain``, the one before."""
         own = [owed for owed in self._owed if owed[0].unit == unit]
         kept = own[-1:] if not certain and len(own) > 1 else []
         self._owed = [owed for owed in self._owed if owed[0].unit != unit] + kept
 
     def hide(self, request: Request) -> bool:
-        """Whether an answer that is owed could be taken for the one to ``request``."""
+        """Return whether an outstanding answer could be taken for the one to ``request``."""
         return any(_shape(owed) == _shape(request) for owed, _ in self._owed)
 
     def probe_for(self, request: Request) -> Request | None:
-        """Return a request whose answer no other can be taken for; None while the unit owes all that could be asked.
+        """Return a request whose answer cannot be confused with an outstanding one; None if there is none.
 
-        It reads from the same address, where it can fewer registers: what is read by it has no effect.
+        It reads from the same address, fewer registers where possible; its data are discarded.
         """
         count, step = request.count, 8 if request.function in BIT_READS else 1
         function = READ_HOLDING if request.function == WRITE_REGISTER else request.function
@@ -68,5 +66,4 @@ class OwedAnswers:
 
 
 def _shape(request: Request) -> tuple[int, int, int]:
-    """Return what an answer shows of its request."""
     return request.unit, request.function, data_bytes(request.function, request.count)

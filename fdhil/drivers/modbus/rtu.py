@@ -1,4 +1,4 @@
-"""The frames of Modbus RTU: what is asked, and what of the bytes that came is the answer. Pure.
+"""Builds and recognises Modbus RTU frames. Pure.
 
 Source: MODBUS over serial line, specification and implementation guide V1.02, 2.5.1.
 """
@@ -15,7 +15,7 @@ _ECHO_BYTES, _EXCEPTION_BYTES, _LEAST_BYTES = 8, 5, 5
 
 
 def crc16(data: bytes) -> int:
-    """Return the checksum, its low byte in the upper half; over a frame with its own behind it is 0.
+    """Return the checksum, its low byte in the upper half; over a frame with its checksum it is 0.
 
     >>> hex(crc16(bytes.fromhex("01 04 00 00 00 02")))
     '0x71cb'
@@ -30,7 +30,7 @@ def framed(unit: int, body: bytes) -> bytes:
 
 
 def data_bytes(function: int, count: int) -> int:
-    """Return how many bytes ``count`` bits or registers take in an answer.
+    """Return the bytes that ``count`` bits or registers take in an answer.
 
     >>> data_bytes(READ_COILS, 9), data_bytes(READ_INPUT, 9)
     (2, 18)
@@ -39,7 +39,7 @@ def data_bytes(function: int, count: int) -> int:
 
 
 def numbers_in(data: bytes, function: int, count: int) -> tuple[int, ...]:
-    """Return the bits (0 or 1) or the registers that the data of an answer hold.
+    """Unpack the bits (0 or 1) or the registers of an answer's data.
 
     >>> numbers_in(bytes([0b101]), READ_COILS, 3)
     (1, 0, 1)
@@ -50,14 +50,14 @@ def numbers_in(data: bytes, function: int, count: int) -> tuple[int, ...]:
 
 
 def answer_bytes(function: int, count: int) -> int:
-    """Return how long the answer to a request for ``count`` bits or registers, or to a write, must be."""
+    """Return the length of the answer to a request for ``count`` bits or registers, or to a write."""
     return 5 + data_bytes(function, count) if function in _READS else _ECHO_BYTES
 
 
 def find_answer(data: bytes, unit: int, function: int, count: int) -> bytes | None:
-    """Return function and data of the unit's answer, wherever it begins; None while it is not all there.
+    """Return function and data of the unit's answer, wherever it begins; None while it is incomplete.
 
-    An adapter that hears its own request, and the noise of a driver that is switched on, come before it.
+    It may follow the echo of the request, or the noise of a driver that is switched on.
     """
     wanted = answer_bytes(function, count)
     at = -1
@@ -73,7 +73,7 @@ def find_answer(data: bytes, unit: int, function: int, count: int) -> bytes | No
 
 
 def is_damaged(data: bytes, unit: int, function: int, count: int) -> bool:
-    """Whether bytes in which there is no answer are what became of it, so that no other will come.
+    """Return whether bytes without an answer are a damaged one, so that no other will come.
 
     Less than a whole frame may be noise, with the answer still to come.
     """
@@ -84,27 +84,28 @@ def is_damaged(data: bytes, unit: int, function: int, count: int) -> bool:
 
 
 def fault_in(data: bytes, unit: int, function: int, count: int) -> tuple[str, str]:
-    """Return class and words of what is wrong with bytes in which there is no answer."""
+    """Return notice code and description of the fault in bytes without an answer."""
     whole = _whole_frame(data)
     if whole and data[0] != unit:
         return "ModbusUnit", foreign_unit(data[0], unit)
     wanted = data_bytes(function, count)
     if whole and data[1] == function and function in _READS and data[2] != wanted:
-        return "ModbusShape", f"{data[2]} bytes came for {wanted} asked; check that one client asks at a time"
+        return "ModbusShape", f"{data[2]} bytes came instead of {wanted}; check that only one client sends requests"
     if len(data) >= answer_bytes(function, count) and data[:2] == bytes([unit, function]):
-        return "ModbusCrc", "an answer came damaged; check shield, termination and the baud rate of the line"
-    text = f"{len(data)} bytes came that are no answer; check baud rate, parity and that one client asks at a time"
+        return "ModbusCrc", "a damaged answer came; check shield, termination and the baud rate of the line"
+    text = (
+        f"{len(data)} bytes came that are not an answer; check baud rate, parity and that only one client "
+        "sends requests"
+    )
     return "ModbusShape", text
 
 
 def foreign_unit(answering: int, asked: int) -> str:
-    """Return the words for an answer of a unit that was not asked."""
-    text = f"unit {answering} answers where unit {asked} was asked; give unit = {answering}"
-    return f"{text} where that is the device, or check that no two have one number"
+    text = f"unit {answering} answered instead of unit {asked}; set unit = {answering}"
+    return f"{text} if that is the device, or check that no two have the same number"
 
 
 def _whole_frame(data: bytes) -> bool:
-    """Whether the bytes are one frame of whichever unit."""
     if len(data) < _LEAST_BYTES:
         return False
     size = 5 + data[2] if data[1] in _READS else _EXCEPTION_BYTES if data[1] & ERROR else _ECHO_BYTES

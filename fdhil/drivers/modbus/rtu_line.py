@@ -1,10 +1,10 @@
-"""A serial line with Modbus RTU units: one request at a time, silent intervals kept, late and foreign answers told.
+"""A serial line with Modbus RTU units: one request at a time, silent intervals, late and foreign answers detected.
 
-An answer names its unit and function but not what was asked. So what comes unasked is thrown away before the next
-request, and after a request that was not answered in time the line is heard for as long again before anybody asks. An
-answer that is later still is told by its shape: while one is owed, nothing of the same shape is asked before the unit
-has answered a probe of another shape (:mod:`fdhil.drivers.modbus.owed_answers`).
-Noise, or a piece, is no answer: ours may still come, and must not be taken for that of the next request.
+An answer names its unit and function but not its request. So unrequested bytes are discarded before each request, and
+after a request that was not answered in time the line is monitored for as long again. An answer that is later still is
+recognised by its shape: while one is outstanding, no request of the same shape is sent before the unit has answered a
+probe of another shape (:mod:`fdhil.drivers.modbus.outstanding_answers`). Noise, or a fragment, is not an answer:
+the real one may still come, and must not be taken for the next request's.
 """
 
 import asyncio
@@ -34,12 +34,12 @@ from fdhil.drivers.serial.server_port import ServerPort
 
 RETRIES = 2
 SILENT_CHARACTERS = 3.5
-SILENT_ABOVE_19200_S = 1.75e-3  # fixed there, "MODBUS over serial line" 2.5.1.1
+SILENT_ABOVE_19200_S = 1.75e-3  # constant by "MODBUS over serial line" 2.5.1.1
 FASTEST_BY_CHARACTERS = 19200
-NETWORK_S = 0.2  # and so far where a serial server packs them
-ADAPTER_S = 0.02  # bytes of one frame may come so far apart: a USB adapter hands them over every 16 ms
+NETWORK_S = 0.2  # gap between bytes of a serial server
+ADAPTER_S = 0.02  # gap between bytes of one frame: a USB adapter delivers every 16 ms
 _REQUEST_BYTES = 8
-MOST_BYTES = 512  # two frames of the longest: what is kept of what is no answer
+MOST_BYTES = 512  # two longest frames: kept of invalid bytes
 
 
 class RtuLine:
@@ -62,23 +62,21 @@ class RtuLine:
 
     @property
     def connected(self) -> bool:
-        """Whether the device is open."""
         return self._port.is_open
 
     async def connect(self, name: str, timeout_s: float) -> None:
-        """Open the device where it is not; ConnectError."""
         async with self._turn:
             if not self._port.is_open:
                 await self._port.connect(name, timeout_s)
 
     async def ask(self, request: Request) -> Answer:
-        """Ask and return the answer; what came damaged is asked for again, what did not come is not."""
+        """Send the request and return the answer; it is repeated after a damaged answer, not after a missing one."""
         async with self._turn:
             for left in range(RETRIES, -1, -1):
                 try:
                     return await self._exchange(request)
                 except DamagedAnswer as error:
-                    if error.kind == "ModbusUnit":  # counted when it came, and waited out
+                    if error.kind == "ModbusUnit":  # already counted, and waited for
                         raise
                     self.counted[error.kind] += 1
                     if not left:
@@ -92,7 +90,7 @@ class RtuLine:
         return await self._transact(request)
 
     async def _resynchronise(self, request: Request) -> None:
-        """Have the unit answer what no late answer can be taken for; DeviceTimeout while it does not."""
+        """Have the unit answer a probe of unmistakable shape; DeviceTimeout while it does not."""
         probe = self._owed.probe_for(request)
         if probe is not None:
             with contextlib.suppress(ModbusRefused):
@@ -104,13 +102,12 @@ class RtuLine:
             raise no_answer(request, self._advice)
 
     async def _transact(self, request: Request) -> Answer:
-        """Ask and return the answer, which settles what the unit was asked before."""
         await self._fall_silent()
         body = struct.pack(">BHH", request.function, request.address, request.value)
         frame = framed(request.unit, body)
         sent_ns = self._port.send(request.name, frame)
         self._busy_until_ns = asked_ns = sent_ns + self._port.wire_ns(_REQUEST_BYTES)
-        self._owed.add(request, sent_ns)  # whoever asked may be stopped before it is answered
+        self._owed.add(request, sent_ns)  # the caller may be cancelled before the answer
         self._late_until_ns = asked_ns + round(2 * request.timeout_s * 1e9)
         echo = b"" if request.function == WRITE_REGISTER else frame
         answer, answered_ns = await self._answer(request, asked_ns, echo)
@@ -122,7 +119,6 @@ class RtuLine:
         return Answer(registers, min(asked_ns, answered_ns), answered_ns)
 
     async def _late_answers(self, name: str) -> None:
-        """Hear the line after a request that was not answered, until the late answer is through or time is up."""
         stale, data = bool(self._port.discard()), b""
         self._owed.forget(time.monotonic_ns())
         while self._owed and time.monotonic_ns() < self._late_until_ns:
@@ -133,7 +129,6 @@ class RtuLine:
         self.counted["ModbusStale"] += stale or bool(data)
 
     async def _fall_silent(self) -> None:
-        """Wait until nothing was on the line for 3.5 characters, and forget what was."""
         while True:
             last_ns = max(self._busy_until_ns, self._port.last_ns)
             left_ns = last_ns + round(self.silence_s * 1e9) - time.monotonic_ns()
@@ -143,9 +138,9 @@ class RtuLine:
         self._port.discard()
 
     async def _answer(self, request: Request, asked_ns: int, echo: bytes) -> tuple[bytes, int]:
-        """Return the answer and when its first character came; DamagedAnswer, DeviceTimeout.
+        """Return the answer and the arrival of its first character; DamagedAnswer, DeviceTimeout.
 
-        ``echo``: what an adapter may hear of the request itself, and is no answer.
+        ``echo``: the request as an adapter may receive it back, which is skipped.
         """
         port, unit, function, count = self._port, request.unit, request.function, request.count
         data, first_ns = b"", 0
@@ -160,7 +155,7 @@ class RtuLine:
             if chunk is not None:
                 first_ns = first_ns or chunk.t_ns - port.wire_ns(len(chunk.data))
                 data = (data + chunk.data).removeprefix(echo)
-                # what began so early that it was all there before was looked at then: a line may babble for long
+                # earlier bytes were already searched: the line may babble for long
                 found = find_answer(data[-(len(chunk.data) + wanted) :], unit, function, count)
                 if found is not None:
                     return found, first_ns
@@ -169,9 +164,9 @@ class RtuLine:
             if data:
                 damaged = DamagedAnswer(request.name, *fault_in(data, unit, function, count))
                 if self._owed.settle(data):
-                    self.counted["ModbusStale"] += 1  # ours is still to come
+                    self.counted["ModbusStale"] += 1  # our answer is still to come
                 elif damaged.kind == "ModbusUnit":
-                    self.counted[damaged.kind] += 1  # it may have been asked by another master: ours may still come
+                    self.counted[damaged.kind] += 1  # another master may have asked: ours may still come
                     foreign = damaged
                 elif is_damaged(data, unit, function, count):
                     self._owed.settle_unit(unit, certain=False)
@@ -183,5 +178,4 @@ class RtuLine:
                 raise noise or foreign or no_answer(request, self._advice)
 
     def close(self) -> None:
-        """Release the device."""
         self._port.close()

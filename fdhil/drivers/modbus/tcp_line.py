@@ -1,8 +1,8 @@
-"""A Modbus TCP connection through pymodbus: our own deadline, one error per fault.
+"""A Modbus TCP connection through pymodbus, with its own deadline and one error per fault.
 
-pymodbus repeats a request by itself (12 s of silence by default), logs every fault at ERROR and closes the line after
-a few silent requests; none of it suits a sensor that is asked 20 times a second, so ``retries`` is 0 and its logger is
-quiet, and what an answer must be is checked here.
+pymodbus repeats requests by itself (12 s of silence by default), logs every fault at ERROR and closes the line after a
+few unanswered requests; none of it suits a sensor that is polled 20 times a second, so ``retries`` is 0, its logger is
+quiet, and answers are validated here.
 """
 
 import asyncio
@@ -28,10 +28,10 @@ from fdhil.drivers.modbus.rtu import (
 )
 from fdhil.errors import ConnectError, DeviceError
 
-CONNECT_S = 2.0  # beyond the time an answer may take
+CONNECT_S = 2.0  # in addition to the answer's time-out
 SILENT_ADVICE = "check the device and its line; a serial server that passes RTU frames needs framing = 'rtu'"
-ANY_UNIT = 0  # of a device that is not behind a gateway
-LIBRARYS_OWN_S = 100.0  # its one time-out for everything is longer than any of ours
+ANY_UNIT = 0  # of a device without a gateway
+LIBRARYS_OWN_S = 100.0  # its only time-out, longer than any of ours
 
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
@@ -41,8 +41,6 @@ class _Nonsense(ModbusException):
 
 
 class _OtherUnit(ModbusException):
-    """Another unit than the one that was asked answered the request; ``unit`` is its number."""
-
     def __init__(self, unit: int) -> None:
         super().__init__(f"unit {unit}")
         self.unit = unit
@@ -62,11 +60,9 @@ class TcpLine:
 
     @property
     def connected(self) -> bool:
-        """Whether the TCP connection stands."""
         return self._client is not None and bool(self._client.connected)
 
     async def connect(self, name: str, timeout_s: float) -> None:
-        """Connect where it does not stand; ConnectError when nobody answers there."""
         async with self._turn:
             if self.connected:
                 return
@@ -87,22 +83,19 @@ class TcpLine:
                 raise ConnectError(name, text)
 
     async def ask(self, request: Request) -> Answer:
-        """Ask and return the answer; DeviceError."""
         async with self._turn:
             asked_ns = time.monotonic_ns()
             answer = await self.answered(self._call(request), request)
             answered_ns = time.monotonic_ns()
         if answer.function_code != request.function:
-            text = (
-                f"function {answer.function_code} is answered where {request.function} was asked; compare host and port"
-            )
+            text = f"function {answer.function_code} was answered instead of {request.function}; compare host and port"
             raise DamagedAnswer(request.name, "ModbusShape", text)
         came = answer.bits if request.function in BIT_READS else answer.registers
         registers = tuple(map(int, came)) if request.count else ()
-        spare = -request.count % 8 if request.function in BIT_READS else 0  # bits come in whole bytes
+        spare = -request.count % 8 if request.function in BIT_READS else 0  # bits are padded to whole bytes
         if len(registers) != request.count + spare:
             what = "bits" if request.function in BIT_READS else "registers"
-            text = f"{len(registers)} {what} came for {request.count} asked; check that one client asks at a time"
+            text = f"{len(registers)} {what} came instead of {request.count}; check that only one client sends requests"
             raise DamagedAnswer(request.name, "ModbusShape", text)
         return Answer(registers[: request.count], asked_ns, answered_ns)
 
@@ -132,13 +125,13 @@ class TcpLine:
             raise DamagedAnswer(request.name, "ModbusUnit", foreign_unit(error.unit, request.unit)) from None
         except _Nonsense:
             self.close()
-            text = "what came is no answer of Modbus TCP, the connection is made anew; compare host and port"
+            text = "the answer is not Modbus TCP: the connection is restarted; compare host and port"
             raise DamagedAnswer(request.name, "ModbusShape", text) from None
         except ModbusException as error:
             raise self._silent(request) from error
         task = asyncio.current_task()
         if task is not None and task.cancelling():
-            # the library waits by wait_for, which in Python 3.11 forgets a cancellation that meets the answer
+            # the library uses wait_for, which in Python 3.11 loses a cancellation that meets the answer
             raise asyncio.CancelledError
         if answer.isError():
             raise ModbusRefused(request.name, request.address, int(answer.exception_code))
@@ -146,26 +139,25 @@ class TcpLine:
 
     def _gone(self, request: Request) -> ConnectError:
         text = f"the connection to the Modbus device {self._where} is gone"
-        text += "; check its supply and cable, and that it serves so many clients"
+        text += "; check its supply and cable, and its limit of clients"
         return ConnectError(request.name, text)
 
     def _silent(self, request: Request) -> DeviceError:
-        if not self.connected:  # the device ended it, which the library does not tell who waits
+        if not self.connected:  # closed by the device, which the library does not report to the waiting task
             self.close()
             return self._gone(request)
-        # a late answer must not be taken for the next one's: the connection is made anew
+        # a late answer must not be taken for the next one's: reconnect
         self.close()
         return no_answer(request, SILENT_ADVICE)
 
     def close(self) -> None:
-        """End the connection."""
         if self._client is not None:
             self._client.close()
             self._client = None
 
 
 def _end_waiting_at_nonsense(client: AsyncModbusTcpClient) -> None:
-    """Have bytes that the library cannot read end the waiting: it raises in the loop, which tells a traceback."""
+    """Fail the pending request when bytes come that the library cannot read: it raises in the event loop instead."""
     wire = client.ctx
     read = wire.callback_data
 
@@ -175,14 +167,14 @@ def _end_waiting_at_nonsense(client: AsyncModbusTcpClient) -> None:
         except ModbusException as error:
             if not wire.response_future.done():
                 wire.response_future.set_exception(_Nonsense(str(error)))
-                wire.response_future.exception()  # nobody may wait any more
+                wire.response_future.exception()  # retrieved, since no task may be waiting any more
             return len(data)
 
-    wire.callback_data = taken  # type: ignore[method-assign] # the library has no place for it
+    wire.callback_data = taken  # type: ignore[method-assign] # the library has no hook for it
 
 
 def _refuse_other_units(client: AsyncModbusTcpClient) -> None:
-    """Have an answer under another unit's number end the waiting: the library skips it, and waits on in vain.
+    """Fail the pending request when another unit answers it: the library skips the answer and waits for ever.
 
     Its transaction number shows that it answers this request.
     """
@@ -194,7 +186,7 @@ def _refuse_other_units(client: AsyncModbusTcpClient) -> None:
         is_ours = body and transaction == wire.request_transaction_id
         if is_ours and unit != wire.request_dev_id != ANY_UNIT and not wire.response_future.done():
             wire.response_future.set_exception(_OtherUnit(unit))
-            wire.response_future.exception()  # nobody may wait any more
+            wire.response_future.exception()  # retrieved, since no task may be waiting any more
         return size, unit, transaction, body
 
-    framer.decode = decoded  # type: ignore[method-assign, assignment] # the library has no place for it
+    framer.decode = decoded  # type: ignore[method-assign, assignment] # the library has no hook for it

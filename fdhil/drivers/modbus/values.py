@@ -1,24 +1,26 @@
-"""Numbers in 16 bit registers. Pure."""
+"""Decodes numbers in 16-bit registers. Pure."""
 
 import itertools
 import math
 import struct
 from collections.abc import Sequence
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
+from fdhil.config import TableEncoder, Thermometer, Voltage
 from fdhil.records import Float
 
 WordOrder = Literal["big", "little"]
+RegisterSensor = Voltage | Thermometer | TableEncoder
 ORDERS: tuple[WordOrder, ...] = ("big", "little")
-SMALLEST = 1e-30  # a float below is one whose words or type are others
-LIKELY = (1e-6, 1e6)  # what instruments show, in their own unit
+SMALLEST = 1e-30  # smaller floats have wrong words or type
+LIKELY = (1e-6, 1e6)  # range of instruments, in their own unit
 CODES = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f", "float64": ">d"}
 
 
 def registers_of(kind: str) -> int:
-    """Return how many registers one number takes.
+    """Return the number of registers of one number.
 
     >>> registers_of("float64")
     4
@@ -27,7 +29,7 @@ def registers_of(kind: str) -> int:
 
 
 def numbers(registers: Sequence[int], kind: str, word_order: WordOrder = "big", byte_order: WordOrder = "big") -> Float:
-    """Return the numbers (n,) of this type that the registers hold one after the other.
+    """Decode consecutive numbers (n,) of this type.
 
     >>> float(numbers([0x0000, 0x4248], "float32", "little")[0])
     50.0
@@ -43,7 +45,7 @@ def numbers(registers: Sequence[int], kind: str, word_order: WordOrder = "big", 
 
 
 def float32(registers: Sequence[int], at: int = 0) -> float:
-    """Return the float32 in two registers, high word first.
+    """Decode the float32 in two registers, high word first.
 
     >>> float32([0x4248, 0x0000])
     50.0
@@ -52,31 +54,14 @@ def float32(registers: Sequence[int], at: int = 0) -> float:
 
 
 def uint32(registers: Sequence[int], at: int = 0) -> int:
-    """Return the unsigned integer in two registers, high word first."""
+    """Decode the unsigned integer in two registers, high word first."""
     return registers[at] << 16 | registers[at + 1]
 
 
-class ValuePlace(Protocol):
-    """Where a value is and what it means: the keys of :class:`fdhil.config.sensors.ModbusValue` and ``scale``."""
+def other_orders(registers: Sequence[int], kind: str, where: RegisterSensor, most: float = LIKELY[1]) -> str:
+    """Describe, for a message, the first value in other word and byte orders.
 
-    @property
-    def function(self) -> int: ...
-    @property
-    def address(self) -> int: ...
-    @property
-    def word_order(self) -> WordOrder: ...
-    @property
-    def byte_order(self) -> WordOrder: ...
-    @property
-    def scale(self) -> float: ...
-    @property
-    def offset(self) -> float: ...
-
-
-def other_orders(registers: Sequence[int], kind: str, where: ValuePlace, most: float = LIKELY[1]) -> str:
-    """Return what the first value of the registers would be in another order of words and bytes, for a message.
-
-    Only what an instrument can show is named: 0, or between ``LIKELY[0]`` and ``most``, scaled.
+    Only plausible values are named: 0, or between ``LIKELY[0]`` and ``most``, scaled.
     """
     found = []
     first = registers[: registers_of(kind)]

@@ -1,12 +1,12 @@
-"""Reads a voltage sensor on Modbus TCP that samples by itself and hands its samples over in blocks.
+"""Reads a voltage sensor on Modbus TCP that samples by itself and delivers its samples in blocks.
 
-Register map (16 bit words, big-endian, the same for input and holding registers): 0-1 newest voltage float32, 2-3
-its sample counter uint32, 4-5 sample rate Hz float32, 6-7 volts per count of the block float32, 8-9 slide-way
-temperature degC float32, 10 trigger, 11 status, 12-13 counter of the block's first sample uint32, 14 samples in the
-block, 16..115 the samples int16. Writing 1 to the trigger latches the newest samples that were not latched before.
-Everything is then read with one request, so that no value is torn.
+Register map (16 bit words, big-endian, the same for input and holding registers): 0-1 newest voltage float32, 2-3 its
+sample counter uint32, 4-5 sample rate Hz float32, 6-7 volts per count of the block float32, 8-9 slide-way temperature
+degC float32, 10 trigger, 11 status, 12-13 counter of the block's first sample uint32, 14 samples in the block, 16..115
+the samples int16. Writing 1 to the trigger latches the newest samples that were not latched before. Everything is then
+read with one request, so that no value is torn.
 
-A sensor with another register map is a class beneath :class:`ModbusVoltage` that reads a :class:`SensorBlock`.
+A sensor with another register map is a subclass of :class:`ModbusVoltage` that reads a :class:`SensorBlock`.
 """
 
 import asyncio
@@ -33,18 +33,18 @@ BLOCK_SAMPLES = 100
 ALL_REGISTERS = FIRST_SAMPLE + BLOCK_SAMPLES
 STATUS_LOST = 2
 STUCK_POLLS = 20
-TEAR = 1 << 16  # the lower word of a count is of another moment than the upper one
-_TEAR_SLACK_S = 0.2  # by which a count may be off from what has passed, and still show that it is torn
+TEAR = 1 << 16  # the lower word of a count was read at another time than the upper one
+_TEAR_SLACK_S = 0.2  # tolerance between count and elapsed time for recognising a torn count
 _SETTLE_STEPS = 8
 _SETTLE_STEP_S = 0.01
-_SETTLED_NS = 50_000_000  # a query is placed when so many later SYNCs have shown which stamps around it were late
+_SETTLED_NS = 50_000_000  # later SYNCs that are needed to recognise late stamps around a query
 
 
 @dataclass(frozen=True, slots=True)
 class SensorBlock:
     """One reading of the whole map: ``volts`` (n,) are the samples ``first`` .. ``first`` + n - 1.
 
-    ``newest`` counts the newest complete sample, ``newest_v`` is for people. ``celsius`` NaN: no temperature.
+    ``newest`` is the number of the newest complete sample, ``newest_v`` its value. ``celsius`` NaN: no temperature.
     """
 
     newest: int
@@ -57,7 +57,7 @@ class SensorBlock:
 
 
 def parse_block(name: str, registers: Sequence[int]) -> SensorBlock:
-    """Decode and check the map; ProtocolError when a value cannot be."""
+    """Decode and validate the map; ProtocolError for an impossible value."""
     rate_hz, volts_per_count, celsius = (float32(registers, at) for at in (4, 6, 8))
     count, first, newest = registers[14], uint32(registers, 12), uint32(registers, 2)
     for what, ok in (
@@ -67,17 +67,17 @@ def parse_block(name: str, registers: Sequence[int]) -> SensorBlock:
         (f"a block that ends after the newest sample ({first} + {count} > {newest} + 1)", first + count <= newest + 1),
     ):
         if not ok:
-            raise ProtocolError(name, f"the sensor reports {what}; compare its register map with the driver's")
+            raise ProtocolError(name, f"the sensor reports {what}; compare its register map with the configuration")
     samples = np.array(registers[FIRST_SAMPLE : FIRST_SAMPLE + count], np.uint16).view(np.int16)
     volts = frozen(samples * volts_per_count)
     return SensorBlock(newest, rate_hz, celsius, registers[11] == STATUS_LOST, first, volts, float32(registers))
 
 
 class ModbusVoltage:
-    """The voltage source ``modbus`` of one axis; ``poll`` asks once and returns what is new.
+    """The voltage source ``modbus`` of one axis; ``poll_samples`` reads once and returns new samples.
 
-    A class beneath it says in ``latch`` and ``block`` how its own register map is read, and in ``example_registers``
-    what a unit that answers has in its input registers from 0 on: the contract's peer serves these.
+    A subclass implements ``latch_samples`` and ``read_block`` for its register map, and ``example_registers``, the
+    input registers from 0 on of a unit that answers, which the contract test serves.
     """
 
     example_registers: ClassVar[Sequence[int]] = ()
@@ -106,32 +106,32 @@ class ModbusVoltage:
         await self.latch()
         block = await self.block()
         asked_ns, answered_ns = self.link.asked_ns, self.link.answered_ns
-        for _ in range(_SETTLE_STEPS):  # the SYNCs around the query must have been drained before it can be placed
+        for _ in range(_SETTLE_STEPS):  # the SYNCs around the query must have been drained
             if not ticks.running or ticks.covers(answered_ns):
                 break
             await asyncio.sleep(_SETTLE_STEP_S)
         return self.accept(block, asked_ns, answered_ns, ticks)
 
     async def latch(self) -> None:
-        """Have the newest samples put into the registers; nothing where the sensor does so by itself."""
+        """Trigger the sensor to store its newest samples in the registers, where it needs that."""
         await self.link.write(TRIGGER, 1)
 
     async def block(self) -> SensorBlock:
-        """Read the registers with one request and change nothing; samples may come again, they are taken once."""
+        """Read the registers with one request, without changing anything; repeated samples are used once."""
         return parse_block(self.name, await self.link.read_input(0, ALL_REGISTERS))
 
     async def reading(self) -> str:
-        """Read the map without latching anything, for people."""
+        """Read without latching and format the value."""
         block = await self.block()
         return f"{block.newest_v:.2f} V at {block.rate_hz:g} Hz"
 
     def accept(
         self, block: SensorBlock, asked_ns: int, answered_ns: int, ticks: TickClock
     ) -> list[VoltageSamples | Temperature | Notice]:
-        """Place a block on the timelines. Pure but for this object's own memory."""
+        """Place a block on the timelines. Pure but for this object's own state."""
         out: list[VoltageSamples | Temperature | Notice] = []
         if self._torn(block, asked_ns):
-            text = f"The {self.name} gave a count whose words are of two moments; this answer is left out."
+            text = f"The {self.name} gave a torn count (its words are from different times): this answer is discarded."
             return [Notice("RegisterTear", "minor", text, self.axis)]
         self._clocks(block, asked_ns, answered_ns, ticks)
         block = self._unseen(block)
@@ -143,7 +143,7 @@ class ModbusVoltage:
         return out
 
     def _torn(self, block: SensorBlock, asked_ns: int) -> bool:
-        """Whether the count is off by 2^16 from what has passed since the last answer; twice running it is so."""
+        """Return whether the count is off by 2^16 from the elapsed time; twice in a row it is accepted."""
         if self._counted is None:
             leap = 0.0
         else:
@@ -175,23 +175,21 @@ class ModbusVoltage:
         return self._tick_clock.line() if self._tick_clock else None
 
     def _unseen(self, block: SensorBlock) -> SensorBlock:
-        """Leave out the samples that have come before; a count that fell is a sensor that was restarted."""
         if self._next is None or block.newest + 1 < self._next:
             return block
         known = min(max(0, self._next - block.first), block.volts.size)
         return replace(block, first=block.first + known, volts=block.volts[known:]) if known else block
 
     def _continuity(self, block: SensorBlock) -> list[Notice]:
-        """Count samples that are missing between blocks, and notice a counter that stands still."""
         notices = []
         if self._next is not None and block.volts.size and block.first > self._next:
             missing = block.first - self._next
             self.lost += missing
-            text = f"The {self.name} lost {missing} samples, the moves in them are not identified; poll it more often."
+            text = f"The {self.name} lost {missing} samples: moves in them are not identified; poll it more often."
             notices.append(Notice("SampleTiming", "minor", text, self.axis))
         self._still = 0 if block.volts.size else self._still + 1
         if self._still == STUCK_POLLS:
-            text = f"The {self.name} answers but samples no more; see whether it is in an error state."
+            text = f"The {self.name} answers but no longer samples; check whether it is in an error state."
             notices.append(Notice("StuckValue", "MAJOR", text, self.axis))
         if block.volts.size:
             self._next = block.first + block.volts.size
@@ -212,12 +210,12 @@ class ModbusVoltage:
         )
 
     def _times(self, counter: np.ndarray, ticks: TickClock) -> tuple[np.ndarray, float]:
-        """Host time at which each sample begins: by way of the SYNC count where there is one, so that what was late
-        in both SYNC and sensor cancels."""
+        """Return the host time at which each sample begins, through the SYNC count if there is one, so that delays
+        common to SYNC and sensor cancel."""
         line = self.line
         if line is not None and ticks.running:
             fraction = line.start + line.step * (counter - line.origin)
             return ticks.time_ns(fraction), line.error * ticks.period_ns + SYNC_LATENESS_NS
         host = self._host_clock.line() if self._host_clock else None
-        assert host is not None  # accept() has just added a query
+        assert host is not None  # accept() has added a query
         return host.start + host.step * (counter - host.origin), host.error

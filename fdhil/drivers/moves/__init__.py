@@ -1,4 +1,4 @@
-"""Tells which moves were ordered as rapids (G0); ``tables.EVENT_SOURCES`` lists the ways."""
+"""Detects rapid moves (G0); ``tables.EVENT_SOURCES`` lists the methods."""
 
 from typing import ClassVar, Protocol
 
@@ -9,10 +9,10 @@ from fdhil.records import AxisSamples, MoveEvent, NcState, TickTimes
 
 
 class EventSource(Protocol):
-    """Tells the moves of one axis: blocks in, events out.
+    """Detects the moves of one axis: blocks in, events out.
 
     ``needs_input``: whether the NC's signal must come with the drive's digital inputs. ``least_share``: of the rapid
-    speed that a rapid must reach to be told.
+    speed that a rapid must reach to be detected.
     """
 
     needs_input: ClassVar[bool]
@@ -22,10 +22,9 @@ class EventSource(Protocol):
         pass
 
     def feed(self, record: AxisSamples | InputSamples | TickTimes | NcState) -> list[MoveEvent]:
-        """Take a block, or what the NC says; return the moves it shows."""
+        """Take a block, or a state of the NC; return the detected moves."""
 
 
 def load_event_source(name: str) -> type[EventSource]:
-    """Return the source that ``tables.EVENT_SOURCES`` lists under ``name``."""
     source: type[EventSource] = tables.load(tables.EVENT_SOURCES, name)
     return source

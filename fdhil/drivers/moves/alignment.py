@@ -1,8 +1,8 @@
-"""Lays an NC's own set-points on those of the bus: by how many cycles the bus counts differently. Pure.
+"""Aligns the NC's own set-points with those on the bus: determines the difference of the cycle counts. Pure.
 
-The NC tells a set-point now and then with its own cycle count; on the bus it comes some cycles later, rounded to the
-drive's increments, from another zero. A group of set-points of a moving axis fits the bus at one place alone: clocks
-only say where to begin looking.
+The NC reports a set-point now and then with its own cycle count; on the bus it comes some cycles later, rounded to the
+drive's increments, from another zero. A group of set-points of a moving axis fits the bus in one position only; clocks
+only determine where the search begins.
 """
 
 from collections import deque
@@ -12,19 +12,17 @@ import numpy as np
 
 from fdhil.records import Float, Int, NcState
 
-GROUP = 16  # set-points that are laid on the bus together
+GROUP = 16  # set-points that are aligned together
 LONGEST_GROUP_S = 2.0
-LEAD_S, LAG_S = 0.2, 6.0  # by which the bus may seem to be ahead, and may lag behind
+LEAD_S, LAG_S = 0.2, 6.0  # limits of the apparent lead and lag of the bus
 KEPT_S = LAG_S + 2 * LONGEST_GROUP_S
 MOST_GROUPS = 50
-ROUNDING = 1.2  # increments between two set-points that were rounded each
+ROUNDING = 1.2  # increments between two rounded set-points
 SAME_PERIOD = 1e-3
 
 
 @dataclass(slots=True)
 class _Group:
-    """Set-points of the moving axis, and the offsets that are left to be tried."""
-
     cycle: list[int] = field(default_factory=list)
     demand_mm: list[float] = field(default_factory=list)
     next_offset: int = 0
@@ -33,7 +31,7 @@ class _Group:
 
 
 class DemandAlignment:
-    """The offset of one axis: bus tick less NC cycle; None until it is known, and when it is no longer so."""
+    """The offset of one axis: bus tick less NC cycle; None while it is unknown or no longer valid."""
 
     def __init__(self, axis: str, period_s: float, increment_mm: float) -> None:
         self._axis = axis
@@ -42,7 +40,7 @@ class DemandAlignment:
         self.clear()
 
     def clear(self) -> None:
-        """Begin anew: a count has."""
+        """Start again after a count restarted."""
         self.offset: int | None = None
         self._first_tick = 0
         self._bus: Float = np.empty(0)
@@ -51,14 +49,14 @@ class DemandAlignment:
         self._before: tuple[int, float] | None = None
 
     def told(self, state: NcState, tick: float) -> None:
-        """Take what the NC told; by the clocks it was near ``tick``."""
+        """Add a state of the NC; by the clocks it was near ``tick``."""
         if state.demand_mm is None or state.nc_tick is None or not self.possible(state):
             return
         cycle, place = state.nc_tick, state.demand_mm.get(self._axis)
         before, self._before = self._before, None if place is None else (cycle, place)
         if place is None or before is None:
             return
-        if cycle <= before[0]:  # the NC was started anew
+        if cycle <= before[0]:  # the NC was restarted
             self.offset, self._open = None, _Group()
             self._waiting.clear()
             return
@@ -76,7 +74,7 @@ class DemandAlignment:
             self._open = _Group()
 
     def possible(self, state: NcState) -> bool:
-        """Whether the NC tells set-points that can be laid on the bus: one for each SYNC."""
+        """Return whether the NC reports set-points that can be aligned: one for each SYNC."""
         period_s = state.nc_period_s
         return (
             state.demand_mm is not None
@@ -86,7 +84,7 @@ class DemandAlignment:
         )
 
     def heard(self, tick: Int, demand_mm: Float) -> None:
-        """Take a block of the bus, (n,) each."""
+        """Add a block of the bus, (n,) each."""
         if not tick.size:
             return
         if not self._bus.size:
@@ -100,7 +98,6 @@ class DemandAlignment:
             self._try(group)
 
     def _try(self, group: _Group) -> None:
-        """Try the offsets at which the bus has come so far, the smallest first; the first that fits alone is it."""
         cycle, demand = np.array(group.cycle), np.array(group.demand_mm)
         newest = self._first_tick + self._bus.size - 1 - group.cycle[-1]
         if self.offset is not None:
@@ -120,7 +117,7 @@ class DemandAlignment:
             self._waiting.remove(group)
 
     def _judge(self, group: _Group, fitting: Int, end: int) -> None:
-        """An offset whose neighbours do not fit is it; at an even speed all of them do, and nothing is told."""
+        """Accept an offset whose neighbours do not fit; at constant speed all of them do, and none is accepted."""
         first = group.found if group.found is not None else int(fitting[0]) if fitting.size else None
         if first is None:
             return
@@ -133,7 +130,7 @@ class DemandAlignment:
             group.found = first
 
     def _fits(self, cycle: Int, demand_mm: Float, offsets: Int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """Return for each offset (n,) whether the bus is there as the NC says, up to where its zero is."""
+        """Return for each offset (n,) whether bus and NC agree, apart from a constant."""
         rows = offsets[:, None] + cycle[None, :] - self._first_tick
         inside = (rows[:, 0] >= 0) & (rows[:, -1] < self._bus.size)
         apart = self._bus[np.clip(rows, 0, self._bus.size - 1)] - demand_mm

@@ -1,7 +1,7 @@
-"""Tells G0 by the NC's own signal: a bit of the drive's digital inputs (0x60FD). Pure.
+"""Detects G0 by the NC's own signal: a bit of the drive's digital inputs (0x60FD). Pure.
 
-The input comes with a slower TPDO than the samples, so an edge is known to that TPDO's period: the beginning is given
-as the tick of the sample before the edge, the end as the tick of the first sample after it.
+The input comes in a slower TPDO than the samples, so an edge is known to that TPDO's period: the beginning is the tick
+of the sample before the edge, the end the tick of the first sample after it.
 """
 
 from fdhil.config import MachineConfig
@@ -10,7 +10,7 @@ from fdhil.records import AxisSamples, MoveEvent, MoveKind, NcState, TickTimes
 
 
 class DigitalInputG0:
-    """Says RAPID while the bit is set, REST when it falls."""
+    """Reports RAPID while the bit is set, REST when it falls."""
 
     needs_input = True
     least_share = 0.0
@@ -22,7 +22,7 @@ class DigitalInputG0:
         self._last_tick = 0
 
     def feed(self, record: AxisSamples | InputSamples | TickTimes | NcState) -> list[MoveEvent]:
-        """Take a block of inputs; return the edges. The first sample ever only tells where the signal stands."""
+        """Take a block of inputs; return the edges. The first sample only initialises the state."""
         if not isinstance(record, InputSamples) or record.axis != self._axis:
             return []
         events = []

@@ -1,6 +1,6 @@
-"""Tells G0 by the demand alone: a move whose demand reaches the rapid speed was ordered as a rapid. Pure.
+"""Detects G0 by the demand alone: a move whose demand reaches the rapid speed is a rapid. Pure.
 
-Which kind a move is shows only when it is fast enough, or over; the event then carries the tick at which it began.
+The kind of a move shows only once it is fast enough, or over; the event carries the tick at which it began.
 """
 
 import numpy as np
@@ -15,26 +15,26 @@ DECISION_S = 2.0
 
 
 class InferredG0:
-    """Feeds on an axis' samples and says RAPID, FEED and REST."""
+    """Classifies moves of an axis' samples as RAPID, FEED and REST."""
 
     needs_input = False
-    least_share = 0.9  # an NC's override of 100 % is above it, any feed is below
+    least_share = 0.9  # above every feed, below an override of 100 %
 
     def __init__(self, axis: str, config: MachineConfig) -> None:
         settings = config.axis[axis]
         self._axis = axis
         self._period_s = config.machine.sync_period_s
         self._rapid_mm_s = self.least_share * settings.rapid_speed_mm_s
-        # one increment per cycle is the rounding of the set-point, not a motion
+        # one increment per cycle is rounding of the set-point, not motion
         rounding = 2 / settings.scaling.increments_per_mm / self._period_s
         self._rest_mm_s = max(REST_SHARE * settings.rapid_speed_mm_s, rounding)
         self._last: tuple[int, float] | None = None
-        self._start: int | None = None  # tick at which the present move began
+        self._start: int | None = None  # first tick of the present move
         self._kind: MoveKind | None = None
         self._still_since: int | None = None
 
     def feed(self, record: AxisSamples | InputSamples | TickTimes | NcState) -> list[MoveEvent]:
-        """Take a block of samples; return the moves that began, ended or became recognisable."""
+        """Take a block of samples; return moves that began, ended or could be classified."""
         if not isinstance(record, AxisSamples) or record.axis != self._axis or record.tick.size == 0:
             return []
         if self._last is not None and record.tick[0] <= self._last[0]:

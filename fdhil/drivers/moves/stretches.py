@@ -1,4 +1,4 @@
-"""Follows one axis' demand: from when to when it moves in one direction. Pure."""
+"""Segments one axis' demand into moves in one direction. Pure."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -7,14 +7,14 @@ import numpy as np
 
 from fdhil.records import AxisSamples, Float, Int
 
-REST_S = 0.010  # a demand that stands for so long has ended the move
-LONG_S = 10.0  # a move that is longer is told in parts
+REST_S = 0.010  # a demand at standstill for so long has ended the move
+LONG_S = 10.0  # a longer move is reported in parts
 KEPT_S = 45.0
 
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """A move in one direction between two ticks; ``goes_on`` where it was only cut because it is long."""
+    """A move in one direction between two ticks; ``goes_on`` where it was only divided because it is long."""
 
     begin: int
     end: int
@@ -22,7 +22,7 @@ class Stretch:
 
 
 class Stretches:
-    """The stretches of one axis; ``rounding_mm`` is what a demand that stands may change from row to row."""
+    """The segments of one axis; ``rounding_mm`` is the change per sample of a demand at standstill."""
 
     def __init__(self, period_s: float, rounding_mm: float) -> None:
         self._period_s = period_s
@@ -30,19 +30,18 @@ class Stretches:
         self.clear()
 
     def clear(self) -> None:
-        """Forget everything: the SYNC count began anew."""
+        """Drop everything: the SYNC count restarted."""
         self._kept: deque[tuple[Int, Float]] = deque()
-        self._side = 0  # of the stretch that is open
+        self._side = 0  # of the open segment
         self._begin = 0
         self._still: int | None = None
 
     @property
     def newest(self) -> int | None:
-        """The newest tick."""
         return int(self._kept[-1][0][-1]) if self._kept else None
 
     def feed(self, samples: AxisSamples) -> list[Stretch]:
-        """Take a block that is not empty; return the stretches that are over."""
+        """Take a block that is not empty; return the completed segments."""
         tick, demand = samples.tick, samples.demand_mm
         if self._kept:
             tick = np.append(self._kept[-1][0][-1], tick)
@@ -63,7 +62,6 @@ class Stretches:
         return found
 
     def _piece(self, side: int, begin: int, end: int) -> list[Stretch]:
-        """Take a piece that moves to one side, or stands (0), between two ticks."""
         if side == 0:
             if self._side and self._still is None:
                 self._still = begin
@@ -81,7 +79,7 @@ class Stretches:
         return [Stretch(self._begin, end)] if end > self._begin else []
 
     def slowest(self, low: int, high: int) -> int:
-        """Return the tick between two ticks from which on the demand goes least; the earlier one if none is known."""
+        """Return the tick in [low, high] after which the demand is slowest; ``low`` if there is none."""
         blocks = [block for block in self._kept if block[0][-1] >= low and block[0][0] <= high]
         if not blocks:
             return low

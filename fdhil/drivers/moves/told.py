@@ -1,9 +1,9 @@
-"""Tells G0 by what the NC itself says: the kind of a move comes from the NC, its edges from the demand. Pure.
+"""Detects G0 by the NC's own reports: the NC gives the kind of a move, the demand its edges. Pure.
 
-The demand shows exactly when an axis moves, to and fro; what the NC says is known to the accuracy of its source. So a
-move in one direction is of the kind that the NC says within it, and where it says two the demand's slowest row between
-them parts them. An NC that tells its own set-points is laid on the bus by them, exact to a cycle; any other by the
-clocks. A move in which the NC was not heard is UNKNOWN, and no rapid.
+The demand shows exactly when an axis moves back and forth; the NC's reports are as accurate in time as their source. So
+a move in one direction has the kind that the NC reports within it, and where it reports two, they are divided at the
+slowest sample of the demand between them. An NC that reports its own set-points is aligned by them, exact to a cycle;
+any other by the clocks. A move without a report of the NC is UNKNOWN, and not used as a rapid.
 """
 
 import math
@@ -19,16 +19,16 @@ from fdhil.drivers.moves.alignment import DemandAlignment
 from fdhil.drivers.moves.stretches import Stretch, Stretches
 from fdhil.records import AxisSamples, MoveEvent, MoveKind, NcMove, NcState, TickTimes
 
-PATIENCE_S = 1.0  # beyond the NC's own silence, until a move of which it said nothing is UNKNOWN
-AFTER_HOLD_S = 0.25  # of standstill that a rapid needs: one that goes on sooner after a hold is none
+PATIENCE_S = 1.0  # beyond the NC's own silence, until a move without a report is UNKNOWN
+AFTER_HOLD_S = 0.25  # of standstill before a rapid: one that continues sooner after a hold is not used
 MOST_STATES = 20_000
 MOVING = (MoveKind.RAPID, MoveKind.FEED, MoveKind.ARC, MoveKind.UNKNOWN)
-NEXT = 1.5  # ticks between two states that are those of neighbouring cycles
+NEXT = 1.5  # ticks between states of neighbouring cycles
 
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """What the NC said, and the ticks between which that was so."""
+    """A state of the NC, and the ticks between which it was valid."""
 
     low: float
     high: float
@@ -36,7 +36,7 @@ class Said:
 
 
 class ToldG0:
-    """Feeds on samples, arrivals of SYNC and the NC's states, and says RAPID, FEED, ARC, UNKNOWN and REST."""
+    """Classifies moves by samples, SYNC arrivals and NC states as RAPID, FEED, ARC, UNKNOWN and REST."""
 
     needs_input = False
     least_share = 0.0
@@ -50,13 +50,13 @@ class ToldG0:
         self._clock = TickClock(period_s)
         self._alignment = DemandAlignment(axis, period_s, increment_mm)
         self._moving = Stretches(period_s, 2 * increment_mm)
-        self._new: deque[NcState] = deque(maxlen=MOST_STATES)  # whose tick is not yet known
+        self._new: deque[NcState] = deque(maxlen=MOST_STATES)  # states without a tick yet
         self._said: deque[Said] = deque(maxlen=MOST_STATES)
         self._waiting: deque[Stretch] = deque()
         self._kind = MoveKind.REST
 
     def feed(self, record: AxisSamples | InputSamples | TickTimes | NcState) -> list[MoveEvent]:
-        """Take a block of samples, arrivals of SYNC, or what the NC says; return the moves that are known by now."""
+        """Take samples, SYNC arrivals, or a state of the NC; return the moves that can be classified by now."""
         if isinstance(record, TickTimes):
             self._clock.add(record)
         elif isinstance(record, NcState):
@@ -67,7 +67,7 @@ class ToldG0:
 
     def _heard(self, samples: AxisSamples) -> Iterator[MoveEvent]:
         newest = self._moving.newest
-        if newest is not None and samples.tick[0] <= newest:  # the SYNC count began anew
+        if newest is not None and samples.tick[0] <= newest:  # the SYNC count restarted
             self._moving.clear()
             self._alignment.clear()
             self._said.clear()
@@ -79,12 +79,11 @@ class ToldG0:
             yield from self._tell(self._waiting.popleft())
 
     def _place_new(self) -> None:
-        """Place what the NC said by the clocks, once the SYNCs of that time have come."""
         while self._new:
             state = self._new[0]
             begin_ns, end_ns = state.stamp_ns - state.error_ns, state.stamp_ns + state.error_ns
             bounds = self._clock.bounds(begin_ns, end_ns)
-            is_last = not any(later.stamp_ns < begin_ns for later in self._new)  # else its time stamp is wrong
+            is_last = not any(later.stamp_ns < begin_ns for later in self._new)  # otherwise its time stamp is wrong
             if bounds is None and is_last and not self._clock.is_past(begin_ns):
                 return
             self._new.popleft()
@@ -98,48 +97,48 @@ class ToldG0:
         last = self._said[-1].state.nc_tick if self._said else None
         return last is not None and state.nc_tick is not None and state.nc_tick < last
 
-    def _where(self, said: Said) -> Said | None:
-        """Return what was said at the ticks that its set-points tell, else the clocks; None while they tell none."""
-        if not self._alignment.possible(said.state):
-            return said
-        if self._alignment.offset is None or said.state.nc_tick is None:
+    def _where(self, timed: Said) -> Said | None:
+        """Locate a state by its set-points, else by the clocks; None while they are not aligned."""
+        if not self._alignment.possible(timed.state):
+            return timed
+        if self._alignment.offset is None or timed.state.nc_tick is None:
             return None
-        tick = said.state.nc_tick + self._alignment.offset
-        return Said(tick, tick, said.state)
+        tick = timed.state.nc_tick + self._alignment.offset
+        return Said(tick, tick, timed.state)
 
-    def _is_known(self, stretch: Stretch, newest: int) -> bool:
+    def _is_known(self, segment: Stretch, newest: int) -> bool:
         last = self._where(self._said[-1]) if self._said else None
-        return (last is not None and last.low > stretch.end) or newest - stretch.end > self._patience
+        return (last is not None and last.low > segment.end) or newest - segment.end > self._patience
 
-    def _tell(self, stretch: Stretch) -> Iterator[MoveEvent]:
-        said = self._about(stretch)
-        pieces = list(self._pieces(stretch, said))
-        for (begin, kind), (end, _) in pairwise([*pieces, (stretch.end, MoveKind.REST)]):
-            held = _held(_of_a_piece(said, begin - self._after_hold, end))
-            told = _move(_of_a_piece(said, begin, end), begin, kind, held)
+    def _tell(self, segment: Stretch) -> Iterator[MoveEvent]:
+        states = self._about(segment)
+        pieces = list(self._pieces(segment, states))
+        for (begin, kind), (end, _) in pairwise([*pieces, (segment.end, MoveKind.REST)]):
+            held = _held(_of_a_piece(states, begin - self._after_hold, end))
+            move = _move(_of_a_piece(states, begin, end), begin, kind, held)
             if kind is not self._kind:
-                yield MoveEvent(self._axis, kind, begin, self._source, told)
+                yield MoveEvent(self._axis, kind, begin, self._source, move)
             self._kind = kind
-        if not stretch.goes_on:
+        if not segment.goes_on:
             self._kind = MoveKind.REST
-            yield MoveEvent(self._axis, MoveKind.REST, stretch.end, self._source)
+            yield MoveEvent(self._axis, MoveKind.REST, segment.end, self._source)
 
-    def _about(self, stretch: Stretch) -> list[Said]:
-        """Return what the NC said in a stretch, and the last before it: that still held; older ones are forgotten."""
+    def _about(self, segment: Stretch) -> list[Said]:
+        """Return the states in a segment and the last before it, which was still valid; drop older ones."""
         placed = [found for found in map(self._where, self._said) if found is not None]
-        found = _of_a_piece(placed, stretch.begin - self._after_hold, stretch.end)
+        found = _of_a_piece(placed, segment.begin - self._after_hold, segment.end)
         while found and self._said[0].state is not found[0].state:
             self._said.popleft()
         return found
 
-    def _pieces(self, stretch: Stretch, said: Sequence[Said]) -> Iterator[tuple[int, MoveKind]]:
-        """Yield from which tick on a stretch is of which kind; at its first tick the axis does not move yet."""
-        within = [each for each in said if each.low > stretch.begin and each.high <= stretch.end]
+    def _pieces(self, segment: Stretch, states: Sequence[Said]) -> Iterator[tuple[int, MoveKind]]:
+        """Yield from which tick on a segment has which kind; at its first tick the axis does not move yet."""
+        within = [each for each in states if each.low > segment.begin and each.high <= segment.end]
         sure = [each for each in within if each.state.motion in MOVING]
         if not sure:
-            yield stretch.begin, MoveKind.UNKNOWN
+            yield segment.begin, MoveKind.UNKNOWN
             return
-        yield stretch.begin, sure[0].state.motion
+        yield segment.begin, sure[0].state.motion
         for one, other in pairwise(sure):
             if one.state.motion is other.state.motion:
                 continue
@@ -149,22 +148,20 @@ class ToldG0:
                 yield self._moving.slowest(math.floor(one.low), math.ceil(other.high)), other.state.motion
 
 
-def _of_a_piece(said: Sequence[Said], begin: int, end: int) -> list[Said]:
-    """Return what was said between two ticks, and the last before them, which still held."""
-    before = [each for each in said if each.high < begin]
-    return [*before[-1:], *(each for each in said if each.high >= begin and each.low <= end)]
+def _of_a_piece(states: Sequence[Said], begin: int, end: int) -> list[Said]:
+    before = [each for each in states if each.high < begin]
+    return [*before[-1:], *(each for each in states if each.high >= begin and each.low <= end)]
 
 
-def _held(said: Sequence[Said]) -> bool | None:
-    """Return whether a feed hold was on; None where that was not told."""
-    holds = [each.state.held for each in said if each.state.feed_hold is not None or each.state.held]
+def _held(states: Sequence[Said]) -> bool | None:
+    holds = [each.state.held for each in states if each.state.feed_hold is not None or each.state.held]
     return any(holds) if holds else None
 
 
-def _move(said: Sequence[Said], begin: int, kind: MoveKind, held: bool | None) -> NcMove:
-    """Return what was said of a move, all of it together; its line is the first that was said while it ran."""
-    states = [each.state for each in said]
-    own = [each.state for each in said if each.low > begin and each.state.motion is kind]
+def _move(timed: Sequence[Said], begin: int, kind: MoveKind, held: bool | None) -> NcMove:
+    """Summarise the states of a move; its line is the first one reported while it ran."""
+    states = [each.state for each in timed]
+    own = [each.state for each in timed if each.low > begin and each.state.motion is kind]
     overrides = [override for state in states if (override := _override(state, kind)) is not None]
     return NcMove(
         line=next((state.line for state in own if state.line is not None), None),

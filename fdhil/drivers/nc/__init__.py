@@ -1,8 +1,7 @@
-"""Tells what an NC does, by an interface of its own; ``tables.NC_SOURCES`` lists the ways.
+"""Reads the state of an NC through an interface of its own; ``tables.NC_SOURCES`` lists the interfaces.
 
-A source only asks and reads: nothing it sends may change anything in the NC. It does not try again by itself, nor tell
-silence: whoever listens to it (:mod:`fdhil.drivers.nc.listener`) leaves it, says that the NC is UNKNOWN, waits longer
-and longer, and enters it anew.
+A source only reads: nothing it sends may change anything in the NC. It neither retries nor detects silence: its
+listener (:mod:`fdhil.drivers.nc.nc_listener`) disconnects, reports the NC as UNKNOWN, and retries with growing pauses.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,29 +14,30 @@ from fdhil.records import NcState
 
 
 class NcSource(Protocol):
-    """One NC: entered, read for as long as it answers, left.
+    """One NC: connected, read while it answers, disconnected.
 
-    ``name`` tells people which NC it is and where, as ``LinuxCNC at 127.0.0.1:5571``. A source can be entered again.
+    ``name`` describes the NC and its address, as ``LinuxCNC at 127.0.0.1:5571``. A source can be entered again.
     """
 
     name: str
 
     async def __aenter__(self) -> Self:
-        """Connect; ConnectError when nobody answers there, ProtocolError when it is not what the config says."""
+        """Connect; ConnectError when it cannot be reached, ProtocolError when it does not match the configuration."""
 
     async def __aexit__(self, *_: object) -> None:
         """Disconnect; raises nothing."""
 
     async def read(self) -> Sequence[NcState]:
-        """Wait for what is new and return it, the oldest first; DeviceError when the NC is lost or answers nonsense.
+        """Wait for new states and return them, the oldest first; DeviceError when the NC is lost or its answer is
+        invalid.
 
-        A source that asks rests for its period here. One that is told waits until something comes; an NC that is
-        well says something at least twice within ``nc_source.silence_s``, also while nothing changes.
+        A polling source waits for its period here, a subscribed one until something comes. A healthy NC sends something
+        at least twice within ``nc_source.silence_s``, also while nothing changes.
         """
 
 
 def load_nc_source(name: str) -> Callable[[MachineConfig], NcSource]:
-    """Return the source that ``tables.NC_SOURCES`` lists under ``name``; ConfigError where its library lacks."""
+    """Return the source that ``tables.NC_SOURCES`` lists under ``name``; ConfigError where its library is missing."""
     try:
         source: Callable[[MachineConfig], NcSource] = tables.load(tables.NC_SOURCES, name)
     except ImportError as error:

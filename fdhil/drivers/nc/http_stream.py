@@ -1,4 +1,4 @@
-"""Gets a document, or a stream of documents, over HTTP/1.1: as much of it as an MTConnect agent needs.
+"""Gets a document, or a stream of documents, over HTTP/1.1, to the extent that an MTConnect agent needs.
 
 Sources: RFC 9112 (messages, chunked), RFC 2046 5.1 (multipart); MTConnect Standard Part 1 (multipart/x-mixed-replace).
 """
@@ -19,7 +19,7 @@ _STATUS = re.compile(rb"HTTP/1\.[01] (\d{3})")
 
 
 class Response:
-    """An answer whose head has come; the rest is read as it is asked for."""
+    """An answer whose head has arrived; the body is read on demand."""
 
     def __init__(self, name: str, reader: asyncio.StreamReader) -> None:
         self._name, self._reader = name, reader
@@ -34,7 +34,7 @@ class Response:
         lines = (await self._until(b"\r\n\r\n")).split(b"\r\n")
         found = _STATUS.match(lines[0])
         if found is None:
-            raise ProtocolError(self._name, f"answers {lines[0][:40]!r}, which is no HTTP; compare host and port")
+            raise ProtocolError(self._name, f"answers {lines[0][:40]!r}, which is not HTTP; compare host and port")
         self.status = int(found[1])
         for line in lines[1:]:
             key, _, value = line.decode("latin-1").partition(":")
@@ -83,13 +83,13 @@ class Response:
         except ValueError:
             self._left = -1
         if not 0 <= self._left <= MOST_BYTES:
-            raise ProtocolError(self._name, f"announces a piece of {size[:20]!r} bytes; is a proxy in between?")
+            raise ProtocolError(self._name, f"announces a chunk of {size[:20]!r} bytes; is a proxy in between?")
         if not self._left:
             self._chunked = False
         return bool(self._left)
 
     async def document(self) -> bytes:
-        """Return the whole body; ProtocolError for one that is too large."""
+        """Return the whole body; ProtocolError if it is too large."""
         whole = b""
         try:
             while came := await self.some():
@@ -109,13 +109,13 @@ class Parts:
         self._name = name
         found = re.search(r'boundary="?([^";,\s]{1,200})"?', content_type)
         if not content_type.lower().startswith("multipart/") or found is None:
-            text = f"answers with {content_type[:60]!r} where a stream was asked for; does a proxy break it?"
+            text = f"answers with {content_type[:60]!r} instead of a stream; is a proxy in between?"
             raise ProtocolError(name, text)
         self._mark = b"--" + found[1].encode().removeprefix(b"--")
         self._rest = b""
 
     def feed(self, came: bytes) -> list[bytes]:
-        """Take the next bytes; return the parts that are whole with them. ProtocolError for what is no part."""
+        """Add bytes; return the completed parts. ProtocolError for invalid ones."""
         self._rest += came
         parts = []
         while (part := self._next()) is not None:
@@ -149,7 +149,7 @@ class Parts:
 
 @asynccontextmanager
 async def get(name: str, url: str, timeout_s: float) -> AsyncIterator[Response]:
-    """Ask for a document; its head has come when this is entered. ConnectError, DeviceTimeout, ProtocolError."""
+    """Request a document; its head has arrived on entry. ConnectError, DeviceTimeout, ProtocolError."""
     parts = urlsplit(url)
     host, port = parts.hostname or "", parts.port or 80
     target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
@@ -168,7 +168,7 @@ async def get(name: str, url: str, timeout_s: float) -> AsyncIterator[Response]:
             text = f"{host}:{port} does not answer within {timeout_s:g} s; is it switched on and the agent running?"
             raise DeviceTimeout(name, text) if writer else ConnectError(name, text) from None
         except OSError as error:
-            text = f"nobody answers at {host}:{port} ({error}); start the agent, or correct url"
+            text = f"{host}:{port} cannot be reached ({error}); start the agent, or correct url"
             raise ConnectError(name, text) from None
         yield response
     finally:

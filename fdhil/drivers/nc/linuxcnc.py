@@ -1,6 +1,7 @@
-"""Listens to LinuxCNC by its bridge (fdhil/bridges/linuxcnc.py): JSON lines over TCP, exact to a servo cycle.
+"""Receives LinuxCNC's state through its bridge (fdhil/bridges/linuxcnc.py): JSON lines over TCP, exact to a servo
+cycle.
 
-The first line tells what the bridge is, each later one the state in one servo cycle: a change of it with the cycle
+The first line identifies the bridge, each later one is the state in one servo cycle: a change of it with the cycle
 before, and a few in between. ``cycle`` is the count of the servo thread and ``mm`` its set-points.
 """
 
@@ -23,7 +24,7 @@ CONNECT_S = 2.0
 HERE = ("127.0.0.1", "localhost", "::1")
 DISTANT_WINDOW_S = 60.0
 LARGEST = 1 << 60  # of what is counted: ns for 36 years
-NETWORK_NS = 5_000_000  # by which the quickest line of a while may be late
+NETWORK_NS = 5_000_000  # delay of the quickest recent line
 
 
 class LinuxCnc:
@@ -38,10 +39,10 @@ class LinuxCnc:
         self._reader: asyncio.StreamReader | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._period_s = 0.0
-        # another computer has a monotonic clock of its own
+        # another computer has its own monotonic clock
         self._distant = None if settings.host in HERE else DistantClock(DISTANT_WINDOW_S)
         self._waiting: deque[bytes] = deque()  # lines
-        self._rest = b""  # the beginning of a line
+        self._rest = b""  # incomplete last line
 
     async def __aenter__(self) -> Self:
         host, port = self._place
@@ -52,14 +53,14 @@ class LinuxCnc:
                 self._reader, self._writer = await asyncio.open_connection(host, port)
         except (OSError, TimeoutError) as error:
             cause = "no answer" if isinstance(error, TimeoutError) else error
-            text = f"nobody answers ({cause}); load the bridge in LinuxCNC's HAL file and start LinuxCNC"
+            text = f"it cannot be reached ({cause}); load the bridge in LinuxCNC's HAL file and start LinuxCNC"
             raise ConnectError(self.name, text) from None
         try:
             async with asyncio.timeout(self._silence_s):
                 self._greet(await self._next())
         except TimeoutError:
             self._disconnect()
-            raise ProtocolError(self.name, "what answers there says nothing: it is not the bridge; see port") from None
+            raise ProtocolError(self.name, "the server there sends nothing: it is not the bridge; check port") from None
         except DeviceError:
             self._disconnect()
             raise
@@ -74,7 +75,7 @@ class LinuxCnc:
         self._reader = self._writer = None
 
     async def read(self) -> Sequence[NcState]:
-        """Return the next states; those that have come already come together."""
+        """Return the next states; those that have already arrived are returned together."""
         states = [self._state(await self._next())]
         while self._waiting:
             states.append(self._state(await self._next()))
@@ -84,10 +85,10 @@ class LinuxCnc:
         while not self._waiting:
             await self._receive()
         line = self._waiting.popleft()
-        told = decode_line(line)
-        if told is None:
-            raise ProtocolError(self.name, f"said {line[:60]!r}, which is no state; is this port the bridge's?")
-        return told
+        message = decode_line(line)
+        if message is None:
+            raise ProtocolError(self.name, f"sent {line[:60]!r}, which is not a state; is this the bridge's port?")
+        return message
 
     async def _receive(self) -> None:
         assert self._reader is not None
@@ -100,34 +101,36 @@ class LinuxCnc:
         *lines, self._rest = (self._rest + came).split(b"\n")
         self._waiting.extend(lines)
         if len(self._rest) > MOST_BYTES:
-            raise ProtocolError(self.name, "sends no lines of text; is this port the bridge's?")
+            raise ProtocolError(self.name, "sends no lines of text; is this the bridge's port?")
 
-    def _greet(self, told: Mapping[str, Any]) -> None:
-        period_s = told.get("servo_period_s")
-        if told.get("schema") != SCHEMA or not isinstance(period_s, float) or not 1e-5 < period_s < 1.0:
-            raise ProtocolError(self.name, f"is no bridge of this fdhil ({SCHEMA}); load the bridge that came with it")
+    def _greet(self, message: Mapping[str, Any]) -> None:
+        period_s = message.get("servo_period_s")
+        if message.get("schema") != SCHEMA or not isinstance(period_s, float) or not 1e-5 < period_s < 1.0:
+            raise ProtocolError(
+                self.name, f"is not a bridge of this fdhil ({SCHEMA}); load the bridge that came with it"
+            )
         self._period_s = period_s
 
-    def _state(self, told: Mapping[str, Any]) -> NcState:
+    def _state(self, message: Mapping[str, Any]) -> NcState:
         try:
-            stamp_ns, error_ns = _whole(told["stamp_ns"]), _whole(told["error_ns"])
+            stamp_ns, error_ns = _whole(message["stamp_ns"]), _whole(message["error_ns"])
             if self._distant is not None:
                 stamp_ns -= self._distant.ahead_ns(stamp_ns, time.monotonic_ns())
                 error_ns += NETWORK_NS
             return NcState(
                 stamp_ns=stamp_ns,
                 error_ns=error_ns,
-                motion=MoveKind(told["motion"]),
-                line=_maybe(told, "line", _whole),
-                programmed_feed_mm_min=_maybe(told, "programmed_feed_mm_min", _finite),
-                feed_mm_min=_maybe(told, "feed_mm_min", _finite),
-                feed_override=_maybe(told, "feed_override", _finite),
-                rapid_override=_maybe(told, "rapid_override", _finite),
-                feed_hold=_maybe(told, "feed_hold", bool),
-                tool=_maybe(told, "tool", _whole),
-                program=_maybe(told, "program", str),
-                demand_mm=self._demand_mm(told["mm"]),
-                nc_tick=_whole(told["cycle"]),
+                motion=MoveKind(message["motion"]),
+                line=_maybe(message, "line", _whole),
+                programmed_feed_mm_min=_maybe(message, "programmed_feed_mm_min", _finite),
+                feed_mm_min=_maybe(message, "feed_mm_min", _finite),
+                feed_override=_maybe(message, "feed_override", _finite),
+                rapid_override=_maybe(message, "rapid_override", _finite),
+                feed_hold=_maybe(message, "feed_hold", bool),
+                tool=_maybe(message, "tool", _whole),
+                program=_maybe(message, "program", str),
+                demand_mm=self._demand_mm(message["mm"]),
+                nc_tick=_whole(message["cycle"]),
                 nc_period_s=self._period_s,
             )
         except (KeyError, ValueError, TypeError, AttributeError, OverflowError) as error:
@@ -136,26 +139,26 @@ class LinuxCnc:
             ) from None
 
     def _demand_mm(self, places: Mapping[str, Any]) -> dict[str, float]:
-        """Return the places of the machine's drives: both of a gantry axis at one, degrees as lengths of arc."""
+        """Return the positions of the machine's drives: the same for both of a gantry axis, degrees as arc lengths."""
         found = {str(axis): _finite(place) for axis, place in places.items()}
         found |= {name: found[name[0]] for name in self._axes if name[0] in found}
         return {name: place * self._mm_per_degree.get(name, 1.0) for name, place in found.items()}
 
 
-def _maybe(told: Mapping[str, Any], key: str, kind: Any) -> Any:
-    value = told.get(key)
+def _maybe(message: Mapping[str, Any], key: str, kind: Any) -> Any:
+    value = message.get(key)
     return None if value is None else kind(value)
 
 
 def _whole(value: Any) -> int:
     number = int(value)
     if abs(number) > LARGEST:
-        raise ValueError("a number of more than 18 digits")
+        raise ValueError("a number with more than 18 digits")
     return number
 
 
 def _finite(value: Any) -> float:
     number = float(value)
     if not math.isfinite(number):
-        raise ValueError(f"{value!r} is no number")
+        raise ValueError(f"{value!r} is not a number")
     return number

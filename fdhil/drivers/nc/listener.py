@@ -1,4 +1,4 @@
-"""Listens to the NC for ever: enters its source, hands its states over, and begins anew when it is lost."""
+"""Receives the NC's states for ever: connects its source, hands its states over, and reconnects it."""
 
 import asyncio
 import time
@@ -12,11 +12,11 @@ from fdhil.records import MoveKind, NcState, Notice
 
 BACK_OFF_S = (0.1, 5.0)
 CODE = "NcSilent"
-EFFECT = "Which moves are rapids is not known meanwhile, and none is used. It is tried again until it answers."
+EFFECT = "Rapid moves cannot be recognised meanwhile; none is used for identification. The connection is retried."
 
 
 class NcListener:
-    """The NC of a machine, by its source of ``tables.NC_SOURCES``; ``counters`` tells what was heard."""
+    """The NC of a machine, by its source of ``tables.NC_SOURCES``; ``read_counters`` counts states and failures."""
 
     def __init__(self, config: MachineConfig) -> None:
         self._source = load_nc_source(config.g0.source)(config)
@@ -25,7 +25,7 @@ class NcListener:
         self._silent = False
 
     async def run(self, take: Callable[[NcState | Notice], None]) -> None:
-        """Hand states over for ever; an NC that is not heard is UNKNOWN from then on, and told once."""
+        """Hand states over for ever; a silent NC is UNKNOWN from then on, and reported once."""
         pause_s = BACK_OFF_S[0]
         while True:
             before = self._states
@@ -43,14 +43,14 @@ class NcListener:
                     async with asyncio.timeout(self._silence_s):
                         states = await source.read()
                 except TimeoutError:
-                    text = f"said nothing for {self._silence_s:g} s; is the NC switched on and its interface running?"
+                    text = f"sent nothing for {self._silence_s:g} s; is the NC switched on and its interface running?"
                     raise DeviceTimeout(source.name, text) from None
                 for state in states:
                     take(state)
                 self._states += len(states)
                 if states and self._silent:
                     self._silent = False
-                    take(Notice(CODE, "info", f"{source.name} is heard again."))
+                    take(Notice(CODE, "info", f"{source.name} answers again."))
 
     def _lost(self, error: DeviceError, take: Callable[[NcState | Notice], None]) -> None:
         self._failures += 1
@@ -60,5 +60,5 @@ class NcListener:
             take(Notice(CODE, "MAJOR", f"{error}{'' if str(error).endswith('?') else '.'} {EFFECT}"))
 
     def counters(self) -> dict[str, int]:
-        """States that were told, and how often the NC was lost or not reached."""
+        """Return the states received, and how often the NC was lost or not reached."""
         return {"states": self._states, "failures": self._failures}

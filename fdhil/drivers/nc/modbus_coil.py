@@ -1,4 +1,4 @@
-"""Asks an NC, or the PLC beside it, what it does by Modbus: bits for the motion, registers for line and overrides."""
+"""Polls the state of an NC, or its PLC, over Modbus: bits for the motion, registers for line and overrides."""
 
 import asyncio
 import time
@@ -17,7 +17,7 @@ _IN_ORDER = {"hold": MoveKind.HOLD, "rapid": MoveKind.RAPID, "arc": MoveKind.ARC
 
 
 class ModbusCoil:
-    """The NC source ``modbus_coil``: every request reads bits, or registers, that lie together."""
+    """The NC source ``modbus_coil``: each request reads adjacent bits, or registers."""
 
     def __init__(self, config: MachineConfig) -> None:
         settings = config.nc_source.modbus_coil
@@ -38,7 +38,6 @@ class ModbusCoil:
         self._link.close()
 
     async def read(self) -> Sequence[NcState]:
-        """Rest until it is time, ask, and return the state; DeviceError."""
         await asyncio.sleep(max(0.0, self._next_s - time.monotonic()))
         self._next_s = max(time.monotonic(), self._next_s + self._period_s)
         answers: dict[int, Sequence[int]] = {}
@@ -55,7 +54,7 @@ class ModbusCoil:
 
 
 def _profile(places: Mapping[str, tuple[int, int, int | None]], override_scale: float) -> NcProfile:
-    """Return the profile that follows from the section: a hold is more than a rapid, and no bit at all is rest."""
+    """Build the profile of the section: a hold outranks a rapid, and no bit at all is rest."""
     signals = {
         name: Signal(name, str(address), override_scale if name.endswith("override") else 1.0, bit)
         for name, (_, address, bit) in places.items()

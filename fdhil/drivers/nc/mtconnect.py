@@ -1,7 +1,7 @@
-"""Listens to an NC by its MTConnect agent: what it is now, then every change of it, as a stream over HTTP.
+"""Receives an NC's state from its MTConnect agent: the current state, then every change, as a stream over HTTP.
 
-The agent sends what is new every ``period_s``, and an empty document when nothing is: what a document tells is no older
-than the one before it. The agent's own stamps part what one document tells; its clock is not compared with ours.
+The agent sends changes every ``period_s``, and an empty document when there are none: a document is no older than the
+one before it. The agent's stamps separate the changes within a document; its clock is not compared with ours.
 """
 
 import asyncio
@@ -62,7 +62,6 @@ class MtConnect:
         await self._open.aclose()
 
     async def _current(self) -> tuple[Streams, int, int]:
-        """Return what the NC does now, with when it was asked for and had come."""
         asked_ns = time.monotonic_ns()
         try:
             async with asyncio.timeout(ANSWER_S), get(self.name, f"{self._place}/current", ANSWER_S) as response:
@@ -85,19 +84,18 @@ class MtConnect:
         response = await self._open.enter_async_context(get(self.name, url, ANSWER_S))
         if response.status != 200 or "xml" in response.headers.get("content-type", ""):
             async with asyncio.timeout(ANSWER_S):
-                read_streams(await response.document(), self.name)  # it says what it refuses
+                read_streams(await response.document(), self.name)  # its error names the cause
             raise ProtocolError(self.name, f"refuses a stream (HTTP {response.status}); compare url")
         return response
 
     def _choose(self, streams: Streams) -> None:
-        """Find the profile's signals among the data items; ProtocolError with what is not there."""
         components = chosen(streams.components, self._settings.device, self._settings.path, self.name)
         found = {name: items_at(components, signal.at) for name, signal in self._profile.signals.items()}
         lacking = [
             signal.at for name, signal in self._profile.signals.items() if found[name] is None and not signal.optional
         ]
         if lacking:
-            text = f"tells no {', no '.join(lacking)}; compare the profile with its /current"
+            text = f"does not report {', '.join(lacking)}; compare the profile with its /current"
             raise ProtocolError(self.name, f"{text}, and see docs/how-to/g0-over-the-network.md")
         self._signals = {item: name for name, item in found.items() if item is not None}
         self._instance = streams.instance
@@ -115,20 +113,21 @@ class MtConnect:
         return self._translator.state(self._shown, self._stamp_ns, error_ns)
 
     async def read(self) -> Sequence[NcState]:
-        """Return what the next document tells; DeviceError."""
+        """Return the states of the next document; DeviceError."""
         while not self._waiting:
             came = await self._response.some()
             if not came:
-                raise ProtocolError(self.name, "it ended the stream; is the agent restarted, or a proxy in between?")
+                raise ProtocolError(
+                    self.name, "it ended the stream; was the agent restarted, or is a proxy in between?"
+                )
             for document in self._parts.feed(came):
                 self._waiting += self._states(read_streams(document, self.name))
         states, self._waiting = self._waiting, []
         return states
 
     def _states(self, streams: Streams) -> Iterator[NcState]:
-        """Yield a state for each instant of a document, and one for a document in which nothing is new."""
         if streams.instance != self._instance:
-            raise ProtocolError(self.name, "the agent was started anew; it is asked from the beginning")
+            raise ProtocolError(self.name, "the agent was restarted; it is read from the beginning")
         came_ns = time.monotonic_ns()
         since_ns, self._came_ns = (
             self._came_ns - self._way_ns,

@@ -17,7 +17,7 @@ _COMPONENTS = ("Path", "Controller")
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What one data item shows from ``time_s`` of the agent's clock on (None: it does not say when).
+    """The value of one data item from ``time_s`` of the agent's clock on (None: without time stamp).
 
     ``element`` is the element's name, with its subType behind a colon; ``text`` is None where it is unavailable.
     """
@@ -31,7 +31,7 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """A path, or the controller above it, of one device, and what is observed of it."""
+    """A path, or its controller, of one device, and its observations."""
 
     device: tuple[str, str]  # name, uuid
     kind: str
@@ -41,7 +41,7 @@ class Component:
 
 @dataclass(frozen=True, slots=True)
 class Streams:
-    """A streams document: what is new, up to ``next_sequence`` of the agent's run ``instance``."""
+    """A streams document: new observations up to ``next_sequence`` of the agent's run ``instance``."""
 
     instance: str
     next_sequence: int
@@ -50,13 +50,13 @@ class Streams:
 
 
 def read_streams(document: bytes, name: str) -> Streams:
-    """Return what a document of the agent ``name`` tells; ProtocolError for an error document and for no document."""
+    """Parse a document of the agent ``name``; ProtocolError for an error document and for an invalid one."""
     if b"<!DOCTYPE" in document or b"<!ENTITY" in document:
-        raise ProtocolError(name, "sends XML with declarations of its own, which no agent does; compare url")
+        raise ProtocolError(name, "sends XML with DTD declarations, which no agent does; compare url")
     try:
         root = ElementTree.fromstring(document)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise ProtocolError(name, f"answers no MTConnect document ({error}); compare url") from None
+        raise ProtocolError(name, f"does not answer with an MTConnect document ({error}); compare url") from None
     if _local(root) == "MTConnectError":
         raise ProtocolError(name, f"refuses: {_refusal(root)}; compare url, device and path with its /probe")
     header = next((child for child in root if _local(child) == "Header"), None)
@@ -65,7 +65,7 @@ def read_streams(document: bytes, name: str) -> Streams:
     try:
         follows, size = int(header.get("nextSequence", "")), int(header.get("bufferSize", "0"))
     except ValueError:
-        raise ProtocolError(name, "tells no nextSequence in its header; it is too old an agent") from None
+        raise ProtocolError(name, "sends no nextSequence in its header; the agent is too old") from None
     return Streams(header.get("instanceId", ""), follows, size, tuple(_components(root, name)))
 
 
@@ -90,7 +90,7 @@ def _observations(stream: ElementTree.Element, name: str) -> Iterator[Observatio
             try:
                 sequence = int(each.get("sequence", ""))
             except ValueError:
-                raise ProtocolError(name, f"tells a {_local(each)[:40]} without a sequence number") from None
+                raise ProtocolError(name, f"sends a {_local(each)[:40]} without a sequence number") from None
             text = (each.text or "").strip()
             sub_type = each.get("subType", "")
             element = f"{_local(each)}:{sub_type}" if sub_type else _local(each)
@@ -110,7 +110,7 @@ def _local(element: ElementTree.Element) -> str:
 
 
 def chosen(components: Sequence[Component], device: str, path: str, name: str) -> tuple[Component, ...]:
-    """Return the path that is listened to and the controllers of its device; ProtocolError where it is not clear."""
+    """Return the configured path and the controllers of its device; ProtocolError where the choice is ambiguous."""
     paths = [each for each in components if each.kind == "Path" and (not device or device in each.device)]
     devices = {each.device for each in paths}
     if len(devices) != 1:
@@ -125,7 +125,7 @@ def chosen(components: Sequence[Component], device: str, path: str, name: str) -
 
 
 def items_at(components: Sequence[Component], places: str) -> str | None:
-    """Return the dataItemId of the first of these places (``Line``, ``PathFeedrate:ACTUAL``, ``@id``) that is there."""
+    """Return the dataItemId of the first of these places (``Line``, ``PathFeedrate:ACTUAL``, ``@id``) that exists."""
     observed = [each for component in components for each in component.observed]
     for place in places.split("|"):
         for each in observed:

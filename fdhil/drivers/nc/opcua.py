@@ -1,7 +1,7 @@
-"""Asks an NC what it does by its OPC UA server: every signal of the profile with one Read request.
+"""Polls an NC's state from its OPC UA server: every signal of the profile with one Read request.
 
-asyncua reconnects by itself only if it is told to, which it is not: the listener enters a source anew. Its logger is
-quiet, for what it logs is told by the errors here.
+asyncua's automatic reconnection stays off: the listener reconnects. Its logger is quiet, since the errors here report
+the same.
 """
 
 import asyncio
@@ -27,7 +27,7 @@ from fdhil.records import NcState
 logging.getLogger("asyncua").setLevel(logging.CRITICAL)
 LOST = (OSError, EOFError, UaError)
 NONSENSE = (struct.error, ValueError, TypeError, KeyError, AttributeError, IndexError)
-"""What asyncua lets through when bytes come that are no OPC UA."""
+"""Errors of asyncua for bytes that are not OPC UA."""
 _NOT_THERE = (ua.StatusCodes.BadNodeIdUnknown, ua.StatusCodes.BadNodeIdInvalid, ua.StatusCodes.BadAttributeIdInvalid)
 
 
@@ -58,7 +58,9 @@ class OpcUa:
             raise ConnectError(self.name, text) from None
         except LOST as error:
             await self._disconnect()
-            text = f"cannot be entered ({_words(error)}); compare url, user, certificate and the server's own settings"
+            text = (
+                f"cannot be connected ({_words(error)}); compare url, user, certificate and the server's own settings"
+            )
             raise ConnectError(self.name, text) from None
         except NONSENSE as error:
             await self._disconnect()
@@ -88,19 +90,20 @@ class OpcUa:
                 del found[name]
         lacking = [signal.at for name, signal in signals.items() if name not in found and not signal.optional]
         if lacking:
-            text = f"has no {', no '.join(lacking)}; compare the profile {self._settings.profile} with a browser of it"
+            text = (
+                f"has no {', no '.join(lacking)}; compare the profile {self._settings.profile} with an OPC UA browser"
+            )
             raise ProtocolError(self.name, text)
         return found
 
     async def read(self) -> Sequence[NcState]:
-        """Rest until it is time, ask, and return the state; DeviceError."""
         await asyncio.sleep(max(0.0, self._next_s - time.monotonic()))
         self._next_s = max(time.monotonic(), self._next_s + self._settings.period_s)
         asked_ns = time.monotonic_ns()
         values = await self._values()
         shown = {name: _shown(value) for name, value in zip(self._nodes, values, strict=True)}
         if all(value is None for value in shown.values()):
-            text = f"shows no value ({_status(values[0])}); is the NC behind it switched on?"
+            text = f"has no value ({_status(values[0])}); is the NC behind it switched on?"
             raise ProtocolError(self.name, text)
         stamp_ns, error_ns = between(asked_ns, time.monotonic_ns(), self._settings.renewed_s)
         return [self._translator.state(shown, stamp_ns, error_ns)]
@@ -116,17 +119,17 @@ class OpcUa:
         except LOST as error:
             raise ConnectError(self.name, f"is lost ({_words(error)}); is the server still running?") from None
         except NONSENSE as error:
-            raise ProtocolError(self.name, f"answers nonsense ({_words(error)}); compare url") from None
+            raise ProtocolError(self.name, f"sends an invalid answer ({_words(error)}); compare url") from None
         if len(values) != len(self._nodes):
-            raise ProtocolError(self.name, f"answers {len(values)} values for {len(self._nodes)} that were asked for")
+            raise ProtocolError(self.name, f"answered {len(values)} values instead of {len(self._nodes)}")
         return values
 
 
 @contextlib.asynccontextmanager
 async def _within(seconds: float) -> AsyncIterator[None]:
-    """Limit the time as asyncio.timeout does, also where the end comes together with an answer.
+    """Limit the time as asyncio.timeout does, also where it expires together with an answer.
 
-    asyncua is cancelled by a class of its own then, which Python 3.11 takes for somebody else's cancellation.
+    asyncua is then cancelled by its own exception class, which Python 3.11 takes for somebody else's cancellation.
     """
     async with asyncio.timeout(seconds):
         try:
@@ -136,7 +139,6 @@ async def _within(seconds: float) -> AsyncIterator[None]:
 
 
 def _shown(value: ua.DataValue) -> Shown:
-    """Return a value that is good; None for one that is not, and for what is no number and no text."""
     if value.Value is None or (value.StatusCode is not None and not value.StatusCode.is_good()):
         return None
     plain: Any = value.Value.Value

@@ -1,4 +1,4 @@
-"""Finds the nodes of a server by what a profile says of their places."""
+"""Finds the nodes of a server by the places in a profile."""
 
 from collections.abc import Iterable, Mapping
 
@@ -13,8 +13,6 @@ PATH = "Objects/"
 
 
 class _Browser:
-    """Looks into nodes, into each once."""
-
     def __init__(self, client: Client) -> None:
         self._client = client
         self._below: dict[ua.NodeId, list[tuple[str, ua.NodeId]]] = {}
@@ -46,7 +44,7 @@ def _named(references: Iterable[ua.ReferenceDescription]) -> Iterable[tuple[str,
 
 
 def check_places(places: Mapping[str, str], source: str) -> None:
-    """ConfigError with every place that is neither a node id nor a path."""
+    """Raise ConfigError with every place that is neither a node id nor a path."""
     faults = []
     for name, at in places.items():
         try:
@@ -54,14 +52,14 @@ def check_places(places: Mapping[str, str], source: str) -> None:
                 ua.NodeId.from_string(at.partition(";")[2] if at.startswith(NAMED) else at)
         except (UaError, ValueError):
             advice = "'ns=2;s=NAME', 'nsu=URI;s=NAME' or 'Objects/NAME/NAME'"
-            faults.append(ConfigFault(f"signals.{name}.at", f"{at[:60]!r} is no place of OPC UA", advice))
+            faults.append(ConfigFault(f"signals.{name}.at", f"{at[:60]!r} is not an OPC UA node or path", advice))
     if faults:
         raise ConfigError(f"NC profile {source}", faults)
 
 
 async def find_nodes(client: Client, places: Mapping[str, str]) -> dict[str, ua.NodeId]:
-    """Return the node of each place that there is: a node id, one with ``nsu=URI;`` in front, or a path of browse
-    names from ``Objects/`` on."""
+    """Return the node of each existing place: a node id, one with ``nsu=URI;`` in front, or a path of browse names from
+    ``Objects/`` on."""
     browser, found = _Browser(client), {}
     spaces = await client.get_namespace_array() if any(at.startswith(NAMED) for at in places.values()) else []
     for name, at in places.items():

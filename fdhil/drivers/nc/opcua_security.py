@@ -1,6 +1,6 @@
-"""Makes a connection to an OPC UA server one that is signed and encrypted, and one of a user, where the config says so.
+"""Sets certificates and user of an OPC UA client, where they are configured.
 
-The key and the password are read each time the server is entered, and are in no message.
+Key and password are read at every connection, and appear in no message.
 """
 
 from pathlib import Path
@@ -16,7 +16,7 @@ SECTION = "nc_source.opcua"
 
 
 async def secure(client: Client, settings: OpcUaNc, name: str) -> None:
-    """Give the client its user and its certificate; ConnectError with the file that cannot be used."""
+    """Set the client's user and certificate; ConnectError names an unusable file."""
     if settings.user is not None and settings.password_file is not None:
         client.set_user(settings.user)
         client.set_password(_read("password_file", settings.password_file, name).decode("utf-8", "replace").strip())
@@ -44,12 +44,12 @@ def _read(key: str, path: Path, name: str) -> bytes:
 
 
 def _held(content: bytes) -> CertProperties:
-    """Return a certificate or a key with what it is written in: asyncua tells by the ending of a name alone."""
+    """Return a certificate or a key with its encoding, which asyncua only derives from a file name."""
     return CertProperties(content, "pem" if b"-----BEGIN" in content else "der")
 
 
 async def _application_uri(certificate: CertProperties) -> str | None:
-    """Return the URI that the certificate is for: a server compares it with what the client calls itself."""
+    """Return the certificate's URI: a server compares it with the client's own."""
     try:
         extensions = (await load_certificate(certificate.path_or_content, certificate.extension)).extensions
         names = extensions.get_extension_for_class(x509.SubjectAlternativeName).value

@@ -1,8 +1,8 @@
-"""Translates what an NC's interface shows into what the NC does, by the rules of a profile. Pure.
+"""Translates the values of an NC's interface into its state, by the rules of a profile. Pure.
 
-A profile names signals, where each is, and rules: the first rule that holds tells the motion. A rule that needs what
-is not told does not hold and is not passed over either: the motion is then UNKNOWN, so that a missing "feed hold"
-never leaves a "rapid" behind.
+A profile names signals, their places, and rules: the first rule that is met gives the motion. A rule that needs a
+missing value is neither met nor skipped: the motion is then UNKNOWN, so that a missing "feed hold" never results in a
+"rapid".
 """
 
 import math
@@ -16,7 +16,7 @@ from fdhil.errors import ProtocolError
 from fdhil.records import MoveKind, NcState
 
 Shown = bool | int | float | str | tuple[Any, ...] | None
-"""A value as an interface shows it; None: it shows none."""
+"""A value of an interface; None: missing."""
 LARGEST_FEED_MM_MIN = 1e7
 LARGEST_OVERRIDE = 10.0
 LARGEST_COUNT = 10**9 - 1
@@ -26,10 +26,10 @@ _NUMBERED = re.compile(r"^\s*[NO]?0*(\d{1,9})\s*$", re.IGNORECASE)
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """One value: ``at`` is its place in the interface's own words, ``scale`` takes it to the unit of NcState.
+    """One value: ``at`` is its place in the interface's own notation, ``scale`` converts it to the unit of NcState.
 
-    ``bit`` is taken of a whole number, ``item`` of an array. ``reads``: the value itself, or the motion that the text
-    of a block tells. One that is ``optional`` may be absent.
+    ``bit`` is taken of an integer, ``item`` of an array. ``reads``: the value itself, or the motion of the block whose
+    text it is. An ``optional`` one may be absent.
     """
 
     name: str
@@ -43,14 +43,13 @@ class Signal:
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """What a signal must be: one of ``values`` (or an array with one of them in it), or a number within bounds."""
+    """What a signal must be: one of ``values`` (or an array that contains one), or a number within bounds."""
 
     values: tuple[bool | float | str, ...] = ()
     at_least: float = -math.inf
     at_most: float = math.inf
 
     def holds(self, value: Shown) -> bool:
-        """Whether a value that is told is so."""
         if self.values:
             return any(each in self.values for each in (value if isinstance(value, tuple) else (value,)))
         number = _number(value)
@@ -59,22 +58,22 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """The motion is ``kind`` when every condition holds."""
+    """The motion is ``kind`` when every condition is met."""
 
     kind: MoveKind
     when: Mapping[str, Condition]
 
     def holds(self, values: Mapping[str, Shown]) -> bool | None:
-        """Whether it holds; None where that depends on what is not told."""
-        told = {name: values.get(name) for name in self.when}
-        if any(value is not None and not self.when[name].holds(value) for name, value in told.items()):
+        """Return whether it is met; None where that depends on a missing value."""
+        needed = {name: values.get(name) for name in self.when}
+        if any(value is not None and not self.when[name].holds(value) for name, value in needed.items()):
             return False
-        return None if None in told.values() else True
+        return None if None in needed.values() else True
 
 
 @dataclass(frozen=True, slots=True)
 class NcProfile:
-    """How an NC shows what it does: its signals by name, and the rules of its motion in order."""
+    """How an NC shows its state: its signals by name, and the rules of its motion in order."""
 
     title: str
     interface: str
@@ -83,7 +82,7 @@ class NcProfile:
     notes: tuple[str, ...] = ()
 
     def motion(self, values: Mapping[str, Shown]) -> MoveKind:
-        """Return the kind of the first rule that holds, UNKNOWN where none does or it cannot be told."""
+        """Return the kind of the first rule that is met, UNKNOWN where none is or a value is missing."""
         for rule in self.rules:
             holds = rule.holds(values)
             if holds or holds is None:
@@ -92,7 +91,7 @@ class NcProfile:
 
 
 class Translator:
-    """Makes states of what an interface shows, one after the other; ``name`` is the NC's in messages."""
+    """Translates values of an interface into successive states; ``name`` is the NC's in messages."""
 
     def __init__(self, profile: NcProfile, name: str) -> None:
         self._profile, self._name = profile, name
@@ -100,11 +99,11 @@ class Translator:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the blocks before: the connection was made anew."""
+        """Reset the modal state after a reconnection."""
         self._blocks = {s.name: BLOCKS[s.reads]() for s in self._profile.signals.values() if s.reads in BLOCKS}
 
     def state(self, shown: Mapping[str, Shown], stamp_ns: int, error_ns: int) -> NcState:
-        """Return what the NC does by what it shows, signal by signal; ProtocolError for what cannot be."""
+        """Translate the values of the signals into a state; ProtocolError for impossible values."""
         values = {s.name: _taken(s, shown.get(s.name)) for s in self._profile.signals.values()}
         fields = {name: self._field(name, values[name]) for name in FIELDS if name in values}
         for name, blocks in self._blocks.items():
@@ -114,18 +113,16 @@ class Translator:
         return NcState(stamp_ns, error_ns, self._profile.motion(values), **fields)
 
     def _field(self, name: str, value: Shown) -> Any:
-        """Return a field of NcState; what is not told, and a number that means none, is None."""
         if value is None:
             return None
         try:
             return FIELDS[name](value)
         except (ValueError, TypeError, OverflowError):
-            text = f"tells {str(value)[:40]!r} as {name}; compare its place and its scale in the profile with the NC"
+            text = f"reports {str(value)[:40]!r} as {name}; compare its place and scale in the profile with the NC"
             raise ProtocolError(self._name, text) from None
 
 
 def _taken(signal: Signal, shown: Shown) -> Shown:
-    """Return the item, the bit or the scaled number that a signal takes of what is shown."""
     value = shown
     if signal.item is not None:
         value = value[signal.item] if isinstance(value, tuple) and signal.item < len(value) else None
@@ -138,7 +135,6 @@ def _taken(signal: Signal, shown: Shown) -> Shown:
 
 
 def _number(value: Shown) -> float | None:
-    """Return a number, also one that is shown as a text; None where it is none."""
     if isinstance(value, tuple) or value is None:
         return None
     try:
@@ -159,7 +155,7 @@ def _within(most: float) -> Callable[[Shown], float]:
 
 
 def _counted(least: int) -> Callable[[Shown], int | None]:
-    """A whole number, or one with an N or O in front; below ``least`` it means none."""
+    """Return a parser of whole numbers, also with an N or O in front; below ``least`` they mean none."""
 
     def check(value: Shown) -> int | None:
         if isinstance(value, str):
@@ -167,7 +163,7 @@ def _counted(least: int) -> Callable[[Shown], int | None]:
             return int(found[1]) if found and least <= int(found[1]) <= LARGEST_COUNT else None
         number = _number(value)
         if number is None or number != round(number):
-            raise ValueError(f"{value!r} is no whole number")
+            raise ValueError(f"{value!r} is not a whole number")
         return int(number) if least <= number <= LARGEST_COUNT else None
 
     return check
@@ -181,7 +177,7 @@ def _yes(value: Shown) -> bool:
 
 def _text(value: Shown) -> str | None:
     if not isinstance(value, str):
-        raise TypeError(f"{value!r} is no text")
+        raise TypeError(f"{value!r} is not a text")
     return value.strip()[:TEXT] or None
 
 
@@ -195,4 +191,4 @@ FIELDS: Mapping[str, Callable[[Shown], Any]] = {
     "tool": _counted(0),
     "program": _text,
 }
-"""The signals that are fields of NcState, and how each is read; every other one serves the rules alone."""
+"""Signals that are fields of NcState, with their parsers; all others are only used by the rules."""

@@ -51,10 +51,10 @@ class _File(_Table):
 
 
 def read_nc_profile(name: str, interface: str) -> NcProfile:
-    """Return a packaged profile by its name, or a user's own by its path; ConfigError with all that is wrong."""
+    """Return a packaged profile by its name, or a user's own by its path; ConfigError with every fault."""
     profile = profile_of(_document(name), name)
     if profile.interface != interface:
-        raise _faults(name, [("interface", f"is for {profile.interface}, and is used for {interface}")])
+        raise _faults(name, [("interface", f"is for {profile.interface}, but is used for {interface}")])
     return profile
 
 
@@ -74,7 +74,7 @@ def profile_of(document: Mapping[str, Any], source: str) -> NcProfile:
         raise _faults(source, found) from None
     signals = {name: Signal(name, **signal.model_dump()) for name, signal in file.signals.items()}
     faults = [
-        (f"motion.{place}.when.{name}", "is optional, and decides the motion" if name in signals else "is no signal")
+        (f"motion.{place}.when.{name}", "is optional, but decides the motion" if name in signals else "is not a signal")
         for place, rule in enumerate(file.motion, 1)
         for name in rule.when
         if name not in signals or signals[name].optional

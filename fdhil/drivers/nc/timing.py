@@ -1,12 +1,12 @@
-"""When what an NC shows was true. Pure."""
+"""Bounds the time at which a polled value was true. Pure."""
 
-LEAST_ERROR_NS = 1000  # no clock of a computer is read more exactly
+LEAST_ERROR_NS = 1000  # resolution of the computer's clock
 
 
 def between(asked_ns: int, answered_ns: int, renewed_s: float) -> tuple[int, int]:
-    """Return the middle of the time in which a value was true that was shown, and half its length, in ns.
+    """Return the middle of the time in which a polled value was true, and half its length, in ns.
 
-    It was read for the answer between question and answer, and was then up to ``renewed_s`` old.
+    It was read between request and answer, and was then up to ``renewed_s`` old.
 
     >>> between(1_000_000, 3_000_000, 0.002)
     (1000000, 2000000)

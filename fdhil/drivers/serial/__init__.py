@@ -1,1 +1,1 @@
-"""Serial lines: the port as a stream of stamped bytes, lines of text, and the instruments that tell by them."""
+"""Serial lines: the port as a stream of stamped bytes, lines of text, and instruments that send text."""

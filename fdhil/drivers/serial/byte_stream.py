@@ -1,4 +1,4 @@
-"""What comes over a line as bytes, each with the time at which it was read: the part that every kind of line has."""
+"""A stream of received bytes with their times: common to all kinds of line."""
 
 import asyncio
 import time
@@ -8,20 +8,20 @@ from dataclasses import dataclass
 
 from fdhil.errors import ConnectError
 
-MOST_KEPT = 1 << 16  # bytes that nobody has asked for; the oldest are let go
+MOST_KEPT = 1 << 16  # unread bytes; the oldest are discarded
 
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Bytes that were read together, and when (host-monotonic ns): they had arrived by then, the first ones earlier."""
+    """Bytes that were read together, and when (host-monotonic ns): the first ones had arrived earlier."""
 
     data: bytes
     t_ns: int
 
 
 class ByteStream(ABC):
-    """A line that is open or not; ``last_ns`` (host-monotonic) is when bytes came last, ``dropped`` counts those that
-    found no room."""
+    """A line that is open or not; ``last_ns`` (host-monotonic) is when bytes came last, ``dropped`` counts discarded
+    ones."""
 
     where: str
     character_s: float
@@ -37,7 +37,7 @@ class ByteStream(ABC):
     @property
     @abstractmethod
     def is_open(self) -> bool:
-        """Whether the line is open and has not gone away."""
+        """Whether the line is open and still there."""
 
     @abstractmethod
     async def connect(self, name: str, timeout_s: float) -> None:
@@ -45,14 +45,14 @@ class ByteStream(ABC):
 
     @abstractmethod
     def send(self, name: str, data: bytes) -> int:
-        """Write at once and return when (host-monotonic ns); ConnectError when the line is gone or takes nothing."""
+        """Write at once and return when (host-monotonic ns); ConnectError when the line is gone or accepts nothing."""
 
     @abstractmethod
     def close(self) -> None:
         """Close the line."""
 
     def wire_ns(self, count: int) -> int:
-        """How long ``count`` characters take on the wire."""
+        """Return the time that ``count`` characters take on the wire."""
         return round(count * self.character_s * 1e9)
 
     async def receive(self, name: str, until_ns: int) -> Chunk | None:
@@ -72,7 +72,7 @@ class ByteStream(ABC):
         return chunk
 
     def discard(self) -> int:
-        """Forget what has come and was not asked for; return how many bytes that were."""
+        """Discard received bytes; return their number."""
         kept, self._kept = self._kept, 0
         self._chunks.clear()
         return kept

@@ -1,10 +1,9 @@
-"""Reads an instrument that tells its value in lines of text over a serial line: asked, or by itself."""
+"""Reads an instrument that sends its value in lines of text over a serial line: on request, or by itself."""
 
 import re
 import time
-from typing import Protocol
 
-from fdhil.config import MachineConfig
+from fdhil.config import MachineConfig, Thermometer, Voltage
 from fdhil.config.sensors import SerialPlace
 from fdhil.drivers.meter import MeterVoltage
 from fdhil.drivers.serial.lines import LineReader
@@ -15,23 +14,11 @@ FIRST_NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
 SHOWN = 40  # characters of a line in a message
 
 
-class TextPlace(Protocol):
-    """What an instrument is asked and where its number is: the keys of :class:`fdhil.config.sensors.TextValue`."""
-
-    @property
-    def query(self) -> str: ...
-    @property
-    def pattern(self) -> str: ...
-    @property
-    def scale(self) -> float: ...
-    @property
-    def offset(self) -> float: ...
-
-
 class SerialLink:
-    """The serial line to one instrument; ``name`` is used in messages."""
+    """The serial line to one device; ``name`` is used in messages."""
 
     wire = "serial"
+    timeout_code = "SerialTimeout"
 
     def __init__(self, name: str, place: SerialPlace) -> None:
         self.name = name
@@ -40,40 +27,36 @@ class SerialLink:
 
     @property
     def connected(self) -> bool:
-        """Whether the device is open."""
         return self.port.is_open
 
     async def connect(self) -> None:
-        """Open the device; ConnectError."""
         self.port.open(self.name)
 
     def fault_code(self, error: DeviceError) -> str | None:
-        """Return the class under which ``error`` is told."""
         if isinstance(error, DeviceTimeout):
-            return "SerialTimeout"
+            return self.timeout_code
         return "SerialPortGone" if isinstance(error, ConnectError) else "SerialShape"
 
     def close(self) -> None:
-        """Release the device."""
         self.port.close()
 
 
 class TextMeter:
     """One number of an instrument's line."""
 
-    def __init__(self, name: str, place: SerialPlace, text: TextPlace, period_s: float) -> None:
+    def __init__(self, name: str, settings: Voltage | Thermometer) -> None:
         self.name = name
-        self.link = SerialLink(name, place)
+        self.link = SerialLink(name, settings)
         self._lines = LineReader(self.link.port, name)
-        self._text, self._timeout_s = text, place.timeout_s
-        self._number = re.compile(text.pattern or FIRST_NUMBER)
-        self.tells_by_itself = not text.query
-        self._wait_s = place.timeout_s + (period_s if self.tells_by_itself else 0.0)
+        self._text = settings
+        self._number = re.compile(settings.pattern or FIRST_NUMBER)
+        self.tells_by_itself = not settings.query
+        self._wait_s = settings.timeout_s + (settings.period_s if self.tells_by_itself else 0.0)
         self.asked_ns = self.answered_ns = 0
         self._line = ""
 
     async def value(self) -> float:
-        """Return the next number that is told, scaled; DeviceTimeout, ConnectError, ProtocolError for another text."""
+        """Return the next number, scaled; DeviceTimeout, ConnectError, ProtocolError for a line without one."""
         asked_ns = self._ask() if self._text.query else 0
         line = await self._lines.next_line(time.monotonic_ns() + round(self._wait_s * 1e9))
         if line is None:
@@ -85,7 +68,7 @@ class TextMeter:
         return self._number_in(line.text)
 
     def _ask(self) -> int:
-        """Ask, and return when the question was through; an answer that came too late is forgotten before."""
+        """Send the query and return when it was through; an answer that came too late is discarded before."""
         query = self._text.query.encode()
         self._lines.discard()
         return self.link.port.send(self.name, query) + self.link.port.wire_ns(len(query))
@@ -103,12 +86,8 @@ class TextMeter:
         return self._text.scale * raw + self._text.offset
 
     def doubt(self, shown: str) -> str:
-        """Return what is to be told of a value that cannot be."""
         return f"the line {self._line[:SHOWN]!r} gives {shown}; compare pattern, scale and unit with the instrument"
 
 
 def serial_voltage(axis: str, config: MachineConfig) -> MeterVoltage:
-    """Return the voltage source ``serial``."""
-    settings = config.axis[axis].voltage
-    meter = TextMeter(f"voltage sensor {axis}", settings, settings, settings.period_s)
-    return MeterVoltage(axis, config, meter)
+    return MeterVoltage(axis, config, TextMeter(f"voltage sensor {axis}", config.axis[axis].voltage))

@@ -1,4 +1,4 @@
-"""Lines of text that come over a serial port, each with the time at which its end had come."""
+"""Splits the bytes of a serial port into lines, each with the arrival time of its end."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -6,19 +6,19 @@ from dataclasses import dataclass
 from fdhil.drivers.serial.byte_stream import Chunk
 from fdhil.drivers.serial.port import SerialPort
 
-LONGEST = 512  # characters; what is longer without an end is no line of an instrument
+LONGEST = 512  # characters; a longer line is not from an instrument
 
 
 @dataclass(frozen=True, slots=True)
 class TextLine:
-    """A line without its end; its last character had come at ``t_ns`` (host-monotonic) at the latest."""
+    """A line without its end; its last character had arrived by ``t_ns`` (host-monotonic)."""
 
     text: str
     t_ns: int
 
 
 class LineReader:
-    """Cuts what a port receives into lines; carriage return, line feed and both end one. ``name`` is for messages."""
+    """Splits received bytes into lines; carriage return, line feed and both end one. ``name`` is for messages."""
 
     def __init__(self, port: SerialPort, name: str) -> None:
         self._port = port
@@ -44,13 +44,12 @@ class LineReader:
             text = line.decode("ascii", "replace").strip()
             if len(line) > LONGEST:
                 self.overlong += 1
-            elif text:  # what came after it in the same read was on the wire after it
+            elif text:  # later bytes of the same read were on the wire after it
                 self._lines.append(TextLine(text, chunk.t_ns - self._port.wire_ns(left)))
         if len(self._begun) > LONGEST:
             self._begun, self.overlong = b"", self.overlong + 1
 
     def discard(self) -> None:
-        """Forget what has come so far."""
         self._port.discard()
         self._lines.clear()
         self._begun = b""

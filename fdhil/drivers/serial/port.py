@@ -1,4 +1,4 @@
-"""A serial port as a stream of bytes. The one place that knows pyserial."""
+"""A serial port as a stream of bytes; the only module that uses pyserial."""
 
 import asyncio
 import os
@@ -16,9 +16,9 @@ _PARITY = {"even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD, "none": serial.
 
 
 class SerialPort(ByteStream):
-    """An open device; nobody else may open it meanwhile. ``name`` is the sensor's, for messages.
+    """A device opened exclusively. ``name`` is the sensor's, for messages.
 
-    A pseudo terminal knows neither rate nor parity: ``wire_ns`` is 0 there.
+    A pseudo terminal has neither rate nor parity: ``compute_wire_ns`` is 0 there.
     """
 
     def __init__(self, place: SerialPlace) -> None:
@@ -34,19 +34,16 @@ class SerialPort(ByteStream):
 
     @property
     def is_open(self) -> bool:
-        """Whether the device is open and has not gone away."""
         return self._serial is not None and not self._gone
 
     def wire_ns(self, count: int) -> int:
-        """How long ``count`` characters take on the wire."""
         return 0 if self._is_pty else super().wire_ns(count)
 
     async def connect(self, name: str, timeout_s: float) -> None:
-        """Open the device: it is there at once or not at all."""
         self.open(name)
 
     def open(self, name: str) -> None:
-        """Open the device; ConnectError when it is not there, may not be used, or another program has it."""
+        """Open the device; ConnectError when it is missing, not permitted, or used by another program."""
         self.close()
         self._is_pty = os.path.realpath(self.device).startswith("/dev/pts/")
         try:
@@ -66,11 +63,11 @@ class SerialPort(ByteStream):
 
     def _why(self, error: Exception) -> str:
         if not Path(self.device).exists():
-            return f"there is no serial device {self.device}; plug the adapter in, or correct device"
+            return f"serial device {self.device} does not exist; plug the adapter in, or correct device"
         if not os.access(self.device, os.R_OK | os.W_OK):
-            return f"the serial device {self.device} may not be used; add the user to the group dialout"
+            return f"the serial device {self.device} is not permitted; add the user to the group dialout"
         if isinstance(error, serial.SerialException) and "lock" in str(error):
-            return f"the serial device {self.device} is used by another program; end it (fdhil run holds it, too)"
+            return f"the serial device {self.device} is used by another program; end that (fdhil run uses it, too)"
         return f"the serial device {self.device} cannot be opened ({error}); check that it is a serial line"
 
     def _read(self) -> None:
@@ -92,7 +89,6 @@ class SerialPort(ByteStream):
         self._stop_reading()
 
     def send(self, name: str, data: bytes) -> int:
-        """Write at once and return when (host-monotonic ns); ConnectError when the device is gone or takes nothing."""
         port = self._held(name)
         try:
             written = os.write(port.fileno(), data)
@@ -100,7 +96,7 @@ class SerialPort(ByteStream):
             self._end(error.strerror or str(error))
             raise self._lost(name) from error
         if written != len(data):
-            self._end("it takes no more bytes")
+            self._end("it accepts no more bytes")
             raise self._lost(name)
         return time.monotonic_ns()
 
@@ -114,7 +110,6 @@ class SerialPort(ByteStream):
             self._loop.remove_reader(self._serial.fileno())
 
     def close(self) -> None:
-        """Close the device."""
         if self._serial is not None:
             if not self._gone:
                 self._stop_reading()

@@ -1,4 +1,4 @@
-"""The port of a serial server: it passes the bytes of its serial line over TCP, as they are."""
+"""Connects to a serial server, which passes the bytes of its serial line over TCP unchanged."""
 
 import asyncio
 import time
@@ -7,12 +7,12 @@ from typing import cast
 from fdhil.drivers.serial.byte_stream import ByteStream
 from fdhil.errors import ConnectError
 
-CONNECT_S = 2.0  # beyond the time that an answer may take
-CHARACTER_S = 11 / 19200  # what its serial line is set to is unknown here
+CONNECT_S = 2.0  # in addition to the answer's time-out
+CHARACTER_S = 11 / 19200  # the settings of its serial line are unknown
 
 
 class ServerPort(ByteStream, asyncio.Protocol):
-    """A TCP connection to a serial server. When the bytes are on its serial line is unknown: ``wire_ns`` is 0."""
+    """A TCP connection to a serial server. The times on its serial line are unknown: ``compute_wire_ns`` is 0."""
 
     character_s = CHARACTER_S
 
@@ -24,7 +24,6 @@ class ServerPort(ByteStream, asyncio.Protocol):
 
     @property
     def is_open(self) -> bool:
-        """Whether the connection stands."""
         return self._transport is not None and not self._gone
 
     def wire_ns(self, count: int) -> int:
@@ -32,7 +31,6 @@ class ServerPort(ByteStream, asyncio.Protocol):
         return 0
 
     async def connect(self, name: str, timeout_s: float) -> None:
-        """Connect; ConnectError when nobody answers there."""
         self.close()
         try:
             async with asyncio.timeout(timeout_s + CONNECT_S):
@@ -42,27 +40,22 @@ class ServerPort(ByteStream, asyncio.Protocol):
             raise ConnectError(name, text) from None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take the connection."""
         self._transport = cast("asyncio.WriteTransport", transport)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes."""
         self._take(data)
 
     def connection_lost(self, error: Exception | None) -> None:
-        """Note that the server ended the connection."""
         if self._transport is not None:
-            self._end(str(error) if error else "the server ended it")
+            self._end(str(error) if error else "the server closed it")
 
     def send(self, name: str, data: bytes) -> int:
-        """Write at once and return when (host-monotonic ns); ConnectError when the connection is gone."""
         if self._transport is None or self._gone:
             raise self._lost(name)
         self._transport.write(data)
         return time.monotonic_ns()
 
     def close(self) -> None:
-        """End the connection."""
         transport, self._transport, self._gone = self._transport, None, ""
         if transport is not None:
             transport.close()

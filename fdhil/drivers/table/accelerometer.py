@@ -8,42 +8,36 @@ import numpy as np
 
 from fdhil.config import Accelerometer
 from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.serial.instrument import SerialLink
 from fdhil.drivers.serial.lines import LineReader, TextLine
-from fdhil.drivers.serial.port import SerialPort
 from fdhil.drivers.table.arrivals import Arrivals
-from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
+from fdhil.errors import DeviceTimeout, ProtocolError
 from fdhil.records import Notice, TableSamples, frozen
 
 SILENCE_NS = 1_000_000_000
-SETTLED_NS = 50_000_000  # an arrival is placed when so many later SYNCs have shown which stamps about it were late
-WRAPS = (1 << 8, 1 << 16, 1 << 24, 1 << 32)  # where counts of devices begin anew
-LARGEST_GAP = 5000  # samples that may be lost in one go; a larger step is another count
+SETTLED_NS = 50_000_000  # later SYNCs that are needed to recognise late stamps around an arrival
+WRAPS = (1 << 8, 1 << 16, 1 << 24, 1 << 32)  # where devices' counts wrap
+LARGEST_GAP = 5000  # samples that may be lost at once; a larger step is another count
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
-class SerialStream:
-    """The connection to a device that talks by itself."""
+class SerialStream(SerialLink):
+    """The serial line to a free-running device."""
 
-    wire = "serial"
+    timeout_code = "TableSilent"
 
     def __init__(self, name: str, settings: Accelerometer) -> None:
-        self.name, self.place = name, settings.device
-        self._port = SerialPort(settings)
-        self._reader = LineReader(self._port, name)
+        super().__init__(name, settings)
+        self.place = settings.device
+        self._reader = LineReader(self.port, name)
         self._heard_ns = 0
 
-    @property
-    def connected(self) -> bool:
-        """Whether the port is open."""
-        return self._port.is_open
-
     async def connect(self) -> None:
-        """Open the port; ConnectError when it cannot be had."""
-        self._port.open(self.name)
+        await super().connect()
         self._heard_ns = time.monotonic_ns()
 
     async def lines(self) -> list[TextLine]:
-        """Return the lines that have come; DeviceTimeout when none has for a second, ConnectError."""
+        """Return the received lines; DeviceTimeout after a second without any, ConnectError."""
         found = []
         while (line := await self._reader.next_line(time.monotonic_ns())) is not None:
             found.append(line)
@@ -56,19 +50,9 @@ class SerialStream:
             )
         return found
 
-    def fault_code(self, error: DeviceError) -> str | None:
-        """Return the class under which ``error`` is told."""
-        if isinstance(error, DeviceTimeout):
-            return "TableSilent"
-        return "SerialPortGone" if isinstance(error, ConnectError) else "SerialShape"
-
-    def close(self) -> None:
-        """Close the port."""
-        self._port.close()
-
 
 class StreamedAccelerometer:
-    """The accelerometer of one axis: ``samples`` came, ``lost`` are missing by the sensor's own count."""
+    """The accelerometer of one axis: ``samples`` received, ``lost`` by the sensor's own count."""
 
     def __init__(self, axis: str, settings: Accelerometer, period_s: float) -> None:
         self.axis = axis
@@ -84,11 +68,10 @@ class StreamedAccelerometer:
         self._told: int | None = None
 
     async def poll(self, ticks: TickClock) -> list[TableSamples | Notice]:
-        """Return what has come since the last time; errors of the link pass, ProtocolError where none is a sample."""
+        """Return new samples; errors of the link pass, ProtocolError where no line is a sample."""
         return self.accept(await self.link.lines(), ticks)
 
     async def reading(self) -> str:
-        """Return the newest sample, for people."""
         until_ns = time.monotonic_ns() + SILENCE_NS
         while not (found := await self.link.lines()):
             if time.monotonic_ns() > until_ns:
@@ -96,16 +79,16 @@ class StreamedAccelerometer:
         return f"{self._numbers(found[-1].text)[1]:.2f} m/s2"
 
     def accept(self, lines: list[TextLine], ticks: TickClock) -> list[TableSamples | Notice]:
-        """Place lines on the SYNC count. Pure but for this object's own memory."""
+        """Place lines on the SYNC count. Pure but for this object's own state."""
         lost_before = self.lost
         for line in lines:
             try:
-                told = self._numbers(line.text)
-            except ProtocolError:  # the first line was under way when the port was opened; others are damaged
+                sample = self._numbers(line.text)
+            except ProtocolError:  # the first line may be incomplete; others are damaged
                 if line is lines[-1] and len(lines) > 1 and not self._held:
                     raise
                 continue
-            self._held.append(self._counted(*told))
+            self._held.append(self._counted(*sample))
             self.samples += 1
             self._waiting.append((self._held[-1][0], line.t_ns))
         while self._waiting and ticks.covers(self._waiting[0][1] + SETTLED_NS):
@@ -114,38 +97,35 @@ class StreamedAccelerometer:
                 self._arrivals.add(count, sum(between) / 2)
         out: list[TableSamples | Notice] = [*self._placed()]
         if self.lost > lost_before:
-            text = f"The {self.name} lost {self.lost - lost_before} samples, moves in them are seen without it."
+            text = f"The {self.name} lost {self.lost - lost_before} samples: moves in them are analysed without it."
             out.append(Notice("SampleTiming", "minor", text, self.axis))
         return out
 
     def _numbers(self, text: str) -> tuple[int | None, float]:
-        """Return count and value of a line; ProtocolError where it has none."""
         s = self._settings
         numbers = _NUMBER.findall(text)
         if len(numbers) < max(s.column, s.count_column):
             wanted = max(s.column, s.count_column)
-            told = f"the line {text[:40]!r} has {len(numbers)} numbers, and number {wanted} is asked for"
-            raise ProtocolError(self.name, f"{told}; compare column and count_column with what the sensor sends")
+            cause = f"the line {text[:40]!r} has {len(numbers)} numbers, but column {wanted} is configured"
+            raise ProtocolError(self.name, f"{cause}; compare column and count_column with what the sensor sends")
         count = int(float(numbers[s.count_column - 1])) if s.count_column else None
         return count, float(numbers[s.column - 1]) * s.scale
 
-    def _counted(self, told: int | None, value: float) -> tuple[int, float]:
-        """Return the count without its beginnings anew; a count of another kind begins another stream."""
+    def _counted(self, count: int | None, value: float) -> tuple[int, float]:
         before = self._newest
-        step = 1 if told is None or self._told is None else _step(self._told, told)
+        step = 1 if count is None or self._told is None else _step(self._told, count)
         if before is None or not 1 <= step <= LARGEST_GAP:
             self._held.clear()
             self._waiting.clear()
             self._arrivals = Arrivals(self._settings.rate_hz, self._period_s)
-            self._newest = told or 0
+            self._newest = count or 0
         else:
             self.lost += step - 1
             self._newest = before + step
-        self._told = told
+        self._told = count
         return self._newest, value
 
     def _placed(self) -> list[TableSamples]:
-        """Return the samples that wait as one record, once it is known where they are."""
         line = self._arrivals.line()
         if line is None or not self._held:
             return []
@@ -160,7 +140,7 @@ class StreamedAccelerometer:
         ]
 
 
-def _step(before: int, told: int) -> int:
-    """Return by how much a count rose, which may have begun anew at the next place where counts do."""
+def _step(before: int, count: int) -> int:
+    """Return the increase of a count, which may have wrapped at the next power that devices use."""
     wrap = next((w for w in WRAPS if w > before), WRAPS[-1])
-    return told - before if told > before else told - before + wrap
+    return count - before if count > before else count - before + wrap

@@ -1,8 +1,8 @@
-"""Places the samples of a stream on the SYNC count, by when they arrived. Pure.
+"""Places the samples of a stream on the SYNC count, by their arrival. Pure.
 
-A sample cannot arrive before it was taken, and how much later it does changes from one to the next. So the line from
-the sensor's count to the SYNC count runs along the earliest arrivals; its slope is the sensor's true rate, which with
-such sensors is some percent off its nominal one.
+A sample cannot arrive before it was taken, and its delay varies. So the line from the sensor's count to the SYNC count
+runs along the earliest arrivals; its slope is the sensor's true rate, some percent off the nominal one for such
+sensors.
 """
 
 from collections import deque
@@ -15,11 +15,11 @@ KEPT = 400
 LEAST_FOR_RATE = 20  # arrivals
 LEAST_SPAN_S = 0.5
 RATE_TOLERANCE = 0.06  # of the nominal rate
-EARLIEST = 10.0  # percent of the arrivals that are taken for undelayed
+EARLIEST = 10.0  # percent of the arrivals that count as undelayed
 
 
 class Arrivals:
-    """Gathers arrivals; ``rate_hz`` is the sensor's nominal rate, ``period_s`` that of SYNC."""
+    """Collects arrivals; ``rate_hz`` is the sensor's nominal rate, ``period_s`` that of SYNC."""
 
     def __init__(self, rate_hz: float, period_s: float) -> None:
         self._nominal = 1.0 / (rate_hz * period_s)
@@ -27,13 +27,13 @@ class Arrivals:
         self._known: deque[tuple[int, float]] = deque(maxlen=KEPT)
 
     def add(self, counter: int, tick: float) -> None:
-        """Sample ``counter`` had arrived at ``tick``; a count or a tick that fell is another stream."""
+        """Add the arrival of sample ``counter`` at ``tick``; a count or a tick that decreased begins another stream."""
         if self._known and (counter <= self._known[-1][0] or tick < self._known[-1][1]):
             self._known.clear()
         self._known.append((counter, tick))
 
     def line(self) -> Line | None:
-        """Return where samples are on the SYNC count, and how far off that may be; None before anything arrived."""
+        """Return the samples' line on the SYNC count with its uncertainty; None before anything arrived."""
         if not self._known:
             return None
         counter, tick = (np.array(column, np.float64) for column in zip(*self._known, strict=True))
@@ -45,7 +45,6 @@ class Arrivals:
         return Line(origin, float(earliest), step, float(usual - earliest) + step / 2)
 
     def _step(self, counter: np.ndarray, tick: np.ndarray) -> float:
-        """Return ticks from one sample to the next: through the earlier half of the arrivals."""
         if counter.size < LEAST_FOR_RATE or tick[-1] - tick[0] < self._least_span:
             return self._nominal
         slope, _ = np.polyfit(counter, tick, 1)

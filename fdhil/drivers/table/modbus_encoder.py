@@ -1,4 +1,4 @@
-"""Asks an encoder at the table behind Modbus: an SSI or EnDat module, which tells where the table stands."""
+"""Polls an encoder at the table behind Modbus, such as an SSI or EnDat module, for the table's position."""
 
 import asyncio
 
@@ -8,7 +8,7 @@ from fdhil.drivers.modbus.link import ModbusLink
 from fdhil.drivers.modbus.meter import ModbusMeter
 from fdhil.records import TableSamples, frozen
 
-SETTLE_STEPS, SETTLE_STEP_S = 8, 0.01  # until the SYNCs about the answer have been drained
+SETTLE_STEPS, SETTLE_STEP_S = 8, 0.01  # wait until the SYNCs around the answer have been drained
 
 
 class ModbusEncoder:
@@ -20,16 +20,15 @@ class ModbusEncoder:
         self.axis = axis
         self.name = f"table encoder {axis}"
         self.samples = 0
-        self._meter = ModbusMeter(self.name, settings, settings, settings.type)
+        self._meter = ModbusMeter(self.name, settings)
         self._period_s = settings.period_s
 
     @property
     def link(self) -> ModbusLink:
-        """The module's connection."""
         return self._meter.link
 
     async def poll(self, ticks: TickClock) -> list[TableSamples]:
-        """Rest for the period and read once; it was read between question and answer. Errors of the link pass."""
+        """Wait for the period and read once; the value belongs between request and answer. Errors of the link pass."""
         await asyncio.sleep(self._period_s)
         value = await self._meter.value()
         self.samples += 1
@@ -45,5 +44,4 @@ class ModbusEncoder:
         return [TableSamples(self.axis, "table_mm", tick, (between[1] - between[0]) / 2, frozen([value]))]
 
     async def reading(self) -> str:
-        """Read once, for people."""
         return f"{await self._meter.value():.4f} mm"

@@ -1,4 +1,4 @@
-"""Decodes the TPDO of an encoder at the table: a second axis' place, or that of an encoder node. Pure."""
+"""Decodes the TPDO of an encoder at the table: of a second axis, or of an encoder node. Pure."""
 
 import numpy as np
 
@@ -9,14 +9,14 @@ from fdhil.drivers.can.sync_grid import Ticked
 from fdhil.drivers.cia402.pdo_queue import decode
 from fdhil.records import Notice, TableSamples, frozen
 
-SILENT_TICKS = 3000  # of SYNC without that TPDO: then it is told
+SILENT_TICKS = 3000  # of SYNC without that TPDO until it is reported
 
 
 class TpdoEncoder:
-    """The table encoder of one axis; ``feed`` takes ticked frames of its bus, ``short`` counts those too short."""
+    """The table encoder of one axis; ``short`` counts frames that are too short."""
 
     def __init__(self, axis: str, settings: TableEncoder) -> None:
-        assert settings.cob_id is not None  # the configuration has seen to it
+        assert settings.cob_id is not None  # checked by the configuration
         self.axis = axis
         self.short = 0
         self._settings = settings
@@ -28,7 +28,7 @@ class TpdoEncoder:
         self._silent = False
 
     def feed(self, ticked: Ticked) -> list[TableSamples | Notice]:
-        """Return the samples of a block, and what must be told. Of two frames after one SYNC neither is sure."""
+        """Return the samples of a block, and notices. Two frames after one SYNC are ambiguous, and neither is used."""
         out: list[TableSamples | Notice] = []
         mine = (ticked.can_id == self.cob_id).nonzero()[0]
         long_enough = ticked.length[mine].astype(np.int64) * 8 >= self._entry.bit_offset + self._entry.bits
@@ -50,12 +50,13 @@ class TpdoEncoder:
         was, self._silent = self._silent, last_tick - self._heard_at > SILENT_TICKS
         if self._silent and not was:
             text = (
-                f"No TPDO {self.cob_id:#x} with the place of table {self.axis} comes, its compliance is not seen; "
+                f"No TPDO {self.cob_id:#x} with the position of table {self.axis} is received: its compliance "
+                "cannot be identified; "
                 "check that its node is started, that the TPDO is synchronous, and cob_id."
             )
             return [Notice("TableSilent", "minor", text, self.axis)]
         return (
-            [Notice("TableSilent", "info", "The table encoder is heard.", self.axis)]
+            [Notice("TableSilent", "info", "The table encoder sends again.", self.axis)]
             if was and not self._silent
             else []
         )

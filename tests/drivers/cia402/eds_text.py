@@ -1,4 +1,4 @@
-"""Writes small EDS files from facts: each object is (index, sub-index, data type, access, mappable, default)."""
+"""Writes small EDS files from a list of objects: (index, sub-index, data type, access, mappable, default)."""
 
 from __future__ import annotations
 

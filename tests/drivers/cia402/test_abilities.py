@@ -1,4 +1,4 @@
-"""What fdhil can do with a drive is told from its EDS: with the reason, the advice, and an exit code."""
+"""What fdhil can do with a drive is decided from its EDS: with the reason, the advice, and an exit code."""
 
 from __future__ import annotations
 
@@ -49,19 +49,19 @@ def test_a_servo_can_be_corrected(tmp_path: Path) -> None:
         "compare other scales": "no",
         "rapid signal": "yes",
     }
-    assert "R and L are not; wire a sensor" in told["voltage"][1]
+    assert "R and L cannot; wire a sensor" in told["voltage"][1]
     assert "--set-pdos" in told["mapping"][1]
 
 
 CASES: dict[str, tuple[tuple[Variable, ...], str, str, str]] = {
     "no offset": (without(SERVO, 0x60B0), "correct on line", "no", "no position offset (60B0)"),
     "offset for no PDO": (changed(SERVO, 0x60B0, "rw", 0), "correct on line", "no", "no RPDO can carry its 60B0"),
-    "offset for RPDOs": (changed(SERVO, 0x60B0, "rww"), "correct on line", "perhaps", "only the drive tells"),
+    "offset for RPDOs": (changed(SERVO, 0x60B0, "rww"), "correct on line", "perhaps", "only a test on the drive shows"),
     "mode not shown": (changed(SERVO, 0x6061, "ro", 0), "correct on line", "no", "no TPDO shows its 6061:00"),
     "no feed-forward": (without(SERVO, 0x60B2), "feed-forward", "no", "60B1, 60B2"),
     "no current": (without(SERVO, 0x6078), "listen", "no", "current (6077:00)"),
     "no speed": (without(SERVO, 0x606C), "listen", "no", "speed (606C:00)"),
-    "no SYNC": (without(SERVO, 0x1005), "listen", "perhaps", "by a timer alone"),
+    "no SYNC": (without(SERVO, 0x1005), "listen", "perhaps", "by a timer only"),
     "no abort option": (SERVO, "stop alone", "perhaps", "6007"),
     "no heartbeat": (without(SERVO, 0x1017), "heartbeat", "no", "1017"),
     "no inputs": (without(SERVO, 0x60FD), "rapid signal", "no", "inferred"),
@@ -134,7 +134,7 @@ def test_the_command_tells_people_and_programs(tmp_path: Path, capsys: Any) -> N
     assert (code, err) == (0, "")
     for words in (
         "correct on line",
-        "60B0 has an RPDO of its own",
+        "60B0 has a separate RPDO",
         "TPDO1 180+node, every 1 SYNC: 6064:00/32, 606C:00/32",
     ):
         assert words in " ".join(out.split())

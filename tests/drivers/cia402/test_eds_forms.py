@@ -1,4 +1,4 @@
-"""Every form that CiA 306 gives an EDS or DCF says the same of the device: node-IDs, compact storage, numbers."""
+"""Every form that CiA 306 allows for an EDS or DCF gives the same device: node-IDs, compact storage, numbers."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from fdhil.drivers.cia402.abilities import abilities
 from fdhil.drivers.cia402.device import Device, PdoPlace, read_device
-from fdhil.drivers.cia402.eds import MAX_SECTIONS, parse_eds
-from fdhil.drivers.cia402.eds_numbers import read_expression
 from fdhil.drivers.cia402.profile_file import read_profile
+from fdhil.eds import MAX_SECTIONS, parse_eds, read_expression
 from fdhil.errors import EdsError
 from fdhil.sim.drive.sheet import read_sheet
 from tests.drivers.cia402.eds_text import COMMON, CURRENT, SERVO, U16, U32, Variable, eds_text, pdos
@@ -33,7 +32,7 @@ def bases(device: Device) -> tuple[list[int | None], list[int | None]]:
 
 
 def answers(text: str, folder: Path, name: str) -> dict[str, str]:
-    """Return what ``fdhil eds`` says of a file, by its points."""
+    """Return the points that ``fdhil eds`` prints for a file."""
     device = device_of(text, folder, name)
     return {
         each.what: f"{each.answer}: {each.why}" for each in abilities(device, read_profile("cia402", folder / name))
@@ -41,7 +40,7 @@ def answers(text: str, folder: Path, name: str) -> dict[str, str]:
 
 
 def as_dcf(node: int, commissioning: str) -> str:
-    """Return the servo's EDS as a DCF: each PDO has the absolute COB-ID that it has on that node."""
+    """Return the servo's EDS as a DCF: each PDO has its absolute COB-ID for that node."""
     lines = []
     for line in eds_text(SERVO).splitlines():
         lines.append(line)
@@ -78,7 +77,7 @@ def test_a_dcf_of_an_impossible_node_is_refused() -> None:
 
 @pytest.mark.parametrize("second", ["NodeID=6", "[DeviceCommissioning]\nNodeId=0x06", "NODEID=0"])
 def test_a_dcf_of_two_nodes_is_refused(second: str) -> None:
-    with pytest.raises(EdsError, match="and '5' in a line above: its COB-IDs are of one of these nodes"):
+    with pytest.raises(EdsError, match="and '5' in a line above: its COB-IDs belong to one of these nodes"):
         parse_eds(as_dcf(5, f"[DeviceComissioning]\nNodeID=5\n{second}").encode(), "a.dcf")
     parse_eds(as_dcf(5, "[DeviceComissioning]\nNodeID=5\nNodeID=0x05").encode(), "a.dcf")
 
@@ -169,12 +168,14 @@ def test_default_that_is_no_number_is_noted(written: str, tmp_path: Path) -> Non
     text = eds_text(SERVO).replace("[1017]", f"[1017]\nParameterValue={written}")
     device = device_of(text, tmp_path)
     assert device.default(0x1017) is None
-    assert device.doubts == (f"1017:00 is written {written}, which is no number: taken as not given",)
+    assert device.doubts == (f"1017:00 is written {written}, which is not a number: ignored",)
 
 
 def test_heartbeat_that_the_file_does_not_give_is_not_zero(tmp_path: Path) -> None:
     variables = [each for each in SERVO if each[0] != 0x1017] + [(0x1017, 0, U16, "rw", 0, None)]
-    assert answers(eds_text(variables), tmp_path, "a.eds")["heartbeat"] == "yes: its EDS does not say its period (1017)"
+    assert (
+        answers(eds_text(variables), tmp_path, "a.eds")["heartbeat"] == "yes: its EDS does not give its period (1017)"
+    )
 
 
 # compact storage
@@ -256,9 +257,9 @@ def fixed_mapping(kind_access: str) -> list[Variable]:
 def test_fixed_mapping_of_writable_type_is_set_to_every_sync(tmp_path: Path) -> None:
     found = answers(eds_text(fixed_mapping("rw")), tmp_path, "a.eds")
     assert found["listen"].startswith("yes")
-    assert found["mapping"] == "yes: RPDO1, TPDO1, TPDO2 must be set up: the defaults are others"
+    assert found["mapping"] == "yes: RPDO1, TPDO1, TPDO2 must be set up: the defaults differ"
 
 
 def test_fixed_mapping_of_fixed_type_is_not_listened_to(tmp_path: Path) -> None:
     found = answers(eds_text(fixed_mapping("ro")), tmp_path, "a.eds")
-    assert found["listen"].startswith("no: no TPDO of every SYNC can carry its position")
+    assert found["listen"].startswith("no: no TPDO with every SYNC can carry its position")

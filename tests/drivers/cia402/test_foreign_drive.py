@@ -1,4 +1,4 @@
-"""Drives of other makers are decoded by their profiles: units, a voltage that is a product, no offset."""
+"""Drives of other vendors are decoded by their profiles: units, a voltage that is a product, no offset."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Counts = Callable[[ObjectKey, int], int]
 
 
 def rows_of(profile: DriveProfile, counts: Counts, *, streamed: bool = True) -> list[Row]:
-    """Frames of one drive: SYNC k, its TPDOs, then the set-points for SYNC k+1."""
+    """Return the frames of one drive: SYNC k, its TPDOs, then the set-points for SYNC k+1."""
     out: list[Row] = []
     for k in range(N):
         at = 1_000_000_000 + k * 1_000_000
@@ -52,7 +52,7 @@ def decoded(
 
 
 def ramp(key: ObjectKey, k: int) -> int:
-    """Counts that tell the objects apart, and fit 16 bits."""
+    """Return counts that differ between the objects and fit 16 bits."""
     return 8 if key[0] in (0x0005, 0x6061, 0x6861) else (key[0] + 3 * key[1]) % 97 + 5 * k
 
 
@@ -101,7 +101,7 @@ def test_two_axes_may_share_a_node_but_not_its_pdos() -> None:
 
 
 def test_a_duty_without_a_sign_gets_that_of_the_loop() -> None:
-    """An EPOS4 that brakes: the current is against the speed, the voltage follows R i + K w."""
+    """A braking EPOS4: the current opposes the speed, the voltage follows R i + K w."""
     config = machine(drive={"profile": "epos4", "dc_link_v": 48.0}, voltage={"sampling": "instant"})
     told = {(0x606C, 0): -1000, (0x30D1, 2): 12_000, (0x3203, 1): 250}
     got = decoded(config, lambda key, _k: told.get(key, 0))

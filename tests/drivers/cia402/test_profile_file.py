@@ -1,4 +1,4 @@
-"""A profile is the user's own file, one that builds on another, or what an EDS offers; what is wrong in it is named."""
+"""A profile is the user's own file, one based on another, or taken from an EDS; its faults are named."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_path_counts_from_the_folder_of_the_configuration(tmp_path: Path) -> N
 
 
 def test_what_a_file_says_is_a_part_of_the_configuration(tmp_path: Path) -> None:
-    """A model that was identified in one unit is not of the machine in another."""
+    """A model identified in one unit does not hold for the same machine in another."""
     digests, records = [], []
     for text in (PDOS, 'speed_unit = "rpm"\n' + PDOS, PDOS):
         own(tmp_path, text)
@@ -72,7 +72,7 @@ def test_what_a_file_says_is_a_part_of_the_configuration(tmp_path: Path) -> None
 
 WRONG = {
     "title = 3\n" + PDOS: "title: Input should be a valid string",
-    "speed_units = 'rpm'\n" + PDOS: "speed_units: is no key of a profile",
+    "speed_units = 'rpm'\n" + PDOS: "speed_units: is not a key of a profile",
     "speed_unit = 'm/s'\n" + PDOS: "speed_unit: Input should be",
     PDOS.replace("0x606C, 0, 32", "0x606C, 0, 33"): "tpdos.1: a PDO holds 64 bits, not 65",
     PDOS.replace("0x6064, 0, 32, true", "0x6064, 0, 32"): "tpdos.1: not enough values",
@@ -80,16 +80,16 @@ WRONG = {
     PDOS.replace("TPDO2", "TPDO"): "tpdos.2: its name 'TPDO' does not end in the number",
     PDOS.replace("cob_base = 0x280\n", ""): "tpdos.2: has no 'cob_base'",
     PDOS.replace("cob_base = 0x280", "cob_base = 0x80"): "cob_base not from",
-    PDOS.replace("cob_base = 0x280", "cob_bas = 0x280"): "cob_bas is no key of a PDO",
-    PDOS.replace("0x6078", "0x6077"): "no TPDO of every SYNC carries its current",
-    PDOS.replace("[[tpdos]]", "[[tpods]]"): "tpods: is no key",
+    PDOS.replace("cob_base = 0x280", "cob_bas = 0x280"): "cob_bas is not a key of a PDO",
+    PDOS.replace("0x6078", "0x6077"): "no TPDO with every SYNC carries its current",
+    PDOS.replace("[[tpdos]]", "[[tpods]]"): "tpods: is not a key",
     "rpdos = 3\n": "tpdos: is missing",
-    "base = 'epos5'": "base: is no profile: 'epos5'",
-    "base = 'own.toml'": "its bases have no end",
-    "logical_axis = 2\n" + PDOS: "logical_axis: it is of axis 2 of its device, the configuration has 1",
-    "base = 3": "base: is no profile",
-    "a = ": "is no TOML",
-    "title = 'no PDOs'": "there is no EDS to take them from",
+    "base = 'epos5'": "base: is not a profile: 'epos5'",
+    "base = 'own.toml'": "is nested too deeply, or circular",
+    "logical_axis = 2\n" + PDOS: "logical_axis: it is for axis 2 of its device, but the configuration has 1",
+    "base = 3": "base: is not a profile",
+    "a = ": "is not valid TOML",
+    "title = 'no PDOs'": "there is no EDS to derive them from",
 }
 
 
@@ -155,7 +155,7 @@ def test_fixed_pdos_are_taken_as_they_are(tmp_path: Path) -> None:
 
 
 def test_own_signals_are_laid_into_the_pdos_of_the_eds(tmp_path: Path) -> None:
-    """A drive that tells its current in mA in an object of its maker's, and its duty."""
+    """A drive with its current in mA in a vendor-specific object, and its duty."""
     own_objects = ((0x2039, 2, I32, "ro", 1, None), (0x3203, 1, U16, "ro", 1, None))
     eds = eds_file(tmp_path, (*COMMON, *own_objects, *pdos()))
     drive = own(
@@ -168,7 +168,7 @@ def test_own_signals_are_laid_into_the_pdos_of_the_eds(tmp_path: Path) -> None:
 
 
 def test_what_the_eds_does_not_have_is_left_out_of_a_packaged_profile(tmp_path: Path) -> None:
-    """An EPOS4 of before there was 0x3203."""
+    """An EPOS4 whose firmware is older than object 0x3203."""
     current = ((0x30D1, 2, I32, "ro", 1, None),)
     eds = eds_file(tmp_path, (*COMMON, *OFFSETS, *current, *pdos()), "maxon motor ag", 0xFB)
     profile = load_profile(Drive(profile="epos4", eds=eds))
@@ -179,7 +179,7 @@ def test_what_the_eds_does_not_have_is_left_out_of_a_packaged_profile(tmp_path: 
 
 
 def test_a_profile_may_be_written_for_a_second_axis(tmp_path: Path) -> None:
-    """Of a device whose axes share the first PDOs: what the file says is taken as it is."""
+    """For a device whose axes share the first PDOs: the file's PDOs are used unchanged."""
     second = {"607A": "687A", "6064": "6864", "606C": "686C", "6041": "6841", "6040": "6840", "6078, 0": "2100, 2"}
     text = 'base = "roboteq"\nlogical_axis = 2\ntarget = [0x607A, 0]\ncurrent = [0x6078, 0]\nposition = [0x6064, 0]\n'
     text += "speed = [0x606C, 0]\nstatusword = [0x6041, 0]\n" + PDOS

@@ -1,4 +1,4 @@
-"""An NC that shows what it does in coils and registers, by pymodbus's own server."""
+"""An NC that shows its state in coils and registers, served by pymodbus."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class ModbusPeer:
     async def _access(
         self, function: int, start: int, address: int, count: int, current: list[int], values: object
     ) -> None:
-        """Put what is shown into pymodbus's registers before it reads them; a coil is a bit of them."""
+        """Copy the state into pymodbus's registers before it reads them; a coil is one bit."""
         self.requests.append((function, address, count))
         for place in range(len(current)):
             at = start + place

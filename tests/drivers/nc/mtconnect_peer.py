@@ -33,7 +33,7 @@ BOUNDARY = "a8e12eced4fb871ac096a99bf9728425"
 
 
 class MtConnectPeer:
-    """An agent with one device and one path; ``instance`` is its run, ``chunked`` how it sends its stream."""
+    """An agent with one device and one path; ``instance`` is its instanceId, ``chunked`` the form of its stream."""
 
     tells = frozenset(OF_FIELD)
     knows = frozenset({*BLOCKS, MoveKind.REST, MoveKind.HOLD})
@@ -50,7 +50,7 @@ class MtConnectPeer:
             self.show(item, "UNAVAILABLE")
 
     def show(self, item: str, text: str, later_s: float = 0.0) -> None:
-        """Let an item show a text from now on; the agent stamps it ``later_s`` later."""
+        """Set an item's text; the agent's time stamp is ``later_s`` later."""
         self.changes.append((self.sequence, item, text, time.time() + later_s))
         self.sequence += 1
 
@@ -71,7 +71,7 @@ class MtConnectPeer:
         await self._server.wait_closed()
 
     def document(self, since: int) -> bytes:
-        """Return the streams document of what changed since."""
+        """Return the streams document of the changes since then."""
         new = [change for change in self.changes if change[0] >= since]
         streams = "".join(self._device(name, new) for name in self.devices) if new else ""
         return (

@@ -1,4 +1,4 @@
-"""An OPC UA server with the nodes of a profile, by asyncua's own server."""
+"""An OPC UA server with the nodes of a profile, served by asyncua."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FIELDS = ("line", "feed_override", "rapid_override", "tool", "program", "feed_mm
 
 
 class _Nodes(dict[ua.NodeId, NodeData]):
-    """Nodes that are copied from those of ``made`` when they are first looked at."""
+    """Nodes that are copied from those of ``made`` on first access."""
 
     made: ClassVar[dict[ua.NodeId, NodeData]] = {}
 
@@ -45,7 +45,7 @@ class _Nodes(dict[ua.NodeId, NodeData]):
 
 
 async def load_once(server: InternalServer, shelf_file: Path | None = None) -> None:
-    """Give a server the nodes that every server has; they are made once, not for each: that takes seconds."""
+    """Give a server the standard nodes, which are created once for all servers: it takes seconds."""
     if not _Nodes.made:
         await InternalServer.load_standard_address_space(server)
         _Nodes.made.update(server.aspace._nodes)
@@ -57,7 +57,7 @@ class _QuickServer(InternalServer):
 
 
 class OpcUaPeer:
-    """A server of a Sinumerik's kind: the nodes are where the profile ``siemens`` says."""
+    """A server like a Sinumerik's: the nodes are those of the profile ``siemens``."""
 
     tells = frozenset(FIELDS)
     knows = frozenset(SHOWN)

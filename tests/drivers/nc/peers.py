@@ -30,14 +30,14 @@ class Peer(Protocol):
     async def __aenter__(self) -> Self: ...
     async def __aexit__(self, *exception: object) -> None: ...
     async def say(self, motion: MoveKind, **fields: Any) -> None:
-        """From now on this is what the NC does; ``fields`` are those of NcState."""
+        """Set the NC's state; ``fields`` are those of NcState."""
 
     async def talk_nonsense(self) -> None:
-        """From now on nothing that is said makes sense."""
+        """Answer with invalid content from now on."""
 
 
 class BridgePeer:
-    """The bridge's lines, as in fdhil/bridges/linuxcnc.py."""
+    """Sends the bridge's lines, as fdhil/bridges/linuxcnc.py does."""
 
     tells = frozenset({"line", "feed_override", "rapid_override", "feed_hold", "tool", "program"})
     knows = frozenset(MoveKind) - {MoveKind.UNKNOWN}

@@ -1,4 +1,4 @@
-"""An NC that shows what it does in coils or registers: what is asked for, what it means, and what can go wrong."""
+"""An NC with its state in coils or registers: the requests, the meaning of the answers, and the faults."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_whatever_is_answered_a_device_error_or_a_state_comes_of_it(body: bytes)
     ("keys", "text"),
     [
         ({"rapid": "3.1"}, "coils have no bits"),
-        ({"bits": "holding_registers", "rapid": "3"}, "say which bit"),
+        ({"bits": "holding_registers", "rapid": "3"}, "register without a bit"),
         ({"bits": "holding_registers", "rapid": "3.16"}, "at 15"),
         ({"rapid": "70000"}, "65535"),
         ({"rapid": "0", "hold": "2500"}, "too far apart"),

@@ -1,4 +1,4 @@
-"""An MTConnect agent's documents: by HTTP as agents send it, in the order of the NC, and what is no such document."""
+"""An MTConnect agent's documents: by HTTP as agents send it, in the NC's order, and invalid documents."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def config_of(**keys: Any) -> MachineConfig:
 
 
 async def heard(source: MtConnect, count: int) -> list[NcState]:
-    """Read until so many states have come."""
+    """Read until this many states were received."""
     states: list[NcState] = []
     async with asyncio.timeout(300):
         while len(states) < count:
@@ -60,7 +60,7 @@ async def test_a_document_of_another_run_ends_it_and_the_next_time_it_begins_ane
         async with source:
             await source.read()
             peer.instance = 2
-            with pytest.raises(ProtocolError, match="started anew"):
+            with pytest.raises(ProtocolError, match="was restarted"):
                 await heard(source, 10_000)
         async with source:
             await source.read()
@@ -87,7 +87,7 @@ async def test_what_the_profile_needs_and_the_agent_lacks_is_named(tmp_path: Any
         '[[motion]]\nkind = "rapid"\nwhen = { mode = ["G0"] }\n'
     )
     async with MtConnectPeer() as peer:
-        with pytest.raises(ProtocolError, match="tells no x:Motion"):
+        with pytest.raises(ProtocolError, match="does not report x:Motion"):
             await MtConnect(config_of(**peer.settings, profile=str(own))).__aenter__()
 
 
@@ -103,13 +103,13 @@ async def test_an_empty_document_says_that_all_is_as_before() -> None:
 @pytest.mark.parametrize(
     ("answer", "text"),
     [
-        (b"HTTP/1.1 200 OK\r\nContent-Length: 3\r\n\r\n<a>", "no MTConnect document"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 3\r\n\r\n<a>", "does not answer with an MTConnect document"),
         (b"HTTP/1.1 200 OK\r\nContent-Length: 4\r\n\r\n<a/>", "answers with a a document"),
         (b"HTTP/1.1 200 OK\r\n\r\n<!DOCTYPE a [<!ENTITY b 'c'>]><a/>", "declarations"),
-        (b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n", "piece"),
-        (b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nffffffffff\r\n", "piece"),
+        (b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n", "chunk"),
+        (b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nffffffffff\r\n", "chunk"),
         (b"HTTP/1.1 200 OK\r\nContent-Length: 40\r\n\r\n<a/>", "ended the connection"),
-        (b"ftp ready\r\n\r\n", "no HTTP"),
+        (b"ftp ready\r\n\r\n", "not HTTP"),
         (b"x" * 70_000, "without an end"),
         (b"", "ended the connection"),
         (

@@ -1,4 +1,4 @@
-"""An OPC UA server of an NC: nodes by id and by name, users and certificates, and what is not there."""
+"""An OPC UA server of an NC: nodes by id and by name, users and certificates, and missing nodes."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ async def test_a_value_that_is_not_good_is_none_and_decides_nothing() -> None:
             assert (await source.read())[0].motion is MoveKind.UNKNOWN
             for node in peer.nodes.values():
                 await node.write_attribute(ua.AttributeIds.Value, bad)
-            with pytest.raises(ProtocolError, match="shows no value"):
+            with pytest.raises(ProtocolError, match="has no value"):
                 await source.read()
 
 
 class _CancelledWithAnswer(asyncio.CancelledError):
-    """As asyncua's wait ends that is cancelled just as the answer comes."""
+    """Behaves as asyncua's wait that is cancelled at the moment of the answer."""
 
 
 @pytest.mark.usefixtures("real_time")
@@ -96,7 +96,7 @@ async def test_a_node_that_lacks_is_named_and_an_optional_one_is_not_missed(tmp_
 
 @pytest.mark.usefixtures("long_computation")
 async def test_nodes_are_found_by_their_names_in_whichever_namespace() -> None:
-    """The profile of the companion specification, and its channel below two others that lack what is asked for."""
+    """The companion specification's profile, with its channel after two others that lack the required nodes."""
     async with OpcUaPeer() as peer:
         space = await peer.server.register_namespace("http://opcfoundation.org/UA/CNC/")
         interface = await peer.server.nodes.objects.add_object(space, "CncInterface")
@@ -127,7 +127,7 @@ async def test_a_namespace_may_be_given_by_its_name(tmp_path: Path) -> None:
         with pytest.raises(ProtocolError, match="has no nsu=nobody"):
             await once(config_of(**{**peer.settings, "profile": str(own)}))
     own.write_text(own.read_text().replace("nsu=nobody;s=", ""))
-    with pytest.raises(ConfigError, match=r"signals\.status\.at: '/Channel.*' is no place of OPC UA"):
+    with pytest.raises(ConfigError, match=r"signals\.status\.at: '/Channel.*' is not an OPC UA node or path"):
         OpcUa(config_of(profile=str(own)))
 
 
@@ -139,14 +139,14 @@ class _Users:
 
 
 async def certificates(folder: Path, name: str, uri: str) -> tuple[Path, Path]:
-    """Make a key and a certificate that is for this URI."""
+    """Create a key and a certificate for this URI."""
     key, certificate = folder / f"{name}.pem", folder / f"{name}.der"
     await cert_gen.setup_self_signed_certificate(key, certificate, uri, "localhost", [], {"commonName": name})
     return certificate, key
 
 
 def as_pem(certificate: Path) -> Path:
-    """Write a certificate as text, under a name that does not tell so."""
+    """Write a certificate as PEM under a name without the suffix .pem."""
     text = certificate.with_suffix(".crt")
     text.write_text(ssl.DER_cert_to_PEM_cert(certificate.read_bytes()))
     return text
@@ -162,7 +162,7 @@ async def test_a_user_a_certificate_and_encryption(tmp_path: Path) -> None:
         with pytest.raises(ConnectError, match=r"password_file.*cannot be read"):
             await once(config_of(**keys))
         password.write_text("wrong\n")
-        with pytest.raises(ConnectError, match="cannot be entered"):
+        with pytest.raises(ConnectError, match="cannot be connected"):
             await once(config_of(**keys))
         password.write_text("right\n")
         await peer.say(MoveKind.ARC)
@@ -174,7 +174,7 @@ async def test_a_user_a_certificate_and_encryption(tmp_path: Path) -> None:
 
 @asynccontextmanager
 async def server_of(answer: bytes | None) -> AsyncIterator[str]:
-    """Serve what answers these bytes, or nothing, and yield its place."""
+    """Serve these bytes as the answer, or nothing, and yield the address."""
     ended: list[asyncio.StreamWriter] = []
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -1,4 +1,4 @@
-"""What an NC shows becomes what it does, by the rules of a profile: packaged ones, a user's own, and wrong values."""
+"""Values of an NC become its state by the rules of a profile: packaged ones, a user's own, and wrong values."""
 
 from __future__ import annotations
 
@@ -138,13 +138,13 @@ def test_a_wrong_profile_names_the_place(tmp_path: Path, document: dict[str, Any
 
 
 def test_a_profile_of_another_interface_is_refused() -> None:
-    with pytest.raises(ConfigError, match="is for mtconnect, and is used for opcua"):
+    with pytest.raises(ConfigError, match="is for mtconnect, but is used for opcua"):
         read_nc_profile("mtconnect", "opcua")
 
 
 @pytest.mark.parametrize(
     ("content", "text"),
-    [(None, "cannot be read"), (b"\xff", "no TOML"), (b"#" * 300_000, "larger"), (b"a = [", "TOML")],
+    [(None, "cannot be read"), (b"\xff", "not valid TOML"), (b"#" * 300_000, "larger"), (b"a = [", "TOML")],
 )
 def test_a_file_that_cannot_be_used_is_told(tmp_path: Path, content: bytes | None, text: str) -> None:
     path = tmp_path / "own.toml"

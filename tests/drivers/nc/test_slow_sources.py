@@ -1,4 +1,4 @@
-"""A source that is asked every 100 ms, of an NC that renews what it shows as often: kinds are right, edges exact."""
+"""A source that is read every 100 ms, of an NC that updates as often: kinds are right, edges exact."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RENEWED_S = 0.1
 
 
 def asked(told: Course, phase_ms: int, age_ms: int, answer_ms: int, period_ms: int = 100) -> Iterator[NcState]:
-    """As a polled source: what is shown was so ``age_ms`` before it was asked for; no SYNC goes ahead of cycle 0."""
+    """Behave as a polled source: values were valid ``age_ms`` before the request; no SYNC precedes cycle 0."""
     for at in range(phase_ms + age_ms, len(told.kind), period_ms):
         stamp_ns, error_ns = between(at * MS, (at + answer_ms) * MS, RENEWED_S)
         yield NcState(stamp_ns, error_ns, told.kind[at - age_ms], told.line[at - age_ms] or None)
@@ -25,7 +25,7 @@ def asked(told: Course, phase_ms: int, age_ms: int, answer_ms: int, period_ms: i
 @settings(max_examples=12)
 @given(st.integers(0, 99), st.integers(0, 99), st.integers(1, 20), st.integers(0, 4))
 def test_kinds_come_right_and_edges_exact_whenever_it_is_asked(phase: int, age: int, answer: int, lag: int) -> None:
-    """Rapids of 0.3 s: longer than the period, the renewal and the answer together."""
+    """Rapids of 0.3 s: longer than the period, the update and the answer together."""
     told = course((rest(300), rapid(90), rest(50), feed(30), rest(50), rapid(-90, 3), rest(400)))
     events = hear(told, list(asked(told, phase, age, answer)), lag)
     moves = [(event.kind, event.tick) for event in events]
@@ -37,7 +37,7 @@ def test_kinds_come_right_and_edges_exact_whenever_it_is_asked(phase: int, age: 
 @settings(max_examples=12)
 @given(st.integers(0, 99), st.integers(0, 99), st.integers(1, 60))
 def test_no_feed_is_ever_a_rapid(phase: int, age: int, answer: int) -> None:
-    """The program has moves without a rest between them, and shorter ones than it can tell."""
+    """The program has moves without a rest between them, and shorter ones than the source can resolve."""
     told = course(PROGRAM)
     events = hear(told, list(asked(told, phase, age, answer)), 0)
     rapids = [False] * len(told.kind)

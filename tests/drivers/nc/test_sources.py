@@ -1,4 +1,4 @@
-"""Every listed NC source keeps the contract, against a real peer on a socket."""
+"""Every listed NC source meets the contract, against a real peer on a socket."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def config_of(name: str, peer: Peer, **more: Any) -> MachineConfig:
 
 
 async def until(source: NcSource, holds: Callable[[NcState], bool]) -> NcState:
-    """Read until a state holds."""
+    """Read until a state satisfies the condition."""
     async with asyncio.timeout(300):
         while True:
             for state in await source.read():

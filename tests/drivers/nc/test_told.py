@@ -1,4 +1,4 @@
-"""The kind of a move comes from the NC, its edges from the demand on the bus: whatever the source, none is off."""
+"""The kind of a move comes from the NC, its edges from the demand on the bus: exact with every source."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ INCREMENT_MM = 20 / 65536
 
 @dataclass(frozen=True)
 class Part:
-    """A piece of a program: its kind, its line, and its set-points relative to where it begins, 1 ms apart."""
+    """A piece of a program: its kind, its line, and its set-points relative to its start, 1 ms apart."""
 
     kind: MoveKind
     line: int
@@ -52,7 +52,7 @@ PROGRAM = (rest(300), rapid(200), rest(50), feed(30), rapid(-230, 3), rest(40), 
 
 @dataclass(frozen=True)
 class Course:
-    """What the NC ordered in each of its cycles, and the first cycle of each part with its kind."""
+    """The NC's command in each of its cycles, and the first cycle of each part with its kind."""
 
     demand_mm: Float
     kind: Sequence[MoveKind]
@@ -72,7 +72,7 @@ def course(parts: Sequence[Part]) -> Course:
 
 
 def exact(told: Course, zero_ns: int, first_cycle: int = 5000) -> list[NcState]:
-    """As the bridge: each change with the cycle before it, and every tenth cycle."""
+    """Behave as the bridge: each change with the cycle before it, and every tenth cycle."""
     n = len(told.kind)
     change = [k for k in range(1, n) if (told.kind[k], told.line[k]) != (told.kind[k - 1], told.line[k - 1])]
     tell = sorted({*range(0, n, 10), *change, *(k - 1 for k in change)})
@@ -87,7 +87,7 @@ def exact(told: Course, zero_ns: int, first_cycle: int = 5000) -> list[NcState]:
 
 
 def polled(told: Course, zero_ns: int, period: int = 100) -> list[NcState]:
-    """As a source that is asked now and then: an answer may be a whole period old."""
+    """Behave as a polled source: an answer may be a whole period old."""
     return [
         NcState(zero_ns + k * MS, period * MS, told.kind[k], told.line[k] or None, rapid_override=1.0)
         for k in range(0, len(told.kind), period)
@@ -97,7 +97,7 @@ def polled(told: Course, zero_ns: int, period: int = 100) -> list[NcState]:
 def hear(
     told: Course, states: Sequence[NcState], lag: int, source: ToldG0 | None = None, *, block: int = 50, first: int = 0
 ) -> list[MoveEvent]:
-    """Run the bus: the NC's cycle k is at tick ``first`` + k + lag, from a zero of its own; SYNC k comes at k ms."""
+    """Run the bus: the NC's cycle k is at tick ``first`` + k + lag, from its own zero; SYNC k comes at k ms."""
     source = source or ToldG0("X", machine(g0={"source": "linuxcnc"}))
     bus = np.concatenate([np.zeros(lag), told.demand_mm, np.full(500, told.demand_mm[-1])])
     bus = np.round(bus / INCREMENT_MM) * INCREMENT_MM + 17.0
@@ -121,7 +121,7 @@ def edges(events: Sequence[MoveEvent]) -> list[tuple[MoveKind, int]]:
 
 
 def truth(told: Course, lag: int) -> list[tuple[MoveKind, int]]:
-    """The same of the program: a part begins with the last tick of the one before; none follows itself."""
+    """Return the moves of the program: a part begins with the previous one's last tick; none follows itself."""
     return [(kind, lag + cycle - 1) for cycle, kind in told.edges[1:]]
 
 
@@ -197,7 +197,7 @@ def test_an_nc_that_is_silent_tells_no_rapid() -> None:
 
 
 def test_set_points_that_are_not_those_of_the_bus_tell_nothing() -> None:
-    """A bridge of another machine, or another axis: its clocks would do, but its words are not about this axis."""
+    """A bridge of another machine or axis: its clocks would fit, but its messages are not about this axis."""
     told, other = course([rest(300), rapid(400), rest(4000)]), course([rest(300), rapid(350), rest(4050)])
     assert RAPID not in [kind for kind, _ in edges(hear(told, exact(other, 0), 0))]
 

@@ -1,1 +1,1 @@
-"""Holds the drive models, one TOML file each."""
+"""Drive profiles, one TOML file each."""

@@ -1,1 +1,1 @@
-"""Holds how NCs show what they do, one TOML file each."""
+"""Profiles of NC interfaces, one TOML file each."""

@@ -1,4 +1,4 @@
-"""EDS files with every quirk seen in the field are read; what cannot be read is one error class with the line."""
+"""EDS files with every irregularity found in the field are read; unreadable ones raise one error with the line."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from canopen.objectdictionary import ObjectDictionary
+from canopen.objectdictionary import import_od
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.drivers.cia402.eds import MAX_BYTES, MAX_OBJECTS, load_eds, parse_eds
+from fdhil.eds import INTEGER_TYPES, MAX_BYTES, MAX_OBJECTS, EdsFile, parse_eds, read_eds, read_expression
 from fdhil.errors import EdsError
+from tests.eds import SHEETS, write_eds
 
 GOOD = """\
 [FileInfo]
@@ -74,30 +75,36 @@ QUIRKS = {
 }
 
 
-def objects_of(dictionary: ObjectDictionary) -> dict[tuple[int, int], Any]:
-    """Return all variables of a dictionary by (index, sub-index)."""
-    found: dict[tuple[int, int], Any] = {}
-    for index in dictionary:
-        entry = dictionary[index]
-        if hasattr(entry, "subindices"):
-            found |= {(index, sub): variable for sub, variable in entry.subindices.items()}
-        else:
-            found[index, 0] = entry
-    return found
+def defaults_of(file: EdsFile) -> dict[tuple[int, int], str]:
+    """Return the defaults of all entries by (index, sub-index), as written."""
+    return {(entry.index, entry.sub): entry.default for item in file.objects for entry in item.entries}
 
 
 @pytest.mark.parametrize("quirk", QUIRKS)
 def test_quirk_is_mended(quirk: str) -> None:
-    dictionary = parse_eds(QUIRKS[quirk], "drive.eds", 5)
-    objects = objects_of(dictionary)
-    assert objects[0x1800, 1].default == 0x40000185
-    assert objects[0x1000, 0].default == 0x20192
+    defaults = defaults_of(parse_eds(QUIRKS[quirk], "drive.eds"))
+    assert read_expression(defaults[0x1800, 1]) == (0x40000180, True)
+    assert read_expression(defaults[0x1000, 0]) == (0x20192, False)
 
 
 def test_a_file_is_read(tmp_path: Path) -> None:
     path = tmp_path / "a.eds"
     path.write_text(GOOD)
-    assert objects_of(load_eds(path, 3))[0x1800, 1].default == 0x40000183
+    assert defaults_of(read_eds(path))[0x1800, 1] == "$NODEID+0x40000180"
+
+
+@pytest.mark.parametrize("sheet", SHEETS)
+def test_reader_agrees_with_the_canopen_library(sheet: str, tmp_path: Path) -> None:
+    path = write_eds(sheet, tmp_path)
+    dictionary, node_id = import_od(str(path), 5), 5
+    for item in read_eds(path).objects:
+        for entry in (entry for entry in item.entries if entry.data_type in INTEGER_TYPES):
+            found: Any = dictionary[item.index]
+            variable = found if item.object_type == 7 else found[entry.sub]
+            number, relative = read_expression(entry.default) or (None, False)
+            assert variable.default == (number if number is None else number + node_id * relative)
+            assert (variable.data_type, variable.access_type) == (entry.data_type, entry.access)
+            assert variable.pdo_mappable == entry.mappable
 
 
 @pytest.mark.parametrize(
@@ -107,8 +114,8 @@ def test_a_file_is_read(tmp_path: Path) -> None:
         (b"hello", "line 1: it has no object"),
         (b"\xef\xbb\xbf<?xml version='1.0'?>\n<ISO15745ProfileContainer>\n", "line 1: it is XML (an XDD"),
         (GOOD.replace("ObjectType=0x7", "ObjectType=banana").encode(), "line 19: ObjectType is 'banana'"),
-        (GOOD.replace("DataType=0x0007\n", "", 1).encode(), "line 17: [1000] is wrong"),
-        (GOOD.replace("[1800]", "[1801]").encode(), "is wrong"),
+        (GOOD.replace("DataType=0x0007\n", "", 1).encode(), "line 17: [1000] has no DataType"),
+        (GOOD.replace("[1800]", "[1801]").encode(), "[1800sub0] belongs to no object"),
         (b"[1000]\nParameterName=a\nObjectType=8\nCompactSubObj=999999999\n", "line 4: CompactSubObj is 999999999"),
         (b"[1000]\n" + b"x" * 5000, "line 2 is longer"),
         (b" " * (MAX_BYTES + 1), "larger than 2 MiB"),
@@ -124,7 +131,7 @@ def test_what_cannot_be_read_is_one_error(raw: bytes, says: str) -> None:
 
 def test_a_missing_file_is_the_same_error(tmp_path: Path) -> None:
     with pytest.raises(EdsError, match="cannot be read"):
-        load_eds(tmp_path / "none.eds")
+        read_eds(tmp_path / "none.eds")
 
 
 @pytest.mark.usefixtures("real_time")
@@ -138,5 +145,5 @@ def test_damage_never_escapes_as_another_error(data: st.DataObject) -> None:
         raw[at : at + data.draw(st.integers(0, 20))] = data.draw(st.binary(max_size=6))
     found = None
     with contextlib.suppress(EdsError):
-        found = parse_eds(bytes(raw), "bad.eds", 5)
-    assert found is None or isinstance(found, ObjectDictionary)
+        found = parse_eds(bytes(raw), "bad.eds")
+    assert found is None or isinstance(found, EdsFile)

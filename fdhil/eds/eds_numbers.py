@@ -25,12 +25,12 @@ def read_expression(text: str, *, octal: bool = False) -> tuple[int, bool] | Non
     >>> read_expression("0x180 + $NodeId"), read_expression("$NODEID"), read_expression("$NODEID*2")
     ((384, True), (0, True), None)
     """
-    left, total, relative = re.sub(r"[\s()]", "", text).upper(), 0, False
-    if not left or _APART.search(text):
+    rest, total, relative = re.sub(r"[\s()]", "", text).upper(), 0, False
+    if not rest or _APART.search(text):
         return None
-    left = left if left[0] in "+-" else f"+{left}"
-    while left:
-        term = _TERM.match(left)
+    rest = rest if rest[0] in "+-" else f"+{rest}"
+    while rest:
+        term = _TERM.match(rest)
         if term is None:
             return None
         sign, word = term[1], term[2]
@@ -40,16 +40,16 @@ def read_expression(text: str, *, octal: bool = False) -> tuple[int, bool] | Non
             relative = True
         else:
             total += int(sign + word, 16 if word.startswith("0X") else 8 if octal and _OCTAL.fullmatch(word) else 10)
-        left = left[term.end() :]
+        rest = rest[term.end() :]
     return total, relative
 
 
-def octal_reading(text: str) -> int | None:
-    """Return what a number with a leading zero is where that means octal, if it is another then; None otherwise.
+def read_octal(text: str) -> int | None:
+    """Read a number with a leading zero as octal; None where that makes no difference.
 
     CiA 306 and programs in C take it for octal, most files and their tools mean decimal.
 
-    >>> octal_reading("0100"), octal_reading("007"), octal_reading("0180"), octal_reading("0x10")
+    >>> read_octal("0100"), read_octal("007"), read_octal("0180"), read_octal("0x10")
     (64, None, None, None)
     """
     decimal, octal = read_expression(text), read_expression(text, octal=True)

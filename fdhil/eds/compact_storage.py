@@ -1,4 +1,4 @@
-"""Writes out what EDS and DCF files store in compact form (CiA 306): CompactSubObj, [1A00Value], CompactPDO.
+"""Expands the compact storage of EDS and DCF files (CiA 306): CompactSubObj, [1A00Value], CompactPDO.
 
 Works on sections by their names (``1A00``, ``1A00sub1``, ``1A00Value``); each section is a mapping of keys to texts.
 """
@@ -7,33 +7,33 @@ import re
 from collections.abc import Iterator, Mapping
 
 from fdhil.cia402 import COB_RPDO, COB_TPDO, Object
-from fdhil.drivers.cia402.eds_numbers import read_number
+from fdhil.eds.eds_numbers import read_number
 
 MOST_PDOS = 512
 Keys = Mapping[str, str]
 _LIST = re.compile(r"([0-9A-F]{4})(Name|Value|Denotation)", re.IGNORECASE)
 _UNSIGNED8, _UNSIGNED16, _UNSIGNED32 = "5", "6", "7"
 _ARRAY, _RECORD = "8", "9"
-# bits of CompactPDO: the communication parameters that each PDO has; COB-ID and type are always there
+# bits of CompactPDO: the communication parameters of each PDO; COB-ID and type always exist
 _PARAMETERS = ((1, _UNSIGNED32), (2, _UNSIGNED8), (3, _UNSIGNED16), (4, _UNSIGNED8), (5, _UNSIGNED16), (6, _UNSIGNED8))
 
 
-def is_list(title: str) -> bool:
-    """Whether a section is a list of names or values of an object's sub-objects."""
+def is_value_list(title: str) -> bool:
+    """Return whether a section lists names or values of an object's sub-objects."""
     return _LIST.fullmatch(title) is not None
 
 
-def written_out(sections: Mapping[str, Keys], most: int) -> Mapping[str, Keys]:
-    """Return the sections that the file leaves out, by the compact form, with their keys; and values of those it has.
+def expand_compact_storage(sections: Mapping[str, Keys], most: int) -> Mapping[str, Keys]:
+    """Return the sections that the compact form implies, and existing ones with their values from value lists.
 
-    Where there are more than ``most`` it ends with some more.
+    Expansion stops when there are more than ``most``.
     """
-    made: dict[str, Keys] = dict(_compact_pdos(sections))
+    made: dict[str, Keys] = dict(_expand_pdos(sections))
     for title, keys in {**sections, **made}.items():
         if len(made) > most:
             return made
         if len(title) == 4 and (count := read_number(keys.get("CompactSubObj", ""))):
-            for sub, part in _sub_objects(sections, title, keys, count):
+            for sub, part in _expand_sub_objects(sections, title, keys, count):
                 made.setdefault(f"{title}sub{sub:X}", part)
     for title, keys in sections.items():
         if (found := _LIST.fullmatch(title)) and found[2].lower() == "value":
@@ -44,10 +44,9 @@ def written_out(sections: Mapping[str, Keys], most: int) -> Mapping[str, Keys]:
     return made
 
 
-def _sub_objects(
+def _expand_sub_objects(
     sections: Mapping[str, Keys], title: str, keys: Keys, count: int
 ) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield the sub-objects of an object with CompactSubObj: all as the object says, each with its own name."""
     names = next((names for at, names in sections.items() if at.lower() == f"{title}name".lower()), {})
     shared = {key: keys[key] for key in ("DataType", "AccessType", "PDOMapping", "DefaultValue") if key in keys}
     shared |= {key: keys[key] for key in ("LowLimit", "HighLimit") if key in keys}
@@ -58,8 +57,7 @@ def _sub_objects(
         yield sub, {**shared, "ParameterName": names.get(str(sub), f"{name} {sub}")}
 
 
-def _compact_pdos(sections: Mapping[str, Keys]) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield the parameters of the PDOs that CompactPDO and the numbers of PDOs in [DeviceInfo] stand for."""
+def _expand_pdos(sections: Mapping[str, Keys]) -> Iterator[tuple[str, dict[str, str]]]:
     device: Keys = sections.get("DeviceInfo", {})
     mask = read_number(device.get("CompactPDO", "")) or 0
     granularity = read_number(device.get("Granularity", "")) or 0
@@ -74,7 +72,7 @@ def _compact_pdos(sections: Mapping[str, Keys]) -> Iterator[tuple[str, dict[str,
             at = f"{parameter + place:04X}"
             if at not in sections:
                 cob_id = f"$NODEID+{bases[place]:#x}" if place < len(bases) else "0x80000000"
-                yield from _communication(at, mask, cob_id)
+                yield from _describe_communication(at, mask, cob_id)
             at = f"{mapping + place:04X}"
             if at not in sections:
                 room = 64 // granularity if 0 < granularity <= 64 else 8
@@ -83,7 +81,7 @@ def _compact_pdos(sections: Mapping[str, Keys]) -> Iterator[tuple[str, dict[str,
                 yield at, {**head, "AccessType": access, "DefaultValue": "0", "CompactSubObj": str(room)}
 
 
-def _communication(title: str, mask: int, cob_id: str) -> Iterator[tuple[str, dict[str, str]]]:
+def _describe_communication(title: str, mask: int, cob_id: str) -> Iterator[tuple[str, dict[str, str]]]:
     yield title, {"ParameterName": "PDO communication parameter", "ObjectType": _RECORD}
     had = [(sub, kind) for sub, kind in _PARAMETERS if sub <= 2 or mask >> (sub - 1) & 1]
     first = {"ParameterName": "Number of entries", "DataType": _UNSIGNED8, "AccessType": "ro"}
