@@ -21,7 +21,7 @@ import numpy as np
 
 from fdhil.config import CanBus, MachineConfig, parse
 from fdhil.drivers.bus_source import DRAIN_S
-from fdhil.drivers.can.bus import CanBus as Bus
+from fdhil.drivers.can.bus import ListeningBus as Bus
 from fdhil.drivers.cia402.bus_decoder import BusDecoder
 from fdhil.records import AxisSamples
 

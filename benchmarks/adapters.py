@@ -20,7 +20,7 @@ from collections.abc import Callable
 import numpy as np
 
 from fdhil.config import CanBus
-from fdhil.drivers.can.bus import CanBus as Bus
+from fdhil.drivers.can.bus import ListeningBus as Bus
 
 RATES_HZ = (1000, 2500, 8000)
 DRAIN_S = 0.05

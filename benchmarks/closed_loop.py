@@ -77,7 +77,7 @@ def measure(terms: Mapping[str, float] | None = None) -> dict[str, float]:
     Also the ratio of the last two, the real-time factor, and the largest difference in um.
     """
     config = bench_config()
-    axis, model = config.axis["X"], nominal_models(config)["X"].changed(**terms or {})
+    axis, model = config.axis["X"], nominal_models(config)["X"].replace_values(**terms or {})
     reference = np.ascontiguousarray(bench_demand(10.0)[:, 0])
     drive = closed_loop.prepare(model, axis, 0.001)
     assert isinstance(drive, Drive)

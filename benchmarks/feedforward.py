@@ -14,8 +14,8 @@ import numpy as np
 from benchmarks.inverse import scattered
 from fdhil.config import MachineConfig
 from fdhil.correction.flatness_feedforward import law
-from fdhil.guard.feedforward import Law
-from fdhil.guard.requests import parse_law
+from fdhil.guard.feedforward_law import Law
+from fdhil.guard.request_parsing import parse_law
 from fdhil.model import closed_loop
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Float
@@ -44,7 +44,9 @@ def heard(config: MachineConfig, axis: str, path: Float) -> tuple[Float, Float]:
     own, drive = guard_law(config, axis), config.axis[axis].drive
     targets = np.rint(path * config.axis[axis].scaling.increments_per_mm).astype(np.int64).tolist()
     targets = [targets[0]] * (own.depth + 1) + targets
-    pairs = np.array([own.offsets(targets[k : k - own.depth : -1]) for k in range(own.depth, own.depth + path.size)])
+    pairs = np.array(
+        [own.compute_offsets(targets[k : k - own.depth : -1]) for k in range(own.depth, own.depth + path.size)]
+    )
     torque = 1e-3 * config.axis[axis].nominal.K * drive.rated_current_a
     return pairs[:, 0] * 2 * math.pi / drive.increments_per_rev, pairs[:, 1] * torque
 
@@ -83,7 +85,7 @@ def main() -> None:
     targets = list(range(0, 10 * own.depth, 10))
     turns = 20_000
     print(
-        f"one axis' law in the guard: {timeit.timeit(lambda: own.offsets(targets), number=turns) / turns * 1e6:.0f} us"
+        f"one axis' law in the guard: {timeit.timeit(lambda: own.compute_offsets(targets), number=turns) / turns * 1e6:.0f} us"
     )
 
 

@@ -20,13 +20,13 @@ import time
 from pathlib import Path
 
 from fdhil.arming.guard_client import GuardClient
-from fdhil.guard import core
-from fdhil.guard.frames import Listener
+from fdhil.guard import guard_step
+from fdhil.guard.corrected_path import CorrectedPath
+from fdhil.guard.frame_monitor import FrameMonitor
+from fdhil.guard.guard_settings import AxisSettings, GuardSettings, Pdo, encode_settings
+from fdhil.guard.guard_state import GuardRequest, GuardState, StepInputs, make_initial_state
 from fdhil.guard.interlocks import FACTS
-from fdhil.guard.limits import OffsetLimits
-from fdhil.guard.path import CorrectedPath
-from fdhil.guard.settings import AxisSettings, Pdo, Settings, to_json
-from fdhil.guard.state import Inputs, Request, State, initial
+from fdhil.guard.offset_limits import OffsetLimits
 
 LIMITS = OffsetLimits(offset=819, rate=65, acceleration=6, variation=9830, window=1000)
 ROWS = 20
@@ -46,11 +46,11 @@ def axis(name: str, node: int) -> AxisSettings:
     return AxisSettings(name, node, target, offset, tpdos, 3276.8, 500.0, 4000.0, 1, LIMITS, 32768, 2)
 
 
-def settings(run_directory: str) -> Settings:
+def settings(run_directory: str) -> GuardSettings:
     """Two axes in SYNC time."""
     digest = hashlib.sha256(TOKEN.encode()).hexdigest()
     axes = (axis("X", 1), axis("Y", 2))
-    return Settings("can0", "socketcand", 0.001, "sync", 0.020, 100, digest, run_directory, axes)
+    return GuardSettings("can0", "socketcand", 0.001, "sync", 0.020, 100, digest, run_directory, axes)
 
 
 def frames(tick: int) -> list[tuple[int, bytes]]:
@@ -98,7 +98,7 @@ def latencies(cycles: int) -> list[float]:
         for end in (far, client):
             end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         file = Path(folder) / "guard.json"
-        file.write_text(to_json(settings(folder)))
+        file.write_text(encode_settings(settings(folder)))
         command = [sys.executable, "-m", "fdhil.guard", "--settings", str(file), "--descriptor", str(far.fileno())]
         with subprocess.Popen(command, pass_fds=[far.fileno()], stdout=subprocess.PIPE) as process, client:
             far.close()
@@ -145,23 +145,23 @@ def measure(hub: Hub, guard: GuardClient, cycles: int) -> list[float]:
 def step_us(repeats: int = 2000) -> float:
     """Microseconds of processor time of one step while armed, two axes, the best of ten."""
     made = settings("")
-    listener, state = Listener(made), initial(made)
+    listener, state = FrameMonitor(made), make_initial_state(made)
     path = CorrectedPath(0, ([0] * ROWS,) * 2, ([0] * ROWS,) * 2, True, "p", 1)
-    calls: list[tuple[State, Inputs]] = []
+    calls: list[tuple[GuardState, StepInputs]] = []
     for tick in range(1, 300):
-        seen, bus = listener.at_sync(bytes([(tick - 1) % 240 + 1]), tick * 1e-3, tick * 1e-3)
-        request = Request("arm", True, "p", dict.fromkeys(FACTS, True)) if tick == 150 else None
-        inputs = Inputs(True, seen, bus, path=path, request=request)
+        seen, bus = listener.close_sync_cycle(bytes([(tick - 1) % 240 + 1]), tick * 1e-3, tick * 1e-3)
+        request = GuardRequest("arm", True, "p", dict.fromkeys(FACTS, True)) if tick == 150 else None
+        inputs = StepInputs(True, seen, bus, path=path, request=request)
         if tick > 160:
             calls.append((state, inputs))
-        state, _ = core.step(state, inputs, made)
+        state, _ = guard_step.step_guard(state, inputs, made)
         for cob_id, data in frames(tick):
-            listener.take(cob_id, data, tick * 1e-3)
+            listener.take_frame(cob_id, data, tick * 1e-3)
     best = float("inf")
     for _ in range(10):
         start_s = time.process_time()
         for k in range(repeats):
-            core.step(*calls[k % len(calls)], made)
+            guard_step.step_guard(*calls[k % len(calls)], made)
         best = min(best, (time.process_time() - start_s) / repeats)
     return best * 1e6
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from fdhil import tables
 from fdhil.config import Identification
-from fdhil.daemon.kernel_warmup import nominal_rapid
+from fdhil.daemon.kernel_warmup import simulate_nominal_rapid
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import AxisPipeline, analyse
 from fdhil.pipeline.identified_loops import analyse_windows
@@ -54,7 +54,7 @@ def main() -> None:
         print(f"{method:<22} estimate and validate {_figures(took)}")
     config = bench_config("X")
     pipeline = AxisPipeline("X", config)
-    rapids = [nominal_rapid("X", config.axis["X"], 0.001, 1 - 2 * (k % 2), seed=k) for k in range(WINDOWS + 2)]
+    rapids = [simulate_nominal_rapid("X", config.axis["X"], 0.001, 1 - 2 * (k % 2), seed=k) for k in range(WINDOWS + 2)]
     took = [_timed(partial(pipeline.feed, window)) for window in rapids][2:]
     print(f"{'pipeline':<22} {rapids[0].n} samples, with pool, history, skill {_figures(took)}")
     drawn_machines()

@@ -20,7 +20,7 @@ from websockets.asyncio.client import connect
 from benchmarks.whole_machine import cpu_s
 from fdhil.cli.demo.processes import Process, Twin
 from fdhil.cli.demo.toml import to_toml
-from fdhil.daemon.control import SOCKET_NAME, ask
+from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
 from fdhil.errors import FdhilError
 from studies.pages import ROOT
 
@@ -91,7 +91,7 @@ def memory_mb(pid: int) -> float:
 def status(out: Path) -> dict[str, Any] | None:
     """Return the daemon's status, None while there is none."""
     try:
-        return ask(out / "run" / SOCKET_NAME, {"request": "status"}, timeout_s=60.0)
+        return ask_daemon(out / "run" / SOCKET_NAME, {"request": "status"}, timeout_s=60.0)
     except FdhilError:
         return None
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from fdhil.cli.demo import loop
 from fdhil.cli.demo.processes import Process, Twin
 from fdhil.cli.demo.toml import to_toml
-from fdhil.daemon.control import SOCKET_NAME, ask
+from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
 from fdhil.errors import FdhilError
 
 PROGRAM = "G21 G90\n" + "G0 X300 Y300\nG4 P0.3\nG0 X0 Y0\nG4 P0.3\n" * 100 + "M2\n"
@@ -46,7 +46,7 @@ def main() -> None:
 
 def _status(out: Path) -> dict[str, object] | None:
     try:
-        return ask(out / "data" / "run" / SOCKET_NAME, {"request": "status"})
+        return ask_daemon(out / "data" / "run" / SOCKET_NAME, {"request": "status"})
     except FdhilError:
         return None
 

@@ -20,11 +20,11 @@ from fdhil import errors
 from fdhil.cli.main import cli, leaves
 from fdhil.config.template import default, sections, template, toml
 from fdhil.daemon.alarms import CONDITIONS
-from fdhil.daemon.notice_words import WORDS
-from fdhil.guard.core import FEED_HOLD_S, SETTLED_CYCLES
-from fdhil.guard.interlocks import CATALOGUE, EFFECT
-from fdhil.guard.protocol import HOLD_CYCLES
-from fdhil.guard.transitions import FEED_SENT, FEED_TRANSITIONS, SENT, TRANSITIONS, Event
+from fdhil.daemon.notice_texts import WORDS
+from fdhil.guard.guard_protocol import HOLD_CYCLES
+from fdhil.guard.guard_step import FEED_HOLD_S, SETTLED_CYCLES
+from fdhil.guard.interlocks import INTERLOCK_CATALOGUE, REACTION_EFFECTS
+from fdhil.guard.state_transitions import FEED_SENT, FEED_TRANSITIONS, SENT, TRANSITIONS, Event
 from fdhil.sim.fault_kinds import FAULTS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -146,7 +146,7 @@ def guard_reference() -> str:
     lines = [
         "# The guard's states and interlocks",
         "",
-        "Generated from `fdhil/guard/transitions.py` and `fdhil/guard/interlocks.py`, the tables that the guard itself",
+        "Generated from `fdhil/guard/state_transitions.py` and `fdhil/guard/interlocks.py`, the tables that the guard itself",
         "goes by: no other way leads from one state to another. [Safety](../explanation/safety.md) says why.",
         *_states("States", SENT, TRANSITIONS),
         *_states("States of the on-line feed-forward", FEED_SENT, FEED_TRANSITIONS),
@@ -156,10 +156,12 @@ def guard_reference() -> str:
         f"All must be good for {SETTLED_CYCLES} SYNC before arming. A hold lasts {HOLD_CYCLES} SYNC at most, "
         f"a feed hold {FEED_HOLD_S:g} s.",
     ]
-    for reaction, effect in sorted(EFFECT.items(), reverse=True):
+    for reaction, effect in sorted(REACTION_EFFECTS.items(), reverse=True):
         lines += ["", f"### {effect[:1].upper()}{effect[1:]}", "", "| class | cause | what to do |", "|---|---|---|"]
         lines += [
-            f"| `{code}` | {cause} | {action} |" for code, (own, cause, action) in CATALOGUE.items() if own is reaction
+            f"| `{code}` | {cause} | {action} |"
+            for code, (own, cause, action) in INTERLOCK_CATALOGUE.items()
+            if own is reaction
         ]
     return "\n".join(lines) + "\n"
 
@@ -169,7 +171,7 @@ def notice_reference() -> str:
     lines = [
         "# Notices",
         "",
-        "Generated from `fdhil/daemon/notice_words.py`. A notice of severity minor or MAJOR waits until somebody",
+        "Generated from `fdhil/daemon/notice_texts.py`. A notice of severity minor or MAJOR waits until somebody",
         "acknowledges it; its own text tells the cause. Those marked * are conditions: their alarm is active until the",
         "machine reports the end. What the guard watches has its words in [the guard's table](guard.md), where",
         ", ".join(f"`{code}`" for code in sorted(CONDITIONS - set(WORDS))) + " are conditions.",

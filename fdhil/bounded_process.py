@@ -44,7 +44,7 @@ class BoundedProcess:
                 if document := decode_line(line):  # a process that was ended leaves half a line
                     take(document)
         finally:
-            code = await self.end()
+            code = await self.kill_and_wait()
         return code
 
     async def start(self, request: Mapping[str, Any]) -> None:
@@ -76,7 +76,7 @@ class BoundedProcess:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)  # asyncio's own kill() may take the exit code from who waits
 
-    async def end(self) -> int:
+    async def kill_and_wait(self) -> int:
         """Kill it and return its exit code, 0 where it never ran."""
         self.kill()
         return 0 if self._process is None else await asyncio.shield(self._process.wait())
@@ -114,7 +114,7 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def report(document: Mapping[str, Any]) -> None:
+def report_to_parent(document: Mapping[str, Any]) -> None:
     """Report an object to the parent."""
     sys.stdout.buffer.write(encode_line(document))
     sys.stdout.flush()

@@ -102,7 +102,7 @@ LOGICAL_AXIS_STEP = 0x800
 LOGICAL_AXES = range(1, 9)
 
 
-def first_axis_index(index: int) -> int:
+def get_first_axis_index(index: int) -> int:
     """Return the index of the same object on the first axis of its device.
 
     >>> hex(first_axis_index(0x68B0))
@@ -111,7 +111,7 @@ def first_axis_index(index: int) -> int:
     return 0x6000 + (index - 0x6000) % LOGICAL_AXIS_STEP if 0x6000 <= index < 0xA000 else index
 
 
-class State(Enum):
+class PowerState(Enum):
     """States of the CiA 402 power state machine."""
 
     NOT_READY = "Not ready to switch on"
@@ -125,15 +125,15 @@ class State(Enum):
 
 
 # (mask, value) of the statusword for each state, CiA 402-2 table 30
-STATUS_PATTERN: tuple[tuple[int, int, State], ...] = (
-    (0x4F, 0x00, State.NOT_READY),
-    (0x4F, 0x40, State.SWITCH_ON_DISABLED),
-    (0x6F, 0x21, State.READY),
-    (0x6F, 0x23, State.SWITCHED_ON),
-    (0x6F, 0x27, State.OPERATION_ENABLED),
-    (0x6F, 0x07, State.QUICK_STOP_ACTIVE),
-    (0x4F, 0x0F, State.FAULT_REACTION_ACTIVE),
-    (0x4F, 0x08, State.FAULT),
+STATUS_PATTERN: tuple[tuple[int, int, PowerState], ...] = (
+    (0x4F, 0x00, PowerState.NOT_READY),
+    (0x4F, 0x40, PowerState.SWITCH_ON_DISABLED),
+    (0x6F, 0x21, PowerState.READY),
+    (0x6F, 0x23, PowerState.SWITCHED_ON),
+    (0x6F, 0x27, PowerState.OPERATION_ENABLED),
+    (0x6F, 0x07, PowerState.QUICK_STOP_ACTIVE),
+    (0x4F, 0x0F, PowerState.FAULT_REACTION_ACTIVE),
+    (0x4F, 0x08, PowerState.FAULT),
 )
 
 STATUS_INTERNAL_LIMIT = 1 << 11
@@ -149,16 +149,16 @@ CONTROL_FAULT_RESET = 0x80
 
 # the next controlword on the way from a state to Operation enabled
 _TOWARD_ENABLED = {
-    State.FAULT: CONTROL_FAULT_RESET,
-    State.SWITCH_ON_DISABLED: CONTROL_SHUTDOWN,
-    State.READY: CONTROL_SWITCH_ON,
-    State.SWITCHED_ON: CONTROL_ENABLE_OPERATION,
-    State.OPERATION_ENABLED: CONTROL_ENABLE_OPERATION,
-    State.QUICK_STOP_ACTIVE: CONTROL_DISABLE_VOLTAGE,
+    PowerState.FAULT: CONTROL_FAULT_RESET,
+    PowerState.SWITCH_ON_DISABLED: CONTROL_SHUTDOWN,
+    PowerState.READY: CONTROL_SWITCH_ON,
+    PowerState.SWITCHED_ON: CONTROL_ENABLE_OPERATION,
+    PowerState.OPERATION_ENABLED: CONTROL_ENABLE_OPERATION,
+    PowerState.QUICK_STOP_ACTIVE: CONTROL_DISABLE_VOLTAGE,
 }
 
 
-def state_of(statusword: int) -> State:
+def decode_power_state(statusword: int) -> PowerState:
     """Return the power state that a 16 bit ``statusword`` shows.
 
     >>> state_of(0x1237).value
@@ -167,10 +167,10 @@ def state_of(statusword: int) -> State:
     for mask, value, state in STATUS_PATTERN:
         if statusword & mask == value:
             return state
-    return State.NOT_READY
+    return PowerState.NOT_READY
 
 
-def controlword_toward_enabled(state: State) -> int | None:
+def choose_enabling_controlword(state: PowerState) -> int | None:
     """Return the controlword that brings ``state`` one step nearer to Operation enabled; None: wait for the drive."""
     return _TOWARD_ENABLED.get(state)
 
@@ -202,15 +202,15 @@ def lay_out(entries: Sequence[tuple[int, int, int, bool]]) -> tuple[PdoEntry, ..
     return tuple(placed)
 
 
-def pdo_length(entries: Sequence[PdoEntry]) -> int:
+def compute_pdo_length(entries: Sequence[PdoEntry]) -> int:
     """Return the number of data bytes of a PDO with these entries."""
     return (sum(entry.bits for entry in entries) + 7) // 8
 
 
-def unpack(entries: Sequence[PdoEntry], data: bytes) -> tuple[int, ...]:
+def unpack_pdo(entries: Sequence[PdoEntry], data: bytes) -> tuple[int, ...]:
     """Decode the mapped integers of one frame (little-endian, CiA 301 7.1.4); ValueError when it is too short."""
-    if len(data) < pdo_length(entries):
-        raise ValueError(f"the PDO has {len(data)} bytes, its mapping needs {pdo_length(entries)}")
+    if len(data) < compute_pdo_length(entries):
+        raise ValueError(f"the PDO has {len(data)} bytes, its mapping needs {compute_pdo_length(entries)}")
     whole = int.from_bytes(data, "little")
     values = []
     for entry in entries:
@@ -221,7 +221,7 @@ def unpack(entries: Sequence[PdoEntry], data: bytes) -> tuple[int, ...]:
     return tuple(values)
 
 
-def pack(entries: Sequence[PdoEntry], values: Sequence[int]) -> bytes:
+def pack_pdo(entries: Sequence[PdoEntry], values: Sequence[int]) -> bytes:
     """Encode integers into one frame; ValueError when a value is no integer or does not fit its entry."""
     whole = 0
     for entry, value in zip(entries, values, strict=True):
@@ -229,13 +229,13 @@ def pack(entries: Sequence[PdoEntry], values: Sequence[int]) -> bytes:
         if type(value) is not int or not low <= value <= high:  # a float or numpy integer would be cut silently
             raise ValueError(f"{value!r} does not fit the {entry.bits} bit object {entry.index:04X}:{entry.sub:02X}")
         whole |= (value & (1 << entry.bits) - 1) << entry.bit_offset
-    return whole.to_bytes(pdo_length(entries), "little")
+    return whole.to_bytes(compute_pdo_length(entries), "little")
 
 
 INTEGER32 = (-(1 << 31), (1 << 31) - 1)
 
 
-def target_range(offset: int) -> tuple[int, int]:
+def compute_target_range(offset: int) -> tuple[int, int]:
     """Return the lowest and the highest target (0x607A) whose sum with an offset of either sign is an INTEGER32."""
     low, high = INTEGER32
     return low + offset, high - offset
@@ -257,13 +257,13 @@ class Scaling:
         """Increments per millimetre of table travel."""
         return self.increments_per_rev / self.screw_pitch_mm
 
-    def to_increments(self, position_mm: float) -> int:
+    def convert_to_increments(self, position_mm: float) -> int:
         """Round a position or offset in mm to drive increments; ValueError for NaN and infinities."""
         if not math.isfinite(position_mm):
             raise ValueError(f"{position_mm} mm is not a valid position")
         return round(self.sign * position_mm * self.increments_per_mm)
 
-    def to_mm(self, increments: float) -> float:
+    def convert_to_mm(self, increments: float) -> float:
         """Return the position or offset in mm of a number of drive increments."""
         return self.sign * increments / self.increments_per_mm
 
@@ -294,7 +294,7 @@ _EMCY_TEXT = {
 }
 
 
-def emcy_text(code: int) -> str:
+def describe_emergency(code: int) -> str:
     """Return what an EMCY code means (CiA 301, table 26).
 
     >>> emcy_text(0x8611)

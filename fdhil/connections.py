@@ -17,7 +17,7 @@ QUIET_S = 20.0
 """Time, at most twice as long, in which a request must be complete and an answer be read."""
 
 
-class BoundedHttp(H11Protocol):
+class BoundedHttpProtocol(H11Protocol):
     """An HTTP connection that is closed when idle."""
 
     _look: asyncio.TimerHandle
@@ -29,22 +29,22 @@ class BoundedHttp(H11Protocol):
         """Accept a connection, and close another one when there are too many."""
         super().connection_made(transport)
         self.since_s = self.loop.time()
-        self._look = self.loop.call_later(QUIET_S, self._end_if_quiet)
+        self._look = self.loop.call_later(QUIET_S, self._abort_if_stalled)
         if self.limit_concurrency is not None and len(self.connections) >= self.limit_concurrency:
-            _make_room([each for each in self.connections if isinstance(each, Bounded) and each is not self])
+            _abort_longest_idle([each for each in self.connections if isinstance(each, Bounded) and each is not self])
 
     @property
-    def idle(self) -> bool:
+    def is_idle(self) -> bool:
         """Whether it has no request in progress."""
         return self.cycle is None or self.cycle.response_complete  # type: ignore[redundant-expr]  # none came yet
 
-    def _end_if_quiet(self) -> None:
+    def _abort_if_stalled(self) -> None:
         unread = self.transport.get_write_buffer_size()
         before, self._seen = self._seen, (self._answers, unread)
-        if before == self._seen and (self.idle or unread):
+        if before == self._seen and (self.is_idle or unread):
             self.transport.abort()
         else:
-            self._look = self.loop.call_later(QUIET_S, self._end_if_quiet)
+            self._look = self.loop.call_later(QUIET_S, self._abort_if_stalled)
 
     def on_response_complete(self) -> None:
         """Wait for the next request."""
@@ -63,13 +63,13 @@ class BoundedHttp(H11Protocol):
         super().connection_lost(exc)
 
 
-class BoundedSocket(WebSocketsSansIOProtocol):
+class BoundedWebSocketProtocol(WebSocketsSansIOProtocol):
     """A WebSocket that is not read while its client does not read: answers to its pings take no memory."""
 
     since_s = 0.0
 
     @property
-    def idle(self) -> bool:
+    def is_idle(self) -> bool:
         """Whether it is being closed."""
         return self.close_sent
 
@@ -90,14 +90,14 @@ class BoundedSocket(WebSocketsSansIOProtocol):
             self.transport.resume_reading()
 
 
-Bounded = BoundedHttp | BoundedSocket
+Bounded = BoundedHttpProtocol | BoundedWebSocketProtocol
 
 
-def _make_room(others: Sequence[Bounded]) -> None:
+def _abort_longest_idle(others: Sequence[Bounded]) -> None:
     """Close the longest idle connection of the address with the most; never a WebSocket in use."""
     count = Counter(each.client and each.client[0] for each in others)
-    may_go = [each for each in others if each.idle or isinstance(each, BoundedHttp)]
-    order = sorted(may_go, key=lambda each: (-count[each.client and each.client[0]], not each.idle, each.since_s))
+    may_go = [each for each in others if each.is_idle or isinstance(each, BoundedHttpProtocol)]
+    order = sorted(may_go, key=lambda each: (-count[each.client and each.client[0]], not each.is_idle, each.since_s))
     for ended in order[:1]:
         ended.connections.discard(ended)
         ended.transport.abort()

@@ -14,7 +14,7 @@ LINE_ENDS = "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"  # of str.splitlines
 
 def read_csv_text(path: Path) -> str:
     """Return a file's text; RecordingError when it is unreadable, not text, or exceeds the size of a recording."""
-    return text_of(read_content(path), str(path))
+    return decode_text(read_content(path), str(path))
 
 
 def read_content(path: Path) -> bytes:
@@ -25,21 +25,21 @@ def read_content(path: Path) -> bytes:
     except OSError as error:
         raise RecordingError(f"{path} cannot be read ({error.strerror}): check the path") from None
     if len(raw) > MAX_BYTES:
-        raise _too_large(str(path))
+        raise _make_size_error(str(path))
     return raw
 
 
-def text_of(raw: bytes, source: str, encoding: str = "utf-8-sig") -> str:
+def decode_text(raw: bytes, source: str, encoding: str = "utf-8-sig") -> str:
     """Decode a file's bytes; RecordingError when they are not text, or have too many rows for a recording."""
     if any(raw.count(end.encode()) > MAX_ROWS for end in LINE_ENDS):
-        raise _too_large(source)
+        raise _make_size_error(source)
     try:
         return raw.decode(encoding)
     except UnicodeDecodeError:
         raise RecordingError(f"{source} is not a text file: export it as CSV in UTF-8") from None
 
 
-def _too_large(source: str) -> RecordingError:
+def _make_size_error(source: str) -> RecordingError:
     return RecordingError(f"{source} is larger than {MAX_BYTES >> 20} MiB or {MAX_ROWS} rows: cut it into parts")
 
 
@@ -52,6 +52,6 @@ def check_lengths(lines: Sequence[str], first: int, source: str) -> None:
             )
 
 
-def shown(text: str) -> str:
+def quote_cell(text: str) -> str:
     """Return a cell or header for an error message, shortened."""
     return repr(text if len(text) <= SHOWN_CHARS else f"{text[:SHOWN_CHARS]}...")

@@ -59,7 +59,7 @@ class ConnectError(DeviceError):
     """A bus, port or peer cannot be reached."""
 
     @classmethod
-    def of_socket(cls, device: str, error: OSError, absent: str) -> ConnectError:
+    def from_socket_error(cls, device: str, error: OSError, absent: str) -> ConnectError:
         """Return why ``device`` did not answer at its UNIX socket; ``absent`` is the text when nothing listens."""
         text, cause = absent, error.strerror or error
         if error.errno in (errno.EACCES, errno.EPERM):

@@ -75,7 +75,7 @@ class FeedDriveBench:
     ) -> None:
         from fdhil.cli.demo.machines import merge
 
-        document = _document(axes, bus) | {"sim": {"pace": pace, "modbus": modbus}}
+        document = _build_bench_document(axes, bus) | {"sim": {"pace": pace, "modbus": modbus}}
         merge(document, changes or {})
         self.folder = folder
         self._document, self._patience_s = document, patience_s
@@ -193,7 +193,7 @@ class FeedDriveBench:
                 return received
 
 
-def _document(axes: str, bus: str) -> dict[str, Any]:
+def _build_bench_document(axes: str, bus: str) -> dict[str, Any]:
     from fdhil.cli.demo.machines import machine_document
 
     document = machine_document()

@@ -20,11 +20,11 @@ class Clock:
         """Return the wall clock, s since 1970; it may be wrong, and may be set."""
         return time.time()
 
-    def since_boot_ns(self) -> int:
+    def read_boot_time_ns(self) -> int:
         """Return the time since the computer was started, including suspended time: a machine ages meanwhile."""
         return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
-    def boot_id(self) -> str:
+    def read_boot_id(self) -> str:
         """Return the kernel's identifier of this boot; times since boot compare only within one boot."""
         try:
             return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()

@@ -73,14 +73,14 @@ DRIVE_PROFILES: Mapping[str, str] = {
     "roboteq": "fdhil.drivers.cia402.profiles:roboteq.toml",
 }
 PUBLISHERS: Mapping[str, str] = {
-    "opcua": "fdhil.shopfloor.opcua:publish",
-    "mqtt": "fdhil.shopfloor.mqtt:publish",
-    "mtconnect": "fdhil.shopfloor.mtconnect:publish",
-    "prometheus": "fdhil.shopfloor.prometheus:publish",
+    "opcua": "fdhil.shopfloor.opcua_server:publish",
+    "mqtt": "fdhil.shopfloor.mqtt_publisher:publish",
+    "mtconnect": "fdhil.shopfloor.mtconnect_adapter:publish",
+    "prometheus": "fdhil.shopfloor.prometheus_endpoint:publish",
 }
 
 
-def load(table: Mapping[str, str], name: str) -> Any:
+def load_entry(table: Mapping[str, str], name: str) -> Any:
     """Import and return the factory or module that ``table`` lists under ``name``; KeyError for an unknown name."""
     module, _, attribute = table[name].partition(":")
     return getattr(import_module(module), attribute) if attribute else import_module(module)

@@ -21,7 +21,7 @@ import numpy as np
 from fdhil.config import Identification
 from fdhil.identification.estimators import least_squares, maximum_likelihood, partial_moments
 from fdhil.identification.filtering import zero_phase
-from fdhil.records import PARAMETERS, Recording, Window, frozen
+from fdhil.records import PARAMETERS, Recording, Window, freeze_array
 from fdhil.store.recording_csv import parse_recording
 from studies import bench, instrumental_variables, pages
 from studies.comparison_page import Figures, figure, text
@@ -64,7 +64,7 @@ def values_of(windows: Sequence[Window], lowpass_hz: float) -> list[Array]:
 def two_steps(parts: Sequence[tuple[Array, Array]]) -> Array:
     """Return [R, L, K, Jt, ft, Cd] (6,) of rows (m, 4) of [u, Di, i, w] and of [i, Dw, w, sign w]."""
     electrical, mechanical = (np.vstack([part[k] for part in parts]) for k in (0, 1))
-    return least_squares.solve_two_steps(electrical, mechanical)[0][least_squares.ORDER]
+    return least_squares.solve_two_steps(electrical, mechanical)[0][least_squares.PARAMETER_ORDER]
 
 
 def voltage_left_raw(windows: Sequence[Window]) -> Array:
@@ -73,8 +73,8 @@ def voltage_left_raw(windows: Sequence[Window]) -> Array:
     half = [
         replace(
             w,
-            current_a=frozen(zero_phase(w.current_a, hz, w.dt_s)),
-            speed_rad_s=frozen(zero_phase(w.speed_rad_s, hz, w.dt_s)),
+            current_a=freeze_array(zero_phase(w.current_a, hz, w.dt_s)),
+            speed_rad_s=freeze_array(zero_phase(w.speed_rad_s, hz, w.dt_s)),
         )
         for w in windows
     ]

@@ -20,8 +20,8 @@ from studies import pages
 from studies.crash_page import goals, page
 from tests.crash import clocks as wrong_clocks
 from tests.crash import disks as small_disks
-from tests.crash.keepers import KEEPERS
 from tests.crash.loops import KINDS, tried
+from tests.crash.stored_records import KEEPERS
 from tests.integration import power_cuts
 
 __all__ = ["goals", "main", "page"]

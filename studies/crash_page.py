@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from studies import pages
-from tests.crash.injected import FAULTS
+from tests.crash.call_faults import FAULTS
 
 Figures = Mapping[str, Any]
 LEAST_CUTS = 60

@@ -99,7 +99,7 @@ def left_over(period_s: float) -> Array:
 
 def methods() -> dict[str, Method]:
     """Return the listed estimators by name, each with the product's settings, and instrumental variables."""
-    listed = {name: tables.load(tables.ESTIMATORS, name) for name in tables.ESTIMATORS}
+    listed = {name: tables.load_entry(tables.ESTIMATORS, name) for name in tables.ESTIMATORS}
     found = listed | {instrumental_variables.NAME: instrumental_variables.estimate}
     return {name.replace("_", " "): partial(estimate, settings=Identification()) for name, estimate in found.items()}
 

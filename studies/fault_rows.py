@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdhil.guard.limits import OffsetLimits
+from fdhil.guard.offset_limits import OffsetLimits
 from fdhil.sim.frame import Frame
 
 Rng = np.random.Generator

@@ -47,7 +47,7 @@ def record(config: MachineConfig, records: int, first: int = 0, seed: int = 1) -
                 history.add_window(outcome(rapid % 20 != 0, whole[axis]), "", stamp)
             elif part == 1:
                 changed = {name: value * chance.gauss(1, 0.01) for name, value in BENCH.as_dict().items()}
-                history.add_revision(published(rapid + 1, axis, Parameters.of(changed)), [rapid + 1], stamp)
+                history.add_revision(published(rapid + 1, axis, Parameters.from_mapping(changed)), [rapid + 1], stamp)
             elif rapid % EACH_NOTICE:
                 history.add_skill(Skill(axis, rapid, *(abs(chance.gauss(2, 1)) for _ in range(4))), stamp)
             else:

@@ -11,17 +11,17 @@ from typing import Any, cast
 import numpy as np
 
 from fdhil.guard.can_socket import CanSocket
-from fdhil.guard.frames import Listener
+from fdhil.guard.corrected_path import CorrectedPath
+from fdhil.guard.emergency_ramp import ramp_to_zero
+from fdhil.guard.event_journal import SYSTEM
+from fdhil.guard.frame_monitor import FrameMonitor
+from fdhil.guard.guard_protocol import Mode
+from fdhil.guard.guard_state import GuardRequest, StepInputs, StepOutput
 from fdhil.guard.interlocks import FACTS, Alarm
-from fdhil.guard.journal import SYSTEM
-from fdhil.guard.landing import land
-from fdhil.guard.path import CorrectedPath
-from fdhil.guard.protocol import Mode
-from fdhil.guard.state import Inputs, Output, Request
 from studies.fault_rows import HIJACK, RAMPED, Descent, Row, Tamper, descent
-from tests.guard import machine
-from tests.guard.machine import DIGEST, Bench
-from tests.guard.wire import Wire
+from tests.guard import simulated_bus
+from tests.guard.frame_checks import Wire
+from tests.guard.simulated_bus import DIGEST, Bench
 
 MOTOR: dict[str, Any] = {"speed_count": 1e-3, "speed_step": 44.0, "heartbeat_timeout_s": 0.1}
 CLOCKS: dict[str, dict[str, Any]] = {"A7": {"offset_synchronous": False}, "A8": {"clock": "monotonic"}}
@@ -30,13 +30,13 @@ SHARE = 0.15
 """Of the SYNC of a program a fault falls on so many; each has the machine to itself."""
 
 
-class LateListener(Listener):
+class LateListener(FrameMonitor):
     """A listener whose SYNC comes ``late_s`` after its time."""
 
     late_s = 0.0
 
-    def at_sync(self, data: bytes, stamp_s: float, now_s: float) -> tuple[Any, Any]:
-        return super().at_sync(data, stamp_s + self.late_s, now_s + self.late_s)
+    def close_sync_cycle(self, data: bytes, stamp_s: float, now_s: float) -> tuple[Any, Any]:
+        return super().close_sync_cycle(data, stamp_s + self.late_s, now_s + self.late_s)
 
 
 class Cut(Bench):
@@ -53,14 +53,14 @@ class Cut(Bench):
         self.wrong: list[str] = []
         self.series: list[tuple[int, ...]] = [(0, 0)]
 
-    def hear(self, cob_id: int, data: bytes) -> None:
+    def receive_frames(self, cob_id: int, data: bytes) -> None:
         frames = [(cob_id, data)]
         if self.tamper is not None and cob_id not in (HIJACK, 0x764, 0x081):
             frames = self.tamper(self.tick - self.changed_at, (cob_id, data))
         for frame in frames:
-            super().hear(*frame)
+            super().receive_frames(*frame)
 
-    def step(self, inputs: Inputs) -> Output:
+    def step(self, inputs: StepInputs) -> StepOutput:
         """Decide, and check the frames sent."""
         if inputs.unsent and self.outputs and self.outputs[-1].offsets is not None:
             for k in inputs.unsent:
@@ -84,16 +84,16 @@ class Cut(Bench):
         unchanging = (self.settings, self.path, self.demand, self.state)
         return copy.deepcopy(self, {id(each): each for each in unchanging})
 
-    def sync(self, request: Request | None = None, **how: Any) -> Output:
+    def run_sync(self, request: GuardRequest | None = None, **how: Any) -> StepOutput:
         """One SYNC; the drives' heartbeats come with it."""
         for drive in self.drives:
-            self.hear(0x700 + drive.node_id, b"\x05")
-        return super().sync(request, **how)
+            self.receive_frames(0x700 + drive.node_id, b"\x05")
+        return super().run_sync(request, **how)
 
 
 def cutting(rng: np.random.Generator, clock: str) -> Cut:
     """A machine with a random program in which offsets are applied."""
-    made = machine.bench(amplitude=int(rng.integers(100, 800)), **CLOCKS.get(clock, {}))
+    made = simulated_bus.bench(amplitude=int(rng.integers(100, 800)), **CLOCKS.get(clock, {}))
     axes = tuple(replace(axis, **MOTOR) for axis in made.settings.axes)
     cut = Cut(replace(made.settings, axes=axes), made.path, made.demand, made.drives)
     cut.begin()
@@ -102,7 +102,7 @@ def cutting(rng: np.random.Generator, clock: str) -> Cut:
         raise RuntimeError(f"cannot be armed: {refused}")
     cut.run(30)
     cut.play()
-    cut.until(Mode.ACTIVE)
+    cut.run_until(Mode.ACTIVE)
     return cut
 
 
@@ -134,7 +134,7 @@ def _begin(cut: Cut, row: str, of: Row, rng: np.random.Generator) -> None:
         if row == "A9":  # not to where the counter may begin anew
             cut.counter = (cut.counter + int(rng.integers(4, 230))) % 240 or 100
     for cob_id, data in of.insert(rng) if of.insert is not None else ():
-        cut.inject(cob_id, data)
+        cut.inject_frame(cob_id, data)
         if cob_id == HIJACK:
             value = int.from_bytes(data, "little", signed=True)
             cut.wires[0].foreign(value)
@@ -146,7 +146,7 @@ def _begin(cut: Cut, row: str, of: Row, rng: np.random.Generator) -> None:
     assert cut.path is not None
     match row:
         case "A2":
-            cut.listener.error("passive")
+            cut.listener.set_controller_state("passive")
         case "A6":
             cut.listener.lost_frames += 1
         case "E5":
@@ -185,7 +185,7 @@ class EverySync:
 def _land(cut: Cut) -> None:
     """What the guard's supervisor does when the loop itself has failed."""
     bus = EverySync()
-    land(cut.state, (), cut.settings, cast(CanSocket, bus), SYSTEM)
+    ramp_to_zero(cut.state, (), cut.settings, cast(CanSocket, bus), SYSTEM)
     bus.close()
     values = [int.from_bytes(data, "little", signed=True) for _, data in bus.sent]
     for offsets in batched(values, len(cut.wires)):
@@ -215,19 +215,19 @@ def _spoil(cut: Cut, by: int) -> None:
 def _one_sync(cut: Cut, row: str, k: int) -> None:
     match row:
         case "A7":
-            cut.silence() if k < 100 else cut.sync()
+            cut.silence() if k < 100 else cut.run_sync()
         case "A5":
-            cut.sync(unsent=() if k > 3 else (0, 1))
+            cut.run_sync(unsent=() if k > 3 else (0, 1))
         case "A8":
             assert isinstance(cut.listener, LateListener)
             cut.listener.late_s += 5e-5
-            cut.sync()
+            cut.run_sync()
         case "F14":
-            cut.sync(late=k <= 12)
+            cut.run_sync(late=k <= 12)
         case "E18" | "F13" if k == 1:
-            cut.sync(Request("disarm" if row == "E18" else "stop"))
+            cut.run_sync(GuardRequest("disarm" if row == "E18" else "stop"))
         case _:
-            cut.sync()
+            cut.run_sync()
 
 
 def descents(row: str, times: int, seed: int) -> tuple[list[Descent | None], list[str], int]:
@@ -242,7 +242,7 @@ def descents(row: str, times: int, seed: int) -> tuple[list[Descent | None], lis
     while len(found) < times:
         cut = cutting(rng, row)
         while len(found) < times:
-            cut.sync()
+            cut.run_sync()
             if cut.mode is not Mode.ACTIVE:
                 break
             left = cut.path.end - cut.state.places[0].row if cut.path is not None else 0

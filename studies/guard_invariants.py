@@ -17,19 +17,19 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from fdhil.guard.feedforward import Pair
-from fdhil.guard.protocol import SENDING, FeedMode, Mode
-from fdhil.guard.state import Output, Request
+from fdhil.guard.feedforward_law import Pair
+from fdhil.guard.guard_protocol import SENDING, FeedMode, Mode
+from fdhil.guard.guard_state import GuardRequest, StepOutput
 from studies import pages
-from tests.guard.fed import LIMITS as FED
-from tests.guard.fed import fed_settings
-from tests.guard.fed import request as feed_request
-from tests.guard.machine import ENABLED, RECORD, Bench, arm_request, bench
-from tests.guard.wire import Wire
+from tests.guard.feedforward_machine import LIMITS as FED
+from tests.guard.feedforward_machine import fed_settings
+from tests.guard.feedforward_machine import request as feed_request
+from tests.guard.frame_checks import Wire
+from tests.guard.simulated_bus import ENABLED, RECORD, Bench, arm_request, bench
 
 EPISODE = 5000
 AXES = ("X", "Y")
-ADOPT = Request("adopt", True)
+ADOPT = GuardRequest("adopt", True)
 FORGETS: Pair = (0, 0)
 
 
@@ -93,7 +93,7 @@ class Walk:
         return self.rng.randrange(len(AXES))
 
     def cycle(
-        self, request: Request | None = None, late: bool = False, unsent: Sequence[int] = (), nc: bool = True
+        self, request: GuardRequest | None = None, late: bool = False, unsent: Sequence[int] = (), nc: bool = True
     ) -> None:
         """Run one SYNC and check its frames. ``unsent``: the axes whose frames of the step before were not sent."""
         machine = self.machine
@@ -101,11 +101,11 @@ class Walk:
             self._not_left(machine.outputs[-1], unsent)
         machine.outputs, machine.frames, machine.held = machine.outputs[-1:], machine.frames[-1:], []
         dropped = tuple([cob_id for cob_id, until in self.drop.items() if machine.tick < until])
-        output = machine.sync(request, late=late, unsent=unsent, nc=nc, drop=dropped)
+        output = machine.run_sync(request, late=late, unsent=unsent, nc=nc, drop=dropped)
         self.seen["sync"] += 1
         self.judge(output, late)
 
-    def _not_left(self, output: Output, unsent: Sequence[int]) -> None:
+    def _not_left(self, output: StepOutput, unsent: Sequence[int]) -> None:
         for k in unsent:
             if output.offsets is not None:
                 self.wires[k].lost()
@@ -113,7 +113,7 @@ class Walk:
                 self.machine.drives[k].received_fed = None
                 self.fed_wires[k].lost()
 
-    def judge(self, output: Output, late: bool) -> None:
+    def judge(self, output: StepOutput, late: bool) -> None:
         """Check the frames sent at a SYNC, or at the local timer without one."""
         machine, before, self.mode = self.machine, self.mode, self.machine.mode
         if self.mode is not before:
@@ -152,14 +152,14 @@ class Walk:
         """Another node writes the offset of a drive, by our COB-ID or by SDO."""
         node = self.node
         data = struct.pack("<i", value) if service == 0x301 else struct.pack("<BHBi", 0x23, 0x60B0, 0, value)
-        self.machine.inject(service + node, data)
+        self.machine.inject_frame(service + node, data)
         self.wires[node].foreign(value)
 
 
-def compared(walk: Walk, valid: bool = True) -> Request:
+def compared(walk: Walk, valid: bool = True) -> GuardRequest:
     """Both drives were compared now, and found as they were commissioned."""
     touched = {name: axis.touched for name, axis in zip(AXES, walk.machine.state.axes, strict=True)}
-    return Request("compared", valid, compared=dict.fromkeys(AXES, RECORD), touched=touched)
+    return GuardRequest("compared", valid, compared=dict.fromkeys(AXES, RECORD), touched=touched)
 
 
 def armed(walk: Walk) -> None:
@@ -168,9 +168,9 @@ def armed(walk: Walk) -> None:
     for drive in machine.drives:
         drive.statusword, drive.mode, drive.answers, drive.scale, drive.position_error = ENABLED, 8, True, 1.0, 0
         drive.remapped, drive.takes_fed = False, lambda pair: pair
-        machine.hear(0x700 + drive.node_id, b"\x05")
+        machine.receive_frames(0x700 + drive.node_id, b"\x05")
     walk.drop.clear()
-    machine.listener.error("active")
+    machine.listener.set_controller_state("active")
     machine.main_alive, machine.rest, machine.playing, machine.row = True, None, False, 0
     arm = feed_request() if walk.fed and walk.rng.random() < 0.6 else arm_request()
     walk.cycle()
@@ -226,7 +226,7 @@ def forged(walk: Walk) -> None:
     value = walk.rng.choice((walk.rng.randint(-819, 819), walk.rng.randint(-(2**31), 2**31 - 1)))
     node = walk.node
     for _ in range(walk.rng.choice((1, 1, 2, 3, 12))):
-        walk.machine.hear(0x381 + node, struct.pack("<ii", walk.rng.choice((value, 0)), value))
+        walk.machine.receive_frames(0x381 + node, struct.pack("<ii", walk.rng.choice((value, 0)), value))
         for _ in range(walk.rng.choice((0, 1, 1, 9, 10))):
             walk.cycle()
 
@@ -234,7 +234,7 @@ def forged(walk: Walk) -> None:
 def garbage(walk: Walk) -> None:
     """Any bytes under a COB-ID that the guard listens to."""
     cob_id = walk.rng.choice((0x181, 0x281, 0x381, 0x481, 0x1A1, 0x201, 0x000, 0x081, 0x701, 0x401, 0x764))
-    walk.machine.hear(cob_id, walk.rng.randbytes(walk.rng.randint(0, 8)))
+    walk.machine.receive_frames(cob_id, walk.rng.randbytes(walk.rng.randint(0, 8)))
 
 
 def lost_tpdo(walk: Walk) -> None:
@@ -257,7 +257,7 @@ def requested(walk: Walk) -> None:
     elif kind in ("arm", "feedforward"):
         walk.cycle((arm_request if kind == "arm" else feed_request)(token_valid=valid))
     else:
-        walk.cycle(Request(kind, valid))
+        walk.cycle(GuardRequest(kind, valid))
 
 
 def no_sync(walk: Walk) -> None:
@@ -270,11 +270,13 @@ def no_sync(walk: Walk) -> None:
 
 
 def error_state(walk: Walk) -> None:
-    walk.machine.listener.error(walk.rng.choice(("active", "warning", "passive", "off", "restarted")))
+    walk.machine.listener.set_controller_state(walk.rng.choice(("active", "warning", "passive", "off", "restarted")))
 
 
 def written(walk: Walk) -> None:
-    walk.machine.hear(0x601 + walk.node, struct.pack("<BHBI", 0x23, walk.rng.choice((0x6065, 0x1A02, 0x6060)), 0, 0))
+    walk.machine.receive_frames(
+        0x601 + walk.node, struct.pack("<BHBI", 0x23, walk.rng.choice((0x6065, 0x1A02, 0x6060)), 0, 0)
+    )
 
 
 def jumped(walk: Walk) -> None:

@@ -9,7 +9,7 @@ from fdhil.config import Axis, Identification
 from fdhil.config.axis import Nominal
 from fdhil.config.regulators import Regulators
 from fdhil.model import closed_loop
-from fdhil.records import PARAMETERS, Estimate, Float, Parameters, rms
+from fdhil.records import PARAMETERS, Estimate, Float, Parameters, compute_rms
 from fdhil.validation.agreement import LEAST_CHANGE
 from studies import drives
 from studies.drives import Drive
@@ -46,7 +46,7 @@ def off(estimate: Estimate, drive: Drive) -> list[str]:
     """Return the parameters that deviate from the drive's by more than their intervals, and by enough to matter."""
     found = []
     for name in PARAMETERS:
-        value, std, true = estimate.value(name), estimate.std(name), drive.truth()[name]
+        value, std, true = estimate.get_value(name), estimate.get_std(name), drive.truth()[name]
         if abs(value - true) > max(SURE * std, LEAST_CHANGE[name] * true):
             found.append(f"{name} {value / true - 1.0:+.1%}, {abs(value - true) / std:.0f} deviations")
     return found
@@ -74,4 +74,4 @@ def beside_the_path(models: Sequence[Parameters], scene: Scene) -> list[str]:
 
 def _missed(model: Parameters, axis: Axis, demand_mm: Float, position_mm: Float) -> tuple[float, float]:
     told = closed_loop.simulate(model, axis, drives.CYCLE_S, demand_mm).position_mm
-    return 1e3 * rms(position_mm - told), 1e3 * rms(position_mm - demand_mm)
+    return 1e3 * compute_rms(position_mm - told), 1e3 * compute_rms(position_mm - demand_mm)

@@ -23,11 +23,11 @@ from typing import Any
 
 from fdhil import config as machine_config
 from fdhil.bridges import linuxcnc as bridge
-from fdhil.child import ending_with_parent, stopping_in_order
+from fdhil.child_process import interrupt_on_stop_signals, wrap_to_end_with_parent
 from fdhil.cli.demo.machines import machine_document
 from fdhil.cli.demo.processes import Process
 from fdhil.cli.demo.toml import to_toml
-from fdhil.daemon.control import SOCKET_NAME
+from fdhil.daemon.daemon_socket import SOCKET_NAME
 from fdhil.program import load_trajectory
 from tests.linuxcnc.beside import PART, SHUTTLE, TRIES, contour_of_each_cut, record, repeated, until
 from tests.linuxcnc.machine import LinuxCnc, write_machine
@@ -87,7 +87,7 @@ class Retrofit:
     def fdhil(self, *arguments: object, fine: tuple[int, ...] = (0,)) -> dict[str, Any]:
         """Run a command with --json; its own words end the study when its exit code is not ``fine``."""
         command = [self.python, "-m", "fdhil", *map(str, arguments), "--json"]
-        done = subprocess.run(ending_with_parent(command), capture_output=True, text=True, check=False)
+        done = subprocess.run(wrap_to_end_with_parent(command), capture_output=True, text=True, check=False)
         if done.returncode not in fine:
             sys.exit(f"{' '.join(map(str, arguments))} failed: {done.stdout[-3000:]}{done.stderr[-3000:]}")
         return dict(json.loads(done.stdout))
@@ -193,7 +193,7 @@ def install(hour: Retrofit) -> None:
     with hour.step("python -m venv, pip install fdhil"):
         venv.create(hour.folder / "venv", with_pip=True)
         hour.python = str(hour.folder / "venv" / "bin" / "python")
-        subprocess.run(ending_with_parent([hour.python, "-m", "pip", "install", "-q", str(ROOT)]), check=True)
+        subprocess.run(wrap_to_end_with_parent([hour.python, "-m", "pip", "install", "-q", str(ROOT)]), check=True)
 
 
 def tell(hour: Retrofit, before_um: float, after_um: float) -> None:
@@ -216,7 +216,7 @@ def main() -> None:
     parser.add_argument("--install", action="store_true", help="begin with pip install into a fresh environment")
     options = parser.parse_args()
     port = free_port()
-    with stopping_in_order(), tempfile.TemporaryDirectory(prefix="fdhil-hour-") as name:
+    with interrupt_on_stop_signals(), tempfile.TemporaryDirectory(prefix="fdhil-hour-") as name:
         hour = Retrofit(Path(name))
         trace = hour.folder / "trace.csv"
         if options.install:

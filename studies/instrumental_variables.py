@@ -19,7 +19,7 @@ from fdhil.identification.covariance import aliasing, coloured_meat, residual_ga
 from fdhil.identification.derivatives import derivative
 from fdhil.identification.estimators.least_squares import (
     OPEN_SHARE,
-    ORDER,
+    PARAMETER_ORDER,
     Signals,
     align,
     noise_through,
@@ -88,7 +88,7 @@ def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
 def raw_values(windows: Sequence[Window], settings: Identification) -> Float | None:
     """Return [R, L, K, Jt, ft, Cd] (6,) unchecked; None when there are too few rows."""
     rows = gather([w for w in windows if w.voltage_v is not None], settings)
-    return None if rows is None else fit(rows)[ORDER]
+    return None if rows is None else fit(rows)[PARAMETER_ORDER]
 
 
 def gather(windows: Sequence[Window], settings: Identification) -> Rows | None:
@@ -174,7 +174,7 @@ def _finish(rows: Rows, theta: Float, windows: Sequence[Window], settings: Ident
     covariance = bread @ coloured_meat([one, two], gammas, rows.lengths) @ bread.T
     covariance += np.diag(np.square(OPEN_SHARE * theta))
     alias = aliasing(window.voltage_sampling, window.dt_s)
-    covariance += np.diag(np.square(alias[ORDER] * theta))
+    covariance += np.diag(np.square(alias[PARAMETER_ORDER] * theta))
     condition = max(_condition(one, rows.electrical[:, 1:]), _condition(two, rows.mechanical[:, 1:]))
     return two_step_estimate(NAME, theta, covariance, residuals, condition, rows.mechanical)
 

@@ -104,7 +104,7 @@ def judge(
 def _harm(outcomes: Iterable[WindowOutcome], scene: Scene) -> tuple[str, ...]:
     told = [o.estimate for o in outcomes if o.verdict.accepted and o.estimate is not None]
     wrong = [text for estimate in told for text in harm.off(estimate, scene.drive)]
-    models = [p for p in (estimate.parameters() for estimate in told) if math.isfinite(sum(p.as_dict().values()))]
+    models = [p for p in (estimate.build_parameters() for estimate in told) if math.isfinite(sum(p.as_dict().values()))]
     return (*wrong, *(harm.beside_the_path(models, scene) if models else ()))
 
 

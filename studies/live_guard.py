@@ -26,15 +26,15 @@ from fdhil import config as machine_config
 from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.guard_settings import settings_of
 from fdhil.config import MachineConfig
-from fdhil.guard.settings import Settings, to_json
-from fdhil.guard.transmit_socket import connect_bus, greet
+from fdhil.guard.guard_settings import GuardSettings, encode_settings
+from fdhil.guard.transmit_socket import greet_hub, open_transmit_socket
 from fdhil.records import Float, Trajectory
 from fdhil.sim.frame import Frame
 from fdhil.sim.machine import Machine
 from fdhil.sim.wire.attach import attach
 from tests.bench import bench_document
-from tests.guard.machine import FACTS_GIVEN, commissioned
-from tests.guard.wire import Wire
+from tests.guard.frame_checks import Wire
+from tests.guard.simulated_bus import FACTS_GIVEN, commissioned
 
 AXES = "XY"
 TOKEN = "the operator's"
@@ -171,8 +171,8 @@ class LiveGuard:
         place = {key: value for key, value in self._bus.settings.items() if key in ("port", "host")}
         self._place = self.config.bus["can0"].model_copy(update=place)
         made = settings_of(self.config, "can0", folder, hashlib.sha256(TOKEN.encode()).hexdigest())
-        self.settings: Settings = commissioned(made)
-        (folder / "guard.json").write_text(to_json(self.settings))
+        self.settings: GuardSettings = commissioned(made)
+        (folder / "guard.json").write_text(encode_settings(self.settings))
         self._nodes = {axis.offset.cob_id: k for k, axis in enumerate(self.settings.axes)}
         self._scale = [axis.increments_per_mm for axis in self.settings.axes]
         self._journal, self._journal_end = os.pipe()
@@ -360,8 +360,8 @@ class LiveGuard:
         """Never returns."""
         try:
             os.dup2(self._journal_end, 1)
-            bus = connect_bus("can0", self._place)
-            greet("can0", self._place, bus)
+            bus = open_transmit_socket("can0", self._place)
+            greet_hub("can0", self._place, bus)
             bus.setblocking(True)
             bus.set_inheritable(True)
             arguments = ["--settings", str(self.folder / "guard.json"), "--descriptor", str(bus.fileno())]

@@ -17,7 +17,7 @@ import numpy as np
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
-from fdhil.records import PARAMETERS, Recording, WindowOutcome, frozen, unit_of
+from fdhil.records import PARAMETERS, Recording, WindowOutcome, freeze_array, get_unit
 from studies import pages
 from studies.bench import Array
 from studies.pages import grid, paragraph
@@ -44,14 +44,14 @@ def bench_steps(path: Path) -> Recording:
 def told(axis: str, dt_s: float, speed_rad_s: Array, current_a: Array) -> Recording:
     """Return a recording of speed and current alone; the position is the speed's integral."""
     steps = (speed_rad_s[1:] + speed_rad_s[:-1]) / 2 * dt_s
-    position = frozen(np.concatenate([[0.0], np.cumsum(steps)]) * PITCH_MM / (2 * np.pi))
+    position = freeze_array(np.concatenate([[0.0], np.cumsum(steps)]) * PITCH_MM / (2 * np.pi))
     return Recording(
         axis=axis,
         dt_s=dt_s,
-        time_s=frozen(np.arange(speed_rad_s.size) * dt_s),
+        time_s=freeze_array(np.arange(speed_rad_s.size) * dt_s),
         voltage_v=None,
-        current_a=frozen(current_a),
-        speed_rad_s=frozen(speed_rad_s),
+        current_a=freeze_array(current_a),
+        speed_rad_s=freeze_array(speed_rad_s),
         position_mm=position,
         demand_mm=position,
         voltage_sampling="interval_mean",
@@ -76,7 +76,7 @@ def figures_of(recording: Recording) -> dict[str, Any]:
 def _window(outcome: WindowOutcome) -> dict[str, Any]:
     window, estimate, verdict = outcome.window, outcome.estimate, outcome.verdict
     names = () if estimate is None else (*PARAMETERS, *estimate.terms)
-    values = {n: (estimate.value(n), estimate.std(n), unit_of(n)) for n in names if estimate is not None}
+    values = {n: (estimate.get_value(n), estimate.get_std(n), get_unit(n)) for n in names if estimate is not None}
     return {
         "start_s": window.start_s,
         "direction": window.direction,
@@ -91,12 +91,12 @@ def _window(outcome: WindowOutcome) -> dict[str, Any]:
 def _course(outcome: WindowOutcome) -> dict[str, Array]:
     """Return time s, speed rad/s, and torque measured and by the model, N.m, for a plot."""
     window, estimate = outcome.window, outcome.estimate
-    if estimate is None or not np.isfinite(estimate.value("Jt")):
+    if estimate is None or not np.isfinite(estimate.get_value("Jt")):
         return {}
-    p, w = estimate.parameters(), np.asarray(window.speed_rad_s)
+    p, w = estimate.build_parameters(), np.asarray(window.speed_rad_s)
     smooth = np.convolve(np.pad(w, 5, mode="edge"), np.ones(11) / 11, mode="valid")
-    slow = p.term("stribeck") * np.exp(-((w / p.term("stribeck_speed", 1.0)) ** 2))
-    model = p.Jt * np.gradient(smooth, window.dt_s) + p.ft * w + np.sign(w) * (p.Cd + slow) + p.term("load")
+    slow = p.get_term("stribeck") * np.exp(-((w / p.get_term("stribeck_speed", 1.0)) ** 2))
+    model = p.Jt * np.gradient(smooth, window.dt_s) + p.ft * w + np.sign(w) * (p.Cd + slow) + p.get_term("load")
     rows = slice(None, None, SHOWN)
     time = np.arange(w.size) * window.dt_s
     measured = np.asarray(window.current_a) * (p.K if np.isfinite(p.K) else 1.0)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numba import njit
 
-from fdhil.records import Recording, VoltageSampling, frozen
+from fdhil.records import Recording, VoltageSampling, freeze_array
 from studies.bench import Array, table_text
 
 STEP_S = 3.125e-5
@@ -333,12 +333,12 @@ def recording(
     return Recording(
         axis="X",
         dt_s=run.dt_s,
-        time_s=frozen(np.arange(run.speed.size) * run.dt_s),
-        voltage_v=frozen(told["voltage_V"]) if voltage else None,
-        current_a=frozen(told["current_A"]),
-        speed_rad_s=frozen(told["speed_rad_per_s"]),
-        position_mm=frozen(told["position_m"] * 1e3),
-        demand_mm=frozen(told["demand_m"] * 1e3),
+        time_s=freeze_array(np.arange(run.speed.size) * run.dt_s),
+        voltage_v=freeze_array(told["voltage_V"]) if voltage else None,
+        current_a=freeze_array(told["current_A"]),
+        speed_rad_s=freeze_array(told["speed_rad_per_s"]),
+        position_mm=freeze_array(told["position_m"] * 1e3),
+        demand_mm=freeze_array(told["demand_m"] * 1e3),
         voltage_sampling=sensors.sampling,
         pitch_mm=mechanics.pitch_m * 1e3,
         rapid_speed_rad_s=rapid_m_s / mechanics.pitch_m * 2 * np.pi,

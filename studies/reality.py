@@ -29,7 +29,7 @@ from fdhil.pipeline.identified_loops import better_axis, explained
 from fdhil.prediction.contour import contour_error_um
 from fdhil.prediction.predict import ahead_of_motor_mm
 from fdhil.program.loading import load_trajectory
-from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Parameters, Trajectory, WindowOutcome, rms
+from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Parameters, Trajectory, WindowOutcome, compute_rms
 from studies import pages
 from studies.bench import Array, shuttle
 from studies.comparison import SURE_95
@@ -232,7 +232,7 @@ def outcomes_of(machine: Machine, seed: int) -> tuple[list[WindowOutcome], float
             analyse(w, config.identification, config.axis["X"], config.machine.sync_period_s)
             for w in find_windows(told)
         ]
-        following.append(rms((moved.motor_m - moved.demand) * 1e6))
+        following.append(compute_rms((moved.motor_m - moved.demand) * 1e6))
     settings, axis, period_s = config.identification, config.axis["X"], config.machine.sync_period_s
     windows = [o.window for o in outcomes]
 
@@ -282,19 +282,24 @@ def contour(
         ahead = ahead_of_motor_mm(reference.position_mm, wanted, models, config)
         seen = motor + np.column_stack([ahead.get(axis, np.zeros(len(motor))) for axis in reference.axes])
         own = {axis: (reference.position_mm[axis] - seen[:, k]) * 1e3 for k, axis in enumerate(reference.axes)}
-        lesson = learn(lesson, own, rms(error_um(seen)), models, config)
+        lesson = learn(lesson, own, compute_rms(error_um(seen)), models, config)
         rough = {axis: planned[axis] + lesson.offset_um[axis] for axis in reference.axes}
         wanted = fit_all(rough, config.axis, reference.dt_s)
     after = passes[0]
-    return rms(before), rms(after), float((after - before).max()), tuple(rms(one) for one in passes[1:])
+    return (
+        compute_rms(before),
+        compute_rms(after),
+        float((after - before).max()),
+        tuple(compute_rms(one) for one in passes[1:]),
+    )
 
 
 def errors_of(estimate: Estimate | None, truth: Array) -> tuple[Array, Array]:
     """Return errors in per cent of the truth, and in the estimate's deviations, (6,) each."""
     if estimate is None:
         return np.full(6, np.nan), np.full(6, np.nan)
-    values = np.array([estimate.value(name) for name in PARAMETERS])
-    stds = np.array([estimate.std(name) for name in PARAMETERS])
+    values = np.array([estimate.get_value(name) for name in PARAMETERS])
+    stds = np.array([estimate.get_std(name) for name in PARAMETERS])
     # where a load balances friction, there is none in that direction
     shares = np.divide(values - truth, truth, out=np.full(6, np.nan), where=truth != 0)
     return 100 * shares, (values - truth) / stds
@@ -307,7 +312,7 @@ def examine(machine: Machine, seed: int = 0) -> Found:
     estimate, verdict = pool(outcomes, settings)
     told = [errors_of(o.estimate, machine.truth(o.window.direction)) for o in outcomes if o.verdict.accepted]
     candidates = [estimate, *(o.estimate for o in outcomes)]  # a refused model is cut with all the same
-    usable = [e.parameters() for e in candidates if e is not None and _whole(e)]
+    usable = [e.build_parameters() for e in candidates if e is not None and _whole(e)]
     nothing = (np.nan, np.nan, np.nan, ())
     before_um, after_um, worse_um, passes_um = contour(machine, usable[0], loops) if usable else nothing
     left = [o.verdict.unexplained_um for o in outcomes if o.verdict.unexplained_um is not None]
@@ -332,7 +337,7 @@ def examine(machine: Machine, seed: int = 0) -> Found:
 
 
 def _whole(estimate: Estimate) -> bool:
-    values = np.array([estimate.value(name) for name in PARAMETERS])
+    values = np.array([estimate.get_value(name) for name in PARAMETERS])
     return bool(np.isfinite(values).all() and (values[:4] > 0).all() and (values[4:] >= 0).all())
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdhil.records import Recording, VoltageSampling, frozen
+from fdhil.records import Recording, VoltageSampling, freeze_array
 from studies import drives
 from studies.drives import Array, Drive, Move, Rng, Signals, log_uniform
 
@@ -134,12 +134,12 @@ def recorded(scene: Scene, rows: Rows, *, says_rapid: bool = True) -> Recording:
     return Recording(
         axis="X",
         dt_s=rows.dt_s,
-        time_s=frozen(np.arange(n) * rows.dt_s),
-        voltage_v=frozen(s["voltage"]),
-        current_a=frozen(s["current"]),
-        speed_rad_s=frozen(s["speed"]),
-        position_mm=frozen(s["position"] * 1e3),
-        demand_mm=frozen(s["demand"] * 1e3),
+        time_s=freeze_array(np.arange(n) * rows.dt_s),
+        voltage_v=freeze_array(s["voltage"]),
+        current_a=freeze_array(s["current"]),
+        speed_rad_s=freeze_array(s["speed"]),
+        position_mm=freeze_array(s["position"] * 1e3),
+        demand_mm=freeze_array(s["demand"] * 1e3),
         voltage_sampling=scene.sampling,
         pitch_mm=scene.drive.pitch_m * 1e3,
         rapid_speed_rad_s=rapid if says_rapid else None,

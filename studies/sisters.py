@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from fdhil.fleet.outliers import Course, judge
-from fdhil.records import Float, frozen
+from fdhil.records import Float, freeze_array
 from studies import pages
 from studies.pages import grid, paragraph
 
@@ -34,7 +34,7 @@ Draw = Callable[[np.random.Generator, int], list[Course]]
 
 def single(name: str, value: float, std: float = 0.0, axis: str = "X") -> Course:
     """Return an axis with one known set, without temperature."""
-    return Course(name, axis, frozen([value]), frozen([np.nan]), frozen([0.0]), std)
+    return Course(name, axis, freeze_array([value]), freeze_array([np.nan]), freeze_array([0.0]), std)
 
 
 def by_one_set(rng: np.random.Generator, count: int) -> list[Course]:
@@ -56,7 +56,7 @@ def drawn(
         age = rng.uniform(0, 24) + np.linspace(0.0, 1.0, SETS)
         own = 0.05 * (1 + spread * rng.normal())
         values = own * (1 + per_k * (at_c - 20.0) + per_month * age) * (1 + 1e-3 * rng.normal(size=SETS))
-        courses.append(Course(f"mill-{k}", "X", frozen(values), frozen(at_c), frozen(age), 1e-4))
+        courses.append(Course(f"mill-{k}", "X", freeze_array(values), freeze_array(at_c), freeze_array(age), 1e-4))
     return courses
 
 
@@ -64,24 +64,24 @@ def in_steady_halls(rng: np.random.Generator, count: int) -> list[Course]:
     """Return machines in halls of constant temperature: their own sets do not show its effect."""
     courses = []
     for course in drawn(rng, count):
-        at_c = frozen(np.full(SETS, course.temperatures_c[0]))
+        at_c = freeze_array(np.full(SETS, course.temperatures_c[0]))
         values = course.values * (1 + PER_K * (at_c - course.temperatures_c))
-        courses.append(replace(course, temperatures_c=at_c, values=frozen(values)))
+        courses.append(replace(course, temperatures_c=at_c, values=freeze_array(values)))
     return courses
 
 
 def half_without_thermometer(rng: np.random.Generator, count: int) -> list[Course]:
     """Return machines of which every second has no thermometer."""
-    unknown = frozen(np.full(SETS, np.nan))
+    unknown = freeze_array(np.full(SETS, np.nan))
     return [replace(c, temperatures_c=unknown) if k % 2 else c for k, c in enumerate(drawn(rng, count))]
 
 
 def with_a_busy_one(rng: np.random.Generator, count: int) -> list[Course]:
     """Return machines with a peer that has a hundred times the sets and another slope: only that may be reported."""
     courses = drawn(rng, count)
-    at_c = frozen(rng.uniform(15, 35, SETS_OF_THE_BUSY))
-    values = frozen(np.median(courses[0].values) * (1 - 3 * PER_K * (at_c - np.median(at_c))))
-    ages = frozen(np.full(SETS_OF_THE_BUSY, courses[0].ages_months[0]))
+    at_c = freeze_array(rng.uniform(15, 35, SETS_OF_THE_BUSY))
+    values = freeze_array(np.median(courses[0].values) * (1 - 3 * PER_K * (at_c - np.median(at_c))))
+    ages = freeze_array(np.full(SETS_OF_THE_BUSY, courses[0].ages_months[0]))
     return [replace(courses[0], machine=BUSY, values=values, temperatures_c=at_c, ages_months=ages), *courses[1:]]
 
 
@@ -115,7 +115,7 @@ def share_found(count: int, worn: int, shift: float, groups: int, seed: int = 0)
     for _ in range(groups):
         courses = drawn(rng, count)
         for k in range(worn):
-            courses[k] = replace(courses[k], values=frozen(courses[k].values * (1 + shift * SPREAD)))
+            courses[k] = replace(courses[k], values=freeze_array(courses[k].values * (1 + shift * SPREAD)))
         told = scores(courses)
         found += sum(told[f"mill-{k}"] > 1 for k in range(worn))
     return found / (groups * worn)

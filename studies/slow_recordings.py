@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from fdhil.records import SlowVoltage, VoltageSampling, frozen
+from fdhil.records import SlowVoltage, VoltageSampling, freeze_array
 from studies import drives, faults, machine_faults, signal_faults
 from studies.drives import Array, Drive, Rng, Signals, log_uniform
 from studies.faults import Kind
@@ -95,7 +95,7 @@ def scene_of(rng: Rng) -> Scene:
 
 def told(scene: Scene, sensed: Sensed, severity: float = 0.0, *, says_rapid: bool = True) -> Spoilt:
     """Return the recording with the severity of its fault."""
-    slow = SlowVoltage(sensed.begin_s, sensed.period_s, 2e-4, frozen(sensed.voltage))
+    slow = SlowVoltage(sensed.begin_s, sensed.period_s, 2e-4, freeze_array(sensed.voltage))
     return Spoilt(replace(recorded(scene, sensed.rows, says_rapid=says_rapid), slow_voltage=slow), severity)
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from fdhil.config import Identification
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.windows import find_windows
-from fdhil.records import PARAMETERS, SlowVoltage, VoltageSampling, Window, frozen
+from fdhil.records import PARAMETERS, SlowVoltage, VoltageSampling, Window, freeze_array
 from fdhil.store.recording_csv import parse_recording
 from studies import bench, pages
 from studies.drives import Array
@@ -60,7 +60,7 @@ def slow_windows(
         count = int((window.n * window.dt_s - begin_s) / period_s)
         begin = window.start_s + begin_s - delay_s + np.arange(count) * period_s
         told = sampled(fine, bench.STEP_S, begin, period_s, sampling) + noise * 60 * rng.standard_normal(count)
-        slow = SlowVoltage(begin_s, period_s, 0.0002, frozen(told))
+        slow = SlowVoltage(begin_s, period_s, 0.0002, freeze_array(told))
         answer.append(replace(window, voltage_v=None, voltage_sampling=sampling, slow_voltage=slow))
     return answer
 

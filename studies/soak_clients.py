@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 from websockets.sync.client import connect
 
-from fdhil.daemon.control import SOCKET_NAME
+from fdhil.daemon.daemon_socket import SOCKET_NAME
 from studies.soak_shop import Shop
 
 WAIT_S = 60.0

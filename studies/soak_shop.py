@@ -22,7 +22,7 @@ from fdhil.cli.demo.toml import to_toml
 from fdhil.commissioning.record import save_record
 from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
-from fdhil.daemon.control import SOCKET_NAME, ask
+from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
 from fdhil.errors import ConnectError, FdhilError
 from tests.ports import free_port
 
@@ -207,7 +207,7 @@ class Shop:
 
     def ask(self, request: str, **more: Any) -> dict[str, Any]:
         """Send a request to the daemon."""
-        return dict(ask(self.folder / "run" / SOCKET_NAME, {"request": request, **more}, timeout_s=PATIENCE_S))
+        return dict(ask_daemon(self.folder / "run" / SOCKET_NAME, {"request": request, **more}, timeout_s=PATIENCE_S))
 
     def status(self) -> dict[str, Any] | None:
         """Return the daemon's status, None while it does not answer."""

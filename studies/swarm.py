@@ -36,7 +36,7 @@ FIRST_S = 3.0  # of rest after the last fault, until the drives must be at zero
 FAULTS_END_S = 3.0
 SHOWN = 40  # failures on the page
 MOST_CPU_S = 5.0  # of a machine-second: what takes longer does not end
-CODE = ("fdhil/**/*.py", "tests/machine/[!t]*.py", "tests/guard/wire.py", "tests/bench.py", "studies/swarm.py")
+CODE = ("fdhil/**/*.py", "tests/machine/[!t]*.py", "tests/guard/frame_checks.py", "tests/bench.py", "studies/swarm.py")
 SYNC_PERIODS_S = (0.001, 0.002, 0.004)
 AXES = ("X", "XY", "XY", "XY", "XYZ")
 

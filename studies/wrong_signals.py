@@ -20,7 +20,7 @@ from fdhil.config import Axis, Identification
 from fdhil.identification.windows import find_windows
 from fdhil.model import closed_loop
 from fdhil.pipeline import analyse, pool
-from fdhil.records import PARAMETERS, Estimate, Parameters, Recording, Window, frozen, rms
+from fdhil.records import PARAMETERS, Estimate, Parameters, Recording, Window, compute_rms, freeze_array
 from fdhil.validation.data_sheet import gain_error
 from fdhil.validation.signal_consistency import missing_move
 from studies import pages
@@ -190,7 +190,7 @@ def _moving(window: Window) -> tuple[int, int]:
 def faulty(recorded: Recording, fault: Fault) -> Recording:
     """Return the recording with the fault; a voltage that was not recorded stays out."""
     names = [name for name in fault.values if getattr(recorded, FIELDS[name]) is not None]
-    changed: Recording = replace(recorded, **{FIELDS[n]: frozen(np.array(fault.values[n])) for n in names})  # type: ignore[arg-type]
+    changed: Recording = replace(recorded, **{FIELDS[n]: freeze_array(np.array(fault.values[n])) for n in names})  # type: ignore[arg-type]
     return changed
 
 
@@ -230,7 +230,7 @@ def judge(plant: Plant, recorded: Recording, fault: Fault, *, configured: bool) 
 
 def _beside_interval(estimate: Estimate, plant: Plant, direction: int) -> Iterator[str]:
     for name, true in zip(PARAMETERS, plant.machine.truth(direction), strict=True):
-        value, std = estimate.value(name), estimate.std(name)
+        value, std = estimate.get_value(name), estimate.get_std(name)
         if name not in estimate.given and abs(value - true) > max(SURE * std, SHARE * abs(true)):
             yield f"{name} {value / true:.3g} times what it is"
 
@@ -240,16 +240,20 @@ def _beside_path(estimate: Estimate, plant: Plant) -> Iterator[str]:
     for share in RAPID_SHARES:
         demand_mm = 1e3 * shuttle(0.2, share * plant.rapid_m_s, 1.0, 2)
         true = run(plant.machine.mechanics, 1e-3 * demand_mm, plant.machine.loops).motor_m * 1e3
-        errors = [1e3 * rms(true - _predicted(e, plant, demand_mm)) for e in (estimate, _good(plant.machine.name))]
-        limit = max(LEAST_UM, Identification().tolerance_for(1e3 * rms(true - demand_mm)))
+        errors = [
+            1e3 * compute_rms(true - _predicted(e, plant, demand_mm)) for e in (estimate, _good(plant.machine.name))
+        ]
+        limit = max(LEAST_UM, Identification().tolerance_for(1e3 * compute_rms(true - demand_mm)))
         if errors[0] > errors[1] + limit:
             yield f"{errors[0]:.3g} um beside the path"
 
 
 def _predicted(estimate: Estimate, plant: Plant, demand_mm: Array) -> Array:
-    values = estimate.parameters().as_dict()
+    values = estimate.build_parameters().as_dict()
     winding = {name: getattr(plant.axis.nominal, name) for name in ("R", "L") if not np.isfinite(values[name])}
-    return closed_loop.simulate(estimate.parameters().changed(**winding), plant.axis, 1e-3, demand_mm).position_mm
+    return closed_loop.simulate(
+        estimate.build_parameters().replace_values(**winding), plant.axis, 1e-3, demand_mm
+    ).position_mm
 
 
 @cache

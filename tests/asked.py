@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdhil.records import SlowVoltage, Window, frozen
+from fdhil.records import SlowVoltage, Window, freeze_array
 from studies.slow_sensor import slow_windows
 
 FINE_S, FINE_IN_PERIOD, REACH = 0.002, 5, 2
@@ -27,7 +27,7 @@ def _asked(window: Window, rng: np.random.Generator, timely: bool) -> Window:
         fine.begin_s + FINE_S * FINE_IN_PERIOD,
         FINE_S * FINE_IN_PERIOD,
         fine.error_s,
-        frozen(fine.voltage_v[places + off]),
-        frozen(FINE_S * off),
+        freeze_array(fine.voltage_v[places + off]),
+        freeze_array(FINE_S * off),
     )
     return replace(window, slow_voltage=slow)

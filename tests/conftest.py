@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import pytest
 from hypothesis import Phase, settings
 
-from fdhil.guard.signals import KEPT
+from fdhil.guard.stop_signals import KEPT
 
 pytest_plugins = ["tests.tiers", "tests.virtual_threads"]
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported; as the command line does

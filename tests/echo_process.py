@@ -4,13 +4,13 @@ import os
 import sys
 import time
 
-from fdhil.bounded_process import limit_process, receive_request, report
+from fdhil.bounded_process import limit_process, receive_request, report_to_parent
 
 
 def main() -> None:
     limit_process(0, {})
     request = receive_request()
-    report({"request": request, "pid": os.getpid()})
+    report_to_parent({"request": request, "pid": os.getpid()})
     if request["then"] == "hang":
         time.sleep(1000)
     elif request["then"] == "break off":

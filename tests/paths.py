@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from fdhil.records import Float, Trajectory, frozen, frozen_ints
+from fdhil.records import Float, Trajectory, freeze_array, freeze_integers
 
 
 def _geometry(step_mm: float = 0.002) -> Float:
@@ -58,10 +58,10 @@ def trajectory(demand: Float, axes: str = "XY", dt_s: float = 0.001) -> Trajecto
     n = len(demand)
     return Trajectory(
         dt_s,
-        frozen(np.arange(n) * dt_s),
-        {axis: frozen(demand[:, a]) for a, axis in enumerate(axes)},
+        freeze_array(np.arange(n) * dt_s),
+        {axis: freeze_array(demand[:, a]) for a, axis in enumerate(axes)},
         np.zeros(n, dtype=np.bool_),
-        frozen_ints(np.zeros(n)),
+        freeze_integers(np.zeros(n)),
     )
 
 

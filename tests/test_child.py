@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from fdhil import child
-from fdhil.child import ending_with_parent, stopping_in_order
+from fdhil import child_process
+from fdhil.child_process import interrupt_on_stop_signals, wrap_to_end_with_parent
 
 pytestmark = pytest.mark.usefixtures("processes")
 
 ENDED = [sys.executable, "-c", "import sys; sys.stdin.read()"]
 PARENT = """
 import os, subprocess, sys
-from fdhil.child import ending_with_parent
+from fdhil.child_process import ending_with_parent
 code = "import signal, sys; print('up', flush=True); signal.pause()"
 subprocess.Popen(ending_with_parent([sys.executable, "-c", code]), stdin=subprocess.DEVNULL)
 sys.stdin.read()
@@ -53,7 +53,7 @@ def test_child_ends_when_its_parent_ends(number: signal.Signals | None) -> None:
 def test_child_of_a_parent_that_has_ended_already_is_not_started(tmp_path: Path) -> None:
     with subprocess.Popen(ENDED, stdin=subprocess.PIPE) as ended:
         ended.communicate()
-    command = [*ending_with_parent([])[:4], str(ended.pid), "15", "touch", str(tmp_path / "started")]
+    command = [*wrap_to_end_with_parent([])[:4], str(ended.pid), "15", "touch", str(tmp_path / "started")]
     assert subprocess.run(command).returncode == 1
     assert not [*tmp_path.iterdir()]
 
@@ -61,7 +61,7 @@ def test_child_of_a_parent_that_has_ended_already_is_not_started(tmp_path: Path)
 def test_child_has_the_defaults_of_a_pipe_and_of_the_signal_that_ends_it() -> None:
     before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
     try:
-        status = subprocess.check_output(ending_with_parent(["cat", "/proc/self/status"]), text=True)
+        status = subprocess.check_output(wrap_to_end_with_parent(["cat", "/proc/self/status"]), text=True)
     finally:
         signal.signal(signal.SIGTERM, before)
     ignored = int(next(line.split()[1] for line in status.splitlines() if line.startswith("SigIgn")), 16)
@@ -69,33 +69,33 @@ def test_child_has_the_defaults_of_a_pipe_and_of_the_signal_that_ends_it() -> No
 
 
 def test_command_that_is_not_there_is_named() -> None:
-    done = subprocess.run(ending_with_parent(["/nowhere/tool"]), capture_output=True, text=True)
+    done = subprocess.run(wrap_to_end_with_parent(["/nowhere/tool"]), capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (1, "/nowhere/tool cannot be started: No such file or directory\n")
 
 
-@pytest.mark.parametrize("number", child.ENDING_SIGNALS)
+@pytest.mark.parametrize("number", child_process.ENDING_SIGNALS)
 def test_first_signal_is_raised_and_a_second_does_not_disturb_what_ends(number: signal.Signals) -> None:
-    before = {each: signal.getsignal(each) for each in child.ENDING_SIGNALS}
+    before = {each: signal.getsignal(each) for each in child_process.ENDING_SIGNALS}
     ended = []
 
     def interrupted() -> None:
         try:
             os.kill(os.getpid(), number)
         finally:
-            for each in child.ENDING_SIGNALS:
+            for each in child_process.ENDING_SIGNALS:
                 os.kill(os.getpid(), each)
             ended.append(True)
 
-    with pytest.raises(KeyboardInterrupt), stopping_in_order():
+    with pytest.raises(KeyboardInterrupt), interrupt_on_stop_signals():
         interrupted()
     assert ended
-    assert {each: signal.getsignal(each) for each in child.ENDING_SIGNALS} == before
+    assert {each: signal.getsignal(each) for each in child_process.ENDING_SIGNALS} == before
 
 
 def test_signal_that_is_ignored_stays_so() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with stopping_in_order():
+        with interrupt_on_stop_signals():
             os.kill(os.getpid(), signal.SIGHUP)
     finally:
         signal.signal(signal.SIGHUP, before)

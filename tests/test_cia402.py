@@ -9,48 +9,57 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fdhil import cia402
-from fdhil.cia402 import PdoEntry, Scaling, State, lay_out, pack, pdo_length, state_of, unpack
+from fdhil.cia402 import (
+    PdoEntry,
+    PowerState,
+    Scaling,
+    compute_pdo_length,
+    decode_power_state,
+    lay_out,
+    pack_pdo,
+    unpack_pdo,
+)
 
 # CiA 402-2, statusword of each state; x bits are tried both ways
 STATES = {
-    State.NOT_READY: "x0xx0000",
-    State.SWITCH_ON_DISABLED: "x1xx0000",
-    State.READY: "x01x0001",
-    State.SWITCHED_ON: "x01x0011",
-    State.OPERATION_ENABLED: "x01x0111",
-    State.QUICK_STOP_ACTIVE: "x00x0111",
-    State.FAULT_REACTION_ACTIVE: "x0xx1111",
-    State.FAULT: "x0xx1000",
+    PowerState.NOT_READY: "x0xx0000",
+    PowerState.SWITCH_ON_DISABLED: "x1xx0000",
+    PowerState.READY: "x01x0001",
+    PowerState.SWITCHED_ON: "x01x0011",
+    PowerState.OPERATION_ENABLED: "x01x0111",
+    PowerState.QUICK_STOP_ACTIVE: "x00x0111",
+    PowerState.FAULT_REACTION_ACTIVE: "x0xx1111",
+    PowerState.FAULT: "x0xx1000",
 }
 
 
 @pytest.mark.parametrize("state", STATES)
 @given(st.integers(0, 0xFFFF))
-def test_states_are_told_by_their_bits_alone(state: State, other_bits: int) -> None:
+def test_states_are_told_by_their_bits_alone(state: PowerState, other_bits: int) -> None:
     pattern = STATES[state]
     fixed = int(pattern.replace("x", "0"), 2)
     free = int("".join("1" if bit == "x" else "0" for bit in pattern), 2) | 0xFF00
-    assert state_of(fixed | other_bits & free) is state
+    assert decode_power_state(fixed | other_bits & free) is state
 
 
 def test_every_state_leads_to_operation_enabled() -> None:
     arrives = {
-        State.FAULT: State.SWITCH_ON_DISABLED,
-        State.SWITCH_ON_DISABLED: State.READY,
-        State.READY: State.SWITCHED_ON,
-        State.SWITCHED_ON: State.OPERATION_ENABLED,
-        State.QUICK_STOP_ACTIVE: State.SWITCH_ON_DISABLED,
+        PowerState.FAULT: PowerState.SWITCH_ON_DISABLED,
+        PowerState.SWITCH_ON_DISABLED: PowerState.READY,
+        PowerState.READY: PowerState.SWITCHED_ON,
+        PowerState.SWITCHED_ON: PowerState.OPERATION_ENABLED,
+        PowerState.QUICK_STOP_ACTIVE: PowerState.SWITCH_ON_DISABLED,
     }
     for start in arrives:
         state, words = start, []
-        while state is not State.OPERATION_ENABLED:
-            words.append(cia402.controlword_toward_enabled(state))
+        while state is not PowerState.OPERATION_ENABLED:
+            words.append(cia402.choose_enabling_controlword(state))
             state = arrives[state]
             assert len(words) < 6
         assert None not in words
-    assert cia402.controlword_toward_enabled(State.NOT_READY) is None
-    assert cia402.controlword_toward_enabled(State.FAULT_REACTION_ACTIVE) is None
-    assert cia402.controlword_toward_enabled(State.OPERATION_ENABLED) == 0x0F
+    assert cia402.choose_enabling_controlword(PowerState.NOT_READY) is None
+    assert cia402.choose_enabling_controlword(PowerState.FAULT_REACTION_ACTIVE) is None
+    assert cia402.choose_enabling_controlword(PowerState.OPERATION_ENABLED) == 0x0F
 
 
 @st.composite
@@ -74,19 +83,19 @@ def mapped(draw: st.DrawFn) -> tuple[tuple[PdoEntry, ...], tuple[int, ...]]:
 @given(mapped(), st.binary(max_size=4))
 def test_what_is_packed_is_unpacked(pdo: tuple[tuple[PdoEntry, ...], tuple[int, ...]], tail: bytes) -> None:
     entries, values = pdo
-    data = pack(entries, values)
-    assert len(data) == pdo_length(entries) <= 8
-    assert unpack(entries, data) == values
-    assert unpack(entries, data + tail) == values  # of a long PDO the mapped bytes count
+    data = pack_pdo(entries, values)
+    assert len(data) == compute_pdo_length(entries) <= 8
+    assert unpack_pdo(entries, data) == values
+    assert unpack_pdo(entries, data + tail) == values  # of a long PDO the mapped bytes count
     with pytest.raises(ValueError, match="its mapping needs"):
-        unpack(entries, data[:-1])
+        unpack_pdo(entries, data[:-1])
 
 
 @pytest.mark.parametrize("value", [1 << 15, -(1 << 15) - 1, 1.0, 1.7, math.nan, True, None])
 def test_what_does_not_fit_is_refused(value: object) -> None:
     entries = lay_out([(0x6078, 0, 16, True)])
     with pytest.raises(ValueError, match="does not fit"):
-        pack(entries, [value])  # type: ignore[list-item]  # a wrong type is what is tried
+        pack_pdo(entries, [value])  # type: ignore[list-item]  # a wrong type is what is tried
 
 
 def test_more_than_64_bits_are_refused() -> None:
@@ -101,10 +110,10 @@ def test_a_mapping_value_is_index_sub_and_bits() -> None:
 @given(st.integers(-(2**31), 2**31 - 1), st.sampled_from([1, -1]))
 def test_increments_and_millimetres_agree(increments: int, sign: int) -> None:
     scaling = Scaling(65536, 20.0, sign)
-    assert scaling.to_increments(scaling.to_mm(increments)) == increments
+    assert scaling.convert_to_increments(scaling.convert_to_mm(increments)) == increments
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_no_position_is_refused(value: float) -> None:
     with pytest.raises(ValueError, match="not a valid position"):
-        Scaling(65536, 20.0).to_increments(value)
+        Scaling(65536, 20.0).convert_to_increments(value)

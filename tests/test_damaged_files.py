@@ -17,11 +17,11 @@ from fdhil.arming.program_check import HEADER, SCHEMA, keep
 from fdhil.arming.token import TOKEN_NAME, ensure_token, read_token
 from fdhil.config import Nc
 from fdhil.errors import ConfigError, FdhilError, ProgramError
-from fdhil.guard.settings import load, to_json
+from fdhil.guard.guard_settings import encode_settings, load_settings
 from fdhil.prediction.models import load_model_file
 from fdhil.program import Budget, interpret
 from fdhil.sim import fault_script
-from tests.guard.machine import settings
+from tests.guard.simulated_bus import settings
 
 HOSTILE = {
     "deep": "[" * 200_000,
@@ -47,15 +47,15 @@ def flips(whole: bytes, most: int, seed: int) -> Iterator[bytes]:
 @pytest.mark.usefixtures("real_time")
 def test_no_flipped_bit_of_the_guards_settings_is_believed(tmp_path: Path) -> None:
     path, true = tmp_path / "guard.json", settings()
-    path.write_text(to_json(true))
-    assert load(path) == true
+    path.write_text(encode_settings(true))
+    assert load_settings(path) == true
     for flipped in flips(path.read_bytes(), 300, 1):
         path.write_bytes(flipped)
         with pytest.raises(ConfigError, match=r"run fdhil-guard|let fdhil-guard write it"):
-            load(path)
+            load_settings(path)
 
 
-@pytest.mark.parametrize("read", [load, load_model_file])
+@pytest.mark.parametrize("read", [load_settings, load_model_file])
 @pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE)
 def test_a_hostile_document_is_a_config_error(text: str, read: Callable[[Path], object], tmp_path: Path) -> None:
     """The guard's settings and a model file: any content gives one sentence of bounded length."""

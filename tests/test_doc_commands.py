@@ -17,7 +17,7 @@ from fdhil import config
 from fdhil.cli.guard import guard
 from fdhil.cli.main import cli, leaves
 from fdhil.config.fleet import Fleet
-from fdhil.daemon.kernel_warmup import nominal_rapid
+from fdhil.daemon.kernel_warmup import simulate_nominal_rapid
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.fleet.offer import Change
 from fdhil.fleet.rollout import ChangeFile
@@ -25,7 +25,7 @@ from fdhil.store.column_map import ColumnMap
 from fdhil.store.windows import encode_window
 from studies import bench
 from tests.bench import bench_document
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 from tests.store.made import published
 
 ROOT = Path(__file__).parents[1]
@@ -156,9 +156,9 @@ def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     machine = config.load(tmp_path / "configs" / "sim.toml")
     store = OutcomeStore(machine)
     store.open()
-    store.keep([published(1), published(1, "Y")])
+    store.store_outcomes([published(1), published(1, "Y")])
     store.close()
-    rapid = encode_window(nominal_rapid("X", machine.axis["X"], machine.machine.sync_period_s), machine.digest)
+    rapid = encode_window(simulate_nominal_rapid("X", machine.axis["X"], machine.machine.sync_period_s), machine.digest)
     (tmp_path / WINDOW).parent.mkdir(exist_ok=True)
     (tmp_path / WINDOW).write_bytes(rapid)
     monkeypatch.chdir(tmp_path)

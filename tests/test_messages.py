@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 import fdhil
-from fdhil.daemon.notice_words import WORDS
-from fdhil.guard.interlocks import CATALOGUE, EFFECT
+from fdhil.daemon.notice_texts import WORDS
+from fdhil.guard.interlocks import INTERLOCK_CATALOGUE, REACTION_EFFECTS
 from tests.fault_matrix import ROWS, TOLD_OTHERWISE
 
 PRODUCT = Path(fdhil.__file__).parent
@@ -77,11 +77,13 @@ def test_each_refusal_tells_class_cause_and_next_action() -> None:
 def test_every_class_is_in_the_documents_with_effect_and_next_action(
     record_property: Callable[[str, object], None],
 ) -> None:
-    told = {code for code, *_ in calls()} | CATALOGUE.keys() | WORDS.keys()
+    told = {code for code, *_ in calls()} | INTERLOCK_CATALOGUE.keys() | WORDS.keys()
     told |= {name for row in ROWS.values() if row.id not in TOLD_OTHERWISE for name in row.classes}
     assert sorted(told - documented()) == []
     assert all(map(all, WORDS.values()))
-    assert all(cause and action and EFFECT[reaction] for reaction, cause, action in CATALOGUE.values())
+    assert all(
+        cause and action and REACTION_EFFECTS[reaction] for reaction, cause, action in INTERLOCK_CATALOGUE.values()
+    )
     record_property("goal", f"{len(told)} classes, each with cause, effect and next action, all in the documents")
 
 

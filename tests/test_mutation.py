@@ -15,41 +15,41 @@ from studies.mutation import Mutant, function_of, of_code, of_values, put
 from studies.trial import UNCALLED, UNNOTICED
 
 ROOT = Path(__file__).parent.parent
-LIMITS = "fdhil.guard.limits"
+LIMITS = "fdhil.guard.offset_limits"
 
 
 @pytest.mark.usefixtures("long_computation")
 def test_the_mistakes_of_a_module_are_those_of_its_functions_properties_tables_and_constants() -> None:
-    import_module("fdhil.guard.core")  # only what is loaded is searched for who reads a table
+    import_module("fdhil.guard.guard_step")  # only what is loaded is searched for who reads a table
     code = {mutant.name for mutant in of_code(LIMITS)}
     assert "limits.clamp: return min(max(value, low), high) -> return min(max(value, low), None)" in code
     assert "limits.Travel.total: return self.current + sum(self.past) -> return self.current - sum(self.past)" in code
     assert "limits.CEILING_OFFSET_UM: 250 -> 251" in {mutant.name for mutant in of_values(LIMITS)}
-    assert not {mutant.place for mutant in of_values("fdhil.guard.transitions")} & {"SENT", "TRANSITIONS"}
+    assert not {mutant.place for mutant in of_values("fdhil.guard.state_transitions")} & {"SENT", "TRANSITIONS"}
     rows = {mutant.name for mutant in of_values("fdhil.guard.interlocks")}
     assert "interlocks.CATALOGUE: BusOff: FREEZE -> REFUSE" in rows
     assert "interlocks.FACTS: model_fresh -> no such row" in rows
-    predicates = {mutant.place for mutant in of_code("fdhil.guard.conditions")}
+    predicates = {mutant.place for mutant in of_code("fdhil.guard.interlock_checks")}
     assert "AXIS_INTERLOCKS[StaleData]" in predicates
 
 
 def test_a_mistake_replaces_what_others_have_imported() -> None:
-    from fdhil.guard.limits import clamp
+    from fdhil.guard.offset_limits import limit_value
 
     turned = Mutant(LIMITS, "clamp", "", "", "def clamp(value, low, high):\n    return max(max(value, low), high)\n")
-    function, code = clamp, function_of(LIMITS, "clamp").__code__
+    function, code = limit_value, function_of(LIMITS, "clamp").__code__
     try:
         put(turned)
         assert function(5, 1, 3) == 5
     finally:
-        clamp.__code__ = code
+        limit_value.__code__ = code
     assert function(5, 1, 3) == 3
 
 
 @pytest.mark.usefixtures("processes")
 def test_mistakes_are_noticed_by_tests_that_call_the_place(tmp_path: Path) -> None:
     """The study on a small module: called and checked code is detected, uncalled code is reported."""
-    options = ["--modules", "requests", "--every", "12", "--tests", "tests/guard/test_requests.py"]
+    options = ["--modules", "requests", "--every", "12", "--tests", "tests/guard/test_request_parsing.py"]
     command = [sys.executable, "-m", "studies.mutants", *options, "--out", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -11,7 +11,7 @@ from fdhil.identification.loops import DIFFER
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import AxisPipeline, Known, analyse, pool
 from fdhil.pipeline.identified_loops import OwnLoops, better_axis, loops_of, mechanics_of, suspected
-from fdhil.records import LoopEstimate, ParameterSet, Reason, Verdict, WindowOutcome, frozen
+from fdhil.records import LoopEstimate, ParameterSet, Reason, Verdict, WindowOutcome, freeze_array
 from fdhil.validation.table_error_budget import LOOPS_DIFFER
 from studies.bench import shuttle
 from studies.real_plant import Loops, Mechanics, Sensors, recording, run
@@ -71,7 +71,7 @@ def test_a_running_machine_goes_on_with_its_own_loops(filtered: list[WindowOutco
 
 def test_published_set_has_the_loops_it_was_validated_with(filtered: list[WindowOutcome]) -> None:
     verdict = Verdict(True, None, (), 0.1, (Reason(DIFFER, "the configured ones leave 28 um"),))
-    found = LoopEstimate("X", "p_pi_pi", ("speed_filter_s",), frozen([1e-3]), frozen([[1e-10]]), verdict)
+    found = LoopEstimate("X", "p_pi_pi", ("speed_filter_s",), freeze_array([1e-3]), freeze_array([[1e-10]]), verdict)
     outcomes = AxisPipeline("X", bench_config("X"), known=Known(loops=found)).feed(filtered[0].window)
     (published,) = (outcome for outcome in outcomes if isinstance(outcome, ParameterSet))
     assert published.loops == {"speed_filter_s": 1e-3}
@@ -87,9 +87,9 @@ def test_loops_are_sought_with_a_weight_beyond_dry_friction_as_a_load() -> None:
     windows = find_windows(recording(moved, mechanics, Sensors(), 0.5))
     plants = [mechanics_of(analyse(window, SETTINGS, AXIS, PERIOD_S), AXIS) for window in windows]
     lifted, lowered = (plant for plant in plants if plant is not None)
-    assert lifted.term("load") == lowered.Cd == 0.0
+    assert lifted.get_term("load") == lowered.Cd == 0.0
     assert lifted.Cd == pytest.approx(6.8, abs=0.3)
-    assert lowered.term("load") == pytest.approx(4.8, abs=0.3)
+    assert lowered.get_term("load") == pytest.approx(4.8, abs=0.3)
 
 
 def test_pool_is_refused_where_half_of_the_rapids_refute_the_loops_of_the_others(

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdhil.config import MachineConfig
-from fdhil.daemon.kernel_warmup import nominal_rapid
+from fdhil.daemon.kernel_warmup import simulate_nominal_rapid
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import AxisPipeline, Record, analyse
 from fdhil.pipeline.axis import WAITING_RAPIDS
@@ -34,13 +34,13 @@ from fdhil.records import (
     VoltageSamples,
     Window,
     WindowOutcome,
-    frozen,
-    frozen_ints,
+    freeze_array,
+    freeze_integers,
 )
 from fdhil.store.windows import decode_window, encode_window
 from studies.judging import GOOD
 from studies.slow_recordings import recording_of
-from tests.daemon.machine import config_of, rapids
+from tests.daemon.simulated_machine import config_of, rapids
 from tests.store.made import bits, same
 
 
@@ -126,7 +126,9 @@ def test_a_replayed_window_gives_the_same_bits_through_a_file(config: MachineCon
 def test_a_gain_that_is_wrong_all_along_is_told_once_against_the_data_sheet(config: MachineConfig) -> None:
     """No window can show it; the sets are published nevertheless, since the data sheet may be wrong."""
     records = [
-        replace(r, voltage_v=frozen(1.2 * r.voltage_v)) if isinstance(r, AxisSamples) and r.voltage_v is not None else r
+        replace(r, voltage_v=freeze_array(1.2 * r.voltage_v))
+        if isinstance(r, AxisSamples) and r.voltage_v is not None
+        else r
         for r in rapids(config, count=2)
     ]
     outcomes = fed(AxisPipeline("X", config), records)
@@ -180,7 +182,7 @@ def test_a_changed_load_is_told_at_once_and_used_from_the_second_window(config: 
     heavy = axis.model_copy(update={"nominal": axis.nominal.model_copy(update={"Jt": 0.085})})
 
     def rapid(settings: object, k: int) -> Window:
-        made = nominal_rapid("X", heavy if settings == "heavy" else axis, 0.001, 1 if k % 2 else -1, seed=k)
+        made = simulate_nominal_rapid("X", heavy if settings == "heavy" else axis, 0.001, 1 if k % 2 else -1, seed=k)
         return replace(made, start_tick=2000 * k)
 
     for k in range(1, 5):
@@ -202,7 +204,7 @@ def test_one_window_that_is_off_leaves_no_trace(config: MachineConfig) -> None:
     odd = axis.model_copy(update={"nominal": axis.nominal.model_copy(update={"R": 0.7, "K": 0.9})})
     sets = []
     for k, real in enumerate((axis, axis, axis, odd, axis), start=1):
-        window = replace(nominal_rapid("X", real, 0.001, seed=k), start_tick=2000 * k)
+        window = replace(simulate_nominal_rapid("X", real, 0.001, seed=k), start_tick=2000 * k)
         outcomes = pipeline.feed(window)
         sets.append([o for o in outcomes if isinstance(o, ParameterSet)])
         assert [o.code for o in outcomes if isinstance(o, Notice)] == (["ParameterJump"] if k == 4 else [])
@@ -229,15 +231,15 @@ def test_a_sensors_voltage_is_placed_by_its_count_however_late_the_host_is(
     tick = np.arange(100, 100 + n)
     # a host that is late by up to 5 ms, in bursts: arrivals are true only as a whole
     arrival = np.maximum.accumulate(tick * period_ns + rng.exponential(3e5, n).astype(np.int64))
-    recent.add(TickTimes(frozen_ints(tick), frozen_ints(arrival)))
+    recent.add(TickTimes(freeze_integers(tick), freeze_integers(arrival)))
     signal = np.sin(np.arange(n + 200) / 50)
     counter = np.arange(7 * ratio, (7 + n) * ratio)  # its sample 7 * ratio begins with tick 107, but for late_s
     begins = 107 + (counter - 7 * ratio) / ratio - late_s / 1e-3
     t_ns = np.interp(begins, tick, arrival)
     volts = signal[np.minimum((begins - 100).round().astype(int).clip(0), n + 199)]
     for part in np.array_split(np.arange(counter.size), 80):
-        block = (frozen_ints(counter[part]), frozen_ints(t_ns[part]), frozen_ints(np.full(part.size, 9)))
-        recent.add(VoltageSamples("s", "X", *block, frozen(volts[part]), 1000.0 * ratio))
+        block = (freeze_integers(counter[part]), freeze_integers(t_ns[part]), freeze_integers(np.full(part.size, 9)))
+        recent.add(VoltageSamples("s", "X", *block, freeze_array(volts[part]), 1000.0 * ratio))
     recent.add(samples(np.arange(100, 100 + n)))
     recording = recent.cut(1000, 2000)
     assert recording.voltage_v is not None
@@ -252,24 +254,24 @@ def test_a_sensors_voltage_is_placed_by_its_count_however_late_the_host_is(
 def test_lost_sensor_samples_and_an_unfit_rate_stay_unknown(config: MachineConfig) -> None:
     recent = beside_a_sensor(config)
     tick = np.arange(2000)
-    recent.add(TickTimes(frozen_ints(tick), frozen_ints(tick * 1_000_000)))
+    recent.add(TickTimes(freeze_integers(tick), freeze_integers(tick * 1_000_000)))
     recent.add(samples(tick))
     counter = np.delete(np.arange(2000), np.arange(500, 510))
-    block = (frozen_ints(counter), frozen_ints(counter * 1_000_000), frozen_ints(np.ones(counter.size)))
-    recent.add(VoltageSamples("s", "X", *block, frozen(np.ones(counter.size)), 1000.0))
+    block = (freeze_integers(counter), freeze_integers(counter * 1_000_000), freeze_integers(np.ones(counter.size)))
+    recent.add(VoltageSamples("s", "X", *block, freeze_array(np.ones(counter.size)), 1000.0))
     recording = recent.cut(400, 600)
     assert recording.voltage_v is not None
     assert np.flatnonzero(np.isnan(recording.voltage_v)).tolist() == list(range(100, 110))
     unfit = beside_a_sensor(config)
-    unfit.add(TickTimes(frozen_ints(tick), frozen_ints(tick * 1_000_000)))
-    unfit.add(VoltageSamples("s", "X", *block, frozen(np.ones(counter.size)), 730.0))
+    unfit.add(TickTimes(freeze_integers(tick), freeze_integers(tick * 1_000_000)))
+    unfit.add(VoltageSamples("s", "X", *block, freeze_array(np.ones(counter.size)), 730.0))
     assert unfit.cut(400, 600).voltage_v is None
 
 
 def samples(tick: np.ndarray) -> AxisSamples:
-    zeros = frozen(np.zeros(tick.size))
-    ticks = frozen_ints(tick)
-    return AxisSamples("X", ticks, zeros, zeros, zeros, zeros, None, zeros, frozen_ints(zeros))
+    zeros = freeze_array(np.zeros(tick.size))
+    ticks = freeze_integers(tick)
+    return AxisSamples("X", ticks, zeros, zeros, zeros, zeros, None, zeros, freeze_integers(zeros))
 
 
 def test_memory_is_bounded(config: MachineConfig) -> None:
@@ -277,7 +279,7 @@ def test_memory_is_bounded(config: MachineConfig) -> None:
     for start in range(0, 100_000, 50):
         tick = np.arange(start, start + 50)
         recent.add(samples(tick))
-        recent.add(TickTimes(frozen_ints(tick), frozen_ints(tick * 1_000_000)))
+        recent.add(TickTimes(freeze_integers(tick), freeze_integers(tick * 1_000_000)))
     assert len(recent._samples) <= 22
     assert len(recent._times) <= 22
     assert math.isnan(recent.cut(0, 10).speed_rad_s[0])
@@ -295,7 +297,7 @@ def test_a_window_that_leaves_l_open_is_accepted_and_publishes_nothing(tmp_path:
 def vertical(config: MachineConfig, k: int, load_nm: float) -> Window:
     axis, side = config.axis["X"], 1 if k % 2 else -1
     nominal = axis.nominal.model_copy(update={"Cd": 5.0 + side * load_nm})
-    made = nominal_rapid("X", axis.model_copy(update={"nominal": nominal}), 0.001, side, seed=k)
+    made = simulate_nominal_rapid("X", axis.model_copy(update={"nominal": nominal}), 0.001, side, seed=k)
     return replace(made, start_tick=2000 * k)
 
 
@@ -309,7 +311,7 @@ def test_a_load_is_published_and_no_set_flips_with_the_direction(config: Machine
     assert len(sets) == 9
     assert [warning.code for warning in sets[0].warnings] == ["OneDirection"]
     for each in sets[1:]:
-        assert each.parameters.term("load") == pytest.approx(1.0, abs=0.1)
+        assert each.parameters.get_term("load") == pytest.approx(1.0, abs=0.1)
         assert each.parameters.Cd == pytest.approx(5.0, rel=0.1)
         assert each.covariance.shape == (7, 7)
         assert each.loops == {}

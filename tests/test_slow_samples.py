@@ -6,7 +6,7 @@ import numpy as np
 
 from fdhil import config as machine_config
 from fdhil.pipeline.recent_samples import RecentSamples
-from fdhil.records import AxisSamples, Float, TickTimes, VoltageSamples, frozen, frozen_ints
+from fdhil.records import AxisSamples, Float, TickTimes, VoltageSamples, freeze_array, freeze_integers
 from tests.bench import bench_axis
 
 PERIOD_NS = 1_000_000
@@ -21,9 +21,9 @@ def _recent(rate_hz: float, begin_ticks: float, samples: int, lost: int = -1) ->
     axis = machine_config.parse({"machine": {"name": "bench"}, "axis": {"X": bench_axis()}}, "test").axis["X"]
     section = axis.model_copy(update={"voltage": axis.voltage.model_copy(update={"source": "modbus"})})
     recent, ticks = RecentSamples("X", section, 30_000, 1e-3), np.arange(2000)
-    zero = frozen(np.zeros(ticks.size))
-    recent.add(TickTimes(frozen_ints(ticks), frozen_ints(ticks * PERIOD_NS)))
-    recent.add(AxisSamples("X", frozen_ints(ticks), zero, zero, zero, zero, None, zero, frozen_ints(ticks * 0)))
+    zero = freeze_array(np.zeros(ticks.size))
+    recent.add(TickTimes(freeze_integers(ticks), freeze_integers(ticks * PERIOD_NS)))
+    recent.add(AxisSamples("X", freeze_integers(ticks), zero, zero, zero, zero, None, zero, freeze_integers(ticks * 0)))
     counter = np.arange(samples)
     begins = (begin_ticks + counter * SKEW * 1e3 / rate_hz) * PERIOD_NS
     for k, part in enumerate(np.array_split(counter, 20)):
@@ -33,10 +33,10 @@ def _recent(rate_hz: float, begin_ticks: float, samples: int, lost: int = -1) ->
             VoltageSamples(
                 sensor="voltage sensor X",
                 axis="X",
-                counter=frozen_ints(part),
-                t_ns=frozen_ints(np.round(begins[part])),
-                t_error_ns=frozen_ints(np.full(part.size, 150_000)),
-                voltage_v=frozen(part),
+                counter=freeze_integers(part),
+                t_ns=freeze_integers(np.round(begins[part])),
+                t_error_ns=freeze_integers(np.full(part.size, 150_000)),
+                voltage_v=freeze_array(part),
                 sample_rate_hz=rate_hz,
             )
         )
@@ -83,8 +83,12 @@ def test_a_meter_that_was_asked_off_its_instants_keeps_the_time_of_each_value() 
     rng, counter = np.random.default_rng(2), np.arange(195)
     true = counter * 10.0 + rng.uniform(-4.0, 4.0, counter.size)
     for part in np.array_split(counter, 40):
-        t_ns, error_ns = frozen_ints(np.round(true[part] * PERIOD_NS)), frozen_ints(np.full(part.size, 300_000))
-        recent.add(VoltageSamples("meter", "X", frozen_ints(part), t_ns, error_ns, frozen(part), 100.0, on_grid=False))
+        t_ns, error_ns = freeze_integers(np.round(true[part] * PERIOD_NS)), freeze_integers(np.full(part.size, 300_000))
+        recent.add(
+            VoltageSamples(
+                "meter", "X", freeze_integers(part), t_ns, error_ns, freeze_array(part), 100.0, on_grid=False
+            )
+        )
     slow = recent.cut(500, 1500).slow_voltage
     assert slow is not None
     assert slow.late_s is not None

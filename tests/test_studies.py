@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fdhil.config import Identification
-from fdhil.records import frozen
+from fdhil.records import freeze_array
 from fdhil.store.recording_csv import parse_recording
 from studies import bench, comparison, drift, estimators, faults, judging
 from studies.pages import paragraph
@@ -76,7 +76,7 @@ def test_what_is_accepted_or_named_wrongly_is_counted_for_good_and_bad_alike() -
 def test_a_good_recording_is_judged_good_and_a_turned_one_is_not() -> None:
     assert judging.judge(judging.GOOD, 1, faults.Spoilt(SHUTTLE)).accepted
     assert SHUTTLE.voltage_v is not None
-    turned = replace(SHUTTLE, voltage_v=frozen(-SHUTTLE.voltage_v))
+    turned = replace(SHUTTLE, voltage_v=freeze_array(-SHUTTLE.voltage_v))
     judged = judging.judge("wrong sign", 1, faults.Spoilt(turned, 1.0))
     assert not judged.accepted
     assert "Unphysical" in judged.codes

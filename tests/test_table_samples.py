@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from fdhil.pipeline.table_samples import Motion, RecentTable
-from fdhil.records import Float, TableSamples, TableSignal, frozen
+from fdhil.records import Float, TableSamples, TableSignal, freeze_array
 
 N, START = 200, 1000
 SPEED = 0.5  # mm a tick
 
 
 def motion(speed: float = SPEED) -> Motion:
-    return Motion(START, frozen(speed * np.arange(N)), np.full(N, speed))
+    return Motion(START, freeze_array(speed * np.arange(N)), np.full(N, speed))
 
 
 def said(signal: TableSignal, tick: Float, values: Float, error: float = 0.0, rate: float = 1.0) -> TableSamples:
-    return TableSamples("X", signal, frozen(tick), error, frozen(values), rate)
+    return TableSamples("X", signal, freeze_array(tick), error, freeze_array(values), rate)
 
 
 def test_places_at_their_sync_are_taken_as_they_are() -> None:

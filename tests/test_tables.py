@@ -17,7 +17,7 @@ TABLES: dict[str, Mapping[str, str]] = {
 
 @pytest.mark.parametrize(("table", "name"), [(table, name) for table in TABLES for name in TABLES[table]])
 def test_what_is_listed_is_there(table: str, name: str) -> None:
-    assert tables.load(TABLES[table], name) is not None
+    assert tables.load_entry(TABLES[table], name) is not None
 
 
 def test_the_defaults_are_listed() -> None:
@@ -27,4 +27,4 @@ def test_the_defaults_are_listed() -> None:
 
 def test_what_is_not_listed_is_a_key_error() -> None:
     with pytest.raises(KeyError):
-        tables.load(tables.CORRECTIONS, "none")
+        tables.load_entry(tables.CORRECTIONS, "none")

@@ -85,7 +85,7 @@ def test_validated_model_is_taken(plant: str, tmp_path: Path) -> None:
         return
     write_model([result], CONFIG.axis, path)
     written = load_model_file(path).parameters
-    newest = replace(published(1, "X", result.pooled.parameters()), covariance=result.pooled.covariance)
+    newest = replace(published(1, "X", result.pooled.build_parameters()), covariance=result.pooled.covariance)
     assert validated_models({"X": newest}, CONFIG, "store")[0] == written
     assert correction.plan(MOVE, written, CONFIG).after.rms_um < 50.0
 
@@ -100,9 +100,9 @@ def test_pool_whose_friction_at_standstill_chance_made_negative_is_taken(tmp_pat
     estimate, verdict = pool(outcomes, Identification())
     assert verdict.accepted
     assert estimate is not None
-    assert estimate.value("Cd") == pytest.approx(4.95 + 1.45 / (1 + 2.8**2 / 0.25), rel=1e-3)
+    assert estimate.get_value("Cd") == pytest.approx(4.95 + 1.45 / (1 + 2.8**2 / 0.25), rel=1e-3)
     path = tmp_path / "model.json"
     write_model([FileResult("recording.csv", "X", tuple(outcomes), estimate, verdict)], CONFIG.axis, path)
     written = load_model_file(path).parameters["X"]
-    assert written.Cd + written.term("stribeck") == 0.0
+    assert written.Cd + written.get_term("stribeck") == 0.0
     predict(MOVE, {"X": written}, CONFIG)

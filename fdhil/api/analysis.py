@@ -19,9 +19,9 @@ from fdhil.records import (
     Verdict,
     Window,
     WindowOutcome,
-    read_only,
+    make_read_only_view,
 )
-from fdhil.store.recording_table import NOTES, PITCH, RECORD_HZ, SLOW_HZ, SOURCES
+from fdhil.store.recording_table import COLUMN_SOURCES, IMPORT_NOTES, PITCH_KEY, RECORD_HZ, SLOW_HZ
 from fdhil.validation.data_sheet import gain_error
 from fdhil.validation.signal_consistency import missing_move
 
@@ -87,10 +87,12 @@ def analyse_recordings(
 
 
 def _with_pitch(recorded: Recording | Window, axis: Axis | None) -> Recording | Window:
-    if axis is None or isinstance(recorded, Window) or not recorded.headers or PITCH in recorded.headers:
+    if axis is None or isinstance(recorded, Window) or not recorded.headers or PITCH_KEY in recorded.headers:
         return recorded
     share = axis.screw_pitch_mm / recorded.pitch_mm
-    return replace(recorded, pitch_mm=axis.screw_pitch_mm, position_mm=read_only(share * recorded.position_mm))
+    return replace(
+        recorded, pitch_mm=axis.screw_pitch_mm, position_mm=make_read_only_view(share * recorded.position_mm)
+    )
 
 
 def _locked(windows: Sequence[Window], name: str, axis: str) -> FileResult:
@@ -105,7 +107,7 @@ def _locked(windows: Sequence[Window], name: str, axis: str) -> FileResult:
 
 
 def _of_reading(recorded: Recording | Window, verdict: Verdict) -> Verdict:
-    notes = None if isinstance(recorded, Window) else recorded.headers.get(NOTES)
+    notes = None if isinstance(recorded, Window) else recorded.headers.get(IMPORT_NOTES)
     if notes is not None:
         read = Reason("ReadOtherwise", notes, "compare with the file")
         verdict = replace(verdict, warnings=(*verdict.warnings, read))
@@ -126,7 +128,7 @@ def _windows(recorded: Recording | Window, axis: Axis | None, *, any_move: bool)
 
 def _told_by(recorded: Recording | Window, settings: Identification) -> Identification:
     headers = {} if isinstance(recorded, Window) else recorded.headers
-    sources = {key: headers[key] for key in SOURCES if key in headers}
+    sources = {key: headers[key] for key in COLUMN_SOURCES if key in headers}
     return settings.model_copy(update=sources) if sources else settings
 
 

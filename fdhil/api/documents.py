@@ -11,7 +11,7 @@ from fdhil.config import Axis
 from fdhil.identification.physical_bounds import bounded
 from fdhil.identification.windows import moving_range
 from fdhil.identification.without_voltage import NO_VOLTAGE
-from fdhil.records import PARAMETERS, UNITS, Estimate, Verdict, WindowOutcome, unit_of
+from fdhil.records import PARAMETERS, UNITS, Estimate, Verdict, WindowOutcome, get_unit
 
 SCHEMA = "fdhil-identify-1"
 
@@ -85,7 +85,9 @@ def _verdict(verdict: Verdict) -> dict[str, Any]:
 def _terms(estimate: Estimate | None) -> dict[str, Any]:
     if estimate is None:
         return {}
-    return {n: {"value": estimate.value(n), "std": estimate.std(n), "unit": unit_of(n)} for n in estimate.terms}
+    return {
+        n: {"value": estimate.get_value(n), "std": estimate.get_std(n), "unit": get_unit(n)} for n in estimate.terms
+    }
 
 
 def voltage_delay(estimate: Estimate | None) -> dict[str, Any] | None:
@@ -102,11 +104,11 @@ def _parameters(estimate: Estimate | None, verdict: Verdict) -> dict[str, Any]:
     answer: dict[str, Any] = {}
     for name in PARAMETERS:
         if estimate is not None and name in estimate.given:
-            given = {"value": estimate.value(name), "std": 0.0, "unit": UNITS[name]}
+            given = {"value": estimate.get_value(name), "std": 0.0, "unit": UNITS[name]}
             answer[name] = {**given, "given": True} if name == "K" else {"value": None, "reason": str(NO_VOLTAGE)}
             continue
-        if estimate is not None and math.isfinite(estimate.value(name)) and math.isfinite(estimate.std(name)):
-            answer[name] = {"value": estimate.value(name), "std": estimate.std(name), "unit": UNITS[name]}
+        if estimate is not None and math.isfinite(estimate.get_value(name)) and math.isfinite(estimate.get_std(name)):
+            answer[name] = {"value": estimate.get_value(name), "std": estimate.get_std(name), "unit": UNITS[name]}
             continue
         reason = estimate.missing.get(name) if estimate is not None else None
         reason = reason or (verdict.reasons[0] if verdict.reasons else None)

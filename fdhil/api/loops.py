@@ -7,12 +7,12 @@ from typing import Any
 
 from fdhil.api.analysis import FileResult
 from fdhil.config import Axis, Identification, MachineConfig, Regulators
-from fdhil.daemon.outcome_json import loops_document
+from fdhil.daemon.outcome_json import build_loops_document
 from fdhil.pipeline.identified_loops import loops_of
 from fdhil.records import LoopEstimate
 
 ALL_FED = 0.01  # tolerance of a feed-forward share of 1
-UNITS: Mapping[str, str] = {
+LOOP_UNITS: Mapping[str, str] = {
     "position_gain_per_s": "1/s",
     "speed_feedforward": "1",
     "speed_kp": "A.s/rad",
@@ -42,13 +42,15 @@ def compare_loops(found: LoopEstimate | None, axis: Axis | None) -> dict[str, An
     if found is None:
         return None
     regulators = None if axis is None else axis.regulators
-    document = loops_document(found)
+    document = build_loops_document(found)
     gains = document["gains"].items()
     return {
         "structure": found.structure,
         "configured_structure": None if regulators is None else regulators.structure,
         "same_as": [dict(each) for each in equivalent_loops(found)],
-        "gains": {n: {**gain, "unit": UNITS[n], "configured": configured_value(regulators, n)} for n, gain in gains},
+        "gains": {
+            n: {**gain, "unit": LOOP_UNITS[n], "configured": configured_value(regulators, n)} for n, gain in gains
+        },
         **{key: document[key] for key in ("validated", "unexplained_um", "configured_um", "reasons", "warnings")},
     }
 

@@ -16,7 +16,7 @@ from fdhil.records import Recording as RecordedSignals
 from fdhil.store.column_map import check_map, mapped, read_column_map
 from fdhil.store.column_proposal import propose
 from fdhil.store.derived_columns import check_sizes, derive_columns
-from fdhil.store.recording_table import FORMAT, NOTES, VOLTAGE, RecordingTable, recording_of
+from fdhil.store.recording_table import IMPORT_NOTES, RECORDING_FORMAT, VOLTAGE_COLUMN, RecordingTable, recording_of
 from fdhil.store.recordings import read_raw, read_recording, read_stored
 from fdhil.store.sample_times import even_times, usual_step
 
@@ -87,7 +87,7 @@ class Recording:
     ) -> None:
         given = {
             "time_s": (time, 1.0),
-            VOLTAGE: (voltage, 1.0),
+            VOLTAGE_COLUMN: (voltage, 1.0),
             "current_A": (current, 1.0),
             "torque_Nm": (torque, 1.0),
             "speed_rad_per_s": (speed, speed_scale),
@@ -105,7 +105,7 @@ class Recording:
             "temperature_C": temperature_c,
             "voltage_sampling": None if voltage is None else voltage_sampling,
         }
-        headers = {"format": FORMAT, "axis": axis, **{k: str(v) for k, v in options.items() if v is not None}}
+        headers = {"format": RECORDING_FORMAT, "axis": axis, **{k: str(v) for k, v in options.items() if v is not None}}
         self._hold(recording_of(_table(headers, columns, name), name), name)
 
     def _hold(self, signals: RecordedSignals | Window, name: str) -> None:
@@ -207,7 +207,7 @@ def _table(headers: dict[str, str], columns: dict[str, Float], name: str) -> Rec
         columns["time_s"], note = even_times(time_s, None, name)
         headers["sample_rate_hz"] = repr(1.0 / usual_step(columns["time_s"]))
         if note:
-            headers[NOTES] = note
+            headers[IMPORT_NOTES] = note
     else:
         headers["sample_rate_hz"] = "1000"
     if "speed_rad_per_s" not in columns and "angle_rad" not in columns and "position_m" in columns:

@@ -18,7 +18,7 @@ from fdhil.api.machine import Machine
 from fdhil.api.model import Model
 from fdhil.api.recordings import Recording, read
 from fdhil.errors import FdhilError, RecordingError
-from fdhil.records import INTERVAL_95, PARAMETERS, Estimate, Float, LoopEstimate, Reason, unit_of
+from fdhil.records import INTERVAL_95, PARAMETERS, Estimate, Float, LoopEstimate, Reason, get_unit
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class Result:
         open_ends = [str(p) for p in self.parameters.values() if p.value is None]
         if open_ends or self._estimate is None:
             raise FdhilError(f"the model of axis {self.axis} is incomplete: {'; '.join(open_ends)}")
-        return Model.of({name: self._estimate.value(name) for name in (*PARAMETERS, *self.terms)})
+        return Model.from_mapping({name: self._estimate.get_value(name) for name in (*PARAMETERS, *self.terms)})
 
     def plot(self, window: int = 0) -> Any:
         """Return a ``matplotlib.figure.Figure`` of a window: measured and modelled signals, residuals, their whiteness.
@@ -185,11 +185,11 @@ class Result:
         return self.found.pooled
 
     def _parameter(self, name: str) -> Parameter:
-        estimate, unit = self._estimate, unit_of(name) or ""
+        estimate, unit = self._estimate, get_unit(name) or ""
         if estimate is not None and name in estimate.given:
-            return Parameter(name, estimate.value(name), 0.0, unit, None, given=True)
-        if estimate is not None and math.isfinite(estimate.value(name)) and math.isfinite(estimate.std(name)):
-            return Parameter(name, estimate.value(name), estimate.std(name), unit)
+            return Parameter(name, estimate.get_value(name), 0.0, unit, None, given=True)
+        if estimate is not None and math.isfinite(estimate.get_value(name)) and math.isfinite(estimate.get_std(name)):
+            return Parameter(name, estimate.get_value(name), estimate.get_std(name), unit)
         reason = None if estimate is None else estimate.missing.get(name)
         return Parameter(name, None, None, unit, reason or next(iter(self.reasons), None))
 

@@ -11,6 +11,6 @@ def refusal(code: str, text: str, advice: str = "") -> dict[str, Any]:
     return {"ok": False, "code": code, "text": text, "advice": advice}
 
 
-ABANDONED: Answer = refusal(
+CHECK_ABANDONED: Answer = refusal(
     "Abandoned", "arming was abandoned during preparation; nothing is armed", "arm again if needed"
 )

@@ -14,7 +14,7 @@ from fdhil.arming.background_check import BackgroundCheck
 from fdhil.arming.checked_program import CheckedProgram
 from fdhil.arming.guard_link import GuardLink
 from fdhil.arming.knowledge import Knowledge
-from fdhil.arming.lessons import ahead_of_motors_mm, taught
+from fdhil.arming.lessons import compute_axis_deflections_mm, taught
 from fdhil.arming.own_thread import in_own_thread
 from fdhil.arming.passes import Passes
 from fdhil.arming.preparing import (
@@ -27,14 +27,14 @@ from fdhil.arming.preparing import (
     prepare_armament,
     prepare_feeding,
 )
-from fdhil.arming.standing import ADOPT, GONE, REST, START_AND_ADOPT, Standing, landed, verdict
+from fdhil.arming.standing import ADOPT_ADVICE, GONE, REST, START_AND_ADOPT, Standing, landed, verdict
 from fdhil.arming.standstill import Standstill
 from fdhil.arming.stream_feeder import StreamFeeder
 from fdhil.arming.token import ensure_token
 from fdhil.arming.whole_plan import plan_whole
 from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError
-from fdhil.guard.protocol import LANDING
+from fdhil.guard.guard_protocol import RAMPING_MODES
 from fdhil.records import AxisSamples, NcState, Notice, Skill
 from fdhil.store.rows import Revision
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
@@ -130,7 +130,7 @@ class ArmingDesk:
                 return refusal("NotOff", text, "run fdhil disarm or wait for its end, then arm again")
             self._disarms = self.guard.disarms
             if self.guard.state in ("FROZEN", "lost"):
-                way_out = ADOPT if self.guard.connected else START_AND_ADOPT
+                way_out = ADOPT_ADVICE if self.guard.connected else START_AND_ADOPT
                 text = f"the guard is {self.guard.state}: {self.guard.standing}"
                 return refusal("OffsetStands", text, f"{way_out}, then arm again")
             if feeding:
@@ -138,7 +138,7 @@ class ArmingDesk:
             return await self._arm(Path(str(program)), method, token, request)
 
     async def _landed(self) -> bool:
-        await in_own_thread(landed, self.guard.look, LANDING_S, LANDING, self._clock)
+        await in_own_thread(landed, self.guard.look, LANDING_S, RAMPING_MODES, self._clock)
         if self.guard.state in REST:
             self._release()
         return self.guard.state in REST
@@ -196,7 +196,7 @@ class ArmingDesk:
         known, rest = self.knowledge.now(), self._standstill.now()
         armament = await asyncio.to_thread(prepare_armament, request, rows, self._config, known, rest)
         summary = armament.summary()
-        ahead_mm = await asyncio.to_thread(ahead_of_motors_mm, rows, request)
+        ahead_mm = await asyncio.to_thread(compute_axis_deflections_mm, rows, request)
         self._passes.begin(armament.begin.demand, armament.rows, request.models, learner, ahead_mm)
         answer = await self._hand_over(self.guard.arm, armament, summary, token)
         if not answer["ok"]:

@@ -23,7 +23,7 @@ from fdhil.model.closed_loop import State
 from fdhil.model.kernels import CURRENT
 from fdhil.prediction.contour import contour_error_um
 from fdhil.prediction.model_terms import Band, band
-from fdhil.records import Float, Parameters, rms, table_path
+from fdhil.records import Float, Parameters, compute_rms, compute_table_path
 
 ALONE_S, JOINED_S = 0.9, 1.4  # begin and end of the blend into the checked rows
 AT_START_INCREMENTS = 1.5
@@ -156,9 +156,11 @@ class FirstBlock:
         )
 
     def _better(self, found: Mapping[str, _Found]) -> bool:
-        around = table_path((*found,), np.column_stack([self._path[axis] for axis in found]))
+        around = compute_table_path((*found,), np.column_stack([self._path[axis] for axis in found]))
         old_um, new_um = (
-            rms(contour_error_um(around, table_path((*found,), np.column_stack(positions)), self._period_s, 0))
+            compute_rms(
+                contour_error_um(around, compute_table_path((*found,), np.column_stack(positions)), self._period_s, 0)
+            )
             for positions in ([one.old_mm for one in found.values()], [one.new_mm for one in found.values()])
         )
         return new_um < old_um

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
-from fdhil.guard import table
-from fdhil.guard.protocol import SOCKET_NAME
+from fdhil.guard import correction_table
+from fdhil.guard.guard_protocol import SOCKET_NAME
 from fdhil.json_lines import decode_line, encode_line
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
@@ -45,7 +45,7 @@ class GuardClient:
         except OSError as error:
             self._socket.close()
             absent = f"no guard answers ({error.strerror or error}); start fdhil-guard with this machine's config"
-            raise ConnectError.of_socket(str(path), error, absent) from None
+            raise ConnectError.from_socket_error(str(path), error, absent) from None
 
     def status(self) -> dict[str, Any]:
         return self.ask({"request": "status"})
@@ -53,8 +53,8 @@ class GuardClient:
     def load(
         self,
         axes: Sequence[str],
-        demand: Mapping[str, table.Column],
-        offset: Mapping[str, table.Column],
+        demand: Mapping[str, correction_table.Column],
+        offset: Mapping[str, correction_table.Column],
         program_digest: str,
         first: int = 0,
         final: bool = True,
@@ -66,8 +66,8 @@ class GuardClient:
         drive increments (sequences of int or numpy integer arrays). Raises StoreError if the table is too long or
         memory is short, ValueError if a value does not fit into 32 bits.
         """
-        body = table.encode(axes, demand, offset, program_digest, first, final)
-        descriptor = table.seal(body)
+        body = correction_table.encode_table(axes, demand, offset, program_digest, first, final)
+        descriptor = correction_table.seal_table(body)
         try:
             return self.ask({"request": "table", "renew": renew}, self._timeout_s + len(body) / 2e5, descriptor)
         finally:

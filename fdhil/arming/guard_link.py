@@ -6,23 +6,23 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from fdhil.arming.answers import ABANDONED
+from fdhil.arming.answers import CHECK_ABANDONED
 from fdhil.arming.checked_program import Piece
 from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.preparing import Armament, Feeding
 from fdhil.arming.standing import ABSENT, GONE, START_AND_ADOPT, Standing, landed, lost, standing
 from fdhil.arming.standing_mark import StandingMark
 from fdhil.errors import ConnectError, DeviceError
-from fdhil.guard.protocol import AT_REST, CHARGED
+from fdhil.guard.guard_protocol import AT_REST, CHARGED_STATES
 from fdhil.records import Notice
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 SETTLING_TRIES = 25
 SETTLING_S = 0.2
-ORDERED = {"Disarmed", "Finished", "Stopped"}
-TRIPPED = "GuardTripped"
+ORDERED_ENDS = {"Disarmed", "Finished", "Stopped"}
+GUARD_TRIPPED = "GuardTripped"
 RECORD_VOID = "RecordVoid"
-VOIDING = {RECORD_VOID, "NodeRebooted"}
+RECORD_VOIDING_CODES = {RECORD_VOID, "NodeRebooted"}
 
 
 class GuardLink:
@@ -147,7 +147,7 @@ class GuardLink:
         """
         with self._asked(arming=True) as client:
             if given_up():
-                return ABANDONED
+                return CHECK_ABANDONED
             answer = self._load(client, armament, armament.begin)
             if not answer["ok"]:
                 return answer
@@ -181,10 +181,10 @@ class GuardLink:
         self, client: GuardClient, arm: Callable[[], Mapping[str, Any]], given_up: Callable[[], bool]
     ) -> Mapping[str, Any]:
         """Repeat the request for a few seconds while the interlocks settle; any other refusal is final."""
-        answer: Mapping[str, Any] = ABANDONED
+        answer: Mapping[str, Any] = CHECK_ABANDONED
         for _ in range(SETTLING_TRIES):
             if given_up():
-                return ABANDONED
+                return CHECK_ABANDONED
             client.alive(None)  # planning took its time: the guard needs a recent sign of life
             answer = arm()
             if answer["ok"] or [reason["code"] for reason in answer.get("refused", [])] != ["NotSettled"]:
@@ -245,7 +245,11 @@ def _moved(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
         known = not left or standing(before).nothing == residual.nothing
         return [] if known else [Notice("GuardState", severity, f"{now['state']}{left}")]
     notice = Notice("GuardState", severity, f"{before['state']} -> {now['state']}{why}{left}", cause.get("axis", ""))
-    tripped = before["state"] in CHARGED and now["state"] not in CHARGED and cause.get("code") not in ORDERED
+    tripped = (
+        before["state"] in CHARGED_STATES
+        and now["state"] not in CHARGED_STATES
+        and cause.get("code") not in ORDERED_ENDS
+    )
     if not tripped:
         return [notice]
-    return [notice, Notice(TRIPPED, "MAJOR", f"{cause.get('code')}: {cause.get('text')}", cause.get("axis", ""))]
+    return [notice, Notice(GUARD_TRIPPED, "MAJOR", f"{cause.get('code')}: {cause.get('text')}", cause.get("axis", ""))]

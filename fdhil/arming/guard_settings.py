@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.arming.token import given_credential
-from fdhil.cia402 import COB_RPDO, first_axis_index
+from fdhil.cia402 import COB_RPDO, get_first_axis_index
 from fdhil.commissioning.identifiers import require_own_identifiers, sent_pdos
 from fdhil.commissioning.offset_writers import INVALID_COB_ID, identifier_of
 from fdhil.commissioning.record import KEY_NAME, CommissioningRecord, load_record, of_config
@@ -17,9 +17,9 @@ from fdhil.config import Axis, MachineConfig, OffsetBounds, share_fault
 from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
 from fdhil.drivers.cia402.profile_file import load_profile, require_offset
 from fdhil.errors import ConfigError, ConfigFault, StoreError
-from fdhil.guard.feedforward import FeedforwardLimits
-from fdhil.guard.limits import OffsetLimits
-from fdhil.guard.settings import AxisSettings, Feedforward, Pdo, Settings
+from fdhil.guard.feedforward_law import FeedforwardLimits
+from fdhil.guard.guard_settings import AxisSettings, FeedforwardPdo, GuardSettings, Pdo
+from fdhil.guard.offset_limits import OffsetLimits
 
 SPEED_STEPS = 2.0  # times the motor's power: margin for the load's own inertia and for sensor noise
 HEARTBEATS_AWAITED = 2.0  # periods of the drive's heartbeat until it counts as lost
@@ -45,13 +45,13 @@ def corrected_bus(machine: MachineConfig, source: str) -> str:
     return buses.pop()
 
 
-def settings_of(machine: MachineConfig, bus: str, run_directory: Path, token_sha256: str) -> Settings:
+def settings_of(machine: MachineConfig, bus: str, run_directory: Path, token_sha256: str) -> GuardSettings:
     """Return what the guard needs of the configuration and the drive profiles.
 
     Raises ConfigError if a profile does not allow it, or if a COB-ID of the guard is used by another device.
     """
     axes = [_axis(machine, name, axis) for name, axis in machine.axis.items() if axis.correction is not None]
-    settings = Settings(
+    settings = GuardSettings(
         bus=bus,
         transport="can_raw" if machine.bus[bus].interface == "socketcan" else "socketcand",
         sync_period_s=machine.machine.sync_period_s,
@@ -167,7 +167,7 @@ def _largest_acceleration_rad_s2(axis: Axis) -> float:
     return max(of_the_motor, axis.max_acceleration_mm_s2 * 2 * math.pi / axis.screw_pitch_mm)
 
 
-def _feedforward(profile: DriveProfile, machine: MachineConfig, name: str, axis: Axis) -> Feedforward | None:
+def _feedforward(profile: DriveProfile, machine: MachineConfig, name: str, axis: Axis) -> FeedforwardPdo | None:
     """Return what the on-line feed-forward of an axis may send; None without [axis.X.feedforward]."""
     limits = axis.feedforward
     if limits is None:
@@ -180,7 +180,7 @@ def _feedforward(profile: DriveProfile, machine: MachineConfig, name: str, axis:
     period = machine.machine.sync_period_s
     speed = axis.drive.increments_per_rev / (2 * math.pi)
     torque = 1e3 / (axis.nominal.K * axis.drive.rated_current_a)
-    return Feedforward(
+    return FeedforwardPdo(
         _pdo(found[0], machine.node_id(name)),
         FeedforwardLimits(
             speed=max(1, math.floor(limits.max_speed_rad_s * speed)),
@@ -220,5 +220,5 @@ def _rpdo(profile: DriveProfile, key: tuple[int, int], axis: str) -> PdoSpec:
 
 def _pdo(spec: PdoSpec, node_id: int) -> Pdo:
     """Convert a PDO for the guard, which names the objects of a device's second axis like those of the first."""
-    layout = tuple((first_axis_index(entry.index), entry.sub, entry.bits, entry.signed) for entry in spec.entries)
+    layout = tuple((get_first_axis_index(entry.index), entry.sub, entry.bits, entry.signed) for entry in spec.entries)
     return Pdo(spec.cob_base + node_id, layout, spec.every_sync)

@@ -70,7 +70,7 @@ class Knowledge:
         return {name: axis.temperature_c for name, axis in self._axes.items() if axis.temperature_c is not None}
 
     def _now_s(self) -> float:
-        return self._clock.since_boot_ns() * 1e-9
+        return self._clock.read_boot_time_ns() * 1e-9
 
     def now(self) -> dict[str, AxisKnowledge]:
         now_s = self._now_s()

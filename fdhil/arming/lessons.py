@@ -20,7 +20,7 @@ from fdhil.correction.learning import Lesson, learn
 from fdhil.correction.limits import fit_all
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.predict import ahead_of_motor_mm
-from fdhil.records import Float, Parameters, Reason, rms, table_path
+from fdhil.records import Float, Parameters, Reason, compute_rms, compute_table_path
 from fdhil.store.lessons import lesson_path, read_lesson, write_lesson
 
 MOST_ROWS = 1_000_000
@@ -51,8 +51,8 @@ class Pupil:
             axis: (delayed(path, tau_s / period_s) - position_mm[:, k]) * 1e3
             for k, (axis, path) in enumerate(self.demand_mm.items())
         }
-        path, table = (table_path((*self.demand_mm,), rows) for rows in (planned, position_mm))
-        left_um = rms(contour_error_um(path, table, period_s))
+        path, table = (compute_table_path((*self.demand_mm,), rows) for rows in (planned, position_mm))
+        left_um = compute_rms(contour_error_um(path, table, period_s))
         lesson = learn(self.lesson, error_um, left_um, self.models, self.config)
         write_lesson(self.path, lesson)
         return lesson
@@ -79,12 +79,12 @@ def taught(checked: CheckedProgram, request: ArmRequest, machine: str) -> tuple[
     return _with_offsets(checked, demand_mm, fitting, learned, config), learner
 
 
-def ahead_of_motors_mm(checked: CheckedProgram, request: ArmRequest) -> Float | None:
+def compute_axis_deflections_mm(checked: CheckedProgram, request: ArmRequest) -> Float | None:
     """Return table less motor position (n, axes) along a whole program by its models; None without compliance.
 
     Raises StoreError if the rows cannot be read.
     """
-    sprung = any(model.term("resonance") for model in request.models.values())
+    sprung = any(model.get_term("resonance") for model in request.models.values())
     if not sprung or not checked.whole or checked.rows > MOST_ROWS:
         return None
     demand_mm, offset_um = _rows(checked, request.config)

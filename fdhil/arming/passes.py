@@ -23,7 +23,7 @@ from fdhil.errors import StoreError
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.contour import WINDOW_S
 from fdhil.prediction.gain import format_upper_limit
-from fdhil.records import AxisSamples, Float, Int, MoveKind, NcState, Notice, Parameters, Reason, table_path
+from fdhil.records import AxisSamples, Float, Int, MoveKind, NcState, Notice, Parameters, Reason, compute_table_path
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 Rows = tuple[Int, Float, Float]
@@ -248,7 +248,7 @@ class Pass:
             position = self._position[self._first : end]
             if self._ahead_mm is not None:
                 position = position + self._ahead_mm[self._rows : self._rows + len(position)]
-            path, table = table_path(self._axes, self._demand), table_path(self._axes, position)
+            path, table = compute_table_path(self._axes, self._demand), compute_table_path(self._axes, position)
             error = contour_error_um(path, table, self._dt_s, self._first)
             self._rows, self._left = self._rows + error.size, self._left - error.size
             self._squares += float(error @ error)
@@ -283,7 +283,7 @@ class Pass:
 def disturbance(state: NcState) -> str | None:
     """Return the NC's event by which a running program is not as planned (feed hold, override); None without one."""
     where = "" if state.line is None else f" in line {state.line}"
-    if state.held:
+    if state.is_held:
         return f"the NC held its feed{where}"
     override = state.rapid_override if state.motion is MoveKind.RAPID else state.feed_override
     moving = state.motion in (MoveKind.RAPID, MoveKind.FEED, MoveKind.ARC)

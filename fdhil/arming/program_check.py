@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from fdhil.arming.code_digest import code_digest
-from fdhil.bounded_process import limit_process, receive_request, report
+from fdhil.bounded_process import limit_process, receive_request, report_to_parent
 from fdhil.config import MachineConfig
 from fdhil.correction import gate
 from fdhil.correction.streaming import StreamBlock, stream
@@ -261,13 +261,13 @@ def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) 
 def main() -> None:
     """Answer one request; each output line is a JSON object, the last one is the answer."""
     limit_process(NICENESS, {})
-    answer_request(receive_request(), report)
+    answer_request(receive_request(), report_to_parent)
 
 
 def answer_request(request: Mapping[str, Any], report: Report) -> None:
     """Check the requested program, and pass progress, blocks and the answer to ``say``."""
     config = MachineConfig.model_validate(request["config"])
-    models = {axis: Parameters.of(values) for axis, values in request["models"].items()}
+    models = {axis: Parameters.from_mapping(values) for axis, values in request["models"].items()}
 
     def run(body: BinaryIO) -> dict[str, Any]:
         return check(Path(request["program"]), request["program_digest"], models, config, body, report)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass
 from typing import Any
 
-from fdhil.guard.protocol import AT_REST
+from fdhil.guard.guard_protocol import AT_REST
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 GONE = frozenset({"absent", "lost"})
@@ -14,7 +14,7 @@ REST: frozenset[str] = AT_REST | GONE
 ABSENT: Mapping[str, Any] = {"state": "absent", "text": "no guard runs: nothing can be armed, nothing is sent"}
 LANDING_S = 3.0  # without a SYNC; the ramp and the zeros after it are counted in SYNC by the guard
 LOOK_S = 0.02
-ADOPT = "hold the feed, then run fdhil adopt"
+ADOPT_ADVICE = "hold the feed, then run fdhil adopt"
 START_AND_ADOPT = "hold the feed, start fdhil-guard, then run fdhil adopt"
 
 
@@ -134,5 +134,5 @@ def verdict(status: Mapping[str, Any]) -> dict[str, Any]:
         return {"ok": True, "text": f"guard: OFF, {residual}", **report}
     cause = (status.get("cause") or {}).get("text")
     text = f"the guard is {state}" + (f" ({cause})" if cause else "") + f": {residual}"
-    advice = ADOPT if state in AT_REST else f"check fdhil status; if it does not end, {ADOPT}"
+    advice = ADOPT_ADVICE if state in AT_REST else f"check fdhil status; if it does not end, {ADOPT_ADVICE}"
     return {"ok": False, "code": "OffsetStands", "text": text, "advice": advice, **report}

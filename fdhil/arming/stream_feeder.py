@@ -8,7 +8,7 @@ from fdhil.arming.preparing import Armament
 from fdhil.arming.standing import REST
 from fdhil.arming.standstill import Standstill
 from fdhil.errors import DeviceError, StoreError
-from fdhil.guard.protocol import RESERVE_S
+from fdhil.guard.guard_protocol import RESERVE_S
 from fdhil.records import Notice
 
 SCARCE_S = 5.0  # half the ring: a late check is reported before the guard ends the correction

@@ -15,7 +15,7 @@ from fdhil.config import MachineConfig
 from fdhil.errors import StoreError
 from fdhil.prediction.gain import gain, moving_axes, worst_skill_um
 from fdhil.program import load_trajectory
-from fdhil.records import Correction, Float, Reason, rms
+from fdhil.records import Correction, Float, Reason, compute_rms
 
 BLOCK_S = 2.0
 
@@ -66,7 +66,7 @@ def _conclude(
 
 
 def _errors(contour_um: Float) -> dict[str, float]:
-    return {"rms_um": rms(contour_um), "max_um": float(contour_um.max())}
+    return {"rms_um": compute_rms(contour_um), "max_um": float(contour_um.max())}
 
 
 def _in_memory(rows: bytes) -> int:

@@ -111,7 +111,7 @@ class AxisReader:
         self._before_mm: float | None = None
         self._voltage = 0.0
 
-    def sample(self, value: Mapping[str, float]) -> Sample:
+    def read_sample(self, value: Mapping[str, float]) -> Sample:
         """Return the sample of one cycle; ``value`` has a value for each key of the axis' pins."""
         axis, scale = self.axis, self.axis.scales
         position_mm = value["position_feedback"] * scale["position"]
@@ -125,37 +125,37 @@ class AxisReader:
             volts, self._voltage = self._voltage, volts
         sign = 1 if axis.per_mm > 0 else -1
         return Sample(
-            _whole(value["position_command"] * scale["position"] * axis.per_mm, 31),
-            _whole(position_mm * axis.per_mm, 31),
-            _whole(speed_mm_s * axis.per_mm, 31),
-            _whole(value["current"] * scale["current"] * sign * 1e5, 31),
-            _whole(volts * sign * 50.0, 15),
-            _whole(value.get("offset", 0.0) * scale["position"] * axis.per_mm, 31),
+            _round_to_integer(value["position_command"] * scale["position"] * axis.per_mm, 31),
+            _round_to_integer(position_mm * axis.per_mm, 31),
+            _round_to_integer(speed_mm_s * axis.per_mm, 31),
+            _round_to_integer(value["current"] * scale["current"] * sign * 1e5, 31),
+            _round_to_integer(volts * sign * 50.0, 15),
+            _round_to_integer(value.get("offset", 0.0) * scale["position"] * axis.per_mm, 31),
             bool(value["enabled"]),
         )
 
 
-def _whole(value: float, bits: int) -> int:
+def _round_to_integer(value: float, bits: int) -> int:
     """Round to a signed integer with ``bits`` magnitude bits; NaN and overflow become the lowest value."""
     most = (1 << bits) - 1
     return round(value) if -most <= value <= most else -most - 1
 
 
-def frames_of(cycle: int, axes: Sequence[Axis], samples: Sequence[Sample]) -> Iterator[tuple[int, bytes]]:
+def encode_cycle(cycle: int, axes: Sequence[Axis], samples: Sequence[Sample]) -> Iterator[tuple[int, bytes]]:
     """Yield the frames (COB-ID, data) of one servo cycle: set-points, SYNC, and what was sampled at it."""
     for axis, now in zip(axes, samples, strict=True):
         yield RPDO1 + axis.node_id, struct.pack("<Hi", 0x1F if now.enabled else 0, now.target)
-    yield SYNC, bytes([counter_of(cycle)])
+    yield SYNC, bytes([get_sync_counter(cycle)])
     for axis, now in zip(axes, samples, strict=True):
         yield TPDO1 + axis.node_id, struct.pack("<ii", now.position, now.speed)
         word = ENABLED if now.enabled else DISABLED
         yield TPDO2 + axis.node_id, struct.pack("<Hih", word, now.current, now.voltage)
-        yield TPDO3 + axis.node_id, struct.pack("<ii", _whole(now.target + now.offset, 31), now.offset)
+        yield TPDO3 + axis.node_id, struct.pack("<ii", _round_to_integer(now.target + now.offset, 31), now.offset)
         if cycle % MODE_EVERY == 0:
             yield TPDO4 + axis.node_id, struct.pack("<b", POSITION_MODE)
 
 
-def counter_of(cycle: int) -> int:
+def get_sync_counter(cycle: int) -> int:
     """Return the counter byte of a cycle's SYNC.
 
     >>> counter_of(0), counter_of(239), counter_of(240)
@@ -177,9 +177,9 @@ class OffsetQueue:
         self._per_unit = [axis.per_mm * axis.scales["position"] for axis in axes]
         self._lead = lead
         self.dropped = self.restarts = 0
-        self._stop()
+        self._reset()
 
-    def _stop(self) -> None:
+    def _reset(self) -> None:
         self._next = 1  # the number of the row to be written next
         self._zero: int | None = None  # the cycle in which row 0 would have taken effect
         self._held = [0.0] * len(self._per_unit)
@@ -187,22 +187,22 @@ class OffsetQueue:
         self._newest = -1
 
     @property
-    def running(self) -> bool:
+    def is_running(self) -> bool:
         """Whether rows were written to the streamer."""
         return self._next > 1
 
-    def applied(self, cycle: int, row: int, empty: bool) -> None:
+    def check_applied_row(self, cycle: int, row: int, empty: bool) -> None:
         """Take the row that the sampler saw in effect in a cycle. An empty streamer restarts the queue."""
         self._newest = cycle
-        if not self.running or not row:
+        if not self.is_running or not row:
             return
         if self._zero is None and not empty and row < self._next:
             self._zero = cycle - row
         elif self._zero is not None and (empty or cycle - row != self._zero):
             self.restarts += 1
-            self._stop()
+            self._reset()
 
-    def take(self, node_id: int, data: bytes) -> None:
+    def take_offset(self, node_id: int, data: bytes) -> None:
         """Take the offset of an axis, with the counter of the SYNC that it answers."""
         place = self._axes.get(node_id)
         if place is None or len(data) != 5 or self._newest < 0:
@@ -211,13 +211,13 @@ class OffsetQueue:
         cycle = self._newest - (self._newest - (counter - 1)) % SYNC_RANGE
         self._answers.setdefault(cycle + 1 + self._lead, {})[place] = increments / self._per_unit[place]
 
-    def rows(self) -> Iterator[tuple[int, list[float]]]:
+    def take_rows(self) -> Iterator[tuple[int, list[float]]]:
         """Yield the rows to be written now."""
         if not self._answers:
             return
-        if not self.running:
+        if not self.is_running:
             for _ in range(self._lead):
-                yield self._row()
+                yield self._next_row()
         if self._zero is None:
             self._answers.clear()  # until the first row came back
             return
@@ -230,17 +230,17 @@ class OffsetQueue:
                 self.dropped += 1
                 continue
             while self._next < number:
-                yield self._row()
+                yield self._next_row()
             for place, offset in offsets.items():
                 self._held[place] = offset
-            yield self._row()
+            yield self._next_row()
 
-    def _row(self) -> tuple[int, list[float]]:
+    def _next_row(self) -> tuple[int, list[float]]:
         self._next += 1
         return self._next - 1, list(self._held)
 
 
-class Client:
+class HubClient:
     """One connection of a socketcand client."""
 
     def __init__(self, wire: socket.socket) -> None:
@@ -251,7 +251,7 @@ class Client:
         self.raw = self.gone = False
         self._in = b""
 
-    def commands(self) -> Iterator[list[bytes]]:
+    def read_commands(self) -> Iterator[list[bytes]]:
         """Yield the words of each received command."""
         try:
             came = self.wire.recv(1 << 16)
@@ -265,7 +265,7 @@ class Client:
         for command in whole:
             yield command.split()
 
-    def flush(self) -> None:
+    def flush_output(self) -> None:
         """Send as much as the client takes; drop a client that reads nothing."""
         try:
             while self.out:
@@ -276,7 +276,7 @@ class Client:
             self.gone = True
 
 
-class Hub:
+class SocketcandHub:
     """The bus on a TCP port: samples go to all clients; a client's frames go to the others, except offsets.
 
     Offsets are for HAL alone: their effect is read back from there.
@@ -285,21 +285,21 @@ class Hub:
     def __init__(self, host: str, port: int) -> None:
         self._listener = socket.create_server((host, port))
         self._listener.setblocking(False)
-        self._clients: list[Client] = []
+        self._clients: list[HubClient] = []
 
-    def received(self) -> list[tuple[int, bytes]]:
+    def receive_frames(self) -> list[tuple[int, bytes]]:
         """Accept clients and return the frames that they sent."""
         with contextlib.suppress(OSError):  # no client is waiting
-            self._clients.append(Client(self._listener.accept()[0]))
+            self._clients.append(HubClient(self._listener.accept()[0]))
         frames = []
         for client in self._clients:
-            for words in client.commands():
-                frame = self._obey(client, words)
+            for words in client.read_commands():
+                frame = self._execute_command(client, words)
                 if frame is not None:
                     frames.append(frame)
         return frames
 
-    def _obey(self, client: Client, words: Sequence[bytes]) -> tuple[int, bytes] | None:
+    def _execute_command(self, client: HubClient, words: Sequence[bytes]) -> tuple[int, bytes] | None:
         match list(words):
             case [b"<", b"open", *_]:
                 client.out += b"< ok >"
@@ -314,22 +314,22 @@ class Hub:
                 except ValueError:
                     return None
                 if not RPDO2 < frame[0] < RPDO2 + 0x80:
-                    self.send(_text([frame], time.time()), but=client)
+                    self.send_text(_encode_frames([frame], time.time()), but=client)
                 return frame
         return None
 
-    def send(self, text: bytes, but: Client | None = None) -> None:
+    def send_text(self, text: bytes, but: HubClient | None = None) -> None:
         """Send to every client in raw mode."""
         for client in self._clients:
             if client.raw and client is not but:
                 client.out += text
-            client.flush()
+            client.flush_output()
             if client.gone:
                 client.wire.close()
         self._clients = [client for client in self._clients if not client.gone]
 
 
-def _text(frames: Sequence[tuple[int, bytes]], stamp_s: float) -> bytes:
+def _encode_frames(frames: Sequence[tuple[int, bytes]], stamp_s: float) -> bytes:
     stamp = f"{stamp_s:.6f}"
     return "".join(f"< frame {cob_id:03X} {stamp} {data.hex().upper()} >" for cob_id, data in frames).encode()
 
@@ -339,9 +339,11 @@ class HalSampler:
 
     def __init__(self, hal: Any, component: Any, axes: Sequence[Axis], options: argparse.Namespace) -> None:
         channel, thread, more = options.channel, options.thread, options.also
-        kinds = {pin.name: pin for pin in map(Pin, _halcmd("-s", "show", "pin").splitlines()) if pin.name}
-        functions = [words for line in _halcmd("-s", "show", "funct").splitlines() if len(words := line.split()) == 6]
-        self.corrected = SHARED[0] in _halcmd("-s", "show", "sig").split()
+        kinds = {pin.name: pin for pin in map(HalPin, _run_halcmd("-s", "show", "pin").splitlines()) if pin.name}
+        functions = [
+            words for line in _run_halcmd("-s", "show", "funct").splitlines() if len(words := line.split()) == 6
+        ]
+        self.corrected = SHARED[0] in _run_halcmd("-s", "show", "sig").split()
         self._places: list[dict[str, int]] = []
         wanted: dict[str, int] = {}
         for axis in axes:
@@ -349,7 +351,7 @@ class HalSampler:
             if self.corrected and axis.corrected:
                 pins["offset"] = f"fdhil-limit-{axis.name.lower()}.out"
             for key, pin in pins.items():
-                _require(
+                _require_pin(
                     pin, kinds, functions, f"axis.{axis.name}.drive.hal.{key}", "bit" if key == "enabled" else "float"
                 )
             self._places.append({key: wanted.setdefault(pin, len(wanted)) for key, pin in pins.items()})
@@ -362,22 +364,22 @@ class HalSampler:
         types = "".join(HAL_TYPES[kinds[pin].kind] for pin in wanted) + "s"
         if not hal.component_exists("sampler"):
             depths, kinds_of_all = [str(DEPTH)] * (1 + len(more)), [types, *more]
-            _halcmd("loadrt", "sampler", f"depth={','.join(depths)}", f"cfg={','.join(kinds_of_all)}")
+            _run_halcmd("loadrt", "sampler", f"depth={','.join(depths)}", f"cfg={','.join(kinds_of_all)}")
         for pin, place in wanted.items():
-            _halcmd(
+            _run_halcmd(
                 "net",
                 kinds[pin].signal or f"fdhil-{pin.replace('.', '-')}",
                 pin,
                 "=>",
                 f"sampler.{channel}.pin.{place}",
             )
-        _halcmd("net", "fdhil-lost", f"sampler.{channel}.overruns", "=>", f"sampler.{channel}.pin.{len(wanted)}")
-        threads = _halcmd("-s", "show", "thread")
+        _run_halcmd("net", "fdhil-lost", f"sampler.{channel}.overruns", "=>", f"sampler.{channel}.pin.{len(wanted)}")
+        threads = _run_halcmd("-s", "show", "thread")
         if f"sampler.{channel}" not in threads.split():
-            _halcmd("addf", f"sampler.{channel}", thread)
+            _run_halcmd("addf", f"sampler.{channel}", thread)
         self._stream = hal.stream(component, hal.sampler_base + channel, types)
 
-    def cycles(self) -> Iterator[tuple[int, list[dict[str, float]], int, bool]]:
+    def read_cycles(self) -> Iterator[tuple[int, list[dict[str, float]], int, bool]]:
         """Yield each new cycle: its number, the axes' values, the streamer's row, whether the streamer is empty."""
         while self._stream.readable:
             row = self._stream.read()
@@ -388,7 +390,7 @@ class HalSampler:
             yield self._stream.sampleno + row[-1], values, applied, empty  # lost samples count, too
 
 
-class Pin:
+class HalPin:
     """A line of ``halcmd -s show pin``: owner, type, direction, value, name, and linked signal."""
 
     def __init__(self, line: str) -> None:
@@ -399,7 +401,7 @@ class Pin:
             self.signal = words[6] if len(words) > 6 else ""
 
 
-def _require(pin: str, pins: Mapping[str, Pin], functions: Sequence[Sequence[str]], key: str, kind: str) -> None:
+def _require_pin(pin: str, pins: Mapping[str, HalPin], functions: Sequence[Sequence[str]], key: str, kind: str) -> None:
     """Raise PinError unless HAL has the pin, with this type, and a thread computes it.
 
     ``functions`` are the words of ``halcmd -s show funct``: owner, two addresses, floating point, users, name.
@@ -419,14 +421,14 @@ def _require(pin: str, pins: Mapping[str, Pin], functions: Sequence[Sequence[str
         raise PinError(f"{key}: pin {pin} is not computed in the servo thread: {why}, or name another pin")
 
 
-def _halcmd(*words: str) -> str:
+def _run_halcmd(*words: str) -> str:
     done = subprocess.run(["halcmd", *words], capture_output=True, text=True, check=False)
     if done.returncode:
         raise PinError(f"halcmd {' '.join(words)}: {done.stderr.strip() or done.stdout.strip()}")
     return done.stdout
 
 
-class Bridge:
+class HalBridge:
     """Carries samples to the bus and offsets to the streamer, in one loop."""
 
     def __init__(self, hal: Any, component: Any, options: argparse.Namespace) -> None:
@@ -438,34 +440,34 @@ class Bridge:
             next(t for t in document["axis"].values() if t["drive"].get("source") == "hal")["drive"]["bus"]
         ]
         self._readers = [AxisReader(axis) for axis in self.axes]
-        self._hub = Hub(options.host, int(bus["port"]))
+        self._hub = SocketcandHub(options.host, int(bus["port"]))
         self._sampler = HalSampler(hal, component, self.axes, options)
         lead, corrected = int(bus.get("offset_lead_cycles", 0)), [axis for axis in self.axes if axis.corrected]
         self._queue = OffsetQueue(corrected, lead) if self._sampler.corrected and lead else None
         self._component = component
         if self._queue is not None:
-            _halcmd("net", "fdhil-beat", f"{NAME}.heartbeat", "=>", "fdhil-watchdog.in")
+            _run_halcmd("net", "fdhil-beat", f"{NAME}.heartbeat", "=>", "fdhil-watchdog.in")
             self._streamer = hal.stream(component, hal.streamer_base, "s" + "f" * len(corrected))
         self._silent_s = GUARD_SILENT_S + lead * self.axes[0].period_s
         self._guard_s = -self._silent_s
         self._started_s = time.time()
 
-    def turn(self) -> None:
+    def run_turn(self) -> None:
         """Run one turn: send samples, receive frames, feed the streamer."""
         text = bytearray()
-        for cycle, values, row, empty in self._sampler.cycles():
+        for cycle, values, row, empty in self._sampler.read_cycles():
             if self._queue is not None:
-                self._queue.applied(cycle, row, empty)
-            samples = [reader.sample(value) for reader, value in zip(self._readers, values, strict=True)]
+                self._queue.check_applied_row(cycle, row, empty)
+            samples = [reader.read_sample(value) for reader, value in zip(self._readers, values, strict=True)]
             stamp_s = self._started_s + cycle * self.axes[0].period_s
-            text += _text(list(frames_of(cycle, self.axes, samples)), stamp_s)
-        self._hub.send(bytes(text))
-        for cob_id, data in self._hub.received():
+            text += _encode_frames(list(encode_cycle(cycle, self.axes, samples)), stamp_s)
+        self._hub.send_text(bytes(text))
+        for cob_id, data in self._hub.receive_frames():
             if RPDO2 < cob_id < RPDO2 + 0x80 and self._queue is not None:
-                self._queue.take(cob_id - RPDO2, data)
+                self._queue.take_offset(cob_id - RPDO2, data)
                 self._guard_s = time.monotonic()
         if self._queue is not None:
-            for number, offsets in self._queue.rows():
+            for number, offsets in self._queue.take_rows():
                 if self._streamer.writable:
                     self._streamer.write((number, *offsets))
             if time.monotonic() - self._guard_s < self._silent_s:
@@ -473,13 +475,13 @@ class Bridge:
             self._component["dropped"], self._component["restarts"] = self._queue.dropped, self._queue.restarts
 
 
-def serve(hal: Any, component: Any, options: argparse.Namespace) -> NoReturn:
+def serve_bus(hal: Any, component: Any, options: argparse.Namespace) -> NoReturn:
     """Set up and run until LinuxCNC ends."""
-    bridge = Bridge(hal, component, options)
+    bridge = HalBridge(hal, component, options)
     component.ready()
     sys.stderr.write(f"{NAME}: presents axes {', '.join(axis.name for axis in bridge.axes)} as a CANopen bus\n")
     while True:
-        bridge.turn()
+        bridge.run_turn()
         time.sleep(LOOK_S)
 
 
@@ -502,7 +504,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in ("dropped", "restarts"):  # offsets that came too late, times that the streamer ran empty
         component.newpin(name, hal.HAL_S32, hal.HAL_OUT)
     try:
-        serve(hal, component, options)
+        serve_bus(hal, component, options)
     except KeyboardInterrupt:
         return 0
     except Exception as error:  # noqa: BLE001 - an error here must not end LinuxCNC

@@ -68,7 +68,7 @@ class Cycle(NamedTuple):
     held: bool
 
 
-class Teller:
+class StatePublisher:
     """Selects the states to publish: each change with the cycle before it, and a few in between. Pure."""
 
     def __init__(self, axes: Sequence[str], mm_per_unit: float, period_ns: int) -> None:
@@ -81,7 +81,7 @@ class Teller:
         self._published = -RESTING_CYCLES
         self._joints: tuple[float, ...] = ()
 
-    def clock(self, number: int, now_ns: int) -> None:
+    def update_clock(self, number: int, now_ns: int) -> None:
         """Update the clock: cycle ``number`` was the newest at ``now_ns``; no cycle is later than its reception."""
         zero_ns = float(now_ns - number * self._period_ns)
         if self._zero_ns is None or zero_ns < self._zero_ns:
@@ -89,14 +89,14 @@ class Teller:
         else:
             self._zero_ns += FORGET * min(zero_ns - self._zero_ns, STAMP_ERROR_NS)
 
-    def tell(self, cycle: Cycle, status: Status) -> list[dict[str, Any]]:
+    def select_states(self, cycle: Cycle, status: Status) -> list[dict[str, Any]]:
         """Return the states to publish at this cycle, the oldest first."""
         still = cycle.joints == self._joints
         self._joints = cycle.joints
         held = cycle.held or status.paused
         motion = "hold" if held and still else KINDS.get(cycle.motion_type, "unknown")
         mark = (motion, cycle.line, held, *status)
-        state = self._state(cycle, motion, held, status)
+        state = self._build_state(cycle, motion, held, status)
         before, self._last = self._last, state
         states: list[dict[str, Any]] = []
         if mark != self._mark:
@@ -109,7 +109,7 @@ class Teller:
             self._published, self._mark = cycle.number, mark
         return states
 
-    def _state(self, cycle: Cycle, motion: str, held: bool, status: Status) -> dict[str, Any]:
+    def _build_state(self, cycle: Cycle, motion: str, held: bool, status: Status) -> dict[str, Any]:
         assert self._zero_ns is not None
         places: dict[str, float] = {}
         for joint, axis in enumerate(self._axes):
@@ -132,7 +132,7 @@ class Teller:
         }
 
 
-class Listeners:
+class TcpBroadcast:
     """Sends lines to all TCP clients; drops one that does not keep up. Their input is ignored."""
 
     def __init__(self, host: str, port: int, greeting: bytes) -> None:
@@ -142,9 +142,9 @@ class Listeners:
         self._greeting = greeting
         self._waiting: dict[socket.socket, bytearray] = {}
 
-    def send(self, lines: bytes) -> None:
+    def send_lines(self, lines: bytes) -> None:
         """Accept new clients, and send the lines to all as far as they take them."""
-        self._admit()
+        self._accept_listeners()
         for listener, waiting in list(self._waiting.items()):
             waiting += lines
             try:
@@ -153,17 +153,17 @@ class Listeners:
             except BlockingIOError:
                 if len(waiting) <= MOST_WAITING:
                     continue
-                self._let_go(listener)
+                self._drop_listener(listener)
             except OSError:
-                self._let_go(listener)
+                self._drop_listener(listener)
 
     def close(self) -> None:
         """Close all connections."""
         for listener in list(self._waiting):
-            self._let_go(listener)
+            self._drop_listener(listener)
         self._socket.close()
 
-    def _admit(self) -> None:
+    def _accept_listeners(self) -> None:
         while True:
             try:
                 listener, _ = self._socket.accept()
@@ -171,31 +171,31 @@ class Listeners:
                 return
             listener.setblocking(False)
             if len(self._waiting) >= MOST_LISTENERS:  # the slowest makes room, or the oldest
-                self._let_go(max(self._waiting, key=lambda each: len(self._waiting[each])))
+                self._drop_listener(max(self._waiting, key=lambda each: len(self._waiting[each])))
             self._waiting[listener] = bytearray(self._greeting)
 
-    def _let_go(self, listener: socket.socket) -> None:
+    def _drop_listener(self, listener: socket.socket) -> None:
         del self._waiting[listener]
         listener.close()
 
 
-class Tap:
+class HalSampler:
     """HAL's sampler after the motion controller: every servo cycle once."""
 
     def __init__(self, hal: Any, component: Any, joints: int, channel: int, thread: str) -> None:
         pins = [(f"joint.{joint}.motor-pos-cmd", "f") for joint in range(joints)] + list(VALUES)
-        pins += [(pin, "b") for pin in HOLDS if _signal_of(pin)]
+        pins += [(pin, "b") for pin in HOLDS if _find_signal(pin)]
         self._joints = joints
         kinds = "".join(kind for _, kind in pins)
         if not hal.component_exists("sampler"):
-            _halcmd("loadrt", "sampler", f"depth={DEPTH}", f"cfg={kinds}")
+            _run_halcmd("loadrt", "sampler", f"depth={DEPTH}", f"cfg={kinds}")
         for k, (pin, _) in enumerate(pins):
-            signal_name = _signal_of(pin) or f"fdhil-{pin.replace('.', '-')}"
-            _halcmd("net", signal_name, pin, "=>", f"sampler.{channel}.pin.{k}")
-        _halcmd("addf", f"sampler.{channel}", thread)
+            signal_name = _find_signal(pin) or f"fdhil-{pin.replace('.', '-')}"
+            _run_halcmd("net", signal_name, pin, "=>", f"sampler.{channel}.pin.{k}")
+        _run_halcmd("addf", f"sampler.{channel}", thread)
         self._stream = hal.stream(component, hal.sampler_base + channel, kinds)
 
-    def cycles(self) -> Iterator[Cycle]:
+    def read_cycles(self) -> Iterator[Cycle]:
         """Yield the cycles since the last call."""
         while self._stream.readable:
             row = self._stream.read()
@@ -205,15 +205,15 @@ class Tap:
             yield Cycle(self._stream.sampleno, joints, rest[0], rest[1], rest[2], rest[3], any(rest[4:]))
 
 
-def _halcmd(*words: str) -> str:
+def _run_halcmd(*words: str) -> str:
     done = subprocess.run(["halcmd", *words], capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"halcmd {' '.join(words)}: {done.stderr.strip() or done.stdout.strip()}")
     return done.stdout
 
 
-def _signal_of(pin: str) -> str:
-    words = _halcmd("-s", "show", "pin", pin).split()
+def _find_signal(pin: str) -> str:
+    words = _run_halcmd("-s", "show", "pin", pin).split()
     arrows = [k for k, word in enumerate(words) if word in ("==>", "<==", "<=>")]
     return words[arrows[0] + 1] if arrows else ""
 
@@ -227,7 +227,7 @@ class StatusReader:
         self._due_s = 0.0
         self.now = Status()
 
-    def poll(self) -> None:
+    def poll_status(self) -> None:
         """Poll when it is due."""
         if time.monotonic() < self._due_s:
             return
@@ -247,7 +247,7 @@ class StatusReader:
         )
 
 
-def machine_of(linuxcnc: Any, path: str) -> tuple[list[str], float, int]:
+def read_machine(linuxcnc: Any, path: str) -> tuple[list[str], float, int]:
     """Return the axis of each joint, millimetres per unit and the servo period (ns) from LinuxCNC's INI file."""
     ini = linuxcnc.ini(path)
     letters = [c for c in (ini.find("TRAJ", "COORDINATES") or "XYZ").upper() if c.isalpha()]
@@ -260,34 +260,36 @@ def machine_of(linuxcnc: Any, path: str) -> tuple[list[str], float, int]:
     return axes[:joints], mm, int(float(ini.find("EMCMOT", "SERVO_PERIOD") or 1_000_000))
 
 
-def serve(options: argparse.Namespace, hal: Any, linuxcnc: Any, component: Any) -> NoReturn:
+def serve_states(options: argparse.Namespace, hal: Any, linuxcnc: Any, component: Any) -> NoReturn:
     """Set up and publish until the process ends."""
-    axes, mm, period_ns = machine_of(linuxcnc, options.ini)
+    axes, mm, period_ns = read_machine(linuxcnc, options.ini)
     axes = list(options.axes.upper()) if options.axes else axes
     greeting = {"schema": SCHEMA, "axes": axes, "servo_period_s": period_ns * 1e-9}
-    listeners = Listeners(options.host, options.port, _line(greeting))
-    tap = Tap(hal, component, len(axes), options.channel, options.thread)
-    teller, status = Teller(axes, mm, period_ns), StatusReader(linuxcnc)
+    listeners = TcpBroadcast(options.host, options.port, _encode_line(greeting))
+    tap = HalSampler(hal, component, len(axes), options.channel, options.thread)
+    teller, status = StatePublisher(axes, mm, period_ns), StatusReader(linuxcnc)
     component.ready()
-    _say(f"publishes LinuxCNC's state at {options.host}:{listeners.port}")
+    _log_line(f"publishes LinuxCNC's state at {options.host}:{listeners.port}")
     while True:
-        status.poll()
-        cycles = list(tap.cycles())
+        status.poll_status()
+        cycles = list(tap.read_cycles())
         if cycles:
-            teller.clock(cycles[-1].number, time.monotonic_ns())
-        listeners.send(b"".join(_line(state) for cycle in cycles for state in teller.tell(cycle, status.now)))
+            teller.update_clock(cycles[-1].number, time.monotonic_ns())
+        listeners.send_lines(
+            b"".join(_encode_line(state) for cycle in cycles for state in teller.select_states(cycle, status.now))
+        )
         time.sleep(LOOK_S)
 
 
-def _say(text: str) -> None:
+def _log_line(text: str) -> None:
     sys.stderr.write(f"{NAME}: {text}\n")
 
 
-def _line(document: Mapping[str, Any]) -> bytes:
+def _encode_line(document: Mapping[str, Any]) -> bytes:
     return json.dumps(document, separators=(",", ":")).encode() + b"\n"
 
 
-def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
+def _parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Publishes LinuxCNC's state to fdhil; loaded by LinuxCNC's HAL file.")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at; 0.0.0.0: also for other computers")
     parser.add_argument("--port", type=int, default=5571, help="TCP port, as in [nc_source.linuxcnc]")
@@ -300,7 +302,7 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run until LinuxCNC ends; report errors without keeping LinuxCNC from starting."""
-    options = _options(arguments)
+    options = _parse_options(arguments)
     here = Path(__file__).resolve().parent
     sys.path[:] = [folder for folder in sys.path if Path(folder).resolve() != here]  # it has a linuxcnc.py
     # LinuxCNC's own modules, absent in tests
@@ -310,11 +312,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     component = hal.component(NAME)
     try:
-        serve(options, hal, linuxcnc, component)
+        serve_states(options, hal, linuxcnc, component)
     except KeyboardInterrupt:
         return 0
     except Exception as error:  # noqa: BLE001 - an error here must not end LinuxCNC
-        _say(f"fdhil receives nothing ({error}); LinuxCNC starts without it")
+        _log_line(f"fdhil receives nothing ({error}); LinuxCNC starts without it")
         component.ready()
         time.sleep(SEEN_READY_S)
         return 0

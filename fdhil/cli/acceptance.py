@@ -51,14 +51,14 @@ def acceptance(config: Path, out: Path, pdf: Path | None, as_json: bool, **optio
     from fdhil import config as machine_config
     from fdhil.cli.acceptance_findings import NO_LIMIT, Asked, document_of, find
     from fdhil.cli.acceptance_page import page_of
-    from fdhil.report import deliver, require
+    from fdhil.report import require, write_page_or_pdf
 
     require()
     machine = machine_config.load(config)
     forewarn("predict", "correct")
     found = find(machine, config, Asked(**options))
     document = document_of(found)
-    deliver(page_of(found, document), out, pdf)
+    write_page_or_pdf(page_of(found, document), out, pdf)
     if as_json:
         click.echo(json.dumps(document, allow_nan=False))
     else:

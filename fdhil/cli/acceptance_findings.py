@@ -27,7 +27,7 @@ from fdhil.prediction.circular import Circular, circle_program, evaluate
 from fdhil.program import program_digest
 from fdhil.records import PARAMETERS, UNITS, Correction, Float, Prediction
 from fdhil.report.history_course import AxisHistory
-from fdhil.report.history_reading import PASS, by_axis, read_history, read_notices, read_passes
+from fdhil.report.history_reading import PASS_CODE, by_axis, read_history, read_notices, read_passes
 
 SCHEMA = "fdhil-acceptance-1"
 NO_LIMIT = "no limit was set: give the required accuracy with --circle-um and --contour-um"
@@ -94,7 +94,7 @@ def find(machine: MachineConfig, config: Path, options: Asked) -> Findings:
     try:
         histories = by_axis(machine, *read_history(machine, tell=partial(click.echo, err=True)))
         passes = read_passes(machine)[-NEWEST_PASSES:]
-        notices = [n for n in read_notices(machine) if n["acknowledged"] is None and n["code"] != PASS]
+        notices = [n for n in read_notices(machine) if n["acknowledged"] is None and n["code"] != PASS_CODE]
     except StoreError as error:
         if error.code != "NoHistory":
             raise
@@ -159,7 +159,7 @@ def _circles(config: Path, options: Asked, plane: tuple[str, str], from_history:
 
 def _table_mm(predicted: Prediction, plane: tuple[str, str]) -> Float:
     reference = predicted.reference
-    return reference.table_mm(predicted.predicted_mm)[:, [reference.table_axes.index(axis) for axis in plane]]
+    return reference.compute_table_mm(predicted.predicted_mm)[:, [reference.table_axes.index(axis) for axis in plane]]
 
 
 def read_path(path: Path, plane: tuple[str, str]) -> Float:

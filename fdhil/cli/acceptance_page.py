@@ -8,7 +8,7 @@ from fdhil.cli.doctor.latency import latency_text
 from fdhil.report import Page, Section, Table
 from fdhil.report.circular import polar
 from fdhil.report.history_verdict import LATEST_HEAD, latest_rows
-from fdhil.report.parameter_view import MEANING, minute
+from fdhil.report.parameter_view import INTERVAL_MEANING, minute
 from fdhil.report.path import correction_page
 
 CIRCLE_ROWS = (
@@ -101,7 +101,9 @@ def _parameters(found: Findings) -> Section:
     tables = [Table(LATEST_HEAD, latest_rows(history, shares), f"Axis {history.axis}")
               for history in found.histories if history.rows]  # fmt: skip
     text = (
-        f"The newest published parameters, identified from rapid moves; {MEANING}." if tables else "None published yet."
+        f"The newest published parameters, identified from rapid moves; {INTERVAL_MEANING}."
+        if tables
+        else "None published yet."
     )
     return Section("Parameters", text, tables)
 

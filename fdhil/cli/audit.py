@@ -25,19 +25,19 @@ def audit(config: Path, last: int, as_json: bool) -> int:
     The log lists each request to the machine with its time, client and result.
     """
     machine = machine_config.load(config)
-    from fdhil.daemon.journal import printable
-    from fdhil.store.audit import FILE_NAME, entries
+    from fdhil.daemon.service_log import escape_unprintable
+    from fdhil.store.audit import AUDIT_FILE_NAME, entries
 
     found = list(entries(machine.store.directory))
     broken = [number for number, (_, wrong) in enumerate(found, start=1) if wrong]
-    path = machine.store.directory / FILE_NAME
+    path = machine.store.directory / AUDIT_FILE_NAME
     if as_json:
         shown = [{"number": number, **entry} for number, (entry, _) in enumerate(found, start=1)][-last:]
         document = {"schema": "fdhil-audit-1", "file": str(path), "entries": shown, "of": len(found), "broken": broken}
         click.echo(json.dumps(document))
         return 1 if broken else 0
     for number, (entry, wrong) in list(enumerate(found, start=1))[-last:]:
-        click.echo(printable(_line(number, entry, wrong)))
+        click.echo(escape_unprintable(_line(number, entry, wrong)))
     click.echo(_verdict(path, len(found), broken))
     return 1 if broken else 0
 

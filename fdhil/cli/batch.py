@@ -10,7 +10,7 @@ from pathlib import Path
 
 from fdhil.api.analysis import FileResult, Progress, analyse_recordings, ignore_progress
 from fdhil.api.compiling import forewarn
-from fdhil.child import end_with
+from fdhil.child_process import request_parent_death_signal
 from fdhil.cli.failing import error_document
 from fdhil.config import Identification, MachineConfig
 from fdhil.errors import FdhilError, RecordingError
@@ -93,7 +93,7 @@ def analyse_file(
 
 def read_recorded(path: Path, accelerometer: Path | None, columns: ColumnMap | None) -> Recording | Window:
     if next(os.walk(path), None) is not None:  # a folder without recordings; others are expanded before
-        known = ", ".join(suffixes.RECORDINGS)
+        known = ", ".join(suffixes.RECORDING_SUFFIXES)
         raise RecordingError(f"{path} has no recordings ({known}); give the folder that has them")
     if accelerometer is None and columns is None and (stored := read_stored(path)) is not None:
         return stored
@@ -116,4 +116,4 @@ def _cores() -> int:
 def _processes() -> ProcessPoolExecutor:
     # spawned, not forked: a progress display has threads; the processes end with this one
     spawning = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(_cores(), spawning, initializer=end_with, initargs=(os.getpid(),))
+    return ProcessPoolExecutor(_cores(), spawning, initializer=request_parent_death_signal, initargs=(os.getpid(),))

@@ -70,11 +70,11 @@ def result_text(step: str, found: Mapping[str, Any]) -> str:
 
 def _figure(name: str, value: Mapping[str, Any]) -> str:
     from fdhil.records import INTERVAL_95
-    from fdhil.report.parameter_view import DISPLAY, cell
+    from fdhil.report.parameter_view import DISPLAY_UNITS, cell
 
     if value["std"] is None:
         return f"{value['value']:.4g} {value['unit']} (given, not identified)"
-    return f"{cell(name, value['value'], INTERVAL_95 * value['std'], ' ')} {DISPLAY[name][0]}"
+    return f"{cell(name, value['value'], INTERVAL_95 * value['std'], ' ')} {DISPLAY_UNITS[name][0]}"
 
 
 def tried_by_moving(machine: MachineConfig, axis: str) -> bool:
@@ -87,13 +87,13 @@ def moves_of(machine: MachineConfig, axis: str) -> dict[str, str]:
     if machine.axis[axis].drive.source == "hal":
         moved = "10 um toward plus, or 50 um if friction holds it"
         return {"listen": NOTHING, "move": moved, "watchdog test": "back to where it was"}
-    from fdhil.commissioning.steps import RAMPS, SIGN_TEST_UM, largest_move_um
+    from fdhil.commissioning.steps import SIGN_TEST_UM, TRIAL_RAMPS, largest_move_um
 
     largest = largest_move_um(machine, axis)
     return dict.fromkeys(STEPS, NOTHING) | {
         "enable": "nothing, except to hold the position",
         "sign test": f"{SIGN_TEST_UM:g} um toward plus and back, by the offset",
-        "feed-forward test": f"{largest:.0f} um toward plus and back, by the offset, {RAMPS // 2} times",
+        "feed-forward test": f"{largest:.0f} um toward plus and back, by the offset, {TRIAL_RAMPS // 2} times",
         "watchdog test": "nothing; the drive stops by itself and is switched on again",
     }
 
@@ -101,7 +101,7 @@ def moves_of(machine: MachineConfig, axis: str) -> dict[str, str]:
 def trial_moves(machine: MachineConfig, axis: str, room: Room | None) -> dict[str, str]:
     """Return the motion of each step of the ``TRIAL``. Raises DriveFault if the room is too small."""
     from fdhil.commissioning.strokes import plan_jog, plan_rapid, require_single_drive
-    from fdhil.commissioning.trial import RAPIDS
+    from fdhil.commissioning.trial import TRIAL_RAPIDS
 
     require_single_drive(machine, axis)
     settings = machine.axis[axis]
@@ -109,13 +109,13 @@ def trial_moves(machine: MachineConfig, axis: str, room: Room | None) -> dict[st
         top = settings.shown(settings.rapid_speed_mm_s, "/s", "g")
         return dict.fromkeys(TRIAL, NOTHING) | {
             "jog": "a few millimetres within the room that you allow, and back",
-            "test rapids": f"within the room that you allow at up to {top}, and back, {RAPIDS // 2} times",
+            "test rapids": f"within the room that you allow at up to {top}, and back, {TRIAL_RAPIDS // 2} times",
         }
     jog, rapid = plan_jog(axis, settings, room), plan_rapid(axis, settings, room)
     steep = settings.shown(rapid.acceleration_mm_s2, "/s2", "g")
     return dict.fromkeys(TRIAL, NOTHING) | {
         "jog": f"{jog}, and back",
-        "test rapids": f"{rapid} with {steep}, and back, {RAPIDS // 2} times",
+        "test rapids": f"{rapid} with {steep}, and back, {TRIAL_RAPIDS // 2} times",
     }
 
 

@@ -88,20 +88,20 @@ def _history(machine: MachineConfig, axis: str) -> Iterator[tuple[Known | None, 
 
     While a daemon runs nothing is stored: it records the rapids itself.
     """
-    from fdhil.daemon.lock import BusLocked, sole_owner
+    from fdhil.daemon.machine_lock import BusLocked, lock_machine
     from fdhil.daemon.outcome_store import OutcomeStore
     from fdhil.pipeline import Known
 
     with ExitStack() as open_:
         try:
-            open_.enter_context(sole_owner(machine.run_directory, machine.store.directory))
+            open_.enter_context(lock_machine(machine.run_directory, machine.store.directory))
         except BusLocked:
             yield None, lambda _outcomes: None
             return
         store = OutcomeStore(machine)
         open_.callback(store.close)
         _tell(store.open())
-        yield Known(newest=store.known(axis).newest), lambda outcomes: _tell(store.keep(outcomes))
+        yield Known(newest=store.read_axis_history(axis).newest), lambda outcomes: _tell(store.store_outcomes(outcomes))
 
 
 def _tell(notices: Sequence[Notice]) -> None:

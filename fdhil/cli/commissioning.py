@@ -16,7 +16,7 @@ from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, CONFIG, FILE
 from fdhil.cli.terminal_text import print_progress
 from fdhil.errors import DeviceError
-from fdhil.guard.protocol import SOCKET_NAME
+from fdhil.guard.guard_protocol import SOCKET_NAME
 
 if TYPE_CHECKING:
     from fdhil.commissioning.config_check import Place
@@ -139,12 +139,12 @@ def _tell_compared(
 
     A doubt that arose after the comparison remains: in the guard, and in a mark that differs from ``marks``.
     """
-    from fdhil.commissioning.compare import POINT
+    from fdhil.commissioning.compare import RECORD_POINT
     from fdhil.commissioning.void import confirm_record, is_void, void_record
 
     directory, seen = machine.store.directory, {}
     for place, finding in found:
-        if finding.point == POINT:
+        if finding.point == RECORD_POINT:
             axis = place.removeprefix("axis ")
             seen[axis] = finding.found if finding.ok else ""
             if not finding.ok:

@@ -66,7 +66,7 @@ def read_pass(path: Path) -> dict[str, Any]:
 
     from fdhil.csv_text import read_csv_text
     from fdhil.prediction import contour_error_um
-    from fdhil.records import rms, table_path
+    from fdhil.records import compute_rms, compute_table_path
 
     names, *rows = read_csv_text(path).splitlines()
     columns = names.split(",")
@@ -86,9 +86,9 @@ def read_pass(path: Path) -> dict[str, Any]:
         raise RecordingError(f"{path} is not a pass: it needs rows of numbers with {wanted}; record it again")
 
     def errors(um: "Float") -> dict[str, float]:
-        return {"rms_um": rms(um), "max_um": float(np.max(np.abs(um)))}
+        return {"rms_um": compute_rms(um), "max_um": float(np.max(np.abs(um)))}
 
-    programmed, table = (table_path(axes, each) for each in (reference, actual))
+    programmed, table = (compute_table_path(axes, each) for each in (reference, actual))
     return {
         "file": str(path),
         "rows": int(time_s.size),
@@ -147,7 +147,7 @@ def _recording_values(path: Path) -> Values:
     pooled = result.pooled
     values = {}
     for name in PARAMETERS:
-        value, half = pooled.value(name), INTERVAL_95 * pooled.std(name)
+        value, half = pooled.get_value(name), INTERVAL_95 * pooled.get_std(name)
         known = math.isfinite(value) and math.isfinite(half)
         values[name] = {
             "value": value if math.isfinite(value) else None,

@@ -16,7 +16,7 @@ from fdhil.store.recordings import read_table
 def export_file(recording: Path, out: Path, format_name: str | None, columns: Path | None) -> dict[str, Any]:
     """Write ``recording`` to ``out``; return the JSON document. Raises click.BadParameter for an invalid format."""
     suffix = out.suffix.lower()
-    name = format_name or suffixes.RECORDINGS.get(suffix) or suffixes.BUS_LOGS.get(suffix) or "csv"
+    name = format_name or suffixes.RECORDING_SUFFIXES.get(suffix) or suffixes.BUS_LOGS.get(suffix) or "csv"
     is_log = recording.suffix.lower() in suffixes.BUS_LOGS
     if is_log != (name in suffixes.BUS_LOGS.values()):
         what, others = "a recording", [*tables.RECORDING_FORMATS]

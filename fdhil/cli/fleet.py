@@ -49,11 +49,11 @@ def uplink(config: Path, as_json: bool) -> None:
     machine = machine_config.load(config)
     with with_extra():
         from fdhil.fleet.uplink import send
-    from fdhil.daemon import journal
-    from fdhil.shopfloor.process import run, say_ready
+    from fdhil.daemon import service_log
+    from fdhil.shopfloor.publisher_process import report_ready, run_publisher
 
-    with journal.lines_as_json(as_json):
-        run(lambda machine: send(machine, say_ready), machine)
+    with service_log.write_lines_as_json(as_json):
+        run_publisher(lambda machine: send(machine, report_ready), machine)
 
 
 class Questions(SuggestingGroup):
@@ -94,11 +94,11 @@ def collect(fleet: Path, as_json: bool) -> None:
     settings = load(fleet)
     with with_extra():
         from fdhil.fleet.collector import collect as gather
-    from fdhil.daemon import journal
-    from fdhil.shopfloor.process import run, say_ready
+    from fdhil.daemon import service_log
+    from fdhil.shopfloor.publisher_process import report_ready, run_publisher
 
-    with journal.lines_as_json(as_json):
-        run(lambda settings: gather(settings, say_ready), settings)
+    with service_log.write_lines_as_json(as_json):
+        run_publisher(lambda settings: gather(settings, report_ready), settings)
 
 
 def query_database(settings: "Fleet", question: str, **given: str | None) -> dict[str, Any]:

@@ -126,15 +126,15 @@ def stage(
 
 
 def _tell(change: Change, found: Standing, opened: Offer | None, withdrawn: Sequence[str], as_json: bool) -> None:
-    from fdhil.daemon.journal import printable
+    from fdhil.daemon.service_log import escape_unprintable
 
     if as_json:
         click.echo(json.dumps({**_document(change, found, opened), "withdrawn": list(withdrawn)}))
         return
     for line in _lines(change, found, opened):
-        click.echo(printable(line))
+        click.echo(escape_unprintable(line))
     if withdrawn:
-        click.echo(printable(f"withdrawn from {_named(withdrawn)}; machines that accepted it keep it"))
+        click.echo(escape_unprintable(f"withdrawn from {_named(withdrawn)}; machines that accepted it keep it"))
 
 
 def _lines(change: Change, found: Standing, opened: Offer | None) -> Iterator[str]:

@@ -12,13 +12,13 @@ Lines = Callable[[Mapping[str, Any]], Iterator[str]]
 
 def tell(answer: Mapping[str, Any], question: str, as_json: bool, lines: Lines | None = None) -> None:
     """Print an answer as text, by default with the ``LINES`` of its question, or as one JSON document."""
-    from fdhil.daemon.journal import printable
+    from fdhil.daemon.service_log import escape_unprintable
 
     if as_json:
         click.echo(json.dumps({"schema": f"fdhil-fleet-{question}-1", **answer}))
         return
     for line in (lines or LINES[question])(answer):
-        click.echo(printable(line))
+        click.echo(escape_unprintable(line))
 
 
 def status(answer: Mapping[str, Any]) -> Iterator[str]:

@@ -14,9 +14,9 @@ from fdhil.cli.epilogs import read_epilog
 from fdhil.cli.failing import prepare_streams, run_safely
 from fdhil.cli.options import CONFIG
 from fdhil.errors import DeviceError
-from fdhil.guard.protocol import SETTINGS_NAME
-from fdhil.guard.settings import from_json, to_json
-from fdhil.guard.transmit_socket import connect_bus, greet
+from fdhil.guard.guard_protocol import SETTINGS_NAME
+from fdhil.guard.guard_settings import decode_settings, encode_settings
+from fdhil.guard.transmit_socket import greet_hub, open_transmit_socket
 
 
 @click.command(epilog=read_epilog("guard"), context_settings={"help_option_names": ["-h", "--help"]})
@@ -37,18 +37,18 @@ def guard(config: Path, check: bool) -> None:
     token_sha256 = hashlib.sha256(operator_token(machine.run_directory).encode()).hexdigest()
     run_directory = machine.guard_directory
     make_directory(run_directory)
-    text = to_json(guard_settings.settings_of(machine, name, run_directory, token_sha256))
-    from_json(text, str(config))  # settings that the guard would refuse are refused before it starts
+    text = encode_settings(guard_settings.settings_of(machine, name, run_directory, token_sha256))
+    decode_settings(text, str(config))  # settings that the guard would refuse are refused before it starts
     file, bus = run_directory / SETTINGS_NAME, machine.bus[name]
     if check:
         _write(file, text)
         click.echo(f"{file}: settings of the guard for {name}")
         return
-    with connect_bus(name, bus) as transmit, lock_bus(bus, transmit, run_directory) as lock:
+    with open_transmit_socket(name, bus) as transmit, lock_bus(bus, transmit, run_directory) as lock:
         # if no NC runs the bus, the drives are compared with their commissioning records
         compare_again(machine, name, lambda text: click.echo(json.dumps({"event": "record_void", "text": text})))
-        _write(file, to_json(guard_settings.settings_of(machine, name, run_directory, token_sha256)))
-        greet(name, bus, transmit)
+        _write(file, encode_settings(guard_settings.settings_of(machine, name, run_directory, token_sha256)))
+        greet_hub(name, bus, transmit)
         os.set_inheritable(lock.fileno(), True)
         transmit.set_inheritable(True)
         arguments = ["-m", "fdhil.guard", "--settings", str(file), "--descriptor", str(transmit.fileno())]

@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.config import MachineConfig
-from fdhil.report import Page, Section, Table, deliver
+from fdhil.report import Page, Section, Table, write_page_or_pdf
 from fdhil.report.chart import svg
-from fdhil.report.history_course import BAND, MANY, AxisHistory, over_temperature, over_time
+from fdhil.report.history_course import DAY_PERCENTILES, MOST_SINGLE_ESTIMATES, AxisHistory, over_temperature, over_time
 from fdhil.report.history_trends import moved, slope_rows
 from fdhil.report.history_verdict import IN_ORDER, LATEST_HEAD, Refusals, latest_rows, sentences
-from fdhil.report.parameter_view import DISPLAY, MEANING, MEANINGS, cell, half_of
+from fdhil.report.parameter_view import DISPLAY_UNITS, INTERVAL_MEANING, PARAMETER_MEANINGS, cell, half_of
 
 MOST_REVISIONS = 50
 MOST_NOTICES = 30
@@ -31,11 +31,11 @@ def write_report(
     sections += [_notices(notices)] if notices else []
     page = Page(
         f"{machine.machine.name}: condition of the drives",
-        f"Identified from rapid moves; {_span(histories)}. {MEANING.capitalize()}.",
+        f"Identified from rapid moves; {_span(histories)}. {INTERVAL_MEANING.capitalize()}.",
         [_tile(history, refused.get(history.axis, Refusals())) for history in histories],
         sections,
     )
-    deliver(page, path, pdf)
+    write_page_or_pdf(page, path, pdf)
 
 
 def _span(histories: Sequence[AxisHistory]) -> str:
@@ -71,10 +71,10 @@ def _verdict(machine: MachineConfig, histories: Sequence[AxisHistory], refused: 
 
 
 def _axis_section(history: AxisHistory, refused: Refusals) -> Section:
-    many = max((len(history.estimates(name)) for name in history.names()), default=0) > MANY
+    many = max((len(history.estimates(name)) for name in history.names()), default=0) > MOST_SINGLE_ESTIMATES
     shown = "" if not many else (
-        f"With more than {MANY} rapids the plots show the median of each day, and a band from the {BAND[0]:.0f}th to "
-        f"the {BAND[1]:.0f}th percentile."
+        f"With more than {MOST_SINGLE_ESTIMATES} rapids the plots show the median of each day, and a band from the {DAY_PERCENTILES[0]:.0f}th to "
+        f"the {DAY_PERCENTILES[1]:.0f}th percentile."
     )  # fmt: skip
     tables = [*_health_tables(history.told), *_refused_tables(refused), *_revision_tables(history.rows)]
     return Section(f"Axis {history.axis}", shown, tables, _pictures(history))
@@ -83,11 +83,11 @@ def _axis_section(history: AxisHistory, refused: Refusals) -> Section:
 def _pictures(history: AxisHistory) -> list[tuple[str, str]]:
     pictures = []
     for name in history.names():
-        what = f"{name.partition('_')[0]}, {MEANINGS[name]}"
+        what = f"{name.partition('_')[0]}, {PARAMETER_MEANINGS[name]}"
         pictures.append((f"{what}, over time", svg(over_time(history, name), WIDTH, HEIGHT)))
     for name in history.names():
         if (course := over_temperature(history, name)) is not None:
-            what = f"{name.partition('_')[0]}, {MEANINGS[name]}"
+            what = f"{name.partition('_')[0]}, {PARAMETER_MEANINGS[name]}"
             caption = f"{what}, over the temperature of the slide-way, with which it varies"
             pictures.append((caption, svg(course, WIDTH, HEIGHT)))
     return pictures
@@ -99,7 +99,7 @@ def _health_tables(health: Mapping[str, Any] | None) -> list[Table]:
     slopes = Table(
         head=["parameter", "per kelvin", "per day", "maintenance limit"],
         rows=slope_rows(health),
-        caption=f"Slopes since the last change; {MEANING}",
+        caption=f"Slopes since the last change; {INTERVAL_MEANING}",
     )
     changes = Table(
         head=["time", "window", "parameters that changed", "likely cause"],
@@ -121,7 +121,7 @@ def _revision_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
     if not rows:
         return []
     names = list(dict.fromkeys(name for row in rows for name in row["parameters"]))
-    head = ["revision", "time (UTC)", "degC", "windows", *(f"{name} {DISPLAY[name][0]}" for name in names)]
+    head = ["revision", "time (UTC)", "degC", "windows", *(f"{name} {DISPLAY_UNITS[name][0]}" for name in names)]
     newest = rows[-MOST_REVISIONS:][::-1]
     left_out = len(rows) - len(newest)
     cells = [
@@ -135,7 +135,7 @@ def _revision_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
         for row in newest
     ]
     more = f"; {left_out} older ones are omitted (fdhil history --json lists them)" if left_out else ""
-    caption = f"Published parameter sets, newest first{more}; {MEANING}"
+    caption = f"Published parameter sets, newest first{more}; {INTERVAL_MEANING}"
     return [Table(head, cells, caption, folded=f"{len(rows)} published parameter sets")]
 
 

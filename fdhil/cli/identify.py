@@ -16,8 +16,8 @@ from fdhil import report as reports
 from fdhil import tables
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, FILE, OutputFile, Picture, Writing
-from fdhil.records import INTERVAL_95, unit_of
-from fdhil.report.parameter_view import MEANING, cell, head
+from fdhil.records import INTERVAL_95, get_unit
+from fdhil.report.parameter_view import INTERVAL_MEANING, cell, head
 from fdhil.store import suffixes
 from fdhil.store.output import open_output
 
@@ -182,7 +182,7 @@ def _within(place: Path) -> Iterator[Path]:
     closed: list[Path] = []  # includes a path that is not a folder
     for folder, _, names in os.walk(place, onerror=lambda error: closed.append(Path(error.filename))):
         for file in (Path(folder, name) for name in names if not name.startswith(".")):
-            if file.suffix.lower() in suffixes.RECORDINGS and _may_be_read(file):
+            if file.suffix.lower() in suffixes.RECORDING_SUFFIXES and _may_be_read(file):
                 yield file
     yield from closed
 
@@ -247,7 +247,7 @@ def _show(results: Sequence[FileResult], axes: Mapping[str, Axis], with_loops: b
             continue
         # fits a terminal of 80 columns
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
-        console.print(f"{result.file}: axis {result.axis}; {MEANING}", style="italic")
+        console.print(f"{result.file}: axis {result.axis}; {INTERVAL_MEANING}", style="italic")
         table.add_column("rapid\ns", no_wrap=True)
         for name in PARAMETERS:
             table.add_column(head(name), justify="right", no_wrap=True)
@@ -290,7 +290,7 @@ def _cells(estimate: Estimate | None, verdict: Verdict, has_table_error: bool) -
 def _cell(estimate: Estimate, name: str) -> str:
     if name in estimate.given and name != "K":
         return "-"  # from the data sheet, not determined by this recording
-    value, half = estimate.value(name), INTERVAL_95 * estimate.std(name)
+    value, half = estimate.get_value(name), INTERVAL_95 * estimate.get_std(name)
     return cell(name, value, None).replace("(no ±)", "(given)") if name in estimate.given else cell(name, value, half)
 
 
@@ -300,8 +300,8 @@ def _show_terms(console: Any, result: FileResult) -> None:
     each = ((f"{o.window.start_s:.2f} s", usable_estimate(o)) for o in result.outcomes)
     for who, estimate in each if result.pooled is None else (("all", result.pooled),):
         if estimate is not None and estimate.terms:
-            cells = (cell(n, estimate.value(n), INTERVAL_95 * estimate.std(n), " ") for n in estimate.terms)
-            named = (f"{n} {value} {unit_of(n)}" for n, value in zip(estimate.terms, cells, strict=True))
+            cells = (cell(n, estimate.get_value(n), INTERVAL_95 * estimate.get_std(n), " ") for n in estimate.terms)
+            named = (f"{n} {value} {get_unit(n)}" for n, value in zip(estimate.terms, cells, strict=True))
             console.print(f"  terms of {who}: {', '.join(named)}")
 
 

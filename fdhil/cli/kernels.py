@@ -12,9 +12,9 @@ from fdhil import config as machine_config
 from fdhil import tables
 from fdhil.cli.demo.machines import REAL, machine_document
 from fdhil.config import MachineConfig
-from fdhil.daemon.kernel_warmup import nominal_rapid, warm
+from fdhil.daemon.kernel_warmup import compile_kernels, simulate_nominal_rapid
 from fdhil.pipeline import analyse
-from fdhil.records import SlowVoltage, Window, frozen
+from fdhil.records import SlowVoltage, Window, freeze_array
 from fdhil.sim.machine import Machine
 
 SLOW_ROWS = 5
@@ -24,7 +24,7 @@ def compile_all() -> None:
     """Run synthetic rapids through all computations: estimators, checks, corrections, the simulated drive."""
     config = machine_config.parse(machine_document())
     for method in (None, *tables.ESTIMATORS):
-        warm(config, method)
+        compile_kernels(config, method)
     for window in _unusual(config):
         analyse(window, config.identification)
     for machine in (config, machine_config.parse(machine_document(REAL))):
@@ -34,15 +34,15 @@ def compile_all() -> None:
 def _unusual(config: MachineConfig) -> Iterator[Window]:
     # a stuck sensor, an instantaneous voltage and a slow voltage take other code paths than an ordinary rapid
     axis = config.axis["X"]
-    sound = nominal_rapid("X", axis, config.machine.sync_period_s)
+    sound = simulate_nominal_rapid("X", axis, config.machine.sync_period_s)
     speed = np.round(sound.speed_rad_s, 2)
     speed[200:230] = speed[200]
-    yield replace(sound, speed_rad_s=frozen(speed))
+    yield replace(sound, speed_rad_s=freeze_array(speed))
     yield replace(sound, voltage_sampling="instant")
     assert sound.voltage_v is not None
     rows = sound.n // SLOW_ROWS * SLOW_ROWS
     means = sound.voltage_v[:rows].reshape(-1, SLOW_ROWS).mean(axis=1)
-    slow = SlowVoltage(0.0, SLOW_ROWS * sound.dt_s, 0.2 * sound.dt_s, frozen(means))
+    slow = SlowVoltage(0.0, SLOW_ROWS * sound.dt_s, 0.2 * sound.dt_s, freeze_array(means))
     yield replace(sound, voltage_v=None, slow_voltage=slow)
 
 

@@ -26,7 +26,7 @@ def show_loops(result: FileResult, axis: Axis | None, console: Any) -> None:
     from rich import box
     from rich.table import Table
 
-    from fdhil.api.loops import UNITS, configured_value, equivalent_loops
+    from fdhil.api.loops import LOOP_UNITS, configured_value, equivalent_loops
 
     found = result.loops
     if found is None:
@@ -42,7 +42,7 @@ def show_loops(result: FileResult, axis: Axis | None, console: Any) -> None:
         std = math.sqrt(found.covariance[k, k])
         configured = configured_value(regulators, name)
         shown = "-" if configured is None else f"{configured:.5g}"
-        table.add_row(name, f"{value:.4g} ± {INTERVAL_95 * std:.2g}", shown, UNITS[name])
+        table.add_row(name, f"{value:.4g} ± {INTERVAL_95 * std:.2g}", shown, LOOP_UNITS[name])
     console.print(table)
     for same in equivalent_loops(found):
         gains = ", ".join(f"{key} {value:.4g}" for key, value in same.items() if not isinstance(value, str))

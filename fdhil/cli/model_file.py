@@ -47,14 +47,14 @@ def write_model(results: Sequence[FileResult], axes: Mapping[str, Axis], path: P
 
 
 def _model(name: str, estimate: Estimate, axis: Axis | None) -> dict[str, Any]:
-    values = {key: estimate.value(key) for key in PARAMETERS}
+    values = {key: estimate.get_value(key) for key in PARAMETERS}
     unknown = [key for key, value in values.items() if not math.isfinite(value)]
     if unknown and axis is None:
         text = f"{' and '.join(unknown)} of axis {name} cannot be determined without a voltage"
         raise click.UsageError(f"{text}; give --config with nominal values to write a complete model")
     if axis is not None:
         values |= {key: float(getattr(axis.nominal, key)) for key in unknown}
-    terms = {key: estimate.value(key) for key in estimate.terms}
+    terms = {key: estimate.get_value(key) for key in estimate.terms}
     return {**values, "terms": terms} if terms else values
 
 

@@ -106,11 +106,11 @@ def reject(config: Path, offer: Path, by: str, reason: str, as_json: bool) -> No
 
 
 def _text(option: str, text: str, most: int) -> str:
-    from fdhil.daemon.journal import printable
+    from fdhil.daemon.service_log import escape_unprintable
 
     if not text.strip() or len(text) > most:
         raise ConfigError(option, [ConfigFault(option, "is empty or too long", f"at most {most} characters")])
-    return printable(text.strip())
+    return escape_unprintable(text.strip())
 
 
 def _place(machine: MachineConfig, offer: Path) -> Path:

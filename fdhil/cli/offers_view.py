@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil.config import MachineConfig
-from fdhil.daemon.journal import printable
+from fdhil.daemon.service_log import escape_unprintable
 
 if TYPE_CHECKING:
     from fdhil.fleet.offered import Changed, Judged
@@ -26,7 +26,7 @@ def tell(found: Sequence[Judged], machine: MachineConfig, as_json: bool) -> None
         return
     for each in found:
         for line in _lines(each, machine):
-            click.echo(printable(line))
+            click.echo(escape_unprintable(line))
     if not found:
         trusted = "" if machine.offers.trust else "; none is fetched, because [offers] trust names no key"
         click.echo(f"no proposed changes in {machine.offers_directory}{trusted}")
@@ -42,7 +42,7 @@ def accepted(done: Judged, before: MachineConfig, file: Path, as_json: bool) -> 
         click.echo(json.dumps({"schema": "fdhil-offer-accepted-1", **_document(done, before), "kept": kept}))
         return
     for line in _changes(done, before):
-        click.echo(printable(line))
+        click.echo(escape_unprintable(line))
     if kept is None:
         click.echo(f"{done.offer} accepted; {file} has these values already and was not changed")
         return

@@ -21,7 +21,7 @@ from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FILE
 from fdhil.cli.terminal_text import print_progress
 from fdhil.errors import DeviceError, DriveFault
-from fdhil.guard.protocol import SOCKET_NAME
+from fdhil.guard.guard_protocol import SOCKET_NAME
 
 if TYPE_CHECKING:
     from fdhil.commissioning.play import Bench, Plan, Played

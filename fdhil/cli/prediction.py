@@ -16,7 +16,7 @@ from fdhil.api.compiling import forewarn
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FROM_HISTORY, MODEL, PROGRAM, OutputFile, Positive, Writing
 from fdhil.records import INTERVAL_95
-from fdhil.report.parameter_view import MEANING
+from fdhil.report.parameter_view import INTERVAL_MEANING
 
 if TYPE_CHECKING:
     from fdhil.cli.forecast import Past
@@ -148,7 +148,7 @@ def _with_history(
     std_um = prediction.contour_std_um(reference, models, _covariances(reference, past), config)
     document["contour"]["max_std_um"] = float(std_um.max())
     for entry, zone in zip(zones, predicted.zones, strict=True):
-        entry["std_um"] = float(std_um[predicted.worst_row(zone)])
+        entry["std_um"] = float(std_um[predicted.find_worst_row(zone)])
     steps = forecast.steps(past, predicted, models, config, since)
     document["steps"] = forecast.step_entries(steps)
     now = forecast.comparison(program, digest, past, predicted, models, config, zones)
@@ -177,13 +177,13 @@ def correct(options: Asked, method: str | None) -> int:
     from fdhil.api.machine import held_out_max_um
     from fdhil.correction.result_documents import correction_document
     from fdhil.prediction.models import load_model_file
-    from fdhil.store.known_gain import known_gain
+    from fdhil.store.known_gain import predict_gain_from_history
 
     forewarn("predict", "correct")
     held_out_um = {} if options.model_path is None else load_model_file(options.model_path).held_out_um
     largest_um = held_out_max_um(reference, config, "history" if options.from_history else options.model_path)
     planned = correction.plan(reference, models, config, method, largest_um)
-    predicted = known_gain(planned, models, config, options.from_history, held_out_um)
+    predicted = predict_gain_from_history(planned, models, config, options.from_history, held_out_um)
     if options.out is not None:
         _write(options.out, _correction_columns(planned))
     _report(options, config, planned, predicted)
@@ -200,7 +200,7 @@ def _report(
     if options.report is None and options.pdf is None:
         return
     from fdhil.records import Prediction
-    from fdhil.report import deliver
+    from fdhil.report import write_page_or_pdf
     from fdhil.report.path import correction_page, prediction_page
 
     name, machine = options.program.name, config.machine.name
@@ -213,7 +213,7 @@ def _report(
         page = prediction_page(name, machine, found, parameters)
     else:
         page = correction_page(name, machine, found, parameters, predicted)
-    deliver(page, options.report, options.pdf)
+    write_page_or_pdf(page, options.report, options.pdf)
 
 
 def inputs(
@@ -284,7 +284,7 @@ def _show_prediction(
     contour, time_s = result_documents.contour(predicted), predicted.reference.time_s
     click.echo(
         f"{time_s[-1] - time_s[0]:.2f} s of path: contour error {contour['rms_um']:.1f} um RMS,"
-        f" {contour['max_um']:.1f} um at most" + (f"; {MEANING}" if zones and "std_um" in zones[0] else "")
+        f" {contour['max_um']:.1f} um at most" + (f"; {INTERVAL_MEANING}" if zones and "std_um" in zones[0] else "")
     )
     entries = result_documents.zones(predicted) if zones is None else zones
     shown = sorted(sorted(entries, key=lambda zone: -zone["max_um"])[:MANY_ZONES], key=lambda zone: zone["start_s"])

@@ -36,23 +36,23 @@ def publish(protocol: str, config: Path, devices: Path | None, as_json: bool) ->
     if devices is not None:
         _write_devices(machine, devices)
         return
-    from fdhil.daemon import journal
-    from fdhil.shopfloor.process import run
+    from fdhil.daemon import service_log
+    from fdhil.shopfloor.publisher_process import run_publisher
 
     try:
-        publisher = tables.load(tables.PUBLISHERS, protocol)
+        publisher = tables.load_entry(tables.PUBLISHERS, protocol)
     except ImportError as error:
         extra = EXTRAS.get(protocol, protocol)
         what = f"fdhil publish {protocol} needs the library {error.name}, which is not installed"
         raise FdhilError(f"{what}: pip install 'fdhil[{extra}]'") from None
-    with journal.lines_as_json(as_json):
-        run(publisher, machine)
+    with service_log.write_lines_as_json(as_json):
+        run_publisher(publisher, machine)
 
 
 def _write_devices(machine: MachineConfig, file: Path) -> None:
-    from fdhil.shopfloor.mtconnect import devices
+    from fdhil.shopfloor.mtconnect_adapter import build_agent_devices
     from fdhil.store.output import open_output
 
     with open_output(file) as written:
-        written.write(devices(machine).encode())
+        written.write(build_agent_devices(machine).encode())
     click.echo("restart the agent, which reads the file at its start", err=True)

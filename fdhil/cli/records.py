@@ -39,18 +39,18 @@ def replay(recordings: tuple[Path, ...], config: Path | None, method: str | None
     Windows of one axis are analysed in the given order, so that their pooling is repeated as well.
     """
     machine = machine_config.load(config) if config else None
-    from fdhil.daemon.journal import line_of
-    from fdhil.daemon.outcome_json import as_document
+    from fdhil.daemon.outcome_json import build_outcome_document
+    from fdhil.daemon.service_log import format_outcome
 
     files = []
     validated = True
     for path, outcomes in _replayed(recordings, machine, method):
-        documents = [as_document(outcome) for outcome in outcomes]
+        documents = [build_outcome_document(outcome) for outcome in outcomes]
         windows = [document for document in documents if document["kind"] == "window"]
         validated &= bool(windows) and all(document["validated"] for document in windows)
         files.append({"file": str(path), "outcomes": documents})
         for outcome in () if as_json else outcomes:
-            click.echo(line_of(outcome)[0])
+            click.echo(format_outcome(outcome)[0])
         if not windows and not as_json:
             click.echo(f"{path}: NoWindow: the file contains no rapid move")
     if as_json:

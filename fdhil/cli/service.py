@@ -46,12 +46,12 @@ def run(config: Path, method: str | None, as_json: bool) -> int:
     """
     machine = machine_config.load(config)
     from fdhil.api.compiling import forewarn
-    from fdhil.daemon import journal, service  # late: --help imports nothing heavy
+    from fdhil.daemon import daemon_service, service_log  # late: --help imports nothing heavy
     from fdhil.drivers import open_machine
 
     forewarn("identify", "predict", "correct")
-    with journal.lines_as_json(as_json):
-        residual = service.run(machine, open_machine, method)
+    with service_log.write_lines_as_json(as_json):
+        residual = daemon_service.run_daemon_service(machine, open_machine, method)
     return 0 if residual.nothing else 3
 
 
@@ -62,9 +62,9 @@ def _ask(
     progress: Callable[[Mapping[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     load = machine_config.load_places if request["request"] == "disarm" else machine_config.load
-    from fdhil.daemon.control import SOCKET_NAME, ask
+    from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
 
-    return ask(load(config).run_directory / SOCKET_NAME, request, timeout_s, progress)
+    return ask_daemon(load(config).run_directory / SOCKET_NAME, request, timeout_s, progress)
 
 
 @click.command()
@@ -92,10 +92,10 @@ def status(config: Path, watch: bool, as_json: bool) -> None:
 
 def _show_status(config: Path, as_json: bool) -> None:
     from fdhil.cli.status_view import show
-    from fdhil.daemon.status import config_difference
+    from fdhil.daemon.daemon_status import describe_config_difference
 
     answer = _ask(config, {"request": "status"})
-    answer["config_difference"] = config_difference(answer, machine_config.load(config).digest)
+    answer["config_difference"] = describe_config_difference(answer, machine_config.load(config).digest)
     if as_json:
         click.echo(json.dumps(answer))
     else:
@@ -261,7 +261,7 @@ def _written_after(config: Path, what: str, answer: Mapping[str, Any]) -> Iterat
 
 def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: bool) -> Mapping[str, Any]:
     from fdhil.arming.standing import landed, standing, verdict
-    from fdhil.guard.protocol import AT_REST
+    from fdhil.guard.guard_protocol import AT_REST
 
     status = guard.status()
     residual, state = standing(status), status["state"]

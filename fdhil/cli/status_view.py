@@ -12,7 +12,7 @@ from rich.table import Table
 from fdhil.cli.console import PrintableConsole
 from fdhil.cli.loops_view import loops_line
 from fdhil.records import PARAMETERS
-from fdhil.report.parameter_view import MEANING, cell, half_of, head
+from fdhil.report.parameter_view import INTERVAL_MEANING, cell, half_of, head
 
 BARS = "▁▂▃▄▅▆▇█"
 COURSE = 7  # revisions in a sparkline, limited by the column width
@@ -225,7 +225,9 @@ def _axes_table(axes: Mapping[str, Any]) -> Table:
 
 def narrow_table(title: str | None = None) -> Table:
     """Return a table whose parameter columns fit 80 columns, with a caption that explains ±."""
-    table = Table(title=title, title_justify="left", caption=MEANING, caption_justify="left", box=box.SIMPLE_HEAD)
+    table = Table(
+        title=title, title_justify="left", caption=INTERVAL_MEANING, caption_justify="left", box=box.SIMPLE_HEAD
+    )
     table.show_edge, table.pad_edge, table.collapse_padding = False, False, True
     return table
 

@@ -70,7 +70,7 @@ def set_user(web: Web, config: Path, name: str, role: Role, remove: bool, as_jso
         raise ConfigError(str(config), [fault])
     from fdhil.config import users
 
-    if re.fullmatch(users.NAME, name) is None:
+    if re.fullmatch(users.USER_NAME_PATTERN, name) is None:
         raise click.BadParameter("a name may contain letters, digits, . _ @ and -, at most 64 characters")
     users_by_name = dict(users.read_users(path)) if path.exists() else {}
     if remove:

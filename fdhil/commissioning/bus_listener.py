@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SDO_RESPONSE, COB_SYNC, Nmt
-from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.bus import ListeningBus
 from fdhil.drivers.can.frames import ERROR_FLAG, REMOTE_FLAG, Frames
 from fdhil.errors import ConnectError
 
@@ -113,7 +113,7 @@ def _period_s(stamps_ns: list[int]) -> float | None:
 class BusListener:
     """Records the traffic of a bus in its own thread until it is closed; a context manager."""
 
-    def __init__(self, bus: CanBus) -> None:
+    def __init__(self, bus: ListeningBus) -> None:
         self.traffic = Traffic()
         self.name = bus.name
         self._bus = bus

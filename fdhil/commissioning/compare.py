@@ -14,10 +14,10 @@ from fdhil.commissioning.record import CommissioningRecord, fingerprint, is_rpdo
 from fdhil.commissioning.survey import Survey, survey
 from fdhil.commissioning.void import confirm_record, void_mark, void_record
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.bus import ListeningBus
 from fdhil.errors import DeviceError, ForeignMaster, StoreError
 
-POINT = "commissioning record"
+RECORD_POINT = "commissioning record"
 LISTEN_S, NODES_S = 1.0, 0.3
 TURN_S = 0.1
 
@@ -37,7 +37,7 @@ def compare_record(record: CommissioningRecord, found: Survey) -> Finding:
     if not cause and seen != record.fingerprint:
         cause = f"it has changed since it was commissioned: {_difference(record, found)}"
     advice = f"correct it with the drive's own tool, or run fdhil commission --axis {record.axis}"
-    return Finding(POINT, record.fingerprint, seen, not cause, cause, advice)
+    return Finding(RECORD_POINT, record.fingerprint, seen, not cause, cause, advice)
 
 
 def _difference(record: CommissioningRecord, found: Survey) -> str:
@@ -61,7 +61,7 @@ def compare_drive(config: MachineConfig, record: CommissioningRecord) -> Finding
         raise
     except DeviceError as error:
         cause, _, advice = str(error).partition("; ")
-        return Finding(POINT, record.fingerprint, "no answer", False, cause, advice or "check its supply")
+        return Finding(RECORD_POINT, record.fingerprint, "no answer", False, cause, advice or "check its supply")
 
 
 def compare_again(config: MachineConfig, bus: str, say: Callable[[str], None]) -> None:
@@ -109,7 +109,7 @@ def _records(config: MachineConfig, bus: str) -> list[CommissioningRecord]:
 
 def _listen(config: MachineConfig, bus: str) -> Traffic:
     """With an NC on the bus a shorter time is enough: its nodes show themselves at once."""
-    with BusListener(CanBus(bus, config.bus[bus])) as listener:
+    with BusListener(ListeningBus(bus, config.bus[bus])) as listener:
         for turn in range(round(LISTEN_S / TURN_S)):
             listener.listen(TURN_S)
             if listener.traffic.master is not None and turn * TURN_S >= NODES_S:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from fdhil.commissioning.bus_listener import LISTEN_S, BusListener, Traffic
-from fdhil.commissioning.compare import POINT, compare_record
+from fdhil.commissioning.compare import RECORD_POINT, compare_record
 from fdhil.commissioning.finding import Finding, read_optional
 from fdhil.commissioning.identifiers import compare_identifiers
 from fdhil.commissioning.master import Master
@@ -18,7 +18,7 @@ from fdhil.commissioning.record import CommissioningRecord, load_record
 from fdhil.commissioning.survey import Survey, survey
 from fdhil.commissioning.timing import judge_sync
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.bus import ListeningBus
 from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
 from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.drivers.moves import load_event_source
@@ -45,7 +45,7 @@ def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _te
     found: list[Place] = []
     for bus in dict.fromkeys(axis.drive.bus for axis in config.axis.values()):
         say(f"listening on bus {bus}")
-        with BusListener(CanBus(bus, config.bus[bus])) as listener:
+        with BusListener(ListeningBus(bus, config.bus[bus])) as listener:
             listener.listen(LISTEN_S)
             listener.require_readable()
             traffic = listener.traffic
@@ -127,7 +127,7 @@ def _record(config: MachineConfig, axis: str, found: Survey) -> Iterator[Finding
         record = load_record(config.store.directory, axis, config.store.commissioning_key, may_lack_key=True)
     except StoreError as error:
         cause, _, advice = str(error).partition("; ")
-        yield Finding(POINT, "as signed off", "cannot be read", False, cause, advice)
+        yield Finding(RECORD_POINT, "as signed off", "cannot be read", False, cause, advice)
         return
     if record is not None:
         yield compare_record(record, found)

@@ -12,7 +12,7 @@ from typing import Protocol, Self
 from fdhil import cia402
 from fdhil.commissioning.bus_watch import BusWatch
 from fdhil.commissioning.landing import Landed, land, outcome
-from fdhil.commissioning.realtime import CYCLE, prioritise
+from fdhil.commissioning.realtime import CYCLE_PRIORITY, prioritise
 from fdhil.commissioning.set_points import SetPoints
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import MachineConfig
@@ -122,7 +122,7 @@ class Cycle:
 
     def _run(self) -> None:
         if self._realtime:
-            self.scheduling = prioritise(CYCLE)
+            self.scheduling = prioritise(CYCLE_PRIORITY)
         due = time.monotonic()
         try:
             while not self._stopping.is_set():

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from fdhil.cia402 import COB_SYNC, pack, unpack
+from fdhil.cia402 import COB_SYNC, pack_pdo, unpack_pdo
 from fdhil.commissioning.record import CommissioningRecord, axis_digest
 from fdhil.commissioning.transmit import SocketcandSender
 from fdhil.config import MachineConfig, OffsetBounds
@@ -82,7 +82,7 @@ class HalAxis:
                     last_frame_s = time.monotonic()
                     if increments is not None:
                         values = (increments, data[0])
-                        self._port.send(self._offset.cob_base + self._node_id, pack(self._offset.entries, values))
+                        self._port.send(self._offset.cob_base + self._node_id, pack_pdo(self._offset.entries, values))
                 elif can_id in self._tpdos:
                     self._take(can_id, data, seen)
             if time.monotonic() - last_frame_s > SILENCE_S:
@@ -92,7 +92,7 @@ class HalAxis:
 
     def _take(self, can_id: int, data: bytes, seen: Seen) -> None:
         entries = self._tpdos[can_id].entries
-        value = dict(zip([entry.index for entry in entries], unpack(entries, data), strict=True))
+        value = dict(zip([entry.index for entry in entries], unpack_pdo(entries, data), strict=True))
         seen.status = value.get(0x6041, seen.status)
         seen.position += [value[0x6064]] if 0x6064 in value else []
         if 0x60B0 in value:

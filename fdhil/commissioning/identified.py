@@ -10,7 +10,7 @@ from fdhil.errors import DriveFault
 from fdhil.identification.delay import delay_score
 from fdhil.identification.estimators.maximum_likelihood import fit_windows
 from fdhil.pipeline import AxisPipeline, Known, Record
-from fdhil.records import PARAMETERS, Outcome, ParameterSet, Skill, WindowOutcome, unit_of
+from fdhil.records import PARAMETERS, Outcome, ParameterSet, Skill, WindowOutcome, get_unit
 
 ACCEPTANCE_MOVES = 2
 LEFT_SHARE = 0.25  # largest prediction error, as a share of the measured following error
@@ -37,7 +37,11 @@ class Rapids:
         """Value, standard deviation (None: from the data sheet, not identified) and unit of each parameter."""
         values, deviations = self.published.parameters.as_dict(), self.published.covariance.diagonal().tolist()
         return {
-            name: {"value": values[name], "std": math.sqrt(variance) if variance > 0.0 else None, "unit": unit_of(name)}
+            name: {
+                "value": values[name],
+                "std": math.sqrt(variance) if variance > 0.0 else None,
+                "unit": get_unit(name),
+            }
             for name, variance in zip(PARAMETERS, deviations, strict=False)
         }
 

@@ -134,7 +134,7 @@ class Master:
             due = spec.valid and (self._sends_offset or cob_id not in self._offset_ids)
             if due and all((e.index, e.sub) in values for e in spec.entries):
                 with suppress(ForeignMaster):  # it controls this drive, or sends its offset
-                    self.bus.send(cob_id, cia402.pack(spec.entries, [values[e.index, e.sub] for e in spec.entries]))
+                    self.bus.send(cob_id, cia402.pack_pdo(spec.entries, [values[e.index, e.sub] for e in spec.entries]))
 
     def _take_answer(self) -> None:
         """Register the last TPDO of every SYNC, which may answer a SYNC long before the newest."""
@@ -195,7 +195,7 @@ class Master:
                 self._take_answer()
             elif can_id in self._seldom:  # it follows the last answer to its SYNC
                 self._due[can_id] = self._answered + self._seldom[can_id]
-            for entry, value in zip(spec.entries, cia402.unpack(spec.entries, data), strict=True):
+            for entry, value in zip(spec.entries, cia402.unpack_pdo(spec.entries, data), strict=True):
                 feedback.objects[entry.index, entry.sub] = value
                 feedback.cycle[entry.index, entry.sub] = self.cycle
         elif can_id == self.sdo.response_id:
@@ -290,9 +290,9 @@ class Master:
             time.sleep(self.period_s / 2)
         return sum(values) / len(values)
 
-    def state(self) -> cia402.State:
+    def state(self) -> cia402.PowerState:
         """Return the power state of the newest statusword."""
-        return cia402.state_of(self.heard.objects.get(self.profile.statusword, 0))
+        return cia402.decode_power_state(self.heard.objects.get(self.profile.statusword, 0))
 
     def close(self) -> None:
         """Stop sending and release the bus, unless it is shared."""

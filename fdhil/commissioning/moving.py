@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
 
-from fdhil.cia402 import State, emcy_text
+from fdhil.cia402 import PowerState, describe_emergency
 from fdhil.commissioning.cycle import Cycle
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.set_points import Bounds, SetPoints
@@ -53,9 +53,9 @@ def watch_power(masters: Sequence[Master], path: SetPoints) -> None:
     for master in masters:
         if master.behind > SILENT_CYCLES:
             path.stop(f"axis {master.axis}: its drive has been silent for {SILENT_CYCLES} SYNC")
-        if master.state() is not State.OPERATION_ENABLED:
+        if master.state() is not PowerState.OPERATION_ENABLED:
             codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[-1:]]
-            why = f" (EMCY {codes[0]:04X}: {emcy_text(codes[0])})" if codes and codes[0] else ""
+            why = f" (EMCY {codes[0]:04X}: {describe_emergency(codes[0])})" if codes and codes[0] else ""
             if codes and codes[0] == EMCY_HEARTBEAT:
                 why += f"; this PC was late by up to {master.loop.lateness.most_us / 1e3:.1f} ms: reduce its load"
             path.stop(f"axis {master.axis}: its drive fell from Operation enabled to {master.state().value}{why}")

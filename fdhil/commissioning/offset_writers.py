@@ -7,7 +7,7 @@ masters that write one offset make the table step from one value to the other.
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from fdhil.cia402 import COB_SDO_RESPONSE, Object, unpack
+from fdhil.cia402 import COB_SDO_RESPONSE, Object, unpack_pdo
 from fdhil.commissioning.bus_listener import Traffic
 from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.master import Master
@@ -188,7 +188,7 @@ def _shown_offset(profile: DriveProfile, node_id: int, traffic: Traffic) -> tupl
     data = None if found is None else traffic.data.get(found[0].cob_base + node_id)
     if found is None or data is None:
         return 0, 0
-    return unpack(found[0].entries, data.to_bytes(8, "little"))[found[0].entries.index(found[1])], found[1].bits
+    return unpack_pdo(found[0].entries, data.to_bytes(8, "little"))[found[0].entries.index(found[1])], found[1].bits
 
 
 def _carries(traffic: Traffic, cob_id: int, held: int, bits: int) -> bool:

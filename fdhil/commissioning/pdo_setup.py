@@ -6,7 +6,7 @@ then it is made valid again. On failure the old PDOs are restored.
 
 from dataclasses import dataclass
 
-from fdhil.cia402 import NmtCommand, Object, State, state_of
+from fdhil.cia402 import NmtCommand, Object, PowerState, decode_power_state
 from fdhil.commissioning.finding import read_optional
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.survey import INVALID_COB_ID, PdoFound, compare_pdo, listen, read_mapping, read_pdos
@@ -54,7 +54,7 @@ def set_up_pdos(master: Master) -> SetUp:
 
 def _require_disabled(master: Master) -> None:
     word = read_optional(master, Object.STATUSWORD)
-    if word is not None and state_of(word) is State.OPERATION_ENABLED:
+    if word is not None and decode_power_state(word) is PowerState.OPERATION_ENABLED:
         raise DriveFault(master.device, "it is in Operation enabled, so nothing was written; switch it off first")
 
 

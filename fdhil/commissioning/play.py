@@ -110,7 +110,7 @@ def _require_inside(plan: Plan) -> None:
         points.step()
     if points.stopped is not None:
         row = min(points.played, len(rows) - 1)
-        where = f"{plan.trajectory.time_s[row]:.3f} s, {plan.trajectory.place(row)}"
+        where = f"{plan.trajectory.time_s[row]:.3f} s, {plan.trajectory.describe_position(row)}"
         advice = "nothing was sent; change the program, or [axis.*.setpoints] if the machine has the room"
         raise DriveFault("the demand", f"{points.stopped} (row {row + 1}, {where}); {advice}")
 
@@ -186,7 +186,7 @@ class Bench:
         """Return the distance of each axis from the first row."""
         first = self.plan.rows(here)[0]
         return [
-            self._config.axis[master.axis].scaling.to_mm(float(start) - at)
+            self._config.axis[master.axis].scaling.convert_to_mm(float(start) - at)
             for master, start, at in zip(self.masters, first, here, strict=True)
         ]
 
@@ -203,7 +203,7 @@ class Bench:
                 raise DriveFault(master.device, f"{text}; move it there, or use --go-to-start to move it there slowly")
 
     def _mm(self, master: Master, increments: float) -> float:
-        return self._config.axis[master.axis].scaling.to_mm(increments)
+        return self._config.axis[master.axis].scaling.convert_to_mm(increments)
 
     def _shown(self, master: Master, mm: float) -> str:
         return self._config.axis[master.axis].shown(mm, form=".3f")

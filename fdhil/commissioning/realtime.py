@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Iterator
 
-CYCLE = 50  # that of a real-time kernel's interrupt threads, above all ordinary work
+CYCLE_PRIORITY = 50  # that of a real-time kernel's interrupt threads, above all ordinary work
 BESIDE = 45  # the process's other threads: one that holds the interpreter lock must be able to run
 SWITCH_INTERVAL_S = 0.0002  # the cycle must not wait the default 5 ms for an observing thread
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # on fault: untouched reservations use no memory

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fdhil.cia402 import COB_SDO_REQUEST, COB_SDO_RESPONSE, Object, emcy_text
+from fdhil.cia402 import COB_SDO_REQUEST, COB_SDO_RESPONSE, Object, describe_emergency
 from fdhil.commissioning.bus_listener import LISTEN_S, BusListener, Traffic
 from fdhil.commissioning.device_type import is_drive
 from fdhil.commissioning.survey import Identity
@@ -163,7 +163,7 @@ def scan_nodes(bus: BusScanner, axes: Mapping[int, str], descriptions: Sequence[
 
 def _node(traffic: Traffic, node_id: int, axis: str | None, answers: Answers | None) -> Node:
     codes = sorted(traffic.emergencies.get(node_id, set()) - {0})
-    emergencies = tuple(f"{code:04X} {emcy_text(code)}" for code in codes)
+    emergencies = tuple(f"{code:04X} {describe_emergency(code)}" for code in codes)
     return Node(node_id, axis, traffic.nmt(node_id), traffic.heartbeat_s(node_id), emergencies, answers)
 
 

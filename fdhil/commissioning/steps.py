@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from typing import NamedTuple
 
 from fdhil import cia402
-from fdhil.cia402 import Mode, NmtCommand, Object, State
+from fdhil.cia402 import Mode, NmtCommand, Object, PowerState
 from fdhil.commissioning.compare import found_fingerprint
 from fdhil.commissioning.feedforward import feedforward_open, prove_feedforward
 from fdhil.commissioning.finding import read_optional
@@ -34,7 +34,7 @@ ENABLE_TIMEOUT_S = 5.0
 SETTLE_CYCLES = 400
 BOOTED = "it has booted since it was compared, so its set-up may have changed; commission it again"
 AVERAGE_CYCLES = 200
-RAMPS = 8
+TRIAL_RAMPS = 8
 MOST_RAMPS = 24
 RAMP_CYCLES = 20
 EARLY_CYCLES = 8
@@ -66,16 +66,16 @@ def enable(master: Master) -> None:
     """Bring the drive to Operation enabled, holding its position; DriveFault if it does not get there."""
     deadline = time.monotonic() + ENABLE_TIMEOUT_S * master.patience
     reset_tried = False
-    while master.state() is not State.OPERATION_ENABLED:
+    while master.state() is not PowerState.OPERATION_ENABLED:
         if time.monotonic() > deadline:
             text = f"it stays in {master.state().value!r}; check supply, enable input and safe torque off"
             raise DriveFault(master.device, text)
-        if master.state() is State.FAULT:
+        if master.state() is PowerState.FAULT:
             if reset_tried:
                 raise faulted(master, "it is in fault")
             master.controlword, reset_tried = 0, True
             master.wait_cycles(10)
-        word = cia402.controlword_toward_enabled(master.state())
+        word = cia402.choose_enabling_controlword(master.state())
         if word is not None:
             master.hold_here()
             master.controlword = word
@@ -98,7 +98,7 @@ def disable(master: Master) -> None:
     for word in OFF_WORDS:
         master.controlword = word
         master.wait_cycles(20)
-    if master.state() is State.FAULT:
+    if master.state() is PowerState.FAULT:
         master.controlword = cia402.CONTROL_FAULT_RESET
         master.wait_cycles(20)
         master.controlword = cia402.CONTROL_DISABLE_VOLTAGE
@@ -180,7 +180,7 @@ def sign_test(master: Master) -> float:
         )
     ramp(master, 0, 1)
     master.wait_cycles(SETTLE_CYCLES)
-    return settings.scaling.to_mm(moved) * 1e3
+    return settings.scaling.convert_to_mm(moved) * 1e3
 
 
 def _sign_step(master: Master) -> int:
@@ -189,7 +189,7 @@ def _sign_step(master: Master) -> int:
         text = f"one increment is {1e3 / scaling.increments_per_mm:.3g} um, more than the sign test's {um:g} um"
         advice = "set a finer resolution in the drive, and correct drive.increments_per_rev"
         raise DriveFault(master.device, f"{text}: its scaling is too coarse for any correction; {advice}")
-    return scaling.to_increments(um / 1e3)
+    return scaling.convert_to_increments(um / 1e3)
 
 
 def feedforward_test(master: Master) -> bool | None:
@@ -211,11 +211,11 @@ def feedforward_test(master: Master) -> bool | None:
         goal = step * RAMP_CYCLES if number % 2 == 0 else 0
         excess += _early_excess(master, goal, step)
         master.wait_cycles(SETTLE_CYCLES // 2)
-        if number + 1 >= RAMPS and len(excess) >= RAMPS:
+        if number + 1 >= TRIAL_RAMPS and len(excess) >= TRIAL_RAMPS:
             break
     ramp(master, 0, 1)
     require_enabled(master)
-    if len(excess) < RAMPS:
+    if len(excess) < TRIAL_RAMPS:
         return None
     least, most = (sum(bounds) / len(excess) for bounds in zip(*excess, strict=True))
     return True if least > 0.5 * share else False if most < 0.25 * share else None

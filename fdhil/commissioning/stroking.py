@@ -34,7 +34,7 @@ class Travel(NamedTuple):
 
 def position_mm(master: Master) -> float:
     """Return the axis' position."""
-    return master.config.axis[master.axis].scaling.to_mm(master.heard.objects[master.profile.position])
+    return master.config.axis[master.axis].scaling.convert_to_mm(master.heard.objects[master.profile.position])
 
 
 def travel_of(master: Master, record: CommissioningRecord, room: Room, given: Travel | None = None) -> Travel:
@@ -51,7 +51,9 @@ def travel_of(master: Master, record: CommissioningRecord, room: Room, given: Tr
     low, high = start + room.back * unit, start + room.forward * unit
     limits: dict[str, Travel] = {}
     if record.travel is not None:
-        limits["its software limits (0x607D)"] = Travel(*sorted(scaling.to_mm(limit) for limit in record.travel))
+        limits["its software limits (0x607D)"] = Travel(
+            *sorted(scaling.convert_to_mm(limit) for limit in record.travel)
+        )
     if setpoints is not None:
         limits["[axis.*.setpoints]"] = Travel(*setpoints.travel_mm)
     if given is not None and not resumed:

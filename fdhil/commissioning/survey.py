@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from fdhil.cia402 import Mode, Object, State
+from fdhil.cia402 import Mode, Object, PowerState
 from fdhil.commissioning.bus_listener import UNREADABLE
 from fdhil.commissioning.compare_scales import compare_scales
 from fdhil.commissioning.device_type import describe, is_drive
@@ -368,5 +368,5 @@ def faulted(master: Master, what: str) -> DriveFault:
 
 def require_enabled(master: Master) -> None:
     """Raise DriveFault if the drive has left Operation enabled."""
-    if master.state() is not State.OPERATION_ENABLED:
+    if master.state() is not PowerState.OPERATION_ENABLED:
         raise faulted(master, f"it fell from Operation enabled to {master.state().value}")

@@ -8,7 +8,7 @@ import numpy as np
 from fdhil.cia402 import COB_SYNC
 from fdhil.commissioning.finding import Finding
 from fdhil.drivers.can.frames import Frames
-from fdhil.records import Float, frozen
+from fdhil.records import Float, freeze_array
 
 LONGEST = 3.0  # periods between two SYNCs: after a longer gap the guard ends a correction
 CODE = "SampleTiming"
@@ -29,7 +29,7 @@ def measure(frames: Frames, tpdos: Collection[int]) -> Timing:
     answers = frames["t_ns"][np.isin(frames["id"], list(tpdos))]
     place = np.searchsorted(sync, answers, side="right") - 1
     after = (answers - sync[np.maximum(place, 0)])[place >= 0] if sync.size else answers[:0]
-    return Timing(frozen(np.diff(sync) * 1e-9), frozen(after * 1e-9))
+    return Timing(freeze_array(np.diff(sync) * 1e-9), freeze_array(after * 1e-9))
 
 
 def judge_sync(interval_s: Float | Sequence[float], period_s: float, counted: bool) -> Finding:

@@ -14,7 +14,7 @@ import can
 
 from fdhil import config
 from fdhil.commissioning.bus_watch import BusWatch, WatchedRing
-from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.bus import ListeningBus
 from fdhil.drivers.can.frames import FrameRing
 from fdhil.drivers.can.port import Filter, Port
 from fdhil.drivers.can.python_can import VirtualPort
@@ -76,7 +76,7 @@ SENDERS: Mapping[str, Callable[[str, config.CanBus], SendingPort]] = {
 }
 
 
-class TransmitBus(CanBus):
+class TransmitBus(ListeningBus):
     """A bus that is listened to and sent on; it is read frame by frame, since answers are waited for.
 
     ``watch`` inspects all frames; without one the identifiers of the machine's own drives are unknown.

@@ -22,12 +22,12 @@ from fdhil.commissioning.survey import listen, require, survey
 from fdhil.commissioning.timing import judge_answers, judge_sync, measure
 from fdhil.commissioning.watchdog import watched
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.bus import ListeningBus
 from fdhil.errors import DeviceError, DriveFault, StoreError
 from fdhil.pipeline import Known
 from fdhil.records import Outcome, Recording
 
-RAPIDS = 6
+TRIAL_RAPIDS = 6
 TIMING_CYCLES = 1000
 REST_S = 0.8  # between two strokes: a window needs a quarter second before it, and a third after
 JOG_REST_S = 0.2
@@ -109,7 +109,7 @@ def try_axis(
                 operator.report("restore")
     trial.outcomes = tuple(identify(config, axis, capture.records, known))
     trial.found |= judged(config, axis, trial.outcomes, capture.recording(), operator)
-    trial.found["test rapids"] = {"rapid": str(rapid), "moves": RAPIDS, **trial.found["test rapids"]}
+    trial.found["test rapids"] = {"rapid": str(rapid), "moves": TRIAL_RAPIDS, **trial.found["test rapids"]}
     for step in FROM_RAPIDS:
         progress.keep(step, now, trial.found[step])
     return trial
@@ -187,7 +187,7 @@ def time_bus(master: Master) -> Found:
     SYNC evenness is reported but not assessed, since it is this computer's; ``fdhil check`` assesses the NC's.
     """
     name, counted = master.bus.name, master.config.guard.clock == "sync"
-    with CanBus(name, master.config.bus[name]) as bus:
+    with ListeningBus(name, master.config.bus[name]) as bus:
         master.wait_cycles(TIMING_CYCLES)
         timing = measure(bus.drain(), [spec.cob_base + master.node_id for spec in master.profile.tpdos])
     findings = [
@@ -232,7 +232,7 @@ def rapids_to_and_fro(master: Master, travel_mm: Travel, rapid: Stroke, operator
     """Move an enabled axis back and forth as fast as G0, and return the recording."""
     with Overhearing(master.config, master.axis, rapid.speed_mm_s) as capture:
         master.wait_cycles(round(REST_S / master.period_s))
-        for _ in range(RAPIDS // 2):
+        for _ in range(TRIAL_RAPIDS // 2):
             for moved in (rapid, rapid.back()):
                 stroke(master, travel_mm, moved, REST_S, operator.at)
         wait_heard(master, capture)

@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Callable, Iterator
 
-from fdhil.cia402 import NmtCommand, Object, State, emcy_text
+from fdhil.cia402 import NmtCommand, Object, PowerState, describe_emergency
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.moving import EMCY_HEARTBEAT
 from fdhil.commissioning.survey import require_enabled
@@ -36,16 +36,16 @@ def watchdog_test(master: Master, enable: Callable[[Master], None]) -> str:
             master.wait(lambda: _reacted(master, before_count), STARVE_TIMEOUT_S, "")
         master.wait_cycles(ANSWER_CYCLES)  # its EMCY may follow its statusword
         master.check()
-        if master.state() is State.OPERATION_ENABLED:  # by 0x1029 it may have left Operational silently
+        if master.state() is PowerState.OPERATION_ENABLED:  # by 0x1029 it may have left Operational silently
             master.nmt(NmtCommand.START)
             master.wait_cycles(ANSWER_CYCLES)
-        if master.state() is State.OPERATION_ENABLED:
+        if master.state() is PowerState.OPERATION_ENABLED:
             text = "it did not stop when fdhil's heartbeat ended: its watchdog does not work; check 0x1016 and 0x6007"
             raise DriveFault(master.device, text)
         codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[fed_from:]]
         if EMCY_HEARTBEAT not in codes:
-            shown = ", ".join(f"{code:04X} ({emcy_text(code)})" for code in codes) or "none"
-            missed = f"8130 ({emcy_text(EMCY_HEARTBEAT)})"
+            shown = ", ".join(f"{code:04X} ({describe_emergency(code)})" for code in codes) or "none"
+            missed = f"8130 ({describe_emergency(EMCY_HEARTBEAT)})"
             text = f"it stopped with the EMCY {shown} instead of {missed}; find the other cause of the stop"
             raise DriveFault(master.device, text)
     return "proven"
@@ -75,7 +75,7 @@ def _entry(node_id: int, period_s: float) -> int:
 
 
 def _reacted(master: Master, before_count: int) -> bool:
-    return master.state() is not State.OPERATION_ENABLED or len(master.heard.emergencies) > before_count
+    return master.state() is not PowerState.OPERATION_ENABLED or len(master.heard.emergencies) > before_count
 
 
 def _feed(master: Master, sub: int, entry: int, enable: Callable[[Master], None]) -> int:
@@ -91,7 +91,7 @@ def _feed(master: Master, sub: int, entry: int, enable: Callable[[Master], None]
         before_count = len(master.heard.emergencies)
         master.heartbeat = True
         master.wait_cycles(round(FEEDING_S / master.period_s))
-        if master.state() is State.OPERATION_ENABLED:
+        if master.state() is PowerState.OPERATION_ENABLED:
             return before_count
         codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[before_count:]]
         if EMCY_HEARTBEAT not in codes:

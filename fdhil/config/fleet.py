@@ -12,7 +12,7 @@ from fdhil.config.section import Section
 from fdhil.config.uplink import NatsServer
 from fdhil.config.web import Web
 
-NAME = r"^[A-Za-z0-9_-]{1,64}$"
+MACHINE_NAME_PATTERN = r"^[A-Za-z0-9_-]{1,64}$"
 
 
 class Server(NatsServer):
@@ -22,7 +22,7 @@ class Server(NatsServer):
 class Stream(Section):
     """[stream]: what the server keeps until it is in the database; created at the first start."""
 
-    name: str = Field("fdhil", pattern=NAME, description="name of the stream")
+    name: str = Field("fdhil", pattern=MACHINE_NAME_PATTERN, description="name of the stream")
     replicas: int = Field(1, ge=1, le=5, description="replicas of each message in the cluster")
     max_bytes: int = Field(
         10 << 30, ge=1 << 16, le=1 << 50, description="space for waiting messages; when full, machines keep theirs"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from fdhil.cia402 import target_range
+from fdhil.cia402 import compute_target_range
 from fdhil.config.axis import Axis
 from fdhil.config.offset_bounds import OffsetBounds
 
@@ -31,7 +31,7 @@ class PositionRange:
         """Return the range of an axis: INTEGER32 less the largest offset that may be sent to it."""
         most = OffsetBounds.given(axis, sync_period_s).whole[0] if axis.correction is not None else 0
         per_mm = axis.scaling.sign * axis.scaling.increments_per_mm
-        return PositionRange(name, *target_range(most), per_mm, axis.unit, axis.mm_per_unit)
+        return PositionRange(name, *compute_target_range(most), per_mm, axis.unit, axis.mm_per_unit)
 
     def fits(self, position_mm: float) -> bool:
         """Return whether the set-point of a finite position, with any allowed offset, fits into 32 bits."""

@@ -27,8 +27,8 @@ COST, BLOCK, LANES = 2**15, 8, 1
 SCRYPT_BYTES = 64 * 1024 * 1024
 SHORTEST_PASSWORD, LONGEST_PASSWORD = 10, 200
 MAX_FILE = 256 * 1024
-NAME = r"^[A-Za-z0-9][A-Za-z0-9._@-]{0,63}$"
-UserName = Annotated[str, StringConstraints(pattern=NAME)]
+USER_NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._@-]{0,63}$"
+UserName = Annotated[str, StringConstraints(pattern=USER_NAME_PATTERN)]
 
 
 class User(BaseModel):

@@ -55,7 +55,7 @@ def offsets(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: float
     turning = np.where(np.abs(demanded) > STILL_RAD_S, demanded, 0.0)
     smooth, dry = resisting(p, turning, reference_mm * 2 * np.pi / axis.screw_pitch_mm)
     # a load acts at rest too: there the speed loop's integral holds it
-    current = (p.Jt * acceleration + smooth + dry - p.term("load")) / p.K
+    current = (p.Jt * acceleration + smooth + dry - p.get_term("load")) / p.K
     times = np.arange(reference_mm.size) * dt_s
     early = np.interp(times + lead, times, current)
     # the drive's own feed-forward is the acceleration of the next row, held: half a cycle ahead as well

@@ -49,7 +49,7 @@ def demand(
         asked = required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
         share, what = max(zip((float(one.max()) for one in asked), ("current", "voltage"), strict=True))
         peak = float(np.abs(before.current_a[axis]).max()) / config.axis[axis].regulators.current_limit_a
-        place = reference.place(int(np.argmax(np.maximum(*asked))))
+        place = reference.describe_position(int(np.argmax(np.maximum(*asked))))
         if share > 1.0 or before.limited_s[axis] > STEADY_S:
             refused.append((axis, share, what, place))
         elif share > NEAR_SHARE or peak > NEAR_SHARE or before.limited_s[axis] > 0.0:
@@ -81,7 +81,7 @@ def worse_rows(before_um: Float, after_um: Float, dt_s: float) -> Bool:
 
 def harm_advice(models: Mapping[str, Parameters]) -> str:
     """Return the advice where a correction would do harm."""
-    swinging = {axis: model.term("resonance") for axis, model in models.items() if model.term("resonance")}
+    swinging = {axis: model.get_term("resonance") for axis, model in models.items() if model.get_term("resonance")}
     if not swinging:
         return "try the method inverse, or lower the feed there"
     axes = ", ".join(f"{axis} at {hertz:.0f} Hz" for axis, hertz in swinging.items())

@@ -50,7 +50,7 @@ def allowed_um(config: MachineConfig, axis: str) -> float:
 
 def lag_reason(name: str, needed_um: float, allowed_um: float, model: Parameters, axis: Axis) -> Reason:
     """Return the reason for an axis that lags, or a table that oscillates, by more than an offset may compensate."""
-    feedforward, hertz = axis.regulators.speed_feedforward, model.term("resonance")
+    feedforward, hertz = axis.regulators.speed_feedforward, model.get_term("resonance")
     needs = f"needs offsets of {needed_um:.0f} um, {allowed_um:.0f} um are allowed"
     if hertz and feedforward >= FULL:
         text = f"axis {name} {needs}: its table oscillates behind the motor at {hertz:.0f} Hz, beyond the drive's reach"

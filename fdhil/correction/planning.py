@@ -12,7 +12,7 @@ from fdhil.correction import gate
 from fdhil.correction.limits import fit_all
 from fdhil.correction.method import Method, Plan
 from fdhil.prediction.predict import predict, predict_corrected
-from fdhil.records import Correction, Float, Parameters, Prediction, Reason, Trajectory, frozen
+from fdhil.records import Correction, Float, Parameters, Prediction, Reason, Trajectory, freeze_array
 
 MASK_PASSES = 3
 
@@ -30,7 +30,7 @@ def plan(
     axis has no model; KeyError for an unknown method.
     """
     name = method or tables.DEFAULT_CORRECTION
-    factory: Method = tables.load(tables.CORRECTIONS, name)
+    factory: Method = tables.load_entry(tables.CORRECTIONS, name)
     before = predict(reference, models, config)
     warnings: tuple[Reason, ...] = ()
     refused = gate.writing_off(reference.axes, config) or gate.held_out(held_out_um)
@@ -43,7 +43,7 @@ def plan(
         offset, after, masked = _mask_harm(reference, models, config, before, wanted)
         refused = gate.result(before, after, wanted.untouched)
     if refused:
-        zero = dict.fromkeys(reference.axes, frozen(np.zeros(before.contour_um.size)))
+        zero = dict.fromkeys(reference.axes, freeze_array(np.zeros(before.contour_um.size)))
         also = zero if name == "flatness" else {}
         return Correction(name, before, before, zero, refused, warnings, 0.0, also, also)
     return Correction(
@@ -59,7 +59,7 @@ def plan(
 
 
 def _frozen(offsets: Mapping[str, Float]) -> dict[str, Float]:
-    return {axis: frozen(values) for axis, values in offsets.items()}
+    return {axis: freeze_array(values) for axis, values in offsets.items()}
 
 
 def _mask_harm(

@@ -17,7 +17,7 @@ from fdhil.prediction.gain import Gain
 from fdhil.prediction.inverse_dynamics import required
 from fdhil.prediction.retime import demand_sources
 from fdhil.program import Motion
-from fdhil.records import Correction, Float, Parameters, Prediction, Reason, Trajectory, rms
+from fdhil.records import Correction, Float, Parameters, Prediction, Reason, Trajectory, compute_rms
 
 
 def prediction_document(predicted: Prediction, models: Mapping[str, Parameters]) -> dict[str, Any]:
@@ -25,7 +25,7 @@ def prediction_document(predicted: Prediction, models: Mapping[str, Parameters])
     return {
         "duration_s": round(float(predicted.reference.time_s[-1] - predicted.reference.time_s[0]), 6),
         "axes": {
-            axis: {"rms_error_um": rms(error), "max_error_um": float(abs(error).max())}
+            axis: {"rms_error_um": compute_rms(error), "max_error_um": float(abs(error).max())}
             for axis, error in predicted.error_um.items()
         },
         "seen_at": seen_at(models),
@@ -63,7 +63,7 @@ def contour(predicted: Prediction) -> dict[str, float]:
 
 def seen_at(models: Mapping[str, Parameters]) -> dict[str, str]:
     """Return per axis the point of prediction: the table if the model has a resonance, else the encoder."""
-    return {axis: "table" if model.term("resonance") else "encoder" for axis, model in models.items()}
+    return {axis: "table" if model.get_term("resonance") else "encoder" for axis, model in models.items()}
 
 
 def zones(predicted: Prediction) -> list[dict[str, Any]]:
@@ -73,7 +73,7 @@ def zones(predicted: Prediction) -> list[dict[str, Any]]:
             "start_s": z.start_s,
             "end_s": z.end_s,
             "where": z.where,
-            "line": int(predicted.reference.line[predicted.worst_row(z)]),
+            "line": int(predicted.reference.line[predicted.find_worst_row(z)]),
             "max_um": z.max_um,
             "cause": z.cause,
         }

@@ -22,7 +22,7 @@ from fdhil.correction.limits import check
 from fdhil.correction.mirror import lag_reason
 from fdhil.model.closed_loop import Commands, Response, State, standing
 from fdhil.prediction.contour import WINDOW_S, contour_error_um
-from fdhil.records import Float, Parameters, Reason, table_path
+from fdhil.records import Float, Parameters, Reason, compute_table_path
 
 LIMITED_S = 0.02  # longer limiting within a block is not settling
 
@@ -165,10 +165,10 @@ def _gated(
     window: int,
 ) -> StreamBlock:
     low, high = max(0, kept - window), kept + rows + window
-    around = table_path((*path,), np.column_stack([values[low:high] for values in path.values()]))
+    around = compute_table_path((*path,), np.column_stack([values[low:high] for values in path.values()]))
     errors = []
     for which in ("before_mm", "after_mm"):
-        actual = table_path((*result,), np.column_stack([getattr(p, which) for p in result.values()]))
+        actual = compute_table_path((*result,), np.column_stack([getattr(p, which) for p in result.values()]))
         errors.append(contour_error_um(around, actual, config.machine.sync_period_s, kept - low))
     refused = [refusal for piece in result.values() for refusal in piece.refused]
     before_um, after_um = errors

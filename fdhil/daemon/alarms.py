@@ -58,7 +58,7 @@ class Alarm:
         return self.until is None or bool(self.waiting)
 
     @property
-    def rank(self) -> tuple[bool, bool, int]:
+    def urgency(self) -> tuple[bool, bool, int]:
         """Sort key: active before gone, MAJOR before minor, newest first."""
         return self.until is not None, self.newest.notice.severity != "MAJOR", -self.newest.number
 
@@ -71,19 +71,19 @@ class AlarmTable:
         self.ended: dict[int, Stamp] = {}
         """End of each ended alarm, by the number of the notice that raised it last and of the one that ended it."""
         for stored in notices:
-            self.take(stored)
+            self.take_notice(stored)
 
-    def take(self, stored: StoredNotice) -> None:
+    def take_notice(self, stored: StoredNotice) -> None:
         """Take the next notice."""
         notice = stored.notice
         codes = ENDED_BY.get(notice.code, (notice.code,) if notice.severity == "info" else ())
-        own = key_of(notice)
+        own = get_alarm_key(notice)
         for key in [key for key in self._alarms if key[0] in codes and (key[0] != notice.code or key == own)]:
-            self._end(key, stored)
+            self._end_alarm(key, stored)
         if notice.severity != "info":
-            self._raise(own, stored)
+            self._raise_alarm(own, stored)
 
-    def _raise(self, key: Key, stored: StoredNotice) -> None:
+    def _raise_alarm(self, key: Key, stored: StoredNotice) -> None:
         alarm = self._alarms.get(key)
         if alarm is None:
             alarm = self._alarms[key] = Alarm(stored, stored.stamp)
@@ -94,55 +94,55 @@ class AlarmTable:
         alarm.raised.append(stored)
         if stored.is_open:
             alarm.waiting.add(stored.number)
-        self._settle(key)
+        self._drop_finished(key)
 
-    def _end(self, key: Key, stored: StoredNotice) -> None:
+    def _end_alarm(self, key: Key, stored: StoredNotice) -> None:
         alarm = self._alarms[key]
         if alarm.until is None:
             alarm.until = stored.stamp
             self.ended[alarm.newest.number] = self.ended[stored.number] = stored.stamp
             for old in list(self.ended)[:-ENDS]:
                 del self.ended[old]
-        self._settle(key)
+        self._drop_finished(key)
 
-    def forget(self, number: int) -> None:
+    def forget_notice(self, number: int) -> None:
         """Drop a notice that is too old to be acknowledged."""
         for key, alarm in list(self._alarms.items()):
             if number in alarm.waiting:
                 alarm.waiting.discard(number)
-                self._settle(key)
+                self._drop_finished(key)
 
-    def acknowledge(self, given: Acknowledgement) -> None:
+    def acknowledge_notices(self, given: Acknowledgement) -> None:
         """Record that notices were acknowledged."""
         for key, alarm in list(self._alarms.items()):
             if alarm.waiting.intersection(given.notices):
                 alarm.waiting.difference_update(given.notices)
                 alarm.given = given
-                self._settle(key)
+                self._drop_finished(key)
 
-    def _settle(self, key: Key) -> None:
+    def _drop_finished(self, key: Key) -> None:
         if not self._alarms[key].is_shown:
             del self._alarms[key]
 
-    def shown(self) -> list[Alarm]:
+    def list_shown(self) -> list[Alarm]:
         """Return the alarms that are active or wait to be acknowledged, the most urgent first."""
-        return sorted(self._alarms.values(), key=lambda alarm: alarm.rank)
+        return sorted(self._alarms.values(), key=lambda alarm: alarm.urgency)
 
-    def left_active(self) -> list[Notice]:
+    def end_previous_conditions(self) -> list[Notice]:
         """Return notices that end the conditions of an earlier daemon; what persists is reported again."""
         left = [key for key, alarm in self._alarms.items() if alarm.until is None and key[0] not in KEPT_OVER_RESTART]
         text = "The daemon was restarted; the condition is reported again if it persists."
         return [Notice(code, "info", f"Bus {about}: {text}" if about else text, axis) for code, axis, about in left]
 
 
-def key_of(notice: Notice) -> Key:
+def get_alarm_key(notice: Notice) -> Key:
     """Return class, axis and, where an axis may have several alarms of the class, the bus or parameter it names."""
     pattern = _SUBJECTS.get(notice.code)
     named = pattern.search(notice.text) if pattern else None
     return notice.code, notice.axis, named[1] if named else ""
 
 
-def alarm_document(alarm: Alarm) -> dict[str, Any]:
+def build_alarm_document(alarm: Alarm) -> dict[str, Any]:
     """Return an alarm as a JSON document; ``since`` is the last time that it was raised."""
     notice = alarm.newest.notice
     return {
@@ -160,9 +160,9 @@ def alarm_document(alarm: Alarm) -> dict[str, Any]:
     }
 
 
-def alarms_status(alarms: Sequence[Alarm], most: int) -> dict[str, Any]:
+def build_alarms_status(alarms: Sequence[Alarm], most: int) -> dict[str, Any]:
     """Return how many alarms are active or unacknowledged, and the first ``most``, as a JSON document."""
     active = sum(alarm.until is None for alarm in alarms)
     waiting = sum(bool(alarm.waiting) for alarm in alarms)
-    first = [alarm_document(alarm) for alarm in alarms[:most]]
+    first = [build_alarm_document(alarm) for alarm in alarms[:most]]
     return {"active": active, "unacknowledged": waiting, "first": first}

@@ -21,7 +21,7 @@ class GantryWatch:
         self._largest_um = dict.fromkeys(self._limit_um, 0.0)
         self._skewed: set[str] = set()
 
-    def feed(self, samples: AxisSamples) -> None:
+    def take_samples(self, samples: AxisSamples) -> None:
         """Take a block of one drive."""
         axis = samples.axis[0]
         if axis not in self._limit_um or samples.tick.size == 0:
@@ -47,15 +47,15 @@ class GantryWatch:
                 if not self._waiting[name][0].size:
                     del self._waiting[name]
 
-    def look(self) -> tuple[bool, Sequence[Notice]]:
+    def check_skew(self) -> tuple[bool, Sequence[Notice]]:
         """Return whether any axis was skewed since the last call, and a notice for each skew that begins or ends."""
         found = {axis: um for axis, um in self._largest_um.items() if um > self._limit_um[axis]}
         new = [axis for axis in found if axis not in self._skewed]
         over = [Notice("GantrySkew", "info", "the drives agree again", axis) for axis in self._skewed - set(found)]
         self._skewed = set(found)
         self._largest_um = dict.fromkeys(self._limit_um, 0.0)
-        begun = [Notice("GantrySkew", "MAJOR", self._text(axis, found[axis]), axis) for axis in new]
+        begun = [Notice("GantrySkew", "MAJOR", self._describe_skew(axis, found[axis]), axis) for axis in new]
         return bool(found), begun + over
 
-    def _text(self, axis: str, um: float) -> str:
+    def _describe_skew(self, axis: str, um: float) -> str:
         return f"the drives {axis} and {axis}2 are {um:.0f} um apart, {self._limit_um[axis]:g} are allowed"

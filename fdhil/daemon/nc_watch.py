@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from fdhil.daemon.journal import printable
+from fdhil.daemon.service_log import escape_unprintable
 from fdhil.records import MoveKind, NcState, Notice
 
 FRESH_S = 1.0
@@ -28,22 +28,22 @@ class NcWatch:
         self._received_s = 0.0
         self._unusual: dict[str, str] = {}
 
-    def note(self, state: NcState, now_s: float) -> list[Notice]:
+    def take_state(self, state: NcState, now_s: float) -> list[Notice]:
         """Take a state; return notices for what becomes unusual, and for what is normal again."""
         self._state, self._received_s = state, now_s
         if state.motion is MoveKind.UNKNOWN:
             return []
-        found = dict(_unusual(state))
-        begun = [_notice(what, "minor", text) for what, text in found.items() if what not in self._unusual]
-        over = [_notice(what, "info", _usual(what)) for what in self._unusual if what not in found]
+        found = dict(_find_unusual(state))
+        begun = [_make_notice(what, "minor", text) for what, text in found.items() if what not in self._unusual]
+        over = [_make_notice(what, "info", _describe_normal_again(what)) for what in self._unusual if what not in found]
         self._unusual = found
         return begun + over
 
-    def placed(self, notice: Notice, now_s: float) -> Notice:
+    def add_nc_line(self, notice: Notice, now_s: float) -> Notice:
         """Return a notice as reported: printable, and unless it is info with the current line of the NC."""
-        return replace(notice, text=printable(notice.text + self._place(notice, now_s)))
+        return replace(notice, text=escape_unprintable(notice.text + self._describe_nc_line(notice, now_s)))
 
-    def _place(self, notice: Notice, now_s: float) -> str:
+    def _describe_nc_line(self, notice: Notice, now_s: float) -> str:
         state = self._state
         if state is None or notice.severity == "info" or state.line is None or state.motion not in WORKING:
             return ""
@@ -52,7 +52,7 @@ class NcWatch:
         program = "" if state.program is None else f" of {state.program.rpartition('/')[2]}"
         return f" (the NC is at line {state.line}{program})"
 
-    def status(self, now_s: float) -> dict[str, Any] | None:
+    def build_status(self, now_s: float) -> dict[str, Any] | None:
         """Return the NC's last reported state with its age; None when there was none."""
         state = self._state
         if state is None:
@@ -71,17 +71,17 @@ class NcWatch:
         }
 
 
-def _unusual(state: NcState) -> Iterator[tuple[str, str]]:
-    if state.held:
+def _find_unusual(state: NcState) -> Iterator[tuple[str, str]]:
+    if state.is_held:
         yield "feed hold", f"the NC's feed is held: {HELD}"
     for what, override in (("rapid override", state.rapid_override), ("feed override", state.feed_override)):
         if override is not None and abs(override - 1.0) > FULL:
             yield what, f"the NC's {what} is {100 * override:.0f} %: {ADVICE[what]}"
 
 
-def _usual(what: str) -> str:
+def _describe_normal_again(what: str) -> str:
     return "the NC's feed continues" if what == "feed hold" else f"the NC's {what} is 100 % again"
 
 
-def _notice(what: str, severity: Any, text: str) -> Notice:
+def _make_notice(what: str, severity: Any, text: str) -> Notice:
     return Notice("FeedHold" if what == "feed hold" else "OverrideChanged", severity, text)

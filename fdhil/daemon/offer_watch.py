@@ -16,7 +16,7 @@ class OfferWatch:
         self._store = config.store.directory
         self._reported: set[str] = set()
 
-    def look(self) -> list[Notice]:
+    def find_new_offers(self) -> list[Notice]:
         """Return a notice for each proposal that has arrived since the last call."""
         try:
             found = waiting(self._folder, self._store) if self._folder is not None else []

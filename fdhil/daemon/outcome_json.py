@@ -6,24 +6,24 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, WindowOutcome, unit_of
+from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, WindowOutcome, get_unit
 from fdhil.store.history import described, friction_of
 from fdhil.store.set_document import set_document
 
 
-def as_document(outcome: Outcome) -> dict[str, Any]:
+def build_outcome_document(outcome: Outcome) -> dict[str, Any]:
     """Return an outcome as a JSON document; ``kind`` is window, parameters, skill, notice or loops."""
     if isinstance(outcome, WindowOutcome):
-        return _window(outcome)
+        return _build_window_document(outcome)
     if isinstance(outcome, ParameterSet):
         return {"kind": "parameters", **set_document(outcome)}
     if isinstance(outcome, LoopEstimate):
-        return loops_document(outcome)
+        return build_loops_document(outcome)
     assert isinstance(outcome, Skill | Notice)
     return {"kind": "skill" if isinstance(outcome, Skill) else "notice", **asdict(outcome)}
 
 
-def loops_document(found: LoopEstimate) -> dict[str, Any]:
+def build_loops_document(found: LoopEstimate) -> dict[str, Any]:
     """Return the identified control loops of a drive as a JSON document."""
     stds = np.sqrt(np.diag(found.covariance)).tolist()
     gains = zip(found.names, found.values.tolist(), stds, strict=True)
@@ -40,9 +40,9 @@ def loops_document(found: LoopEstimate) -> dict[str, Any]:
     }
 
 
-def _window(outcome: WindowOutcome) -> dict[str, Any]:
+def _build_window_document(outcome: WindowOutcome) -> dict[str, Any]:
     window, verdict = outcome.window, outcome.verdict
-    all_figures = {name: figures | {"unit": unit_of(name)} for name, figures in described(outcome).items()}
+    all_figures = {name: figures | {"unit": get_unit(name)} for name, figures in described(outcome).items()}
     terms = outcome.estimate.terms if outcome.estimate else ()
     return {
         "kind": "window",
@@ -60,13 +60,13 @@ def _window(outcome: WindowOutcome) -> dict[str, Any]:
         "parameters": {name: figures for name, figures in all_figures.items() if name not in terms},
         "terms": {name: figures for name, figures in all_figures.items() if name in terms},
         "friction_at_rapid": friction_of(outcome),
-        "delay_s": _delay(outcome),
+        "delay_s": _build_delay_document(outcome),
         "at_table": None if outcome.at_table is None else asdict(outcome.at_table),
         "nc": None if window.nc is None else asdict(window.nc),
     }
 
 
-def _delay(outcome: WindowOutcome) -> dict[str, Any] | None:
+def _build_delay_document(outcome: WindowOutcome) -> dict[str, Any] | None:
     """Return the delay of the voltage against current and speed; None where it was not estimated."""
     estimate = outcome.estimate
     if estimate is None or estimate.delay_s is None or not math.isfinite(estimate.delay_s):

@@ -9,11 +9,11 @@ from typing import Any
 
 from fdhil.arming.answers import Answer
 from fdhil.config import MachineConfig
-from fdhil.daemon import journal
-from fdhil.daemon.notice_book import NEWEST, NotAcknowledged, NoticeBook, acknowledgement_of, counted
+from fdhil.daemon import service_log
+from fdhil.daemon.notice_log import NEWEST, NotAcknowledged, NoticeLog, describe_numbers, parse_acknowledgement
 from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.errors import StoreError
-from fdhil.identification.between import HISTORY, Member
+from fdhil.identification.between import HISTORY_WINDOWS, Member
 from fdhil.identification.drift import Point
 from fdhil.pipeline import POOL_WINDOWS, Known
 from fdhil.records import (
@@ -26,11 +26,11 @@ from fdhil.records import (
     ParameterSet,
     Skill,
     WindowOutcome,
-    frozen,
+    freeze_array,
 )
 from fdhil.store import WINDOWS_FOLDER as WINDOWS_FOLDER
 from fdhil.store.atomic import sync_folder
-from fdhil.store.history import FILE_NAME, History
+from fdhil.store.history import HISTORY_FILE_NAME, History
 from fdhil.store.newest_sets import newest_loops, newest_sets
 from fdhil.store.outbox import Outbox
 from fdhil.store.rows import Revision, Stamp, StoredWindow
@@ -42,7 +42,7 @@ SKILLS = 3
 SUFFIXES = ("-wal", "-shm", "")
 
 
-def raw_scales(config: MachineConfig, axis: str) -> Scales:
+def get_raw_scales(config: MachineConfig, axis: str) -> Scales:
     """Return the scales from the drive's integers to the values of each column, as the drivers apply them."""
     settings = config.axis[axis]
     profile = load_profile(settings.drive)
@@ -57,17 +57,19 @@ def raw_scales(config: MachineConfig, axis: str) -> Scales:
     }
 
 
-def _numbers(window: StoredWindow, key: str) -> Float:
+def _read_figures(window: StoredWindow, key: str) -> Float:
     """Return a figure (6,) of each parameter of a stored window, NaN where it is missing."""
     figures = window.parameters or {}
-    return frozen([math.nan if (number := figures.get(name, {}).get(key)) is None else number for name in PARAMETERS])
+    return freeze_array(
+        [math.nan if (number := figures.get(name, {}).get(key)) is None else number for name in PARAMETERS]
+    )
 
 
-def _members(windows: Sequence[StoredWindow]) -> tuple[Member, ...]:
+def _read_pool_members(windows: Sequence[StoredWindow]) -> tuple[Member, ...]:
     members = []
     for place, window in enumerate(windows, start=1 - len(windows)):
         if (pooled := window.told) is not None:
-            values, own, shared = (frozen(pooled[key]) for key in ("values", "own", "shared"))
+            values, own, shared = (freeze_array(pooled[key]) for key in ("values", "own", "shared"))
             members.append(Member(tuple(pooled["names"]), values, own, shared, place, window.direction))
     return tuple(members)
 
@@ -84,11 +86,13 @@ class OutcomeStore:
         self._directory = config.store.directory
         self._lock = threading.Lock()
         self._outbox = Outbox(config.uplink, config.uplink_directory) if config.uplink else None
-        self._scales = {axis: raw_scales(config, axis) for axis in config.axis}
+        self._scales = {axis: get_raw_scales(config, axis) for axis in config.axis}
         self._history: History | None = None
         self._windows: WindowStore | None = None
-        self._accepted = {axis: deque[tuple[int, int]](maxlen=HISTORY) for axis in config.axis}  # start tick and row
-        self.notices = NoticeBook()
+        self._accepted = {
+            axis: deque[tuple[int, int]](maxlen=HISTORY_WINDOWS) for axis in config.axis
+        }  # start tick and row
+        self.notices = NoticeLog()
         self.fault: str | None = None
         self._file_reported = False
         self.strays: tuple[str, ...] = ()
@@ -97,13 +101,13 @@ class OutcomeStore:
         """Open or create the store; a damaged history is moved aside, never deleted. Return notices."""
         notices = []
         try:
-            notices += self._open()
-            notices += self.notices.left_active()
+            notices += self._open_files()
+            notices += self.notices.end_previous_conditions()
         except StoreError as error:
             if error.code == "CorruptFile":
-                notices += self._put_aside(error)
+                notices += self._put_history_aside(error)
             else:
-                notices += self._refused(error)
+                notices += self._note_refusal(error)
         if self.strays:
             names = ", ".join(self.strays[:5])
             folder = self._directory / WINDOWS_FOLDER
@@ -111,7 +115,7 @@ class OutcomeStore:
             notices.append(Notice("StrayFiles", "minor", text))
         return notices
 
-    def _open(self) -> list[Notice]:
+    def _open_files(self) -> list[Notice]:
         new = self._history is None
         if self._history is None:
             outbox = self._outbox
@@ -119,16 +123,16 @@ class OutcomeStore:
             self._history = History.open(self._directory, *adding)
         folder = self._directory / WINDOWS_FOLDER
         self._windows = WindowStore(folder, self._config.store.keep_windows, self._config.digest)
-        self.strays = tuple(map(journal.printable, self._windows.strays))
+        self.strays = tuple(map(service_log.escape_unprintable, self._windows.strays))
         if not new:
             return []
         places = self._history.put_damaged_aside()
-        self.notices.begin(self._history.notices(limit=NEWEST))
+        self.notices.load_history(self._history.notices(limit=NEWEST))
         self._history.checkpoint()
         text = f"Damaged rows of the history were moved aside, older ones are used: {places}; check the disk."
         return [Notice("CorruptFile", "MAJOR", text)] if places else []
 
-    def _leave_replaced(self) -> list[Notice]:
+    def _abandon_replaced_history(self) -> list[Notice]:
         """Close a history whose file was replaced, removed or overwritten; the new file is opened next."""
         if self._history is None or self._history.is_in_place():
             return []
@@ -137,24 +141,24 @@ class OutcomeStore:
         self._history = None
         for rows in self._accepted.values():
             rows.clear()  # row numbers of the old file
-        path = self._directory / FILE_NAME
+        path = self._directory / HISTORY_FILE_NAME
         text = f"{path} was replaced, removed or overwritten while the daemon ran: records made since that file"
         return [Notice("StoreReplaced", "MAJOR", f"{text} was written are not in it; new records go to the new file.")]
 
-    def _put_aside(self, error: StoreError) -> list[Notice]:
-        path = self._directory / FILE_NAME
+    def _put_history_aside(self, error: StoreError) -> list[Notice]:
+        path = self._directory / HISTORY_FILE_NAME
         k = 1
-        while any(path.with_name(f"{FILE_NAME}.corrupt-{k}{suffix}").exists() for suffix in SUFFIXES):
+        while any(path.with_name(f"{HISTORY_FILE_NAME}.corrupt-{k}{suffix}").exists() for suffix in SUFFIXES):
             k += 1
-        aside = path.with_name(f"{FILE_NAME}.corrupt-{k}")
+        aside = path.with_name(f"{HISTORY_FILE_NAME}.corrupt-{k}")
         try:
             for suffix in SUFFIXES:
                 with suppress(FileNotFoundError):
-                    path.with_name(FILE_NAME + suffix).rename(path.with_name(aside.name + suffix))
+                    path.with_name(HISTORY_FILE_NAME + suffix).rename(path.with_name(aside.name + suffix))
             sync_folder(self._directory)
-            notices = self._open()
+            notices = self._open_files()
         except (OSError, StoreError):
-            return self._refused(error)
+            return self._note_refusal(error)
         text = f"The history was damaged; it is kept as {aside.name}, and a new one was started; check the disk."
         return [Notice("CorruptFile", "MAJOR", text), *notices]
 
@@ -165,97 +169,101 @@ class OutcomeStore:
                 self._history.close()
                 self._history = None
 
-    def newest(self) -> dict[str, Revision]:
+    def read_newest_revisions(self) -> dict[str, Revision]:
         """Return the newest revision of each axis in the history."""
         return {} if self._history is None else newest_sets(self._history, self._config.axis)
 
-    def skills(self) -> list[Skill]:
+    def read_newest_skills(self) -> list[Skill]:
         """Return the newest skills of all axes, oldest first."""
         if self._history is None:
             return []
         return [skill for axis in self._config.axis for skill in self._history.skills(axis, limit=SKILLS)]
 
-    def known(self, axis: str) -> Known:
+    def read_axis_history(self, axis: str) -> Known:
         """Return what an earlier run left: first values, newest set, estimates of the newest accepted windows."""
         if self._history is None:
             return Known()
         newest = self._history.revisions(axis, limit=1)
         first = {
-            direction: Parameters.of(dict(zip(PARAMETERS, _numbers(window, "value"), strict=True)))
+            direction: Parameters.from_mapping(dict(zip(PARAMETERS, _read_figures(window, "value"), strict=True)))
             for direction, window in self._history.first_windows(axis).items()
         }
-        windows = [window for window in self._history.windows(axis, limit=2 * HISTORY) if window.accepted][-HISTORY:]
+        windows = [window for window in self._history.windows(axis, limit=2 * HISTORY_WINDOWS) if window.accepted][
+            -HISTORY_WINDOWS:
+        ]
         points = tuple(
-            Point(_numbers(window, "value"), _numbers(window, "std"), window.start_tick, window.direction)
+            Point(_read_figures(window, "value"), _read_figures(window, "std"), window.start_tick, window.direction)
             for window in windows[-4 * POOL_WINDOWS :]
         )
         published = newest[0].set if newest else None
         loops = newest_loops(self._history, axis, self._config.digest)
-        return Known(first, published, points, _members(windows), loops)
+        return Known(first, published, points, _read_pool_members(windows), loops)
 
-    def counts(self, axis: str) -> tuple[int, int]:
+    def count_windows(self, axis: str) -> tuple[int, int]:
         """Return how many windows of an axis were ever accepted and refused."""
         return (0, 0) if self._history is None else self._history.counts(axis)
 
-    def keep(self, outcomes: Sequence[Outcome]) -> list[Notice]:
+    def store_outcomes(self, outcomes: Sequence[Outcome]) -> list[Notice]:
         """Store outcomes durably in order; return a notice when that fails, and one when it works again."""
         with self._lock:
             notices = []
             try:
-                notices += self._leave_replaced()
-                notices += self._write(outcomes)
-                if replaced := self._leave_replaced():  # replaced during the write
-                    notices += [*replaced, *self._write(outcomes)]
+                notices += self._abandon_replaced_history()
+                notices += self._write_outcomes(outcomes)
+                if replaced := self._abandon_replaced_history():  # replaced during the write
+                    notices += [*replaced, *self._write_outcomes(outcomes)]
             except StoreError as error:
-                return notices + self._refused(error)
-            notices += self._left_files()
+                return notices + self._note_refusal(error)
+            notices += self._report_undeleted_file()
             if self.fault is not None and any(isinstance(outcome, WindowOutcome) for outcome in outcomes):
                 self.fault = None
                 text = "The store can be written again; records in between were not stored, arm again when needed."
                 notices.append(Notice("StoreRecovered", "info", text))
         return notices
 
-    def _write(self, outcomes: Sequence[Outcome]) -> list[Notice]:
-        notices = self._open() if self._history is None or self._windows is None else []
+    def _write_outcomes(self, outcomes: Sequence[Outcome]) -> list[Notice]:
+        notices = self._open_files() if self._history is None or self._windows is None else []
         assert self._history is not None
         for outcome in outcomes:
-            self._keep(outcome)
+            self._store_outcome(outcome)
         self._history.checkpoint()
         return notices
 
-    def _left_files(self) -> list[Notice]:
+    def _report_undeleted_file(self) -> list[Notice]:
         left = self._windows.left if self._windows is not None else None
         if left is None or self._file_reported:
             return []
         self._file_reported = True
         return [Notice("StrayFiles", "minor", str(left))]
 
-    def acknowledge(self, request: Mapping[str, Any]) -> Answer:
+    def store_acknowledgement(self, request: Mapping[str, Any]) -> Answer:
         """Store an acknowledgement of notices; StoreError when the disk refuses."""
         with self._lock:
             try:
-                given = acknowledgement_of(request, self.notices.chosen(request), Stamp.now(self._clock))
+                given = parse_acknowledgement(request, self.notices.select_open(request), Stamp.now(self._clock))
             except NotAcknowledged as refused:
                 return refused.answer
             if self._history is None:
-                self._open()
+                self._open_files()
             assert self._history is not None
             self._require_in_place(self._history)
             if given.notices:
                 self._history.add_acknowledgement(given)
                 self._require_in_place(self._history)
                 self._history.checkpoint()
-                self.notices.acknowledged(given)
-        text = f"{counted(given.notices)} acknowledged by {given.who}; {self.notices.status()['count']} more are open"
-        journal.write_line(text)
+                self.notices.note_acknowledged(given)
+        text = f"{describe_numbers(given.notices)} acknowledged by {given.who}; {self.notices.build_status()['count']} more are open"
+        service_log.write_line(text)
         return {"ok": True, "text": text, "acknowledged": list(given.notices)}
 
     def _require_in_place(self, history: History) -> None:
         if not history.is_in_place():
-            text = f"{self._directory / FILE_NAME} was replaced; nothing is acknowledged; check the notices again"
+            text = (
+                f"{self._directory / HISTORY_FILE_NAME} was replaced; nothing is acknowledged; check the notices again"
+            )
             raise StoreError(text, "StoreReplaced")
 
-    def _keep(self, outcome: Outcome) -> None:
+    def _store_outcome(self, outcome: Outcome) -> None:
         assert self._history is not None
         assert self._windows is not None
         stamp = Stamp.now(self._clock)
@@ -270,13 +278,13 @@ class OutcomeStore:
             ids = [number for tick, number in self._accepted[outcome.axis] if tick in outcome.window_ticks]
             self._history.add_revision(outcome, ids, stamp)
         elif isinstance(outcome, Notice):
-            self.notices.stored(outcome, self._history.add_notice(outcome, stamp), stamp)
+            self.notices.add_stored(outcome, self._history.add_notice(outcome, stamp), stamp)
         elif isinstance(outcome, LoopEstimate):
             self._history.add_loops(outcome, stamp)
         else:
             self._history.add_skill(outcome, stamp)
 
-    def _refused(self, error: StoreError) -> list[Notice]:
+    def _note_refusal(self, error: StoreError) -> list[Notice]:
         again, self.fault = self.fault == error.code, error.code
         self._windows = None  # its folder may be gone
         if again:

@@ -25,14 +25,14 @@ class RecordQueue:
         else:
             self._queue.put_nowait(record)
 
-    async def batch(self) -> list[Record]:
+    async def take_batch(self) -> list[Record]:
         """Return all waiting records, once there are any."""
         records = [await self._queue.get()]
         while not self._queue.empty():
             records.append(self._queue.get_nowait())
         return records
 
-    def digested(self, records: int) -> None:
+    def mark_processed(self, records: int) -> None:
         """Note that this number of returned records was processed."""
         for _ in range(records):
             self._queue.task_done()

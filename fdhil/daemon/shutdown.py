@@ -11,14 +11,14 @@ from collections.abc import Callable, Coroutine
 from dataclasses import astuple, dataclass
 from typing import Any
 
-from fdhil.daemon import journal
+from fdhil.daemon import service_log
 
 EXIT_CODE = 3
 TEARDOWN_S = 2.0  # of the event loop, after the last step
 
 
 @dataclass(frozen=True, slots=True)
-class Budgets:
+class StepBudgets:
     """Time limit of each step, s; systemd's TimeoutStopSec is above ``total_s``."""
 
     zero_s: float = 20.0  # the guard answers at a SYNC, or when it has missed it for 10 s; then it ramps
@@ -46,14 +46,14 @@ class Shutdown:
         self._deadlines_s: dict[str, float] = {}
         self._limit: threading.Timer | None = None
 
-    def begin(self) -> None:
+    def start_deadline(self) -> None:
         """End the process after ``total_s``, whatever is still running."""
         if self._limit is None and self._leave is not None:
-            self._limit = threading.Timer(self.total_s, self._give_up)
+            self._limit = threading.Timer(self.total_s, self._exit_now)
             self._limit.daemon = True
             self._limit.start()
 
-    async def step(self, what: str, work: Coroutine[Any, Any, Any], within_s: float, effect: str) -> None:
+    async def run_step(self, what: str, work: Coroutine[Any, Any, Any], within_s: float, effect: str) -> None:
         """Run one step within its time, counted from its first start; else report it with its ``effect``."""
         now_s = asyncio.get_running_loop().time()
         deadline_s = self._deadlines_s.setdefault(what, now_s + within_s)
@@ -66,7 +66,7 @@ class Shutdown:
             task.result()
         elif what not in self.overrun:
             self.overrun.append(what)
-            journal.write_line(
+            service_log.write_line(
                 f"stopping: {what} is not finished after {within_s:g} s and is abandoned; {effect}", "MAJOR"
             )
 
@@ -75,13 +75,13 @@ class Shutdown:
         if self.overrun and self._leave is not None:
             self._leave(EXIT_CODE)
 
-    def end(self) -> None:
+    def cancel_deadline(self) -> None:
         """Cancel the limit."""
         if self._limit is not None:
             self._limit.cancel()
 
-    def _give_up(self) -> None:
+    def _exit_now(self) -> None:
         with contextlib.suppress(Exception):  # nothing may prevent the exit
-            journal.write_line(f"not stopped after {self.total_s:g} s: the process ends now", "MAJOR")
+            service_log.write_line(f"not stopped after {self.total_s:g} s: the process ends now", "MAJOR")
         assert self._leave is not None
         self._leave(EXIT_CODE)

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Mapping
 
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.bus import CanBus, ListenedBus, OpenBus
+from fdhil.drivers.can.bus import ListenedBus, ListeningBus, OpenBus
 from fdhil.drivers.can.frame_history import FrameHistory
 from fdhil.drivers.can.port import Stamps
 from fdhil.drivers.can.tick_clock import TickClock
@@ -27,7 +27,7 @@ STAMPS_COST: Mapping[Stamps, str] = {
 class BusSource:
     """One bus: drains the ring, decodes the frames, and reconnects after a failure."""
 
-    def __init__(self, name: str, config: MachineConfig, open_bus: OpenBus = CanBus) -> None:
+    def __init__(self, name: str, config: MachineConfig, open_bus: OpenBus = ListeningBus) -> None:
         self.name = name
         self._config, self._open_bus = config, open_bus
         self._bus: ListenedBus | None = None

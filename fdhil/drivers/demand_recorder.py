@@ -10,7 +10,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
-from fdhil.records import AxisSamples, Float, Int, Notice, Trajectory, frozen, frozen_ints
+from fdhil.records import AxisSamples, Float, Int, Notice, Trajectory, freeze_array, freeze_integers
 
 _SPOILING = ("DemandMismatch", "BusDown", "SyncCollision", "RxOverflow", "ForeignProducer")
 
@@ -119,12 +119,12 @@ class DemandRecorder:
             tick = np.concatenate(axis.ticks) if axis.ticks else np.empty(0, np.int64)
             inside = (tick >= first) & (tick < stop)
             rows[tick[inside] - first] = (np.concatenate(axis.demands) if axis.ticks else np.empty(0))[inside]
-            position[name] = frozen(rows)
+            position[name] = freeze_array(rows)
             gaps += [Gap(name, int(run[0]), int(run[-1]) + 1) for run in _runs(np.flatnonzero(np.isnan(rows)))]
         rapid = np.zeros(stop - first, np.bool_)
         rapid.setflags(write=False)
-        time_s = frozen(np.arange(stop - first) * self._dt_s)
-        line = frozen_ints(np.zeros(stop - first))
+        time_s = freeze_array(np.arange(stop - first) * self._dt_s)
+        line = freeze_integers(np.zeros(stop - first))
         reference = Trajectory(self._dt_s, time_s, position, rapid, line, mm_per_degree=self._mm_per_degree)
         return RecordedDemand(reference, tuple(gaps), tuple(self._doubts.values()))
 

@@ -14,7 +14,7 @@ from contextlib import asynccontextmanager
 from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.drivers.bus_source import BusSource
-from fdhil.drivers.can.bus import CanBus, OpenBus
+from fdhil.drivers.can.bus import ListeningBus, OpenBus
 from fdhil.drivers.can.frame_history import candump
 from fdhil.drivers.nc.listener import NcListener
 from fdhil.drivers.sensor_source import Record, SensorSource, Take, sensors_of
@@ -27,7 +27,7 @@ __all__ = ["MachineSource", "Record", "open_machine"]
 class MachineSource:
     """All sources of a machine; ``run`` hands over their records, ``read_counters`` returns their counts."""
 
-    def __init__(self, config: MachineConfig, open_bus: OpenBus = CanBus) -> None:
+    def __init__(self, config: MachineConfig, open_bus: OpenBus = ListeningBus) -> None:
         used = dict.fromkeys(axis.drive.bus for axis in config.axis.values())
         self._buses = {name: BusSource(name, config, open_bus) for name in used}
         self._sensors = {
@@ -72,7 +72,7 @@ class MachineSource:
                 for event in bus.hear_nc(record):
                     take(event)
 
-    def counters(self) -> dict[str, int]:
+    def get_counters(self) -> dict[str, int]:
         """Return the frames received and lost in total, and per bus and sensor with its name in front."""
         buses = {name: bus.counters() for name, bus in self._buses.items()}
         flat = {"frames": sum(c["frames"] for c in buses.values()), "lost": sum(c["lost"] for c in buses.values())}
@@ -84,7 +84,7 @@ class MachineSource:
             flat |= {f"nc.{key}": value for key, value in self._nc.counters().items()}
         return flat
 
-    def black_box(self) -> dict[str, str]:
+    def dump_recent_frames(self) -> dict[str, str]:
         """Return the frames of the last 10 s of each bus, as the lines of a candump log."""
         return {name: candump(name, bus.history.frames()) for name, bus in self._buses.items()}
 
@@ -95,7 +95,7 @@ class MachineSource:
 
 
 @asynccontextmanager
-async def open_machine(config: MachineConfig, open_bus: OpenBus = CanBus) -> AsyncIterator[MachineSource]:
+async def open_machine(config: MachineConfig, open_bus: OpenBus = ListeningBus) -> AsyncIterator[MachineSource]:
     """Open everything that the configuration names; ConnectError (exit code 3) when a device cannot be reached."""
     source = MachineSource(config, open_bus)
     try:

@@ -19,7 +19,7 @@ from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.link import Link
 from fdhil.drivers.told_count import ToldCount
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
-from fdhil.records import Notice, VoltageSamples, frozen, frozen_ints
+from fdhil.records import Notice, VoltageSamples, freeze_array, freeze_integers
 
 GATHER_S = 0.05  # values are handed over together, as often as other sensors are polled
 SYNC_LATENESS_NS = 200_000  # delay of a SYNC's stamp on a busy computer
@@ -171,9 +171,13 @@ class MeterVoltage:
         if not volts:
             return []
         rate_hz = 1e9 / self._grid.period_ns
-        placed = frozen_ints(np.array(counter)), frozen_ints(np.array(t_ns)), frozen_ints(np.array(error_ns))
+        placed = (
+            freeze_integers(np.array(counter)),
+            freeze_integers(np.array(t_ns)),
+            freeze_integers(np.array(error_ns)),
+        )
         on_grid = self._mean or self._meter.tells_by_itself
-        return [VoltageSamples(self.name, self.axis, *placed, frozen(np.array(volts)), rate_hz, on_grid)]
+        return [VoltageSamples(self.name, self.axis, *placed, freeze_array(np.array(volts)), rate_hz, on_grid)]
 
     def _when(self, one: _Value, ticks: TickClock) -> tuple[float, float, float]:
         """Return the host time (ns) of a value, its delay, and its uncertainty, without the meter's filter."""

@@ -48,7 +48,7 @@ def sensors_of(axis: str, config: MachineConfig) -> dict[str, Sensor]:
     """Create the separate sensors of an axis, by what they measure."""
     settings, found = config.axis[axis], {}
     if settings.voltage.separate:
-        found["voltage"] = tables.load(tables.VOLTAGE_SOURCES, settings.voltage.source)(axis, config)
+        found["voltage"] = tables.load_entry(tables.VOLTAGE_SOURCES, settings.voltage.source)(axis, config)
     if settings.temperature is not None:
         found["temperature"] = SlidewayThermometer(axis, settings.temperature)
     if settings.table is not None and settings.table.source == "modbus":

@@ -4,7 +4,7 @@ from typing import Any, LiteralString
 
 from fdhil.errors import StoreError
 from fdhil.fleet.sets import Db
-from fdhil.records import INTERVAL_95, unit_of
+from fdhil.records import INTERVAL_95, get_unit
 
 MOST_LISTED = 1000  # limit of listed windows (changed verdict or unreadable); all of them are counted
 # labels as reported last; an axis' own label overrides its machine's
@@ -80,7 +80,7 @@ def changes(db: Db, revision: int, by: str) -> dict[str, Any]:
         "method": method["method"],
         **counts,
         "by": by,
-        "moved": [row | {"unit": unit_of(row["parameter"])} for row in moved],
+        "moved": [row | {"unit": get_unit(row["parameter"])} for row in moved],
         "verdicts": db.execute(_LABELLED + _VERDICTS, arguments).fetchall(),
         "listed": [
             row | {"recorded_at": row["recorded_at"].isoformat(timespec="seconds")}

@@ -23,7 +23,7 @@ from nats.aio.msg import Msg
 from nats.js import JetStreamContext
 
 from fdhil.config.fleet import Fleet
-from fdhil.daemon import journal
+from fdhil.daemon import service_log
 from fdhil.errors import StoreError
 from fdhil.fleet import migrations, objects
 from fdhil.fleet.message import Record, Unread, decode
@@ -133,7 +133,7 @@ class Collector:
         await migrations.bring_up(db)
         await db.execute(_INCOMING)
         reader = await prepare_stream(client.jetstream(), self._fleet.stream)
-        journal.write_line("connected to the server and the database")
+        service_log.write_line("connected to the server and the database")
         coming = asyncio.ensure_future(_next(reader))
         try:
             while True:
@@ -192,7 +192,9 @@ class Collector:
                 await cursor.execute(NOTE_INCOMING)
                 await _put_aside(cursor, aside)
         for subject, unread in aside:
-            journal.write_line(f"part of a message of {subject} was refused and stored apart: {unread.reason}", "minor")
+            service_log.write_line(
+                f"part of a message of {subject} was refused and stored apart: {unread.reason}", "minor"
+            )
 
 
 def _dated(record: Record, stored_at: datetime) -> Record:

@@ -15,7 +15,7 @@ from nats.js import JetStreamContext
 from nats.js.api import DiscardPolicy, Header, StorageType, StreamConfig
 
 from fdhil.config import MachineConfig
-from fdhil.daemon import journal
+from fdhil.daemon import service_log
 from fdhil.errors import StoreError
 from fdhil.fleet.message import Message, of_answer
 from fdhil.fleet.offer import LARGEST, Offer, OfferRefused, read
@@ -140,7 +140,7 @@ class Letterbox:
         except StoreError as error:
             complaint = str(error)
         if complaint and complaint != self._last_complaint:
-            journal.write_line(complaint, "minor")
+            service_log.write_line(complaint, "minor")
         self._last_complaint = complaint
         return [of_answer(asdict(each), self._machine, store) for each in self._answers()]
 
@@ -153,7 +153,7 @@ class Letterbox:
             self._reported = min(self._reported, len(answers))  # the file was started again
             return answers[self._reported :]
         except StoreError as error:
-            journal.write_line(str(error), "minor")
+            service_log.write_line(str(error), "minor")
             return []
 
     def _lay(self, documents: list[bytes]) -> None:
@@ -164,7 +164,7 @@ class Letterbox:
             try:
                 offer = read(document, self._config.offers.trust)
             except OfferRefused as error:
-                journal.write_line(f"an offer was ignored: {error}", "minor")
+                service_log.write_line(f"an offer was ignored: {error}", "minor")
                 continue
             wanted[folder / file_name(offer.name, offer.version)] = document
         try:
@@ -176,7 +176,7 @@ class Letterbox:
         for path, document in wanted.items():
             if not _is(path, document):
                 write_file(path, document)
-                journal.write_line(f"new offer of the fleet server in {path}; review it with fdhil offers list")
+                service_log.write_line(f"new offer of the fleet server in {path}; review it with fdhil offers list")
 
 
 def _is(path: Path, document: bytes) -> bool:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from fdhil.config import Maintenance
 from fdhil.fleet.sets import OF_AXES, SERVICED, Axis, Db, Row, asked, axes_of, newest_sets, std_of
-from fdhil.records import PARAMETERS, unit_of
+from fdhil.records import PARAMETERS, get_unit
 from fdhil.report.history_trends import of_axis
 from fdhil.store.rows import Stamp, StoredWindow
 
@@ -58,7 +58,7 @@ def due(db: Db) -> list[dict[str, Any]]:
     due_limits = []
     for key, each in limits.items():
         for parameter, limit in each.items():
-            place = {"machine": key[0], "axis": key[1], "parameter": parameter, "unit": unit_of(parameter)}
+            place = {"machine": key[0], "axis": key[1], "parameter": parameter, "unit": get_unit(parameter)}
             due_limits.append(place | {"value": last[key][parameter]} | dict(limit))
     return sorted(due_limits, key=lambda each: datetime.fromisoformat(each["date"]))
 

@@ -19,14 +19,14 @@ from nacl.exceptions import CryptoError
 from nacl.signing import VerifyKey
 from pydantic import Field, FiniteFloat, StringConstraints, ValidationError, model_validator
 
-from fdhil.config.fleet import NAME as MACHINE
+from fdhil.config.fleet import MACHINE_NAME_PATTERN as MACHINE
 from fdhil.config.from_afar import never
 from fdhil.config.offers import key_bytes
 from fdhil.config.reading import checked_value
 from fdhil.config.section import Section
 from fdhil.config.uplink import Label, Labels
 from fdhil.errors import ConfigError, ConfigFault, FdhilError
-from fdhil.store.offers import NAME
+from fdhil.store.offers import OFFER_NAME_PATTERN
 
 SCHEMA = "fdhil-offer-1"
 LARGEST = 512 * 1024  # bytes of an offer
@@ -47,7 +47,7 @@ class OfferRefused(FdhilError):
 class Change(Section):
     """A proposed change: ``values`` by their keys, ``axis.*`` for each axis that has the ``axis_labels``."""
 
-    name: str = Field(pattern=f"^{NAME}$")
+    name: str = Field(pattern=f"^{OFFER_NAME_PATTERN}$")
     version: int = Field(ge=1, le=999_999_999)
     text: Label
     labels: Labels = Field(default_factory=dict, max_length=50)

@@ -10,7 +10,7 @@ from fdhil.fleet.due import due
 from fdhil.fleet.outliers import Course, Sisters, judge, of_machines
 from fdhil.fleet.services import services
 from fdhil.fleet.sets import MONTH_S, Db, Row, ages_months, axes_of, date_of, known, newest_sets, std_of
-from fdhil.records import INTERVAL_95, PARAMETERS, frozen, unit_of
+from fdhil.records import INTERVAL_95, PARAMETERS, freeze_array, get_unit
 
 NEWEST_SETS = 50  # of an axis in comparisons
 LEAST_TREND = 5  # sets
@@ -66,7 +66,7 @@ def trend(db: Db, machine: str, axis: str, parameter: str) -> dict[str, Any]:
         for row in rows
     ]
     pairs = [(row["at"].timestamp(), row[parameter]) for row in rows if row[parameter] is not None]
-    return {"machine": machine, "axis": axis, "parameter": parameter, "unit": unit_of(parameter), "sets": points} | {
+    return {"machine": machine, "axis": axis, "parameter": parameter, "unit": get_unit(parameter), "sets": points} | {
         "slope_per_30_days": _slope(pairs)
     }
 
@@ -85,7 +85,7 @@ def _slope(pairs: list[tuple[float, float]]) -> float | None:
 def compare(db: Db, parameter: str, by: str, axis: str | None) -> dict[str, Any]:
     """Return a parameter of the same axis of all machines, grouped by the label ``by`` of the machines."""
     groups = _groups(db, by, axis)
-    return {"parameter": parameter, "unit": unit_of(parameter), "by": by, "groups": _compared(groups, parameter)}
+    return {"parameter": parameter, "unit": get_unit(parameter), "by": by, "groups": _compared(groups, parameter)}
 
 
 def _compared(groups: Mapping[tuple[str, str], Sequence[Rows]], parameter: str) -> list[dict[str, Any]]:
@@ -123,7 +123,7 @@ def outliers(db: Db, by: str, axis: str | None) -> dict[str, Any]:
         for group in _compared(groups, parameter):
             of_group = {name: group[name] for name in ("label", "axis", "median", "bound")}
             found += [
-                {"parameter": parameter, "unit": unit_of(parameter), "sisters": len(group["sisters"])}
+                {"parameter": parameter, "unit": get_unit(parameter), "sisters": len(group["sisters"])}
                 | of_group
                 | each
                 | {"doubt": doubts.get(each["machine"])}
@@ -143,10 +143,12 @@ def _groups(db: Db, by: str, axis: str | None) -> dict[tuple[str, str], list[Row
 
 def _course(rows: Rows, parameter: str) -> Course:
     known_rows = [row for row in rows if row[parameter] is not None]
-    values = frozen([row[parameter] for row in known_rows])
-    at_c = frozen([math.nan if row["temperature_c"] is None else row["temperature_c"] for row in known_rows])
+    values = freeze_array([row[parameter] for row in known_rows])
+    at_c = freeze_array([math.nan if row["temperature_c"] is None else row["temperature_c"] for row in known_rows])
     last = known_rows[-1]
-    return Course(last["machine"], last["axis"], values, at_c, frozen(ages_months(known_rows)), std_of(last, parameter))
+    return Course(
+        last["machine"], last["axis"], values, at_c, freeze_array(ages_months(known_rows)), std_of(last, parameter)
+    )
 
 
 def _label(about: Mapping[str, Any], axis: str, by: str) -> str:
@@ -155,7 +157,7 @@ def _label(about: Mapping[str, Any], axis: str, by: str) -> str:
 
 
 def _set(row: Mapping[str, Any]) -> dict[str, Any]:
-    figures = {name: _figures(row, name) | {"unit": unit_of(name)} for name in PARAMETERS}
+    figures = {name: _figures(row, name) | {"unit": get_unit(name)} for name in PARAMETERS}
     head = {"revision": row["revision"], "time": date_of(row["at"]), "temperature_c": row["temperature_c"]}
     return head | {"parameters": figures}
 

@@ -11,7 +11,7 @@ import numpy as np
 from fdhil.errors import StoreError
 from fdhil.fleet.sets import Db, Row, date_of, std_of
 from fdhil.identification.trends import student_95
-from fdhil.records import PARAMETERS, Float, unit_of
+from fdhil.records import PARAMETERS, Float, get_unit
 
 MOST_SETS = 20  # on either side of a service, within NEAR
 LEAST_SETS = 2  # on either side
@@ -85,7 +85,7 @@ def _service(db: Db, row: Row) -> dict[str, Any]:
         own = [each for each in sets if each["axis"] == axis]
         found = ((name, _change(own, name, row["serviced_at"])) for name in PARAMETERS)
         changes += [
-            {"axis": axis, "parameter": name, "unit": unit_of(name), **change} for name, change in found if change
+            {"axis": axis, "parameter": name, "unit": get_unit(name), **change} for name, change in found if change
         ]
     head = {"machine": row["machine"], "axis": row["axis"] or None, "serviced_at": date_of(row["serviced_at"])}
     return head | {"note": row["note"], "changes": changes}

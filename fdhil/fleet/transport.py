@@ -22,7 +22,7 @@ from fdhil.cancellation import GivenUp, run_attempt
 from fdhil.config.credentials import password_of, secret_in, tls_of
 from fdhil.config.fleet import Stream
 from fdhil.config.uplink import NatsServer
-from fdhil.daemon import journal
+from fdhil.daemon import service_log
 from fdhil.errors import ConnectError
 from fdhil.fleet.message import SUBJECTS
 
@@ -52,7 +52,7 @@ async def try_for_good(
         if done() > before:
             delay_s, logged = FIRST_RETRY_S, ""
         if cause != logged:
-            journal.write_line(complaint.format(cause=cause), "minor")
+            service_log.write_line(complaint.format(cause=cause), "minor")
         logged = cause
         await asyncio.sleep(delay_s)
         delay_s = min(LAST_RETRY_S, 2 * delay_s)

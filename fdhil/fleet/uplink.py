@@ -16,7 +16,7 @@ from nats.js import JetStreamContext
 
 from fdhil.config import MachineConfig
 from fdhil.config.uplink import Uplink
-from fdhil.daemon import journal
+from fdhil.daemon import service_log
 from fdhil.errors import ConfigError, ConfigFault, StoreError
 from fdhil.fleet.delivery import Letterbox
 from fdhil.fleet.message import Message, digest_of, joined, of_entry, of_machine
@@ -90,7 +90,7 @@ class Sender:
                 await self._send(stream, position, entries, client.max_payload)
                 continue
             if not caught_up:
-                journal.write_line(f"all records are sent ({self.sent} since the start)")
+                service_log.write_line(f"all records are sent ({self.sent} since the start)")
                 caught_up = True
             if client.is_closed:
                 raise ConnectionResetError("the connection has ended")

@@ -11,12 +11,12 @@ import sys
 from pathlib import Path
 
 from fdhil.errors import FdhilError
-from fdhil.guard import signals
+from fdhil.guard import stop_signals
 from fdhil.guard.can_socket import adopt_descriptor
-from fdhil.guard.frames import Listener
-from fdhil.guard.journal import Journal, Notifier
-from fdhil.guard.process import Guard
-from fdhil.guard.settings import load
+from fdhil.guard.event_journal import EventJournal, SystemdNotifier
+from fdhil.guard.frame_monitor import FrameMonitor
+from fdhil.guard.guard_process import Guard
+from fdhil.guard.guard_settings import load_settings
 
 
 def main() -> int:
@@ -25,9 +25,9 @@ def main() -> int:
     parser.add_argument("--settings", type=Path, required=True, help="the settings file that fdhil-guard wrote")
     parser.add_argument("--descriptor", type=int, required=True, help="the open CAN_RAW or socketcand descriptor")
     options = parser.parse_args()
-    with signals.catch() as wake:
+    with stop_signals.catch_signals() as wake:
         try:
-            guard = _made(options.settings, options.descriptor, wake)
+            guard = _build_guard(options.settings, options.descriptor, wake)
         except FdhilError as error:
             sys.stderr.write(f"fdhil-guard: {error}\n")
             return error.exit_code
@@ -41,10 +41,12 @@ def main() -> int:
         return guard.run()
 
 
-def _made(file: Path, descriptor: int, wake: socket.socket) -> Guard:
-    settings = load(file)
-    can = adopt_descriptor(settings.transport, descriptor, settings.sent_ids, Listener(settings).wanted_ids())
-    return Guard(settings, can, Journal(), Notifier(os.environ.get("NOTIFY_SOCKET")), wake)
+def _build_guard(file: Path, descriptor: int, wake: socket.socket) -> Guard:
+    settings = load_settings(file)
+    can = adopt_descriptor(
+        settings.transport, descriptor, settings.sent_ids, FrameMonitor(settings).list_received_ids()
+    )
+    return Guard(settings, can, EventJournal(), SystemdNotifier(os.environ.get("NOTIFY_SOCKET")), wake)
 
 
 if __name__ == "__main__":

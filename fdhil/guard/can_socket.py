@@ -59,7 +59,7 @@ class CanSocket(ABC):
     def receive(self) -> list[Frame]:
         """Return the waiting frames, a few hundred at most, without blocking; BusDown when the bus is gone."""
 
-    def restored(self) -> bool:
+    def try_restore(self) -> bool:
         """Return whether a lost bus is back, with old frames discarded; a closed hub connection never is."""
         return False
 
@@ -96,7 +96,7 @@ class RawCan(CanSocket):
         self._overflow = 0
         self._channel = descriptor.getsockname()[0]
 
-    def restored(self) -> bool:
+    def try_restore(self) -> bool:
         """Bind again, as after an adapter was plugged in again; return whether the interface is up."""
         try:
             self._socket.bind((self._channel,))
@@ -120,14 +120,14 @@ class RawCan(CanSocket):
                     return frames
                 raise BusDown(error.strerror or str(error)) from None
             can_id, length, payload = _CAN_FRAME.unpack(data)
-            stamp_s = self._ancillary(ancillary)
+            stamp_s = self._read_frame_stamp(ancillary)
             if can_id & CAN_ERR_FLAG:
-                frames += [(ERROR, name.encode(), stamp_s) for name in controller_states(can_id, payload)]
+                frames += [(ERROR, name.encode(), stamp_s) for name in decode_controller_states(can_id, payload)]
             elif can_id <= 0x7FF:
                 frames.append((can_id, payload[:length], stamp_s))
         return frames
 
-    def _ancillary(self, ancillary: list[tuple[int, int, bytes]]) -> float:
+    def _read_frame_stamp(self, ancillary: list[tuple[int, int, bytes]]) -> float:
         stamp_s = 0.0
         for _, kind, data in ancillary:
             if kind == SO_TIMESTAMP:
@@ -144,7 +144,7 @@ class RawCan(CanSocket):
         return True
 
 
-def controller_states(can_id: int, data: bytes) -> list[str]:
+def decode_controller_states(can_id: int, data: bytes) -> list[str]:
     """Decode the controller state of an error frame (linux/can/error.h): off, restarted, passive, active."""
     states = []
     if can_id & 0x40:
@@ -184,14 +184,14 @@ class SocketcandText(CanSocket):
         *pieces, self._rest = (self._rest + chunk).split(b">")
         if len(self._rest) > MAX_PENDING_BYTES:
             raise BusDown("the hub does not speak the socketcand protocol")
-        return [frame for piece in pieces if (frame := self._parse(piece)) is not None]
+        return [frame for piece in pieces if (frame := self._parse_text_frame(piece)) is not None]
 
-    def _parse(self, piece: bytes) -> Frame | None:
+    def _parse_text_frame(self, piece: bytes) -> Frame | None:
         words = piece.split()
         if len(words) < 4:
             return None
         if words[1] == b"error":
-            return self._controller(words)
+            return self._parse_error_frame(words)
         cob_id = self._wanted.get(words[2])
         if cob_id is None or words[1] != b"frame":
             return None
@@ -202,9 +202,9 @@ class SocketcandText(CanSocket):
         return (cob_id, data, stamp_s) if math.isfinite(stamp_s) else None
 
     @staticmethod
-    def _controller(words: list[bytes]) -> Frame | None:
+    def _parse_error_frame(words: list[bytes]) -> Frame | None:
         try:
-            states = controller_states(int(words[2], 16), bytes(8))
+            states = decode_controller_states(int(words[2], 16), bytes(8))
         except ValueError:
             return None
         return (ERROR, states[0].encode(), 0.0) if states else None

@@ -14,7 +14,7 @@ class Reaction(IntEnum):
     FREEZE = 3
 
 
-EFFECT: Mapping[Reaction, str] = {
+REACTION_EFFECTS: Mapping[Reaction, str] = {
     Reaction.REFUSE: "nothing is sent",
     Reaction.HOLD: "the offset is held for a few cycles, then ramped to zero",
     Reaction.RAMP_DOWN: "the offset is ramped to zero and the correction is off until it is armed again",
@@ -37,13 +37,13 @@ class Alarm:
     @property
     def reaction(self) -> Reaction:
         """The guard's reaction to it while it sends."""
-        return CATALOGUE[self.code][0]
+        return INTERLOCK_CATALOGUE[self.code][0]
 
     @property
     def cause(self) -> str:
         """The cause as a clause."""
         where = f"axis {self.axis}: " if self.axis else ""
-        shown = f"{where}{CATALOGUE[self.code][1]}" + (f" ({self.detail})" if self.detail else "")
+        shown = f"{where}{INTERLOCK_CATALOGUE[self.code][1]}" + (f" ({self.detail})" if self.detail else "")
         return f"{self.late}, therefore {shown}" if self.late else shown
 
     @property
@@ -52,20 +52,20 @@ class Alarm:
         if self.code == "NotOff" and self.detail == "FROZEN":
             return "hold the feed, then run fdhil adopt"
         if self.late and self.reaction is not Reaction.FREEZE:
-            return CATALOGUE["PcLate"][2]
-        return CATALOGUE[self.code][2]
+            return INTERLOCK_CATALOGUE["PcLate"][2]
+        return INTERLOCK_CATALOGUE[self.code][2]
 
     def sentence(self, off: bool = False) -> str:
         """Return cause, effect on the machine (``off``: nothing is applied any more) and next action."""
-        effect = "the correction is off and nothing is applied" if off else EFFECT[self.reaction]
+        effect = "the correction is off and nothing is applied" if off else REACTION_EFFECTS[self.reaction]
         return f"{self.cause}; {effect}; {self.action}"
 
 
 Alarms = tuple[Alarm, ...]
-LATE = "this PC was late"
+LATE_PC = "this PC was late"
 _R, _H, _F, _N = Reaction.RAMP_DOWN, Reaction.HOLD, Reaction.FREEZE, Reaction.REFUSE
 # class: (reaction while sending, cause, next action)
-CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
+INTERLOCK_CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     # the bus
     "BusOff": (_F, "the CAN controller is bus-off", "hold the feed, check cable and termination, then adopt"),
     "ErrorPassive": (_R, "the CAN controller is error-passive", "check cable, termination and bit rate"),

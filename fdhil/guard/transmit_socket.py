@@ -9,7 +9,7 @@ from fdhil.errors import ConnectError, ProtocolError
 CONNECT_S = 5.0
 
 
-class BusPlace(Protocol):
+class BusAddress(Protocol):
     """Address of a bus: the network interface ``channel``, or the channel of a hub."""
 
     @property
@@ -29,10 +29,10 @@ class BusPlace(Protocol):
         """The hub's TCP port."""
 
 
-def connect_bus(name: str, bus: BusPlace) -> socket.socket:
+def open_transmit_socket(name: str, bus: BusAddress) -> socket.socket:
     """Open the transmit descriptor; a hub needs ``greet`` after it. ConnectError when the bus is unavailable."""
     if bus.interface == "socketcan":
-        return _open_raw(name, bus.channel)
+        return _open_can_raw(name, bus.channel)
     if bus.interface == "socketcand":
         try:
             return socket.create_connection((bus.host, bus.port), timeout=CONNECT_S)
@@ -44,7 +44,7 @@ def connect_bus(name: str, bus: BusPlace) -> socket.socket:
     raise ConnectError(f"bus {name}", text)
 
 
-def _open_raw(name: str, channel: str) -> socket.socket:
+def _open_can_raw(name: str, channel: str) -> socket.socket:
     raw = None
     try:
         raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
@@ -58,24 +58,24 @@ def _open_raw(name: str, channel: str) -> socket.socket:
     return raw
 
 
-def greet(name: str, bus: BusPlace, hub: socket.socket) -> None:
+def greet_hub(name: str, bus: BusAddress, hub: socket.socket) -> None:
     """Perform the greeting of a hub, byte by byte, so that no frame is lost."""
     if bus.interface != "socketcand":
         return
     deadline_s = time.monotonic() + CONNECT_S
     hub.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     try:
-        _expect(hub, "hi", deadline_s)
+        _expect_word(hub, "hi", deadline_s)
         for command in (f"open {bus.channel}", "rawmode"):
             hub.sendall(f"< {command} >".encode("ascii"))
-            _expect(hub, "ok", deadline_s)
+            _expect_word(hub, "ok", deadline_s)
     except OSError as error:
         hub.close()
         text = f"the hub at {bus.host} port {bus.port} ended the greeting ({error}); check that it is a socketcand"
         raise ConnectError(f"bus {name}", text) from None
 
 
-def _expect(hub: socket.socket, word: str, deadline_s: float) -> None:
+def _expect_word(hub: socket.socket, word: str, deadline_s: float) -> None:
     answer = b""
     while not answer.endswith(b">"):
         hub.settimeout(max(0.001, deadline_s - time.monotonic()))

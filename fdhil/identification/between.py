@@ -14,7 +14,7 @@ import numpy as np
 from fdhil.model.compiled import compiled
 from fdhil.records import PARAMETERS, Float
 
-HISTORY = 24  # windows: older ones say little about the present warming
+HISTORY_WINDOWS = 24  # windows: older ones say little about the present warming
 FOR_BOTH_SLOPES = 3  # windows per direction from which on viscous friction may depend on it
 # shares of a parameter's size; finer steps than a factor of two change no interval by a tenth
 STEPS = np.array([0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064])
@@ -100,7 +100,7 @@ KINDS = (
 
 def between(members: Sequence[Member]) -> Between:
     """Estimate how much the parameters vary between windows given in order; only the newest ``HISTORY`` count."""
-    newest = members[-HISTORY:]
+    newest = members[-HISTORY_WINDOWS:]
     sizes: dict[str, float] = {}
     walk: dict[str, float] = {}
     scatter: dict[str, float] = {}

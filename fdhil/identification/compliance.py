@@ -12,7 +12,7 @@ import numpy as np
 
 from fdhil.config import Axis
 from fdhil.identification.table_motion import LEAST_ROWS, Accelerometer, Encoder, Motor, noise, shaft
-from fdhil.records import INTERVAL_95, Estimate, Float, Parameters, Reason, Window, frozen, rms
+from fdhil.records import INTERVAL_95, Estimate, Float, Parameters, Reason, Window, compute_rms, freeze_array
 
 TERMS = ("resonance", "resonance_damping", "resonance_share")
 BAND_HZ = (12.0, 300.0)
@@ -101,7 +101,7 @@ def _fitted(sensor: Encoder | Accelerometer, dt: float) -> tuple[Float, Float] |
     start = np.array([math.log(trials[best]), math.log(DAMPING[0]), late])
     weak = np.array([0.0, 1.0 / DAMPING[1], 1.0 / LATE_STD_S])
     expected = start.copy()
-    scale = max(1.0, rms(sensor.follows(trials[best], DAMPING[0], late)))
+    scale = max(1.0, compute_rms(sensor.follows(trials[best], DAMPING[0], late)))
     low, high = np.log(2 * math.pi * np.array(BAND_HZ))
 
     def unexplained(x: Float) -> Float:
@@ -163,7 +163,7 @@ def _told(w: float, z: float, q: float, std: float, spread: Float, late_s: float
     whole[:2, :2], whole[2, 2] = spread[:2, :2], std**2
     doubts = lever @ np.diag([0.0 if held else UNSURE_ALONE * off, 0.0, UNSURE_SHARE * max(1.0, off**3)])[:, [0, 2]]
     covariance = lever @ whole @ lever.T + doubts @ doubts.T
-    return Compliance(frozen([hertz, damping, q]), frozen(covariance), frozen(doubts), late_s)
+    return Compliance(freeze_array([hertz, damping, q]), freeze_array(covariance), freeze_array(doubts), late_s)
 
 
 def _least(unexplained: Left, start: Float, steps: Float) -> tuple[Float, Float, Float]:
@@ -217,9 +217,9 @@ def joined(estimate: Estimate, identified: Compliance) -> Estimate:
     return replace(
         estimate,
         names=(*(estimate.names[k] for k in kept), *TERMS),
-        values=frozen([*estimate.values[kept], *identified.values]),
-        covariance=frozen(_apart(estimate.covariance[np.ix_(kept, kept)], identified.covariance)),
-        systematic=frozen(_apart(before[kept], identified.doubts)),
+        values=freeze_array([*estimate.values[kept], *identified.values]),
+        covariance=freeze_array(_apart(estimate.covariance[np.ix_(kept, kept)], identified.covariance)),
+        systematic=freeze_array(_apart(before[kept], identified.doubts)),
     )
 
 

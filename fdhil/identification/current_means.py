@@ -17,7 +17,7 @@ from fdhil.identification.signals import mended
 from fdhil.identification.slow_rows import STEPPED_ROW_S
 from fdhil.identification.windows import bridged, carried
 from fdhil.model.closed_loop import simulate
-from fdhil.records import Float, Parameters, Window, read_only, rms
+from fdhil.records import Float, Parameters, Window, compute_rms, make_read_only_view
 
 SURELY = 0.6  # of the other replay's residual: largest of the right one
 SAME_GRID = 1e-3  # of a sample: tolerance of the set-points' cycle
@@ -41,7 +41,7 @@ def with_current_means(
     if plain < SURELY * stepped and windows[0].dt_s < STEPPED_ROW_S:
         return windows  # no doubt to remove
     if plain < SURELY * stepped:
-        return [replace(w, current_off_a=read_only(np.zeros(w.n))) for w in windows]
+        return [replace(w, current_off_a=make_read_only_view(np.zeros(w.n))) for w in windows]
     if not stepped < SURELY * plain:
         return windows
     lag = reading_lag(axis, windows[0].dt_s)
@@ -65,7 +65,7 @@ def _left_mm(window: Window, settings: Identification, axis: Axis, sync_period_s
 
     def left(speed_offset: Float | None) -> float:
         moved = simulate(model, axis, window.dt_s, demand, offset, speed_offset_rad_s=speed_offset).position_mm
-        return rms((moved - moved[0] - position + position[0])[known])
+        return compute_rms((moved - moved[0] - position + position[0])[known])
 
     return left(None), left(late)
 
@@ -76,8 +76,8 @@ def _moved(window: Window, lag: float) -> Window:
     beyond = lag * np.gradient(moving_mean(carried(window.speed_rad_s), width), window.dt_s)
     return replace(
         window,
-        current_a=read_only(window.current_a + beyond),
-        current_off_a=read_only(LEFT_OPEN * np.abs(lag) * beyond / lag),
+        current_a=make_read_only_view(window.current_a + beyond),
+        current_off_a=make_read_only_view(LEFT_OPEN * np.abs(lag) * beyond / lag),
     )
 
 

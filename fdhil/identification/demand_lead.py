@@ -11,7 +11,7 @@ import numpy as np
 from fdhil.config import Axis
 from fdhil.identification.windows import bridged
 from fdhil.model.closed_loop import simulate
-from fdhil.records import Float, Parameters, Window, read_only, rms
+from fdhil.records import Float, Parameters, Window, compute_rms, make_read_only_view
 
 LEAST_FEEDFORWARD = 0.5  # with less, the lag at constant speed is the position loop's
 WHOLE = 0.3  # of a cycle: tolerance of a whole lead
@@ -31,8 +31,8 @@ def with_demand_on_time(window: Window, axis: Axis | None, sync_period_s: float 
     cycles = round(lead)
     if not (1 <= cycles <= MOST and abs(lead - cycles) < WHOLE):
         return window, 0
-    offset = None if window.offset_mm is None else read_only(_later(window.offset_mm, cycles))
-    moved = replace(window, demand_mm=read_only(_later(window.demand_mm, cycles)), offset_mm=offset)
+    offset = None if window.offset_mm is None else make_read_only_view(_later(window.offset_mm, cycles))
+    moved = replace(window, demand_mm=make_read_only_view(_later(window.demand_mm, cycles)), offset_mm=offset)
     return (moved, cycles) if _lead(moved, axis, sync_period_s)[1] < EXPLAINED * left else (window, 0)
 
 
@@ -50,7 +50,7 @@ def _lead(window: Window, axis: Axis, sync_period_s: float | None) -> tuple[floa
     power = float(way @ way)
     if not (power > 0.0 and np.isfinite(ahead).all()):
         return 0.0, 0.0
-    return float(ahead @ way) / power, rms(ahead)
+    return float(ahead @ way) / power, compute_rms(ahead)
 
 
 def _later(values: Float, rows: int) -> Float:

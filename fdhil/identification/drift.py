@@ -21,7 +21,7 @@ AGREEING = 2
 SURELY = 2.0  # standard deviations by which a change must exceed its limit
 RELEASE = 0.8  # an alarm is cleared when the change has fallen to this share of its limit
 RELEASING = 4  # estimates whose mean clears an alarm
-FRICTION = ("ft", "Cd")
+FRICTION_PARAMETERS = ("ft", "Cd")
 # smaller changes are drift, not a jump, however narrow the intervals are
 LEAST_JUMP: Mapping[str, float] = {"R": 0.05, "L": 0.08, "K": 0.03, "Jt": 0.03, "ft": 0.40, "Cd": 0.25}
 
@@ -83,7 +83,7 @@ class DriftTracker:
     def _recent(self, direction: int) -> list[list[Point]]:
         points = list(self.points)
         same = [point for point in points if point.direction == direction][-RECENT:]
-        return [same if name in FRICTION else points[-RECENT:] for name in PARAMETERS]
+        return [same if name in FRICTION_PARAMETERS else points[-RECENT:] for name in PARAMETERS]
 
     def _moved(self, point: Point) -> list[str]:
         """Return the parameters that differ from the recent history by more than chance and drift (median and MAD)."""
@@ -124,7 +124,7 @@ class DriftTracker:
     @staticmethod
     def _agree(one: Point, other: Point) -> bool:
         same_direction = one.direction == other.direction
-        rows = [k for k, name in enumerate(PARAMETERS) if same_direction or name not in FRICTION]
+        rows = [k for k, name in enumerate(PARAMETERS) if same_direction or name not in FRICTION_PARAMETERS]
         chance = BEYOND_CHANCE * np.sqrt(one.stds**2 + other.stds**2)
         least = np.array([LEAST_JUMP[name] for name in PARAMETERS]) * np.abs(one.values)
         return bool((np.abs(one.values - other.values) <= np.maximum(chance, least))[rows].all())

@@ -78,13 +78,13 @@ def judge(estimate: Estimate, condition: float, top_rad_s: float, top_nm: float 
 
 def _unknown(estimate: Estimate, top_rad_s: float, top_nm: float) -> dict[str, Reason]:
     missing = {}
-    friction = abs(estimate.value("ft")) * top_rad_s + abs(estimate.value("Cd"))
+    friction = abs(estimate.get_value("ft")) * top_rad_s + abs(estimate.get_value("Cd"))
     # a friction coefficient may be zero: its interval is compared with the total friction torque, or, since a weight
     # may balance it in one direction, with the drive's torque
     matters = max(FRICTION_SHARE * friction, TORQUE_SHARE * top_nm)
     least = {"ft": matters / max(top_rad_s, 1e-300), "Cd": matters}
     for name, limit in RELATIVE_STD_LIMIT.items():
-        value, std = estimate.value(name), estimate.std(name)
+        value, std = estimate.get_value(name), estimate.get_std(name)
         size = max(abs(value), least.get(name, 0.0))
         share = std / size if size else np.inf
         if share > limit:
@@ -114,7 +114,7 @@ def unphysical(estimate: Estimate, *, one_way: bool = False) -> list[Reason]:
     """
     reasons = []
     for name, (low, high) in PHYSICAL.items():
-        value = estimate.value(name)
+        value = estimate.get_value(name)
         if np.isfinite(value) and not low <= value <= high:
             text = f"{name} = {value:.4g} lies outside {max(low, 0):.3g} to {high:.3g}: {ESTIMATED_FROM[name]} disagree"
             reasons.append(Reason("Unphysical", text, SIGNALS))

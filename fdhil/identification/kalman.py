@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fdhil.identification.motion import BROKEN, DIFFUSE, UNKNOWN, Modes, Motion
+from fdhil.identification.motion import BROKEN_MODE, DIFFUSE, UNKNOWN_MODE, Modes, Motion
 from fdhil.model.compiled import compiled
 from fdhil.model.feed_drive import transition
-from fdhil.records import Bool, Float, read_only
+from fdhil.records import Bool, Float, make_read_only_view
 
 Rows = npt.NDArray[np.int64]
 
@@ -65,7 +65,7 @@ class Readings(NamedTuple):
         """
         means = motion.voltage_sampling == "interval_mean"
         rise_v, share = (np.zeros(0), emf_share) if means else (motion.voltage_rise, emf_share - 1.0)
-        current, speed = read_only(motion.current), read_only(motion.speed)
+        current, speed = make_read_only_view(motion.current), make_read_only_view(motion.speed)
         return cls(motion.dt_s, motion.mode, motion.observed, current, speed, rise_v, share, motion.speed_walk)
 
 
@@ -186,10 +186,10 @@ def _whiten_one(
             if counted % LOG_ROWS == 0:
                 logdet += np.log(product)
                 product = 1.0
-        if mode[k] == BROKEN:
+        if mode[k] == BROKEN_MODE:
             p11, p12, p22, still = DIFFUSE * vi, 0.0, DIFFUSE * vw, 0
             continue
-        was, known = known, 0 if mode[k] == UNKNOWN else 1
+        was, known = known, 0 if mode[k] == UNKNOWN_MODE else 1
         if known != was:
             still = 0
         if still < SETTLED_ROWS:  # else the gains are constant
@@ -248,9 +248,9 @@ def respond(
                 white[k, 1, c] = gain[WHITE_IW] * e1 + gain[WHITE_W] * e2
                 i[c] += gain[G_II] * e1 + gain[G_IW] * e2
                 w[c] += gain[G_WI] * e1 + gain[G_WW] * e2
-        if mode[k] == BROKEN:
+        if mode[k] == BROKEN_MODE:
             continue
-        step = steps[0 if mode[k] == UNKNOWN else 1]
+        step = steps[0 if mode[k] == UNKNOWN_MODE else 1]
         if risen.size:
             rise = risen[k]
         for c in range(q):
@@ -344,7 +344,7 @@ def slow_innovations(
             values[2 * k], variance[2 * k] = _take(x, p, of_current, current[k], spread[k, 0])
         if spread[k, 1] < np.inf:
             values[2 * k + 1], variance[2 * k + 1] = _take(x, p, of_speed, speed[k], spread[k, 1])
-        known, now = mode[k] != UNKNOWN, k * dt
+        known, now = mode[k] != UNKNOWN_MODE, k * dt
         push = -(theta[CD] * mode[k] + (load[k] if load.size else 0.0)) / theta[JT] if known else 0.0
         stray = 0.0 if known else readings.walk * readings.walk / dt
         while b < row.size and row[b] == k:
@@ -391,7 +391,7 @@ def departure(
                 error, spread = _take(x, p, of_signal[j], y[k, j], variance[k, j])
                 total += error * error / spread
                 news += before / spread if j == signal else 0.0
-        known = 0 if mode[k] == UNKNOWN else 1
+        known = 0 if mode[k] == UNKNOWN_MODE else 1
         step = steps[known]
         for c in range(3):
             i, w, u = p[STATE_I, c], p[STATE_W, c], p[STATE_U, c]

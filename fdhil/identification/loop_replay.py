@@ -10,7 +10,7 @@ from fdhil.identification.filtering import all_about, moving_mean
 from fdhil.identification.motion import surely_moving
 from fdhil.identification.windows import bridged
 from fdhil.model import closed_loop, kernels
-from fdhil.records import Bool, Float, Parameters, Window, read_only
+from fdhil.records import Bool, Float, Parameters, Window, make_read_only_view
 
 LEAST_ROWS = 50
 REST_ROWS = 30
@@ -82,7 +82,7 @@ def rapid_of(window: Window, plant: Parameters, sync_period_s: float | None = No
     return Rapid(
         window.dt_s,
         first,
-        read_only(demand[cut].copy()),
+        make_read_only_view(demand[cut].copy()),
         position[cut],
         current[cut],
         known[cut],

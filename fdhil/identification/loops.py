@@ -19,7 +19,7 @@ from fdhil.identification.demand_lead import with_demand_on_time
 from fdhil.identification.loop_fit import DELAY, KEYS, Fit, Problem
 from fdhil.identification.loop_replay import Rapid, fitting_periods, rapid_of, with_regulators
 from fdhil.identification.loop_start import CASCADE, begun_anew, made_up_axis
-from fdhil.records import INTERVAL_95, LoopEstimate, Parameters, Reason, Verdict, Window, frozen, rms
+from fdhil.records import INTERVAL_95, LoopEstimate, Parameters, Reason, Verdict, Window, compute_rms, freeze_array
 
 WORTH, WORTH_LEFT = 0.1, 0.1  # of the tolerance, or of the residual: least effect of another key
 LEAST_UM = 0.02
@@ -71,7 +71,7 @@ def identify_loops(
     if not usable:
         return None
     rapids = tuple(rapid for rapid, _ in usable)
-    following = rms(np.concatenate([one.lag_mm[one.known] for one in rapids])) * 1e3
+    following = compute_rms(np.concatenate([one.lag_mm[one.known] for one in rapids])) * 1e3
     tolerance = settings.tolerance_for(following)
     problem = _problem(rapids, axis, windows[0])
     modelled = tuple(replace(rapid, plant=own, load_nm=np.zeros_like(rapid.load_nm)) for rapid, own in usable)
@@ -230,7 +230,9 @@ def _told(name: str, fitted: Fit, verdict: Verdict, configured_um: float | None)
     structure = fitted.problem.axis.regulators.structure
     if structure != "pid":
         structure = "double_pi" if values.get("position_ki_per_s2", 0.0) > 0.0 else "p_pi_pi"
-    return LoopEstimate(name, structure, names, frozen([*values.values()]), frozen(covariance), verdict, configured_um)
+    return LoopEstimate(
+        name, structure, names, freeze_array([*values.values()]), freeze_array(covariance), verdict, configured_um
+    )
 
 
 def _verdict(fitted: Fit, tolerance_um: float, following_um: float, configured_um: float | None) -> Verdict:

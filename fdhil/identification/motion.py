@@ -14,10 +14,10 @@ from fdhil.identification.windows import RUN_SHARE, bridged, carried, noise_of, 
 from fdhil.model.feed_drive import interval_shape
 from fdhil.records import Bool, Float, SlowVoltage, VoltageSampling, Window
 
-UNKNOWN = 0  # stuck, reversing or about to move: the friction torque is unknown
+UNKNOWN_MODE = 0  # stuck, reversing or about to move: the friction torque is unknown
 # best possible accuracy of the model, as a share of a signal's peak: the voltage's waveform within a sample is unknown
 SHAPE_SHARE = (3e-4, 1e-4, 1e-4)
-BROKEN = 9  # a sample is lost: the interval is skipped
+BROKEN_MODE = 9  # a sample is lost: the interval is skipped
 DIFFUSE = 1e6  # variance, in units of the measurement's, of an unknown state
 
 Modes = npt.NDArray[np.int8]
@@ -157,12 +157,12 @@ def prepare(window: Window) -> Motion:
     observed = np.isfinite(window.speed_rad_s) & np.isfinite(window.current_a)
     sure = surely_moving(window.speed_rad_s, window.rapid_speed_rad_s)
     side = np.sign(carried(window.speed_rad_s)).astype(np.int8)
-    mode = np.where(sure, np.sign(_majority(side, sure)), UNKNOWN).astype(np.int8)
-    mode[:-1][mode[:-1] != mode[1:]] = UNKNOWN  # both ends of an interval must be in the same motion
+    mode = np.where(sure, np.sign(_majority(side, sure)), UNKNOWN_MODE).astype(np.int8)
+    mode[:-1][mode[:-1] != mode[1:]] = UNKNOWN_MODE  # both ends of an interval must be in the same motion
     if slow is not None:
         mean, rise = carried(slow.voltage_v), np.zeros(slow.voltage_v.size)
     elif window.voltage_v is not None:
-        mode[~np.isfinite(window.voltage_v)] = BROKEN
+        mode[~np.isfinite(window.voltage_v)] = BROKEN_MODE
         mean, rise = interval_shape(carried(window.voltage_v), window.voltage_sampling)
     speed, current = carried(window.speed_rad_s), carried(window.current_a)
     return Motion(

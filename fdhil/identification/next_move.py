@@ -38,11 +38,11 @@ def predict_next_moves(window: Window, estimate: Estimate) -> list[NextMove]:
     """
     if window.voltage_v is None:
         return []
-    parameters, noise = estimate.parameters(), noise_levels(window)
+    parameters, noise = estimate.build_parameters(), noise_levels(window)
     current, speed = carried(window.current_a), carried(window.speed_rad_s)
     now = information(parameters, noise, window.dt_s, current, speed)
     known = np.diag(inverse_of(now)[0])
-    stays = np.maximum(np.square([estimate.std(name) for name in PARAMETERS]) - known, 0.0)
+    stays = np.maximum(np.square([estimate.get_std(name) for name in PARAMETERS]) - known, 0.0)
 
     def left(variances: Float) -> Mapping[str, float]:
         return dict(zip(PARAMETERS, np.sqrt((variances + stays) / (known + stays)).tolist(), strict=True))

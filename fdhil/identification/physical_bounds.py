@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.model.physical import Bound, bounds
-from fdhil.records import Estimate, Float, frozen
+from fdhil.records import Estimate, Float, freeze_array
 
 SIGNIFICANT = 3.0  # standard deviations beyond a bound
 _FRICTION = ("Cd", "stribeck")
@@ -25,7 +25,7 @@ def bounded(estimate: Estimate, direction: int | None = None) -> Estimate:
         estimate = _with_load(estimate, direction)
     names, values = estimate.names, estimate.values
     within = nearest(names, values, estimate.covariance)
-    return estimate if within is values else replace(estimate, values=frozen(within))
+    return estimate if within is values else replace(estimate, values=freeze_array(within))
 
 
 def nearest(names: Sequence[str], values: Float, covariance: Float) -> Float:
@@ -110,11 +110,11 @@ def _with_load(estimate: Estimate, direction: int) -> Estimate:
     values[estimate.names.index("Cd")] -= pushing_nm
     systematic = estimate.systematic
     if systematic is not None:
-        systematic = frozen(as_load @ np.pad(systematic, ((0, size - len(systematic)), (0, 0))))
+        systematic = freeze_array(as_load @ np.pad(systematic, ((0, size - len(systematic)), (0, 0))))
     return replace(
         estimate,
         names=(*estimate.names, "load"),
-        values=frozen(values),
-        covariance=frozen(as_load @ estimate.covariance @ as_load.T),
+        values=freeze_array(values),
+        covariance=freeze_array(as_load @ estimate.covariance @ as_load.T),
         systematic=systematic,
     )

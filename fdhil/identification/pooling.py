@@ -15,7 +15,7 @@ from fdhil.identification.between import Between, Member
 from fdhil.identification.covariance import aliasing
 from fdhil.identification.ripple_parts import as_amplitude, as_parts
 from fdhil.identification.slow_rows import leaves_steps_open
-from fdhil.records import PARAMETERS, Estimate, Float, Int, Window, frozen
+from fdhil.records import PARAMETERS, Estimate, Float, Int, Window, freeze_array
 
 # share of a common doubt that may still differ between windows of one drive: it depends on the regulators, which are
 # the same, and a little on the move
@@ -178,17 +178,17 @@ def _estimate(found: _Solution, names: Sequence[str], added: Sequence[str], firs
     covariance += systematic @ systematic.T
     for row, name in enumerate(PARAMETERS):
         if name not in known:
-            answer[row] = first.value(name)
+            answer[row] = first.get_value(name)
             covariance[row, :] = covariance[:, row] = 0.0 if name in first.given else np.nan
     return replace(
         first,
         names=listed,
-        values=frozen(answer),
-        covariance=frozen(covariance),
+        values=freeze_array(answer),
+        covariance=freeze_array(covariance),
         residuals={},
         delay_s=None,
         delay_std_s=None,
-        systematic=frozen(systematic[:, len(PARAMETERS) :]),
+        systematic=freeze_array(systematic[:, len(PARAMETERS) :]),
     )
 
 

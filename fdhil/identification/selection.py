@@ -81,11 +81,11 @@ def _weak(wider: Fit, chosen: Sequence[Candidate], base: Fit, estimate_of: Calla
     lost = bool(estimate.missing) and not set(estimate.missing) <= set(estimate_of(base).missing)
     if lost or not set(terms) <= set(estimate.names):
         return {chosen[-1].family}
-    weak = {name for name in terms if not abs(estimate.value(name)) > LEAST_SURE * _std(estimate, name)}
+    weak = {name for name in terms if not abs(estimate.get_value(name)) > LEAST_SURE * _std(estimate, name)}
     if len(terms) < len(chosen) and not _surely_late(wider, estimate):
         weak.add(LATE)
-    low = estimate.value("stribeck") if "stribeck" in estimate.names else 0.0
-    friction = {"Cd": estimate.value("Cd"), "stribeck": low}
+    low = estimate.get_value("stribeck") if "stribeck" in estimate.names else 0.0
+    friction = {"Cd": estimate.get_value("Cd"), "stribeck": low}
     if low and any(bound.beyond(friction) > 0.0 for bound in bounds(tuple(friction))):
         weak.add("stribeck" if "stribeck" in terms else chosen[-1].family)
     return weak
@@ -105,7 +105,7 @@ def _may_be_late(base: Fit, delay_s: float) -> bool:
 def _std(estimate: Estimate, family: str) -> float:
     """Return the deviation of a term; for Stribeck friction at its chosen speed, which decides whether it exists."""
     if family != "stribeck":
-        return estimate.std(family)
+        return estimate.get_std(family)
     k, speed = estimate.names.index(family), estimate.names.index("stribeck_speed")
     covariance = estimate.covariance
     return math.sqrt(covariance[k, k] - covariance[k, speed] ** 2 / covariance[speed, speed])

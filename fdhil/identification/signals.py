@@ -16,7 +16,7 @@ from fdhil.identification.filtering import moving_mean
 from fdhil.identification.motion import resolution, surely_moving
 from fdhil.identification.normal import inverse_gram
 from fdhil.identification.windows import bridged, noise_of
-from fdhil.records import Bool, Float, Window, read_only
+from fdhil.records import Bool, Float, Window, make_read_only_view
 
 SpeedSource = Literal["auto", "sensor", "difference", "filtered"]
 
@@ -88,7 +88,10 @@ def _mended(window: Window, source: SpeedSource) -> Window:
     lost = np.convolve(~np.isfinite(window.speed_rad_s), np.ones(2 * REACH + 1), "same") > 0.5
     speed = np.where(lost, np.nan, speed)
     return replace(
-        window, speed_rad_s=read_only(speed), speed_late_s=found.late_s, speed_late_std_s=max(found.std_s, 1e-9)
+        window,
+        speed_rad_s=make_read_only_view(speed),
+        speed_late_s=found.late_s,
+        speed_late_std_s=max(found.std_s, 1e-9),
     )
 
 

@@ -19,7 +19,7 @@ from fdhil.identification.kalman import CD, FT, JT, LOAD, VOLTAGE, K, L, R
 from fdhil.identification.motion import Course, Motion, Within
 from fdhil.identification.windows import RUN_SHARE
 from fdhil.model.closed_loop import simulate
-from fdhil.records import PARAMETERS, Float, Parameters, Window, rms
+from fdhil.records import PARAMETERS, Float, Parameters, Window, compute_rms
 
 LEAST_ROW_S = 0.003  # in shorter samples the first two are less than the regulator's own effect
 ROW_S, OFF_MEAN = 0.010, 0.08  # at such samples, with a speed loop of 40 Hz; a slower loop responds less
@@ -89,12 +89,12 @@ def beyond_line_a(theta: Float, axis: Axis, demand_mm: Float, row_s: float) -> F
 def left_at_the_table_mm(theta: Float, axis: Axis, window: Window) -> float:
     """Return the RMS difference between measured position and the closed loop with ``theta`` (k,)."""
     response = simulate(_moving_parameters(theta), axis, window.dt_s, window.demand_mm)
-    return rms(window.position_mm - response.position_mm)
+    return compute_rms(window.position_mm - response.position_mm)
 
 
 def _moving_parameters(theta: Float) -> Parameters:
     friction = {"ft": max(float(theta[FT]), 0.0), "Cd": max(float(theta[CD]), 0.0)}
-    return Parameters.of({**dict(zip(PARAMETERS, theta, strict=False)), **friction})
+    return Parameters.from_mapping({**dict(zip(PARAMETERS, theta, strict=False)), **friction})
 
 
 def told_by_loops(motion: Motion, sync_period_s: float | None) -> bool:

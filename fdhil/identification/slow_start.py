@@ -9,7 +9,7 @@ from fdhil.config import Identification
 from fdhil.identification.covariance import aliasing
 from fdhil.identification.estimators.least_squares import (
     NAME,
-    ORDER,
+    PARAMETER_ORDER,
     mechanical_signals,
     residuals_of,
     solve_two_steps,
@@ -41,7 +41,7 @@ def slow_start(windows: Sequence[Window], settings: Identification) -> tuple[Flo
     if rows is None:
         return None
     electrical, mechanical = rows
-    theta = solve_two_steps(electrical, mechanical)[0][ORDER]
+    theta = solve_two_steps(electrical, mechanical)[0][PARAMETER_ORDER]
     if theta[R] > 0.0 and theta[L] < LEAST_TIME_CONSTANT_S * theta[R]:
         # so coarse a delay is mistaken for L: R i + L di/dt is like R i, earlier by L / R
         shifts = [shift + TIME_CONSTANT_S - float(theta[L] / theta[R]) for shift in shifts]

@@ -19,7 +19,7 @@ from fdhil.identification.courses import terms_nm
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.kalman import DELAY, JT, NO_SAMPLE, K, Marks, Readings, SlowSensor, slow_innovations
 from fdhil.identification.motion import Motion
-from fdhil.records import Float, read_only
+from fdhil.records import Float, make_read_only_view
 
 CURRENT_LATE_S, CURRENT_LATE = 1e-5, 0.01  # in s, and of a sample: one standard deviation, see below
 CURRENT_ABOVE = 2.5e-4  # of the accelerating current, one standard deviation
@@ -109,7 +109,7 @@ def innovations_of(
     delay_s = float(theta[DELAY])
     marks = marks_of(motion, delay_s, delay_s if ordered_for_s is None else ordered_for_s)
     instant = motion.voltage_sampling == "instant"
-    voltage = read_only(motion.voltage_mean)
+    voltage = make_read_only_view(motion.voltage_mean)
     sensor = SlowSensor(voltage, instant, motion.slow.period_s, motion.shape_variance, marks)
     spread = spread_of(motion, variances) if spread is None else spread
     more = np.zeros(0) if more_nm is None else more_nm

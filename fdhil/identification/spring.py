@@ -13,7 +13,7 @@ from fdhil.config import Axis
 from fdhil.identification.fit import Fit, fit, pose
 from fdhil.identification.innovations import whiten
 from fdhil.identification.kalman import LOAD
-from fdhil.identification.motion import BROKEN, UNKNOWN, Course, Modes, Motion, Noise
+from fdhil.identification.motion import BROKEN_MODE, UNKNOWN_MODE, Course, Modes, Motion, Noise
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.spring_torques import LEAST_SHARE, MOST_OF_ROWS, MOST_SHARE, Spring, Torques
 from fdhil.records import Float
@@ -154,8 +154,8 @@ def _bent(plain: Motion, theta: Float, spring: Spring) -> Motion:
 
 def _surely(motion: Motion) -> Modes:
     reach = math.ceil(NEAR_REST_S / motion.dt_s)
-    near = np.convolve(motion.mode == UNKNOWN, np.ones(2 * reach + 1), "same") > 0.0
-    return np.where(near & (motion.mode != BROKEN), UNKNOWN, motion.mode).astype(np.int8)
+    near = np.convolve(motion.mode == UNKNOWN_MODE, np.ones(2 * reach + 1), "same") > 0.0
+    return np.where(near & (motion.mode != BROKEN_MODE), UNKNOWN_MODE, motion.mode).astype(np.int8)
 
 
 def _with_prior(fitted: Fit, spring: Spring, expected: Told) -> Fit:

@@ -22,7 +22,7 @@ MOST_TURN = 0.9 * np.pi  # of a ripple per sample at top speed: beyond it orders
 SMOOTHING_S = 0.005
 WHOLE_DEAD_TIME = 0.01  # of the peak current: above it a dead time has its full effect
 LEAST_TURN = 1e-9  # rad per interval
-PHASE = "_phase"  # suffix of a ripple's cosine, and of its phase
+PHASE_SUFFIX = "_phase"  # suffix of a ripple's cosine, and of its phase
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +74,7 @@ def ripples(motion: Motion) -> dict[str, tuple[Course, Course]]:
         # the integral of exp(j k a) is exp(j k a) / (j k)
         mean = np.where(still, 0.0, np.append(wave[1:], wave[-1]) - wave) * (share / order)
         name = f"ripple_{'screw' if order in SCREW_ORDERS else 'motor'}_{order}"
-        made[name] = (Course(name, LOAD, -mean.real), Course(name + PHASE, LOAD, mean.imag))
+        made[name] = (Course(name, LOAD, -mean.real), Course(name + PHASE_SUFFIX, LOAD, mean.imag))
     return made
 
 

@@ -20,11 +20,21 @@ SURE_SLOPE = 3.0  # standard deviations
 LEAST_DAYS = 1.0
 FARTHEST_SPANS = 5.0
 COLLINEAR = 1e-4  # share of a covariate that must be independent of the others
-FRICTION = "friction_at_rapid"  # Cd + ft w at the rapid speed: well determined where ft and Cd compensate each other
-BY_DIRECTION = ("ft", "Cd", FRICTION)
+FRICTION_AT_RAPID = (
+    "friction_at_rapid"  # Cd + ft w at the rapid speed: well determined where ft and Cd compensate each other
+)
+BY_DIRECTION = ("ft", "Cd", FRICTION_AT_RAPID)
 LEAST_TURNS = 3  # least changes of direction
 # smaller steps are not reported: nonlinear drift resembles them
-LEAST_STEP: dict[str, float] = {"R": 0.05, "L": 0.08, "K": 0.03, "Jt": 0.02, "ft": 0.15, "Cd": 0.10, FRICTION: 0.10}
+LEAST_STEP: dict[str, float] = {
+    "R": 0.05,
+    "L": 0.08,
+    "K": 0.03,
+    "Jt": 0.02,
+    "ft": 0.15,
+    "Cd": 0.10,
+    FRICTION_AT_RAPID: 0.10,
+}
 LEAST_STEP |= {f"{name}/K": LEAST_STEP[name] for name in ("Jt", "ft", "Cd")}  # K hardly changes
 
 

@@ -11,7 +11,7 @@ from itertools import islice, pairwise
 import numpy as np
 
 from fdhil.identification.filtering import moving_mean
-from fdhil.records import Bool, Float, Int, Recording, SlowVoltage, Stages, Window, read_only
+from fdhil.records import Bool, Float, Int, Recording, SlowVoltage, Stages, Window, make_read_only_view
 
 RUN_SHARE = 0.02
 RAPID_SHARE = 0.60
@@ -141,11 +141,13 @@ def _cut(recording: Recording, speed: Float, run: Run, floor: int, ceiling: int,
         start_tick=recording.start_tick + a,
         start_s=float(recording.time_s[a]),
         dt_s=recording.dt_s,
-        demand_mm=read_only(recording.demand_mm[part]),
-        position_mm=read_only(recording.position_mm[part]),
-        speed_rad_s=read_only(recording.speed_rad_s[part]),
-        current_a=read_only(recording.current_a[part]),
-        voltage_v=read_only(voltage[part]) if voltage is not None and recording.slow_voltage is None else None,
+        demand_mm=make_read_only_view(recording.demand_mm[part]),
+        position_mm=make_read_only_view(recording.position_mm[part]),
+        speed_rad_s=make_read_only_view(recording.speed_rad_s[part]),
+        current_a=make_read_only_view(recording.current_a[part]),
+        voltage_v=make_read_only_view(voltage[part])
+        if voltage is not None and recording.slow_voltage is None
+        else None,
         voltage_sampling=recording.voltage_sampling,
         stages=_stages(speed, run, a, recording.dt_s),
         direction=run.direction,
@@ -155,7 +157,9 @@ def _cut(recording: Recording, speed: Float, run: Run, floor: int, ceiling: int,
         temperature_c=recording.temperature_c,
         voltage_delay_s=recording.voltage_delay_s,
         source=recording.source,
-        offset_mm=read_only(offset[part]) if offset is not None and np.any(np.abs(offset[part]) > 0) else None,
+        offset_mm=make_read_only_view(offset[part])
+        if offset is not None and np.any(np.abs(offset[part]) > 0)
+        else None,
         slow_voltage=_slow_part(recording, a, b),
         torque_constant_nm_per_a=recording.torque_constant_nm_per_a,
         table_mm=_seen(recording.table_mm, part),
@@ -164,7 +168,7 @@ def _cut(recording: Recording, speed: Float, run: Run, floor: int, ceiling: int,
 
 
 def _seen(values: Float | None, part: slice) -> Float | None:
-    return None if values is None or not np.isfinite(values[part]).any() else read_only(values[part])
+    return None if values is None or not np.isfinite(values[part]).any() else make_read_only_view(values[part])
 
 
 def _slow_part(recording: Recording, a: int, b: int) -> SlowVoltage | None:
@@ -178,8 +182,8 @@ def _slow_part(recording: Recording, a: int, b: int) -> SlowVoltage | None:
     moved = slow.begin_s + first * slow.period_s - begin
     if end <= first:
         return None
-    late = None if slow.late_s is None else read_only(slow.late_s[first:end])
-    return replace(slow, begin_s=moved, voltage_v=read_only(slow.voltage_v[first:end]), late_s=late)
+    late = None if slow.late_s is None else make_read_only_view(slow.late_s[first:end])
+    return replace(slow, begin_s=moved, voltage_v=make_read_only_view(slow.voltage_v[first:end]), late_s=late)
 
 
 def _stages(speed: Float, run: Run, offset: int, dt: float) -> Stages:

@@ -19,7 +19,7 @@ from fdhil.identification.covariance import larger
 from fdhil.identification.identifiability import empty_estimate, judge
 from fdhil.identification.normal import inverse_gram, solve
 from fdhil.identification.torque_rows import TorqueRows, torque_rows
-from fdhil.records import PARAMETERS, RATIOS, Estimate, Float, Reason, Result, Window, rms
+from fdhil.records import PARAMETERS, RATIOS, Estimate, Float, Reason, Result, Window, compute_rms
 
 METHOD = "least_squares"
 TOLD_BY_SHEET = ("R", "L", "K")
@@ -77,7 +77,7 @@ class TorqueFit:
     @property
     def unexplained(self) -> float:
         """RMS of the residual as a share of the current's."""
-        return rms(self.residual) / max(rms(self.current), 1e-300)
+        return compute_rms(self.residual) / max(compute_rms(self.current), 1e-300)
 
 
 @lru_cache(maxsize=8)
@@ -97,8 +97,8 @@ def _joined(fitted: TorqueFit) -> TorqueFit:
     news = effective_rows(fitted.residual)
     while True:
         wanted = _wanted(fitted, news)
-        torque, least = fitted.design @ fitted.theta, WORTH * rms(fitted.current)
-        worth = [other for other in wanted if rms(other.design @ other.theta - torque) > least]
+        torque, least = fitted.design @ fitted.theta, WORTH * compute_rms(fitted.current)
+        worth = [other for other in wanted if compute_rms(other.design @ other.theta - torque) > least]
         if not worth:
             size = fitted.theta.size
             shifts = {other.terms[-1].names[0]: other.theta[:size] - fitted.theta for other in wanted}

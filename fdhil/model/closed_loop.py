@@ -127,7 +127,7 @@ class Ready(Protocol):
 
 def prepare(parameters: Parameters, axis: Axis, sync_period_s: float) -> Ready:
     """Prepare the drive of an axis for repeated runs."""
-    drive: Ready = tables.load(tables.REGULATORS, axis.regulators.structure)(parameters, axis, sync_period_s)
+    drive: Ready = tables.load_entry(tables.REGULATORS, axis.regulators.structure)(parameters, axis, sync_period_s)
     return drive
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdhil.model.compiled import compiled, inlined
-from fdhil.records import Float, Parameters, VoltageSampling, read_only
+from fdhil.records import Float, Parameters, VoltageSampling, make_read_only_view
 
 SUBSTEP_S = 6.25e-5  # interval at which stick and slip are decided; the linear part needs no substep
 _SERIES_TERMS = 14
@@ -152,4 +152,4 @@ def simulate_plant(
     substeps = max(1, int(np.ceil(dt_s / SUBSTEP_S - 1e-9)))
     gains = np.array([1 / p.L, p.Cd / p.Jt, p.K, p.Cd])
     start = np.array([current0_a, speed0_rad_s])
-    return _simulate(system_matrix(p), gains, read_only(mean), rise, dt_s, substeps, start)
+    return _simulate(system_matrix(p), gains, make_read_only_view(mean), rise, dt_s, substeps, start)

@@ -18,9 +18,9 @@ from fdhil.model import kernels, terms
 from fdhil.model.closed_loop import Commands, Response, State
 from fdhil.model.leap import leap
 from fdhil.model.terms import exponential
-from fdhil.records import Float, Parameters, read_only
+from fdhil.records import Float, Parameters, make_read_only_view
 
-_NO_LEAP = read_only(np.empty((0, kernels.LEAP_COLUMNS)))
+_NO_LEAP = make_read_only_view(np.empty((0, kernels.LEAP_COLUMNS)))
 
 
 @lru_cache(maxsize=64)
@@ -96,13 +96,13 @@ class Drive:
         end = state.copy()
         torque = commands.torque_offset_nm
         out = kernels.run(
-            read_only(commands.reference_mm),
-            read_only(commands.speed_offset_rad_s),
+            make_read_only_view(commands.reference_mm),
+            make_read_only_view(commands.speed_offset_rad_s),
             torque / self.nominal_k if torque.size else torque,
             first,
             commands.reference_mm.size - first if rows is None else rows,
             self.plant,
-            read_only(self.leap),
+            make_read_only_view(self.leap),
             self.masses,
             self.gains,
             self.terms,

@@ -10,7 +10,7 @@ import numpy as np
 
 from fdhil.config import Axis
 from fdhil.model import kernels
-from fdhil.records import Float, Parameters, read_only
+from fdhil.records import Float, Parameters, make_read_only_view
 
 _RIPPLE = re.compile(r"ripple_(?:screw|motor)_(\d+)")
 _SENSORS = ("speed_delay",)  # terms of the reported signals, without effect on the motion
@@ -24,7 +24,7 @@ def torque(parameters: Parameters, speed_rad_s: Float, angle_rad: Float) -> Floa
     angle is 2 pi x / pitch.
     """
     speed, angle = (np.ascontiguousarray(values, dtype=np.float64) for values in (speed_rad_s, angle_rad))
-    return kernels.torque(read_only(speed), read_only(angle), packed(parameters))
+    return kernels.torque(make_read_only_view(speed), make_read_only_view(angle), packed(parameters))
 
 
 def rad_per_mm(axis: Axis) -> float:
@@ -45,7 +45,7 @@ def full_dead_time_a(axis: Axis) -> float:
 def dead_time_v(parameters: Parameters, axis: Axis, current_a: float) -> float:
     """Return the voltage lost to the dead time."""
     share = max(-1.0, min(1.0, current_a / full_dead_time_a(axis)))
-    return parameters.term("dead_time") * share
+    return parameters.get_term("dead_time") * share
 
 
 def any_of(parameters: Parameters) -> bool:
@@ -55,42 +55,42 @@ def any_of(parameters: Parameters) -> bool:
 
 def has_spring(parameters: Parameters) -> bool:
     """Whether motor and table are separate masses."""
-    return parameters.term("resonance") > 0.0
+    return parameters.get_term("resonance") > 0.0
 
 
 def builds_up(parameters: Parameters) -> bool:
     """Whether dry friction builds up over a displacement (presliding)."""
-    return parameters.term("presliding_um") > 0.0
+    return parameters.get_term("presliding_um") > 0.0
 
 
 @lru_cache(maxsize=256)
 def packed(parameters: Parameters) -> Float:
     """Return (13 + 3 ripples,) the terms in the kernels' order."""
     p, values = parameters, np.zeros(kernels.RIPPLES)
-    values[kernels.LOAD] = p.term("load")
-    values[kernels.DRY_POSITIVE] = p.term("coulomb_positive", p.Cd)
-    values[kernels.DRY_NEGATIVE] = p.term("coulomb_negative", p.Cd)
+    values[kernels.LOAD] = p.get_term("load")
+    values[kernels.DRY_POSITIVE] = p.get_term("coulomb_positive", p.Cd)
+    values[kernels.DRY_NEGATIVE] = p.get_term("coulomb_negative", p.Cd)
     values[kernels.VISCOUS] = p.ft
-    values[kernels.VISCOUS_POSITIVE] = p.term("viscous_positive", p.ft)
-    values[kernels.VISCOUS_NEGATIVE] = p.term("viscous_negative", p.ft)
-    values[kernels.STRIBECK] = p.term("stribeck")
-    values[kernels.STRIBECK_SPEED] = p.term("stribeck_speed")
-    values[kernels.DEAD_TIME] = p.term("dead_time")
-    values[kernels.PRESLIDING] = p.term("presliding_um")
+    values[kernels.VISCOUS_POSITIVE] = p.get_term("viscous_positive", p.ft)
+    values[kernels.VISCOUS_NEGATIVE] = p.get_term("viscous_negative", p.ft)
+    values[kernels.STRIBECK] = p.get_term("stribeck")
+    values[kernels.STRIBECK_SPEED] = p.get_term("stribeck_speed")
+    values[kernels.DEAD_TIME] = p.get_term("dead_time")
+    values[kernels.PRESLIDING] = p.get_term("presliding_um")
     values[kernels.SPRING], values[kernels.DAMPER] = spring(p)
     ripples = [
-        (float(found[1]), amplitude, p.term(f"{name}_phase"))
+        (float(found[1]), amplitude, p.get_term(f"{name}_phase"))
         for name, amplitude in p.terms
         if (found := _RIPPLE.fullmatch(name))
     ]
-    return read_only(np.concatenate([values, *ripples]))
+    return make_read_only_view(np.concatenate([values, *ripples]))
 
 
 def with_resonance(parameters: Parameters, axis: Axis) -> Parameters:
     """Return the model with the resonance of the axis' section, unless it has its own."""
     if axis.resonance_hz is None or "resonance" in dict(parameters.terms):
         return parameters
-    return parameters.changed(resonance=axis.resonance_hz, resonance_damping=axis.resonance_damping)
+    return parameters.replace_values(resonance=axis.resonance_hz, resonance_damping=axis.resonance_damping)
 
 
 def spring(parameters: Parameters) -> tuple[float, float]:
@@ -99,9 +99,9 @@ def spring(parameters: Parameters) -> tuple[float, float]:
     ``resonance`` is that of both masses against each other with the motor free: the peak from motor torque to motor
     speed. With the motor held, the table resonates at sqrt(1 - share) of it; ``resonance_share`` of Jt is the table's.
     """
-    share, whole = parameters.term("resonance_share", TABLE_SHARE), 2 * math.pi * parameters.term("resonance")
+    share, whole = parameters.get_term("resonance_share", TABLE_SHARE), 2 * math.pi * parameters.get_term("resonance")
     reduced = parameters.Jt * share * (1.0 - share)
-    return whole**2 * reduced, 2 * parameters.term("resonance_damping") * whole * reduced
+    return whole**2 * reduced, 2 * parameters.get_term("resonance_damping") * whole * reduced
 
 
 @lru_cache(maxsize=64)
@@ -112,7 +112,7 @@ def masses(parameters: Parameters, pitch_mm: float, step_s: float) -> Float:
     torque on the motor, torque on the table. Positions are in mm. All viscous friction acts on the motor.
     """
     p = parameters
-    share = p.term("resonance_share", TABLE_SHARE)
+    share = p.get_term("resonance_share", TABLE_SHARE)
     mm_per_rad, (k, d) = pitch_mm / (2 * math.pi), spring(p)
     motor, table = p.Jt * (1 - share), p.Jt * share
     a = np.zeros((8, 8))
@@ -123,7 +123,7 @@ def masses(parameters: Parameters, pitch_mm: float, step_s: float) -> Float:
     a[3, [1, 2, 3, 4, 7]] = np.array([d, k / mm_per_rad, -d, -k / mm_per_rad, 1.0]) / table
     held = a.copy()
     held[3] = held[4] = 0.0
-    return read_only(np.array([exponential(one * step_s)[:5] for one in (a, held)]))
+    return make_read_only_view(np.array([exponential(one * step_s)[:5] for one in (a, held)]))
 
 
 def exponential(a: Float) -> Float:

@@ -86,7 +86,7 @@ def _with_table(outcome: WindowOutcome, signals: WindowSignals) -> WindowOutcome
         return _with_table(replace(outcome, verdict=replace(outcome.verdict, warnings=warnings)), signals)
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            found = compliance(window, estimate.parameters())
+            found = compliance(window, estimate.build_parameters())
     except GAVE_UP:  # signals that are no table's motion
         found = None
     if found is not None:
@@ -95,7 +95,7 @@ def _with_table(outcome: WindowOutcome, signals: WindowSignals) -> WindowOutcome
         warnings = (*outcome.verdict.warnings, *beside_the_config(found, axis))
         estimate = joined(outcome.estimate or estimate, found)
         outcome = replace(outcome, estimate=estimate, verdict=replace(outcome.verdict, warnings=warnings))
-    seen = at_the_table(window, estimate.parameters(), axis, signals.sync_period_s)
+    seen = at_the_table(window, estimate.build_parameters(), axis, signals.sync_period_s)
     return outcome if seen is None else replace(outcome, at_table=seen)
 
 
@@ -141,7 +141,7 @@ def estimated(signals: WindowSignals) -> WindowFit:
     fit = _fitted(window, settings)
     if fit is not None and axis is not None:
         fit = maximum_likelihood.with_loops(fit, window, settings, axis, signals.sync_period_s)
-    if name == maximum_likelihood.NAME and fit is not None:
+    if name == maximum_likelihood.MAXIMUM_LIKELIHOOD and fit is not None:
         return _with_spring(WindowFit(signals, maximum_likelihood.finish(fit), fit))
     return WindowFit(signals, estimator([window], settings), fit)
 

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from fdhil.config import MachineConfig
-from fdhil.identification.between import HISTORY, Member
+from fdhil.identification.between import HISTORY_WINDOWS, Member
 from fdhil.identification.drift import LEAST_JUMP, DriftTracker, Point
 from fdhil.identification.pooling import change_covariance, member
 from fdhil.identification.windows import find_windows
@@ -125,7 +125,7 @@ class AxisPipeline:
         self._published = known.newest
         self._tracker = DriftTracker(config.maintenance, axis)
         self._tracker.resume(known.first, known.points)
-        self._history: deque[Member] = deque(_since_jump(known), maxlen=HISTORY)
+        self._history: deque[Member] = deque(_since_jump(known), maxlen=HISTORY_WINDOWS)
         self._with_skill = with_skill
         # without it the axis' section is invented
         self._loops = OwnLoops(config.axis[axis] if with_skill else None, self._settings, self._period_s, known.loops)
@@ -228,7 +228,7 @@ class AxisPipeline:
         self._place += 1
         found = _Pooled(outcome, member(window, estimate, self._place))
         covariance = change_covariance(window, estimate)
-        notices = self._tracker.update(estimate.parameters(), covariance, window.start_tick, window.direction)
+        notices = self._tracker.update(estimate.build_parameters(), covariance, window.start_tick, window.direction)
         if self._tracker.holding:
             self._held.append(found)
             return notices
@@ -260,7 +260,7 @@ class AxisPipeline:
         self._published = ParameterSet(
             axis=self.axis,
             revision=1 if self._published is None else self._published.revision + 1,
-            parameters=estimate.parameters(),
+            parameters=estimate.build_parameters(),
             covariance=estimate.covariance,
             windows=len(self._pool),
             tick=window.start_tick + window.n,

@@ -43,7 +43,7 @@ def softer_axis(rapids: Rapids, axis: Axis, sync_period_s: float) -> Axis | None
 
     None if one is configured already, if the rapids are explained, and if none explains them.
     """
-    rapids = [pair for pair in rapids if not pair[1].term("resonance")][-MOST_RAPIDS:]
+    rapids = [pair for pair in rapids if not pair[1].get_term("resonance")][-MOST_RAPIDS:]
     if axis.resonance_hz is not None or not rapids:
         return None
     left, following = _left_um(rapids, axis, sync_period_s)
@@ -107,13 +107,13 @@ def mechanics_of(outcome: WindowOutcome, axis: Axis | None) -> Parameters | None
     """Return the parameters of a window's estimate, its winding completed; None without K, Jt, ft or Cd."""
     if outcome.estimate is None:
         return None
-    found = bounded(outcome.estimate, outcome.window.direction).parameters()
+    found = bounded(outcome.estimate, outcome.window.direction).build_parameters()
     values = found.as_dict()
     winding = {"R": UNKNOWN_R, "L": UNKNOWN_L} if axis is None else {"R": axis.nominal.R, "L": axis.nominal.L}
     filled = {name: winding.get(name, value) if value != value else value for name, value in values.items()}
     if any(value != value for value in filled.values()) or filled["Jt"] <= 0.0 or filled["K"] <= 0.0:
         return None
-    return found.changed(**filled)
+    return found.replace_values(**filled)
 
 
 def suspected(outcomes: Sequence[WindowOutcome]) -> bool:

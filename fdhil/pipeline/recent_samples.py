@@ -27,8 +27,8 @@ from fdhil.records import (
     TableSamples,
     TickTimes,
     VoltageSamples,
-    frozen,
-    read_only,
+    freeze_array,
+    make_read_only_view,
 )
 
 PLACING_BLOCKS = 40  # some 2 s of a sensor that is polled every 50 ms
@@ -118,7 +118,7 @@ class RecentSamples:
         return Recording(
             axis=self._axis,
             dt_s=self._period_s,
-            time_s=frozen(np.arange(start - first, start - first + n) * self._period_s),
+            time_s=freeze_array(np.arange(start - first, start - first + n) * self._period_s),
             voltage_v=voltage,
             current_a=_placed(((b.tick, b.current_a) for b in blocks), start, n),
             speed_rad_s=speed,
@@ -192,7 +192,7 @@ class RecentSamples:
         tick = np.concatenate([b.tick for b in self._times])
         begins = ((b.counter, np.interp(b.t_ns, tick_ns, tick)) for b in self._voltage)
         late = np.nan_to_num(_placed(begins, first, count) - (line[0] + line[1] * (first + np.arange(count))))
-        return frozen(np.clip(late, -MOST_LATE * line[1], MOST_LATE * line[1]) * self._period_ns * 1e-9)
+        return freeze_array(np.clip(late, -MOST_LATE * line[1], MOST_LATE * line[1]) * self._period_ns * 1e-9)
 
     def _separate(self, start: int, n: int) -> tuple[Float | None, float | None]:
         place = self._placing()
@@ -245,4 +245,4 @@ def _placed(parts: Iterable[tuple[Int, Float]], first: int, n: int) -> Float:
         row = counts - first
         inside = (row >= 0) & (row < n)
         values[row[inside]] = part[inside]
-    return read_only(values)
+    return make_read_only_view(values)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.records import Float, TableSamples, TableSignal, frozen
+from fdhil.records import Float, TableSamples, TableSignal, freeze_array
 
 UNSURE_MM = 2e-3  # largest motion within the uncertainty of a position's instant
 LONGEST_STEP = 1.5  # interval of acceleration samples beyond which one was lost
@@ -67,7 +67,7 @@ class RecentTable:
             further = np.interp(tick, at, motion.position_mm[known]) - motion.position_mm[row]
             sure = np.abs(motion.speed_mm_tick[row]) * block.tick_error <= UNSURE_MM
             values[row[sure]] = (readings - further)[sure]
-        return frozen(values) if np.isfinite(values).any() else None
+        return freeze_array(values) if np.isfinite(values).any() else None
 
     def accelerations(self, motion: Motion) -> Float | None:
         """Return the table's acceleration (n,) at the rows, NaN where a sample is lost; None without any.
@@ -87,7 +87,7 @@ class RecentTable:
             if rate >= 1.0
             else _cubic(tick - motion.start, readings, n, 1 / rate)
         )
-        return frozen(values) if np.isfinite(values).any() else None
+        return freeze_array(values) if np.isfinite(values).any() else None
 
 
 def _means(place: Float, readings: Float, n: int) -> Float:

@@ -19,8 +19,18 @@ from fdhil.identification.physical_bounds import bounded
 from fdhil.identification.pooling import member, pooled
 from fdhil.pipeline.analysis import GAVE_UP, gave_up, own
 from fdhil.pipeline.identified_loops import better_axis
-from fdhil.records import PARAMETERS, Estimate, HeldOut, LoopEstimate, Reason, Verdict, Window, WindowOutcome, frozen
-from fdhil.validation.agreement import WINDING, is_of_winding, moved
+from fdhil.records import (
+    PARAMETERS,
+    Estimate,
+    HeldOut,
+    LoopEstimate,
+    Reason,
+    Verdict,
+    Window,
+    WindowOutcome,
+    freeze_array,
+)
+from fdhil.validation.agreement import WINDING_PARAMETERS, is_of_winding, moved
 from fdhil.validation.held_out_moves import (
     Move,
     held_out_reason,
@@ -82,7 +92,7 @@ def _with_drift(estimate: Estimate, members: Sequence[Member]) -> Estimate:
     covariance, k = estimate.covariance.copy(), estimate.names.index(WARMING)
     places = [m.place for m in members]
     covariance[k, k] += apart.walk[WARMING] * apart.sizes[WARMING] ** 2 * (max(places) - min(places))
-    return replace(estimate, covariance=frozen(covariance))
+    return replace(estimate, covariance=freeze_array(covariance))
 
 
 def together(
@@ -131,7 +141,7 @@ def _estimated(
     if not again.names == same.names == quick.names:
         return again
     wider = np.nan_to_num(quick.covariance - same.covariance)  # zero where a slow voltage leaves R or L undetermined
-    return replace(again, covariance=frozen(again.covariance + wider))
+    return replace(again, covariance=freeze_array(again.covariance + wider))
 
 
 def one_sided(outcomes: Iterable[WindowOutcome]) -> list[Reason]:
@@ -227,7 +237,7 @@ def pool_with_held_out(
         predicted = _judged(trial, all_moves, best, sync_period_s)[1]
         if not all(is_predicted(p, settings) for o, p in zip(trial, predicted, strict=True) if o.verdict.accepted):
             windows = [_on_time(o, mine, sync_period_s) for o in trial if o.verdict.accepted]
-            plants = [all_moves.parameters()] * len(windows)
+            plants = [all_moves.build_parameters()] * len(windows)
             found = identify_loops(windows, plants, mine, settings, sync_period_s)
             if (better := better_axis(mine, found)) is not None:
                 best, loops = better, found
@@ -249,11 +259,11 @@ def pool_with_held_out(
 
 def _with_spread(estimate: Estimate, outcomes: Sequence[WindowOutcome]) -> Estimate:
     covariance = estimate.covariance.copy()
-    for name in WINDING:
-        values = [o.estimate.value(name) for o in outcomes if o.verdict.accepted and o.estimate is not None]
+    for name in WINDING_PARAMETERS:
+        values = [o.estimate.get_value(name) for o in outcomes if o.verdict.accepted and o.estimate is not None]
         k = estimate.names.index(name)
         covariance[k, k] += float(np.nanvar(values))
-    return replace(estimate, covariance=frozen(covariance))
+    return replace(estimate, covariance=freeze_array(covariance))
 
 
 def _judged(

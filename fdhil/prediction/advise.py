@@ -87,7 +87,7 @@ def advise(
             start_s=float(reference.time_s[rows[0]]),
             end_s=float(reference.time_s[rows[-1]]) + reference.dt_s,
             error_um=error,
-            where=reference.place(row),
+            where=reference.describe_position(row),
             cause=zone.cause if zone else "straight",
             axis=_off(prediction, row),
             load=_load(loads, rows),

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdhil.errors import RecordingError
-from fdhil.records import Float, frozen
+from fdhil.records import Float, freeze_array
 
-GRID = 720  # angles at which the runs are compared
+CIRCLE_POINTS = 720  # angles at which the runs are compared
 NEAR = 0.2  # of the radius: rows farther from the circle are lead-in or lead-out
 TURN = 2 * np.pi
 
@@ -62,7 +62,7 @@ def evaluate(path_mm: Float, radius_mm: float, centre_mm: tuple[float, float] | 
     away = path_mm - centre
     radius = np.hypot(*away.T)
     on = np.abs(radius - radius_mm) < NEAR * radius_mm
-    if np.count_nonzero(on) < GRID // 8:
+    if np.count_nonzero(on) < CIRCLE_POINTS // 8:
         raise RecordingError(f"the path contains no circle of {radius_mm:g} mm radius; check the radius")
     angle, deviation_um = np.unwrap(np.arctan2(away[on, 1], away[on, 0])), (radius[on] - radius_mm) * 1e3
     turned = angle - angle[0]
@@ -75,20 +75,22 @@ def evaluate(path_mm: Float, radius_mm: float, centre_mm: tuple[float, float] | 
             raise RecordingError(f"{text}; run it with G2 and G3, each a little more than once around")
         runs[bool(there[-1] > there[0])] = _middle_turn(there, deviation_um[part])
     both = _centred(np.concatenate([runs[True], runs[False]]))
-    return Circular(radius_mm, frozen(both[:GRID]), frozen(both[GRID:]))
+    return Circular(radius_mm, freeze_array(both[:CIRCLE_POINTS]), freeze_array(both[CIRCLE_POINTS:]))
 
 
 def _middle_turn(angle: Float, deviation_um: Float) -> Float:
     inside = np.abs(angle - (angle[0] + angle[-1]) / 2) <= TURN / 2
     at = np.mod(angle[inside], TURN)
     order = np.argsort(at, kind="stable")
-    found: Float = np.interp(np.arange(GRID) * TURN / GRID, at[order], deviation_um[inside][order], period=TURN)
+    found: Float = np.interp(
+        np.arange(CIRCLE_POINTS) * TURN / CIRCLE_POINTS, at[order], deviation_um[inside][order], period=TURN
+    )
     return found
 
 
 def _centred(deviation_um: Float) -> Float:
     """Return deviations (GRID,) or (2 GRID,) about their least-squares centre, exact where it is micrometres away."""
-    angle = np.arange(deviation_um.size) * TURN / GRID
+    angle = np.arange(deviation_um.size) * TURN / CIRCLE_POINTS
     across, along = (2 * np.mean(deviation_um * wave) for wave in (np.cos(angle), np.sin(angle)))
     return np.asarray(deviation_um - across * np.cos(angle) - along * np.sin(angle))
 

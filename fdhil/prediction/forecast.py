@@ -12,7 +12,7 @@ from fdhil.identification import trends
 from fdhil.identification.trends import LEAST_STEP, Slope, reach_days, slope
 from fdhil.prediction.model_terms import all_names, families, put_back
 from fdhil.prediction.predict import contour_um, predict
-from fdhil.records import PARAMETERS, Float, Parameters, ParameterSet, Prediction, Zone, rms
+from fdhil.records import PARAMETERS, Float, Parameters, ParameterSet, Prediction, Zone, compute_rms
 
 BEYOND_CHANCE = 3.0  # standard deviations
 GROUPS: Mapping[str, tuple[str, ...]] = {"inertia": ("Jt",), "friction": ("ft", "Cd")}
@@ -121,7 +121,7 @@ def step_costs(
         for what in moved(earlier[axis], now[axis]):
             names = GROUPS[what]
             old = {name: float(getattr(earlier[axis].parameters, name)) for name in names}
-            without = contour_um(reference, {**models, axis: models[axis].changed(**old)}, config)
+            without = contour_um(reference, {**models, axis: models[axis].replace_values(**old)}, config)
             change = prediction.contour_um - without
             row = int(np.argmax(np.abs(change)))
             if abs(change[row]) < COMMON_UM:
@@ -133,9 +133,9 @@ def step_costs(
                     changed={name: (old[name], float(getattr(models[axis], name))) for name in names},
                     since_revision=earlier[axis].revision,
                     cost_um=float(change[row]),
-                    rms_um=prediction.rms_um - rms(without),
+                    rms_um=prediction.rms_um - compute_rms(without),
                     line=int(reference.line[row]),
-                    where=reference.place(row),
+                    where=reference.describe_position(row),
                 )
             )
     return tuple(sorted(steps, key=lambda step: -abs(step.cost_um)))
@@ -166,7 +166,7 @@ def zone_changes(
     gone = [zone for zone in then.zones if not any(_meet(zone, other) for other in prediction.zones)]
     changes = []
     for zone in sorted((*prediction.zones, *gone), key=lambda zone: zone.start_s):
-        rows = prediction.rows(zone)
+        rows = prediction.get_zone_rows(zone)
         peak = rows.start + int(np.argmax(np.maximum(prediction.contour_um, then.contour_um)[rows]))
         now_um, before_um = float(prediction.contour_um[rows].max()), float(then.contour_um[rows].max())
         by = ((axis, name, now_um - float(other[rows].max())) for (axis, name), other in without.items())

@@ -14,7 +14,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.prediction.uncertainty import contour_std_um
-from fdhil.records import INTERVAL_95, Correction, Float, Parameters, Skill, Trajectory, rms
+from fdhil.records import INTERVAL_95, Correction, Float, Parameters, Skill, Trajectory, compute_rms
 
 MARGIN = 1.5
 """A path turns and starts more often than the rapids that show what a model leaves, and tables deflect behind encoders.
@@ -84,7 +84,7 @@ def gain(
     if left_um is None:
         return Gain(before_um, after_um, None)
     known = {axis: covariances.get(axis, np.zeros((6, 6))) for axis in reference.axes}
-    std_um = rms(contour_std_um(reference, models, known, config, planned.offset_um)) if covariances else 0.0
+    std_um = compute_rms(contour_std_um(reference, models, known, config, planned.offset_um)) if covariances else 0.0
     predicted_um = after_um if planned.refused else with_held_out_um(after_um, left_um)
     return Gain(before_um, predicted_um, math.hypot(INTERVAL_95 * std_um, left_um))
 

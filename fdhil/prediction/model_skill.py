@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fdhil.config import Axis
-from fdhil.records import Float, Int, Parameters, Skill, Window, rms
+from fdhil.records import Float, Int, Parameters, Skill, Window, compute_rms
 from fdhil.validation.replay import replay_setpoints
 
 LONGEST_DELAY = 8.0  # in SYNC cycles
@@ -23,7 +23,7 @@ def skill(window: Window, parameters: Parameters, axis: Axis, sync_period_s: flo
     return Skill(
         axis=window.axis,
         tick=window.start_tick,
-        rms_um=rms(replayed.difference_um),
+        rms_um=compute_rms(replayed.difference_um),
         max_um=float(np.abs(replayed.difference_um).max()),
         delay_ms=_delay(window.position_mm, replayed.predicted_mm, replayed.rows) * sync_period_s * 1e3,
         measured_rms_um=replayed.measured_um,

@@ -39,8 +39,8 @@ def linear(parameters: Parameters, dry_nm: float = 0.0) -> Parameters:
 def mean_friction(parameters: Parameters) -> Parameters:
     """Return the six with friction averaged over both directions, and the terms other than friction."""
     p = parameters
-    viscous = 0.5 * (p.term("viscous_positive", p.ft) + p.term("viscous_negative", p.ft))
-    dry = 0.5 * (p.term("coulomb_positive", p.Cd) + p.term("coulomb_negative", p.Cd))
+    viscous = 0.5 * (p.get_term("viscous_positive", p.ft) + p.get_term("viscous_negative", p.ft))
+    dry = 0.5 * (p.get_term("coulomb_positive", p.Cd) + p.get_term("coulomb_negative", p.Cd))
     left = tuple(pair for pair in p.terms if pair[0] not in (*DRY, "viscous_positive", "viscous_negative"))
     return replace(p, ft=viscous, Cd=dry, terms=left)
 
@@ -65,7 +65,7 @@ def band(parameters: Parameters, angle_rad: float) -> Band:
     """Return the band of a shaft that rests at an angle."""
     p = parameters
     pull = float(terms.torque(p, np.zeros(1), np.array([angle_rad]))[0])
-    low, high = (p.term(f"coulomb_{side}", p.Cd) + p.term("stribeck") for side in ("negative", "positive"))
+    low, high = (p.get_term(f"coulomb_{side}", p.Cd) + p.get_term("stribeck") for side in ("negative", "positive"))
     return Band(pull - low, pull + high)
 
 
@@ -102,7 +102,7 @@ def put_back(now: Parameters, earlier: Parameters, names: Sequence[str]) -> Para
     for name in names:
         part = get_main_term(name) != name
         changed[name] = before.get(name, present.get(name, 0.0) if part else 0.0)
-    return now.changed(**changed)
+    return now.replace_values(**changed)
 
 
 def all_names(*models: Parameters) -> tuple[str, ...]:

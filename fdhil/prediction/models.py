@@ -23,7 +23,7 @@ from fdhil.identification.physical_bounds import beyond_chance, nearest
 from fdhil.model import physical
 from fdhil.model.terms import with_resonance
 from fdhil.prediction.model_terms import families, values_of
-from fdhil.records import PARAMETERS, UNITS, Parameters, ParameterSet, Trajectory, unit_of
+from fdhil.records import PARAMETERS, UNITS, Parameters, ParameterSet, Trajectory, get_unit
 
 MAX_BYTES = 64 * 1024
 SHOWN_CHARS = 40
@@ -158,7 +158,7 @@ def _physical_model(axis: str, published: ParameterSet, faults: list[ConfigFault
         text = "Unphysical: friction in the newest set would drive the axis, or a value must not be negative"
         faults.append(ConfigFault(axis, text, "record rapids in both directions, and identify the axis again"))
         return published.parameters
-    return Parameters.of(dict(zip(names, nearest(names, values, covariance).tolist(), strict=True)))
+    return Parameters.from_mapping(dict(zip(names, nearest(names, values, covariance).tolist(), strict=True)))
 
 
 def _cannot(path: Path, what: str, suggestion: str) -> ConfigError:
@@ -181,7 +181,7 @@ def _parameters(axis: str, values: Any, faults: list[ConfigFault]) -> Parameters
     faults += _term_faults(axis, terms, values.get("Cd"))
     if len(faults) > before:
         return None
-    return Parameters.of({**{name: values[name] for name in PARAMETERS}, **terms})
+    return Parameters.from_mapping({**{name: values[name] for name in PARAMETERS}, **terms})
 
 
 def _table(axis: str, name: str, values: Any, faults: list[ConfigFault]) -> dict[str, Any]:
@@ -213,10 +213,10 @@ def _unknown(axis: str, name: str, known: tuple[str, ...], listed: str) -> Confi
 def _term_faults(axis: str, terms: Mapping[str, Any], dry_nm: Any) -> list[ConfigFault]:
     place, faults = f"{axis}.terms", []
     for name, value in terms.items():
-        if name in PARAMETERS or unit_of(name) is None:
+        if name in PARAMETERS or get_unit(name) is None:
             faults.append(_unknown(place, name, TERMS, "terms are"))
         elif fault := _fault(name, value):
-            faults.append(ConfigFault(f"{place}.{name}", fault, f"in {unit_of(name)}"))
+            faults.append(ConfigFault(f"{place}.{name}", fault, f"in {get_unit(name)}"))
     for main, (name, *_) in families(tuple(terms)).items():
         if main not in terms:
             text = f"has no meaning without {main[:SHOWN_CHARS]}"

@@ -12,7 +12,7 @@ from fdhil.model.closed_loop import Response, simulate, simulate_axes
 from fdhil.prediction.contour import contour_error_um
 from fdhil.prediction.model_terms import without_dry_friction
 from fdhil.prediction.zones import find_zones
-from fdhil.records import Float, Parameters, Prediction, Trajectory, frozen
+from fdhil.records import Float, Parameters, Prediction, Trajectory, freeze_array
 
 
 def check_axes(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> None:
@@ -78,7 +78,7 @@ def ahead_of_motor_mm(
     period_s = config.machine.sync_period_s
     found = {}
     for axis, path_mm in position_mm.items():
-        if models[axis].term("resonance"):
+        if models[axis].get_term("resonance"):
             offset_mm = offset_um[axis] * 1e-3
             response = simulate(models[axis], config.axis[axis], period_s, path_mm, offset_mm)
             found[axis] = response.table_mm - response.position_mm
@@ -101,7 +101,7 @@ def _responses(
 
 
 def _contour(reference: Trajectory, responses: Mapping[str, Response]) -> Float:
-    actual = reference.table_mm({axis: response.table_mm for axis, response in responses.items()})
+    actual = reference.compute_table_mm({axis: response.table_mm for axis, response in responses.items()})
     return contour_error_um(reference.path_mm, actual, reference.dt_s)
 
 
@@ -113,15 +113,15 @@ def _assemble(
     without_friction: Callable[[], Float] | None = None,
 ) -> Prediction:
     axes = reference.axes
-    contour = frozen(_contour(reference, responses))
+    contour = freeze_array(_contour(reference, responses))
     loop_s = max(1.0 / config.axis[axis].regulators.position_gain_per_s for axis in axes)
     limited = np.max([responses[axis].limited for axis in axes], axis=0)
     return Prediction(
         reference=reference,
-        predicted_mm={axis: frozen(responses[axis].table_mm) for axis in axes},
-        error_um={axis: frozen((responses[axis].table_mm - reference.position_mm[axis]) * 1e3) for axis in axes},
+        predicted_mm={axis: freeze_array(responses[axis].table_mm) for axis in axes},
+        error_um={axis: freeze_array((responses[axis].table_mm - reference.position_mm[axis]) * 1e3) for axis in axes},
         contour_um=contour,
-        current_a={axis: frozen(responses[axis].current_a) for axis in axes},
+        current_a={axis: freeze_array(responses[axis].current_a) for axis in axes},
         limited_s={axis: responses[axis].limited_s for axis in axes},
         zones=find_zones(reference, contour, limited, loop_s, zones_above_um, without_friction),
     )

@@ -19,7 +19,7 @@ from fdhil.config import MachineConfig
 from fdhil.prediction.feed_search import Source
 from fdhil.prediction.predict import predict
 from fdhil.program.planner.smoothing import Smoother
-from fdhil.records import Bool, Float, Int, Parameters, Trajectory, frozen, frozen_ints
+from fdhil.records import Bool, Float, Int, Parameters, Trajectory, freeze_array, freeze_integers
 
 APART_S = 0.1  # an error that oscillates through 0 has several peaks at one corner
 EXACT_MM = 5e-3  # effect of rounding to 9 decimals on a minute under two averages; other averages leave far more
@@ -69,10 +69,10 @@ def _source(reference: Trajectory, path: Float, stretch: Int, rule: Rule) -> Sou
         moved, lines = (positions, stretch) if as_it_is else rule(path, stretch, per_stretch[stretch])
         return replace(
             reference,
-            time_s=frozen(reference.time_s[0] + np.arange(lines.size) * reference.dt_s),
-            position_mm={axis: frozen(moved[:, columns.index(axis[0])]) for axis in reference.axes},
+            time_s=freeze_array(reference.time_s[0] + np.arange(lines.size) * reference.dt_s),
+            position_mm={axis: freeze_array(moved[:, columns.index(axis[0])]) for axis in reference.axes},
             rapid=np.broadcast_to(np.False_, lines.size),
-            line=frozen_ints(lines),
+            line=freeze_integers(lines),
         )
 
     # a segment ends where the error is small: later errors are not its own

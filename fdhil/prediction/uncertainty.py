@@ -12,7 +12,7 @@ from fdhil.model import closed_loop
 from fdhil.prediction.contour import contour_error_um
 from fdhil.prediction.model_terms import get_main_term, values_of
 from fdhil.prediction.predict import check_axes
-from fdhil.records import Float, Parameters, Prediction, Trajectory, unit_of
+from fdhil.records import Float, Parameters, Prediction, Trajectory, get_unit
 
 STEP = 0.005  # relative change of a parameter for its derivative
 # friction may be 0: its step is absolute then; a phase is relative to a radian
@@ -22,8 +22,8 @@ SMALLEST = {"N.m.s": 1e-4, "N.m": 1e-2, "rad": 1.0}
 def _changed(parameters: Parameters, name: str) -> tuple[Parameters, float]:
     """Return the parameters with one parameter or term slightly increased, and the step."""
     value = values_of(parameters)[name]
-    step = max(abs(value) * STEP, SMALLEST.get(unit_of(name) or "", 0.0) * STEP)
-    return parameters.changed(**{name: value + step}), step
+    step = max(abs(value) * STEP, SMALLEST.get(get_unit(name) or "", 0.0) * STEP)
+    return parameters.replace_values(**{name: value + step}), step
 
 
 def _positions(
@@ -102,16 +102,16 @@ def sensitivity_um(
     found = _positions(reference, models, config, offset_um)
     path = reference.path_mm
     here = {axis: found[axis][2] for axis in reference.axes}
-    base = contour_error_um(path, reference.table_mm(here), reference.dt_s)
+    base = contour_error_um(path, reference.compute_table_mm(here), reference.dt_s)
     result: list[dict[str, dict[str, float]]] = [{axis: {} for axis in reference.axes} for _ in prediction.zones]
     for axis in reference.axes:
         moved, steps, _ = found[axis]
         for k, (name, value) in enumerate(values_of(models[axis]).items()):
             if get_main_term(name) != name:
                 continue
-            contour = contour_error_um(path, reference.table_mm({**here, axis: moved[k]}), reference.dt_s)
+            contour = contour_error_um(path, reference.compute_table_mm({**here, axis: moved[k]}), reference.dt_s)
             per_percent = 0.01 * abs(value) / steps[k]
             for zone, per_axis in zip(prediction.zones, result, strict=True):
-                rows = prediction.rows(zone)
+                rows = prediction.get_zone_rows(zone)
                 per_axis[axis][name] = float(contour[rows].max() - base[rows].max()) * per_percent
     return tuple(result)

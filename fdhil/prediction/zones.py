@@ -281,7 +281,7 @@ def _zone(reference: Trajectory, shape: Geometry, contour_um: Float, run: _Run, 
     return Zone(
         start_s=round(float(reference.time_s[run.first]), 6),
         end_s=round(float(reference.time_s[run.last - 1]) + reference.dt_s, 6),
-        where=reference.place(place),
+        where=reference.describe_position(place),
         max_um=float(contour_um[run.peak]),
         cause=run.cause,
     )

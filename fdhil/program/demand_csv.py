@@ -16,11 +16,11 @@ from typing import IO
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.csv_text import check_lengths, read_content, shown, text_of
+from fdhil.csv_text import check_lengths, decode_text, quote_cell, read_content
 from fdhil.errors import ConfigError, ConfigFault, ProgramError, RecordingError
 from fdhil.program.limit_notes import limit_notes
 from fdhil.program.reach import first_beyond
-from fdhil.records import Float, Trajectory, frozen, frozen_ints
+from fdhil.records import Float, Trajectory, freeze_array, freeze_integers
 
 _STEP_TOLERANCE = 1e-3  # of the SYNC period, for the period itself
 _JITTER_TOLERANCE = 0.01  # of the SYNC period, for one row
@@ -47,7 +47,7 @@ def read_demand_csv(path: Path, config: MachineConfig, sha256: str | None = None
     """
     content = read_content(path)
     require_digest(path, hashlib.sha256(content).hexdigest(), sha256)
-    text = text_of(content, str(path))
+    text = decode_text(content, str(path))
     lines = text.splitlines() or [""]
     check_lengths(lines, 1, str(path))
     names = [name.strip() for name in lines[0].split(",")]
@@ -58,7 +58,7 @@ def read_demand_csv(path: Path, config: MachineConfig, sha256: str | None = None
         begins = f"a demand begins with the line {','.join(wanted)}"
         raise RecordingError(f"{path}: there is no column {', '.join(absent)}{instead}; {begins}")
     if twice := next((name for k, name in enumerate(names) if name in names[:k]), None):
-        raise RecordingError(f"{path} has two columns {shown(twice)}; remove one")
+        raise RecordingError(f"{path} has two columns {quote_cell(twice)}; remove one")
     if not text.endswith("\n"):
         cut = f"line {len(lines)} has no end of line, so its last number may be truncated"
         raise RecordingError(f"{path} is truncated: {cut}; copy it again")
@@ -82,12 +82,17 @@ def read_demand_csv(path: Path, config: MachineConfig, sha256: str | None = None
     still = np.zeros(len(table))
     rapid = still.astype(np.bool_)
     rapid.setflags(write=False)
-    position_mm = {axis: frozen(moved.get(axis, still)) for axis in config.axis}
+    position_mm = {axis: freeze_array(moved.get(axis, still)) for axis in config.axis}
     if (beyond := first_beyond(position_mm, config)) is not None:
         raise RecordingError(f"{path} line {_line_of(lines, beyond.row)}: {beyond.text}")
-    time_s = frozen(columns["time_s"])
+    time_s = freeze_array(columns["time_s"])
     demand = Trajectory(
-        config.machine.sync_period_s, time_s, position_mm, rapid, frozen_ints(still), mm_per_degree=config.mm_per_degree
+        config.machine.sync_period_s,
+        time_s,
+        position_mm,
+        rapid,
+        freeze_integers(still),
+        mm_per_degree=config.mm_per_degree,
     )
     return replace(demand, notes=limit_notes(demand, config))
 
@@ -117,7 +122,7 @@ def _bad_row(path: Path, lines: Sequence[str], names: Sequence[str]) -> Recordin
             except ValueError:
                 finite = False
             if not finite:
-                what = f"has {shown(cell.strip())} instead of a finite number"
+                what = f"has {quote_cell(cell.strip())} instead of a finite number"
                 return RecordingError(f"{path} line {number} {what}; record or export it again")
     return RecordingError(f"{path} cannot be read as numbers; export it again")
 

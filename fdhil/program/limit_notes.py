@@ -51,7 +51,7 @@ def _note(demand: Trajectory, found: Float, limit: float, what: str, unit: str, 
     if found[row] <= ROOM * limit:
         return
     line = f"line {demand.line[row]}, " if demand.line[row] else ""
-    place = f"{line}{demand.time_s[row]:.3f} s, {demand.place(row)}"
+    place = f"{line}{demand.time_s[row]:.3f} s, {demand.describe_position(row)}"
     text = f"{what} {found[row]:.4g} {unit} at {place}: the limit of {key} is {limit:.4g}"
     advice = f"correct {key} if the NC has another limit; else its planner exceeds it, as S-curve planners do in blends"
     yield Reason("DemandBeyondLimits", text, advice)

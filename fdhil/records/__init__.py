@@ -4,9 +4,24 @@ Physics is SI (V, A, rad/s, N.m, kg.m2, s), path geometry is in millimetres, pat
 name ends in ``_um``. None of them contains drive increments.
 """
 
-from fdhil.records.nc import NcState
-from fdhil.records.paths import Correction, HeldOut, Prediction, Skill, Trajectory, Zone, table_path
-from fdhil.records.signals import (
+from fdhil.records.nc_state import NcState
+from fdhil.records.path_records import Correction, HeldOut, Prediction, Skill, Trajectory, Zone, compute_table_path
+from fdhil.records.physical_parameters import (
+    INTERVAL_95,
+    PARAMETERS,
+    RATIOS,
+    UNITS,
+    Bool,
+    Float,
+    Int,
+    Parameters,
+    compute_rms,
+    freeze_array,
+    freeze_integers,
+    get_unit,
+    make_read_only_view,
+)
+from fdhil.records.signal_records import (
     AxisSamples,
     MoveEvent,
     MoveKind,
@@ -21,21 +36,6 @@ from fdhil.records.signals import (
     VoltageSamples,
     VoltageSampling,
     Window,
-)
-from fdhil.records.values import (
-    INTERVAL_95,
-    PARAMETERS,
-    RATIOS,
-    UNITS,
-    Bool,
-    Float,
-    Int,
-    Parameters,
-    frozen,
-    frozen_ints,
-    read_only,
-    rms,
-    unit_of,
 )
 from fdhil.records.verdicts import (
     AtTable,
@@ -91,10 +91,10 @@ __all__ = [
     "Window",
     "WindowOutcome",
     "Zone",
-    "frozen",
-    "frozen_ints",
-    "read_only",
-    "rms",
-    "table_path",
-    "unit_of",
+    "compute_rms",
+    "compute_table_path",
+    "freeze_array",
+    "freeze_integers",
+    "get_unit",
+    "make_read_only_view",
 ]

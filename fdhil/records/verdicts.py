@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from fdhil.records.signals import Window
-from fdhil.records.values import PARAMETERS, RATIOS, Float, Parameters
+from fdhil.records.physical_parameters import PARAMETERS, RATIOS, Float, Parameters
+from fdhil.records.signal_records import Window
 
 
 class Result(Enum):
@@ -58,18 +58,18 @@ class Estimate:
     systematic: Float | None = None
     given: tuple[str, ...] = ()
 
-    def value(self, name: str) -> float:
+    def get_value(self, name: str) -> float:
         """Return one parameter's value, NaN when it is not identifiable."""
         return float(self.values[self.names.index(name)])
 
-    def std(self, name: str) -> float:
+    def get_std(self, name: str) -> float:
         """Return one parameter's standard deviation."""
         k = self.names.index(name)
         return float(np.sqrt(self.covariance[k, k]))
 
-    def parameters(self) -> Parameters:
+    def build_parameters(self) -> Parameters:
         """Return the six parameters and the added terms; NaN stays NaN."""
-        return Parameters.of({name: self.value(name) for name in (*PARAMETERS, *self.terms)})
+        return Parameters.from_mapping({name: self.get_value(name) for name in (*PARAMETERS, *self.terms)})
 
     @property
     def terms(self) -> tuple[str, ...]:

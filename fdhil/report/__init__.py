@@ -4,6 +4,6 @@ Needs the extra ``report`` (matplotlib, jinja2); importing this package does not
 """
 
 from fdhil.report.page import Page, Section, Table, html, require, write
-from fdhil.report.pdf import deliver, find_browser, write_pdf
+from fdhil.report.pdf import find_browser, write_page_or_pdf, write_pdf
 
-__all__ = ["Page", "Section", "Table", "deliver", "find_browser", "html", "require", "write", "write_pdf"]
+__all__ = ["Page", "Section", "Table", "find_browser", "html", "require", "write", "write_page_or_pdf", "write_pdf"]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fdhil.prediction.circular import GRID, Circular
+from fdhil.prediction.circular import CIRCLE_POINTS, Circular
 from fdhil.records import Float
 from fdhil.report.drawing import COLOURS, INK, REFERENCE, drawing, legend_above
 
@@ -28,7 +28,7 @@ def division_um(test: Circular) -> float:
 def polar(test: Circular, names: tuple[str, str] = ("X", "Y")) -> str:
     """Draw both runs of a circular test about the programmed circle as inline SVG."""
     division = division_um(test)
-    angle = np.append(np.arange(GRID), 0) * 2 * np.pi / GRID
+    angle = np.append(np.arange(CIRCLE_POINTS), 0) * 2 * np.pi / CIRCLE_POINTS
     with drawing(4.8, 4.9, 0.4) as made:
         axes = made.axes
         axes.set_position((0.02, 0.05, 0.96, 0.86))

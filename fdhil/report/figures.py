@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from fdhil.model.feed_drive import simulate_plant
-from fdhil.records import Float, Parameters, Window, rms
+from fdhil.records import Float, Parameters, Window, compute_rms
 from fdhil.report.chart import MOST_POINTS, Chart, Panel, Trace, svg
 from fdhil.report.drawing import COLOURS, INK, REFERENCE
 from fdhil.report.maps import TALL, Curve, Place, corner, error_map, magnified, path
@@ -90,7 +90,7 @@ def model_against_drive(window: Window, parameters: Parameters, fit_percent: flo
     fit = "" if fit_percent is None else f", fit {fit_percent:.2f} %"
     answer = simulated_speed(window, parameters)
     difference = window.speed_rad_s - answer
-    left = rms(difference[np.isfinite(difference)])
+    left = compute_rms(difference[np.isfinite(difference)])
     overlay = [
         Trace("drive, measured", time_s, window.speed_rad_s, REFERENCE, "wide"),
         Trace(f"model{fit}", time_s, answer, COLOURS[1]),
@@ -129,7 +129,7 @@ def contour_errors(dt_s: float, cases: Mapping[str, Float]) -> str:
         time_s, peaks = _peaks(error_um, dt_s)
         traces.append(Trace(label, time_s, np.maximum(peaks, LEAST_UM) if log else peaks, colour))
     words = "; ".join(
-        f"{label} {rms(error):.3g} um RMS, {error.max():.3g} um at most" for label, error in cases.items()
+        f"{label} {compute_rms(error):.3g} um RMS, {error.max():.3g} um at most" for label, error in cases.items()
     )
     panel = Panel("contour error (um)", traces, log=log, from_zero=not log)
     return svg(Chart("time (s)", [panel], f"Contour error along the path: {words}."), 4.8, 3.2)

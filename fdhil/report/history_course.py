@@ -10,10 +10,10 @@ import numpy as np
 from fdhil.records import INTERVAL_95, Float
 from fdhil.report.chart import DAY_S, Chart, Panel, Trace
 from fdhil.report.drawing import COLOURS, INK
-from fdhil.report.parameter_view import DISPLAY, cell, half_of, spoken
+from fdhil.report.parameter_view import DISPLAY_UNITS, cell, half_of, spoken
 
-MANY = 200  # estimates: more are shown by their daily medians
-BAND = (5.0, 95.0)  # percentiles of a day's estimates
+MOST_SINGLE_ESTIMATES = 200  # estimates: more are shown by their daily medians
+DAY_PERCENTILES = (5.0, 95.0)  # percentiles of a day's estimates
 IN_VIEW = 4.0  # of the estimates' range: a farther limit would flatten the curve
 
 
@@ -31,7 +31,7 @@ class AxisHistory:
         of_windows = [window["parameters"] for window in (self.told or {}).get("windows", ())]
         known = dict.fromkeys(name for parameters in of_windows for name in parameters)
         known |= dict.fromkeys(name for row in self.rows for name in row["parameters"])
-        return [name for name in DISPLAY if name in known]
+        return [name for name in DISPLAY_UNITS if name in known]
 
     def estimates(self, name: str) -> list[Mapping[str, Any]]:
         """Return the windows that have an estimate of a parameter."""
@@ -41,7 +41,7 @@ class AxisHistory:
 
 def over_time(history: AxisHistory, name: str) -> Chart:
     """Return the chart of a parameter over time: estimates or daily medians, published values, trend."""
-    unit, factor = DISPLAY[name]
+    unit, factor = DISPLAY_UNITS[name]
     traces = [*_published(history, name), *_estimated(history, name)]
     health = history.told or {}
     if line := health.get("trends", {}).get(name):
@@ -63,8 +63,8 @@ def over_temperature(history: AxisHistory, name: str) -> Chart | None:
     known = [window for window in history.estimates(name) if window["temperature_c"] is not None]
     if not known or line is None or line["low"] <= 0.0 <= line["high"]:
         return None
-    unit, factor = DISPLAY[name]
-    drawn = known[:: -(-len(known) // MANY)]
+    unit, factor = DISPLAY_UNITS[name]
+    drawn = known[:: -(-len(known) // MOST_SINGLE_ESTIMATES)]
     celsius = np.array([window["temperature_c"] for window in drawn])
     ends = np.array([celsius.min(), line["at_celsius"], celsius.max()])
     ends.sort()
@@ -79,11 +79,11 @@ def over_temperature(history: AxisHistory, name: str) -> Chart | None:
 
 def _published(history: AxisHistory, name: str) -> list[Trace]:
     rows = [row for row in history.rows if name in row["parameters"]]
-    if len(rows) > MANY or len(history.estimates(name)) > MANY:
+    if len(rows) > MOST_SINGLE_ESTIMATES or len(history.estimates(name)) > MOST_SINGLE_ESTIMATES:
         rows = list({row["time"][:10]: row for row in rows}.values())
     if not rows:
         return []
-    values = np.array([row["parameters"][name]["value"] for row in rows]) * DISPLAY[name][1]
+    values = np.array([row["parameters"][name]["value"] for row in rows]) * DISPLAY_UNITS[name][1]
     return [Trace("published", _seconds(row["time"] for row in rows), values, COLOURS[1])]
 
 
@@ -92,18 +92,20 @@ def _estimated(history: AxisHistory, name: str) -> list[Trace]:
     if not known:
         return []
     time_s = _seconds(window["time"] for window in known)
-    if len(known) <= MANY:
+    if len(known) <= MOST_SINGLE_ESTIMATES:
         return [_points(known, name, time_s)]
-    values = np.array([window["parameters"][name]["value"] for window in known]) * DISPLAY[name][1]
+    values = np.array([window["parameters"][name]["value"] for window in known]) * DISPLAY_UNITS[name][1]
     starts = np.flatnonzero(np.diff(time_s // DAY_S, prepend=-1.0))
     days = np.split(values, starts[1:])
-    low, middle, high = (np.array([np.percentile(day, p) for day in days]) for p in (BAND[0], 50.0, BAND[1]))
+    low, middle, high = (
+        np.array([np.percentile(day, p) for day in days]) for p in (DAY_PERCENTILES[0], 50.0, DAY_PERCENTILES[1])
+    )
     at = np.array([float(np.median(part)) for part in np.split(time_s, starts[1:])])
     return [Trace("median of the day, with 90 % of its rapids", at, middle, COLOURS[0], low=low, high=high)]
 
 
 def _points(windows: Sequence[Mapping[str, Any]], name: str, at: Float) -> Trace:
-    factor = DISPLAY[name][1]
+    factor = DISPLAY_UNITS[name][1]
     values = np.array([window["parameters"][name]["value"] for window in windows]) * factor
     half = INTERVAL_95 * np.array([window["parameters"][name]["std"] for window in windows]) * factor
     return Trace("each rapid, 95 % interval", at, values, COLOURS[0], "points", values - half, values + half)
@@ -121,13 +123,13 @@ def _levels(history: AxisHistory, name: str, traces: Sequence[Trace]) -> list[tu
     low, high = min(float(np.nanmin(v)) for v in shown), max(float(np.nanmax(v)) for v in shown)
     limits = (history.told or {}).get("limits", {})
     named = {"nominal": history.nominal.get(name), "limit": limits.get(name, {}).get("limit")}
-    levels = [(label, value * DISPLAY[name][1]) for label, value in named.items() if value is not None]
+    levels = [(label, value * DISPLAY_UNITS[name][1]) for label, value in named.items() if value is not None]
     room = IN_VIEW * max(high - low, 0.02 * abs(high))
     return [(label, level) for label, level in levels if low - room <= level <= high + room]
 
 
 def _words(history: AxisHistory, name: str) -> str:
-    unit, factor = DISPLAY[name]
+    unit, factor = DISPLAY_UNITS[name]
     known = [row["parameters"][name]["value"] for row in history.rows if name in row["parameters"]]
     known = known or [window["parameters"][name]["value"] for window in history.estimates(name)]
     ends = f", first {known[0] * factor:.4g} {unit}, latest {known[-1] * factor:.4g} {unit}" if known else ""

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from fdhil.store.rows import Revision, StoredWindow
 
 NEWEST_NOTICES = 500
-PASS = "PassMeasured"
+PASS_CODE = "PassMeasured"
 
 
 def read_history(
@@ -84,7 +84,7 @@ def read_passes(machine: MachineConfig) -> list[dict[str, Any]]:
 
     with History.read(machine.store.directory) as stored:
         known = stored.notices(limit=RECENT_NOTICES)
-    return [notice_document(notice) for notice in known if notice.notice.code == PASS]
+    return [notice_document(notice) for notice in known if notice.notice.code == PASS_CODE]
 
 
 def _row(revision: Revision) -> dict[str, Any]:

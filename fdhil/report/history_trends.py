@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from fdhil.records import PARAMETERS, RATIOS, unit_of
-from fdhil.report.parameter_view import DISPLAY, cell, half_of
+from fdhil.records import PARAMETERS, RATIOS, get_unit
+from fdhil.report.parameter_view import DISPLAY_UNITS, cell, half_of
 
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig
@@ -67,9 +67,9 @@ def of_axis(
     """Return an axis' health; ``limits`` maps a symbol to its first published value and its allowed relative change."""
     import numpy as np
 
-    from fdhil.identification.trends import BY_DIRECTION, FRICTION, slope, steps, without_direction
+    from fdhil.identification.trends import BY_DIRECTION, FRICTION_AT_RAPID, slope, steps, without_direction
 
-    symbols = (*symbols, FRICTION) if symbols == PARAMETERS else symbols
+    symbols = (*symbols, FRICTION_AT_RAPID) if symbols == PARAMETERS else symbols
     values, stds = (_columns(windows, key, symbols) for key in ("value", "std"))
     values[stds == 0.0] = np.nan  # given, not estimated: a data sheet's value has no trend
     direction = np.array([window.direction for window in windows], dtype=np.float64)
@@ -103,9 +103,11 @@ def of_axis(
 def _columns(windows: Sequence[StoredWindow], key: str, symbols: Sequence[str]) -> Float:
     import numpy as np
 
-    from fdhil.identification.trends import FRICTION
+    from fdhil.identification.trends import FRICTION_AT_RAPID
 
-    known: list[dict[str, Any]] = [{**(window.parameters or {}), FRICTION: window.friction or {}} for window in windows]
+    known: list[dict[str, Any]] = [
+        {**(window.parameters or {}), FRICTION_AT_RAPID: window.friction or {}} for window in windows
+    ]
     columns = [[parameters.get(name, {}).get(key) for name in symbols] for parameters in known]
     return np.array(columns, dtype=np.float64).reshape(-1, len(symbols))
 
@@ -141,7 +143,7 @@ def _dates(reached: Crossing, newest_s: float) -> dict[str, str | None]:
 
 
 def _changes(found: Sequence[Step], windows: Sequence[StoredWindow]) -> list[dict[str, Any]]:
-    from fdhil.identification.trends import FRICTION
+    from fdhil.identification.trends import FRICTION_AT_RAPID
 
     changes: list[list[Step]] = []
     for step in found:
@@ -153,11 +155,13 @@ def _changes(found: Sequence[Step], windows: Sequence[StoredWindow]) -> list[dic
     for together in changes:
         window = windows[together[0].row]
         parameters = {
-            s.name: {"before": s.before, "after": s.before + s.size, "std": s.std, "unit": unit_of(s.name)}
+            s.name: {"before": s.before, "after": s.before + s.size, "std": s.std, "unit": get_unit(s.name)}
             for s in together
         }
         # the sum of ft and Cd adds no cause to either of them
-        moved_by = frozenset(name.removesuffix("/K") for name in parameters) - {FRICTION} or frozenset({"ft", "Cd"})
+        moved_by = frozenset(name.removesuffix("/K") for name in parameters) - {FRICTION_AT_RAPID} or frozenset(
+            {"ft", "Cd"}
+        )
         cause = CAUSES.get(moved_by, "a changed drive or sensor")
         described.append(
             {"window": window.number, "time": _date(window.stamp.wall_s), "cause": cause, "parameters": parameters}
@@ -189,19 +193,19 @@ def slope_rows(health: Mapping[str, Any]) -> list[list[str]]:
     """Return a row per parameter that has a slope: per kelvin, per day, and its limit's date."""
     slopes, trends, limits = (health[key] for key in ("slopes", "trends", "limits"))
     rows = []
-    for name in DISPLAY:
+    for name in DISPLAY_UNITS:
         if name in slopes or name in trends:
             cells = [
                 cell(name, line[key], half_of(line), " ") if (line := lines.get(name)) else "-"
                 for lines, key in ((slopes, "per_kelvin"), (trends, "per_day"))
             ]
-            rows.append([f"{name.partition('_')[0]} {DISPLAY[name][0]}", *cells, _when(name, limits.get(name))])
+            rows.append([f"{name.partition('_')[0]} {DISPLAY_UNITS[name][0]}", *cells, _when(name, limits.get(name))])
     return rows
 
 
 def moved(change: Mapping[str, Any]) -> str:
     """Describe a change in words."""
-    parts = ((name, DISPLAY[name], p) for name, p in change["parameters"].items())
+    parts = ((name, DISPLAY_UNITS[name], p) for name, p in change["parameters"].items())
     return ", ".join(
         f"{name} {p['before'] * factor:.4g} -> {p['after'] * factor:.4g} {unit}" for name, (unit, factor), p in parts
     )
@@ -210,7 +214,7 @@ def moved(change: Mapping[str, Any]) -> str:
 def _when(name: str, limit: Mapping[str, Any] | None) -> str:
     if limit is None:
         return "-"
-    value = f"{limit['limit'] * DISPLAY[name][1]:.4g}"
+    value = f"{limit['limit'] * DISPLAY_UNITS[name][1]:.4g}"
     if limit["reached"]:
         return f"{value} reached"
     latest = limit["latest"][:10] if limit["latest"] else "open"

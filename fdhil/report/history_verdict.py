@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from fdhil.records import PARAMETERS
 from fdhil.report.history_course import AxisHistory
 from fdhil.report.history_trends import moved
-from fdhil.report.parameter_view import DISPLAY, cell, half_of
+from fdhil.report.parameter_view import DISPLAY_UNITS, cell, half_of
 
 if TYPE_CHECKING:
     from fdhil.store.rows import StoredWindow
@@ -20,7 +20,7 @@ RECENT_DAYS = 7.0  # before the newest rapid: changes within are reported
 NEWEST_RAPIDS = 100
 MANY_REFUSED = 0.2  # of the newest rapids
 IN_ORDER = "In order: no limit is near, and no parameter stepped in the last week."
-UNKNOWN = "Nothing has been identified yet."
+NOT_IDENTIFIED = "Nothing has been identified yet."
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ def sentences(history: AxisHistory, refused: Refusals) -> list[str]:
     health = history.told or {}
     sentences: list[str] = []
     for name, limit in health.get("limits", {}).items():
-        value = f"{limit['limit'] * DISPLAY[name][1]:.4g} {DISPLAY[name][0]}"
+        value = f"{limit['limit'] * DISPLAY_UNITS[name][1]:.4g} {DISPLAY_UNITS[name][0]}"
         if limit["reached"]:
             sentences.insert(0, f"{name} has reached its maintenance limit of {value}: inspect the axis now.")
         else:
@@ -69,7 +69,7 @@ def sentences(history: AxisHistory, refused: Refusals) -> list[str]:
     elif refused.newest_refused > MANY_REFUSED * refused.newest_seen:
         newest = f"{refused.newest_refused} of the newest {refused.newest_seen} rapids were not accepted"
         sentences.append(f"{newest}, {_most(refused)}.")
-    return sentences or [IN_ORDER if health.get("windows") else UNKNOWN]
+    return sentences or [IN_ORDER if health.get("windows") else NOT_IDENTIFIED]
 
 
 def _recent(health: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -98,7 +98,7 @@ def latest_rows(history: AxisHistory, shares: Mapping[str, float]) -> list[list[
     limits = (history.told or {}).get("limits", {})
     rows = []
     for name in (name for name in PARAMETERS if name in newest):
-        unit, factor = DISPLAY[name]
+        unit, factor = DISPLAY_UNITS[name]
         value, nominal = newest[name]["value"], history.nominal.get(name)
         rows.append([
             name, cell(name, value, half_of(newest[name]), " "), unit,

@@ -8,11 +8,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from fdhil.identification.next_move import predict_next_moves
-from fdhil.records import INTERVAL_95, PARAMETERS, Estimate, Float, Verdict, WindowOutcome, unit_of
+from fdhil.records import INTERVAL_95, PARAMETERS, Estimate, Float, Verdict, WindowOutcome, get_unit
 from fdhil.report.chart import Chart, Panel, Trace, svg, thinned
 from fdhil.report.drawing import COLOURS, INK, REFERENCE
 from fdhil.report.page import Page, Section, Table
-from fdhil.report.parameter_view import MEANING, MEANINGS, cell, head
+from fdhil.report.parameter_view import INTERVAL_MEANING, PARAMETER_MEANINGS, cell, head
 from fdhil.validation.simulation import simulated
 
 MOST_WINDOWS = 6
@@ -86,21 +86,21 @@ def _parameters(found: Identified) -> Section:
     terms = found.pooled.terms if found.pooled is not None else ()
     rows = [_row(name, found.pooled, found.verdict) for name in (*PARAMETERS, *terms)]
     reasons = [[str(r), r.advice] for r in dict.fromkeys((*found.verdict.reasons, *found.verdict.warnings))]
-    tables = [Table(("parameter", "value", "unit", "what it is"), rows, MEANING)]
+    tables = [Table(("parameter", "value", "unit", "what it is"), rows, INTERVAL_MEANING)]
     tables += [Table(("finding", "what to do"), reasons)] if reasons else []
     return Section("Parameters", tables=tables)
 
 
 def _row(name: str, estimate: Estimate | None, verdict: Verdict) -> tuple[str, str, str, str]:
-    if estimate is None or not math.isfinite(estimate.value(name)):
+    if estimate is None or not math.isfinite(estimate.get_value(name)):
         reason = estimate.missing.get(name) if estimate is not None else None
         reason = reason or next(iter(verdict.reasons), None)
         return name, "-", "", str(reason) if reason is not None else "not determined"
     if name in estimate.given:
-        return name, f"{estimate.value(name):.4g}", unit_of(name) or "", "given, not estimated"
-    shown = cell(name, estimate.value(name), INTERVAL_95 * estimate.std(name), " ")
-    unit = head(name).split("\n")[1] if name in PARAMETERS else unit_of(name) or ""
-    return name, shown, unit, MEANINGS.get(name, "additional term")
+        return name, f"{estimate.get_value(name):.4g}", get_unit(name) or "", "given, not estimated"
+    shown = cell(name, estimate.get_value(name), INTERVAL_95 * estimate.get_std(name), " ")
+    unit = head(name).split("\n")[1] if name in PARAMETERS else get_unit(name) or ""
+    return name, shown, unit, PARAMETER_MEANINGS.get(name, "additional term")
 
 
 def _window(outcome: WindowOutcome) -> Section:
@@ -161,7 +161,7 @@ def correlations(values: Float) -> Float:
 def _correlation(estimate: Estimate | None) -> Iterator[Section]:
     if estimate is None:
         return
-    names = [n for n in estimate.names if math.isfinite(estimate.std(n)) and estimate.std(n) > 0.0]
+    names = [n for n in estimate.names if math.isfinite(estimate.get_std(n)) and estimate.get_std(n) > 0.0]
     if len(names) < 2:
         return
     kept = [estimate.names.index(name) for name in names]
@@ -178,10 +178,10 @@ def _next(found: Identified) -> Iterator[Section]:
     window = max((outcome.window for outcome in found.outcomes), key=lambda window: window.n, default=None)
     if estimate is None or window is None or estimate.missing or estimate.given:
         return
-    p = estimate.parameters()
+    p = estimate.build_parameters()
     if min(p.R, p.L, p.K, p.Jt) <= 0.0:
         return
-    widest = max(PARAMETERS, key=lambda name: estimate.std(name) / max(abs(estimate.value(name)), 1e-300))
+    widest = max(PARAMETERS, key=lambda name: estimate.get_std(name) / max(abs(estimate.get_value(name)), 1e-300))
     moves = predict_next_moves(window, estimate)
     rows = [(move.name, *(f"{move.shares[name]:.2f}" for name in PARAMETERS)) for move in moves]
     best = min(moves, key=lambda move: move.shares[widest], default=None)

@@ -6,16 +6,16 @@ from typing import Any
 
 from fdhil.records import UNITS
 
-MEANING = "± is half the width of the 95 % interval"
+INTERVAL_MEANING = "± is half the width of the 95 % interval"
 # displayed unit and factor; the ratios to K and all of JSON stay in SI units
-DISPLAY: Mapping[str, tuple[str, float]] = {name: (unit, 1.0) for name, unit in UNITS.items()} | {
+DISPLAY_UNITS: Mapping[str, tuple[str, float]] = {name: (unit, 1.0) for name, unit in UNITS.items()} | {
     "R": ("mohm", 1e3),
     "L": ("mH", 1e3),
     "Jt": ("g.m2", 1e3),
     "ft": ("mN.m.s", 1e3),
 }
 
-MEANINGS: Mapping[str, str] = {
+PARAMETER_MEANINGS: Mapping[str, str] = {
     "R": "resistance of the winding",
     "L": "inductance of the winding",
     "K": "torque per ampere",
@@ -40,12 +40,12 @@ def minute(time: str) -> str:
 
 def spoken(name: str) -> str:
     """Return a parameter's symbol, or its description if it has none."""
-    return MEANINGS[name] if "_" in name else name
+    return PARAMETER_MEANINGS[name] if "_" in name else name
 
 
 def head(name: str) -> str:
     """Return the heading of a parameter's column: its symbol above its unit."""
-    return f"{name}\n{DISPLAY[name][0]}"
+    return f"{name}\n{DISPLAY_UNITS[name][0]}"
 
 
 def half_of(interval: Mapping[str, Any]) -> float | None:
@@ -59,7 +59,7 @@ def cell(name: str, value: float | None, half: float | None, between: str = "\n"
     """Format a value and half of its interval in the parameter's unit, both to the half's first digit."""
     if value is None or not math.isfinite(value):
         return "-"
-    factor = DISPLAY[name][1] if name in DISPLAY else 1.0  # terms are displayed in SI units
+    factor = DISPLAY_UNITS[name][1] if name in DISPLAY_UNITS else 1.0  # terms are displayed in SI units
     shown = value * factor
     if half is None or not math.isfinite(half):
         return f"{shown:.4g}{between}(no ±)"

@@ -112,7 +112,7 @@ def _names(reference: Trajectory, plane: tuple[str, str]) -> tuple[str, str]:
 
 
 def _flat(reference: Trajectory, positions: Prediction | None, plane: tuple[str, str]) -> Float:
-    path = reference.path_mm if positions is None else reference.table_mm(positions.predicted_mm)
+    path = reference.path_mm if positions is None else reference.compute_table_mm(positions.predicted_mm)
     return path[:, [reference.table_axes.index(axis) for axis in plane]]
 
 
@@ -153,7 +153,7 @@ def worst_places(predicted: Prediction) -> list[tuple[Zone, int]]:
     found: list[tuple[Zone, int]] = []
     for most, zones in ((MOST_PLACES, [*causes.values(), *of_kinds.values()]), (FEW_PLACES, others)):
         for zone in zones:
-            row = predicted.worst_row(zone)
+            row = predicted.find_worst_row(zone)
             apart = all(np.linalg.norm(path[row] - path[other]) > APART_MM for _, other in found)
             if apart and len(found) < most:
                 found.append((zone, row))
@@ -172,7 +172,7 @@ def _places(cases: Sequence[tuple[str, Prediction]]) -> Section:
 
 def _place(cases: Sequence[tuple[str, Prediction]], zone: Zone, row: int) -> tuple[str, str]:
     reference = cases[0][1].reference
-    inside = cases[0][1].rows(zone)
+    inside = cases[0][1].get_zone_rows(zone)
     first, last = inside.start, inside.stop
     before, aside = round(BEFORE_S / reference.dt_s), round(ASIDE_S / reference.dt_s)
     rows = slice(max(0, first - aside), last + aside)
@@ -216,7 +216,7 @@ def nearest_mm(predicted: Prediction, rows: slice) -> Float:
     counts.
     """
     reference = predicted.reference
-    actual = reference.table_mm(predicted.predicted_mm)[rows]
+    actual = reference.compute_table_mm(predicted.predicted_mm)[rows]
     return nearest_points_mm(reference.path_mm, actual, reference.dt_s, rows.start)
 
 
@@ -226,11 +226,11 @@ def _zones(before: Prediction, after: Prediction | None) -> Section:
     numbers = {row: str(k) for k, (_, row) in enumerate(worst_places(before), 1)}
     rows = []
     for zone in sorted(largest, key=lambda zone: zone.start_s):
-        row = before.worst_row(zone)
+        row = before.find_worst_row(zone)
         times = f"{zone.start_s:.2f} to {zone.end_s:.2f}"
         cells = [numbers.get(row, ""), times, str(reference.line[row] or ""), zone.where, zone.cause]
         cells.append(f"{zone.max_um:.1f}")
-        rows.append(cells if after is None else [*cells, f"{after.contour_um[before.rows(zone)].max():.2f}"])
+        rows.append(cells if after is None else [*cells, f"{after.contour_um[before.get_zone_rows(zone)].max():.2f}"])
     if not rows:
         return Section("Zones", "No zone stands out.")
     left_out = len(before.zones) - len(rows)

@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import IO
 
-from fdhil.child import ending_with_parent
+from fdhil.child_process import wrap_to_end_with_parent
 from fdhil.errors import FdhilError
 from fdhil.report.page import Page, html, write
 from fdhil.store.output import open_output
@@ -24,7 +24,7 @@ MISSING = (
 )
 
 
-def deliver(page: Page, html_file: Path | None, pdf_file: Path | None) -> None:
+def write_page_or_pdf(page: Page, html_file: Path | None, pdf_file: Path | None) -> None:
     """Write the page to the requested files. FdhilError or OutputError."""
     if html_file is not None:
         write(page, html_file)
@@ -64,7 +64,7 @@ def run_browser(browser: str, folder: Path, *arguments: str, output: IO[str] | N
     command = [browser, *SWITCHES, *sandbox, f"--user-data-dir={folder / 'profile'}", *arguments]
     try:
         ended = subprocess.run(
-            ending_with_parent(command),
+            wrap_to_end_with_parent(command),
             stdout=output or subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,

@@ -77,83 +77,102 @@ class EdgeNode:
         self._seq = 0
         self._bd_seq = -1
 
-    def topic(self, verb: str, device: str = "") -> str:
+    def make_topic(self, verb: str, device: str = "") -> str:
         """Return the topic of a message."""
         return "/".join((NAMESPACE, self._group, verb, self._node, *([device] if device else [])))
 
-    def will(self, now_ms: int) -> Message:
+    def begin_connection(self, now_ms: int) -> Message:
         """Begin a new connection: return the death certificate that the broker publishes when the connection breaks."""
         self._bd_seq = (self._bd_seq + 1) % WRAP
-        return self.death(now_ms)
+        return self.build_death(now_ms)
 
-    def death(self, now_ms: int) -> Message:
+    def build_death(self, now_ms: int) -> Message:
         """Return the death certificate of this connection."""
-        return Message(self.topic("NDEATH"), _payload(now_ms, None, [_fields(self._birth_death(now_ms))]), qos=1)
+        return Message(
+            self.make_topic("NDEATH"),
+            _encode_payload(now_ms, None, [_encode_metric(self._make_birth_death_metric(now_ms))]),
+            qos=1,
+        )
 
-    def births(self, node: Iterable[Metric], devices: Mapping[str, Iterable[Metric]], now_ms: int) -> list[Message]:
+    def build_births(
+        self, node: Iterable[Metric], devices: Mapping[str, Iterable[Metric]], now_ms: int
+    ) -> list[Message]:
         """Return the birth certificates of the node and its devices, with all known metrics."""
         self._sent, self._seq = {}, -1
         rebirth = Metric(REBIRTH, BOOLEAN, False, now_ms, description="write true to have all births sent again")
-        own = [_fields(self._birth_death(now_ms)), _fields(rebirth)]
-        born = [self._born("", list(node), now_ms, own)]
-        return born + [self._born(device, list(metrics), now_ms, []) for device, metrics in devices.items()]
+        own = [_encode_metric(self._make_birth_death_metric(now_ms)), _encode_metric(rebirth)]
+        born = [self._build_birth("", list(node), now_ms, own)]
+        return born + [self._build_birth(device, list(metrics), now_ms, []) for device, metrics in devices.items()]
 
-    def news(self, node: Iterable[Metric], devices: Mapping[str, Iterable[Metric]], now_ms: int) -> list[Message]:
+    def build_changes(
+        self, node: Iterable[Metric], devices: Mapping[str, Iterable[Metric]], now_ms: int
+    ) -> list[Message]:
         """Return the changes since the last call: values, devices that became silent, and returning ones.
 
         A device that is not listed is silent. One with a metric that its birth did not name is born again.
         """
         now = {device: list(metrics) for device, metrics in devices.items()}
-        if self._outgrown("", own := list(node)):
-            return self.births(own, now, now_ms)
+        if self._needs_rebirth("", own := list(node)):
+            return self.build_births(own, now, now_ms)
         silent = [device for device in self._sent if device and device not in now]
-        messages = [message for message in [self._changed("", own, now_ms)] if message is not None]
+        messages = [message for message in [self._build_data("", own, now_ms)] if message is not None]
         for device in silent:
             del self._sent[device]
-            messages.append(Message(self.topic("DDEATH", device), _payload(now_ms, self._next(), [])))
+            messages.append(
+                Message(self.make_topic("DDEATH", device), _encode_payload(now_ms, self._advance_sequence(), []))
+            )
         for device, metrics in now.items():
-            if device not in self._sent or self._outgrown(device, metrics):
-                messages.append(self._born(device, metrics, now_ms, []))
-            elif (changed := self._changed(device, metrics, now_ms)) is not None:
+            if device not in self._sent or self._needs_rebirth(device, metrics):
+                messages.append(self._build_birth(device, metrics, now_ms, []))
+            elif (changed := self._build_data(device, metrics, now_ms)) is not None:
                 messages.append(changed)
         return messages
 
-    def _outgrown(self, device: str, metrics: list[Metric]) -> bool:
+    def _needs_rebirth(self, device: str, metrics: list[Metric]) -> bool:
         sent = self._sent.get(device, {})
         return any(m.name not in sent or sent[m.name].datatype != m.datatype for m in metrics)
 
-    def _born(self, device: str, metrics: list[Metric], now_ms: int, own: Sequence[Mapping[str, Any]]) -> Message:
-        seq = self._next()
+    def _build_birth(
+        self, device: str, metrics: list[Metric], now_ms: int, own: Sequence[Mapping[str, Any]]
+    ) -> Message:
+        seq = self._advance_sequence()
         self._sent[device] = {metric.name: metric for metric in metrics}
-        named = [{**_fields(metric), "alias": self._alias(device, metric.name)} for metric in metrics]
-        return Message(self.topic("DBIRTH" if device else "NBIRTH", device), _payload(now_ms, seq, [*own, *named]))
+        named = [{**_encode_metric(metric), "alias": self._get_alias(device, metric.name)} for metric in metrics]
+        return Message(
+            self.make_topic("DBIRTH" if device else "NBIRTH", device), _encode_payload(now_ms, seq, [*own, *named])
+        )
 
-    def _changed(self, device: str, metrics: list[Metric], now_ms: int) -> Message | None:
+    def _build_data(self, device: str, metrics: list[Metric], now_ms: int) -> Message | None:
         """Return changed metrics by alias; None where nothing changed. A metric that is gone becomes null."""
         sent = self._sent[device]
         still = {metric.name for metric in metrics}
         gone = [replace(old, value=None, stamp_ms=now_ms) for name, old in sent.items() if name not in still]
-        new = [metric for metric in (*metrics, *gone) if _is_new(metric, sent[metric.name])]
+        new = [metric for metric in (*metrics, *gone) if _is_changed(metric, sent[metric.name])]
         if not new:
             return None
         sent.update({metric.name: metric for metric in new})
-        by_alias = [{**_value_of(m), "alias": self._alias(device, m.name), "timestamp": m.stamp_ms} for m in new]
-        return Message(self.topic("DDATA" if device else "NDATA", device), _payload(now_ms, self._next(), by_alias))
+        by_alias = [
+            {**_encode_value(m), "alias": self._get_alias(device, m.name), "timestamp": m.stamp_ms} for m in new
+        ]
+        return Message(
+            self.make_topic("DDATA" if device else "NDATA", device),
+            _encode_payload(now_ms, self._advance_sequence(), by_alias),
+        )
 
-    def _alias(self, device: str, name: str) -> int:
+    def _get_alias(self, device: str, name: str) -> int:
         return self._aliases.setdefault((device, name), len(self._aliases) + 1)
 
-    def _birth_death(self, now_ms: int) -> Metric:
+    def _make_birth_death_metric(self, now_ms: int) -> Metric:
         return Metric(BIRTH_DEATH, INT64, max(0, self._bd_seq), now_ms)
 
-    def _next(self) -> int:
+    def _advance_sequence(self) -> int:
         self._seq = (self._seq + 1) % WRAP
         return self._seq
 
 
-def wants_rebirth(payload: bytes) -> bool:
+def is_rebirth_command(payload: bytes) -> bool:
     """Return whether a command requests the births; every other command is ignored."""
-    command = _classes()["Payload"]()
+    command = _build_message_classes()["Payload"]()
     try:
         command.ParseFromString(payload)
     except DecodeError:
@@ -169,12 +188,12 @@ class HostState:
     stamp_ms: int
 
 
-def host_topic(host: str) -> str:
+def make_host_topic(host: str) -> str:
     """Return the topic on which a primary host application publishes its state."""
     return f"{NAMESPACE}/STATE/{host}"
 
 
-def host_state(payload: bytes) -> HostState | None:
+def parse_host_state(payload: bytes) -> HostState | None:
     """Parse the state of a host application; None when it is invalid."""
     try:
         document = json.loads(payload)
@@ -185,22 +204,22 @@ def host_state(payload: bytes) -> HostState | None:
     return HostState(online, stamp_ms) if whole else None
 
 
-def _is_new(metric: Metric, sent: Metric) -> bool:
-    return _value_of(metric) != _value_of(sent) or (metric.event and metric.stamp_ms != sent.stamp_ms)
+def _is_changed(metric: Metric, sent: Metric) -> bool:
+    return _encode_value(metric) != _encode_value(sent) or (metric.event and metric.stamp_ms != sent.stamp_ms)
 
 
-def _fields(metric: Metric) -> dict[str, Any]:
+def _encode_metric(metric: Metric) -> dict[str, Any]:
     pairs = [(UNIT, metric.unit), (DESCRIPTION, metric.description)]
     properties = [(key, text) for key, text in pairs if text]
     property_set = {
         "keys": [key for key, _ in properties],
         "values": [{"type": STRING, "string_value": text} for _, text in properties],
     }
-    named = {"name": metric.name, "timestamp": metric.stamp_ms, "datatype": metric.datatype, **_value_of(metric)}
+    named = {"name": metric.name, "timestamp": metric.stamp_ms, "datatype": metric.datatype, **_encode_value(metric)}
     return {**named, "properties": property_set} if properties else named
 
 
-def _value_of(metric: Metric) -> dict[str, Any]:
+def _encode_value(metric: Metric) -> dict[str, Any]:
     value = metric.value
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return {"is_null": True}
@@ -214,8 +233,8 @@ def _value_of(metric: Metric) -> dict[str, Any]:
     return {"string_value": str(value).encode("utf-8", "replace").decode()}
 
 
-def _payload(now_ms: int, seq: int | None, metrics: Iterable[Mapping[str, Any]]) -> bytes:
-    classes = _classes()
+def _encode_payload(now_ms: int, seq: int | None, metrics: Iterable[Mapping[str, Any]]) -> bytes:
+    classes = _build_message_classes()
     whole = classes["Payload"](timestamp=now_ms, metrics=[classes["Metric"](**fields) for fields in metrics])
     if seq is not None:
         whole.seq = seq
@@ -223,10 +242,10 @@ def _payload(now_ms: int, seq: int | None, metrics: Iterable[Mapping[str, Any]])
 
 
 @cache
-def _classes() -> Mapping[str, Any]:
+def _build_message_classes() -> Mapping[str, Any]:
     file = descriptor_pb2.FileDescriptorProto(name="sparkplug_b", package="fdhil.sparkplug", syntax="proto2")
     for name, fields in _FIELDS.items():
-        file.message_type.add(name=name).field.extend(_described(fields))
+        file.message_type.add(name=name).field.extend(_describe_fields(fields))
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     return {
@@ -234,7 +253,7 @@ def _classes() -> Mapping[str, Any]:
     }
 
 
-def _described(fields: Iterable[tuple[int, str, str]]) -> Iterator[Any]:
+def _describe_fields(fields: Iterable[tuple[int, str, str]]) -> Iterator[Any]:
     field = descriptor_pb2.FieldDescriptorProto
     for number, kind, name in fields:
         label = field.LABEL_REPEATED if kind.endswith("*") else field.LABEL_OPTIONAL

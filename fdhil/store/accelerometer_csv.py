@@ -14,7 +14,7 @@ from fdhil.csv_text import read_csv_text
 from fdhil.errors import RecordingError
 from fdhil.identification.filtering import quick_size, zero_phase
 from fdhil.identification.windows import bridged
-from fdhil.records import Float, Recording, frozen
+from fdhil.records import Float, Recording, freeze_array
 
 LEAST_ROWS = 100
 LEAST_CORRELATION = 0.7  # of recordings of the same moves
@@ -39,8 +39,8 @@ def with_accelerometer(recording: Recording, path: Path) -> Recording:
             f"{LEAST_CORRELATION} is required): use the file of the same run, with all its moves"
         )
     values = axes[:, best] if correlation > 0 else -axes[:, best]
-    rows = frozen(np.arange(recording.speed_rad_s.size) * recording.dt_s)
-    return replace(recording, table_m_s2=frozen(_at(rows, time_s - time_s[0] + begin_s, values)))
+    rows = freeze_array(np.arange(recording.speed_rad_s.size) * recording.dt_s)
+    return replace(recording, table_m_s2=freeze_array(_at(rows, time_s - time_s[0] + begin_s, values)))
 
 
 def _read(path: Path) -> tuple[Float, Float]:

@@ -23,7 +23,7 @@ from fdhil.store.atomic import store_error, sync_folder, write_all
 from fdhil.store.rows import Stamp
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
-FILE_NAME = "audit.jsonl"
+AUDIT_FILE_NAME = "audit.jsonl"
 TAIL_BYTES = 16 * 1024
 LOCKED_S, LOOK_S = 10.0, 0.01  # wait for another writer; every reader of the file can lock it, too
 BEGIN = "0" * 64  # the seal before the first line
@@ -35,7 +35,7 @@ def append(folder: Path, entry: Mapping[str, Any], clock: Clock = SYSTEM_CLOCK) 
 
     A line that a power cut left incomplete is terminated first; ``entries`` reports it.
     """
-    path = folder / FILE_NAME
+    path = folder / AUDIT_FILE_NAME
     try:
         with _opened(path) as descriptor:
             before, whole = _last_seal(descriptor)
@@ -100,7 +100,7 @@ def _seal(before: str, body: Mapping[str, Any]) -> str:
 
 def entries(folder: Path) -> Iterator[tuple[dict[str, Any], str | None]]:
     """Yield each entry, oldest first, and its defect, None if it is intact. Raises StoreError."""
-    path = folder / FILE_NAME
+    path = folder / AUDIT_FILE_NAME
     try:
         with path.open("rb") as file:
             before = BEGIN

@@ -15,19 +15,19 @@ from pydantic import AfterValidator, Field, ValidationError
 
 from fdhil.config.reading import read_toml
 from fdhil.config.section import Finite, Section
-from fdhil.csv_text import shown
+from fdhil.csv_text import quote_cell
 from fdhil.errors import ConfigError, ConfigFault, RecordingError
 from fdhil.records import Float
 from fdhil.store.counter_wraps import jump_of_reading, unwrap_counter, unwrap_turns
 from fdhil.store.derived_columns import TORQUE, check_sizes, derive_columns
 from fdhil.store.recording_table import (
     ANGLE,
-    FORMAT,
-    NOTES,
+    IMPORT_NOTES,
     PATH,
-    PITCH,
+    PITCH_KEY,
+    RECORDING_FORMAT,
     SAMPLING,
-    VOLTAGE,
+    VOLTAGE_COLUMN,
     RecordingTable,
     unlike_lengths,
 )
@@ -119,7 +119,7 @@ def _faults(column_map: ColumnMap) -> list[ConfigFault]:
         units = {**FACTORS[signal], **(PER_REVOLUTION if signal == "speed_rad_per_s" else {})}
         faults += [
             ConfigFault(
-                f"columns.{signal}.unit", f"{shown(c.unit)} is not a unit of it", f"use one of {', '.join(units)}"
+                f"columns.{signal}.unit", f"{quote_cell(c.unit)} is not a unit of it", f"use one of {', '.join(units)}"
             )
             for c in _as_tuple(columns)
             if c.unit not in units
@@ -127,8 +127,8 @@ def _faults(column_map: ColumnMap) -> list[ConfigFault]:
     per_revolution = [
         c.unit for c in _as_tuple(column_map.columns.get("speed_rad_per_s", ())) if c.unit in PER_REVOLUTION
     ]
-    wanted = ["axis", *([PITCH] if per_revolution or column_map.columns.keys() & {*PATH} else [])]
-    wanted += [SAMPLING] if VOLTAGE in column_map.columns else []
+    wanted = ["axis", *([PITCH_KEY] if per_revolution or column_map.columns.keys() & {*PATH} else [])]
+    wanted += [SAMPLING] if VOLTAGE_COLUMN in column_map.columns else []
     missing = [key for key in wanted if key not in column_map.headers]
     return faults + [
         ConfigFault(f"headers.{key}", "is missing", "add it: the file does not contain it") for key in missing
@@ -141,10 +141,14 @@ def mapped(raw: RecordingTable, column_map: ColumnMap, source: str) -> Recording
     Conversions of the numbers are listed in the header ``import_notes``. Raises RecordingError if a column is missing
     or the rest is wrong.
     """
-    headers = {"format": FORMAT, **raw.headers, **{key: _text(value) for key, value in column_map.headers.items()}}
+    headers = {
+        "format": RECORDING_FORMAT,
+        **raw.headers,
+        **{key: _text(value) for key, value in column_map.headers.items()},
+    }
     pitch_m = math.nan
-    if PITCH in headers:
-        pitch_m = _positive(headers[PITCH], PITCH, "a length above 0, in m", source)
+    if PITCH_KEY in headers:
+        pitch_m = _positive(headers[PITCH_KEY], PITCH_KEY, "a length above 0, in m", source)
     rate_hz = None
     if "sample_rate_hz" in headers:
         rate_hz = _positive(headers["sample_rate_hz"], "sample_rate_hz", "a number above 0", source)
@@ -167,7 +171,7 @@ def mapped(raw: RecordingTable, column_map: ColumnMap, source: str) -> Recording
     derive_columns(headers, columns)
     check_sizes(columns, source)
     if notes := [*notes, *([note] if note else [])]:
-        headers[NOTES] = "; ".join(notes)
+        headers[IMPORT_NOTES] = "; ".join(notes)
     return RecordingTable(headers, columns)
 
 
@@ -186,8 +190,8 @@ def whole_heading(raw: RecordingTable, name: str, source: str) -> str:
         return name
     found = [each for each in names if name.lower() in each.lower()]
     if len(found) > 1:
-        listed = " and ".join(map(shown, found[:SHOWN_NAMES]))
-        raise RecordingError(f"{source}: {shown(name)} is a part of {listed}: write more of the intended heading")
+        listed = " and ".join(map(quote_cell, found[:SHOWN_NAMES]))
+        raise RecordingError(f"{source}: {quote_cell(name)} is a part of {listed}: write more of the intended heading")
     return found[0] if found else name
 
 
@@ -208,9 +212,9 @@ def _sampled_together(raw: RecordingTable, column_map: ColumnMap, source: str) -
     for name in names:
         if not any(name in table.columns or name in table.doubts for table in tables):
             raise RecordingError(
-                f"{source} has no column {shown(name)}; it has {_what_it_has(*tables)}: correct the column map"
+                f"{source} has no column {quote_cell(name)}; it has {_what_it_has(*tables)}: correct the column map"
             )
-    listed = ", ".join(map(shown, names))
+    listed = ", ".join(map(quote_cell, names))
     if not having:
         raise RecordingError(
             f"{source} has no group with all of {listed}: they have different sample times; record or export them with "
@@ -243,7 +247,9 @@ def _signals(
                 notes[f"{column.name} wraps like a counter of {bits} bits and was unwrapped"] = None
             is_clock = column.name in raw.clocks
             if is_clock and signal != "time_s":
-                raise RecordingError(f"{source}: {shown(column.name)} is a time, not {signal}: correct the column map")
+                raise RecordingError(
+                    f"{source}: {quote_cell(column.name)} is a time, not {signal}: correct the column map"
+                )
             factor = 1.0 if is_clock else _factor(signal, column.unit, pitch_m)
             _check_unit(raw, signal, column, source)
             parts[f"{column.name} ({k + 1})"] = (values * column.factor + column.offset) * factor
@@ -262,7 +268,7 @@ def _over_turns(values: Float, column: Column, pitch: float, source: str) -> tup
     jump = None if is_turn else jump_of_reading(values)
     if jump is not None:
         raise RecordingError(
-            f"{source}: {shown(column.name)} jumps by {jump:g}, like a position within one turn, "
+            f"{source}: {quote_cell(column.name)} jumps by {jump:g}, like a position within one turn, "
             f"but one turn is {turn:g} by the column map: correct pitch_m_per_rev, unit and factor, or export a "
             "position over all turns"
         )
@@ -278,7 +284,7 @@ def _check_places(raw: RecordingTable, column_map: ColumnMap, source: str) -> No
         other = found.setdefault(id(raw.columns[column.name]), column.name)
         if other != column.name:
             raise RecordingError(
-                f"{source} has {shown(other)} and {shown(column.name)} above one column: its head lists one signal a "
+                f"{source} has {quote_cell(other)} and {quote_cell(column.name)} above one column: its head lists one signal a "
                 "line; name the columns #1, #2 ... from the left instead"
             )
 
@@ -290,7 +296,7 @@ def _check_unit(raw: RecordingTable, signal: str, column: Column, source: str) -
     wrong = units and not any(math.isclose(known[unit], known[column.unit]) for unit in units)
     if wrong and "factor" not in column.model_fields_set and column.name not in raw.clocks:
         raise RecordingError(
-            f"{source} has {shown(column.name)} in {units[0]}, the column map has {column.unit}: correct unit in the "
+            f"{source} has {quote_cell(column.name)} in {units[0]}, the column map has {column.unit}: correct unit in the "
             "map, or set factor = 1 if the file is wrong"
         )
 
@@ -363,13 +369,13 @@ def _factor(signal: str, unit: str, pitch_m: float) -> float:
 
 def _column(raw: RecordingTable, name: str, source: str) -> Float:
     if name in raw.doubts:
-        raise RecordingError(f"{source}: {shown(name)} {raw.doubts[name]}")
+        raise RecordingError(f"{source}: {quote_cell(name)} {raw.doubts[name]}")
     return raw.columns[name]
 
 
 def _what_it_has(*tables: RecordingTable) -> str:
     names_of_all = dict.fromkeys(name for table in tables for name in (*table.columns, *table.doubts))
-    names = [shown(name) for name in names_of_all if not name.startswith("#")]
+    names = [quote_cell(name) for name in names_of_all if not name.startswith("#")]
     places = [name for name in names_of_all if name.startswith("#")]
     listed = [", ".join(names[:SHOWN_NAMES])] if names else []
     if places:

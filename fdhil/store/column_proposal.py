@@ -18,7 +18,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from fdhil.csv_text import shown
+from fdhil.csv_text import quote_cell
 from fdhil.errors import RecordingError
 from fdhil.records import Float
 from fdhil.store.column_map import FACTORS, units_of_heading, whole_heading
@@ -128,8 +128,8 @@ def _from_given(raw: RecordingTable, given: Mapping[str, str | Sequence[str]], s
         part, *unit = (name_and_unit,) if isinstance(name_and_unit, str) else name_and_unit
         heading = whole_heading(raw, part, source)
         if heading not in raw.columns:
-            listed = ", ".join(map(shown, _distinct(raw)))
-            raise RecordingError(f"{source} has no column {shown(part)}; it has {listed}: correct columns")
+            listed = ", ".join(map(quote_cell, _distinct(raw)))
+            raise RecordingError(f"{source} has no column {quote_cell(part)}; it has {listed}: correct columns")
         found[signal] = (heading, "given")
         known = unit[0] if unit else _unit(heading, raw, signal) or next(iter(FACTORS[signal]))  # SI
         proposed.append(Proposed(signal, heading, known, "given"))

@@ -6,7 +6,7 @@ import numpy as np
 
 from fdhil.errors import RecordingError
 from fdhil.records import Float
-from fdhil.store.recording_table import ANGLE, NOTES, SAMPLING, VOLTAGE
+from fdhil.store.recording_table import ANGLE, IMPORT_NOTES, SAMPLING, VOLTAGE_COLUMN
 
 TORQUE = "torque_Nm"
 CONSTANT = "torque_constant_nm_per_a"
@@ -34,10 +34,10 @@ def derive_columns(headers: dict[str, str], columns: dict[str, Float]) -> None:
         columns["current_A"] = torque / float(headers[CONSTANT])
         return
     columns["current_A"], headers[CONSTANT] = torque, "1"
-    if columns.pop(VOLTAGE, None) is not None:
+    if columns.pop(VOLTAGE_COLUMN, None) is not None:
         headers.pop(SAMPLING, None)
         note = f"the voltage was dropped: with a torque it needs {CONSTANT}"
-        headers[NOTES] = "; ".join(filter(None, [headers.get(NOTES, ""), note]))
+        headers[IMPORT_NOTES] = "; ".join(filter(None, [headers.get(IMPORT_NOTES, ""), note]))
 
 
 def difference(positions: Float, time_s: Float) -> Float:

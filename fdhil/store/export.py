@@ -9,7 +9,7 @@ from fdhil import tables
 from fdhil.errors import RecordingError
 from fdhil.records import Float, SlowVoltage, Window
 from fdhil.store.output import open_output
-from fdhil.store.recording_table import FORMAT, SAMPLING, TABLE, VOLTAGE, RecordingTable
+from fdhil.store.recording_table import RECORDING_FORMAT, SAMPLING, TABLE, VOLTAGE_COLUMN, RecordingTable
 
 
 def table_of(window: Window) -> RecordingTable:
@@ -22,7 +22,7 @@ def table_of(window: Window) -> RecordingTable:
     slow = window.slow_voltage
     voltage = _held(window, slow) if slow is not None else window.voltage_v
     signals = {
-        VOLTAGE: voltage,
+        VOLTAGE_COLUMN: voltage,
         "current_A": window.current_a,
         "speed_rad_per_s": window.speed_rad_s,
         "position_m": window.position_mm / 1000,
@@ -40,7 +40,7 @@ def _headers(window: Window) -> dict[str, str]:
     slow, rapid_m_s = window.slow_voltage, window.rapid_speed_rad_s / (2 * math.pi) * window.pitch_mm / 1000
     has_no_voltage = window.voltage_v is None and slow is None
     headers = {
-        "format": FORMAT,
+        "format": RECORDING_FORMAT,
         "sample_rate_hz": f"{1 / window.dt_s:.12g}",
         SAMPLING: None if has_no_voltage else window.voltage_sampling,
         "axis": window.axis,
@@ -85,6 +85,6 @@ def export_table(table: RecordingTable, path: Path, format_name: str = "csv") ->
 
     Raises OutputError if it cannot be written, FdhilError if the format's library is not installed.
     """
-    content: bytes = tables.load(tables.RECORDING_FORMATS, format_name).encode(table)
+    content: bytes = tables.load_entry(tables.RECORDING_FORMATS, format_name).encode(table)
     with open_output(path) as file:
         file.write(content)

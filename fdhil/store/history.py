@@ -25,7 +25,7 @@ from fdhil.store.atomic import make_folder
 from fdhil.store.rows import DECODED, Acknowledgement, Comparison, Revision, Stamp, StoredNotice, StoredWindow
 from fdhil.store.schema import Also, stamp_of, told
 
-FILE_NAME = HISTORY_FILE
+HISTORY_FILE_NAME = HISTORY_FILE
 CHECKED = 5_000  # newest rows of a table that are always verified: start-up time must not grow with the history
 KEEP_NOTICES = 100_000
 RECENT_NOTICES = 5_000  # the newest ones to be acknowledged; older ones no longer are
@@ -55,7 +55,7 @@ class History:
     @classmethod
     def open(cls, directory: Path, also: Also | None = None, begin: Begin | None = None) -> History:
         """Open for writing; ``also`` adds to each row. StoreError: SchemaVersion, CorruptFile, ReadOnlyStore."""
-        path = directory / FILE_NAME
+        path = directory / HISTORY_FILE_NAME
         with told(path):
             try:
                 make_folder(directory)
@@ -82,7 +82,7 @@ class History:
         ``warn`` receives the damaged rows that were left out, at close. A caller that reopens it often keeps in
         ``checked`` the files whose structure was intact (device and inode); rows are still verified one by one.
         """
-        path = directory / FILE_NAME
+        path = directory / HISTORY_FILE_NAME
         db, version = schema.open_to_read(path, checked)
         return cls(db, path, version, warn)
 
@@ -379,7 +379,7 @@ def described(outcome: WindowOutcome) -> dict[str, dict[str, Any]]:
         return {}
     document: dict[str, dict[str, Any]] = {}
     for name in estimate.names:
-        value, std = estimate.value(name), estimate.std(name)
+        value, std = estimate.get_value(name), estimate.get_std(name)
         if math.isfinite(value):
             document[name] = {"value": value, "std": std if math.isfinite(std) else None}
         else:

@@ -10,7 +10,7 @@ from fdhil.store.history import History
 RECENT_MOVES = 3  # whose skill bounds what a correction can reach
 
 
-def known_gain(
+def predict_gain_from_history(
     planned: Correction,
     models: Mapping[str, Parameters],
     config: MachineConfig,

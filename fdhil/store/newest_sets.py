@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fdhil.identification.loops import better_loops, regulators_of
 from fdhil.records import LoopEstimate
-from fdhil.store.history import FILE_NAME, History
+from fdhil.store.history import HISTORY_FILE_NAME, History
 from fdhil.store.rows import Revision
 
 
@@ -17,7 +17,7 @@ def read_newest_sets(
 
     ``warn`` receives the damaged rows. Raises StoreError if a history exists but cannot be read.
     """
-    if not (store_directory / FILE_NAME).is_file():
+    if not (store_directory / HISTORY_FILE_NAME).is_file():
         return {}
     with History.read(store_directory, warn) as history:
         return newest_sets(history, axes)

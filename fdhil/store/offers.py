@@ -17,9 +17,9 @@ from fdhil.store.atomic import make_folder, store_error, write_file
 
 ANSWERS_FILE = "offers.json"
 SCHEMA = "fdhil-offers-1"
-NAME = r"[a-z0-9][a-z0-9-]{0,39}"
+OFFER_NAME_PATTERN = r"[a-z0-9][a-z0-9-]{0,39}"
 LARGEST_ANSWERS = 4 << 20
-_FILE = re.compile(rf"({NAME})-([1-9][0-9]{{0,8}})\.offer")
+_FILE = re.compile(rf"({OFFER_NAME_PATTERN})-([1-9][0-9]{{0,8}})\.offer")
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from fdhil.csv_text import check_lengths, shown, text_of
+from fdhil.csv_text import check_lengths, decode_text, quote_cell
 from fdhil.errors import RecordingError
 from fdhil.records import Float, Recording
 from fdhil.store.recording_table import MIN_ROWS, TABLE, RecordingTable, check_headers, recording_of
@@ -17,7 +17,7 @@ def parse_recording(text: str, source: str = "recording") -> Recording:
 
 def decode(content: bytes, source: str) -> RecordingTable:
     """Return the table of a file's bytes. Raises RecordingError with the line at fault."""
-    return parse_table(text_of(content, source), source)
+    return parse_table(decode_text(content, source), source)
 
 
 def parse_table(text: str, source: str) -> RecordingTable:
@@ -34,7 +34,7 @@ def parse_table(text: str, source: str) -> RecordingTable:
     for name in names:
         if name and names.count(name) > 1:
             places = " and ".join(f"#{j + 1}" for j, other in enumerate(names) if other == name)
-            raise RecordingError(f"{source} has {shown(name)} above {places} (line {k + 1}): rename or remove one")
+            raise RecordingError(f"{source} has {quote_cell(name)} above {places} (line {k + 1}): rename or remove one")
     if not text.endswith("\n"):
         raise RecordingError(
             f"{source} is truncated: line {len(lines)} is incomplete, its last number may be cut off; copy it again"
@@ -53,8 +53,8 @@ def _headers(lines: list[str], width: int, source: str) -> dict[str, str]:
         key, colon, value = line[1:].partition(":")
         key, value = key.strip(), value.strip()
         if colon and headers.setdefault(key, value) != value:
-            both = f"{shown(headers[key])} and again, in line {number}, {shown(value)}"
-            raise RecordingError(f"{source} has header {shown(key)} = {both}: remove the wrong one")
+            both = f"{quote_cell(headers[key])} and again, in line {number}, {quote_cell(value)}"
+            raise RecordingError(f"{source} has header {quote_cell(key)} = {both}: remove the wrong one")
     return headers
 
 
@@ -96,9 +96,9 @@ def _bad_row(lines: list[str], first_row: int, names: list[str], source: str) ->
                 value = float(cell)
             except ValueError:
                 return RecordingError(
-                    f"{source} line {k + 1} has {shown(cell.strip())} instead of a number: correct it"
+                    f"{source} line {k + 1} has {quote_cell(cell.strip())} instead of a number: correct it"
                 )
             if not (math.isfinite(value) or (math.isnan(value) and name in TABLE)):
-                what = f"{source} line {k + 1} has the non-finite value {shown(cell.strip())}"
+                what = f"{source} line {k + 1} has the non-finite value {quote_cell(cell.strip())}"
                 return RecordingError(f"{what}: leave out the row of a lost sample")
     return RecordingError(f"{source} does not contain numbers: export it again")

@@ -9,7 +9,15 @@ import numpy as np
 from fdhil.records import Float, Window
 from fdhil.store.export import table_of
 from fdhil.store.parquet_library import pa, pc, pq
-from fdhil.store.recording_table import FORMAT, UNIT_KEYS, UNITS, UNREADABLE, RecordingTable, check_size, unreadable
+from fdhil.store.recording_table import (
+    RECORDING_FORMAT,
+    UNIT_KEYS,
+    UNITS,
+    UNREADABLE,
+    RecordingTable,
+    check_size,
+    unreadable,
+)
 from fdhil.store.trace_cells import past_midnight
 from fdhil.store.windows import FORMAT as WINDOW_FORMAT
 from fdhil.store.windows import decode_window, read_window
@@ -99,7 +107,7 @@ def _seconds(times: pa.ChunkedArray) -> Float:
 
 def is_recording(path: Path) -> bool:
     """Return whether a Parquet file is a recording and not a stored window; False if unknown."""
-    return _format_of(path) == FORMAT
+    return _format_of(path) == RECORDING_FORMAT
 
 
 def read_if_window(path: Path) -> Window | None:

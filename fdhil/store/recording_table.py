@@ -14,22 +14,22 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fdhil.csv_text import MAX_ROWS, shown
+from fdhil.csv_text import MAX_ROWS, quote_cell
 from fdhil.errors import RecordingError
-from fdhil.records import Float, Recording, SlowVoltage, VoltageSampling, frozen
+from fdhil.records import Float, Recording, SlowVoltage, VoltageSampling, freeze_array
 
-FORMAT = "fdhil-recording-1"
+RECORDING_FORMAT = "fdhil-recording-1"
 COLUMNS = ("time_s", "current_A", "speed_rad_per_s")
 PATH = ("position_m", "demand_m")  # only for results in micrometres; they need a pitch
 ANGLE = "angle_rad"  # of the motor, in place of a position
-VOLTAGE = "voltage_V"
+VOLTAGE_COLUMN = "voltage_V"
 TABLE = ("table_mm", "table_m_s2")  # sensors at the table, which may have lost samples
 REQUIRED = ("format", "sample_rate_hz", "axis")
-PITCH = "pitch_m_per_rev"  # required with a position or a demand
+PITCH_KEY = "pitch_m_per_rev"  # required with a position or a demand
 STAND_IN_PITCH_M = 2e-3 * math.pi  # of a motor without a screw: 1 mm in a message means 1 rad
 SAMPLING = "voltage_sampling"  # required with a voltage
-NOTES = "import_notes"  # header: conversions of another program's numbers
-SOURCES: Mapping[str, tuple[str, ...]] = {
+IMPORT_NOTES = "import_notes"  # header: conversions of another program's numbers
+COLUMN_SOURCES: Mapping[str, tuple[str, ...]] = {
     "speed_source": ("sensor", "difference", "filtered"),
     "voltage_source": ("terminals", "command"),
 }
@@ -92,14 +92,14 @@ def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
     check_headers(table.headers, table.columns, source)
     table, pitches = _as_lengths(table, source)
     headers = dict(table.headers)
-    names = [name for name in (*COLUMNS, *PATH, ANGLE, VOLTAGE, *TABLE) if name in table.columns]
+    names = [name for name in (*COLUMNS, *PATH, ANGLE, VOLTAGE_COLUMN, *TABLE) if name in table.columns]
     values = _rows(table, names, source)
     dt = 1.0 / _within(headers, "sample_rate_hz", RATE_HZ, source)
     rows, gaps = _place(values[:, 0], dt, source)
     columns = _spread(values, rows)
     sampling = _sampling(headers, source) if SAMPLING in headers else "interval_mean"
     _check_sources(headers, source)
-    pitch_m = _within(headers, PITCH, pitches, source) if PITCH in headers else STAND_IN_PITCH_M
+    pitch_m = _within(headers, PITCH_KEY, pitches, source) if PITCH_KEY in headers else STAND_IN_PITCH_M
     rapid_m_s = _within(headers, "rapid_speed_m_per_s", RAPID_M_S, source) if "rapid_speed_m_per_s" in headers else None
     paths = {name: _told(name, names, columns) for name in PATH}
     position_m, demand_m = paths["position_m"], paths["demand_m"]
@@ -110,12 +110,12 @@ def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
     return Recording(
         axis=headers["axis"],
         dt_s=dt,
-        time_s=frozen(values[0, 0] + dt * np.arange(columns.shape[0])),
-        voltage_v=_told(VOLTAGE, names, columns),
-        current_a=frozen(columns[:, 1]),
-        speed_rad_s=frozen(columns[:, 2]),
-        position_mm=frozen(position_m * 1e3),
-        demand_mm=frozen(np.full(len(columns), np.nan) if demand_m is None else demand_m * 1e3),
+        time_s=freeze_array(values[0, 0] + dt * np.arange(columns.shape[0])),
+        voltage_v=_told(VOLTAGE_COLUMN, names, columns),
+        current_a=freeze_array(columns[:, 1]),
+        speed_rad_s=freeze_array(columns[:, 2]),
+        position_mm=freeze_array(position_m * 1e3),
+        demand_mm=freeze_array(np.full(len(columns), np.nan) if demand_m is None else demand_m * 1e3),
         voltage_sampling=sampling,
         pitch_mm=pitch_m * 1e3,
         rapid_speed_rad_s=None if rapid_m_s is None else rapid_m_s / pitch_m * 2 * math.pi,
@@ -178,7 +178,11 @@ def check_headers(headers: Mapping[str, str], columns: Mapping[str, object], sou
     """Return the headers of a recording with these columns. Raises RecordingError with what is missing."""
     rotary = PITCH_OF_ROTARY in headers
     has_path = any(name in columns for name in PATH)
-    required = [*REQUIRED, *([PITCH] if has_path and not rotary else []), *([SAMPLING] if VOLTAGE in columns else [])]
+    required = [
+        *REQUIRED,
+        *([PITCH_KEY] if has_path and not rotary else []),
+        *([SAMPLING] if VOLTAGE_COLUMN in columns else []),
+    ]
     if rotary and "pitch_m_per_rev" in headers:
         raise RecordingError(f"{source} has pitch_m_per_rev and {PITCH_OF_ROTARY}: keep the one for its axis' unit")
     if not rotary and (angles := [name for name in ANGLES.values() if name in columns]):
@@ -190,12 +194,14 @@ def check_headers(headers: Mapping[str, str], columns: Mapping[str, object], sou
             f"{source} has no header {', '.join(missing)}: add a line such as '# {missing[0]}: ...', or give "
             "--columns with a column map for another program's file"
         )
-    if headers["format"] != FORMAT:
-        raise RecordingError(f"{source} has format {shown(headers['format'])}, not {FORMAT!r}: convert it first")
+    if headers["format"] != RECORDING_FORMAT:
+        raise RecordingError(
+            f"{source} has format {quote_cell(headers['format'])}, not {RECORDING_FORMAT!r}: convert it first"
+        )
     absent = [name for name in COLUMNS if name not in columns]
     absent += [angle for name, angle in ANGLES.items() if rotary and name in columns]
     if absent:
-        has = ", ".join([shown(name) for name in columns][:MOST_SHOWN]) or "no columns"
+        has = ", ".join([quote_cell(name) for name in columns][:MOST_SHOWN]) or "no columns"
         raise RecordingError(
             f"{source} has no column {', '.join(absent)}; it has {has}: rename, or give --columns with a column map"
         )
@@ -223,7 +229,7 @@ def _rows(table: RecordingTable, names: list[str], source: str) -> Float:
 
 
 def _told(name: str, names: list[str], columns: Float) -> Float | None:
-    return frozen(columns[:, names.index(name)]) if name in names else None
+    return freeze_array(columns[:, names.index(name)]) if name in names else None
 
 
 def _slow_voltage(headers: dict[str, str], start_s: float, dt_s: float, source: str) -> SlowVoltage | None:
@@ -252,7 +258,7 @@ def _slow_voltage(headers: dict[str, str], start_s: float, dt_s: float, source: 
         )
     error = _optional(headers, "voltage_error_s", source) or 0.0
     return SlowVoltage(
-        begin - start_s, period, abs(error), frozen(samples), _late(headers, samples.size, period, source)
+        begin - start_s, period, abs(error), freeze_array(samples), _late(headers, samples.size, period, source)
     )
 
 
@@ -266,7 +272,7 @@ def _late(headers: dict[str, str], samples: int, period: float, source: str) -> 
         late = np.zeros(0)
     if late.size != samples or not (np.abs(late) < period / 2).all():
         raise RecordingError(f"{source} has invalid voltage_late_s for its voltage samples: export it again")
-    return frozen(late)
+    return freeze_array(late)
 
 
 def _place(
@@ -303,13 +309,13 @@ def _sampling(headers: dict[str, str], source: str) -> VoltageSampling:
         return "interval_mean"
     if value == "instant":
         return "instant"
-    raise RecordingError(f"{source} has voltage_sampling {shown(value)}: it must be interval_mean or instant")
+    raise RecordingError(f"{source} has voltage_sampling {quote_cell(value)}: it must be interval_mean or instant")
 
 
 def _check_sources(headers: dict[str, str], source: str) -> None:
-    for key, words in SOURCES.items():
+    for key, words in COLUMN_SOURCES.items():
         if key in headers and headers[key] not in words:
-            raise RecordingError(f"{source} has {key} {shown(headers[key])}: it must be {' or '.join(words)}")
+            raise RecordingError(f"{source} has {key} {quote_cell(headers[key])}: it must be {' or '.join(words)}")
 
 
 def _torque_constant(headers: dict[str, str], source: str) -> float | None:
@@ -320,7 +326,9 @@ def _torque_constant(headers: dict[str, str], source: str) -> float | None:
 def _positive(headers: dict[str, str], key: str, source: str) -> float:
     value = _optional(headers, key, source)
     if value is None or not value > 0:
-        raise RecordingError(f"{source} has header {key} = {shown(str(headers.get(key)))}: it must be a number above 0")
+        raise RecordingError(
+            f"{source} has header {key} = {quote_cell(str(headers.get(key)))}: it must be a number above 0"
+        )
     return value
 
 
@@ -341,8 +349,8 @@ def _optional(headers: dict[str, str], key: str, source: str) -> float | None:
         value = float(headers[key])
     except ValueError:
         raise RecordingError(
-            f"{source} has header {key} = {shown(headers[key])} instead of a number: correct it"
+            f"{source} has header {key} = {quote_cell(headers[key])} instead of a number: correct it"
         ) from None
     if not math.isfinite(value):
-        raise RecordingError(f"{source} has the non-finite header {key} = {shown(headers[key])}: correct it")
+        raise RecordingError(f"{source} has the non-finite header {key} = {quote_cell(headers[key])}: correct it")
     return value

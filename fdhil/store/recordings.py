@@ -43,11 +43,11 @@ def read_raw(path: Path, text: TraceText | None = None) -> RecordingTable:
 
 
 def _format_of(path: Path) -> str:
-    return suffixes.RECORDINGS.get(path.suffix.lower(), "csv")
+    return suffixes.RECORDING_SUFFIXES.get(path.suffix.lower(), "csv")
 
 
 def _decoded(name: str, content: bytes, source: str) -> RecordingTable:
     if not content:
         raise RecordingError(f"{source} is empty: record it again")
-    table: RecordingTable = tables.load(tables.RECORDING_FORMATS, name).decode(content, source)
+    table: RecordingTable = tables.load_entry(tables.RECORDING_FORMATS, name).decode(content, source)
     return table

@@ -20,7 +20,7 @@ from fdhil.records import (
     Reason,
     Skill,
     Verdict,
-    frozen,
+    freeze_array,
 )
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
@@ -35,7 +35,7 @@ class Stamp:
 
     @staticmethod
     def now(clock: Clock = SYSTEM_CLOCK) -> Stamp:
-        return Stamp(clock.wall_s(), clock.boot_id(), clock.since_boot_ns())
+        return Stamp(clock.wall_s(), clock.read_boot_id(), clock.read_boot_time_ns())
 
     def age_s(self, clock: Clock = SYSTEM_CLOCK) -> float:
         """Return the age; a negative one, of a clock that was set back, is unreliable."""
@@ -142,8 +142,10 @@ def _number(value: float | None) -> float:
 
 
 def _revision(row: Mapping[str, Any]) -> Revision:
-    parameters = Parameters.of({name: row[name] for name in PARAMETERS} | json.loads(row.get("terms") or "{}"))
-    covariance: Float = frozen(np.array(json.loads(row["covariance"]), dtype=np.float64))
+    parameters = Parameters.from_mapping(
+        {name: row[name] for name in PARAMETERS} | json.loads(row.get("terms") or "{}")
+    )
+    covariance: Float = freeze_array(np.array(json.loads(row["covariance"]), dtype=np.float64))
     published = ParameterSet(
         row["axis"], row["revision"], parameters, covariance, row["windows"], row["tick"], row["temperature_c"],
         row["config_digest"], (), row.get("unexplained_um"), _warnings(row), json.loads(row.get("loops") or "null"),
@@ -153,7 +155,9 @@ def _revision(row: Mapping[str, Any]) -> Revision:
 
 def _comparison(row: Mapping[str, Any]) -> tuple[Stamp, Comparison]:
     used = {
-        axis: UsedParameters(int(u["revision"]), Parameters.of({n: v for n, v in u.items() if n != "revision"}))
+        axis: UsedParameters(
+            int(u["revision"]), Parameters.from_mapping({n: v for n, v in u.items() if n != "revision"})
+        )
         for axis, u in json.loads(row["parameters"]).items()
     }
     zones = tuple(json.loads(row["zones"]))
@@ -193,8 +197,10 @@ def _loops(row: Mapping[str, Any]) -> tuple[Stamp, LoopEstimate]:
     gains = json.loads(row["gains"])
     reasons = tuple(Reason(*parts) for parts in json.loads(row["reasons"]))
     verdict = Verdict(bool(row["accepted"]), None, reasons, row["unexplained_um"], _warnings(row))
-    covariance = frozen(np.array(json.loads(row["covariance"]), dtype=np.float64))
-    found = LoopEstimate(row["axis"], row["structure"], tuple(gains), frozen([*gains.values()]), covariance, verdict)
+    covariance = freeze_array(np.array(json.loads(row["covariance"]), dtype=np.float64))
+    found = LoopEstimate(
+        row["axis"], row["structure"], tuple(gains), freeze_array([*gains.values()]), covariance, verdict
+    )
     return _stamp(row), found
 
 

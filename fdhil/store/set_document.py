@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.records import INTERVAL_95, PARAMETERS, ParameterSet, unit_of
+from fdhil.records import INTERVAL_95, PARAMETERS, ParameterSet, get_unit
 
 
 def parameters_status(published: ParameterSet) -> Mapping[str, Mapping[str, Any]]:
@@ -36,7 +36,7 @@ def _figures(name: str, value: float, std: float) -> Mapping[str, Any]:
         "std": std if known else None,
         "low": value - half if known else None,
         "high": value + half if known else None,
-        "unit": unit_of(name),
+        "unit": get_unit(name),
     }
 
 

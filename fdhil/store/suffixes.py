@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-RECORDINGS: Mapping[str, str] = {
+RECORDING_SUFFIXES: Mapping[str, str] = {
     ".csv": "csv", ".parquet": "parquet", ".mat": "mat", ".mf4": "mdf4", ".h5": "hdf5", ".hdf5": "hdf5",
 }  # fmt: skip
 # logs of all frames of a bus, as python-can reads and writes them

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from fdhil.csv_text import shown
+from fdhil.csv_text import quote_cell
 from fdhil.errors import RecordingError
 from fdhil.store.trace_cells import is_clock, is_number, is_void, plain
 
@@ -169,7 +169,7 @@ def _words(row: Row) -> str:
 
 
 def _no_row(row: Row, source: str, more: str = "") -> RecordingError:
-    text = shown(" ".join(row.cells))
+    text = quote_cell(" ".join(row.cells))
     return RecordingError(
         f"{source} line {row.line} is not a row of numbers: {text}{more and f', {more}'}; export it again"
     )

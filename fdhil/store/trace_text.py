@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from fdhil.config.section import Section
-from fdhil.csv_text import check_lengths, shown, text_of
+from fdhil.csv_text import check_lengths, decode_text, quote_cell
 from fdhil.errors import RecordingError
 from fdhil.records import Float
 from fdhil.store.recording_table import RecordingTable, check_size
@@ -80,18 +80,18 @@ def _text(content: bytes, settings: TraceText, source: str) -> str:
             raise RecordingError(
                 f"{source}: unknown encoding {settings.encoding}: correct it in the column map"
             ) from None
-        return text_of(content, source, settings.encoding)
+        return decode_text(content, source, settings.encoding)
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return text_of(content, source, "utf-16")
+        return decode_text(content, source, "utf-16")
     if b"\0" in content[:2]:  # UTF-16 without its mark
-        return text_of(content, source, "utf-16-be" if content[:1] == b"\0" else "utf-16-le")
+        return decode_text(content, source, "utf-16-be" if content[:1] == b"\0" else "utf-16-le")
     for encoding in ENCODINGS:
         try:
             content.decode(encoding)
         except UnicodeDecodeError:
             continue
-        return text_of(content, source, encoding)
-    return text_of(content, source)
+        return decode_text(content, source, encoding)
+    return decode_text(content, source)
 
 
 def _without_outer_quotes(lines: list[str]) -> list[str]:
@@ -145,7 +145,7 @@ def _no_rows(lines: Sequence[str], separator: str, source: str) -> RecordingErro
     last = next((line.strip() for line in reversed(lines) if any(map(str.isdigit, line))), "")
     return RecordingError(
         f"{source} has no rows of numbers (separator {separator!r}; the last line with a digit is "
-        f"{shown(last)}): give separator and decimal under [text] of the column map, or export it as text"
+        f"{quote_cell(last)}): give separator and decimal under [text] of the column map, or export it as text"
     )
 
 
@@ -165,12 +165,12 @@ def _decimal(body: Body, separator: str, source: str) -> str:
                 padded = padded or cell
     if marked:
         raise RecordingError(
-            f"{source} has numbers such as {shown(marked)} only, whose mark may be decimal or separate "
+            f"{source} has numbers such as {quote_cell(marked)} only, whose mark may be decimal or separate "
             "thousands: give decimal under [text] of the column map"
         )
     if padded and separator == ",":
         raise RecordingError(
-            f"{source} has cells such as {shown(padded)} and no decimal point: commas between cells may be "
+            f"{source} has cells such as {quote_cell(padded)} and no decimal point: commas between cells may be "
             "decimal commas; export it with quoted cells, or with another separator"
         )
     return "."
@@ -203,7 +203,7 @@ def _table(body: Body, head: Head, decimal: str) -> RecordingTable:
         columns |= dict.fromkeys(named[j], read.values)
         texts |= dict.fromkeys(named[j], head.texts.get(j, ()))
         if read.bad is not None:
-            text = f"has {shown(cells[read.bad])} in line {body.rows[read.bad].line}, instead of a number"
+            text = f"has {quote_cell(cells[read.bad])} in line {body.rows[read.bad].line}, instead of a number"
             doubts |= dict.fromkeys(named[j], f"{text}: correct it, or export the file again")
         if read.is_clock:
             clocks.update(named[j])

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fdhil.errors import RecordingError, StoreError
-from fdhil.records import Float, NcMove, SlowVoltage, Stages, Window, read_only
+from fdhil.records import Float, NcMove, SlowVoltage, Stages, Window, make_read_only_view
 from fdhil.store.atomic import make_folder, store_error, sync_folder, write_file
 from fdhil.store.parquet_library import pa, pq
 from fdhil.store.parquet_pages import uncompressed_bytes
@@ -184,7 +184,7 @@ def _decode(content: bytes) -> tuple[Window, str]:
     if grid is not None:
         samples = _values(table.column("slow_voltage_v"), {})[: int(grid["samples"])]
         begin, period, error = (float(grid[name]) for name in ("begin_s", "period_s", "error_s"))
-        late = read_only(np.array(grid["late_s"], np.float64)) if "late_s" in grid else None
+        late = make_read_only_view(np.array(grid["late_s"], np.float64)) if "late_s" in grid else None
         if late is not None and late.shape != samples.shape:
             raise ValueError("its slow voltage lacks a time per sample")
         arrays["slow_voltage"] = SlowVoltage(begin, period, error, samples, late)
@@ -215,7 +215,7 @@ def _values(column: Any, described: Mapping[str, Any]) -> Float:
     values = np.asarray(column.to_numpy(), dtype=np.float64)
     if "factor" in described:
         values = RawScale(float(described["factor"]), float(described["divisor"])).decode(values)
-    return read_only(values)
+    return make_read_only_view(values)
 
 
 def _window(head: Mapping[str, Any], arrays: Mapping[str, Any]) -> Window:

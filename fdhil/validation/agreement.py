@@ -7,7 +7,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from fdhil.identification.drift import FRICTION, LEAST_JUMP
+from fdhil.identification.drift import FRICTION_PARAMETERS, LEAST_JUMP
 from fdhil.identification.pooling import difference_covariance
 from fdhil.records import PARAMETERS, Estimate, Float, Reason, Window
 from fdhil.validation.significance import BUDGET
@@ -21,8 +21,8 @@ GAINS: Mapping[str, Float] = {  # powers of R, L, K, Jt, ft, Cd
     "speed": np.array([0.0, 0.0, -1.0, -2.0, -2.0, -1.0]),
 }
 LEAST_GAIN_CHANGE = 0.02
-WARMING = ("R", *FRICTION)
-WINDING = ("R", "L")
+WARMING = ("R", *FRICTION_PARAMETERS)
+WINDING_PARAMETERS = ("R", "L")
 LEAST_CHANGE: Mapping[str, float] = {"R": 0.02, "L": 0.03, "K": 0.01, "Jt": 0.02, "ft": 0.15, "Cd": 0.10}
 
 Pair = tuple[tuple[Window, Estimate], tuple[Window, Estimate]]
@@ -34,7 +34,7 @@ def values_apart(estimate: Estimate, likeliest: Float) -> Iterator[Reason]:
     The structure is tested about the likeliest values: the values of another method are accepted as far as they agree.
     """
     for name, best in zip(PARAMETERS, likeliest, strict=True):
-        value, std = estimate.value(name), estimate.std(name)
+        value, std = estimate.get_value(name), estimate.get_std(name)
         if abs(value - best) > max(BEYOND_CHANCE * std, LEAST_CHANGE[name] * abs(best)):
             text = (
                 f"{name} = {value:.4g} by {estimate.method} lies {abs(value - best) / std:.1f} of its standard "
@@ -59,7 +59,7 @@ def moved(estimates: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
             continue
         worst = worst or pair
         code = "LoadChanged" if name == "Jt" else "ParameterJump"
-        before, after = (estimate.value(name) for _, estimate in pair)
+        before, after = (estimate.get_value(name) for _, estimate in pair)
         text = f"{name} changes from {before:.4g} to {after:.4g} between the windows"
         reasons.append(Reason(code, text, "identify the windows before and after the change separately"))
     if len(reasons) == 1:
@@ -71,25 +71,25 @@ def moved(estimates: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
 
 def is_of_winding(reason: Reason) -> bool:
     """Return whether a reason reports a jump of R or L: the current loop hides that at the table."""
-    return reason.code == "ParameterJump" and reason.text.split(" ", 1)[0] in WINDING
+    return reason.code == "ParameterJump" and reason.text.split(" ", 1)[0] in WINDING_PARAMETERS
 
 
 def _farthest(estimates: Sequence[tuple[Window, Estimate]], name: str) -> Pair | None:
     """Return the two windows, in order, between which a parameter changes most, if that is a jump."""
-    known = [(w, e) for w, e in estimates if np.isfinite(e.value(name))]  # a slow voltage may leave R and L open
+    known = [(w, e) for w, e in estimates if np.isfinite(e.get_value(name))]  # a slow voltage may leave R and L open
     if len(known) < 2:
         return None
     pairs = list(combinations(known, 2)) if name not in WARMING else list(pairwise(known))
-    if name in FRICTION:
+    if name in FRICTION_PARAMETERS:
         pairs = list(_by_direction(known))
     if not pairs:
         return None
-    one, other = max(pairs, key=lambda pair: abs(pair[1][1].value(name) - pair[0][1].value(name)))
+    one, other = max(pairs, key=lambda pair: abs(pair[1][1].get_value(name) - pair[0][1].get_value(name)))
     k = PARAMETERS.index(name)
     chance = BEYOND_CHANCE * float(np.sqrt(difference_covariance(one, other)[k, k]))
     share = LEAST_JUMP[name] if name in WARMING else LEAST_CHANGE[name]
-    least = share * abs(float(np.median([e.value(name) for _, e in known])))
-    return (one, other) if abs(other[1].value(name) - one[1].value(name)) > max(chance, least) else None
+    least = share * abs(float(np.median([e.get_value(name) for _, e in known])))
+    return (one, other) if abs(other[1].get_value(name) - one[1].get_value(name)) > max(chance, least) else None
 
 
 def _by_direction(estimates: Sequence[tuple[Window, Estimate]]) -> Iterator[Pair]:
@@ -103,11 +103,11 @@ def gain_change(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) ->
     With g the factor of a sensor's gain, [1] and [2] hold again for parameters times g to the powers of ``GAINS``.
     """
     before, after = one[1], other[1]
-    names = [name for name in PARAMETERS if before.value(name) > 0 and after.value(name) > 0]
+    names = [name for name in PARAMETERS if before.get_value(name) > 0 and after.get_value(name) > 0]
     if len(names) < len(PARAMETERS) - 1:  # friction may be zero
         return None
     if one[0].direction != other[0].direction:  # load and screw change friction by direction
-        names = [name for name in names if name not in FRICTION]
+        names = [name for name in names if name not in FRICTION_PARAMETERS]
     rows = [PARAMETERS.index(name) for name in names]
     moved = np.log(after.values[rows] / before.values[rows])
     apart = difference_covariance(one, other) / np.outer(before.values[:6], after.values[:6])

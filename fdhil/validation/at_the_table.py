@@ -7,7 +7,7 @@ import numpy as np
 from fdhil.config import Axis
 from fdhil.identification.windows import moving_range
 from fdhil.model import closed_loop
-from fdhil.records import AtTable, Float, Parameters, Window, rms
+from fdhil.records import AtTable, Float, Parameters, Window, compute_rms
 
 LEAST_ROWS = 20
 LONGEST_MM = 1e6  # longer than any axis
@@ -34,7 +34,9 @@ def at_the_table(
     error, unseen = (1e3 * (table - other)[rows] for other in (window.demand_mm, window.position_mm))
     predicted = _predicted(window, parameters, axis, sync_period_s or window.dt_s)
     left = None if predicted is None else float(np.std(1e3 * (table - predicted)[rows]))
-    return AtTable(rms(error), float(np.abs(error).max()), rms(unseen), float(np.abs(unseen).max()), left)
+    return AtTable(
+        compute_rms(error), float(np.abs(error).max()), compute_rms(unseen), float(np.abs(unseen).max()), left
+    )
 
 
 def _zero(window: Window) -> float:

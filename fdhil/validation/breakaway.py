@@ -9,7 +9,7 @@ import numpy as np
 from fdhil.identification.courses import terms_nm
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.fit import Fit
-from fdhil.identification.motion import UNKNOWN
+from fdhil.identification.motion import UNKNOWN_MODE
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.significance import BUDGET
 
@@ -90,5 +90,5 @@ def _rest_before(fit: Fit, begin: int, side: int) -> int | None:
         return None
     row = first + int(holding[-1])
     quiet = abs(float(motion.speed[row - rows : row + 1].mean())) < 4 * noise.speed_rad_s / np.sqrt(rows)
-    unknown = bool((motion.mode[row - rows : row + 1] == UNKNOWN).all())
+    unknown = bool((motion.mode[row - rows : row + 1] == UNKNOWN_MODE).all())
     return row if quiet and unknown and row < begin - 1 else None

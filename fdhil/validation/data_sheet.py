@@ -36,16 +36,16 @@ def gain_error(estimate: Estimate, nominal: Parameters) -> Reason | None:
     """
     blind = set(WINDING) <= set(estimate.given)  # given values show no sensor's gain
     compared, tolerance = (TORQUES, FRICTION_TOLERANCE) if blind else (COMPARED, TOLERANCE)
-    names = [name for name in compared if estimate.value(name) > 0 and np.isfinite(estimate.std(name))]
+    names = [name for name in compared if estimate.get_value(name) > 0 and np.isfinite(estimate.get_std(name))]
     names = [name for name in names if name not in estimate.given and getattr(nominal, name) > 0]
     if len(names) < LEAST_BEYOND:
         return None
     rows = [PARAMETERS.index(name) for name in names]
-    values = np.array([estimate.value(name) for name in names])
+    values = np.array([estimate.get_value(name) for name in names])
     apart = np.log(values / [getattr(nominal, name) for name in names])
     sure = BUDGET["data sheet"].deviations
     shared = np.zeros(len(rows)) if estimate.systematic is None else np.square(estimate.systematic[rows]).sum(axis=1)
-    chance = np.array([estimate.std(name) for name in names]) ** 2 - shared
+    chance = np.array([estimate.get_std(name) for name in names]) ** 2 - shared
     allowed = math.log1p(tolerance) + (sure * np.sqrt(np.maximum(chance, 0.0)) + np.sqrt(shared)) / values
     if np.count_nonzero(np.abs(apart) > allowed) < LEAST_BEYOND:
         return None
@@ -71,7 +71,7 @@ def scale_convention(estimate: Estimate, nominal: Parameters) -> Reason | None:
     values of a phase, or RMS ones, do not: K, Jt, ft and Cd are then off by one factor, and R and L by none.
     """
     names = [name for name in COMPARED if name not in estimate.given and getattr(nominal, name) > 0]
-    apart = {name: estimate.value(name) / getattr(nominal, name) for name in names}
+    apart = {name: estimate.get_value(name) / getattr(nominal, name) for name in names}
     if set(names) != set(COMPARED) or not all(ratio > 0.0 for ratio in apart.values()):
         return None
     share, inertia = math.log(apart["K"]), math.log(apart["Jt"])

@@ -18,7 +18,7 @@ from fdhil.config import Axis, Identification
 from fdhil.identification.between import between
 from fdhil.identification.physical_bounds import bounded
 from fdhil.identification.pooling import member, pooled
-from fdhil.records import Estimate, Float, HeldOut, Parameters, Reason, Window, frozen
+from fdhil.records import Estimate, Float, HeldOut, Parameters, Reason, Window, freeze_array
 from fdhil.validation.replay import Replay, replay_setpoints
 
 TERM = "presliding_um"
@@ -40,8 +40,8 @@ def with_presliding(estimate: Estimate, windows: Sequence[Window], axis: Axis, s
 
     def left(um: float) -> float:
         """Return the mean square of the replays' residuals, um2; infinite where none can be run."""
-        parameters = estimate.parameters()
-        parameters = parameters.changed(**{TERM: um}) if um > 0.0 else parameters
+        parameters = estimate.build_parameters()
+        parameters = parameters.replace_values(**{TERM: um}) if um > 0.0 else parameters
         found = [replay_setpoints(window, parameters, axis, sync_period_s) for window in chosen]
         known = [each.unexplained_um**2 for each in found if each is not None]
         return float(np.mean(known)) if known else math.inf
@@ -70,11 +70,11 @@ def _with_term(estimate: Estimate, value: float, std: float) -> Estimate:
     covariance: Float = np.zeros((n + 1, n + 1))
     covariance[:n, :n] = estimate.covariance
     covariance[n, n] = std**2
-    values, shared = frozen(np.append(estimate.values, value)), estimate.systematic
+    values, shared = freeze_array(np.append(estimate.values, value)), estimate.systematic
     if shared is not None:
-        shared = frozen(np.vstack([shared, np.zeros((1, shared.shape[1]))]))
+        shared = freeze_array(np.vstack([shared, np.zeros((1, shared.shape[1]))]))
     names = (*estimate.names, TERM)
-    return replace(estimate, names=names, values=values, covariance=frozen(covariance), systematic=shared)
+    return replace(estimate, names=names, values=values, covariance=freeze_array(covariance), systematic=shared)
 
 
 def predict_held_out(moves: Sequence[Move], model: Estimate, axis: Axis, sync_period_s: float) -> list[Replay | None]:
@@ -84,12 +84,14 @@ def predict_held_out(moves: Sequence[Move], model: Estimate, axis: Axis, sync_pe
     drive. A single move is predicted by ``model`` itself.
     """
     members = [member(window, estimate, k) for k, (window, estimate) in enumerate(moves)]
-    build_up = {TERM: model.value(TERM)} if TERM in model.names else {}
+    build_up = {TERM: model.get_value(TERM)} if TERM in model.names else {}
     found = []
     for k, (window, _) in enumerate(moves):
         rest = [m for m in members if m.place != k]
-        without = bounded(pooled(rest, model, between(rest))).parameters().changed(**build_up) if rest else None
-        usable = without if without is not None and _is_drive(without) else model.parameters()
+        without = (
+            bounded(pooled(rest, model, between(rest))).build_parameters().replace_values(**build_up) if rest else None
+        )
+        usable = without if without is not None and _is_drive(without) else model.build_parameters()
         found.append(replay_setpoints(window, usable, axis, sync_period_s))
     return found
 

@@ -20,8 +20,8 @@ from fdhil.identification.delay import delay_direction
 from fdhil.identification.fit import Fit
 from fdhil.identification.kalman import DELAY
 from fdhil.identification.normal import inverse_of, solve
-from fdhil.identification.terms import PHASE
-from fdhil.records import PARAMETERS, Estimate, Float, frozen
+from fdhil.identification.terms import PHASE_SUFFIX
+from fdhil.records import PARAMETERS, Estimate, Float, freeze_array
 from fdhil.validation.score_bench import Bench, Finding
 
 NO_WORSE = 3.0  # standard deviations by which an alternative may explain less by chance
@@ -108,7 +108,7 @@ def widened(
     if {"voltage", "current"} & set(restless):
         shift = _of_names(estimate, fit, _lag(fit))
         covariance = covariance + np.outer(shift, shift)
-    return replace(estimate, covariance=frozen(covariance))
+    return replace(estimate, covariance=freeze_array(covariance))
 
 
 def _lag(fit: Fit) -> Float:
@@ -136,6 +136,6 @@ def _of_names(estimate: Estimate, fit: Fit, shift: Float) -> Float:
     courses = fit.problem.motions[0].courses
     for entry, by in zip(fit.free, shift, strict=True):
         name = PARAMETERS[entry] if entry < DELAY else courses[entry - FIRST_COURSE].name if entry > DELAY else ""
-        if name in estimate.names and f"{name}{PHASE}" not in estimate.names and not name.endswith(PHASE):
+        if name in estimate.names and f"{name}{PHASE_SUFFIX}" not in estimate.names and not name.endswith(PHASE_SUFFIX):
             moved[estimate.names.index(name)] = by
     return moved

@@ -12,7 +12,7 @@ from fdhil.identification.motion import resolution
 from fdhil.identification.windows import moving_range
 from fdhil.model import closed_loop
 from fdhil.model.terms import with_resonance
-from fdhil.records import PARAMETERS, Float, Int, Parameters, Window, rms
+from fdhil.records import PARAMETERS, Float, Int, Parameters, Window, compute_rms
 
 LEAST_ROWS = 20
 OFF_GRID = 1e-3  # of a cycle, by which a row may differ from it
@@ -53,12 +53,12 @@ class Replay:
     @property
     def unexplained_um(self) -> float:
         """RMS difference that the model does not explain, less the effect of the position's resolution."""
-        return math.sqrt(max(0.0, rms(self.difference_um) ** 2 - self.step_um**2 / 12.0))
+        return math.sqrt(max(0.0, compute_rms(self.difference_um) ** 2 - self.step_um**2 / 12.0))
 
     @property
     def measured_um(self) -> float:
         """RMS of the measured following error."""
-        return rms(self.following_um)
+        return compute_rms(self.following_um)
 
 
 def replay(
@@ -104,7 +104,7 @@ def replay_window(window: Window, parameters: Parameters, axis: Axis, sync_perio
         return None
     signals, moving = (window.demand_mm, window.position_mm), moving_range(window)
     best: Replay | None = None
-    for share in SHARES_OF_LOAD if not parameters.term("load") else (0.0,):
+    for share in SHARES_OF_LOAD if not parameters.get_term("load") else (0.0,):
         parted = _parted(parameters, window.direction, _standstill_a(window), share)
         if parted is None:
             continue
@@ -147,7 +147,7 @@ def replay_setpoints(window: Window, parameters: Parameters, axis: Axis, sync_pe
 def completed(parameters: Parameters, spare: Parameters) -> Parameters:
     """Return the parameters with unknown R and L taken from ``spare``: they have little effect at the table."""
     values = parameters.as_dict()
-    return parameters.changed(
+    return parameters.replace_values(
         **{name: getattr(spare, name) for name in PARAMETERS[:2] if not math.isfinite(values[name])}
     )
 
@@ -165,7 +165,7 @@ def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tu
     rest that the model lacks, and the current is what the model holds.
     """
     helping = share * p.Cd
-    held, rests = direction * (p.K * current_a - p.term("load")), max(p.term("stribeck"), 0.0)
+    held, rests = direction * (p.K * current_a - p.get_term("load")), max(p.get_term("stribeck"), 0.0)
     least = (-held - p.Cd - rests) / 2.0
     if share == 0.0:
         helping = max(0.0, least, -p.Cd)  # a load that helps may be more than friction: then their sum is below 0
@@ -177,7 +177,7 @@ def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tu
     current = current_a - direction * max(0.0, held - most) / p.K
     if helping == 0.0:
         return p, current
-    return p.changed(Cd=p.Cd + helping, load=p.term("load") - direction * helping), current
+    return p.replace_values(Cd=p.Cd + helping, load=p.get_term("load") - direction * helping), current
 
 
 def _stands(window: Window, rest: slice) -> bool:

@@ -87,7 +87,7 @@ def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows, lost_v: f
 
 
 def _resistance_share(fit: Fit) -> float:
-    return maximum_likelihood.finish(fit).std("R") / float(fit.theta[0])
+    return maximum_likelihood.finish(fit).get_std("R") / float(fit.theta[0])
 
 
 def _holding(window: Window, fit: Fit, rows: Rows) -> Iterator[Reason]:

@@ -16,7 +16,7 @@ from fdhil.identification.courses import load_nm, voltage_v
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.kalman import DELAY, departure
-from fdhil.identification.motion import BROKEN, Modes
+from fdhil.identification.motion import BROKEN_MODE, Modes
 from fdhil.records import Float
 
 NEIGHBOUR_S = 0.040  # around the doubted rows that are included: some time constants of a winding
@@ -60,7 +60,7 @@ class Bridge:
         motion, theta = self.fit.problem.motions[0], self.fit.theta
         rows = round(NEIGHBOUR_S / motion.dt_s)
         part = slice(max(0, start - rows), min(motion.n, end + rows))
-        if (motion.mode[part] == BROKEN).any():
+        if (motion.mode[part] == BROKEN_MODE).any():
             return None
         signal = SIGNALS.index(name)
         # a voltage that is late by part of a row, or an instant, is mixed from two

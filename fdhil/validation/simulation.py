@@ -45,7 +45,7 @@ def simulated(window: Window, estimate: Estimate, fit: Fit | None) -> Simulated 
     """
     if window.voltage_v is None and window.slow_voltage is None:
         return None
-    p = _complete(estimate, fit).parameters()
+    p = _complete(estimate, fit).build_parameters()
     values = np.array(list(p.as_dict().values()))
     if not np.isfinite(values).all() or not (values[:4] > 0).all():
         return None

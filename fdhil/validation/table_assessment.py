@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from fdhil.records import PARAMETERS, Float, Parameters, Reason, rms
+from fdhil.records import PARAMETERS, Float, Parameters, Reason, compute_rms
 from fdhil.validation.breakaway import Breakaway
 from fdhil.validation.model_deficiencies import Lacking
 from fdhil.validation.replay import replay_window
@@ -69,7 +69,7 @@ class TableAssessment:
     def _convert_to_um(self, loop: TableError, momentums: list[Float]) -> list[float]:
         """Return the RMS at the table (um) of momentums (n,), each with its return move."""
         moves = np.array([to_and_fro(momentum) for momentum in momentums])
-        return [rms(row) for row in loop.um(moves, self.fitted.window.dt_s)]
+        return [compute_rms(row) for row in loop.um(moves, self.fitted.window.dt_s)]
 
     def _derive_loop(self, p: Parameters) -> TableError:
         return TableError.of(p, self.fitted.window.pitch_mm, self.signals.axis)
@@ -113,7 +113,7 @@ class TableAssessment:
         at = [estimate.names.index(name) for name in ("Cd", "stribeck")]
         holding_nm = math.sqrt(float(estimate.covariance[np.ix_(at, at)].sum()))
         um = holding_nm * self._derive_loop(p).lasting_um(self.fitted.window.dt_s)
-        return RestPosition(estimate.std("stribeck"), um)
+        return RestPosition(estimate.get_std("stribeck"), um)
 
     @cached_property
     def rest_position_error_um(self) -> float:
@@ -126,7 +126,7 @@ class TableAssessment:
             return math.inf
         after = np.arange(window.n) >= self.signals.motion_range[1]
         rests = self.signals.standstill & np.isfinite(window.position_mm) & after
-        return rms(1e3 * (window.position_mm - replayed.predicted_mm)[rests]) if rests.any() else math.inf
+        return compute_rms(1e3 * (window.position_mm - replayed.predicted_mm)[rests]) if rests.any() else math.inf
 
     @cached_property
     def is_harmless(self) -> bool:

@@ -26,7 +26,7 @@ from fdhil.config.controller import TOLERANCE_SHARE
 from fdhil.identification.filtering import moving_mean, quick_size
 from fdhil.identification.windows import carried
 from fdhil.model.terms import torque
-from fdhil.records import Bool, Float, Parameters, Reason, Window, rms
+from fdhil.records import Bool, Float, Parameters, Reason, Window, compute_rms
 from fdhil.validation.replay import Replay, replay_window
 
 # of a drive with unknown regulators: corner of its speed loop, and its position gain
@@ -255,7 +255,9 @@ def weigh(
     if not _runs(parameters):
         return None
     loop = TableError.of(parameters, window.pitch_mm, axis)
-    whole, left = (rms(row) for row in loop.um(np.array([move.whole(parameters), move.left(parameters)]), window.dt_s))
+    whole, left = (
+        compute_rms(row) for row in loop.um(np.array([move.whole(parameters), move.left(parameters)]), window.dt_s)
+    )
     left = _beyond_noise(left, loop, parameters, move, noise)
     replayed = _replayed(window, parameters, axis, sync_period_s)
     if replayed is None and axis is not None:
@@ -282,7 +284,7 @@ def _followed_um(window: Window) -> float:
     apart = (window.position_mm - window.demand_mm)[np.isfinite(window.position_mm - window.demand_mm)]
     if apart.size == 0 or not np.nanmax(window.demand_mm) > np.nanmin(window.demand_mm):
         return 0.0
-    return 1e3 * rms(apart - apart[0])
+    return 1e3 * compute_rms(apart - apart[0])
 
 
 def _runs(parameters: Parameters) -> bool:

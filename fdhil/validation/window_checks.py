@@ -126,8 +126,8 @@ def _check_estimate(table: TableAssessment) -> Iterator[Reason]:
         yield Reason("SolverFailed", "the fit does not converge", "inspect the window's signals")
     yield from unphysical(fitted.widened_estimate or estimate, one_way=True)
     for name in estimate.terms:
-        if name in NEVER_NEGATIVE and estimate.value(name) < -SURE * estimate.std(name):
-            text = f"{name} = {estimate.value(name):.4g} would add voltage: voltage or current has an offset"
+        if name in NEVER_NEGATIVE and estimate.get_value(name) < -SURE * estimate.get_std(name):
+            text = f"{name} = {estimate.get_value(name):.4g} would add voltage: voltage or current has an offset"
             yield Reason("CalibrationSuspect", text, "set the zeros of current and voltage sensor at standstill")
 
 
@@ -140,8 +140,8 @@ def _check_stick_slip(table: TableAssessment) -> Iterator[Reason]:
     estimate, budget, resting = table.fitted.estimate, table.budget, table.rest_position
     if estimate is None or "stribeck" not in estimate.names:
         return
-    more, dry = estimate.value("stribeck"), abs(estimate.value("Cd"))
-    torque_nm = estimate.value("K") * float(np.nanmax(np.abs(table.fitted.window.current_a)))
+    more, dry = estimate.get_value("stribeck"), abs(estimate.get_value("Cd"))
+    torque_nm = estimate.get_value("K") * float(np.nanmax(np.abs(table.fitted.window.current_a)))
     least = max(dry, SLIPPING_SHARE * torque_nm)
     advice = "lubricate the slide-way and inspect its guides first"
     text = f"higher than the dry friction of {dry:.3g} N.m: the axis"

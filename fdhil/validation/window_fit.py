@@ -53,13 +53,13 @@ class WindowFit:
         """The estimate as a drive that can be simulated; R and L that it lacks are the fit's or the data sheet's."""
         if self.estimate is None or not set(PARAMETERS) <= set(self.estimate.names):
             return None
-        estimated = self.estimate.parameters()
+        estimated = self.estimate.build_parameters()
         if self.fit is not None:
             estimated = completed(estimated, Parameters(*self.fit.theta[:6]))
         if self.signals.axis is not None:
             return completed(estimated, Parameters(**self.signals.axis.nominal.model_dump()))
         # behind an ordinary current loop R and L, which need a voltage, have no effect
-        return estimated if self.signals.has_voltage else estimated.changed(R=1.0, L=1.0)
+        return estimated if self.signals.has_voltage else estimated.replace_values(R=1.0, L=1.0)
 
     @cached_property
     def fit_percent(self) -> float | None:
@@ -153,5 +153,5 @@ class WindowFit:
     def lost_voltage_v(self) -> float:
         """The part of the recorded voltage that does not reach the motor: a term of the estimate, or a deficiency."""
         found = [abs(each.finding.amplitude) for each in self.deficiencies if each.finding.name == DEAD_TIME]
-        term = self.parameters.term("dead_time") if self.parameters is not None else 0.0
+        term = self.parameters.get_term("dead_time") if self.parameters is not None else 0.0
         return abs(term) + sum(found)

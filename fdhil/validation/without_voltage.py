@@ -9,7 +9,7 @@ import numpy as np
 
 from fdhil.identification.normal import inverse_gram
 from fdhil.identification.without_voltage import TorqueFit, candidates, effective_rows, late_s
-from fdhil.records import Reason, rms
+from fdhil.records import Reason, compute_rms
 from fdhil.validation.shifts import build_delay_reason
 from fdhil.validation.significance import BUDGET
 from fdhil.validation.window_signals import WindowSignals
@@ -74,7 +74,7 @@ def surest_load(fitted: TorqueFit) -> Load:
     amplitude, begin, end = float(amplitudes[k]), int(edges[a[k]]), int(edges[b[k]])
     rest = left + amplitude * (design @ (inverse @ (shared[b[k]] - shared[a[k]])))
     rest[begin:end] -= amplitude
-    std = rms(rest) * float(np.sqrt(rest.size / effective_rows(rest) / max(power[k], 1e-300)))
+    std = compute_rms(rest) * float(np.sqrt(rest.size / effective_rows(rest) / max(power[k], 1e-300)))
     return Load(amplitude, std, begin, end)
 
 

@@ -43,7 +43,7 @@ class Daemon:
             raise DeviceTimeout("daemon", text) from None
         except OSError as error:
             absent = f"is not running ({error.strerror or error}); start it with fdhil run CONFIG"
-            raise ConnectError.of_socket("daemon", error, absent) from None
+            raise ConnectError.from_socket_error("daemon", error, absent) from None
 
     async def status(self) -> Mapping[str, Any]:
         """Return the status document, at most half a second old: many browsers cause no more requests than one.

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from fdhil.cancellation import run_attempt
-from fdhil.daemon.live import SIGNALS, unpacked
+from fdhil.daemon.live_stream import LIVE_SIGNALS, decode_base64
 from fdhil.errors import ConnectError, DeviceError
 from fdhil.json_lines import decode_line
 from fdhil.web.live_ring import Ring
@@ -128,8 +128,8 @@ class LiveFeed:
             take(line)
 
     def _samples(self, line: Mapping[str, Any]) -> None:
-        values = unpacked(line["values"], "<f4").reshape(len(SIGNALS), -1)
-        after = unpacked(line["ticks"], "<i4") if "ticks" in line else np.arange(values.shape[1])
+        values = decode_base64(line["values"], "<f4").reshape(len(LIVE_SIGNALS), -1)
+        after = decode_base64(line["ticks"], "<i4") if "ticks" in line else np.arange(values.shape[1])
         axis, first = line["axis"], int(line["tick"])
         base = self._bases.get(axis)
         if base is None or first + base < self.rings[axis].end:
@@ -155,8 +155,8 @@ class LiveFeed:
         if self._line is None or base is None:
             return
         begin, slope = self._line
-        ticks = np.floor(begin + slope * unpacked(line["t_ns"], "<i8")).astype(np.int64) + base
-        self.rings[line["axis"]].put_voltage(ticks, unpacked(line["values"], "<f4"))
+        ticks = np.floor(begin + slope * decode_base64(line["t_ns"], "<i8")).astype(np.int64) + base
+        self.rings[line["axis"]].put_voltage(ticks, decode_base64(line["values"], "<f4"))
 
     def _skip(self, line: Mapping[str, Any]) -> None:
         self.skipped_lines += int(line["lines"])
@@ -179,5 +179,5 @@ def _cause(error: Exception) -> str:
     if isinstance(error, TimeoutError):
         return f"the daemon was silent for {SILENT_S:.0f} s; check its log"
     if isinstance(error, OSError):
-        return str(ConnectError.of_socket("daemon", error, "is not running; start it with fdhil run CONFIG"))
+        return str(ConnectError.from_socket_error("daemon", error, "is not running; start it with fdhil run CONFIG"))
     return "the daemon sent an unknown message; use the same version of fdhil for both"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdhil.daemon.live import SIGNALS
+from fdhil.daemon.live_stream import LIVE_SIGNALS
 
 Rows = NDArray[np.float32]
 UNITS = {
@@ -22,7 +22,7 @@ UNITS = {
     "demand_mm": "mm",
     "temperature_c": "°C",
 }
-DRAWN = (*SIGNALS, "temperature_c")
+DRAWN = (*LIVE_SIGNALS, "temperature_c")
 VOLTAGE, TEMPERATURE = DRAWN.index("voltage_v"), DRAWN.index("temperature_c")
 
 
@@ -65,7 +65,7 @@ class Ring:
         self._values[:, np.arange(max(before, self.begin), self.end) % self.capacity] = np.nan
         keep = ticks >= self.begin
         places = ticks[keep] % self.capacity
-        self._values[: len(SIGNALS), places] = values[:, keep]
+        self._values[: len(LIVE_SIGNALS), places] = values[:, keep]
         self._values[TEMPERATURE, places] = self._celsius
 
     def put_voltage(self, ticks: NDArray[np.int64], values: NDArray[Any]) -> None:

@@ -70,4 +70,4 @@ class Replayer:
     async def close(self) -> None:
         process, self._process = self._process, None
         if process is not None:
-            await process.end()
+            await process.kill_and_wait()

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from fdhil.config import MachineConfig
 from fdhil.config.web import Web, is_loopback
-from fdhil.daemon import heap
+from fdhil.daemon import malloc_tuning
 from fdhil.daemon.shutdown import Shutdown
 from fdhil.errors import ConfigError, ConfigFault, ConnectError, FdhilError
 
@@ -72,13 +72,13 @@ def serve(web: Web, make: Callable[[], FastAPI], ready: Callable[[str], None]) -
     require()
     check_reach(web)
     certificate = _tls(web)
-    heap.keep_small()
+    malloc_tuning.limit_heap_growth()
     with _listening(web) as listener:
         shutdown = Shutdown(END_S, os._exit)
         try:
             asyncio.run(_serve(web, make, listener, certificate, ready, shutdown))
         finally:
-            shutdown.end()
+            shutdown.cancel_deadline()
 
 
 def url_of(web: Web, listener: socket.socket) -> str:
@@ -126,7 +126,7 @@ async def _serve(
     server = server_of(make(), certificate, lambda: ready(url_of(web, listener)))
 
     def stop() -> None:
-        shutdown.begin()
+        shutdown.start_deadline()
         server.should_exit = True
 
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -142,14 +142,14 @@ async def _give_back() -> None:
     """Return free memory regularly: a page of a long history takes 100 MB while it is made."""
     while True:
         await asyncio.sleep(GIVE_BACK_S)
-        await asyncio.to_thread(heap.give_back)
+        await asyncio.to_thread(malloc_tuning.trim_heap)
 
 
 def server_of(app: FastAPI, certificate: ssl.SSLContext | None, ready: Callable[[], None]) -> uvicorn.Server:
     """Return the server of an application; it calls ``ready`` once it listens."""
     import uvicorn  # late: this module must import without the extra
 
-    from fdhil.connections import MOST_CONNECTIONS, BoundedHttp, BoundedSocket
+    from fdhil.connections import MOST_CONNECTIONS, BoundedHttpProtocol, BoundedWebSocketProtocol
 
     class Server(uvicorn.Server):
         @contextlib.contextmanager
@@ -163,7 +163,7 @@ def server_of(app: FastAPI, certificate: ssl.SSLContext | None, ready: Callable[
     settings = uvicorn.Config(
         app,
         log_config=None, log_level="error", access_log=False, server_header=False, proxy_headers=False,
-        http=BoundedHttp, ws=BoundedSocket, ws_max_size=LARGEST_MESSAGE, limit_concurrency=MOST_CONNECTIONS,
+        http=BoundedHttpProtocol, ws=BoundedWebSocketProtocol, ws_max_size=LARGEST_MESSAGE, limit_concurrency=MOST_CONNECTIONS,
         timeout_keep_alive=KEEP_ALIVE_S, timeout_graceful_shutdown=STOP_S,
     )  # fmt: skip
     settings.load()

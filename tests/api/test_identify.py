@@ -165,7 +165,7 @@ def test_next_move_promises_no_narrower_interval_than_it_brings() -> None:
 
 def test_simulated_model_answers_as_the_motor_did() -> None:
     m = measured("steps of voltage")
-    made = fdhil.simulate(fdhil.Model.of(TRUTH), m.voltage, 1e-3)
+    made = fdhil.simulate(fdhil.Model.from_mapping(TRUTH), m.voltage, 1e-3)
     assert np.abs(made.speed - m.speed).max() < 0.02 * np.abs(m.speed).max()
 
 
@@ -191,7 +191,7 @@ def test_recordings_of_two_axes_are_refused() -> None:
 
 def test_model_becomes_a_state_space_of_python_control() -> None:
     control = pytest.importorskip("control")
-    system = fdhil.Model.of(TRUTH).to_control()
+    system = fdhil.Model.from_mapping(TRUTH).to_control()
     gain = control.dcgain(system)[1, 0]
     assert gain == pytest.approx(TRUTH["K"] / (TRUTH["K"] ** 2 + TRUTH["R"] * TRUTH["ft"]))
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from fdhil.guard import table
+from fdhil.guard import correction_table
 from tests.arming.guard_peer import ZERO, Guard
 
 RESERVE_ROWS = 1000
@@ -34,7 +34,7 @@ class Mill:
         return {"ok": True, "state": self.state, "row": self.row or None, "rows": rows, **known}
 
     def _load(self) -> Answer:
-        _, path = table.decode(table.read_sealed(self._peer.descriptor))
+        _, path = correction_table.decode_table(correction_table.read_sealed_memory(self._peer.descriptor))
         if path.first == 0:
             self.rows = []
         if path.first != len(self.rows):

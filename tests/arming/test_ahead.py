@@ -33,7 +33,7 @@ from tests.arming.mill import RESERVE_ROWS, Mill
 from tests.arming.test_preparing import known, save_records
 from tests.arming.test_program_check import HEAD, SQUARE
 from tests.bench import bench_config
-from tests.daemon.machine import config_of
+from tests.daemon.simulated_machine import config_of
 from tests.store.made import published
 
 NEAR_S = 12.0  # instead of AHEAD_S where a process really checks: the same, in a fifth of the processor time

@@ -11,9 +11,9 @@ from fdhil.arming.preparing import MODEL_AGE_S, Feeding, Refused, feeding_facts,
 from fdhil.commissioning.record import axis_digest, save_record
 from fdhil.config import FeedforwardLimits, MachineConfig
 from fdhil.guard.interlocks import FEEDFORWARD_FACTS
-from fdhil.guard.requests import parse_law
+from fdhil.guard.request_parsing import parse_law
 from tests.arming.test_preparing import known, record_of
-from tests.daemon.machine import config_of
+from tests.daemon.simulated_machine import config_of
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from fdhil.correction import PlanLimits, check
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.models import nominal_models
 from fdhil.program import load_trajectory
-from fdhil.records import AxisSamples, Float, Parameters, frozen, frozen_ints
+from fdhil.records import AxisSamples, Float, Parameters, freeze_array, freeze_integers
 from studies import real_plant
 from studies.real_plant import Mechanics
 from tests.bench import bench_config
@@ -112,7 +112,7 @@ def test_what_the_way_to_the_start_leaves_is_expected(tmp_path: Path) -> None:
 def test_a_load_shifts_what_the_axes_hold(tmp_path: Path) -> None:
     """The plant is independent of the model: each axis stands at an edge of a friction band shifted by its load."""
     plant = replace(Mechanics(), load_nm=4.0, static=0.2)
-    model = Parameters.of({**plant.truth(), "load": 4.0, "stribeck": 1.0, "stribeck_speed": 10.0})
+    model = Parameters.from_mapping({**plant.truth(), "load": 4.0, "stribeck": 1.0, "stribeck_speed": 10.0})
     models = {"X": model, "Y": model}
     program, begin = checked(tmp_path, LONG, models, CONFIG)
     first = FirstBlock(begin, program, models, CONFIG)
@@ -143,9 +143,9 @@ def test_an_axis_that_does_not_stand_at_the_start_leaves_the_rows(rest: dict[str
 
 def heard(first: int, current: Float, position: float = 1.0) -> AxisSamples:
     n = current.size
-    still = frozen(np.full(n, position))
-    zero, ticks = frozen(np.zeros(n)), frozen_ints(np.arange(first, first + n))
-    return AxisSamples("X", ticks, still, still, zero, frozen(current), None, zero, frozen_ints(np.zeros(n)))
+    still = freeze_array(np.full(n, position))
+    zero, ticks = freeze_array(np.zeros(n)), freeze_integers(np.arange(first, first + n))
+    return AxisSamples("X", ticks, still, still, zero, freeze_array(current), None, zero, freeze_integers(np.zeros(n)))
 
 
 def test_the_current_is_that_of_the_last_samples() -> None:
@@ -160,9 +160,9 @@ def test_the_current_is_that_of_the_last_samples() -> None:
 def test_an_axis_that_moves_or_was_not_heard_is_not_at_rest() -> None:
     rows = round(WATCHED_S / 0.001)
     good = heard(0, np.full(2 * rows, 2.0))
-    moved = replace(good, position_mm=frozen(np.linspace(0, 1, 2 * rows)))
-    holed = replace(good, tick=frozen_ints(np.where(good.tick > rows, good.tick + 1, good.tick)))
-    offset = replace(good, offset_mm=frozen(np.full(2 * rows, 0.001)))
+    moved = replace(good, position_mm=freeze_array(np.linspace(0, 1, 2 * rows)))
+    holed = replace(good, tick=freeze_integers(np.where(good.tick > rows, good.tick + 1, good.tick)))
+    offset = replace(good, offset_mm=freeze_array(np.full(2 * rows, 0.001)))
     for samples in (moved, holed, offset):
         standstill = Standstill(CONFIG)
         standstill.take(samples)

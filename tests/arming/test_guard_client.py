@@ -17,10 +17,10 @@ import pytest
 from fdhil.arming.guard_client import GuardClient, GuardLost
 from fdhil.errors import ConnectError, DeviceTimeout
 from fdhil.guard import __main__ as entry
-from fdhil.guard import signals
-from fdhil.guard.requests import parse_line
-from fdhil.guard.settings import to_json
-from tests.guard.machine import settings
+from fdhil.guard import stop_signals
+from fdhil.guard.guard_settings import encode_settings
+from fdhil.guard.request_parsing import parse_line
+from tests.guard.simulated_bus import settings
 
 
 @pytest.fixture
@@ -139,8 +139,8 @@ def test_it_starts_on_its_descriptor_and_stops_at_a_signal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, handlers: None
 ) -> None:
     file = tmp_path / "guard.json"
-    file.write_text(to_json(settings(run_directory=str(tmp_path), clock="monotonic")))
-    caught = signals.catch
+    file.write_text(encode_settings(settings(run_directory=str(tmp_path), clock="monotonic")))
+    caught = stop_signals.catch_signals
 
     def catch_and_raise() -> socket.socket:
         wake = caught()
@@ -148,7 +148,7 @@ def test_it_starts_on_its_descriptor_and_stops_at_a_signal(
             os.kill(os.getpid(), number)
         return wake
 
-    monkeypatch.setattr(signals, "catch", catch_and_raise)
+    monkeypatch.setattr(stop_signals, "catch_signals", catch_and_raise)
     with socket.create_server(("127.0.0.1", 0)) as server:
         near = socket.create_connection(server.getsockname())
         assert start(monkeypatch, "--settings", str(file), "--descriptor", str(near.detach())) == 3
@@ -159,7 +159,7 @@ def test_without_settings_or_descriptor_it_says_what_is_wrong(
 ) -> None:
     file = tmp_path / "guard.json"
     assert start(monkeypatch, "--settings", str(file), "--descriptor", "0") == 2
-    file.write_text(to_json(settings(run_directory=str(tmp_path))))
+    file.write_text(encode_settings(settings(run_directory=str(tmp_path))))
     assert start(monkeypatch, "--settings", str(file), "--descriptor", str(1 << 20)) == 3
     told = capsys.readouterr().err.splitlines()
     assert "run fdhil-guard" in told[0]
@@ -171,8 +171,8 @@ def test_without_settings_or_descriptor_it_says_what_is_wrong(
 def test_a_machine_whose_numbers_are_unknown_leaves_two_signals_alone(
     monkeypatch: pytest.MonkeyPatch, handlers: None
 ) -> None:
-    monkeypatch.setattr(signals, "SIGACTION", {})
-    wake = signals.catch()
+    monkeypatch.setattr(stop_signals, "SIGACTION", {})
+    wake = stop_signals.catch_signals()
     signal.raise_signal(signal.SIGQUIT)
     assert wake.recv(10) == bytes([signal.SIGQUIT])
     wake.close()

@@ -15,13 +15,13 @@ import pytest
 from fdhil.arming.checked_program import Piece
 from fdhil.arming.desk import ALIVE_S, ArmingDesk
 from fdhil.arming.guard_client import GuardClient
-from fdhil.arming.guard_link import TRIPPED, GuardLink
+from fdhil.arming.guard_link import GUARD_TRIPPED, GuardLink
 from fdhil.arming.token import read_token
 from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.errors import DeviceError
 from tests.arming.guard_peer import FINE, Guard
-from tests.daemon.machine import config_of
+from tests.daemon.simulated_machine import config_of
 
 STARVED = {"state": "RAMP_DOWN", "cause": {"code": "TableStarved", "text": "no rows", "axis": ""}, "ok": True}
 
@@ -67,7 +67,7 @@ def test_a_trip_that_another_request_saw_is_told_all_the_same(guard: Guard, fold
     piece = Piece(0, {"X": [0]}, {"X": [0]}, False)
     assert link.extend(long, piece)["ok"]  # type: ignore[arg-type]
     assert link.state == "RAMP_DOWN"
-    assert [notice.code for notice in link.refresh()] == ["GuardState", TRIPPED]
+    assert [notice.code for notice in link.refresh()] == ["GuardState", GUARD_TRIPPED]
     assert link.refresh() == []
     link.close()
 

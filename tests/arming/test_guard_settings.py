@@ -15,9 +15,9 @@ from fdhil.config import CorrectionLimits, Drive, TableEncoder
 from fdhil.drivers.cia402.profile import DriveProfile
 from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.errors import ConfigError
-from fdhil.guard.limits import OffsetLimits
-from fdhil.guard.settings import from_json, to_json
-from tests.guard.peer import write_config
+from fdhil.guard.guard_settings import decode_settings, encode_settings
+from fdhil.guard.offset_limits import OffsetLimits
+from tests.guard.drive_peer import write_config
 
 
 def test_limits_are_whole_increments_rounded_down(tmp_path: Path) -> None:
@@ -55,7 +55,7 @@ def test_the_software_limits_are_those_of_the_commissioning(tmp_path: Path) -> N
     save_record(replace(RECORD, options={"607D01": -1000, "607D02": 820_000}), config.store.directory)
     made = settings_of(config, "can0", tmp_path, "")
     assert [axis.travel for axis in made.axes] == [(-1000, 820_000), None]
-    assert from_json(to_json(made)) == made
+    assert decode_settings(encode_settings(made)) == made
 
 
 def test_the_guard_knows_the_record_and_whether_it_holds(tmp_path: Path) -> None:
@@ -74,7 +74,7 @@ def test_the_guard_knows_the_record_and_whether_it_holds(tmp_path: Path) -> None
     void_record(store, "X", "booted")
     assert known() == [(signed.fingerprint, True), ("", False)]
     made = settings_of(config, "can0", tmp_path, "")
-    assert from_json(to_json(made)) == made
+    assert decode_settings(encode_settings(made)) == made
 
 
 def test_what_the_guard_sends_is_nobody_elses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ from tests.arming.mill import Mill
 from tests.arming.test_ahead import opened
 from tests.arming.test_passes import heard, measured
 from tests.arming.test_preparing import save_records
-from tests.daemon.machine import config_of
+from tests.daemon.simulated_machine import config_of
 
 pytestmark = pytest.mark.usefixtures("real_time")
 

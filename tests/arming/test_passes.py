@@ -17,11 +17,11 @@ from fdhil.arming.preparing import Armament, Refused
 from fdhil.config import MachineConfig
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.gain import Gain, format_half_interval, joint_held_out_um, worst_skill_um
-from fdhil.records import AxisSamples, Correction, Float, Notice, Skill, frozen, frozen_ints
+from fdhil.records import AxisSamples, Correction, Float, Notice, Skill, freeze_array, freeze_integers
 from tests.arming.mill import Mill
 from tests.arming.test_ahead import opened
 from tests.arming.test_preparing import save_records, whole
-from tests.daemon.machine import config_of
+from tests.daemon.simulated_machine import config_of
 
 REST_ROWS = 300
 
@@ -48,8 +48,10 @@ def heard(demand: Mapping[str, Float], position: Mapping[str, Float]) -> Iterato
         tick, zeros = np.arange(1000, 1000 + wanted.size), np.zeros(wanted.size)
         for k in range(0, wanted.size, size):
             part = slice(k, k + size)
-            ticks, still = frozen_ints(tick[part]), frozen(zeros[part])
-            yield AxisSamples(axis, ticks, frozen(wanted[part]), frozen(is_at[part]), still, still, None, still, ticks)
+            ticks, still = freeze_integers(tick[part]), freeze_array(zeros[part])
+            yield AxisSamples(
+                axis, ticks, freeze_array(wanted[part]), freeze_array(is_at[part]), still, still, None, still, ticks
+            )
 
 
 def test_a_pass_is_measured_as_a_prediction_is_whatever_its_pieces(

@@ -37,7 +37,7 @@ from fdhil.identification.loops import DIFFER
 from fdhil.program import loading, program_digest
 from fdhil.records import LoopEstimate, Notice, Reason, Skill, Verdict
 from fdhil.store.rows import Revision, Stamp
-from tests.daemon.machine import config_of
+from tests.daemon.simulated_machine import config_of
 from tests.store.made import published
 
 GENTLE = "G21 G90 G94\nG1 X20 F4000\nG1 Y20\nG4 P0.2\nM2\n"
@@ -319,5 +319,5 @@ def test_a_resonance_that_is_configured_is_planned_with(config: MachineConfig, p
     config = config.model_copy(update={"axis": {**config.axis, "X": axis}})
     request = prepare(program, None, config, known(config))
     assert isinstance(request, ArmRequest)
-    assert request.models["X"].term("resonance") == 90.0
+    assert request.models["X"].get_term("resonance") == 90.0
     assert request.models["Y"].terms == ()

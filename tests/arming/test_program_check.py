@@ -31,7 +31,7 @@ from fdhil.program import load_trajectory, program_digest
 from fdhil.records import Reason
 from tests.arming.check_process import answered, asked, says_instead
 from tests.arming.test_preparing import known, save_records
-from tests.daemon.machine import config_of
+from tests.daemon.simulated_machine import config_of
 
 SQUARE = "G1 X40 F6000\nG1 Y30\nG1 X0\nG1 Y0\n"
 HEAD = "G21 G90 G94\nG4 P0.5\n"
@@ -367,7 +367,7 @@ def test_a_store_that_refuses_is_told(tmp_path: Path) -> None:
 def test_rows_of_other_terms_or_loops_are_other_rows(config: MachineConfig, tmp_path: Path) -> None:
     program = written(tmp_path, HEAD + SQUARE + "G4 P0.3\nM2\n")
     digest, six = program_digest(program), nominal_models(config)
-    rich = {axis: model.changed(stribeck=2.0, stribeck_speed=10.0) for axis, model in six.items()}
+    rich = {axis: model.replace_values(stribeck=2.0, stribeck_speed=10.0) for axis, model in six.items()}
     filtered = with_loops(config, {axis: {"speed_filter_s": 5e-4} for axis in config.axis}, "test")
     background, bodies = BackgroundCheck(config), dict[str, bytes]()
     for models, machine in ((six, config), (rich, config), (six, filtered)):

@@ -20,13 +20,13 @@ from fdhil.arming.guard_link import GuardLink
 from fdhil.arming.standing_mark import FILE_NAME, StandingMark
 from fdhil.arming.token import ensure_token, read_token
 from fdhil.config import MachineConfig
-from fdhil.daemon.control import ask
+from fdhil.daemon.daemon_socket import ask_daemon
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.errors import ConnectError, DeviceError
 from fdhil.store import audit
 from tests.arming.guard_peer import Guard
-from tests.daemon.machine import Machine, config_of
-from tests.daemon.shop import BENCH, fdhil
+from tests.daemon.machine_rig import BENCH, fdhil
+from tests.daemon.simulated_machine import SimulatedMachine, config_of
 from tests.machine.virtual_time import HastyClock
 
 OFF: Mapping[str, Any] = {"ok": True, "state": "OFF", "cause": None, "may_stand_um": {"X": 0.0, "Y": 0.0}}
@@ -240,19 +240,19 @@ async def test_arming_a_frozen_guard_says_adopt_and_not_disarm(
 
 
 def running(machine: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, meanwhile: Any) -> tuple[int, str]:
-    monkeypatch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
-    monkeypatch.setattr("fdhil.drivers.open_machine", Machine().open)
+    monkeypatch.setattr("fdhil.daemon.daemon_service.compile_kernels", lambda config, method: None)
+    monkeypatch.setattr("fdhil.drivers.open_machine", SimulatedMachine().open)
     path = machine.parent / "fdhil-data" / "run" / "daemon.sock"
 
     def stop() -> None:
         told: dict[str, Any] = {}
         while not told:
             try:
-                told = ask(path, {"request": "status"})
+                told = ask_daemon(path, {"request": "status"})
             except ConnectError:
                 threading.Event().wait(0.02)
         meanwhile(path)
-        ask(path, {"request": "stop"})
+        ask_daemon(path, {"request": "stop"})
 
     thread = threading.Thread(target=stop)
     thread.start()
@@ -262,7 +262,7 @@ def running(machine: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, meanwhi
 
 
 def status_when(path: Path, ready: Any) -> dict[str, Any]:
-    while not ready(told := ask(path, {"request": "status"})):
+    while not ready(told := ask_daemon(path, {"request": "status"})):
         threading.Event().wait(0.02)
     return told
 
@@ -346,7 +346,7 @@ def in_the_audit(machine: Path) -> list[tuple[str, str | None]]:
 @pytest.mark.fault("F5")
 def test_no_disk_keeps_an_offset_from_being_taken_away(machine: Path, guard: Guard, capsys: Any) -> None:
     folder = machine_config.load(machine).store.directory
-    (folder / audit.FILE_NAME).mkdir(parents=True)
+    (folder / audit.AUDIT_FILE_NAME).mkdir(parents=True)
     now = [FROZEN, OFF]
     guard.says = lambda kind: {"ok": True} if kind in ("adopt", "disarm") else now.pop(0) if len(now) > 1 else now[0]
     code, out, err = fdhil("adopt", machine, "--yes", capsys=capsys)
@@ -354,7 +354,7 @@ def test_no_disk_keeps_an_offset_from_being_taken_away(machine: Path, guard: Gua
     assert err.count("adopt is not in the audit: ") == 2
     code, out, err = fdhil("disarm", machine, capsys=capsys)
     assert (code, "disarm at the guard is not in the audit" in err) == (0, True)
-    (folder / audit.FILE_NAME).rmdir()
+    (folder / audit.AUDIT_FILE_NAME).rmdir()
     assert fdhil("disarm", machine, capsys=capsys)[0] == 0
     assert in_the_audit(machine) == [("disarm at the guard", "done")]
 

@@ -21,7 +21,7 @@ from fdhil.prediction.models import nominal_models
 from fdhil.program import program_digest
 from tests.arming.test_preparing import whole
 from tests.bench import bench_config, bench_document
-from tests.daemon.machine import config_of
+from tests.daemon.simulated_machine import config_of
 from tests.paths import bench_trajectory
 
 

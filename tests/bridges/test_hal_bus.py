@@ -13,12 +13,12 @@ from fdhil.bridges.hal_bus import (
     SYNC,
     SYNC_RANGE,
     AxisReader,
+    HalPin,
     OffsetQueue,
-    Pin,
     PinError,
-    _require,
-    counter_of,
-    frames_of,
+    _require_pin,
+    encode_cycle,
+    get_sync_counter,
     read_axes,
 )
 from fdhil.config.axis import Drive
@@ -43,7 +43,7 @@ def reader(**hal: Any) -> AxisReader:
     return AxisReader(read_axes(document(**hal))[0])
 
 
-def test_axes_without_hal_pins_are_left_out() -> None:
+def test_axes_without_hal_pins_are_ignored() -> None:
     assert [(axis.name, axis.node_id, axis.corrected) for axis in read_axes(document())] == [
         ("X", 1, True),
         ("Y", 2, True),
@@ -52,32 +52,32 @@ def test_axes_without_hal_pins_are_left_out() -> None:
 
 def test_scales_and_signs_are_applied() -> None:
     inch = reader(position_mm_per_unit=25.4, current_a_per_unit=-5.0, voltage="v", voltage_v_per_unit=24.0)
-    sample = inch.sample({**VALUE, "voltage": 0.5, "offset": 0.001})
+    sample = inch.read_sample({**VALUE, "voltage": 0.5, "offset": 0.001})
     assert (sample.target, sample.position) == (12_700_000, round(9.9 * 25.4 * 50_000))
     assert (sample.current, sample.voltage, sample.offset) == (-1_000_000, 600, 1270)
     torque = reader(current=None, torque="t", torque_nm_per_unit=4.0)
     assert torque.axis.pins["current"] == "t"
-    assert torque.sample({**VALUE, "current": 1.0}).current == pytest.approx(4.0 / 0.8 * 1e5)
+    assert torque.read_sample({**VALUE, "current": 1.0}).current == pytest.approx(4.0 / 0.8 * 1e5)
 
 
 def test_a_missing_speed_pin_is_replaced_by_the_difference_of_positions() -> None:
     axis = reader()
-    assert axis.sample(VALUE).speed == 0
-    assert axis.sample({**VALUE, "position_feedback": 10.0}).speed == pytest.approx(0.1 / 0.001 * 50_000, abs=1)
+    assert axis.read_sample(VALUE).speed == 0
+    assert axis.read_sample({**VALUE, "position_feedback": 10.0}).speed == pytest.approx(0.1 / 0.001 * 50_000, abs=1)
 
 
 def test_a_commanded_voltage_is_reported_in_the_cycle_after_it() -> None:
     axis = reader(voltage="v", voltage_is="commanded")
-    assert [axis.sample({**VALUE, "voltage": v}).voltage for v in (1.0, 2.0, 3.0)] == [0, 50, 100]
+    assert [axis.read_sample({**VALUE, "voltage": v}).voltage for v in (1.0, 2.0, 3.0)] == [0, 50, 100]
 
 
-def test_a_value_that_is_no_number_is_far_out_of_range() -> None:
-    assert reader().sample({**VALUE, "position_feedback": math.nan}).position == -(2**31)
+def test_nan_value_becomes_far_out_of_range() -> None:
+    assert reader().read_sample({**VALUE, "position_feedback": math.nan}).position == -(2**31)
 
 
-def test_frames_are_those_of_profile_hal() -> None:
+def test_frames_match_profile_hal() -> None:
     axes = read_axes(document())
-    frames = list(frames_of(10, axes, [AxisReader(axis).sample(VALUE) for axis in axes]))
+    frames = list(encode_cycle(10, axes, [AxisReader(axis).read_sample(VALUE) for axis in axes]))
     profile = load_profile(Drive.model_validate({"source": "hal", "hal": PINS}))
     lengths = {spec.cob_base + node: spec.length for spec in (*profile.rpdos, *profile.tpdos) for node in (1, 2)}
     assert [cob_id for cob_id, _ in frames][:3] == [0x201, 0x202, SYNC]
@@ -99,13 +99,13 @@ class Streamer:
             if self.waiting:
                 self.row, (self.applied, _) = self.waiting.pop(0)
             self.seen[self.cycle] = 0.0 if empty else self.applied
-            self.queue.applied(self.cycle, self.row, empty)
+            self.queue.check_applied_row(self.cycle, self.row, empty)
             if offset is not None:
                 answered = self.cycle - late
                 increments = offset.get(answered + 1 + LEAD, 0)
                 for node in (1, 2):
-                    self.queue.take(node, struct.pack("<iB", increments, counter_of(answered)))
-            self.waiting += self.queue.rows()
+                    self.queue.take_offset(node, struct.pack("<iB", increments, get_sync_counter(answered)))
+            self.waiting += self.queue.take_rows()
 
 
 @pytest.mark.parametrize("late", [0, 1, 15])
@@ -117,7 +117,7 @@ def test_each_offset_takes_effect_in_its_own_cycle(late: int) -> None:
     assert streamer.queue.restarts == 0
 
 
-def test_a_missing_answer_keeps_the_offset_before() -> None:
+def test_missing_answer_keeps_the_previous_offset() -> None:
     streamer = Streamer()
     streamer.run(200, {})
     for cycle in range(1201, 1260):
@@ -126,12 +126,12 @@ def test_a_missing_answer_keeps_the_offset_before() -> None:
     assert streamer.queue.restarts == 0
 
 
-def test_silence_runs_the_streamer_empty_and_the_next_answers_start_again_in_step() -> None:
+def test_streamer_restarts_aligned_after_a_silence() -> None:
     streamer = Streamer()
     streamer.run(200, {})
     streamer.run(SYNC_RANGE)  # nobody answers
     assert not streamer.waiting
-    assert not streamer.queue.running
+    assert not streamer.queue.is_running
     wanted = dict.fromkeys(range(1600, 1700), 700)
     streamer.run(400, wanted)
     assert {c for c, mm in streamer.seen.items() if mm} == set(wanted)
@@ -161,11 +161,11 @@ odrive float OUT 0 odrive.0.iq
         ("odrive.0.iq", "runs in userspace"),
     ],
 )
-def test_a_bad_pin_is_refused_with_its_key_and_name(pin: str, text: str) -> None:
-    pins = {each.name: each for each in map(Pin, PIN_LINES.splitlines()) if each.name}
+def test_invalid_pin_is_refused_with_its_key_and_name(pin: str, text: str) -> None:
+    pins = {each.name: each for each in map(HalPin, PIN_LINES.splitlines()) if each.name}
     with pytest.raises(PinError, match=r"^axis\.X\.drive\.hal\.current: ") as refused:
-        _require(pin, pins, FUNCTIONS, "axis.X.drive.hal.current", "float")
+        _require_pin(pin, pins, FUNCTIONS, "axis.X.drive.hal.current", "float")
     assert text in str(refused.value)
     for good in ("pid.y.output", "encoder.0.position"):
-        _require(good, pins, FUNCTIONS, "axis.X.drive.hal.current", "float")
+        _require_pin(good, pins, FUNCTIONS, "axis.X.drive.hal.current", "float")
     assert pins["encoder.0.position"].signal == "x-fb"

@@ -20,8 +20,8 @@ from fdhil.config import MachineConfig
 from fdhil.records import Notice
 from fdhil.store.history import History
 from tests.commissioning.test_record import RECORD
-from tests.daemon.machine import config_of
-from tests.daemon.shop import BENCH, fdhil
+from tests.daemon.machine_rig import BENCH, fdhil
+from tests.daemon.simulated_machine import config_of
 from tests.store.made import STAMP, outcome, published, window
 
 CIRCLE = ("--radius-mm", "10", "--feed", "3000")

@@ -23,7 +23,7 @@ from fdhil.fleet.window_work import analyse_again
 from fdhil.identification.windows import moving_range
 from fdhil.store.windows import read_window
 from studies import bench
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 from tests.fleet import rapids
 from tests.identification.recorded import signals
 

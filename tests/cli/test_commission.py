@@ -31,7 +31,7 @@ WAITS = {
     "drivers.can.sdo.RESPONSE_TIMEOUT_S": 0.2,
     "commissioning.strokes.JOG_MM": 1.0,
     "commissioning.trial.TIMING_CYCLES": 100,
-    "commissioning.trial.RAPIDS": 4,
+    "commissioning.trial.TRIAL_RAPIDS": 4,
     "commissioning.trial.REST_S": 0.6,
     "commissioning.trial.LAST_REST_S": 0.4,
 }
@@ -273,7 +273,7 @@ def test_what_is_done_to_a_drive_is_in_the_audit_before_it_is_done(
 @pytest.mark.fault("F5")
 @pytest.mark.parametrize("options", [(), ("--set-pdos",)])
 def test_what_cannot_be_written_down_is_not_done(options: tuple[str, ...], bench: Bench) -> None:
-    (bench.store / audit.FILE_NAME).mkdir(parents=True)
+    (bench.store / audit.AUDIT_FILE_NAME).mkdir(parents=True)
     code, _, err = bench.commission("--yes", *options)
     assert (code, "could not be written" in err) == (3, True)
     assert bench.peer.heard == []

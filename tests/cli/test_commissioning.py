@@ -20,7 +20,7 @@ import pytest
 
 from fdhil.cli.main import cli, run_safely
 from fdhil.commissioning.bus_listener import LISTEN_S
-from fdhil.commissioning.compare import POINT
+from fdhil.commissioning.compare import RECORD_POINT
 from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.record import load_record
 from fdhil.commissioning.void import is_void, void_record
@@ -249,7 +249,7 @@ def test_where_the_guard_took_nothing_of_a_comparison_void_records_stay_so(
         if answer is None:
             guard.close()
         guard.says = lambda _kind: {"ok": False, "refused": [answer]}
-        return [("axis X", Finding(POINT, "f", "f"))]
+        return [("axis X", Finding(RECORD_POINT, "f", "f"))]
 
     monkeypatch.setattr("fdhil.commissioning.config_check.check_machine", compare)
     void_record(config.store.directory, "X", "booted")
@@ -274,7 +274,7 @@ def test_what_is_seen_while_drives_are_compared_speaks_against_them(
     def compare(*_: object) -> list[tuple[str, Finding]]:
         void_record(store, "X", "booted again")
         guard.says = lambda kind: {"ok": False, "refused": [void]} if kind == "compared" else said
-        return [(f"axis {axis}", Finding(POINT, "f", "f")) for axis in "XY"]
+        return [(f"axis {axis}", Finding(RECORD_POINT, "f", "f")) for axis in "XY"]
 
     monkeypatch.setattr("fdhil.commissioning.config_check.check_machine", compare)
     guard.says = lambda _kind: said

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 
 ROWS = 500
 

@@ -17,7 +17,7 @@ from fdhil.cli.console import PrintableConsole
 from fdhil.cli.terminal_text import without_controls
 from fdhil.errors import ConfigError
 from tests.bench import bench_toml
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 
 HOSTILE = ("\x1b[2J\x1b]0;owned\x07", "\x9b31m", "a\rb", "\b\b", "\x00", "\u202eexe")
 

@@ -12,7 +12,7 @@ import pytest
 from fdhil.cli.main import cli, leaves
 from fdhil.cli.options import ConfigFirst
 from tests.bench import bench_toml
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 
 DEMAND = "time_s,X_mm,Y_mm\n" + "".join(f"{k / 1000:.3f},{min(k, 400) / 100:.5f},0\n" for k in range(800))
 

@@ -39,7 +39,7 @@ def passes(*labels: str) -> list[Cut]:
 
 def published() -> Published:
     names = (*PARAMETERS, "load")
-    return Published(TRUE.changed(Jt=0.0751, load=2.5), dict.fromkeys(names, 1e-3), 20.0)
+    return Published(TRUE.replace_values(Jt=0.0751, load=2.5), dict.fromkeys(names, 1e-3), 20.0)
 
 
 def test_the_shipped_configuration_is_the_demonstrations_machine() -> None:
@@ -146,7 +146,7 @@ def test_realistic_machine_stops_in_order_when_the_demonstration_ends_first(
 RUNNING = """
 import sys
 from pathlib import Path
-from fdhil.child import stopping_in_order
+from fdhil.child_process import stopping_in_order
 from fdhil.cli.demo import loop
 from fdhil.cli.demo.machines import machine_document
 loop._commission = lambda stage: None  # arming is not needed here

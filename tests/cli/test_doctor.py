@@ -21,7 +21,7 @@ from fdhil import config as machine_config
 from fdhil.cli.demo.toml import to_toml
 from fdhil.cli.doctor import doctor
 from fdhil.records import Notice
-from fdhil.store.history import FILE_NAME, History
+from fdhil.store.history import HISTORY_FILE_NAME, History
 from fdhil.store.rows import Stamp
 from tests.bench import bench_document
 from tests.drivers.peer import DrivePeer
@@ -94,12 +94,12 @@ def little_room(pc: Pc, patch: pytest.MonkeyPatch) -> None:
 
 
 def damaged_history(pc: Pc, patch: pytest.MonkeyPatch) -> None:
-    (pc.store / FILE_NAME).write_bytes(b"no database" * 1000)
+    (pc.store / HISTORY_FILE_NAME).write_bytes(b"no database" * 1000)
 
 
 def newer_history(pc: Pc, patch: pytest.MonkeyPatch) -> None:
     History.open(pc.store).close()
-    with sqlite3.connect(pc.store / FILE_NAME) as db:
+    with sqlite3.connect(pc.store / HISTORY_FILE_NAME) as db:
         db.execute("PRAGMA user_version = 99")
     db.close()
 

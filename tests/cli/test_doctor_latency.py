@@ -10,8 +10,8 @@ import pytest
 
 from fdhil.cli.doctor.latency import examine_latency, histogram_lines, latency_text, measure_latency, read_latency
 from fdhil.config import MachineConfig
-from tests.daemon.machine import config_of
-from tests.daemon.shop import BENCH, fdhil
+from tests.daemon.machine_rig import BENCH, fdhil
+from tests.daemon.simulated_machine import config_of
 
 
 class Pc:

@@ -8,7 +8,7 @@ import pytest
 from fdhil.api.loops import equivalent_loops
 from fdhil.config.regulators import Regulators
 from fdhil.model import closed_loop
-from fdhil.records import LoopEstimate, Parameters, Verdict, frozen
+from fdhil.records import LoopEstimate, Parameters, Verdict, freeze_array
 from studies.bench import shuttle
 from tests.bench import bench_config
 
@@ -16,8 +16,8 @@ NAMES = ("position_gain_per_s", "speed_feedforward", "speed_kp", "position_ki_pe
 
 
 def found(structure: str, names: tuple[str, ...], values: tuple[float, ...]) -> LoopEstimate:
-    covariance = frozen(np.zeros((len(names), len(names))))
-    return LoopEstimate("X", structure, names, frozen(values), covariance, Verdict(True, None, ()), None)
+    covariance = freeze_array(np.zeros((len(names), len(names))))
+    return LoopEstimate("X", structure, names, freeze_array(values), covariance, Verdict(True, None, ()), None)
 
 
 def test_pid_is_reported_as_the_two_cascades_of_its_sum_and_product() -> None:

@@ -22,10 +22,10 @@ from fdhil.cli.bus_lock import lock_bus
 from fdhil.cli.guard import guard
 from fdhil.cli.main import cli, run_safely
 from fdhil.commissioning.record import axis_digest, save_record
-from fdhil.guard.limits import OffsetLimits
-from fdhil.guard.settings import load
+from fdhil.guard.guard_settings import load_settings
+from fdhil.guard.offset_limits import OffsetLimits
 from tests.arming.test_guard_settings import RECORD
-from tests.guard.peer import Peer, at_rest, write_config
+from tests.guard.drive_peer import Peer, hold_demand, write_config
 from tests.held_port import held_port
 
 
@@ -36,7 +36,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 
 @pytest.fixture
 def peer() -> Iterator[Peer]:
-    with at_rest() as made:
+    with hold_demand() as made:
         yield made
 
 
@@ -53,7 +53,7 @@ def test_check_writes_the_settings_and_a_token(
     assert run(monkeypatch, str(config), "--check") == 0
     assert "guard.json" in capsys.readouterr().out
     directory = tmp_path / "fdhil-data" / "run"
-    settings = load(directory / "guard.json")
+    settings = load_settings(directory / "guard.json")
     token = (directory / "token").read_text()
     assert stat.S_IMODE((directory / "token").stat().st_mode) == 0o600
     assert settings.token_sha256 == hashlib.sha256(token.encode()).hexdigest()
@@ -171,7 +171,7 @@ def test_a_guard_under_a_user_of_its_own(
     machine = machine_config.load(config)
     save_record(replace(RECORD, config_digest=axis_digest(machine, "X")), machine.store.directory, key)
     assert run(monkeypatch, str(config), "--check") == 0
-    settings = load(tmp_path / "own" / "guard.json")
+    settings = load_settings(tmp_path / "own" / "guard.json")
     assert settings.token_sha256 == hashlib.sha256(b"the operator's").hexdigest()
     assert settings.daemon_uid == pwd.getpwnam("daemon").pw_uid
     assert settings.run_directory == str(tmp_path / "own")

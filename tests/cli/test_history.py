@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.records import PARAMETERS, Notice, frozen
+from fdhil.records import PARAMETERS, Notice, freeze_array
 from fdhil.store.history import History
 from fdhil.store.rows import Acknowledgement, Stamp
-from tests.daemon.machine import config_of
-from tests.daemon.shop import BENCH, fdhil
+from tests.daemon.machine_rig import BENCH, fdhil
+from tests.daemon.simulated_machine import config_of
 from tests.store.made import outcome, published, window
 
 START_S = 1_800_000_000.0
@@ -45,7 +45,7 @@ def worn(tmp_path_factory: pytest.TempPathFactory) -> Path:
             values[4] += WEAR_PER_DAY * day
             values[5] += PER_KELVIN * (celsius - 22)
             values[3] *= 1.13 if day >= STEP_DAY else 1.0
-            estimate = replace(made.estimate, values=frozen(values), covariance=frozen(np.diag(STDS**2)))
+            estimate = replace(made.estimate, values=freeze_array(values), covariance=freeze_array(np.diag(STDS**2)))
             stamp = Stamp(START_S + 86_400 * day, "boot", k)
             number = history.add_window(replace(made, estimate=estimate), "", stamp)
             parameters = replace(published(1).parameters, **dict(zip(PARAMETERS, values.tolist(), strict=True)))
@@ -153,7 +153,7 @@ def test_a_long_store_is_a_small_page(tmp_path: Path, capsys: Any) -> None:
     with History.open(config_of(tmp_path, ("X", "Y")).store.directory) as history:
         for k in range(240):
             values = made.estimate.values * (1 + 0.01 * rng.standard_normal(6))
-            estimate = replace(made.estimate, values=frozen(values))
+            estimate = replace(made.estimate, values=freeze_array(values))
             history.add_window(replace(made, estimate=estimate), "", Stamp(START_S + 7_200 * k, "boot", k))
     assert fdhil("report", path, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
     page = (tmp_path / "report.html").read_text()

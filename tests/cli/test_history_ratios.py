@@ -12,11 +12,11 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.pipeline import analyse
-from fdhil.records import frozen
+from fdhil.records import freeze_array
 from fdhil.store.history import History
 from fdhil.store.rows import Stamp
-from tests.daemon.machine import config_of
-from tests.daemon.shop import BENCH, fdhil
+from tests.daemon.machine_rig import BENCH, fdhil
+from tests.daemon.simulated_machine import config_of
 from tests.identification.recorded import windows
 
 START_S, DAYS, LOADED_ON_DAY = 1_800_000_000.0, 20, 12
@@ -38,7 +38,7 @@ def deaf(tmp_path_factory: pytest.TempPathFactory) -> Path:
             values = analysed.estimate.values + deviations * rng.standard_normal(deviations.size)
             values[6] *= 1.13 if day >= LOADED_ON_DAY else 1.0
             values[8] *= 1.0 + WEAR_PER_DAY * day
-            estimate = replace(analysed.estimate, values=frozen(values))
+            estimate = replace(analysed.estimate, values=freeze_array(values))
             history.add_window(replace(analysed, estimate=estimate), "", Stamp(START_S + 86_400.0 * day, "boot", day))
     return path
 

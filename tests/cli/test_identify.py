@@ -203,7 +203,7 @@ def test_every_file_format_gives_the_same_answer(tmp_path: Path) -> None:
     table = table_of(slow_windows(0.005)[0])
     answers = []
     for name in tables.RECORDING_FORMATS:
-        path = tmp_path / f"rapid{suffixes.suffix_of(suffixes.RECORDINGS, name)}"
+        path = tmp_path / f"rapid{suffixes.suffix_of(suffixes.RECORDING_SUFFIXES, name)}"
         export_table(table, path, name)
         answers.append(told_document(invoke("--json", path))["files"][0]["pooled"])
     assert answers[0]["validated"]

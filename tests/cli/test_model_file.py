@@ -13,18 +13,18 @@ from fdhil.api.analysis import FileResult
 from fdhil.cli.model_file import write_model
 from fdhil.identification.loops import DIFFER
 from fdhil.prediction.models import load_model_file, with_loops
-from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Reason, Result, Verdict, frozen
+from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Reason, Result, Verdict, freeze_array
 from tests.bench import bench_config
 from tests.store.made import BENCH
 
 CONFIG = bench_config("X")
 POOLED = Estimate(
-    "maximum_likelihood", PARAMETERS, frozen([*BENCH.as_dict().values()]), frozen(np.eye(6)), {}, Result.OK
+    "maximum_likelihood", PARAMETERS, freeze_array([*BENCH.as_dict().values()]), freeze_array(np.eye(6)), {}, Result.OK
 )
 VALID = FileResult("a.csv", "X", (), POOLED, Verdict(True, 99.0))
 REFUTED = replace(VALID, pooled=None, verdict=Verdict(False, None, (Reason(DIFFER, "the loops are others"),)))
 PID = LoopEstimate(
-    "X", "pid", ("position_gain_per_s", "position_ki_per_s2"), frozen([84.0, 1760.0]), frozen(np.eye(2)),
+    "X", "pid", ("position_gain_per_s", "position_ki_per_s2"), freeze_array([84.0, 1760.0]), freeze_array(np.eye(2)),
     Verdict(True, None, (), 0.3, (Reason(DIFFER, "72 um"),)), 72.0,
 )  # fmt: skip
 

@@ -20,7 +20,7 @@ from fdhil.cli.paper.claims import Claim, Trial, Verdict
 from fdhil.cli.paper.scenarios import PATHS, SCENARIOS, machine
 from fdhil.model.feed_drive import simulate_plant
 from fdhil.program import load_trajectory
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = ROOT / "configs" / "paper.toml"
@@ -128,7 +128,7 @@ def test_the_shipped_machine_is_the_one_that_is_used() -> None:
 def test_the_mirror_does_what_is_known_of_it(scenario: str, place: str, before: float, after: float) -> None:
     found = [
         paths.largest_um(scenario, answer, place)
-        for answer in (paths.predicted(scenario), paths.corrected(scenario, "mirror"))
+        for answer in (paths.predicted(scenario), paths.predict_paper_correction(scenario, "mirror"))
     ]
     assert found == pytest.approx([before, after], abs=1.0)
 

@@ -14,7 +14,7 @@ from fdhil.cli.forecast import crossing_text
 from fdhil.cli.main import cli, run_safely
 from fdhil.errors import StoreError
 from fdhil.program import write_demand_csv
-from fdhil.records import Parameters, ParameterSet, frozen
+from fdhil.records import Parameters, ParameterSet, freeze_array
 from fdhil.store.history import History
 from fdhil.store.rows import Stamp
 from tests.bench import bench_toml
@@ -88,7 +88,9 @@ def test_history_gives_parameters_and_their_uncertainty(bench: Path) -> None:
     covariance = np.diag([(0.003 * value) ** 2 for value in values.values()])
     with History.open(bench / "fdhil-data") as history:
         for axis in "XY":
-            published = ParameterSet(axis, 1, Parameters.of(values), frozen(covariance), 3, 0, None, "digest")
+            published = ParameterSet(
+                axis, 1, Parameters.from_mapping(values), freeze_array(covariance), 3, 0, None, "digest"
+            )
             history.add_revision(published, [], Stamp(0.0, "boot", 0))
     out = bench / "out.csv"
     arguments = ["--config", bench / "bench.toml", "--from-history", "--json", "--out", out]
@@ -113,7 +115,9 @@ def publish(
     nominal = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
     covariance = np.diag([(known_to * value) ** 2 for value in nominal.values()])
     with History.open(folder / "fdhil-data") as history:
-        known = ParameterSet(axis, number, Parameters.of(nominal | changed), frozen(covariance), 3, 0, None, "digest")
+        known = ParameterSet(
+            axis, number, Parameters.from_mapping(nominal | changed), freeze_array(covariance), 3, 0, None, "digest"
+        )
         history.add_revision(known, [], Stamp(86400.0 * (number if days is None else days), "boot", 0))
 
 

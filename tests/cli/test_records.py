@@ -13,14 +13,14 @@ from click.testing import CliRunner, Result
 
 from fdhil.cli.main import cli
 from fdhil.cli.records import read_windows
-from fdhil.daemon.kernel_warmup import nominal_rapid
+from fdhil.daemon.kernel_warmup import simulate_nominal_rapid
 from fdhil.daemon.outcome_store import OutcomeStore
-from fdhil.records import frozen
+from fdhil.records import freeze_array
 from fdhil.store.recordings import read_recording
 from fdhil.store.windows import encode_window
 from studies.slow_sensor import slow_windows
-from tests.daemon.machine import config_of
-from tests.daemon.shop import BENCH, fdhil
+from tests.daemon.machine_rig import BENCH, fdhil
+from tests.daemon.simulated_machine import config_of
 from tests.store.made import outcome, published, window
 
 
@@ -30,7 +30,7 @@ def machine(tmp_path: Path) -> Path:
     path.write_text(BENCH)
     store = OutcomeStore(config_of(tmp_path, ("X", "Y")))
     store.open()
-    store.keep([outcome(), published(1), outcome(accepted=False), outcome(), published(2), published(1, "Y")])
+    store.store_outcomes([outcome(), published(1), outcome(accepted=False), outcome(), published(2), published(1, "Y")])
     store.close()
     return path
 
@@ -39,7 +39,7 @@ def machine(tmp_path: Path) -> Path:
 def rapid(tmp_path: Path) -> Path:
     path = tmp_path / "w00000001-X.parquet"
     config = config_of(tmp_path)
-    path.write_bytes(encode_window(nominal_rapid("X", config.axis["X"], 0.001), config.digest))
+    path.write_bytes(encode_window(simulate_nominal_rapid("X", config.axis["X"], 0.001), config.digest))
     return path
 
 
@@ -86,7 +86,7 @@ def test_an_export_keeps_a_slow_sensors_samples_to_the_last_bit(tmp_path: Path, 
     assert before is not None
     told = np.array(before.voltage_v)
     told[70] = np.nan
-    made = replace(made, slow_voltage=replace(before, voltage_v=frozen(told)))
+    made = replace(made, slow_voltage=replace(before, voltage_v=freeze_array(told)))
     stored.write_bytes(encode_window(made, ""))
     assert fdhil("export", stored, "--out", out, capsys=capsys) == (0, "", f"wrote {out}\n")
     (window,) = read_windows(out)
@@ -163,7 +163,9 @@ def test_history_says_how_the_parameters_follow_the_temperature(tmp_path: Path, 
         warm = outcome(of=window(temperature_c=20.0 + k))
         assert warm.estimate is not None
         values = warm.estimate.values * np.where(np.array(warm.estimate.names) == "ft", 1 - 0.1 * k, 1.0)
-        store.keep([replace(warm, estimate=replace(warm.estimate, values=frozen(values))), published(k + 1)])
+        store.store_outcomes(
+            [replace(warm, estimate=replace(warm.estimate, values=freeze_array(values))), published(k + 1)]
+        )
     store.close()
     _, out, _ = fdhil("history", path, "--json", capsys=capsys)
     told = json.loads(out)["slopes"]["X"]

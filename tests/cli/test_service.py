@@ -20,12 +20,12 @@ import pytest
 from fdhil.arming.token import ensure_token
 from fdhil.cli.status_view import believed, sparkline
 from fdhil.config import load
-from fdhil.daemon import journal
-from fdhil.daemon.status import Watch
+from fdhil.daemon import service_log
+from fdhil.daemon.daemon_status import DaemonStatus
 from fdhil.records import Notice
 from fdhil.report.parameter_view import cell, half_of
-from tests.daemon.machine import config_of
-from tests.daemon.shop import BENCH, fdhil
+from tests.daemon.machine_rig import BENCH, fdhil
+from tests.daemon.simulated_machine import config_of
 from tests.heeding_modes import HEEDING_MODES
 from tests.held_port import held_port
 from tests.store.made import outcome, published
@@ -65,11 +65,11 @@ def answering(machine: Path, answer: Mapping[str, Any], *told: Mapping[str, Any]
 
 
 def status_of(tmp_path: Path) -> dict[str, Any]:
-    watch = Watch(config_of(tmp_path, ("X", "Y")), 0.0)
+    watch = DaemonStatus(config_of(tmp_path, ("X", "Y")), 0.0)
     for told in (outcome(), published(), Notice("LoadChanged", "MAJOR", "[red]Jt rose[/red]", "X")):
-        watch.outcome_came(told, 1.0)
+        watch.take_outcome(told, 1.0)
     store = {"directory": "d", "fault": "DiskFull", "strays": []}
-    return {"ok": True, "state": "OFF(SHADOW)", **watch.status(2.0), "counters": {"frames": 7}, "store": store}
+    return {"ok": True, "state": "OFF(SHADOW)", **watch.build_status(2.0), "counters": {"frames": 7}, "store": store}
 
 
 def test_status_as_a_table_and_as_json(machine: Path, tmp_path: Path, capsys: Any) -> None:
@@ -257,10 +257,10 @@ def test_small_pictures() -> None:
 
 def test_lines_of_the_daemon_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     """One JSON object per line on stdout, only with --json."""
-    with journal.lines_as_json(True):
-        journal.write_line("X: LoadChanged", "MAJOR")
-    with journal.lines_as_json(False):
-        journal.write_line("X: said to a person")
+    with service_log.write_lines_as_json(True):
+        service_log.write_line("X: LoadChanged", "MAJOR")
+    with service_log.write_lines_as_json(False):
+        service_log.write_line("X: said to a person")
     said = capsys.readouterr()
     line = json.loads(said.out)
     assert datetime.fromisoformat(line.pop("time")).tzinfo is not None

@@ -15,7 +15,7 @@ import pytest
 
 from fdhil.cli.main import cli, leaves
 from tests.bench import axis_toml, bench_toml
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 from tests.held_port import held_port
 
 DONE, USAGE, TROUBLE = 0, 2, 3

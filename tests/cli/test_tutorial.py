@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from fdhil.child import ending_with_parent
+from fdhil.child_process import wrap_to_end_with_parent
 from tests.ports import free_port
 
 ROOT = Path(__file__).parents[2]
@@ -28,7 +28,7 @@ RAPIDS = 20
 class Terminal:
     def __init__(self, words: list[str], folder: Path) -> None:
         self._child = subprocess.Popen(
-            ending_with_parent(words),
+            wrap_to_end_with_parent(words),
             cwd=folder,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

@@ -13,7 +13,7 @@ import pytest
 
 from fdhil.cli.main import cli, leaves
 from fdhil.sim.wire.hub import Hub
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 from tests.sim.hub_thread import HubThread
 from tests.sim.twin_process import write_config
 

@@ -9,8 +9,8 @@ import numpy as np
 from fdhil import config as configuration
 from fdhil.cli.loops_view import loops_line
 from fdhil.commissioning.config_check import compare_loops
-from fdhil.daemon.outcome_json import loops_document
-from fdhil.records import LoopEstimate, Reason, Verdict, frozen
+from fdhil.daemon.outcome_json import build_loops_document
+from fdhil.records import LoopEstimate, Reason, Verdict, freeze_array
 from fdhil.store.history import History
 from fdhil.store.rows import Stamp
 from tests.bench import bench_document
@@ -22,7 +22,9 @@ DIFFER = Reason(
 
 def loops(*warnings: Reason) -> LoopEstimate:
     verdict = Verdict(True, None, (), 0.3, warnings)
-    return LoopEstimate("X", "p_pi_pi", ("position_gain_per_s",), frozen([55.0]), frozen(np.eye(1)), verdict, 34.0)
+    return LoopEstimate(
+        "X", "p_pi_pi", ("position_gain_per_s",), freeze_array([55.0]), freeze_array(np.eye(1)), verdict, 34.0
+    )
 
 
 def test_what_the_rapids_showed_is_compared_with_the_configuration(tmp_path: Path) -> None:
@@ -39,5 +41,5 @@ def test_what_the_rapids_showed_is_compared_with_the_configuration(tmp_path: Pat
 
 
 def test_the_status_tells_of_loops_that_are_not_as_configured() -> None:
-    assert loops_line(loops_document(loops())) == ""
-    assert "LoopsDiffer: the configured regulators leave 34 um" in loops_line(loops_document(loops(DIFFER)))
+    assert loops_line(build_loops_document(loops())) == ""
+    assert "LoopsDiffer: the configured regulators leave 34 um" in loops_line(build_loops_document(loops(DIFFER)))

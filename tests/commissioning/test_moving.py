@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from fdhil.cia402 import State
+from fdhil.cia402 import PowerState
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.moving import following, move
 from fdhil.commissioning.set_points import Bounds, straight
@@ -28,7 +28,7 @@ class Enabled:
         self.bounds = Bounds.of("X", config.axis["X"], config.machine.sync_period_s, (-50.0, 50.0), SPEED_MM_S)
 
     def way(self, mm: float) -> Float:
-        goal = self.master.config.axis["X"].scaling.to_increments(mm)
+        goal = self.master.config.axis["X"].scaling.convert_to_increments(mm)
         assert self.master.target is not None
         return straight((self.master.target,), (goal,), (self.bounds.speed,), (self.bounds.acceleration,), 20)
 
@@ -79,7 +79,7 @@ def test_a_way_out_of_the_travel_is_refused(enabled: Enabled) -> None:
 def test_a_drive_that_trips_ends_the_motion(enabled: Enabled) -> None:
     def trip() -> None:
         path = enabled.master.loop.path
-        if path is not None and path.cycles > 30 and enabled.master.state() is State.OPERATION_ENABLED:
+        if path is not None and path.cycles > 30 and enabled.master.state() is PowerState.OPERATION_ENABLED:
             enabled.peer.drive.trip(0x3210)
 
     with pytest.raises(DriveFault, match="its drive fell from Operation enabled"):

@@ -67,7 +67,7 @@ def corrected(folder: Path) -> MachineConfig:
     return parse(document | {"guard": {"clock": "sync"}}, folder=folder)
 
 
-def surveyed(settings: MachineConfig) -> tuple[Survey, Finding]:
+def survey_bench_drive(settings: MachineConfig) -> tuple[Survey, Finding]:
     with Master(settings, "X") as master:
         found = survey(master)
     return found, next(each for each in found.findings if each.point == POINT)
@@ -92,7 +92,7 @@ def test_second_writer_of_an_offset_is_found(
 ) -> None:
     drive, settings = peer
     give_rpdo(drive, number, cob_id, words)
-    _, finding = surveyed(settings)
+    _, finding = survey_bench_drive(settings)
     assert (finding.ok, says in finding.cause) == (False, True), finding
     assert f"bit 31 of 0x{0x1400 + number - 1:04X}:01" in finding.advice
 
@@ -108,7 +108,7 @@ def test_second_writer_that_only_the_eds_names_is_found(tmp_path: Path) -> None:
     settings = config(drive={"eds": str(eds)})
     with DrivePeer(settings) as drive:
         give_rpdo(drive, 512, 0x7F, [POSITION_OFFSET])
-        _, finding = surveyed(settings)
+        _, finding = survey_bench_drive(settings)
     assert "RPDO512 (COB-ID 07F) writes 60B0" in finding.cause
 
 
@@ -122,7 +122,10 @@ def test_asking_for_rpdos_ends_where_there_are_none(peer: tuple[DrivePeer, Machi
 def test_multiplexed_rpdo_is_a_writer(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     give_rpdo(drive, 4, 0x501, [], count=254)
-    assert "RPDO4 (COB-ID 501) is multiplexed and can write 60B0 and 60B1 and 60B2" in surveyed(settings)[1].cause
+    assert (
+        "RPDO4 (COB-ID 501) is multiplexed and can write 60B0 and 60B1 and 60B2"
+        in survey_bench_drive(settings)[1].cause
+    )
 
 
 def test_other_rpdos_are_kept_for_the_record_and_not_refused(peer: tuple[DrivePeer, MachineConfig]) -> None:
@@ -130,7 +133,7 @@ def test_other_rpdos_are_kept_for_the_record_and_not_refused(peer: tuple[DrivePe
     give_rpdo(drive, 4, 0x501, [OUTPUTS])
     give_rpdo(drive, 5, 0x8000_0333, [POSITION_OFFSET])
     give_rpdo(drive, 6, 0x8000_0000, [OUTPUTS])
-    found, finding = surveyed(settings)
+    found, finding = survey_bench_drive(settings)
     assert finding.ok is True
     assert found.rpdos == {"1403": 0x501, "1404": 0x8000_0333}
 
@@ -139,7 +142,7 @@ def test_rpdo_that_cannot_be_read_is_reported(peer: tuple[DrivePeer, MachineConf
     drive, settings = peer
     dictionary = drive.drive.dictionary
     dictionary.entries[0x140301] = replace(dictionary.entries[0x140301], access="wo")
-    _, finding = surveyed(settings)
+    _, finding = survey_bench_drive(settings)
     assert finding.ok is None
     assert "not all of its RPDOs can be read" in finding.cause
 
@@ -222,7 +225,7 @@ def test_drive_of_another_bus_makes_no_identifier_harmless(tmp_path: Path) -> No
 def test_rpdo_of_29_bits_is_none_of_the_profiles(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     drive.drive.dictionary.numbers[0x140101] = 0x2000_0301
-    findings = {each.point: each for each in surveyed(settings)[0].findings}
+    findings = {each.point: each for each in survey_bench_drive(settings)[0].findings}
     assert findings["RPDO2"].ok is False
     assert "RPDO2 has the COB-ID 20000301, not 301" in findings["RPDO2"].cause
 
@@ -314,5 +317,5 @@ def test_object_that_is_mapped_in_another_size_is_found(
 
 
 def test_sizes_of_a_drive_that_is_right_are_as_mapped(peer: tuple[DrivePeer, MachineConfig]) -> None:
-    findings = {each.point: each for each in surveyed(peer[1])[0].findings}
+    findings = {each.point: each for each in survey_bench_drive(peer[1])[0].findings}
     assert (findings["object sizes"].ok, findings["object sizes"].found) == (True, "15 as mapped")

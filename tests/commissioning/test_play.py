@@ -36,7 +36,7 @@ from tests.commissioning.foreign_nc import (
     LateOperator,
     moves,
 )
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 from tests.drivers.peer import DrivePeer
 from tests.integration.conftest import sign_off
 

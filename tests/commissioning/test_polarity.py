@@ -11,7 +11,7 @@ import pytest
 
 from fdhil.commissioning.polarity import judge_acceleration, judge_jog
 from fdhil.commissioning.set_points import straight
-from fdhil.records import Recording, SlowVoltage, frozen
+from fdhil.records import Recording, SlowVoltage, freeze_array
 from tests.bench import bench_config
 
 DT, PITCH, JOG = 0.001, 20.0, 5.0
@@ -30,8 +30,8 @@ def jogged(weight_nm: float = 0.0, top_mm_s: float = 5.0, way_mm: float = JOG) -
     current = torque / K + 0.05 * noise[0]
     voltage = R * current + K * speed + 0.05 * noise[1]
     return Recording(
-        "X", DT, frozen(np.arange(position.size) * DT), frozen(voltage), frozen(current), frozen(speed),
-        frozen(position), frozen(position), "interval_mean", PITCH, None,
+        "X", DT, freeze_array(np.arange(position.size) * DT), freeze_array(voltage), freeze_array(current), freeze_array(speed),
+        freeze_array(position), freeze_array(position), "interval_mean", PITCH, None,
     )  # fmt: skip
 
 
@@ -48,14 +48,16 @@ def test_a_right_axis_passes_also_one_that_carries_a_weight(weight_nm: float) ->
         "current sign",
         "voltage sign",
     ]
-    lossy = replace(jog, current_a=frozen(np.where(np.arange(jog.current_a.size) % 50 == 3, np.nan, jog.current_a)))
+    lossy = replace(
+        jog, current_a=freeze_array(np.where(np.arange(jog.current_a.size) % 50 == 3, np.nan, jog.current_a))
+    )
     assert causes(lossy) == ""
 
 
 WRONG: dict[str, tuple[Callable[[Recording], Recording], str]] = {
     "current": (lambda r: replace(r, current_a=-r.current_a), "SignOrScale: current times speed is negative"),
     "voltage": (
-        lambda r: replace(r, voltage_v=frozen(-(r.voltage_v if r.voltage_v is not None else 0))),
+        lambda r: replace(r, voltage_v=freeze_array(-(r.voltage_v if r.voltage_v is not None else 0))),
         "SignOrScale: voltage times current, and times speed is negative",
     ),
     "speed": (
@@ -82,7 +84,7 @@ def test_what_is_wrong_is_named(what: str) -> None:
 def test_words_that_are_swapped_are_told() -> None:
     """A float with swapped words is noise of any size."""
     jog = jogged()
-    noise = frozen(np.random.default_rng(2).normal(size=jog.speed_rad_s.size) * 1e3)
+    noise = freeze_array(np.random.default_rng(2).normal(size=jog.speed_rad_s.size) * 1e3)
     assert "SignOrScale: voltage times current" in causes(replace(jog, voltage_v=noise))
 
 
@@ -90,9 +92,9 @@ def test_a_slower_sensor_is_judged_too() -> None:
     jog = jogged()
     assert jog.voltage_v is not None
     means = jog.voltage_v[: jog.voltage_v.size // 50 * 50].reshape(-1, 50).mean(axis=1)
-    slow = replace(jog, voltage_v=None, slow_voltage=SlowVoltage(0.0, 0.05, 0.0, frozen(means)))
+    slow = replace(jog, voltage_v=None, slow_voltage=SlowVoltage(0.0, 0.05, 0.0, freeze_array(means)))
     assert causes(slow) == ""
-    turned = replace(slow, slow_voltage=SlowVoltage(0.0, 0.05, 0.0, frozen(-means)))
+    turned = replace(slow, slow_voltage=SlowVoltage(0.0, 0.05, 0.0, freeze_array(-means)))
     assert "voltage times current, and times speed is negative" in causes(turned)
 
 
@@ -105,14 +107,14 @@ def test_a_motor_takes_power_while_it_accelerates() -> None:
     rapid = jogged(top_mm_s=400.0, way_mm=150.0)
     assert judge_acceleration(rapid).ok is True
     assert rapid.voltage_v is not None
-    wrong = judge_acceleration(replace(rapid, voltage_v=frozen(-rapid.voltage_v)))
+    wrong = judge_acceleration(replace(rapid, voltage_v=freeze_array(-rapid.voltage_v)))
     assert (wrong.ok, "J while it accelerated, which is impossible for a motor" in wrong.cause) == (False, True)
 
 
 def test_a_table_that_goes_another_way_is_told() -> None:
     jog = jogged()
     seen = replace(
-        jog, table_mm=frozen(np.where(np.arange(jog.position_mm.size) % 3 == 0, jog.position_mm + 7.0, np.nan))
+        jog, table_mm=freeze_array(np.where(np.arange(jog.position_mm.size) % 3 == 0, jog.position_mm + 7.0, np.nan))
     )
     assert [f.point for f in judge_jog(seen, JOG, AXIS) if f.ok][2] == "table"
     turned = replace(jog, table_mm=-jog.position_mm)

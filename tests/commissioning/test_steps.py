@@ -14,7 +14,7 @@ import can
 import numpy as np
 import pytest
 
-from fdhil.cia402 import Object, State
+from fdhil.cia402 import Object, PowerState
 from fdhil.commissioning import steps, survey
 from fdhil.commissioning import watchdog as watchdog_module
 from fdhil.commissioning.cycle import Cycle
@@ -396,9 +396,9 @@ def test_a_ramp_whose_begin_was_missed_is_made_again(peer: tuple[DrivePeer, Mach
     with SlowReader(settings, "X") as master, rolled_back(master):
         prepare(master)
         enable(master)
-        master.slow = 2 * steps.RAMPS
+        master.slow = 2 * steps.TRIAL_RAMPS
         assert feedforward_test(master) is True
-        assert master.readings > 3 * steps.RAMPS
+        assert master.readings > 3 * steps.TRIAL_RAMPS
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -523,9 +523,9 @@ def test_states_are_shown(peer: tuple[DrivePeer, MachineConfig]) -> None:
     _, settings = peer
     with Master(settings, "X") as master, rolled_back(master):
         prepare(master)
-        assert master.state() is State.SWITCH_ON_DISABLED
+        assert master.state() is PowerState.SWITCH_ON_DISABLED
         enable(master)
-        assert master.state() is State.OPERATION_ENABLED
+        assert master.state() is PowerState.OPERATION_ENABLED
 
 
 @pytest.mark.fault("E16")

@@ -23,19 +23,19 @@ REFERENCE = bench_trajectory(10)
 
 
 @pytest.fixture(scope="module", params=list(tables.CORRECTIONS))
-def planned(request: pytest.FixtureRequest) -> tuple[str, Correction]:
+def planned_correction(request: pytest.FixtureRequest) -> tuple[str, Correction]:
     return request.param, plan(REFERENCE, MODELS, CONFIG, request.param)
 
 
-def test_the_path_is_better_with_it(planned: tuple[str, Correction]) -> None:
-    name, correction = planned
+def test_the_path_is_better_with_it(planned_correction: tuple[str, Correction]) -> None:
+    name, correction = planned_correction
     assert correction.method == name
     assert correction.refused == ()
     assert rms(correction.after.contour_um) < 0.2 * rms(correction.before.contour_um)
 
 
-def test_every_axis_gets_an_offset_per_row_that_the_guard_lets_pass(planned: tuple[str, Correction]) -> None:
-    _, correction = planned
+def test_every_axis_gets_an_offset_per_row_that_the_guard_lets_pass(planned_correction: tuple[str, Correction]) -> None:
+    _, correction = planned_correction
     assert list(correction.offset_um) == list(REFERENCE.position_mm)
     for axis, offset in correction.offset_um.items():
         limits = PlanLimits.of(CONFIG.axis[axis], CONFIG.machine.sync_period_s)
@@ -46,8 +46,8 @@ def test_every_axis_gets_an_offset_per_row_that_the_guard_lets_pass(planned: tup
         assert not offset.flags.writeable
 
 
-def test_position_offsets_or_an_on_line_feed_forward_never_both(planned: tuple[str, Correction]) -> None:
-    _, correction = planned
+def test_position_offsets_or_an_on_line_feed_forward_never_both(planned_correction: tuple[str, Correction]) -> None:
+    _, correction = planned_correction
     sends_positions = any(offset.any() for offset in correction.offset_um.values())
     assert sends_positions != bool(correction.torque_offset_nm)
     assert set(correction.torque_offset_nm) == set(correction.speed_offset_rad_s)
@@ -57,7 +57,7 @@ def test_position_offsets_or_an_on_line_feed_forward_never_both(planned: tuple[s
 def test_at_rest_nothing_is_asked_for(name: str) -> None:
     at_rest = trajectory(np.zeros((600, 2)))
     before = predict(at_rest, MODELS, CONFIG)
-    first, second = (tables.load(tables.CORRECTIONS, name)(at_rest, MODELS, CONFIG, before) for _ in range(2))
+    first, second = (tables.load_entry(tables.CORRECTIONS, name)(at_rest, MODELS, CONFIG, before) for _ in range(2))
     assert isinstance(first, Plan)
     for plan_of in (first, second):
         sent = (plan_of.offset_um, plan_of.speed_offset_rad_s, plan_of.torque_offset_nm)
@@ -66,7 +66,7 @@ def test_at_rest_nothing_is_asked_for(name: str) -> None:
 
 @pytest.mark.parametrize("name", tables.CORRECTIONS)
 def test_a_method_keeps_the_limits_by_itself(name: str) -> None:
-    wanted = tables.load(tables.CORRECTIONS, name)(REFERENCE, MODELS, CONFIG, predict(REFERENCE, MODELS, CONFIG))
+    wanted = tables.load_entry(tables.CORRECTIONS, name)(REFERENCE, MODELS, CONFIG, predict(REFERENCE, MODELS, CONFIG))
     assert wanted.refused == ()
     for axis, offset in wanted.offset_um.items():
         limits = PlanLimits.of(CONFIG.axis[axis], CONFIG.machine.sync_period_s)

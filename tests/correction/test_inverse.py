@@ -12,7 +12,7 @@ from fdhil.arming.guard_settings import limits_of
 from fdhil.correction import PlanLimits, check, mirror, plan
 from fdhil.correction.inverse import BLOCK_S
 from fdhil.correction.linear import delay_s, inverse
-from fdhil.guard.table import check_rows
+from fdhil.guard.correction_table import check_rows
 from fdhil.model import closed_loop
 from fdhil.prediction import predict, predict_corrected
 from fdhil.prediction.models import nominal_models

@@ -13,7 +13,7 @@ from fdhil.correction.learning import MOST_SHARE, Lesson, learn
 from fdhil.correction.limits import fit_all
 from fdhil.correction.planning import plan
 from fdhil.prediction import contour_error_um
-from fdhil.records import Float, Parameters, Trajectory, rms
+from fdhil.records import Float, Parameters, Trajectory, compute_rms
 from studies.real_plant import Loops, Mechanics, at_rest, run
 from tests.bench import bench_config
 from tests.paths import bench_trajectory
@@ -36,7 +36,7 @@ def cut(mechanics: Mechanics, loops: Loops, reference: Trajectory, offset_um: Ma
 def passes(count: int, loops: Loops, wear: float = 0.0, disturbed: int = -1) -> tuple[list[float], list[float]]:
     """Return the RMS (um) of each pass with learning, and of the model alone on the same machine at that pass."""
     config, reference = bench_config(), bench_trajectory(10)
-    models = dict.fromkeys(reference.axes, Parameters.of(REAL.truth()).changed(Cd=5.2))
+    models = dict.fromkeys(reference.axes, Parameters.from_mapping(REAL.truth()).replace_values(Cd=5.2))
     offset = plan(reference, models, config).offset_um
     lesson, mechanics = Lesson.none(reference), REAL
     learned, alone = [], []
@@ -55,7 +55,7 @@ def passes(count: int, loops: Loops, wear: float = 0.0, disturbed: int = -1) -> 
 
 
 def left(reference: Trajectory, at: Mapping[str, Float]) -> float:
-    return rms(contour_error_um(reference.path_mm, np.column_stack(list(at.values())), reference.dt_s))
+    return compute_rms(contour_error_um(reference.path_mm, np.column_stack(list(at.values())), reference.dt_s))
 
 
 def bounded(lesson: Lesson, config: MachineConfig) -> None:

@@ -22,7 +22,7 @@ from tests.tiers import sampled
 
 CONFIG = bench_config()
 PATH = bench_trajectory(10)
-PLAIN = Parameters.of(Mechanics().truth())
+PLAIN = Parameters.from_mapping(Mechanics().truth())
 
 
 def told(m: Mechanics) -> Parameters:
@@ -39,7 +39,7 @@ def told(m: Mechanics) -> Parameters:
         terms |= {f"ripple_motor_{m.motor_order}": m.motor_ripple_nm}
     if m.resonance_hz:
         terms |= {"resonance": m.resonance_hz, "resonance_damping": m.damping, "resonance_share": m.table_share}
-    return PLAIN.changed(**terms)
+    return PLAIN.replace_values(**terms)
 
 
 def cut(
@@ -94,14 +94,14 @@ def test_a_configured_resonance_need_not_be_exact(hertz: float) -> None:
     blind = cut(plant, plan(PATH, {"X": PLAIN, "Y": PLAIN}, CONFIG).offset_um)
     assert np.mean(blind > before + 1.0) > 0.15
     for share in (0.85, 1.15):
-        model = PLAIN.changed(resonance=share * hertz, resonance_damping=0.03)
+        model = PLAIN.replace_values(resonance=share * hertz, resonance_damping=0.03)
         after = cut(plant, plan(PATH, {"X": model, "Y": model}, CONFIG).offset_um)
         assert rms(after) < 0.45 * rms(blind)
 
 
 def test_a_resonance_beyond_the_drives_reach_is_told() -> None:
     """No offset within the limits compensates the table's oscillation at 20 Hz."""
-    model = PLAIN.changed(resonance=20.0, resonance_damping=0.03)
+    model = PLAIN.replace_values(resonance=20.0, resonance_damping=0.03)
     refused = plan(PATH, {"X": model, "Y": model}, CONFIG).refused
     assert {reason.code for reason in refused} == {"ResonanceBeyondReach"}
     assert "at 20 Hz" in refused[0].text

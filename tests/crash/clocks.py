@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from tests.guard.machine import Frame
-from tests.guard.test_process import Rig
+from tests.guard.simulated_bus import Frame
+from tests.guard.test_guard_process import Rig
 
 FAKETIME = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1")
 EMERGENCY: Frame = (0x081, bytes.fromhex("1081000000000000"))

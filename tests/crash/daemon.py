@@ -8,14 +8,14 @@ from pathlib import Path
 from unittest.mock import patch
 
 from fdhil.config import MachineConfig
-from fdhil.daemon import service
+from fdhil.daemon import daemon_service
+from fdhil.daemon.daemon_service import DaemonService, InternalError
 from fdhil.daemon.outcome_store import WINDOWS_FOLDER, OutcomeStore
-from fdhil.daemon.service import InternalError, Service
 from fdhil.errors import FdhilError
 from fdhil.records import Notice, Outcome, ParameterSet, WindowOutcome
-from fdhil.store.history import FILE_NAME, History
-from tests.crash.keepers import believed, configured
-from tests.daemon.machine import Machine, rapids
+from fdhil.store.history import HISTORY_FILE_NAME, History
+from tests.crash.stored_records import check_readable, configured
+from tests.daemon.simulated_machine import SimulatedMachine, rapids
 
 RAPIDS = 2
 FIRST_RAPID = 403  # the tick at which it begins
@@ -32,13 +32,13 @@ class Daemon:
         _run(self.folder, lambda **_: None)
 
     def found(self) -> set[int]:
-        if not (self.folder / FILE_NAME).exists():
+        if not (self.folder / HISTORY_FILE_NAME).exists():
             return set()
         with History.read(self.folder) as history:
             windows, sets = history.windows("X"), history.revisions("X")
         whole = []
         for row in windows[-RAPIDS:]:
-            if (window := believed(self.folder / WINDOWS_FOLDER / row.file)) is not None:
+            if (window := check_readable(self.folder / WINDOWS_FOLDER / row.file)) is not None:
                 assert window.start_tick == row.start_tick
                 whole.append(row.start_tick)
         return {
@@ -65,8 +65,12 @@ def _run(folder: Path, tell: Callable[..., None]) -> None:
 
 
 async def _served(config: MachineConfig, tell: Callable[..., None]) -> None:
-    daemon, loop, received = Service(config, Machine(rapids(config, count=RAPIDS)).open), asyncio.get_running_loop(), 0
-    before = OutcomeStore.keep
+    daemon, loop, received = (
+        DaemonService(config, SimulatedMachine(rapids(config, count=RAPIDS)).open),
+        asyncio.get_running_loop(),
+        0,
+    )
+    before = OutcomeStore.store_outcomes
 
     def keep(self: OutcomeStore, outcomes: Sequence[Outcome]) -> list[Notice]:
         nonlocal received
@@ -82,8 +86,8 @@ async def _served(config: MachineConfig, tell: Callable[..., None]) -> None:
             loop.call_soon_threadsafe(daemon._stop.set)
         return notices
 
-    warmed = patch.object(service, "warm", lambda *_: None)  # the kernels are compiled already
-    with warmed, patch.object(OutcomeStore, "keep", keep):
+    warmed = patch.object(daemon_service, "compile_kernels", lambda *_: None)  # the kernels are compiled already
+    with warmed, patch.object(OutcomeStore, "store_outcomes", keep):
         await daemon.run()
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fdhil.errors import FdhilError
-from tests.crash.injected import Make, Told, done_by, look
+from tests.crash.call_faults import CommandChannel, Make, done_by, look
 
 NEW_SPACE, NEW_USER = 0x00020000, 0x10000000
 READ_ONLY, REMOUNT, PRIVATE = 1, 32, 0x4000 | (1 << 18)
@@ -22,7 +22,7 @@ RECORDS, LATER = 3, 9
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
-def filled(make: Make, folder: Path, free_bytes: int) -> Told:
+def filled(make: Make, folder: Path, free_bytes: int) -> CommandChannel:
     def work(tell: Callable[..., None]) -> None:
         disk = _mounted(folder)
         _keep(make, disk, 1, tell)
@@ -36,7 +36,7 @@ def filled(make: Make, folder: Path, free_bytes: int) -> Told:
     return done_by(work)
 
 
-def read_only(make: Make, folder: Path) -> Told:
+def read_only(make: Make, folder: Path) -> CommandChannel:
     def work(tell: Callable[..., None]) -> None:
         disk = _mounted(folder)
         for number in (1, 2):

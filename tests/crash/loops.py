@@ -15,9 +15,8 @@ from functools import partial
 from pathlib import Path
 
 from fdhil.store.history import History
-from tests.crash.daemon import FIRST_RAPID, Daemon, run_daemon
-from tests.crash.injected import (
-    Told,
+from tests.crash.call_faults import (
+    CommandChannel,
     Work,
     calls_of,
     faults_of,
@@ -27,7 +26,8 @@ from tests.crash.injected import (
     looked_at,
     was_injected,
 )
-from tests.crash.keepers import KEEPERS, Keeper
+from tests.crash.daemon import FIRST_RAPID, Daemon, run_daemon
+from tests.crash.stored_records import KEEPERS, Keeper
 
 BEGUN_BEFORE = ("parameters", "notices", "the daemon")  # how a history is made is tried with the rapids
 LIES = "lied of 3 bytes"  # the kernel told what it had not done: no record can be promised, but none may be half
@@ -103,7 +103,7 @@ def _faults(begun: Path, kind: Kind, folder: Path, found: Found, most: int | Non
     yield from chosen
 
 
-def _judged(at: tuple[str, int, str], told: Told, after: Told, found: Found) -> None:
+def _judged(at: tuple[str, int, str], told: CommandChannel, after: CommandChannel, found: Found) -> None:
     call, nth, fault = at
     found.runs[fault] += 1
     found.acknowledged += len(told.kept)
@@ -124,5 +124,5 @@ def _judged(at: tuple[str, int, str], told: Told, after: Told, found: Found) -> 
     found.wrong += [f"{call} {nth} {fault}: {text}" for text in wrong]
 
 
-def _is_plain(after: Told) -> bool:
+def _is_plain(after: CommandChannel) -> bool:
     return all(text.startswith("StoreError: ") and "; " in text for text in after.wrong)

@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 
 from fdhil.commissioning.progress import Progress
-from fdhil.daemon import blackbox
+from fdhil.daemon import black_box
 from fdhil.errors import StoreError
 from fdhil.store import atomic
 from fdhil.system_clock import Clock
-from tests.crash import clocks, disks, injected
-from tests.crash.keepers import KEEPERS, Plain
+from tests.crash import call_faults, clocks, disks
 from tests.crash.loops import KINDS, Kind, tried
+from tests.crash.stored_records import KEEPERS, Plain
 
 OF_EACH = 8  # faults, of the hundreds that the study tries
 
@@ -26,7 +26,7 @@ OF_EACH = 8  # faults, of the hundreds that the study tries
 @pytest.mark.debian
 @pytest.mark.parametrize("name", KINDS)
 @pytest.mark.fault("F1", "F3", "F4", "F6")
-def test_what_was_acknowledged_outlives_any_call_that_fails_or_is_the_last(name: str, tmp_path: Path) -> None:
+def test_acknowledged_records_survive_any_failing_or_final_system_call(name: str, tmp_path: Path) -> None:
     found = tried(name, tmp_path, OF_EACH)
     assert found.wrong == []
     assert found.acknowledged > 0
@@ -44,10 +44,8 @@ class Careless(Plain):
 
 
 @pytest.mark.debian
-def test_a_store_that_empties_a_file_before_it_writes_it_is_found_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    keep = partial(injected.keep_some, Careless)
+def test_store_that_truncates_before_writing_is_detected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    keep = partial(call_faults.keep_some, Careless)
     monkeypatch.setitem(KINDS, "careless", Kind(Careless, keep))
     found = tried("careless", tmp_path)
     assert found.lost > 0
@@ -57,7 +55,7 @@ def test_a_store_that_empties_a_file_before_it_writes_it_is_found_out(
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("name", KEEPERS)
 @pytest.mark.fault("F3")
-def test_a_full_disk_takes_nothing_back(name: str, tmp_path: Path) -> None:
+def test_full_disk_loses_no_acknowledged_record(name: str, tmp_path: Path) -> None:
     make = KEEPERS[name]
     result = disks.filled(make, tmp_path, free_bytes=0)
     assert (result.wrong, result.ended) == ([], True)
@@ -72,7 +70,7 @@ def test_a_full_disk_takes_nothing_back(name: str, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("name", KEEPERS)
 @pytest.mark.fault("F5")
-def test_a_read_only_disk_takes_nothing_and_loses_nothing(name: str, tmp_path: Path) -> None:
+def test_read_only_disk_refuses_and_loses_nothing(name: str, tmp_path: Path) -> None:
     result = disks.read_only(KEEPERS[name], tmp_path)
     assert (result.wrong, result.ended) == ([], True)
     assert (result.kept, {1, 2} <= set(result.found)) == ([1, 2, 9], True)
@@ -80,7 +78,7 @@ def test_a_read_only_disk_takes_nothing_and_loses_nothing(name: str, tmp_path: P
     assert any(words in text for words in ("it is read-only", "Read-only file system", "told before"))
 
 
-def test_steps_that_cannot_be_read_now_are_not_written_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unreadable_steps_are_not_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Progress(tmp_path, "X").keep("sign test", "this drive", {"um": 10.0})
 
     def refuses(*_: Any, **__: Any) -> None:
@@ -94,7 +92,7 @@ def test_steps_that_cannot_be_read_now_are_not_written_over(tmp_path: Path, monk
 
 
 @pytest.mark.fault("F9")
-def test_the_newest_black_box_stays_whatever_the_clock_shows(tmp_path: Path) -> None:
+def test_newest_black_box_is_kept_with_any_clock(tmp_path: Path) -> None:
     class BackwardClock(Clock):
         shown_s = datetime(2026, 11, 23, tzinfo=UTC).timestamp()
 
@@ -103,15 +101,17 @@ def test_the_newest_black_box_stays_whatever_the_clock_shows(tmp_path: Path) -> 
             return self.shown_s
 
     clock = BackwardClock()
-    (tmp_path / blackbox.FOLDER).mkdir()
-    (tmp_path / blackbox.FOLDER / "20261120T010203.000004Z-Old.log").write_text("of before there were numbers")
+    (tmp_path / black_box.BLACK_BOX_FOLDER).mkdir()
+    (tmp_path / black_box.BLACK_BOX_FOLDER / "20261120T010203.000004Z-Old.log").write_text(
+        "of before there were numbers"
+    )
     for number in range(12):
-        assert blackbox.dump(tmp_path, f"Made{number}", dict, clock).code == "BlackBox"
-    assert [box.code for box in blackbox.kept(tmp_path)] == [f"Made{number}" for number in range(4, 12)]
+        assert black_box.write_black_box(tmp_path, f"Made{number}", dict, clock).code == "BlackBox"
+    assert [box.code for box in black_box.find_black_boxes(tmp_path)] == [f"Made{number}" for number in range(4, 12)]
 
 
 @pytest.mark.fault("F9")
-def test_the_newest_file_stays_whatever_the_clock_shows(tmp_path: Path) -> None:
+def test_newest_file_is_kept_with_any_clock(tmp_path: Path) -> None:
     for number in range(6):
         file = tmp_path / str(number)
         others = list(tmp_path.iterdir())
@@ -124,7 +124,7 @@ def test_the_newest_file_stays_whatever_the_clock_shows(tmp_path: Path) -> None:
 @pytest.mark.debian
 @pytest.mark.parametrize("name", ["set on an hour", "set back to 1970"])
 @pytest.mark.fault("A28", "F9")
-def test_no_frame_of_a_ramp_changes_with_the_clock(name: str, tmp_path: Path) -> None:
+def test_ramp_frames_do_not_depend_on_the_wall_clock(name: str, tmp_path: Path) -> None:
     usual = clocks.ramp(tmp_path / "usual", clocks.NEVER_SET)
     assert len(usual) > clocks.FAULT_ROW - clocks.FIRST_ROW
     assert clocks.ramp(tmp_path / "set", clocks.CLOCKS[name]) == usual

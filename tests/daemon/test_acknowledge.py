@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 
-from fdhil.daemon import notice_book
-from fdhil.daemon.control import ask
-from fdhil.daemon.notice_book import NotAcknowledged, NoticeBook, acknowledgement_of
+from fdhil.daemon import notice_log
+from fdhil.daemon.daemon_socket import ask_daemon
+from fdhil.daemon.notice_log import NotAcknowledged, NoticeLog, parse_acknowledgement
 from fdhil.records import Notice
 from fdhil.store.history import History
 from fdhil.store.rows import StoredNotice
-from tests.daemon.machine import Machine, config_of
-from tests.daemon.test_service import _quick_start, serving, status_when  # noqa: F401 (a fixture)
+from tests.daemon.simulated_machine import SimulatedMachine, config_of
+from tests.daemon.test_daemon_service import _skip_kernel_warmup, serving, status_when  # noqa: F401 (a fixture)
 from tests.store.made import STAMP
 
 DOWN = Notice("BusDown", "MAJOR", "Bus can0: gone; nothing is received until it is reconnected, which is retried.")
@@ -25,14 +25,14 @@ DUE = Notice("MaintenanceDue", "minor", "ft will reach its limit soon; plan it."
 
 
 async def _acknowledged(path: Path, **request: Any) -> dict[str, Any]:
-    return await asyncio.to_thread(ask, path, {"request": "acknowledge", **request})
+    return await asyncio.to_thread(ask_daemon, path, {"request": "acknowledge", **request})
 
 
-async def test_a_notice_waits_until_somebody_answers_for_it_also_over_a_restart(
+async def test_notice_stays_open_until_acknowledged_also_across_a_restart(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = config_of(tmp_path)
-    async with serving(config, Machine([DOWN, BACK, DUE])) as path:
+    async with serving(config, SimulatedMachine([DOWN, BACK, DUE])) as path:
         status = await status_when(path, lambda s: s["unacknowledged"]["count"] == 2)
         assert status["unacknowledged"]["MAJOR"] == 1
         assert [n["code"] for n in status["unacknowledged"]["newest"]] == ["BusDown", "MaintenanceDue"]
@@ -46,7 +46,7 @@ async def test_a_notice_waits_until_somebody_answers_for_it_also_over_a_restart(
         again = await _acknowledged(path, notices=[number], by="ben")
         assert (again["ok"], again["acknowledged"]) == (True, [])
     assert "notice 1 acknowledged by anna" in capsys.readouterr().err
-    async with serving(config, Machine()) as path:
+    async with serving(config, SimulatedMachine()) as path:
         status = await status_when(path, lambda s: True)
         assert [n["code"] for n in status["unacknowledged"]["newest"]] == ["MaintenanceDue"]
         answer = await _acknowledged(path, up_to=status["unacknowledged"]["newest"][-1]["number"], by="ben")
@@ -73,30 +73,30 @@ async def test_a_notice_waits_until_somebody_answers_for_it_also_over_a_restart(
         ({"notices": [1], "by": "anna", "note": "x" * 201}, "BadRequest"),
     ],
 )
-def test_what_cannot_be_met_is_refused_with_what_to_give(request_: dict[str, Any], code: str) -> None:
-    book = NoticeBook()
-    book.begin([StoredNotice(1, DOWN, STAMP), StoredNotice(2, BACK, STAMP)])
+def test_invalid_acknowledgement_is_refused_with_advice(request_: dict[str, Any], code: str) -> None:
+    book = NoticeLog()
+    book.load_history([StoredNotice(1, DOWN, STAMP), StoredNotice(2, BACK, STAMP)])
     with pytest.raises(NotAcknowledged) as refused:
-        acknowledgement_of(request_, book.chosen(request_))
+        parse_acknowledgement(request_, book.select_open(request_))
     assert refused.value.answer["code"] == code
     assert refused.value.answer["advice"]
-    assert book.status()["count"] == 1
+    assert book.build_status()["count"] == 1
 
 
-def test_a_name_cannot_forge_a_line_of_the_log() -> None:
-    given = acknowledgement_of({"by": "anna\x1b[2J\n", "note": "a\nb"}, [1])
+def test_operator_name_cannot_forge_a_log_line() -> None:
+    given = parse_acknowledgement({"by": "anna\x1b[2J\n", "note": "a\nb"}, [1])
     assert (given.who, given.note) == ("anna\\x1b[2J", "a\\nb")
 
 
-def test_only_the_newest_notices_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(notice_book, "NEWEST", 3)
-    book = NoticeBook()
+def test_only_the_newest_notices_stay_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(notice_log, "NEWEST", 3)
+    book = NoticeLog()
     for number in range(1, 6):
-        book.stored(DOWN, number, STAMP)
-    assert [result["number"] for result in book.status()["newest"]] == [3, 4, 5]
+        book.add_stored(DOWN, number, STAMP)
+    assert [result["number"] for result in book.build_status()["newest"]] == [3, 4, 5]
 
 
-def test_a_long_list_of_numbers_is_gone_through_a_few_times_however_many_wait() -> None:
+def test_long_list_of_numbers_is_processed_in_linear_time() -> None:
     class Counted(list[int]):
         times = 0
 
@@ -104,8 +104,8 @@ def test_a_long_list_of_numbers_is_gone_through_a_few_times_however_many_wait() 
             self.times += 1
             return super().__iter__()
 
-    book = NoticeBook()
-    book.begin([StoredNotice(number, DOWN, STAMP) for number in range(1, 101)])
+    book = NoticeLog()
+    book.load_history([StoredNotice(number, DOWN, STAMP) for number in range(1, 101)])
     numbers = Counted(range(1, 101))
-    assert len(book.chosen({"notices": numbers})) == 100
+    assert len(book.select_open({"notices": numbers})) == 100
     assert numbers.times < 5

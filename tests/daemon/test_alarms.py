@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-from fdhil.daemon import journal
-from fdhil.daemon.alarms import AlarmTable, alarm_document
+from fdhil.daemon import service_log
+from fdhil.daemon.alarms import AlarmTable, build_alarm_document
 from fdhil.records import Notice
 from fdhil.store.history import History
 from fdhil.store.rows import Acknowledgement, Stamp, StoredNotice
-from tests.daemon.machine import Machine, config_of
-from tests.daemon.test_service import _quick_start, serving, status_when  # noqa: F401 (a fixture)
+from tests.daemon.simulated_machine import SimulatedMachine, config_of
+from tests.daemon.test_daemon_service import _skip_kernel_warmup, serving, status_when  # noqa: F401 (a fixture)
 
 LOST = Notice("HeartbeatLost", "MAJOR", "Drive X sends no heartbeat any more.", "X")
 BACK = Notice("HeartbeatLost", "info", "Drive X sends its heartbeat again.", "X")
@@ -29,14 +29,14 @@ def table(*notices: Notice) -> AlarmTable:
 
 
 def acknowledge(alarms: AlarmTable, *numbers: int) -> None:
-    alarms.acknowledge(Acknowledgement(numbers, "anna", "", at(90)))
+    alarms.acknowledge_notices(Acknowledgement(numbers, "anna", "", at(90)))
 
 
 def documents(alarms: AlarmTable) -> list[dict[str, Any]]:
-    return [alarm_document(alarm) for alarm in alarms.shown()]
+    return [build_alarm_document(alarm) for alarm in alarms.list_shown()]
 
 
-def test_return_of_a_heartbeat_ends_its_alarm_and_raises_no_other() -> None:
+def test_returning_heartbeat_ends_its_alarm_only() -> None:
     (active,) = documents(table(LOST))
     assert (active["state"], active["until"]) == ("active", None)
     (gone,) = documents(table(LOST, BACK))
@@ -44,35 +44,35 @@ def test_return_of_a_heartbeat_ends_its_alarm_and_raises_no_other() -> None:
     assert gone["since"] < gone["until"]
 
 
-def test_active_alarm_stays_when_it_is_acknowledged_and_leaves_when_it_ends() -> None:
+def test_acknowledged_alarm_stays_until_it_ends() -> None:
     alarms = table(LOST)
     acknowledge(alarms, 1)
     (active,) = documents(alarms)
     assert (active["state"], active["numbers"], active["acknowledged"]["who"]) == ("active", [], "anna")
-    alarms.take(StoredNotice(2, BACK, at(2)))
+    alarms.take_notice(StoredNotice(2, BACK, at(2)))
     assert documents(alarms) == []
 
 
-def test_gone_alarm_waits_until_it_is_acknowledged_and_the_next_one_counts_from_one() -> None:
+def test_gone_alarm_stays_until_acknowledged_and_the_count_restarts() -> None:
     alarms = table(LOST, BACK)
     acknowledge(alarms, 1)
     assert documents(alarms) == []
-    alarms.take(StoredNotice(3, LOST, at(3)))
+    alarms.take_notice(StoredNotice(3, LOST, at(3)))
     assert documents(alarms)[0]["count"] == 1
 
 
-def test_chattering_is_counted_in_one_alarm() -> None:
+def test_chattering_condition_is_counted_in_one_alarm() -> None:
     (alarm,) = documents(table(*[LOST, BACK] * 7, LOST))
     assert (alarm["state"], alarm["count"], len(alarm["numbers"])) == ("active", 8, 8)
     assert alarm["first"] < alarm["since"]
 
 
-def test_event_that_does_not_last_is_gone_at_once_and_waits() -> None:
+def test_event_is_gone_at_once_and_unacknowledged() -> None:
     (alarm,) = documents(table(TRIP))
     assert (alarm["state"], alarm["since"], alarm["numbers"]) == ("gone", alarm["until"], [1])
 
 
-def test_active_alarms_are_in_front_of_graver_ones_that_are_gone() -> None:
+def test_active_alarms_precede_more_severe_gone_ones() -> None:
     due = Notice("MaintenanceDue", "minor", "ft has changed by 55 %, limit 50 %", "Y")
     assert [alarm["code"] for alarm in documents(table(due, TRIP, LOST))] == [
         "HeartbeatLost", "MaintenanceDue", "GuardTripped",
@@ -87,40 +87,40 @@ def test_active_alarms_are_in_front_of_graver_ones_that_are_gone() -> None:
         (Notice("BusSilent", "info", "Bus can2 is active again."), ["can0", "can1"]),
     ],
 )
-def test_end_of_one_bus_leaves_the_alarm_of_another(ends: Notice, left: list[str]) -> None:
+def test_end_on_one_bus_keeps_the_alarm_of_another(ends: Notice, left: list[str]) -> None:
     silent = [Notice("BusSilent", "MAJOR", f"No frame is received on bus {bus}: so it is.") for bus in ("can0", "can1")]
     alarms = documents(table(*silent, ends))
     assert sorted(alarm["text"].split()[6].strip(":") for alarm in alarms if alarm["state"] == "active") == left
 
 
-def test_parameter_that_is_back_leaves_the_alarm_of_another_parameter() -> None:
+def test_recovered_parameter_keeps_the_alarm_of_another() -> None:
     due = [Notice("MaintenanceDue", "minor", f"{name} has changed by 55 %", "X") for name in ("ft", "Cd")]
     alarms = documents(table(*due, Notice("MaintenanceDue", "info", "ft is back at 0.05", "X")))
     assert {alarm["text"][:2]: alarm["state"] for alarm in alarms} == {"ft": "gone", "Cd": "active"}
 
 
-def test_store_that_works_again_ends_the_alarm_of_the_full_disk() -> None:
+def test_recovered_store_ends_the_disk_full_alarm() -> None:
     full = Notice("DiskFull", "MAJOR", "full")
     (alarm,) = documents(table(full, Notice("StoreRecovered", "info", "written again")))
     assert alarm["state"] == "gone"
 
 
-async def test_alarm_of_a_daemon_that_ended_is_over_when_the_next_one_starts(tmp_path: Path) -> None:
+async def test_next_daemon_ends_the_alarms_of_the_previous_one(tmp_path: Path) -> None:
     config = config_of(tmp_path)
-    async with serving(config, Machine([LOST])) as path:
+    async with serving(config, SimulatedMachine([LOST])) as path:
         status = await status_when(path, lambda s: s["alarms"]["active"])
         assert (status["alarms"]["first"][0]["code"], status["unacknowledged"]["count"]) == ("HeartbeatLost", 1)
-    async with serving(config, Machine()) as path:
+    async with serving(config, SimulatedMachine()) as path:
         status = await status_when(path, lambda s: s["alarms"]["first"][0]["until"])
         assert (status["alarms"]["active"], status["alarms"]["unacknowledged"]) == (0, 1)
 
 
-async def test_end_that_a_flood_held_back_is_stored_when_the_flood_is_over(
+async def test_suppressed_end_of_an_alarm_is_stored_after_the_flood(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(journal, "REFILL_PER_S", 20.0)
+    monkeypatch.setattr(service_log, "REFILL_PER_S", 20.0)
     config = config_of(tmp_path)
-    async with serving(config, Machine([LOST, BACK] * 40)) as path:
+    async with serving(config, SimulatedMachine([LOST, BACK] * 40)) as path:
         status = await status_when(path, lambda s: s["alarms"]["first"] and not s["alarms"]["active"])
         assert status["alarms"]["first"][0]["count"] < 40
         await status_when(path, lambda s: s["notices"][-1]["text"] == BACK.text)

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.guard.core import SETTLED_CYCLES
+from fdhil.guard.guard_step import SETTLED_CYCLES
 from tests.bench import AXIS, axis_toml
-from tests.daemon.shop import HEAD, TO_AND_FRO, Shop, fdhil, opened
+from tests.daemon.machine_rig import HEAD, TO_AND_FRO, MachineRig, fdhil, opened
 from tests.paths import bench_demand
 
 Capture = pytest.CaptureFixture[str]
@@ -32,53 +32,53 @@ def bench_of(axis: str, speed_feedforward: float) -> str:
 
 
 @pytest.fixture
-def shop(tmp_path: Path) -> Iterator[Shop]:
+def rig(tmp_path: Path) -> Iterator[MachineRig]:
     with opened(tmp_path, HEAD + "".join(bench_of(axis, own) for axis, (own, _) in CASES.items())) as shop:
         shop.commission()
         yield shop
 
 
-def test_an_identified_machine_follows_without_a_program(shop: Shop, capsys: Capture) -> None:
-    with shop.guard() as guard, shop.daemon() as daemon:
-        code, _, err = fdhil("arm", shop.path, "--method", "flatness", capsys=capsys)
+def test_feedforward_of_an_identified_machine_reduces_the_following_error(rig: MachineRig, capsys: Capture) -> None:
+    with rig.guard() as guard, rig.daemon() as daemon:
+        code, _, err = fdhil("arm", rig.path, "--method", "flatness", capsys=capsys)
         assert (code, "refused: ModelNotValidated" in err) == (1, True), err
-        shop.nc(on=True)
-        shop.play("shuttle.ngc", f"G21 G90 G94\n{TO_AND_FRO}M2\n")
-        shop.status_when(lambda s: all(s["axes"][a]["accepted"] >= 2 for a in "XY"))
-        before = largest_errors_um(shop, "before")
-        after = fed_forward(shop, capsys)
+        rig.nc(on=True)
+        rig.play("shuttle.ngc", f"G21 G90 G94\n{TO_AND_FRO}M2\n")
+        rig.wait_for_status(lambda s: all(s["axes"][a]["accepted"] >= 2 for a in "XY"))
+        before = largest_errors_um(rig, "before")
+        after = fed_forward(rig, capsys)
         for axis, (_, smaller) in CASES.items():
             assert before[axis] / after[axis] >= smaller, (before, after)
-        assert fdhil("disarm", shop.path, capsys=capsys)[0] == 0
-        status = shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
+        assert fdhil("disarm", rig.path, capsys=capsys)[0] == 0
+        status = rig.wait_for_status(lambda s: s["state"] == "OFF" and s["armed"] is None)
         assert feed_of(status)["applied"] == {"X": [0, 0], "Y": [0, 0]}
-        assert largest_errors_um(shop, "again") == pytest.approx(before, rel=0.1)
-        fades_out_on_an_emergency(shop, capsys)
+        assert largest_errors_um(rig, "again") == pytest.approx(before, rel=0.1)
+        fades_out_on_an_emergency(rig, capsys)
         assert daemon.stop() == 0
         assert guard.stop() == 0
 
 
-def switch_on(shop: Shop, capsys: Capture) -> None:
-    shop.status_when(lambda s: s["guard"].get("good_for", 0) > SETTLED_CYCLES)
+def switch_on(shop: MachineRig, capsys: Capture) -> None:
+    shop.wait_for_status(lambda s: s["guard"].get("good_for", 0) > SETTLED_CYCLES)
     code, out, err = fdhil("arm", shop.path, "--method", "flatness", "--json", capsys=capsys)
     assert code == 0, (out, err)
     assert json.loads(out)["state"] == "FEEDFORWARD"
 
 
-def fed_forward(shop: Shop, capsys: Capture) -> dict[str, float]:
+def fed_forward(shop: MachineRig, capsys: Capture) -> dict[str, float]:
     switch_on(shop, capsys)
-    shop.status_when(lambda s: s["state"] == "FEEDFORWARD")
+    shop.wait_for_status(lambda s: s["state"] == "FEEDFORWARD")
     errors_um = largest_errors_um(shop, "after")
-    status = shop.status_when(lambda s: s["guard"])
+    status = shop.wait_for_status(lambda s: s["guard"])
     assert status["state"] == "FEEDFORWARD", status["guard"]
     return errors_um
 
 
-def fades_out_on_an_emergency(shop: Shop, capsys: Capture) -> None:
+def fades_out_on_an_emergency(shop: MachineRig, capsys: Capture) -> None:
     switch_on(shop, capsys)
-    shop.status_when(lambda s: s["state"] == "FEEDFORWARD")
+    shop.wait_for_status(lambda s: s["state"] == "FEEDFORWARD")
     shop.twin.command("fault", fault="frame", can_id=0x081, data="1043080000000000")
-    status = shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
+    status = shop.wait_for_status(lambda s: s["state"] == "OFF" and s["armed"] is None)
     assert feed_of(status)["cause"]["code"] == "DriveEmergency"
     boxes = shop.config.store.directory / "blackbox"
     shop.wait(lambda: any(boxes.glob("*-DriveEmergency.log")))
@@ -91,7 +91,7 @@ def feed_of(status: dict[str, Any]) -> dict[str, Any]:
     return dict(status["guard"]["feedforward"])
 
 
-def largest_errors_um(shop: Shop, name: str) -> dict[str, float]:
+def largest_errors_um(shop: MachineRig, name: str) -> dict[str, float]:
     """Run the bench's path by the NC; return each axis' largest tracking error, um, by the simulator."""
     demand, trace = shop.folder / "path.csv", shop.folder / f"{name}.csv"
     path = bench_demand(10, hold_s=0.2)

@@ -11,8 +11,8 @@ from fdhil.pipeline import Record
 from fdhil.records import MoveEvent, MoveKind, NcMove, NcState, Notice
 from fdhil.store.history import History
 from fdhil.store.windows import list_windows, read_window
-from tests.daemon.machine import Machine, config_of, rapids
-from tests.daemon.test_service import serving, status_when
+from tests.daemon.simulated_machine import SimulatedMachine, config_of, rapids
+from tests.daemon.test_daemon_service import serving, status_when
 
 
 def said(records: Sequence[Record], moves: Sequence[NcMove]) -> list[Record]:
@@ -23,11 +23,11 @@ def said(records: Sequence[Record], moves: Sequence[NcMove]) -> list[Record]:
     ]
 
 
-async def test_what_the_nc_says_of_a_rapid_goes_with_its_window(tmp_path: Path) -> None:
+async def test_nc_report_of_a_rapid_is_stored_with_its_window(tmp_path: Path) -> None:
     config = config_of(tmp_path)
     moves = [NcMove(12, "part.ngc", (1.0, 1.0), False), NcMove(14, "part.ngc", (0.7, 0.7), False)]
     state = NcState(time.monotonic_ns(), 1000, MoveKind.RAPID, 14, rapid_override=0.7, program="/nc/part.ngc")
-    machine = Machine(said(rapids(config, count=2), moves))
+    machine = SimulatedMachine(said(rapids(config, count=2), moves))
     machine.give(state, Notice("BusSilent", "MAJOR", "nothing is heard"))
     async with serving(config, machine) as path:
         status = await status_when(path, lambda s: s["axes"]["X"]["accepted"] and s["axes"]["X"]["refused"])

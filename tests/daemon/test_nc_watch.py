@@ -14,7 +14,7 @@ WORKING = NcState(
 TROUBLE = Notice("DriveFault", "MAJOR", "the drive has a fault", "X")
 
 
-def test_an_override_and_a_hold_are_told_once_and_when_they_are_over() -> None:
+def test_override_and_feed_hold_are_reported_once_and_at_their_end() -> None:
     watch, result = NcWatch(), []
     for state in (
         WORKING,
@@ -24,43 +24,43 @@ def test_an_override_and_a_hold_are_told_once_and_when_they_are_over() -> None:
         replace(WORKING, motion=MoveKind.UNKNOWN, rapid_override=None),
         WORKING,
     ):
-        result += [(notice.code, notice.severity) for notice in watch.note(state, 1.0)]
+        result += [(notice.code, notice.severity) for notice in watch.take_state(state, 1.0)]
     assert result == [
         ("OverrideChanged", "minor"), ("FeedHold", "minor"), ("FeedHold", "info"), ("OverrideChanged", "info"),
     ]  # fmt: skip
 
 
-def test_trouble_is_told_with_the_line_that_the_nc_works_at() -> None:
+def test_problem_is_reported_with_the_current_nc_line() -> None:
     watch = NcWatch()
-    assert watch.placed(TROUBLE, 0.0) == TROUBLE
-    watch.note(WORKING, 1.0)
-    assert watch.placed(TROUBLE, 1.5).text == "the drive has a fault (the NC is at line 12 of part.ngc)"
-    assert watch.placed(replace(TROUBLE, severity="info"), 1.5).text == TROUBLE.text
-    assert watch.placed(TROUBLE, 3.0) == TROUBLE, "an NC that is not heard any more is nowhere"
-    watch.note(replace(WORKING, motion=MoveKind.REST), 4.0)
-    assert watch.placed(TROUBLE, 4.0) == TROUBLE
+    assert watch.add_nc_line(TROUBLE, 0.0) == TROUBLE
+    watch.take_state(WORKING, 1.0)
+    assert watch.add_nc_line(TROUBLE, 1.5).text == "the drive has a fault (the NC is at line 12 of part.ngc)"
+    assert watch.add_nc_line(replace(TROUBLE, severity="info"), 1.5).text == TROUBLE.text
+    assert watch.add_nc_line(TROUBLE, 3.0) == TROUBLE, "an NC that is not heard any more is nowhere"
+    watch.take_state(replace(WORKING, motion=MoveKind.REST), 4.0)
+    assert watch.add_nc_line(TROUBLE, 4.0) == TROUBLE
 
 
-def test_the_status_says_what_the_nc_does() -> None:
+def test_status_shows_the_nc_state() -> None:
     watch = NcWatch()
-    assert watch.status(0.0) is None
-    watch.note(replace(WORKING, rapid_override=0.5, feed_hold=True), 1.0)
-    status = watch.status(1.25)
+    assert watch.build_status(0.0) is None
+    watch.take_state(replace(WORKING, rapid_override=0.5, feed_hold=True), 1.0)
+    status = watch.build_status(1.25)
     assert status is not None
     assert (status["heard_s_ago"], status["motion"], status["tool"]) == (0.25, "rapid", 3)
     line = "NC: rapid line 12 of part.ngc, feed override 100 %, rapid override 50 %, feed hold"
     assert nc_line(status) == line
-    watch.note(NcState(0, 0, MoveKind.UNKNOWN), 2.0)
-    status = watch.status(5.0)
+    watch.take_state(NcState(0, 0, MoveKind.UNKNOWN), 2.0)
+    status = watch.build_status(5.0)
     assert status is not None
     assert nc_line(status) == "NC: no data for 3 s, its moves are unknown"
 
 
-def test_a_name_that_is_no_unicode_is_told_escaped() -> None:
+def test_non_unicode_program_name_is_escaped() -> None:
     watch = NcWatch()
-    watch.note(replace(WORKING, program="/nc/b\udcf6hlen.ngc"), 1.0)
-    assert watch.placed(TROUBLE, 1.5).text == "the drive has a fault (the NC is at line 12 of b\\udcf6hlen.ngc)"
-    assert watch.placed(replace(TROUBLE, severity="info", text="\udcf6"), 1.5).text == "\\udcf6"
-    status = watch.status(1.5)
+    watch.take_state(replace(WORKING, program="/nc/b\udcf6hlen.ngc"), 1.0)
+    assert watch.add_nc_line(TROUBLE, 1.5).text == "the drive has a fault (the NC is at line 12 of b\\udcf6hlen.ngc)"
+    assert watch.add_nc_line(replace(TROUBLE, severity="info", text="\udcf6"), 1.5).text == "\\udcf6"
+    status = watch.build_status(1.5)
     assert status is not None
     assert status["program"] == "/nc/b\\udcf6hlen.ngc"

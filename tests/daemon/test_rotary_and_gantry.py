@@ -18,7 +18,7 @@ from fdhil.cli.demo.machines import machine_document
 from fdhil.commissioning.steps import commission
 from fdhil.prediction import contour_error_um, predict
 from fdhil.program import load_trajectory
-from fdhil.records import Parameters, rms, table_path
+from fdhil.records import Parameters, compute_rms, compute_table_path
 from fdhil.store.history import History
 from tests.bench import rotary_axis
 from tests.drivers.peer import DrivePeer
@@ -82,8 +82,8 @@ def cut(machine: Machine, path: str) -> float:
     machine.plant.trace(trace)
     machine.play(program_of(path), "path.ngc")
     axes = tuple(machine.config.axis)
-    reference, table = (table_path(axes, rows) for rows in read_trace(trace, axes))
-    return rms(contour_error_um(reference, table, 0.001))
+    reference, table = (compute_table_path(axes, rows) for rows in read_trace(trace, axes))
+    return compute_rms(contour_error_um(reference, table, 0.001))
 
 
 def machine(*axes: str) -> dict[str, Any]:
@@ -111,7 +111,7 @@ def rotary() -> dict[str, Any]:
     return document
 
 
-def test_rotary_table_is_a_feed_drive_like_any_other(tmp_path: Path) -> None:
+def test_rotary_axis_is_identified_and_corrected(tmp_path: Path) -> None:
     shuttle = "|G4 P0.25|".join(["G0 X400 A224", "G0 X0 A0", "G0 X300 A168", "G0 X0 A0", ""])
     check(run(tmp_path, rotary(), "F1500|G1 X30 A40|X60 A0|X80 A60|X0 A0", shuttle))
 
@@ -127,7 +127,7 @@ def gantry(**second: Any) -> dict[str, Any]:
     return document
 
 
-def test_both_drives_of_a_gantry_are_identified_and_corrected_each_by_its_own_model(tmp_path: Path) -> None:
+def test_each_gantry_drive_is_identified_and_corrected_by_its_own_model(tmp_path: Path) -> None:
     whole = run(tmp_path, gantry(), GANTRY, GANTRY_SHUTTLE)
     check(whole)
     assert np.abs(whole.found["Y"].Jt - whole.found["Y2"].Jt) > 0.008

@@ -15,27 +15,27 @@ from typing import Any
 import pytest
 
 from fdhil.config import MachineConfig
-from fdhil.daemon.service import Service
-from fdhil.daemon.shutdown import Budgets, Shutdown
+from fdhil.daemon.daemon_service import DaemonService
+from fdhil.daemon.shutdown import Shutdown, StepBudgets
 from fdhil.errors import ConnectError, DeviceError
-from tests.daemon.machine import Machine, config_of
+from tests.daemon.simulated_machine import SimulatedMachine, config_of
 
 UNIT = Path(__file__).parents[2] / "systemd" / "fdhil.service"
 
 
 @pytest.fixture(autouse=True)
-def _quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
+def _skip_kernel_warmup(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fdhil.daemon.daemon_service.compile_kernels", lambda config, method: None)
 
 
-class ClosingMachine(Machine):
+class ClosingMachine(SimulatedMachine):
     def __init__(self, error: Exception | None = None) -> None:
         super().__init__()
         self.error = error
         self.released, self.running = asyncio.Event(), asyncio.Event()
 
     @asynccontextmanager
-    async def open(self, config: MachineConfig) -> AsyncIterator[Machine]:
+    async def open(self, config: MachineConfig) -> AsyncIterator[SimulatedMachine]:
         self.opened += 1
         self.running.set()
         try:
@@ -50,7 +50,7 @@ class ClosingMachine(Machine):
                     continue
 
 
-async def stopped(service: Service, running: asyncio.Event) -> None:
+async def stopped(service: DaemonService, running: asyncio.Event) -> None:
     task = asyncio.create_task(service.run())
     await asyncio.wait([task, asyncio.create_task(running.wait())], return_when=asyncio.FIRST_COMPLETED)
     os.kill(os.getpid(), signal.SIGTERM)
@@ -58,46 +58,46 @@ async def stopped(service: Service, running: asyncio.Event) -> None:
 
 
 @pytest.mark.parametrize("error", [ConnectError("can0", "went away"), OSError("bad descriptor"), RuntimeError("bug")])
-async def test_daemon_stops_while_its_source_fails_at_closing(tmp_path: Path, error: Exception) -> None:
+async def test_daemon_stops_while_closing_its_source_fails(tmp_path: Path, error: Exception) -> None:
     machine = ClosingMachine(error)
-    await stopped(Service(config_of(tmp_path), machine.open), machine.running)
+    await stopped(DaemonService(config_of(tmp_path), machine.open), machine.running)
     assert machine.opened == 1
 
 
 async def test_daemon_stops_between_two_failures_of_its_source(tmp_path: Path) -> None:
-    machine = Machine()
+    machine = SimulatedMachine()
     seen = asyncio.Event()
 
     @asynccontextmanager
-    async def open_source(config: MachineConfig) -> AsyncIterator[Machine]:
+    async def open_source(config: MachineConfig) -> AsyncIterator[SimulatedMachine]:
         async with machine.open(config) as source:
             machine.give(DeviceError("can0", "went away"))
             if machine.opened == 2:
                 seen.set()
             yield source
 
-    await stopped(Service(config_of(tmp_path), open_source), seen)
+    await stopped(DaemonService(config_of(tmp_path), open_source), seen)
 
 
 @pytest.mark.usefixtures("real_time")
-async def test_device_that_does_not_close_is_reported_and_left(
+async def test_device_that_does_not_close_is_reported_and_abandoned(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     machine, left = ClosingMachine(), list[int]()
-    service = Service(config_of(tmp_path), machine.open, None, replace(Budgets(), source_s=0.01), left.append)
+    service = DaemonService(config_of(tmp_path), machine.open, None, replace(StepBudgets(), source_s=0.01), left.append)
     await stopped(service, machine.running)
     service.shutdown.leave_overrun()
-    service.shutdown.end()
+    service.shutdown.cancel_deadline()
     assert "closing buses and sensors is not finished after 0.01 s and is abandoned" in capsys.readouterr().err
     assert left == [3]
     machine.released.set()
 
 
-async def test_disk_that_does_not_answer_is_reported_and_left(
+async def test_hanging_disk_is_reported_and_abandoned(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disk_answers, machine = threading.Event(), ClosingMachine(ConnectError("can0", "went away"))
-    service = Service(config_of(tmp_path), machine.open, None, replace(Budgets(), store_s=0.01))
+    service = DaemonService(config_of(tmp_path), machine.open, None, replace(StepBudgets(), store_s=0.01))
     close: Callable[[], Any] = service._store.close
     monkeypatch.setattr(service._store, "close", lambda: (disk_answers.wait(), close()))
     try:
@@ -107,7 +107,7 @@ async def test_disk_that_does_not_answer_is_reported_and_left(
         disk_answers.set()
 
 
-def test_process_that_has_not_stopped_in_time_is_ended() -> None:
+def test_process_that_stops_too_late_is_ended() -> None:
     left, ended = list[int](), threading.Event()
 
     def leave(code: int) -> None:
@@ -115,12 +115,12 @@ def test_process_that_has_not_stopped_in_time_is_ended() -> None:
         ended.set()
 
     shutdown = Shutdown(0.0, leave)
-    shutdown.begin()
-    shutdown.begin()
+    shutdown.start_deadline()
+    shutdown.start_deadline()
     ended.wait()
     assert left == [3]
 
 
-def test_systemd_waits_longer_than_all_steps_take() -> None:
+def test_systemd_timeout_exceeds_all_steps() -> None:
     (stop_s,) = (line.split("=")[1] for line in UNIT.read_text().splitlines() if line.startswith("TimeoutStopSec="))
-    assert float(stop_s) > Budgets().total_s
+    assert float(stop_s) > StepBudgets().total_s

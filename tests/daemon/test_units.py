@@ -20,7 +20,7 @@ LARGEST_EXPOSURE = 1.5
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_unit_says_what_the_service_relies_on(name: str) -> None:
+def test_unit_has_the_settings_that_the_service_needs(name: str) -> None:
     lines = (UNITS / name).read_text().splitlines()
     settings = dict(line.split("=", 1) for line in lines if "=" in line and not line.startswith("#"))
     assert settings["LimitCORE"] == "0"
@@ -42,7 +42,7 @@ def test_the_unit_says_what_the_service_relies_on(name: str) -> None:
 @pytest.mark.debian
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.fault("G13")
-def test_systemd_agrees(name: str, tmp_path: Path) -> None:
+def test_systemd_accepts_the_unit(name: str, tmp_path: Path) -> None:
     unit = tmp_path / name
     unit.write_text((UNITS / name).read_text().replace("/opt/fdhil/bin/fdhil", sys.executable))
     verified = subprocess.run(["systemd-analyze", "verify", str(unit)], capture_output=True, text=True)
@@ -54,9 +54,7 @@ def test_systemd_agrees(name: str, tmp_path: Path) -> None:
 @pytest.mark.debian
 @pytest.mark.fault("G13")
 @pytest.mark.goal("R14")
-def test_every_service_is_verified_and_as_confined_as_promised(
-    tmp_path: Path, record_property: Callable[[str, object], None]
-) -> None:
+def test_every_service_is_verified_and_confined(tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
     exposed = {name: exposure(name, tmp_path) for name in SERVICES}
     record_property("goal", ", ".join(f"{name} {figure:g}" for name, figure in exposed.items()))
     assert max(exposed.values()) <= LARGEST_EXPOSURE, exposed

@@ -16,51 +16,51 @@ from fdhil.errors import ConnectError
 from fdhil.prediction import contour_error_um
 from fdhil.store.history import History
 from fdhil.store.windows import list_windows
-from tests.daemon.shop import CORNER, REAL, SHUTTLE, Shop, fdhil, opened, patient
+from tests.daemon.machine_rig import CORNER, REAL, SHUTTLE, MachineRig, fdhil, opened, patient
 
 Capture = pytest.CaptureFixture[str]
 pytestmark = [pytest.mark.timeout(1500), pytest.mark.usefixtures("processes")]
 
 
 @pytest.fixture
-def shop(tmp_path: Path) -> Iterator[Shop]:
+def rig(tmp_path: Path) -> Iterator[MachineRig]:
     with opened(tmp_path) as shop:
         shop.commission()
         yield shop
 
 
-def test_from_the_bus_to_the_history_to_a_corrected_cut_and_back(shop: Shop, capsys: Capture) -> None:
-    with shop.guard() as guard, shop.daemon() as daemon:
-        _refuses_what_is_not_known(shop, capsys)
-        shop.nc(on=True)
-        shop.play("shuttle.ngc", SHUTTLE)
-        refused = shop.status_when(
+def test_recorded_rapids_lead_to_a_corrected_cut_and_back_to_zero(rig: MachineRig, capsys: Capture) -> None:
+    with rig.guard() as guard, rig.daemon() as daemon:
+        _refuses_what_is_not_known(rig, capsys)
+        rig.nc(on=True)
+        rig.play("shuttle.ngc", SHUTTLE)
+        refused = rig.wait_for_status(
             lambda s: (
                 s["sync"]["rate_hz"] and all(s["axes"][a]["accepted"] + s["axes"][a]["refused"] >= 4 for a in "XY")
             )
         )
-        _knows_the_drives(refused)
-        _refuses_a_second_daemon(shop)
-        _cuts_corrected(shop, capsys)
-        _refuses_a_drive_that_was_written_to_until_it_is_compared(shop, capsys)
-        code, out, err = fdhil("arm", shop.path, shop.folder / "corner.ngc", capsys=capsys)
+        _has_identified_the_drives(refused)
+        _refuses_a_second_daemon(rig)
+        _cuts_corrected(rig, capsys)
+        _refuses_a_drive_that_was_written_to_until_it_is_compared(rig, capsys)
+        code, out, err = fdhil("arm", rig.path, rig.folder / "corner.ngc", capsys=capsys)
         assert code == 0, (out, err)
         assert daemon.stop() == 0  # disarms first
         assert guard.stop() == 0
-    log = (shop.folder / "daemon.log").read_text()
+    log = (rig.folder / "daemon.log").read_text()
     assert log.count("Armed: armed corner.ngc") == 2, log
     assert "ArmRefused: ModelNotValidated" in log
     assert "GuardState: ARMED -> " in log
     assert "PassMeasured: pass 1 of corner.ngc: contour error measured" in log
     assert log.splitlines()[-1].endswith(" stopped, offset 0"), log
-    token = (shop.run_directory / "token").read_text()
-    for file in (*shop.folder.glob("*.log"), *shop.config.store.directory.rglob("*.sqlite*")):
+    token = (rig.run_directory / "token").read_text()
+    for file in (*rig.folder.glob("*.log"), *rig.config.store.directory.rglob("*.sqlite*")):
         assert token.encode() not in file.read_bytes(), file
-    _replays_bit_by_bit(shop, capsys)
-    _history_is_told(shop, capsys)
+    _replays_bit_by_bit(rig, capsys)
+    _check_history_command(rig, capsys)
 
 
-def _refuses_what_is_not_known(shop: Shop, capsys: Capture) -> None:
+def _refuses_what_is_not_known(shop: MachineRig, capsys: Capture) -> None:
     program = shop.folder / "corner.ngc"
     program.write_text(CORNER)
     code, out, err = fdhil("arm", shop.path, program, capsys=capsys)
@@ -68,7 +68,7 @@ def _refuses_what_is_not_known(shop: Shop, capsys: Capture) -> None:
     assert "refused: ModelNotValidated" in err
 
 
-def _knows_the_drives(status: dict[str, object]) -> None:
+def _has_identified_the_drives(status: dict[str, object]) -> None:
     document = json.loads(json.dumps(status))
     assert document["state"] == "OFF"
     assert document["frames"]["received"] > 20_000
@@ -82,33 +82,33 @@ def _knows_the_drives(status: dict[str, object]) -> None:
             assert result["low"] < result["high"]
 
 
-def _refuses_a_second_daemon(shop: Shop) -> None:
+def _refuses_a_second_daemon(shop: MachineRig) -> None:
     second = Process("second daemon", ["fdhil", "run", str(shop.path)], shop.folder / "second.log")
     with pytest.raises(ConnectError, match="BusLocked"):
         second.event("ready")
     assert second.stop() == 3
 
 
-def _cuts_corrected(shop: Shop, capsys: Capture) -> None:
+def _cuts_corrected(shop: MachineRig, capsys: Capture) -> None:
     plain = _cut(shop, "plain")
     code, out, err = fdhil("arm", shop.path, shop.folder / "corner.ngc", "--json", capsys=capsys)
     assert code == 0, (out, err)
     answer = json.loads(out)
     assert answer["state"] == "ARMED"
     assert answer["after"]["rms_um"] < 0.2 * answer["before"]["rms_um"]
-    status = shop.status_when(lambda s: s["state"] == "ARMED")
+    status = shop.wait_for_status(lambda s: s["state"] == "ARMED")
     assert status["armed"]["program"] == str(shop.folder / "corner.ngc")
     corrected = _cut(shop, "corrected")
     assert corrected < 0.2 * plain, (corrected, plain)
-    shop.told("-> OFF: Finished")
+    shop.get_notices("-> OFF: Finished")
 
 
-def _refuses_a_drive_that_was_written_to_until_it_is_compared(shop: Shop, capsys: Capture) -> None:
+def _refuses_a_drive_that_was_written_to_until_it_is_compared(shop: MachineRig, capsys: Capture) -> None:
     place = shop.config.bus["can0"]
     with can.Bus(interface="socketcand", channel=place.channel, host=place.host, port=place.port) as bus:
         written = struct.pack("<BHBI", 0x23, 0x6065, 0, 32768)
         bus.send(can.Message(arbitration_id=0x601, data=written, is_extended_id=False))
-        shop.status_when(lambda s: any(notice["code"] == "RecordVoid" for notice in s["notices"]))
+        shop.wait_for_status(lambda s: any(notice["code"] == "RecordVoid" for notice in s["notices"]))
     code, out, err = fdhil("arm", shop.path, shop.folder / "corner.ngc", capsys=capsys)
     assert (code, out) == (1, "")
     assert "refused: RecordVoid: axis X" in err
@@ -120,7 +120,7 @@ def _refuses_a_drive_that_was_written_to_until_it_is_compared(shop: Shop, capsys
     shop.play("dwell.ngc", "G4 P0.3\nM2\n")  # the interlocks want 100 good SYNC
 
 
-def _cut(shop: Shop, name: str, program: str = "corner.ngc", text: str = CORNER) -> float:
+def _cut(shop: MachineRig, name: str, program: str = "corner.ngc", text: str = CORNER) -> float:
     trace = shop.folder / f"{name}.csv"
     shop.play(program, text, trace=trace)
     rows = np.genfromtxt(trace, delimiter=",", names=True)
@@ -129,7 +129,7 @@ def _cut(shop: Shop, name: str, program: str = "corner.ngc", text: str = CORNER)
     return float(np.sqrt(np.mean(contour_error_um(reference, table, 1e-3) ** 2)))
 
 
-def _replays_bit_by_bit(shop: Shop, capsys: Capture) -> None:
+def _replays_bit_by_bit(shop: MachineRig, capsys: Capture) -> None:
     folder = shop.config.store.directory / "windows"
     files = [file.path for file in list_windows(folder).windows if file.axis == "X"]
     assert len(files) == 4
@@ -151,7 +151,7 @@ def _replays_bit_by_bit(shop: Shop, capsys: Capture) -> None:
         assert of["skill"]["rms_um"] == skill.rms_um
 
 
-def _history_is_told(shop: Shop, capsys: Capture) -> None:
+def _check_history_command(shop: MachineRig, capsys: Capture) -> None:
     _, out, _ = fdhil("history", shop.path, "--json", capsys=capsys)
     assert [row["revision"] for row in json.loads(out)["revisions"] if row["axis"] == "Y"] == [1, 2, 3, 4]
     code, _, err = fdhil("status", shop.path, capsys=capsys)

@@ -9,9 +9,9 @@ import pytest
 
 from fdhil import correction
 from fdhil.arming.guard_settings import settings_of
-from fdhil.cia402 import pack
+from fdhil.cia402 import pack_pdo
 from fdhil.prediction.contour import contour_error_um
-from fdhil.records import Float, Parameters, Trajectory, frozen, rms
+from fdhil.records import Float, Parameters, Trajectory, compute_rms, freeze_array
 from tests.dressed.wardrobe import LED, OUTFITS, Outfit, dressed, started
 from tests.sim.bench_twin import PERIOD_S, TwinInHand, corner, trajectory
 
@@ -34,13 +34,13 @@ def played(twin: TwinInHand, demand: Trajectory, path: Float, offset_um: dict[st
         following = len(table) + DELAY  # the row whose target has just been sent
         for pdo, increments in senders:
             value = round(increments[following]) if following < increments.size else 0
-            twin.machine.receive("can0", (pdo.cob_id, pack(pdo.entries, [value])))
+            twin.machine.receive("can0", (pdo.cob_id, pack_pdo(pdo.entries, [value])))
 
     twin.each_cycle = each_cycle
     twin.machine.nc.play("cut", demand)
     twin.run_until("finished")
     actual = np.array(table)[: len(path)]
-    return rms(contour_error_um(path, actual, PERIOD_S))
+    return compute_rms(contour_error_um(path, actual, PERIOD_S))
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -56,7 +56,7 @@ def test_a_corrected_cut_is_better(outfit: Outfit, tmp_path: Path) -> None:
     if outfit.on_line:
         after = played(twin, demand, path, dict(planned.offset_um))
     else:
-        moved = {axis: frozen(demand.position_mm[axis] + planned.offset_um[axis] * 1e-3) for axis in demand.axes}
+        moved = {axis: freeze_array(demand.position_mm[axis] + planned.offset_um[axis] * 1e-3) for axis in demand.axes}
         after = played(twin, Trajectory(PERIOD_S, demand.time_s, moved, demand.rapid, demand.line), path)
     assert before > 20
     assert after < before / 10

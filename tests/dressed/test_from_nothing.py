@@ -13,25 +13,25 @@ import pytest
 from fdhil import config as machine_config
 from fdhil import correction
 from fdhil.arming.guard_settings import settings_of
-from fdhil.cia402 import pack
+from fdhil.cia402 import pack_pdo
 from fdhil.cli.demo.toml import to_toml
 from fdhil.commissioning.config_check import check_machine
 from fdhil.commissioning.record import save_record
 from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
 from fdhil.errors import DriveFault
-from fdhil.guard import core
-from fdhil.guard.frames import Listener
-from fdhil.guard.path import CorrectedPath
-from fdhil.guard.protocol import Mode
-from fdhil.guard.state import Inputs, Output, Request, initial
+from fdhil.guard import guard_step
+from fdhil.guard.corrected_path import CorrectedPath
+from fdhil.guard.frame_monitor import FrameMonitor
+from fdhil.guard.guard_protocol import Mode
+from fdhil.guard.guard_state import GuardRequest, StepInputs, StepOutput, make_initial_state
 from fdhil.records import Float, Parameters, Trajectory
 from tests.bench import AXIS, bench_document
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 from tests.dressed.test_set_up import on_a_bus, quick
 from tests.dressed.wardrobe import OUTFITS, Outfit, started
 from tests.drivers.peer import DrivePeer
-from tests.guard.machine import FACTS_GIVEN
+from tests.guard.simulated_bus import FACTS_GIVEN
 from tests.sim.bench_twin import PERIOD_S, TwinInHand, smooth, trajectory
 from tests.sim.rig import NO_NOISE
 
@@ -105,9 +105,9 @@ class Guarded:
 
     def __init__(self, twin: TwinInHand, config: MachineConfig, folder: Path, path: CorrectedPath) -> None:
         self.settings = settings_of(config, "can0", folder, "")
-        self.listener, self.state = Listener(self.settings), initial(self.settings)
-        self.twin, self.path, self.outputs = twin, path, list[Output]()
-        self.request: Request | None = None
+        self.listener, self.state = FrameMonitor(self.settings), make_initial_state(self.settings)
+        self.twin, self.path, self.outputs = twin, path, list[StepOutput]()
+        self.request: GuardRequest | None = None
         self.heard = len(twin.wire)
         self.tick = 0
         twin.each_cycle = self.turn
@@ -118,20 +118,20 @@ class Guarded:
             if can_id == 0x080:
                 self._decide(data)
             else:
-                self.listener.take(can_id, data, self.tick * PERIOD_S)
+                self.listener.take_frame(can_id, data, self.tick * PERIOD_S)
         self.heard = len(self.twin.wire)
 
     def _decide(self, sync: bytes) -> None:
         self.tick += 1
         now_s = self.tick * PERIOD_S
-        axes, bus = self.listener.at_sync(sync, now_s, now_s)
-        inputs = Inputs(True, axes, bus, alarms=self.listener.alarms(), path=self.path, request=self.request)
+        axes, bus = self.listener.close_sync_cycle(sync, now_s, now_s)
+        inputs = StepInputs(True, axes, bus, alarms=self.listener.take_alarms(), path=self.path, request=self.request)
         self.request = None
-        self.state, output = core.step(self.state, inputs, self.settings)
+        self.state, output = guard_step.step_guard(self.state, inputs, self.settings)
         self.outputs.append(output)
         if output.offsets is not None:
             for axis, offset in zip(self.settings.axes, output.offsets, strict=True):
-                self.twin.machine.receive("can0", (axis.offset.cob_id, pack(axis.offset.entries, [offset])))
+                self.twin.machine.receive("can0", (axis.offset.cob_id, pack_pdo(axis.offset.entries, [offset])))
 
 
 def to_and_fro() -> Trajectory:
@@ -171,7 +171,7 @@ def corrected_on_line(machine: MachineConfig, config: MachineConfig, folder: Pat
     before = off_path_um(twin, demand)
     guard = Guarded(twin, config, folder, path)
     twin.run(200)
-    guard.request = Request("arm", True, PROGRAM, FACTS_GIVEN)
+    guard.request = GuardRequest("arm", True, PROGRAM, FACTS_GIVEN)
     twin.run(20)
     assert guard.state.mode is Mode.ARMED, guard.outputs[-20:]
     after = off_path_um(twin, demand)

@@ -24,7 +24,7 @@ from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
 from fdhil.drivers.can.logged_frame import BUS_ERROR, FD_LENGTHS, LoggedFrame, LogHeader
 from fdhil.errors import RecordingError
 from fdhil.store import suffixes
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 
 FORMATS = tuple(suffixes.BUS_LOGS.values())
 CANDUMP = """\

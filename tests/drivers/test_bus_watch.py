@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdhil.cia402 import emcy_text
+from fdhil.cia402 import describe_emergency
 from fdhil.drivers.can.frames import frames_of
 from fdhil.drivers.can.node_watch import NodeWatch
 from fdhil.drivers.can.sync_grid import LONGEST_SILENCE_S, SyncGrid
@@ -299,7 +299,7 @@ def test_a_boot_and_a_lost_state_are_noticed() -> None:
     ("code", "text"), [(0x8130, "heartbeat or life guarding lost"), (0x3210, "voltage"), (0x0100, "unknown")]
 )
 def test_emergency_texts(code: int, text: str) -> None:
-    assert emcy_text(code) == text
+    assert describe_emergency(code) == text
 
 
 def test_a_sync_that_stops_is_noticed_once() -> None:

@@ -12,7 +12,7 @@ from fdhil import config as configuration
 from fdhil.drivers.demand_recorder import DemandRecorder, Gap
 from fdhil.errors import ConfigError, RecordingError
 from fdhil.program import load_trajectory, write_demand_csv
-from fdhil.records import AxisSamples, Float, Notice, frozen, frozen_ints
+from fdhil.records import AxisSamples, Float, Notice, freeze_array, freeze_integers
 from tests.bench import bench_config, bench_document
 
 PATH = np.concatenate([np.zeros(500), np.linspace(0.0, 10.0, 301), np.full(3000, 10.0)])
@@ -20,8 +20,8 @@ PATH = np.concatenate([np.zeros(500), np.linspace(0.0, 10.0, 301), np.full(3000,
 
 def samples(axis: str, demand: Float, ticks: Sequence[int]) -> AxisSamples:
     tick = np.array(ticks, dtype=np.int64)
-    values, rest = frozen(demand[tick]), frozen(np.zeros(tick.size))
-    return AxisSamples(axis, frozen_ints(tick), values, values, rest, rest, None, rest, frozen_ints(rest))
+    values, rest = freeze_array(demand[tick]), freeze_array(np.zeros(tick.size))
+    return AxisSamples(axis, freeze_integers(tick), values, values, rest, rest, None, rest, freeze_integers(rest))
 
 
 def feed(recorder: DemandRecorder, lost: Sequence[int] = (), until: int = PATH.size) -> None:

@@ -12,15 +12,17 @@ from fdhil.drivers.cia402.drive import InputSamples
 from fdhil.drivers.moves import load_event_source
 from fdhil.drivers.moves.digital_input import DigitalInputG0
 from fdhil.drivers.moves.inferred import InferredG0
-from fdhil.records import AxisSamples, Float, MoveEvent, MoveKind, NcState, TickTimes, frozen, frozen_ints
+from fdhil.records import AxisSamples, Float, MoveEvent, MoveKind, NcState, TickTimes, freeze_array, freeze_integers
 from tests.drivers.wire import machine
 
 
 def samples(demand_mm: Float, first: int = 0, axis: str = "X") -> AxisSamples:
     n = demand_mm.size
-    zeros = frozen(np.zeros(n))
-    ticks = frozen_ints(np.arange(first, first + n))
-    return AxisSamples(axis, ticks, frozen(demand_mm), zeros, zeros, zeros, None, zeros, frozen_ints(np.zeros(n)))
+    zeros = freeze_array(np.zeros(n))
+    ticks = freeze_integers(np.arange(first, first + n))
+    return AxisSamples(
+        axis, ticks, freeze_array(demand_mm), zeros, zeros, zeros, None, zeros, freeze_integers(np.zeros(n))
+    )
 
 
 def move(distance_mm: float, speed_mm_s: float, acceleration: float = 4000.0) -> Float:
@@ -73,7 +75,9 @@ def test_blocks_do_not_matter(block: int) -> None:
 
 def test_the_ncs_signal_is_taken_edge_by_edge() -> None:
     source = DigitalInputG0("X", machine())
-    record = InputSamples("X", frozen_ints(np.arange(0, 60, 10)), frozen_ints([0, 0, 1 << 16, 1 << 16 | 1, 1, 0]))
+    record = InputSamples(
+        "X", freeze_integers(np.arange(0, 60, 10)), freeze_integers([0, 0, 1 << 16, 1 << 16 | 1, 1, 0])
+    )
     assert [(e.kind, e.tick) for e in source.feed(record)] == [(MoveKind.RAPID, 10), (MoveKind.REST, 40)]
     assert source.feed(InputSamples("Y", record.tick, record.inputs)) == []
 
@@ -85,8 +89,8 @@ def test_contract(name: str) -> None:
         samples(np.zeros(0)),
         samples(np.zeros(10)),
         samples(move(400, 500), axis="Y"),
-        InputSamples("X", frozen_ints([]), frozen_ints([])),
-        InputSamples("Y", frozen_ints([0, 10, 20, 30]), frozen_ints([0, *[1 << 16] * 3])),
+        InputSamples("X", freeze_integers([]), freeze_integers([])),
+        InputSamples("Y", freeze_integers([0, 10, 20, 30]), freeze_integers([0, *[1 << 16] * 3])),
     ):
         assert source.feed(record) == []
 
@@ -102,13 +106,13 @@ def test_every_listed_source_tells_a_rapid_in_its_own_name(name: str) -> None:
     events: list[MoveEvent] = []
     for first in range(0, demand.size, 50):
         ticks = np.arange(first, min(first + 50, demand.size))
-        events += source.feed(TickTimes(frozen_ints(ticks), frozen_ints(ticks * 1_000_000)))
+        events += source.feed(TickTimes(freeze_integers(ticks), freeze_integers(ticks * 1_000_000)))
         for tick in ticks[::10].tolist():
             said = MoveKind.RAPID if high[tick] else MoveKind.REST
             events += source.feed(NcState(tick * 1_000_000, 5_000_000, said))
         events += source.feed(samples(demand[ticks], first))
         inputs = np.where(high[ticks[::10]], 1 << config.g0.input_bit, 0)
-        events += source.feed(InputSamples("X", frozen_ints(ticks[::10]), frozen_ints(inputs)))
+        events += source.feed(InputSamples("X", freeze_integers(ticks[::10]), freeze_integers(inputs)))
     assert [event.kind for event in events] == [MoveKind.RAPID, MoveKind.REST] * 2
     assert {(event.axis, event.source) for event in events} == {("X", name)}
     edges = np.flatnonzero(np.diff(high))

@@ -63,7 +63,7 @@ async def test_a_bus_on_which_nothing_is_heard_is_listened_to_and_gets_no_frame(
     settings = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as drive:
         async with open_machine(settings) as source:
-            assert source.counters()["frames"] == 0
+            assert source.get_counters()["frames"] == 0
         assert drive.recv(0) is None
 
 

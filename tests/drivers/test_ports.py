@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import CanBus as BusSettings
-from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.bus import ListeningBus
 from fdhil.drivers.can.filters import drive_filters
 from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, FrameRing
 from fdhil.drivers.can.ports import PORTS
@@ -87,7 +87,7 @@ def test_frames_come_in_order_however_the_stream_is_cut(hub: MiniHub) -> None:
         b"< frame 00000123 1700000000.000300 AA BB ><error junk>< frame xyz 1 00 >< error 20000040 1700000000.0004 >"
         b"< frame 281 1700000000.000500 01                     >"
     )
-    with CanBus("can0", settings_of(hub.port)) as bus:
+    with ListeningBus("can0", settings_of(hub.port)) as bus:
         for k in range(0, len(text), 7):
             hub.say(text[k : k + 7])
         wait_for(lambda: bus.counters()["frames"] >= 5)
@@ -101,7 +101,7 @@ def test_frames_come_in_order_however_the_stream_is_cut(hub: MiniHub) -> None:
 
 
 def test_nothing_is_sent_unless_the_bus_was_opened_for_it(hub: MiniHub) -> None:
-    with CanBus("can0", settings_of(hub.port)) as bus:
+    with ListeningBus("can0", settings_of(hub.port)) as bus:
         assert not hasattr(bus, "send")
         assert not any(hasattr(port, "send") for port in PORTS.values())
 
@@ -117,7 +117,7 @@ def test_what_is_sent_is_socketcand(hub: MiniHub) -> None:
 
 
 def test_a_hub_that_hangs_up_is_an_end_not_silence(hub: MiniHub) -> None:
-    with CanBus("can0", settings_of(hub.port)) as bus:
+    with ListeningBus("can0", settings_of(hub.port)) as bus:
         hub.hang_up()
         wait_for(lambda: bus.ended is not None)
         assert bus.ended == "the CAN hub ended the connection"
@@ -127,24 +127,24 @@ def test_a_hub_that_hangs_up_is_an_end_not_silence(hub: MiniHub) -> None:
 def test_what_is_no_hub_is_said(greetings: tuple[bytes, ...]) -> None:
     hub = MiniHub(greetings)
     with pytest.raises(ConnectError, match="check host, port and channel"):
-        CanBus("can0", settings_of(hub.port))
+        ListeningBus("can0", settings_of(hub.port))
     hub.close()
 
 
 def test_nobody_there_is_said() -> None:
     with held_port() as port, pytest.raises(ConnectError, match="cannot be reached"):
-        CanBus("can0", settings_of(port))
+        ListeningBus("can0", settings_of(port))
 
 
 def test_an_interface_that_is_not_there_is_said() -> None:
     with pytest.raises(ConnectError, match=r"ip link|no CAN"):
-        CanBus("can9", BusSettings(interface="socketcan", channel="nocan9"))
+        ListeningBus("can9", BusSettings(interface="socketcan", channel="nocan9"))
 
 
 @pytest.mark.usefixtures("real_time")
 def test_a_full_ring_holds_the_hub_back(hub: MiniHub) -> None:
     line = b"< frame 181 1700000000.000100 1122334455667788 >"
-    with CanBus("can0", settings_of(hub.port), ring_frames=64) as bus:
+    with ListeningBus("can0", settings_of(hub.port), ring_frames=64) as bus:
         sender = threading.Thread(target=hub.say, args=(line * 20_000,))
         sender.start()
         got = 0
@@ -170,7 +170,7 @@ def test_virtual_bus_gives_what_it_got() -> None:
 
 
 def test_a_hub_s_frames_pass_the_filters_too(hub: MiniHub) -> None:
-    with CanBus("can0", settings_of(hub.port), filters=drive_filters([1], [0x33])) as bus:
+    with ListeningBus("can0", settings_of(hub.port), filters=drive_filters([1], [0x33])) as bus:
         for name in ("080", "181", "182", "033", "034", "00000001"):
             hub.say(f"< frame {name} 1700000000.0001 11 >".encode())
         hub.say(b"< error 20000040 1700000000.0002 >")

@@ -17,13 +17,13 @@ from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import CanBus as BusSettings
 from fdhil.config import parse
 from fdhil.drivers.bus_source import BusSource
-from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.bus import ListeningBus
 from fdhil.drivers.can.filters import drive_filters
 from fdhil.drivers.can.frames import EXTENDED_FLAG, REMOTE_FLAG, frames_of
 from fdhil.drivers.can.python_can import LISTEN_ONLY, arguments
 from fdhil.drivers.cia402.bus_decoder import BusDecoder
 from fdhil.errors import ConfigError, ConnectError
-from fdhil.guard.transmit_socket import connect_bus
+from fdhil.guard.transmit_socket import open_transmit_socket
 from fdhil.records import AxisSamples, Notice
 from fdhil.sim.wire.attach import attach
 from tests.bench import bench_document
@@ -78,7 +78,7 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 
 def test_a_serial_adapter_is_listened_to_and_acknowledges_nothing(adapter: SerialAdapter) -> None:
-    with CanBus("can0", settings_of(adapter)) as bus:
+    with ListeningBus("can0", settings_of(adapter)) as bus:
         assert "S8\r" in (said := adapter.heard("L"))  # 1 Mbit/s
         assert "O\r" not in said
         adapter.say("t0800", "t18181122334455667788", "T000001232AABB", "r2810")
@@ -93,12 +93,12 @@ def test_a_serial_adapter_is_listened_to_and_acknowledges_nothing(adapter: Seria
 
 
 def test_on_demand_it_acknowledges(adapter: SerialAdapter) -> None:
-    with CanBus("can0", settings_of(adapter, listen_only=False, bitrate=500_000)):
+    with ListeningBus("can0", settings_of(adapter, listen_only=False, bitrate=500_000)):
         assert "S6\r" in adapter.heard("O")
 
 
 def test_the_drives_frames_alone(adapter: SerialAdapter) -> None:
-    with CanBus("can0", settings_of(adapter, frames="drives"), filters=drive_filters([1], [0x33])) as bus:
+    with ListeningBus("can0", settings_of(adapter, frames="drives"), filters=drive_filters([1], [0x33])) as bus:
         adapter.say("t0800", "t1811AA", "t1821BB", "t0331CC", "t0341DD", "t7011EE", "T000000011FF", "t0011FF")
         wait_for(lambda: bus.counters()["frames"] >= 5)
         got = bus.drain()["id"].tolist()
@@ -106,13 +106,13 @@ def test_the_drives_frames_alone(adapter: SerialAdapter) -> None:
 
 
 def test_an_adapter_that_talks_nonsense_or_goes_is_an_end_not_silence(adapter: SerialAdapter) -> None:
-    with CanBus("can0", settings_of(adapter)) as bus:
+    with ListeningBus("can0", settings_of(adapter)) as bus:
         adapter.say("t1zz0")
         wait_for(lambda: bus.ended is not None)
         assert bus.ended is not None
         assert "is gone, or sent an invalid frame" in bus.ended
     gone = SerialAdapter()
-    with CanBus("can0", settings_of(gone)) as bus:
+    with ListeningBus("can0", settings_of(gone)) as bus:
         gone.close()
         wait_for(lambda: bus.ended is not None)
 
@@ -161,7 +161,7 @@ def rows_of(records: Iterable[object]) -> npt.NDArray[np.float64]:
 def test_an_adapter_that_is_not_there_is_said(interface: str) -> None:
     settings = BusSettings.model_validate({"interface": interface, "channel": "0"})
     with pytest.raises(ConnectError, match=f"the {interface} adapter 0 cannot be opened .*or use SocketCAN") as said:
-        CanBus("can0", settings)
+        ListeningBus("can0", settings)
     assert "\n" not in str(said.value)
 
 
@@ -185,7 +185,7 @@ def test_nothing_is_ever_sent_through_them(interface: str) -> None:
     with pytest.raises(ConnectError, match="does not send on"):
         TransmitBus("can0", settings)
     with pytest.raises(ConnectError, match="for listening only"):
-        connect_bus("can0", settings)
+        open_transmit_socket("can0", settings)
     with pytest.raises(ConnectError, match="do not support the interface"):
         attach("can0", settings)
 

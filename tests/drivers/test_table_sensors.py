@@ -21,7 +21,7 @@ from fdhil.drivers.table.arrivals import Arrivals
 from fdhil.drivers.table.modbus_encoder import ModbusEncoder
 from fdhil.drivers.table.tpdo_encoder import SILENT_TICKS, TpdoEncoder
 from fdhil.errors import ConnectError, DeviceTimeout, ProtocolError
-from fdhil.records import Notice, TableSamples, TickTimes, frozen_ints
+from fdhil.records import Notice, TableSamples, TickTimes, freeze_integers
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
 from fdhil.sim.wire.sensor_wires import SensorWires
 from tests.bench import bench_document
@@ -38,7 +38,7 @@ def ticked(frames: list[tuple[int, int, bytes]], last_tick: int = 0) -> Ticked:
         np.array([len(one) for _, _, one in frames], np.uint8),
         np.array(data, np.uint64),
         np.array([tick for tick, _, _ in frames], np.int64),
-        TickTimes(frozen_ints([]), frozen_ints([])),
+        TickTimes(freeze_integers([]), freeze_integers([])),
         max([last_tick, *(tick for tick, _, _ in frames)]),
     )
 
@@ -46,7 +46,7 @@ def ticked(frames: list[tuple[int, int, bytes]], last_tick: int = 0) -> Ticked:
 def clock(ticks: int = 4000) -> TickClock:
     """Return a SYNC count whose tick k came at k ms."""
     found = TickClock(1e-3)
-    found.add(TickTimes(frozen_ints(np.arange(ticks)), frozen_ints(np.arange(ticks) * MS)))
+    found.add(TickTimes(freeze_integers(np.arange(ticks)), freeze_integers(np.arange(ticks) * MS)))
     return found
 
 
@@ -197,7 +197,7 @@ async def test_a_module_on_modbus_is_placed_between_question_and_answer() -> Non
         assert await encoder.poll(TickClock(1e-3)) == []  # without SYNC there is no place on its count
         ticks = TickClock(1e-3)
         begun = encoder.link.asked_ns
-        ticks.add(TickTimes(frozen_ints(np.arange(4000)), frozen_ints(begun + np.arange(4000) * MS)))
+        ticks.add(TickTimes(freeze_integers(np.arange(4000)), freeze_integers(begun + np.arange(4000) * MS)))
         (sample,) = await encoder.poll(ticks)
         assert await encoder.reading() == "44.0000 mm"
         encoder.link.close()

@@ -19,7 +19,7 @@ from fdhil.drivers import MachineSource, Record, open_machine
 from fdhil.errors import ConnectError, DriveFault, ProtocolError
 from fdhil.records import AxisSamples, MoveEvent, MoveKind, Notice, Temperature, VoltageSamples
 from tests.bench import bench_toml
-from tests.daemon.shop import patient
+from tests.daemon.machine_rig import patient
 from tests.drivers.wire import machine
 
 HELD_UP = {"SyncLost", "SyncJitter", "HeartbeatLost", "BusSilent"}  # what is true of a machine whose process sleeps
@@ -138,7 +138,7 @@ async def test_a_rapid_is_recorded_whole(twin: Twin) -> None:
         twin.tell(command="trace", file=str(trace))
         twin.tell(command="play", file=str(rapid(twin.folder)))
         records = await gather(source, moved)
-        counters = source.counters()
+        counters = source.get_counters()
     await asyncio.to_thread(twin.event, "finished")
     assert counters["lost"] == 0
     assert {r.code for r in records if isinstance(r, Notice)} <= HELD_UP

@@ -45,7 +45,7 @@ async def peer_of(name: str) -> AsyncIterator[tuple[SensorPeer | None, MachineCo
             line.unplug()
         return
     async with sensor_peer() as peer:
-        peer.served = getattr(tables.load(tables.VOLTAGE_SOURCES, name), "example_registers", ())
+        peer.served = getattr(tables.load_entry(tables.VOLTAGE_SOURCES, name), "example_registers", ())
         yield peer, config_of(name, peer.port)
 
 
@@ -74,11 +74,11 @@ def test_the_voltage_comes_from_one_place_alone(name: str) -> None:
     """``drive`` is an object in a TPDO; every other source is a sensor of its own that the machine polls."""
     config = config_of(name)
     profile = load_profile(config.axis["X"].drive)
-    source = tables.load(tables.VOLTAGE_SOURCES, name)("X", config)
+    source = tables.load_entry(tables.VOLTAGE_SOURCES, name)("X", config)
     separate = name in SEPARATE
     assert config.axis["X"].voltage.separate == separate
     assert list(sensors_of("X", config)) == ["voltage"] * separate
-    assert any(key.endswith(".X.samples") for key in MachineSource(config).counters()) == separate
+    assert any(key.endswith(".X.samples") for key in MachineSource(config).get_counters()) == separate
     assert VoltageObject("X", config).key == (None if separate else profile.voltage)
     if not separate:
         assert (source.key, source.v_per_count) == (profile.voltage, profile.voltage_v_per_count)

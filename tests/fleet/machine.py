@@ -44,7 +44,7 @@ class Machine:
 
     def record(self, count: int, axes: tuple[str, ...] = AXES, parameters: Mapping[str, float] | None = None) -> int:
         """Record ``count`` rounds of each axis: a window, a set, a skill, one notice per round; return the number."""
-        changed = Parameters.of(BENCH.as_dict() | dict(parameters or {}))
+        changed = Parameters.from_mapping(BENCH.as_dict() | dict(parameters or {}))
         outcomes: list[Outcome] = []
         for _ in range(count):
             self._tick += 1000
@@ -54,7 +54,7 @@ class Machine:
                 outcomes.append(published(self._tick // 1000, axis, changed))
                 outcomes.append(Skill(axis, self._tick, 1.5, 4.0, 2.0, 1.6))
             outcomes.append(Notice("Drift", "minor", "Friction rises; look at the lubrication.", axes[0], self._tick))
-        assert self.store.keep(outcomes) == []
+        assert self.store.store_outcomes(outcomes) == []
         return len(outcomes)
 
     def close(self) -> None:

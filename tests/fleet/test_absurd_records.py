@@ -69,7 +69,7 @@ async def test_no_record_of_one_machine_breaks_the_questions_about_all(database:
     for k in range(6):
         machine = Machine(written(tmp_path / str(k), f"mill-{k}"))
         machine.record(3)
-        machine.store.acknowledge({"up_to": 1, "by": "Anna"})
+        machine.store.store_acknowledgement({"up_to": 1, "by": "Anna"})
         machine.close()
         sound += told_by(machine)
     await gather(fleet, [*sound, *cases(sound)])

@@ -10,7 +10,9 @@ import pytest
 pytestmark = pytest.mark.usefixtures("processes")
 
 
-@pytest.mark.parametrize("module", ["fdhil.daemon.service", "fdhil.guard.process", "fdhil.cli.main", "fdhil.cli.fleet"])
+@pytest.mark.parametrize(
+    "module", ["fdhil.daemon.daemon_service", "fdhil.guard.guard_process", "fdhil.cli.main", "fdhil.cli.fleet"]
+)
 def test_it_runs_without_the_extra(module: str) -> None:
     code = f"import sys, {module}; print([name for name in ('nats', 'psycopg', 'distributed') if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -9,7 +9,7 @@ import pytest
 
 from fdhil.errors import StoreError
 from fdhil.fleet.export import key_of, pseudonym
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 from tests.fleet.machine import Machine, written
 from tests.fleet.servers import Postgres
 from tests.fleet.works import fleet_of, gather, told_by
@@ -42,7 +42,7 @@ async def test_no_name_no_text_and_no_time_is_in_it(
         labels = {"type": "V-800", "works": "Halle 7"}
         machine = Machine(written(tmp_path / name, name, labels=labels, axis_labels={"X": {"screw": "A"}}))
         machine.record(3)
-        machine.store.acknowledge({"up_to": 1, "by": "anna"})
+        machine.store.store_acknowledgement({"up_to": 1, "by": "anna"})
         machine.close()
         messages += told_by(machine)
     await gather(works, messages)

@@ -18,7 +18,7 @@ from fdhil.cli.doctor.uplink import _outbox
 from fdhil.errors import ConfigError, StoreError
 from fdhil.records import Notice
 from fdhil.store import outbox
-from fdhil.store.history import FILE_NAME, History
+from fdhil.store.history import HISTORY_FILE_NAME, History
 from fdhil.store.outbox import OutboxReader, Position, read_position, write_position
 from tests.bench import bench_document
 from tests.fleet.machine import Machine, written
@@ -38,7 +38,7 @@ def reading(machine: Machine) -> Iterator[OutboxReader]:
 
 
 def change(machine: Machine, statement: str) -> None:
-    with closing(sqlite3.connect(machine.config.store.directory / FILE_NAME)) as db, db:
+    with closing(sqlite3.connect(machine.config.store.directory / HISTORY_FILE_NAME)) as db, db:
         db.execute(statement)
 
 
@@ -55,7 +55,7 @@ def test_everything_that_is_recorded_is_entered_in_order(machine: Machine) -> No
 
 def test_an_acknowledgement_is_told_too(machine: Machine) -> None:
     machine.record(1)
-    machine.store.acknowledge({"up_to": 1, "by": "Anna"})
+    machine.store.store_acknowledgement({"up_to": 1, "by": "Anna"})
     with reading(machine) as reader:
         assert reader.entries(0, 1000)[-1].kind == "acknowledgement"
 
@@ -103,7 +103,7 @@ def often(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("running", [True, False])
 def test_an_older_copy_of_the_history_is_sent_under_an_identity_of_its_own(running: bool, machine: Machine) -> None:
     machine.record(1)
-    history = machine.config.store.directory / FILE_NAME
+    history = machine.config.store.directory / HISTORY_FILE_NAME
     shutil.copy(history, history.with_name("backup"))
     machine.record(2)
     with reading(machine) as reader:
@@ -112,7 +112,7 @@ def test_an_older_copy_of_the_history_is_sent_under_an_identity_of_its_own(runni
     write_position(folder_of(machine), sent)
     if running:
         history.with_name("backup").replace(history)
-        assert [notice.code for notice in machine.store.keep([])] == ["StoreReplaced"]
+        assert [notice.code for notice in machine.store.store_outcomes([])] == ["StoreReplaced"]
     else:
         machine.close()
         history.with_name("backup").replace(history)
@@ -120,7 +120,7 @@ def test_an_older_copy_of_the_history_is_sent_under_an_identity_of_its_own(runni
             reader.start(sent)
         assert [trouble.code for trouble in _outbox(machine.config)] == ["UplinkOutbox"]
         assert machine.store.open() == []
-    machine.store.keep([Notice("A", "minor", "after")])
+    machine.store.store_outcomes([Notice("A", "minor", "after")])
     with reading(machine) as reader:
         assert reader.store != sent.store
         assert reader.start(sent) == Position(reader.store)
@@ -233,7 +233,7 @@ def older(tmp_path: Path) -> Path:
     file = written(tmp_path, windows="some", every_window=2)
     machine = Machine(file, quiet=True)
     machine.record(4)
-    machine.store.acknowledge({"up_to": 1, "by": "Anna"})
+    machine.store.store_acknowledgement({"up_to": 1, "by": "Anna"})
     machine.close()
     return file
 
@@ -262,7 +262,7 @@ def test_what_was_recorded_before_is_told_once_in_its_order(older: Path) -> None
 def test_a_clock_that_was_set_back_turns_nothing_round(older: Path) -> None:
     config = machine_config.load(older)
     assert config.uplink is not None
-    with closing(sqlite3.connect(config.store.directory / FILE_NAME)) as db:
+    with closing(sqlite3.connect(config.store.directory / HISTORY_FILE_NAME)) as db:
         db.execute("UPDATE revisions SET wall_s = 1000 - id")
         outbox.Outbox(config.uplink, config.uplink_directory).begin(db)
         rows = db.execute("SELECT row FROM outbox WHERE of = 'revisions' ORDER BY id").fetchall()

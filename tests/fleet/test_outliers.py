@@ -10,7 +10,7 @@ import pytest
 
 from fdhil.fleet.mixed import shared_slopes
 from fdhil.fleet.outliers import BOUNDS, Course, Sisters, judge, of_machines
-from fdhil.records import Float, frozen
+from fdhil.records import Float, freeze_array
 from studies import sisters
 from studies.pages import FOLDER
 from studies.sisters import SETS, single
@@ -28,7 +28,7 @@ def outliers(courses: list[Course]) -> list[str]:
 
 
 def worn(course: Course, factor: float) -> Course:
-    return replace(course, values=frozen(course.values * factor))
+    return replace(course, values=freeze_array(course.values * factor))
 
 
 def test_a_worn_axis_is_named() -> None:
@@ -62,12 +62,12 @@ def test_a_cold_hall_is_no_outlier() -> None:
     rng = np.random.default_rng(2)
     courses = fleet(rng, spread=0.01)
     cold = courses[0]
-    at_c = frozen(cold.temperatures_c - float(np.median(cold.temperatures_c)) - 5.0)
-    values = frozen(0.05 * (1 - 0.01 * (at_c - 20.0)))
+    at_c = freeze_array(cold.temperatures_c - float(np.median(cold.temperatures_c)) - 5.0)
+    values = freeze_array(0.05 * (1 - 0.01 * (at_c - 20.0)))
     courses[0] = replace(cold, values=values, temperatures_c=at_c)
     assert judged(courses).slope_per_k == pytest.approx(-0.01, rel=0.2)
     assert outliers(courses) == []
-    unknown = frozen(np.full(SETS, np.nan))
+    unknown = freeze_array(np.full(SETS, np.nan))
     blind = [replace(course, temperatures_c=unknown) for course in courses]
     assert judged(blind).levels[0].machine == "mill-0"
 
@@ -76,21 +76,23 @@ def test_an_old_machine_is_no_outlier_among_young_ones() -> None:
     """The effect of two more years follows from the history of each of the others."""
     rng = np.random.default_rng(6)
     courses = fleet(rng, spread=0.01, per_month=0.01)
-    age = frozen(48.0 + np.linspace(0.0, 1.0, SETS))
+    age = freeze_array(48.0 + np.linspace(0.0, 1.0, SETS))
     courses[0] = replace(
-        courses[0], ages_months=age, values=frozen(0.05 * (1 - 0.01 * (courses[0].temperatures_c - 20.0) + 0.01 * age))
+        courses[0],
+        ages_months=age,
+        values=freeze_array(0.05 * (1 - 0.01 * (courses[0].temperatures_c - 20.0) + 0.01 * age)),
     )
     assert judged(courses).slope_per_month == pytest.approx(0.01, rel=0.3)
     assert outliers(courses) == []
-    young = [replace(course, ages_months=frozen(np.linspace(0.0, 1.0, SETS))) for course in courses]
+    young = [replace(course, ages_months=freeze_array(np.linspace(0.0, 1.0, SETS))) for course in courses]
     assert judged(young).levels[0].machine == "mill-0"
 
 
 def test_where_no_temperature_moves_an_unknown_slope_accuses_nobody() -> None:
     """Each hall has a constant temperature: the effect of 30 K is unknown and may explain the coldest machine."""
     rng = np.random.default_rng(7)
-    courses = [replace(c, temperatures_c=frozen(np.full(SETS, 22.0))) for c in fleet(rng, 8, 0.002, per_k=0.0)]
-    courses[0] = worn(replace(courses[0], temperatures_c=frozen(np.full(SETS, -8.0))), 1.3)
+    courses = [replace(c, temperatures_c=freeze_array(np.full(SETS, 22.0))) for c in fleet(rng, 8, 0.002, per_k=0.0)]
+    courses[0] = worn(replace(courses[0], temperatures_c=freeze_array(np.full(SETS, -8.0))), 1.3)
     assert outliers(courses) == []
     courses[0] = replace(courses[0], temperatures_c=courses[1].temperatures_c)
     assert outliers(courses) == ["mill-0"]
@@ -99,7 +101,7 @@ def test_where_no_temperature_moves_an_unknown_slope_accuses_nobody() -> None:
 def test_an_axis_without_a_thermometer_is_judged_within_what_others_have() -> None:
     courses = fleet(np.random.default_rng(8), spread=0.005)
     warm = 1 - 0.01 * (35.0 - float(np.median(courses[2].temperatures_c)))  # the warmest, if one could see it
-    courses[2] = worn(replace(courses[2], temperatures_c=frozen(np.full(SETS, np.nan))), warm)
+    courses[2] = worn(replace(courses[2], temperatures_c=freeze_array(np.full(SETS, np.nan))), warm)
     assert outliers(courses) == []
     courses[2] = worn(courses[2], 2.5)
     assert outliers(courses) == ["mill-2"]
@@ -121,9 +123,9 @@ def _axis(rng: np.random.Generator, per_k: float, range_k: float) -> tuple[Float
 def test_a_machine_with_a_hundred_times_the_sets_does_not_speak_for_all() -> None:
     rng = np.random.default_rng(9)
     courses = fleet(rng, spread=0.01)
-    at_c = frozen(np.tile(np.linspace(15.0, 35.0, 50), 10))
-    values = frozen(0.05 * (1 + 0.03 * (at_c - 25.0)))  # it alone gets stiffer as it warms
-    courses[0] = Course("mill-0", "X", values, at_c, frozen(np.zeros(500)), 1e-4)
+    at_c = freeze_array(np.tile(np.linspace(15.0, 35.0, 50), 10))
+    values = freeze_array(0.05 * (1 + 0.03 * (at_c - 25.0)))  # it alone gets stiffer as it warms
+    courses[0] = Course("mill-0", "X", values, at_c, freeze_array(np.zeros(500)), 1e-4)
     assert judged(courses).slope_per_k == pytest.approx(-0.01, rel=0.3)
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from fdhil.fleet import migrations
 from fdhil.fleet.message import Message, Record
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 from tests.fleet.machine import Machine, written
 from tests.fleet.servers import Postgres
 from tests.fleet.works import fleet_of, gather, keep, received_of, told_by
@@ -58,7 +58,7 @@ async def test_the_questions(
     machines: list[Machine], works: Path, database: Postgres, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     messages = [message for machine in machines for message in told_by(machine)]
-    machines[0].store.acknowledge({"up_to": 2, "by": "Anna"})
+    machines[0].store.store_acknowledgement({"up_to": 2, "by": "Anna"})
     messages += told_by(machines[0])[-1:]
     await gather(fleet_of(database, tmp_path), messages[:50])
     await gather(fleet_of(database, tmp_path), messages[30:])  # some of them twice

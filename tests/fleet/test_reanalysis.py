@@ -25,7 +25,7 @@ from fdhil.fleet.window_work import Method, code_digest
 from fdhil.fleet.workers import WindowCrew, workers
 from fdhil.pipeline import analyse
 from fdhil.records import Reason, WindowOutcome
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 from tests.fleet.machine import Machine, written
 from tests.fleet.servers import Postgres, children, listens, until
 from tests.fleet.works import fleet_of, gather, told_by
@@ -47,7 +47,7 @@ def works(database: Postgres, tmp_path: Path) -> Path:
             window = windows(0.003, 100 * k + seed, moves=2)[seed % 2]
             found = analyse(window, BEFORE)
             assert found.verdict.accepted
-            assert machine.store.keep([found if seed < EACH - 1 else refused(found)]) == []
+            assert machine.store.store_outcomes([found if seed < EACH - 1 else refused(found)]) == []
         machine.close()
         asyncio.run(gather(fleet_of(database, tmp_path), told_by(machine, with_windows=True)))
     file = tmp_path / "fleet.toml"
@@ -62,7 +62,7 @@ def refused(found: WindowOutcome) -> WindowOutcome:
     )
 
 
-def asked(capsys: pytest.CaptureFixture[str], code: int, *words: object) -> dict[str, Any]:
+def run_query(capsys: pytest.CaptureFixture[str], code: int, *words: object) -> dict[str, Any]:
     """Reanalyse without further processes, and return the document."""
     found, out, err = fdhil("fleet", "reanalyse", *map(str, words), "--workers", "0", "--json", capsys=capsys)
     assert (found, err) == (code, "")
@@ -75,7 +75,7 @@ def test_a_new_method_is_a_revision_beside_what_was_found(
     works: Path, database: Postgres, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = database.ask("SELECT * FROM fleet.records ORDER BY machine, message")
-    same = asked(capsys, 0, works, "--method", "least_squares")
+    same = run_query(capsys, 0, works, "--method", "least_squares")
     assert (same["windows"], same["without_config"], same["unreadable"]) == (12, 12, 0)
     assert {each["change"] for each in same["moved"]} == {0.0}  # the bits of the machine itself
     assert {each["windows"] for each in same["moved"]} == {10}
@@ -84,14 +84,14 @@ def test_a_new_method_is_a_revision_beside_what_was_found(
     ]
     assert {each["machine"] for each in same["listed"]} == {"mill-0", "mill-1"}
 
-    part = asked(capsys, 0, works, "--machine", "mill-1", "--method", "partial_moments")
+    part = run_query(capsys, 0, works, "--machine", "mill-1", "--method", "partial_moments")
     assert (part["revision"], part["windows"]) == (2, 6)
-    whole = asked(capsys, 0, works, "--method", "partial_moments")
+    whole = run_query(capsys, 0, works, "--method", "partial_moments")
     assert (whole["revision"], whole["windows"]) == (2, 12)
     of_ft = next(each for each in whole["moved"] if each["parameter"] == "ft")
     assert 0 < of_ft["off"] <= of_ft["most"]
     assert of_ft["unit"] == "N.m.s"
-    assert asked(capsys, 0, works, "--method", "partial_moments")["digest"] == whole["digest"] != same["digest"]
+    assert run_query(capsys, 0, works, "--method", "partial_moments")["digest"] == whole["digest"] != same["digest"]
     assert database.ask("SELECT * FROM fleet.records ORDER BY machine, message") == before
     assert database.ask("SELECT revision, count(*) FROM fleet.reanalysed GROUP BY 1 ORDER BY 1") == [(1, 12), (2, 12)]
 
@@ -102,15 +102,15 @@ def test_a_new_method_is_a_revision_beside_what_was_found(
 
 
 def test_the_time_and_the_axis_bound_it(works: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert asked(capsys, 0, works, "--until", "2020-01-01", "--method", "least_squares")["windows"] == 0
-    assert asked(capsys, 0, works, "--axis", "Y", "--method", "least_squares")["windows"] == 0
-    assert asked(capsys, 0, works, "--since", "2020-01-01", "--method", "least_squares")["windows"] == 12
+    assert run_query(capsys, 0, works, "--until", "2020-01-01", "--method", "least_squares")["windows"] == 0
+    assert run_query(capsys, 0, works, "--axis", "Y", "--method", "least_squares")["windows"] == 0
+    assert run_query(capsys, 0, works, "--since", "2020-01-01", "--method", "least_squares")["windows"] == 12
 
 
 def test_with_the_configuration_of_its_machine_a_window_is_weighed(
     works: Path, tmp_path: Path, database: Postgres, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = asked(capsys, 0, works, "--method", "least_squares", "--config", tmp_path / "1" / "machine.toml")
+    told = run_query(capsys, 0, works, "--method", "least_squares", "--config", tmp_path / "1" / "machine.toml")
     assert (told["windows"], told["without_config"]) == (12, 6)
     query = "SELECT DISTINCT machine, unexplained_um IS NULL FROM fleet.reanalysed ORDER BY 1"
     assert database.ask(query) == [("mill-0", True), ("mill-1", False)]
@@ -125,19 +125,19 @@ def test_what_cannot_be_read_is_told_and_tried_again(
     path = objects.path_of(tmp_path / "objects", name)
     content = path.read_bytes()
     path.write_bytes(content[:-100])
-    told = asked(capsys, 3, works, "--method", "least_squares")
+    told = run_query(capsys, 3, works, "--method", "least_squares")
     assert (told["windows"], told["unreadable"]) == (12, 1)
     assert ["damaged" in (each["error"] or "") for each in told["listed"]].count(True) == 1
-    assert asked(capsys, 3, works, "--method", "least_squares")["digest"] == told["digest"]
+    assert run_query(capsys, 3, works, "--method", "least_squares")["digest"] == told["digest"]
     path.write_bytes(content)
-    again = asked(capsys, 0, works, "--method", "least_squares")
+    again = run_query(capsys, 0, works, "--method", "least_squares")
     assert (again["windows"], again["unreadable"]) == (12, 0)
 
 
 def test_killed_in_the_middle_it_goes_on_where_it_was_to_the_same_bytes(
     works: Path, database: Postgres, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    whole = asked(capsys, 0, works, "--method", "least_squares")
+    whole = run_query(capsys, 0, works, "--method", "least_squares")
     alone = database.ask(ROWS)
     database.ask("TRUNCATE fleet.reanalyses RESTART IDENTITY CASCADE")
     code = f"""
@@ -160,7 +160,7 @@ slowly({str(works)!r})
         resumed(works, crew, lambda *far: told.append(far))
     assert told == [(k, 12 - done) for k in range(13 - done)]  # what was done is not done again
     assert database.ask(ROWS) == alone
-    assert asked(capsys, 0, works, "--method", "least_squares")["digest"] == whole["digest"]
+    assert run_query(capsys, 0, works, "--method", "least_squares")["digest"] == whole["digest"]
 
 
 def runs(pid: int) -> bool:
@@ -194,7 +194,7 @@ def cluster() -> Iterator[tuple[str, subprocess.Popen[bytes], subprocess.Popen[b
 def test_on_a_cluster_that_is_there_and_goes_away(
     works: Path, database: Postgres, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    alone = asked(capsys, 0, works, "--method", "least_squares")
+    alone = run_query(capsys, 0, works, "--method", "least_squares")
     database.ask("TRUNCATE fleet.reanalyses RESTART IDENTITY CASCADE")
     with cluster() as (address, scheduler, worker):
         command = [sys.executable, "-m", "fdhil.cli.main", "fleet", "reanalyse", str(works), "--scheduler", address]
@@ -249,5 +249,5 @@ def test_what_a_machine_told_that_is_no_number_spoils_no_report(
             f"""UPDATE fleet.records SET record = jsonb_set(record, '{{parameters}}', '{text}') || '{{"reasons": 7}}'
             WHERE kind = 'window' AND machine = 'mill-0' AND (record->>'number')::int = {k + 1}"""
         )
-    told = asked(capsys, 0, works, "--method", "least_squares")
+    told = run_query(capsys, 0, works, "--method", "least_squares")
     assert {each["windows"] for each in told["moved"]} == {5}

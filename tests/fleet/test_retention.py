@@ -58,7 +58,7 @@ class TestWithADatabase:
         before = machines(database)
         (first,) = database.ask("""SELECT "ft", at, revision FROM fleet.parameter_sets WHERE axis = 'X'
             ORDER BY stored_at, sequence LIMIT 1""")
-        found = let_go(works)
+        found = apply_policy(works)
         assert found["months"] == ["records_2026_01", "records_2026_03"]
         assert partitions(database) == ["records_2026_06", "records_other"]
         assert machines(database) == before  # number of records, none missing, and the machine's description
@@ -66,14 +66,14 @@ class TestWithADatabase:
         assert database.ask("SELECT first_at FROM fleet.axes WHERE axis = 'X'") == [(first[1],)]
         kept = database.ask("SELECT axis, kind FROM fleet.kept ORDER BY axis, kind")
         assert kept == [("", "about"), ("X", "parameters"), ("Y", "parameters")]
-        assert let_go(works)["months"] == []
+        assert apply_policy(works)["months"] == []
 
     async def test_what_went_does_not_come_back_and_what_was_never_heard_is_counted(
         self, works: Fleet, told: list[Received], database: Postgres
     ) -> None:
         await keep(works, told[:4] + told[5:])  # the fifth waits on its machine
         assert machines(database)[0][2] == 1
-        let_go(works)
+        apply_policy(works)
         count = "SELECT count(*) FROM fleet.records WHERE kind <> 'about'"
         rows = database.ask(count)
         await keep(works, told[:4] + told[5:])  # the machine has lost its position
@@ -82,8 +82,8 @@ class TestWithADatabase:
         await keep(works, [told[4]._replace(stored_at=NOW)])
         assert machines(database)[0][1:3] == (len(told) - 1, 0)
         assert partitions(database)[0] == "records_2026_01"
-        assert "records_2026_01" not in let_go(works)["months"]  # it came today: it lives as long as the rest
-        assert let_go(works, datetime(2026, 11, 1, tzinfo=UTC))["months"][0] == "records_2026_01"
+        assert "records_2026_01" not in apply_policy(works)["months"]  # it came today: it lives as long as the rest
+        assert apply_policy(works, datetime(2026, 11, 1, tzinfo=UTC))["months"][0] == "records_2026_01"
         assert machines(database)[0][1:3] == (len(told) - 1, 0)
 
     async def test_a_collector_that_knew_the_month_before_it_went_goes_on(
@@ -91,7 +91,7 @@ class TestWithADatabase:
     ) -> None:
         """Its next record of that month is in records_other and does not prevent a new partition."""
         await keep(works, told[:4])
-        let_go(works)
+        apply_policy(works)
         database.ask("""INSERT INTO fleet.records SELECT machine, 'late', recorded_at, store, 999, axis, kind, now(),
             window_name, record FROM fleet.kept WHERE kind = 'parameters' LIMIT 1""")
         await keep(works, [told[4]._replace(stored_at=NOW)])
@@ -103,7 +103,7 @@ class TestWithADatabase:
     ) -> None:
         old, young = told[1], told[2]._replace(stored_at=NOW)
         await keep(works, [told_at(old, datetime(1970, 1, 1, tzinfo=UTC), stored=MONTHS[0]), young])
-        assert let_go(works)["records_of_wrong_clocks"] == 1
+        assert apply_policy(works)["records_of_wrong_clocks"] == 1
         assert machines(database)[0][1] == 2
 
     async def test_windows_go_when_no_row_names_them(
@@ -120,7 +120,7 @@ class TestWithADatabase:
             await keep(works, [told_at(told[-1]._replace(content=last._replace(message=name, window=None)), at)])
             database.ask(f"UPDATE fleet.records SET window_name = '{name}' WHERE message = '{name}'")
         objects.keep(works.objects.directory, names[3], b"window")  # on its way: its row is not there yet
-        found = let_go(works)
+        found = apply_policy(works)
         there = [name for name in names if objects.path_of(works.objects.directory, name).exists()]
         assert there == [names[2], names[3]]  # of the first the row went, of the second the name
         assert (found["windows_forgotten"], found["files_removed"], found["bytes_freed"]) == (1, 2, 12)
@@ -130,7 +130,7 @@ class TestWithADatabase:
             retain(db, works.model_copy(update={"retention": Retention()}), NOW)
 
 
-def let_go(works: Fleet, now: datetime = NOW) -> dict[str, Any]:
+def apply_policy(works: Fleet, now: datetime = NOW) -> dict[str, Any]:
     with entered(works) as db:
         return json.loads(json.dumps(retain(db, works, now)))  # type: ignore[no-any-return]
 

@@ -16,7 +16,7 @@ from fdhil.daemon.offer_watch import OfferWatch
 from fdhil.store import audit
 from fdhil.store.offers import ANSWERS_FILE
 from tests.commissioning.test_record import RECORD
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 from tests.fleet.offers import NOW, Works, machine_of
 
 CHANGE = """
@@ -94,7 +94,7 @@ def test_who_accepted_what_is_in_the_audit(works: Works, file: Path, capsys: Any
 
 def test_where_the_audit_cannot_be_written_nothing_is_accepted(works: Works, file: Path, capsys: Any) -> None:
     store = lay(works, file).store.directory
-    (store / audit.FILE_NAME).mkdir(parents=True)
+    (store / audit.AUDIT_FILE_NAME).mkdir(parents=True)
     before = file.read_bytes()
     assert fdhil("offers", "accept", file, "friction", "--by", "Bert", capsys=capsys)[0] == 3
     assert file.read_bytes() == before
@@ -146,23 +146,23 @@ def test_a_machine_that_trusts_nobody_is_told_so(works: Works, file: Path, capsy
     lay(works, file)
     file.write_text(file.read_text().partition("# what follows")[0])
     assert "which is not listed in [offers] trust" in fdhil("offers", "list", file, capsys=capsys)[1]
-    assert OfferWatch(machine_config.load(file)).look() == []
+    assert OfferWatch(machine_config.load(file)).find_new_offers() == []
 
 
 def test_the_daemon_tells_of_an_offer_once_until_it_is_answered(works: Works, file: Path, capsys: Any) -> None:
     config = lay(works, file)
     (config.offers_directory / "notes.txt").write_text("none of ours")
     watch = OfferWatch(config)
-    (notice,) = watch.look()
+    (notice,) = watch.find_new_offers()
     assert (notice.code, notice.severity) == ("OfferWaits", "minor")
     assert notice.text == "a configuration change is proposed: friction version 3"
-    assert watch.look() == []
+    assert watch.find_new_offers() == []
     lay(works, file, version=4)
-    assert [each.text for each in watch.look()] == ["a configuration change is proposed: friction version 4"]
+    assert [each.text for each in watch.find_new_offers()] == ["a configuration change is proposed: friction version 4"]
     fdhil("offers", "reject", file, "friction", "--by", "Bert", "--reason", "another oil", capsys=capsys)
-    assert [each.text[-1] for each in OfferWatch(config).look()] == ["3"]
+    assert [each.text[-1] for each in OfferWatch(config).find_new_offers()] == ["3"]
     (config.store.directory / ANSWERS_FILE).write_text("{")
-    assert "is damaged" in OfferWatch(config).look()[0].text
+    assert "is damaged" in OfferWatch(config).find_new_offers()[0].text
 
 
 @pytest.mark.parametrize(
@@ -185,10 +185,12 @@ def test_a_change_that_cannot_be_offered_is_2(old: str, new: str, words: str, wo
 def test_the_daemon_remembers_of_the_offers_those_alone_that_lie_there(works: Works, file: Path) -> None:
     config = lay(works, file)
     watch = OfferWatch(config)
-    watch.look()
+    watch.find_new_offers()
     for number in range(1, 60):
         for old in config.offers_directory.glob("*.offer"):
             old.unlink()
         (config.offers_directory / f"other-{number}.offer").touch()
-        assert [each.text for each in watch.look()] == [f"a configuration change is proposed: other version {number}"]
+        assert [each.text for each in watch.find_new_offers()] == [
+            f"a configuration change is proposed: other version {number}"
+        ]
     assert len(watch._reported) == 1

@@ -16,9 +16,9 @@ from fdhil.config.editing import edited
 from fdhil.errors import ConfigError, FdhilError, StoreError
 from fdhil.store.atomic import write_file
 from fdhil.store.offers import read_answers
-from tests.crash import disks, injected
-from tests.crash.keepers import Plain
+from tests.crash import call_faults, disks
 from tests.crash.loops import KINDS, Kind, tried
+from tests.crash.stored_records import Plain
 from tests.fleet.offers import Works, machine_of
 
 KEY = "axis.X.nominal.ft"
@@ -98,7 +98,7 @@ def offers(tmp_path: Path) -> Path:
 def test_an_acceptance_is_whole_whatever_call_fails_or_is_the_last(
     offers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(KINDS, "acceptances", Kind(Acceptances, partial(injected.keep_some, Acceptances)))
+    monkeypatch.setitem(KINDS, "acceptances", Kind(Acceptances, partial(call_faults.keep_some, Acceptances)))
     found = tried("acceptances", tmp_path / "tried", most=16)
     assert found.wrong == []
     assert found.acknowledged > 0

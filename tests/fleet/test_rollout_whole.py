@@ -22,7 +22,7 @@ from fdhil.fleet.offer import Offer
 from fdhil.fleet.transport import connected, prepare_stream
 from fdhil.records import Notice
 from fdhil.store.offers import lying
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 from tests.fleet import servers
 from tests.fleet.machine import Machine
 from tests.fleet.offers import TOLD, Works, machine_of
@@ -132,7 +132,7 @@ def test_a_change_goes_out_stage_by_stage(collected: Shop) -> None:
     digest = shop.config("mill-1").digest
     noticed = Notice("MaintenanceDue", "minor", "Friction rises; look at the lubrication.", "X", 1000)
     lies = Notice("OfferWaits", "minor", "a configuration change is proposed: friction version 4")
-    assert machine.store.keep([replace(published(), config_digest=digest), noticed, lies]) == []
+    assert machine.store.store_outcomes([replace(published(), config_digest=digest), noticed, lies]) == []
     machine.close()
     shop.uplink("mill-1")
     until(

@@ -14,7 +14,7 @@ import pytest
 from fdhil.fleet.services import step_of
 from fdhil.fleet.sets import asking, newest_sets
 from fdhil.records import Float
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 from tests.fleet.machine import Machine, written
 from tests.fleet.servers import Postgres
 from tests.fleet.works import at_days, fleet_of, keep

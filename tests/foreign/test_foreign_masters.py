@@ -12,7 +12,7 @@ import pytest
 from fdhil import config as machine_config
 from fdhil.drivers import Record, open_machine
 from fdhil.records import AxisSamples, Notice
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 from tests.foreign.peers import ForeignProcess
 from tests.sim.twin_process import TwinProcess, write_config
 
@@ -63,7 +63,7 @@ async def sampled(make: str, process: TwinProcess, path: Path) -> tuple[list[Rec
         records.append(record)
         samples = sum(each.tick.size for each in records if isinstance(each, AxisSamples))
         if samples >= 100:
-            counters = source.counters()
+            counters = source.get_counters()
             lost.append(sum(counters[f"can0.{name}"] for name in ("sync_missed", "pdo_lost", "pdo_ambiguous")))
         if samples >= 300:
             enough.set()

@@ -17,7 +17,7 @@ from fdhil.commissioning.scan import BusScanner
 from fdhil.drivers.bus_source import BusSource
 from fdhil.records import AxisSamples, Notice
 from fdhil.sim.wire.hub import Hub
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 from tests.foreign.peers import ForeignProcess
 from tests.sim.hub_thread import joined, serving
 from tests.sim.twin_process import write_config

@@ -10,15 +10,21 @@ from typing import Any
 import pytest
 
 from fdhil.arming.guard_client import ANSWER_S
-from fdhil.guard import core
-from fdhil.guard.conditions import AXIS_INTERLOCKS, BUS_INTERLOCKS, View, failing, not_ready
-from fdhil.guard.interlocks import CATALOGUE, FACTS, Alarm, Reaction
-from fdhil.guard.protocol import Mode
-from fdhil.guard.state import AxisInput, AxisState, BusView, Inputs
-from tests.guard.fed import fed_bench
-from tests.guard.fed import request as feedforward
-from tests.guard.machine import DIGEST, FACTS_GIVEN, Bench, arm_request, axis_settings, bench
-from tests.guard.machine import settings as machine_settings
+from fdhil.guard import guard_step
+from fdhil.guard.guard_protocol import Mode
+from fdhil.guard.guard_state import AxisInput, AxisState, BusView, StepInputs
+from fdhil.guard.interlock_checks import (
+    AXIS_INTERLOCKS,
+    BUS_INTERLOCKS,
+    View,
+    list_arming_obstacles,
+    list_failing_interlocks,
+)
+from fdhil.guard.interlocks import FACTS, INTERLOCK_CATALOGUE, Alarm, Reaction
+from tests.guard.feedforward_machine import fed_bench
+from tests.guard.feedforward_machine import request as feedforward
+from tests.guard.simulated_bus import DIGEST, FACTS_GIVEN, Bench, arm_request, axis_settings, bench
+from tests.guard.simulated_bus import settings as machine_settings
 
 Change = Callable[[AxisInput], AxisInput]
 # one change per interlock, that breaks it and no other
@@ -42,16 +48,16 @@ BUS_CHANGES: dict[str, dict[str, Any]] = {
 }
 
 
-def test_the_daemon_must_vouch_for_each_of_these() -> None:
+def test_arming_is_refused_for_each_missing_fact() -> None:
     machine, fed = bench(), fed_bench()
     machine.settle()
     fed.settle()
-    refused = machine.sync(arm_request(facts={})).refused
+    refused = machine.run_sync(arm_request(facts={})).refused
     assert [alarm.code for alarm in refused or ()] == [
         *("NotCommissioned", "FeedforwardUnknown", "ModelNotValidated", "ModelStale"),
         *("PoorSkill", "HarmPredicted", "ReadOnlyStore", "WatchdogNotArmed"),
     ]
-    refused = fed.sync(feedforward(facts={})).refused
+    refused = fed.run_sync(feedforward(facts={})).refused
     assert [alarm.code for alarm in refused or ()] == [
         *("NotCommissioned", "FeedforwardOff", "ModelNotValidated"),
         *("ModelStale", "ReadOnlyStore", "WatchdogNotArmed"),
@@ -59,34 +65,34 @@ def test_the_daemon_must_vouch_for_each_of_these() -> None:
 
 
 @pytest.fixture(scope="module")
-def settled() -> tuple[Bench, Inputs]:
+def settled_machine() -> tuple[Bench, StepInputs]:
     machine = bench(axes=("X",))
     axes = tuple(replace(axis, heartbeat_timeout_s=0.5) for axis in machine.settings.axes)
     machine.settings = replace(machine.settings, axes=axes)
     machine.listener.settings = machine.settings
     for _ in range(150):
-        machine.hear(0x701, b"\x05")
-        machine.sync()
-    machine.hear(0x701, b"\x05")
-    seen, bus = machine.listener.at_sync(bytes([machine.counter + 1]), 0.151, 0.151)
-    return machine, Inputs(True, seen, bus, path=machine.path)
+        machine.receive_frames(0x701, b"\x05")
+        machine.run_sync()
+    machine.receive_frames(0x701, b"\x05")
+    seen, bus = machine.listener.close_sync_cycle(bytes([machine.counter + 1]), 0.151, 0.151)
+    return machine, StepInputs(True, seen, bus, path=machine.path)
 
 
-def refusals(machine: Bench, inputs: Inputs) -> set[str]:
-    state, output = core.step(machine.state, inputs, machine.settings)
+def refusals(machine: Bench, inputs: StepInputs) -> set[str]:
+    state, output = guard_step.step_guard(machine.state, inputs, machine.settings)
     assert output.refused is not None
     assert (state.mode is Mode.ARMED) is (output.refused == ())
     assert (output.offsets is None) is (state.mode is not Mode.ARMED)
     return {alarm.code for alarm in output.refused}
 
 
-def test_everything_good_arms(settled: tuple[Bench, Inputs]) -> None:
-    machine, inputs = settled
+def test_guard_arms_when_all_interlocks_pass(settled_machine: tuple[Bench, StepInputs]) -> None:
+    machine, inputs = settled_machine
     assert refusals(machine, inputs._replace(request=arm_request())) == set()
 
 
-def test_every_vector_of_what_is_vouched_for(settled: tuple[Bench, Inputs]) -> None:
-    machine, inputs = settled
+def test_every_combination_of_facts_gives_its_refusals(settled_machine: tuple[Bench, StepInputs]) -> None:
+    machine, inputs = settled_machine
     others = ("AuthRequired", "MainLost", "ProgramMismatch")
     for vector in itertools.product((True, False), repeat=len(FACTS) + len(others)):
         facts = dict(zip(FACTS, vector, strict=False))
@@ -99,8 +105,8 @@ def test_every_vector_of_what_is_vouched_for(settled: tuple[Bench, Inputs]) -> N
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_every_vector_of_the_interlocks(settled: tuple[Bench, Inputs]) -> None:
-    machine, inputs = settled
+def test_every_combination_of_interlocks_gives_its_refusals(settled_machine: tuple[Bench, StepInputs]) -> None:
+    machine, inputs = settled_machine
     codes = [*AXIS_CHANGES, *BUS_CHANGES]
     for vector in itertools.product((True, False), repeat=len(codes)):
         axis, bus = inputs.axes[0], inputs.bus
@@ -115,42 +121,42 @@ def test_every_vector_of_the_interlocks(settled: tuple[Bench, Inputs]) -> None:
 
 
 @pytest.mark.parametrize("value", [None, 1, "true", 0, [], {"commissioned": True}])
-def test_only_a_true_true_is_a_fact(settled: tuple[Bench, Inputs], value: object) -> None:
-    machine, inputs = settled
+def test_only_a_literal_true_attests_a_fact(settled_machine: tuple[Bench, StepInputs], value: object) -> None:
+    machine, inputs = settled_machine
     facts = {**FACTS_GIVEN, "commissioned": value}
     assert refusals(machine, inputs._replace(request=arm_request(facts=facts))) == {"NotCommissioned"}
 
 
 @pytest.mark.parametrize("digest", ["", "another"])
 @pytest.mark.fault("E5")
-def test_another_program(settled: tuple[Bench, Inputs], digest: str) -> None:
-    machine, inputs = settled
+def test_arming_is_refused_for_another_program(settled_machine: tuple[Bench, StepInputs], digest: str) -> None:
+    machine, inputs = settled_machine
     assert digest != DIGEST
     assert refusals(machine, inputs._replace(request=arm_request(program_digest=digest))) == {"ProgramMismatch"}
 
 
-def test_not_before_a_hundred_good_cycles() -> None:
+def test_arming_is_refused_before_a_hundred_good_cycles() -> None:
     machine = bench()
     machine.settle(30)
     machine.drives[0].mode = 1
     machine.settle(11)
     machine.drives[0].mode = 8
-    machine.until(Mode.OFF)
+    machine.run_until(Mode.OFF)
     while machine.state.good_for == 0:
-        machine.sync()
+        machine.run_sync()
     for _ in range(98):
         assert {alarm.code for alarm in machine.arm()} == {"NotSettled"}
     assert machine.arm() == ()
 
 
 @pytest.mark.fault("F21")
-def test_not_twice_and_not_by_itself() -> None:
+def test_guard_arms_neither_twice_nor_by_itself() -> None:
     machine = bench()
     machine.settle()
     assert machine.arm() == ()
     assert {alarm.code for alarm in machine.arm()} == {"NotOff"}
     machine.drives[0].statusword = 0x0008
-    machine.until(Mode.OFF)
+    machine.run_until(Mode.OFF)
     machine.drives[0].statusword = 0x1237
     machine.settle(400)
     assert machine.mode is Mode.OFF
@@ -199,14 +205,14 @@ def changed(change: dict[str, Any]) -> View:
         ({"short_frames": 3}, "PdoLength"),
     ],
 )
-def test_unknown_is_never_good(change: dict[str, Any], code: str) -> None:
+def test_unknown_inputs_fail_every_interlock(change: dict[str, Any], code: str) -> None:
     bus = BusView(sync_regular=True, silent=False)
-    assert failing(bus, (GOOD,)) == ()
-    bad = failing(bus, (changed(change),))
+    assert list_failing_interlocks(bus, (GOOD,)) == ()
+    bad = list_failing_interlocks(bus, (changed(change),))
     assert code in {alarm.code for alarm in bad}
 
 
-def test_every_vector_of_an_axis_is_told_exactly() -> None:
+def test_every_combination_of_axis_inputs_gives_its_alarms() -> None:
     own, seen, axis = GOOD
     bus = BusView(sync_regular=True, silent=False)
     bits = {"DriveNotEnabled": -0x0004, "NotFollowing": -0x1000, "LimitActive": 0x0800, "FollowingError": 0x2000}
@@ -232,16 +238,18 @@ def test_every_vector_of_an_axis_is_told_exactly() -> None:
         remembered = axis
         for name in broken & kept.keys():
             remembered = remembered._replace(**kept[name])
-        assert {alarm.code for alarm in failing(bus, ((own, now, remembered),))} == broken | stale
+        assert {alarm.code for alarm in list_failing_interlocks(bus, ((own, now, remembered),))} == broken | stale
 
 
-def test_every_vector_of_the_bus_is_told_exactly() -> None:
+def test_every_combination_of_bus_inputs_gives_its_alarms() -> None:
     states = {"active": "", "warning": "", "passive": "ErrorPassive", "off": "BusOff", "down": "BusDown"}
     result = set()
     for state, regular, silent, lost in itertools.product(states, (True, False), (True, False), (0, 1)):
         expected = {states[state]} - {""} | ({"SyncLost"} if silent else set()) | ({"RxOverflow"} if lost else set())
         expected |= set() if regular else {"SyncJitter"}
-        assert {alarm.code for alarm in failing(BusView(state, regular, silent, lost), (GOOD,))} == expected
+        assert {
+            alarm.code for alarm in list_failing_interlocks(BusView(state, regular, silent, lost), (GOOD,))
+        } == expected
         result |= expected
     assert result == {code for code, _ in BUS_INTERLOCKS}
 
@@ -258,9 +266,9 @@ def test_every_vector_of_the_bus_is_told_exactly() -> None:
         ({"window": 4 * 819 - 1}, "LimitBeyondWindow"),
     ],
 )
-def test_what_forbids_arming_alone(change: dict[str, Any], code: str) -> None:
-    assert not_ready((GOOD,)) == ()
-    assert not_ready((changed(change),)) == (Alarm(code, "X"),)
+def test_conditions_that_only_forbid_arming(change: dict[str, Any], code: str) -> None:
+    assert list_arming_obstacles((GOOD,)) == ()
+    assert list_arming_obstacles((changed(change),)) == (Alarm(code, "X"),)
 
 
 FREEZES = {"BusOff", "BusRestarted", "BusDown", "SyncLost", "NmtStateWrong", "NodeRebooted"}
@@ -272,12 +280,12 @@ REFUSES |= {"HarmPredicted", "WatchdogNotArmed", "LimitBeyondWindow", "AuthRequi
 REFUSES |= {"NotOff", "NotSettled", "GuardBusy", "DisarmedSince", "PcLate"}
 
 
-def test_what_cannot_be_ramped_freezes_what_may_pass_is_held_and_all_else_that_goes_wrong_ramps_down() -> None:
+def test_each_alarm_class_has_its_reaction() -> None:
     for reaction, codes in ((Reaction.FREEZE, FREEZES), (Reaction.HOLD, HOLDS), (Reaction.REFUSE, REFUSES)):
-        assert {code for code in CATALOGUE if Alarm(code).reaction is reaction} == codes
+        assert {code for code in INTERLOCK_CATALOGUE if Alarm(code).reaction is reaction} == codes
 
 
-def test_an_alarm_says_axis_cause_detail_effect_and_next_action() -> None:
+def test_alarm_sentence_has_axis_cause_detail_effect_and_action() -> None:
     bare, full = Alarm("SyncLost"), Alarm("SyncLost", "X", "for 4 ms")
     assert bare.cause == "no SYNC is received"
     assert full.cause == "axis X: no SYNC is received (for 4 ms)"
@@ -291,7 +299,7 @@ def test_an_alarm_says_axis_cause_detail_effect_and_next_action() -> None:
     assert Alarm("SyncLost", detail="FROZEN").action == action
 
 
-@pytest.mark.parametrize("code", CATALOGUE)
+@pytest.mark.parametrize("code", INTERLOCK_CATALOGUE)
 def test_each_class_has_cause_effect_and_action(code: str) -> None:
     alarm = Alarm(code, "X", "detail")
     sentence = alarm.sentence()
@@ -319,10 +327,10 @@ def test_each_class_has_cause_effect_and_action(code: str) -> None:
         {"window": 4 * 819},
     ],
 )
-def test_the_last_good_value_is_good(change: dict[str, Any]) -> None:
+def test_interlocks_pass_at_their_limits(change: dict[str, Any]) -> None:
     bus = BusView(sync_regular=True, silent=False)
-    assert failing(bus, (changed(change),)) == ()
-    assert not_ready((changed(change),)) == ()
+    assert list_failing_interlocks(bus, (changed(change),)) == ()
+    assert list_arming_obstacles((changed(change),)) == ()
 
 
 @pytest.mark.parametrize(
@@ -338,16 +346,19 @@ def test_the_last_good_value_is_good(change: dict[str, Any]) -> None:
         (BusView("active", True, False, 1), {"RxOverflow"}),
     ],
 )
-def test_what_the_bus_alone_forbids(bus: BusView, codes: set[str]) -> None:
-    assert {alarm.code for alarm in failing(bus, (GOOD,))} == codes
+def test_bus_alarms_alone_forbid_arming(bus: BusView, codes: set[str]) -> None:
+    assert {alarm.code for alarm in list_failing_interlocks(bus, (GOOD,))} == codes
 
 
-def test_feedback_that_is_three_old_is_a_gap_four_is_stale() -> None:
+def test_feedback_three_cycles_old_is_a_gap_and_four_is_stale() -> None:
     bus = BusView(sync_regular=True, silent=False)
-    assert {alarm.code for alarm in failing(bus, (changed({"feedback_age": 3.0}),))} == {"FeedbackGap"}
-    assert {alarm.code for alarm in failing(bus, (changed({"feedback_age": 3.5}),))} == {"FeedbackGap", "StaleData"}
+    assert {alarm.code for alarm in list_failing_interlocks(bus, (changed({"feedback_age": 3.0}),))} == {"FeedbackGap"}
+    assert {alarm.code for alarm in list_failing_interlocks(bus, (changed({"feedback_age": 3.5}),))} == {
+        "FeedbackGap",
+        "StaleData",
+    }
 
 
-def test_the_client_waits_longer_than_the_guard_for_a_sync() -> None:
+def test_client_waits_longer_than_the_guard_for_sync() -> None:
     """Otherwise arming without SYNC would look like a lost guard instead of a SyncLost refusal."""
     assert machine_settings(clock="sync").silence_s + 1 < ANSWER_S

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from fdhil.guard import table
-from fdhil.guard.control import MAX_CLIENTS, MAX_LINE_BYTES
-from tests.guard.test_process import DEMAND, ENDS_S, OFFSET, Rig, check_limits
+from fdhil.guard import correction_table
+from fdhil.guard.guard_socket import MAX_CLIENTS, MAX_LINE_BYTES
+from tests.guard.test_guard_process import DEMAND, ENDS_S, OFFSET, Rig, check_limits
 
 pytestmark = pytest.mark.usefixtures("processes")
 
@@ -104,7 +104,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     made.close()
 
 
-def test_neither_garbage_nor_floods_nor_signals_cost_a_running_correction_one_sync(rig: Rig, tmp_path: Path) -> None:
+def test_running_correction_misses_no_sync_under_garbage_floods_and_signals(rig: Rig, tmp_path: Path) -> None:
     rig.arm()
     rig.settle()
     client = rig.client
@@ -115,8 +115,10 @@ def test_neither_garbage_nor_floods_nor_signals_cost_a_running_correction_one_sy
     lines = list(garbage())
     ended = threading.Event()
     zeros = {"X": [0] * 900, "Y": [0] * 900}
-    piece = table.seal(table.encode("XY", zeros, zeros, "another", 800, False))
-    whole = table.seal(table.encode("XY", {a: [0] * 40_000 for a in "XY"}, {a: [0] * 40_000 for a in "XY"}, "other"))
+    piece = correction_table.seal_table(correction_table.encode_table("XY", zeros, zeros, "another", 800, False))
+    whole = correction_table.seal_table(
+        correction_table.encode_table("XY", {a: [0] * 40_000 for a in "XY"}, {a: [0] * 40_000 for a in "XY"}, "other")
+    )
     cursor = iter(lines * 1000)
     floods = [
         many('{"request": "status"}'),
@@ -162,7 +164,7 @@ def test_neither_garbage_nor_floods_nor_signals_cost_a_running_correction_one_sy
 
 
 @pytest.mark.fault("F13")
-def test_what_asks_it_to_stop_has_it_ramp_first(rig: Rig) -> None:
+def test_stop_signals_ramp_down_before_the_exit(rig: Rig) -> None:
     rig.into_the_cut()
     assert abs(rig.peer.offsets_sent()[-1][1]) > 100
     for number in STOPPING:
@@ -185,7 +187,7 @@ sys.exit(__main__.main())
 
 @pytest.mark.parametrize("error", ["RuntimeError('lost')", "MemoryError"])
 @pytest.mark.fault("F20")
-def test_whatever_breaks_the_loop_the_offset_is_ramped_to_zero(tmp_path: Path, error: str) -> None:
+def test_offset_is_ramped_to_zero_when_the_loop_fails(tmp_path: Path, error: str) -> None:
     rig = Rig(tmp_path, program=("-c", BROKEN.format(error=error)))
     try:
         client = connection(rig) if wait_for_ready(rig) else None
@@ -211,7 +213,7 @@ def wait_for_ready(rig: Rig) -> bool:
     return True
 
 
-def test_a_second_request_waits_for_the_answer_to_the_first(rig: Rig) -> None:
+def test_second_request_waits_for_the_first_answer(rig: Rig) -> None:
     guard = rig.connect()
     rig.peer.stand()
     rig.peer.wait(lambda: guard.status()["tick"] == rig.peer.tick, "the last SYNC")

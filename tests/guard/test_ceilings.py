@@ -20,15 +20,15 @@ from fdhil.correction import PlanLimits, check
 from fdhil.correction.gate import writing_off
 from fdhil.correction.limits import fit, to_increments
 from fdhil.errors import ConfigError
-from fdhil.guard import limits as guard_limits
-from fdhil.guard.settings import AxisSettings, from_json, to_json
-from fdhil.guard.table import check_rows
+from fdhil.guard import offset_limits as guard_limits
+from fdhil.guard.correction_table import check_rows
+from fdhil.guard.guard_settings import AxisSettings, decode_settings, encode_settings
 from tests.bench import bench_document
-from tests.guard.machine import LIMITS
-from tests.guard.machine import settings as made_settings
+from tests.guard.simulated_bus import LIMITS
+from tests.guard.simulated_bus import settings as made_settings
 
 
-def test_config_and_guard_have_the_same_ceilings() -> None:
+def test_config_and_guard_share_the_same_ceilings() -> None:
     """The guard does not import the config, so that both define the ceilings."""
     ours = (CEILING_OFFSET_UM, CEILING_SPEED_MM_S, CEILING_ACCELERATION_MM_S2, VARIATION_MM)
     assert ours == (
@@ -37,7 +37,7 @@ def test_config_and_guard_have_the_same_ceilings() -> None:
         guard_limits.CEILING_ACCELERATION_MM_S2,
         guard_limits.CEILING_VARIATION_MM,
     )
-    assert guard_limits.ceilings(3276.8, 0.001, 500.0, 4000.0) == LIMITS  # the bench is at all of them
+    assert guard_limits.compute_limit_ceilings(3276.8, 0.001, 500.0, 4000.0) == LIMITS  # the bench is at all of them
 
 
 def documents() -> st.SearchStrategy[dict[str, Any]]:
@@ -78,9 +78,7 @@ def coarse_document() -> dict[str, Any]:
 @settings(max_examples=150, deadline=None)
 @given(documents(), st.integers(0, 2**32 - 1))
 @example(coarse_document(), 0)
-def test_planner_and_guard_agree_on_every_axis_and_nothing_exceeds_a_ceiling(
-    document: dict[str, Any], seed: int
-) -> None:
+def test_planner_and_guard_limits_agree_and_keep_the_ceilings(document: dict[str, Any], seed: int) -> None:
     machine = parsed(document)
     if isinstance(machine, str):
         assert any(words in machine for words in ("too coarse", "from the largest offset to zero", "feed drives have"))
@@ -120,7 +118,7 @@ def parsed(document: dict[str, Any]) -> machine_config.MachineConfig | str:
 
 
 def altered(**changes: object) -> str:
-    document = json.loads(to_json(made_settings()))
+    document = json.loads(encode_settings(made_settings()))
     axis = document["axes"][0]
     for key, value in changes.items():
         (axis["limits"] if key in axis["limits"] else axis)[key] = value
@@ -129,16 +127,16 @@ def altered(**changes: object) -> str:
 
 @pytest.mark.parametrize("name", ["offset", "rate", "acceleration", "variation", "window"])
 @pytest.mark.fault("G11")
-def test_a_settings_file_can_raise_no_limit_above_its_ceiling(name: str) -> None:
+def test_settings_file_cannot_raise_a_limit_above_its_ceiling(name: str) -> None:
     value = getattr(LIMITS, name)
-    assert from_json(altered(**{name: value})).axes[0].limits == LIMITS
+    assert decode_settings(altered(**{name: value})).axes[0].limits == LIMITS
     wrongs: tuple[object, ...] = (value + 1, 10 * value, 2**62, 0, -1, value + 0.5, True, None, "1", [], math.inf)
     for wrong in wrongs:
         with pytest.raises(ConfigError, match="let fdhil-guard write it"):
-            from_json(altered(**{name: wrong}))
+            decode_settings(altered(**{name: wrong}))
 
 
-def test_the_axis_own_speed_and_the_scale_bound_it_too() -> None:
+def test_axis_speed_and_scale_bound_the_limits() -> None:
     for changes in (
         {"max_speed_mm_s": 100.0},
         {"max_acceleration_mm_s2": 1000.0},
@@ -149,31 +147,31 @@ def test_the_axis_own_speed_and_the_scale_bound_it_too() -> None:
         {"max_speed_mm_s": None},
     ):
         with pytest.raises(ConfigError):
-            from_json(altered(**changes))
+            decode_settings(altered(**changes))
 
 
 @pytest.mark.parametrize("travel", [None, [-5000, 700_000]])
-def test_the_travel_of_an_axis_is_read_as_it_was_written(travel: list[int] | None) -> None:
-    document = json.loads(to_json(made_settings()))
+def test_axis_travel_survives_the_settings_file(travel: list[int] | None) -> None:
+    document = json.loads(encode_settings(made_settings()))
     document["axes"][0]["travel"] = travel
-    assert from_json(json.dumps(document)).axes[0].travel == (travel and tuple(travel))
+    assert decode_settings(json.dumps(document)).axes[0].travel == (travel and tuple(travel))
 
 
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.fault("G11")
-def test_no_value_of_any_kind_in_any_field_is_anything_but_a_refusal() -> None:
-    clean = json.loads(to_json(made_settings()))
+def test_any_invalid_value_in_any_field_is_refused() -> None:
+    clean = json.loads(encode_settings(made_settings()))
     paths = list(_paths(clean))
     assert len(paths) > 100
     wrongs: tuple[object, ...] = ("\ud800", -1, 1e300, [], {}, [[[]]], None, True, 10**400)
     for path, wrong in itertools.product(paths, wrongs):
-        document = json.loads(to_json(made_settings()))
+        document = json.loads(encode_settings(made_settings()))
         inner = document
         for key in path[:-1]:
             inner = inner[key]
         inner[path[-1]] = wrong
         try:
-            read = from_json(json.dumps(document))
+            read = decode_settings(json.dumps(document))
         except ConfigError:
             continue
         assert all(_inside(axis) for axis in read.axes)

@@ -9,14 +9,14 @@ from dataclasses import dataclass, field, replace
 import pytest
 
 from fdhil.errors import ConfigError
-from fdhil.guard.protocol import Mode
-from fdhil.guard.settings import from_json, to_json
-from fdhil.guard.state import Request
-from tests.guard.machine import Bench, Drive, Frame, bench
+from fdhil.guard.guard_protocol import Mode
+from fdhil.guard.guard_settings import decode_settings, encode_settings
+from fdhil.guard.guard_state import GuardRequest
+from tests.guard.simulated_bus import Bench, Drive, Frame, bench
 
 WRITER, PITCH_ERROR, PERIOD = 0x501, 197, 25
 """An RPDO of drive X that carries 60B0; 60.1 um every 25 SYNC, as an NC that compensates a screw's pitch sends them."""
-ADOPT = Request("adopt", token_valid=True)
+ADOPT = GuardRequest("adopt", token_valid=True)
 
 
 def written_by(*cob_ids: int, amplitude: int = 800) -> Bench:
@@ -27,13 +27,13 @@ def written_by(*cob_ids: int, amplitude: int = 800) -> Bench:
 
 
 def write(machine: Bench, value: int = PITCH_ERROR, cob_id: int = WRITER) -> None:
-    machine.hear(cob_id, struct.pack("<i", value))
+    machine.receive_frames(cob_id, struct.pack("<i", value))
     machine.drives[0].received_offset = value
 
 
 def run(machine: Bench, cycles: int, value: Callable[[int], int] = lambda _tick: PITCH_ERROR) -> None:
     for _ in range(cycles):
-        machine.sync()
+        machine.run_sync()
         if machine.tick % PERIOD == 0:
             write(machine, value(machine.tick))
 
@@ -44,7 +44,7 @@ def cutting(machine: Bench, offset: int = 300) -> Bench:
     machine.run(30)
     machine.play()
     while machine.offsets[0] < offset:
-        machine.sync()
+        machine.run_sync()
     machine.alarms.clear()
     return machine
 
@@ -60,31 +60,31 @@ def test_guard_adopts_no_offset_that_another_master_writes() -> None:
     run(machine, 600)
     assert machine.frames == []
     assert (machine.mode, cause(machine)) == (Mode.FROZEN, ("OffsetHijack", "X"))
-    refused = machine.sync(ADOPT).refused
+    refused = machine.run_sync(ADOPT).refused
     assert refused is not None
     assert "OffsetHijack" in {alarm.code for alarm in refused}
     assert machine.frames == []
 
 
-def test_offset_of_another_master_can_be_adopted_once_that_is_silent() -> None:
+def test_offset_of_a_silent_foreign_master_can_be_adopted() -> None:
     machine = written_by(WRITER)
     machine.drives[0].hold(PITCH_ERROR)
     run(machine, 100)
     machine.run(1100)
     assert machine.frames == []
-    assert machine.sync(ADOPT).refused == ()
-    machine.until(Mode.OFF)
+    assert machine.run_sync(ADOPT).refused == ()
+    machine.run_until(Mode.OFF)
     assert machine.held[-1] == (0, 0)
 
 
-def test_offset_that_changes_by_itself_is_not_adopted() -> None:
+def test_offset_that_changes_without_the_guard_is_not_adopted() -> None:
     """The other master uses an unknown COB-ID; its offset varies along the axis."""
     machine = written_by()
     machine.drives[0].hold(PITCH_ERROR)
     for _ in range(8):
-        machine.sync()
+        machine.run_sync()
     for _ in range(400):
-        machine.sync()
+        machine.run_sync()
         if machine.tick % PERIOD == 0:
             machine.drives[0].hold(PITCH_ERROR + machine.tick)
     assert machine.frames == []
@@ -103,7 +103,7 @@ class LateDrive(Drive):
         return frames + extra
 
 
-def test_last_offsets_of_a_drive_that_is_late_are_no_other_masters() -> None:
+def test_late_read_back_is_not_attributed_to_another_master() -> None:
     plain = bench(amplitude=800)
     axes = [
         replace(
@@ -114,17 +114,17 @@ def test_last_offsets_of_a_drive_that_is_late_are_no_other_masters() -> None:
     ]
     machine = Bench(replace(plain.settings, axes=tuple(axes)), plain.path, plain.demand, [LateDrive(1), LateDrive(2)])
     cutting(machine, 200)
-    machine.hear(0x000, b"\x80\x01")
+    machine.receive_frames(0x000, b"\x80\x01")
     machine.run(10)
     assert machine.mode is Mode.FROZEN
     assert machine.state.undisturbed_for > 1000
 
 
 @pytest.mark.fault("A19")
-def test_frame_of_another_rpdo_ends_the_correction_at_once() -> None:
+def test_frame_of_a_foreign_rpdo_ends_the_correction_at_once() -> None:
     machine = cutting(written_by(0x401, WRITER))
     write(machine)
-    machine.sync()
+    machine.run_sync()
     frames = len(machine.frames)
     assert (machine.mode, cause(machine)) == (Mode.RAMP_DOWN, ("OffsetHijack", "X"))
     machine.run(15)
@@ -138,7 +138,7 @@ def test_frame_of_another_rpdo_ends_the_correction_at_once() -> None:
         pytest.param(100, Mode.OFF, id="after the ramp"),
     ],
 )
-def test_master_that_writes_again_and_again_is_not_fought(period: int, mode: Mode) -> None:
+def test_guard_freezes_when_another_master_keeps_writing(period: int, mode: Mode) -> None:
     machine = cutting(written_by(WRITER))
     before = len(machine.frames)
     for _ in range(30):
@@ -149,11 +149,11 @@ def test_master_that_writes_again_and_again_is_not_fought(period: int, mode: Mod
 
 
 @pytest.mark.fault("A19")
-def test_offset_that_was_not_sent_is_found_by_the_read_back() -> None:
+def test_foreign_offset_is_detected_by_the_read_back() -> None:
     """By an unknown COB-ID; the drive shows every second of its values."""
     machine = cutting(written_by(), 100)
     for _ in range(120):
-        machine.sync()
+        machine.run_sync()
         if machine.tick % PERIOD == PERIOD - 1:
             machine.drives[0].received_offset = -PITCH_ERROR
         if machine.alarms:
@@ -162,20 +162,20 @@ def test_offset_that_was_not_sent_is_found_by_the_read_back() -> None:
     assert (machine.mode, machine.state.measuring > 0) == (Mode.RAMP_DOWN, True)
 
 
-def test_one_reading_that_was_not_sent_is_forgiven() -> None:
+def test_one_unexpected_reading_is_tolerated() -> None:
     machine = cutting(written_by(), 100)
     while machine.tick % 10 != 9:
-        machine.sync()
+        machine.run_sync()
     machine.drives[0].received_offset = -PITCH_ERROR
     machine.run(100)
     assert machine.alarms == []
 
 
-def test_nothing_is_armed_beside_another_master() -> None:
+def test_arming_is_refused_next_to_another_master() -> None:
     machine = written_by(WRITER)
     machine.settle()
     write(machine, 0)
-    machine.sync()
+    machine.run_sync()
     assert "NotSettled" in {alarm.code for alarm in machine.arm()}
 
 
@@ -184,7 +184,7 @@ def test_arming_is_refused_with_the_reason_of_a_void_record() -> None:
     axes = machine.settings.axes
     why = "its RPDO4 (COB-ID 501) writes 60B0"
     settings = replace(machine.settings, axes=(replace(axes[0], record_void=True, void_reason=why), *axes[1:]))
-    machine = Bench(from_json(to_json(settings)), machine.path, machine.demand, machine.drives)
+    machine = Bench(decode_settings(encode_settings(settings)), machine.path, machine.demand, machine.drives)
     machine.settle()
     refused = {alarm.code: alarm.sentence() for alarm in machine.arm()}
     assert f"({why}); nothing is sent; " in refused["RecordVoid"]
@@ -193,10 +193,10 @@ def test_arming_is_refused_with_the_reason_of_a_void_record() -> None:
     assert why not in {alarm.code: alarm.sentence() for alarm in machine.arm()}["RecordVoid"]
 
 
-def test_writers_are_heard_and_none_of_ours() -> None:
+def test_foreign_writers_are_received_and_must_not_be_our_ids() -> None:
     made = written_by(0x401, WRITER).settings
-    assert from_json(to_json(made)) == made
+    assert decode_settings(encode_settings(made)) == made
     for ours in (0x301, 0x201, 0x181):
         axes = (replace(made.axes[0], writers=(ours,)), *made.axes[1:])
         with pytest.raises(ConfigError, match="is listed as a foreign writer's"):
-            from_json(to_json(replace(made, axes=axes)))
+            decode_settings(encode_settings(replace(made, axes=axes)))

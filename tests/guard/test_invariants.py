@@ -10,11 +10,11 @@ import pytest
 from hypothesis import settings as hypothesis_settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
-from fdhil.guard.protocol import IN_CHARGE, ON_PATH, SENDING, Mode
-from fdhil.guard.state import Request
+from fdhil.guard.guard_protocol import IN_CHARGE, ON_PATH, SENDING, Mode
+from fdhil.guard.guard_state import GuardRequest
 from studies.guard_invariants import episode
-from tests.guard.machine import ENABLED, RECORD, Bench, arm_request, bench
-from tests.guard.wire import CEILING, Wire
+from tests.guard.frame_checks import CEILING, Wire
+from tests.guard.simulated_bus import ENABLED, RECORD, Bench, arm_request, bench
 
 pytestmark = pytest.mark.usefixtures("long_computation")
 
@@ -47,17 +47,17 @@ class Faults(RuleBasedStateMachine):
         self.wires = [Wire(axis.limits, 0) for axis in self.machine.settings.axes]
 
     @initialize(held=st.tuples(VALUES, VALUES))
-    def starts_beside_what_the_drives_hold(self, held: tuple[int, int]) -> None:
+    def start_with_offsets_in_the_drives(self, held: tuple[int, int]) -> None:
         self.wires = [Wire(axis.limits, value) for axis, value in zip(self.machine.settings.axes, held, strict=True)]
         for drive, value in zip(self.machine.drives, held, strict=True):
             drive.hold(value)
 
-    def cycle(self, request: Request | None = None, unsent: Sequence[int] = (), **how: object) -> None:
+    def cycle(self, request: GuardRequest | None = None, unsent: Sequence[int] = (), **how: object) -> None:
         machine, before = self.machine, self.machine.mode
         if machine.outputs and machine.outputs[-1].offsets is not None:
             for k in unsent:
                 self.wires[k].lost()
-        output = machine.sync(request, unsent=unsent, **how)  # type: ignore[arg-type] # keywords of sync
+        output = machine.run_sync(request, unsent=unsent, **how)  # type: ignore[arg-type] # keywords of sync
         after = machine.mode
         if after is not before:
             granted = {Mode.ARMED, Mode.ADOPT, Mode.OFF} if request is not None else set()
@@ -86,11 +86,11 @@ class Faults(RuleBasedStateMachine):
         self.machine.rest, self.machine.playing, self.machine.row = None, False, 0
         self.cycle()
         self.cycle(self.comparison(True, RECORD))
-        self.machine.hear(0x701, b"\x05")
-        self.machine.hear(0x702, b"\x05")
+        self.machine.receive_frames(0x701, b"\x05")
+        self.machine.receive_frames(0x702, b"\x05")
         for _ in range(40):
             self.cycle()
-        self.cycle(Request("adopt", token_valid=True))
+        self.cycle(GuardRequest("adopt", token_valid=True))
         for _ in range(140):
             self.cycle()
         self.cycle(arm_request())
@@ -108,13 +108,13 @@ class Faults(RuleBasedStateMachine):
 
     @rule()
     def disarm(self) -> None:
-        self.cycle(Request("disarm"))
+        self.cycle(GuardRequest("disarm"))
         assert self.machine.mode not in IN_CHARGE
 
     @rule(valid=st.booleans())
     def adopt(self, valid: bool) -> None:
         before = self.machine.mode
-        self.cycle(Request("adopt", token_valid=valid))
+        self.cycle(GuardRequest("adopt", token_valid=valid))
         assert valid or self.machine.mode is before or self.machine.mode is not Mode.ADOPT
 
     @rule(valid=st.booleans())
@@ -165,32 +165,32 @@ class Faults(RuleBasedStateMachine):
 
     @rule(node=NODES, code=st.sampled_from((0x0000, 0x8130, 0x7500)), size=st.integers(0, 8))
     def emergency(self, node: int, code: int, size: int) -> None:
-        self.machine.hear(0x081 + node, struct.pack("<H6x", code)[:size])
+        self.machine.receive_frames(0x081 + node, struct.pack("<H6x", code)[:size])
 
     @rule(node=NODES, state=st.sampled_from((0x04, 0x05, 0x7F)))
     def heartbeat(self, node: int, state: int) -> None:
-        self.machine.hear(0x701 + node, bytes([state]))
+        self.machine.receive_frames(0x701 + node, bytes([state]))
 
     @rule(command=st.sampled_from((1, 2, 0x80, 0x81)), node=st.sampled_from((0, 1, 9)))
     def nmt(self, command: int, node: int) -> None:
-        self.machine.hear(0x000, bytes([command, node]))
+        self.machine.receive_frames(0x000, bytes([command, node]))
 
     @rule(node=NODES, value=VALUES, by_sdo=st.booleans())
     def foreign_offset(self, node: int, value: int, by_sdo: bool) -> None:
         sdo = struct.pack("<BHBi", 0x23, 0x60B0, 0, value)
-        self.machine.inject(0x601 + node if by_sdo else 0x301 + node, sdo if by_sdo else struct.pack("<i", value))
+        self.machine.inject_frame(0x601 + node if by_sdo else 0x301 + node, sdo if by_sdo else struct.pack("<i", value))
         self.wires[node].foreign(value)
 
     @rule(data=st.binary(max_size=8))
     def foreign_heartbeat(self, data: bytes) -> None:
-        self.machine.hear(0x764, data)
+        self.machine.receive_frames(0x764, data)
 
     @rule(node=NODES, shown=VALUES, demand=VALUES, apart=st.lists(st.sampled_from((0, 1, 9, 10)), max_size=4))
     def forged_read_back(self, node: int, shown: int, demand: int, apart: list[int]) -> None:
         for cycles in (0, *apart):
             for _ in range(cycles):
                 self.cycle()
-            self.machine.hear(0x381 + node, struct.pack("<ii", demand, shown))
+            self.machine.receive_frames(0x381 + node, struct.pack("<ii", demand, shown))
 
     @rule(node=NODES, remapped=st.booleans())
     def remapped_read_back(self, node: int, remapped: bool) -> None:
@@ -216,13 +216,13 @@ class Faults(RuleBasedStateMachine):
     def compared(self, digest: str, valid: bool) -> None:
         self.cycle(self.comparison(valid, digest))
 
-    def comparison(self, valid: bool, digest: str) -> Request:
+    def comparison(self, valid: bool, digest: str) -> GuardRequest:
         touched = {name: axis.touched for name, axis in zip("XY", self.machine.state.axes, strict=True)}
-        return Request("compared", valid, compared={"X": digest, "Y": RECORD}, touched=touched)
+        return GuardRequest("compared", valid, compared={"X": digest, "Y": RECORD}, touched=touched)
 
     @rule(cob_id=st.sampled_from((0x181, 0x281, 0x381, 0x481, 0x201)), data=st.binary(max_size=8))
     def garbage(self, cob_id: int, data: bytes) -> None:
-        self.machine.hear(cob_id, data)
+        self.machine.receive_frames(cob_id, data)
 
     @rule(jump=st.integers(1, 239))
     def sync_counter_jumps(self, jump: int) -> None:

@@ -12,13 +12,13 @@ import pytest
 from fdhil.config import CanBus
 from fdhil.errors import ConnectError, ProtocolError
 from fdhil.guard import __main__ as guard_main
-from fdhil.guard.settings import to_json
-from tests.guard.machine import commissioned
-from tests.guard.machine import settings as guard_settings
-from tests.guard.peer import open_bus
+from fdhil.guard.guard_settings import encode_settings
+from tests.guard.drive_peer import open_bus
+from tests.guard.simulated_bus import commissioned
+from tests.guard.simulated_bus import settings as guard_settings
 
 
-def test_buses_that_cannot_be_opened() -> None:
+def test_unusable_bus_is_reported() -> None:
     with pytest.raises(ConnectError, match="inside one process"):
         open_bus("can0", CanBus(interface="virtual"))
     with pytest.raises(ConnectError, match="cannot be opened"):
@@ -28,7 +28,7 @@ def test_buses_that_cannot_be_opened() -> None:
 @pytest.mark.parametrize(
     ("greeting", "error"), [(b"< hello >", ProtocolError), (b"", ConnectError), (b"x" * 300, ConnectError)]
 )
-def test_a_peer_that_is_no_hub(greeting: bytes, error: type[Exception]) -> None:
+def test_peer_that_is_not_a_hub_is_reported(greeting: bytes, error: type[Exception]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         import threading
 
@@ -44,7 +44,7 @@ def test_a_peer_that_is_no_hub(greeting: bytes, error: type[Exception]) -> None:
         thread.join()
 
 
-def test_a_hub_that_is_not_there() -> None:
+def test_absent_hub_is_reported() -> None:
     with socket.socket() as nobody:  # has the port and does not listen there
         nobody.bind(("127.0.0.1", 0))
         port = nobody.getsockname()[1]
@@ -72,7 +72,7 @@ class RawSocket:
 
 
 @pytest.mark.parametrize("up", [True, False])
-def test_a_raw_socket_hears_nothing_before_the_guard_listens_and_is_closed_when_it_is_of_no_use(
+def test_raw_socket_receives_nothing_before_the_guard_and_is_closed_on_error(
     up: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[RawSocket] = []
@@ -98,7 +98,7 @@ def run_main(monkeypatch: pytest.MonkeyPatch, settings: Path, descriptor: int) -
 
 
 @pytest.mark.usefixtures("handlers")
-def test_settings_that_cannot_be_read_are_one_sentence(
+def test_unreadable_settings_are_reported_in_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "guard.json").write_text("{")
@@ -109,11 +109,11 @@ def test_settings_that_cannot_be_read_are_one_sentence(
 
 
 @pytest.mark.usefixtures("handlers")
-def test_a_descriptor_that_is_no_socket_is_one_sentence(
+def test_invalid_descriptor_is_reported_in_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     settings = commissioned(guard_settings())
-    (tmp_path / "guard.json").write_text(to_json(replace(settings, run_directory=str(tmp_path))))
+    (tmp_path / "guard.json").write_text(encode_settings(replace(settings, run_directory=str(tmp_path))))
     with (tmp_path / "a file").open("wb") as file:
         assert run_main(monkeypatch, tmp_path / "guard.json", file.fileno()) == 3
     output = capsys.readouterr().err

@@ -15,7 +15,7 @@ from fdhil.identification.compliance import TERMS, Compliance, beside_the_config
 from fdhil.identification.signals import mended
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
-from fdhil.records import Float, Parameters, Window, frozen
+from fdhil.records import Float, Parameters, Window, freeze_array
 from studies import real_plant
 from studies.bench import shuttle
 from studies.real_plant import Mechanics, Sensors
@@ -48,7 +48,9 @@ def rapid(hertz: float, seed: int = 1) -> Window:
     table_mm = np.round(1e3 * run.table_m + 5e-5 * rng.standard_normal(run.table_m.size), 4)
     pushed = accelerations(mechanics, demand_m, table_mm.size) + 0.3 + 0.05 * rng.standard_normal(table_mm.size)
     recording = replace(
-        real_plant.recording(run, mechanics, sensors, 0.5, seed), table_mm=frozen(table_mm), table_m_s2=frozen(pushed)
+        real_plant.recording(run, mechanics, sensors, 0.5, seed),
+        table_mm=freeze_array(table_mm),
+        table_m_s2=freeze_array(pushed),
     )
     (window,) = find_windows(recording)
     return window
@@ -85,7 +87,7 @@ def test_an_accelerometer_tells_resonance_and_damping(hertz: float) -> None:
 def test_the_gain_of_an_accelerometer_and_its_lateness_do_not_matter() -> None:
     window = rapid(50.0)
     assert window.table_m_s2 is not None
-    found = seen(window, table_mm=None, table_m_s2=frozen(1.05 * np.roll(window.table_m_s2, 2)))
+    found = seen(window, table_mm=None, table_m_s2=freeze_array(1.05 * np.roll(window.table_m_s2, 2)))
     within(found, 50.0)
     assert found is not None
     assert found.late_s == pytest.approx(2e-3, abs=5e-4)
@@ -102,13 +104,13 @@ def test_nothing_is_told_without_a_sensor_or_of_one_that_lost_most() -> None:
     lost = window.table_mm.copy()
     lost[::3] = np.nan
     assert seen(window, table_mm=None, table_m_s2=None) is None
-    assert seen(window, table_mm=frozen(lost), table_m_s2=None) is None
+    assert seen(window, table_mm=freeze_array(lost), table_m_s2=None) is None
 
 
 def test_a_sensor_of_something_else_is_no_table() -> None:
     noise = np.random.default_rng(3).standard_normal(rapid(80.0).n)
-    assert seen(rapid(80.0), table_mm=frozen(noise), table_m_s2=None) is None
-    assert seen(rapid(80.0), table_mm=None, table_m_s2=frozen(noise)) is None
+    assert seen(rapid(80.0), table_mm=freeze_array(noise), table_m_s2=None) is None
+    assert seen(rapid(80.0), table_mm=None, table_m_s2=freeze_array(noise)) is None
 
 
 def test_it_joins_the_estimate_with_the_doubt_that_windows_share() -> None:
@@ -116,14 +118,14 @@ def test_it_joins_the_estimate_with_the_doubt_that_windows_share() -> None:
     estimate = outcome.estimate
     assert estimate is not None
     assert set(TERMS) <= set(estimate.terms)
-    assert estimate.value("resonance") == pytest.approx(80.0, rel=0.1)
+    assert estimate.get_value("resonance") == pytest.approx(80.0, rel=0.1)
     assert estimate.systematic is not None
     assert estimate.systematic.shape[0] == len(estimate.names) == estimate.covariance.shape[0]
     found = seen(rapid(50.0), table_m_s2=None)
     assert found is not None
     again = joined(estimate, found)  # it replaces the first one
     assert again.names == estimate.names
-    assert again.value("resonance") == pytest.approx(50.0, rel=0.1)
+    assert again.get_value("resonance") == pytest.approx(50.0, rel=0.1)
 
 
 @pytest.mark.usefixtures("real_time")
@@ -161,7 +163,7 @@ def test_whatever_a_sensor_tells_the_window_is_analysed(name: str, kind: str) ->
         "motor": window.position_mm,
         "steps": np.round(window.position_mm, 0),
     }[kind]
-    told = replace(window, table_mm=frozen(values) if name == "table_mm" else None)
-    outcome = analyse(replace(told, table_m_s2=frozen(values) if name != "table_mm" else None), Identification())
+    told = replace(window, table_mm=freeze_array(values) if name == "table_mm" else None)
+    outcome = analyse(replace(told, table_m_s2=freeze_array(values) if name != "table_mm" else None), Identification())
     assert outcome.estimate is not None
-    assert outcome.estimate.value("Jt") == pytest.approx(TRUE.Jt, rel=0.05)
+    assert outcome.estimate.get_value("Jt") == pytest.approx(TRUE.Jt, rel=0.05)

@@ -34,9 +34,9 @@ def test_inertia_is_right_whether_set_points_step_or_not(name: str, tmp_path: Pa
     estimates = [o.estimate for o in _identified(axis, tmp_path).outcomes if o.estimate is not None]
     assert len(estimates) == 6
     for estimate in estimates:
-        error = abs(estimate.value("Jt") - axis.plant.Jt)
+        error = abs(estimate.get_value("Jt") - axis.plant.Jt)
         assert error < 0.03 * axis.plant.Jt
-        assert error < 4.0 * estimate.std("Jt")
+        assert error < 4.0 * estimate.get_std("Jt")
 
 
 def test_lag_of_readings_is_that_of_a_drive_that_steps(tmp_path: Path) -> None:
@@ -70,4 +70,4 @@ def test_interval_of_the_winding_contains_axes_that_are_not_quite_parted(tmp_pat
     found = _identified(coupled, tmp_path)
     assert found.pooled is not None
     for name, true in coupled.truth().items():
-        assert abs(found.pooled.value(name) - true) < 3.0 * found.pooled.std(name), name
+        assert abs(found.pooled.get_value(name) - true) < 3.0 * found.pooled.get_std(name), name

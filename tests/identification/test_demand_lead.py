@@ -10,7 +10,7 @@ import pytest
 from fdhil.config import Identification
 from fdhil.identification.demand_lead import with_demand_on_time
 from fdhil.pipeline import analyse
-from fdhil.records import Window, frozen
+from fdhil.records import Window, freeze_array
 from studies.real_plant import Loops
 from tests.bench import bench_config
 from tests.identification.realistic import rapids
@@ -21,7 +21,7 @@ AXIS = bench_config("X").axis["X"]
 
 def _ahead(window: Window, cycles: int) -> Window:
     later = np.full(cycles, window.demand_mm[-1])
-    return replace(window, demand_mm=frozen(np.concatenate([window.demand_mm[cycles:], later])))
+    return replace(window, demand_mm=freeze_array(np.concatenate([window.demand_mm[cycles:], later])))
 
 
 @pytest.mark.parametrize("cycles", [1, 4, 9])

@@ -17,7 +17,7 @@ from fdhil.identification.estimators import Estimator, chosen, least_squares, ma
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.pooling import member, pooled
 from fdhil.identification.windows import find_windows
-from fdhil.records import PARAMETERS, Estimate, Float, Result, Window, frozen
+from fdhil.records import PARAMETERS, Estimate, Float, Result, Window, freeze_array
 from fdhil.store.recording_csv import parse_recording
 from studies import bench, instrumental_variables
 from tests.identification.recorded import signals, windows
@@ -87,9 +87,9 @@ def test_either_direction_gives_the_same(name: str) -> None:
     assert window.voltage_v is not None
     mirrored = replace(
         window,
-        voltage_v=frozen(-window.voltage_v),
-        current_a=frozen(-window.current_a),
-        speed_rad_s=frozen(-window.speed_rad_s),
+        voltage_v=freeze_array(-window.voltage_v),
+        current_a=freeze_array(-window.current_a),
+        speed_rad_s=freeze_array(-window.speed_rad_s),
         direction=-1,
     )
     there, back = (_estimator(name)([w], SETTINGS) for w in (window, mirrored))
@@ -105,7 +105,7 @@ def test_order_of_windows_does_not_matter(name: str) -> None:
 def test_scaled_units_scale_the_parameters(name: str) -> None:
     window = windows(0.002)[0]
     assert window.voltage_v is not None
-    in_kilovolt = replace(window, voltage_v=frozen(window.voltage_v * 1e-3))
+    in_kilovolt = replace(window, voltage_v=freeze_array(window.voltage_v * 1e-3))
     plain, scaled = (_estimator(name)([w], SETTINGS) for w in (window, in_kilovolt))
     # torque = K i is in kilo-units too, so every parameter shrinks by the same factor
     np.testing.assert_allclose(scaled.values, plain.values * 1e-3, rtol=1e-4)
@@ -118,7 +118,7 @@ def test_lost_rows_are_left_out(name: str) -> None:
     for field in ("voltage_v", "current_a", "speed_rad_s"):
         values = np.array(getattr(window, field))
         values[400:403] = np.nan
-        lost[field] = frozen(values)
+        lost[field] = freeze_array(values)
     holed = Window(**{f: getattr(window, f) for f in window.__slots__} | lost | {"gaps": ((400, 403),)})
     assert (_errors_percent(_estimator(name)([holed], SETTINGS)) < CLOSER.get(name, REACH)).all()
 
@@ -134,7 +134,7 @@ def test_instants_of_a_switching_voltage_are_honest(name: str) -> None:
 
 def test_nothing_to_fit_is_told(name: str) -> None:
     window = windows(0.001)[0]
-    still = replace(window, speed_rad_s=frozen(np.zeros(window.n)))
+    still = replace(window, speed_rad_s=freeze_array(np.zeros(window.n)))
     estimate = _estimator(name)([still], SETTINGS)
     assert estimate.result is not Result.OK
     assert set(estimate.missing) == set(PARAMETERS)
@@ -167,7 +167,7 @@ def test_instruments_take_the_bias_of_raw_noise_out() -> None:
 
 def test_instruments_need_a_demand_that_moves() -> None:
     window = windows(0.002)[0]
-    still = replace(window, demand_mm=frozen(np.zeros(window.n)))
+    still = replace(window, demand_mm=freeze_array(np.zeros(window.n)))
     estimate = _estimator("instrumental_variables")([still], SETTINGS)
     assert estimate.result is not Result.OK
     assert np.isnan(estimate.values).all()
@@ -178,7 +178,7 @@ def _late(window: Window, share: float) -> Window:
     """Return the window with its voltage late by ``share`` of a sample."""
     assert window.voltage_v is not None
     row = np.arange(window.n)
-    return replace(window, voltage_v=frozen(np.interp(row - share, row, window.voltage_v)))
+    return replace(window, voltage_v=freeze_array(np.interp(row - share, row, window.voltage_v)))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.03, -0.03])
@@ -194,7 +194,7 @@ def test_what_may_be_the_voltages_course_is_a_doubt_and_no_delay(share: float) -
         apart = np.abs(estimate.values - TRUTH) / np.sqrt(np.diag(estimate.covariance))
         assert (apart < 3.0).all()
     # more windows do not reduce a doubt that they share
-    assert averaged.std("L") > 0.8 * one.std("L")
+    assert averaged.get_std("L") > 0.8 * one.get_std("L")
 
 
 def test_a_delay_that_is_told_carries_the_doubt_of_the_course() -> None:
@@ -202,7 +202,7 @@ def test_a_delay_that_is_told_carries_the_doubt_of_the_course() -> None:
     assert estimate.delay_s == pytest.approx(0.2e-3, abs=3e-5)
     assert estimate.delay_std_s is not None
     assert 2e-5 < estimate.delay_std_s < 6e-5
-    assert abs(estimate.value("L") / TRUTH[1] - 1) < 3 * estimate.std("L") / TRUTH[1]
+    assert abs(estimate.get_value("L") / TRUTH[1] - 1) < 3 * estimate.get_std("L") / TRUTH[1]
 
 
 def _coloured(window: Window, seed: int) -> Window:
@@ -213,9 +213,9 @@ def _coloured(window: Window, seed: int) -> Window:
     lasting = lfilter([0.6], [1.0, -0.8], white, axis=1)[:, 200:]
     return replace(
         window,
-        voltage_v=frozen(window.voltage_v + 0.18 * white[0, 200:]),
-        current_a=frozen(window.current_a + 0.15 * lasting[1]),
-        speed_rad_s=frozen(window.speed_rad_s + 0.45 * lasting[2]),
+        voltage_v=freeze_array(window.voltage_v + 0.18 * white[0, 200:]),
+        current_a=freeze_array(window.current_a + 0.15 * lasting[1]),
+        speed_rad_s=freeze_array(window.speed_rad_s + 0.45 * lasting[2]),
     )
 
 

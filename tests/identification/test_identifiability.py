@@ -27,14 +27,14 @@ def test_each_wide_interval_is_a_null_with_its_reason() -> None:
     assert set(told.missing) == {"L"}
     assert told.missing["L"].code == "LowExcitation"
     assert "30 %" in told.missing["L"].text
-    assert np.isnan(told.value("L"))
-    assert told.value("R") == 0.5
+    assert np.isnan(told.get_value("L"))
+    assert told.get_value("R") == 0.5
 
 
 def test_nil_viscous_friction_is_a_value() -> None:
     told = judge(_estimate([*VALUES[:4], 0.0, 5.0], [0.01] * 6), 10.0, 157.0)
     assert told.result is Result.OK
-    assert told.value("ft") == 0.0
+    assert told.get_value("ft") == 0.0
 
 
 @pytest.mark.parametrize("condition", [1e7, np.inf, np.nan])

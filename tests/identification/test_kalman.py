@@ -9,7 +9,7 @@ import pytest
 
 from fdhil.identification import kalman
 from fdhil.identification.innovations import answers, gains_of, innovations, whiten
-from fdhil.identification.motion import BROKEN, DIFFUSE, UNKNOWN, Motion, prepare
+from fdhil.identification.motion import BROKEN_MODE, DIFFUSE, UNKNOWN_MODE, Motion, prepare
 from fdhil.records import Float, VoltageSampling
 from studies import bench
 from tests.identification.recorded import windows
@@ -20,7 +20,7 @@ THETA = np.array([*bench.Plant().truth().values(), 0.0])
 def _motion(sampling: VoltageSampling) -> Motion:
     """Return a rapid with three lost samples and an interval of unknown friction."""
     motion = prepare(replace(windows(0.002)[0], voltage_sampling=sampling))
-    motion.mode[500] = BROKEN
+    motion.mode[500] = BROKEN_MODE
     motion.observed[500:503] = False
     return motion
 
@@ -40,12 +40,12 @@ def _textbook(motion: Motion, theta: Float) -> Float:
             white[k] = np.linalg.solve(np.linalg.cholesky(spread), error)
             gain = p @ np.linalg.inv(spread)
             x, p = x + gain @ error, (np.eye(2) - gain) @ p
-        if mode == BROKEN:
+        if mode == BROKEN_MODE:
             p = DIFFUSE * measured
             continue
-        s = steps[0 if mode == UNKNOWN else 1]
+        s = steps[0 if mode == UNKNOWN_MODE else 1]
         phi, of_voltage = s[:4].reshape(2, 2), s[[kalman.I_U, kalman.W_U]]
-        walk = np.array([s[kalman.I_WALK], 1.0]) * (motion.speed_walk if mode == UNKNOWN else 0.0)
+        walk = np.array([s[kalman.I_WALK], 1.0]) * (motion.speed_walk if mode == UNKNOWN_MODE else 0.0)
         rise = 0.0 if means else motion.voltage_rise[k]
         x = phi @ x + of_voltage * motion.voltage_mean[k] + s[[kalman.I_RISE, kalman.W_RISE]] * rise
         x = x + s[[kalman.I_T, kalman.W_T]] * theta[kalman.CD] * mode

@@ -13,7 +13,7 @@ from fdhil.config import Axis, Identification
 from fdhil.identification.loops import DIFFER, better_loops, differences, identify_loops, with_loops
 from fdhil.identification.windows import find_windows
 from fdhil.model import closed_loop
-from fdhil.records import Float, LoopEstimate, Parameters, Reason, Recording, Verdict, Window, frozen
+from fdhil.records import Float, LoopEstimate, Parameters, Reason, Recording, Verdict, Window, freeze_array
 from studies import real_plant as real
 from tests.bench import bench_document
 from tests.model.slow_drive import SlowDrive
@@ -21,7 +21,7 @@ from tests.paths import bench_demand, rms
 
 PERIOD = 0.001
 SETTINGS = Identification()
-NOMINAL = Parameters.of(real.Mechanics().truth())
+NOMINAL = Parameters.from_mapping(real.Mechanics().truth())
 GAINS = ("position_gain_per_s", "speed_feedforward", "speed_kp", "speed_ki")
 
 
@@ -73,12 +73,12 @@ def observed(axis: Axis, demand_m: Float, row_s: float = PERIOD) -> list[Window]
     recording = Recording(
         axis="X",
         dt_s=row_s,
-        time_s=frozen(np.arange(place.size) * row_s),
-        voltage_v=frozen(noted[:, :, 0].mean(axis=1)),
-        current_a=frozen(noted[:, 0, 1] + 0.15 * rng.standard_normal(place.size)),
-        speed_rad_s=frozen(noted[:, 0, 2]),
-        position_mm=frozen(place),
-        demand_mm=frozen(demand_m * 1e3),
+        time_s=freeze_array(np.arange(place.size) * row_s),
+        voltage_v=freeze_array(noted[:, :, 0].mean(axis=1)),
+        current_a=freeze_array(noted[:, 0, 1] + 0.15 * rng.standard_normal(place.size)),
+        speed_rad_s=freeze_array(noted[:, 0, 2]),
+        position_mm=freeze_array(place),
+        demand_mm=freeze_array(demand_m * 1e3),
         voltage_sampling="interval_mean",
         pitch_mm=20.0,
         rapid_speed_rad_s=float(np.abs(np.diff(demand_m)).max() / row_s / 0.02 * 2 * np.pi),

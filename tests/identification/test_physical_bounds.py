@@ -44,9 +44,9 @@ def test_friction_at_standstill_that_chance_made_negative_is_zero() -> None:
     told = estimate(changed(Cd=4.95, stribeck=-6.4))
     assert unphysical(told) == []
     within = bounded(told)
-    assert within.value("Cd") + within.value("stribeck") == 0.0
+    assert within.get_value("Cd") + within.get_value("stribeck") == 0.0
     # both move, the more the less certain they are
-    assert within.value("Cd") == pytest.approx(5.675)
+    assert within.get_value("Cd") == pytest.approx(5.675)
     assert within.covariance is told.covariance
 
 
@@ -61,8 +61,8 @@ def test_correlated_values_follow_the_one_that_is_bounded() -> None:
     covariance = np.zeros((6, 6))
     covariance[4:, 4:] = [[1e-4, -9e-3], [-9e-3, 1.0]]  # ft and Cd nearly compensate each other
     within = bounded(estimate(np.array([*TRUE[:4], -0.001, 6.0]), covariance, names))
-    assert within.value("ft") == 0.0
-    assert within.value("Cd") == pytest.approx(6.0 - 0.09)
+    assert within.get_value("ft") == 0.0
+    assert within.get_value("Cd") == pytest.approx(6.0 - 0.09)
 
 
 def test_load_beyond_dry_friction_is_told_of_moves_in_one_direction() -> None:
@@ -71,10 +71,10 @@ def test_load_beyond_dry_friction_is_told_of_moves_in_one_direction() -> None:
     assert unphysical(lowered, one_way=True) == []
     for direction in (1, -1):
         within = bounded(lowered, direction)
-        assert (within.value("Cd"), within.value("load")) == (0.0, -10.0 * direction)
-        assert within.std("load") == pytest.approx(1e-3)
+        assert (within.get_value("Cd"), within.get_value("load")) == (0.0, -10.0 * direction)
+        assert within.get_std("load") == pytest.approx(1e-3)
         speed = np.array([50.0 * direction])
-        assert torque(within.parameters(), speed, np.zeros(1)) == pytest.approx(
+        assert torque(within.build_parameters(), speed, np.zeros(1)) == pytest.approx(
             direction * (0.05 * 50.0 - 10.0)
         )  # the constraint is the same
 

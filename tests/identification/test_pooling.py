@@ -11,7 +11,7 @@ import pytest
 from fdhil.identification.between import ALIKE, Member, between
 from fdhil.identification.pooling import friction_at, member, pooled
 from fdhil.identification.ripple_parts import as_amplitude, as_parts
-from fdhil.records import INTERVAL_95, PARAMETERS, Estimate, Float, Parameters, frozen
+from fdhil.records import INTERVAL_95, PARAMETERS, Estimate, Float, Parameters, freeze_array
 from tests.store.made import outcome, window
 
 BENCH = Parameters(0.5, 0.005, 0.8, 0.075, 0.05, 5.0)
@@ -76,8 +76,8 @@ def test_a_constant_load_joins_where_there_are_both_directions_and_hardly_ever_w
             found = pooled(members, FIRST, between(members))
             joined[load] += "load" in found.terms
             if load and found.terms:
-                assert found.value("load") == pytest.approx(load, abs=6 * found.std("load"))
-                assert found.value("Cd") == pytest.approx(5.0, abs=6 * found.std("Cd"))
+                assert found.get_value("load") == pytest.approx(load, abs=6 * found.get_std("load"))
+                assert found.get_value("Cd") == pytest.approx(5.0, abs=6 * found.get_std("Cd"))
     assert joined[0.5] == 60
     assert joined[0.0] <= 1
     one_way = [replace(m, direction=1) for m in drawn(np.random.default_rng(1), [BENCH] * 4, [RAPID] * 4, 0.0)]
@@ -89,9 +89,11 @@ def test_viscous_friction_by_direction_joins_as_two_values_about_ft() -> None:
     rng = np.random.default_rng(3)
     truth = [replace(BENCH, ft=0.06 if k % 2 == 0 else 0.04) for k in range(12)]
     found = pooled(drawn(rng, truth, [RAPID, RAPID, 100.0, 100.0] * 3), FIRST, ALIKE)
-    assert found.value("viscous_positive") == pytest.approx(0.06, rel=0.03)
-    assert found.value("viscous_negative") == pytest.approx(0.04, rel=0.03)
-    assert found.value("ft") == pytest.approx((found.value("viscous_positive") + found.value("viscous_negative")) / 2)
+    assert found.get_value("viscous_positive") == pytest.approx(0.06, rel=0.03)
+    assert found.get_value("viscous_negative") == pytest.approx(0.04, rel=0.03)
+    assert found.get_value("ft") == pytest.approx(
+        (found.get_value("viscous_positive") + found.get_value("viscous_negative")) / 2
+    )
     root = np.linalg.eigvalsh(found.covariance / np.outer(*[np.sqrt(np.diag(found.covariance))] * 2))
     assert root.min() > -1e-9
 
@@ -121,9 +123,9 @@ def test_terms_are_averaged_over_the_windows_that_have_them_and_a_ripples_phase_
     members[0] = drawn(rng, [BENCH], [RAPID])[0]
     found = pooled(members, FIRST, ALIKE, joining=False)
     assert found.terms == names[6:]
-    assert found.value("ripple_screw_1") == pytest.approx(0.2, abs=0.02)
-    assert abs(abs(found.value("ripple_screw_1_phase")) - np.pi) < 0.1
-    assert found.std("ripple_screw_1") == pytest.approx(0.01 / 3**0.5, rel=0.1)
+    assert found.get_value("ripple_screw_1") == pytest.approx(0.2, abs=0.02)
+    assert abs(abs(found.get_value("ripple_screw_1_phase")) - np.pi) < 0.1
+    assert found.get_std("ripple_screw_1") == pytest.approx(0.01 / 3**0.5, rel=0.1)
     rare = pooled([members[1], *drawn(rng, [BENCH] * 3, [RAPID] * 3)], FIRST, ALIKE, joining=False)
     assert rare.terms == ()
 
@@ -143,23 +145,25 @@ def test_what_is_given_or_missing_stays_so() -> None:
     values, covariance = made.estimate.values.copy(), made.estimate.covariance.copy()
     values[:2] = covariance[:2, :] = covariance[:, :2] = np.nan
     covariance[2, :] = covariance[:, 2] = 0.0
-    deaf = replace(made.estimate, values=frozen(values), covariance=frozen(covariance), given=("K",))
+    deaf = replace(made.estimate, values=freeze_array(values), covariance=freeze_array(covariance), given=("K",))
     members = [member(made.window, deaf, place) for place in range(3)]
     found = pooled(members, deaf, between(members))
     assert np.isnan(found.values[:2]).all()
-    assert (found.value("K"), found.std("K")) == (0.8, 0.0)
-    assert found.std("Jt") < deaf.std("Jt")
+    assert (found.get_value("K"), found.get_std("K")) == (0.8, 0.0)
+    assert found.get_std("Jt") < deaf.get_std("Jt")
 
 
 def test_at_one_speed_the_sum_of_friction_is_known_better_than_its_parts() -> None:
     assert FIRST is not None
-    told = replace(FIRST, values=frozen(list(BENCH.as_dict().values())), covariance=frozen(covariance_at(RAPID)))
+    told = replace(
+        FIRST, values=freeze_array(list(BENCH.as_dict().values())), covariance=freeze_array(covariance_at(RAPID))
+    )
     known = friction_at(told, RAPID)
     assert known is not None
     assert known[0] == pytest.approx(5.0 + 0.05 * RAPID)
     assert known[1] == pytest.approx(0.01, rel=0.01)
-    assert told.std("Cd") > 5 * known[1]
-    unknown = replace(told, values=frozen([*told.values[:4], np.nan, 5.0]))
+    assert told.get_std("Cd") > 5 * known[1]
+    unknown = replace(told, values=freeze_array([*told.values[:4], np.nan, 5.0]))
     assert friction_at(unknown, RAPID) is None
 
 
@@ -178,5 +182,5 @@ def test_a_term_that_windows_tell_each_in_its_own_way_bends_nothing_else() -> No
     apart = between(members)
     assert apart.scatter["resonance"] == pytest.approx(100.0, rel=0.3)  # 10 Hz to each side
     found = pooled(members, FIRST, apart, joining=False)
-    assert abs(found.value("Jt") - BENCH.Jt) < 3 * found.std("Jt")
-    assert found.std("resonance") > 2.0
+    assert abs(found.get_value("Jt") - BENCH.Jt) < 3 * found.get_std("Jt")
+    assert found.get_std("resonance") > 2.0

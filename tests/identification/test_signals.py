@@ -12,7 +12,7 @@ from fdhil.config import Identification
 from fdhil.identification.estimators import least_squares, maximum_likelihood
 from fdhil.identification.signals import between_means, filtered, lag_of, mended, of_position, shifted
 from fdhil.pipeline import analyse
-from fdhil.records import Float, Window, frozen
+from fdhil.records import Float, Window, freeze_array
 from studies.real_plant import Mechanics, Sensors
 from tests.identification.realistic import rapids
 
@@ -69,8 +69,8 @@ def test_the_lag_is_told_with_the_parameters_and_the_window_stays_as_recorded() 
     assert outcome.verdict.accepted, outcome.verdict.reasons
     assert outcome.window is window
     assert outcome.estimate is not None
-    assert outcome.estimate.value("speed_delay") == pytest.approx(5e-4, abs=2e-5)
-    assert outcome.estimate.std("speed_delay") < 2e-5
+    assert outcome.estimate.get_value("speed_delay") == pytest.approx(5e-4, abs=2e-5)
+    assert outcome.estimate.get_std("speed_delay") < 2e-5
 
 
 def test_a_setting_says_what_the_speed_is() -> None:
@@ -87,8 +87,8 @@ def test_what_parts_speed_and_position_otherwise_is_no_lag() -> None:
     (window,) = rapids(sensors=Sensors(speed="difference"))
     position = np.array(window.position_mm)
     position[400:] += 3.0  # samples are lost there
-    assert mended(replace(window, position_mm=frozen(position))).speed_late_s is None
-    stuck = replace(window, position_mm=frozen(np.full(window.n, 7.0)))
+    assert mended(replace(window, position_mm=freeze_array(position))).speed_late_s is None
+    stuck = replace(window, position_mm=freeze_array(np.full(window.n, 7.0)))
     assert mended(stuck) is stuck
 
 
@@ -105,7 +105,7 @@ def _without(window: Window, begin: int, end: int) -> Window:
     def lost(values: Float | None) -> Float:
         rows = np.array(values)
         rows[begin:end] = np.nan
-        return frozen(rows)
+        return freeze_array(rows)
 
     return replace(
         window,

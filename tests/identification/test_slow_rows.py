@@ -13,7 +13,7 @@ from fdhil.identification.motion import prepare
 from fdhil.identification.slow_rows import beyond_line_a, with_open_course
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
-from fdhil.records import Estimate, Float, Parameters, Recording, Window, frozen
+from fdhil.records import Estimate, Float, Parameters, Recording, Window, freeze_array
 from fdhil.sim.drive.physics import Physics
 from studies.bench import shuttle
 from tests.bench import bench_config
@@ -48,12 +48,12 @@ def _windows(row_s: float, noise: float = 0.001, seed: int = 1) -> list[Window]:
     recording = Recording(
         axis="X",
         dt_s=row_s,
-        time_s=frozen(np.arange(demand.size) * row_s),
-        voltage_v=frozen(voltage + volts),
-        current_a=frozen(current + amperes),
-        speed_rad_s=frozen(speed + turns),
-        position_mm=frozen(position),
-        demand_mm=frozen(demand),
+        time_s=freeze_array(np.arange(demand.size) * row_s),
+        voltage_v=freeze_array(voltage + volts),
+        current_a=freeze_array(current + amperes),
+        speed_rad_s=freeze_array(speed + turns),
+        position_mm=freeze_array(position),
+        demand_mm=freeze_array(demand),
         voltage_sampling="interval_mean",
         pitch_mm=AXIS.screw_pitch_mm,
         rapid_speed_rad_s=AXIS.rapid_speed_rad_s,
@@ -118,7 +118,7 @@ def test_rows_of_2_ms_leave_the_inertia_open_and_those_of_1_ms_do_not() -> None:
     for row_ms in (1, 2):
         (window,) = rapids(dt_s=1e-3 * row_ms)
         estimate = maximum_likelihood.estimate([window], SETTINGS)
-        stds[row_ms] = estimate.std("Jt") / estimate.value("Jt")
-        assert abs(estimate.value("K") / 0.8 - 1.0) < 4 * estimate.std("K")
+        stds[row_ms] = estimate.get_std("Jt") / estimate.get_value("Jt")
+        assert abs(estimate.get_value("K") / 0.8 - 1.0) < 4 * estimate.get_std("K")
     assert stds[1] < 0.01
     assert 0.05 < stds[2] < 0.1

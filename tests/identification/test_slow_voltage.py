@@ -11,7 +11,7 @@ from fdhil.config import Identification
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
-from fdhil.records import PARAMETERS, Float, Result, VoltageSampling, frozen
+from fdhil.records import PARAMETERS, Float, Result, VoltageSampling, freeze_array
 from studies import bench
 from studies.judging import GOOD
 from studies.slow_recordings import recording_of
@@ -55,8 +55,8 @@ def test_instants_tell_the_inductance_roughly_and_say_so() -> None:
     estimate = maximum_likelihood.estimate(slow_windows(0.010, sampling, delay_s=0.003, noise=0.005), SETTINGS)
     assert not estimate.missing
     assert (_errors_percent(estimate.values)[[0, 2, 3, 4, 5]] < (4.0, 0.4, 0.4, 6.0, 9.0)).all()
-    assert estimate.std("L") > 0.15 * estimate.value("L")
-    assert abs(estimate.value("L") - TRUTH[1]) < 2 * estimate.std("L")
+    assert estimate.get_std("L") > 0.15 * estimate.get_value("L")
+    assert abs(estimate.get_value("L") - TRUTH[1]) < 2 * estimate.get_std("L")
 
 
 @pytest.mark.parametrize("delay_s", [0.0065, -0.008])
@@ -72,7 +72,7 @@ def test_lost_samples_of_the_sensor_cost_no_more_than_themselves() -> None:
     assert window.slow_voltage is not None
     told = np.array(window.slow_voltage.voltage_v)
     told[60:66] = np.nan
-    holed = replace(window, slow_voltage=replace(window.slow_voltage, voltage_v=frozen(told)))
+    holed = replace(window, slow_voltage=replace(window.slow_voltage, voltage_v=freeze_array(told)))
     estimate = maximum_likelihood.estimate([holed], SETTINGS)
     assert (_errors_percent(estimate.values) < MEANS).all()
 
@@ -94,7 +94,7 @@ def test_a_delay_that_least_squares_took_for_a_negative_l_is_found(seed: int) ->
     estimate = maximum_likelihood.estimate(find_windows(recording), SETTINGS)
     assert estimate.result is Result.OK
     assert estimate.delay_s is not None
-    assert estimate.value("L") / estimate.value("R") == pytest.approx(3.5e-3, rel=0.1)
+    assert estimate.get_value("L") / estimate.get_value("R") == pytest.approx(3.5e-3, rel=0.1)
     assert abs(estimate.delay_s) == pytest.approx(3.8e-3, rel=0.05)
 
 
@@ -104,11 +104,11 @@ def test_a_meter_that_was_asked_off_its_instants_tells_as_much_as_one_that_was_n
     for estimate in (on, off):
         assert not estimate.missing
         assert (_errors_percent(estimate.values)[[0, 2, 3]] < (6.0, 0.6, 0.6)).all()
-    assert off.std("R") == pytest.approx(on.std("R"), rel=0.5)
+    assert off.get_std("R") == pytest.approx(on.get_std("R"), rel=0.5)
     window = asked_windows()[0]
     assert window.slow_voltage is not None
     assert analyse(window, SETTINGS).verdict.accepted
     blind = replace(window, slow_voltage=replace(window.slow_voltage, late_s=None))
     known, unknown = (maximum_likelihood.estimate([one], SETTINGS) for one in (window, blind))
-    assert abs(unknown.value("L") / TRUTH[1] - 1) > 1.5 * abs(known.value("L") / TRUTH[1] - 1)
-    assert unknown.std("L") / unknown.value("L") > 1.2 * known.std("L") / known.value("L")
+    assert abs(unknown.get_value("L") / TRUTH[1] - 1) > 1.5 * abs(known.get_value("L") / TRUTH[1] - 1)
+    assert unknown.get_std("L") / unknown.get_value("L") > 1.2 * known.get_std("L") / known.get_value("L")

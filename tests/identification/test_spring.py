@@ -77,9 +77,9 @@ def test_a_told_resonance_takes_what_bends_the_six_away() -> None:
         assert told.verdict.accepted
         assert told.estimate is not None
         assert stiff.estimate is not None
-        assert told.estimate.value(RESONANCE) == pytest.approx(120.0, rel=0.03)
-        assert told.estimate.value(SHARE) == pytest.approx(0.6, abs=0.06)
-        errors = np.array([[e.value(n) for n in PARAMETERS] for e in (told.estimate, stiff.estimate)]) / truth - 1.0
+        assert told.estimate.get_value(RESONANCE) == pytest.approx(120.0, rel=0.03)
+        assert told.estimate.get_value(SHARE) == pytest.approx(0.6, abs=0.06)
+        errors = np.array([[e.get_value(n) for n in PARAMETERS] for e in (told.estimate, stiff.estimate)]) / truth - 1.0
         assert abs(errors[0, 3]) < 0.001  # of the inertia
         assert abs(errors[0, 1]) < min(0.003, 0.5 * abs(errors[1, 1]))  # of the inductance
 
@@ -90,10 +90,10 @@ def test_what_is_told_is_no_news_of_every_window() -> None:
     outcomes = judged(windows, axis_of(SLOW, "slow", 150.0))
     for outcome in outcomes:
         assert outcome.estimate is not None
-        assert outcome.estimate.std(SHARE) > 0.05
+        assert outcome.estimate.get_std(SHARE) > 0.05
     estimate, _ = pool(outcomes, SETTINGS)
     assert estimate is not None
-    assert estimate.std(SHARE) > 0.7 * min(o.estimate.std(SHARE) for o in outcomes if o.estimate is not None)
+    assert estimate.get_std(SHARE) > 0.7 * min(o.estimate.get_std(SHARE) for o in outcomes if o.estimate is not None)
 
 
 def test_a_told_resonance_is_replayed_where_friction_rules() -> None:
@@ -122,7 +122,7 @@ def test_a_resonance_that_nobody_told_is_found_by_the_replay() -> None:
         assert outcome.verdict.accepted
         assert outcome.estimate is not None
         # seen from the motor, frequency and share compensate each other: the table's motion is determined
-        hertz, share = outcome.estimate.value(RESONANCE), outcome.estimate.value(SHARE)
+        hertz, share = outcome.estimate.get_value(RESONANCE), outcome.estimate.get_value(SHARE)
         assert hertz * (1 - share) ** 0.5 == pytest.approx(80.0 * 0.4**0.5, rel=0.15)
 
 
@@ -185,4 +185,4 @@ def test_friction_at_low_speed_falls_off_where_rows_tell_it() -> None:
     assert outcome.verdict.accepted, outcome.verdict.reasons
     assert outcome.estimate is not None
     for name in {"stribeck"} & set(outcome.estimate.terms):
-        assert abs(outcome.estimate.value(name)) < 10.0
+        assert abs(outcome.estimate.get_value(name)) < 10.0

@@ -43,8 +43,8 @@ def test_the_dead_time_of_a_commanded_voltage_is_told_and_biases_nothing() -> No
     (window,) = rapids(sensors=Sensors(command=True), loops=Loops(dead_time_v=2.0))
     estimate = _estimate(window)
     assert estimate.terms == ("dead_time",)
-    assert estimate.value("dead_time") == pytest.approx(2.0, abs=4 * estimate.std("dead_time"))
-    assert estimate.std("dead_time") < 0.1
+    assert estimate.get_value("dead_time") == pytest.approx(2.0, abs=4 * estimate.get_std("dead_time"))
+    assert estimate.get_std("dead_time") < 0.1
     assert _apart(estimate).max() < 4.0
     assert analyse(window, SETTINGS).verdict.accepted
 
@@ -58,7 +58,7 @@ def test_at_the_terminals_no_dead_time_is_looked_for() -> None:
 def test_a_bus_that_sags_is_told_per_watt() -> None:
     (window,) = rapids(sensors=Sensors(command=True), loops=Loops(bus_sag=0.05, peak_power_w=10e3))
     estimate = _estimate(window)
-    assert estimate.value("bus_sag") == pytest.approx(5e-6, rel=0.02)
+    assert estimate.get_value("bus_sag") == pytest.approx(5e-6, rel=0.02)
     assert _apart(estimate).max() < 4.0
 
 
@@ -66,9 +66,11 @@ def test_a_ripple_has_amplitude_and_phase() -> None:
     (window,) = rapids(Mechanics(screw_ripple=0.15, screw_phase=1.0), Sensors(noise=0.002))
     estimate = _estimate(window)
     assert estimate.terms == ("ripple_screw_1", "ripple_screw_1_phase")
-    assert estimate.value("ripple_screw_1") == pytest.approx(0.75, abs=4 * estimate.std("ripple_screw_1"))
-    assert estimate.value("ripple_screw_1_phase") == pytest.approx(1.0, abs=4 * estimate.std("ripple_screw_1_phase"))
-    assert 0.0 < estimate.std("ripple_screw_1") < 0.2
+    assert estimate.get_value("ripple_screw_1") == pytest.approx(0.75, abs=4 * estimate.get_std("ripple_screw_1"))
+    assert estimate.get_value("ripple_screw_1_phase") == pytest.approx(
+        1.0, abs=4 * estimate.get_std("ripple_screw_1_phase")
+    )
+    assert 0.0 < estimate.get_std("ripple_screw_1") < 0.2
 
 
 @pytest.mark.parametrize("static", [-0.4, 0.4])
@@ -77,8 +79,8 @@ def test_friction_that_rises_or_falls_at_low_speed_joins(static: float) -> None:
     for window in (there, back):
         estimate = _estimate(window)
         assert estimate.terms == ("stribeck", "stribeck_speed")
-        assert estimate.value("stribeck") == pytest.approx(5.0 * static, abs=4 * estimate.std("stribeck"))
-        assert estimate.value("stribeck_speed") == pytest.approx(25.0, abs=4 * estimate.std("stribeck_speed"))
+        assert estimate.get_value("stribeck") == pytest.approx(5.0 * static, abs=4 * estimate.get_std("stribeck"))
+        assert estimate.get_value("stribeck_speed") == pytest.approx(25.0, abs=4 * estimate.get_std("stribeck_speed"))
         assert _apart(estimate).max() < 4.0
 
 
@@ -90,15 +92,15 @@ def test_an_ordinary_machine_with_everything_at_once_is_known() -> None:
         estimate = _estimate(window)
         truth = TRUTH / np.array([1.01, 1.01, 1.0, 1 / 1.01, 1 / 1.01, 1 / 1.01])
         np.testing.assert_allclose(estimate.values[[0, 2, 3]], truth[[0, 2, 3]], rtol=0.005)
-        assert estimate.value("dead_time") == pytest.approx(2.0, rel=0.1)
-        assert estimate.value("bus_sag") == pytest.approx(3e-6, rel=0.1)
-        assert estimate.value("speed_delay") == pytest.approx(5e-4, rel=0.02)
+        assert estimate.get_value("dead_time") == pytest.approx(2.0, rel=0.1)
+        assert estimate.get_value("bus_sag") == pytest.approx(3e-6, rel=0.1)
+        assert estimate.get_value("speed_delay") == pytest.approx(5e-4, rel=0.02)
 
 
 def test_windows_are_fitted_together_with_their_terms() -> None:
     windows = rapids(sensors=Sensors(command=True), loops=Loops(dead_time_v=1.0), moves=2)
     estimate = maximum_likelihood.estimate(windows, SETTINGS)
-    assert estimate.value("dead_time") == pytest.approx(1.0, abs=4 * estimate.std("dead_time"))
+    assert estimate.get_value("dead_time") == pytest.approx(1.0, abs=4 * estimate.get_std("dead_time"))
     assert estimate.covariance.shape == (7, 7)
 
 

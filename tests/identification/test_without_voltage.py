@@ -11,7 +11,7 @@ from fdhil.config import Identification
 from fdhil.identification.torque_rows import torque_rows
 from fdhil.identification.windows import find_windows
 from fdhil.identification.without_voltage import fit, late_s, told
-from fdhil.records import RATIOS, Estimate, Result, Window, frozen
+from fdhil.records import RATIOS, Estimate, Result, Window, freeze_array
 from studies.real_plant import SLOW, SLOW_LOOPS, Mechanics, Run, Sensors, recording, run
 from tests.identification.deaf import SCREW, screw_windows, to_and_fro
 
@@ -28,10 +28,10 @@ def test_one_rapid_tells_mass_and_the_friction_of_its_direction(way: int) -> Non
     window = screw_windows()[way]
     found, truth = estimate(window), SCREW.truth()
     truth["Cd"] += window.direction * SCREW.load_nm
-    assert found.value("Jt") == pytest.approx(truth["Jt"], rel=0.005)
+    assert found.get_value("Jt") == pytest.approx(truth["Jt"], rel=0.005)
     for name in ("ft", "Cd"):
-        assert found.value(name) == pytest.approx(truth[name], rel=0.03)
-    assert (found.value("K"), found.std("K"), found.given) == (SCREW.K, 0.0, ("K",))
+        assert found.get_value(name) == pytest.approx(truth[name], rel=0.03)
+    assert (found.get_value("K"), found.get_std("K"), found.given) == (SCREW.K, 0.0, ("K",))
     assert set(found.missing) == {"R", "L"}
     assert found.result is Result.UNDER_EXCITED
 
@@ -39,20 +39,20 @@ def test_one_rapid_tells_mass_and_the_friction_of_its_direction(way: int) -> Non
 @pytest.mark.parametrize("speed", ["sensor", "difference", "middle"])
 def test_whatever_the_speed_is_made_of(speed: str) -> None:
     found = estimate(screw_windows(speed=speed, noise=3e-4)[0])
-    assert found.value("Jt") == pytest.approx(SCREW.Jt, rel=0.01)
-    assert found.value("Cd") == pytest.approx(SCREW.Cd + SCREW.load_nm, rel=0.06)
+    assert found.get_value("Jt") == pytest.approx(SCREW.Jt, rel=0.01)
+    assert found.get_value("Cd") == pytest.approx(SCREW.Cd + SCREW.load_nm, rel=0.06)
 
 
 def test_what_the_data_sheet_tells_is_given_and_the_recording_knows_better() -> None:
     window = screw_windows()[0]
     found = estimate(window, R=0.6, L=0.003, K=0.5)
     assert found.given == ("R", "L", "K")
-    assert (found.value("R"), found.value("L"), found.value("K")) == (0.6, 0.003, SCREW.K)
+    assert (found.get_value("R"), found.get_value("L"), found.get_value("K")) == (0.6, 0.003, SCREW.K)
     assert not found.missing
     assert found.result is Result.OK
     other = estimate(replace(window, torque_constant_nm_per_a=None), R=0.6, L=0.003, K=2 * SCREW.K)
-    assert other.value("Jt") == pytest.approx(2 * found.value("Jt"))
-    assert other.std("Cd") == pytest.approx(2 * found.std("Cd"))
+    assert other.get_value("Jt") == pytest.approx(2 * found.get_value("Jt"))
+    assert other.get_std("Cd") == pytest.approx(2 * found.get_std("Cd"))
 
 
 def test_without_any_torque_constant_the_ratios_are_told() -> None:
@@ -62,7 +62,7 @@ def test_without_any_torque_constant_the_ratios_are_told() -> None:
     assert not found.terms
     with_it = estimate(window)
     for ratio, name in zip(RATIOS, TOLD, strict=True):
-        assert found.value(ratio) * SCREW.K == pytest.approx(with_it.value(name))
+        assert found.get_value(ratio) * SCREW.K == pytest.approx(with_it.get_value(name))
 
 
 def test_intervals_hold_the_truth() -> None:
@@ -75,7 +75,7 @@ def test_intervals_hold_the_truth() -> None:
             for window in windows:
                 found, truth = estimate(window), mechanics.truth()
                 truth["Cd"] += window.direction * mechanics.load_nm
-                errors.append([(found.value(name) - truth[name]) / found.std(name) for name in TOLD])
+                errors.append([(found.get_value(name) - truth[name]) / found.get_std(name) for name in TOLD])
     assert len(errors) == 24
     assert (np.sqrt(np.mean(np.square(errors), axis=0)) < 1.4).all()
     assert (np.sqrt(np.mean(np.square(errors), axis=0)) > 0.4).all()
@@ -94,40 +94,40 @@ def test_slow_rows_tell_the_same(dt_s: float) -> None:
         found = estimate(window)
         for name, truth in Mechanics().truth().items():
             if name in TOLD:
-                assert abs(found.value(name) - truth) < 3 * found.std(name) < 0.1 * truth
+                assert abs(found.get_value(name) - truth) < 3 * found.get_std(name) < 0.1 * truth
 
 
 def test_friction_at_low_speed_joins_where_it_is_worth_it() -> None:
     risen = replace(SCREW, static=-0.5, static_speed_rad_s=30.0, screw_ripple=0.0)
     found = estimate(screw_windows(2, 0, risen)[0])
     assert "stribeck" in found.terms
-    assert found.value("stribeck") == pytest.approx(-0.5 * SCREW.Cd, rel=0.3)
-    assert found.value("stribeck_speed") == pytest.approx(30.0, rel=0.4)
-    assert found.value("Cd") == pytest.approx(SCREW.Cd + SCREW.load_nm, rel=0.1)
-    assert found.std("stribeck_speed") > 0
+    assert found.get_value("stribeck") == pytest.approx(-0.5 * SCREW.Cd, rel=0.3)
+    assert found.get_value("stribeck_speed") == pytest.approx(30.0, rel=0.4)
+    assert found.get_value("Cd") == pytest.approx(SCREW.Cd + SCREW.load_nm, rel=0.1)
+    assert found.get_std("stribeck_speed") > 0
 
 
 def test_a_ripple_with_the_screw_joins_with_its_phase() -> None:
     rippled = replace(SCREW, static=0.0, screw_ripple=0.3, screw_phase=1.0, pitch_m=0.01)
     found = estimate(screw_windows(2, 0, rippled)[0])
     # at rapid speed the screw turns 15 times a second, well below the low-pass
-    assert found.value("ripple_screw_1") == pytest.approx(0.3 * SCREW.Cd, rel=0.05)
-    assert found.value("ripple_screw_1_phase") == pytest.approx(1.0, abs=0.05)
+    assert found.get_value("ripple_screw_1") == pytest.approx(0.3 * SCREW.Cd, rel=0.05)
+    assert found.get_value("ripple_screw_1_phase") == pytest.approx(1.0, abs=0.05)
 
 
 def test_a_late_current_is_told_and_biases_nothing() -> None:
     window = screw_windows()[0]
-    late = replace(window, current_a=frozen(np.concatenate([np.zeros(3), window.current_a[:-3]])))
+    late = replace(window, current_a=freeze_array(np.concatenate([np.zeros(3), window.current_a[:-3]])))
     fitted = fit(late, SETTINGS)
     assert fitted is not None
     late_by, std = late_s(fitted)
     assert late_by == pytest.approx(3e-3, abs=max(4 * std, 2e-4))
-    assert told(late, fitted, {}).value("Jt") == pytest.approx(SCREW.Jt, rel=0.01)
+    assert told(late, fitted, {}).get_value("Jt") == pytest.approx(SCREW.Jt, rel=0.01)
 
 
 def test_hardly_any_row_is_an_empty_estimate() -> None:
     window = screw_windows()[0]
-    lost = replace(window, current_a=frozen(np.full(window.n, np.nan)))
+    lost = replace(window, current_a=freeze_array(np.full(window.n, np.nan)))
     assert torque_rows(lost, SETTINGS) is None
     assert fit(lost, SETTINGS) is None
     assert estimate(lost).result is Result.UNDER_EXCITED
@@ -135,4 +135,4 @@ def test_hardly_any_row_is_an_empty_estimate() -> None:
 
 def test_a_screw_that_gives_takes_nothing_from_the_mass() -> None:
     found = estimate(screw_windows(2, 0, replace(SCREW, resonance_hz=60.0))[0])
-    assert found.value("Jt") == pytest.approx(SCREW.Jt, rel=0.005)
+    assert found.get_value("Jt") == pytest.approx(SCREW.Jt, rel=0.005)

@@ -107,7 +107,7 @@ def transport(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture
-def settling_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_settling_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.3)
     monkeypatch.setattr("fdhil.commissioning.transmit.LOOK_S", 0.05)
     monkeypatch.setattr("fdhil.commissioning.steps.SETTLE_CYCLES", 150)

@@ -13,7 +13,7 @@ import time
 from itertools import count
 from pathlib import Path
 
-from tests.crash.keepers import KEEPERS, Keeper, place_of
+from tests.crash.stored_records import KEEPERS, Keeper, place_of
 
 JUMPS_S = (0.0, 3600.0, -3600.0, -1.7e9, 3.0e8)  # an hour either way, back to about 1970, on to ten years ahead
 

@@ -21,8 +21,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.crash.injected import looked_at
-from tests.crash.keepers import KEEPERS, MUCH_LATER, place_of
+from tests.crash.call_faults import looked_at
+from tests.crash.stored_records import KEEPERS, MUCH_LATER, place_of
 
 ROOT = Path(__file__).parents[2]
 CACHE = Path(os.environ.get("VCAN_VM_CACHE") or Path.home() / ".cache" / "vcan-vm")

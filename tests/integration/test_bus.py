@@ -42,7 +42,7 @@ def send(bus: can.BusABC, can_id: int, data: bytes = b"") -> None:
     bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
 
-def test_sdo_by_a_stock_client_expedited_segmented_and_block(bench: Bench) -> None:
+def test_stock_client_reads_and_writes_by_every_sdo_transfer(bench: Bench) -> None:
     bus = bench.join()
     network = canopen.Network(bus=bus)
     network.connect()
@@ -69,7 +69,7 @@ def test_sdo_by_a_stock_client_expedited_segmented_and_block(bench: Bench) -> No
         bus.shutdown()
 
 
-def test_a_reset_node_boots_and_can_be_started(bus: can.BusABC) -> None:
+def test_reset_node_boots_and_can_be_started(bus: can.BusABC) -> None:
     send(bus, 0x000, bytes([0x81, 1]))
     while received(bus, 0x701) != b"\x00":  # heartbeats may come before it
         pass
@@ -79,9 +79,7 @@ def test_a_reset_node_boots_and_can_be_started(bus: can.BusABC) -> None:
     assert len(received(bus, 0x281)) >= 6
 
 
-def test_the_nc_s_takeover_is_whole_when_another_thread_orders_it(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nc_takeover_from_another_thread_is_complete(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     of_axis = bench.service.machine.nc._wiring
 
     def slow(axis: str) -> Wiring:
@@ -95,13 +93,13 @@ def test_the_nc_s_takeover_is_whole_when_another_thread_orders_it(
     assert modes == [CYCLIC_POSITION] * 2
 
 
-def test_a_command_to_a_machine_that_has_ended_returns(bench: Bench) -> None:
+def test_command_to_an_ended_machine_returns(bench: Bench) -> None:
     bench.service.stop()
     bench.command('{"command": "nc", "on": true}')
     assert bench.events.empty()
 
 
-def test_another_master_enables_a_drive_and_its_set_point_acts_two_cycles_late(bus: can.BusABC) -> None:
+def test_foreign_master_set_point_acts_two_cycles_later(bus: can.BusABC) -> None:
     send(bus, 0x000, bytes([0x01, 1]))
     send(bus, 0x601, struct.pack("<BHBI", 0x2F, 0x6060, 0, 8))
     received(bus, 0x581)

@@ -9,9 +9,9 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.cli.demo.processes import Process
-from fdhil.daemon.control import SOCKET_NAME, ask
+from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
 from fdhil.errors import DeviceError
-from tests.guard.peer import Peer, at_rest, write_config
+from tests.guard.drive_peer import Peer, hold_demand, write_config
 from tests.listening import tcp_ports
 
 pytestmark = pytest.mark.usefixtures("processes")
@@ -21,12 +21,12 @@ CYCLES = 500
 
 @pytest.fixture
 def peer() -> Iterator[Peer]:
-    with at_rest() as made:
+    with hold_demand() as made:
         yield made
 
 
 @pytest.mark.goal("R15")
-def test_the_daemon_of_a_default_configuration_sends_no_frame_and_listens_at_no_port(
+def test_default_daemon_sends_no_frame_and_opens_no_port(
     peer: Peer, tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:
     config = write_config(tmp_path, peer.port, corrected=False)
@@ -34,7 +34,7 @@ def test_the_daemon_of_a_default_configuration_sends_no_frame_and_listens_at_no_
 
     def listening() -> bool:
         try:
-            return bool(ask(socket, {"request": "status"})["source"]["state"] == "listening")
+            return bool(ask_daemon(socket, {"request": "status"})["source"]["state"] == "listening")
         except DeviceError:
             return False
 
@@ -43,7 +43,7 @@ def test_the_daemon_of_a_default_configuration_sends_no_frame_and_listens_at_no_
         peer.wait(listening, "the daemon")
         first = peer.tick
         peer.wait(lambda: peer.tick > first + CYCLES, "the cycles")
-        assert ask(socket, {"request": "arm", "token": "any"})["ok"] is False
+        assert ask_daemon(socket, {"request": "arm", "token": "any"})["ok"] is False
         ports = tcp_ports(daemon.pid)
     finally:
         daemon.stop()

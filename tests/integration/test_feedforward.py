@@ -49,7 +49,7 @@ def sections() -> dict[str, Any]:
 
 
 @pytest.fixture
-def client(bench: Bench, settling_soon: None, tmp_path: Path) -> Iterator[GuardClient]:
+def client(bench: Bench, short_settling_time: None, tmp_path: Path) -> Iterator[GuardClient]:
     for axis in "XY":
         record = commission(bench.config, axis)
         save_record(record, bench.config.store.directory)
@@ -92,7 +92,7 @@ def largest_errors_um(bench: Bench, client: GuardClient, demand: Path, trace: Pa
     return {axis: 1e3 * float(np.abs(error).max()) for axis, error in errors.items()}
 
 
-def test_the_largest_tracking_error_shrinks(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
+def test_feedforward_reduces_the_largest_following_error(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
     demand = tmp_path / "demand.csv"
     path = bench_demand(10)
     lines = [f"{k * 0.001:.3f},{x:.9f},{y:.9f}" for k, (x, y) in enumerate(path)]

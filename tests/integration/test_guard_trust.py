@@ -20,7 +20,7 @@ from fdhil.cli.demo.processes import Process
 from fdhil.cli.main import cli
 from fdhil.commissioning.void import is_void, void_record
 from fdhil.guard.interlocks import FACTS
-from tests.guard import impatient
+from tests.guard import short_timeouts
 from tests.integration.conftest import PATIENCE_S, Bench, sign_off
 from tests.integration.test_guard import toml
 
@@ -39,7 +39,7 @@ def sections() -> dict[str, Any]:
     return {"sim": {"pace": "lockstep", "modbus": False}, "guard": {"clock": "sync"}}
 
 
-class Shop:
+class TrustRig:
     def __init__(self, bench: Bench, folder: Path) -> None:
         self.bench, self.folder, self.config = bench, folder, folder / "machine.toml"
         self.config.write_text(toml(json.loads(bench.config.model_dump_json(exclude_none=True))), "utf-8")
@@ -50,19 +50,19 @@ class Shop:
 
     @contextmanager
     def guard(self) -> Iterator[GuardClient]:
-        with Process("guard", [impatient.__name__, str(self.config)], self.folder / "guard.log") as process:
+        with Process("guard", [short_timeouts.__name__, str(self.config)], self.folder / "guard.log") as process:
             process.event("ready", PATIENCE_S)
             with GuardClient(self.run) as client:
                 yield client
 
     def nc(self, on: bool) -> None:
         if on:
-            (self.run / impatient.BUS).unlink(missing_ok=True)
+            (self.run / short_timeouts.BUS).unlink(missing_ok=True)
         self.bench.command(json.dumps({"command": "nc", "on": on}))
         while (event := self.bench.events.get(timeout=PATIENCE_S))["event"] != "nc" or event["on"] is not on:
             pass
         if not on:
-            (self.run / impatient.BUS).touch()
+            (self.run / short_timeouts.BUS).touch()
 
     def fault(self, **fault: object) -> None:
         self.bench.command(json.dumps({"command": "fault", **fault}))
@@ -94,66 +94,66 @@ class Shop:
 
 
 @pytest.fixture
-def shop(bench: Bench, tmp_path: Path) -> Shop:
-    return Shop(bench, tmp_path)
+def rig(bench: Bench, tmp_path: Path) -> TrustRig:
+    return TrustRig(bench, tmp_path)
 
 
 VOID = {("RecordVoid", "X")}
 
 
-def test_a_record_holds_until_something_against_it_was_seen(shop: Shop) -> None:
-    with shop.guard() as client, shop.bench.join() as bus:
-        shop.nc(on=True)
-        shop.until(client, set())
-        shop.write(bus, WINDOW, 0xFFFFFFFF)
-        shop.until(client, VOID)
-        shop.nc(on=False)
-        assert shop.check() == 1
-        assert is_void(shop.store, "X")
-        shop.write(bus, WINDOW, 32768)
-        assert shop.check() == 0
-        assert not is_void(shop.store, "X")
-        shop.nc(on=True)
-        shop.until(client, set())
-        shop.fault(axis="X", fault="reboot")
-        shop.until(client, VOID | {("NmtStateWrong", "X")})
-        shop.nc(on=False)
-        assert shop.check() == 0
-        shop.nc(on=True)
-        shop.until(client, set())
-    shop.nc(on=False)
-    with shop.bench.join() as bus:
-        shop.write(bus, 0x6007, 0, 0x2B)
-    with shop.guard() as client:  # it is compared before the guard starts, which has not heard of it
-        assert is_void(shop.store, "X")
-        shop.nc(on=True)
-        shop.until(client, VOID)
+def test_record_is_valid_until_an_event_voids_it(rig: TrustRig) -> None:
+    with rig.guard() as client, rig.bench.join() as bus:
+        rig.nc(on=True)
+        rig.until(client, set())
+        rig.write(bus, WINDOW, 0xFFFFFFFF)
+        rig.until(client, VOID)
+        rig.nc(on=False)
+        assert rig.check() == 1
+        assert is_void(rig.store, "X")
+        rig.write(bus, WINDOW, 32768)
+        assert rig.check() == 0
+        assert not is_void(rig.store, "X")
+        rig.nc(on=True)
+        rig.until(client, set())
+        rig.fault(axis="X", fault="reboot")
+        rig.until(client, VOID | {("NmtStateWrong", "X")})
+        rig.nc(on=False)
+        assert rig.check() == 0
+        rig.nc(on=True)
+        rig.until(client, set())
+    rig.nc(on=False)
+    with rig.bench.join() as bus:
+        rig.write(bus, 0x6007, 0, 0x2B)
+    with rig.guard() as client:  # it is compared before the guard starts, which has not heard of it
+        assert is_void(rig.store, "X")
+        rig.nc(on=True)
+        rig.until(client, VOID)
 
 
-def test_a_void_record_outlives_the_guard_beside_a_running_nc(shop: Shop) -> None:
-    shop.nc(on=True)
-    void_record(shop.store, "X", "booted")
-    with shop.guard() as client:
-        shop.until(client, VOID)
+def test_void_record_survives_a_guard_restart_next_to_a_running_nc(rig: TrustRig) -> None:
+    rig.nc(on=True)
+    void_record(rig.store, "X", "booted")
+    with rig.guard() as client:
+        rig.until(client, VOID)
 
 
-def test_a_remapped_read_back_at_100_mm_moves_nothing(shop: Shop, tmp_path: Path) -> None:
+def test_remapped_read_back_moves_nothing(rig: TrustRig, tmp_path: Path) -> None:
     rows = 450
     demand = tmp_path / "demand.csv"
     way = [100 * (10 * t**3 - 15 * t**4 + 6 * t**5) for t in (min(k / (rows - 10), 1.0) for k in range(rows))]
     demand.write_text("time_s,X_mm,Y_mm\n" + "".join(f"{k * 1e-3:.3f},{x:.6f},0\n" for k, x in enumerate(way)))
-    shop.nc(on=True)
-    shop.bench.command(json.dumps({"command": "play", "file": str(demand)}))
-    shop.bench.event("finished")
-    shop.fault(axis="X", fault="remap", value=3)
-    with shop.bench.join() as bus:
+    rig.nc(on=True)
+    rig.bench.command(json.dumps({"command": "play", "file": str(demand)}))
+    rig.bench.event("finished")
+    rig.fault(axis="X", fault="remap", value=3)
+    with rig.bench.join() as bus:
         bus.set_filters([{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in (0x301, 0x302, 0x764)])
-        with shop.guard() as client:
+        with rig.guard() as client:
             deadline = time.monotonic() + PATIENCE_S
             while (status := client.status())["state"] != "FROZEN":
                 assert time.monotonic() < deadline, status
                 time.sleep(0.05)
             assert status["cause"]["code"] == "OffsetDoubtful"
             assert "100000.0 um may still be applied" in status["cause"]["text"]
-            assert not client.adopt(read_token(shop.run))["ok"]
+            assert not client.adopt(read_token(rig.run))["ok"]
         assert bus.recv(0.1) is None

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from fdhil.guard import conditions, core, limits
-from fdhil.guard.limits import OffsetLimits
+from fdhil.guard import guard_step, interlock_checks, offset_limits
+from fdhil.guard.offset_limits import OffsetLimits
 from studies import kills
 from studies.fault_rows import RAMPED, Descent, descent
 from studies.live_guard import LiveGuard
@@ -18,7 +18,7 @@ LIMITS = OffsetLimits(offset=819, rate=65, acceleration=6, variation=9830, windo
 
 
 @pytest.mark.parametrize("row", sampled(RAMPED, every=3))
-def test_a_fault_at_any_time_ends_at_zero_in_time(row: str) -> None:
+def test_fault_at_any_time_ends_at_zero_in_time(row: str) -> None:
     assert RAMPED[row].code in ROWS[row].classes or not ROWS[row].classes or row == "F3"
     found = kills.frame_part(row, 3, 7)
     assert found.wrong == []
@@ -27,14 +27,14 @@ def test_a_fault_at_any_time_ends_at_zero_in_time(row: str) -> None:
 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.fault("F15")
-def test_a_killed_process_ends_at_zero() -> None:
+def test_killed_process_ends_at_zero() -> None:
     found = kills.live_part("kills", 1, 3)
     assert found.wrong == []
     assert found.frames > 100
 
 
 @pytest.mark.usefixtures("processes")
-def test_rig_arms_again_after_it_gave_up_a_correction(tmp_path: Path) -> None:
+def test_rig_arms_again_after_an_abandoned_correction(tmp_path: Path) -> None:
     live = LiveGuard(tmp_path)
     try:
         live.start_guard()
@@ -52,13 +52,13 @@ def test_rig_arms_again_after_it_gave_up_a_correction(tmp_path: Path) -> None:
     ("part", "times"),
     [("kills", 3), ("restarts", 6), ("hangs", 1), ("faults", 8)],
 )
-def test_the_same_on_socketcan(part: str, times: int) -> None:
+def test_fault_at_any_time_ends_at_zero_on_socketcan(part: str, times: int) -> None:
     found = kills.live_part(part, times, 1, "socketcan")
     assert found.wrong == []
     assert found.counts["frames while hung"] == 0
 
 
-def test_a_descent_is_judged_by_its_bounds() -> None:
+def test_ramp_down_is_checked_by_its_bounds() -> None:
     down = [(300, 0), *[(300 - 6 * k, 0) for k in range(51)]]
     assert descent(down, 0, LIMITS, 2) == Descent(1, 51, within=False)
     assert descent(down, 0, LIMITS, 20) == Descent(1, 51, within=True)
@@ -67,12 +67,18 @@ def test_a_descent_is_judged_by_its_bounds() -> None:
     assert descent(down[:-1], 0, LIMITS, 20) is None
 
 
-def test_a_guard_that_does_not_see_a_fault_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(core, conditions.failing.__name__, lambda _bus, _views: ())
+def test_guard_that_misses_a_fault_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guard_step, interlock_checks.list_failing_interlocks.__name__, lambda _bus, _views: ())
     assert kills.frame_part("E11", 1, 7).wrong
 
 
-def test_a_guard_that_ramps_by_a_step_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(core, limits.follow.__name__, lambda _limits, _offset, _rate, wanted, _rate_wanted: wanted)
-    monkeypatch.setattr(core, limits.violation.__name__, lambda _limits, _before, _rate, _offset: None)
+def test_guard_that_steps_to_zero_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        guard_step,
+        offset_limits.move_toward_goal.__name__,
+        lambda _limits, _offset, _rate, wanted, _rate_wanted: wanted,
+    )
+    monkeypatch.setattr(
+        guard_step, offset_limits.find_limit_violation.__name__, lambda _limits, _before, _rate, _offset: None
+    )
     assert any("a step" in each for each in kills.frame_part("F15", 20, 7).wrong)

@@ -51,19 +51,19 @@ async def _recorded(bench: Bench, program: Path) -> tuple[list[Any], dict[str, i
 
         async def until(condition: Callable[[], bool]) -> None:
             """Wait while the source runs and has lost nothing: after that, moves are not counted on."""
-            while not (running.done() or source.counters()["lost"] or condition()):  # noqa: ASYNC110 - no event
+            while not (running.done() or source.get_counters()["lost"] or condition()):  # noqa: ASYNC110 - no event
                 await asyncio.sleep(0.02)
 
         async with asyncio.timeout(4 * PATIENCE_S):
             # a sensor that is first asked when a rapid has begun has no voltage of its beginning
-            await until(lambda: all(n for name, n in source.counters().items() if name.endswith(".samples")))
+            await until(lambda: all(n for name, n in source.get_counters().items() if name.endswith(".samples")))
             bench.command(json.dumps({"command": "play", "file": str(program)}))
             await asyncio.to_thread(bench.event, "finished")
             await until(lambda: all(settled(records, axis, rapids) for axis in bench.config.axis))
         running.cancel()
         with suppress(asyncio.CancelledError):
             await running
-        return records, source.counters()
+        return records, source.get_counters()
 
 
 def shuttle(folder: Path, rounds: int = 2) -> Path:
@@ -72,7 +72,7 @@ def shuttle(folder: Path, rounds: int = 2) -> Path:
     return path
 
 
-def test_nothing_is_lost_and_the_drives_are_identified(bench: Bench, tmp_path: Path) -> None:
+def test_no_sample_is_lost_and_the_drives_are_identified(bench: Bench, tmp_path: Path) -> None:
     records, counters = asyncio.run(recorded(bench, shuttle(tmp_path)))
     assert counters["lost"] == 0, counters
     demand_and_position_are_aligned([r for r in records if isinstance(r, AxisSamples) and r.axis == "X"])
@@ -102,8 +102,8 @@ def demand_and_position_are_aligned(blocks: list[AxisSamples]) -> None:
     assert np.max(np.abs(travel - (position[1:] - position[0]))) < 0.2
 
 
-@pytest.mark.usefixtures("settling_soon")
-def test_an_axis_is_commissioned(bench: Bench, transport: str) -> None:
+@pytest.mark.usefixtures("short_settling_time")
+def test_axis_is_commissioned(bench: Bench, transport: str) -> None:
     record = commission(bench.config, "X")
     assert record.watchdog == "proven"
     # a virtual machine with one processor may be too slow to see the ramp begin: then it must not be told either way
@@ -111,7 +111,7 @@ def test_an_axis_is_commissioned(bench: Bench, transport: str) -> None:
     assert record.sign_test_um == pytest.approx(10, abs=1)
 
 
-def test_an_emergency_is_told(bench: Bench) -> None:
+def test_emergency_is_reported(bench: Bench) -> None:
     async def notices() -> set[str]:
         codes = set()
         async with open_machine(bench.config) as source:

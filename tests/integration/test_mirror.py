@@ -46,7 +46,7 @@ def mirror() -> Iterator[None]:
         subprocess.run(command, check=True)
 
 
-def test_the_daemon_hears_the_bus_and_cannot_send_on_it(mirror: None) -> None:
+def test_daemon_receives_from_a_mirror_bus_and_cannot_send(mirror: None) -> None:
     command = ["ip", "netns", "exec", "fdhil", sys.executable, "-c", DAEMON]
     with (
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw,

@@ -35,7 +35,7 @@ def bench(bench: Bench) -> Bench:
     return take_voltage_from_sensors(bench)
 
 
-def test_what_is_accepted_is_right(bench: Bench, tmp_path: Path) -> None:
+def test_accepted_parameters_cover_the_true_values(bench: Bench, tmp_path: Path) -> None:
     records, counters = asyncio.run(recorded(bench, shuttle(tmp_path)))
     held_up = counters["lost"] > 0  # this host, for longer than a machine in real time waits for it: the windows say so
     assert any(isinstance(r, VoltageSamples) for r in records)
@@ -51,4 +51,4 @@ def test_what_is_accepted_is_right(bench: Bench, tmp_path: Path) -> None:
             assert accepted is not None
             for name, true in TRUE.items():
                 within = 0.01 if name not in ("ft", "Cd") else 0.05
-                assert accepted.value(name) == pytest.approx(true, rel=within), name
+                assert accepted.get_value(name) == pytest.approx(true, rel=within), name

@@ -45,7 +45,7 @@ def sections() -> dict[str, Any]:
     }
 
 
-def test_a_correction_works_beside_it(bench: Bench, tmp_path: Path) -> None:
+def test_correction_works_with_the_played_program(bench: Bench, tmp_path: Path) -> None:
     way = np.concatenate([np.zeros(20), 2.5 * (1 - np.cos(np.linspace(0, np.pi, 500))), np.full(100, 5.0)])
     demand = tmp_path / "demand.csv"
     rows = [f"{k * 0.001:.3f},{x:.6f},{x:.6f}" for k, x in enumerate(way)]

@@ -16,13 +16,13 @@ def _machine() -> None:
     prepare()
 
 
-def test_nothing_that_was_acknowledged_is_lost_when_the_power_is_cut(tmp_path: Path) -> None:
+def test_power_cut_loses_no_acknowledged_record(tmp_path: Path) -> None:
     found = cut_power(3, tmp_path, pictures=2)
     assert (found.cuts, found.pictures, found.lost, found.damage) == (3, 6, [], [])
     assert all(found.acknowledged.values())
     assert found.checked > 0
 
 
-def test_a_store_that_waits_for_no_disk_loses_what_it_acknowledged(tmp_path: Path) -> None:
+def test_store_without_fsync_loses_acknowledged_records(tmp_path: Path) -> None:
     found = cut_power(2, tmp_path, "careless")
     assert found.lost or found.damage

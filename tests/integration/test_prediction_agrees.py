@@ -51,7 +51,7 @@ def table(config: MachineConfig, program: Path, folder: Path) -> Float:
 @pytest.mark.parametrize("plant", PLANTS)
 @pytest.mark.parametrize("feedforward", [1.0, 0.5])
 @pytest.mark.parametrize("program", ["bench_10m.ngc", "bench_20m.ngc"])
-def test_within_half_a_micrometre_away_from_the_limits(
+def test_prediction_matches_the_simulator_within_half_a_micrometre(
     program: str, feedforward: float, plant: str, tmp_path: Path
 ) -> None:
     config = machine(feedforward, PLANTS[plant])

@@ -15,7 +15,7 @@ from fdhil import config as machine_config
 from fdhil.config import MachineConfig
 from fdhil.drivers import open_machine
 from fdhil.pipeline import AxisPipeline
-from fdhil.records import AxisSamples, Float, Trajectory, WindowOutcome, frozen
+from fdhil.records import AxisSamples, Float, Trajectory, WindowOutcome, freeze_array
 from fdhil.sim.machine import Machine
 from fdhil.sim.service import SimService
 from tests.bench import bench_document
@@ -37,15 +37,15 @@ def rapid_mm(period_s: float, length_mm: float = 300.0, speed: float = 500.0, ac
     return np.asarray(acceleration * up**2 / 2 + speed * cruising + speed * down - acceleration * down**2 / 2)
 
 
-def there_and_back(_: Path, config: MachineConfig) -> Trajectory:
+def move_back_and_forth(_: Path, config: MachineConfig) -> Trajectory:
     period_s = config.machine.sync_period_s
     way, rest = rapid_mm(period_s), round(REST_S / period_s)
     places = np.concatenate([np.zeros(rest), way, np.full(rest, 300.0), 300.0 - way, np.zeros(rest)])
     moving = np.concatenate([np.zeros(rest), way * 0 + 1, np.zeros(rest), way * 0 + 1, np.zeros(rest)]) > 0
     return Trajectory(
         period_s,
-        frozen(np.arange(places.size) * period_s),
-        {axis: frozen(places) for axis in config.axis},
+        freeze_array(np.arange(places.size) * period_s),
+        {axis: freeze_array(places) for axis in config.axis},
         moving,
         np.zeros(places.size, dtype=np.int64),
     )
@@ -65,19 +65,19 @@ async def recorded(bench: Bench) -> tuple[list[Any], dict[str, int]]:
                 await asyncio.sleep(0.02)
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
-        return records, source.counters()
+        return records, source.get_counters()
 
 
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("period_s", [0.002, 0.004, 0.01])
-def test_four_axes_are_recorded_row_by_row(period_s: float, tmp_path: Path) -> None:
+def test_four_axes_are_recorded_sample_by_sample(period_s: float, tmp_path: Path) -> None:
     document = bench_document(AXES)
     document["machine"]["sync_period_s"] = period_s
     document["bus"] = {"can0": {"interface": "virtual", "channel": f"slow-{period_s}"}}
     document["sim"] = {"pace": "lockstep", "modbus": False}
     config = machine_config.parse(document, folder=tmp_path)
     events: queue.Queue[dict[str, Any]] = queue.Queue()
-    service = SimService(config, events.put, there_and_back)
+    service = SimService(config, events.put, move_back_and_forth)
     thread = threading.Thread(target=service.run, name="twin")
     thread.start()
     bench = Bench(config, service, events)
@@ -97,7 +97,7 @@ def test_four_axes_are_recorded_row_by_row(period_s: float, tmp_path: Path) -> N
         assert max(window.speed_rad_s.max() for window in windows) == pytest.approx(157.1, rel=0.03)
 
 
-def test_the_shipped_four_axes_fit_their_bus_and_would_not_at_1_ms() -> None:
+def test_shipped_four_axis_config_fits_its_bus_but_not_at_1_ms() -> None:
     config = machine_config.load(ROOT / "configs" / "four-axes.toml")
     load = Machine(config).describe(dict.fromkeys(config.axis, Path()))["bus_load_worst"]["can0"]
     assert 0.3 < load < 0.6

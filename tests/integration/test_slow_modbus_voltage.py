@@ -40,7 +40,7 @@ def outcomes_of(bench: Bench, folder: Path, rounds: int = 2) -> dict[str, list[O
     return {axis: digested(AxisPipeline(axis, bench.config), records) for axis in bench.config.axis}
 
 
-def test_published_parameters_hold_the_truth_in_their_intervals(bench: Bench, tmp_path: Path) -> None:
+def test_published_intervals_cover_the_true_values(bench: Bench, tmp_path: Path) -> None:
     for outcomes in outcomes_of(bench, tmp_path).values():
         windows = [o for o in outcomes if isinstance(o, WindowOutcome)]
         assert [o.verdict.accepted for o in windows] == [True] * 4, [o.verdict for o in windows]
@@ -58,7 +58,7 @@ def test_published_parameters_hold_the_truth_in_their_intervals(bench: Bench, tm
             assert apart < 4 * stds[k] < 0.15 * true, name
 
 
-def test_a_delay_beyond_a_sample_is_refused_with_its_figure(bench: Bench, tmp_path: Path) -> None:
+def test_delay_beyond_a_sample_is_refused_with_its_value(bench: Bench, tmp_path: Path) -> None:
     for axis in bench.config.axis:
         fault = {"command": "fault", "fault": "sensor_delayed", "axis": axis, "value": 2}
         bench.command(json.dumps(fault))

@@ -93,7 +93,7 @@ def play(bench: Bench, client: GuardClient, demand: Path, stream: RowStream) -> 
                 time.sleep(0.03)
 
 
-def test_rows_end_before_a_place_that_is_refused(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
+def test_streamed_rows_end_before_a_refused_position(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
     there, hard = bench_demand(10), bench_demand(20, (0.030, 0.015))
     path = np.concatenate([np.repeat(there[:1], 300, axis=0), *[there, there[::-1]] * 2, hard])
     place = len(path) - len(hard)

@@ -42,7 +42,7 @@ def config() -> MachineConfig:
     return machine_config.parse(document)
 
 
-def to_and_fro() -> np.ndarray[Any, Any]:
+def move_back_and_forth() -> np.ndarray[Any, Any]:
     t = np.arange(0.0, 1.2, PERIOD_S)
     way = np.cumsum(np.clip(np.minimum(t * 4000, (0.725 - t) * 4000), 0, 500)) * PERIOD_S
     both = np.concatenate([np.zeros(200), way, way[-1] - way])
@@ -66,7 +66,7 @@ def recorded() -> dict[str, list[WindowOutcome]]:
     recent = {axis: RecentSamples(axis, section, 10_000, PERIOD_S) for axis, section in machine.axis.items()}
     hand = TwinInHand(machine)
     hand.switch_on()
-    hand.play(to_and_fro())
+    hand.play(move_back_and_forth())
     hand.machine.tables.accelerometers["Y"].take()
     frames: list[tuple[int, int, bytes]] = []
     lines: list[TextLine] = []
@@ -96,18 +96,18 @@ def estimates(axis: str) -> list[Estimate]:
 
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("axis", list(TRUE))
-def test_the_resonance_is_found_in_each_rapid_and_the_rapid_believed(axis: str) -> None:
+def test_resonance_is_found_and_each_rapid_accepted(axis: str) -> None:
     assert [o.window.direction for o in recorded()[axis]] == [1, -1]
     assert [o.verdict.accepted for o in recorded()[axis]] == [True, True], [o.verdict for o in recorded()[axis]]
     assert len(estimates(axis)) == 2
     for estimate in estimates(axis):
-        assert abs(estimate.value("resonance") - TRUE[axis]) < 3 * estimate.std("resonance")
-        assert estimate.value("resonance") == pytest.approx(TRUE[axis], rel=0.1)
-        assert abs(estimate.value("resonance_damping") - 0.02) < 4 * estimate.std("resonance_damping")
+        assert abs(estimate.get_value("resonance") - TRUE[axis]) < 3 * estimate.get_std("resonance")
+        assert estimate.get_value("resonance") == pytest.approx(TRUE[axis], rel=0.1)
+        assert abs(estimate.get_value("resonance_damping") - 0.02) < 4 * estimate.get_std("resonance_damping")
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_the_model_with_it_knows_what_the_motors_encoder_does_not_see() -> None:
+def test_model_with_resonance_predicts_what_the_motor_encoder_misses() -> None:
     for result in (o.at_table for o in recorded()["X"]):
         assert result is not None
         assert result.unseen_rms_um > 15.0
@@ -117,7 +117,7 @@ def test_the_model_with_it_knows_what_the_motors_encoder_does_not_see() -> None:
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_each_sensor_s_signal_is_on_the_rows_of_the_drive() -> None:
+def test_each_sensor_signal_is_aligned_with_the_drives_samples() -> None:
     for axis, name in (("X", "table_mm"), ("Y", "table_m_s2")):
         for outcome in recorded()[axis]:
             values = getattr(outcome.window, name)

@@ -50,13 +50,13 @@ def machine(case: str, *, told: bool) -> MachineConfig:
 
 
 def predicted(config: MachineConfig, terms: dict[str, float]) -> Float:
-    models = {axis: Parameters(**s.nominal.model_dump()).changed(**terms) for axis, s in config.axis.items()}
+    models = {axis: Parameters(**s.nominal.model_dump()).replace_values(**terms) for axis, s in config.axis.items()}
     answer = predict(load_trajectory(PROGRAM, config), models, config)
     return np.column_stack([answer.predicted_mm["X"], answer.predicted_mm["Y"]])
 
 
 @pytest.mark.parametrize("case", REALITY)
-def test_within_an_increment_once_under_way(case: str, tmp_path: Path) -> None:
+def test_terms_match_the_simulator_within_an_increment(case: str, tmp_path: Path) -> None:
     untold = machine(case, told=False)
     actual = table(untold, PROGRAM, tmp_path)
     with_terms, without = predicted(machine(case, told=True), TERMS[case]), predicted(untold, {})

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from fdhil.arming.passes import FINISHED
-from fdhil.child import ending_with_parent
+from fdhil.child_process import wrap_to_end_with_parent
 from fdhil.prediction import contour_error_um
 from fdhil.records import Trajectory
 
@@ -33,7 +33,7 @@ M2
 
 def fdhil(*arguments: object, code: int = 0) -> dict[str, Any]:
     done = subprocess.run(
-        ending_with_parent([sys.executable, "-m", "fdhil", *map(str, arguments), "--json"]),
+        wrap_to_end_with_parent([sys.executable, "-m", "fdhil", *map(str, arguments), "--json"]),
         capture_output=True,
         text=True,
         timeout=PATIENCE_S,
@@ -54,7 +54,7 @@ def until(ready: Callable[[], bool]) -> None:
 def record(config: Path, out: Path, cut: Callable[[], None]) -> None:
     command = [sys.executable, "-m", "fdhil", "record", str(config), "--out", str(out), "--rest", "0.6", "--json"]
     with subprocess.Popen(
-        ending_with_parent(command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        wrap_to_end_with_parent(command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as recording:
         assert recording.stderr is not None
         first = recording.stderr.readline()

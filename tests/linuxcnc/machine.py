@@ -20,7 +20,7 @@ from typing import IO, Any, Self
 
 import numpy as np
 
-from fdhil.child import ending_with_parent
+from fdhil.child_process import wrap_to_end_with_parent
 from fdhil.records import Float
 from tests.sim.twin_process import TwinProcess
 
@@ -144,7 +144,7 @@ class LinuxCnc:
                 *command,
             )
         return subprocess.Popen(
-            ending_with_parent(command),
+            wrap_to_end_with_parent(command),
             cwd=self.folder,
             env=environment,
             stdin=subprocess.DEVNULL,

@@ -20,7 +20,7 @@ from fdhil import config as machine_config
 from fdhil.bridges import hal_bus
 from fdhil.cli.demo.processes import Process
 from fdhil.config.axis import HAL_INCREMENTS
-from fdhil.daemon.control import SOCKET_NAME
+from fdhil.daemon.daemon_socket import SOCKET_NAME
 from fdhil.prediction import contour_error_um
 from fdhil.records import Float
 from tests.linuxcnc.beside import SHUTTLE, TRIES, fdhil, record, repeated, until

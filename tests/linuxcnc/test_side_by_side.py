@@ -15,7 +15,7 @@ from fdhil.bridges import linuxcnc as bridge
 from fdhil.cli.demo.machines import machine_document
 from fdhil.cli.demo.processes import Process
 from fdhil.cli.demo.toml import to_toml
-from fdhil.daemon.control import SOCKET_NAME
+from fdhil.daemon.daemon_socket import SOCKET_NAME
 from fdhil.program import load_trajectory
 from tests.linuxcnc.beside import PART, SHUTTLE, TRIES, contour_of_each_cut, fdhil, record, repeated, until
 from tests.linuxcnc.machine import LinuxCnc

@@ -9,10 +9,10 @@ from collections import Counter
 from contextlib import closing
 from typing import Any
 
-from fdhil.guard.adoption import may_stand
-from fdhil.guard.protocol import AT_REST
+from fdhil.guard.guard_protocol import AT_REST
+from fdhil.guard.offset_adoption import list_applied_offsets
 from fdhil.store.audit import entries
-from tests.guard.wire import Wire
+from tests.guard.frame_checks import Wire
 from tests.machine.whole_machine import Machine
 
 OFFSET = 0x60B000
@@ -94,7 +94,7 @@ class Judge:
         if guard is None or guard.state.mode not in AT_REST or guard._silent:
             self._untrue.clear()
             return
-        for (unit, _), reported in zip(self._wires.values(), may_stand(guard.state), strict=True):
+        for (unit, _), reported in zip(self._wires.values(), list_applied_offsets(guard.state), strict=True):
             held = self._held(unit)
             is_true = reported in (None, held) or held == 0  # more than there is may be feared
             self._untrue[unit.axis] = 0 if is_true else self._untrue[unit.axis] + 1

@@ -128,7 +128,7 @@ class GuardSocket(CanSocket):
         frames, self.inbox = self.inbox[:MOST_FRAMES], self.inbox[MOST_FRAMES:]
         return frames
 
-    def restored(self) -> bool:
+    def try_restore(self) -> bool:
         self.inbox.clear()
         return not self._bus.is_down
 

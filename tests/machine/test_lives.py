@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.guard.machine import ramp_cycles
+from tests.guard.simulated_bus import ramp_cycles
 from tests.machine.invariants import TABLES, Judge
 from tests.machine.whole_machine import Machine
 from tests.tiers import sampled
@@ -194,12 +194,12 @@ def test_the_guard_sleeps_while_no_sync_comes(begin: Begin, monkeypatch: pytest.
     machine.run(0.5)
     assert machine.guard is not None
     turns: list[float] = []
-    turn = machine.guard.turn
+    turn = machine.guard.run_turn
 
     def counted() -> int | None:
         turns.append(machine.clock.now_s())
         return turn()
 
-    monkeypatch.setattr(machine.guard, "turn", counted)
+    monkeypatch.setattr(machine.guard, "run_turn", counted)
     machine.run(5.0)
     assert 50 < len(turns) < 500  # it looks 20 times a second, and when it is asked

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fdhil.guard import core
+from fdhil.guard import guard_step
 from studies import swarm
 from tests.machine.invariants import Judge
 from tests.machine.test_lives import into_the_cut
@@ -89,8 +89,8 @@ def test_a_step_of_the_offset_is_seen_by_the_judge(begin: Begin, monkeypatch: py
     machine = begin()
     Judge(machine)
     into_the_cut(machine, 0.3)
-    monkeypatch.setattr(core, "follow", lambda _limits, _offset, _rate, wanted, _rate_wanted: wanted)
-    monkeypatch.setattr(core, "violation", lambda _limits, _before, _rate, _offset: None)
+    monkeypatch.setattr(guard_step, "move_toward_goal", lambda _limits, _offset, _rate, wanted, _rate_wanted: wanted)
+    monkeypatch.setattr(guard_step, "find_limit_violation", lambda _limits, _before, _rate, _offset: None)
     machine.run(0.1)
     machine.kill("daemon")
     machine.run(0.1)

@@ -34,10 +34,10 @@ class VirtualClock(Clock):
     def wall_s(self) -> float:
         return FIRST_WALL_S + self.time_s + self.set_s
 
-    def since_boot_ns(self) -> int:
+    def read_boot_time_ns(self) -> int:
         return round(self.time_s * 1e9)
 
-    def boot_id(self) -> str:
+    def read_boot_id(self) -> str:
         return "00000000-0000-4000-8000-000000000001"
 
     def sleep(self, seconds: float) -> None:

@@ -24,13 +24,13 @@ from fdhil.arming.token import make_directory, operator_token
 from fdhil.commissioning.record import CommissioningRecord, axis_digest, load_record, save_record
 from fdhil.commissioning.void import confirm_record, void_mark
 from fdhil.config import MachineConfig
-from fdhil.daemon.control import SOCKET_NAME
-from fdhil.daemon.service import Service
+from fdhil.daemon.daemon_service import DaemonService
+from fdhil.daemon.daemon_socket import SOCKET_NAME
 from fdhil.drivers import open_machine
-from fdhil.guard.frames import Listener
-from fdhil.guard.journal import Clock as GuardClock
-from fdhil.guard.journal import Journal, Notifier
-from fdhil.guard.process import Guard
+from fdhil.guard.event_journal import Clock as GuardClock
+from fdhil.guard.event_journal import EventJournal, SystemdNotifier
+from fdhil.guard.frame_monitor import FrameMonitor
+from fdhil.guard.guard_process import Guard
 from fdhil.program import load_trajectory
 from fdhil.sim.fault_script import parse as parse_fault
 from fdhil.sim.frame import BusFrame
@@ -94,7 +94,7 @@ class Machine:
         self.at_foreign_frame: Callable[[int, bytes], None] = lambda _cob_id, _data: None
         self.guard: Guard | None = None
         self.guard_exit: int | None = None
-        self.service: Service | None = None
+        self.service: DaemonService | None = None
         self._loop: VirtualLoop | None = None
         self._serving: asyncio.Task[Any] | None = None
         self._hung_until_s = 0.0
@@ -228,7 +228,7 @@ class Machine:
         loop = self._loop = VirtualLoop(self.clock)
         with self._current(loop):
             opened = functools.partial(open_machine, open_bus=self.bus.open)
-            self.service = Service(self.config, opened, clock=self.clock)
+            self.service = DaemonService(self.config, opened, clock=self.clock)
             self._serving = loop.create_task(self.service.run())
         self.run_until(lambda: f"ready: {self.config.machine.name}" in self.log.getvalue()[-20_000:])
 
@@ -288,7 +288,7 @@ class Machine:
         run, name = self.config.guard_directory, corrected_bus(self.config, "machine")
         digest = hashlib.sha256(operator_token(self.config.run_directory).encode()).hexdigest()
         settings = settings_of(self.config, name, run, digest)
-        can = GuardSocket(self.bus, settings.sent_ids, Listener(settings).wanted_ids())
+        can = GuardSocket(self.bus, settings.sent_ids, FrameMonitor(settings).list_received_ids())
         self._journal_near, journal_far = os.pipe()
         os.set_blocking(self._journal_near, False)
         self._journal_far = journal_far
@@ -300,10 +300,10 @@ class Machine:
         def poll() -> Any:
             return GuardPoll(can, self._guard_rests, self._pass_for_failed_guard)
 
-        journal = Journal(journal_far, GuardClock(self.clock.now_s, self.clock.wall_s, poll))
+        journal = EventJournal(journal_far, GuardClock(self.clock.now_s, self.clock.wall_s, poll))
         self.guard_exit = None
-        self.guard = Guard(settings, can, journal, Notifier(None), wake)
-        self.guard.begin()
+        self.guard = Guard(settings, can, journal, SystemdNotifier(None), wake)
+        self.guard.report_ready()
         self._guard_due_s = self.clock.now_s()
 
     def _guard_ended(self) -> None:
@@ -318,10 +318,10 @@ class Machine:
         guard = self.guard
         assert guard is not None
         for client in guard.control.clients:
-            client.release()
+            client.release_descriptor()
             client.socket.close()
         guard.control._listener.socket.close()
-        guard.control._closer.end()
+        guard.control._closer.finish_closing()
         guard._notifier.close()
         guard._can.close()
         self._guard_ended()
@@ -387,7 +387,7 @@ class Machine:
             return
         if not can.is_readable and now_s < self._guard_due_s:
             return
-        self.guard_exit = guard.turn()
+        self.guard_exit = guard.run_turn()
         if self.guard_exit is not None:
             self._guard_ended()
 

@@ -38,7 +38,7 @@ class SlowDrive:
     def _smooth(self, w: float, theta: float, side: float) -> float:
         p, terms = self.p, dict(self.p.terms)
         angle = theta + self.start * 2 * math.pi / self.pitch
-        total = p.term("load") + w * p.term("viscous_positive" if side > 0 else "viscous_negative", p.ft)
+        total = p.get_term("load") + w * p.get_term("viscous_positive" if side > 0 else "viscous_negative", p.ft)
         for name, amplitude in terms.items():
             if name.startswith("ripple") and not name.endswith("phase"):
                 total += amplitude * math.sin(int(name.split("_")[2]) * angle + terms.get(name + "_phase", 0.0))
@@ -46,12 +46,12 @@ class SlowDrive:
 
     def _dry(self, w: float, side: float) -> float:
         p = self.p
-        dry = p.term("coulomb_positive" if side > 0 else "coulomb_negative", p.Cd)
-        return dry + (p.term("stribeck") * math.exp(-((w / p.term("stribeck_speed", 1.0)) ** 2)))
+        dry = p.get_term("coulomb_positive" if side > 0 else "coulomb_negative", p.Cd)
+        return dry + (p.get_term("stribeck") * math.exp(-((w / p.get_term("stribeck_speed", 1.0)) ** 2)))
 
     def _behind_the_inverter(self, u: float) -> float:
         whole_at = self.g.voltage_limit_v * self.g.current_period_s / (4 * self.nominal.L)
-        return u - self.p.term("dead_time") * max(-1.0, min(1.0, self.i / whole_at))
+        return u - self.p.get_term("dead_time") * max(-1.0, min(1.0, self.i / whole_at))
 
     def _slopes(self, i: float, w: float, theta: float, u: float, side: float) -> tuple[float, float, float]:
         p = self.p
@@ -218,10 +218,10 @@ class TwoMassDrive(SlowDrive):
 
     def __init__(self, parameters: Parameters, axis: Axis, period_s: float, increments: int = 65536) -> None:
         super().__init__(parameters, axis, period_s, increments)
-        p, self.share = parameters, parameters.term("resonance_share", 0.5)
+        p, self.share = parameters, parameters.get_term("resonance_share", 0.5)
         reduced = p.Jt * self.share * (1 - self.share)
-        self.stiffness = reduced * (2 * math.pi * p.term("resonance")) ** 2
-        self.damping = 2 * p.term("resonance_damping") * math.sqrt(self.stiffness * reduced)
+        self.stiffness = reduced * (2 * math.pi * p.get_term("resonance")) ** 2
+        self.damping = 2 * p.get_term("resonance_damping") * math.sqrt(self.stiffness * reduced)
         self.table = self.table_w = 0.0
         self.tables_mm: list[float] = []
 

@@ -34,7 +34,7 @@ def test_agrees_with_independent_physics(seed: int) -> None:
     """Within 0.6 um of a drive with quantisation (dry friction keeps the rounding), 0.02 um of one without."""
     random = np.random.default_rng(100 + seed)
     scaled = [v * random.uniform(0.85, 1.15) for v in NOMINAL.as_dict().values()]
-    parameters = Parameters.of(dict(zip(PARAMETERS, scaled, strict=True)))
+    parameters = Parameters.from_mapping(dict(zip(PARAMETERS, scaled, strict=True)))
     demand = random_demand(seed)
     response = closed_loop.simulate(parameters, AXIS, PERIOD, demand)
     assert response.limited_s == 0.0

@@ -68,7 +68,7 @@ def loaded(slow: SlowDrive, axis: Axis, demand: Float) -> SlowDrive:
 @pytest.mark.parametrize(("joined", "delay"), sampled(product(TERMS, [0, 3]), every=3))
 def test_agrees_with_independent_physics(joined: str, delay: int) -> None:
     """For a move, a reversal and rest."""
-    axis, parameters = bench(current_delay_cycles=delay), PLAIN.changed(**TERMS[joined])
+    axis, parameters = bench(current_delay_cycles=delay), PLAIN.replace_values(**TERMS[joined])
     demand = there_and_back(150)
     response = closed_loop.simulate(parameters, axis, PERIOD, demand)
     slow = loaded(SlowDrive(parameters, axis, PERIOD, increments=65536 << 20), axis, demand).run(demand.tolist())
@@ -80,7 +80,7 @@ def test_agrees_with_independent_physics(joined: str, delay: int) -> None:
 @pytest.mark.parametrize("joined", TERMS)
 def test_agrees_with_an_adaptive_solver(joined: str) -> None:
     """Against ``solve_ivp`` with standstill as an event."""
-    axis, parameters = bench(), PLAIN.changed(**TERMS[joined])
+    axis, parameters = bench(), PLAIN.replace_values(**TERMS[joined])
     demand = there_and_back(60)
     response = closed_loop.simulate(parameters, axis, PERIOD, demand)
     exact = loaded(EventDrive(parameters, axis, PERIOD, 65536 << 20), axis, demand).run(demand.tolist())
@@ -92,7 +92,7 @@ def test_agrees_with_an_adaptive_solver(joined: str) -> None:
 def test_a_table_behind_a_spring_agrees_with_independent_physics(share: float) -> None:
     """The remaining difference is the instant within a step at which the table stops."""
     axis = bench(current_delay_cycles=1)
-    parameters = PLAIN.changed(
+    parameters = PLAIN.replace_values(
         resonance=70.0, resonance_damping=0.03, resonance_share=share, stribeck=0.5, stribeck_speed=8.0
     )
     demand = there_and_back(240, (0.060, 0.030))
@@ -106,14 +106,14 @@ def test_a_table_behind_a_spring_agrees_with_independent_physics(share: float) -
 def test_a_stiff_spring_is_none() -> None:
     """At a resonance far beyond the drive's bandwidth."""
     demand, axis = there_and_back(150), bench()
-    stiff = closed_loop.simulate(PLAIN.changed(resonance=3000.0, resonance_damping=0.1), axis, PERIOD, demand)
+    stiff = closed_loop.simulate(PLAIN.replace_values(resonance=3000.0, resonance_damping=0.1), axis, PERIOD, demand)
     one = closed_loop.simulate(PLAIN, axis, PERIOD, demand)
     assert np.abs(stiff.table_mm - one.table_mm).max() < 0.1e-3
 
 
 def named(m: real_plant.Mechanics, loops_: real_plant.Loops) -> Parameters:
     """Return the same machine by the names of the terms."""
-    return Parameters.of(m.truth()).changed(
+    return Parameters.from_mapping(m.truth()).replace_values(
         load=m.load_nm,
         coulomb_positive=(1 + m.asymmetry) * m.Cd,
         coulomb_negative=(1 - m.asymmetry) * m.Cd,
@@ -160,7 +160,7 @@ def test_an_axis_stands_as_long_as_it_is_told_to(structure: str, share: float) -
     """For any holding current within the friction band."""
     more = {"double_pi": {"position_ki_per_s2": 300.0}, "pid": {"position_ki_per_s2": 2500.0, "speed_ki": 0.0}}
     axis = bench(structure=structure, current_delay_cycles=2, speed_filter_s=0.0005, **more.get(structure, {}))
-    parameters = PLAIN.changed(**TERMS["all"], resonance=90.0)
+    parameters = PLAIN.replace_values(**TERMS["all"], resonance=90.0)
     pull = float(terms.torque(parameters, np.zeros(1), np.array([7.0 * terms.rad_per_mm(axis)]))[0])
     current = (pull + share * parameters.Cd) / parameters.K
     state = closed_loop.standing(parameters, axis, 7.0, current)
@@ -173,7 +173,7 @@ def test_an_axis_stands_as_long_as_it_is_told_to(structure: str, share: float) -
 @pytest.mark.parametrize("joined", [*TERMS, "resonance"])
 def test_runs_in_pieces_give_the_same_bits(joined: str) -> None:
     axis = bench(current_delay_cycles=5, speed_filter_s=0.0004)
-    parameters = PLAIN.changed(**TERMS.get(joined, {"resonance": 80.0}))
+    parameters = PLAIN.replace_values(**TERMS.get(joined, {"resonance": 80.0}))
     demand = there_and_back(90)
     whole = closed_loop.simulate(parameters, axis, PERIOD, demand)
     tail = closed_loop.simulate(parameters, axis, PERIOD, demand, state=whole.state_at(41), first=41)
@@ -183,7 +183,7 @@ def test_runs_in_pieces_give_the_same_bits(joined: str) -> None:
 def test_terms_that_are_nil_are_none() -> None:
     demand, axis = there_and_back(150), bench()
     start, found = closed_loop.start(float(demand[0])), []
-    for parameters in (PLAIN, PLAIN.changed(load=0.0)):
+    for parameters in (PLAIN, PLAIN.replace_values(load=0.0)):
         drive = closed_loop.prepare(parameters, axis, PERIOD)
         assert isinstance(drive, loops.Drive)
         found.append(replace(drive, leap=drive.leap[:0]).run(closed_loop.Commands(demand), start))
@@ -194,13 +194,13 @@ def test_terms_that_are_nil_are_none() -> None:
 
 def test_the_speed_delay_is_the_sensors() -> None:
     demand, axis = there_and_back(90), bench()
-    late = closed_loop.simulate(PLAIN.changed(speed_delay=0.002), axis, PERIOD, demand)
+    late = closed_loop.simulate(PLAIN.replace_values(speed_delay=0.002), axis, PERIOD, demand)
     assert np.array_equal(late.position_mm, closed_loop.simulate(PLAIN, axis, PERIOD, demand).position_mm)
 
 
 def test_the_torque_is_the_formula() -> None:
     """Term by term, also at rest, where dry friction has no sign."""
-    p = PLAIN.changed(**TERMS["all"], coulomb_negative=3.0)
+    p = PLAIN.replace_values(**TERMS["all"], coulomb_negative=3.0)
     speed, angle = np.array([-20.0, 0.0, 5.0]), np.array([1.0, 2.0, 3.0])
     ripple = 0.3 * np.sin(angle) + 0.2 * np.sin(12 * angle - 1.0)
     dry = np.array([-3.0 - 0.8 * np.exp(-4.0), 0.0, 4.2 + 0.8 * np.exp(-0.25)])
@@ -214,7 +214,7 @@ def test_leaps_give_what_steps_give(joined: str, seed: int) -> None:
     """With the mean of the terms over a speed cycle."""
     random = np.random.default_rng(seed)
     axis = bench(speed_filter_s=0.0005 * (seed == 1), setpoint_filter_s=0.001 * (seed == 2))
-    parameters = PLAIN.changed(**TERMS[joined], Jt=PLAIN.Jt * random.uniform(0.7, 1.4))
+    parameters = PLAIN.replace_values(**TERMS[joined], Jt=PLAIN.Jt * random.uniform(0.7, 1.4))
     demand = there_and_back(300) + (np.arange(300) > 200) * 3.0 * (seed == 3)  # a jump clips
     drive = closed_loop.prepare(parameters, axis, PERIOD)
     assert isinstance(drive, loops.Drive)

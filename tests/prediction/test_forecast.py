@@ -10,7 +10,7 @@ import pytest
 from fdhil.prediction import predict, sensitivity_um
 from fdhil.prediction.forecast import Course, course, crossing, last_step, step_costs, zone_changes
 from fdhil.prediction.models import nominal_models
-from fdhil.records import PARAMETERS, Parameters, ParameterSet, Trajectory, frozen, frozen_ints
+from fdhil.records import PARAMETERS, Parameters, ParameterSet, Trajectory, freeze_array, freeze_integers
 from tests.bench import bench_config
 from tests.paths import bench_trajectory
 
@@ -21,13 +21,13 @@ STD = np.array([0.003 * value for value in NOMINAL.as_dict().values()])
 
 def published(axis: str, revision: int, **changed: float) -> ParameterSet:
     """Return a set with some values other than nominal, known to 0.3 %."""
-    values = NOMINAL.changed(**changed)
-    return ParameterSet(axis, revision, values, frozen(np.diag(STD**2)), 3, 0, None, "digest")
+    values = NOMINAL.replace_values(**changed)
+    return ParameterSet(axis, revision, values, freeze_array(np.diag(STD**2)), 3, 0, None, "digest")
 
 
 def with_lines(reference: Trajectory) -> Trajectory:
     """Return the reference as a program with one line per 100 ms."""
-    return replace(reference, line=frozen_ints(1 + np.arange(reference.time_s.size) // 100))
+    return replace(reference, line=freeze_integers(1 + np.arange(reference.time_s.size) // 100))
 
 
 def test_a_fixture_costs_what_the_prediction_without_it_says() -> None:
@@ -145,7 +145,7 @@ def test_slopes_begin_behind_the_last_step() -> None:
 
 
 def test_a_parameter_set_without_covariance_still_has_steps() -> None:
-    unknown = frozen(np.full((6, 6), np.nan))
+    unknown = freeze_array(np.full((6, 6), np.nan))
     before, after = (replace(published("X", k, Jt=jt), covariance=unknown) for k, jt in ((1, 0.075), (2, 0.085)))
     assert last_step([before, after]) == 0
     assert isinstance(before.parameters, Parameters)
@@ -154,7 +154,7 @@ def test_a_parameter_set_without_covariance_still_has_steps() -> None:
 def test_a_term_that_joined_or_left_is_told_as_a_whole() -> None:
     """The effect of falling friction since a prediction without it, and the reverse."""
     reference = bench_trajectory(10)
-    rich = NOMINAL.changed(stribeck=2.0, stribeck_speed=10.0)
+    rich = NOMINAL.replace_values(stribeck=2.0, stribeck_speed=10.0)
     for earlier, now in ((NOMINAL, rich), (rich, NOMINAL)):
         models = {"X": now, "Y": now}
         prediction = predict(reference, models, CONFIG)

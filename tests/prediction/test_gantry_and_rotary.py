@@ -58,7 +58,7 @@ def test_gantry_axis_with_equal_drives_is_predicted_as_one_drive() -> None:
 def test_gantry_axis_with_unequal_drives_is_at_their_mean() -> None:
     config = parse(rotary_and_gantry_document())
     models = nominal_models(config)
-    models["Y2"] = models["Y2"].changed(Jt=0.1, Cd=8.0)
+    models["Y2"] = models["Y2"].replace_values(Jt=0.1, Cd=8.0)
     reference = demand("F3000|G1 Y20|Y0", config)
     predicted = predict(reference, models, config)
     mean_um = (predicted.error_um["Y"] + predicted.error_um["Y2"]) / 2
@@ -88,7 +88,7 @@ def test_deviation_and_sensitivity_share_a_gantry_axis_between_its_drives() -> N
 def test_correction_of_a_rotary_and_a_gantry_axis_helps_and_keeps_its_limits(method: str, gain: float) -> None:
     config = parse(rotary_and_gantry_document())
     models = nominal_models(config)
-    models["Y2"] = models["Y2"].changed(Jt=0.09)
+    models["Y2"] = models["Y2"].replace_values(Jt=0.09)
     planned = correction.plan(demand("F1500|G1 X20 Y10 A20|X0 A0|Y0", config), models, config, method)
     assert planned.refused == ()
     assert planned.after.rms_um < planned.before.rms_um / gain

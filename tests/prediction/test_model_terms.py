@@ -11,7 +11,7 @@ from fdhil.records import Parameters
 from tests.bench import bench_config
 
 BASE = Parameters(0.5, 0.005, 0.8, 0.075, 0.05, 5.0)
-RICH = BASE.changed(
+RICH = BASE.replace_values(
     load=2.0,
     coulomb_positive=6.0,
     coulomb_negative=4.0,
@@ -48,7 +48,7 @@ def test_the_torque_against_motion_is_the_sum_of_its_terms() -> None:
 def test_what_a_path_demands_has_the_terms_in_it() -> None:
     axis = bench_config().axis["X"]
     path = np.linspace(0.0, 100.0, 1001)
-    amperes = [required(path, model, axis, 0.001)[0][500] * 200.0 for model in (BASE, BASE.changed(load=2.0))]
+    amperes = [required(path, model, axis, 0.001)[0][500] * 200.0 for model in (BASE, BASE.replace_values(load=2.0))]
     assert amperes[1] - amperes[0] == pytest.approx(2.0 / 0.8)
 
 
@@ -69,6 +69,6 @@ def test_without_dry_friction_the_rest_stays() -> None:
 
 def test_a_term_is_put_back_as_a_whole() -> None:
     names = ("stribeck", "stribeck_speed")
-    assert put_back(RICH, BASE, names).term("stribeck") == 0.0
-    assert put_back(RICH, BASE, names).term("stribeck_speed") == 10.0
+    assert put_back(RICH, BASE, names).get_term("stribeck") == 0.0
+    assert put_back(RICH, BASE, names).get_term("stribeck_speed") == 10.0
     assert dict(put_back(BASE, RICH, names).terms) == {"stribeck": 1.0, "stribeck_speed": 10.0}

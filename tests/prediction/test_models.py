@@ -115,7 +115,7 @@ def test_a_configured_resonance_is_in_the_model() -> None:
     found = models_for(path, nominal, config, "m.json")
     assert dict(found["X"].terms) == {"resonance": 80.0, "resonance_damping": 0.05}
     assert found["Y"].terms == ()
-    own = nominal["X"].changed(resonance=60.0)
+    own = nominal["X"].replace_values(resonance=60.0)
     assert models_for(path, nominal | {"X": own}, config, "m.json")["X"] == own
 
 
@@ -178,14 +178,14 @@ def test_loops_of_an_earlier_configuration_are_refused_unless_it_has_them_now() 
 
 
 def published_friction(dry_nm: float, stribeck_nm: float, covariance: Float) -> dict[str, ParameterSet]:
-    parameters = BENCH.changed(Cd=dry_nm, stribeck=stribeck_nm, stribeck_speed=8.0)
+    parameters = BENCH.replace_values(Cd=dry_nm, stribeck=stribeck_nm, stribeck_speed=8.0)
     return {"X": replace(published(parameters=parameters), covariance=covariance)}
 
 
 def test_an_older_set_that_chance_made_unphysical_is_used_within_the_bounds() -> None:
     covariance = np.diag([0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 2.8**2, 1.0])
     models, _ = validated_models(published_friction(4.95, -6.4, covariance), CONFIG, "store")
-    assert models["X"].Cd + models["X"].term("stribeck") == 0.0
+    assert models["X"].Cd + models["X"].get_term("stribeck") == 0.0
     assert models["X"].Cd == pytest.approx(4.95 + 1.45 / (1 + 2.8**2))
     for told in (published_friction(4.95, -26.4, covariance), published_friction(4.95, -6.4, np.zeros((6, 6)))):
         with pytest.raises(ConfigError, match="X: Unphysical: friction in the newest set would drive"):

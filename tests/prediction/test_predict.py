@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.daemon.kernel_warmup import nominal_rapid
+from fdhil.daemon.kernel_warmup import simulate_nominal_rapid
 from fdhil.errors import ConfigError
 from fdhil.prediction import contour_error_um, predict, skill
 from fdhil.prediction.models import nominal_models
@@ -63,7 +63,7 @@ def test_drifts_change_the_path(
     """Figures 14 and 15: a drift on one axis moves the path, near E by little (friction) or much (inertia)."""
     reference = bench_trajectory(10)
     healthy = predict(reference, MODELS, CONFIG)
-    drifted = predict(reference, MODELS | {"X": MODELS["X"].changed(**drift)}, CONFIG)
+    drifted = predict(reference, MODELS | {"X": MODELS["X"].replace_values(**drift)}, CONFIG)
     moved = np.abs(healthy.predicted_mm["X"] - drifted.predicted_mm["X"]) * 1e3
     x, y = reference.position_mm["X"], reference.position_mm["Y"]
     near_e = np.hypot(x - 200, y - 55) < 5
@@ -118,7 +118,7 @@ def test_contour_error_wants_shapes_that_fit(first: int | None) -> None:
 
 
 def rapid(**signals: Any) -> Window:
-    return replace(nominal_rapid("Y", CONFIG.axis["Y"], 0.001, 1, seed=0), **signals)
+    return replace(simulate_nominal_rapid("Y", CONFIG.axis["Y"], 0.001, 1, seed=0), **signals)
 
 
 def skill_of(window: Window) -> Skill | None:
@@ -169,6 +169,6 @@ def test_one_axis_alone() -> None:
 
 def test_a_model_that_overflows_is_told() -> None:
     reference = bench_trajectory(10)
-    wild = MODELS | {"X": MODELS["X"].changed(viscous_positive=1e9)}
+    wild = MODELS | {"X": MODELS["X"].replace_values(viscous_positive=1e9)}
     with pytest.raises(ConfigError, match="overflows"):
         predict(reference, wild, CONFIG)

@@ -16,7 +16,7 @@ from fdhil.prediction.models import nominal_models
 from fdhil.prediction.retime import Averages, demand_sources, stretches_around
 from fdhil.program import interpret
 from fdhil.program.budget import Budget
-from fdhil.records import Float, Trajectory, frozen
+from fdhil.records import Float, Trajectory, freeze_array
 from tests.bench import bench_config
 from tests.paths import bench_trajectory, jerky_demand, trajectory
 
@@ -27,7 +27,7 @@ PROGRAM = "G1 X0 Y55 F10000\nX100\nG3 X200 Y55 I50 J0\nG1 X250 Y55\nX250 Y0\nM2\
 
 def rounded(reference: Trajectory, decimals: int) -> Trajectory:
     return replace(
-        reference, position_mm={a: frozen(np.round(path, decimals)) for a, path in reference.position_mm.items()}
+        reference, position_mm={a: freeze_array(np.round(path, decimals)) for a, path in reference.position_mm.items()}
     )
 
 

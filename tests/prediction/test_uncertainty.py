@@ -68,12 +68,12 @@ def test_inertia_drives_the_corners() -> None:
 def test_terms_have_their_share_of_the_uncertainty() -> None:
     """Falling friction known to 0.5 N.m adds its effect; a covariance of the six alone omits it."""
     reference = bench_trajectory(10)
-    models = {axis: MODELS[axis].changed(stribeck=1.0, stribeck_speed=10.0) for axis in "XY"}
+    models = {axis: MODELS[axis].replace_values(stribeck=1.0, stribeck_speed=10.0) for axis in "XY"}
     six, eight = np.zeros((6, 6)), np.zeros((8, 8))
     eight[6, 6] = 0.25
     assert contour_std_um(reference, models, {"X": six, "Y": six}, CONFIG).max() == 0.0
     told = contour_std_um(reference, models, {"X": eight, "Y": eight}, CONFIG)
-    less, more = ({axis: models[axis].changed(stribeck=nm) for axis in "XY"} for nm in (0.95, 1.05))
+    less, more = ({axis: models[axis].replace_values(stribeck=nm) for axis in "XY"} for nm in (0.95, 1.05))
     small, large = (predict(reference, changed, CONFIG).error_um for changed in (less, more))
     moved = [(large[axis][600:700] - small[axis][600:700]) * 0.5 / 0.1 for axis in "XY"]
     # on the straight along X what is across the path is Y's
@@ -83,7 +83,7 @@ def test_terms_have_their_share_of_the_uncertainty() -> None:
 
 def test_a_term_is_named_where_it_drives_a_zone() -> None:
     reference = bench_trajectory(10)
-    rich = MODELS["X"].changed(stribeck=2.0, stribeck_speed=10.0, ripple_screw_1=0.5, ripple_screw_1_phase=1.0)
+    rich = MODELS["X"].replace_values(stribeck=2.0, stribeck_speed=10.0, ripple_screw_1=0.5, ripple_screw_1_phase=1.0)
     models = {"X": rich, "Y": MODELS["Y"]}
     prediction = predict(reference, models, CONFIG)
     for zone in sensitivity_um(prediction, models, CONFIG):

@@ -23,7 +23,7 @@ CORNERS = ((0, 55), (100, 55), (200, 55), (250, 55))
 NC = {"fir": CONFIG, "linuxcnc": LINUXCNC}
 
 
-def planned(text: str, config: MachineConfig) -> Trajectory:
+def plan_test_program(text: str, config: MachineConfig) -> Trajectory:
     return plan_program(list(interpret(text.splitlines(), Budget.of(config.nc))), config)
 
 
@@ -55,7 +55,7 @@ def test_the_bench_has_four_corners_however_wide_the_nc_blends_them(feed: int, m
     if mode == "fir":
         zones = zones_of(bench_trajectory(feed))
     else:
-        zones = zones_of(planned(BENCH.format(mode=mode, feed=1000 * feed), LINUXCNC), LINUXCNC)
+        zones = zones_of(plan_test_program(BENCH.format(mode=mode, feed=1000 * feed), LINUXCNC), LINUXCNC)
     large = [zone for zone in zones if zone.max_um > 46.0 and zone.cause != "stop"]
     assert {zone.cause for zone in large} == {"corner"}
     for zone in large:
@@ -98,7 +98,7 @@ def test_a_rounded_path_errs_where_its_arcs_begin_and_end(feed: int) -> None:
 def test_circles(nc: str, radius_mm: float, feed_mm_min: float, cause: str) -> None:
     config = NC[nc]
     program = f"G21 G90 G64\nG3 X0 Y0 I{radius_mm} P4 F{feed_mm_min}\nM2\n"
-    reference = planned(program, config)
+    reference = plan_test_program(program, config)
     zones = zones_of(reference, config)
     assert "corner" not in {zone.cause for zone in zones}
     # once the loops have settled from the start, and before the stop
@@ -111,7 +111,7 @@ def test_circles(nc: str, radius_mm: float, feed_mm_min: float, cause: str) -> N
 
 def test_a_circle_beyond_the_drives_is_saturation() -> None:
     """20 m/min on 10 mm."""
-    zones = zones_of(planned("G21 G90 G64\nG3 X0 Y0 I10 P3 F20000\nM2\n", CONFIG))
+    zones = zones_of(plan_test_program("G21 G90 G64\nG3 X0 Y0 I10 P3 F20000\nM2\n", CONFIG))
     assert {zone.cause for zone in zones} == {"saturation"}
 
 
@@ -120,7 +120,7 @@ def test_chords_of_a_circle_are_a_circle(nc: str) -> None:
     """Each chord turns by 5 degrees within 18 ms, below the loops' time."""
     angle = np.linspace(0.0, 4 * np.pi, 145)[1:]
     chords = [f"G1 X{20 - 20 * np.cos(a):.4f} Y{20 * np.sin(a):.4f} F6000" for a in angle]
-    zones = zones_of(planned("\n".join(["G21 G90 G64 P0.01", *chords, "M2"]), NC[nc]), NC[nc])
+    zones = zones_of(plan_test_program("\n".join(["G21 G90 G64 P0.01", *chords, "M2"]), NC[nc]), NC[nc])
     inside = [zone for zone in zones if zone.start_s > 0.25 and zone.cause != "stop"]
     assert {zone.cause for zone in inside} == {"circular lag", "reversal"}
 
@@ -130,7 +130,7 @@ def test_chords_of_a_circle_are_a_circle(nc: str) -> None:
 def test_a_helix_is_a_circle(nc: str, radius_mm: float) -> None:
     space = bench_config("XYZ")
     config = space.model_copy(update={"nc": NC[nc].nc})
-    zones = zones_of(planned(f"G21 G90 G64\nG3 X0 Y0 I{radius_mm} Z20 P3 F8000\nM2\n", config), config)
+    zones = zones_of(plan_test_program(f"G21 G90 G64\nG3 X0 Y0 I{radius_mm} Z20 P3 F8000\nM2\n", config), config)
     assert {zone.cause for zone in zones} <= {"start", "circular lag", "reversal", "stop"}
     assert seconds(zones, "circular lag") > 0.5
 
@@ -146,7 +146,7 @@ def test_what_is_a_corner_goes_with_the_time_of_the_loops(gain: float, cause: st
     }
     config = CONFIG.model_copy(update={"axis": axes})
     models = {axis: replace(model, Cd=0.0) for axis, model in nominal_models(config).items()}
-    reference = planned("G21 G90 G64\nG1 X100 F6000\nG3 X120 Y20 J20\nG1 Y150\nM2\n", config)
+    reference = plan_test_program("G21 G90 G64\nG1 X100 F6000\nG3 X120 Y20 J20\nG1 Y150\nM2\n", config)
     zones = predict(reference, models, config, zones_above_um=0.5).zones
     assert seconds(zones, cause) > 0.2
     assert seconds(zones, never) == 0.0

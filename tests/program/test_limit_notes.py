@@ -10,7 +10,7 @@ import pytest
 from fdhil.config import MachineConfig, parse
 from fdhil.program import interpret, plan
 from fdhil.program.limit_notes import limit_notes
-from fdhil.records import Float, Reason, Trajectory, frozen, frozen_ints
+from fdhil.records import Float, Reason, Trajectory, freeze_array, freeze_integers
 from tests.bench import bench_document
 
 PROFILES = ("trapezoidal", "jerk_limited", "linuxcnc")
@@ -26,9 +26,11 @@ def config_of(profile: str = "linuxcnc", **nc: Any) -> MachineConfig:
 
 def notes_of(x_mm: Float, y_mm: Float, config: MachineConfig) -> tuple[Reason, ...]:
     rows = np.arange(x_mm.size)
-    still = frozen_ints(np.zeros(x_mm.size))
-    position = {"X": frozen(x_mm), "Y": frozen(y_mm)}
-    return limit_notes(Trajectory(0.001, frozen(rows * 0.001), position, np.zeros(x_mm.size, np.bool_), still), config)
+    still = freeze_integers(np.zeros(x_mm.size))
+    position = {"X": freeze_array(x_mm), "Y": freeze_array(y_mm)}
+    return limit_notes(
+        Trajectory(0.001, freeze_array(rows * 0.001), position, np.zeros(x_mm.size, np.bool_), still), config
+    )
 
 
 def ramp(acceleration: float, top: float, rows: int = 600) -> Float:

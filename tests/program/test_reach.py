@@ -54,7 +54,7 @@ def test_no_position_that_fits_wraps_around_with_any_offset_and_the_next_one_is_
     reach = PositionRange.of("X", config.axis["X"], 0.001)
     scaling, most = config.axis["X"].scaling, math.floor(most_um * 1e-3 * per_rev / pitch_mm)
     position_mm = (end * (1 << 31) + away) / (scaling.sign * scaling.increments_per_mm)
-    target = scaling.to_increments(position_mm)
+    target = scaling.convert_to_increments(position_mm)
     fits = all(-(1 << 31) <= target + offset < 1 << 31 for offset in (-most, 0, most))
     assert reach.fits(position_mm) or not fits or most == 0
     if reach.fits(position_mm):

@@ -100,7 +100,7 @@ def test_path_speed_limits_lengths_and_no_angles() -> None:
 
 def test_place_is_in_degrees() -> None:
     demand = planned("F1000|G1 X10 A45", machine())
-    assert demand.place(len(demand.time_s) - 1) == "X 10.0 Y 0.0 A 45.0"
+    assert demand.describe_position(len(demand.time_s) - 1) == "X 10.0 Y 0.0 A 45.0"
 
 
 def test_position_beyond_32_bits_is_refused_in_degrees() -> None:

@@ -14,17 +14,17 @@ from itertools import count
 
 import pytest
 
-from fdhil.guard import core, limits
+from fdhil.guard import guard_step, offset_limits
+from fdhil.guard.corrected_path import PathPosition
+from fdhil.guard.guard_protocol import ON_PATH, SENDING, Mode
+from fdhil.guard.guard_settings import GuardSettings
+from fdhil.guard.guard_state import BusView, GuardState, StepInputs, StepOutput, make_initial_state
 from fdhil.guard.interlocks import Alarm
-from fdhil.guard.path import Place
-from fdhil.guard.protocol import ON_PATH, SENDING, Mode
-from fdhil.guard.settings import Settings
-from fdhil.guard.state import BusView, Inputs, Output, State, initial
-from tests.guard.machine import settings as guard_settings
+from tests.guard.simulated_bus import settings as guard_settings
 from tests.proof.symbolic import Integer, assume, for_every_path, integers, prove
 from tests.proof.test_motion import Axis
 
-CEILING, NEXT_OFFSETS = limits.ceiling.__name__, core._next_offsets.__name__
+CEILING, NEXT_OFFSETS = offset_limits.compute_offset_ceiling.__name__, guard_step._compute_next_offsets.__name__
 
 pytestmark = pytest.mark.usefixtures("long_computation")
 
@@ -34,7 +34,7 @@ MODES = sorted(SENDING)
 class AnyPath:
     """A table with arbitrary offsets, not even smooth."""
 
-    def offsets_at(self, row: int) -> tuple[Integer]:
+    def get_row_offsets(self, row: int) -> tuple[Integer]:
         return (integers(f"table_{row}")[0],)
 
 
@@ -48,29 +48,31 @@ class Core:
         self.axis = Axis(monkeypatch)
         (self.ceiling,) = integers("ceiling")
         assume(self.axis.limits.offset <= self.ceiling)
-        monkeypatch.setattr(core, CEILING, lambda _increments_per_mm: self.ceiling)
-        monkeypatch.setattr(core, "type", lambda value: int if isinstance(value, Integer) else type(value), False)
+        monkeypatch.setattr(guard_step, CEILING, lambda _increments_per_mm: self.ceiling)
+        monkeypatch.setattr(guard_step, "type", lambda value: int if isinstance(value, Integer) else type(value), False)
         made = guard_settings(axes=("X",))
-        self.settings: Settings = replace(made, axes=(replace(made.axes[0], limits=self.axis.limits),))
-        blank = initial(made)
+        self.settings: GuardSettings = replace(made, axes=(replace(made.axes[0], limits=self.axis.limits),))
+        blank = make_initial_state(made)
         held = blank.axes[0]._replace(offset=self.axis.offset, rate=self.axis.rate, sent=(self.axis.offset,) * 8)
-        self.state: State = blank._replace(mode=mode, axes=(held,), places=(Place(5),))
+        self.state: GuardState = blank._replace(mode=mode, axes=(held,), places=(PathPosition(5),))
 
-    def move(self) -> tuple[State, Output]:
-        inputs = Inputs(True, (), BusView(silent=False), path=AnyPath())
-        return core._move(self.state, inputs, self.settings)
+    def move(self) -> tuple[GuardState, StepOutput]:
+        inputs = StepInputs(True, (), BusView(silent=False), path=AnyPath())
+        return guard_step._move_offsets(self.state, inputs, self.settings)
 
 
 def frames_keep_limits(mode: Mode, monkeypatch: pytest.MonkeyPatch) -> None:
     made = Core(mode, monkeypatch)
     wanted, broken, calls = integers("anything broken")[0], integers("broken")[0], iter(range(9))
 
-    def computed(_state: State, _path: object, _settings: Settings) -> tuple[tuple[Integer, ...], Alarm | None]:
+    def computed(
+        _state: GuardState, _path: object, _settings: GuardSettings
+    ) -> tuple[tuple[Integer, ...], Alarm | None]:
         if mode in ON_PATH and next(calls) == 0 and broken == 1:
             return (), Alarm("OffsetRate")
         return (wanted,), None
 
-    monkeypatch.setattr(core, NEXT_OFFSETS, computed)
+    monkeypatch.setattr(guard_step, NEXT_OFFSETS, computed)
     state, output = made.move()
     after = state.axes[0]
     if output.offsets is None:
@@ -101,13 +103,13 @@ def promise_motion(axis: Axis, monkeypatch: pytest.MonkeyPatch) -> None:
         return None if passes == 1 else "OffsetRate"
 
     for name, promise in {"follow": move, "brake": move, "violation": violation}.items():
-        monkeypatch.setattr(core, name, promise)
+        monkeypatch.setattr(guard_step, name, promise)
 
 
 def frames_leave(mode: Mode, monkeypatch: pytest.MonkeyPatch) -> None:
     """From a safe state inside the ceiling a frame always leaves, and the state that it leaves is safe.
 
-    ``follow``, ``brake`` and ``violation`` stand for what ``test_motion`` proves of them.
+    ``follow``, ``brake`` and ``violation`` stand for what ``test_theorem_about_motion_is_proven`` proves of them.
     """
     made = Core(mode, monkeypatch)
     promise_motion(made.axis, monkeypatch)
@@ -124,7 +126,7 @@ def frames_leave(mode: Mode, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("theorem", [frames_keep_limits, frames_leave], ids=lambda theorem: theorem.__name__)
 @pytest.mark.parametrize("mode", MODES)
-def test_frames(
+def test_theorem_about_frames_is_proven(
     theorem: Callable[[Mode, pytest.MonkeyPatch], None], mode: Mode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for_every_path(partial(theorem, mode, monkeypatch))

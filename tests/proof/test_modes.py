@@ -14,27 +14,27 @@ from pathlib import Path
 import pytest
 
 import fdhil.guard
-from fdhil.guard import adoption, core, feedforward, shadow, state
-from fdhil.guard.conditions import ARMING_INTERLOCKS, AXIS_INTERLOCKS, BUS_INTERLOCKS
-from fdhil.guard.interlocks import CATALOGUE, FACTS, Alarm, Alarms, Reaction
-from fdhil.guard.path import Place
-from fdhil.guard.protocol import AT_REST, HOLD_CYCLES, IN_CHARGE, LANDING, ON_PATH, SENDING, Mode
-from fdhil.guard.settings import MOST_LEAD, Settings
-from fdhil.guard.state import BusView, Inputs, Request, State, initial
-from fdhil.guard.transitions import NEXT, ZEROS_UNCONFIRMED, Event
-from tests.guard.machine import FACTS_GIVEN, settings
+from fdhil.guard import feedforward_law, guard_state, guard_step, offset_adoption, shadow_correction
+from fdhil.guard.corrected_path import PathPosition
+from fdhil.guard.guard_protocol import AT_REST, HOLD_CYCLES, IN_CHARGE, ON_PATH, RAMPING_MODES, SENDING, Mode
+from fdhil.guard.guard_settings import MOST_LEAD, GuardSettings
+from fdhil.guard.guard_state import BusView, GuardRequest, GuardState, StepInputs, make_initial_state
+from fdhil.guard.interlock_checks import ARMING_INTERLOCKS, AXIS_INTERLOCKS, BUS_INTERLOCKS
+from fdhil.guard.interlocks import FACTS, INTERLOCK_CATALOGUE, Alarm, Alarms, Reaction
+from fdhil.guard.state_transitions import NEXT, ZEROS_UNCONFIRMED, Event
+from tests.guard.simulated_bus import FACTS_GIVEN, settings
 
 pytestmark = pytest.mark.usefixtures("long_computation")
 
-QUIET = Inputs(True, (), BusView(silent=False, sync_regular=True))
-CODES = sorted(CATALOGUE)
+QUIET = StepInputs(True, (), BusView(silent=False, sync_regular=True))
+CODES = sorted(INTERLOCK_CATALOGUE)
 
 
-def state_in(mode: Mode, made: Settings, *, offset: int = 7, **changes: object) -> State:
+def state_in(mode: Mode, made: GuardSettings, *, offset: int = 7, **changes: object) -> GuardState:
     """A state of which nothing but its mode and the offsets matters."""
-    blank = initial(made)
+    blank = make_initial_state(made)
     axes = tuple(axis._replace(offset=offset, sent=(offset,) * len(axis.sent)) for axis in blank.axes)
-    return blank._replace(mode=mode, axes=axes, places=(Place(5),), **changes)
+    return blank._replace(mode=mode, axes=axes, places=(PathPosition(5),), **changes)
 
 
 def alarm_sets() -> Iterator[Alarms]:
@@ -43,62 +43,62 @@ def alarm_sets() -> Iterator[Alarms]:
     yield from ((Alarm(one), Alarm(other)) for one, other in product(CODES, CODES) if one != other)
 
 
-def test_every_alarm_ends_what_is_sent_as_its_reaction_says() -> None:
+def test_every_alarm_has_the_effect_of_its_reaction() -> None:
     for synchronous, measuring, offset in product((True, False), (0, 1), (0, 7)):
         made = settings(offset_synchronous=synchronous)
         for mode, alarms in product(Mode, alarm_sets()):
             before = state_in(mode, made, measuring=measuring, offset=offset)
-            after = core._react(before, QUIET._replace(alarms=alarms), alarms, made).mode
-            worst = max((core._reaction(alarm, made) for alarm in alarms), default=Reaction.REFUSE)
+            after = guard_step._react_to_alarms(before, QUIET._replace(alarms=alarms), alarms, made).mode
+            worst = max((guard_step._find_reaction(alarm, made) for alarm in alarms), default=Reaction.REFUSE)
             if mode in AT_REST:
                 assert after is mode
             elif worst is Reaction.FREEZE:
                 assert after in AT_REST
             elif worst is Reaction.RAMP_DOWN:
-                assert after in LANDING | AT_REST
+                assert after in RAMPING_MODES | AT_REST
             else:
                 assert after is mode
 
 
 @pytest.mark.parametrize("mode", sorted(IN_CHARGE))
-def test_lost_daemon_withdrawn_fact_and_frames_that_do_not_leave_end_it(mode: Mode) -> None:
+def test_lost_daemon_withdrawn_fact_and_unsent_frames_end_the_correction(mode: Mode) -> None:
     made = settings()
     for lost in (
         QUIET._replace(main_alive=False),
         *(QUIET._replace(withdrawn=(Alarm(code),)) for code in FACTS.values()),
     ):
-        assert core._react(state_in(mode, made), lost, (), made).mode in LANDING
-    unsent = state_in(mode, made, failed_run=2 * core.FAILED_SENDS)
-    assert core._react(unsent, QUIET, (), made).mode is Mode.FROZEN
+        assert guard_step._react_to_alarms(state_in(mode, made), lost, (), made).mode in RAMPING_MODES
+    unsent = state_in(mode, made, failed_run=2 * guard_step.FAILED_SENDS)
+    assert guard_step._react_to_alarms(unsent, QUIET, (), made).mode is Mode.FROZEN
 
 
 @pytest.mark.parametrize("kind", ["disarm", "stop"])
 @pytest.mark.parametrize("mode", sorted(IN_CHARGE))
-def test_disarming_needs_nothing(mode: Mode, kind: str) -> None:
+def test_disarm_has_no_precondition(mode: Mode, kind: str) -> None:
     made = settings()
-    asked = QUIET._replace(request=Request(kind))
-    state, refused = core._request(state_in(mode, made), asked, (), (), made)
+    asked = QUIET._replace(request=GuardRequest(kind))
+    state, refused = guard_step._decide_request(state_in(mode, made), asked, (), (), made)
     assert (state.mode, refused) == (Mode.RAMP_DOWN, ())
 
 
-def test_hold_lasts_no_longer_than_it_may() -> None:
+def test_hold_has_a_bounded_duration() -> None:
     made = settings()
     for mode, code in product((Mode.ARMED, *sorted(ON_PATH)), CODES):
         state, cycles = state_in(mode, made), 0
         while state.mode in IN_CHARGE:
-            state, cycles = core._held(state, Alarm(code), made), cycles + 1
+            state, cycles = guard_step._hold_offset(state, Alarm(code), made), cycles + 1
         assert state.mode is Mode.RAMP_DOWN
-        assert cycles == 1 + (made.cycles(core.FEED_HOLD_S) if code == "FeedHold" else HOLD_CYCLES)
+        assert cycles == 1 + (made.convert_to_cycles(guard_step.FEED_HOLD_S) if code == "FeedHold" else HOLD_CYCLES)
 
 
-def test_landing_ends_once_zeros_are_sent_whatever_the_drives_show() -> None:
-    for lead, shown, mode in product(range(MOST_LEAD + 1), product((True, False), repeat=2), sorted(LANDING)):
+def test_ramp_down_ends_after_zeros_whatever_the_drives_show() -> None:
+    for lead, shown, mode in product(range(MOST_LEAD + 1), product((True, False), repeat=2), sorted(RAMPING_MODES)):
         made = settings(lead=lead)
         state = state_in(mode, made, offset=0)
         axes = tuple(axis._replace(zero_shown=each) for axis, each in zip(state.axes, shown, strict=True))
         state, cycles = state._replace(axes=axes), 0
-        while state.mode in LANDING:
-            state, cycles = core._arrived(state, None, lead), cycles + 1
+        while state.mode in RAMPING_MODES:
+            state, cycles = guard_step._finish_ramps(state, None, lead), cycles + 1
         assert state.mode is (Mode.OFF if all(shown) else Mode.FROZEN)
         assert cycles <= ZEROS_UNCONFIRMED + lead + 1
 
@@ -106,7 +106,7 @@ def test_landing_ends_once_zeros_are_sent_whatever_the_drives_show() -> None:
 # --- what begins it ---
 
 
-def test_nothing_but_arming_and_adopting_leaves_rest() -> None:
+def test_only_arm_and_adopt_leave_the_idle_states() -> None:
     ways = {(mode, event): after for (mode, event), after in NEXT.items() if mode in AT_REST and after is not mode}
     assert {event for (_, event), after in ways.items() if after in SENDING} == {Event.ARM, Event.ADOPT}
     assert [mode for mode, event in ways if event is Event.ARM] == [Mode.OFF]
@@ -119,7 +119,7 @@ def guard_trees() -> dict[str, ast.Module]:
     return {path.name: ast.parse(path.read_text()) for path in sorted(folder.glob("*.py"))}
 
 
-def test_mode_changes_by_the_table_alone() -> None:
+def test_mode_changes_only_by_the_transition_table() -> None:
     """No call but the one in ``State.after`` gives a state another mode; the shadow's copy is never sent."""
     found = [
         (name, ast.unparse(keyword.value))
@@ -129,14 +129,14 @@ def test_mode_changes_by_the_table_alone() -> None:
         for keyword in call.keywords
         if keyword.arg == "mode"
     ]
-    others = sorted({(name, value) for name, value in found if name != Path(feedforward.__file__).name})
+    others = sorted({(name, value) for name, value in found if name != Path(feedforward_law.__file__).name})
     assert others == [
-        (Path(shadow.__file__).name, "Mode.ARMED"),
-        (Path(state.__file__).name, "NEXT[self.mode, event]"),
+        (Path(shadow_correction.__file__).name, "Mode.ARMED"),
+        (Path(guard_state.__file__).name, "NEXT[self.mode, event]"),
     ]
 
 
-def test_arming_and_adopting_stand_in_one_place_each() -> None:
+def test_arm_and_adopt_events_occur_in_one_function_each() -> None:
     used = [
         (name, function.name, event)
         for name, tree in guard_trees().items()
@@ -145,13 +145,13 @@ def test_arming_and_adopting_stand_in_one_place_each() -> None:
         for call in ast.walk(function)
         if isinstance(call, ast.Call) and ast.unparse(call.func).endswith(".after")
         for event in [ast.unparse(call.args[0])]
-        if event in ("Event.ARM", "Event.ADOPT") and name != Path(feedforward.__file__).name
+        if event in ("Event.ARM", "Event.ADOPT") and name != Path(feedforward_law.__file__).name
     ]
     assert sorted(used) == sorted(
         (Path(module.__file__).name, function.__name__, event)
         for module, function, event in (
-            (adoption, adoption.adopting, "Event.ADOPT"),
-            (core, core._armed, "Event.ARM"),
+            (offset_adoption, offset_adoption.begin_adoption, "Event.ADOPT"),
+            (guard_step, guard_step._enter_armed, "Event.ARM"),
         )
     )
 
@@ -161,25 +161,25 @@ class _Table:
 
     program_digest, first = "program", 0
 
-    def standing_rows(self) -> int:
+    def count_standing_rows(self) -> int:
         return 0
 
 
-def arming(made: Settings, **changes: object) -> tuple[State, Inputs, Request]:
+def arming(made: GuardSettings, **changes: object) -> tuple[GuardState, StepInputs, GuardRequest]:
     """State, inputs and request that nothing forbids, but for the ``changes`` of any of the three."""
     values: dict[str, object] = {
-        "mode": Mode.OFF, "good_for": core.SETTLED_CYCLES, "main_alive": True, "path": _Table(),
+        "mode": Mode.OFF, "good_for": guard_step.SETTLED_CYCLES, "main_alive": True, "path": _Table(),
         "token_valid": True, "program_digest": "program", "facts": FACTS_GIVEN,
     } | changes  # fmt: skip
-    state = initial(made)._replace(mode=values["mode"], good_for=values["good_for"])
+    state = make_initial_state(made)._replace(mode=values["mode"], good_for=values["good_for"])
     inputs = QUIET._replace(main_alive=values["main_alive"], path=values["path"])
-    asked = Request("arm", values["token_valid"], values["program_digest"], values["facts"])
+    asked = GuardRequest("arm", values["token_valid"], values["program_digest"], values["facts"])
     return state, inputs, asked
 
 
 FORBIDDEN: tuple[dict[str, object], ...] = (
     *({"mode": mode} for mode in Mode if mode is not Mode.OFF),
-    {"good_for": core.SETTLED_CYCLES - 1},
+    {"good_for": guard_step.SETTLED_CYCLES - 1},
     *({"main_alive": value} for value in (False, None)),
     *({"token_valid": value} for value in (False, None, 1, "yes")),
     {"path": None},
@@ -189,20 +189,20 @@ FORBIDDEN: tuple[dict[str, object], ...] = (
 )
 
 
-def test_arming_needs_everything() -> None:
+def test_arming_needs_every_condition() -> None:
     made = settings()
     state, inputs, asked = arming(made)
-    assert core._refusals(state, inputs, asked, (), (), made) == ()
+    assert guard_step._list_arm_refusals(state, inputs, asked, (), (), made) == ()
     for one in FORBIDDEN:
         for other in ({}, *FORBIDDEN):
             state, inputs, asked = arming(made, **one, **{k: v for k, v in other.items() if k not in one})
-            assert core._refusals(state, inputs, asked, (), (), made), (one, other)
-            assert core._request(state, inputs._replace(request=asked), (), (), made)[0].mode is state.mode
+            assert guard_step._list_arm_refusals(state, inputs, asked, (), (), made), (one, other)
+            assert guard_step._decide_request(state, inputs._replace(request=asked), (), (), made)[0].mode is state.mode
     state, inputs, asked = arming(made)
     for alarms in alarm_sets():
-        assert bool(core._refusals(state, inputs, asked, alarms, (), made)) is bool(alarms)
+        assert bool(guard_step._list_arm_refusals(state, inputs, asked, alarms, (), made)) is bool(alarms)
 
 
 @pytest.mark.parametrize("table", [BUS_INTERLOCKS, AXIS_INTERLOCKS, ARMING_INTERLOCKS])
 def test_every_interlock_has_a_reaction(table: tuple[tuple[str, object], ...]) -> None:
-    assert {code for code, _ in table} <= set(CATALOGUE)
+    assert {code for code, _ in table} <= set(INTERLOCK_CATALOGUE)

@@ -1,6 +1,6 @@
 """Proves for all limits and all integers that the motion of an offset keeps its limits and reaches zero.
 
-The proven code is ``fdhil.guard.limits``, unchanged. ``stopping`` and ``approach`` multiply unknowns; their contracts
+The proven code is ``fdhil.guard.offset_limits``, unchanged. ``stopping`` and ``approach`` multiply unknowns; their contracts
 are proven first and replace them in later proofs.
 """
 
@@ -11,12 +11,19 @@ from functools import partial
 
 import pytest
 
-from fdhil.guard import limits
-from fdhil.guard.limits import OffsetLimits
+from fdhil.guard import offset_limits
+from fdhil.guard.offset_limits import OffsetLimits
 from tests.proof.contracts import Contracts
 from tests.proof.symbolic import Claim, Integer, assume, choose, for_every_path, integers, lemma, prove
 
-STOPPING, APPROACH, CLAMP = (each.__name__ for each in (limits.stopping, limits.approach, limits.clamp))
+STOPPING, APPROACH, CLAMP = (
+    each.__name__
+    for each in (
+        offset_limits.compute_stopping_distance,
+        offset_limits.compute_approach_rate,
+        offset_limits.limit_value,
+    )
+)
 
 pytestmark = pytest.mark.usefixtures("long_computation")
 
@@ -29,18 +36,21 @@ Stopping = Callable[[Integer, Integer], Integer]
 def stopping_goes_on_from_the_next_cycle() -> None:
     rate, acceleration = integers("rate acceleration")
     assume(rate >= 0, acceleration >= 1)
-    way = limits.stopping(rate, acceleration)
+    way = offset_limits.compute_stopping_distance(rate, acceleration)
     if rate <= acceleration:
         prove(way == 0)
     else:
-        prove(way == (rate - acceleration) + limits.stopping(rate - acceleration, acceleration))
+        prove(way == (rate - acceleration) + offset_limits.compute_stopping_distance(rate - acceleration, acceleration))
 
 
 def stopping_is_longer_when_faster_or_braked_less() -> None:
     """The way is the largest of all ``n r - a n (n + 1) / 2``, that of ``n = r // a``."""
     rate, acceleration, faster, weaker = integers("rate acceleration faster weaker")
     assume(rate >= 0, faster >= rate, weaker >= 1, weaker <= acceleration)
-    way, longer = limits.stopping(rate, acceleration), limits.stopping(faster, weaker)
+    way, longer = (
+        offset_limits.compute_stopping_distance(rate, acceleration),
+        offset_limits.compute_stopping_distance(faster, weaker),
+    )
     steps, most = rate // acceleration, faster // weaker
     lemma((steps * acceleration <= rate) & (rate < steps * acceleration + acceleration))
     lemma((most * weaker <= faster) & (faster < most * weaker + weaker))
@@ -87,7 +97,7 @@ def approach_is_the_fastest_that_stops() -> None:
     eighth = 8 * distance // acceleration
     lemma((eighth * acceleration <= 8 * distance) & (8 * distance < eighth * acceleration + acceleration))
     lemma(eighth >= 0)
-    rate = limits.approach(distance, acceleration)
+    rate = offset_limits.compute_approach_rate(distance, acceleration)
     (root,) = integers("root")
     steps = (root + 1) // 2
     lemma((steps >= 1) & (2 * steps - 1 <= root) & (root <= 2 * steps))
@@ -106,10 +116,10 @@ def approach_is_the_fastest_that_stops() -> None:
     lemma(rate * steps < acceleration * steps * steps)
     lemma(rate < acceleration * steps)
     lemma(rate // acceleration == steps - 1)
-    way = limits.stopping(rate, acceleration)
+    way = offset_limits.compute_stopping_distance(rate, acceleration)
     lemma(way == (steps - 1) * rate - acceleration * half)
     prove(rate + way <= distance)
-    way = limits.stopping(rate + 1, acceleration)
+    way = offset_limits.compute_stopping_distance(rate + 1, acceleration)
     if rate + 1 < acceleration * steps:
         lemma((rate + 1) // acceleration == steps - 1)
         lemma(way == (steps - 1) * (rate + 1) - acceleration * half)
@@ -124,7 +134,7 @@ def approach_is_the_fastest_that_stops() -> None:
 def clamp_is_a_choice() -> None:
     value, low, high = integers("value low high")
     assume(low <= high)
-    prove(limits.clamp(value, low, high) == clamp(value, low, high))
+    prove(offset_limits.limit_value(value, low, high) == clamp(value, low, high))
 
 
 def clamp(value: Integer, low: Integer | int, high: Integer | int) -> Integer:
@@ -150,10 +160,10 @@ class Axis:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.contracts = Contracts()
-        monkeypatch.setattr(limits, STOPPING, self.contracts.stopping)
-        monkeypatch.setattr(limits, APPROACH, self.contracts.approach)
-        monkeypatch.setattr(limits, CLAMP, clamp)
-        monkeypatch.setattr(limits, "max", larger, raising=False)
+        monkeypatch.setattr(offset_limits, STOPPING, self.contracts.stopping)
+        monkeypatch.setattr(offset_limits, APPROACH, self.contracts.approach)
+        monkeypatch.setattr(offset_limits, CLAMP, clamp)
+        monkeypatch.setattr(offset_limits, "max", larger, raising=False)
         self.offset, self.rate, most, rate, self.acceleration = integers("offset rate L S A")
         assume(most >= 1, rate >= 1, self.acceleration >= 1)
         self.limits = OffsetLimits(most, rate, self.acceleration, 1, 1)
@@ -181,13 +191,13 @@ class Axis:
 def follow_keeps_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     axis = Axis(monkeypatch)
     wanted, wanted_rate = integers("wanted wanted_rate")
-    following = limits.follow(axis.limits, axis.offset, axis.rate, wanted, wanted_rate)
+    following = offset_limits.move_toward_goal(axis.limits, axis.offset, axis.rate, wanted, wanted_rate)
     prove(axis.is_good(following, axis.offset, axis.rate))
 
 
 def brake_keeps_limits_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     axis = Axis(monkeypatch)
-    following = limits.brake(axis.limits, axis.offset, axis.rate)
+    following = offset_limits.decelerate_offset(axis.limits, axis.offset, axis.rate)
     move = following - axis.offset
     prove(axis.is_good(following, axis.offset, axis.rate))
     prove((axis.rate == 0).implies(move == 0))
@@ -198,14 +208,14 @@ def check_lets_pass_what_is_safe(monkeypatch: pytest.MonkeyPatch) -> None:
     axis = Axis(monkeypatch)
     (following,) = integers("following")
     assume(axis.is_good(following, axis.offset, axis.rate))
-    prove(limits.violation(axis.limits, axis.offset, axis.rate, following) is None)
+    prove(offset_limits.find_limit_violation(axis.limits, axis.offset, axis.rate, following) is None)
 
 
 def check_lets_pass_only_what_keeps_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the state is, safe or not."""
     axis = Axis(monkeypatch)
     following, before, rate = integers("following before any_rate")
-    if limits.violation(axis.limits, before, rate, following) is None:
+    if offset_limits.find_limit_violation(axis.limits, before, rate, following) is None:
         prove(axis.keeps_limits(following, before, rate))
 
 
@@ -227,7 +237,7 @@ def ramp_to_zero_ends(monkeypatch: pytest.MonkeyPatch) -> None:
         return inward & (abs(rate) <= fastest + axis.acceleration)
 
     closing = closes_in(offset, rate)
-    following = limits.follow(axis.limits, offset, rate, 0, 0)
+    following = offset_limits.move_toward_goal(axis.limits, offset, rate, 0, 0)
     move = following - offset
     closing_next = closes_in(following, move)
     prove((closing & (offset != 0)).implies(closing_next & (abs(following) < abs(offset))))
@@ -251,11 +261,13 @@ MOTION = (
 
 
 @pytest.mark.parametrize("theorem", ARITHMETIC, ids=lambda theorem: theorem.__name__)
-def test_arithmetic(theorem: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "isqrt", square_root)
+def test_theorem_of_arithmetic_is_proven(theorem: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(offset_limits, "isqrt", square_root)
     for_every_path(theorem)
 
 
 @pytest.mark.parametrize("theorem", MOTION, ids=lambda theorem: theorem.__name__)
-def test_motion(theorem: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_theorem_about_motion_is_proven(
+    theorem: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
     for_every_path(partial(theorem, monkeypatch))

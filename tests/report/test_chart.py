@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fdhil.errors import FdhilError
-from fdhil.records import frozen
+from fdhil.records import freeze_array
 from fdhil.report import Page, figures, maps, write_pdf
 from fdhil.report.chart import MOST_POINTS, Chart, Panel, Trace, svg, thinned
 from fdhil.report.drawing import legend_rows
@@ -40,9 +40,11 @@ def test_a_long_curve_keeps_its_peaks() -> None:
 
 def test_the_script_is_told_what_is_drawn() -> None:
     """Shared grids are exported once, lost values are null, and bounds accompany their values."""
-    x = frozen([3.0, 1.0, 2.0])
-    bars = Trace("points", x, frozen([30.0, 10.0, 20.0]), style="points", low=x, high=frozen([33.0, 11.0, 22.0]))
-    line = Trace("line", frozen([1.0, 2.0, 3.0]), frozen([1.0, np.nan, 1 / 3]))
+    x = freeze_array([3.0, 1.0, 2.0])
+    bars = Trace(
+        "points", x, freeze_array([30.0, 10.0, 20.0]), style="points", low=x, high=freeze_array([33.0, 11.0, 22.0])
+    )
+    line = Trace("line", freeze_array([1.0, 2.0, 3.0]), freeze_array([1.0, np.nan, 1 / 3]))
     chart = Chart("time (s)", [Panel("um", [bars, line], levels=[("limit", 40.0)])], "words", marks=[("step", 2.0)])
     found = told(svg(chart))
     assert found["grids"] == [[1, 2, 3]]
@@ -55,7 +57,7 @@ def test_the_script_is_told_what_is_drawn() -> None:
 
 
 def test_seconds_since_1970_keep_all_their_digits() -> None:
-    day = Trace("day", frozen([1_800_000_000.0, 1_800_086_400.0]), frozen([1.0, 2.0]))
+    day = Trace("day", freeze_array([1_800_000_000.0, 1_800_086_400.0]), freeze_array([1.0, 2.0]))
     assert told(svg(Chart("time (UTC)", [Panel("", [day])], "", in_time=True)))["grids"] == [[1800000000, 1800086400]]
 
 

@@ -13,7 +13,7 @@ import pytest
 from fdhil.correction import plan
 from fdhil.prediction import predict
 from fdhil.prediction.models import nominal_models
-from fdhil.records import Correction, frozen
+from fdhil.records import Correction, freeze_array
 from fdhil.report import figures, maps, write
 from fdhil.report.drawing import drawing
 from fdhil.report.path import APART_MM, correction_page, nearest_mm, planes, prediction_page, worst_places
@@ -80,7 +80,7 @@ def test_planes_of_three_axes_and_of_one() -> None:
     """The plane with most of the path comes first; a single axis has no map, but still a page."""
     flat = bench_trajectory(10)
     z = 30 * np.sin(flat.time_s)
-    solid = replace(flat, position_mm={**flat.position_mm, "Z": frozen(z)})
+    solid = replace(flat, position_mm={**flat.position_mm, "Z": freeze_array(z)})
     assert planes(solid) == [("X", "Y"), ("X", "Z")]
     alone = trajectory(np.asarray(flat.position_mm["Y"])[:, None], "Y")
     assert planes(alone) == []

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fdhil.errors import FdhilError
-from fdhil.records import Parameters, Stages, Window, frozen
+from fdhil.records import Parameters, Stages, Window, freeze_array
 from fdhil.report import Page, Section, Table, figures, html, write
 
 PARAMETERS = Parameters(R=0.5, L=0.005, K=0.8, Jt=0.075, ft=0.05, Cd=5.0)
@@ -22,10 +22,10 @@ def window() -> Window:
 
     voltage = np.concatenate([np.zeros(50), np.linspace(0, 60, 200), np.full(300, 60.0)])
     current, speed = simulate_plant(PARAMETERS, voltage, 0.001, "interval_mean")
-    nothing = frozen(np.zeros(voltage.size))
+    nothing = freeze_array(np.zeros(voltage.size))
     return Window(
         axis="X", start_tick=0, start_s=0.0, dt_s=0.001, demand_mm=nothing, position_mm=nothing,
-        speed_rad_s=frozen(speed), current_a=frozen(current), voltage_v=frozen(voltage),
+        speed_rad_s=freeze_array(speed), current_a=freeze_array(current), voltage_v=freeze_array(voltage),
         voltage_sampling="interval_mean", stages=Stages((50, 250), (250, 550), None), direction=1,
         rapid_speed_rad_s=75.0, pitch_mm=20.0,
     )  # fmt: skip

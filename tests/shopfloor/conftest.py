@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from fdhil.shopfloor.opcua_security import ReadServer
+from fdhil.shopfloor.opcua_access import ReadOnlyServer
 from tests.drivers.nc.opcua_peer import load_once
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _nodes_made_once() -> Iterator[None]:
+def _share_standard_nodes() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ReadServer, "load_standard_address_space", load_once)
+        patch.setattr(ReadOnlyServer, "load_standard_address_space", load_once)
         yield

@@ -15,9 +15,9 @@ import aiomqtt
 import pytest
 
 from fdhil import config as machine_config
-from tests.daemon.machine import Machine, rapids
-from tests.daemon.shop import BENCH
-from tests.daemon.test_service import serving, status_when
+from tests.daemon.machine_rig import BENCH
+from tests.daemon.simulated_machine import SimulatedMachine, rapids
+from tests.daemon.test_daemon_service import serving, status_when
 from tests.ports import free_port
 from tests.shopfloor.mosquitto import broker, certify, guarded, open_to_all
 from tests.shopfloor.sparkplug_host import Host, command
@@ -27,8 +27,8 @@ SECRET = "canary-7f3a9"
 
 
 @pytest.fixture(autouse=True)
-def _quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
+def _skip_kernel_warmup(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fdhil.daemon.daemon_service.compile_kernels", lambda config, method: None)
 
 
 def written(folder: Path, port: int, more: str = "") -> Path:
@@ -74,11 +74,11 @@ async def host_application(port: int, **more: object) -> AsyncIterator[Listening
         yield Listening(client)
 
 
-async def test_from_birth_to_death_with_a_real_broker(tmp_path: Path) -> None:
+async def test_real_broker_receives_birth_data_and_death(tmp_path: Path) -> None:
     port = free_port()
     file = written(tmp_path, port)
     config = machine_config.load(file)
-    machine = Machine()
+    machine = SimulatedMachine()
     async with broker(tmp_path, open_to_all(port), port), host_application(port) as listening:
         async with publisher(file) as first:
             await listening.until(lambda host: host.verbs == ["NBIRTH"])
@@ -113,7 +113,7 @@ async def test_from_birth_to_death_with_a_real_broker(tmp_path: Path) -> None:
         assert listening.host.verbs[-1] == "NDEATH"
 
 
-async def test_a_broker_that_goes_away_and_comes_back(tmp_path: Path) -> None:
+async def test_publisher_reconnects_after_a_broker_restart(tmp_path: Path) -> None:
     port = free_port()
     async with publisher(written(tmp_path, port)):
         await _said(tmp_path, "check host and port, and whether it runs")
@@ -124,7 +124,7 @@ async def test_a_broker_that_goes_away_and_comes_back(tmp_path: Path) -> None:
     assert (tmp_path / "publish.log").read_text().count("Traceback") == 0
 
 
-async def test_over_tls_with_a_password_that_nobody_else_sees(tmp_path: Path) -> None:
+async def test_publisher_connects_over_tls_with_a_private_password(tmp_path: Path) -> None:
     port = free_port()
     own = f'tls_certificate_file = "{tmp_path}/client.pem"\ntls_key_file = "{tmp_path}/client.key"\n'
     user = f'user = "mill"\npassword_file = "{tmp_path}/secret"\n'
@@ -144,7 +144,7 @@ async def test_over_tls_with_a_password_that_nobody_else_sees(tmp_path: Path) ->
     assert SECRET not in (tmp_path / "publish.log").read_text()
 
 
-async def test_a_broker_with_anothers_certificate_is_told_nothing(tmp_path: Path) -> None:
+async def test_broker_with_a_wrong_certificate_receives_nothing(tmp_path: Path) -> None:
     port = free_port()
     (another := tmp_path / "another").mkdir()
     certify(another)
@@ -154,7 +154,7 @@ async def test_a_broker_with_anothers_certificate_is_told_nothing(tmp_path: Path
         await _said(tmp_path, "CERTIFICATE_VERIFY_FAILED")
 
 
-async def test_a_primary_host_application_is_waited_for(tmp_path: Path) -> None:
+async def test_publisher_waits_for_the_primary_host(tmp_path: Path) -> None:
     port = free_port()
     file = written(tmp_path, port, 'primary_host = "scada"\n')
     async with broker(tmp_path, open_to_all(port), port), host_application(port) as listening, publisher(file):

@@ -17,20 +17,20 @@ import pytest
 from fdhil.config.credentials import password_of, tls_of
 from fdhil.config.publish import MqttBroker
 from fdhil.errors import ConnectError
-from fdhil.shopfloor import mqtt
-from fdhil.shopfloor.mqtt import HostGone, Session
-from tests.daemon.machine import config_of
-from tests.shopfloor.asked_daemon import NOW, Daemon, identified, load_changed
-from tests.shopfloor.made import publishing, trouble
+from fdhil.shopfloor import mqtt_publisher
+from fdhil.shopfloor.mqtt_publisher import HostGone, MqttSession
+from tests.daemon.simulated_machine import config_of
 from tests.shopfloor.mosquitto import certify
+from tests.shopfloor.polled_daemon import NOW, Daemon, identified, load_changed
 from tests.shopfloor.sparkplug_host import Host, command
+from tests.shopfloor.status_documents import publishing, trouble
 
 NCMD = "spBv1.0/fdhil/NCMD/mill"
 
 
 @pytest.fixture(autouse=True)
-def _no_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mqtt, "REBIRTH_S", 0.0)
+def _skip_rebirth_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mqtt_publisher, "REBIRTH_S", 0.0)
 
 
 class Broker:
@@ -64,12 +64,12 @@ class Broker:
                 self._heard.clear()
 
 
-def session_of(**settings: Any) -> Session:
-    return Session(MqttBroker(**settings), "mill")
+def session_of(**settings: Any) -> MqttSession:
+    return MqttSession(MqttBroker(**settings), "mill")
 
 
 @asynccontextmanager
-async def connected(session: Session) -> AsyncIterator[Broker]:
+async def connected(session: MqttSession) -> AsyncIterator[Broker]:
     broker = Broker()
     task = asyncio.create_task(session.run(cast(aiomqtt.Client, broker)))
     try:
@@ -84,64 +84,64 @@ def is_born(host: Host) -> bool:
     return host.verbs[-1:] == ["DBIRTH/Y"]
 
 
-async def test_births_then_changes_then_silence_then_life_then_a_death_certificate(tmp_path: Path) -> None:
+async def test_session_publishes_births_changes_silence_recovery_and_death(tmp_path: Path) -> None:
     daemon, session = Daemon(tmp_path), session_of()
-    session.node.will(NOW)
+    session.node.begin_connection(NOW)
     async with connected(session) as broker:
         await asyncio.sleep(0)
         assert broker.host.verbs == []  # the daemon was not asked yet
-        session.hear(daemon.news())
+        session.take_update(daemon.news())
         await broker.until(is_born)
         assert broker.host.verbs == ["NBIRTH", "DBIRTH/X", "DBIRTH/Y"]
         assert (broker.host.values[""]["up"], broker.host.values["X"]["K"]) == (True, None)
-        session.hear(daemon.news(*identified(), load_changed()))
+        session.take_update(daemon.news(*identified(), load_changed()))
         await broker.until(lambda host: host.values["X"]["K"] == 0.8)
         x = broker.host.values["X"]
         assert x["K_low"] < 0.8 < x["K_high"]
         assert x["windows_accepted"] == 1
         assert broker.host.units["X"]["K"] == "N.m/A"
         await broker.until(lambda host: host.values["X"]["notice"] == "LoadChanged: Jt rose")
-        session.hear(daemon.silence())
+        session.take_update(daemon.silence())
         await broker.until(lambda host: set(host.values) == {""})
         assert broker.host.verbs[-2:] == ["DDEATH/X", "DDEATH/Y"]
         assert broker.host.values[""]["up"] is False
         assert broker.host.values[""]["state"] is None
-        session.hear(daemon.news())
+        session.take_update(daemon.news())
         await broker.until(is_born)
         assert broker.host.values["X"]["K"] == 0.8
     assert broker.host.verbs[-1] == "NDEATH"
     assert not broker.host.alive
 
 
-async def test_every_notice_is_told_also_the_same_one_again(tmp_path: Path) -> None:
+async def test_every_notice_is_published_even_when_repeated(tmp_path: Path) -> None:
     daemon, session = Daemon(tmp_path), session_of()
-    session.node.will(NOW)
+    session.node.begin_connection(NOW)
     async with connected(session) as broker:
-        session.hear(daemon.news())
+        session.take_update(daemon.news())
         await broker.until(is_born)
         before = broker.host.verbs.count("DDATA/X")
-        session.hear(daemon.news(load_changed("one"), load_changed("two")))
+        session.take_update(daemon.news(load_changed("one"), load_changed("two")))
         await broker.until(lambda host: host.values["X"]["notice"] == "LoadChanged: two")
-        session.hear(daemon.news(load_changed("two")))
+        session.take_update(daemon.news(load_changed("two")))
         await broker.until(lambda host: host.verbs.count("DDATA/X") >= before + 3)
 
 
-async def test_a_slow_broker_is_told_the_newest_state_and_no_more_notices_than_may_wait(
+async def test_slow_broker_receives_the_newest_state_and_a_bounded_number_of_notices(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(mqtt, "MOST_EVENTS", 3)
+    monkeypatch.setattr(mqtt_publisher, "MOST_EVENTS", 3)
     daemon, session = Daemon(tmp_path), session_of()
-    session.node.will(NOW)
+    session.node.begin_connection(NOW)
     async with connected(session) as broker:
-        session.hear(daemon.news())
+        session.take_update(daemon.news())
         await broker.until(is_born)
         before = len(broker.host.verbs)
         for _ in range(100):  # while the broker takes nothing
-            session.hear(daemon.news())
+            session.take_update(daemon.news())
         for number in range(10):
-            session.hear(daemon.news(load_changed(f"{number}")))
+            session.take_update(daemon.news(load_changed(f"{number}")))
         newest = daemon.news(*identified())
-        session.hear(newest)
+        session.take_update(newest)
         await broker.until(lambda host: host.values["X"]["notice"] == "LoadChanged: 9")
         result = broker.host.verbs[before:]
         assert (result.count("DDATA/X"), result.count("NDATA")) == (3, 1)
@@ -151,24 +151,24 @@ async def test_a_slow_broker_is_told_the_newest_state_and_no_more_notices_than_m
     assert output.count("7 notices were not sent one by one: the broker was too slow") == 1
 
 
-async def test_a_trouble_is_an_alarm_until_it_is_over(tmp_path: Path) -> None:
+async def test_problem_is_an_alarm_until_it_ends(tmp_path: Path) -> None:
     daemon, session = Daemon(tmp_path), session_of()
-    session.node.will(NOW)
+    session.node.begin_connection(NOW)
     async with connected(session) as broker:
         daemon.changes = {"troubles": [trouble("NoSamples", "X", text="sends no samples")]}
-        session.hear(daemon.news())
+        session.take_update(daemon.news())
         await broker.until(is_born)
         assert broker.host.values["X"]["alarms"] == "NoSamples: sends no samples"
         daemon.changes = {}
-        session.hear(daemon.news())
+        session.take_update(daemon.news())
         await broker.until(lambda host: host.values["X"]["alarms"] == "")
 
 
-async def test_births_are_sent_again_on_demand_and_nothing_else_is_obeyed(tmp_path: Path) -> None:
+async def test_births_are_sent_again_on_request_and_other_commands_ignored(tmp_path: Path) -> None:
     daemon, session = Daemon(tmp_path), session_of()
-    session.node.will(NOW)
+    session.node.begin_connection(NOW)
     async with connected(session) as broker:
-        session.hear(daemon.news())
+        session.take_update(daemon.news())
         await broker.until(is_born)
         for name in ("arm", "Node Control/Reboot", "Node Control/Next Server"):
             broker.send(NCMD, command(name, True))
@@ -179,14 +179,14 @@ async def test_births_are_sent_again_on_demand_and_nothing_else_is_obeyed(tmp_pa
         assert broker.subscribed == [NCMD]  # no device takes commands
 
 
-async def test_a_daemon_that_is_silent_from_the_start_has_no_axes(tmp_path: Path) -> None:
+async def test_silent_daemon_at_start_has_no_axes(tmp_path: Path) -> None:
     daemon, session = Daemon(tmp_path), session_of()
-    session.node.will(NOW)
+    session.node.begin_connection(NOW)
     async with connected(session) as broker:
-        session.hear(daemon.silence())
+        session.take_update(daemon.silence())
         await broker.until(lambda host: host.verbs == ["NBIRTH"])
         assert broker.host.values[""]["up"] is False
-        session.hear(daemon.news())
+        session.take_update(daemon.news())
         await broker.until(is_born)
 
 
@@ -194,12 +194,12 @@ def host_says(online: bool, stamp_ms: int) -> bytes:
     return json.dumps({"online": online, "timestamp": stamp_ms}).encode()
 
 
-async def test_a_primary_host_is_waited_for_and_left_when_it_goes(tmp_path: Path) -> None:
+async def test_session_waits_for_the_primary_host_and_ends_with_it(tmp_path: Path) -> None:
     daemon, session = Daemon(tmp_path), session_of(primary_host="scada")
-    session.node.will(NOW)
+    session.node.begin_connection(NOW)
     broker, state = Broker(), "spBv1.0/STATE/scada"
     serving = asyncio.create_task(session.run(cast(aiomqtt.Client, broker)))
-    session.hear(daemon.news())
+    session.take_update(daemon.news())
     broker.send(state, host_says(False, NOW))
     broker.send("spBv1.0/STATE/another", host_says(True, NOW + 1))
     for _ in range(20):
@@ -218,12 +218,12 @@ async def test_a_primary_host_is_waited_for_and_left_when_it_goes(tmp_path: Path
     assert broker.host.verbs[-1] == "NDEATH"
 
 
-async def test_a_host_state_of_the_far_future_does_not_silence_the_publisher(tmp_path: Path) -> None:
+async def test_host_state_in_the_future_does_not_silence_the_publisher(tmp_path: Path) -> None:
     daemon, session = Daemon(tmp_path), session_of(primary_host="scada")
-    session.node.will(NOW)
+    session.node.begin_connection(NOW)
     broker, state = Broker(), "spBv1.0/STATE/scada"
     serving = asyncio.create_task(session.run(cast(aiomqtt.Client, broker)))
-    session.hear(daemon.news())
+    session.take_update(daemon.news())
     broker.send(state, host_says(False, 4_000_000_000_000))
     broker.send(state, host_says(True, NOW))
     await broker.until(is_born)
@@ -234,12 +234,12 @@ async def test_a_host_state_of_the_far_future_does_not_silence_the_publisher(tmp
     assert gone.group_contains(HostGone)
 
 
-async def test_a_broker_that_is_not_there_is_told_of_once_and_tried_again(
+async def test_absent_broker_is_logged_once_and_retried(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(mqtt, "FIRST_RETRY_S", 0.001)
+    monkeypatch.setattr(mqtt_publisher, "FIRST_RETRY_S", 0.001)
     tried = asyncio.Queue[None]()
-    monkeypatch.setattr(mqtt, "_client", _counted(tried, mqtt._client))
+    monkeypatch.setattr(mqtt_publisher, "_make_client", _counted(tried, mqtt_publisher._make_client))
     async with publishing("mqtt", config_of(tmp_path, publish={"mqtt": {"port": 1}})):
         for _ in range(4):
             await tried.get()
@@ -247,17 +247,15 @@ async def test_a_broker_that_is_not_there_is_told_of_once_and_tried_again(
     assert output.count("Connection refused; check host and port, and whether it runs; retrying") == 1
 
 
-async def test_it_does_not_go_on_with_old_values_when_the_daemon_cannot_be_heard_any_more(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_publisher_stops_when_polling_the_daemon_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def broken(config: Any, period_s: float) -> AsyncIterator[Any]:
         for fault in (RuntimeError("a fault of fdhil itself"),):
             raise fault
         yield
 
-    monkeypatch.setattr(mqtt, "listen", broken)
+    monkeypatch.setattr(mqtt_publisher, "poll_status", broken)
     with pytest.raises(RuntimeError, match="a fault of fdhil itself"):
-        await mqtt.publish(config_of(tmp_path, publish={"mqtt": {"port": 1}}))
+        await mqtt_publisher.publish(config_of(tmp_path, publish={"mqtt": {"port": 1}}))
 
 
 def _counted(tried: asyncio.Queue[None], client: Callable[..., Any]) -> Callable[..., Any]:
@@ -268,17 +266,17 @@ def _counted(tried: asyncio.Queue[None], client: Callable[..., Any]) -> Callable
     return counted
 
 
-def test_credentials_that_cannot_be_used_are_named(tmp_path: Path) -> None:
+def test_unusable_credentials_are_named(tmp_path: Path) -> None:
     missing = tmp_path / "missing"
     with pytest.raises(ConnectError, match=r"password_file .*missing cannot be used: No such file"):
-        password_of(MqttBroker(user="fdhil", password_file=missing), *mqtt.BROKER)
+        password_of(MqttBroker(user="fdhil", password_file=missing), *mqtt_publisher.BROKER)
     with pytest.raises(ConnectError, match=r"tls_ca_file .*missing cannot be used: No such file"):
-        tls_of(MqttBroker(tls_ca_file=missing), *mqtt.BROKER)
+        tls_of(MqttBroker(tls_ca_file=missing), *mqtt_publisher.BROKER)
     certify(tmp_path)
     ca, empty = tmp_path / "ca.pem", tmp_path / "empty"
     empty.touch()
     with pytest.raises(ConnectError, match=r"tls_certificate_file .*empty cannot be used"):
-        tls_of(MqttBroker(tls_ca_file=ca, tls_certificate_file=empty, tls_key_file=empty), *mqtt.BROKER)
+        tls_of(MqttBroker(tls_ca_file=ca, tls_certificate_file=empty, tls_key_file=empty), *mqtt_publisher.BROKER)
 
 
 @pytest.mark.parametrize(
@@ -292,11 +290,11 @@ def test_credentials_that_cannot_be_used_are_named(tmp_path: Path) -> None:
         ({"node": "mill+"}, "pattern"),
     ],
 )
-def test_settings_that_would_not_do_are_refused(settings: dict[str, Any], words: str) -> None:
+def test_invalid_settings_are_refused(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         MqttBroker(**settings)
 
 
-def test_the_machines_name_is_the_node_without_what_a_topic_cannot_have() -> None:
+def test_node_name_is_the_machine_name_without_topic_characters() -> None:
     assert MqttBroker().node_name("mill #3 / hall +1") == "mill _3 _ hall _1"
     assert MqttBroker(node="m3").node_name("mill") == "m3"

@@ -9,23 +9,23 @@ import pytest
 
 from fdhil.config.users import UsersFile, hashed, write_users
 from fdhil.errors import ConfigError
-from fdhil.shopfloor.opcua_security import MOST_FAILURES, Doorkeeper
-from fdhil.shopfloor.opcua_shown import UNITS, unit_of
-from fdhil.shopfloor.published import AXIS, BUS, MACHINE
-from tests.daemon.machine import config_of
+from fdhil.shopfloor.opcua_access import MOST_FAILURES, OpcUaUserManager
+from fdhil.shopfloor.opcua_values import UNITS, make_unit
+from fdhil.shopfloor.published_items import AXIS, BUS, MACHINE
+from tests.daemon.simulated_machine import config_of
 
 PASSWORD = "canary-of-the-shop-floor"
 
 
 def test_every_unit_has_a_common_code() -> None:
     assert {item.unit for item in (*MACHINE, *AXIS, *BUS)} - {""} <= set(UNITS)
-    assert unit_of("N.m/A").UnitId == 4602160  # as OPC Foundation's table of UNECE codes has F90
+    assert make_unit("N.m/A").UnitId == 4602160  # as OPC Foundation's table of UNECE codes has F90
 
 
-def test_guessing_is_ended(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("fdhil.shopfloor.opcua_security.matches", lambda user, password: password == PASSWORD)
+def test_password_guessing_is_blocked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("fdhil.shopfloor.opcua_access.matches", lambda user, password: password == PASSWORD)
     write_users(tmp_path / "users.json", {"scada": hashed(PASSWORD, "watch")})
-    door = Doorkeeper(UsersFile(tmp_path / "users.json"))
+    door = OpcUaUserManager(UsersFile(tmp_path / "users.json"))
     assert door.get_user(None, "scada", PASSWORD) is not None
     for _ in range(MOST_FAILURES):
         assert door.get_user(None, "scada", "wrong") is None
@@ -43,8 +43,6 @@ def test_guessing_is_ended(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
         ({"trusted_clients": "folder"}, "certificate_file"),
     ],
 )
-def test_no_other_computer_is_served_without_users_and_encryption(
-    keys: dict[str, Any], word: str, tmp_path: Path
-) -> None:
+def test_remote_access_needs_users_and_encryption(keys: dict[str, Any], word: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=word):
         config_of(tmp_path, publish={"opcua": keys})

@@ -19,14 +19,14 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConnectError
-from fdhil.shopfloor.metrics import Metrics
-from fdhil.shopfloor.news import Listener, News
-from fdhil.shopfloor.prometheus import MOST_CONNECTIONS, Page, publish
-from tests.daemon.machine import Machine, config_of, rapids
-from tests.daemon.test_service import serving, status_when
+from fdhil.shopfloor.prometheus_endpoint import MOST_CONNECTIONS, MetricsPage, publish
+from fdhil.shopfloor.prometheus_metrics import MetricsCollector
+from fdhil.shopfloor.status_poller import StatusPoller, StatusUpdate
+from tests.daemon.simulated_machine import SimulatedMachine, config_of, rapids
+from tests.daemon.test_daemon_service import serving, status_when
 from tests.ports import free_port
-from tests.shopfloor.made import NOW_MS, notice, publishing, said, status, trouble
 from tests.shopfloor.mosquitto import certify
+from tests.shopfloor.status_documents import NOW_MS, notice, publishing, said, status, trouble
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 ALERTS, DASHBOARD = CONFIGS / "prometheus" / "fdhil-alerts.yml", CONFIGS / "grafana" / "fdhil.json"
@@ -34,20 +34,20 @@ LOCAL = {"host": "localhost"}
 PATIENCE_S = 300.0
 
 
-def news_of(config: MachineConfig, *answers: dict[str, Any] | None) -> News:
-    listener = Listener(config)
-    return [listener.news(each, NOW_MS, "" if each else "it is not running") for each in answers][-1]
+def news_of(config: MachineConfig, *answers: dict[str, Any] | None) -> StatusUpdate:
+    listener = StatusPoller(config)
+    return [listener.build_update(each, NOW_MS, "" if each else "it is not running") for each in answers][-1]
 
 
-def page_of(news: News | None, hosts: tuple[str, ...] = ("localhost",)) -> Page:
-    metrics = Metrics()
+def page_of(news: StatusUpdate | None, hosts: tuple[str, ...] = ("localhost",)) -> MetricsPage:
+    metrics = MetricsCollector()
     if news is not None:
-        metrics.take(news)
-    return Page(metrics, hosts)
+        metrics.take_update(news)
+    return MetricsPage(metrics, hosts)
 
 
 async def get(
-    page: Page, path: str = "/metrics", headers: dict[str, str] = LOCAL, method: str = "GET"
+    page: MetricsPage, path: str = "/metrics", headers: dict[str, str] = LOCAL, method: str = "GET"
 ) -> httpx.Response:
     transport = httpx.ASGITransport(app=page)  # type: ignore[arg-type]
     async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
@@ -63,14 +63,14 @@ def samples(text: str) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
 
 
 @pytest.fixture
-def everything(tmp_path: Path) -> News:
+def full_update(tmp_path: Path) -> StatusUpdate:
     config = config_of(tmp_path, "XY")
     first = status(notices=[])
     return news_of(config, first, status(troubles=[trouble("BusSilent")], notices=[notice("Armed", 0.1)]))
 
 
-async def test_every_value_is_a_metric_in_base_units(everything: News) -> None:
-    answer = await get(page_of(everything))
+async def test_every_value_is_a_metric_in_base_units(full_update: StatusUpdate) -> None:
+    answer = await get(page_of(full_update))
     assert answer.status_code == 200
     assert answer.headers["content-type"].startswith("text/plain")
     found = samples(answer.text)
@@ -89,22 +89,22 @@ async def test_every_value_is_a_metric_in_base_units(everything: News) -> None:
     assert found["fdhil_alarm", (("axis", ""), ("code", "BusSilent"), ("severity", "MAJOR"))] == 1
     assert found["fdhil_notices_total", (("code", "Armed"), ("severity", "info"))] == 1
     assert found["fdhil_armed_info", (("method", "inverse"), ("program", "part.ngc"))] == 1
-    result = {value.item.name for value in everything.values if value.item.kind != "text"}
+    result = {value.item.name for value in full_update.values if value.item.kind != "text"}
     assert len({name for name, _ in found}) >= len(result)
 
 
-async def test_a_silent_daemon_leaves_up_and_when_it_was_heard(tmp_path: Path) -> None:
+async def test_silent_daemon_leaves_up_and_the_time_of_the_last_answer(tmp_path: Path) -> None:
     config = config_of(tmp_path)
-    page, listener = page_of(None), Listener(config)
+    page, listener = page_of(None), StatusPoller(config)
     assert set(samples((await get(page)).text)) == {("fdhil_up", ())}
-    metrics = Metrics()
-    metrics.take(listener.news(status("X"), NOW_MS))
-    metrics.take(listener.news(None, NOW_MS + 1000, "it is not running"))
-    found = samples((await get(Page(metrics, ("localhost",)))).text)
+    metrics = MetricsCollector()
+    metrics.take_update(listener.build_update(status("X"), NOW_MS))
+    metrics.take_update(listener.build_update(None, NOW_MS + 1000, "it is not running"))
+    found = samples((await get(MetricsPage(metrics, ("localhost",)))).text)
     assert found == {("fdhil_up", ()): 0.0, ("fdhil_answered_timestamp_seconds", ()): NOW_MS * 1e-3}
 
 
-async def test_what_is_not_known_is_absent(tmp_path: Path) -> None:
+async def test_unknown_values_are_absent(tmp_path: Path) -> None:
     answer = status("X")
     answer["axes"]["X"]["parameters"] = None
     answer["guard"]["heard_s_ago"] = 60.0
@@ -117,16 +117,16 @@ async def test_what_is_not_known_is_absent(tmp_path: Path) -> None:
     ("host", "expected"),
     [("localhost", 200), ("LOCALHOST:9837", 200), ("evil.example", 421), ("localhost.evil.example", 421), ("", 421)],
 )
-async def test_only_the_hosts_of_the_config_are_served(everything: News, host: str, expected: int) -> None:
-    answer = await get(page_of(everything), headers={"host": host})
+async def test_only_configured_hosts_are_served(full_update: StatusUpdate, host: str, expected: int) -> None:
+    answer = await get(page_of(full_update), headers={"host": host})
     assert answer.status_code == expected
     assert ("fdhil_" in answer.text) == (expected == 200)
 
 
-async def test_there_is_one_page_and_it_is_for_reading(everything: News) -> None:
-    assert (await get(page_of(everything), "/")).status_code == 404
-    assert (await get(page_of(everything), method="POST")).status_code == 405
-    head = await get(page_of(everything), method="HEAD")
+async def test_metrics_page_is_the_only_one_and_read_only(full_update: StatusUpdate) -> None:
+    assert (await get(page_of(full_update), "/")).status_code == 404
+    assert (await get(page_of(full_update), method="POST")).status_code == 405
+    head = await get(page_of(full_update), method="HEAD")
     assert (head.status_code, head.content) == (200, b"")
 
 
@@ -142,26 +142,26 @@ async def _nonsense_is_answered(address: httpx.URL, caplog: pytest.LogCaptureFix
     assert [record for record in caplog.records if record.name.startswith("uvicorn")] == []
 
 
-async def test_a_real_daemon_is_read_over_http(
+async def test_metrics_of_a_real_daemon_are_served(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
+    monkeypatch.setattr("fdhil.daemon.daemon_service.compile_kernels", lambda config, method: None)
     config = config_of(tmp_path, publish={"prometheus": {"port": 0, "period_s": 0.1}})
     async with publishing("prometheus", config) as task, httpx.AsyncClient(timeout=PATIENCE_S) as client:
         address = (await said(task, capsys, "/metrics")).rsplit(" ", 1)[1]
         await _nonsense_is_answered(httpx.URL(address), caplog)
         assert ("fdhil_up", ()) in samples((await client.get(address)).text)
-        async with serving(config, Machine(rapids(config, count=1))) as path:
+        async with serving(config, SimulatedMachine(rapids(config, count=1))) as path:
             await status_when(path, lambda s: s["axes"]["X"]["accepted"] == 1)
             found = await metrics_when(client, address, ("fdhil_revision", (("axis", "X"),)), 1.0)
             assert found["fdhil_windows_accepted_total", (("axis", "X"),)] == 1
         await metrics_when(client, address, ("fdhil_up", ()), 0.0)
 
 
-async def test_who_only_holds_connections_keeps_no_scrape_out_and_is_ended(
+async def test_idle_connections_are_closed_and_do_not_block_scrapes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = config_of(tmp_path, publish={"prometheus": {"port": 0}})
@@ -177,9 +177,7 @@ async def test_who_only_holds_connections_keeps_no_scrape_out_and_is_ended(
             writer.close()
 
 
-async def test_a_stranger_without_a_certificate_reads_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+async def test_client_without_a_certificate_reads_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     certify(tmp_path)
     files = {"tls_certificate_file": "broker.pem", "tls_key_file": "broker.key", "tls_client_ca_file": "ca.pem"}
     keys = {"host": "0.0.0.0", "port": 0, "allowed_hosts": ["127.0.0.1"], **files}
@@ -213,7 +211,7 @@ async def metrics_when(client: httpx.AsyncClient, address: str, key: Any, value:
         ({"tls_client_ca_file": "c"}, "tls_certificate_file"),
     ],
 )
-def test_no_other_computer_is_served_unless_the_config_says_so(keys: dict[str, Any], word: str, tmp_path: Path) -> None:
+def test_remote_access_needs_an_explicit_setting(keys: dict[str, Any], word: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=word):
         config_of(tmp_path, publish={"prometheus": keys})
     config_of(tmp_path, publish={"prometheus": {"host": "0.0.0.0", "unprotected": True}})
@@ -226,7 +224,7 @@ def test_no_other_computer_is_served_unless_the_config_says_so(keys: dict[str, A
         ({"host": "203.0.113.1", "unprotected": True}, "cannot listen"),  # TEST-NET-3: no computer has it
     ],
 )
-async def test_what_cannot_be_served_is_one_sentence(keys: dict[str, Any], words: str, tmp_path: Path) -> None:
+async def test_unusable_settings_are_reported_in_one_sentence(keys: dict[str, Any], words: str, tmp_path: Path) -> None:
     with pytest.raises(ConnectError, match=words):
         await publish(config_of(tmp_path, publish={"prometheus": keys}))
 
@@ -242,8 +240,8 @@ def expressions_of(dashboard: Any) -> list[str]:
     return [text for each in dashboard for text in expressions_of(each)] if isinstance(dashboard, list) else []
 
 
-async def test_every_metric_of_the_dashboard_and_of_the_alerts_exists(everything: News) -> None:
-    there = {name for name, _ in samples((await get(page_of(everything))).text)}
+async def test_every_metric_of_the_dashboard_and_of_the_alerts_exists(full_update: StatusUpdate) -> None:
+    there = {name for name, _ in samples((await get(page_of(full_update))).text)}
     of_dashboard = set().union(*map(named, expressions_of(json.loads(DASHBOARD.read_text()))))
     of_alerts = set().union(*map(named, re.findall(r"^ +expr: (.*(?:\n {10}.*)*)", ALERTS.read_text(), re.MULTILINE)))
     assert len(of_dashboard) > 40
@@ -251,7 +249,7 @@ async def test_every_metric_of_the_dashboard_and_of_the_alerts_exists(everything
     assert (of_dashboard - there, of_alerts - there) == (set(), set())
 
 
-def test_each_alert_has_a_test_that_sees_it_come() -> None:
+def test_each_alert_has_a_promtool_test() -> None:
     alerts = re.findall(r"- alert: (\w+)", ALERTS.read_text())
     tests = "".join(path.read_text() for path in Path(__file__).parent.glob("*.test.yml"))
     seen = set(re.findall(r"alertname: (\w+)\n +exp_alerts:\n", tests))
@@ -260,7 +258,7 @@ def test_each_alert_has_a_test_that_sees_it_come() -> None:
 
 
 @pytest.mark.debian
-def test_promtool_agrees_with_the_rules_and_their_tests(tmp_path: Path) -> None:
+def test_promtool_accepts_the_rules_and_their_tests(tmp_path: Path) -> None:
     for path in (*CONFIGS.glob("prometheus/*.yml"), *Path(__file__).parent.glob("*.test.yml")):
         shutil.copy(path, tmp_path)
     for words in (
@@ -273,7 +271,7 @@ def test_promtool_agrees_with_the_rules_and_their_tests(tmp_path: Path) -> None:
 
 
 @pytest.mark.debian
-async def test_a_real_prometheus_scrapes_and_an_alert_comes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_real_prometheus_scrapes_and_raises_an_alert(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = config_of(tmp_path, publish={"prometheus": {"port": 0}})
     async with publishing("prometheus", config) as task:
         address = (await said(task, capsys, "/metrics")).rsplit(" ", 1)[1]

@@ -18,9 +18,9 @@ from fdhil.shopfloor.sparkplug import (
     HostState,
     Message,
     Metric,
-    host_state,
-    host_topic,
-    wants_rebirth,
+    is_rebirth_command,
+    make_host_topic,
+    parse_host_state,
 )
 from tests.shopfloor.sparkplug_host import Host, command, decoded
 
@@ -31,7 +31,7 @@ def metric(name: str, value: bool | float | str | None, datatype: int = DOUBLE, 
     return Metric(name, datatype, value, NOW, unit)
 
 
-def heard(host: Host, messages: Sequence[Message]) -> list[str]:
+def parse_messages(host: Host, messages: Sequence[Message]) -> list[str]:
     before = len(host.verbs)
     for message in messages:
         host.take(message.topic, message.payload)
@@ -40,80 +40,93 @@ def heard(host: Host, messages: Sequence[Message]) -> list[str]:
 
 def begun(node: Sequence[Metric], **devices: Sequence[Metric]) -> tuple[EdgeNode, Host]:
     edge, host = EdgeNode("works", "mill"), Host()
-    edge.will(NOW)
-    assert heard(host, edge.births(node, devices, NOW)) == ["NBIRTH", *(f"DBIRTH/{name}" for name in devices)]
+    edge.begin_connection(NOW)
+    assert parse_messages(host, edge.build_births(node, devices, NOW)) == [
+        "NBIRTH",
+        *(f"DBIRTH/{name}" for name in devices),
+    ]
     return edge, host
 
 
-def test_births_tell_everything_with_names_types_and_units() -> None:
+def test_births_have_all_metrics_with_names_types_and_units() -> None:
     x = [metric("R", 0.5, unit="ohm"), metric("windows", -3, INT64), metric("text", "grün | ja", STRING)]
     _, host = begun([metric("up", True, BOOLEAN)], X=x, Y=[metric("R", None)])
     assert host.values == {"": {"up": True}, "X": {"R": 0.5, "windows": -3, "text": "grün | ja"}, "Y": {"R": None}}
     assert host.units["X"]["R"] == "ohm"
 
 
-def test_only_what_changed_is_told_and_by_its_alias_alone() -> None:
+def test_only_changes_are_sent_by_alias() -> None:
     edge, host = begun([metric("state", "OFF", STRING)], X=[metric("R", 0.5), metric("L", 5e-3)])
     same = [metric("state", "OFF", STRING)]
-    assert edge.news(same, {"X": [metric("R", 0.5), metric("L", 5e-3)]}, NOW) == []
-    assert heard(host, edge.news(same, {"X": [metric("R", 0.6), metric("L", 5e-3)]}, NOW)) == ["DDATA/X"]
+    assert edge.build_changes(same, {"X": [metric("R", 0.5), metric("L", 5e-3)]}, NOW) == []
+    assert parse_messages(host, edge.build_changes(same, {"X": [metric("R", 0.6), metric("L", 5e-3)]}, NOW)) == [
+        "DDATA/X"
+    ]
     assert host.values["X"] == {"R": 0.6, "L": 5e-3}
-    assert heard(host, edge.news([metric("state", "ARMED", STRING)], {"X": [metric("R", 0.6)]}, NOW)) == [
+    assert parse_messages(
+        host, edge.build_changes([metric("state", "ARMED", STRING)], {"X": [metric("R", 0.6)]}, NOW)
+    ) == [
         "NDATA",
         "DDATA/X",
     ]
     assert host.values == {"": {"state": "ARMED"}, "X": {"R": 0.6, "L": None}}
-    nan = edge.news([metric("state", "ARMED", STRING)], {"X": [metric("R", math.nan)]}, NOW)
-    assert heard(host, nan) == ["DDATA/X"]
+    nan = edge.build_changes([metric("state", "ARMED", STRING)], {"X": [metric("R", math.nan)]}, NOW)
+    assert parse_messages(host, nan) == ["DDATA/X"]
     assert host.values["X"]["R"] is None
-    assert edge.news([metric("state", "ARMED", STRING)], {"X": [metric("R", math.nan)]}, NOW) == []
+    assert edge.build_changes([metric("state", "ARMED", STRING)], {"X": [metric("R", math.nan)]}, NOW) == []
 
 
 def test_a_silent_device_dies_and_is_born_again() -> None:
     edge, host = begun([], X=[metric("R", 0.5)], Y=[metric("R", 0.7)])
-    assert heard(host, edge.news([], {"Y": [metric("R", 0.7)]}, NOW)) == ["DDEATH/X"]
+    assert parse_messages(host, edge.build_changes([], {"Y": [metric("R", 0.7)]}, NOW)) == ["DDEATH/X"]
     assert set(host.values) == {"", "Y"}
-    assert heard(host, edge.news([], {"X": [metric("R", 0.5)], "Y": [metric("R", 0.7)]}, NOW)) == ["DBIRTH/X"]
+    assert parse_messages(host, edge.build_changes([], {"X": [metric("R", 0.5)], "Y": [metric("R", 0.7)]}, NOW)) == [
+        "DBIRTH/X"
+    ]
     assert host.values["X"] == {"R": 0.5}
 
 
-def test_what_gains_a_value_is_born_again() -> None:
+def test_device_with_a_new_metric_is_born_again() -> None:
     edge, host = begun([], X=[metric("R", 0.5)])
-    assert heard(host, edge.news([], {"X": [metric("R", 0.5), metric("load", 1.0)]}, NOW)) == ["DBIRTH/X"]
-    more = edge.news([metric("program", "a.ngc", STRING)], {"X": [metric("R", 0.5), metric("load", 1.0)]}, NOW)
-    assert heard(host, more) == ["NBIRTH", "DBIRTH/X"]
+    assert parse_messages(host, edge.build_changes([], {"X": [metric("R", 0.5), metric("load", 1.0)]}, NOW)) == [
+        "DBIRTH/X"
+    ]
+    more = edge.build_changes([metric("program", "a.ngc", STRING)], {"X": [metric("R", 0.5), metric("load", 1.0)]}, NOW)
+    assert parse_messages(host, more) == ["NBIRTH", "DBIRTH/X"]
     assert host.values == {"": {"program": "a.ngc"}, "X": {"R": 0.5, "load": 1.0}}
 
 
 def test_each_connection_has_its_own_death_certificate() -> None:
     edge, host = begun([metric("state", "OFF", STRING)])
-    first = edge.death(NOW)
+    first = edge.build_death(NOW)
     assert (first.topic, first.qos) == ("spBv1.0/works/NDEATH/mill", 1)
-    assert decoded(edge.will(NOW).payload)[2][0].value(INT64) == 1
-    heard(host, edge.births([metric("state", "OFF", STRING)], {}, NOW))
-    heard(host, [first])  # the broker tells of the connection before only now
+    assert decoded(edge.begin_connection(NOW).payload)[2][0].value(INT64) == 1
+    parse_messages(host, edge.build_births([metric("state", "OFF", STRING)], {}, NOW))
+    parse_messages(host, [first])  # the broker tells of the connection before only now
     assert host.alive
-    heard(host, [edge.death(NOW)])
+    parse_messages(host, [edge.build_death(NOW)])
     assert not host.alive
 
 
-def test_births_are_asked_for_again_within_a_connection_with_its_number() -> None:
+def test_requested_births_keep_the_number_of_the_connection() -> None:
     edge, host = begun([metric("state", "OFF", STRING)], X=[metric("R", 0.5)])
     before = host.bd_seq
-    assert heard(host, edge.births([metric("state", "OFF", STRING)], {"X": [metric("R", 0.5)]}, NOW)) == [
+    assert parse_messages(
+        host, edge.build_births([metric("state", "OFF", STRING)], {"X": [metric("R", 0.5)]}, NOW)
+    ) == [
         "NBIRTH",
         "DBIRTH/X",
     ]
     assert host.bd_seq == before
 
 
-def test_sequence_numbers_wrap() -> None:
+def test_sequence_numbers_wrap_at_256() -> None:
     edge, host = begun([])
     for k in range(600):
-        heard(host, edge.news([], {"X": [metric("R", float(k))]}, NOW))
+        parse_messages(host, edge.build_changes([], {"X": [metric("R", float(k))]}, NOW))
     assert host.values["X"] == {"R": 599.0}
     for _ in range(300):
-        will = edge.will(NOW)
+        will = edge.begin_connection(NOW)
     assert decoded(will.payload)[2][0].value(INT64) == 300 % 256
 
 
@@ -129,12 +142,12 @@ def test_sequence_numbers_wrap() -> None:
         (b"arm", False),
     ],
 )
-def test_no_command_but_rebirth_is_one(payload: bytes, wanted: bool) -> None:
-    assert wants_rebirth(payload) is wanted
+def test_only_rebirth_is_a_command(payload: bytes, wanted: bool) -> None:
+    assert is_rebirth_command(payload) is wanted
 
 
 @given(st.text(st.characters()), st.floats(), st.integers(-(2**63), 2**63 - 1))
-def test_any_value_arrives_or_is_null(text: str, number: float, count: int) -> None:
+def test_any_value_is_decoded_or_null(text: str, number: float, count: int) -> None:
     result = [metric("text", text, STRING), metric("number", number), metric("count", count, INT64)]
     values = begun(result)[1].values[""]
     assert values["text"] == text.encode("utf-8", "replace").decode()
@@ -143,14 +156,14 @@ def test_any_value_arrives_or_is_null(text: str, number: float, count: int) -> N
 
 
 @given(st.binary(max_size=60))
-def test_any_bytes_are_a_command_or_none(payload: bytes) -> None:
-    assert wants_rebirth(payload) in (True, False)
-    assert host_state(payload) is None or isinstance(host_state(payload), HostState)
+def test_any_bytes_are_parsed_without_error(payload: bytes) -> None:
+    assert is_rebirth_command(payload) in (True, False)
+    assert parse_host_state(payload) is None or isinstance(parse_host_state(payload), HostState)
 
 
-def test_a_primary_host_says_whether_it_is_there() -> None:
-    assert host_topic("scada") == "spBv1.0/STATE/scada"
-    assert host_state(b'{"online": true, "timestamp": 5}') == HostState(True, 5)
-    assert host_state(b'{"online": false, "timestamp": 6}') == HostState(False, 6)
+def test_primary_host_state_is_parsed() -> None:
+    assert make_host_topic("scada") == "spBv1.0/STATE/scada"
+    assert parse_host_state(b'{"online": true, "timestamp": 5}') == HostState(True, 5)
+    assert parse_host_state(b'{"online": false, "timestamp": 6}') == HostState(False, 6)
     for none in (b"ONLINE", b"[]", b'{"online": 1, "timestamp": 5}', b'{"online": true}'):
-        assert host_state(none) is None
+        assert parse_host_state(none) is None

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fdhil.shopfloor.news import ANSWER_S
-from fdhil.shopfloor.process import STOP_S
+from fdhil.shopfloor.publisher_process import STOP_S
+from fdhil.shopfloor.status_poller import ANSWER_S
 
 UNIT = Path(__file__).parents[2] / "systemd" / "fdhil-publish@.service"
 
 
-def test_the_unit_says_what_the_publishers_rely_on() -> None:
+def test_unit_has_the_settings_that_the_publishers_need() -> None:
     lines = UNIT.read_text().splitlines()
     settings = dict(line.split("=", 1) for line in lines if "=" in line and not line.startswith("#"))
     assert settings["ExecStart"] == "/opt/fdhil/bin/fdhil publish %i /etc/fdhil/machine.toml"

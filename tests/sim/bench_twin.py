@@ -9,7 +9,7 @@ import numpy as np
 
 from fdhil import config
 from fdhil.config import MachineConfig
-from fdhil.records import Float, Trajectory, frozen
+from fdhil.records import Float, Trajectory, freeze_array
 from fdhil.sim.frame import Frame
 from fdhil.sim.machine import Machine
 from tests.bench import bench_document
@@ -48,8 +48,8 @@ def trajectory(rows_mm: Float, axes: str = "XY", rapid: bool = False) -> Traject
     n = len(rows_mm)
     return Trajectory(
         PERIOD_S,
-        frozen(np.arange(n) * PERIOD_S),
-        {axis: frozen(rows_mm[:, place]) for place, axis in enumerate(axes)},
+        freeze_array(np.arange(n) * PERIOD_S),
+        {axis: freeze_array(rows_mm[:, place]) for place, axis in enumerate(axes)},
         np.full(n, rapid),
         np.zeros(n, dtype=np.int64),
     )

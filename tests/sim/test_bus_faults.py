@@ -100,7 +100,7 @@ def test_a_bus_that_goes_down_hangs_up_and_takes_everybody_again(bench: FeedDriv
     place = CanBus(**bench.bus_arguments)
     bench.command("nc", on=True)
     bench.wait_for("nc")
-    with bus.CanBus("can0", place) as listening:
+    with bus.ListeningBus("can0", place) as listening:
         wait_for(lambda: listening.counters()["frames"] > 20)
         bench.fault("bus_down", None, duration_s=0.1)
         wait_for(lambda: listening.ended is not None)
@@ -109,7 +109,7 @@ def test_a_bus_that_goes_down_hangs_up_and_takes_everybody_again(bench: FeedDriv
 
 
 def _joins(place: CanBus) -> bool:
-    with contextlib.suppress(ConnectError), bus.CanBus("can0", place) as listening:
+    with contextlib.suppress(ConnectError), bus.ListeningBus("can0", place) as listening:
         wait_for(lambda: listening.counters()["frames"] > 20 or listening.ended is not None)
         return listening.ended is None
     return False

@@ -16,7 +16,7 @@ from fdhil.sim.machine import Machine
 from fdhil.sim.operator_commands import CommandError, OperatorCommands
 from fdhil.sim.service import Pace
 from fdhil.sim.wire.sensor_faults import SensorFaults
-from tests.guard.machine import settings
+from tests.guard.simulated_bus import settings
 from tests.sim.bench_twin import PERIOD_S, TwinInHand, corner, trajectory, twin_config
 
 PER_MM = 65536 / 20

@@ -15,7 +15,7 @@ from typing import Any
 
 import can
 
-from fdhil.child import ending_with_parent
+from fdhil.child_process import wrap_to_end_with_parent
 from tests.bench import axis_toml, bench_toml
 
 COMMAND = [sys.executable, "-m", "fdhil.cli.main", "sim"]
@@ -37,7 +37,7 @@ class TwinProcess:
 
     def __init__(self, *arguments: object) -> None:
         self._process = subprocess.Popen(
-            ending_with_parent([*COMMAND, *map(str, arguments), "--json"], signal.SIGUSR1),
+            wrap_to_end_with_parent([*COMMAND, *map(str, arguments), "--json"], signal.SIGUSR1),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

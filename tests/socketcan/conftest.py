@@ -8,18 +8,18 @@ from pathlib import Path
 import pytest
 
 from fdhil.guard.can_socket import RawCan
-from tests.guard import shop as guard_shop
-from tests.guard.shop import Shop
+from tests.guard import guard_rig as guard_shop
+from tests.guard.guard_rig import GuardRig
 from tests.socketcan.interface import set_up
 
 
 @pytest.fixture
-def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[type[RawCan]], Shop]]:
-    made: list[Shop] = []
+def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[type[RawCan]], GuardRig]]:
+    made: list[GuardRig] = []
 
-    def build(wire: type[RawCan]) -> Shop:
+    def build(wire: type[RawCan]) -> GuardRig:
         monkeypatch.setattr(guard_shop, "Wire", wire)
-        made.append(Shop(tmp_path))
+        made.append(GuardRig(tmp_path))
         return made[-1]
 
     yield build

@@ -9,7 +9,7 @@ import pytest
 
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import CanBus as BusSettings
-from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.bus import ListeningBus
 from fdhil.drivers.can.error_frames import ErrorWatch
 from fdhil.errors import DeviceError
 from fdhil.guard.can_socket import ERROR, BusDown, RawCan
@@ -43,9 +43,9 @@ def wait_for(condition: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-def test_each_state_and_error_of_the_controller_is_told(adapter: SerialAdapter) -> None:
+def test_each_controller_state_and_error_is_reported(adapter: SerialAdapter) -> None:
     watch, received = ErrorWatch(), 0
-    with CanBus("can0", settings_of(adapter)) as bus:
+    with ListeningBus("can0", settings_of(adapter)) as bus:
         for line, expected in SAID:
             adapter.say(line)
             received += 1
@@ -56,8 +56,8 @@ def test_each_state_and_error_of_the_controller_is_told(adapter: SerialAdapter) 
 
 
 @pytest.mark.fault("A4")
-def test_a_controller_that_is_unplugged_ends_the_bus(adapter: SerialAdapter) -> None:
-    with CanBus("can0", settings_of(adapter)) as bus:
+def test_unplugged_controller_ends_the_bus(adapter: SerialAdapter) -> None:
+    with ListeningBus("can0", settings_of(adapter)) as bus:
         adapter.say("t1812AABB")
         wait_for(lambda: bus.counters()["frames"] == 1)
         adapter.unplug()
@@ -65,7 +65,7 @@ def test_a_controller_that_is_unplugged_ends_the_bus(adapter: SerialAdapter) -> 
         assert "is down or gone" in str(bus.ended)
 
 
-def test_a_full_transmit_queue_is_told_at_once(adapter: SerialAdapter) -> None:
+def test_full_transmit_queue_is_reported_at_once(adapter: SerialAdapter) -> None:
     def pour(bus: TransmitBus) -> None:
         for _ in range(100_000):
             bus.send(0x601, bytes(8))
@@ -74,7 +74,7 @@ def test_a_full_transmit_queue_is_told_at_once(adapter: SerialAdapter) -> None:
         pour(bus)
 
 
-def test_the_guard_hears_its_controller_and_drops_what_finds_no_room(adapter: SerialAdapter) -> None:
+def test_guard_sees_controller_states_and_drops_frames_on_a_full_queue(adapter: SerialAdapter) -> None:
     can = RawCan(raw_socket(adapter.channel), allowed={0x301}, wanted={0x080})
     try:
         assert not all(can.send(0x301, bytes(4)) for _ in range(100_000))
@@ -95,7 +95,7 @@ def test_the_guard_hears_its_controller_and_drops_what_finds_no_room(adapter: Se
         can.close()
 
 
-def test_the_guard_s_socket_is_back_when_the_interface_is() -> None:
+def test_guard_socket_recovers_with_the_interface() -> None:
     can = RawCan(raw_socket(), allowed={0x301}, wanted={0x080})
     try:
         for _ in range(3):
@@ -106,9 +106,9 @@ def test_the_guard_s_socket_is_back_when_the_interface_is() -> None:
                 can.receive()
             with pytest.raises(BusDown):
                 can.send(0x301, bytes(4))
-            assert not can.restored()
+            assert not can.try_restore()
             set_up("vcan0", True)
-            assert can.restored()
+            assert can.try_restore()
             assert can.receive() == []  # what came before is no news
             with raw_socket() as other:
                 send(other, 2, 0x080)
@@ -121,17 +121,17 @@ def test_the_guard_s_socket_is_back_when_the_interface_is() -> None:
         can.close()
 
 
-def test_the_guard_s_socket_follows_an_adapter_that_is_plugged_in_again() -> None:
+def test_guard_socket_recovers_after_the_adapter_is_plugged_in_again() -> None:
     with SerialAdapter() as first:
         channel = first.channel
         can = RawCan(raw_socket(channel), allowed={0x301}, wanted={0x080})
     try:
         with pytest.raises(BusDown):
             can.receive()
-        assert not can.restored()
+        assert not can.try_restore()
         with SerialAdapter() as second:
             assert second.channel == channel
-            assert can.restored()
+            assert can.try_restore()
             second.say("t0801FF")
             wait_for(lambda: any(cob_id == 0x080 for cob_id, _, _ in can.receive()))
     finally:

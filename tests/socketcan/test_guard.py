@@ -8,14 +8,14 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from fdhil.guard.can_socket import Frame, RawCan
-from fdhil.guard.frames import Listener
-from tests.guard.machine import commissioned, settings
-from tests.guard.shop import TOKEN, Shop
+from fdhil.guard.frame_monitor import FrameMonitor
+from tests.guard.guard_rig import TOKEN, GuardRig
+from tests.guard.simulated_bus import commissioned, settings
 from tests.socketcan.interface import CAN_FRAME, SerialAdapter, raw_socket, set_up
 
 pytestmark = pytest.mark.socketcan
 DELIVERY_S = 0.5  # from the line to the sockets, on a host that is busy
-WANTED = Listener(commissioned(settings())).wanted_ids()
+WANTED = FrameMonitor(commissioned(settings())).list_received_ids()
 
 
 class Wire(RawCan):
@@ -54,12 +54,12 @@ class OnAdapter(Wire):
     def feed(self, frames: Sequence[Frame]) -> None:
         for cob_id, data, _ in frames:
             self.adapter.say(f"t{cob_id:03X}{len(data)}{data.hex().upper()}")
-        self._until_heard(*frames[-1][:2])
+        self._wait_for_frame(*frames[-1][:2])
         while not self.stuck and self._left < len(self.sent):  # it leaves by a thread of the line discipline's own
             left = self.adapter.drain(DELIVERY_S)
             self._left = self._left + left if left else len(self.sent)  # what left while nobody waited is not counted
 
-    def _until_heard(self, cob_id: int, data: bytes) -> None:
+    def _wait_for_frame(self, cob_id: int, data: bytes) -> None:
         last = CAN_FRAME.pack(cob_id, len(data), data)
         with contextlib.suppress(TimeoutError):
             while self._ear.recv(CAN_FRAME.size) != last:
@@ -71,7 +71,7 @@ class OnAdapter(Wire):
         self.adapter.unplug()
 
 
-def until(shop: Shop, condition: Callable[[], bool], act: Callable[[], None]) -> None:
+def until(shop: GuardRig, condition: Callable[[], bool], act: Callable[[], None]) -> None:
     for _ in range(20_000):
         if condition():
             return
@@ -79,13 +79,13 @@ def until(shop: Shop, condition: Callable[[], bool], act: Callable[[], None]) ->
     raise AssertionError(shop.events()[-5:])
 
 
-def events(shop: Shop, name: str) -> int:
+def events(shop: GuardRig, name: str) -> int:
     return sum(event["event"] == name for event in shop.events())
 
 
 @pytest.mark.fault("A4")
-def test_an_interface_that_goes_down_freezes_and_what_stands_is_adopted_when_it_is_back(
-    make: Callable[[type[Wire]], Shop],
+def test_interface_down_freezes_and_the_offset_is_adopted_on_return(
+    make: Callable[[type[Wire]], GuardRig],
 ) -> None:
     shop = make(OnVcan)
     client = shop.into_the_cut()
@@ -108,7 +108,7 @@ def test_an_interface_that_goes_down_freezes_and_what_stands_is_adopted_when_it_
 
 
 @pytest.mark.fault("A1")
-def test_bus_off_freezes(make: Callable[[type[Wire]], Shop]) -> None:
+def test_bus_off_freezes(make: Callable[[type[Wire]], GuardRig]) -> None:
     shop = make(OnAdapter)
     shop.into_the_cut()
     wire = shop.wire
@@ -123,7 +123,7 @@ def test_bus_off_freezes(make: Callable[[type[Wire]], Shop]) -> None:
 
 
 @pytest.mark.fault("A5")
-def test_a_full_queue_ramps_down_and_freezes_what_cannot_leave(make: Callable[[type[Wire]], Shop]) -> None:
+def test_full_queue_ramps_down_then_freezes(make: Callable[[type[Wire]], GuardRig]) -> None:
     shop = make(OnAdapter)
     shop.into_the_cut()
     wire = shop.wire

@@ -19,7 +19,7 @@ from fdhil.records import (
     Verdict,
     Window,
     WindowOutcome,
-    frozen,
+    freeze_array,
 )
 from fdhil.store.rows import Stamp
 
@@ -58,7 +58,7 @@ def window(n: int = 600, seed: int = 1, raw: bool = True, **changes: Any) -> Win
         "voltage_delay_s": 1 / 3e4,
         "source": "inferred",
     }
-    return Window(**(given | {name: frozen(values) for name, values in signals.items()} | changes))
+    return Window(**(given | {name: freeze_array(values) for name, values in signals.items()} | changes))
 
 
 def bits(values: Float | None) -> bytes | None:
@@ -78,8 +78,8 @@ def outcome(accepted: bool = True, of: Window | None = None, missing: str = "") 
     estimate = Estimate(
         method="least_squares",
         names=PARAMETERS,
-        values=frozen(values),
-        covariance=frozen(np.diag((0.01 * np.nan_to_num(values)) ** 2)),
+        values=freeze_array(values),
+        covariance=freeze_array(np.diag((0.01 * np.nan_to_num(values)) ** 2)),
         residuals={},
         result=Result.OK,
         missing={missing: reason} if missing else {},
@@ -89,6 +89,6 @@ def outcome(accepted: bool = True, of: Window | None = None, missing: str = "") 
 
 def published(revision: int = 1, axis: str = "X", parameters: Parameters = BENCH) -> ParameterSet:
     root = np.random.default_rng(revision).normal(0, 1e-3, (6, 6))
-    covariance = frozen(root @ root.T)
+    covariance = freeze_array(root @ root.T)
     digest, ticks = "0123456789abcdef", (12_345,)
     return ParameterSet(axis, revision, parameters, covariance, 3, 12_345 + revision, 21.5, digest, ticks)

@@ -31,7 +31,7 @@ def wrong(folder: Path) -> list[int]:
 def test_what_is_written_is_read_and_the_file_is_not_for_everybody(written: Path) -> None:
     read = list(audit.entries(written))
     assert [entry["program"] for entry, fault in read if fault is None] == [entry["program"] for entry in ENTRIES]
-    assert (written / audit.FILE_NAME).stat().st_mode & 0o007 == 0
+    assert (written / audit.AUDIT_FILE_NAME).stat().st_mode & 0o007 == 0
 
 
 def test_a_folder_without_an_audit_has_no_entries(tmp_path: Path) -> None:
@@ -55,14 +55,14 @@ CHANGES = {
 @pytest.mark.parametrize("name", list(CHANGES))
 def test_every_change_of_the_file_is_seen(name: str, written: Path) -> None:
     change, expected = CHANGES[name]
-    path = written / audit.FILE_NAME
+    path = written / audit.AUDIT_FILE_NAME
     path.write_bytes(b"\n".join(change(path.read_bytes().splitlines())) + b"\n")
     assert wrong(written) == expected
 
 
 @pytest.mark.fault("F1")
 def test_a_line_cut_off_at_any_byte_is_told_and_the_next_one_stands(written: Path) -> None:
-    path = written / audit.FILE_NAME
+    path = written / audit.AUDIT_FILE_NAME
     whole = path.read_bytes()
     begin = len(whole.rstrip(b"\n").rpartition(b"\n")[0]) + 1
     for size in range(begin + 1, len(whole) - 1):
@@ -103,7 +103,7 @@ def test_a_disk_that_refuses_is_told(
 
 
 def test_a_link_is_not_followed(tmp_path: Path) -> None:
-    (tmp_path / audit.FILE_NAME).symlink_to(tmp_path / "elsewhere")
+    (tmp_path / audit.AUDIT_FILE_NAME).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(StoreError):
         audit.append(tmp_path, {"asked": "arm"})
     assert not (tmp_path / "elsewhere").exists()
@@ -120,7 +120,7 @@ def test_who_keeps_the_audit_locked_delays_it_and_then_it_is_told(
     written: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(audit, "LOCKED_S", 0.05)
-    with (written / audit.FILE_NAME).open() as reader:  # whoever may read it may lock it, too
+    with (written / audit.AUDIT_FILE_NAME).open() as reader:  # whoever may read it may lock it, too
         fcntl.flock(reader, fcntl.LOCK_EX)
         with pytest.raises(StoreError, match="another process holds its lock"):
             audit.append(written, {"asked": "arm"})

@@ -19,11 +19,11 @@ from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.errors import RecordingError, StoreError
 from fdhil.records import Notice, Parameters, Skill
 from fdhil.store import schema
-from fdhil.store.history import FILE_NAME, History
+from fdhil.store.history import HISTORY_FILE_NAME, History
 from fdhil.store.newest_sets import read_newest_sets
 from fdhil.store.rows import Acknowledgement, Comparison, UsedParameters
 from fdhil.store.windows import decode_window, encode_window
-from tests.daemon.machine import config_of
+from tests.daemon.simulated_machine import config_of
 from tests.store.made import BENCH, STAMP, outcome, published, same, window
 
 TABLES = ("windows", "revisions", "skills", "notices", "comparisons", "acknowledgements")
@@ -49,7 +49,7 @@ def filled(folder: Path, wal: Path | None = None) -> bytes:
             history.add_acknowledgement(Acknowledgement((k + 1,), "anna", f"seen {k}", STAMP))
         if wal is not None:
             shutil.copytree(folder, wal)
-    return (folder / FILE_NAME).read_bytes()
+    return (folder / HISTORY_FILE_NAME).read_bytes()
 
 
 def contents(history: History) -> dict[str, list[Any]]:
@@ -87,7 +87,7 @@ def test_no_flipped_bit_of_a_history_changes_what_is_read(tmp_path: Path) -> Non
     for byte, bit in places(len(whole), 4096, 1):
         flipped = bytearray(whole)
         flipped[byte] ^= 1 << bit
-        (damaged / FILE_NAME).write_bytes(flipped)
+        (damaged / HISTORY_FILE_NAME).write_bytes(flipped)
         told: list[str] = []
         try:
             with History.read(damaged, told.append) as history:
@@ -109,7 +109,7 @@ def test_no_flipped_bit_of_a_history_changes_what_is_read(tmp_path: Path) -> Non
 
 def test_a_flipped_bit_of_the_log_after_a_power_cut_costs_the_newest_rows_at_most(tmp_path: Path) -> None:
     filled(tmp_path / "whole", wal=tmp_path / "cut")
-    log = (tmp_path / "cut" / f"{FILE_NAME}-wal").read_bytes()
+    log = (tmp_path / "cut" / f"{HISTORY_FILE_NAME}-wal").read_bytes()
     with History.read(tmp_path / "whole") as history:
         true = contents(history)
     lost = 0
@@ -119,8 +119,8 @@ def test_a_flipped_bit_of_the_log_after_a_power_cut_costs_the_newest_rows_at_mos
         flipped[byte] ^= 1 << rng.randrange(8)
         folder = tmp_path / f"at-{byte}"
         shutil.copytree(tmp_path / "cut", folder)
-        (folder / f"{FILE_NAME}-wal").write_bytes(flipped)
-        (folder / f"{FILE_NAME}-shm").unlink(missing_ok=True)  # a power cut leaves none of it
+        (folder / f"{HISTORY_FILE_NAME}-wal").write_bytes(flipped)
+        (folder / f"{HISTORY_FILE_NAME}-shm").unlink(missing_ok=True)  # a power cut leaves none of it
         try:
             with History.read(folder) as history:
                 found = contents(history)
@@ -140,24 +140,24 @@ def test_the_daemon_begins_anew_or_goes_on_whatever_bit_is_flipped(tmp_path: Pat
         directory.mkdir(parents=True)
         flipped = bytearray(whole)
         flipped[byte] ^= 1 << bit
-        (directory / FILE_NAME).write_bytes(flipped)
+        (directory / HISTORY_FILE_NAME).write_bytes(flipped)
         store = OutcomeStore(config_of(folder))
         first = [notice.code for notice in store.open()]
         store.close()
         if "SchemaVersion" in first:
-            assert (directory / FILE_NAME).read_bytes() == flipped
+            assert (directory / HISTORY_FILE_NAME).read_bytes() == flipped
             continue
         assert first in ([], ["CorruptFile"])
         again = OutcomeStore(config_of(folder))
         assert again.open() == []
-        assert again.keep([published(9), outcome()]) == []
+        assert again.store_outcomes([published(9), outcome()]) == []
         again.close()
         assert read_newest_sets(directory, "X")["X"].set.parameters == BENCH
 
 
 def test_a_damaged_revision_is_told_and_the_one_before_it_is_used(tmp_path: Path) -> None:
     filled(tmp_path)
-    db = sqlite3.connect(tmp_path / FILE_NAME)
+    db = sqlite3.connect(tmp_path / HISTORY_FILE_NAME)
     db.execute("UPDATE revisions SET K = 0.9 WHERE axis = 'X' AND revision = 8")
     db.commit()
     db.close()
@@ -169,7 +169,7 @@ def test_a_damaged_revision_is_told_and_the_one_before_it_is_used(tmp_path: Path
         assert history.put_damaged_aside() == "1 of revisions (row 15)"
         assert history.put_damaged_aside() == ""
         assert history.revisions("X", 1)[0].set.revision == 7
-    db = sqlite3.connect(tmp_path / FILE_NAME)
+    db = sqlite3.connect(tmp_path / HISTORY_FILE_NAME)
     ((of, row, content),) = db.execute("SELECT of, row, content FROM quarantine").fetchall()
     db.close()
     assert (of, row) == ("revisions", 15)
@@ -177,7 +177,7 @@ def test_a_damaged_revision_is_told_and_the_one_before_it_is_used(tmp_path: Path
 
 
 def test_a_row_of_an_older_schema_that_cannot_be_read_is_left_out(tmp_path: Path) -> None:
-    db = sqlite3.connect(tmp_path / FILE_NAME)
+    db = sqlite3.connect(tmp_path / HISTORY_FILE_NAME)
     db.executescript(schema._FIRST + "PRAGMA user_version = 1;")
     row = (1, "X", 1, 0.5, 0.005, 0.8, 0.075, 0.05, 5.0, "[[1.0", 3, "[]", "0123", 5, None, 1.0, "boot", 1)
     db.execute(f"INSERT INTO revisions VALUES ({', '.join('?' * len(row))})", row)

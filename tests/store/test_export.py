@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdhil.records import frozen
+from fdhil.records import freeze_array
 from fdhil.store.export import export_table, table_of
 from fdhil.store.recordings import read_recording
 from fdhil.store.windows import decode_window, encode_window
@@ -53,7 +53,7 @@ def test_the_torque_constant_is_stored_with_a_window_that_tells_it() -> None:
 def test_what_sensors_at_the_table_told_is_exported_with_its_lost_rows(tmp_path: Path) -> None:
     made = window()
     place = np.where(np.arange(made.n) % 7 == 0, np.nan, made.position_mm + 0.01)
-    made = replace(made, table_mm=frozen(place), table_m_s2=frozen(np.linspace(-1.0, 1.0, made.n)))
+    made = replace(made, table_mm=freeze_array(place), table_m_s2=freeze_array(np.linspace(-1.0, 1.0, made.n)))
     path = tmp_path / "table.csv"
     export_table(table_of(made), path)
     read = read_recording(path)

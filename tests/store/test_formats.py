@@ -12,20 +12,20 @@ import pytest
 
 from fdhil import tables
 from fdhil.errors import RecordingError
-from fdhil.records import Float, frozen
+from fdhil.records import Float, freeze_array
 from fdhil.store import suffixes
 from fdhil.store.export import export_table, table_of
 from fdhil.store.recording_table import UNITS, RecordingTable, recording_of
 from fdhil.store.recordings import read_recording, read_table
 from tests.store.made import window
 
-SUFFIX = {name: suffixes.suffix_of(suffixes.RECORDINGS, name) for name in tables.RECORDING_FORMATS}
+SUFFIX = {name: suffixes.suffix_of(suffixes.RECORDING_SUFFIXES, name) for name in tables.RECORDING_FORMATS}
 
 
 def _table() -> RecordingTable:
     made = window()
     lacking = np.where(np.arange(made.n) % 7 == 0, np.nan, made.position_mm)
-    return table_of(window(table_mm=frozen(lacking)))
+    return table_of(window(table_mm=freeze_array(lacking)))
 
 
 @pytest.mark.usefixtures("processes")

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from fdhil.errors import StoreError
-from fdhil.records import LoopEstimate, Notice, Parameters, Reason, Skill, Verdict, frozen
+from fdhil.records import LoopEstimate, Notice, Parameters, Reason, Skill, Verdict, freeze_array
 from fdhil.store import history as history_module
 from fdhil.store import schema
-from fdhil.store.history import FILE_NAME, History
+from fdhil.store.history import HISTORY_FILE_NAME, History
 from fdhil.store.newest_sets import read_newest_sets
 from fdhil.store.rows import Acknowledgement, Comparison, Stamp, StoredNotice, UsedParameters
 from tests.store.made import BENCH, STAMP, outcome, published
@@ -121,7 +121,7 @@ def test_nothing_recorded_yet(tmp_path: Path) -> None:
 @pytest.mark.fault("F19")
 def test_another_schema_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
     History.open(tmp_path).close()
-    db = sqlite3.connect(tmp_path / FILE_NAME)
+    db = sqlite3.connect(tmp_path / HISTORY_FILE_NAME)
     db.execute("PRAGMA user_version = 99")
     db.close()
     for opened in (History.open, History.read):
@@ -135,8 +135,8 @@ def first_schema(folder: Path) -> None:
         history.add_revision(published(), [4], STAMP)
         (row,) = history._db.execute("SELECT * FROM revisions").fetchall()
         row = row[: -len(("digest", "terms", "unexplained_um", "warnings", "loops"))]
-    (folder / FILE_NAME).unlink()
-    db = sqlite3.connect(folder / FILE_NAME)
+    (folder / HISTORY_FILE_NAME).unlink()
+    db = sqlite3.connect(folder / HISTORY_FILE_NAME)
     db.executescript(schema._FIRST + "PRAGMA user_version = 1;")
     db.execute(f"INSERT INTO revisions VALUES ({', '.join('?' * len(row))})", row)
     db.commit()
@@ -153,11 +153,11 @@ def test_an_older_schema_is_brought_up_by_the_writer_and_read_as_it_is(tmp_path:
     with History.open(tmp_path) as history:
         assert [r.window_ids for r in history.revisions()] == [(4,)]
         history.add_comparison(comparison(), STAMP)
-    db = sqlite3.connect(tmp_path / FILE_NAME)
+    db = sqlite3.connect(tmp_path / HISTORY_FILE_NAME)
     assert db.execute("PRAGMA user_version").fetchone() == (schema.SCHEMA_VERSION,)
     db.close()
     for number in (1, 2):
-        copy = sqlite3.connect(tmp_path / f"{FILE_NAME}.schema-{number}")
+        copy = sqlite3.connect(tmp_path / f"{HISTORY_FILE_NAME}.schema-{number}")
         assert copy.execute("PRAGMA user_version").fetchone() == (number,)
         assert copy.execute("SELECT revision FROM revisions").fetchall() == [(1,)]
         copy.close()
@@ -221,7 +221,7 @@ def test_comparisons_of_a_database_that_refuses_are_told(tmp_path: Path) -> None
     "content", [b"this is no database at all, not even nearly" * 100, b"SQLite format 3\0" + b"\xff" * 5000]
 )
 def test_a_broken_database_is_told(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / FILE_NAME).write_bytes(content)
+    (tmp_path / HISTORY_FILE_NAME).write_bytes(content)
     for opened in (History.open, History.read):
         with pytest.raises(StoreError) as error:
             opened(tmp_path)
@@ -239,7 +239,7 @@ def test_terms_warnings_and_what_is_unexplained_are_kept(tmp_path: Path) -> None
     warning = Reason("OneDirection", "all moves are in one direction", "record both")
     made = outcome()
     warned = replace(made, verdict=replace(made.verdict, unexplained_um=1.25, warnings=(warning,)))
-    loaded = replace(published(), parameters=BENCH.changed(load=2.5), unexplained_um=1.25, warnings=(warning,))
+    loaded = replace(published(), parameters=BENCH.replace_values(load=2.5), unexplained_um=1.25, warnings=(warning,))
     with History.open(tmp_path) as history:
         history.add_window(warned, "", STAMP)
         history.add_revision(loaded, [1], STAMP)
@@ -247,9 +247,9 @@ def test_terms_warnings_and_what_is_unexplained_are_kept(tmp_path: Path) -> None
     assert (window.unexplained_um, window.warnings) == (1.25, ("OneDirection: all moves are in one direction",))
     assert window.friction is not None
     assert window.friction["value"] == pytest.approx(5.0 + 0.05 * window.friction["speed_rad_s"])
-    assert revision.set.parameters == BENCH.changed(load=2.5)
+    assert revision.set.parameters == BENCH.replace_values(load=2.5)
     assert (revision.set.unexplained_um, revision.set.warnings) == (1.25, (warning,))
-    assert read_newest_sets(tmp_path, "X")["X"].set.parameters.term("load") == 2.5
+    assert read_newest_sets(tmp_path, "X")["X"].set.parameters.get_term("load") == 2.5
 
 
 def test_the_first_window_of_either_direction_is_known(tmp_path: Path) -> None:
@@ -262,7 +262,9 @@ def test_the_first_window_of_either_direction_is_known(tmp_path: Path) -> None:
 def test_what_was_found_of_the_loops_comes_back(tmp_path: Path) -> None:
     verdict = Verdict(True, None, (), 0.75, (Reason("LoopsDiffer", "the speed filter is 1 ms, not 0"),))
     names = ("position_gain_per_s", "speed_filter_s")
-    found = LoopEstimate("X", "cascade", names, frozen([49.5, 1e-3]), frozen(np.diag([0.04, 1e-10])), verdict)
+    found = LoopEstimate(
+        "X", "cascade", names, freeze_array([49.5, 1e-3]), freeze_array(np.diag([0.04, 1e-10])), verdict
+    )
     with History.open(tmp_path) as history:
         history.add_loops(found, STAMP)
         ((stamp, stored),) = history.loops("X")
@@ -273,7 +275,7 @@ def test_what_was_found_of_the_loops_comes_back(tmp_path: Path) -> None:
 
 
 def test_a_row_that_was_damaged_before_its_schema_was_brought_up_stays_so(tmp_path: Path) -> None:
-    db = sqlite3.connect(tmp_path / FILE_NAME)
+    db = sqlite3.connect(tmp_path / HISTORY_FILE_NAME)
     for step in schema._STEPS[:3]:
         db.executescript(step)
     db.execute("PRAGMA user_version = 3")
@@ -307,7 +309,7 @@ def test_a_reader_that_comes_again_and_again_looks_at_a_whole_file_once(
     for _ in range(2):
         with History.read(tmp_path, checked=checked) as history:
             assert len(history.windows()) == 1
-    (tmp_path / FILE_NAME).rename(tmp_path / "aside")
+    (tmp_path / HISTORY_FILE_NAME).rename(tmp_path / "aside")
     with History.open(tmp_path):
         checks.clear()
     with History.read(tmp_path, checked=checked) as history:
@@ -357,7 +359,7 @@ def test_what_waits_is_not_displaced_by_news(tmp_path: Path) -> None:
 def test_a_locked_history_is_not_read_past_its_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     connect = sqlite3.connect
     History.open(tmp_path).close()
-    db = connect(tmp_path / FILE_NAME, isolation_level=None)
+    db = connect(tmp_path / HISTORY_FILE_NAME, isolation_level=None)
     db.execute("PRAGMA journal_mode = DELETE")
     db.execute("BEGIN EXCLUSIVE")
     monkeypatch.setattr("fdhil.store.schema.sqlite3.connect", lambda *a, **k: connect(*a, **{**k, "timeout": 0.0}))

@@ -12,7 +12,7 @@ import pytest
 
 from fdhil.store import history as module
 from fdhil.store import schema
-from fdhil.store.history import FILE_NAME, History
+from fdhil.store.history import HISTORY_FILE_NAME, History
 from tests.store.made import STAMP, outcome, published
 
 CHECKED = 8
@@ -75,7 +75,7 @@ def test_an_axis_that_moved_long_ago_is_known_all_the_same(tmp_path: Path) -> No
 @pytest.mark.fault("F17")
 def test_an_old_row_that_is_damaged_is_left_out_when_it_is_read(tmp_path: Path) -> None:
     filled(tmp_path).close()
-    with sqlite3.connect(tmp_path / FILE_NAME) as db:
+    with sqlite3.connect(tmp_path / HISTORY_FILE_NAME) as db:
         db.execute("UPDATE revisions SET K = 9.0 WHERE axis = 'Y' AND revision = 4")
         db.execute("UPDATE windows SET axis = 'Q' WHERE id = ?", (ROWS,))  # the very value that is compared
     db.close()

@@ -11,9 +11,9 @@ import numpy as np
 
 from fdhil.config.uplink import Uplink
 from fdhil.identification.loops import DIFFER
-from fdhil.records import LoopEstimate, Reason, Verdict, frozen
+from fdhil.records import LoopEstimate, Reason, Verdict, freeze_array
 from fdhil.store import schema
-from fdhil.store.history import FILE_NAME, History
+from fdhil.store.history import HISTORY_FILE_NAME, History
 from fdhil.store.newest_sets import newest_loops, newest_sets, read_newest_sets
 from fdhil.store.outbox import Outbox, OutboxReader
 from fdhil.store.rows import Stamp
@@ -26,7 +26,9 @@ LATER = Stamp(STAMP.wall_s + 60.0, STAMP.boot, STAMP.monotonic_ns + 60 * 10**9)
 
 def found(*codes: str, accepted: bool = True) -> LoopEstimate:
     verdict = Verdict(accepted, None, (), 0.3, tuple(Reason(code, "72 um") for code in codes))
-    return LoopEstimate("X", "p_pi_pi", ("speed_filter_s",), frozen([2e-3]), frozen(np.array([[1e-10]])), verdict)
+    return LoopEstimate(
+        "X", "p_pi_pi", ("speed_filter_s",), freeze_array([2e-3]), freeze_array(np.array([[1e-10]])), verdict
+    )
 
 
 def test_a_set_comes_back_with_its_loops(tmp_path: Path) -> None:
@@ -62,7 +64,7 @@ def test_an_older_history_opens_and_its_set_is_used_with_the_loops_it_has(tmp_pa
     with History.open(tmp_path, also=Outbox(Uplink(), tmp_path).enter) as history:
         history.add_loops(found(DIFFER), STAMP)
         history.add_revision(published(), [], LATER)
-    with closing(sqlite3.connect(tmp_path / FILE_NAME)) as db:
+    with closing(sqlite3.connect(tmp_path / HISTORY_FILE_NAME)) as db:
         before_loops(db)
     assert read_newest_sets(tmp_path, "X")["X"].set.loops == FOUND  # a reader leaves the file as it is
     with History.open(tmp_path) as history:

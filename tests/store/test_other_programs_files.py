@@ -14,7 +14,7 @@ from fdhil.errors import RecordingError
 from fdhil.records import Float
 from fdhil.store import recording_hdf5, recording_mat, recording_mdf4, recording_parquet
 from fdhil.store.column_map import ColumnMap, mapped
-from fdhil.store.recording_table import NOTES, RecordingTable, recording_of
+from fdhil.store.recording_table import IMPORT_NOTES, RecordingTable, recording_of
 from fdhil.store.recordings import read_table
 
 N = 60
@@ -354,7 +354,7 @@ def test_a_counter_that_was_unwrapped_is_noted_in_the_headers() -> None:
     wrapped = (counts + 32768) % 65536 - 32768
     read = mapped(RecordingTable({}, {"t": TIME, **VALUES, "x": wrapped}), _map(), "trace")
     assert np.array_equal(read.columns["position_m"], counts)
-    assert read.headers[NOTES] == "x wraps like a counter of 16 bits and was unwrapped"
+    assert read.headers[IMPORT_NOTES] == "x wraps like a counter of 16 bits and was unwrapped"
 
 
 def test_two_names_of_one_column_are_refused() -> None:
@@ -379,7 +379,7 @@ def test_a_position_within_one_turn_goes_on_by_the_pitch_or_is_refused() -> None
     slope = {**VALUES, "x": np.fmod(TIME, 0.02)}
     read = mapped(RecordingTable({}, {"t": TIME, **slope}), _map(), "trace")
     np.testing.assert_allclose(read.columns["position_m"], np.arange(N) * 1e-3, atol=1e-9)
-    assert "x wraps at each turn of the screw" in read.headers[NOTES]
+    assert "x wraps at each turn of the screw" in read.headers[IMPORT_NOTES]
     other = {**VALUES, "x": np.fmod(TIME, 0.03)}
     with pytest.raises(RecordingError, match=r"'x' jumps by 0.029, .* one turn is 0.02 by the column map"):
         mapped(RecordingTable({}, {"t": TIME, **other}), _map(), "trace")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fdhil.config import Identification
-from fdhil.daemon.outcome_json import as_document
+from fdhil.daemon.outcome_json import build_outcome_document
 from fdhil.errors import RecordingError
 from fdhil.pipeline import analyse
 from fdhil.records import Window
@@ -41,7 +41,7 @@ def test_a_changed_grid_is_damage() -> None:
 
 def test_what_current_and_speed_alone_tell_has_its_units_in_the_document() -> None:
     outcome = analyse(replace(slow_windows(0.005)[0], slow_voltage=None), Identification())
-    told = as_document(outcome)["parameters"]
+    told = build_outcome_document(outcome)["parameters"]
     assert told["Jt/K"]["value"] == pytest.approx(0.075 / 0.8, rel=0.01)
     assert [told[name]["unit"] for name in ("Jt/K", "ft/K", "Cd/K")] == ["A.s2/rad", "A.s/rad", "A"]
     assert told["L"]["value"] is None

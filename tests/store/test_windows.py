@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fdhil.errors import RecordingError, StoreError
-from fdhil.records import NcMove, Stages, Window, frozen
+from fdhil.records import NcMove, Stages, Window, freeze_array
 from fdhil.store.windows import RawScale, WindowStore, decode_window, encode_window, list_windows, read_window
 from tests.store.made import INCREMENTS_PER_MM, same, window
 
@@ -44,7 +44,10 @@ def test_a_window_comes_back_bit_by_bit(raw: bool, scales: Any) -> None:
     [
         {"voltage_v": None, "voltage_delay_s": None, "temperature_c": None},
         {"stages": Stages(None, None, None), "gaps": (), "direction": -1, "voltage_sampling": "instant"},
-        {"table_mm": frozen(np.r_[np.nan, np.linspace(0.0, 1.0, 599)]), "table_m_s2": frozen(np.full(600, -0.1))},
+        {
+            "table_mm": freeze_array(np.r_[np.nan, np.linspace(0.0, 1.0, 599)]),
+            "table_m_s2": freeze_array(np.full(600, -0.1)),
+        },
         {"nc": NcMove(12, "part.ngc", (0.5, 1.0), True)},
         {"nc": NcMove()},
         {"source": 'umlaut ä "quoted" \x1b[31m', "start_tick": 2**40},
@@ -81,17 +84,17 @@ def test_integers_are_much_smaller_than_floats() -> None:
 @given(hnp.arrays(np.float64, 50, elements=st.floats(allow_nan=True, allow_infinity=True, width=64)))
 def test_any_floats_survive(values: Any) -> None:
     made = window(n=50, raw=False)
-    made = replace(made, speed_rad_s=frozen(values), current_a=frozen(-0.0 * np.ones(50)), gaps=())
+    made = replace(made, speed_rad_s=freeze_array(values), current_a=freeze_array(-0.0 * np.ones(50)), gaps=())
     assert same(decode_window(encode_window(made, "", SCALES)), made)
 
 
 @pytest.mark.parametrize("scale", [RawScale(-0.05), RawScale(2 * math.pi, -65536.0), RawScale(divisor=3276.8)])
 def test_a_scale_is_used_only_where_it_gives_the_same_bits(scale: RawScale) -> None:
     raw = np.array([0.0, 1, -1, 12345, -(2**31), math.nan])
-    encoded = scale.encode(frozen(scale.decode(raw)))
+    encoded = scale.encode(freeze_array(scale.decode(raw)))
     assert encoded is not None
     assert np.array_equal(encoded, raw, equal_nan=True)
-    assert scale.encode(frozen([0.3 * abs(scale.factor / scale.divisor)])) is None
+    assert scale.encode(freeze_array([0.3 * abs(scale.factor / scale.divisor)])) is None
 
 
 def test_a_flipped_byte_is_an_error_or_harmless_but_never_another_window() -> None:

@@ -12,7 +12,7 @@ from fdhil import tables
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
-from fdhil.records import Float, Window, WindowOutcome, frozen
+from fdhil.records import Float, Window, WindowOutcome, freeze_array
 from tests.identification.recorded import recording, windows
 
 FIELDS = ("voltage_v", "current_a", "speed_rad_s", "position_mm")
@@ -23,7 +23,7 @@ def assert_answered(outcome: WindowOutcome) -> None:
     assert outcome.verdict.accepted == (not outcome.verdict.reasons)
     assert outcome.estimate is not None
     for name in outcome.estimate.names:
-        value, std = outcome.estimate.value(name), outcome.estimate.std(name)
+        value, std = outcome.estimate.get_value(name), outcome.estimate.get_std(name)
         if np.isfinite(value):
             assert np.isfinite(std)
             assert std >= 0
@@ -35,7 +35,7 @@ def assert_answered(outcome: WindowOutcome) -> None:
 def _spoilt(window: Window, name: str, start: int, length: int, value: float, scale: float) -> Window:
     values: Float = np.array(getattr(window, name)) * scale
     values[start : start + length] = value
-    fields = {field: getattr(window, field) for field in window.__slots__} | {name: frozen(values)}
+    fields = {field: getattr(window, field) for field in window.__slots__} | {name: freeze_array(values)}
     return Window(**fields)
 
 
@@ -63,7 +63,7 @@ def test_spoilt_windows_are_answered(
 def test_noise_alone_is_answered(seed: int, rows: int, size: float) -> None:
     rng = np.random.default_rng(seed)
     whole = recording(0.0)
-    signals = [frozen(size * rng.standard_normal(rows)) for _ in range(5)]
+    signals = [freeze_array(size * rng.standard_normal(rows)) for _ in range(5)]
     silent = replace(
         whole,
         time_s=whole.time_s[:rows],
@@ -84,14 +84,14 @@ def test_noise_alone_is_answered(seed: int, rows: int, size: float) -> None:
 def test_short_windows_are_answered() -> None:
     window = windows(0.003)[0]
     for rows in (0, 1, 3, 31, 40, 120):
-        arrays = {name: frozen(np.array(getattr(window, name))[:rows]) for name in (*FIELDS, "demand_mm")}
+        arrays = {name: freeze_array(np.array(getattr(window, name))[:rows]) for name in (*FIELDS, "demand_mm")}
         short = Window(**{f: getattr(window, f) for f in window.__slots__} | arrays)
         assert_answered(analyse(short, Identification()))
 
 
 def test_a_window_that_is_lost_whole_is_answered() -> None:
     window = windows(0.003)[0]
-    nothing = frozen(np.full(window.n, np.nan))
+    nothing = freeze_array(np.full(window.n, np.nan))
     lost = Window(
         **{f: getattr(window, f) for f in window.__slots__}
         | dict.fromkeys((*FIELDS, "demand_mm"), nothing)

@@ -14,7 +14,7 @@ from fdhil.config.regulators import Regulators
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.pipeline.analysis import own
-from fdhil.records import PARAMETERS, Parameters, Window, WindowOutcome, rms
+from fdhil.records import PARAMETERS, Parameters, Window, WindowOutcome, compute_rms
 from fdhil.validation.replay import replay_window
 from fdhil.validation.table_error_budget import TableError
 from studies import bench, real_plant
@@ -113,9 +113,9 @@ def test_what_the_model_lacks_warns_with_its_cost_and_widens_the_intervals() -> 
     assert warm.estimate is not None
     plain = judged(rapids())[1].estimate
     assert plain is not None
-    assert warm.estimate.std("R") > 3 * plain.std("R")
+    assert warm.estimate.get_std("R") > 3 * plain.get_std("R")
     middle = 0.5 * (1.0 + 0.5 * 0.1) + 0.5 * 0.25 * 0.1  # the second half's, of a rise by a tenth over both
-    assert abs(warm.estimate.value("R") - middle) < 3 * warm.estimate.std("R")
+    assert abs(warm.estimate.get_value("R") - middle) < 3 * warm.estimate.get_std("R")
 
 
 def test_a_lost_voltage_that_is_no_command_is_told_in_volts() -> None:
@@ -128,7 +128,7 @@ def test_a_lost_voltage_that_is_no_command_is_told_in_volts() -> None:
         told = [*outcome.verdict.reasons, *outcome.verdict.warnings]
         assert any("+2.0" in reason.text and "dead time" in reason.text for reason in told)
         for name, true in Mechanics().truth().items():
-            assert abs(outcome.estimate.value(name) - true) < 3 * outcome.estimate.std(name)
+            assert abs(outcome.estimate.get_value(name) - true) < 3 * outcome.estimate.get_std(name)
 
 
 def test_a_window_of_another_machine_is_not_replayed_with_these_regulators() -> None:
@@ -141,7 +141,7 @@ def test_a_window_of_another_machine_is_not_replayed_with_these_regulators() -> 
 
 def test_rows_that_are_no_set_points_are_not_replayed() -> None:
     (window, _) = rapids()
-    truth = Parameters.of(Mechanics().truth())
+    truth = Parameters.from_mapping(Mechanics().truth())
     assert replay_window(window, truth, AXIS, PERIOD_S) is not None
     assert replay_window(window, truth, AXIS, 0.004) is None
     assert replay_window(replace(window, demand_mm=np.zeros(window.n)), truth, AXIS, PERIOD_S) is None
@@ -149,19 +149,19 @@ def test_rows_that_are_no_set_points_are_not_replayed() -> None:
 
 def test_a_torque_makes_at_the_table_what_the_drive_says() -> None:
     mechanics, rows = Mechanics(Cd=1e-6), 1500
-    loop = TableError.of(Parameters.of(mechanics.truth()), 20.0, AXIS)
+    loop = TableError.of(Parameters.from_mapping(mechanics.truth()), 20.0, AXIS)
     load = np.where(np.arange(rows) >= 500, 1.0, 0.0)
     told = loop.um(np.cumsum(load)[None] * PERIOD_S, PERIOD_S)[0]
     plant = bench.Plant(Cd=1e-6)
     moved = 1e6 * bench.run(plant, np.zeros(rows), load=load).position
-    assert rms(told + moved) < 0.05 * rms(moved)
+    assert compute_rms(told + moved) < 0.05 * compute_rms(moved)
 
 
 def test_noise_is_no_unexplained_torque() -> None:
-    loop = TableError.of(Parameters.of(Mechanics().truth()), 20.0, None)
+    loop = TableError.of(Parameters.from_mapping(Mechanics().truth()), 20.0, None)
     rng = np.random.default_rng(1)
     white, walk = 0.01 * rng.standard_normal((40, 1200)), np.cumsum(0.001 * rng.standard_normal((40, 1200)), axis=1)
-    seen = rms(loop.um(white + walk, PERIOD_S)[:, 200:].ravel())
+    seen = compute_rms(loop.um(white + walk, PERIOD_S)[:, 200:].ravel())
     assert loop.noise_um(0.01, 0.001, 1200, PERIOD_S) == pytest.approx(seen, rel=0.15)
 
 

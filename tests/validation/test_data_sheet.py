@@ -16,7 +16,7 @@ from fdhil.cli.main import cli
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
-from fdhil.records import PARAMETERS, Estimate, Parameters, Result, frozen
+from fdhil.records import PARAMETERS, Estimate, Parameters, Result, freeze_array
 from fdhil.store.recording_csv import parse_recording
 from fdhil.validation.data_sheet import TOLERANCE, gain_error, scale_convention
 from studies import bench
@@ -30,7 +30,7 @@ COLUMN = {"voltage": 1, "current": 2, "speed": 3}
 def estimate(**factors: float) -> Estimate:
     """Return the data sheet's values as an estimate, each times its factor, known to 0.1 %."""
     values = np.array([getattr(NOMINAL, name) * factors.get(name, 1.0) for name in PARAMETERS])
-    return Estimate("any", PARAMETERS, frozen(values), frozen(np.diag((1e-3 * values) ** 2)), {}, Result.OK)
+    return Estimate("any", PARAMETERS, freeze_array(values), freeze_array(np.diag((1e-3 * values) ** 2)), {}, Result.OK)
 
 
 def scaled(text: str, signal: str, gain: float) -> str:
@@ -54,7 +54,7 @@ def test_the_scales_of_the_model_are_what_an_identification_finds(shuttle: str) 
     def fitted(text: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
         found = analyse(find_windows(parse_recording(text))[0], Identification()).estimate
         assert found is not None
-        return np.log([found.value(name) for name in PARAMETERS])
+        return np.log([found.get_value(name) for name in PARAMETERS])
 
     true = fitted(shuttle)
     for signal in ("voltage", "current"):
@@ -133,11 +133,11 @@ def test_a_drive_within_the_tolerance_is_never_refused_cold_or_warm(
 
 def test_a_coarse_estimate_or_one_without_r_and_l_says_nothing() -> None:
     found = estimate(R=1.2, L=1.2, K=1.2, Jt=1.2)
-    coarse = replace(found, covariance=frozen(np.diag((0.3 * found.values) ** 2)))
+    coarse = replace(found, covariance=freeze_array(np.diag((0.3 * found.values) ** 2)))
     assert gain_error(coarse, NOMINAL) is None
     values = found.values.copy()
     values[:3] = np.nan
-    assert gain_error(replace(found, values=frozen(values)), NOMINAL) is None
+    assert gain_error(replace(found, values=freeze_array(values)), NOMINAL) is None
 
 
 @pytest.mark.parametrize("share", [2 / 3, 1.5, 1 / 3])

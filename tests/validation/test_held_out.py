@@ -10,7 +10,7 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.model import closed_loop
-from fdhil.records import PARAMETERS, Estimate, Float, Parameters, Result, Window, frozen
+from fdhil.records import PARAMETERS, Estimate, Float, Parameters, Result, Window, freeze_array
 from fdhil.validation.held_out_moves import (
     TERM,
     held_out_reason,
@@ -31,7 +31,7 @@ SETTINGS = Identification()
 @lru_cache(maxsize=4)
 def moves(presliding_um: float) -> list[Window]:
     demand_mm = 1e3 * shuttle(moves=2)
-    drive = TRUE.changed(**{TERM: presliding_um}) if presliding_um else TRUE
+    drive = TRUE.replace_values(**{TERM: presliding_um}) if presliding_um else TRUE
     response = closed_loop.simulate(drive, AXIS, PERIOD_S, demand_mm)
     noise = 0.05e-3 * np.random.default_rng(1).standard_normal(demand_mm.size)
     return [_with_position(window, response.position_mm + noise, demand_mm) for window in rapids()]
@@ -40,26 +40,28 @@ def moves(presliding_um: float) -> list[Window]:
 def _with_position(window: Window, position_mm: Float, demand_mm: Float) -> Window:
     first = round(window.start_s / PERIOD_S)
     rows = slice(first, first + window.n)
-    return replace(window, position_mm=frozen(position_mm[rows]), demand_mm=frozen(demand_mm[rows]))
+    return replace(window, position_mm=freeze_array(position_mm[rows]), demand_mm=freeze_array(demand_mm[rows]))
 
 
 def estimate(**changes: float) -> Estimate:
-    values = TRUE.changed(**changes).as_dict()
+    values = TRUE.replace_values(**changes).as_dict()
     covariance = np.diag([(1e-3 * value) ** 2 for value in values.values()])
-    return Estimate("maximum_likelihood", PARAMETERS, frozen(list(values.values())), frozen(covariance), {}, Result.OK)
+    return Estimate(
+        "maximum_likelihood", PARAMETERS, freeze_array(list(values.values())), freeze_array(covariance), {}, Result.OK
+    )
 
 
 @pytest.mark.usefixtures("long_computation")
 def test_presliding_is_identified_within_its_interval_and_only_where_there_is_some() -> None:
     found = with_presliding(estimate(), moves(8.0), AXIS, PERIOD_S)
-    assert found.value(TERM) == pytest.approx(8.0, abs=max(0.4, 3 * found.std(TERM)))
+    assert found.get_value(TERM) == pytest.approx(8.0, abs=max(0.4, 3 * found.get_std(TERM)))
     assert with_presliding(estimate(), moves(0.0), AXIS, PERIOD_S).names == PARAMETERS
 
 
 def test_move_is_not_replayed_while_its_axis_still_settles() -> None:
     window = moves(0.0)[0]
     decaying_mm = 20e-3 * np.exp(-np.arange(window.n) * PERIOD_S / 0.035)
-    settling = replace(window, position_mm=frozen(window.position_mm + decaying_mm))
+    settling = replace(window, position_mm=freeze_array(window.position_mm + decaying_mm))
     assert replay_setpoints(window, TRUE, AXIS, PERIOD_S) is not None
     assert replay_setpoints(settling, TRUE, AXIS, PERIOD_S) is None
 
@@ -87,7 +89,7 @@ def test_friction_that_builds_up_lets_the_table_creep_where_sharp_friction_holds
     demand_mm = np.linspace(0.0, 0.5e-3, 200)
     sharp, soft = (
         closed_loop.simulate(model, axis, PERIOD_S, demand_mm).position_mm[-1]
-        for model in (TRUE, TRUE.changed(**{TERM: 10.0}))
+        for model in (TRUE, TRUE.replace_values(**{TERM: 10.0}))
     )
     assert abs(sharp) < 1e-6
     assert 1e-5 < soft < demand_mm[-1]

@@ -9,11 +9,20 @@ import numpy as np
 import pytest
 
 from fdhil.pipeline import AxisPipeline, Record
-from fdhil.records import AxisSamples, MoveEvent, MoveKind, ParameterSet, TickTimes, WindowOutcome, frozen, frozen_ints
+from fdhil.records import (
+    AxisSamples,
+    MoveEvent,
+    MoveKind,
+    ParameterSet,
+    TickTimes,
+    WindowOutcome,
+    freeze_array,
+    freeze_integers,
+)
 from studies import drives
 from studies.drives import Array
 from studies.scenes import demand_of, measured
-from tests.daemon.machine import config_of
+from tests.daemon.simulated_machine import config_of
 from tests.validation.test_interruptions import DRIVE, MOVE, SCENE
 
 BLOCK = 40
@@ -34,18 +43,18 @@ def _live(rates: Array) -> list[Record]:
     for start in range(0, n, BLOCK):
         tick = np.arange(start, min(n, start + BLOCK))
         zeros = np.zeros(tick.size)
-        records.append(TickTimes(frozen_ints(tick), frozen_ints(tick * 1_000_000)))
+        records.append(TickTimes(freeze_integers(tick), freeze_integers(tick * 1_000_000)))
         records.append(
             AxisSamples(
                 "X",
-                frozen_ints(tick),
-                demand_mm=frozen(1e3 * rows["demand"][tick]),
-                position_mm=frozen(1e3 * rows["position"][tick]),
-                speed_rad_s=frozen(rows["speed"][tick]),
-                current_a=frozen(rows["current"][tick]),
-                voltage_v=frozen(rows["voltage"][tick]),
-                offset_mm=frozen(zeros),
-                statusword=frozen_ints(zeros),
+                freeze_integers(tick),
+                demand_mm=freeze_array(1e3 * rows["demand"][tick]),
+                position_mm=freeze_array(1e3 * rows["position"][tick]),
+                speed_rad_s=freeze_array(rows["speed"][tick]),
+                current_a=freeze_array(rows["current"][tick]),
+                voltage_v=freeze_array(rows["voltage"][tick]),
+                offset_mm=freeze_array(zeros),
+                statusword=freeze_integers(zeros),
             )
         )
         records += [event for event in events if tick[0] <= event.tick <= tick[-1]]

@@ -12,7 +12,7 @@ from fdhil.config import Identification
 from fdhil.identification.estimators.maximum_likelihood import fit_windows
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
-from fdhil.records import Window, frozen
+from fdhil.records import Window, freeze_array
 from fdhil.validation.backlash import backlash, dead_band, overrun
 from fdhil.validation.model_deficiencies import lacking
 from fdhil.validation.structure import findings
@@ -50,7 +50,7 @@ def test_a_sensor_that_drifts_is_named_with_its_amount(name: str, fault: str) ->
     values = np.array(getattr(window, field))
     course = np.linspace(0.0, 1.0, values.size)
     wrong = values * (1 + 0.08 * course) if fault == "gain" else values + 0.05 * np.abs(values).max() * course
-    changed: Window = replace(window, **{field: frozen(wrong)})  # type: ignore[arg-type]  # an array of the record
+    changed: Window = replace(window, **{field: freeze_array(wrong)})  # type: ignore[arg-type]  # an array of the record
     reasons = [r for r in analyse(changed, SETTINGS).verdict.reasons if r.code == "CalibrationSuspect"]
     assert reasons
     assert all(re.search(r"[-+]?\d", reason.text) for reason in reasons)
@@ -102,7 +102,7 @@ def test_a_gain_that_drifts_by_little_is_told_by_its_own_size_and_refused(study:
 @pytest.mark.parametrize(("field", "name"), [("voltage_v", "voltage"), ("current_a", "current")])
 def test_a_gain_that_moved_between_rapids_is_named_not_six_parameters(field: str, name: str) -> None:
     there, back = windows(0.002, moves=2)
-    louder: Window = replace(back, **{field: frozen(1.06 * np.array(getattr(back, field)))})  # type: ignore[arg-type]
+    louder: Window = replace(back, **{field: freeze_array(1.06 * np.array(getattr(back, field)))})  # type: ignore[arg-type]
     _, verdict = pool([analyse(there, SETTINGS), analyse(louder, SETTINGS)], SETTINGS)
     (reason,) = verdict.reasons
     assert reason.code == "CalibrationSuspect"

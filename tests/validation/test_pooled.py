@@ -48,7 +48,7 @@ def test_what_instants_miss_is_the_same_in_every_rapid_and_does_not_average_away
     assert verdict.accepted, verdict.reasons
     assert pooled is not None
     for name, share in (("R", 0.05), ("L", 0.2), ("K", 0.003)):
-        assert pooled.std(name) >= 0.99 * share * pooled.value(name)
+        assert pooled.get_std(name) >= 0.99 * share * pooled.get_value(name)
 
 
 @pytest.mark.parametrize(("name", "share"), [("R", 0.12), ("Jt", 0.04), ("K", 0.03)])
@@ -100,19 +100,19 @@ def test_friction_that_differs_by_direction_is_a_load_and_no_jump(refit: bool) -
     assert verdict.accepted, verdict.reasons
     assert estimate is not None
     assert estimate.terms == ("load",)
-    assert abs(estimate.value("load") - 0.5) < 3 * estimate.std("load")
-    assert abs(estimate.value("Cd") - 5.0) < 3 * estimate.std("Cd")
-    assert estimate.std("load") < 0.05
+    assert abs(estimate.get_value("load") - 0.5) < 3 * estimate.get_std("load")
+    assert abs(estimate.get_value("Cd") - 5.0) < 3 * estimate.get_std("Cd")
+    assert estimate.get_std("load") < 0.05
 
 
 def test_a_counterweight_that_is_off_by_three_times_the_friction_is_told() -> None:
     outcomes = real(replace(PLANT, load_nm=15.0))
-    assert [o.estimate is not None and o.estimate.value("Cd") < 0 for o in outcomes] == [False, True, False, True]
+    assert [o.estimate is not None and o.estimate.get_value("Cd") < 0 for o in outcomes] == [False, True, False, True]
     estimate, verdict = pool(outcomes, Identification())
     assert verdict.accepted, verdict.reasons
     assert estimate is not None
-    assert estimate.value("load") == pytest.approx(15.0, abs=0.02)
-    assert estimate.value("Cd") == pytest.approx(5.0, rel=0.02)
+    assert estimate.get_value("load") == pytest.approx(15.0, abs=0.02)
+    assert estimate.get_value("Cd") == pytest.approx(5.0, rel=0.02)
 
 
 @pytest.mark.parametrize("number", [1, 2])
@@ -132,7 +132,7 @@ def test_a_winding_that_warms_is_followed_to_the_newest_window() -> None:
     estimate, verdict = pool(real(replace(PLANT, warming=0.06)), Identification())
     assert verdict.accepted, verdict.reasons
     assert estimate is not None
-    assert estimate.value("R") == pytest.approx(0.5 * (1 + 0.06 * 3.5 / 4), rel=0.01)
+    assert estimate.get_value("R") == pytest.approx(0.5 * (1 + 0.06 * 3.5 / 4), rel=0.01)
 
 
 def test_a_pool_is_not_believed_from_one_direction_while_the_other_is_refused() -> None:

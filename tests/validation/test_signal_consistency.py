@@ -15,7 +15,7 @@ from fdhil.cli.batch import analyse_file
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
-from fdhil.records import Recording, Window, frozen
+from fdhil.records import Recording, Window, freeze_array
 from fdhil.validation.signal_consistency import missing_move
 from fdhil.validation.window_signals import WindowSignals
 from studies import real_plant
@@ -40,7 +40,7 @@ def refusals(recording: Recording) -> str:
 
 def changed(recording: Recording, name: str, change: Callable[[Array], Array]) -> Recording:
     values = np.array(getattr(recording, FIELDS[name]))
-    spoilt: Recording = replace(recording, **{FIELDS[name]: frozen(change(values))})  # type: ignore[arg-type]
+    spoilt: Recording = replace(recording, **{FIELDS[name]: freeze_array(change(values))})  # type: ignore[arg-type]
     return spoilt
 
 
@@ -99,7 +99,7 @@ def test_speed_that_hides_the_rapid_is_named(change: Callable[[Array], Array]) -
 
 def test_recording_at_rest_hides_no_rapid() -> None:
     recording = plant("bench").recording()
-    still = {name: frozen(np.full_like(getattr(recording, f), 3.0)) for name, f in FIELDS.items()}
+    still = {name: freeze_array(np.full_like(getattr(recording, f), 3.0)) for name, f in FIELDS.items()}
     assert missing_move(replace(recording, speed_rad_s=0 * still["speed"], position_mm=still["position"])) is None
 
 
@@ -110,8 +110,8 @@ def _coarse(counts: int, kind: str) -> list[Window]:
     turn_mm = 20.0 / counts
     if kind == "rounded":
         step = 2 * np.pi / counts / moved.dt_s
-        recording = replace(recording, speed_rad_s=frozen(np.round(moved.speed / step) * step))
-    return find_windows(replace(recording, position_mm=frozen(np.round(moved.motor_m * 1e3 / turn_mm) * turn_mm)))
+        recording = replace(recording, speed_rad_s=freeze_array(np.round(moved.speed / step) * step))
+    return find_windows(replace(recording, position_mm=freeze_array(np.round(moved.motor_m * 1e3 / turn_mm) * turn_mm)))
 
 
 @pytest.mark.parametrize("kind", ["difference", "rounded"])
@@ -127,7 +127,7 @@ def test_speed_sensor_that_sticks_while_the_axis_goes_on_is_named() -> None:
     begin = WindowSignals(window, SETTINGS).motion_range[0] + 20
     speed = np.array(window.speed_rad_s)
     speed[begin : begin + 60] = speed[begin]
-    text = " ".join(r.text for r in analyse(replace(window, speed_rad_s=frozen(speed)), SETTINGS).verdict.reasons)
+    text = " ".join(r.text for r in analyse(replace(window, speed_rad_s=freeze_array(speed)), SETTINGS).verdict.reasons)
     assert "speed" in text
 
 
@@ -141,7 +141,7 @@ def test_slow_voltage_that_stands_still_is_named() -> None:
     (window,) = slow_windows()
     slow = window.slow_voltage
     assert slow is not None
-    dead = replace(window, slow_voltage=replace(slow, voltage_v=frozen(0.0 * slow.voltage_v)))
+    dead = replace(window, slow_voltage=replace(slow, voltage_v=freeze_array(0.0 * slow.voltage_v)))
     assert "voltage stays at 0 V" in analyse(dead, SETTINGS).verdict.reasons[0].text
 
 
@@ -161,8 +161,8 @@ def at_table() -> Window:
     moved = real_plant.run(soft, shuttle(0.1, 0.2, 2.0), SLOW_LOOPS)
     recording = real_plant.recording(moved, soft, Sensors(), 0.2)
     rate = np.gradient(np.gradient(moved.table_m, moved.dt_s), moved.dt_s)
-    table = frozen(moved.table_m * 1e3 + 7.0)
-    (window,) = find_windows(replace(recording, table_mm=table, table_m_s2=frozen(rate)))
+    table = freeze_array(moved.table_m * 1e3 + 7.0)
+    (window,) = find_windows(replace(recording, table_mm=table, table_m_s2=freeze_array(rate)))
     return window
 
 
@@ -187,7 +187,7 @@ def test_good_table_sensors_are_used_without_a_warning(at_table: Window) -> None
 def test_wrong_table_sensor_is_named_and_not_used(
     at_table: Window, field: str, change: Callable[[Array], Array], text: str
 ) -> None:
-    spoilt: Window = replace(at_table, **{field: frozen(change(np.array(getattr(at_table, field))))})  # type: ignore[arg-type]
+    spoilt: Window = replace(at_table, **{field: freeze_array(change(np.array(getattr(at_table, field))))})  # type: ignore[arg-type]
     without: Window = replace(at_table, **{field: None})  # type: ignore[arg-type]
     found, expected = (analyse(window, SETTINGS) for window in (spoilt, without))
     assert any(text in warning.text for warning in found.verdict.warnings)

@@ -8,14 +8,14 @@ import numpy as np
 
 from fdhil.config import Identification
 from fdhil.pipeline import analyse
-from fdhil.records import Float, Stages, Window, frozen
+from fdhil.records import Float, Stages, Window, freeze_array
 from fdhil.validation.slow_voltage_checks import slow_voltage_faults
 from studies.slow_sensor import slow_windows
 
 
 def _told(window: Window, volts: Float) -> list[str]:
     assert window.slow_voltage is not None
-    changed = replace(window, slow_voltage=replace(window.slow_voltage, voltage_v=frozen(volts)))
+    changed = replace(window, slow_voltage=replace(window.slow_voltage, voltage_v=freeze_array(volts)))
     return [reason.code for reason in slow_voltage_faults(changed)]
 
 

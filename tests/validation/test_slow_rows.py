@@ -9,7 +9,7 @@ import pytest
 
 from fdhil.identification.estimators.maximum_likelihood import fit_windows
 from fdhil.pipeline import analyse
-from fdhil.records import Window, frozen
+from fdhil.records import Window, freeze_array
 from fdhil.validation.slow_voltage_checks import current_late
 from fdhil.validation.stuck import stuck_values
 from fdhil.validation.window_fit import WindowFit
@@ -20,13 +20,13 @@ from studies.slow_sensor import SETTINGS, slow_windows
 def _coarse(window: Window) -> Window:
     """Return the window with coarse readings that are often equal: 0.3 A, 0.4 rad/s."""
     current, speed = (np.round(v / s) * s for v, s in ((window.current_a, 0.3), (window.speed_rad_s, 0.4)))
-    return replace(window, current_a=frozen(current), speed_rad_s=frozen(speed))
+    return replace(window, current_a=freeze_array(current), speed_rad_s=freeze_array(speed))
 
 
 def _stuck(window: Window, name: str, start: int, rows: int) -> list[str]:
     values = np.array(getattr(window, name))
     values[start : start + rows] = values[start]
-    held = frozen(values)
+    held = freeze_array(values)
     stuck = replace(window, current_a=held) if name == "current_a" else replace(window, speed_rad_s=held)
     fit = fit_windows([stuck], SETTINGS)
     assert fit is not None
@@ -44,7 +44,7 @@ def test_a_steady_signal_that_is_read_coarsely_does_not_stick() -> None:
 @pytest.mark.parametrize("rows", [-3, 2, 4])
 def test_a_current_that_is_late_is_named_with_its_delay(rows: int) -> None:
     (window,) = slow_windows(0.005)
-    late = replace(window, current_a=frozen(np.roll(window.current_a, rows)))
+    late = replace(window, current_a=freeze_array(np.roll(window.current_a, rows)))
     (reason,) = analyse(late, SETTINGS).verdict.reasons
     assert reason.code == "SampleTiming"
     assert f"current is {abs(rows)} ms {'late' if rows > 0 else 'early'}" in reason.text

@@ -10,7 +10,7 @@ import pytest
 from fdhil.identification.identifiability import untold
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
-from fdhil.records import Reason, Result, WindowOutcome, frozen
+from fdhil.records import Reason, Result, WindowOutcome, freeze_array
 from fdhil.validation.slow_voltage_checks import slow_voltage_faults
 from studies.judging import GOOD
 from studies.slow_recordings import recording_of
@@ -33,8 +33,8 @@ def test_what_a_slow_voltage_cannot_tell_is_null_with_its_reason_and_the_window_
     assert outcome.estimate is not None
     assert set(outcome.estimate.missing) == names
     assert {reason.code for reason in outcome.estimate.missing.values()} == {"LowExcitation"}
-    assert all(np.isnan(outcome.estimate.value(name)) for name in names)
-    assert all(np.isfinite(outcome.estimate.value(name)) for name in ("K", "Jt", "ft", "Cd"))
+    assert all(np.isnan(outcome.estimate.get_value(name)) for name in names)
+    assert all(np.isfinite(outcome.estimate.get_value(name)) for name in ("K", "Jt", "ft", "Cd"))
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -44,7 +44,7 @@ def test_a_pool_of_windows_that_leave_l_open_is_validated() -> None:
         estimate, verdict = pool([outcome, outcome, outcome], SETTINGS, refit=refit)
         assert verdict.accepted, verdict.reasons
         assert estimate is not None
-        assert estimate.value("K") == pytest.approx(0.3130582, rel=0.01)
+        assert estimate.get_value("K") == pytest.approx(0.3130582, rel=0.01)
 
 
 def test_nothing_but_r_and_l_may_stay_open_and_only_at_a_slow_sensor() -> None:
@@ -71,7 +71,7 @@ def test_a_slow_sensor_that_stands_while_the_voltage_creeps_is_stuck(seed: int) 
 def test_a_slow_sensor_that_reads_a_steady_voltage_coarsely_is_not(step: float) -> None:
     window = slow_windows(0.010)[0]
     assert window.slow_voltage is not None
-    coarse = frozen(np.round(window.slow_voltage.voltage_v / step) * step)
+    coarse = freeze_array(np.round(window.slow_voltage.voltage_v / step) * step)
     read = replace(window, slow_voltage=replace(window.slow_voltage, voltage_v=coarse))
     assert "StuckValue" not in [reason.code for reason in analyse(read, SETTINGS).verdict.reasons]
 
@@ -90,13 +90,13 @@ def test_a_turned_signal_is_told_by_what_no_drive_can_be(kind: str) -> None:
         assert "Unphysical" in codes
         assert "LowExcitation" not in codes
         assert outcome.estimate is not None
-        values = outcome.estimate.parameters()
+        values = outcome.estimate.build_parameters()
         assert min(values.R, values.K) < 0.0
 
 
 def test_samples_that_hold_too_few_rows_of_a_move_are_no_drive_at_all() -> None:
     (window,) = slow_windows(0.010)
     assert window.slow_voltage is not None
-    none = frozen(np.full(window.slow_voltage.voltage_v.size, np.nan))
+    none = freeze_array(np.full(window.slow_voltage.voltage_v.size, np.nan))
     outcome = analyse(replace(window, slow_voltage=replace(window.slow_voltage, voltage_v=none)), SETTINGS)
     assert "LowExcitation" in {reason.code for reason in outcome.verdict.reasons}

@@ -13,7 +13,7 @@ from fdhil.config import Identification
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.windows import find_windows, moving_range
 from fdhil.pipeline import analyse
-from fdhil.records import Float, Reason, Window, frozen
+from fdhil.records import Float, Reason, Window, freeze_array
 from fdhil.validation.rest import rest_faults
 from fdhil.validation.window_fit import WindowFit
 from fdhil.validation.window_signals import WindowSignals
@@ -37,7 +37,7 @@ def _at_rest(window: Window) -> Sequence[Reason]:
 def test_a_current_that_is_not_the_voltages_over_resistance_at_standstill_has_a_wrong_zero(share: float) -> None:
     window = windows(0.003)[0]
     off = share * float(np.abs(window.current_a).max())
-    (reason,) = _at_rest(replace(window, current_a=frozen(window.current_a + off)))
+    (reason,) = _at_rest(replace(window, current_a=freeze_array(window.current_a + off)))
     assert reason.code == "CalibrationSuspect"
     told = re.search(r"reads (\S+) A", reason.text)
     assert told is not None
@@ -68,7 +68,7 @@ def _lost(window: Window, begin: int, rows: int) -> Window:
     def spoilt(values: Float) -> Float:
         values = values.copy()
         values[begin:end] = np.nan
-        return frozen(values)
+        return freeze_array(values)
 
     return replace(
         window,

@@ -10,7 +10,7 @@ import pytest
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
-from fdhil.records import Window, frozen
+from fdhil.records import Window, freeze_array
 from fdhil.validation.stuck import noise_steps, stuck_values
 from fdhil.validation.window_fit import WindowFit
 from fdhil.validation.window_signals import WindowSignals
@@ -33,7 +33,7 @@ def _coarse(seed: int, **steps: float) -> Window:
 def _stuck(window: Window, name: str, start: int, length: int) -> Window:
     values = np.array(getattr(window, FIELDS[name]))
     values[start : start + length] = values[start]
-    changed: Window = replace(window, **{FIELDS[name]: frozen(values)})  # type: ignore[arg-type]  # one of its arrays
+    changed: Window = replace(window, **{FIELDS[name]: freeze_array(values)})  # type: ignore[arg-type]  # one of its arrays
     return changed
 
 

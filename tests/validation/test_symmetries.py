@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fdhil.config import Identification
 from fdhil.pipeline import analyse, pool
-from fdhil.records import Window, WindowOutcome, frozen
+from fdhil.records import Window, WindowOutcome, freeze_array
 from tests.identification.recorded import windows
 
 SETTINGS = Identification()
@@ -27,7 +27,7 @@ def _values(outcome: WindowOutcome) -> np.ndarray[tuple[int], np.dtype[np.float6
 
 def _scaled(window: Window, voltage: float = 1.0, current: float = 1.0) -> Window:
     assert window.voltage_v is not None
-    volts, amperes = frozen(voltage * window.voltage_v), frozen(current * window.current_a)
+    volts, amperes = freeze_array(voltage * window.voltage_v), freeze_array(current * window.current_a)
     return replace(window, voltage_v=volts, current_a=amperes)
 
 
@@ -42,7 +42,7 @@ def test_units_scale_the_parameters_and_nothing_else(voltage: float, current: fl
 def test_the_other_direction_gives_the_same_drive() -> None:
     window = windows(0.003)[0]
     turned = replace(_scaled(window, -1.0, -1.0), direction=-window.direction)
-    speed, position, demand = (frozen(-v) for v in (window.speed_rad_s, window.position_mm, window.demand_mm))
+    speed, position, demand = (freeze_array(-v) for v in (window.speed_rad_s, window.position_mm, window.demand_mm))
     turned = replace(turned, speed_rad_s=speed, position_mm=position, demand_mm=demand)
     assert _values(analyse(turned, SETTINGS)) == pytest.approx(_values(analyse(window, SETTINGS)), rel=1e-6)
 

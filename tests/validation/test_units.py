@@ -10,7 +10,7 @@ import pytest
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
-from fdhil.records import Recording, Window, frozen
+from fdhil.records import Recording, Window, freeze_array
 from fdhil.store.recording_csv import parse_recording
 from fdhil.validation.plausibility import warnings_of
 from studies import bench
@@ -29,13 +29,13 @@ def window_of(recording: Recording) -> Window:
 def positions(recording: Recording, factor: float) -> Recording:
     return replace(
         recording,
-        position_mm=frozen(recording.position_mm * factor),
-        demand_mm=frozen(recording.demand_mm * factor),
+        position_mm=freeze_array(recording.position_mm * factor),
+        demand_mm=freeze_array(recording.demand_mm * factor),
     )
 
 
 def speeds(recording: Recording, factor: float) -> Recording:
-    return replace(recording, speed_rad_s=frozen(recording.speed_rad_s * factor))
+    return replace(recording, speed_rad_s=freeze_array(recording.speed_rad_s * factor))
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from fdhil import tables
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
-from fdhil.records import Float, Window, WindowOutcome, frozen
+from fdhil.records import Float, Window, WindowOutcome, freeze_array
 from fdhil.store.recording_csv import parse_recording
 from fdhil.validation.plausibility import warnings_of
 from studies import bench
@@ -27,7 +27,7 @@ def _codes(outcome: WindowOutcome) -> set[str]:
 
 def _changed(window: Window, **signals: Callable[[Float], Float]) -> Window:
     assert window.voltage_v is not None
-    arrays = {name: frozen(change(np.array(getattr(window, name)))) for name, change in signals.items()}
+    arrays = {name: freeze_array(change(np.array(getattr(window, name)))) for name, change in signals.items()}
     return replace(window, **arrays)  # type: ignore[arg-type]  # the names are arrays of the record
 
 
@@ -132,7 +132,7 @@ def test_a_short_rapid_lacks_its_cruise() -> None:
 def test_swapped_columns_are_unphysical() -> None:
     window = windows(0.003)[0]
     assert window.voltage_v is not None
-    swapped = replace(window, voltage_v=frozen(-window.voltage_v))
+    swapped = replace(window, voltage_v=freeze_array(-window.voltage_v))
     assert "Unphysical" in _codes(analyse(swapped, SETTINGS))
 
 
@@ -150,8 +150,8 @@ def test_a_window_without_voltage_is_told() -> None:
     told = outcome.estimate
     assert told is not None
     for name, truth in (("Jt/K", 0.075 / 0.8), ("ft/K", 0.05 / 0.8), ("Cd/K", 5.0 / 0.8)):
-        assert abs(told.value(name) - truth) < 5 * told.std(name) < 0.4 * truth
-        assert np.isnan(told.value(name.split("/")[0]))
+        assert abs(told.get_value(name) - truth) < 5 * told.get_std(name) < 0.4 * truth
+        assert np.isnan(told.get_value(name.split("/")[0]))
 
 
 def test_a_sensor_with_its_own_clock_is_aligned_by_the_data() -> None:
@@ -159,17 +159,17 @@ def test_a_sensor_with_its_own_clock_is_aligned_by_the_data() -> None:
     for window, share in zip(windows(0.001, moves=2), (0.3, -0.4), strict=True):
         assert window.voltage_v is not None
         rise = np.gradient(window.voltage_v)
-        late_v = frozen(window.voltage_v - share * rise)
+        late_v = freeze_array(window.voltage_v - share * rise)
         shifted.append(replace(window, voltage_v=late_v, voltage_delay_s=0.0))
     outcomes = [analyse(window, SETTINGS) for window in shifted]
     for outcome, share in zip(outcomes, (0.3, -0.4), strict=True):
         assert outcome.estimate is not None
         assert outcome.estimate.delay_s == pytest.approx(share * 1e-3, abs=5e-5)
-        assert abs(outcome.estimate.value("L") / 0.005 - 1) < 0.01
+        assert abs(outcome.estimate.get_value("L") / 0.005 - 1) < 0.01
     estimate, verdict = pool(outcomes, SETTINGS)
     assert verdict.accepted, verdict.reasons
     assert estimate is not None
-    assert abs(estimate.value("L") / 0.005 - 1) < 0.01
+    assert abs(estimate.get_value("L") / 0.005 - 1) < 0.01
 
 
 @pytest.mark.fault("C3")
@@ -183,7 +183,7 @@ def test_coarse_steps_are_told_and_widen_the_intervals() -> None:
     fine_told, coarse_told = analyse(window, SETTINGS).estimate, analyse(coarse, SETTINGS).estimate
     assert fine_told is not None
     assert coarse_told is not None
-    assert coarse_told.std("R") > 2 * fine_told.std("R")
+    assert coarse_told.get_std("R") > 2 * fine_told.get_std("R")
 
 
 def test_nothing_pooled_from_nothing() -> None:

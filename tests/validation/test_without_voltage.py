@@ -11,7 +11,7 @@ import pytest
 from fdhil import config
 from fdhil.config import Axis, Identification
 from fdhil.pipeline import AxisPipeline, analyse, pool
-from fdhil.records import ParameterSet, Skill, Window, WindowOutcome, frozen
+from fdhil.records import ParameterSet, Skill, Window, WindowOutcome, freeze_array
 from studies import real_plant
 from tests.bench import bench_axis
 from tests.identification.deaf import LOOPS, RAPID_M_S, SCREW, SECTION, SENSORS, screw_windows, to_and_fro
@@ -30,7 +30,7 @@ def test_rapids_of_a_screw_with_a_load_and_friction_of_its_own_are_believed_and_
     assert verdict.accepted
     assert estimate is not None
     for name, tolerance in (("Jt", 0.01), ("ft", 0.06), ("Cd", 0.06)):
-        assert estimate.value(name) == pytest.approx(SCREW.truth()[name], rel=tolerance)
+        assert estimate.get_value(name) == pytest.approx(SCREW.truth()[name], rel=tolerance)
 
 
 @pytest.mark.parametrize("direction", [1, -1])
@@ -40,7 +40,7 @@ def test_one_direction_is_a_pool_of_its_own(direction: int) -> None:
     assert verdict.accepted
     assert estimate is not None
     effective = SCREW.Cd + direction * SCREW.load_nm
-    assert estimate.value("Cd") == pytest.approx(effective, rel=0.06)
+    assert estimate.get_value("Cd") == pytest.approx(effective, rel=0.06)
 
 
 def test_without_a_torque_constant_nothing_is_believed_and_the_way_out_is_told() -> None:
@@ -65,42 +65,42 @@ def test_the_data_sheet_stands_in_for_a_drive_that_tells_no_voltage_and_not_for_
     told = outcome.estimate
     assert told is not None
     assert told.given == ("R", "L", "K")
-    assert told.value("K") == 0.33
+    assert told.get_value("K") == 0.33
     (reason,) = analyse(window, SETTINGS, _axis("modbus")).verdict.reasons
     assert str(reason) == "SampleTiming: the window has no voltage"
 
 
 def _late(window: Window) -> Window:
-    return replace(window, current_a=frozen(np.concatenate([np.zeros(4), window.current_a[:-4]])))
+    return replace(window, current_a=freeze_array(np.concatenate([np.zeros(4), window.current_a[:-4]])))
 
 
 def _clipped(window: Window) -> Window:
     top = 0.8 * float(np.abs(window.current_a).max())
-    return replace(window, current_a=frozen(np.clip(window.current_a, -top, top)))
+    return replace(window, current_a=freeze_array(np.clip(window.current_a, -top, top)))
 
 
 def _stuck(window: Window) -> Window:
     current = window.current_a.copy()
     current[500:600] = current[500]
-    return replace(window, current_a=frozen(current))
+    return replace(window, current_a=freeze_array(current))
 
 
 def _loaded(window: Window) -> Window:
     current = window.current_a.copy()
     current[500:800] += 0.1 * np.abs(current).max()
-    return replace(window, current_a=frozen(current))
+    return replace(window, current_a=freeze_array(current))
 
 
 def _gain(window: Window) -> Window:
     current = window.current_a.copy()
     current[window.n // 2 :] *= 1.2
-    return replace(window, current_a=frozen(current))
+    return replace(window, current_a=freeze_array(current))
 
 
 def _coarse(window: Window) -> Window:
     rng = np.random.default_rng(1)
     noise = 0.3 * np.abs(window.current_a).max() * rng.standard_normal(window.n // 20 + 1).repeat(20)[: window.n]
-    return replace(window, current_a=frozen(window.current_a + noise))
+    return replace(window, current_a=freeze_array(window.current_a + noise))
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ def test_a_triangular_move_is_listed_with_its_parameters_and_not_believed() -> N
     (window,) = find_windows(replace(read, torque_constant_nm_per_a=SCREW.K))
     outcome = analyse(window, SETTINGS)
     assert outcome.estimate is not None
-    assert outcome.estimate.value("Jt") == pytest.approx(SCREW.Jt, rel=0.01)
+    assert outcome.estimate.get_value("Jt") == pytest.approx(SCREW.Jt, rel=0.01)
     assert [reason.code for reason in outcome.verdict.reasons] == ["MissingStage(cruise)"]
 
 
@@ -151,9 +151,9 @@ def test_a_drive_without_feed_forward_is_weighed_by_its_following_error() -> Non
     window = screw_windows()[0]
     rng = np.random.default_rng(3)
     waves = 0.04 * np.abs(window.current_a).max() * np.sin(np.arange(window.n) / 15.0 + rng.uniform(0, 6))
-    rough = replace(window, current_a=frozen(window.current_a + waves))
+    rough = replace(window, current_a=freeze_array(window.current_a + waves))
     assert analyse(rough, SETTINGS).verdict.accepted
-    unled = replace(rough, demand_mm=frozen(np.full(window.n, np.nan)))
+    unled = replace(rough, demand_mm=freeze_array(np.full(window.n, np.nan)))
     assert "ValidationFailed" in [reason.code for reason in analyse(unled, SETTINGS).verdict.reasons]
 
 
@@ -173,7 +173,7 @@ def test_a_running_machine_without_a_voltage_publishes_sets_that_predict_its_mov
     published = pipeline.published
     assert published is not None
     assert published.parameters.Cd == pytest.approx(SCREW.Cd, rel=0.03)
-    assert published.parameters.term("load") == pytest.approx(SCREW.load_nm, rel=0.05)
+    assert published.parameters.get_term("load") == pytest.approx(SCREW.load_nm, rel=0.05)
     assert np.isfinite(published.covariance).all()
     skills = [outcome for outcome in outcomes if isinstance(outcome, Skill)]
     assert skills[-1].rms_um < 0.005 * skills[-1].measured_rms_um

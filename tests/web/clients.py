@@ -15,11 +15,11 @@ from fastapi import FastAPI
 from fdhil import config as machine_config
 from fdhil.config import MachineConfig
 from fdhil.config.users import Role, User, hashed, write_users
-from fdhil.daemon.control import SOCKET_NAME, ControlServer
-from fdhil.daemon.peers import Peer
+from fdhil.daemon.daemon_access import ClientProcess
+from fdhil.daemon.daemon_socket import SOCKET_NAME, ControlServer
 from fdhil.web.access import Access
 from fdhil.web.app import make_app
-from tests.daemon.machine import config_of
+from tests.daemon.simulated_machine import config_of
 
 PASSWORD = "canary-9b1f-password"
 OWN = {"X-Fdhil": "1"}
@@ -64,14 +64,14 @@ async def daemon_that(
 ) -> AsyncIterator[list[Mapping[str, Any]]]:
     asked: list[Mapping[str, Any]] = []
 
-    async def handle(request: Mapping[str, Any], peer: Peer) -> Mapping[str, Any]:
+    async def handle(request: Mapping[str, Any], peer: ClientProcess) -> Mapping[str, Any]:
         asked.append(request)
         told = answer(request)
         return await told if asyncio.iscoroutine(told) else told  # type: ignore[no-any-return]
 
     config.run_directory.mkdir(parents=True, exist_ok=True)
     server = ControlServer(handle, lambda: {"checked_s": 1.0}, abandon, machine_config.Access())
-    async with server.serving(config.run_directory / SOCKET_NAME):
+    async with server.serve_socket(config.run_directory / SOCKET_NAME):
         yield asked
 
 

@@ -22,7 +22,7 @@ class Quiet:
     def pid(self) -> int:
         return self._child.pid
 
-    def check(self) -> None:
+    def check_running(self) -> None:
         if self._child.poll() is not None:
             last = self._log.read_text("utf-8", "replace").strip().splitlines()[-1:]
             raise ConnectError(self.name, f"ended with exit code {self._child.returncode}: {last}")

@@ -24,13 +24,13 @@ from fdhil.cli.demo.toml import to_toml
 from fdhil.commissioning.record import save_record
 from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
-from fdhil.daemon.control import ask
+from fdhil.daemon.daemon_socket import ask_daemon
 from fdhil.errors import ConnectError
-from fdhil.guard.core import SETTLED_CYCLES
+from fdhil.guard.guard_step import SETTLED_CYCLES
 from fdhil.program import load_trajectory, program_digest
 from fdhil.store.history import History
 from tests.bench import bench_document
-from tests.daemon.shop import patient
+from tests.daemon.machine_rig import patient
 from tests.web import weeks
 from tests.web.quiet import Quiet
 
@@ -114,12 +114,12 @@ class Stage:
     def wait(self, done: Callable[[], object]) -> None:
         while not done():
             for process in (self.twin, *self.processes.values()):
-                process.check()
+                process.check_running()
             time.sleep(MEANWHILE_S)
 
     def status(self) -> dict[str, Any] | None:
         try:
-            return ask(self.config.run_directory / "daemon.sock", {"request": "status"}, timeout_s=500.0)
+            return ask_daemon(self.config.run_directory / "daemon.sock", {"request": "status"}, timeout_s=500.0)
         except ConnectError:
             return None
 
@@ -141,7 +141,7 @@ class Stage:
         self.settled()
         request = {"request": "arm", "program": str(self.program), "method": None}
         token = read_token(self.config.run_directory)
-        answer = ask(self.config.run_directory / "daemon.sock", {**request, "token": token}, timeout_s=500.0)
+        answer = ask_daemon(self.config.run_directory / "daemon.sock", {**request, "token": token}, timeout_s=500.0)
         assert answer["ok"], answer
 
     def nc(self, on: bool) -> None:

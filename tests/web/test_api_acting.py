@@ -19,8 +19,8 @@ from fdhil.arming.token import ensure_token
 from fdhil.config import MachineConfig
 from fdhil.config.users import Role, write_users
 from fdhil.web.app import make_app
-from tests.daemon.machine import Machine
-from tests.daemon.test_service import serving
+from tests.daemon.simulated_machine import SimulatedMachine
+from tests.daemon.test_daemon_service import serving
 from tests.web.clients import OWN, client_of, daemon_that, machine_of, user
 
 PROGRAM = b"G21 G90\nG1 X10 F1000\nM2\n"
@@ -95,7 +95,7 @@ async def test_a_program_that_changed_while_it_was_armed_is_disarmed(config: Mac
 
 
 async def test_what_the_daemon_refuses_is_told_with_all_its_reasons(config: MachineConfig) -> None:
-    async with serving(config, Machine()), client_of(make_app(config), "operator") as client:
+    async with serving(config, SimulatedMachine()), client_of(make_app(config), "operator") as client:
         answer = await client.post("/api/machine/arm", json=await confirmed(client), headers=OWN)
         disarmed = await client.post("/api/machine/disarm", headers=OWN)
     told = answer.json()

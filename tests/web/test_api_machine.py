@@ -13,8 +13,8 @@ from fdhil.records import Parameters
 from fdhil.store.history import History
 from fdhil.web.app import make_app
 from fdhil.web.pages.machine_lights import axis_light, change_light, steps
-from tests.daemon.machine import Machine, rapids
-from tests.daemon.test_service import serving, status_when
+from tests.daemon.simulated_machine import SimulatedMachine, rapids
+from tests.daemon.test_daemon_service import serving, status_when
 from tests.store.made import BENCH, STAMP, published
 from tests.web.clients import OWN, client_of, daemon_that, machine_of
 
@@ -31,13 +31,13 @@ STATUS: dict[str, Any] = {
 
 @pytest.fixture(autouse=True)
 def _quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
+    monkeypatch.setattr("fdhil.daemon.daemon_service.compile_kernels", lambda config, method: None)
 
 
 async def test_a_real_daemon_is_shown_with_its_axes_and_what_to_do_next(tmp_path: Path) -> None:
     config = machine_of(tmp_path)
     async with (
-        serving(config, Machine(rapids(config, count=1))) as path,
+        serving(config, SimulatedMachine(rapids(config, count=1))) as path,
         client_of(make_app(config), "watcher") as client,
     ):
         await status_when(path, lambda s: s["axes"]["X"]["accepted"] == 1)

@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.debian, pytest.mark.timeout(900)]
 
 
 @contextmanager
-def tab_of(name: str, stage: Stage, chromium: Browser) -> Iterator[Tab]:
+def open_events_tab(name: str, stage: Stage, chromium: Browser) -> Iterator[Tab]:
     with opened(chromium, stage.url) as tab:
         tab.log_in(stage.token(name))
         yield tab
@@ -31,7 +31,7 @@ def waiting(stage: Stage) -> set[int]:
 
 def test_a_notice_is_acknowledged_with_the_keyboard_alone_and_stays_so(stage: Stage, chromium: Browser) -> None:
     stage.status_when(lambda status: status["unacknowledged"]["count"])
-    with tab_of("operator", stage, chromium) as tab:
+    with open_events_tab("operator", stage, chromium) as tab:
         tab.open("/events")
         button = tab.page.get_by_role("button", name="Acknowledge notice").first
         number = int("".join(filter(str.isdecimal, str(button.get_attribute("aria-label")).partition(":")[0])))
@@ -48,14 +48,14 @@ def test_a_notice_is_acknowledged_with_the_keyboard_alone_and_stays_so(stage: St
 
 
 def test_who_may_only_look_is_told_how_to_acknowledge_and_has_no_button(stage: Stage, chromium: Browser) -> None:
-    with tab_of("watcher", stage, chromium) as tab:
+    with open_events_tab("watcher", stage, chromium) as tab:
         tab.open("/events")
         tab.page.get_by_text("To acknowledge in the browser").wait_for()
         assert tab.page.get_by_role("button", name="Acknowledge").count() == 0
 
 
 def test_the_list_is_filtered_by_its_address(stage: Stage, chromium: Browser) -> None:
-    with tab_of("watcher", stage, chromium) as tab:
+    with open_events_tab("watcher", stage, chromium) as tab:
         tab.open("/events?code=LoadChanged")
         classes = tab.page.locator("article .class code").all_text_contents()
         assert classes
@@ -65,7 +65,7 @@ def test_the_list_is_filtered_by_its_address(stage: Stage, chromium: Browser) ->
 
 
 def test_a_black_box_is_shown_and_given_as_a_file(stage: Stage, chromium: Browser) -> None:
-    with tab_of("watcher", stage, chromium) as tab:
+    with open_events_tab("watcher", stage, chromium) as tab:
         tab.open("/events")
         tab.page.get_by_role("button", name="Show the drives' signals").first.click()
         tab.page.locator("#black-box").wait_for()
@@ -77,7 +77,7 @@ def test_a_black_box_is_shown_and_given_as_a_file(stage: Stage, chromium: Browse
 
 
 def test_a_course_is_read_without_its_picture(stage: Stage, chromium: Browser) -> None:
-    with tab_of("watcher", stage, chromium) as tab:
+    with open_events_tab("watcher", stage, chromium) as tab:
         tab.open("/history/X")
         tab.page.get_by_role("group", name="R over time").wait_for()
         summary = tab.page.locator("summary").first

@@ -10,14 +10,14 @@ import httpx
 import pytest
 
 from fdhil.config import MachineConfig
-from fdhil.daemon import blackbox
+from fdhil.daemon import black_box
 from fdhil.drivers.can.frame_history import candump
 from fdhil.records import Notice
 from fdhil.store.history import History
 from fdhil.store.rows import Acknowledgement, Stamp
 from fdhil.web.app import make_app
-from tests.daemon.machine import Machine
-from tests.daemon.test_service import _quick_start, serving, status_when  # noqa: F401 (a fixture)
+from tests.daemon.simulated_machine import SimulatedMachine
+from tests.daemon.test_daemon_service import _skip_kernel_warmup, serving, status_when  # noqa: F401 (a fixture)
 from tests.drivers.wire import Wire
 from tests.web.clients import OWN, client_of, machine_of
 
@@ -106,7 +106,7 @@ async def test_the_list_is_filtered_and_paged(client: httpx.AsyncClient, machine
 async def test_an_acknowledgement_goes_through_the_daemon_and_is_shown_everywhere(
     client: httpx.AsyncClient, machine: MachineConfig
 ) -> None:
-    async with serving(machine, Machine()) as path:
+    async with serving(machine, SimulatedMachine()) as path:
         wanted = {"notices": [4, 2], "note": "the mapping was wrong"}
         answer = await client.post("/api/events/acknowledge", json=wanted)
         assert answer.status_code == 200, answer.text
@@ -133,8 +133,8 @@ async def test_a_black_box_is_listed_drawn_and_given_as_it_is(
     client: httpx.AsyncClient, machine: MachineConfig
 ) -> None:
     log = candump("can0", Wire(n=900).frames())
-    blackbox.dump(machine.store.directory, "EchoMismatch", lambda: {"can0": log})
-    (machine.store.directory / blackbox.FOLDER / "notes.log").write_text("no black box")
+    black_box.write_black_box(machine.store.directory, "EchoMismatch", lambda: {"can0": log})
+    (machine.store.directory / black_box.BLACK_BOX_FOLDER / "notes.log").write_text("no black box")
     (box,) = (await client.get("/api/events/black-boxes")).json()
     assert (box["code"], box["size_bytes"]) == ("EchoMismatch", len(log))
     drawn = (await client.get(f"/api/events/black-boxes/{box['name']}")).json()
@@ -158,7 +158,7 @@ async def test_a_black_box_is_listed_drawn_and_given_as_it_is(
 async def test_a_name_from_outside_opens_nothing_else(
     name: str, client: httpx.AsyncClient, machine: MachineConfig
 ) -> None:
-    folder = machine.store.directory / blackbox.FOLDER
+    folder = machine.store.directory / black_box.BLACK_BOX_FOLDER
     folder.mkdir()
     (folder / "linked.log").symlink_to(machine.store.directory / "history.sqlite")
     for path in (f"/api/events/black-boxes/{name}", f"/api/events/black-boxes/{name}/file"):
@@ -168,7 +168,7 @@ async def test_a_name_from_outside_opens_nothing_else(
 
 
 async def test_a_black_box_that_is_none_is_said(client: httpx.AsyncClient, machine: MachineConfig) -> None:
-    folder = machine.store.directory / blackbox.FOLDER
+    folder = machine.store.directory / black_box.BLACK_BOX_FOLDER
     folder.mkdir()
     (folder / "20261123T010203.000004Z-Made.log").write_text("nothing that candump wrote")
     answer = await client.get("/api/events/black-boxes/20261123T010203.000004Z-Made.log")

@@ -15,7 +15,7 @@ from fdhil.records import Notice
 from fdhil.store.history import History
 from fdhil.store.rows import Stamp
 from fdhil.web.app import make_app
-from tests.daemon.machine import config_of
+from tests.daemon.simulated_machine import config_of
 from tests.web import weeks
 from tests.web.clients import client_of
 

@@ -20,13 +20,13 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from fdhil.config import Access, MachineConfig
 from fdhil.config.users import hashed, write_users
-from fdhil.daemon.control import SOCKET_NAME, ControlServer
-from fdhil.daemon.live import LiveStream
+from fdhil.daemon.daemon_socket import SOCKET_NAME, ControlServer
+from fdhil.daemon.live_stream import LiveStream
 from fdhil.web.app import make_app
 from fdhil.web.live_feed import MAX_BROWSERS, LiveFeed, Viewer
 from fdhil.web.pages import live as page
-from tests.daemon.machine import config_of
-from tests.daemon.test_live import block
+from tests.daemon.simulated_machine import config_of
+from tests.daemon.test_live_stream import block
 from tests.web.test_live_ring import decoded
 
 BLOCK = 50
@@ -39,11 +39,11 @@ async def daemon(config: MachineConfig) -> AsyncIterator[LiveStream]:
     stream = LiveStream(config)
 
     async def handle(_request: Any, _peer: Any) -> Any:
-        return stream.begin()
+        return stream.open_stream()
 
     config.run_directory.mkdir(parents=True, exist_ok=True)
-    control = ControlServer(handle, lambda: None, lambda: None, Access(), stream.serve)
-    async with control.serving(config.run_directory / SOCKET_NAME):
+    control = ControlServer(handle, lambda: None, lambda: None, Access(), stream.serve_viewer)
+    async with control.serve_socket(config.run_directory / SOCKET_NAME):
         yield stream
 
 
@@ -115,7 +115,7 @@ async def begun(socket: ClientConnection) -> tuple[dict[str, Any], Browser]:
 
 def feed(stream: LiveStream, first: int, blocks: int) -> None:
     for k in range(blocks):
-        stream.take(block(np.arange(first + k * BLOCK, first + (k + 1) * BLOCK)))
+        stream.publish_record(block(np.arange(first + k * BLOCK, first + (k + 1) * BLOCK)))
 
 
 @pytest.mark.usefixtures("real_time")

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.daemon.live import SIGNALS, packed
+from fdhil.daemon.live_stream import LIVE_SIGNALS, encode_base64
 from fdhil.web.live_feed import LiveFeed
 from fdhil.web.live_ring import DRAWN, TEMPERATURE, VOLTAGE, Ring
 from fdhil.web.live_view import MOST_UNSEEN, View, finite
@@ -22,7 +22,7 @@ PERIOD_S = 0.001
 
 
 def rows(ticks: Any) -> Any:
-    return np.outer(np.arange(1, 1 + len(SIGNALS)), np.asarray(ticks)).astype(np.float32)
+    return np.outer(np.arange(1, 1 + len(LIVE_SIGNALS)), np.asarray(ticks)).astype(np.float32)
 
 
 def filled(capacity: int, *parts: Any) -> Ring:
@@ -49,7 +49,7 @@ def test_a_ring_keeps_the_newest_rows_and_what_is_missing_stays_missing(
     kept = ring.rows(tick - 60, tick + 5)
     for column, each in zip(kept.T, range(tick - 60, tick + 5), strict=True):
         if each in sent and each >= ring.begin:
-            np.testing.assert_allclose(column[: len(SIGNALS)], rows([each])[:, 0])
+            np.testing.assert_allclose(column[: len(LIVE_SIGNALS)], rows([each])[:, 0])
         else:
             assert np.isnan(column).all()
 
@@ -137,8 +137,14 @@ def feed_of(axes: str = "XY") -> LiveFeed:
 def line(axis: str, ticks: Any) -> dict[str, Any]:
     ticks = np.asarray(ticks)
     whole = int(ticks[-1] - ticks[0]) == ticks.size - 1
-    holes = {} if whole else {"ticks": packed(ticks - ticks[0], "<i4")}
-    return {"live": "samples", "axis": axis, "tick": int(ticks[0]), "values": packed(rows(ticks), "<f4"), **holes}
+    holes = {} if whole else {"ticks": encode_base64(ticks - ticks[0], "<i4")}
+    return {
+        "live": "samples",
+        "axis": axis,
+        "tick": int(ticks[0]),
+        "values": encode_base64(rows(ticks), "<f4"),
+        **holes,
+    }
 
 
 def test_two_buses_and_a_daemon_that_begins_anew_share_one_count() -> None:
@@ -169,13 +175,23 @@ def test_two_axes_of_one_bus_stay_side_by_side_and_gaps_stay() -> None:
 def test_the_voltage_of_a_sensor_is_laid_by_the_time_of_the_ticks() -> None:
     feed = feed_of("X")
     feed.take(
-        {"live": "voltage", "axis": "X", "t_ns": packed(np.array([1]), "<i8"), "values": packed(np.ones(1), "<f4")}
+        {
+            "live": "voltage",
+            "axis": "X",
+            "t_ns": encode_base64(np.array([1]), "<i8"),
+            "values": encode_base64(np.ones(1), "<f4"),
+        }
     )
     feed.take({"live": "times", "tick": [100, 149], "t_ns": [7_000_000, 56_000_000]})
     feed.take(line("X", range(100, 150)))
     stamps = np.array([10_200_000, 11_300_000])
     feed.take(
-        {"live": "voltage", "axis": "X", "t_ns": packed(stamps, "<i8"), "values": packed(np.array([3.5, 4.5]), "<f4")}
+        {
+            "live": "voltage",
+            "axis": "X",
+            "t_ns": encode_base64(stamps, "<i8"),
+            "values": encode_base64(np.array([3.5, 4.5]), "<f4"),
+        }
     )
     end = feed.rings["X"].end
     assert feed.rings["X"].rows(end - 50, end)[VOLTAGE, 2:6].tolist() == [102, 3.5, 4.5, 105]

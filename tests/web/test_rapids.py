@@ -19,11 +19,11 @@ import pytest
 from fastapi import FastAPI
 
 from fdhil.config import MachineConfig
-from fdhil.daemon.kernel_warmup import nominal_rapid
+from fdhil.daemon.kernel_warmup import simulate_nominal_rapid
 from fdhil.daemon.outcome_store import WINDOWS_FOLDER
 from fdhil.pipeline.overlay import Overlay, lay_over
-from fdhil.records import Window, frozen
-from fdhil.store.history import FILE_NAME, History
+from fdhil.records import Window, freeze_array
+from fdhil.store.history import HISTORY_FILE_NAME, History
 from fdhil.store.windows import decode_window, read_window
 from fdhil.web import file_answer, replayer
 from fdhil.web.answers import Refused
@@ -33,7 +33,7 @@ from fdhil.web.pages.rapid_signals import MOST_POINTS, Signal, signals_of, spect
 from fdhil.web.pages.rapids import replayer_of
 from fdhil.web.replay_process import Replays
 from fdhil.web.replayer import Replayer
-from tests.daemon.machine import config_of
+from tests.daemon.simulated_machine import config_of
 from tests.store.made import STAMP, outcome
 from tests.web import weeks
 
@@ -219,7 +219,7 @@ async def test_no_name_leaves_the_folder_of_the_recordings(
 ) -> None:
     folder = machine.store.directory / WINDOWS_FOLDER
     if not (folder / "link").is_symlink():
-        (folder / "link").symlink_to(machine.store.directory / FILE_NAME)
+        (folder / "link").symlink_to(machine.store.directory / HISTORY_FILE_NAME)
     answer = await client.get(f"/api/rapids/recordings/{name}")
     refused = {(400, "BadName"), (404, "NotFound"), (422, "BadRequest")}  # the last two: of no such route
     assert (answer.status_code, answer.json()["code"]) in refused
@@ -260,7 +260,7 @@ async def test_a_replay_that_hangs_is_ended_and_one_that_has_ended_is_started_an
     before = await running.signals("X", 1)
     process = running._process
     assert process is not None
-    await process.end()
+    await process.kill_and_wait()
     assert await running.signals("X", 1) == before
     assert running._process is not process
     await running.close()
@@ -301,7 +301,7 @@ def test_a_rapid_whose_recording_the_disk_refused_says_so(tmp_path: Path) -> Non
 async def test_a_row_that_is_damaged_is_left_out(tmp_path: Path) -> None:
     config = config_of(tmp_path)
     weeks.fill(config, 3)
-    with sqlite3.connect(config.store.directory / FILE_NAME) as database:
+    with sqlite3.connect(config.store.directory / HISTORY_FILE_NAME) as database:
         database.execute("UPDATE windows SET fit_percent = 12, reasons = 'no JSON' WHERE id = 2")
     database.close()
     async with _client(make_app(config)) as client:
@@ -318,7 +318,7 @@ async def test_before_anything_was_recorded_it_says_so(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def rapid(machine: MachineConfig) -> Window:
-    return nominal_rapid("X", machine.axis["X"], machine.machine.sync_period_s)
+    return simulate_nominal_rapid("X", machine.axis["X"], machine.machine.sync_period_s)
 
 
 def _told(window: Window, config: MachineConfig) -> dict[str, Signal]:
@@ -346,7 +346,9 @@ def test_an_axis_that_the_configuration_does_not_have_is_shown_without_its_loop(
 def test_offsets_and_the_tables_encoder_are_shown_where_they_were_recorded(
     rapid: Window, machine: MachineConfig
 ) -> None:
-    moved = replace(rapid, offset_mm=frozen(np.full(rapid.n, 2e-3)), table_mm=frozen(rapid.demand_mm + 5e-3))
+    moved = replace(
+        rapid, offset_mm=freeze_array(np.full(rapid.n, 2e-3)), table_mm=freeze_array(rapid.demand_mm + 5e-3)
+    )
     told = _told(moved, machine)
     assert set(told["offset_um"].measured) == {2.0}
     assert told["table_error_um"].measured == pytest.approx([5.0] * rapid.n, abs=1e-6)
@@ -356,7 +358,7 @@ def test_offsets_and_the_tables_encoder_are_shown_where_they_were_recorded(
 def test_signals_that_no_drive_has_are_shown_without_a_model(
     value: float, rapid: Window, machine: MachineConfig
 ) -> None:
-    told = _told(replace(rapid, speed_rad_s=frozen(np.full(rapid.n, value))), machine)
+    told = _told(replace(rapid, speed_rad_s=freeze_array(np.full(rapid.n, value))), machine)
     measured = told["speed_rad_s"].measured
     assert len(measured) == rapid.n
     assert all(v is None or v == value for v in measured)
@@ -365,7 +367,7 @@ def test_signals_that_no_drive_has_are_shown_without_a_model(
 def test_lost_rows_are_null(rapid: Window, machine: MachineConfig) -> None:
     speed = rapid.speed_rad_s.copy()
     speed[400:402] = math.nan
-    told = _told(replace(rapid, speed_rad_s=frozen(speed), gaps=((400, 402),)), machine)["speed_rad_s"]
+    told = _told(replace(rapid, speed_rad_s=freeze_array(speed), gaps=((400, 402),)), machine)["speed_rad_s"]
     assert [k for k, v in enumerate(told.measured) if v is None] == [400, 401]
     assert all(v is not None for v in told.measured_spectrum)
 
@@ -383,7 +385,7 @@ def test_the_peak_of_a_sine_is_its_amplitude(rows: int) -> None:
 def test_a_long_recording_is_thinned_and_its_peaks_stay(rapid: Window, machine: MachineConfig) -> None:
     rows = 2 * MOST_POINTS + 500
     longer: dict[str, Any] = {
-        name: frozen(np.append(getattr(rapid, name), np.full(rows - rapid.n, getattr(rapid, name)[-1])))
+        name: freeze_array(np.append(getattr(rapid, name), np.full(rows - rapid.n, getattr(rapid, name)[-1])))
         for name in ("demand_mm", "position_mm", "speed_rad_s", "current_a", "voltage_v")
     }
     told = signals_of(Overlay(replace(rapid, **longer), lay_over(rapid, machine).outcome))

@@ -18,8 +18,8 @@ from fdhil.config.web import Web, is_loopback
 from fdhil.errors import ConfigError, FdhilError
 from fdhil.web import serving
 from tests.bench import bench_axis
-from tests.daemon.machine import config_of
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
+from tests.daemon.simulated_machine import config_of
 from tests.web.certificate import write_certificate
 from tests.web.clients import OWN
 

@@ -16,11 +16,11 @@ import pytest
 
 from fdhil.config import Axis, MachineConfig
 from fdhil.correction.learning import Lesson
-from fdhil.daemon import blackbox
-from fdhil.daemon.kernel_warmup import nominal_rapid
+from fdhil.daemon import black_box
+from fdhil.daemon.kernel_warmup import simulate_nominal_rapid
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.pipeline import AxisPipeline
-from fdhil.records import Notice, Window, frozen
+from fdhil.records import Notice, Window, freeze_array
 from fdhil.store.lessons import lesson_path, write_lesson
 from fdhil.store.rows import Stamp
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
@@ -63,9 +63,9 @@ def fill(config: MachineConfig, rapids: int = 84, last: Stamp | None = None) -> 
             celsius = AMBIENT_C + 1.5 * float(np.sin(1.3 * k)) * (k < rapids - 4)
             for name, pipeline in pipelines.items():
                 window = rapid(name, config, k, rapids, celsius, int(rng.integers(1 << 30)))
-                assert store.keep(pipeline.feed(window)) == []
+                assert store.store_outcomes(pipeline.feed(window)) == []
         clock["at"] = earlier(last, APART_S)
-        store.keep([*NOTICES, black_box(config, clock["at"])])
+        store.store_outcomes([*NOTICES, black_box(config, clock["at"])])
 
 
 @contextmanager
@@ -93,7 +93,7 @@ def earlier(stamp: Stamp, seconds: float) -> Stamp:
 
 
 def black_box(config: MachineConfig, at: Stamp) -> Notice:
-    folder = config.store.directory / blackbox.FOLDER
+    folder = config.store.directory / black_box.BLACK_BOX_FOLDER
     folder.mkdir()
     stamp = datetime.fromtimestamp(at.wall_s, UTC).strftime("%Y%m%dT%H%M%S.%fZ")
     file = folder / f"{stamp}-DriveEmergency.log"
@@ -103,7 +103,7 @@ def black_box(config: MachineConfig, at: Stamp) -> Notice:
 
 def rapid(name: str, config: MachineConfig, k: int, rapids: int, celsius: float, seed: int) -> Window:
     worn = worn_axis(config.axis[name], (k + 1) / rapids, celsius)
-    window = nominal_rapid(name, worn, config.machine.sync_period_s, 1 if k % 2 == 0 else -1, seed)
+    window = simulate_nominal_rapid(name, worn, config.machine.sync_period_s, 1 if k % 2 == 0 else -1, seed)
     window = replace(window, start_tick=k * TICKS_APART, temperature_c=round(celsius, 2), source="inferred")
     if k % REFUSED_EVERY == REFUSED_EVERY - 3:
         return spoiled(window, k // REFUSED_EVERY)
@@ -127,12 +127,12 @@ def spoiled(window: Window, kind: int) -> Window:
     current, voltage = window.current_a.copy(), window.voltage_v.copy()
     if kind % 2 == 0:
         current[begin + 60 : end - 60] += 9.0 * window.direction
-        return replace(window, current_a=frozen(current))
+        return replace(window, current_a=freeze_array(current))
     voltage[begin + 50 : begin + 250] = voltage[begin + 50]
-    return replace(window, voltage_v=frozen(voltage))
+    return replace(window, voltage_v=freeze_array(voltage))
 
 
 def teach(config: MachineConfig, program_digest: str, rows: int) -> None:
-    offset = frozen(0.05 * np.sin(np.arange(rows) / 300.0))
+    offset = freeze_array(0.05 * np.sin(np.arange(rows) / 300.0))
     lesson = Lesson(dict.fromkeys(config.axis, offset), 10.3, 0.7, (3.4, 1.6, 0.9))
     write_lesson(lesson_path(config.store.directory / "lessons", program_digest, config.digest), lesson)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fdhil.child import stopping_in_order
+from fdhil.child_process import interrupt_on_stop_signals
 from fdhil.cli.options import AS_JSON, FOLDER
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def demo(out: Path, realtime: bool, pdf: bool, as_json: bool) -> None:
     from fdhil.cli.demo.loop import run_loop
     from fdhil.cli.demo.realistic import running_realistic
     from fdhil.cli.demo.report import page
-    from fdhil.report import deliver, find_browser, require
+    from fdhil.report import find_browser, require, write_page_or_pdf
 
     require()  # before the computation
 
@@ -45,12 +45,12 @@ def demo(out: Path, realtime: bool, pdf: bool, as_json: bool) -> None:
 
     if pdf:
         find_browser()
-    with stopping_in_order(), running_realistic(out / "realistic", realtime, say) as result:
+    with interrupt_on_stop_signals(), running_realistic(out / "realistic", realtime, say) as result:
         loop = run_loop(out, realtime, say)
         realistic = result()
         report = out / "report.html"
         laid_out = page(loop, [realistic_page.headline(realistic)], [realistic_page.section(realistic)])
-        deliver(laid_out, report, report.with_suffix(".pdf") if pdf else None)
+        write_page_or_pdf(laid_out, report, report.with_suffix(".pdf") if pdf else None)
     if as_json:
         click.echo(json.dumps({**_document(loop, report), "realistic": _realistic(realistic)}))
     else:

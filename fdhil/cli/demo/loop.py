@@ -18,7 +18,7 @@ from fdhil.cli.demo.toml import to_toml
 from fdhil.commissioning.record import save_record
 from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
-from fdhil.daemon.control import SOCKET_NAME, ask
+from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
 from fdhil.errors import DeviceTimeout, FdhilError, RecordingError
 from fdhil.prediction import contour_error_um, predict
 from fdhil.program import load_trajectory
@@ -60,7 +60,7 @@ class Stage:
 
     def ask(self, request: str, **fields: Any) -> dict[str, Any]:
         """Send a request to the daemon. Raises FdhilError with the daemon's text if it refuses."""
-        answer = ask(self.run / SOCKET_NAME, {"request": request, **fields}, timeout_s=PATIENCE_S)
+        answer = ask_daemon(self.run / SOCKET_NAME, {"request": request, **fields}, timeout_s=PATIENCE_S)
         if not answer.get("ok"):
             raise FdhilError(f"the daemon refuses the request {request}: {answer.get('code')}: {answer.get('text')}")
         return answer

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
-from fdhil.child import ending_with_parent
+from fdhil.child_process import wrap_to_end_with_parent
 from fdhil.errors import ConnectError, DeviceTimeout
 
 PATIENCE_S = 900.0  # only for hanging processes, on a busy host; an ended process is detected at once
@@ -31,7 +31,7 @@ class Process:
         self._log = log
         with log.open("ab") as errors:
             self._child = subprocess.Popen(
-                ending_with_parent([sys.executable, "-m", *arguments], death_signal),
+                wrap_to_end_with_parent([sys.executable, "-m", *arguments], death_signal),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=errors,

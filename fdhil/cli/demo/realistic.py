@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from fdhil.child import end_with, stopping_in_order
+from fdhil.child_process import interrupt_on_stop_signals, request_parent_death_signal
 from fdhil.cli.demo.loop import Say, Stage, cut, make_folder, play_shuttle, published_of, running, true_plants
 from fdhil.cli.demo.machines import REAL, machine_document
 from fdhil.cli.demo.report import Cut, Published
@@ -81,8 +81,8 @@ def running_realistic(out: Path, realtime: bool, say: Say) -> Iterator[Callable[
 
 def _send_realistic(sender: Connection, parent: int, out: Path, realtime: bool, say: Say) -> None:
     try:
-        with stopping_in_order():
-            end_with(parent)
+        with interrupt_on_stop_signals():
+            request_parent_death_signal(parent)
             sender.send(run_realistic(out, realtime, say))
     except FdhilError as error:
         sender.send((type(error), str(error)))

@@ -18,11 +18,11 @@ from fdhil.records import (
     Prediction,
     Trajectory,
     Window,
-    unit_of,
+    get_unit,
 )
 from fdhil.report import Page, Section, Table, figures
 from fdhil.report.figures import Curve
-from fdhil.report.parameter_view import DISPLAY, cell
+from fdhil.report.parameter_view import DISPLAY_UNITS, cell
 
 # named locations of the path, mm
 POINTS: Mapping[str, tuple[float, float]] = {
@@ -117,12 +117,12 @@ def identified_rows(axis: str, truth: Parameters, found: Published) -> list[list
     rows = []
     for name in PARAMETERS:
         true, value, std = getattr(truth, name), getattr(found.parameters, name), found.std[name]
-        unit, factor = DISPLAY[name]
+        unit, factor = DISPLAY_UNITS[name]
         found_text, deviation = cell(name, value, INTERVAL_95 * std, " "), f"{100 * (value / true - 1):+.2f} %"
         rows.append([axis, name, f"{true * factor:.5g} {unit}", found_text, deviation])
     for name, value in found.parameters.terms:
         shown = cell(name, value, INTERVAL_95 * found.std[name], " ")
-        rows.append([axis, name, "", f"{shown} {unit_of(name)}".rstrip(), ""])
+        rows.append([axis, name, "", f"{shown} {get_unit(name)}".rstrip(), ""])
     return rows
 
 
@@ -243,7 +243,7 @@ def _predicted(loop: Loop) -> Section:
 def _drift(parameters: Parameters, change: Mapping[str, float]) -> Parameters:
     # friction as an absolute value, inertia as a factor
     values = {name: value * parameters.Jt if name == "Jt" else value for name, value in change.items()}
-    return parameters.changed(**values)
+    return parameters.replace_values(**values)
 
 
 def _corrected(loop: Loop) -> Section:

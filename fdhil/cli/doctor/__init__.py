@@ -15,7 +15,7 @@ from fdhil.cli.doctor.trouble import Trouble
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, CONFIG, Positive
 from fdhil.cli.terminal_text import print_progress
-from fdhil.daemon.clock import newest_record_s
+from fdhil.daemon.clock_watch import find_newest_record_s
 
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig
@@ -69,7 +69,7 @@ def _in_order(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
     from fdhil.cli.doctor import computer, devices, offers, storage, uplink  # late: --help imports nothing heavy
 
     yield from _seen("store", lambda: storage.examine_store(config))
-    yield from _seen("clock", lambda: computer.examine_clock(newest_record_s(config.store.directory)))
+    yield from _seen("clock", lambda: computer.examine_clock(find_newest_record_s(config.store.directory)))
     yield from computer.examine_processors()
     secrets = list(_seen("sockets", lambda: storage.examine_secrets(config)))
     yield from secrets

@@ -4,14 +4,14 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 
 from fdhil.arming.guard_client import GuardClient
 from fdhil.cli.doctor.trouble import Trouble
-from fdhil.commissioning.compare import POINT
+from fdhil.commissioning.compare import RECORD_POINT
 from fdhil.commissioning.config_check import Place, check_machine
 from fdhil.config import MachineConfig
-from fdhil.daemon.control import SOCKET_NAME as DAEMON_SOCKET
-from fdhil.daemon.control import ask
-from fdhil.daemon.status import config_difference
+from fdhil.daemon.daemon_socket import SOCKET_NAME as DAEMON_SOCKET
+from fdhil.daemon.daemon_socket import ask_daemon
+from fdhil.daemon.daemon_status import describe_config_difference
 from fdhil.errors import DeviceError
-from fdhil.guard.protocol import SOCKET_NAME
+from fdhil.guard.guard_protocol import SOCKET_NAME
 
 ORDER = ("NC", "SYNC", "drive")  # prerequisites of all other points of a drive
 MEANS = {
@@ -40,7 +40,7 @@ def examine_devices(
     except DeviceError as error:
         yield Trouble.create_from_error(type(error).__name__, error.device, error, "no drive can be received")
         return
-    yield from troubles_of([each for each in found if each[0] not in recorded or each[1].point != POINT])
+    yield from troubles_of([each for each in found if each[0] not in recorded or each[1].point != RECORD_POINT])
 
 
 def troubles_of(found: Sequence[Place]) -> list[Trouble]:
@@ -68,7 +68,9 @@ def examine_daemon(config: MachineConfig) -> Iterator[Trouble]:
     if not (config.run_directory / DAEMON_SOCKET).exists():
         return
     try:
-        difference = config_difference(ask(config.run_directory / DAEMON_SOCKET, {"request": "status"}), config.digest)
+        difference = describe_config_difference(
+            ask_daemon(config.run_directory / DAEMON_SOCKET, {"request": "status"}), config.digest
+        )
     except DeviceError as error:
         yield Trouble.create_from_error(
             "DaemonSilent", "daemon", error, "nothing is identified, and nothing can be armed"

@@ -12,9 +12,9 @@ from typing import Any
 
 from fdhil.cli.doctor.trouble import Trouble
 from fdhil.commissioning.cycle import Lateness
-from fdhil.commissioning.realtime import CYCLE, prioritise
+from fdhil.commissioning.realtime import CYCLE_PRIORITY, prioritise
 from fdhil.config import MachineConfig
-from fdhil.guard.turn_times import BINS_US, MOST_LATE
+from fdhil.guard.turn_lateness import BINS_US, MOST_LATE
 from fdhil.store.atomic import make_folder, write_file
 
 FILE_NAME = "latency.json"
@@ -30,7 +30,7 @@ def measure_latency(
     """Sleep until each SYNC period for ``seconds``, with the guard's priority if permitted; return the latencies."""
     period_s, measured, over = config.machine.sync_period_s, Lateness(), 0
     before = os.sched_getscheduler(0), os.sched_getparam(0)
-    scheduling = prioritise(CYCLE)
+    scheduling = prioritise(CYCLE_PRIORITY)
     gc.disable()
     try:
         due_s = now_s() + period_s

@@ -11,7 +11,7 @@ from fdhil.commissioning.record import load_record
 from fdhil.commissioning.void import is_void
 from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError, StoreError
-from fdhil.guard.protocol import SOCKET_NAME
+from fdhil.guard.guard_protocol import SOCKET_NAME
 from fdhil.store.history import History
 
 LEAST_FREE_BYTES = 256 << 20

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fdhil.child import stopping_in_order
+from fdhil.child_process import interrupt_on_stop_signals
 from fdhil.cli.options import AS_JSON, FOLDER
 from fdhil.errors import OutputError
 
@@ -37,18 +37,18 @@ def paper(out: Path, runs: int, pdf: bool, as_json: bool) -> None:
     from importlib.metadata import version
 
     from fdhil.cli.paper.page import document, page, write_pictures
-    from fdhil.report import deliver, find_browser, require
+    from fdhil.report import find_browser, require, write_page_or_pdf
     from fdhil.store.output import open_output
 
     require()
     if pdf:
         find_browser()  # before the computation
     _make(out)
-    with stopping_in_order():
+    with interrupt_on_stop_signals():
         claims = gather(runs, lambda text: click.echo(text, err=True) if sys.stderr.isatty() or not as_json else None)
         files = write_pictures(claims, out)
         result = document(claims, runs, version("fdhil"), files)
-        deliver(page(claims), out / "paper.html", out / "paper.pdf" if pdf else None)
+        write_page_or_pdf(page(claims), out / "paper.html", out / "paper.pdf" if pdf else None)
     with open_output(out / "paper.json") as file:
         file.write(json.dumps(result, indent=1, ensure_ascii=False).encode())
     if as_json:

@@ -11,7 +11,7 @@ import numpy as np
 from fdhil.cli.paper.scenarios import machine
 from fdhil.config import Axis
 from fdhil.identification.windows import find_windows
-from fdhil.records import Float, Parameters, Recording, Window, frozen
+from fdhil.records import Float, Parameters, Recording, Window, freeze_array
 from fdhil.sim.drive.physics import Physics, true_parameters
 
 FULL_SCALE = 70.0  # V, A and rad/s: all three signals of figure 4 share its axis
@@ -65,7 +65,7 @@ def plant(axis: str = "X", celsius: float = COLD_C) -> Parameters:
     settings = config.sim.axis[axis]
     rise = celsius - config.sim.thermal.ambient_c
     base = true_parameters(config.axis[axis].nominal, settings)
-    return base.changed(
+    return base.replace_values(
         ft=base.ft * (1 + settings.ft_per_kelvin * rise), Cd=base.Cd * (1 + settings.Cd_per_kelvin * rise)
     )
 
@@ -127,12 +127,12 @@ def rapid(
     return Recording(
         axis="X",
         dt_s=period_s,
-        time_s=frozen(np.arange(demand.size) * period_s),
-        voltage_v=frozen(signals.voltage_v),
-        current_a=frozen(signals.current_a),
-        speed_rad_s=frozen(signals.speed_rad_s),
-        position_mm=frozen(signals.table_mm),
-        demand_mm=frozen(demand),
+        time_s=freeze_array(np.arange(demand.size) * period_s),
+        voltage_v=freeze_array(signals.voltage_v),
+        current_a=freeze_array(signals.current_a),
+        speed_rad_s=freeze_array(signals.speed_rad_s),
+        position_mm=freeze_array(signals.table_mm),
+        demand_mm=freeze_array(demand),
         voltage_sampling="interval_mean",
         pitch_mm=axis.screw_pitch_mm,
         rapid_speed_rad_s=move.speed_mm_s * axis.rapid_speed_rad_s / axis.rapid_speed_mm_s,
@@ -147,9 +147,9 @@ def noisy(recording: Recording, share: float, seed: int) -> list[Window]:
     return find_windows(
         replace(
             recording,
-            voltage_v=frozen(recording.voltage_v + scatter[0]),
-            current_a=frozen(recording.current_a + scatter[1]),
-            speed_rad_s=frozen(recording.speed_rad_s + scatter[2]),
-            position_mm=frozen(np.round(recording.position_mm, 3)),
+            voltage_v=freeze_array(recording.voltage_v + scatter[0]),
+            current_a=freeze_array(recording.current_a + scatter[1]),
+            speed_rad_s=freeze_array(recording.speed_rad_s + scatter[2]),
+            position_mm=freeze_array(np.round(recording.position_mm, 3)),
         )
     )

@@ -8,7 +8,7 @@ from fdhil.cli.paper.drawings import Traced, View
 from fdhil.cli.paper.paths import CORNERS, PLACES
 from fdhil.cli.paper.predicting import FEW_UM, linear_response
 from fdhil.cli.paper.scenarios import DEMANDED, PATHS
-from fdhil.records import Float, Prediction, rms
+from fdhil.records import Float, Prediction, compute_rms
 from fdhil.report import Table
 
 DRAWN = ("full", "half", "lag", "sharp-double-pi")
@@ -41,7 +41,7 @@ def _linear() -> Claim:
         whole = paths.offset_um(name, "mirror")
         full = linear_response(name, answer, whole)
         half = linear_response(name, answer, {axis: 0.5 * values for axis, values in whole.items()})
-        missed = max(100.0 * rms(2.0 * half[axis] - full[axis]) / rms(full[axis]) for axis in whole)
+        missed = max(100.0 * compute_rms(2.0 * half[axis] - full[axis]) / compute_rms(full[axis]) for axis in whole)
         trials.append(Trial(name, "twice the answer to half an offset, less that to all of it", missed, "%", most=5.0))
     return make_claim("equation-9", trials)
 
@@ -49,7 +49,9 @@ def _linear() -> Claim:
 def _ideal() -> Claim:
     trials = []
     for name in DEMANDED:
-        before, after = (paths.rms_um(name, a) for a in (paths.predicted(name), paths.corrected(name, "inverse")))
+        before, after = (
+            paths.rms_um(name, a) for a in (paths.predicted(name), paths.predict_paper_correction(name, "inverse"))
+        )
         trials.append(Trial(name, "RMS left of the error", 100.0 * after / before, "%", most=10.0))
     return make_claim("equation-11", trials, tables=[_methods_table()])
 
@@ -58,7 +60,10 @@ def _methods_table() -> Table:
     rows = []
     for name in PATHS:
         for program in (paths.SLOW, paths.FAST):
-            answers = [paths.predicted(name, program), *(paths.corrected(name, m, program) for m in paths.METHODS)]
+            answers = [
+                paths.predicted(name, program),
+                *(paths.predict_paper_correction(name, m, program) for m in paths.METHODS),
+            ]
             rows.append([name, program, *(f"{paths.rms_um(name, answer, program):.1f}" for answer in answers)])
     return Table(("scenario", "feed", "none", *paths.METHODS), rows, "RMS of the contour error, um")
 
@@ -66,10 +71,12 @@ def _methods_table() -> Table:
 def _mirror() -> Claim:
     trials, pictures = [], []
     for name in DEMANDED:
-        before, after = (paths.rms_um(name, a) for a in (paths.predicted(name), paths.corrected(name, "mirror")))
+        before, after = (
+            paths.rms_um(name, a) for a in (paths.predicted(name), paths.predict_paper_correction(name, "mirror"))
+        )
         trials.append(Trial(name, "RMS error with the mirror over that without", after / before, "x", most=1.0))
         if name in DRAWN:
-            answer, mirrored = paths.predicted(name), paths.corrected(name, "mirror")
+            answer, mirrored = paths.predicted(name), paths.predict_paper_correction(name, "mirror")
             rows = slice(*_rows_after_a(answer))
             pictures.append(Picture(
                 f"Principle of the mirror on axis Y at A, 10 m/min, {PATHS[name].title}: the predicted error, the "
@@ -90,7 +97,7 @@ def _rows_after_a(answer: Prediction) -> tuple[int, int]:
 def _places_table() -> Table:
     rows = []
     for name in PATHS:
-        before, after = paths.predicted(name), paths.corrected(name, "mirror")
+        before, after = paths.predicted(name), paths.predict_paper_correction(name, "mirror")
         pairs = (f"{paths.largest_um(name, before, p):.0f} → {paths.largest_um(name, after, p):.0f}" for p in PLACES)
         rows.append([name, *pairs])
     return Table(
@@ -106,7 +113,7 @@ def turns(values: Float, least: float) -> int:
 
 
 def _three(scenario: str, view: View, program: str = paths.SLOW) -> str:
-    before, after = paths.predicted(scenario, program), paths.corrected(scenario, "mirror", program)
+    before, after = paths.predicted(scenario, program), paths.predict_paper_correction(scenario, "mirror", program)
     return drawings.place(
         [
             Traced("desired", paths.desired_mm(scenario, program)),
@@ -120,7 +127,7 @@ def _three(scenario: str, view: View, program: str = paths.SLOW) -> str:
 def _oscillates() -> Claim:
     trials, pictures = [], []
     for name in PATHS:
-        before, after = paths.predicted(name), paths.corrected(name, "mirror")
+        before, after = paths.predicted(name), paths.predict_paper_correction(name, "mirror")
         then, now = (turns(a.error_um["Y"][slice(*_rows_after_a(a))], FEW_UM) for a in (before, after))
         trials += [
             Trial(name, f"changes of side beyond {FEW_UM:g} um behind A, with the mirror", float(now), "", least=2.0),
@@ -138,7 +145,7 @@ def _oscillates() -> Claim:
 def _worse() -> Claim:
     trials = []
     for name in PATHS:
-        before, after = paths.predicted(name), paths.corrected(name, "mirror")
+        before, after = paths.predicted(name), paths.predict_paper_correction(name, "mirror")
         for place in CORNERS:
             ratio = paths.largest_um(name, after, place) / paths.largest_um(name, before, place)
             trials.append(Trial(name, f"largest error at {place}, with over without", ratio, "x", least=1.0))
@@ -148,7 +155,7 @@ def _worse() -> Claim:
 def _straight(place: str, key: str) -> Claim:
     trials, pictures = [], []
     for name in PATHS:
-        after = paths.corrected(name, "mirror")
+        after = paths.predict_paper_correction(name, "mirror")
         trials.append(Trial(name, f"largest error at {place}, with the mirror",
                             paths.largest_um(name, after, place), "um", most=FEW_UM))  # fmt: skip
         if name in DRAWN[::3] and place == "B":
@@ -163,7 +170,8 @@ def _arc() -> Claim:
     trials = []
     for name in PATHS:
         before, after = (
-            paths.largest_um(name, answer, "D") for answer in (paths.predicted(name), paths.corrected(name, "mirror"))
+            paths.largest_um(name, answer, "D")
+            for answer in (paths.predicted(name), paths.predict_paper_correction(name, "mirror"))
         )
         trials += [
             Trial(name, "largest error at D, without", before, "um", 60.0, 150.0),
@@ -207,7 +215,7 @@ def _beside(answer: Prediction) -> Float:
 def _rounded(oscillation: bool) -> Claim:
     trials, pictures = [], []
     for name in DEMANDED:
-        before, after = paths.predicted(name, "rounded"), paths.corrected(name, "mirror", "rounded")
+        before, after = paths.predicted(name, "rounded"), paths.predict_paper_correction(name, "mirror", "rounded")
         one, other = _beside(before), _beside(after)
         if oscillation:
             trials.append(Trial(name, "standard deviation with the mirror over that without",

@@ -16,9 +16,9 @@ from fdhil.identification.estimators import least_squares, maximum_likelihood
 from fdhil.identification.fit import fit
 from fdhil.identification.motion import prepare
 from fdhil.pipeline.analysis import analyse
-from fdhil.records import UNITS, Estimate, Float, Window, WindowOutcome, rms
+from fdhil.records import UNITS, Estimate, Float, Window, WindowOutcome, compute_rms
 from fdhil.report import Table, figures
-from fdhil.report.parameter_view import DISPLAY
+from fdhil.report.parameter_view import DISPLAY_UNITS
 from fdhil.validation.backlash import dead_band
 
 TEMPERATURES_C = (20.0, 20.5, 21.0, 21.5, 22.0)
@@ -39,8 +39,8 @@ class Drift:
 
     def series(self, name: str) -> tuple[Float, Float, Float]:
         """Return temperature, value and standard deviation, (n,) each."""
-        values = np.array([estimate.value(name) for estimate in self.estimates])
-        return np.array(TEMPERATURES_C), values, np.array([estimate.std(name) for estimate in self.estimates])
+        values = np.array([estimate.get_value(name) for estimate in self.estimates])
+        return np.array(TEMPERATURES_C), values, np.array([estimate.get_std(name) for estimate in self.estimates])
 
     def drop(self, name: str) -> tuple[float, float]:
         """Return the decrease from the coldest to the warmest, and its standard deviation."""
@@ -125,7 +125,7 @@ def _left(window: Window) -> dict[str, Float]:
     rows = least_squares.regressors(signals, window.dt_s)
     theta, _ = least_squares.solve_two_steps(*rows)
     motion = prepare(window)
-    found = fit([motion], np.append(theta[least_squares.ORDER], 0.0), range(6))
+    found = fit([motion], np.append(theta[least_squares.PARAMETER_ORDER], 0.0), range(6))
     surely = (np.abs(motion.mode) == 1) & motion.observed
     innovations = found.residuals[: 2 * motion.n].reshape(-1, 2)[surely, 1]
     return {"residuals": least_squares.residuals_of(theta, *rows)[1], "innovations": innovations}
@@ -185,7 +185,7 @@ def _torques() -> Claim:
     cases, trials, cruise = [], [], []
     for celsius in (COLD_C, WARM_C):
         window = bench.noisy(bench.rapid(bench.plant(celsius=celsius), celsius), 0.001, round(celsius))[0]
-        found = maximum_likelihood.estimate([window], Identification()).parameters()
+        found = maximum_likelihood.estimate([window], Identification()).build_parameters()
         cases.append((f"{celsius:g} °C", window, found))
         cruise.append(found.Cd + found.ft * RAPID_RAD_S)
         speed = figures.simulated_speed(window, found)
@@ -231,7 +231,7 @@ def _drifted(symbol: str, number: int, printed: tuple[float, float], drifts: Map
 
 
 def _drift_picture(symbol: str, printed: tuple[float, float], drifts: Mapping[str, Drift]) -> str:
-    unit, factor = DISPLAY[symbol]
+    unit, factor = DISPLAY_UNITS[symbol]
     series = {}
     for name, drift in drifts.items():
         celsius, values, std = drift.series(symbol)
@@ -245,9 +245,9 @@ def _behaviour() -> Claim:
     for name, noise in (("no-noise", QUIET), ("noise-0.1", 0.001), ("noise-0.5", 0.005)):
         outcome = _outcome(noise)
         assert outcome.estimate is not None
-        window, model = outcome.window, outcome.estimate.parameters()
+        window, model = outcome.window, outcome.estimate.build_parameters()
         simulated = figures.simulated_speed(window, model)
-        missed = rms(window.speed_rad_s - simulated)
+        missed = compute_rms(window.speed_rad_s - simulated)
         trials.append(
             Trial(name, "RMS between model and drive", 100.0 * missed / RAPID_RAD_S, "% of 60 rad/s", most=1.0)
         )

@@ -13,7 +13,7 @@ from fdhil.identification.estimators import least_squares, maximum_likelihood, p
 from fdhil.identification.filtering import zero_phase
 from fdhil.identification.motion import Noise, prepare
 from fdhil.identification.windows import find_windows
-from fdhil.records import PARAMETERS, Bool, Float, Parameters, Recording, Window, frozen
+from fdhil.records import PARAMETERS, Bool, Float, Parameters, Recording, Window, freeze_array
 
 NOISES = (0.001, 0.005, 0.01)
 NO_LOWPASS_HZ = 1e5
@@ -84,7 +84,7 @@ def least_squares_of(
 
 def _solved(parts: Sequence[tuple[Float, Float]]) -> Float:
     electrical, mechanical = (np.vstack([part[k] for part in parts]) for k in (0, 1))
-    values: Float = least_squares.solve_two_steps(electrical, mechanical)[0][least_squares.ORDER]
+    values: Float = least_squares.solve_two_steps(electrical, mechanical)[0][least_squares.PARAMETER_ORDER]
     return values
 
 
@@ -93,8 +93,8 @@ def _voltage_left_raw(windows: Sequence[Window]) -> list[Window]:
     return [
         replace(
             window,
-            current_a=frozen(zero_phase(window.current_a, hz, window.dt_s)),
-            speed_rad_s=frozen(zero_phase(window.speed_rad_s, hz, window.dt_s)),
+            current_a=freeze_array(zero_phase(window.current_a, hz, window.dt_s)),
+            speed_rad_s=freeze_array(zero_phase(window.speed_rad_s, hz, window.dt_s)),
         )
         for window in windows
     ]

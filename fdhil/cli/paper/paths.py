@@ -19,7 +19,7 @@ from fdhil.prediction import contour_error_um
 from fdhil.prediction.models import nominal_models
 from fdhil.prediction.predict import predict_corrected
 from fdhil.program import load_trajectory
-from fdhil.records import Bool, Float, Parameters, Prediction, Trajectory, rms
+from fdhil.records import Bool, Float, Parameters, Prediction, Trajectory, compute_rms
 
 PROGRAMS: Mapping[str, str] = {
     "10 m/min": "bench_10m.ngc",
@@ -59,7 +59,7 @@ def desired_mm(scenario: str, program: str = SLOW) -> Float:
 
 def _models(changes: tuple[tuple[str, float], ...], config: MachineConfig) -> dict[str, Parameters]:
     models = nominal_models(config)
-    return models | {"X": models["X"].changed(**dict(changes))}
+    return models | {"X": models["X"].replace_values(**dict(changes))}
 
 
 @cache
@@ -71,7 +71,7 @@ def predicted(scenario: str, program: str = SLOW, changes: tuple[tuple[str, floa
 
 
 @cache
-def corrected(scenario: str, method: str, program: str = SLOW) -> Prediction:
+def predict_paper_correction(scenario: str, method: str, program: str = SLOW) -> Prediction:
     """Predict a program with an unlimited correction by one of ``METHODS``."""
     before, config = predicted(scenario, program), machine(scenario)
     models = nominal_models(config)
@@ -136,7 +136,7 @@ def largest_um(scenario: str, answer: Prediction, place: str, program: str = SLO
 
 def rms_um(scenario: str, answer: Prediction, program: str = SLOW) -> float:
     """Return the RMS contour error of the whole path, um."""
-    return rms(contour_um(scenario, answer, program))
+    return compute_rms(contour_um(scenario, answer, program))
 
 
 def corner_missed_mm(scenario: str, place: str = "A", program: str = SLOW) -> float:

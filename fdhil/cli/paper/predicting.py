@@ -15,7 +15,7 @@ from fdhil.identification.estimators import maximum_likelihood
 from fdhil.model import closed_loop
 from fdhil.prediction import contour_error_um, predict
 from fdhil.prediction.models import nominal_models
-from fdhil.records import Float, Parameters, Prediction, rms
+from fdhil.records import Float, Parameters, Prediction, compute_rms
 from fdhil.report import Table, figures
 
 DRAWN = ("full", "half", "sharp-lag")  # scenarios with drawings
@@ -85,7 +85,7 @@ def identified() -> Parameters:
     true = nominal_models(machine())["X"]
     recordings = [bench.rapid(true, strokes=2, move=Move.measured(share)) for share in (1.0, SLOW_SHARE)]
     windows = [window for k, one in enumerate(recordings) for window in bench.noisy(one, 0.001, k)]
-    return maximum_likelihood.estimate(windows, Identification()).parameters()
+    return maximum_likelihood.estimate(windows, Identification()).build_parameters()
 
 
 def _prediction() -> Claim:
@@ -95,7 +95,7 @@ def _prediction() -> Claim:
         config, reference = machine(name), paths.reference(name)
         measured = contour_error_um(reference.path_mm, paths.measured_mm(name), reference.dt_s)
         predicted = predict(reference, {"X": model, "Y": model}, config).contour_um
-        missed = 100.0 * rms(predicted - measured) / rms(measured)
+        missed = 100.0 * compute_rms(predicted - measured) / compute_rms(measured)
         trials.append(Trial(name, "RMS between predicted and measured, of the measured", missed, "%", most=10.0))
         if name in DRAWN:
             pictures.append(Picture(

@@ -14,7 +14,7 @@ from fdhil.commissioning.compare_scales import Read, increments_told
 from fdhil.commissioning.init.told import Told, rounded
 from fdhil.commissioning.scan import Answers, BusScanner, Description, best_description, scan_nodes
 from fdhil.config import CanBus
-from fdhil.drivers.cia402.abilities import GENERIC, suggest_profile
+from fdhil.drivers.cia402.abilities import GENERIC_PROFILE, suggest_profile
 from fdhil.drivers.cia402.device import read_device
 from fdhil.drivers.cia402.profile import DriveProfile, speed_unit_of
 from fdhil.drivers.cia402.profile_file import read_profile
@@ -109,7 +109,7 @@ def suggested(answers: Answers, eds: Path | None, read: Read) -> str | None:
         return suggest_profile(read_device(eds))
     if not who.vendor_id:
         return None
-    profiles = {name: read_profile(name) for name in tables.DRIVE_PROFILES if name != GENERIC}
+    profiles = {name: read_profile(name) for name in tables.DRIVE_PROFILES if name != GENERIC_PROFILE}
     own = {name: profile for name, profile in profiles.items() if profile.vendor_id == who.vendor_id}
     if len(own) < 2:
         return next(iter(own), None)

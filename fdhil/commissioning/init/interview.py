@@ -16,7 +16,7 @@ from fdhil.config import Drive, is_second_drive
 from fdhil.config.axis import HalPins
 from fdhil.config.axis_tables import angular, linear
 from fdhil.config.reading import checked
-from fdhil.drivers.cia402.abilities import GENERIC
+from fdhil.drivers.cia402.abilities import GENERIC_PROFILE
 from fdhil.drivers.cia402.profile import DriveProfile
 from fdhil.drivers.cia402.profile_file import NO_OFFSET_ADVICE, load_profile, no_offset
 from fdhil.errors import ConfigError, ConfigFault, EdsError
@@ -256,14 +256,14 @@ def _settle_eds(draft: Draft, path: str, drive: FoundDrive | None, folder: Path)
     """With its EDS a profile maps exactly the drive's objects; the generic profile consists of nothing else."""
     if drive is not None and drive.eds is not None:
         draft.tell(f"{path}.eds", Told(_from(drive.eds, folder), "matches the drive on the bus"))
-    if draft.get(f"{path}.profile") == GENERIC:
+    if draft.get(f"{path}.profile") == GENERIC_PROFILE:
         draft.settle(f"{path}.eds", "from the manufacturer's web site; put it next to this file, or use --eds")
 
 
 def _profile(draft: Draft, path: str, folder: Path) -> DriveProfile | None:
     keys = ("profile", "eds", "logical_axis")
     given = {key: value for key in keys if (value := draft.get(f"{path}.{key}")) is not None}
-    if "profile" not in given or (given["profile"] == GENERIC and "eds" not in given):
+    if "profile" not in given or (given["profile"] == GENERIC_PROFILE and "eds" not in given):
         return None
     return load_profile(checked(Drive, given, path).placed(folder))
 

@@ -51,7 +51,7 @@ class OpenBus(Protocol):
         """Return the open, receiving bus."""
 
 
-class CanBus:
+class ListeningBus:
     """A bus that is received from; a context manager.
 
     ``end_reason`` is the reason why the receive thread stopped (None while it runs).

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, Nmt, emcy_text
+from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, Nmt, describe_emergency
 from fdhil.drivers.can.frames import Frames
 from fdhil.records import Notice
 
@@ -64,7 +64,7 @@ class NodeWatch:
             return []
         self._codes.add(code)
         detail = (data & (1 << 8 * length) - 1).to_bytes(8, "little")[:length].hex(" ")
-        text = f"reports error {code:04X} ({emcy_text(code)}; {detail}); look it up in the drive's manual."
+        text = f"reports error {code:04X} ({describe_emergency(code)}; {detail}); look it up in the drive's manual."
         return [self._notice("DriveEmergency", "MAJOR", text)]
 
     def _heartbeat(self, state: int, t_ns: int) -> list[Notice]:

@@ -18,7 +18,7 @@ from fdhil.drivers.cia402.profile_file import read_profile
 Answer = Literal["yes", "no", "perhaps"]
 SYNC_ID = 0x1005
 SENSOR = "wire a sensor ([axis.X.voltage] source = 'modbus')"
-GENERIC = "cia402"
+GENERIC_PROFILE = "cia402"
 _TWIN = "fdhil_twin"
 _VOLTAGE = re.compile(
     r"\b(motor|output|terminal|phase|quadrature|q)\b.*volt|volt.*\b(generated|motor|d-q)|duty|pwm", re.I
@@ -64,8 +64,8 @@ def abilities(device: Device, profile: DriveProfile) -> list[Ability]:
 
 def suggest_profile(device: Device) -> str:
     """Return the packaged profile of the device's vendor that fits its objects best, else ``cia402``."""
-    named = [name for name in tables.DRIVE_PROFILES if name not in (GENERIC, _TWIN) and _is_of(device, name)]
-    return min(named, key=lambda name: len(missing(device, read_profile(name))), default=GENERIC)
+    named = [name for name in tables.DRIVE_PROFILES if name not in (GENERIC_PROFILE, _TWIN) and _is_of(device, name)]
+    return min(named, key=lambda name: len(missing(device, read_profile(name))), default=GENERIC_PROFILE)
 
 
 def _is_of(device: Device, name: str) -> bool:

@@ -19,7 +19,7 @@ from fdhil.drivers.can.sync_grid import Ticked
 from fdhil.drivers.cia402.pdo_queue import DecoderCounters, Dense, PdoQueue, Setpoint, SetpointRows, decode, dense
 from fdhil.drivers.cia402.profile import DriveProfile, ObjectKey
 from fdhil.drivers.cia402.profile_file import load_profile
-from fdhil.records import AxisSamples, Bool, Float, Int, Notice, frozen, frozen_ints
+from fdhil.records import AxisSamples, Bool, Float, Int, Notice, freeze_array, freeze_integers
 
 _FOREIGN_TICKS = 8
 _OUTAGE = 16  # SYNCs missed at once: the producer may have restarted, and what the drive received is unknown
@@ -137,7 +137,7 @@ class Cia402Decoder:
         out += self._samples(first, stop, demand, offset)
         tick, inputs = self._shown(self.profile.digital_inputs, first, stop)
         if tick.size:
-            out.append(InputSamples(self.axis, frozen_ints(tick), frozen_ints(inputs)))
+            out.append(InputSamples(self.axis, freeze_integers(tick), freeze_integers(inputs)))
         self._forget(stop)
         notices, self._notices = self._notices, []
         return [*out, *notices]
@@ -249,22 +249,22 @@ class Cia402Decoder:
             return decode(entry, grids[name].words[rows + back])
 
         mm = self._mm_per_increment
-        speed = frozen(raw(profile.speed) * profile.speed_rad_s_per_count(self._settings))
-        current = frozen(raw(profile.current) * profile.current_a_per_count(self._settings))
+        speed = freeze_array(raw(profile.speed) * profile.speed_rad_s_per_count(self._settings))
+        current = freeze_array(raw(profile.current) * profile.current_a_per_count(self._settings))
         voltage: Float | None = None
         if self._voltage.keys:
             counts = [raw(key, self._voltage.rows_back) for key in self._voltage.keys]
-            voltage = frozen(self._voltage.volts(counts, current, speed))
+            voltage = freeze_array(self._voltage.volts(counts, current, speed))
         return AxisSamples(
             axis=self.axis,
-            tick=frozen_ints(rows + first),
-            demand_mm=frozen(demand.value[rows] * mm),
-            position_mm=frozen(raw(profile.position) * mm),
+            tick=freeze_integers(rows + first),
+            demand_mm=freeze_array(demand.value[rows] * mm),
+            position_mm=freeze_array(raw(profile.position) * mm),
             speed_rad_s=speed,
             current_a=current,
             voltage_v=voltage,
-            offset_mm=frozen(offset.value[rows] * mm if offset is not None else np.zeros(rows.size)),
-            statusword=frozen_ints(raw(profile.statusword)),
+            offset_mm=freeze_array(offset.value[rows] * mm if offset is not None else np.zeros(rows.size)),
+            statusword=freeze_integers(raw(profile.statusword)),
             lost=lost,
         )
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from fdhil.cia402 import LOGICAL_AXIS_STEP, Mode, Object, PdoEntry, pdo_length
+from fdhil.cia402 import LOGICAL_AXIS_STEP, Mode, Object, PdoEntry, compute_pdo_length
 from fdhil.config import Axis, SpeedUnit
 
 ObjectKey = tuple[int, int]
@@ -40,7 +40,7 @@ class PdoSpec:
     @property
     def length(self) -> int:
         """Bytes of a complete frame."""
-        return pdo_length(self.entries)
+        return compute_pdo_length(self.entries)
 
     def entry(self, key: ObjectKey) -> PdoEntry | None:
         """Return the entry that maps ``key``, or None."""

@@ -7,7 +7,7 @@ from fdhil.config.sensors import block_registers
 from fdhil.drivers.modbus.values import numbers, other_orders, registers_of
 from fdhil.drivers.modbus.voltage import ModbusVoltage, SensorBlock
 from fdhil.errors import ProtocolError
-from fdhil.records import frozen
+from fdhil.records import freeze_array
 
 
 class BlockVoltage(ModbusVoltage):
@@ -56,7 +56,7 @@ class BlockVoltage(ModbusVoltage):
         available = min(available, newest + 1)  # fewer, just switched on
         volts = volts[volts.size - available :]
         shown = float(volts[-1]) if available else 0.0
-        return SensorBlock(newest, block.rate_hz, math.nan, False, newest + 1 - available, frozen(volts), shown)
+        return SensorBlock(newest, block.rate_hz, math.nan, False, newest + 1 - available, freeze_array(volts), shown)
 
     def _unwrapped(self, newest: int) -> int:
         """Continue the count where the sensor's wraps to 0; any other decrease is a restart."""

@@ -25,7 +25,7 @@ from fdhil.drivers.modbus.counter_clock import CounterClock, Line
 from fdhil.drivers.modbus.link import PLAUSIBLE_C, ModbusLink
 from fdhil.drivers.modbus.values import float32, uint32
 from fdhil.errors import ProtocolError
-from fdhil.records import Float, Notice, Temperature, VoltageSamples, frozen, frozen_ints
+from fdhil.records import Float, Notice, Temperature, VoltageSamples, freeze_array, freeze_integers
 
 TRIGGER = 10
 FIRST_SAMPLE = 16
@@ -69,7 +69,7 @@ def parse_block(name: str, registers: Sequence[int]) -> SensorBlock:
         if not ok:
             raise ProtocolError(name, f"the sensor reports {what}; compare its register map with the configuration")
     samples = np.array(registers[FIRST_SAMPLE : FIRST_SAMPLE + count], np.uint16).view(np.int16)
-    volts = frozen(samples * volts_per_count)
+    volts = freeze_array(samples * volts_per_count)
     return SensorBlock(newest, rate_hz, celsius, registers[11] == STATUS_LOST, first, volts, float32(registers))
 
 
@@ -202,10 +202,10 @@ class ModbusVoltage:
         return VoltageSamples(
             sensor=self.name,
             axis=self.axis,
-            counter=frozen_ints(counter),
-            t_ns=frozen_ints(np.round(t_ns)),
-            t_error_ns=frozen_ints(np.full(counter.size, max(1, round(error_ns)))),
-            voltage_v=frozen(self._sign * block.volts),
+            counter=freeze_integers(counter),
+            t_ns=freeze_integers(np.round(t_ns)),
+            t_error_ns=freeze_integers(np.full(counter.size, max(1, round(error_ns)))),
+            voltage_v=freeze_array(self._sign * block.volts),
             sample_rate_hz=block.rate_hz,
         )
 

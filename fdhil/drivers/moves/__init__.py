@@ -26,5 +26,5 @@ class EventSource(Protocol):
 
 
 def load_event_source(name: str) -> type[EventSource]:
-    source: type[EventSource] = tables.load(tables.EVENT_SOURCES, name)
+    source: type[EventSource] = tables.load_entry(tables.EVENT_SOURCES, name)
     return source

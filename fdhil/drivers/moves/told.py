@@ -154,7 +154,7 @@ def _of_a_piece(states: Sequence[Said], begin: int, end: int) -> list[Said]:
 
 
 def _held(states: Sequence[Said]) -> bool | None:
-    holds = [each.state.held for each in states if each.state.feed_hold is not None or each.state.held]
+    holds = [each.state.is_held for each in states if each.state.feed_hold is not None or each.state.is_held]
     return any(holds) if holds else None
 
 

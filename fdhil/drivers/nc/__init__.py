@@ -39,7 +39,7 @@ class NcSource(Protocol):
 def load_nc_source(name: str) -> Callable[[MachineConfig], NcSource]:
     """Return the source that ``tables.NC_SOURCES`` lists under ``name``; ConfigError where its library is missing."""
     try:
-        source: Callable[[MachineConfig], NcSource] = tables.load(tables.NC_SOURCES, name)
+        source: Callable[[MachineConfig], NcSource] = tables.load_entry(tables.NC_SOURCES, name)
     except ImportError as error:
         what = f"{name} needs the library {error.name}, which is not installed"
         raise ConfigError("config", [ConfigFault("g0.source", what, f"pip install 'fdhil[{name}]'")]) from None

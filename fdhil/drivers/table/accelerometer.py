@@ -12,7 +12,7 @@ from fdhil.drivers.serial.instrument import SerialLink
 from fdhil.drivers.serial.lines import LineReader, TextLine
 from fdhil.drivers.table.arrivals import Arrivals
 from fdhil.errors import DeviceTimeout, ProtocolError
-from fdhil.records import Notice, TableSamples, frozen
+from fdhil.records import Notice, TableSamples, freeze_array
 
 SILENCE_NS = 1_000_000_000
 SETTLED_NS = 50_000_000  # later SYNCs that are needed to recognise late stamps around an arrival
@@ -135,7 +135,12 @@ class StreamedAccelerometer:
         tick = line.start + line.step * (counts - line.origin) - late
         return [
             TableSamples(
-                self.axis, "table_m_s2", frozen(tick), line.error, frozen(values), rate_per_tick=1.0 / line.step
+                self.axis,
+                "table_m_s2",
+                freeze_array(tick),
+                line.error,
+                freeze_array(values),
+                rate_per_tick=1.0 / line.step,
             )
         ]
 

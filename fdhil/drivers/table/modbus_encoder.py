@@ -6,7 +6,7 @@ from fdhil.config import TableEncoder
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.modbus.link import ModbusLink
 from fdhil.drivers.modbus.meter import ModbusMeter
-from fdhil.records import TableSamples, frozen
+from fdhil.records import TableSamples, freeze_array
 
 SETTLE_STEPS, SETTLE_STEP_S = 8, 0.01  # wait until the SYNCs around the answer have been drained
 
@@ -40,8 +40,8 @@ class ModbusEncoder:
         between = ticks.bounds(asked_ns, answered_ns)
         if between is None:
             return []
-        tick = frozen([(between[0] + between[1]) / 2])
-        return [TableSamples(self.axis, "table_mm", tick, (between[1] - between[0]) / 2, frozen([value]))]
+        tick = freeze_array([(between[0] + between[1]) / 2])
+        return [TableSamples(self.axis, "table_mm", tick, (between[1] - between[0]) / 2, freeze_array([value]))]
 
     async def reading(self) -> str:
         return f"{await self._meter.value():.4f} mm"

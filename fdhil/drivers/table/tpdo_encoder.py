@@ -7,7 +7,7 @@ from fdhil.config import TableEncoder
 from fdhil.config.table import IN_A_FRAME
 from fdhil.drivers.can.sync_grid import Ticked
 from fdhil.drivers.cia402.pdo_queue import decode
-from fdhil.records import Notice, TableSamples, frozen
+from fdhil.records import Notice, TableSamples, freeze_array
 
 SILENT_TICKS = 3000  # of SYNC without that TPDO until it is reported
 
@@ -40,8 +40,8 @@ class TpdoEncoder:
             self._newest = self._heard_at = int(tick[-1])
         if sure.any():
             counts = decode(self._entry, ticked.data[mine[first[sure]]])
-            values = frozen(counts * self._settings.scale + self._settings.offset)
-            out.append(TableSamples(self.axis, "table_mm", frozen(tick[sure]), 0.0, values))
+            values = freeze_array(counts * self._settings.scale + self._settings.offset)
+            out.append(TableSamples(self.axis, "table_mm", freeze_array(tick[sure]), 0.0, values))
         return out + self._silence(ticked.last_tick)
 
     def _silence(self, last_tick: int) -> list[Notice]:

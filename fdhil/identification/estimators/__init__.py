@@ -17,5 +17,5 @@ class Estimator(Protocol):
 def chosen(settings: Identification) -> tuple[str, Estimator]:
     """Return name and function of the estimator in the settings, else of the default."""
     name = settings.method or tables.DEFAULT_ESTIMATOR
-    estimator: Estimator = tables.load(tables.ESTIMATORS, name)
+    estimator: Estimator = tables.load_entry(tables.ESTIMATORS, name)
     return name, estimator

@@ -21,7 +21,7 @@ from fdhil.identification.windows import carried
 from fdhil.records import PARAMETERS, Bool, Estimate, Float, Reason, Result, Window
 
 NAME = "least_squares"
-ORDER = [1, 0, 2, 3, 4, 5]  # from L, R, K to R, L, K, and back
+PARAMETER_ORDER = [1, 0, 2, 3, 4, 5]  # from L, R, K to R, L, K, and back
 # of [L, R, K, Jt, ft, Cd]: doubt due to stencils and the voltage's waveform within a sample, without noise
 OPEN_SHARE = np.array([1e-3, 5e-4, 5e-5, 3e-4, 0.0, 0.0])
 
@@ -125,7 +125,7 @@ def fit_two_steps(
     covariance = two_step(electrical, mechanical, (residual_u, residual_t), gammas, [p[0].shape[0] for p in parts])
     bias = attenuation(electrical, mechanical, theta, impulse, slope, noise)
     covariance += np.outer(bias, bias) + np.diag(np.square(OPEN_SHARE * theta))
-    covariance += np.diag(np.square(alias[ORDER] * theta))
+    covariance += np.diag(np.square(alias[PARAMETER_ORDER] * theta))
     return two_step_estimate(method, theta, covariance, (residual_u, residual_t), condition, mechanical)
 
 
@@ -150,8 +150,8 @@ def two_step_estimate(
     answer = Estimate(
         method=method,
         names=PARAMETERS,
-        values=theta[ORDER],
-        covariance=covariance[np.ix_(ORDER, ORDER)],
+        values=theta[PARAMETER_ORDER],
+        covariance=covariance[np.ix_(PARAMETER_ORDER, PARAMETER_ORDER)],
         residuals={"electrical": electrical, "mechanical": torque / theta[2] if theta[2] else torque},
         result=Result.OK,
     )
@@ -173,4 +173,4 @@ def raw_values(signals: Sequence[Signals], dt_s: Sequence[float]) -> Float | Non
     electrical, mechanical = (np.vstack([p[k] for p in parts]) for k in (0, 1))
     if not (np.isfinite(electrical).all() and np.isfinite(mechanical).all()):
         return None
-    return solve_two_steps(electrical, mechanical)[0][ORDER]
+    return solve_two_steps(electrical, mechanical)[0][PARAMETER_ORDER]

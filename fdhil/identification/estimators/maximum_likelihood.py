@@ -20,7 +20,7 @@ from fdhil.identification.fit import Fit, but_delay, descend, fit, jacobian, pos
 from fdhil.identification.identifiability import admissible, judge
 from fdhil.identification.kalman import DELAY, JT, VOLTAGE, K, L, R
 from fdhil.identification.model_doubts import model_doubts
-from fdhil.identification.motion import UNKNOWN, Motion, prepare
+from fdhil.identification.motion import UNKNOWN_MODE, Motion, prepare
 from fdhil.identification.normal import inverse_of, solve
 from fdhil.identification.selection import add_terms
 from fdhil.identification.signals import mended
@@ -32,7 +32,7 @@ from fdhil.identification.term_estimates import told_terms
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
 
 __all__ = ["Fit", "descend", "estimate", "fit", "fit_windows", "jacobian", "pose", "typical"]
-NAME = "maximum_likelihood"
+MAXIMUM_LIKELIHOOD = "maximum_likelihood"
 INSTANT_DELAY = 0.5  # of a sample
 RESEMBLING = 0.5  # share of a delay or lost voltage that may be something else: coupled d and q axes
 TURNS = 2  # iterations of parameters and simulated loops
@@ -208,7 +208,7 @@ def robust_inverse(result: Fit, inverse: Float) -> Float:
     """Return ``inverse`` (k, k), or the covariance valid for coloured innovations or uneven variance."""
     motions = result.problem.motions
     parts = result.by_window(result.residuals)
-    known = [(m.mode != UNKNOWN) & m.observed for m in motions]
+    known = [(m.mode != UNKNOWN_MODE) & m.observed for m in motions]
     rows = [e[: 2 * m.n].reshape(-1, 2)[where] for m, e, where in zip(motions, parts, known, strict=True)]
     sampled = [e[2 * m.n :, None] for m, e in zip(motions, parts, strict=True)]
     if not any(suspicious(e) for e in (*rows, *sampled)):
@@ -244,7 +244,7 @@ def finish(result: Fit) -> Estimate:
         chance = chance - inverse[kept] @ np.diag(result.prior) @ inverse[:, kept]
     values = result.theta[entries]
     answer = Estimate(
-        method=NAME,
+        method=MAXIMUM_LIKELIHOOD,
         names=PARAMETERS,
         values=values[: len(PARAMETERS)],
         covariance=chance + own @ own.T + np.diag(np.square(alias * values)),

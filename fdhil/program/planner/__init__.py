@@ -25,7 +25,7 @@ from fdhil.program.planner.smoothing import Smoother
 from fdhil.program.planner.timeline import Timeline
 from fdhil.program.program_notes import ProgramNotes
 from fdhil.program.reach import first_beyond
-from fdhil.records import Float, Int, Trajectory, frozen, frozen_ints
+from fdhil.records import Float, Int, Trajectory, freeze_array, freeze_integers
 
 MAX_ROWS = 10_000_000
 _BLOCK_ROWS = 1 << 16
@@ -114,16 +114,16 @@ def _trajectory(rows: Float, first_row: int, config: MachineConfig) -> Trajector
     rapid = rows[:, -1].astype(np.bool_)
     rapid.setflags(write=False)
     position_mm = {
-        name: frozen(rows[:, ALL_AXES.index(name[0])] * axis.mm_per_unit if name[0] in ALL_AXES else np.zeros(n))
+        name: freeze_array(rows[:, ALL_AXES.index(name[0])] * axis.mm_per_unit if name[0] in ALL_AXES else np.zeros(n))
         for name, axis in config.axis.items()
     }
     if (beyond := first_beyond(position_mm, config)) is not None:  # an arc may, between ends in range
         raise ProgramError(int(rows[beyond.row, -2]), beyond.axis, beyond.text)
     return Trajectory(
         dt_s=dt_s,
-        time_s=frozen((first_row + np.arange(n)) * dt_s),
+        time_s=freeze_array((first_row + np.arange(n)) * dt_s),
         position_mm=position_mm,
         rapid=rapid,
-        line=frozen_ints(rows[:, -2]),
+        line=freeze_integers(rows[:, -2]),
         mm_per_degree=config.mm_per_degree,
     )

@@ -27,7 +27,7 @@ class AxisPlant:
         unknown = [name for name in values if name not in PARAMETERS]
         if unknown:
             raise TypeError(f"{', '.join(unknown)}: not a parameter of a drive")
-        changed = self._parameters.changed(**values)
+        changed = self._parameters.replace_values(**values)
         for name, value in changed.as_dict().items():
             if not (math.isfinite(value) and value >= 0 and (value > 0 or name in ("ft", "Cd"))):
                 raise ValueError(f"{name} = {value} is unphysical; it must be finite and above 0")

@@ -71,7 +71,8 @@ def write(folder: Path, document: dict[str, Any], planned: Correction) -> None:
     reference = planned.before.reference
     arrays = {
         "path_mm": reference.path_mm,
-        "error_um": np.stack([reference.table_mm(case.predicted_mm) - reference.path_mm for case in cases]) * 1e3,
+        "error_um": np.stack([reference.compute_table_mm(case.predicted_mm) - reference.path_mm for case in cases])
+        * 1e3,
         "contour_um": np.stack([case.contour_um for case in cases]),
         "line": reference.line,
     }

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from fdhil import correction
-from fdhil.bounded_process import limit_process, receive_request, report
+from fdhil.bounded_process import limit_process, receive_request, report_to_parent
 from fdhil.config import MachineConfig
 from fdhil.correction.result_documents import advised, correction_document, entry, sources
 from fdhil.errors import FdhilError, ProgramError
@@ -27,7 +27,7 @@ from fdhil.program.demand_csv import read_demand_csv
 from fdhil.records import Correction, Parameters, Trajectory
 from fdhil.report.figures import LEAST_UM, common_scale
 from fdhil.report.path import planes, worst_places
-from fdhil.store.known_gain import known_gain
+from fdhil.store.known_gain import predict_gain_from_history
 from fdhil.store.newest_sets import read_newest_sets
 from fdhil.web.forecast import kept
 
@@ -50,7 +50,9 @@ def forecast(program: Path, name: str, config: MachineConfig, folder: Path, repo
     models, parameters, config = newest_models(reference, config)
     report_progress({"step": "correct", "rows": reference.time_s.size})
     planned = correction.plan(reference, models, config)
-    predicted = known_gain(planned, models, config, any(state["revision"] for state in parameters.values()))
+    predicted = predict_gain_from_history(
+        planned, models, config, any(state["revision"] for state in parameters.values())
+    )
     document = correction_document(name, planned, predicted, models) | {
         "rows": reference.time_s.size,
         "sync_period_s": reference.dt_s,
@@ -130,10 +132,10 @@ def zones(planned: Correction) -> list[dict[str, Any]]:
     reference = before.reference
     numbers = {row: k for k, (_, row) in enumerate(worst_places(before), 1)}
     largest = sorted(before.zones, key=lambda zone: -zone.max_um)
-    listed = [zone for k, zone in enumerate(largest) if k < MOST_ZONES or before.worst_row(zone) in numbers]
+    listed = [zone for k, zone in enumerate(largest) if k < MOST_ZONES or before.find_worst_row(zone) in numbers]
     documents = []
     for zone in listed:
-        row = before.worst_row(zone)
+        row = before.find_worst_row(zone)
         documents.append(
             {
                 "place": numbers.get(row),
@@ -146,7 +148,7 @@ def zones(planned: Correction) -> list[dict[str, Any]]:
                 "feed_mm_min": round(_feed_mm_min(reference, row)),
                 "at_mm": [round(float(reference.position_mm[axis][row]), 6) for axis in reference.table_axes],
                 "before_um": zone.max_um,
-                "after_um": float(after.contour_um[before.rows(zone)].max()),
+                "after_um": float(after.contour_um[before.get_zone_rows(zone)].max()),
             }
         )
     return documents
@@ -182,19 +184,29 @@ def main() -> None:
         config = MachineConfig.model_validate(request["config"])
         tolerance_um = request["tolerance_um"]
         if tolerance_um is None:
-            forecast(program, name, config, Path(request["folder"]), lambda progress: report({"progress": progress}))
+            forecast(
+                program,
+                name,
+                config,
+                Path(request["folder"]),
+                lambda progress: report_to_parent({"progress": progress}),
+            )
         else:
-            lines = advice(program, name, config, tolerance_um, lambda progress: report({"progress": progress}))
+            lines = advice(
+                program, name, config, tolerance_um, lambda progress: report_to_parent({"progress": progress})
+            )
             kept.write_advice(Path(request["folder"]), tolerance_um, lines)
     except FdhilError as error:
         line = getattr(error, "line", None)
-        report({"error": {"code": type(error).__name__, "text": str(error).replace(str(program), name), "line": line}})
+        report_to_parent(
+            {"error": {"code": type(error).__name__, "text": str(error).replace(str(program), name), "line": line}}
+        )
     except MemoryError:
         text = f"{name} needs more memory than allowed for the browser; shorten it"
-        report({"error": {"code": "TooLarge", "text": text}})
+        report_to_parent({"error": {"code": "TooLarge", "text": text}})
     except OSError as error:
         text = f"the result cannot be written ({error.strerror or error}); free disk space"
-        report({"error": {"code": "DiskFault", "text": text}})
+        report_to_parent({"error": {"code": "DiskFault", "text": text}})
 
 
 if __name__ == "__main__":

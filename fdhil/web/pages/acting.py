@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field
 from fdhil import tables
 from fdhil.arming.token import TOKEN_NAME, given_credential, read_token
 from fdhil.config import MachineConfig
-from fdhil.daemon.status import config_difference
+from fdhil.daemon.daemon_status import describe_config_difference
 from fdhil.web.answers import Refused, granted
 from fdhil.web.context import Context, MachineDependency, PrincipalDependency
 from fdhil.web.gate import token_of
@@ -108,7 +108,7 @@ async def _plan(context: Context, name: str | None, method: Method) -> Plan:
         raise Refused(409, "WritingOff", text, "commission a correction as in docs/how-to/commission.md")
     content = [program and program.sha256, method, {axis: reach.model_dump() for axis, reach in axes.items()}]
     confirm = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-    state, difference = str(status["state"]), config_difference(status, config.digest)
+    state, difference = str(status["state"]), describe_config_difference(status, config.digest)
     return Plan(program=program, method=method, axes=axes, state=state, difference=difference, confirm=confirm)
 
 

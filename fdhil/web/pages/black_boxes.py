@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from fdhil.config import MachineConfig
-from fdhil.daemon.blackbox import FOLDER, kept
+from fdhil.daemon.black_box import BLACK_BOX_FOLDER, find_black_boxes
 from fdhil.drivers.cia402.candump_samples import LARGEST_LOG, samples_of_log
 from fdhil.records import AxisSamples, Float
 from fdhil.store.named_file import open_named
@@ -53,7 +53,7 @@ class Envelope(BaseModel):
     axes: list[AxisEnvelope]
 
 
-def listed(store: Path) -> list[BlackBox]:
+def summarise_black_boxes(store: Path) -> list[BlackBox]:
     """Return the black boxes of a store, newest first; files with other names are ignored."""
     return [
         BlackBox(
@@ -62,13 +62,13 @@ def listed(store: Path) -> list[BlackBox]:
             code=box.code,
             size_bytes=box.path.stat().st_size,
         )
-        for box in reversed(kept(store))
+        for box in reversed(find_black_boxes(store))
     ]
 
 
 def opened(store: Path, name: str) -> BinaryIO:
     """Open a black box by a name from outside. Raises StoreError if it is none."""
-    return open_named(store / FOLDER, name)
+    return open_named(store / BLACK_BOX_FOLDER, name)
 
 
 def envelope(store: Path, name: str, config: MachineConfig) -> Envelope:

@@ -6,7 +6,7 @@ from typing import Any, Literal
 from pydantic import BaseModel
 
 from fdhil.daemon.alarms import MOST_TOGETHER, Alarm, AlarmTable
-from fdhil.daemon.notice_words import words_of
+from fdhil.daemon.notice_texts import get_effect_and_action
 from fdhil.store.notice_document import date_of, notice_document
 from fdhil.store.rows import Stamp, StoredNotice
 
@@ -81,7 +81,7 @@ class Events(BaseModel):
 
 def event(stored: StoredNotice, until: Stamp | None = None) -> Event:
     """Return a notice with its explanation, and when its cause ended."""
-    effect, action = words_of(stored.notice)
+    effect, action = get_effect_and_action(stored.notice)
     text = stored.notice.text
     cause = text.partition(f"; {effect}")[0] if effect else text  # the guard's own text contains all three
     ended = None if until is None else date_of(until)
@@ -94,7 +94,7 @@ def page(notices: Sequence[StoredNotice], *, limit: int, before: int | None = No
     Without a severity those of severity info are left out.
     """
     table = AlarmTable(notices)
-    shown = [alarm for alarm in table.shown() if _is(alarm.newest, **only)]
+    shown = [alarm for alarm in table.list_shown() if _is(alarm.newest, **only)]
     active = {alarm.newest.number for alarm in shown if alarm.until is None}
     waiting = [stored for stored in notices if stored.is_open and _is(stored, **only)]
     others = [

@@ -6,12 +6,12 @@ from fastapi import APIRouter, Query
 from fastapi.responses import Response
 from pydantic import BaseModel, Field
 
-from fdhil.daemon.notice_book import MOST_NOTE
+from fdhil.daemon.notice_log import MOST_NOTE
 from fdhil.store.history import RECENT_NOTICES
 from fdhil.web.answers import granted
 from fdhil.web.context import MachineDependency, PrincipalDependency
 from fdhil.web.file_answer import FileAnswer
-from fdhil.web.pages.black_boxes import BlackBox, Envelope, envelope, listed, opened
+from fdhil.web.pages.black_boxes import BlackBox, Envelope, envelope, opened, summarise_black_boxes
 from fdhil.web.pages.event_list import MOST_PAGE, Events, Severity, page
 
 router = APIRouter(prefix="/api/events")
@@ -60,7 +60,7 @@ async def acknowledge(wanted: Acknowledgement, context: MachineDependency, princ
 @router.get("/black-boxes")
 def black_boxes(context: MachineDependency) -> list[BlackBox]:
     """Return the stored black boxes, newest first."""
-    return listed(context.config.store.directory)
+    return summarise_black_boxes(context.config.store.directory)
 
 
 @router.get("/black-boxes/{name}")

@@ -9,8 +9,8 @@ from fdhil.report.chart import Chart, told
 from fdhil.report.drawing import COLOURS
 from fdhil.report.history_course import AxisHistory, over_temperature, over_time
 from fdhil.report.history_trends import moved
-from fdhil.report.history_verdict import IN_ORDER, UNKNOWN, Refusals, latest_rows, sentences
-from fdhil.report.parameter_view import DISPLAY, MEANINGS, cell, half_of, spoken
+from fdhil.report.history_verdict import IN_ORDER, NOT_IDENTIFIED, Refusals, latest_rows, sentences
+from fdhil.report.parameter_view import DISPLAY_UNITS, PARAMETER_MEANINGS, cell, half_of, spoken
 
 MOST_REVISIONS = 50
 MOST_ESTIMATES = 50
@@ -26,7 +26,7 @@ def state_of(history: AxisHistory, refused: Refusals) -> State:
     if any(limit["reached"] for limit in limits.values()):
         return "bad"
     findings = sentences(history, refused)
-    return "good" if findings == [IN_ORDER] else "none" if findings == [UNKNOWN] else "warn"
+    return "good" if findings == [IN_ORDER] else "none" if findings == [NOT_IDENTIFIED] else "warn"
 
 
 def axis_line(history: AxisHistory, refused: Refusals) -> dict[str, Any]:
@@ -65,18 +65,18 @@ def axis_document(machine: MachineConfig, history: AxisHistory, refused: Refusal
 
 
 def _limit(name: str, limit: Mapping[str, Any]) -> dict[str, Any]:
-    unit, factor = DISPLAY[name]
+    unit, factor = DISPLAY_UNITS[name]
     dates = {key: limit[key] for key in ("reached", "date", "earliest", "latest")}
     return {"parameter": name, "name": spoken(name), "value": limit["limit"] * factor, "unit": unit, **dates}
 
 
 def _slopes(health: Mapping[str, Any]) -> list[dict[str, Any]]:
     found = []
-    for name in DISPLAY:
+    for name in DISPLAY_UNITS:
         lines = {key: health.get(of, {}).get(name) for key, of in (("per_kelvin", "slopes"), ("per_day", "trends"))}
         if any(lines.values()):
             shown = {key: line and cell(name, line[key], half_of(line), " ") for key, line in lines.items()}
-            found.append({"parameter": name, "name": spoken(name), "unit": DISPLAY[name][0], **shown})
+            found.append({"parameter": name, "name": spoken(name), "unit": DISPLAY_UNITS[name][0], **shown})
     return found
 
 
@@ -85,13 +85,13 @@ def _change(change: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _course(history: AxisHistory, name: str) -> dict[str, Any]:
-    unit, factor = DISPLAY[name]
+    unit, factor = DISPLAY_UNITS[name]
     warming = over_temperature(history, name)
     return {
         "parameter": name,
         "name": spoken(name),
         "unit": unit,
-        "meaning": MEANINGS[name],
+        "meaning": PARAMETER_MEANINGS[name],
         "over_time": _chart(over_time(history, name)),
         "over_temperature": None if warming is None else _chart(warming),
         "estimates": [_estimate(name, factor, window) for window in history.estimates(name)[-MOST_ESTIMATES:][::-1]],
@@ -127,7 +127,7 @@ def _revision(row: Mapping[str, Any]) -> dict[str, Any]:
         "temperature_celsius": row["temperature_c"],
         "windows_used": row["windows_used"],
         "parameters": {name: cell(name, its["value"], half_of(its), " ") for name, its in parameters.items()},
-        "units": {name: DISPLAY[name][0] for name in parameters},
+        "units": {name: DISPLAY_UNITS[name][0] for name in parameters},
     }
 
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocketDisconnect
 
-from fdhil.daemon.control import SOCKET_NAME
+from fdhil.daemon.daemon_socket import SOCKET_NAME
 from fdhil.web.access import place_of
 from fdhil.web.answers import Refused
 from fdhil.web.context import MachineDependency, PrincipalDependency

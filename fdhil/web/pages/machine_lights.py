@@ -6,8 +6,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel
 
-from fdhil.arming.guard_link import ORDERED
-from fdhil.arming.standing import ADOPT, START_AND_ADOPT
+from fdhil.arming.guard_link import ORDERED_ENDS
+from fdhil.arming.standing import ADOPT_ADVICE, START_AND_ADOPT
 
 Light = Literal["good", "warn", "bad", "none"]
 LIVE_S = 2.0
@@ -87,9 +87,9 @@ def _standing(status: Mapping[str, Any]) -> Iterator[Step]:
     if status["state"] == "lost":
         yield Step(text=f"The guard is lost: {residual.get('text', '')}", advice=START_AND_ADOPT, urgent=True)
     elif not residual["nothing"] and status["state"] in ("OFF", "FROZEN", "OFF(SHADOW)"):
-        yield Step(text=f"{residual['text']}", advice=ADOPT, urgent=True)
+        yield Step(text=f"{residual['text']}", advice=ADOPT_ADVICE, urgent=True)
     cause = guard.get("cause")
-    if cause and cause["code"] not in ORDERED:
+    if cause and cause["code"] not in ORDERED_ENDS:
         yield Step(text=f"{cause['code']}: {cause['text']}", advice=cause.get("advice", ""))
 
 

@@ -6,8 +6,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel
 
-from fdhil.records import INTERVAL_95, unit_of
-from fdhil.report.parameter_view import DISPLAY, cell
+from fdhil.records import INTERVAL_95, get_unit
+from fdhil.report.parameter_view import DISPLAY_UNITS, cell
 from fdhil.report.typography import typeset
 from fdhil.store.history import History
 from fdhil.store.rows import StoredWindow
@@ -202,7 +202,7 @@ def figure_of(name: str, figures: dict[str, Any]) -> Figure:
     value, std = figures.get("value"), figures.get("std")
     half = None if std is None else INTERVAL_95 * std
     ends = (None, None) if value is None or half is None else (value - half, value + half)
-    unit = unit_of(name)
+    unit = get_unit(name)
     return Figure(
         name=name,
         unit=unit,
@@ -212,7 +212,7 @@ def figure_of(name: str, figures: dict[str, Any]) -> Figure:
         high=ends[1],
         reason=None if figures.get("reason") is None else typeset(str(figures["reason"])),
         shown=typeset(cell(name, value, half, " ")),
-        shown_unit=typeset(DISPLAY[name][0] if name in DISPLAY else unit or ""),
+        shown_unit=typeset(DISPLAY_UNITS[name][0] if name in DISPLAY_UNITS else unit or ""),
     )
 
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from fdhil.identification.windows import bridged, moving_range
 from fdhil.pipeline.overlay import Overlay
-from fdhil.records import Float, Reason, Window, rms
+from fdhil.records import Float, Reason, Window, compute_rms
 from fdhil.report.typography import typeset
 from fdhil.web.pages.rapid_list import Said
 
@@ -183,7 +183,7 @@ def _signal(course: _Course, moving: slice, every: int) -> Signal:
         measured=round_digits(measured[::every]),
         modelled=None if modelled is None else round_digits(modelled[::every]),
         residual=None if residual is None else round_digits(residual[::every]),
-        residual_rms=rms(left) if left.size else None,
+        residual_rms=compute_rms(left) if left.size else None,
         measured_spectrum=round_digits(spectrum(measured)),
         residual_spectrum=None if residual is None else round_digits(spectrum(residual)),
     )

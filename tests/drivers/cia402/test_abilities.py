@@ -11,7 +11,7 @@ import pytest
 from fdhil.drivers.cia402.abilities import abilities, named_alike, suggest_profile
 from fdhil.drivers.cia402.device import read_device
 from fdhil.drivers.cia402.profile_file import read_profile
-from tests.daemon.shop import fdhil
+from tests.daemon.machine_rig import fdhil
 from tests.drivers.cia402.eds_text import COMMON, CURRENT, I16, I32, OFFSETS, SERVO, U16, U32, Variable, eds_file, pdos
 
 STOP = ((0x6007, 0, I16, "rw", 0, 1),)

@@ -12,7 +12,7 @@ import pytest
 
 from fdhil import tables
 from fdhil.arming.guard_settings import settings_of
-from fdhil.cia402 import pack
+from fdhil.cia402 import pack_pdo
 from fdhil.config import MachineConfig, parse
 from fdhil.drivers.can.frames import frames_of
 from fdhil.drivers.can.sync_grid import SyncGrid
@@ -38,7 +38,7 @@ def rows_of(profile: DriveProfile, counts: Counts, *, streamed: bool = True) -> 
         specs += [spec for spec in profile.rpdos if spec.valid and streamed]
         for place, spec in enumerate(specs, 1):
             values = [counts((e.index, e.sub), k) for e in spec.entries]
-            out.append((at + place * 50_000, spec.cob_base + 1, pack(spec.entries, values)))
+            out.append((at + place * 50_000, spec.cob_base + 1, pack_pdo(spec.entries, values)))
     return out
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdhil.drivers.moves.told import ToldG0
-from fdhil.records import AxisSamples, Float, MoveEvent, MoveKind, NcState, TickTimes, frozen, frozen_ints
+from fdhil.records import AxisSamples, Float, MoveEvent, MoveKind, NcState, TickTimes, freeze_array, freeze_integers
 from tests.drivers.wire import machine
 
 MS = 1_000_000
@@ -105,13 +105,13 @@ def hear(
     zeros = np.zeros(bus.size)
     for begin in range(0, bus.size, block):
         ticks = first + np.arange(begin, min(begin + block, bus.size))
-        events += source.feed(TickTimes(frozen_ints(ticks), frozen_ints(ticks * MS)))
+        events += source.feed(TickTimes(freeze_integers(ticks), freeze_integers(ticks * MS)))
         while waiting and waiting[0].stamp_ns <= ticks[-1] * MS:
             events += source.feed(waiting.pop(0))
-        part = frozen(zeros[: ticks.size])
-        rows = frozen(bus[ticks - first])
+        part = freeze_array(zeros[: ticks.size])
+        rows = freeze_array(bus[ticks - first])
         events += source.feed(
-            AxisSamples("X", frozen_ints(ticks), rows, part, part, part, None, part, frozen_ints(part))
+            AxisSamples("X", freeze_integers(ticks), rows, part, part, part, None, part, freeze_integers(part))
         )
     return events
 

@@ -13,17 +13,21 @@ from unittest.mock import patch
 
 from fdhil.arming.answers import Answer
 from fdhil.config import Access
-from fdhil.daemon import journal
-from fdhil.daemon.control import ControlServer
-from fdhil.daemon.peers import Peer
-from fdhil.daemon.service import Service
-from fdhil.guard.peers import Role
-from tests.daemon.machine import Machine, config_of
+from fdhil.daemon import service_log
+from fdhil.daemon.daemon_access import ClientProcess
+from fdhil.daemon.daemon_service import DaemonService
+from fdhil.daemon.daemon_socket import ControlServer
+from fdhil.guard.guard_access import Role
+from tests.daemon.simulated_machine import SimulatedMachine, config_of
 from tests.fuzz.tasting import Target
 
 _FOLDER = tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None)
 _LOOP = asyncio.new_event_loop()
-PEERS = (Peer("o", 0, 1, Role.COMMISSION), Peer("w", 1, 2, Role.WATCH), Peer("n", 2, 3, Role.NOBODY))
+PEERS = (
+    ClientProcess("o", 0, 1, Role.COMMISSION),
+    ClientProcess("w", 1, 2, Role.WATCH),
+    ClientProcess("n", 2, 3, Role.NOBODY),
+)
 SAID: list[dict[str, Any]] = [
     {"request": "status"},
     {"request": "live"},
@@ -37,11 +41,11 @@ SAID: list[dict[str, Any]] = [
 async def _server() -> ControlServer:
     config = config_of(Path(_FOLDER.name))
     config.store.directory.mkdir(parents=True)
-    service = Service(config, Machine().open)
+    service = DaemonService(config, SimulatedMachine().open)
 
-    async def handle(request: Mapping[str, Any], peer: Peer) -> Answer:
-        answer = await service._audit.of(request, peer)
-        await service._audit.written()
+    async def handle(request: Mapping[str, Any], peer: ClientProcess) -> Answer:
+        answer = await service._audit.answer_request(request, peer)
+        await service._audit.wait_until_written()
         return answer
 
     return ControlServer(handle, lambda: None, lambda: None, Access())
@@ -68,7 +72,7 @@ class _Client:
 
 async def _answered(data: bytes) -> None:
     peer, client = PEERS[data[0] % len(PEERS)], _Client()
-    answer = await _SERVER._attended(data[1:], peer, client)  # type: ignore[arg-type] # stands for it
+    answer = await _SERVER._answer_line(data[1:], peer, client)  # type: ignore[arg-type] # stands for it
     line = json.dumps(answer)
     assert type(answer["ok"]) is bool
     assert answer.get("armed") is None
@@ -78,7 +82,7 @@ async def _answered(data: bytes) -> None:
 def taste(data: bytes) -> None:
     """Send the bytes as a line, from the user selected by the first byte."""
     if data:
-        with patch.object(journal, "write_line"):
+        with patch.object(service_log, "write_line"):
             _LOOP.run_until_complete(_answered(data))
 
 

@@ -12,13 +12,13 @@ from dataclasses import replace
 from typing import cast
 
 from fdhil.cia402 import COB_SYNC
-from fdhil.guard.can_socket import ERROR, BusDown, SocketcandText, controller_states
-from fdhil.guard.frames import Listener
-from fdhil.guard.protocol import ON_PATH
-from fdhil.guard.state import Output
+from fdhil.guard.can_socket import ERROR, BusDown, SocketcandText, decode_controller_states
+from fdhil.guard.frame_monitor import FrameMonitor
+from fdhil.guard.guard_protocol import ON_PATH
+from fdhil.guard.guard_state import StepOutput
 from tests.fuzz.tasting import Target
-from tests.guard.machine import Bench, bench
-from tests.guard.wire import CEILING
+from tests.guard.frame_checks import CEILING
+from tests.guard.simulated_bus import Bench, bench
 
 MOST_CYCLES = 5
 _RECORD = struct.Struct("<BBB8s")  # identifier, length, number of SYNCs before it, data
@@ -52,13 +52,13 @@ def _in_the_cut() -> Bench:
 
 
 _SENDING = _in_the_cut()
-_IDS = (*_SENDING.listener.wanted_ids(), COB_SYNC, 0x7E5, 0x000)
+_IDS = (*_SENDING.listener.list_received_ids(), COB_SYNC, 0x7E5, 0x000)
 
 
 def _again() -> Bench:
     """Return a copy of the bench in the middle of a cut; constant parts are shared."""
     made = copy.copy(_SENDING)
-    made.listener, heard = Listener(made.settings), made.listener
+    made.listener, heard = FrameMonitor(made.settings), made.listener
     for mine, theirs in zip(made.listener._pdos.values(), heard._pdos.values(), strict=True):
         vars(mine).update(vars(theirs))
     made.listener._nodes = [copy.copy(node) for node in heard._nodes]
@@ -77,18 +77,18 @@ def taste(data: bytes) -> None:
     for before, cob_id, payload in frames[:200]:
         for _ in range(min(before % 4, MOST_CYCLES - cycles)):
             cycles += 1
-            _judge(machine.sync())
+            _judge(machine.run_sync())
         if cob_id == ERROR:
-            machine.listener.error(payload.decode())
+            machine.listener.set_controller_state(payload.decode())
         elif cob_id == COB_SYNC:
-            machine.listener.at_sync(payload, machine.tick * 1e-3, machine.tick * 1e-3)
+            machine.listener.close_sync_cycle(payload, machine.tick * 1e-3, machine.tick * 1e-3)
         else:
-            machine.inject(cob_id, payload)
+            machine.inject_frame(cob_id, payload)
     for _ in range(2):
-        _judge(machine.sync())
+        _judge(machine.run_sync())
 
 
-def _judge(output: Output) -> None:
+def _judge(output: StepOutput) -> None:
     for offset in output.offsets or ():
         assert type(offset) is int
         assert abs(offset) <= CEILING
@@ -98,14 +98,14 @@ def _records(data: bytes) -> list[tuple[int, int, bytes]]:
     found = []
     for which, length, before, payload in _RECORD.iter_unpack(data[: len(data) // _RECORD.size * _RECORD.size]):
         if which == 255:
-            found += [(before, ERROR, state.encode()) for state in controller_states(length, payload)]
+            found += [(before, ERROR, state.encode()) for state in decode_controller_states(length, payload)]
         else:
             found.append((before, _IDS[which % len(_IDS)], payload[: length % 9]))
     return found
 
 
 def _text(data: bytes, machine: Bench) -> list[tuple[int, bytes]]:
-    line = SocketcandText(cast(socket.socket, _Hub(data)), (), machine.listener.wanted_ids())
+    line = SocketcandText(cast(socket.socket, _Hub(data)), (), machine.listener.list_received_ids())
     frames: list[tuple[int, bytes]] = []
     try:
         while True:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 
-from fdhil.guard import table
-from fdhil.guard.requests import parse_line, parse_request
-from fdhil.guard.state import Request
+from fdhil.guard import correction_table
+from fdhil.guard.guard_state import GuardRequest
+from fdhil.guard.request_parsing import parse_line, parse_request
 from tests.fuzz.tasting import Target
-from tests.guard.machine import LIMITS, settings
+from tests.guard.simulated_bus import LIMITS, settings
 
 SETTINGS = settings(token_sha256="0" * 64)
 LAW = {"speed": [1, -2], "torque": [3], "pace": [1], "dry": 0}
@@ -26,15 +26,15 @@ def taste(data: bytes) -> None:
     document = parse_line(data)
     if document is not None:
         request = parse_request(document.get("request"), document, SETTINGS)
-        assert type(request) is Request
+        assert type(request) is GuardRequest
         json.dumps(document.get("id"))
     try:
-        loading = table.begin(data, 1, ["X", "Y"], (LIMITS, LIMITS), None, 0)
+        loading = correction_table.begin_table(data, 1, ["X", "Y"], (LIMITS, LIMITS), None, 0)
         for _ in range(100):
             if loading.done:
                 break
-            loading.check(64)
-    except table.TableRefused as refused:
+            loading.check_next_rows(64)
+    except correction_table.TableRefused as refused:
         assert len(str(refused)) < 1000
         return
     for axis in loading.joined.offset:
@@ -43,8 +43,8 @@ def taste(data: bytes) -> None:
 
 def target() -> Target:
     tables = [
-        table.encode(["X", "Y"], ROWS, ROWS, "p"),
-        table.encode(["X", "Y"], ROWS, ROWS, "p", final=False),
+        correction_table.encode_table(["X", "Y"], ROWS, ROWS, "p"),
+        correction_table.encode_table(["X", "Y"], ROWS, ROWS, "p", final=False),
     ]
     lines = [json.dumps(document).encode() for document in SAID]
     words = [b'"axes"', b'"rows"', b'"first"', b'"final"', b'"program"', b'"laws"', b"NaN", b"1e400", b"null", b"true"]

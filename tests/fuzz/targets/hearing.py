@@ -8,7 +8,7 @@ from collections import Counter
 
 import numpy as np
 
-from fdhil.daemon.hearing import Hearing
+from fdhil.daemon.bus_health import BusHealth
 from fdhil.drivers.can.frames import EXTENDED_FLAG, FrameRing, Frames, frames_of
 from fdhil.drivers.can.socketcand import HubClock, SocketcandPort
 from fdhil.drivers.cia402.bus_decoder import BusDecoder
@@ -26,9 +26,9 @@ UNITS_NS = (10_000, 10_000, 1_000_000, 30_000_000)
 
 def taste(data: bytes) -> None:
     """Decode the frames; an even first byte selects a hub's text."""
-    decoder, hearing = BusDecoder("can0", CONFIG), Hearing(CONFIG, 0.0)
+    decoder, hearing = BusDecoder("can0", CONFIG), BusHealth(CONFIG, 0.0)
     sources = [load_event_source(CONFIG.g0.source)(axis, CONFIG) for axis in decoder.axes]
-    hearing.source_opened(0.0)
+    hearing.note_source_opened(0.0)
     ring = FrameRing(1 << 10)
     if data and data[0] % 2 == 0:
         _text(data[1:], ring)
@@ -43,10 +43,10 @@ def taste(data: bytes) -> None:
             if isinstance(record, AxisSamples | TickTimes):
                 for source in sources:
                     source.feed(record)
-            hearing.record_came(record, now_ns * 1e-9)  # type: ignore[arg-type] # inputs and tables pass it by
-        hearing.counted(Counter({"frames": int(frames.size), "can0.frames": int(frames.size)}), now_ns * 1e-9)
-        hearing.status(now_ns * 1e-9)
-        hearing.troubles({}, now_ns * 1e-9)
+            hearing.take_record(record, now_ns * 1e-9)  # type: ignore[arg-type] # inputs and tables pass it by
+        hearing.take_counters(Counter({"frames": int(frames.size), "can0.frames": int(frames.size)}), now_ns * 1e-9)
+        hearing.build_status(now_ns * 1e-9)
+        hearing.find_lasting_troubles({}, now_ns * 1e-9)
     decoder.counters()
 
 

@@ -19,7 +19,7 @@ from fdhil.correction.learning import Lesson
 from fdhil.drivers.cia402.profile_file import read_profile
 from fdhil.drivers.nc.profile_file import read_nc_profile
 from fdhil.errors import FdhilError
-from fdhil.guard.settings import load, to_json
+from fdhil.guard.guard_settings import encode_settings, load_settings
 from fdhil.prediction.models import load_model_file
 from fdhil.program.demand_csv import read_demand_csv
 from fdhil.store import audit
@@ -28,7 +28,7 @@ from fdhil.store.lessons import read_lesson, write_lesson
 from fdhil.store.windows import read_window
 from tests.bench import bench_config
 from tests.fuzz.tasting import Target
-from tests.guard.machine import settings
+from tests.guard.simulated_bus import settings
 
 _FOLDER = tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None)
 FOLDER = Path(_FOLDER.name)
@@ -53,7 +53,7 @@ def _audit(path: Path) -> None:
 # name of the file -> its reader
 READERS: Mapping[str, Callable[[Path], object]] = {
     "lesson.npz": read_lesson,
-    "guard.json": load,
+    "guard.json": load_settings,
     "model.json": load_model_file,
     record_path(Path(), "X").name: _record,
     "users.json": read_users,
@@ -62,7 +62,7 @@ READERS: Mapping[str, Callable[[Path], object]] = {
     "drive.toml": _profile,
     "nc.toml": lambda path: read_nc_profile(str(path), "mtconnect"),
     f"key{HEADER}": lambda path: CheckedProgram.find(path.parent, "key", path.parent),
-    audit.FILE_NAME: _audit,
+    audit.AUDIT_FILE_NAME: _audit,
     "window.parquet": read_window,
 }
 
@@ -83,11 +83,11 @@ def _written() -> Mapping[str, bytes]:
     write_lesson(FOLDER / "lesson.npz", Lesson({"X": np.arange(4.0)}, 3.0, 0.5, (3.0, 1.0)))
     write_users(FOLDER / "users.json", {"w": hashed("canary-9b1f-password", "watch")})
     save_record(replace(RECORD, axis="X"), FOLDER)
-    (FOLDER / audit.FILE_NAME).unlink(missing_ok=True)
+    (FOLDER / audit.AUDIT_FILE_NAME).unlink(missing_ok=True)
     audit.append(FOLDER, {"asked": "arm"})
     written = {path.name: path.read_bytes() for path in FOLDER.iterdir()}
     return written | {
-        "guard.json": to_json(settings("X")).encode(),
+        "guard.json": encode_settings(settings("X")).encode(),
         "model.json": json.dumps({"X": {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}}).encode(),
         "demand.csv": b"time_s,X_mm\n0.000,0.0\n0.001,0.1\n0.002,0.2\n",
         "columns.toml": b'[headers]\naxis = "X"\nsample_rate_hz = 1000\n'

@@ -16,10 +16,10 @@ from fdhil.drivers.nc.linuxcnc import SCHEMA, LinuxCnc
 from fdhil.drivers.nc.mtconnect import MtConnect
 from fdhil.drivers.nc.mtconnect_xml import read_streams
 from fdhil.errors import DeviceError
-from fdhil.records import AxisSamples, TickTimes, frozen, frozen_ints
-from fdhil.shopfloor.mtconnect import Adapter
-from fdhil.shopfloor.published import published
-from fdhil.shopfloor.sparkplug import host_state, wants_rebirth
+from fdhil.records import AxisSamples, TickTimes, freeze_array, freeze_integers
+from fdhil.shopfloor.mtconnect_adapter import ShdrAdapter
+from fdhil.shopfloor.published_items import list_published_values
+from fdhil.shopfloor.sparkplug import is_rebirth_command, parse_host_state
 from tests.drivers.wire import machine
 from tests.fuzz.tasting import Target
 
@@ -34,16 +34,16 @@ def _block(first: int) -> tuple[TickTimes, AxisSamples]:
     way_mm, zeros = np.clip(0.1 * (tick - 20.0), 0.0, 4.0), np.zeros(40)
     samples = AxisSamples(
         "X",
-        frozen_ints(tick),
-        demand_mm=frozen(way_mm),
-        position_mm=frozen(way_mm),
-        speed_rad_s=frozen(zeros),
-        current_a=frozen(zeros),
-        voltage_v=frozen(zeros),
-        offset_mm=frozen(zeros),
-        statusword=frozen_ints(zeros),
+        freeze_integers(tick),
+        demand_mm=freeze_array(way_mm),
+        position_mm=freeze_array(way_mm),
+        speed_rad_s=freeze_array(zeros),
+        current_a=freeze_array(zeros),
+        voltage_v=freeze_array(zeros),
+        offset_mm=freeze_array(zeros),
+        statusword=freeze_integers(zeros),
     )
-    return TickTimes(frozen_ints(tick), frozen_ints(tick * 1_000_000)), samples
+    return TickTimes(freeze_integers(tick), freeze_integers(tick * 1_000_000)), samples
 
 
 HEARD, LATER = (*_block(0), *_block(40)), (*_block(80), *_block(2000))
@@ -66,9 +66,9 @@ async def _linuxcnc(data: bytes) -> None:
         while True:
             for state in await bridge.read():
                 moves.feed(state)
-                watch.note(state, 1.0)
-                json.dumps(watch.status(1.0), allow_nan=False)
-                published(("X",), ("can0",), {"nc": watch.status(1.0)}, 1)
+                watch.take_state(state, 1.0)
+                json.dumps(watch.build_status(1.0), allow_nan=False)
+                list_published_values(("X",), ("can0",), {"nc": watch.build_status(1.0)}, 1)
     finally:
         for record in LATER:
             moves.feed(record)
@@ -90,7 +90,9 @@ async def _xml(data: bytes) -> None:
     streams, agent = read_streams(data, "agent"), MtConnect(AGENT)
     agent._choose(streams)
     for state in agent._states(streams):
-        json.dumps(published(("X",), ("can0",), {"nc": {"line": state.line, "heard_s_ago": 0.0}}, 1)[-1].value)
+        json.dumps(
+            list_published_values(("X",), ("can0",), {"nc": {"line": state.line, "heard_s_ago": 0.0}}, 1)[-1].value
+        )
 
 
 class _Agent:
@@ -109,12 +111,12 @@ class _Agent:
 
 
 async def _shdr(data: bytes) -> None:
-    await Adapter().attend(_reader(data), _Agent())  # type: ignore[arg-type] # stands for it
+    await ShdrAdapter().serve_agent(_reader(data), _Agent())  # type: ignore[arg-type] # stands for it
 
 
 async def _sparkplug(data: bytes) -> None:
-    assert type(wants_rebirth(data)) is bool
-    host_state(data)
+    assert type(is_rebirth_command(data)) is bool
+    parse_host_state(data)
 
 
 WAYS: tuple[Callable[[bytes], Awaitable[None]], ...] = (_linuxcnc, _http, _xml, _shdr, _sparkplug)

@@ -82,7 +82,7 @@ def _read_all(module: Any, asked: Connection, others: Connection) -> None:
 
 
 def target_of(name: str, longest: int, words: list[bytes]) -> Target:
-    form = tables.load(tables.RECORDING_FORMATS, name)
+    form = tables.load_entry(tables.RECORDING_FORMATS, name)
     whole = table_of(window(n=120))
     few = RecordingTable(whole.headers, {key: values[:20] for key, values in whole.columns.items()})
     reader = _Reader(form) if hasattr(form, "library") else None

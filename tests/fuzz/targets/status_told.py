@@ -7,19 +7,19 @@ import json
 from pathlib import Path
 from typing import Any
 
-from fdhil.shopfloor.mqtt import Session
-from fdhil.shopfloor.news import Listener
-from fdhil.shopfloor.shdr import lines, notice, picture
-from tests.daemon.machine import config_of
+from fdhil.shopfloor.mqtt_publisher import MqttSession
+from fdhil.shopfloor.shdr import build_adapter_state, format_notice, list_changed_lines
+from fdhil.shopfloor.status_poller import StatusPoller
+from tests.daemon.simulated_machine import config_of
 from tests.fuzz.tasting import Target
-from tests.shopfloor.made import NOW_MS, status, trouble
-from tests.shopfloor.made import notice as noticed
+from tests.shopfloor.status_documents import NOW_MS, status, trouble
+from tests.shopfloor.status_documents import notice as noticed
 
 CONFIG = config_of(Path("/nowhere"), ("X",))
-HEARD, BORN = Listener(CONFIG), Session(CONFIG.publish.mqtt, "node")
-BEFORE = HEARD.news(status("X", notices=[]), NOW_MS)  # only new values are published
-SHOWN = picture(BEFORE)
-BORN.node.births(*BORN._metrics(BEFORE), NOW_MS)
+HEARD, BORN = StatusPoller(CONFIG), MqttSession(CONFIG.publish.mqtt, "node")
+BEFORE = HEARD.build_update(status("X", notices=[]), NOW_MS)  # only new values are published
+SHOWN = build_adapter_state(BEFORE)
+BORN.node.build_births(*BORN._make_metrics(BEFORE), NOW_MS)
 
 
 def taste(data: bytes) -> None:
@@ -38,15 +38,15 @@ def taste(data: bytes) -> None:
         "line": number[0] if number else None,
         "feed_mm_min": number[-1] if number else 1,
     }
-    news = copy.copy(HEARD).news(json.loads(json.dumps(said)), NOW_MS)
-    for line in [*lines(SHOWN, picture(news)), *map(notice, news.events)]:
+    news = copy.copy(HEARD).build_update(json.loads(json.dumps(said)), NOW_MS)
+    for line in [*list_changed_lines(SHOWN, build_adapter_state(news)), *map(format_notice, news.events)]:
         assert line.count("|") >= 2
         assert line.isprintable(), line
         line.encode()
-    _again()._changes(news)
+    _again()._build_changes(news)
 
 
-def _again() -> Session:
+def _again() -> MqttSession:
     """Return a copy of the session with its published values; constant parts are shared."""
     session, node = copy.copy(BORN), copy.copy(BORN.node)
     session.node, session._notices = node, {}
