@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.config import CanBus, MachineConfig, parse
+from fdhil.config import CanBus, MachineConfig, parse_config
 from fdhil.drivers.bus_source import DRAIN_S
-from fdhil.drivers.can.bus import ListeningBus as Bus
+from fdhil.drivers.can.bus_listener import ListeningBus as Bus
 from fdhil.drivers.cia402.bus_decoder import BusDecoder
 from fdhil.records import AxisSamples
 
@@ -40,7 +40,7 @@ def machine(clock: str) -> MachineConfig:
             "current_kp": 12.566, "current_ki": 1256.64, "voltage_limit_v": 300.0,
         },
     }  # fmt: skip
-    return parse({"machine": {"name": "bench"}, "axis": dict.fromkeys(AXES, axis), "guard": {"clock": clock}})
+    return parse_config({"machine": {"name": "bench"}, "axis": dict.fromkeys(AXES, axis), "guard": {"clock": clock}})
 
 
 def cycle_frames(k: int) -> list[tuple[int, bytes]]:
@@ -99,19 +99,19 @@ def fit_load(stopping: threading.Event) -> None:
 
 def lost(bus: Bus, decoder: BusDecoder) -> int:
     """All that was lost so far."""
-    counted = decoder.counters()
-    return bus.counters()["lost"] + counted["pdo_lost"] + counted["sync_missed"]
+    counted = decoder.read_counters()
+    return bus.read_counters()["lost"] + counted["pdo_lost"] + counted["sync_missed"]
 
 
 def acquire(bus: Bus, decoder: BusDecoder, pipe: Connection, cycles: int, paced: bool) -> dict[str, float]:
     """Receive and decode what the hub sends for ``cycles``; returns figures."""
-    frames_before, lost_before = bus.counters()["frames"], lost(bus, decoder)
+    frames_before, lost_before = bus.read_counters()["frames"], lost(bus, decoder)
     expected = sum(len(cycle_frames(k % CYCLES)) for k in range(cycles))
     rows, wall, cpu = 0, time.perf_counter(), time.process_time()
     pipe.send((cycles, paced))
-    while bus.counters()["frames"] - frames_before < expected:
+    while bus.read_counters()["frames"] - frames_before < expected:
         time.sleep(DRAIN_S if paced else 0.005)
-        records = decoder.feed(bus.drain(), time.monotonic_ns())
+        records = decoder.decode_frames(bus.drain_frames(), time.monotonic_ns())
         rows += sum(r.tick.size for r in records if isinstance(r, AxisSamples))
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     pipe.recv()

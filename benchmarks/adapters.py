@@ -20,7 +20,7 @@ from collections.abc import Callable
 import numpy as np
 
 from fdhil.config import CanBus
-from fdhil.drivers.can.bus import ListeningBus as Bus
+from fdhil.drivers.can.bus_listener import ListeningBus as Bus
 
 RATES_HZ = (1000, 2500, 8000)
 DRAIN_S = 0.05
@@ -44,7 +44,7 @@ def listen(bus: Bus, write: Write, rate_hz: int, frames: int) -> str:
     sender.start()
     while heard < frames and time.monotonic() < quiet_s:
         time.sleep(DRAIN_S)
-        block = bus.drain()
+        block = bus.drain_frames()
         if block.size:
             late_ms.append((block["t_ns"] - block["data"].astype(np.int64)) * 1e-6)
             heard, quiet_s = heard + block.size, time.monotonic() + 2.0

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdhil.config import parse
+from fdhil.config import parse_config
 from fdhil.model import closed_loop
 from fdhil.model.loops import Drive
 from fdhil.prediction.models import nominal_models
@@ -110,7 +110,7 @@ def structures() -> dict[str, float]:
     for name, own in (("p_pi_pi", {}), ("double_pi", {"position_ki_per_s2": 300.0}), ("pid", {"speed_ki": 0.0})):
         document = bench_document("X")
         document["axis"]["X"]["regulators"] |= OPTIONS | own | {"structure": name}
-        config = parse(document)
+        config = parse_config(document)
         axis, model = config.axis["X"], nominal_models(config)["X"]
         seconds = best(partial(closed_loop.simulate, model, axis, 0.001, reference))
         found[name] = reference.size * 0.001 / seconds

@@ -24,7 +24,7 @@ import nats.js.errors
 import psycopg
 from nats.aio.client import Client
 
-from fdhil.config.fleet import Database, Fleet, Objects, Server, Stream
+from fdhil.config.fleet_config import Database, Fleet, Objects, Server, Stream
 from fdhil.fleet import migrations
 from fdhil.fleet.collector import _AT_ONCE, _COLUMNS, Collector, _rows
 from fdhil.fleet.message import Message, Record, decode, joined, of_entry

@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import psycopg
 
-from fdhil.config.fleet import Database, Fleet
+from fdhil.config.fleet_config import Database, Fleet
 from fdhil.fleet import migrations, questions, sets
 from fdhil.fleet.sets import Db
 from tests.fleet.servers import Postgres, postgres

@@ -19,7 +19,7 @@ import psycopg
 from psycopg.types.json import Jsonb
 
 from fdhil.config import Identification
-from fdhil.config.fleet import Database, Fleet, Objects
+from fdhil.config.fleet_config import Database, Fleet, Objects
 from fdhil.fleet import migrations, objects, reanalysis
 from fdhil.fleet.changes import changes
 from fdhil.fleet.sets import asking, entered

@@ -35,7 +35,7 @@ def machine(profile: str, acceleration_mm_s2: float = ACCELERATION_MM_S2) -> con
     for axis in document["axis"].values():
         axis["max_acceleration_mm_s2"] = acceleration_mm_s2
     document["nc"] = {"profile": profile}
-    return configuration.parse(document)
+    return configuration.parse_config(document)
 
 
 def chords(count: int) -> Iterator[Motion]:

@@ -60,7 +60,7 @@ def machine(folder: Path, period_ms: float, interface: str | None, lockstep: boo
         assert sim.stdout is not None
         ready = json.loads(sim.stdout.readline())
         path.write_text(text.replace("port = 0", f"port = {ready['buses']['can0'].get('port')}"))
-        sign_off(config.load(path))
+        sign_off(config.load_config(path))
         yield path
         sim.terminate()
 

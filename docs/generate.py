@@ -18,7 +18,7 @@ import click
 
 from fdhil import errors
 from fdhil.cli.main import cli, leaves
-from fdhil.config.template import default, sections, template, toml
+from fdhil.config.config_template import format_toml, get_default, list_tables, write_template
 from fdhil.daemon.alarms import CONDITIONS
 from fdhil.daemon.notice_texts import WORDS
 from fdhil.guard.guard_protocol import HOLD_CYCLES
@@ -79,14 +79,16 @@ def _plain(text: str) -> str:
 def config_reference() -> str:
     """Return the table of every configuration key as Markdown."""
     lines = ["# Configuration keys", "", "Generated from `fdhil/config/`. Unknown keys are refused."]
-    for table in sections():
+    for table in list_tables():
         lines += ["", f"## [{table.path}]", ""]
         if table.meaning:
             lines += [table.meaning, ""]
         lines += ["| key | default | meaning |", "|---|---|---|"]
         for key, field in table.keys:
-            value = default(field)
-            shown = "required" if field.is_required() else f"`{toml(value)}`" if value is not None else "left out"
+            value = get_default(field)
+            shown = (
+                "required" if field.is_required() else f"`{format_toml(value)}`" if value is not None else "left out"
+            )
             lines.append(f"| `{key}` | {shown} | {field.description or ''} |")
     return "\n".join(lines) + "\n"
 
@@ -205,7 +207,7 @@ def _states(
 
 
 GENERATED = {
-    ROOT / "configs" / "machine-template.toml": template,
+    ROOT / "configs" / "machine-template.toml": write_template,
     ROOT / "docs" / "reference" / "config.md": config_reference,
     ROOT / "docs" / "reference" / "commands.md": command_reference,
     ROOT / "docs" / "reference" / "python.md": python_reference,

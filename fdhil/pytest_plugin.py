@@ -90,7 +90,7 @@ class FeedDriveBench:
         from fdhil.program import load_trajectory
         from fdhil.sim.service import SimService
 
-        service = SimService(config.parse(self._document, folder=self.folder), self._events.put, load_trajectory)
+        service = SimService(config.parse_config(self._document, folder=self.folder), self._events.put, load_trajectory)
         self._service = service
         self._thread = threading.Thread(target=service.run, name="feed drive bench")
         self._thread.start()

@@ -27,15 +27,15 @@ REGULATORS: Mapping[str, str] = {
 }
 DRIVE_VOLTAGE = "drive"  # comes with the drive's samples; every other source is a sensor of its own
 VOLTAGE_SOURCES: Mapping[str, str] = {
-    "drive": "fdhil.drivers.cia402.drive:VoltageObject",
-    "modbus": "fdhil.drivers.modbus.sources:modbus_voltage",
-    "serial": "fdhil.drivers.serial.instrument:serial_voltage",
+    "drive": "fdhil.drivers.cia402.pdo_decoder:VoltageObject",
+    "modbus": "fdhil.drivers.modbus.voltage_source:create_modbus_voltage",
+    "serial": "fdhil.drivers.serial.text_instrument:create_serial_voltage",
 }
 NC_SOURCES: Mapping[str, str] = {
-    "linuxcnc": "fdhil.drivers.nc.linuxcnc:LinuxCnc",
-    "modbus_coil": "fdhil.drivers.nc.modbus_coil:ModbusCoil",
-    "mtconnect": "fdhil.drivers.nc.mtconnect:MtConnect",
-    "opcua": "fdhil.drivers.nc.opcua:OpcUa",
+    "linuxcnc": "fdhil.drivers.nc.linuxcnc_source:LinuxCncSource",
+    "modbus_coil": "fdhil.drivers.nc.modbus_coil:ModbusCoilSource",
+    "mtconnect": "fdhil.drivers.nc.mtconnect_source:MtConnectSource",
+    "opcua": "fdhil.drivers.nc.opcua_source:OpcUaSource",
 }
 NC_PROFILES: Mapping[str, str] = {
     "mtconnect": "fdhil.drivers.nc.profiles:mtconnect.toml",
@@ -45,9 +45,9 @@ NC_PROFILES: Mapping[str, str] = {
     "beckhoff": "fdhil.drivers.nc.profiles:beckhoff.toml",
 }
 EVENT_SOURCES: Mapping[str, str] = {
-    "inferred": "fdhil.drivers.moves.inferred:InferredG0",
-    "digital_input": "fdhil.drivers.moves.digital_input:DigitalInputG0",
-    **dict.fromkeys(NC_SOURCES, "fdhil.drivers.moves.told:ToldG0"),
+    "inferred": "fdhil.drivers.moves.inferred_moves:InferredMoves",
+    "digital_input": "fdhil.drivers.moves.digital_input_moves:DigitalInputMoves",
+    **dict.fromkeys(NC_SOURCES, "fdhil.drivers.moves.nc_reported_moves:NcReportedMoves"),
 }
 # file formats of recordings: modules that encode and decode
 RECORDING_FORMATS: Mapping[str, str] = {

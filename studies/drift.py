@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.config import Identification, MachineConfig, parse
+from fdhil.config import Identification, MachineConfig, parse_config
 from fdhil.identification.trends import crossing, slope, steps
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import AxisPipeline, analyse, pool
@@ -48,7 +48,7 @@ def machine() -> MachineConfig:
         "nominal": bench.Plant().truth(),
         "regulators": dict.fromkeys((*gains, "current_limit_a", "voltage_limit_v"), 1.0),
     }
-    return parse({"machine": {"name": "study"}, "axis": {"X": axis}}, "study", made_up=True)
+    return parse_config({"machine": {"name": "study"}, "axis": {"X": axis}}, "study", made_up=True)
 
 
 def drawn(rng: np.random.Generator) -> bench.Plant:

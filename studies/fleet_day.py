@@ -28,7 +28,7 @@ MIDNIGHT_S = 1_800_000_000.0
 
 def machine(folder: Path, name: str, server: str) -> MachineConfig:
     """Return a machine with [uplink] that has recorded nothing."""
-    return machine_config.load(written(folder, name, server=server, windows="none", machine=name))
+    return machine_config.load_config(written(folder, name, server=server, windows="none", machine=name))
 
 
 def record(config: MachineConfig, records: int, first: int = 0, seed: int = 1) -> None:

@@ -106,7 +106,7 @@ def wait_for(holds: Callable[[], bool], what: str, patience_s: float = 1200.0) -
 
 
 async def _send(files: Sequence[str]) -> None:
-    configs = [machine_config.load(Path(file)) for file in files]
+    configs = [machine_config.load_config(Path(file)) for file in files]
     await asyncio.gather(*(uplink.send(config, lambda _: None) for config in configs))
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from fdhil.config import Axis, Identification
-from fdhil.config.axis import Nominal
+from fdhil.config.axis_section import Nominal
 from fdhil.config.regulators import Regulators
 from fdhil.model import closed_loop
 from fdhil.records import PARAMETERS, Estimate, Float, Parameters, compute_rms
@@ -66,7 +66,7 @@ def beside_the_path(models: Sequence[Parameters], scene: Scene) -> list[str]:
         true = drives.run(scene.drive, demand, drives.CYCLE_S)
         for model in models:
             missed, following = _missed(model, axis, 1e3 * demand, 1e3 * true.position)
-            limit = limit or max(Identification().tolerance_for(following), STEPS_UM)
+            limit = limit or max(Identification().compute_tolerance_um(following), STEPS_UM)
             if missed > limit:
                 found.append(f"{missed:.2g} um of {following:.3g} um beside the path at {share:.0%} of the speed")
     return found

@@ -178,7 +178,7 @@ def beside_linuxcnc(hour: Retrofit, twin: TwinProcess, port: int, stack: ExitSta
     with hour.step("fdhil run, fdhil-guard"):
         for name, command in (("guard", ["fdhil.cli.guard"]), ("daemon", ["fdhil", "run"])):
             stack.enter_context(Process(name, [*command, str(hour.file)], hour.folder / f"{name}.log"))
-        run_directory = machine_config.load(hour.file).store.run_directory
+        run_directory = machine_config.load_config(hour.file).store.run_directory
         assert run_directory is not None
         until((run_directory / SOCKET_NAME).exists)
     loads = f"loadusr -Wn {bridge.NAME} /usr/bin/python3 {bridge.__file__} --port {port} --channel 1\n"
@@ -226,7 +226,7 @@ def main() -> None:
             with ExitStack() as stack:
                 beside_linuxcnc(hour, twin, port, stack)
             twin.event("finished")
-        config = machine_config.load(hour.file)
+        config = machine_config.load_config(hour.file)
         before_um, *_, after_um = contour_of_each_cut(trace, load_trajectory(hour.folder / "part.csv", config))
         tell(hour, before_um, after_um)
     sys.exit(after_um >= before_um)

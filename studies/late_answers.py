@@ -17,16 +17,16 @@ from unittest.mock import patch
 import canopen.sdo.client
 import serial
 
-from fdhil.config.sensors import ModbusPlace, SerialPlace
-from fdhil.drivers.can import sdo
+from fdhil.config.sensor_sections import ModbusDevice, SerialDevice
+from fdhil.drivers.can import sdo_channel
 from fdhil.drivers.modbus import rtu_line
-from fdhil.drivers.modbus.line import Request
-from fdhil.drivers.serial import byte_stream, port
+from fdhil.drivers.modbus.modbus_line import ModbusRequest
+from fdhil.drivers.serial import byte_stream, serial_port
 from fdhil.errors import DeviceError
 from fdhil.sim.frame_faults import FrameFault, FrameFaults
 from fdhil.sim.wire.modbus_answers import answer, spoilt
 from fdhil.sim.wire.sensor_faults import SensorFaults
-from tests.drivers.serial_peer import framed
+from tests.drivers.serial_peer import build_frame
 from tests.machine.virtual_time import VirtualLoop, run
 
 TIMEOUT_S = 0.2
@@ -53,11 +53,11 @@ class Questioned:
         """There is nothing to latch."""
 
 
-class LatePort(port.SerialPort):
+class LatePort(serial_port.SerialPort):
     """A serial port without a line: requests are answered at a random time, and corrupted as ordered."""
 
     def __init__(
-        self, place: SerialPlace, loop: VirtualLoop, rng: random.Random, most_late: float, noise: float
+        self, place: SerialDevice, loop: VirtualLoop, rng: random.Random, most_late: float, noise: float
     ) -> None:
         super().__init__(place)
         self.device_now = Questioned()
@@ -79,8 +79,8 @@ class LatePort(port.SerialPort):
         if self._rng.random() < LATE:
             delay_s = TIMEOUT_S * self._rng.uniform(0.0, self._most_late)
             self.late += delay_s > TIMEOUT_S
-        pieces = spoilt(self.faults, framed, data[0], body)
-        self.spoilt += pieces != [framed(data[0], body)]
+        pieces = spoilt(self.faults, build_frame, data[0], body)
+        self.spoilt += pieces != [build_frame(data[0], body)]
         for place, piece in enumerate(pieces):
             self._virtual.call_later(delay_s + 0.002 * place, self._arrive, piece)
         if self._rng.random() < self._noise:
@@ -106,7 +106,7 @@ def modbus(
     Counts what was asked, answered, ``wrong``, late (than the time-out), spoilt, and the faults that the driver told.
     """
     loop, rng = VirtualLoop(), random.Random(seed)
-    place = ModbusPlace(device="/dev/virtual", timeout_s=TIMEOUT_S, baud_rate=115200)
+    place = ModbusDevice(device="/dev/virtual", timeout_s=TIMEOUT_S, baud_rate=115200)
     wire = LatePort(place, loop, rng, most_late, noise)
     wire.faults.answers.update(dict.fromkeys(kinds, SPOILT_PERCENT if len(kinds) > 1 else SPOILT_ALONE_PERCENT))
     clock = SimpleNamespace(monotonic_ns=loop.monotonic_ns)
@@ -120,13 +120,13 @@ def modbus(
             count = rng.choice(COUNTS)
             seen["asked"] += 1
             try:
-                got = await line.ask(Request("sensor", 1, 4, 0, count, TIMEOUT_S))
+                got = await line.send_request(ModbusRequest("sensor", 1, 4, 0, count, TIMEOUT_S))
             except DeviceError:
                 seen["refused"] += 1
                 continue
             seen["answered"] += 1
             seen["wrong"] += got.registers != (question & 0xFFFF,) * count
-        seen.update(line.counted)
+        seen.update(line.fault_counts)
 
     with (
         patch.object(rtu_line, "SerialPort", lambda _place: wire),
@@ -144,7 +144,7 @@ class Node:
     def __init__(self, faults: FrameFaults) -> None:
         self.question, self.now_s = 0, 0.0
         self._faults = faults
-        self.link: sdo.SdoLink | None = None
+        self.link: sdo_channel.SdoChannel | None = None
 
     def send(self, _can_id: int, data: bytes) -> None:
         """Answer an expedited upload; an abort has no answer."""
@@ -155,7 +155,7 @@ class Node:
     def _deliver(self, passed: list[Any]) -> None:
         assert self.link is not None
         for (_, data), _ in passed:
-            self.link.deliver(data)
+            self.link.deliver_response(data)
 
     def sleep(self, seconds: float) -> None:
         """Let time pass; what is late arrives meanwhile."""
@@ -189,11 +189,11 @@ def sdo_reads(questions: int, seed: int, most_late_s: float) -> Counter[str]:
     queues = SimpleNamespace(Queue=_waiting_in(node), Empty=queue.Empty)
     clock = SimpleNamespace(sleep=node.sleep, monotonic=lambda: node.now_s)
     with (
-        patch.object(sdo, "queue", queues),
+        patch.object(sdo_channel, "queue", queues),
         patch.object(canopen.sdo.client, "queue", queues),
-        patch.object(sdo, "time", clock),
+        patch.object(sdo_channel, "time", clock),
     ):
-        node.link = link = sdo.SdoLink("drive", 1, node.send)
+        node.link = link = sdo_channel.SdoChannel("drive", 1, node.send)
         for question in range(questions):
             node.question = question
             seen["asked"] += 1

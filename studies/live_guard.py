@@ -165,7 +165,7 @@ class LiveGuard:
             "guard": {"clock": "sync"},
             "bus": {"can0": bus},
         }
-        self.config: MachineConfig = machine_config.parse(document, folder=folder)
+        self.config: MachineConfig = machine_config.parse_config(document, folder=folder)
         self.machine = Machine(self.config)
         self._bus = attach("can0", self.config.bus["can0"])
         place = {key: value for key, value in self._bus.settings.items() if key in ("port", "host")}

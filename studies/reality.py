@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.config import Axis, MachineConfig, parse
+from fdhil.config import Axis, MachineConfig, parse_config
 from fdhil.correction.learning import Lesson, learn
 from fdhil.correction.limits import fit_all
 from fdhil.correction.planning import plan
@@ -203,7 +203,7 @@ def config_of(machine: Machine) -> MachineConfig:
     }
     if machine.told_resonance_hz:
         axis |= {"resonance_hz": machine.told_resonance_hz}
-    return parse({"machine": {"name": "study"}, "axis": {"X": axis, "Y": axis}}, "study", made_up=True)
+    return parse_config({"machine": {"name": "study"}, "axis": {"X": axis, "Y": axis}}, "study", made_up=True)
 
 
 @lru_cache(maxsize=4)

@@ -64,8 +64,8 @@ class Reader:
     @staticmethod
     def _read(text: str) -> tuple[Leaves, Leaves]:
         """Return the parsed text, and the configuration made of it."""
-        raw = config.toml_document(text.encode("utf-8"), SAMPLE.name)
-        return leaves(raw), leaves(config.parse(raw, SAMPLE.name).model_dump(mode="json"))
+        raw = config.parse_toml(text.encode("utf-8"), SAMPLE.name)
+        return leaves(raw), leaves(config.parse_config(raw, SAMPLE.name).model_dump(mode="json"))
 
     def outcome(self, at: int, text: str) -> str:
         """Return the outcome of a slip at a position, one of ``OUTCOMES``."""

@@ -116,7 +116,7 @@ class Shop:
     def start_twin(self) -> None:
         """Switch the machine on; it has the ports that it had before."""
         self.file.write_text(to_toml(self.document), "utf-8")
-        self.config = machine_config.load(self.file)
+        self.config = machine_config.load_config(self.file)
         self.twin = Twin(self.file, self.logs / "machine.log")
 
     def start(self, name: str) -> None:

@@ -17,17 +17,17 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.config.sensors import ModbusPlace
-from fdhil.drivers.can.frames import frames_of
+from fdhil.config.sensor_sections import ModbusDevice
+from fdhil.drivers.can.frame_ring import pack_frames
 from fdhil.drivers.cia402.bus_decoder import BusDecoder
-from fdhil.drivers.modbus.link import ModbusLink
+from fdhil.drivers.modbus.modbus_unit import ModbusUnit
 from fdhil.errors import DeviceError
 from fdhil.sim.frame_faults import FrameFault, FrameFaults
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
 from fdhil.sim.wire.modbus_tcp import SensorServers
 from studies import pages
 from studies.late_answers import Questioned, modbus, sdo_reads
-from tests.drivers.wire import Wire, machine
+from tests.drivers.frame_builder import FrameBuilder, build_machine_config
 
 SPOILT = ("flipped", "noisy", "split", "wrong_unit", "short", "too_many")
 LOSSES = {"TPDO1": {0x181}, "TPDO2": {0x281}, "SYNC": {0x80}, "any of the three": {0x80, 0x181, 0x281}}
@@ -47,7 +47,7 @@ def over_tcp(questions: int, kind: str) -> Counter[str]:
     seen: Counter[str] = Counter()
 
     async def ask() -> None:
-        link = ModbusLink("sensor", ModbusPlace(port=servers.ports["X"], timeout_s=TCP_TIMEOUT_S))
+        link = ModbusUnit("sensor", ModbusDevice(port=servers.ports["X"], timeout_s=TCP_TIMEOUT_S))
         rng = random.Random(1)
         for question in range(questions):
             device.question = question
@@ -55,7 +55,7 @@ def over_tcp(questions: int, kind: str) -> Counter[str]:
             seen["asked"] += 1
             try:
                 await link.connect()
-                got = await link.read_input(0, count)
+                got = await link.read_input_registers(0, count)
             except DeviceError:
                 seen["refused"] += 1
                 continue
@@ -74,30 +74,30 @@ def losses(frames: int, seed: int, can_ids: set[int], percent: float) -> Counter
     """Lose some frames of a bus; count sent, lost and reported ones, and rows with another row's value."""
     seen: Counter[str] = Counter()
     while seen["frames"] < frames:
-        wire = Wire(n=TICKS)
+        wire = FrameBuilder(n=TICKS)
         fault = FrameFault("drop", can_ids=can_ids, percent=percent, from_sync=EDGE, until_sync=TICKS - EDGE)
         faults = FrameFaults([fault], seed + seen["frames"])
-        decoder = BusDecoder("can0", machine())
+        decoder = BusDecoder("can0", build_machine_config())
         for samples in _decoded(wire, faults, decoder, seen):
             seen["rows"] += samples.tick.size
             for k, volts, amperes in zip(samples.tick, samples.voltage_v, samples.current_a, strict=True):
-                true = (wire.tpdo2(int(k) + 1)[2] * 0.02, wire.tpdo2(int(k))[1] * 0.05)
+                true = (wire.build_tpdo2(int(k) + 1)[2] * 0.02, wire.build_tpdo2(int(k))[1] * 0.05)
                 seen["misplaced"] += abs(volts - true[0]) > 1e-6 or abs(amperes - true[1]) > 1e-6
-        told = decoder.counters()
+        told = decoder.read_counters()
         seen["lost"] += faults.total("drop")
         seen["reported"] += told["sync_missed"] + told["pdo_lost"]
         seen["late"] += told["pdo_late"] + told["pdo_duplicates"]
     return seen
 
 
-def _decoded(wire: Wire, faults: FrameFaults, decoder: BusDecoder, seen: Counter[str]) -> Iterator[Any]:
+def _decoded(wire: FrameBuilder, faults: FrameFaults, decoder: BusDecoder, seen: Counter[str]) -> Iterator[Any]:
     """Yield the samples of a bus whose frames pass the faults, some at a time."""
-    rows = wire.rows()
+    rows = wire.build_rows()
     seen["frames"] += len(rows)
     left = [(t, i, d) for t, can_id, data in rows for (i, d), _ in faults.take((can_id, data), "received", 0.0)]
     for start in range(0, len(left), 350):
-        block = frames_of(left[start : start + 350])
-        for record in decoder.feed(block, int(block["t_ns"][-1])):
+        block = pack_frames(left[start : start + 350])
+        for record in decoder.decode_frames(block, int(block["t_ns"][-1])):
             if hasattr(record, "voltage_v"):
                 yield record
 

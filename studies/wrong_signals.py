@@ -243,7 +243,7 @@ def _beside_path(estimate: Estimate, plant: Plant) -> Iterator[str]:
         errors = [
             1e3 * compute_rms(true - _predicted(e, plant, demand_mm)) for e in (estimate, _good(plant.machine.name))
         ]
-        limit = max(LEAST_UM, Identification().tolerance_for(1e3 * compute_rms(true - demand_mm)))
+        limit = max(LEAST_UM, Identification().compute_tolerance_um(1e3 * compute_rms(true - demand_mm)))
         if errors[0] > errors[1] + limit:
             yield f"{errors[0]:.3g} um beside the path"
 

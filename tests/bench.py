@@ -61,7 +61,7 @@ def bench_toml(axes: str = "XY", corrected: bool = True, **changes: Any) -> str:
 
 def bench_config(axes: str = "XY", folder: Path = Path()) -> config.MachineConfig:
     """Return the bench's configuration; its store is below ``folder``."""
-    return config.parse(bench_document(axes), folder=folder)
+    return config.parse_config(bench_document(axes), folder=folder)
 
 
 def rotary_axis(radius_mm: float = 100.0, **changes: Any) -> dict[str, Any]:

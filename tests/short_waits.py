@@ -13,8 +13,8 @@ SHORT_WAITS: dict[str, float] = {
     "commissioning.survey.LISTEN_S": 0.05,
     "commissioning.transmit.LOOK_S": 0.01,
     "cli.consent.LOOK_S": 0.01,
-    "drivers.can.bus.POLL_S": 0.01,
-    "drivers.can.sdo.QUIET_S": 0.05,
+    "drivers.can.bus_listener.POLL_S": 0.01,
+    "drivers.can.sdo_channel.QUIET_S": 0.05,
     "commissioning.steps.SETTLE_CYCLES": 120,
     "commissioning.steps.AVERAGE_CYCLES": 60,
 }

@@ -35,14 +35,14 @@ STATES = {
 
 @pytest.mark.parametrize("state", STATES)
 @given(st.integers(0, 0xFFFF))
-def test_states_are_told_by_their_bits_alone(state: PowerState, other_bits: int) -> None:
+def test_states_are_decoded_from_their_bits(state: PowerState, other_bits: int) -> None:
     pattern = STATES[state]
     fixed = int(pattern.replace("x", "0"), 2)
     free = int("".join("1" if bit == "x" else "0" for bit in pattern), 2) | 0xFF00
     assert decode_power_state(fixed | other_bits & free) is state
 
 
-def test_every_state_leads_to_operation_enabled() -> None:
+def test_every_state_can_reach_operation_enabled() -> None:
     arrives = {
         PowerState.FAULT: PowerState.SWITCH_ON_DISABLED,
         PowerState.SWITCH_ON_DISABLED: PowerState.READY,
@@ -63,7 +63,7 @@ def test_every_state_leads_to_operation_enabled() -> None:
 
 
 @st.composite
-def mapped(draw: st.DrawFn) -> tuple[tuple[PdoEntry, ...], tuple[int, ...]]:
+def build_entries(draw: st.DrawFn) -> tuple[tuple[PdoEntry, ...], tuple[int, ...]]:
     entries: list[tuple[int, int, int, bool]] = []
     left = 64
     for _ in range(draw(st.integers(1, 8))):
@@ -80,8 +80,8 @@ def mapped(draw: st.DrawFn) -> tuple[tuple[PdoEntry, ...], tuple[int, ...]]:
     return laid, values
 
 
-@given(mapped(), st.binary(max_size=4))
-def test_what_is_packed_is_unpacked(pdo: tuple[tuple[PdoEntry, ...], tuple[int, ...]], tail: bytes) -> None:
+@given(build_entries(), st.binary(max_size=4))
+def test_packed_values_are_unpacked_unchanged(pdo: tuple[tuple[PdoEntry, ...], tuple[int, ...]], tail: bytes) -> None:
     entries, values = pdo
     data = pack_pdo(entries, values)
     assert len(data) == compute_pdo_length(entries) <= 8
@@ -92,7 +92,7 @@ def test_what_is_packed_is_unpacked(pdo: tuple[tuple[PdoEntry, ...], tuple[int, 
 
 
 @pytest.mark.parametrize("value", [1 << 15, -(1 << 15) - 1, 1.0, 1.7, math.nan, True, None])
-def test_what_does_not_fit_is_refused(value: object) -> None:
+def test_value_that_does_not_fit_is_refused(value: object) -> None:
     entries = lay_out([(0x6078, 0, 16, True)])
     with pytest.raises(ValueError, match="does not fit"):
         pack_pdo(entries, [value])  # type: ignore[list-item]  # a wrong type is what is tried
@@ -114,6 +114,6 @@ def test_increments_and_millimetres_agree(increments: int, sign: int) -> None:
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_no_position_is_refused(value: float) -> None:
+def test_missing_position_is_refused(value: float) -> None:
     with pytest.raises(ValueError, match="not a valid position"):
         Scaling(65536, 20.0).convert_to_increments(value)

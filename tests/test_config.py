@@ -9,36 +9,36 @@ from typing import Any
 import pytest
 
 from fdhil import config
-from fdhil.config import reading
-from fdhil.config.section import _of_a_machine
+from fdhil.config import config_loader
+from fdhil.config.section import _check_magnitude
 from fdhil.errors import ConfigError
 from tests.bench import bench_config, bench_document
 
 
-def faults(document: dict[str, Any]) -> str:
+def list_faults(document: dict[str, Any]) -> str:
     with pytest.raises(ConfigError) as caught:
-        config.parse(document)
+        config.parse_config(document)
     assert caught.value.exit_code == 2
     return "\n".join(str(fault) for fault in caught.value.faults)
 
 
-def test_the_bench_is_complete_and_everything_else_has_a_default() -> None:
+def test_bench_config_is_complete_and_other_keys_have_defaults() -> None:
     machine = bench_config()
     assert machine.nc.smoothing_s == (0.060, 0.030)
-    assert [machine.node_id(axis) for axis in machine.axis] == [1, 2]
+    assert [machine.get_node_id(axis) for axis in machine.axis] == [1, 2]
     assert machine.axis["X"].scaling.increments_per_mm == pytest.approx(3276.8)
     assert machine.axis["X"].rapid_speed_rad_s == pytest.approx(157.0796, rel=1e-6)
 
 
 @pytest.mark.fault("F7")
-def test_all_faults_are_told_at_once() -> None:
+def test_all_faults_are_reported_at_once() -> None:
     document = bench_document()
     del document["axis"]["X"]["screw_pitch_mm"]
     document["axis"]["X"]["nominal"]["Jtt"] = 3.0
     document["axis"]["Y"]["nominal"]["R"] = math.nan
     document["axis"]["Y"]["correction"]["max_offset_um"] = 900.0
     document["g0"] = {"source": "infered"}
-    text = faults(document)
+    text = list_faults(document)
     assert "axis.X.screw_pitch_mm: is missing (table travel per motor revolution)" in text
     assert "axis.X.nominal.Jtt: is not a key of this section (did you mean 'Jt'?)" in text
     assert "axis.Y.nominal.R: " in text
@@ -59,39 +59,39 @@ def test_all_faults_are_told_at_once() -> None:
         ({"voltage_limit_v": "300"}, "axis.X.regulators.voltage_limit_v: must be a number, not '300'"),
     ],
 )
-def test_regulators(change: dict[str, Any], expected: str) -> None:
+def test_regulator_structures_check_their_gains(change: dict[str, Any], expected: str) -> None:
     document = bench_document()
     document["axis"]["X"]["regulators"].update(change)
-    assert expected in faults(document)
+    assert expected in list_faults(document)
 
 
 @pytest.mark.parametrize("value", [True, "1", "1e3", "yes"])
-def test_a_number_is_neither_text_nor_a_switch(value: object) -> None:
+def test_number_refuses_text_and_booleans(value: object) -> None:
     document = bench_document()
     document["axis"]["X"]["nominal"]["R"] = value
     document["axis"]["X"]["correction"] = {"max_offset_um": value}
     document["sim"] = {"seed": value, "axis": {"X": {"limit_switches_mm": [value, 1.0]}}}
     document["bus"] = {"can0": {"bitrate": value}}
-    told = faults(document)
+    told = list_faults(document)
     keys = ("axis.X.nominal.R", "axis.X.correction.max_offset_um", "sim.seed", "bus.can0.bitrate")
     for key in (*keys, "sim.axis.X.limit_switches_mm.0"):
         assert f"{key}: must be a number, not {value!r}" in told
 
 
 @pytest.mark.parametrize("value", [1, 0.0, "yes", "true"])
-def test_a_switch_is_true_or_false(value: object) -> None:
+def test_switch_accepts_only_booleans(value: object) -> None:
     document = bench_document()
     document["sim"] = {"nc": value}
-    assert f"sim.nc: must be true or false, not {value!r}" in faults(document)
+    assert f"sim.nc: must be true or false, not {value!r}" in list_faults(document)
 
 
-def test_whole_numbers_paths_and_options_of_an_adapter_are_taken_as_they_are_written() -> None:
+def test_integers_paths_and_adapter_options_are_accepted() -> None:
     document = bench_document()
     document["axis"]["X"]["nominal"]["R"] = 1
     document["store"] = {"directory": "data"}
     options = {"text": "1", "switch": True, "whole": 1, "number": 1.5}
     document["bus"] = {"can0": {"bitrate": 1e6, "options": options}}
-    read = config.parse(document)
+    read = config.parse_config(document)
     assert (read.axis["X"].nominal.R, read.store.directory, read.bus["can0"].bitrate) == (1.0, Path("data"), 1_000_000)
     assert repr(dict(read.bus["can0"].options)) == repr(options)
 
@@ -103,7 +103,7 @@ def test_limits_that_cannot_be_ramped_down_in_time_are_refused() -> None:
         "max_speed_mm_s": 2.0,
         "max_acceleration_mm_s2": 400.0,
     }
-    assert "from the largest offset to zero these limits need" in faults(document)
+    assert "from the largest offset to zero these limits need" in list_faults(document)
 
 
 @pytest.mark.parametrize(
@@ -128,35 +128,38 @@ def test_increments_too_coarse_for_the_limits_are_refused(
     document["axis"]["X"]["correction"] = dict(zip(names, limits, strict=True))
     document["axis"]["X"]["drive"] = {"increments_per_rev": per_turn}
     if told:
-        assert told in faults(document)
+        assert told in list_faults(document)
     else:
-        assert config.OffsetBounds.of(config.parse(document).axis["X"], 0.001).whole[2] == 1
+        assert (
+            config.OffsetBounds.compute_effective(config.parse_config(document).axis["X"], 0.001).whole_increments[2]
+            == 1
+        )
 
 
-def test_two_drives_with_one_node_id_are_refused() -> None:
+def test_duplicate_node_id_is_refused() -> None:
     document = bench_document()
     document["axis"]["X"]["drive"] = {"node_id": 2}
-    assert "have the same node_id on one bus" in faults(document)
+    assert "have the same node_id on one bus" in list_faults(document)
 
 
 @pytest.mark.parametrize("section", ["guard", "play"])
-def test_a_heartbeat_of_ours_under_a_drives_node_id_is_refused(section: str) -> None:
+def test_own_heartbeat_with_a_drives_node_id_is_refused(section: str) -> None:
     document = bench_document() | {section: {"node_id": 2}}
-    assert f"{section}.node_id: it is that of drive Y" in faults(document)
+    assert f"{section}.node_id: it is that of drive Y" in list_faults(document)
 
 
-def test_one_bus_by_two_names_is_refused() -> None:
+def test_two_sections_for_one_bus_are_refused() -> None:
     """Every SYNC would be sent twice, and two drives with the same node-ID would be accepted."""
     place = {"interface": "socketcand", "host": "127.0.0.1", "port": 29536}
     document = bench_document() | {"bus": {"can0": place, "can1": place}}
     document["axis"]["Y"]["drive"] = {"node_id": 1, "bus": "can1"}
-    assert "bus.can1: it is the same bus as [bus.can0]" in faults(document)
+    assert "bus.can1: it is the same bus as [bus.can0]" in list_faults(document)
     document["bus"]["can1"] = {**place, "channel": "can1"}
-    config.parse(document)
+    config.parse_config(document)
 
 
-def test_the_mark_that_an_editor_puts_before_a_text_is_no_part_of_it() -> None:
-    assert config.toml_document(b"\xef\xbb\xbf[machine]\nname = 'mill'\n", "m.toml") == {"machine": {"name": "mill"}}
+def test_byte_order_mark_is_ignored() -> None:
+    assert config.parse_toml(b"\xef\xbb\xbf[machine]\nname = 'mill'\n", "m.toml") == {"machine": {"name": "mill"}}
 
 
 @pytest.mark.parametrize(
@@ -168,19 +171,19 @@ def test_the_mark_that_an_editor_puts_before_a_text_is_no_part_of_it() -> None:
         (b"", "machine"),
     ],
 )
-def test_files_that_are_no_config(tmp_path: Path, text: bytes, expected: str) -> None:
+def test_invalid_files_are_config_errors(tmp_path: Path, text: bytes, expected: str) -> None:
     path = tmp_path / "machine.toml"
     path.write_bytes(text)
     with pytest.raises(ConfigError, match=expected):
-        config.load(path)
+        config.load_config(path)
 
 
 def test_a_missing_file_is_a_config_error() -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
-        config.load(Path("nowhere.toml"))
+        config.load_config(Path("nowhere.toml"))
 
 
-def test_the_store_lies_beside_the_config(tmp_path: Path) -> None:
+def test_store_directory_is_relative_to_the_config(tmp_path: Path) -> None:
     machine = bench_config(folder=tmp_path)
     assert machine.store.directory == tmp_path / "fdhil-data"
     assert machine.store.run_directory == tmp_path / "fdhil-data" / "run"
@@ -202,13 +205,13 @@ def test_the_store_lies_beside_the_config(tmp_path: Path) -> None:
         ("nc", "smoothing_s", [1e9], "from 0 to 10"),
     ],
 )
-def test_a_number_out_of_its_range_is_told_with_the_range(section: str, key: str, value: float, range_: str) -> None:
+def test_number_out_of_range_is_reported_with_the_range(section: str, key: str, value: float, range_: str) -> None:
     document = bench_document("X")
     table = document
     for part in section.split("."):
         table = table.setdefault(part, {})
     table[key] = value
-    told = faults(document)
+    told = list_faults(document)
     assert f"{section}.{key}" in told
     assert range_ in told
 
@@ -219,16 +222,18 @@ def test_every_number_of_every_section_has_a_range() -> None:
 
     def walk(section: type[config.Section], place: str) -> None:
         for key, field in section.model_fields.items():
-            inner = [a for a in reading._arguments(field.annotation) if isinstance(a, type)]
+            inner = [a for a in config_loader._list_type_arguments(field.annotation) if isinstance(a, type)]
             for kind in inner:
                 if issubclass(kind, config.Section):
                     walk(kind, f"{place}{key}.")
                 elif kind in (int, float):
-                    told = list(reading._constraints(field)) + list(reading._constraints(field.annotation))
+                    told = list(config_loader._iterate_constraints(field)) + list(
+                        config_loader._iterate_constraints(field.annotation)
+                    )
                     bounded = any(hasattr(c, "le") for c in told) and any(
                         hasattr(c, "ge") or hasattr(c, "gt") for c in told
                     )
-                    bounded |= any(getattr(c, "func", None) is _of_a_machine for c in told)
+                    bounded |= any(getattr(c, "func", None) is _check_magnitude for c in told)
                     if not bounded and key != "sign":
                         open_ended.append(f"{place}{key}")
 
@@ -254,11 +259,11 @@ def test_every_number_of_every_section_has_a_range() -> None:
     ids=lambda text: text[:24],
 )
 @pytest.mark.fault("G7")
-def test_a_hostile_file_is_a_config_error_of_few_words(text: str, expected: str, tmp_path: Path) -> None:
+def test_hostile_file_is_a_short_config_error(text: str, expected: str, tmp_path: Path) -> None:
     path = tmp_path / "machine.toml"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
-        config.load(path)
+        config.load_config(path)
     told = str(caught.value)
     assert expected in told
     assert len(told) < 12_000

@@ -11,15 +11,15 @@ import pytest
 
 from fdhil import config
 from fdhil.config import MachineConfig
-from fdhil.config.template import filled
+from fdhil.config.config_template import write_filled_template
 from fdhil.errors import ConfigError
 from tests.bench import bench_document, rotary_and_gantry_document, rotary_axis
 
 Change = Callable[[dict[str, Any]], object]
 
 
-def test_degrees_become_lengths_of_arc_at_the_radius() -> None:
-    axis = config.parse(rotary_and_gantry_document()).axis["A"]
+def test_degrees_become_arc_lengths_at_the_radius() -> None:
+    axis = config.parse_config(rotary_and_gantry_document()).axis["A"]
     assert axis.mm_per_unit == pytest.approx(100.0 * math.pi / 180.0)
     assert axis.screw_pitch_mm == pytest.approx(12.0 * axis.mm_per_unit)
     assert axis.rapid_speed_rad_s == pytest.approx(280.0 / 12.0 * 2 * math.pi)  # of the motor: without the radius
@@ -32,7 +32,7 @@ def test_radius_changes_no_quantity_of_the_motor() -> None:
     for document, radius_mm in zip(documents, (50.0, 500.0), strict=True):
         document["axis"]["A"] = rotary_axis(radius_mm)
         document["axis"]["A"].pop("correction")
-    near, far = (config.parse(document).axis["A"] for document in documents)
+    near, far = (config.parse_config(document).axis["A"] for document in documents)
     assert near.rapid_speed_rad_s == pytest.approx(far.rapid_speed_rad_s)
     per_degree = [axis.scaling.increments_per_mm * axis.mm_per_unit for axis in (near, far)]
     assert per_degree == pytest.approx([65536 / 12.0] * 2)
@@ -46,7 +46,7 @@ def test_other_tables_of_a_rotary_axis_are_in_degrees_too() -> None:
         "table": {"cob_id": 0x2A0, "scale": 0.001},
     }
     document["sim"] = {"axis": {"A": {"start_deg": 45.0}}}
-    read = config.parse(document)
+    read = config.parse_config(document)
     axis, factor = read.axis["A"], read.axis["A"].mm_per_unit
     assert axis.drive.following_error_window_mm == pytest.approx(2.0 * factor)
     assert axis.top_speed_mm_s == pytest.approx(300.0 * factor)
@@ -57,35 +57,35 @@ def test_other_tables_of_a_rotary_axis_are_in_degrees_too() -> None:
     assert read.sim.axis["A"].start_mm == pytest.approx(45.0 * factor)
 
 
-def test_second_drive_takes_the_keys_of_the_first_but_its_node_id_and_sensors() -> None:
+def test_second_drive_inherits_keys_except_node_id_and_sensors() -> None:
     document = rotary_and_gantry_document()
     document["axis"]["Y"] |= {
         "drive": {"node_id": 7, "profile": "epos4", "rated_current_a": 12.0},
         "resonance_hz": 90.0,
     }
     document["axis"]["Y"]["table"] = {"cob_id": 0x2A0}
-    read = config.parse(document)
+    read = config.parse_config(document)
     first, second = read.axis["Y"], read.axis["Y2"]
     assert second.model_copy(update={"drive": first.drive, "table": first.table}) == first
     assert second.drive == first.drive.model_copy(update={"node_id": None, "sign": -1})
-    assert (read.node_id("Y"), read.node_id("Y2"), second.table) == (7, 3, None)
+    assert (read.get_node_id("Y"), read.get_node_id("Y2"), second.table) == (7, 3, None)
 
 
-def test_configuration_survives_its_own_dump() -> None:
-    read = config.parse(rotary_and_gantry_document())
+def test_configuration_survives_dump_and_reload() -> None:
+    read = config.parse_config(rotary_and_gantry_document())
     dumped = MachineConfig.model_validate(read.model_dump(mode="json"))
     assert dumped == read
     assert dumped.digest == read.digest
 
 
-def test_digest_knows_the_unit_and_the_radius_but_not_the_watched_difference() -> None:
-    digests = {config.parse(rotary_and_gantry_document()).digest}
+def test_digest_covers_unit_and_radius_but_not_max_difference() -> None:
+    digests = {config.parse_config(rotary_and_gantry_document()).digest}
     document = rotary_and_gantry_document()
     document["axis"]["Y2"]["max_difference_um"] = 200.0
-    digests.add(config.parse(document).digest)
+    digests.add(config.parse_config(document).digest)
     assert len(digests) == 1
     document["axis"]["A"]["radius_mm"] = 101.0
-    assert config.parse(document).digest not in digests
+    assert config.parse_config(document).digest not in digests
 
 
 @pytest.mark.parametrize(
@@ -140,11 +140,11 @@ def test_digest_knows_the_unit_and_the_radius_but_not_the_watched_difference() -
         ),
     ],
 )
-def test_what_cannot_be_is_refused_with_its_key(change: Change, expected: str) -> None:
+def test_impossible_axis_is_refused_with_its_key(change: Change, expected: str) -> None:
     document = rotary_and_gantry_document()
     change(document["axis"])
     with pytest.raises(ConfigError) as caught:
-        config.parse(document)
+        config.parse_config(document)
     assert expected in str(caught.value)
 
 
@@ -167,19 +167,19 @@ def test_wrong_kind_of_value_is_a_fault_of_the_configuration(key: str, value: ob
         ("drive", {}),
         ("sim", {}),
     ]:
-        assert config.parse(document).axis["A"].mm_per_unit > 1.0
+        assert config.parse_config(document).axis["A"].mm_per_unit > 1.0
     else:
         with pytest.raises(ConfigError):
-            config.parse(document)
+            config.parse_config(document)
 
 
-def test_radius_of_a_linear_axis_is_questioned_and_not_used() -> None:
+def test_radius_of_a_linear_axis_gives_a_warning() -> None:
     document = bench_document("X")
     document["axis"]["X"]["radius_mm"] = 80.0
-    read = config.parse(document)
+    read = config.parse_config(document)
     assert read.axis["X"].mm_per_unit == 1.0
-    assert read.digest == config.parse(bench_document("X")).digest
-    (sentence,) = config.unlikely(read)
+    assert read.digest == config.parse_config(bench_document("X")).digest
+    (sentence,) = config.find_unlikely_values(read)
     assert sentence.startswith("axis.X.radius_mm is only used by a rotary axis")
 
 
@@ -188,12 +188,12 @@ def test_both_drives_of_a_gantry_axis_share_a_bus() -> None:
     document["bus"] = {"can0": {}, "can1": {"channel": "can1"}}
     document["axis"]["Y2"]["drive"]["bus"] = "can1"
     with pytest.raises(ConfigError, match=r"axis\.Y2\.drive\.bus: both drives of axis Y are on one bus"):
-        config.parse(document)
+        config.parse_config(document)
 
 
-def test_filled_template_of_a_rotary_axis_has_its_degrees_and_is_read_again(tmp_path: Path) -> None:
+def test_filled_template_of_a_rotary_axis_round_trips(tmp_path: Path) -> None:
     document = rotary_and_gantry_document()
     path = tmp_path / "machine.toml"
-    path.write_text(filled(document, {"axis.A.rapid_speed_deg_s": "measured"}))
+    path.write_text(write_filled_template(document, {"axis.A.rapid_speed_deg_s": "measured"}))
     assert "rapid_speed_deg_s = 280.0  # measured" in path.read_text().splitlines()
-    assert config.load(path).digest == config.parse(document, folder=tmp_path).digest
+    assert config.load_config(path).digest == config.parse_config(document, folder=tmp_path).digest

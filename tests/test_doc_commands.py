@@ -16,7 +16,7 @@ import pytest
 from fdhil import config
 from fdhil.cli.guard import guard
 from fdhil.cli.main import cli, leaves
-from fdhil.config.fleet import Fleet
+from fdhil.config.fleet_config import Fleet
 from fdhil.daemon.kernel_warmup import simulate_nominal_rapid
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.fleet.offer import Change
@@ -153,7 +153,7 @@ def test_block_that_is_not_tried_is_found(tmp_path: Path) -> None:
 def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of configs/ with a store of one rapid and one parameter set, as after ``fdhil run``."""
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
-    machine = config.load(tmp_path / "configs" / "sim.toml")
+    machine = config.load_config(tmp_path / "configs" / "sim.toml")
     store = OutcomeStore(machine)
     store.open()
     store.store_outcomes([published(1), published(1, "Y")])
@@ -231,6 +231,6 @@ def test_every_piece_of_a_configuration_can_be_put_into_one(page: Path) -> None:
         elif "set" in piece:
             Change.model_validate(ChangeFile.model_validate(piece).change)
         elif not {"fault", "tpdos", "base"} & set(piece):
-            assert config.parse(merged(bench_document(), piece)).axis
+            assert config.parse_config(merged(bench_document(), piece)).axis
     for text in blocks(page, "python"):
         compile(text, str(page), "exec")

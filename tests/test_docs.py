@@ -47,11 +47,11 @@ def uncommented(text: str, *chosen: str) -> str:
 def loaded(tmp_path: Path, text: str) -> config.MachineConfig:
     path = tmp_path / "machine.toml"
     path.write_text(text, "utf-8")
-    return config.load(path)
+    return config.load_config(path)
 
 
 def test_the_template_as_it_stands_sends_nothing() -> None:
-    machine = config.load(TEMPLATE)
+    machine = config.load_config(TEMPLATE)
     assert list(machine.axis) == ["X"]
     assert machine.axis["X"].correction is None
     assert machine.axis["X"].feedforward is None
@@ -71,7 +71,7 @@ def test_each_optional_block_of_the_template_may_be_uncommented(tmp_path: Path) 
 def test_each_section_of_the_template_may_be_uncommented_and_shows_its_defaults(tmp_path: Path) -> None:
     text = TEMPLATE.read_text("utf-8")
     sections = re.findall(r"^#?(\[.*\])$", text, re.MULTILINE)
-    everything, as_it_stands = loaded(tmp_path, uncommented(text, *sections)), config.load(TEMPLATE)
+    everything, as_it_stands = loaded(tmp_path, uncommented(text, *sections)), config.load_config(TEMPLATE)
     assert everything.nc == as_it_stands.nc
     examples = {"run_directory": None, "daemon_user": None}  # keys without a default
     assert everything.guard.model_copy(update=examples) == as_it_stands.guard
@@ -102,7 +102,7 @@ def test_every_error_of_the_reference_is_told_to_the_end_of_its_sentence() -> No
 
 @pytest.mark.parametrize("path", sorted(ROOT.glob("configs/*.toml")), ids=lambda path: path.name)
 def test_every_shipped_config_is_valid(path: Path) -> None:
-    assert config.load(path).axis
+    assert config.load_config(path).axis
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

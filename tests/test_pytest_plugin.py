@@ -44,7 +44,7 @@ def test_its_configuration_is_one_that_commands_take(tmp_path: Path) -> None:
     from fdhil.pytest_plugin import FeedDriveBench
 
     with FeedDriveBench(tmp_path, axes="XZ", modbus=True) as bench:
-        machine = config.load(bench.write_config())
+        machine = config.load_config(bench.write_config())
     assert [*machine.axis] == ["X", "Z"]
     assert machine.axis["Z"].voltage.port == bench.ready["modbus"]["Z"]["port"]
 

@@ -18,7 +18,7 @@ def _recent(rate_hz: float, begin_ticks: float, samples: int, lost: int = -1) ->
 
     Block ``lost`` of the sensor's 20 is left out.
     """
-    axis = machine_config.parse({"machine": {"name": "bench"}, "axis": {"X": bench_axis()}}, "test").axis["X"]
+    axis = machine_config.parse_config({"machine": {"name": "bench"}, "axis": {"X": bench_axis()}}, "test").axis["X"]
     section = axis.model_copy(update={"voltage": axis.voltage.model_copy(update={"source": "modbus"})})
     recent, ticks = RecentSamples("X", section, 30_000, 1e-3), np.arange(2000)
     zero = freeze_array(np.zeros(ticks.size))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from fdhil.drivers.can import sdo
-from fdhil.drivers.cia402.pdo_queue import Dense
+from fdhil.drivers.can import sdo_channel
+from fdhil.drivers.cia402.pdo_queue import DensePdo
 from fdhil.drivers.modbus import rtu_line
 from studies import wires
 from studies.late_answers import modbus, sdo_reads
@@ -36,7 +36,7 @@ def test_no_late_answer_of_an_sdo_server_is_taken() -> None:
 
 
 def test_a_server_that_is_not_heard_out_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sdo, "QUIET_S", 0.0)
+    monkeypatch.setattr(sdo_channel, "QUIET_S", 0.0)
     assert sdo_reads(1500, 11, 1.45)["wrong"] > 0
 
 
@@ -57,7 +57,7 @@ def test_every_lost_frame_is_counted_and_leaves_no_value_of_another_row(name: st
 
 
 def test_a_value_of_another_row_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Dense, "certain", lambda self, between: self.present)
+    monkeypatch.setattr(DensePdo, "find_certain_ticks", lambda self, between: self.present)
     assert wires.losses(60_000, 5, wires.LOSSES["any of the three"], 5.0)["misplaced"] > 0
 
 

@@ -40,7 +40,7 @@ class Machine:
     @classmethod
     def load(cls, path: str | Path) -> Machine:
         """Read a configuration (TOML). ConfigError with all its faults."""
-        return cls(config.load(Path(path)), str(path))
+        return cls(config.load_config(Path(path)), str(path))
 
     @classmethod
     def of(cls, machine: Machine | str | Path) -> Machine:

@@ -13,9 +13,9 @@ from fdhil.commissioning.identifiers import require_own_identifiers, sent_pdos
 from fdhil.commissioning.offset_writers import INVALID_COB_ID, identifier_of
 from fdhil.commissioning.record import KEY_NAME, CommissioningRecord, load_record, of_config
 from fdhil.commissioning.void import is_void, void_reason
-from fdhil.config import Axis, MachineConfig, OffsetBounds, share_fault
-from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
-from fdhil.drivers.cia402.profile_file import load_profile, require_offset
+from fdhil.config import Axis, MachineConfig, OffsetBounds, find_share_fault
+from fdhil.drivers.cia402.drive_profile import DriveProfile, PdoSpec
+from fdhil.drivers.cia402.drive_profile_file import load_profile, require_offset
 from fdhil.errors import ConfigError, ConfigFault, StoreError
 from fdhil.guard.feedforward_law import FeedforwardLimits
 from fdhil.guard.guard_settings import AxisSettings, FeedforwardPdo, GuardSettings, Pdo
@@ -88,14 +88,14 @@ def _known_ids(names: Iterable[str]) -> Iterator[int]:
 
 def limits_of(axis: Axis, sync_period_s: float) -> OffsetLimits:
     """Return the limits in whole increments per SYNC cycle, as the planner has them, rounded down. ConfigError."""
-    if fault := share_fault(axis, sync_period_s):
+    if fault := find_share_fault(axis, sync_period_s):
         raise ConfigError("config", [ConfigFault("axis.*.correction", fault, "leave this axis uncorrected")])
-    return OffsetLimits(*OffsetBounds.of(axis, sync_period_s).whole)
+    return OffsetLimits(*OffsetBounds.compute_effective(axis, sync_period_s).whole_increments)
 
 
 def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
     profile = load_profile(axis.drive)
-    node_id, period_s = machine.node_id(name), machine.machine.sync_period_s
+    node_id, period_s = machine.get_node_id(name), machine.machine.sync_period_s
     per_rad = axis.drive.increments_per_rev / (2 * math.pi)
     require_offset(profile, name)
     target, offset = _rpdo(profile, profile.target, name), _rpdo(profile, profile.offset, name)
@@ -120,7 +120,7 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
         setpoint_delay_cycles=axis.drive.setpoint_delay_cycles,
         heartbeat_timeout_s=heartbeat_timeout_s(machine, name),
         feedforward=_feedforward(profile, machine, name, axis),
-        speed_count=abs(profile.speed_rad_s_per_count(axis)) * per_rad * period_s,
+        speed_count=abs(profile.compute_speed_scale(axis)) * per_rad * period_s,
         speed_step=SPEED_STEPS * _largest_acceleration_rad_s2(axis) * per_rad * period_s**2,
         travel=None if record is None else record.travel,
         writers=_writers(machine, name, profile, record),
@@ -136,13 +136,13 @@ def _writers(
     By the record these are those of all RPDOs that map one, valid or not. The default RPDOs are added: one that did not
     exist, or was invalid, at commissioning was set up by another master since.
     """
-    node, recorded = machine.node_id(name), () if record is None else record.rpdos
+    node, recorded = machine.get_node_id(name), () if record is None else record.rpdos
     harmless = {identifier_of(cob_id) for cob_id in recorded if not cob_id & INVALID_COB_ID}
     suspect = {identifier_of(cob_id) for cob_id in recorded if cob_id & INVALID_COB_ID}
     suspect |= {base + node for base in COB_RPDO} | {spec.cob_base + node for spec in profile.rpdos}
     same_bus = {n: axis for n, axis in machine.axis.items() if axis.drive.bus == machine.axis[name].drive.bus}
     known = {
-        spec.cob_base + machine.node_id(other)
+        spec.cob_base + machine.get_node_id(other)
         for other, axis in same_bus.items()
         for found in (load_profile(axis.drive),)
         for spec in (*found.rpdos, *found.tpdos)
@@ -181,7 +181,7 @@ def _feedforward(profile: DriveProfile, machine: MachineConfig, name: str, axis:
     speed = axis.drive.increments_per_rev / (2 * math.pi)
     torque = 1e3 / (axis.nominal.K * axis.drive.rated_current_a)
     return FeedforwardPdo(
-        _pdo(found[0], machine.node_id(name)),
+        _pdo(found[0], machine.get_node_id(name)),
         FeedforwardLimits(
             speed=max(1, math.floor(limits.max_speed_rad_s * speed)),
             speed_rate=max(1, math.floor(limits.max_speed_rate_rad_s2 * speed * period)),

@@ -19,7 +19,7 @@ from fdhil.commissioning.offset_writers import INVALID_COB_ID, identifier_of
 from fdhil.commissioning.record import CommissioningRecord, holds, load_record
 from fdhil.config import MachineConfig
 from fdhil.correction import flatness_feedforward, gate
-from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.identification.loops import regulators_of
 from fdhil.model.terms import with_resonance
 from fdhil.prediction.gain import Gain, joint_held_out_um, largest_skill_um, with_held_out_um, worst_skill_um
@@ -257,7 +257,7 @@ def _feeds(record: CommissioningRecord | None, config: MachineConfig, axis: str)
     if record is None or found is None:
         return False
     cob_id = record.options.get(feedforward_object(found[0].number), INVALID_COB_ID)
-    return not cob_id & INVALID_COB_ID and identifier_of(cob_id) == found[0].cob_base + config.node_id(axis)
+    return not cob_id & INVALID_COB_ID and identifier_of(cob_id) == found[0].cob_base + config.get_node_id(axis)
 
 
 def standing_facts(

@@ -54,7 +54,7 @@ def acceptance(config: Path, out: Path, pdf: Path | None, as_json: bool, **optio
     from fdhil.report import require, write_page_or_pdf
 
     require()
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     forewarn("predict", "correct")
     found = find(machine, config, Asked(**options))
     document = document_of(found)

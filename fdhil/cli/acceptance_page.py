@@ -60,8 +60,8 @@ def _verdict(found: Findings) -> Section:
     for axis, section in machine.axis.items():
         rapid = f"{section.rapid_speed_mm_s * 0.06:g} m/min"
         if section.unit == "deg":
-            rapid = section.shown(section.rapid_speed_mm_s, "/s", "g")
-        reach = f"{section.shown(section.screw_pitch_mm, form='g')} a turn, rapid {rapid}"
+            rapid = section.format_in_unit(section.rapid_speed_mm_s, "/s", "g")
+        reach = f"{section.format_in_unit(section.screw_pitch_mm, form='g')} a turn, rapid {rapid}"
         rows.append([f"axis {axis}", f"{reach}, at most {section.max_acceleration_mm_s2 / 1e3:g} m/s²"])
     points = [[str(number), point] for number, point in enumerate(found.open_points, 1)]
     tables = [Table(("", "open point"), points)] if points else []

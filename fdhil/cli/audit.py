@@ -24,7 +24,7 @@ def audit(config: Path, last: int, as_json: bool) -> int:
 
     The log lists each request to the machine with its time, client and result.
     """
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     from fdhil.daemon.service_log import escape_unprintable
     from fdhil.store.audit import AUDIT_FILE_NAME, entries
 

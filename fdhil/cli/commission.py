@@ -80,7 +80,7 @@ def commission(
     Completed steps are skipped unless the drive or the configuration changed; an interrupted run continues where it
     ended. On any failure and on Ctrl-C the axis is braked, the offset returns to zero and the drive is switched off.
     """
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     # an axis of HAL pins without offsets needs no commissioning
     proven = [name for name, axis in machine.axis.items() if axis.correction is not None or axis.drive.source != "hal"]
     axes = [only] if only else proven or list(machine.axis)
@@ -214,7 +214,7 @@ def _set_pdos(machine: MachineConfig, axis: str, options: Asked) -> dict[str, An
     from fdhil.cli.bus_lock import lock_bus
     from fdhil.commissioning.master import Master
     from fdhil.commissioning.pdo_setup import set_up_pdos
-    from fdhil.drivers.cia402.profile_file import load_profile
+    from fdhil.drivers.cia402.drive_profile_file import load_profile
 
     profile = load_profile(machine.axis[axis].drive)
     if not options.yes:

@@ -106,13 +106,13 @@ def trial_moves(machine: MachineConfig, axis: str, room: Room | None) -> dict[st
     require_single_drive(machine, axis)
     settings = machine.axis[axis]
     if room is None:
-        top = settings.shown(settings.rapid_speed_mm_s, "/s", "g")
+        top = settings.format_in_unit(settings.rapid_speed_mm_s, "/s", "g")
         return dict.fromkeys(TRIAL, NOTHING) | {
             "jog": "a few millimetres within the room that you allow, and back",
             "test rapids": f"within the room that you allow at up to {top}, and back, {TRIAL_RAPIDS // 2} times",
         }
     jog, rapid = plan_jog(axis, settings, room), plan_rapid(axis, settings, room)
-    steep = settings.shown(rapid.acceleration_mm_s2, "/s2", "g")
+    steep = settings.format_in_unit(rapid.acceleration_mm_s2, "/s2", "g")
     return dict.fromkeys(TRIAL, NOTHING) | {
         "jog": f"{jog}, and back",
         "test rapids": f"{rapid} with {steep}, and back, {TRIAL_RAPIDS // 2} times",

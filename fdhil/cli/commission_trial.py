@@ -57,7 +57,7 @@ def try_commissioned(
         return None if options.yes else agreed(question)
 
     settings = machine.axis[axis]
-    operator = Operator(report, saw, result, lambda mm: guide.show_position(settings.shown(mm, form=".3f")))
+    operator = Operator(report, saw, result, lambda mm: guide.show_position(settings.format_in_unit(mm, form=".3f")))
     forewarn("identify")
     with _history(machine, axis) as (known, keep):
         tried = try_axis(machine, record, room, operator, progress, known)

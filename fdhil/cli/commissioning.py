@@ -44,7 +44,7 @@ def scan(config: Path, places: tuple[Path, ...], as_json: bool) -> None:
     Listens for some seconds, then reads by SDO. If an NC runs the bus (SYNC, NMT commands, set-points or SDO requests
     are received), nothing is sent, and the list contains only what was received.
     """
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     from fdhil.commissioning.scan import scan_bus  # late: --help imports nothing heavy
 
     descriptions = _descriptions(places, config.parent)
@@ -116,7 +116,7 @@ def check(config: Path, as_json: bool) -> int:
     Each point is ok, differs (with expected value, found value and next action), or was not compared. Only listens and
     reads. If an NC runs the bus, it only listens, and points that need an SDO request are not compared.
     """
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     from fdhil.commissioning.config_check import check_machine
     from fdhil.commissioning.void import void_mark
 

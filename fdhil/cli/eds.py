@@ -17,9 +17,9 @@ from fdhil.cli.options import AS_JSON, FILE
 from fdhil.errors import ConfigError, ConfigFault
 
 if TYPE_CHECKING:
-    from fdhil.drivers.cia402.abilities import Ability
-    from fdhil.drivers.cia402.device import Device, DeviceObject
-    from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
+    from fdhil.drivers.cia402.capabilities import Capability
+    from fdhil.drivers.cia402.device_description import DeviceDescription, DeviceObject
+    from fdhil.drivers.cia402.drive_profile import DriveProfile, PdoSpec
 
 SCHEMA = "fdhil-eds-1"
 COLOURS = {"yes": "green", "perhaps": "yellow", "no": "red"}
@@ -40,9 +40,13 @@ def eds(file: Path, name: str | None, as_json: bool) -> int:
     Suggests a profile for the vendor and the PDOs to set up. Lists the objects that may be a motor voltage, a DC link
     or a current. Nothing is sent. The drive itself may differ from its EDS.
     """
-    from fdhil.drivers.cia402.abilities import abilities, named_alike, suggest_profile  # late: --help imports nothing
-    from fdhil.drivers.cia402.device import read_device
-    from fdhil.drivers.cia402.profile_file import read_profile
+    from fdhil.drivers.cia402.capabilities import (  # late: --help imports nothing
+        assess_capabilities,
+        find_similar_names,
+        suggest_profile,
+    )
+    from fdhil.drivers.cia402.device_description import read_device
+    from fdhil.drivers.cia402.drive_profile_file import read_profile
 
     if name is not None and name not in tables.DRIVE_PROFILES and not name.endswith(".toml"):
         near = difflib.get_close_matches(name, tables.DRIVE_PROFILES, n=1)
@@ -52,8 +56,8 @@ def eds(file: Path, name: str | None, as_json: bool) -> int:
     device = read_device(file)
     suggested = suggest_profile(device)
     profile = read_profile(name or suggested, file)
-    found = abilities(device, profile)
-    candidates = {what: named_alike(device, what) for what in ("voltage", "dc_link", "current")}
+    found = assess_capabilities(device, profile)
+    candidates = {what: find_similar_names(device, what) for what in ("voltage", "dc_link", "current")}
     if as_json:
         click.echo(json.dumps(_document(device, profile, suggested, found, candidates)))
     else:
@@ -62,10 +66,10 @@ def eds(file: Path, name: str | None, as_json: bool) -> int:
 
 
 def _document(
-    device: Device,
+    device: DeviceDescription,
     profile: DriveProfile,
     suggested: str,
-    found: Sequence[Ability],
+    found: Sequence[Capability],
     candidates: Mapping[str, Sequence[DeviceObject]],
 ) -> dict[str, Any]:
     return {
@@ -77,14 +81,14 @@ def _document(
             "vendor_id": device.vendor_id,
             "product_code": device.product_code,
             "is_drive": device.is_drive,
-            "axes": list(device.axes),
+            "axes": list(device.logical_axes),
             "objects": len(device.objects),
             "rpdos": len(device.rpdos),
             "tpdos": len(device.tpdos),
         },
         "profile": profile.name,
         "suggested_profile": suggested,
-        "notes": [*profile.notes, *device.doubts],
+        "notes": [*profile.notes, *device.ambiguities],
         "abilities": [asdict(ability) for ability in found],
         "named_alike": {what: [_object(at) for at in objects] for what, objects in candidates.items()},
         "pdos": [_pdo(spec) for spec in (*profile.rpdos, *profile.tpdos)],
@@ -92,7 +96,7 @@ def _document(
 
 
 def _object(at: DeviceObject) -> dict[str, Any]:
-    in_tpdo = "yes" if at.in_tpdo else "perhaps" if at.perhaps_in_tpdo else "no"
+    in_tpdo = "yes" if at.fits_in_tpdo else "perhaps" if at.may_fit_in_tpdo else "no"
     entry = {"index": at.key[0], "sub": at.key[1], "name": at.name, "bits": at.bits, "signed": at.signed}
     return entry | {"access": at.access, "in_tpdo": in_tpdo}
 
@@ -109,10 +113,10 @@ def _pdo(spec: PdoSpec) -> dict[str, Any]:
 
 
 def _show(
-    device: Device,
+    device: DeviceDescription,
     profile: DriveProfile,
     suggested: str,
-    found: Sequence[Ability],
+    found: Sequence[Capability],
     candidates: Mapping[str, Sequence[DeviceObject]],
 ) -> None:
     from rich import box
@@ -124,8 +128,8 @@ def _show(
     out = open_console()
     who = " ".join(filter(None, (device.vendor_name, device.product_name))) or "unnamed"
     out.print(Text(f"{device.file}: {who}, vendor {device.vendor_id:08X}, product {device.product_code:08X}"))
-    if len(device.axes) > 1:
-        others = ", ".join(map(str, device.axes[1:]))
+    if len(device.logical_axes) > 1:
+        others = ", ".join(map(str, device.logical_axes[1:]))
         out.print(Text(f"it also has axes {others}: set drive.logical_axis for these"), soft_wrap=True)
     by = "suggested" if profile.name == suggested else f"{suggested} is suggested"
     title = f" ({profile.title})" if profile.title else ""
@@ -138,13 +142,13 @@ def _show(
     for what, objects in candidates.items():
         if objects:
             out.print(Text(f"by name, may be {CANDIDATES[what]}: {_named(objects)}"), soft_wrap=True)
-    for note in (*profile.notes, *device.doubts) if device.is_drive else device.doubts:
+    for note in (*profile.notes, *device.ambiguities) if device.is_drive else device.ambiguities:
         out.print(Text(f"note: {note}"), soft_wrap=True)
     _show_pdos(out, profile if device.is_drive else None)
 
 
 def _named(objects: Sequence[DeviceObject]) -> str:
-    listed = [f"{at.key[0]:04X}:{at.key[1]:02X} {at.name}{'' if at.in_tpdo else ' (SDO)'}" for at in objects]
+    listed = [f"{at.key[0]:04X}:{at.key[1]:02X} {at.name}{'' if at.fits_in_tpdo else ' (SDO)'}" for at in objects]
     more = f" and {len(listed) - MOST_NAMED} more" if len(listed) > MOST_NAMED else ""
     return "; ".join(listed[:MOST_NAMED]) + more
 

@@ -24,12 +24,12 @@ def export_file(recording: Path, out: Path, format_name: str | None, columns: Pa
             what, others = "a bus log", [*suffixes.BUS_LOGS.values()]
         raise click.BadParameter(f"{recording} is {what}, which converts to {', '.join(others)}", param_hint="--format")
     if is_log:
-        from fdhil.drivers.can.bus_log import converted_log
+        from fdhil.drivers.can.log_conversion import convert_log
 
-        log = converted_log(recording, suffixes.BUS_LOGS[recording.suffix.lower()], name)
+        log = convert_log(recording, suffixes.BUS_LOGS[recording.suffix.lower()], name)
         with open_output(out) as file:
             file.write(log.content)
-        return {"format": name} | log.report()
+        return {"format": name} | log.report_conversion()
     table = read_table(recording, None if columns is None else read_column_map(columns))
     export_table(table, out, name)
     return {"format": name, "axis": table.headers.get("axis"), "rows": next(iter(table.columns.values())).size}

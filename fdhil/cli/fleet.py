@@ -13,7 +13,7 @@ from fdhil.cli.options import AS_JSON, CONFIG, FLEET, LINES
 from fdhil.errors import FdhilError
 
 if TYPE_CHECKING:
-    from fdhil.config.fleet import Fleet
+    from fdhil.config.fleet_config import Fleet
 
 BY = click.option("--by", default="type", show_default=True, help="Label of [uplink] that groups comparable machines.")
 ELSEWHERE: Mapping[str, str] = {
@@ -46,7 +46,7 @@ def uplink(config: Path, as_json: bool) -> None:
     """
     from fdhil import config as machine_config
 
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     with with_extra():
         from fdhil.fleet.uplink import send
     from fdhil.daemon import service_log
@@ -89,9 +89,9 @@ def collect(fleet: Path, as_json: bool) -> None:
     Reads them from JetStream. Several collectors may run, on one or more computers. Creates stream and tables if they
     are missing. Stops on SIGTERM or Ctrl-C.
     """
-    from fdhil.config.fleet import load
+    from fdhil.config.fleet_config import load_fleet_config
 
-    settings = load(fleet)
+    settings = load_fleet_config(fleet)
     with with_extra():
         from fdhil.fleet.collector import collect as gather
     from fdhil.daemon import service_log
@@ -112,9 +112,9 @@ def query_database(settings: "Fleet", question: str, **given: str | None) -> dic
 def query_and_print(fleet: Path, question: str, as_json: bool, **given: str | None) -> dict[str, Any]:
     """Answer a question from the database of ``fleet``, and print the answer."""
     from fdhil.cli import fleet_view
-    from fdhil.config.fleet import load
+    from fdhil.config.fleet_config import load_fleet_config
 
-    answer = query_database(load(fleet), question, **given)
+    answer = query_database(load_fleet_config(fleet), question, **given)
     fleet_view.tell(answer, question, as_json)
     return answer
 

@@ -62,13 +62,13 @@ def reanalyse(
     on the number of workers.
     """
     from fdhil.config import Identification
-    from fdhil.config.fleet import load
+    from fdhil.config.fleet_config import load_fleet_config
 
     if scheduler is not None and workers is not None:
         raise click.UsageError(
             "--workers are processes of this computer, --scheduler is a cluster; give only one of them"
         )
-    settings, machines = load(fleet), _by_name(configs)
+    settings, machines = load_fleet_config(fleet), _by_name(configs)
     with with_extra():
         from fdhil.fleet import reanalysis, sets
         from fdhil.fleet.changes import changes
@@ -95,8 +95,8 @@ def _by_name(configs: tuple[Path, ...]) -> dict[str, MachineConfig]:
 
     machines: dict[str, MachineConfig] = {}
     for path in configs:
-        read = config.load(path)
-        name = read.machine.name if read.uplink is None else read.uplink.name_of(read.machine.name)
+        read = config.load_config(path)
+        name = read.machine.name if read.uplink is None else read.uplink.get_plant_name(read.machine.name)
         if name in machines:
             raise click.BadParameter(f"{path} describes {name}, as another --config does", param_hint="--config")
         machines[name] = read

@@ -99,9 +99,9 @@ def stage(
     Lists the answers of the machines. With --key CHANGE is proposed to the next machines, once all earlier ones have
     accepted it, have identified with it, and have reported no notice since.
     """
-    from fdhil.config.fleet import load
+    from fdhil.config.fleet_config import load_fleet_config
 
-    settings = load(fleet)
+    settings = load_fleet_config(fleet)
     with with_extra():
         from fdhil.fleet import rollout
     proposal, days = rollout.read_change(change)

@@ -10,7 +10,7 @@ from fdhil.cli import fleet_view
 from fdhil.cli.fleet import query_and_print, query_database, with_extra
 from fdhil.cli.options import AS_JSON, FILE, FLEET
 from fdhil.cli.terminal_text import print_progress
-from fdhil.config.fleet import load
+from fdhil.config.fleet_config import load_fleet_config
 
 
 @click.command()
@@ -33,7 +33,7 @@ def service(
     if remove and at is None:
         raise click.UsageError("--remove needs the recorded --date")
     when = datetime.now(UTC).replace(microsecond=0) if at is None else at.replace(tzinfo=UTC)
-    settings = load(fleet)
+    settings = load_fleet_config(fleet)
     with with_extra():
         from fdhil.fleet import services, sets
     with sets.entered(settings) as db:
@@ -65,7 +65,7 @@ def retain(fleet: Path, as_json: bool) -> None:
     Deletes whole months of records, and files of windows. Run it once a day by a timer. The first parameters of each
     axis are kept, and deleted records do not count as missing.
     """
-    settings = load(fleet)
+    settings = load_fleet_config(fleet)
     with with_extra():
         from fdhil.fleet import retention, sets
     with sets.entered(settings) as db:
@@ -85,7 +85,7 @@ def export(fleet: Path, folder: Path, labels: tuple[str, ...], key: Path | None,
     Writes Parquet files: names of machines become keyed digests, times become ages in months, texts and labels are
     omitted except for --label. The key identifies the machines; keep it secret.
     """
-    settings = load(fleet)
+    settings = load_fleet_config(fleet)
     with with_extra():
         from fdhil.fleet import export as given_away
         from fdhil.fleet import sets
@@ -109,7 +109,7 @@ def web(fleet: Path, host: str | None, port: int | None, as_json: bool) -> None:
     """
     from fdhil.cli.web import placed, tell_ready
 
-    settings = load(fleet)
+    settings = load_fleet_config(fleet)
     with with_extra():
         from fdhil.fleet import questions as _  # noqa: F401 - a missing library is reported before the start
     from fdhil.web import serving
@@ -134,4 +134,4 @@ def web_user(fleet: Path, name: str, remove: bool, as_json: bool) -> None:
     """
     from fdhil.cli.web import set_user
 
-    set_user(load(fleet).web, fleet, name, "watch", remove, as_json)
+    set_user(load_fleet_config(fleet).web, fleet, name, "watch", remove, as_json)

@@ -32,7 +32,7 @@ def guard(config: Path, check: bool) -> None:
     from fdhil.arming.token import make_directory, operator_token
     from fdhil.commissioning.compare import compare_again
 
-    machine = guard_settings.with_given_key(machine_config.load(config))
+    machine = guard_settings.with_given_key(machine_config.load_config(config))
     name = guard_settings.corrected_bus(machine, str(config))
     token_sha256 = hashlib.sha256(operator_token(machine.run_directory).encode()).hexdigest()
     run_directory = machine.guard_directory

@@ -197,7 +197,7 @@ def _may_be_read(file: Path) -> bool:
 def _settings(path: Path | None, method: str | None) -> tuple[Identification, MachineConfig | None]:
     from fdhil import config
 
-    machine = config.load(path) if path is not None else None
+    machine = config.load_config(path) if path is not None else None
     settings = machine.identification if machine is not None else config.Identification()
     return (settings.model_copy(update={"method": method}) if method else settings), machine
 

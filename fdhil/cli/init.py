@@ -109,7 +109,7 @@ def running_pins() -> list[str]:
 def _hal_text(text: str, file: Path, nc: Machine, draft: Draft) -> str:
     from fdhil.commissioning.init.hal_file import correction_hal, splices_of
 
-    machine = machine_config.parse(machine_config.toml_document(text.encode(), str(file)), str(file), file.parent)
+    machine = machine_config.parse_config(machine_config.parse_toml(text.encode(), str(file)), str(file), file.parent)
     corrected = [axis for axis, settings in machine.axis.items() if settings.correction is not None]
     draft.notes.append(
         f"{file.with_suffix('.hal').name} loads the bridge: add it as the last HALFILE in [HAL] of the INI; "

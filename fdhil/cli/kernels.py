@@ -22,12 +22,12 @@ SLOW_ROWS = 5
 
 def compile_all() -> None:
     """Run synthetic rapids through all computations: estimators, checks, corrections, the simulated drive."""
-    config = machine_config.parse(machine_document())
+    config = machine_config.parse_config(machine_document())
     for method in (None, *tables.ESTIMATORS):
         compile_kernels(config, method)
     for window in _unusual(config):
         analyse(window, config.identification)
-    for machine in (config, machine_config.parse(machine_document(REAL))):
+    for machine in (config, machine_config.parse_config(machine_document(REAL))):
         Machine(machine).power_on()
 
 

@@ -43,7 +43,7 @@ def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
 
     Includes those in FILES. Shows the new values and what they invalidate. Nothing is changed.
     """
-    machine_config.load(config)
+    machine_config.load_config(config)
     with with_extra():
         from fdhil.fleet.offered import judge, present
     from fdhil.cli import offers_view
@@ -69,7 +69,7 @@ def accept(config: Path, offer: Path, by: str, may_loosen: bool, as_json: bool) 
     verified again. The old CONFIG is kept next to it. A running daemon uses the new values after a restart; nothing is
     armed.
     """
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     by, place = _text("--by", by, MOST_BY), _place(machine, offer)
     with with_extra():
         from fdhil.fleet.offered import accept as write
@@ -92,7 +92,7 @@ def reject(config: Path, offer: Path, by: str, reason: str, as_json: bool) -> No
 
     The fleet server is informed. The configuration does not change.
     """
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     by, place, reason = _text("--by", by, MOST_BY), _place(machine, offer), _text("--reason", reason, MOST_REASON)
     with with_extra():
         from fdhil.fleet.offered import reject as note

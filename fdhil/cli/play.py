@@ -62,7 +62,7 @@ def play(
     drives off. If fdhil fails, the drives miss its heartbeat and stop by themselves. A correction can be armed
     meanwhile.
     """
-    machine = machine_config.load(config_path)
+    machine = machine_config.load_config(config_path)
     from fdhil.commissioning.play import plan_play
     from fdhil.program import load_trajectory
 
@@ -192,8 +192,8 @@ def _told(plan: Plan, program: Path) -> str:
     for axis, path in trajectory.position_mm.items():
         speed = abs(path[1:] - path[:-1]).max(initial=0.0) / trajectory.dt_s
         ends, least, most = path[[0, -1]], path.min(), path.max()
-        first, last, low, high = (plan.config.axis[axis].shown(mm, form=".3f") for mm in (*ends, least, most))
-        fastest = plan.config.axis[axis].shown(speed, "/s", ".1f")
+        first, last, low, high = (plan.config.axis[axis].format_in_unit(mm, form=".3f") for mm in (*ends, least, most))
+        fastest = plan.config.axis[axis].format_in_unit(speed, "/s", ".1f")
         lines.append(f"  {axis} from {first} to {last}, between {low} and {high}, at up to {fastest}")
     return "\n".join(lines)
 
@@ -201,7 +201,7 @@ def _told(plan: Plan, program: Path) -> str:
 def _ask(bench: Bench, program: Path, here: list[int]) -> None:
     ways = zip(bench.plan.axes, bench.away_mm(here), strict=True)
     shown = {axis: bench.plan.config.axis[axis] for axis in bench.plan.axes}
-    start = ", ".join(f"{axis} {shown[axis].shown(way, form='+.3f')}" for axis, way in ways if way)
+    start = ", ".join(f"{axis} {shown[axis].format_in_unit(way, form='+.3f')}" for axis, way in ways if way)
     first = f"First the axes move slowly to the start ({start}). " if start else ""
     question = (
         f"The drives match their commissioning. {first}Then {program.name} is played. "

@@ -29,14 +29,14 @@ def interpret(program: Path, config_path: Path | None, as_document: bool, max_bl
     refused if the machine lacks an axis or a set-point exceeds 32 bits. Nothing is printed unless the whole program can
     be interpreted.
     """
-    from fdhil.config import Nc, load
+    from fdhil.config import Nc, load_config
     from fdhil.program.budget import Budget
     from fdhil.program.interpreter import Interpreter
     from fdhil.program.motions import as_json
     from fdhil.program.planner.limits import checked
     from fdhil.program.program_notes import ProgramNotes
 
-    config = None if config_path is None else load(config_path)
+    config = None if config_path is None else load_config(config_path)
     budget = replace(
         Budget.of(Nc() if config is None else config.nc), max_blocks=max_blocks, max_repeated_blocks=max_repeated
     )

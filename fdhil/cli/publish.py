@@ -32,7 +32,7 @@ def publish(protocol: str, config: Path, devices: Path | None, as_json: bool) ->
     """
     if devices is not None and protocol != "mtconnect":
         raise click.UsageError("--devices applies only to mtconnect")
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     if devices is not None:
         _write_devices(machine, devices)
         return

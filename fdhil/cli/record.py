@@ -41,15 +41,15 @@ def record(config: Path, out: Path, seconds: float | None, rest: float, with_gap
     Row k is r[k], the set-point of the drives at that SYNC, without offsets. If samples were lost, nothing is written
     unless --with-gaps is given.
     """
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     import asyncio
 
     from fdhil.drivers.demand_recorder import DemandRecorder
 
     recorder = DemandRecorder(machine, rest)
     asyncio.run(_listen(machine, recorder, seconds))
-    recorded = recorder.demand()
-    written = recorded is not None and (with_gaps or recorded.complete)
+    recorded = recorder.build_demand()
+    written = recorded is not None and (with_gaps or recorded.is_complete)
     if recorded is not None and written:
         from fdhil.program import write_demand_csv
         from fdhil.store.output import open_output
@@ -60,7 +60,7 @@ def record(config: Path, out: Path, seconds: float | None, rest: float, with_gap
         click.echo(json.dumps(_document(out, recorded, written)))
     else:
         _tell(recorded, written)
-    if recorded is None or not recorded.complete:
+    if recorded is None or not recorded.is_complete:
         click.get_current_context().exit(1)
 
 
@@ -77,13 +77,13 @@ async def _listen(machine: machine_config.MachineConfig, recorder: DemandRecorde
 
     def take(record: Record) -> None:
         nonlocal shown
-        if not recorder.done:
-            recorder.feed(record)
-        state = "recording" if recorder.moving else "waiting for a motion" if recorder.heard else None
+        if not recorder.is_done:
+            recorder.add_record(record)
+        state = "recording" if recorder.has_moved else "waiting for a motion" if recorder.has_all_axes else None
         if state != shown:
             click.echo(f"{state} (Ctrl-C ends)", err=True)
             shown = state
-        if recorder.done:
+        if recorder.is_done:
             stopped.set()
 
     async with open_machine(machine) as source:
@@ -108,7 +108,7 @@ def _document(out: Path, recorded: RecordedDemand | None, written: bool) -> dict
         "file": str(out) if written else None,
         "rows": 0 if recorded is None else int(recorded.reference.time_s.size),
         "duration_s": 0.0 if recorded is None else float(recorded.reference.time_s[-1]),
-        "complete": recorded is not None and recorded.complete,
+        "complete": recorded is not None and recorded.is_complete,
         "gaps": gaps,
         "doubts": [NOTHING_MOVED] if recorded is None else list(recorded.doubts),
     }

@@ -38,7 +38,7 @@ def replay(recordings: tuple[Path, ...], config: Path | None, method: str | None
 
     Windows of one axis are analysed in the given order, so that their pooling is repeated as well.
     """
-    machine = machine_config.load(config) if config else None
+    machine = machine_config.load_config(config) if config else None
     from fdhil.daemon.outcome_json import build_outcome_document
     from fdhil.daemon.service_log import format_outcome
 
@@ -109,7 +109,7 @@ def _config_of(window: Window) -> machine_config.MachineConfig:
         "regulators": regulators,
     }
     machine = {"name": "replay", "sync_period_s": min(window.dt_s, 0.02)}
-    return machine_config.parse({"machine": machine, "axis": {window.axis: axis}}, "recording", made_up=True)
+    return machine_config.parse_config({"machine": machine, "axis": {window.axis: axis}}, "recording", made_up=True)
 
 
 @click.command(cls=Writing)
@@ -126,7 +126,7 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
 
     Lists revisions, slopes, changes, maintenance dates and notices.
     """
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     from fdhil.report import require
     from fdhil.report.history_reading import by_axis, read_history, read_notices
 
@@ -196,7 +196,7 @@ def report(config: Path, out: Path, pdf: Path | None, as_json: bool) -> None:
     from fdhil.report import require
 
     require()
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     from fdhil.cli.history_report import write_report
     from fdhil.report.history_reading import by_axis, read_history, read_notices, read_refusals
 

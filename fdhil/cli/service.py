@@ -44,7 +44,7 @@ def run(config: Path, method: str | None, as_json: bool) -> int:
     Writes one line per outcome to stderr, or with --json to stdout. On SIGTERM or Ctrl-C it ramps the correction to
     zero and stops.
     """
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     from fdhil.api.compiling import forewarn
     from fdhil.daemon import daemon_service, service_log  # late: --help imports nothing heavy
     from fdhil.drivers import open_machine
@@ -61,7 +61,7 @@ def _ask(
     timeout_s: float = 10.0,
     progress: Callable[[Mapping[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
-    load = machine_config.load_places if request["request"] == "disarm" else machine_config.load
+    load = machine_config.load_directories if request["request"] == "disarm" else machine_config.load_config
     from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
 
     return ask_daemon(load(config).run_directory / SOCKET_NAME, request, timeout_s, progress)
@@ -95,7 +95,7 @@ def _show_status(config: Path, as_json: bool) -> None:
     from fdhil.daemon.daemon_status import describe_config_difference
 
     answer = _ask(config, {"request": "status"})
-    answer["config_difference"] = describe_config_difference(answer, machine_config.load(config).digest)
+    answer["config_difference"] = describe_config_difference(answer, machine_config.load_config(config).digest)
     if as_json:
         click.echo(json.dumps(answer))
     else:
@@ -123,7 +123,7 @@ def arm(config: Path, program: Path | None, method: str | None, whole: bool, as_
     """
     if program is None and method != "flatness":
         raise click.UsageError("PROGRAM is missing; only --method flatness works without it")
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     if program is not None:
         os.close(
             os.open(program, os.O_RDONLY | os.O_NONBLOCK)
@@ -209,7 +209,7 @@ def acknowledge(config: Path, numbers: tuple[int, ...], everything: bool, note: 
 
 def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]:
     """Disarm at the guard after the daemon failed with ``silent``. Raises ConnectError if the guard fails as well."""
-    machine = machine_config.load_places(config)
+    machine = machine_config.load_directories(config)
     from fdhil.arming.guard_client import GuardClient
     from fdhil.arming.standing import landed, verdict
 
@@ -235,7 +235,7 @@ def adopt(config: Path, yes: bool, as_json: bool) -> None:
     """
     if as_json and not yes:
         raise click.UsageError("--json cannot prompt; give --yes as well")
-    machine = machine_config.load_places(config)
+    machine = machine_config.load_directories(config)
     from fdhil.arming.guard_client import GuardClient
     from fdhil.arming.token import read_token
 
@@ -256,7 +256,7 @@ def _written_after(config: Path, what: str, answer: Mapping[str, Any]) -> Iterat
     try:
         yield
     finally:
-        write_after(machine_config.load_places(config), what, answer)
+        write_after(machine_config.load_directories(config), what, answer)
 
 
 def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: bool) -> Mapping[str, Any]:

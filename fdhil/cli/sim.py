@@ -67,7 +67,7 @@ def _serve(path: Path, as_json: bool, script: Path | None, play: Path | None, tr
     from fdhil.sim import fault_script
     from fdhil.sim.service import SimService
 
-    machine = config.load(path)
+    machine = config.load_config(path)
     entries = [] if script is None else fault_script.load(script, tuple(machine.axis))
 
     service = SimService(

@@ -9,8 +9,8 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.options import AS_JSON, CONFIG, ConfigFirst
-from fdhil.config.users import Role
-from fdhil.config.web import Web
+from fdhil.config.user_file import Role
+from fdhil.config.web_section import Web
 from fdhil.errors import ConfigError, ConfigFault
 
 
@@ -26,7 +26,7 @@ def web(config: Path, host: str | None, port: int | None, as_json: bool) -> None
     computer can connect; others need TLS and users. Arming, disarming and acknowledging need a login with the role
     operate, and web.acting = true. Stops on SIGTERM or Ctrl-C.
     """
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     machine = machine.model_copy(update={"web": placed(machine.web, host, port)})
     from fdhil.web import serving  # late: --help imports nothing heavy
 
@@ -59,7 +59,7 @@ def web_user(config: Path, name: str, role: Role, remove: bool, as_json: bool) -
     watch can read; operate can also disarm and, with web.acting = true, arm and acknowledge. Prompts for the password,
     or reads it as the first line of standard input if that is not a terminal. Only a scrypt hash is stored.
     """
-    set_user(machine_config.load(config).web, config, name, role, remove, as_json)
+    set_user(machine_config.load_config(config).web, config, name, role, remove, as_json)
 
 
 def set_user(web: Web, config: Path, name: str, role: Role, remove: bool, as_json: bool) -> None:
@@ -68,17 +68,19 @@ def set_user(web: Web, config: Path, name: str, role: Role, remove: bool, as_jso
     if path is None:
         fault = ConfigFault("web.users_file", "is missing", 'add users_file = "web-users.json" to [web]')
         raise ConfigError(str(config), [fault])
-    from fdhil.config import users
+    from fdhil.config import user_file
 
-    if re.fullmatch(users.USER_NAME_PATTERN, name) is None:
+    if re.fullmatch(user_file.USER_NAME_PATTERN, name) is None:
         raise click.BadParameter("a name may contain letters, digits, . _ @ and -, at most 64 characters")
-    users_by_name = dict(users.read_users(path)) if path.exists() else {}
+    users_by_name = dict(user_file.read_users(path)) if path.exists() else {}
     if remove:
         if users_by_name.pop(name, None) is None:
             raise click.BadParameter(f"there is no user {name}")
     else:
-        users_by_name[name] = users.hashed(_password(users.SHORTEST_PASSWORD, users.LONGEST_PASSWORD), role)
-    users.write_users(path, users_by_name)
+        users_by_name[name] = user_file.hash_password(
+            _password(user_file.SHORTEST_PASSWORD, user_file.LONGEST_PASSWORD), role
+        )
+    user_file.write_users(path, users_by_name)
     if as_json:
         document = {"schema": "fdhil-web-user-1", "user": name, "role": None if remove else role, "file": str(path)}
         click.echo(json.dumps(document))

@@ -10,8 +10,8 @@ from typing import Self
 import numpy as np
 
 from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SDO_RESPONSE, COB_SYNC, Nmt
-from fdhil.drivers.can.bus import ListeningBus
-from fdhil.drivers.can.frames import ERROR_FLAG, REMOTE_FLAG, Frames
+from fdhil.drivers.can.bus_listener import ListeningBus
+from fdhil.drivers.can.frame_ring import ERROR_FLAG, REMOTE_FLAG, Frames
 from fdhil.errors import ConnectError
 
 LISTEN_S = 2.5  # a heartbeat of one second comes twice
@@ -123,7 +123,7 @@ class BusListener:
 
     def _turn(self) -> None:
         while not self._stopping.wait(_TURN_S):
-            self.take(self._bus.drain())
+            self.take(self._bus.drain_frames())
 
     def take(self, frames: Frames) -> None:
         """Process the frames received since the last poll."""
@@ -133,8 +133,8 @@ class BusListener:
         """Listen for a time; ConnectError if the bus ends meanwhile."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            if self._bus.ended is not None:
-                raise ConnectError(f"bus {self.name}", f"{self._bus.ended}; try again when the bus is back")
+            if self._bus.end_reason is not None:
+                raise ConnectError(f"bus {self.name}", f"{self._bus.end_reason}; try again when the bus is back")
             time.sleep(0.01)
 
     def require_readable(self) -> None:

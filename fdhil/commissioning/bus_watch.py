@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 from fdhil import cia402
 from fdhil.commissioning.bus_listener import shows_master
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.frames import FrameRing
-from fdhil.drivers.cia402.profile import DriveProfile
-from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.drivers.can.frame_ring import FrameRing
+from fdhil.drivers.cia402.drive_profile import DriveProfile
+from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.errors import ConfigError, EdsError, ForeignMaster
 
 _DOWNLOAD = 1  # command specifier of an SDO request that writes (CiA 301, 7.2.4.3.3)
@@ -55,7 +55,7 @@ class BusWatch:
                 profile = load_profile(settings.drive)
             except (ConfigError, EdsError):  # not controllable; its node is watched by the predefined identifiers
                 continue
-            watch._add_drive(axis, profile, config.node_id(axis))
+            watch._add_drive(axis, profile, config.get_node_id(axis))
             if settings.table is not None and settings.table.cob_id is not None:
                 watch._own.add(settings.table.cob_id)
         return watch
@@ -147,7 +147,7 @@ class WatchedRing(FrameRing):
         super().__init__(capacity)
         self._watch = watch
 
-    def append(self, t_ns: int, can_id: int, data: bytes) -> None:
+    def append_frame(self, t_ns: int, can_id: int, data: bytes) -> None:
         """Store one frame (writer's side only)."""
         self._watch.take(can_id, data)
-        super().append(t_ns, can_id, data)
+        super().append_frame(t_ns, can_id, data)

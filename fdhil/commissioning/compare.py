@@ -14,7 +14,7 @@ from fdhil.commissioning.record import CommissioningRecord, fingerprint, is_rpdo
 from fdhil.commissioning.survey import Survey, survey
 from fdhil.commissioning.void import confirm_record, void_mark, void_record
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.bus import ListeningBus
+from fdhil.drivers.can.bus_listener import ListeningBus
 from fdhil.errors import DeviceError, ForeignMaster, StoreError
 
 RECORD_POINT = "commissioning record"

@@ -6,7 +6,7 @@ from functools import partial
 from fdhil.cia402 import Object
 from fdhil.commissioning.finding import Finding, lacks, read_optional
 from fdhil.commissioning.master import Master
-from fdhil.drivers.cia402.profile import speed_unit_of
+from fdhil.drivers.cia402.drive_profile import decode_speed_unit
 
 DC_LINK_TOLERANCE = 0.05
 Read = Callable[[int, int], int | None]
@@ -70,7 +70,7 @@ def compare_speed_unit(master: Master) -> Iterator[Finding]:
     if word is None:
         return
     wanted = master.config.axis[master.axis].drive.speed_unit or master.profile.speed_unit
-    found = speed_unit_of(word)
+    found = decode_speed_unit(word)
     shown = f"0x60A9 = {word:08X}{f', {found}' if found else ''}"
     cause = f"its speed unit ({shown}) is not {wanted}"
     advice = f"set drive.speed_unit = '{found}'" if found else "set 0x60A9 to 00B44700 (rpm) or FDB44700 (millirpm)"

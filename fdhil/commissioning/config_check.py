@@ -18,11 +18,11 @@ from fdhil.commissioning.record import CommissioningRecord, load_record
 from fdhil.commissioning.survey import Survey, survey
 from fdhil.commissioning.timing import judge_sync
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.bus import ListeningBus
-from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
-from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.drivers.can.bus_listener import ListeningBus
+from fdhil.drivers.cia402.drive_profile import DriveProfile, PdoSpec
+from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.drivers.moves import load_event_source
-from fdhil.drivers.sensor_source import Sensor, sensors_of
+from fdhil.drivers.sensor_source import Sensor, create_sensors
 from fdhil.errors import DeviceError, ForeignMaster, StoreError
 from fdhil.identification.loops import better_loops, differences
 from fdhil.store.history import History
@@ -85,7 +85,7 @@ def compare_bus(traffic: Traffic, config: MachineConfig) -> Iterator[Finding]:
 
 def compare_asked(config: MachineConfig, axis: str, received: Sequence[int] = ()) -> list[Finding]:
     """Compare a drive by SDO, while no NC runs the bus; ``received`` are COB-IDs already received there."""
-    node = f"node-ID {config.node_id(axis)}"
+    node = f"node-ID {config.get_node_id(axis)}"
     with Master(config, axis) as master:
         master.heard.ids.update(received)
         try:
@@ -182,13 +182,13 @@ def _rapid(config: MachineConfig, profile: DriveProfile, read: Callable[[], int 
 
 
 def _voltage_object(config: MachineConfig, axis: str, profile: DriveProfile, master: Master) -> Iterator[Finding]:
-    if config.axis[axis].voltage.separate:
+    if config.axis[axis].voltage.is_separate:
         return
     if profile.voltage is None or not profile.voltage_objects:
         cause = f"profile {profile.name} has no object of the terminal voltage"
         yield Finding("voltage", "from the drive", "none", False, cause, "set voltage.source = 'modbus'")
         return
-    scale = profile.terminal_v_per_count(config.axis[axis])
+    scale = profile.compute_voltage_scale(config.axis[axis])
     if not scale:
         cause = f"profile {profile.name} reports a PWM duty, and the DC-link voltage is unknown"
         yield Finding("voltage", "from the drive", "a duty", False, cause, "set drive.dc_link_v, or use a sensor")
@@ -202,7 +202,7 @@ def _voltage_object(config: MachineConfig, axis: str, profile: DriveProfile, mas
 
 def compare_heard(traffic: Traffic, config: MachineConfig, axis: str) -> Iterator[Finding]:
     """Compare one drive as far as the traffic of a running NC shows it; nothing is sent."""
-    profile, node_id = load_profile(config.axis[axis].drive), config.node_id(axis)
+    profile, node_id = load_profile(config.axis[axis].drive), config.get_node_id(axis)
     nmt = traffic.nmt(node_id)
     cause = f"no frame of node-ID {node_id} was received"
     shown = f"{cause}" if node_id not in traffic.nodes else f"node-ID {node_id}, {nmt or 'no heartbeat'}"
@@ -262,13 +262,13 @@ def _heard_value(traffic: Traffic, profile: DriveProfile, node_id: int) -> int |
 
 async def compare_sensors(config: MachineConfig, axis: str) -> list[Finding]:
     """Connect to and read the sensors of one axis; reading alone does not disturb a running daemon."""
-    return [await _sensor(point, sensor) for point, sensor in sensors_of(axis, config).items()]
+    return [await _sensor(point, sensor) for point, sensor in create_sensors(axis, config).items()]
 
 
 async def _sensor(point: str, sensor: Sensor) -> Finding:
     try:
         await sensor.link.connect()
-        return Finding(point, sensor.link.place, await sensor.reading())
+        return Finding(point, sensor.link.place, await sensor.format_reading())
     except DeviceError as error:
         return _unreachable(point, sensor.link.place, error)
     finally:

@@ -227,7 +227,7 @@ class Cycle:
 
     def _receive(self) -> None:
         for bus in self.buses.values():
-            frames = bus.drain()
+            frames = bus.drain_frames()
             if not frames.size:
                 continue
             members = [member for member in self.members if member.bus is bus]
@@ -265,7 +265,7 @@ class Cycle:
     @property
     def lost(self) -> bool:
         """Whether a bus has ended or accepts no frames."""
-        return self.failure is not None or any(bus.ended is not None for bus in self.buses.values())
+        return self.failure is not None or any(bus.end_reason is not None for bus in self.buses.values())
 
     def check(self) -> None:
         """Raise what ended the thread or a bus; with another master only after the drives have stopped."""
@@ -273,8 +273,8 @@ class Cycle:
         if self.failure is not None:
             raise self.failure
         for bus in self.buses.values():
-            if bus.ended is not None:
-                raise DeviceError(f"bus {bus.name}", f"{bus.ended}; start again when the bus is back")
+            if bus.end_reason is not None:
+                raise DeviceError(f"bus {bus.name}", f"{bus.end_reason}; start again when the bus is back")
 
     def _await_landing(self) -> None:
         if self.taken is not None and self._thread.is_alive():

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from fdhil.cia402 import Object
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.survey import read_pdos
-from fdhil.drivers.cia402.profile import PdoSpec
+from fdhil.drivers.cia402.drive_profile import PdoSpec
 from fdhil.errors import DeviceError, DriveFault, ProtocolError, SdoAbort
 
 INVALID_COB_ID = 0x80000000
@@ -55,7 +55,7 @@ def feedforward_open(master: Master) -> Iterator[dict[str, int]]:
 def _spec(master: Master) -> PdoSpec:
     """The drive's mapping must match the profile before anything is written."""
     found = master.profile.find_rpdo(master.profile.speed_offset)
-    if found is None or found[0].entry(master.profile.torque_offset) is None:
+    if found is None or found[0].find_entry(master.profile.torque_offset) is None:
         raise _refused(master, "its profile has no RPDO with 60B1 and 60B2")
     spec = found[0]
     mapped = next(pdo.mapped for one, pdo in read_pdos(master) if one is spec)

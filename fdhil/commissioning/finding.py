@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from fdhil.commissioning.master import Master
-from fdhil.drivers.can.sdo import NO_OBJECT, NO_SUB_INDEX
+from fdhil.drivers.can.sdo_channel import NO_OBJECT, NO_SUB_INDEX
 from fdhil.errors import SdoAbort
 
 
@@ -35,7 +35,7 @@ def read_optional(master: Master, index: int, sub: int = 0, *, signed: bool = Fa
 def has_object(master: Master, index: int) -> bool:
     """Return whether the drive has an object, readable or not."""
     try:
-        master.sdo.read(index)
+        master.sdo.read_bytes(index)
     except SdoAbort as abort:
         return abort.code not in (NO_OBJECT, NO_SUB_INDEX)
     return True

@@ -17,8 +17,8 @@ from fdhil.cia402 import COB_SYNC, pack_pdo, unpack_pdo
 from fdhil.commissioning.record import CommissioningRecord, axis_digest
 from fdhil.commissioning.transmit import SocketcandSender
 from fdhil.config import MachineConfig, OffsetBounds
-from fdhil.drivers.can.frames import FrameRing
-from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.drivers.can.frame_ring import FrameRing
+from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.errors import DriveFault
 
 STEPS_UM = (10.0, 50.0)  # the second if friction holds the axis against the first
@@ -55,8 +55,8 @@ class HalAxis:
             text = f"there is no [axis.{axis}.correction]: offsets are not allowed, so there is nothing to prove"
             raise DriveFault(self.device, f"{text}; add that section and write the HAL file again with fdhil init")
         self.per_mm = settings.scaling.increments_per_mm
-        self.bounds = OffsetBounds.of(settings, config.machine.sync_period_s)
-        profile, self._node_id = load_profile(settings.drive), config.node_id(axis)
+        self.bounds = OffsetBounds.compute_effective(settings, config.machine.sync_period_s)
+        profile, self._node_id = load_profile(settings.drive), config.get_node_id(axis)
         self._tpdos = {spec.cob_base + self._node_id: spec for spec in profile.tpdos}
         offset = profile.find_rpdo(profile.offset)
         assert offset is not None
@@ -74,8 +74,8 @@ class HalAxis:
         """Answer so many SYNCs with an offset (None: with nothing); return what HAL reported. DriveFault on silence."""
         seen, last_frame_s = Seen(), time.monotonic()
         while len(seen.applied) < cycles:
-            self._port.receive(self._ring, 0.05)
-            for frame in self._ring.drain():
+            self._port.receive_frames(self._ring, 0.05)
+            for frame in self._ring.drain_frames():
                 can_id = int(frame["id"])
                 data = int(frame["data"]).to_bytes(8, "little")[: int(frame["dlc"])]
                 if can_id == COB_SYNC:
@@ -145,7 +145,7 @@ def _require_rest(hal: HalAxis) -> None:
 def _move(hal: HalAxis) -> tuple[float, int]:
     """Step the offset: HAL must apply it within its limits, demand and position follow. Return um and increments."""
     before = hal.run(SETTLE_CYCLES, 0)
-    _, rate, acceleration, *_ = hal.bounds.whole
+    _, rate, acceleration, *_ = hal.bounds.whole_increments
     steps = [um for um in STEPS_UM if um * 1e-3 * hal.per_mm <= hal.bounds.offset]
     for um in steps:
         step = round(um * 1e-3 * hal.per_mm)

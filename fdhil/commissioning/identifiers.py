@@ -20,8 +20,8 @@ from fdhil.cia402 import (
 )
 from fdhil.commissioning.finding import Finding
 from fdhil.config import MachineConfig
-from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
-from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.drivers.cia402.drive_profile import DriveProfile, PdoSpec
+from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.errors import ConfigError, ConfigFault
 
 POINT = "identifiers"
@@ -55,7 +55,7 @@ def find_clash(config: MachineConfig, axis: str, received: Collection[int] = (),
 
     ``received`` are COB-IDs received on the bus.
     """
-    profile, node = load_profile(config.axis[axis].drive), config.node_id(axis)
+    profile, node = load_profile(config.axis[axis].drive), config.get_node_id(axis)
     specs = sent_pdos(config, axis, profile) if sent else [*profile.rpdos, *profile.tpdos]
     taken: dict[int, tuple[str, str]] = {}
     for cob_id, *whose in (*_in_use(config, axis), *_nodes_heard(config, axis, received)):
@@ -114,19 +114,19 @@ def _in_use(config: MachineConfig, own: str) -> Iterator[_Use]:
             yield axis.table.cob_id, f"the encoder at the table of axis {name}", f"axis.{name}.table.cob_id"
         if name == own:
             continue
-        profile, node = load_profile(axis.drive), config.node_id(name)
+        profile, node = load_profile(axis.drive), config.get_node_id(name)
         for spec in (*profile.rpdos, *profile.tpdos):
             yield spec.cob_base + node, f"{spec.name} of axis {name}", f"axis.{name}.drive.profile"
-        if node != config.node_id(own):
+        if node != config.get_node_id(own):
             yield from _predefined(node, f"axis {name}", f"axis.{name}.drive")
 
 
 def _nodes_heard(config: MachineConfig, own: str, received: Collection[int]) -> Iterator[_Use]:
     bus = config.axis[own].drive.bus
     names = [name for name, axis in config.axis.items() if axis.drive.bus == bus]
-    nodes = {config.node_id(name) for name in names} | {config.guard.node_id}
+    nodes = {config.get_node_id(name) for name in names} | {config.guard.node_id}
     known = {
-        spec.cob_base + config.node_id(name)
+        spec.cob_base + config.get_node_id(name)
         for name in names
         for profile in (load_profile(config.axis[name].drive),)
         for spec in (*profile.rpdos, *profile.tpdos)

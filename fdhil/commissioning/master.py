@@ -15,10 +15,10 @@ from fdhil import cia402
 from fdhil.commissioning.bus_watch import offset_ids
 from fdhil.commissioning.cycle import Cycle
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.frames import ERROR_FLAG
-from fdhil.drivers.can.sdo import SdoLink
-from fdhil.drivers.cia402.profile import DriveProfile
-from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.drivers.can.frame_ring import ERROR_FLAG
+from fdhil.drivers.can.sdo_channel import SdoChannel
+from fdhil.drivers.cia402.drive_profile import DriveProfile
+from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.errors import DeviceTimeout, ForeignMaster
 
 
@@ -44,18 +44,18 @@ LOCKSTEP_PATIENCE = 20.0  # factor on time limits: a simulated machine shares it
 CATCH_UP_S = 0.25  # a simulated drive that is silent for so long has answered every SYNC
 
 
-class AxisSdo(SdoLink):
+class AxisSdo(SdoChannel):
     """The SDO channel of one axis of a node; CiA 402 objects are numbered as for the first axis."""
 
     profile: DriveProfile
 
-    def read(self, index: int, sub: int = 0) -> bytes:
+    def read_bytes(self, index: int, sub: int = 0) -> bytes:
         """Read an object; SdoAbort, DeviceTimeout or ProtocolError."""
-        return super().read(self.profile.object_index(index), sub)
+        return super().read_bytes(self.profile.shift_object_index(index), sub)
 
     def write_int(self, index: int, sub: int, value: int, length: int) -> None:
         """Write an integer of ``length`` bytes."""
-        super().write_int(self.profile.object_index(index), sub, value, length)
+        super().write_int(self.profile.shift_object_index(index), sub, value, length)
 
 
 class Master:
@@ -67,9 +67,9 @@ class Master:
     def __init__(self, config: MachineConfig, axis: str, cycle: Cycle | None = None) -> None:
         settings = config.axis[axis]
         self.config, self.axis = config, axis
-        self.node_id = config.node_id(axis)
+        self.node_id = config.get_node_id(axis)
         profile = load_profile(settings.drive)
-        self.profile: DriveProfile = profile.with_feedforward() if settings.feedforward else profile
+        self.profile: DriveProfile = profile.enable_feedforward() if settings.feedforward else profile
         self.period_s = config.machine.sync_period_s
         self.device = f"drive {axis}"
         self.loop = cycle or Cycle(config, (settings.drive.bus,))
@@ -199,7 +199,7 @@ class Master:
                 feedback.objects[entry.index, entry.sub] = value
                 feedback.cycle[entry.index, entry.sub] = self.cycle
         elif can_id == self.sdo.response_id:
-            self.sdo.deliver(data)
+            self.sdo.deliver_response(data)
         elif can_id == cia402.COB_EMCY + node:
             feedback.emergencies.append(data)
         elif can_id == cia402.COB_HEARTBEAT + node and data:

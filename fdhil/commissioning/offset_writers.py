@@ -13,10 +13,10 @@ from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import CommissioningRecord
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.sdo import NO_OBJECT, NO_SUB_INDEX
-from fdhil.drivers.cia402.device import read_device
-from fdhil.drivers.cia402.profile import LOGICAL_AXIS_PDOS, DriveProfile
-from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.drivers.can.sdo_channel import NO_OBJECT, NO_SUB_INDEX
+from fdhil.drivers.cia402.device_description import read_device
+from fdhil.drivers.cia402.drive_profile import LOGICAL_AXIS_PDOS, DriveProfile
+from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.errors import SdoAbort
 
 POINT = "offset writers"
@@ -171,8 +171,8 @@ def compare_heard_writers(
     for each, other in config.axis.items():
         if other.drive.bus == axis.drive.bus:
             found = load_profile(other.drive)
-            known |= {spec.cob_base + config.node_id(each) for spec in (*found.rpdos, *found.tpdos)}
-    held, bits = _shown_offset(profile, config.node_id(name), traffic)
+            known |= {spec.cob_base + config.get_node_id(each) for spec in (*found.rpdos, *found.tpdos)}
+    held, bits = _shown_offset(profile, config.get_node_id(name), traffic)
     expected = "written by fdhil only"
     for cob_id in sorted({*traffic.ids} - known) if abs(held) >= LEAST_HELD else ():
         if _carries(traffic, cob_id, held, bits):

@@ -85,7 +85,7 @@ class Overhearing:
 def alone(config: MachineConfig, axis: str, rapid_mm_s: float | None = None) -> MachineConfig:
     """Return the configuration of one axis, with rapids inferred from its demand: no NC is there to report them."""
     settings = config.axis[axis]
-    drive = settings.drive.model_copy(update={"node_id": config.node_id(axis)})
+    drive = settings.drive.model_copy(update={"node_id": config.get_node_id(axis)})
     rapid = rapid_mm_s or settings.rapid_speed_mm_s
     settings = settings.model_copy(update={"drive": drive, "rapid_speed_mm_s": rapid})
     g0 = config.g0.model_copy(update={"source": "inferred"})

@@ -10,7 +10,7 @@ from fdhil.cia402 import NmtCommand, Object, PowerState, decode_power_state
 from fdhil.commissioning.finding import read_optional
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.survey import INVALID_COB_ID, PdoFound, compare_pdo, listen, read_mapping, read_pdos
-from fdhil.drivers.cia402.profile import PdoSpec
+from fdhil.drivers.cia402.drive_profile import PdoSpec
 from fdhil.errors import DeviceError, DriveFault, ProtocolError, SdoAbort
 
 NO_REMOTE_REQUEST = 1 << 30

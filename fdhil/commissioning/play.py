@@ -163,9 +163,9 @@ class Bench:
             if travel is not None and not (travel[0] <= of.low and of.high <= travel[1]):
                 low, high = sorted(self._mm(master, limit) for limit in travel)
                 axis = self._config.axis[master.axis]
-                leave = f"{low / axis.mm_per_unit:g} to {axis.shown(high, form='g')}"
+                leave = f"{low / axis.mm_per_unit:g} to {axis.format_in_unit(high, form='g')}"
                 text = f"its software limits (0x607D) allow {leave}, less than [axis.{master.axis}"
-                raise DriveFault(master.device, f"{text}.setpoints] {axis.shown_key('travel_mm')}; correct that")
+                raise DriveFault(master.device, f"{text}.setpoints] {axis.format_key('travel_mm')}; correct that")
 
     def _require_one_counter(self) -> None:
         counters = {read_optional(master, Object.SYNC_COUNTER_OVERFLOW) or 0 for master in self.masters}
@@ -206,7 +206,7 @@ class Bench:
         return self._config.axis[master.axis].scaling.convert_to_mm(increments)
 
     def _shown(self, master: Master, mm: float) -> str:
-        return self._config.axis[master.axis].shown(mm, form=".3f")
+        return self._config.axis[master.axis].format_in_unit(mm, form=".3f")
 
     # the drives are controlled
 

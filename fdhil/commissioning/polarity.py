@@ -25,7 +25,7 @@ def judge_jog(jog: Recording, distance_mm: float, axis: Axis) -> Iterator[Findin
     """Compare the recording of a jog over ``distance_mm`` and back with an axis whose units are correct."""
     commanded = abs(distance_mm)
     way = float(np.nanmax(np.abs(jog.position_mm - jog.position_mm[np.isfinite(jog.position_mm)][0])))
-    wanted, went = axis.shown(commanded, form="g"), axis.shown(way, form=".3f")
+    wanted, went = axis.format_in_unit(commanded, form="g"), axis.format_in_unit(way, form=".3f")
     cause = f"{CODE}: it was commanded {wanted}, but its position (0x6064) moved {went}"
     same = abs(way - commanded) <= TRAVEL_TOLERANCE * commanded
     advice = "its set-point and position have different scales; correct its factors (0x6091, 0x6092)"

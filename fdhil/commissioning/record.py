@@ -19,7 +19,7 @@ from typing import Any
 from fdhil import tables
 from fdhil.commissioning.void import confirm_record, is_void, void_mark
 from fdhil.config import Drive, MachineConfig
-from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.errors import StoreError
 from fdhil.store.atomic import make_folder, store_error, sync_folder, write_file
 
@@ -120,7 +120,7 @@ def axis_digest(config: MachineConfig, axis: str) -> str:
         del settings["feedforward"]
     settings["drive"] = _described(config.axis[axis].drive)
     guard = config.guard.model_dump(mode="json", include={"node_id", "heartbeat_s"})
-    text = json.dumps([settings, guard, config.machine.sync_period_s, config.node_id(axis)], sort_keys=True)
+    text = json.dumps([settings, guard, config.machine.sync_period_s, config.get_node_id(axis)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -15,8 +15,8 @@ from fdhil.commissioning.device_type import is_drive
 from fdhil.commissioning.survey import Identity
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import CanBus, MachineConfig
-from fdhil.drivers.can.frames import Frames
-from fdhil.drivers.can.sdo import SdoLink
+from fdhil.drivers.can.frame_ring import Frames
+from fdhil.drivers.can.sdo_channel import SdoChannel
 from fdhil.eds import read_eds
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, EdsError, ForeignMaster, ProtocolError
 
@@ -31,7 +31,7 @@ class BusScanner(BusListener):
     """Listens to a bus and, if no master is detected, reads its nodes; a context manager."""
 
     def __init__(self, name: str, settings: CanBus) -> None:
-        self._links: dict[int, SdoLink] = {}
+        self._links: dict[int, SdoChannel] = {}
         self._sending = TransmitBus(name, settings)
         super().__init__(self._sending)
 
@@ -40,7 +40,7 @@ class BusScanner(BusListener):
         super().take(frames)
         for frame in frames[(frames["id"] & 0x780 == COB_SDO_RESPONSE) & (frames["id"] <= 0x7FF)]:
             if link := self._links.get(int(frame["id"]) & 0x7F):
-                link.deliver(int(frame["data"]).to_bytes(8, "little")[: int(frame["dlc"])])
+                link.deliver_response(int(frame["data"]).to_bytes(8, "little")[: int(frame["dlc"])])
 
     def answering(self) -> set[int]:
         """Request the device type of every node-ID; return the nodes that answer.
@@ -61,9 +61,9 @@ class BusScanner(BusListener):
 
     def read(self, node_id: int, index: int, sub: int = 0) -> bytes | None:
         """Read an object; None if the node lacks it or gives no usable answer; ForeignMaster."""
-        link = self._links.setdefault(node_id, SdoLink(f"node {node_id}", node_id, self._sending.send))
+        link = self._links.setdefault(node_id, SdoChannel(f"node {node_id}", node_id, self._sending.send))
         try:
-            return link.read(index, sub)
+            return link.read_bytes(index, sub)
         except ForeignMaster:
             raise
         except (ProtocolError, DeviceTimeout):
@@ -141,7 +141,7 @@ class BusScan:
 
 def scan_bus(name: str, config: MachineConfig, descriptions: Sequence[Description]) -> BusScan:
     """Listen, then read the nodes if no master is detected. ConnectError if the bus is unreachable or silent."""
-    axes = {config.node_id(axis): axis for axis, settings in config.axis.items() if settings.drive.bus == name}
+    axes = {config.get_node_id(axis): axis for axis, settings in config.axis.items() if settings.drive.bus == name}
     with BusScanner(name, config.bus[name]) as bus:
         return scan_nodes(bus, axes, descriptions)
 

@@ -26,7 +26,7 @@ from fdhil.commissioning.set_points import straight
 from fdhil.commissioning.survey import Survey, faulted, listen, require, require_enabled, survey
 from fdhil.commissioning.watchdog import watchdog_test
 from fdhil.config import CorrectionLimits, MachineConfig
-from fdhil.drivers.cia402.profile_file import NO_OFFSET_ADVICE, load_profile, no_offset
+from fdhil.drivers.cia402.drive_profile_file import NO_OFFSET_ADVICE, explain_missing_offset, load_profile
 from fdhil.errors import DeviceError, DriveFault, ForeignMaster, ProtocolError
 
 SIGN_TEST_UM = 10.0
@@ -80,7 +80,7 @@ def enable(master: Master) -> None:
             master.hold_here()
             master.controlword = word
         master.wait_cycles(10)
-    mode = (master.profile.object_index(Object.MODE_DISPLAY), 0)
+    mode = (master.profile.shift_object_index(Object.MODE_DISPLAY), 0)
     if mode in master.heard.objects:
         master.wait(
             lambda: master.heard.objects[mode] == Mode.CYCLIC_SYNC_POSITION,
@@ -241,7 +241,7 @@ def _early_excess(master: Master, goal: int, step: int) -> list[Excess]:
     sign = 1 if goal > master.offset else -1
     settings = master.config.axis[master.axis]
     gain_per_cycle = settings.regulators.position_gain_per_s * master.period_s
-    unit = master.profile.speed_rad_s_per_count(settings) * settings.drive.sign
+    unit = master.profile.compute_speed_scale(settings) * settings.drive.sign
     ramp_rad_s = step / master.period_s / settings.drive.increments_per_rev * 2 * math.pi
     values = [master.offset + sign * step * k for k in range(1, RAMP_CYCLES + 1)]
     in_force = master.play_offset(values) + 1 + settings.drive.setpoint_delay_cycles
@@ -290,8 +290,8 @@ def commission(
     was rolled back; StoreError if a step cannot be stored.
     """
     profile = load_profile(config.axis[axis].drive)
-    if not profile.takes_offset:
-        raise DriveFault(f"drive {axis}", f"{no_offset(profile)}; {NO_OFFSET_ADVICE}")
+    if not profile.can_take_offset:
+        raise DriveFault(f"drive {axis}", f"{explain_missing_offset(profile)}; {NO_OFFSET_ADVICE}")
     with Master(config, axis) as master:
         report("listen")
         listen(master)

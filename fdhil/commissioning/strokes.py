@@ -51,7 +51,10 @@ class Stroke:
 
     def __str__(self) -> str:
         toward = "plus" if self.distance_mm > 0 else "minus"
-        way, speed = self.axis.shown(abs(self.distance_mm), form="g"), self.axis.shown(self.speed_mm_s, "/s", ".3g")
+        way, speed = (
+            self.axis.format_in_unit(abs(self.distance_mm), form="g"),
+            self.axis.format_in_unit(self.speed_mm_s, "/s", ".3g"),
+        )
         return f"{way} toward {toward} at {speed}"
 
 
@@ -67,7 +70,7 @@ def plan_jog(axis: str, settings: Axis, room: Room) -> Stroke:
     """Return the jog toward the side with more room; DriveFault if there is too little."""
     side = USED * room.farthest * settings.mm_per_unit
     if abs(side) < LEAST_JOG_MM:
-        least = settings.shown(LEAST_JOG_MM, form=".3g")
+        least = settings.format_in_unit(LEAST_JOG_MM, form=".3g")
         text = f"the room is {room} {settings.unit}, but the jog needs {least} to one side"
         raise DriveFault(f"drive {axis}", f"{text}; enlarge --room, or omit --room to move nothing")
     acceleration = min(JOG_ACCELERATION_MM_S2, GENTLE * settings.max_acceleration_mm_s2)
@@ -89,9 +92,9 @@ def plan_rapid(axis: str, settings: Axis, room: Room) -> Stroke:
     spent_s = acceleration / jerk + CRUISE_S
     fits = acceleration / 2 * (math.sqrt(spent_s**2 + 4 * abs(side) / acceleration) - spent_s)
     if fastest < SLOWEST * top:
-        most, rapid = settings.shown(fastest, "/s", "g"), settings.shown(top, "/s", "g")
+        most, rapid = settings.format_in_unit(fastest, "/s", "g"), settings.format_in_unit(top, "/s", "g")
         text = f"[axis.{axis}.setpoints] allows {most}, but G0 is {rapid}, so no rapid can be tested"
-        key = settings.shown_key("max_speed_mm_s")
+        key = settings.format_key("max_speed_mm_s")
         raise DriveFault(f"drive {axis}", f"{text}; raise its {key}, or omit --room")
     if fits < SLOWEST * top:
         least = SLOWEST * top * (SLOWEST * top / acceleration + spent_s)

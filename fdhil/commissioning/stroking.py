@@ -60,8 +60,8 @@ def travel_of(master: Master, record: CommissioningRecord, room: Room, given: Tr
         limits["the room of the interrupted trial"] = Travel(given.low_mm - SLACK_MM, given.high_mm + SLACK_MM)
     for by, (least, most, *_) in limits.items():
         if low < least or high > most:
-            text = f"its position is {settings.shown(here, form='.3f')}, limited to {least / unit:g} to "
-            text += f"{settings.shown(most, form='g')} by {by}, but --room is {room} {settings.unit} from here"
+            text = f"its position is {settings.format_in_unit(here, form='.3f')}, limited to {least / unit:g} to "
+            text += f"{settings.format_in_unit(most, form='g')} by {by}, but --room is {room} {settings.unit} from here"
             advice = "change --room, or move the axis away from its end; --again begins a new trial"
             raise DriveFault(master.device, f"{text}; {advice}")
     return Travel(low, high, start)

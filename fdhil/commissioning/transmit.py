@@ -14,18 +14,18 @@ import can
 
 from fdhil import config
 from fdhil.commissioning.bus_watch import BusWatch, WatchedRing
-from fdhil.drivers.can.bus import ListeningBus
-from fdhil.drivers.can.frames import FrameRing
-from fdhil.drivers.can.port import Filter, Port
-from fdhil.drivers.can.python_can import VirtualPort
-from fdhil.drivers.can.socketcan import CAN_FRAME, SocketCanPort
-from fdhil.drivers.can.socketcand import CONNECT_TIMEOUT_S, SocketcandPort
+from fdhil.drivers.can.bus_listener import ListeningBus
+from fdhil.drivers.can.frame_ring import FrameRing
+from fdhil.drivers.can.python_can_port import VirtualPort
+from fdhil.drivers.can.receive_port import Filter, ReceivePort
+from fdhil.drivers.can.socketcan_port import CAN_FRAME, SocketCanPort
+from fdhil.drivers.can.socketcand_port import CONNECT_TIMEOUT_S, SocketcandPort
 from fdhil.errors import ConnectError, DeviceError
 
 LOOK_S = 0.25  # listening time before the first frame is sent: any NC's SYNC arrives meanwhile
 
 
-class SendingPort(Port, Protocol):
+class SendingPort(ReceivePort, Protocol):
     """A port that also sends."""
 
     def send(self, can_id: int, data: bytes) -> None:
@@ -92,7 +92,7 @@ class TransmitBus(ListeningBus):
     def _make_ring(self, frames: int) -> FrameRing:
         return WatchedRing(frames, self.watch)
 
-    def _open(self, settings: config.CanBus, filters: Sequence[Filter]) -> Port:
+    def _open_port(self, settings: config.CanBus, filters: Sequence[Filter]) -> ReceivePort:
         if not settings.may_send:
             text = f"fdhil does not send on {settings.interface} adapters, which this command requires; use SocketCAN"
             raise ConnectError(self.name, text)

@@ -22,7 +22,7 @@ from fdhil.commissioning.survey import listen, require, survey
 from fdhil.commissioning.timing import judge_answers, judge_sync, measure
 from fdhil.commissioning.watchdog import watched
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.bus import ListeningBus
+from fdhil.drivers.can.bus_listener import ListeningBus
 from fdhil.errors import DeviceError, DriveFault, StoreError
 from fdhil.pipeline import Known
 from fdhil.records import Outcome, Recording
@@ -141,7 +141,7 @@ def where_stopped(master: Master, progress: Progress, now: str) -> Iterator[None
 def _shown(master: Master, travel_mm: Travel) -> dict[str, str]:
     settings = master.config.axis[master.axis]
     places = {"stands": position_mm(master), "from": travel_mm.low_mm, "to": travel_mm.high_mm}
-    return {what: settings.shown(mm, form=".3f") for what, mm in places.items()}
+    return {what: settings.format_in_unit(mm, form=".3f") for what, mm in places.items()}
 
 
 def judged(
@@ -189,7 +189,7 @@ def time_bus(master: Master) -> Found:
     name, counted = master.bus.name, master.config.guard.clock == "sync"
     with ListeningBus(name, master.config.bus[name]) as bus:
         master.wait_cycles(TIMING_CYCLES)
-        timing = measure(bus.drain(), [spec.cob_base + master.node_id for spec in master.profile.tpdos])
+        timing = measure(bus.drain_frames(), [spec.cob_base + master.node_id for spec in master.profile.tpdos])
     findings = [
         judge_sync(timing.interval_s, master.period_s, counted=True),
         *judge_answers(timing, master.period_s, counted),

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from fdhil.config.axis import (
+from fdhil.config.axis_section import (
     CEILING_ACCELERATION_MM_S2,
     CEILING_OFFSET_UM,
     CEILING_SPEED_MM_S,
@@ -17,19 +17,26 @@ from fdhil.config.axis import (
     Nominal,
     SpeedUnit,
 )
-from fdhil.config.bus import CanBus
-from fdhil.config.controller import Identification, Nc
-from fdhil.config.machine import MachineConfig
-from fdhil.config.offset_bounds import VARIATION_MM, OffsetBounds, share_fault
+from fdhil.config.bus_section import CanBus
+from fdhil.config.config_loader import (
+    find_unlikely_values,
+    load_config,
+    load_directories,
+    parse_config,
+    parse_toml,
+    read_toml,
+)
+from fdhil.config.machine_config import MachineConfig
+from fdhil.config.nc_section import Identification, Nc
+from fdhil.config.offset_bounds import VARIATION_MM, OffsetBounds, find_share_fault
 from fdhil.config.position_range import PositionRange
-from fdhil.config.reading import load, load_places, parse, read_toml, toml_document, unlikely
-from fdhil.config.reality import Reality
+from fdhil.config.reality_section import Reality
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import Section, is_second_drive
-from fdhil.config.sensors import Thermometer, Voltage
-from fdhil.config.service import Access, Maintenance
-from fdhil.config.simulation import Noise, SimAxis, Thermal
-from fdhil.config.table import Accelerometer, TableEncoder
+from fdhil.config.sensor_sections import Thermometer, Voltage
+from fdhil.config.service_sections import Access, Maintenance
+from fdhil.config.simulation_sections import Noise, SimAxis, Thermal
+from fdhil.config.table_sensor_sections import Accelerometer, TableEncoder
 
 __all__ = [
     "CEILING_ACCELERATION_MM_S2",
@@ -60,12 +67,12 @@ __all__ = [
     "Thermal",
     "Thermometer",
     "Voltage",
+    "find_share_fault",
+    "find_unlikely_values",
     "is_second_drive",
-    "load",
-    "load_places",
-    "parse",
+    "load_config",
+    "load_directories",
+    "parse_config",
+    "parse_toml",
     "read_toml",
-    "share_fault",
-    "toml_document",
-    "unlikely",
 ]

@@ -18,28 +18,29 @@ _OWN_SENSORS = ("table", "accelerometer", "temperature", "voltage")
 _OF_THE_TABLE_ENCODER = ("scale", "offset")
 
 
-def mm_per_degree(radius_mm: float) -> float:
+def compute_mm_per_degree(radius_mm: float) -> float:
     """Return the length of arc of one degree at a radius, mm."""
     return math.radians(radius_mm)
 
 
-def angular(key: str) -> str:
+def convert_key_to_degrees(key: str) -> str:
     """Convert a model's key to that of a rotary axis: ``rapid_speed_mm_s`` to ``rapid_speed_deg_s``."""
     return key if key == "radius_mm" else key.replace("_mm", "_deg")
 
 
-def linear(key: str) -> str:
+def convert_key_to_mm(key: str) -> str:
     """Convert a key of a rotary axis to that of the models; 1 mdeg is as many um as 1 deg is mm."""
     return key.replace("_mdeg", "_um").replace("_deg", "_mm")
 
 
-def rotary_axes(document: Mapping[str, Any]) -> dict[str, float]:
+def find_rotary_axes(document: Mapping[str, Any]) -> dict[str, float]:
     """Return mm per degree of each axis written in degrees; 1 where its radius is invalid."""
-    axes = {name: _table(axis) for name, axis in _table(document.get("axis")).items()}
+    axes = {name: _get_table(axis) for name, axis in _get_table(document.get("axis")).items()}
     rotary = {name: axis for name, axis in axes.items() if axis.get("unit") == "deg" or any("_deg" in k for k in axis)}
     radii = {name: axis.get("radius_mm") for name, axis in rotary.items()}
     return {
-        name: mm_per_degree(float(r)) if r is not None and _is_number(r) and r > 0 else 1.0 for name, r in radii.items()
+        name: compute_mm_per_degree(float(r)) if r is not None and _is_number(r) and r > 0 else 1.0
+        for name, r in radii.items()
     }
 
 
@@ -47,9 +48,9 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
 
 
-def complete(document: Mapping[str, Any], faults: list[ConfigFault]) -> dict[str, Any]:
+def complete_axis_tables(document: Mapping[str, Any], faults: list[ConfigFault]) -> dict[str, Any]:
     """Return the document as the models need it; invalid units are added to ``faults``."""
-    axes = {**_table(document.get("axis"))}
+    axes = {**_get_table(document.get("axis"))}
     for name in filter(is_second_drive, [*axes]):
         first = axes.get(name[0])
         if first is None:
@@ -57,27 +58,27 @@ def complete(document: Mapping[str, Any], faults: list[ConfigFault]) -> dict[str
             faults.append(ConfigFault(f"axis.{name}", text, f"add [axis.{name[0]}], or rename this section"))
             del axes[name]
         elif isinstance(first, Mapping) and isinstance(axes[name], Mapping):
-            faults += _sensor_faults(name, first, axes[name])
-            axes[name] = _taken_over(first, axes[name])
+            faults += _find_sensor_faults(name, first, axes[name])
+            axes[name] = _inherit_keys(first, axes[name])
     found: dict[str, Any] = {**document}
     if axes:
         found["axis"] = axes
-    for name, factor in rotary_axes(found).items():
+    for name, factor in find_rotary_axes(found).items():
         if axes[name].get("unit", "mm") == "mm":
             faults.append(ConfigFault(f"axis.{name}.unit", 'is "mm", and keys are in degrees', 'give unit = "deg"'))
-        found["axis"][name] = _lengths(axes[name], factor, f"axis.{name}", faults)
-        simulated = _table(_table(document.get("sim")).get("axis"))
+        found["axis"][name] = _convert_to_lengths(axes[name], factor, f"axis.{name}", faults)
+        simulated = _get_table(_get_table(document.get("sim")).get("axis"))
         if name in simulated:
-            part = _lengths(simulated[name], factor, f"sim.axis.{name}", faults)
+            part = _convert_to_lengths(simulated[name], factor, f"sim.axis.{name}", faults)
             found["sim"] = {**found["sim"], "axis": {**found["sim"]["axis"], name: part}}
     return found
 
 
-def _table(value: Any) -> Mapping[str, Any]:
+def _get_table(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
-def _taken_over(first: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+def _inherit_keys(first: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
     taken = {key: value for key, value in first.items() if key not in _OWN_SENSORS}
     for key, value in own.items():
         below = taken.get(key)
@@ -89,36 +90,36 @@ def _taken_over(first: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, A
     return taken
 
 
-def _sensor_faults(name: str, first: Mapping[str, Any], own: Mapping[str, Any]) -> Iterator[ConfigFault]:
-    if _table(first.get("voltage")).get("source", "drive") != "drive" and "voltage" not in own:
+def _find_sensor_faults(name: str, first: Mapping[str, Any], own: Mapping[str, Any]) -> Iterator[ConfigFault]:
+    if _get_table(first.get("voltage")).get("source", "drive") != "drive" and "voltage" not in own:
         text = f"is missing: the sensor of [axis.{name[:1]}.voltage] measures the other motor"
         yield ConfigFault(f"axis.{name}.voltage", text, 'give its own sensor, or source = "drive"')
 
 
-def _lengths(table: Any, factor: float, path: str, faults: list[ConfigFault]) -> Any:
+def _convert_to_lengths(table: Any, factor: float, path: str, faults: list[ConfigFault]) -> Any:
     if not isinstance(table, Mapping):
         return table
     found: dict[str, Any] = {}
     for key, value in table.items():
-        name = linear(key)
+        name = convert_key_to_mm(key)
         if isinstance(value, Mapping):
-            found[key] = _lengths(value, factor, f"{path}.{key}", faults)
+            found[key] = _convert_to_lengths(value, factor, f"{path}.{key}", faults)
         elif name == key:
             if "_mm" in key and key != "radius_mm":
                 text = "is a length, and this axis is rotary"
-                faults.append(ConfigFault(f"{path}.{key}", text, f"give {angular(key)}, in degrees"))
+                faults.append(ConfigFault(f"{path}.{key}", text, f"give {convert_key_to_degrees(key)}, in degrees"))
             encoder = path.endswith(".table") and key in _OF_THE_TABLE_ENCODER
-            found[key] = _scaled(value, factor) if encoder else value
+            found[key] = _scale_numbers(value, factor) if encoder else value
         elif name in table:
             faults.append(ConfigFault(f"{path}.{key}", f"duplicates {name}", "keep one of them"))
         else:
-            found[name] = _scaled(value, factor)
+            found[name] = _scale_numbers(value, factor)
     if path.endswith(".table"):
         found.setdefault("scale", 1e-3 * factor)
     return found
 
 
-def _scaled(value: Any, factor: float) -> Any:
+def _scale_numbers(value: Any, factor: float) -> Any:
     if isinstance(value, list | tuple):
-        return [_scaled(item, factor) for item in value]
+        return [_scale_numbers(item, factor) for item in value]
     return value * factor if _is_number(value) else value

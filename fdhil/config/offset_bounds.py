@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from fdhil.config.axis import CEILING_ACCELERATION_MM_S2, CEILING_OFFSET_UM, CEILING_SPEED_MM_S, Axis
+from fdhil.config.axis_section import CEILING_ACCELERATION_MM_S2, CEILING_OFFSET_UM, CEILING_SPEED_MM_S, Axis
 
 AXIS_SPEED_SHARE = 0.10  # largest share of the axis' speed for an offset
 AXIS_ACCELERATION_SHARE = 0.50
@@ -29,7 +29,7 @@ class OffsetBounds:
     window: int
 
     @staticmethod
-    def given(axis: Axis, sync_period_s: float) -> OffsetBounds:
+    def compute_configured(axis: Axis, sync_period_s: float) -> OffsetBounds:
         """Convert the configured limits to increments; ValueError when writing is off."""
         if axis.correction is None:
             raise ValueError("writing is off for this axis")
@@ -43,49 +43,49 @@ class OffsetBounds:
         )
 
     @staticmethod
-    def of(axis: Axis, sync_period_s: float) -> OffsetBounds:
+    def compute_effective(axis: Axis, sync_period_s: float) -> OffsetBounds:
         """Return the effective limits: the configured ones within the axis' share, lowered until an offset can be
         removed in time.
 
         ValueError when writing is off (no ``[axis.X.correction]``).
         """
-        given, scale = OffsetBounds.given(axis, sync_period_s), axis.scaling.increments_per_mm
+        given, scale = OffsetBounds.compute_configured(axis, sync_period_s), axis.scaling.increments_per_mm
         share = AXIS_ACCELERATION_SHARE * axis.max_acceleration_mm_s2 * scale * sync_period_s**2
         limits = replace(
             given,
             rate=min(given.rate, AXIS_SPEED_SHARE * axis.top_speed_mm_s * scale * sync_period_s),
             acceleration=min(given.acceleration, share),
         )
-        if not limits.too_coarse and limits.time_to_safe_s(sync_period_s) > TIME_TO_SAFE_S:
+        if not limits.is_too_coarse and limits.compute_time_to_safe_s(sync_period_s) > TIME_TO_SAFE_S:
             braking = max(1, math.floor(BRAKING_S / sync_period_s))
             ramp = max(1, math.floor(TIME_TO_SAFE_S / sync_period_s) - DETECTION_CYCLES - 2 - 3 * braking)
-            rate = min(limits.rate, float(braking * _whole(limits.acceleration)))
-            limits = replace(limits, rate=rate, offset=min(limits.offset, float(ramp * _whole(rate))))
+            rate = min(limits.rate, float(braking * _round_down(limits.acceleration)))
+            limits = replace(limits, rate=rate, offset=min(limits.offset, float(ramp * _round_down(rate))))
         return limits
 
     @property
-    def too_coarse(self) -> bool:
+    def is_too_coarse(self) -> bool:
         """Whether an increment is more than the largest offset, or more than twice what a cycle may change."""
         return self.offset < 1.0 - _ULPS or min(self.rate, self.acceleration) < LEAST_INCREMENTS
 
-    def time_to_safe_s(self, sync_period_s: float) -> float:
+    def compute_time_to_safe_s(self, sync_period_s: float) -> float:
         """Return the longest time from a fault to zero: n_detect + 1 + L/S + 3 S/A cycles."""
-        offset, rate, acceleration, _, _ = self.whole
+        offset, rate, acceleration, _, _ = self.whole_increments
         return (DETECTION_CYCLES + 1 - (-offset // rate) - 3 * (-rate // acceleration)) * sync_period_s
 
     @property
-    def whole(self) -> tuple[int, int, int, int, int]:
+    def whole_increments(self) -> tuple[int, int, int, int, int]:
         """The limits in whole increments, rounded down but at least one, as the guard enforces them on every frame."""
-        offset, rate, acceleration = map(_whole, (self.offset, self.rate, self.acceleration))
+        offset, rate, acceleration = map(_round_down, (self.offset, self.rate, self.acceleration))
         return offset, rate, acceleration, math.floor(self.variation + _ULPS), self.window
 
 
-def _whole(increments: float) -> int:
+def _round_down(increments: float) -> int:
     """Round down; one increment is the least that can be sent."""
     return max(1, math.floor(increments + _ULPS))
 
 
-def limit_faults(axis: Axis, sync_period_s: float) -> list[str]:
+def find_limit_faults(axis: Axis, sync_period_s: float) -> list[str]:
     """Explain why the configured limits cannot be kept: increments too coarse, or ramp to zero too long."""
     if axis.correction is None:
         return []
@@ -98,10 +98,10 @@ def limit_faults(axis: Axis, sync_period_s: float) -> list[str]:
         ):
             if value > most * (1 + 1e-9):
                 return [f"{key} is {value:.4g}; a rotary axis is limited to {most:g}, whatever its radius"]
-    limits = OffsetBounds.given(axis, sync_period_s)
-    if limits.too_coarse:
-        return [_too_coarse(axis, limits)]
-    needed_s = limits.time_to_safe_s(sync_period_s)
+    limits = OffsetBounds.compute_configured(axis, sync_period_s)
+    if limits.is_too_coarse:
+        return [_describe_coarse_limit(axis, limits)]
+    needed_s = limits.compute_time_to_safe_s(sync_period_s)
     if needed_s > TIME_TO_SAFE_S:
         return [
             f"from the largest offset to zero these limits need {needed_s * 1e3:.0f} ms, 120 are allowed"
@@ -110,13 +110,13 @@ def limit_faults(axis: Axis, sync_period_s: float) -> list[str]:
     return []
 
 
-def share_fault(axis: Axis, sync_period_s: float) -> str | None:
+def find_share_fault(axis: Axis, sync_period_s: float) -> str | None:
     """Explain why so slow an axis cannot be corrected: its share of speed or acceleration is below one increment."""
-    limits = OffsetBounds.of(axis, sync_period_s)
-    return _too_coarse(axis, limits) if limits.too_coarse else None
+    limits = OffsetBounds.compute_effective(axis, sync_period_s)
+    return _describe_coarse_limit(axis, limits) if limits.is_too_coarse else None
 
 
-def _too_coarse(axis: Axis, limits: OffsetBounds) -> str:
+def _describe_coarse_limit(axis: Axis, limits: OffsetBounds) -> str:
     name, finest = min(
         ("max_offset_um", limits.offset),
         ("max_speed_mm_s", limits.rate),

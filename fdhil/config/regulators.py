@@ -7,13 +7,13 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from fdhil import tables
-from fdhil.config.section import NotNegative, Positive, Section, one_of
+from fdhil.config.section import NotNegative, Positive, Section, require_one_of
 
 
 class Regulators(Section):
     """[axis.X.regulators]: the drive's nested loops."""
 
-    structure: Annotated[str, one_of(tables.REGULATORS)] = Field(
+    structure: Annotated[str, require_one_of(tables.REGULATORS)] = Field(
         "p_pi_pi", description=f"the regulators' structure: {', '.join(tables.REGULATORS)}"
     )
     position_gain_per_s: Positive = Field(ge=1e-2, le=1e5, description="Kv of the position loop, 1/s")
@@ -51,7 +51,7 @@ class Regulators(Section):
     error_previous_target: bool = Field(True, description="linuxcnc_pid: error against the previous command")
 
     @model_validator(mode="after")
-    def _integrals(self) -> Regulators:
+    def _check_structure(self) -> Regulators:
         if self.structure == "p_pi_pi" and self.position_ki_per_s2:
             raise ValueError("structure p_pi_pi has no position_ki_per_s2; set structure = 'double_pi'")
         if self.structure == "double_pi" and not self.position_ki_per_s2:
@@ -64,17 +64,17 @@ class Regulators(Section):
             raise ValueError(
                 "structure linuxcnc_pid has neither setpoint_filter_s nor torque_feedforward: leave them out"
             )
-        if self.structure != "linuxcnc_pid" and (own := self._of_linuxcnc()):
+        if self.structure != "linuxcnc_pid" and (own := self._list_linuxcnc_keys()):
             raise ValueError(f"structure {self.structure} has no {', '.join(own)}; set structure = 'linuxcnc_pid'")
         return self
 
-    def _of_linuxcnc(self) -> list[str]:
+    def _list_linuxcnc_keys(self) -> list[str]:
         fields = type(self).model_fields.items()
         own = [key for key, field in fields if (field.description or "").startswith("linuxcnc_pid:")]
         return [key for key in own if getattr(self, key) != type(self).model_fields[key].default]
 
 
-def period_faults(regulators: Regulators, sync_period_s: float) -> list[str]:
+def find_period_faults(regulators: Regulators, sync_period_s: float) -> list[str]:
     faults = []
     for key, longer, of, shorter in (
         ("speed_period_s", sync_period_s, "sync_period_s of its bus", regulators.speed_period_s),

@@ -15,25 +15,27 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 SMALLEST, LARGEST = 1e-12, 1e9
 
 
-def _of_a_machine(value: float) -> float:
+def _check_magnitude(value: float) -> float:
     # not by ge and le: those of a key would replace these instead of narrowing them
     if value != 0 and not SMALLEST <= abs(value) <= LARGEST:
         raise ValueError(f"must be from {SMALLEST:g} to {LARGEST:g}")
     return value
 
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False), AfterValidator(_of_a_machine)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False), AfterValidator(_of_a_machine)]
-Finite = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_of_a_machine)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False), AfterValidator(_check_magnitude)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False), AfterValidator(_check_magnitude)]
+Finite = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_check_magnitude)]
 
 
-def _without_controls(name: str) -> str:
+def _refuse_control_characters(name: str) -> str:
     if any(unicodedata.category(letter) in ("Cc", "Cs", "Zl", "Zp") for letter in name):
         raise ValueError("must be one line without control characters")
     return name
 
 
-ShownName = Annotated[str, AfterValidator(_without_controls)]  # shown on terminals, pages and in other programs
+ShownName = Annotated[
+    str, AfterValidator(_refuse_control_characters)
+]  # shown on terminals, pages and in other programs
 AXIS_PATTERN = "[A-Z]2?"  # Y2 is the second drive of the gantry axis Y
 AxisName = Annotated[str, Field(pattern=f"^{AXIS_PATTERN}$")]
 
@@ -53,19 +55,21 @@ def _check_types(plan: Any, of: type[BaseModel]) -> None:
         if kind in ("int", "float", "bool"):
             inner = dict(plan)
             plan.clear()
-            plan.update(core_schema.no_info_before_validator_function(_switch if kind == "bool" else _number, inner))
+            plan.update(
+                core_schema.no_info_before_validator_function(_check_switch if kind == "bool" else _check_number, inner)
+            )
         else:
             for part in plan.values():
                 _check_types(part, of)
 
 
-def _number(value: Any) -> Any:
+def _check_number(value: Any) -> Any:
     if isinstance(value, bool | str):
         raise PydanticCustomError("no_number", "must be a number")
     return value
 
 
-def _switch(value: Any) -> Any:
+def _check_switch(value: Any) -> Any:
     if not isinstance(value, bool):
         raise PydanticCustomError("no_switch", "must be true or false")
     return value
@@ -91,19 +95,19 @@ class Section(BaseModel):
 class SectionWithFiles(Section):
     """A table whose paths are relative to the folder of its file."""
 
-    def placed(self, folder: Path) -> Self:
+    def resolve_paths(self, folder: Path) -> Self:
         """Return a copy with its file paths resolved against ``folder``."""
         return self.model_copy(update={key: folder / value for key, value in self if isinstance(value, Path)})
 
 
-def one_of(table: Mapping[str, str], or_suffix: str | None = None) -> AfterValidator:
+def require_one_of(table: Mapping[str, str], or_suffix: str | None = None) -> AfterValidator:
     """Return the validator of a name from a table, or of a path that ends in ``or_suffix``."""
 
-    def check(name: str) -> str:
+    def check_name(name: str) -> str:
         if name not in table and not (or_suffix and name.endswith(or_suffix)):
             near = difflib.get_close_matches(name, table, n=1)
             names = ", ".join(table) + (f", or a path that ends in {or_suffix}" if or_suffix else "")
             raise ValueError(f"must be one of {names}" + (f"; did you mean {near[0]!r}?" if near else ""))
         return name
 
-    return AfterValidator(check)
+    return AfterValidator(check_name)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.ndimage import distance_transform_edt, maximum_filter1d
 
-from fdhil.config import MachineConfig, share_fault
+from fdhil.config import MachineConfig, find_share_fault
 from fdhil.prediction.inverse_dynamics import held_share, required
 from fdhil.records import Bool, Float, Parameters, Prediction, Reason, Trajectory
 
@@ -34,7 +34,7 @@ def _unwritable(axis: str, config: MachineConfig) -> Reason | None:
             f"axis {axis} has no section [axis.{axis}.correction]: writing to its drive is off",
             f"add [axis.{axis}.correction] with max_offset_um, max_speed_mm_s and max_acceleration_mm_s2",
         )
-    fault = share_fault(config.axis[axis], config.machine.sync_period_s)
+    fault = find_share_fault(config.axis[axis], config.machine.sync_period_s)
     return (
         None if fault is None else Reason("CoarseIncrements", f"axis {axis}: {fault}", f"leave axis {axis} uncorrected")
     )

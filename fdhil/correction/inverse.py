@@ -87,7 +87,7 @@ class AxisInverse:
     def of(parameters: Parameters, config: MachineConfig, axis: str, start_mm: float) -> AxisInverse:
         """Return it at rest at ``start_mm``, without an offset; ValueError if writing is off for the axis."""
         period, drive = config.machine.sync_period_s, config.axis[axis]
-        limits = PlanLimits.of(drive, period)
+        limits = PlanLimits.compute_effective(drive, period)
         loop = AxisLoop(
             parameters,
             drive,

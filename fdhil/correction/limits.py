@@ -30,9 +30,9 @@ class PlanLimits(OffsetBounds):
     um_per_increment: float
 
     @staticmethod
-    def of(axis: Axis, sync_period_s: float) -> PlanLimits:
+    def compute_effective(axis: Axis, sync_period_s: float) -> PlanLimits:
         """Return the limits of an axis; ValueError when writing is off (no ``[axis.X.correction]``)."""
-        allowed = OffsetBounds.of(axis, sync_period_s)
+        allowed = OffsetBounds.compute_effective(axis, sync_period_s)
         return PlanLimits(**asdict(allowed), um_per_increment=1e3 / axis.scaling.increments_per_mm)
 
     @property
@@ -155,7 +155,7 @@ def fit_all(wanted_um: Mapping[str, Float], axes: Mapping[str, Axis], sync_perio
     """Plan the wanted offsets of all axes inside their limits; return them in um, in whole increments."""
     planned: dict[str, Float] = {}
     for name, wanted in wanted_um.items():
-        limits = PlanLimits.of(axes[name], sync_period_s)
+        limits = PlanLimits.compute_effective(axes[name], sync_period_s)
         whole = to_increments(fit(wanted / limits.um_per_increment, limits))
         planned[name] = whole.astype(np.float64) * limits.um_per_increment
     return planned

@@ -199,7 +199,7 @@ class BusHealth:
         """Return the problem of a drive from which no data arrive while its bus is active."""
         if now_s - self._received_s[bus] > LIVE_S:
             return None
-        node = f"node {self._config.node_id(axis)} on {bus}"
+        node = f"node {self._config.get_node_id(axis)} on {bus}"
         if self._counters.get(f"{bus}.{axis}.heard") == 0:
             text = f"the drive ({node}) has never sent a frame; its axis is not monitored"
             if not synced:

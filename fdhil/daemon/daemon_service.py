@@ -17,7 +17,7 @@ from fdhil.arming.guard_link import GUARD_TRIPPED, RECORD_VOIDING_CODES
 from fdhil.arming.standing import ADOPT_ADVICE, START_AND_ADOPT, Standing
 from fdhil.cancellation import find_first_error
 from fdhil.commissioning.void import void_record
-from fdhil.config import MachineConfig, unlikely
+from fdhil.config import MachineConfig, find_unlikely_values
 from fdhil.daemon import alarms, black_box, malloc_tuning, service_log
 from fdhil.daemon.acquisition import Acquisition, OpenSource
 from fdhil.daemon.audit_middleware import AuditMiddleware
@@ -139,7 +139,7 @@ class DaemonService:
     async def _run_tasks(self) -> None:
         clock = ClockWatch(await asyncio.to_thread(find_newest_record_s, self._config.store.directory))
         self._record_notices(await asyncio.to_thread(self._store.open))
-        self._log_outcomes([Notice("ConfigUnlikely", "minor", text) for text in unlikely(self._config)])
+        self._log_outcomes([Notice("ConfigUnlikely", "minor", text) for text in find_unlikely_values(self._config)])
         await asyncio.to_thread(self._prepare_pipelines)
         async with self._control.serve_socket(self._run_directory / SOCKET_NAME), asyncio.TaskGroup() as tasks:
             stop, budgets = self.shutdown, self._budgets

@@ -64,7 +64,7 @@ class LiveStream:
             "axes": list(config.axis),
             "signals": LIVE_SIGNALS,
         }
-        self._by_the_clock = any(axis.voltage.separate for axis in config.axis.values())
+        self._by_the_clock = any(axis.voltage.is_separate for axis in config.axis.values())
         self._temperatures: dict[str, bytes] = {}
         self._viewers: set[_Viewer] = set()
 

@@ -125,13 +125,13 @@ class MoveMonitor:
         ``windows`` is the number of moves that became a window.
         """
         scale, fastest = self.position_by_speed, self.fastest_mm_s
-        pitch, rapid = map(self._axis.shown_key, ("screw_pitch_mm", "rapid_speed_mm_s"))
+        pitch, rapid = map(self._axis.format_key, ("screw_pitch_mm", "rapid_speed_mm_s"))
         if scale is not None and abs(scale - 1.0) > SCALE_TOLERANCE:
             text = f"the position travels {scale:.3g} times the integral of the speed"
             return "ScaleSuspect", f"{text}; correct increments_per_rev, the drive's profile or its sign"
         if self.seen >= FEW and fastest > TOO_FAST * self._rapid_mm_s:
             return "PitchSuspect", (
-                f"moves reach {self._axis.shown(fastest, '/s')}, {fastest / self._rapid_mm_s:.2f} times the rapid"
+                f"moves reach {self._axis.format_in_unit(fastest, '/s')}, {fastest / self._rapid_mm_s:.2f} times the rapid"
                 f" speed of the config; correct {pitch}, increments_per_rev or {rapid}"
             )
         if self.seen < FEW or windows:
@@ -139,12 +139,12 @@ class MoveMonitor:
         return self._explain_unused_moves(now_s)
 
     def _explain_unused_moves(self, now_s: float) -> tuple[str, str] | None:
-        pitch, rapid = map(self._axis.shown_key, ("screw_pitch_mm", "rapid_speed_mm_s"))
+        pitch, rapid = map(self._axis.format_key, ("screw_pitch_mm", "rapid_speed_mm_s"))
         if self.slow:
             return "MovesNotUsed", (
                 f"{self.seen} moves recorded, none used: {self.slow} stay below {self._needed:.0%} of the rapid speed"
-                f" of {self._axis.shown(self._rapid_mm_s, '/s', 'g')}, the fastest at"
-                f" {self._axis.shown(self.fastest_mm_s, '/s')}; run rapids at full override, or correct {rapid} or"
+                f" of {self._axis.format_in_unit(self._rapid_mm_s, '/s', 'g')}, the fastest at"
+                f" {self._axis.format_in_unit(self.fastest_mm_s, '/s')}; run rapids at full override, or correct {rapid} or"
                 f" {pitch}"
             )
         if self.usable >= FEW and now_s - self.usable_s > PATIENCE_S:

@@ -11,7 +11,7 @@ from fdhil.arming.answers import Answer
 from fdhil.config import MachineConfig
 from fdhil.daemon import service_log
 from fdhil.daemon.notice_log import NEWEST, NotAcknowledged, NoticeLog, describe_numbers, parse_acknowledgement
-from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.errors import StoreError
 from fdhil.identification.between import HISTORY_WINDOWS, Member
 from fdhil.identification.drift import Point
@@ -47,12 +47,12 @@ def get_raw_scales(config: MachineConfig, axis: str) -> Scales:
     settings = config.axis[axis]
     profile = load_profile(settings.drive)
     position = (RawScale(settings.scaling.sign / settings.scaling.increments_per_mm),)
-    voltage = abs(profile.terminal_v_per_count(settings))
+    voltage = abs(profile.compute_voltage_scale(settings))
     return {
         "demand_mm": position,
         "position_mm": position,
-        "speed_rad_s": (RawScale(profile.speed_rad_s_per_count(settings)),),
-        "current_a": (RawScale(profile.current_a_per_count(settings)),),
+        "speed_rad_s": (RawScale(profile.compute_speed_scale(settings)),),
+        "current_a": (RawScale(profile.compute_current_scale(settings)),),
         "voltage_v": (RawScale(voltage), RawScale(-voltage)) if voltage else (),
     }
 

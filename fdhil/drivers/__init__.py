@@ -1,5 +1,5 @@
 """Receives from the machine's buses and sensors and turns it into records."""
 
-from fdhil.drivers.machine import MachineSource, Record, open_machine
+from fdhil.drivers.machine_source import MachineSource, Record, open_machine
 
 __all__ = ["MachineSource", "Record", "open_machine"]

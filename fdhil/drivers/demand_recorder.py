@@ -33,20 +33,20 @@ class RecordedDemand:
     doubts: tuple[str, ...]
 
     @property
-    def complete(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether it has no gap and no reason for doubt."""
         return not self.gaps and not self.doubts
 
 
 @dataclass(slots=True)
-class _Sniffed:
+class _AxisDemand:
     ticks: list[Int]
     demands: list[Float]
     newest: int = -1
     moved_first: int | None = None
     moved_last: int | None = None
 
-    def add(self, samples: AxisSamples, anything_moved: bool) -> None:
+    def add_samples(self, samples: AxisSamples, anything_moved: bool) -> None:
         if not samples.tick.size:
             return
         demand = samples.demand_mm
@@ -79,33 +79,33 @@ class DemandRecorder:
         self._dt_s, self._mm_per_degree = config.machine.sync_period_s, config.mm_per_degree
         self._rest_rows = math.ceil(rest_s / self._dt_s)
         self._end_rows = math.ceil(config.nc.end_rest_s / self._dt_s)
-        self._axes = {name: _Sniffed([], []) for name in config.axis}
+        self._axes = {name: _AxisDemand([], []) for name in config.axis}
         self._doubts: dict[str, str] = {}
 
-    def feed(self, record: object) -> None:
+    def add_record(self, record: object) -> None:
         """Add a record; only samples and warnings matter here."""
         if isinstance(record, AxisSamples):
-            self._axes[record.axis].add(record, self.moving)
+            self._axes[record.axis].add_samples(record, self.has_moved)
         elif isinstance(record, Notice) and record.code in _SPOILING and record.severity != "info":
             self._doubts[record.code] = record.text
 
     @property
-    def heard(self) -> bool:
+    def has_all_axes(self) -> bool:
         """Whether the demand of every axis has been received."""
         return all(axis.newest >= 0 for axis in self._axes.values())
 
     @property
-    def moving(self) -> bool:
+    def has_moved(self) -> bool:
         return any(axis.moved_first is not None for axis in self._axes.values())
 
     @property
-    def done(self) -> bool:
+    def is_done(self) -> bool:
         """Whether a motion has ended for the requested rest; a lost bus ends it too."""
         last = [axis.moved_last for axis in self._axes.values() if axis.moved_last is not None]
         newest = min(axis.newest for axis in self._axes.values())
         return "BusDown" in self._doubts or (bool(last) and newest >= max(last) + self._rest_rows)
 
-    def demand(self) -> RecordedDemand | None:
+    def build_demand(self) -> RecordedDemand | None:
         """Return the demand from the sample before the first motion to the rest after the last, if any."""
         firsts = [axis.moved_first for axis in self._axes.values() if axis.moved_first is not None]
         lasts = [axis.moved_last for axis in self._axes.values() if axis.moved_last is not None]
@@ -120,7 +120,7 @@ class DemandRecorder:
             inside = (tick >= first) & (tick < stop)
             rows[tick[inside] - first] = (np.concatenate(axis.demands) if axis.ticks else np.empty(0))[inside]
             position[name] = freeze_array(rows)
-            gaps += [Gap(name, int(run[0]), int(run[-1]) + 1) for run in _runs(np.flatnonzero(np.isnan(rows)))]
+            gaps += [Gap(name, int(run[0]), int(run[-1]) + 1) for run in _split_runs(np.flatnonzero(np.isnan(rows)))]
         rapid = np.zeros(stop - first, np.bool_)
         rapid.setflags(write=False)
         time_s = freeze_array(np.arange(stop - first) * self._dt_s)
@@ -129,5 +129,5 @@ class DemandRecorder:
         return RecordedDemand(reference, tuple(gaps), tuple(self._doubts.values()))
 
 
-def _runs(rows: Int) -> list[Int]:
+def _split_runs(rows: Int) -> list[Int]:
     return [run for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if run.size]

@@ -9,8 +9,8 @@ from fdhil import tables
 from fdhil.cancellation import run_attempt
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.tick_clock import TickClock
-from fdhil.drivers.link import Link
-from fdhil.drivers.modbus.link import ModbusLink
+from fdhil.drivers.modbus.modbus_unit import ModbusUnit
+from fdhil.drivers.sensor_connection import SensorConnection
 from fdhil.drivers.table.accelerometer import StreamedAccelerometer
 from fdhil.drivers.table.modbus_encoder import ModbusEncoder
 from fdhil.drivers.thermometer import SlidewayThermometer
@@ -34,20 +34,20 @@ class Sensor(Protocol):
     lost: int
 
     @property
-    def link(self) -> Link:
+    def link(self) -> SensorConnection:
         """Its connection."""
 
-    async def poll(self, ticks: TickClock) -> Sequence[Record]:
+    async def poll_samples(self, ticks: TickClock) -> Sequence[Record]:
         """Poll once and return new records; DeviceError."""
 
-    async def reading(self) -> str:
+    async def format_reading(self) -> str:
         """Read without side effects on a running daemon, and return the formatted value; DeviceError."""
 
 
-def sensors_of(axis: str, config: MachineConfig) -> dict[str, Sensor]:
+def create_sensors(axis: str, config: MachineConfig) -> dict[str, Sensor]:
     """Create the separate sensors of an axis, by what they measure."""
     settings, found = config.axis[axis], {}
-    if settings.voltage.separate:
+    if settings.voltage.is_separate:
         found["voltage"] = tables.load_entry(tables.VOLTAGE_SOURCES, settings.voltage.source)(axis, config)
     if settings.temperature is not None:
         found["temperature"] = SlidewayThermometer(axis, settings.temperature)
@@ -65,7 +65,7 @@ class SensorSource:
         self.sensor = sensor
         self._ticks = ticks
         self._failures = 0
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
 
     async def run(self, take: Take) -> None:
         """Poll for ever; a fault is one notice, its end another."""
@@ -73,36 +73,36 @@ class SensorSource:
         while True:
             begun = time.monotonic()
             try:
-                for record in await run_attempt(self.sensor.name, self._poll()):
+                for record in await run_attempt(self.sensor.name, self._poll_sensor()):
                     take(record)
             except DeviceError as error:
-                self._failed(error, take)
+                self._report_failure(error, take)
                 await asyncio.sleep(pause)
                 pause = min(2 * pause, BACK_OFF_S[1])
                 continue
             pause = BACK_OFF_S[0]
-            for code in sorted(self._told):
+            for code in sorted(self._reported):
                 take(Notice(code, "info", f"The {self.sensor.name} answers again.", self.sensor.axis))
-            self._told.clear()
+            self._reported.clear()
             await asyncio.sleep(max(0.0, POLL_S - (time.monotonic() - begun)))
 
-    async def _poll(self) -> Sequence[Record]:
-        if not self.sensor.link.connected:
+    async def _poll_sensor(self) -> Sequence[Record]:
+        if not self.sensor.link.is_connected:
             await self.sensor.link.connect()
-        return await self.sensor.poll(self._ticks)
+        return await self.sensor.poll_samples(self._ticks)
 
-    def _failed(self, error: DeviceError, take: Take) -> None:
+    def _report_failure(self, error: DeviceError, take: Take) -> None:
         self._failures += 1
-        code = self.sensor.link.fault_code(error)
-        if code is not None and code not in self._told:
-            self._told.add(code)
+        code = self.sensor.link.classify_fault(error)
+        if code is not None and code not in self._reported:
+            self._reported.add(code)
             take(Notice(code, "MAJOR", str(error), self.sensor.axis))
 
-    def counters(self) -> dict[str, int]:
+    def read_counters(self) -> dict[str, int]:
         """Return samples received and lost, failed polls, and recovered faults of the line."""
         own = {"samples": self.sensor.samples, "lost": self.sensor.lost, "failures": self._failures}
         link = self.sensor.link
-        return own | (dict(link.counted) if isinstance(link, ModbusLink) else {})
+        return own | (dict(link.fault_counts) if isinstance(link, ModbusUnit) else {})
 
     def close(self) -> None:
         self.sensor.link.close()

@@ -4,11 +4,11 @@ import asyncio
 
 from fdhil.config import Thermometer
 from fdhil.drivers.can.tick_clock import TickClock
-from fdhil.drivers.link import Link
-from fdhil.drivers.meter import Meter
-from fdhil.drivers.modbus.link import PLAUSIBLE_C
-from fdhil.drivers.modbus.meter import ModbusMeter
-from fdhil.drivers.serial.instrument import TextMeter
+from fdhil.drivers.meter_voltage import Meter
+from fdhil.drivers.modbus.modbus_unit import PLAUSIBLE_C
+from fdhil.drivers.modbus.register_meter import RegisterMeter
+from fdhil.drivers.sensor_connection import SensorConnection
+from fdhil.drivers.serial.text_instrument import TextMeter
 from fdhil.errors import ProtocolError
 from fdhil.records import Temperature
 
@@ -27,25 +27,25 @@ class SlidewayThermometer:
         if settings.source == "serial":
             self._meter = TextMeter(self.name, settings)
         else:
-            self._meter = ModbusMeter(self.name, settings, PLAUSIBLE_C[1])
+            self._meter = RegisterMeter(self.name, settings, PLAUSIBLE_C[1])
 
     @property
-    def link(self) -> Link:
+    def link(self) -> SensorConnection:
         return self._meter.link
 
-    async def poll(self, ticks: TickClock) -> list[Temperature]:
+    async def poll_samples(self, ticks: TickClock) -> list[Temperature]:
         """Wait for the period and read once; ProtocolError for an impossible temperature, and errors of the link."""
-        if not self._meter.tells_by_itself:
+        if not self._meter.is_free_running:
             await asyncio.sleep(self._period_s)
-        celsius = await self._celsius()
+        celsius = await self._read_celsius()
         self.samples += 1
         return [Temperature(self.axis, ticks.newest_tick, celsius, "slideway")]
 
-    async def reading(self) -> str:
-        return f"{await self._celsius():.2f} degC"
+    async def format_reading(self) -> str:
+        return f"{await self._read_celsius():.2f} degC"
 
-    async def _celsius(self) -> float:
-        celsius = await self._meter.value()
+    async def _read_celsius(self) -> float:
+        celsius = await self._meter.read_value()
         if not PLAUSIBLE_C[0] < celsius < PLAUSIBLE_C[1]:  # also refuses NaN
-            raise ProtocolError(self.name, self._meter.doubt(f"{celsius:g} degC"))
+            raise ProtocolError(self.name, self._meter.describe_implausible(f"{celsius:g} degC"))
         return celsius

@@ -22,7 +22,7 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.js import JetStreamContext
 
-from fdhil.config.fleet import Fleet
+from fdhil.config.fleet_config import Fleet
 from fdhil.daemon import service_log
 from fdhil.errors import StoreError
 from fdhil.fleet import migrations, objects

@@ -121,7 +121,7 @@ class Letterbox:
 
     def __init__(self, config: MachineConfig) -> None:
         self._config = config
-        self._machine = config.works_name
+        self._machine = config.plant_name
         self._next_s = 0.0
         self._reported = 0
         self._last_complaint = ""

@@ -19,12 +19,12 @@ from nacl.exceptions import CryptoError
 from nacl.signing import VerifyKey
 from pydantic import Field, FiniteFloat, StringConstraints, ValidationError, model_validator
 
-from fdhil.config.fleet import MACHINE_NAME_PATTERN as MACHINE
-from fdhil.config.from_afar import never
-from fdhil.config.offers import key_bytes
-from fdhil.config.reading import checked_value
+from fdhil.config.config_loader import check_value
+from fdhil.config.fleet_config import MACHINE_NAME_PATTERN as MACHINE
+from fdhil.config.offers_section import decode_plant_key
+from fdhil.config.remote_change_policy import explain_refusal
 from fdhil.config.section import Section
-from fdhil.config.uplink import Label, Labels
+from fdhil.config.uplink_section import Label, Labels
 from fdhil.errors import ConfigError, ConfigFault, FdhilError
 from fdhil.store.offers import OFFER_NAME_PATTERN
 
@@ -56,7 +56,7 @@ class Change(Section):
 
     @model_validator(mode="after")
     def _may_be_offered(self) -> Self:
-        faults = [f"{path}: {why}" for path in self.values if (why := never(path))]
+        faults = [f"{path}: {why}" for path in self.values if (why := explain_refusal(path))]
         if any(path.startswith("axis.*.") for path in self.values) and not self.axis_labels:
             faults.append("axis_labels: axis.* means the axes with these labels; name them")
         if faults:
@@ -95,7 +95,7 @@ def canonical(offer: Offer) -> bytes:
 def sign(offer: Offer, key: Path) -> bytes:
     """Return the signed document; ConfigError where the key file or a value cannot be used."""
     for path, value in offer.values.items():
-        checked_value(path.replace("axis.*.", "axis.X."), value)
+        check_value(path.replace("axis.*.", "axis.X."), value)
     pair = _pair(key)
     line = canonical(offer)
     signature = pair.sign(_told(line)).hex()
@@ -117,7 +117,7 @@ def read(document: bytes, trusted: Collection[str]) -> Offer:
             f"{text}; confirm the key with the fleet server's operator by another channel before you list it"
         )
     try:
-        VerifyKey(key_bytes(key)).verify(_told(line), bytes.fromhex(found[2].decode()))
+        VerifyKey(decode_plant_key(key)).verify(_told(line), bytes.fromhex(found[2].decode()))
     except (CryptoError, ValueError):
         raise OfferRefused("it was changed after it was signed; do not trust it, ask for a new copy") from None
     return _parsed(line)
@@ -173,7 +173,7 @@ def _pair(path: Path) -> nkeys.KeyPair:
         raise _key_fault(path, "can be read by others, who could sign offers with it", f"run chmod 0600 {path}")
     try:
         pair = nkeys.from_seed(seed)
-        key_bytes(pair.public_key.decode())
+        decode_plant_key(pair.public_key.decode())
     except (nkeys.NkeysError, ValueError, TypeError, IndexError):
         raise _key_fault(path, "is not a signing key", "create one with fdhil fleet key") from None
     return pair

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from fdhil import config as machine_config
-from fdhil.config import MachineConfig, parse, toml_document, unlikely
-from fdhil.config.editing import NotEditable, edited
-from fdhil.config.from_afar import loosens
+from fdhil.config import MachineConfig, find_unlikely_values, parse_config, parse_toml
+from fdhil.config.remote_change_policy import is_loosening
+from fdhil.config.toml_editing import NotEditable, edit_toml
 from fdhil.errors import ConfigError, OutputError, StoreError
 from fdhil.fleet.guard_limits import guard_limits
 from fdhil.fleet.offer import LARGEST, Offer, OfferRefused, read
@@ -92,7 +92,7 @@ class Present:
 
 def present(file: Path, now_s: float | None = None) -> Present:
     """Load the machine of a configuration; ConfigError, StoreError where its answers cannot be read."""
-    config = machine_config.load(file)
+    config = machine_config.load_config(file)
     raw, answers = file.read_bytes(), read_answers(config.store.directory)
     return Present(file, raw, config, answers, _newest(config), time.time() if now_s is None else now_s)
 
@@ -160,7 +160,7 @@ def _require_in_force(offer: Offer, machine: Present) -> None:
 
 
 def _require_for(offer: Offer, machine: Present) -> None:
-    name = machine.config.works_name
+    name = machine.config.plant_name
     if offer.machines and name not in offer.machines:
         raise OfferRefused(f"its stage {offer.stage} is not for {name}")
     for label, text in offer.labels.items():
@@ -172,21 +172,21 @@ def _require_for(offer: Offer, machine: Present) -> None:
 
 def _weighed(judged: Judged, offer: Offer, machine: Present) -> Judged:
     values = dict(_values(offer, machine))
-    document = copy.deepcopy(toml_document(machine.raw, str(machine.file)))
+    document = copy.deepcopy(parse_toml(machine.raw, str(machine.file)))
     for path, value in values.items():
         _put(document, path, value)
     try:
-        new = parse(document, str(offer), machine.file.parent)
+        new = parse_config(document, str(offer), machine.file.parent)
         found = {path: (_at(machine.config, path), _at(new, path)) for path in values}
-        changes = [Changed(p, old, now, loosens(p, old, now)) for p, (old, now) in found.items() if old != now]
+        changes = [Changed(p, old, now, is_loosening(p, old, now)) for p, (old, now) in found.items() if old != now]
         text = machine.raw.decode()
         if changes:
-            text = edited(text, {each.path: values[each.path] for each in changes}, str(offer))
+            text = edit_toml(text, {each.path: values[each.path] for each in changes}, str(offer))
     except ConfigError as error:
         raise OfferRefused(f"it would make the configuration invalid: {error}") from None
     except NotEditable as error:
         raise OfferRefused(f"{machine.file} cannot be edited by line: {error}") from None
-    doubts = [text for text in unlikely(new) if text not in unlikely(machine.config)]
+    doubts = [text for text in find_unlikely_values(new) if text not in find_unlikely_values(machine.config)]
     of_guard = list(_loosened(machine.config, new)) if changes else []
     return replace(judged, changes=changes, text=text, config=new, doubts=doubts, of_guard=of_guard)
 

@@ -15,7 +15,7 @@ from typing import Any, LiteralString
 import psycopg
 from psycopg.types.json import Jsonb
 
-from fdhil.config.fleet import Fleet
+from fdhil.config.fleet_config import Fleet
 from fdhil.errors import StoreError
 from fdhil.fleet import migrations
 from fdhil.fleet.sets import Db, entered

@@ -14,7 +14,7 @@ from typing import Any, LiteralString
 
 from psycopg import sql
 
-from fdhil.config.fleet import Fleet
+from fdhil.config.fleet_config import Fleet
 from fdhil.errors import ConfigError, ConfigFault, StoreError
 from fdhil.fleet.migrations import LOCK
 from fdhil.fleet.objects import path_of

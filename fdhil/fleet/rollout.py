@@ -15,10 +15,10 @@ import psycopg
 from psycopg.rows import DictRow, dict_row
 from pydantic import Field
 
-from fdhil.config.fleet import Fleet
-from fdhil.config.reading import checked, checked_as, load_as
+from fdhil.config.config_loader import check_section, check_section_file, load_section_file
+from fdhil.config.fleet_config import Fleet
 from fdhil.config.section import Section
-from fdhil.config.uplink import Label, Labels
+from fdhil.config.uplink_section import Label, Labels
 from fdhil.errors import ConfigError, ConfigFault, ConnectError
 from fdhil.fleet import delivery, migrations
 from fdhil.fleet.offer import Change, Offer, OfferRefused, sign
@@ -104,8 +104,8 @@ class Standing:
 
 def read_change(path: Path) -> tuple[Change, int]:
     """Return the change defined by a file, and its validity in days; ConfigError."""
-    file = load_as(ChangeFile, path, "a change to offer")
-    return checked_as(Change, file.change, str(path)), file.valid_days
+    file = load_section_file(ChangeFile, path, "a change to offer")
+    return check_section_file(Change, file.change, str(path)), file.valid_days
 
 
 def offer_of(change: Change, days: int, by: str, stage: int, machines: Sequence[str]) -> Offer:
@@ -113,7 +113,7 @@ def offer_of(change: Change, days: int, by: str, stage: int, machines: Sequence[
     now_s = int(time.time())
 
     fields = {**change.model_dump(), "stage": stage, "machines": machines, "by": by}
-    return checked(Offer, {**fields, "made_s": now_s, "expires_s": now_s + days * DAY_S}, change.name)
+    return check_section(Offer, {**fields, "made_s": now_s, "expires_s": now_s + days * DAY_S}, change.name)
 
 
 @asynccontextmanager

@@ -19,9 +19,9 @@ from nats.js import JetStreamContext
 from nats.js.api import AckPolicy, ConsumerConfig, DiscardPolicy, RetentionPolicy, StorageType, StreamConfig
 
 from fdhil.cancellation import GivenUp, run_attempt
-from fdhil.config.credentials import password_of, secret_in, tls_of
-from fdhil.config.fleet import Stream
-from fdhil.config.uplink import NatsServer
+from fdhil.config.credentials import create_tls_context, read_password, read_secret
+from fdhil.config.fleet_config import Stream
+from fdhil.config.uplink_section import NatsServer
 from fdhil.daemon import service_log
 from fdhil.errors import ConnectError
 from fdhil.fleet.message import SUBJECTS
@@ -60,14 +60,14 @@ async def try_for_good(
 
 def check_credentials(settings: NatsServer, section: str) -> None:
     """Check the credential files; ConnectError names the one that cannot be used."""
-    tls_of(settings, "NATS server", section)
+    create_tls_context(settings, "NATS server", section)
     _proof_of(settings, section)
 
 
 def _proof_of(settings: NatsServer, section: str) -> dict[str, Any]:
-    secret = secret_in(settings.credentials_file, "NATS server", f"[{section}] credentials_file")
+    secret = read_secret(settings.credentials_file, "NATS server", f"[{section}] credentials_file")
     if secret is None:
-        return {"user": settings.user, "password": password_of(settings, "NATS server", section)}
+        return {"user": settings.user, "password": read_password(settings, "NATS server", section)}
     seeds = _SEED.findall(secret)
     try:
         nkeys.from_seed(bytearray(seeds[0].encode()))
@@ -85,7 +85,7 @@ async def connected(settings: NatsServer, name: str, section: str) -> AsyncItera
     ERRORS when no server can be reached. Retries are the caller's decision.
     """
     client = Client()
-    tls = tls_of(settings, "NATS server", section)
+    tls = create_tls_context(settings, "NATS server", section)
     servers = [server.replace("nats://", "tls://") if tls else server for server in settings.servers]
     errors: list[Exception] = []
 

@@ -15,7 +15,7 @@ from nats.aio.client import Client
 from nats.js import JetStreamContext
 
 from fdhil.config import MachineConfig
-from fdhil.config.uplink import Uplink
+from fdhil.config.uplink_section import Uplink
 from fdhil.daemon import service_log
 from fdhil.errors import ConfigError, ConfigFault, StoreError
 from fdhil.fleet.delivery import Letterbox
@@ -64,7 +64,7 @@ class Sender:
 
     def __init__(self, config: MachineConfig, settings: Uplink) -> None:
         """StoreError where the folder of the position cannot be made."""
-        self.machine = settings.name_of(config.machine.name)
+        self.machine = settings.get_plant_name(config.machine.name)
         self.sent = 0
         self._settings = settings
         self._store = config.store.directory

@@ -72,7 +72,7 @@ def identify_loops(
         return None
     rapids = tuple(rapid for rapid, _ in usable)
     following = compute_rms(np.concatenate([one.lag_mm[one.known] for one in rapids])) * 1e3
-    tolerance = settings.tolerance_for(following)
+    tolerance = settings.compute_tolerance_um(following)
     problem = _problem(rapids, axis, windows[0])
     modelled = tuple(replace(rapid, plant=own, load_nm=np.zeros_like(rapid.load_nm)) for rapid, own in usable)
     kinds = [replace(problem, rapids=r) for r in (rapids, modelled)]

@@ -52,7 +52,7 @@ class RecentSamples:
         self._capacity = capacity
         self._period_s = period_s
         self._period_ns = period_s * 1e9
-        self.separate_voltage = section.voltage.separate
+        self.separate_voltage = section.voltage.is_separate
         self._first_tick: int | None = None
         self._samples: deque[AxisSamples] = deque()
         self._voltage: deque[VoltageSamples] = deque()

@@ -103,7 +103,7 @@ def with_loops(config: MachineConfig, loops: Loops, source: str) -> MachineConfi
     document = config.model_dump(mode="json")
     for axis, values in known.items():
         document["axis"][axis]["regulators"] |= values
-    return configuration.parse(document, source, made_up=True)
+    return configuration.parse_config(document, source, made_up=True)
 
 
 def validated_models(

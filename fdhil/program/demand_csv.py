@@ -165,7 +165,7 @@ def _check_speeds(path: Path, columns: Mapping[str, Float], config: MachineConfi
         raise RecordingError(
             f"{path}: axis {name} moves at {speeds[name] / axis.mm_per_unit:.3g} {axis.unit}/s, {ratios[name]:.3g} "
             f"times its rapid speed; is {name}_{axis.unit} in {thousandths} or in increments? "
-            f"convert it to {axis.unit}, or correct {axis.shown_key('rapid_speed_mm_s')}"
+            f"convert it to {axis.unit}, or correct {axis.format_key('rapid_speed_mm_s')}"
         )
     if ratios[name] < _TOO_SLOW and max(float(np.ptp(values)) for values in columns.values()) < _SMALL_MM:
         text = (

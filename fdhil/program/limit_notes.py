@@ -38,7 +38,7 @@ def _beyond(demand: Trajectory, config: MachineConfig) -> Iterator[Reason]:
             ("accelerates by", acceleration, "s2", "max_acceleration_mm_s2"),
         ):
             text, limit = f"axis {name} {what}", getattr(axis, key) / unit
-            shown = f"axis.{name}.{axis.shown_key(key)}"
+            shown = f"axis.{name}.{axis.format_key(key)}"
             yield from _note(demand, found / unit, limit, text, f"{axis.unit}/{per}", shown)
     if not speeds:
         return

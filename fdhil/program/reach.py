@@ -23,10 +23,10 @@ def first_beyond(position_mm: Mapping[str, Float], config: MachineConfig) -> Bey
     """Return the first row at which an axis is out of range; None if all (n,) positions fit."""
     found = []
     for name, axis in config.axis.items():
-        reach = PositionRange.of(name, axis, config.machine.sync_period_s)
+        reach = PositionRange.build_for_axis(name, axis, config.machine.sync_period_s)
         increments = np.rint(position_mm[name] * reach.per_mm)
         out = np.flatnonzero(~((reach.low <= increments) & (increments <= reach.high)))  # NaN does not fit either
         if out.size:
             row = int(out[0])
-            found.append(Beyond(row, name, reach.fault(float(position_mm[name][row]))))
+            found.append(Beyond(row, name, reach.describe_fault(float(position_mm[name][row]))))
     return min(found, default=None)

@@ -21,8 +21,8 @@ from aiomqtt.exceptions import MqttConnectError
 
 from fdhil.cancellation import GivenUp, end_tasks, find_first_error, run_attempt
 from fdhil.config import MachineConfig
-from fdhil.config.credentials import password_of, tls_of
-from fdhil.config.publish import MqttBroker
+from fdhil.config.credentials import create_tls_context, read_password
+from fdhil.config.publish_sections import MqttBroker
 from fdhil.daemon import service_log
 from fdhil.shopfloor.published_items import PublishedEvent, PublishedValue
 from fdhil.shopfloor.publisher_process import report_ready
@@ -63,9 +63,9 @@ async def publish(config: MachineConfig) -> None:
     ConnectError when the files of its credentials cannot be used.
     """
     settings = config.publish.mqtt
-    session = MqttSession(settings, settings.node_name(config.machine.name))
-    tls_of(settings, *BROKER)  # faulty files end the command
-    password_of(settings, *BROKER)
+    session = MqttSession(settings, settings.get_node_name(config.machine.name))
+    create_tls_context(settings, *BROKER)  # faulty files end the command
+    read_password(settings, *BROKER)
     where = f"{settings.host}:{settings.port}"
     report_ready(
         f"Sparkplug B of {config.machine.name}: {session.node.make_topic('NBIRTH')}, for the broker at {where}"
@@ -130,8 +130,8 @@ def _make_client(settings: MqttBroker, session: MqttSession) -> aiomqtt.Client:
         settings.port,
         identifier=f"fdhil-{identity}",  # the broker then closes our previous connection
         username=settings.user,
-        password=password_of(settings, *BROKER),
-        tls_context=tls_of(settings, *BROKER),
+        password=read_password(settings, *BROKER),
+        tls_context=create_tls_context(settings, *BROKER),
         will=aiomqtt.Will(will.topic, will.payload, will.qos, retain=False),
         clean_session=True,
         keepalive=round(settings.keepalive_s),

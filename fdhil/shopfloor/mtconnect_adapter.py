@@ -12,7 +12,7 @@ import time
 from collections import Counter
 
 from fdhil.config import MachineConfig
-from fdhil.config.publish import MtConnectAdapter
+from fdhil.config.publish_sections import MtConnectAdapter
 from fdhil.daemon import service_log
 from fdhil.errors import ConnectError
 from fdhil.shopfloor.published_items import list_published_values

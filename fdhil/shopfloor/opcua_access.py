@@ -20,9 +20,9 @@ from asyncua.server.internal_server import InternalServer
 from asyncua.server.internal_session import InternalSession
 from asyncua.server.user_managers import UserManager
 
-from fdhil.config.publish import OpcUaServer
-from fdhil.config.users import User as KnownUser
-from fdhil.config.users import UsersFile, matches
+from fdhil.config.publish_sections import OpcUaServer
+from fdhil.config.user_file import User as KnownUser
+from fdhil.config.user_file import UsersFile, verify_password
 from fdhil.errors import ConnectError
 from fdhil.shopfloor.opcua_subscriptions import ReportedValues
 
@@ -65,7 +65,7 @@ class ReadOnlyRuleset(SimpleRoleRuleset):
         if (
             self._users is not None
             and isinstance(user, OpcUaReader)
-            and self._users.user(user.name or "") != user.known
+            and self._users.find_user(user.name or "") != user.known
         ):
             return False
         return action_type_id in self._permitted
@@ -95,8 +95,8 @@ class OpcUaUserManager(UserManager):
         failures = sum(address == self.address for address, _ in self._failures)
         if failures >= MOST_FAILURES or username is None or password is None:
             return None
-        known = self.users.user(username)
-        if matches(known, password):
+        known = self.users.find_user(username)
+        if verify_password(known, password):
             return OpcUaReader(role=UserRole.User, name=username, known=known)
         self._failures.append((self.address, now_s))
         return None

@@ -12,7 +12,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 
 from fdhil.config import MachineConfig
-from fdhil.config.publish import PrometheusMetrics
+from fdhil.config.publish_sections import PrometheusMetrics
 from fdhil.connections import BoundedHttpProtocol
 from fdhil.errors import ConnectError
 from fdhil.shopfloor.prometheus_metrics import MetricsCollector

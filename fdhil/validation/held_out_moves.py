@@ -112,12 +112,12 @@ def worst_of(predicted: Sequence[Replay | None]) -> HeldOut | None:
 
 def is_predicted(found: Replay | None, settings: Identification) -> bool:
     """Return whether a model predicts a move that it was not identified on to the tolerance."""
-    return found is not None and found.unexplained_um <= settings.tolerance_for(found.measured_um)
+    return found is not None and found.unexplained_um <= settings.compute_tolerance_um(found.measured_um)
 
 
 def held_out_reason(found: HeldOut, settings: Identification) -> Reason | None:
     """Return why a model is not validated if it does not predict the moves that it was not identified on."""
-    limit_um = settings.tolerance_for(found.following_um)
+    limit_um = settings.compute_tolerance_um(found.following_um)
     if found.rms_um <= limit_um:
         return None
     text = (

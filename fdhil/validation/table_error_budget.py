@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 
 from fdhil.config import Axis, Identification
-from fdhil.config.controller import TOLERANCE_SHARE
+from fdhil.config.nc_section import TOLERANCE_SHARE
 from fdhil.identification.filtering import moving_mean, quick_size
 from fdhil.identification.windows import carried
 from fdhil.model.terms import torque
@@ -261,11 +261,11 @@ def weigh(
     left = _beyond_noise(left, loop, parameters, move, noise)
     replayed = _replayed(window, parameters, axis, sync_period_s)
     if replayed is None and axis is not None:
-        return Weight(left, settings.tolerance_for(whole), whole, left, "own loop")
+        return Weight(left, settings.compute_tolerance_um(whole), whole, left, "own loop")
     if replayed is None:
         limit = min(TOLERANCE_SHARE * max(whole, _followed_um(window)), MOST_SHARE * whole)
         return Weight(left, limit, whole, left, "ordinary loop")
-    limit = settings.tolerance_for(replayed.measured_um)
+    limit = settings.compute_tolerance_um(replayed.measured_um)
     soft = replayed.unexplained_um > limit and _stiff_um(window, parameters, axis, sync_period_s) <= limit
     return Weight(replayed.unexplained_um, limit, replayed.measured_um, left, "replay", soft)
 

@@ -86,7 +86,7 @@ def _check_backlash(signals: WindowSignals) -> list[Reason]:
 
 def _check_voltage_recorded(signals: WindowSignals) -> Iterator[Reason]:
     """Yield a reason where a sensor should have measured the voltage: no data sheet replaces what it shows of K."""
-    has_sensor = signals.axis is not None and signals.axis.voltage.separate
+    has_sensor = signals.axis is not None and signals.axis.voltage.is_separate
     if has_sensor and not signals.has_voltage and signals.window.torque_constant_nm_per_a is None:
         yield Reason("SampleTiming", "the window has no voltage", "connect the voltage sensor")
 

@@ -16,7 +16,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fdhil.config.users import LONGEST_PASSWORD, Role, User, UsersFile, matches
+from fdhil.config.user_file import LONGEST_PASSWORD, Role, User, UsersFile, verify_password
 from fdhil.web.answers import Refused
 
 LIFE_S = 12 * 3600.0
@@ -150,7 +150,7 @@ class Access:
         return self._users_file is not None
 
     def _user(self, name: str) -> User | None:
-        return self._users_file.user(name) if self._users_file else None
+        return self._users_file.find_user(name) if self._users_file else None
 
     async def log_in(self, name: str, password: str, address: str) -> tuple[str, Session]:
         """Return a new token and its session; Refused for a wrong name or password, or after too many.
@@ -166,7 +166,7 @@ class Access:
             raise _too_many(wait_s)
         async with self._turns.turn(place, wrong):
             user = await asyncio.to_thread(self._user, name)
-            fits = await asyncio.to_thread(matches, user, password[: LONGEST_PASSWORD + 1])
+            fits = await asyncio.to_thread(verify_password, user, password[: LONGEST_PASSWORD + 1])
         if user is None or not fits:
             self._guesses.wrong(*keys)
             raise Refused(

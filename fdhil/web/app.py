@@ -18,7 +18,7 @@ from starlette.middleware.gzip import GZipMiddleware
 
 from fdhil.arming.answers import refusal
 from fdhil.config import MachineConfig
-from fdhil.config.web import Web
+from fdhil.config.web_section import Web
 from fdhil.daemon.daemon_socket import SOCKET_NAME
 from fdhil.errors import FdhilError
 from fdhil.web import pages

@@ -13,7 +13,7 @@ from fastapi import Depends
 from starlette.requests import HTTPConnection
 
 from fdhil.config import MachineConfig
-from fdhil.config.web import Web
+from fdhil.config.web_section import Web
 from fdhil.store.history import History
 from fdhil.web.access import Access, Asker
 from fdhil.web.daemon import Daemon

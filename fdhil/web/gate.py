@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from fdhil.config.web import Web
+from fdhil.config.web_section import Web
 from fdhil.web.access import Access, Asker
 from fdhil.web.answers import Refused
 

@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from fdhil.config import MachineConfig
-from fdhil.config.web import Web, is_loopback
+from fdhil.config.web_section import Web, is_loopback
 from fdhil.daemon import malloc_tuning
 from fdhil.daemon.shutdown import Shutdown
 from fdhil.errors import ConfigError, ConfigFault, ConnectError, FdhilError

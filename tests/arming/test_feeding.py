@@ -25,7 +25,7 @@ def config(tmp_path: Path) -> MachineConfig:
 
 def save_records(config: MachineConfig, **changes: Any) -> None:
     for axis in "XY":
-        options = {"6007": 1, "1402": 0x400 + config.node_id(axis)}
+        options = {"6007": 1, "1402": 0x400 + config.get_node_id(axis)}
         values: dict[str, Any] = {"axis": axis, "config_digest": axis_digest(config, axis), "options": options}
         save_record(record_of(config, **(values | (changes if axis == "X" else {}))), config.store.directory)
 

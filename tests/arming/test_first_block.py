@@ -81,7 +81,7 @@ def test_the_error_before_the_first_corner_is_gone(text: str, tmp_path: Path) ->
     for axis in "XY":
         assert len(anew.offset[axis]) == len(begin.offset[axis])
         assert anew.offset[axis][1700:] == begin.offset[axis][1700:] or text == SHORT
-        limits = PlanLimits.of(CONFIG.axis[axis], 0.001)
+        limits = PlanLimits.compute_effective(CONFIG.axis[axis], 0.001)
         assert check(np.array(anew.offset[axis]), limits) == []
 
 

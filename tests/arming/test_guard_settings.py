@@ -12,8 +12,8 @@ from fdhil.arming.guard_settings import heartbeat_timeout_s, limits_of, settings
 from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
 from fdhil.commissioning.void import void_record
 from fdhil.config import CorrectionLimits, Drive, TableEncoder
-from fdhil.drivers.cia402.profile import DriveProfile
-from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.drivers.cia402.drive_profile import DriveProfile
+from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.errors import ConfigError
 from fdhil.guard.guard_settings import decode_settings, encode_settings
 from fdhil.guard.offset_limits import OffsetLimits
@@ -21,7 +21,7 @@ from tests.guard.drive_peer import write_config
 
 
 def test_limits_are_whole_increments_rounded_down(tmp_path: Path) -> None:
-    config = machine_config.load(write_config(tmp_path, 1))
+    config = machine_config.load_config(write_config(tmp_path, 1))
     axis = config.axis["X"].model_copy(update={"correction": CorrectionLimits()})
     assert limits_of(axis, 0.002) == OffsetLimits(163, 13, 3, 9830, 500)
     slow = config.axis["X"].model_copy(update={"rapid_speed_mm_s": 100.0, "max_acceleration_mm_s2": 1000.0})
@@ -35,7 +35,7 @@ RECORD = CommissioningRecord(
 
 
 def test_the_drives_heartbeat_is_watched_as_it_was_commissioned(tmp_path: Path) -> None:
-    counted = machine_config.load(write_config(tmp_path, 1))
+    counted = machine_config.load_config(write_config(tmp_path, 1))
     assert counted.guard.clock == "sync"
     config = counted.model_copy(update={"guard": counted.guard.model_copy(update={"clock": "monotonic"})})
     assert heartbeat_timeout_s(config, "X") == 0
@@ -50,7 +50,7 @@ def test_the_drives_heartbeat_is_watched_as_it_was_commissioned(tmp_path: Path) 
 
 
 def test_the_software_limits_are_those_of_the_commissioning(tmp_path: Path) -> None:
-    config = machine_config.load(write_config(tmp_path, 1))
+    config = machine_config.load_config(write_config(tmp_path, 1))
     assert [axis.travel for axis in settings_of(config, "can0", tmp_path, "").axes] == [None, None]
     save_record(replace(RECORD, options={"607D01": -1000, "607D02": 820_000}), config.store.directory)
     made = settings_of(config, "can0", tmp_path, "")
@@ -59,7 +59,7 @@ def test_the_software_limits_are_those_of_the_commissioning(tmp_path: Path) -> N
 
 
 def test_the_guard_knows_the_record_and_whether_it_holds(tmp_path: Path) -> None:
-    config = machine_config.load(write_config(tmp_path, 1))
+    config = machine_config.load_config(write_config(tmp_path, 1))
     store, signed = config.store.directory, replace(RECORD, config_digest=axis_digest(config, "X"))
 
     def known() -> list[tuple[str, bool]]:
@@ -79,7 +79,7 @@ def test_the_guard_knows_the_record_and_whether_it_holds(tmp_path: Path) -> None
 
 def test_what_the_guard_sends_is_nobody_elses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An offset that another drive takes for its set-point would move an axis that is not corrected."""
-    config = machine_config.load(write_config(tmp_path, 1))
+    config = machine_config.load_config(write_config(tmp_path, 1))
     drives = {"X": config.axis["X"], "Y": config.axis["Y"].model_copy(update={"correction": None})}
     (sent,) = (
         axis.offset.cob_id

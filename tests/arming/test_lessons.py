@@ -11,7 +11,7 @@ import pytest
 from fdhil.arming import passes
 from fdhil.arming.standstill import Standstill
 from fdhil.config import MachineConfig
-from fdhil.config.controller import Correction as Learning
+from fdhil.config.nc_section import Correction as Learning
 from fdhil.records import Correction, MoveKind, NcState
 from tests.arming.mill import Mill
 from tests.arming.test_ahead import opened

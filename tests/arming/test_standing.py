@@ -283,7 +283,7 @@ def test_run_leaves_with_zero_only_when_the_guard_says_so(
 def test_run_without_a_guard_does_not_leave_with_zero_what_the_run_before_left(
     machine: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
-    store = machine_config.load(machine).store.directory
+    store = machine_config.load_config(machine).store.directory
     StandingMark(store).keep(standing.standing(FROZEN))
     told: dict[str, Any] = {}
     code, err = running(machine, monkeypatch, capsys, lambda p: told.update(status_when(p, lambda s: s["notices"])))
@@ -339,13 +339,13 @@ def test_adopt_says_what_stands_asks_and_ends_at_zero(
 
 
 def in_the_audit(machine: Path) -> list[tuple[str, str | None]]:
-    found = audit.entries(machine_config.load(machine).store.directory)
+    found = audit.entries(machine_config.load_config(machine).store.directory)
     return [(entry.get("asked") or entry["answered"], entry.get("result")) for entry, wrong in found if wrong is None]
 
 
 @pytest.mark.fault("F5")
 def test_no_disk_keeps_an_offset_from_being_taken_away(machine: Path, guard: Guard, capsys: Any) -> None:
-    folder = machine_config.load(machine).store.directory
+    folder = machine_config.load_config(machine).store.directory
     (folder / audit.AUDIT_FILE_NAME).mkdir(parents=True)
     now = [FROZEN, OFF]
     guard.says = lambda kind: {"ok": True} if kind in ("adopt", "disarm") else now.pop(0) if len(now) > 1 else now[0]

@@ -15,7 +15,7 @@ from fdhil.arming.first_block import FirstBlock
 from fdhil.arming.preparing import ArmRequest, Refused
 from fdhil.arming.program_check import check, encoded
 from fdhil.arming.whole_plan import plan_whole
-from fdhil.config import MachineConfig, parse
+from fdhil.config import MachineConfig, parse_config
 from fdhil.errors import ProgramError
 from fdhil.prediction.models import nominal_models
 from fdhil.program import program_digest
@@ -33,7 +33,7 @@ def config(tmp_path: Path) -> MachineConfig:
 def test_rows_are_in_the_drives_increments_and_sign() -> None:
     document = copy.deepcopy(bench_document())
     document["axis"]["Y"]["drive"] = {"sign": -1}
-    config = parse(document)
+    config = parse_config(document)
     planned = correction.plan(bench_trajectory(10), nominal_models(config), config, "mirror")
     position = planned.before.reference.position_mm
     rows = np.frombuffer(encoded(position, planned.offset_um, config), "<i4").reshape(-1, 4)
@@ -63,7 +63,7 @@ FAR = "G1 X{:.4f} F30000\nG1 X0\nM2\n"
 def test_a_program_beyond_32_bits_is_refused_whichever_way_it_is_checked(tmp_path: Path) -> None:
     document = bench_document("X")
     document["axis"]["X"]["drive"] = {"increments_per_rev": 20_000_000}
-    config = parse(document, folder=tmp_path)
+    config = parse_config(document, folder=tmp_path)
     program = tmp_path / "far.ngc"
     program.write_text(FAR.format(2147.2337))
     told = "line 1, 'X': axis X at 2147.2337 mm: .* is 2147.2336 mm"

@@ -21,8 +21,8 @@ from fdhil.bridges.hal_bus import (
     get_sync_counter,
     read_axes,
 )
-from fdhil.config.axis import Drive
-from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.config.axis_section import Drive
+from fdhil.drivers.cia402.drive_profile_file import load_profile
 
 LEAD = 20
 PINS = {

@@ -28,7 +28,7 @@ from tests.tiers import sampled
 
 WAITS = {
     "commissioning.watchdog.STARVE_TIMEOUT_S": 1.0,
-    "drivers.can.sdo.RESPONSE_TIMEOUT_S": 0.2,
+    "drivers.can.sdo_channel.RESPONSE_TIMEOUT_S": 0.2,
     "commissioning.strokes.JOG_MM": 1.0,
     "commissioning.trial.TIMING_CYCLES": 100,
     "commissioning.trial.TRIAL_RAPIDS": 4,
@@ -59,7 +59,7 @@ class Bench:
 
     @property
     def store(self) -> Path:
-        return machine_config.load(self.file).store.directory
+        return machine_config.load_config(self.file).store.directory
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def bench(
     bus = f'[bus.can0]\ninterface = "virtual"\nchannel = "{uuid.uuid4().hex}"\n[guard]\nclock = "sync"\n'
     slow = bench_toml("X").replace("sync_period_s = 0.001", "sync_period_s = 0.002")
     file.write_text(slow + "[axis.X.drive]\nnode_id = 1\n" + bus)
-    with DrivePeer(machine_config.load(file)) as peer:
+    with DrivePeer(machine_config.load_config(file)) as peer:
         yield Bench(peer, file, capsys)
 
 
@@ -172,7 +172,7 @@ def test_an_axis_is_tried_where_the_operator_agrees_and_known_to_the_history(
     for name, true in TRUE.items():
         assert newest.set.parameters.as_dict()[name] == pytest.approx(true, rel=0.01), name
 
-    beats = bench.peer.heard.count(0x700 + machine_config.load(bench.file).play.node_id)
+    beats = bench.peer.heard.count(0x700 + machine_config.load_config(bench.file).play.node_id)
     assert beats > 4  # the drive stops by itself after this process ends
     assert [bench.peer.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
 
@@ -303,7 +303,7 @@ def test_a_wrong_set_up_is_refused(what: str, bench: Bench) -> None:
 
 @pytest.mark.parametrize("what", sampled(FOREIGN, every=3))
 def test_an_nc_that_is_switched_on_in_the_sign_test_leaves_no_record(what: str, bench: Bench) -> None:
-    config = machine_config.load(bench.file)
+    config = machine_config.load_config(bench.file)
     with ForeignNc(config.bus["can0"].channel, FOREIGN[what], is_offset) as nc:
         code, out, err = bench.commission("--yes", "--json")
         assert nc.on
@@ -330,7 +330,7 @@ def test_an_nc_that_is_switched_on_in_the_sign_test_leaves_no_record(what: str, 
     ],
 )
 def test_nothing_begins_where_an_nc_came_while_a_question_stood(question: int, sync: int, bench: Bench) -> None:
-    config = machine_config.load(bench.file)
+    config = machine_config.load_config(bench.file)
     with ForeignNc(config.bus["can0"].channel, FOREIGN["SYNC"], lambda _: False) as nc:
         code, _, err = bench.commission(said=LateOperator(nc, "-2 130\ny\ny\ny\n", question))
         assert nc.on

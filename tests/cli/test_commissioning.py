@@ -24,7 +24,7 @@ from fdhil.commissioning.compare import RECORD_POINT
 from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.record import load_record
 from fdhil.commissioning.void import is_void, void_record
-from fdhil.config import load
+from fdhil.config import load_config
 from fdhil.sim.drive.objects import serial_number
 from fdhil.sim.wire.hub import Hub
 from tests.arming.guard_peer import Guard
@@ -40,9 +40,9 @@ WAITS: tuple[tuple[str, str, float], ...] = (
     ("commissioning.steps", "SETTLE_CYCLES", 120),
     ("commissioning.steps", "AVERAGE_CYCLES", 400),
     ("commissioning.watchdog", "STARVE_TIMEOUT_S", 15.0),  # simulated drives are slower on a slow host
-    ("drivers.can.sdo", "RESPONSE_TIMEOUT_S", 5.0),
-    ("drivers.can.sdo", "DEADLINE_S", 20.0),
-    ("drivers.can.sdo", "QUIET_S", 0.1),
+    ("drivers.can.sdo_channel", "RESPONSE_TIMEOUT_S", 5.0),
+    ("drivers.can.sdo_channel", "DEADLINE_S", 20.0),
+    ("drivers.can.sdo_channel", "QUIET_S", 0.1),
 )
 # fdhil as a process of its own with these waits
 QUICK = f"""
@@ -143,7 +143,7 @@ def test_a_scan_lists_the_drives_with_their_eds(fdhil: Said, bench: Bench) -> No
         "vendor_id": 0x46444849,
         "product_code": 0x402,
         "revision": 0x10000,
-        "serial": serial_number(load(bench.config()), "Y"),
+        "serial": serial_number(load_config(bench.config()), "Y"),
     }
     assert answers["name"] == "fdhil twin drive"
     assert answers["device_type"] & 0xFFFF == 402
@@ -240,7 +240,7 @@ def test_where_the_guard_took_nothing_of_a_comparison_void_records_stay_so(
 ) -> None:
     """The guard refuses the comparison, or disconnects before its answer."""
     path = write_config(tmp_path, bus='interface = "virtual"')
-    config = load(path)
+    config = load_config(path)
     config.guard_directory.mkdir(parents=True, exist_ok=True)
     guard = Guard(config.guard_directory)
     guard.says = lambda _kind: {"ok": True, "state": "OFF", "touched": {"X": 0, "Y": 0}}
@@ -265,7 +265,7 @@ def test_what_is_seen_while_drives_are_compared_speaks_against_them(
 ) -> None:
     """X reboots, which the daemon detects, and Y, which only the guard detects: both records stay void."""
     path = write_config(tmp_path, bus='interface = "virtual"')
-    config = load(path)
+    config = load_config(path)
     store = config.store.directory
     config.guard_directory.mkdir(parents=True, exist_ok=True)
     guard, said = Guard(config.guard_directory), {"ok": True, "state": "OFF", "touched": {"X": 3, "Y": 0}}
@@ -357,7 +357,11 @@ def test_an_axis_is_commissioned_and_signed_off(fdhil: Said, bench: Bench) -> No
     assert "axis X is commissioned: moved +" in out
     record = load_record(config.parent / "fdhil-data", "X")
     assert record is not None
-    assert (record.watchdog, record.serial, record.options["1017"]) == ("proven", serial_number(load(config), "X"), 100)
+    assert (record.watchdog, record.serial, record.options["1017"]) == (
+        "proven",
+        serial_number(load_config(config), "X"),
+        100,
+    )
 
 
 @pytest.mark.usefixtures("long_computation")

@@ -56,7 +56,7 @@ def test_text_keeps_its_length_and_all_that_is_harmless(text: str) -> None:
 @pytest.mark.parametrize("name", ["Mill\x1b[2J", "Mill\nX", "Mill\x7f", "Mill\u2028"])
 def test_machine_name_with_control_characters_is_refused(name: str) -> None:
     with pytest.raises(ConfigError, match=r"machine\.name: must be one line without control characters"):
-        config.parse({"machine": {"name": name}})
+        config.parse_config({"machine": {"name": name}})
 
 
 def test_error_about_a_hostile_file_name_is_harmless(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

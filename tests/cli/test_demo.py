@@ -30,7 +30,7 @@ WAY = np.column_stack([np.linspace(0, 10, 50), np.zeros(50)])
 
 
 def machine() -> machine_config.MachineConfig:
-    return machine_config.parse(machine_document(REAL))
+    return machine_config.parse_config(machine_document(REAL))
 
 
 def passes(*labels: str) -> list[Cut]:
@@ -43,7 +43,7 @@ def published() -> Published:
 
 
 def test_the_shipped_configuration_is_the_demonstrations_machine() -> None:
-    shipped, shown = machine_config.load(SHIPPED), machine()
+    shipped, shown = machine_config.load_config(SHIPPED), machine()
     assert {axis: twin.reality for axis, twin in shipped.sim.axis.items()} == {
         axis: twin.reality for axis, twin in shown.sim.axis.items()
     }

@@ -32,7 +32,7 @@ from tests.short_waits import shorten_waits
 @pytest.fixture(autouse=True)
 def quick(virtual_threads: object, monkeypatch: pytest.MonkeyPatch) -> None:
     """Use shorter waits, and a PC without other load."""
-    shorten_waits(monkeypatch, {"drivers.can.sdo.RESPONSE_TIMEOUT_S": 0.2})
+    shorten_waits(monkeypatch, {"drivers.can.sdo_channel.RESPONSE_TIMEOUT_S": 0.2})
     monkeypatch.setattr("os.getloadavg", lambda: (0.1, 0.1, 0.1))
     monkeypatch.setattr("fdhil.cli.doctor.computer.GOVERNOR", Path("/none"))
 
@@ -62,7 +62,7 @@ class Pc:
         return path
 
     def peer(self) -> DrivePeer:
-        return DrivePeer(machine_config.load(self.write()))
+        return DrivePeer(machine_config.load_config(self.write()))
 
     def examined(self, *options: str) -> tuple[int, list[dict[str, Any]]]:
         result = CliRunner().invoke(doctor, [str(self.write()), "--json", *options], standalone_mode=False)

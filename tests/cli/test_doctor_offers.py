@@ -18,7 +18,7 @@ from tests.fleet.offers import Works, machine_of
 @pytest.fixture
 def machine(tmp_path: Path) -> MachineConfig:
     works = Works(tmp_path)
-    config = machine_config.load(machine_of(works, tmp_path / "mill"))
+    config = machine_config.load_config(machine_of(works, tmp_path / "mill"))
     config.offers_directory.mkdir(parents=True)
     (config.offers_directory / file_name("friction", 3)).write_bytes(works.document())
     return config
@@ -57,4 +57,4 @@ def test_where_no_works_is_trusted_nothing_is_looked_at(machine: MachineConfig) 
 
 
 def test_no_offer_is_no_trouble(tmp_path: Path) -> None:
-    assert told(machine_config.load(machine_of(Works(tmp_path), tmp_path / "mill"))) == []
+    assert told(machine_config.load_config(machine_of(Works(tmp_path), tmp_path / "mill"))) == []

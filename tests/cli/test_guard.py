@@ -89,7 +89,7 @@ def test_no_drive_is_commissioned_while_a_guard_owns_the_bus(
     """The running guard read the records at its start and would not use a new one."""
     config = write_config(tmp_path, peer.port)
     monkeypatch.setattr(sys, "argv", ["fdhil", "commission", str(config), "--yes"])
-    with lock_bus(machine_config.load(config).bus["can0"]):
+    with lock_bus(machine_config.load_config(config).bus["can0"]):
         assert run_safely(cli) == 3
     assert "BusLocked" in capsys.readouterr().err
 
@@ -168,7 +168,7 @@ def test_a_guard_under_a_user_of_its_own(
     key = given / "commissioning.key"
     key.write_text("5e" * 32)
     key.chmod(0o400)
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     save_record(replace(RECORD, config_digest=axis_digest(machine, "X")), machine.store.directory, key)
     assert run(monkeypatch, str(config), "--check") == 0
     settings = load_settings(tmp_path / "own" / "guard.json")

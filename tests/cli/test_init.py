@@ -18,11 +18,11 @@ import pytest
 from fdhil import config as machine_config
 from fdhil.cli.demo.toml import to_toml
 from fdhil.cli.main import cli, run_safely
-from fdhil.config.template import filled
+from fdhil.config.config_template import write_filled_template
 from fdhil.report.history_reading import by_axis
 from tests.commissioning.test_linuxcnc_files import HAL_TEXT, INI, ROTARY_AND_GANTRY
+from tests.drivers.frame_builder import build_machine_config
 from tests.drivers.peer import DrivePeer
-from tests.drivers.wire import machine
 from tests.eds import write_eds
 from tests.short_waits import shorten_waits
 
@@ -40,7 +40,7 @@ RAPID = {"screw_pitch_mm": 20.0, "rapid_speed_mm_s": 500.0, "max_acceleration_mm
 def fdhil(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Said:
     """Run a command in this process with ``said`` on standard input; return exit code, stdout and stderr."""
     monkeypatch.setattr("fdhil.cli.init.INTERFACES", Path("no interfaces"))
-    shorten_waits(monkeypatch, {"commissioning.scan.ANSWER_S": 1.0, "drivers.can.sdo.RESPONSE_TIMEOUT_S": 0.2})
+    shorten_waits(monkeypatch, {"commissioning.scan.ANSWER_S": 1.0, "drivers.can.sdo_channel.RESPONSE_TIMEOUT_S": 0.2})
 
     def run(*arguments: object, said: str = "") -> tuple[int, str, str]:
         monkeypatch.setattr("sys.argv", ["fdhil", *map(str, arguments)])
@@ -59,7 +59,7 @@ def bus() -> dict[str, Any]:
 
 @pytest.fixture
 def peer(virtual_threads: object, bus: dict[str, Any]) -> Iterator[DrivePeer]:
-    with DrivePeer(machine(bus=bus["can0"])) as running:
+    with DrivePeer(build_machine_config(bus=bus["can0"])) as running:
         yield running
 
 
@@ -80,7 +80,7 @@ def test_linuxcncs_files_and_few_answers_make_a_machine(fdhil: Said, tmp_path: P
     assert code == 0, err
     assert "next: fdhil doctor" in out
     assert "  check nominal.Cd of axis.X, axis.Y = 2.0: guessed: 5 % of the continuous torque" in out
-    made = machine_config.load(file)
+    made = machine_config.load_config(file)
     x, y = made.axis["X"], made.axis["Y"]
     assert (made.machine.name.strip(), made.machine.sync_period_s, made.nc.profile) == ("Mill No 3", 0.002, "linuxcnc")
     assert (x.rapid_speed_mm_s, x.drive.increments_per_rev, x.drive.sign) == (400.0, 10000, 1)
@@ -112,8 +112,8 @@ def test_rotary_axis_and_gantry_of_linuxcnc_need_a_radius_and_two_node_ids(fdhil
     assert not file.exists()
     code, _, err = fdhil(*arguments, written(tmp_path, axis=axes))
     assert code == 0, err
-    made = machine_config.load(file)
-    assert len({*map(made.node_id, made.axis)}) == 4
+    made = machine_config.load_config(file)
+    assert len({*map(made.get_node_id, made.axis)}) == 4
     assert (made.axis["Y"].drive.sign, made.axis["Y2"].drive.sign) == (-1, 1)
     a, text = made.axis["A"], file.read_text()
     assert (a.rapid_speed_mm_s / a.mm_per_unit, a.screw_pitch_mm / a.mm_per_unit) == pytest.approx((90.0, 8.192))
@@ -147,7 +147,7 @@ def test_a_dry_run_prints_the_file_and_writes_none(fdhil: Said, tmp_path: Path) 
     answers = written(tmp_path, axis={"X": axis})
     code, out, err = fdhil("init", tmp_path / "m.toml", "--answers", answers, "--offline", "--dry-run")
     assert code == 0
-    assert machine_config.parse(tomllib.loads(out)).axis["X"].nominal.R == 0.5
+    assert machine_config.parse_config(tomllib.loads(out)).axis["X"].nominal.R == 0.5
     assert "would be written" in err
     assert not (tmp_path / "m.toml").exists()
 
@@ -191,7 +191,7 @@ def test_the_drive_tells_its_scales_and_the_operator_the_rest(
     assert code == 0, err
     assert err.count("try again") == 4
     assert "node 1 (fdhil twin drive" in err
-    made = machine_config.load(file).axis["X"]
+    made = machine_config.load_config(file).axis["X"]
     assert (made.drive.profile, made.drive.increments_per_rev, made.nominal.K) == ("fdhil_twin", 65536, 0.8)
     assert (made.nominal.Jt, made.correction is not None) == (0.075, True)
     assert "check nominal.K of axis.X = 0.8: guessed: the drive's rated torque" in out
@@ -210,7 +210,7 @@ def test_numbers_that_cannot_be_of_one_machine_are_asked_again(
     code, out, err = fdhil("init", file, "--offline", said="\n".join(lines) + "\n")
     assert code == 0, (err, out)
     assert "invalid:" in err
-    assert machine_config.load(file).axis["X"].nominal.L == 0.005
+    assert machine_config.load_config(file).axis["X"].nominal.L == 0.005
 
 
 def test_an_eds_that_cannot_be_read_is_asked_again(fdhil: Said, tmp_path: Path) -> None:
@@ -223,7 +223,7 @@ def test_an_eds_that_cannot_be_read_is_asked_again(fdhil: Said, tmp_path: Path) 
     code, out, err = fdhil("init", file, "--offline", said="\n".join(lines) + "\n")
     assert code == 0, (err, out)
     assert "lost.eds" in err
-    made = machine_config.load(file).axis["X"]
+    made = machine_config.load_config(file).axis["X"]
     assert (made.drive.profile, made.drive.eds) == ("cia402", tmp_path / "elmo.eds")
 
 
@@ -247,7 +247,7 @@ def test_what_a_file_says_cannot_break_the_comments(fdhil: Said, tmp_path: Path)
     arguments = ("--from-linuxcnc", tmp_path / "mill.ini", "--answers", answers, "--offline")
     code, _, err = fdhil("init", tmp_path / "m.toml", *arguments)
     assert code == 0, err
-    assert machine_config.load(tmp_path / "m.toml").axis["X"].drive.increments_per_rev == 10000
+    assert machine_config.load_config(tmp_path / "m.toml").axis["X"].drive.increments_per_rev == 10000
 
 
 @pytest.mark.usefixtures("real_time")
@@ -285,7 +285,7 @@ def test_an_answer_that_the_drive_contradicts_is_noted(
     code, out, err = fdhil("init", tmp_path / "m.toml", "--answers", written(tmp_path, axis={"X": sheet}, bus=bus))
     assert code == 0, err
     assert "note: axis.X.drive.increments_per_rev: the answers have 4096, the drive has 65536" in out
-    assert machine_config.load(tmp_path / "m.toml").axis["X"].drive.increments_per_rev == 4096
+    assert machine_config.load_config(tmp_path / "m.toml").axis["X"].drive.increments_per_rev == 4096
 
 
 def test_limits_that_were_left_open_are_such_that_coarse_increments_can_keep(fdhil: Said, tmp_path: Path) -> None:
@@ -296,7 +296,7 @@ def test_limits_that_were_left_open_are_such_that_coarse_increments_can_keep(fdh
         file = tmp_path / f"{increments}.toml"
         code, _, err = fdhil("init", file, "--answers", answers, "--offline")
         assert code == 0, err
-        found = machine_config.load(file).axis["X"].correction
+        found = machine_config.load_config(file).axis["X"].correction
         assert found is not None
         assert (found.max_offset_um, found.max_speed_mm_s, found.max_acceleration_mm_s2) == limits
 
@@ -318,13 +318,13 @@ def test_an_axis_without_a_drive_is_refused(fdhil: Said, peer: DrivePeer, bus: d
 def test_a_drive_that_was_given_to_an_axis_is_not_proposed_to_another(
     fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path
 ) -> None:
-    with DrivePeer(machine(axes="XY", bus=bus["can0"]), "Y"):
+    with DrivePeer(build_machine_config(axes="XY", bus=bus["can0"]), "Y"):
         sheet = SHEET | RAPID | {"drive": {}}
         answers = written(tmp_path, axis={"X": sheet, "Y": sheet | {"drive": {"node_id": 1}}}, bus=bus)
         code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", answers)
     assert code == 0, err
-    made = machine_config.load(tmp_path / "m.toml")
-    assert {axis: made.node_id(axis) for axis in made.axis} == {"X": 2, "Y": 1}
+    made = machine_config.load_config(tmp_path / "m.toml")
+    assert {axis: made.get_node_id(axis) for axis in made.axis} == {"X": 2, "Y": 1}
 
 
 def test_a_pc_without_can_says_what_to_give(fdhil: Said, tmp_path: Path) -> None:
@@ -342,12 +342,12 @@ def test_the_pcs_own_can_interface_is_proposed(fdhil: Said, tmp_path: Path, monk
     axis = SHEET | RAPID | {"drive": SHEET["drive"] | {"increments_per_rev": 65536}}
     code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", written(tmp_path, axis={"X": axis}), "--offline")
     assert code == 0, err
-    made = machine_config.load(tmp_path / "m.toml").bus["can0"]
+    made = machine_config.load_config(tmp_path / "m.toml").bus["can0"]
     assert (made.interface, made.channel) == ("socketcan", "can3")
 
 
 @pytest.mark.parametrize("name", ["sim", "realistic", "four-axes", "vcan", "machine-template"])
 def test_a_configuration_written_with_its_comments_means_the_same(name: str) -> None:
     document = tomllib.loads((ROOT / "configs" / f"{name}.toml").read_text("utf-8"))
-    again = tomllib.loads(filled(document, {"machine.name": 'a "source" \\ of it'}, "head"))
+    again = tomllib.loads(write_filled_template(document, {"machine.name": 'a "source" \\ of it'}, "head"))
     assert again == document

@@ -70,7 +70,7 @@ def test_correction_with_the_model_file_makes_no_place_of_the_real_path_worse(sh
 
 
 def test_correction_from_the_history_uses_the_loops_of_the_published_sets(shop: Shop) -> None:
-    config = configuration.load(shop.config)
+    config = configuration.load_config(shop.config)
     model = load_model_file(shop.model)
     found = replace(published(1, "X", model.parameters["X"]), config_digest=config.digest, loops=model.loops["X"])
     with History.open(config.store.directory) as history:

@@ -105,7 +105,7 @@ class Shop:
         return process
 
     def last_in_the_audit(self) -> tuple[str, str | None]:
-        *_, (entry, _) = audit.entries(machine_config.load(self.folder / "machine.toml").store.directory)
+        *_, (entry, _) = audit.entries(machine_config.load_config(self.folder / "machine.toml").store.directory)
         return entry.get("asked") or entry["answered"], entry.get("result")
 
     def wait(self, condition: Callable[[], bool]) -> None:
@@ -155,7 +155,7 @@ def shop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shop]:
     folder = tmp_path_factory.mktemp("play")
     with TwinProcess(write_config(folder)) as twin, twin.join() as bus:
         made = Shop(twin, folder, bus)
-        sign_off(machine_config.load(made.config(twin.bus_settings["port"])))
+        sign_off(machine_config.load_config(made.config(twin.bus_settings["port"])))
         yield made
 
 

@@ -61,7 +61,7 @@ def test_a_recorded_program_is_its_demand_to_the_increment(twin: tuple[TwinProce
     process.command("play", file=str(program))
     code, document = recording.end()
     assert (code, document["complete"], document["gaps"]) == (0, True, []), document
-    machine = configuration.load(config)
+    machine = configuration.load_config(config)
     ordered, heard = increments(load_trajectory(program, machine)), increments(load_trajectory(out, machine))
     first = int(np.flatnonzero(np.abs(np.diff(ordered, axis=0)).max(axis=1))[0])  # the first increment that moves
     rows = min(len(heard), len(ordered) - first)

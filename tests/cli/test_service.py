@@ -19,7 +19,7 @@ import pytest
 
 from fdhil.arming.token import ensure_token
 from fdhil.cli.status_view import believed, sparkline
-from fdhil.config import load
+from fdhil.config import load_config
 from fdhil.daemon import service_log
 from fdhil.daemon.daemon_status import DaemonStatus
 from fdhil.records import Notice
@@ -134,7 +134,7 @@ def test_arm_sends_the_token_and_says_what_is_promised(machine: Path, tmp_path: 
     token = (machine.parent / "fdhil-data" / "run" / "token").read_text()
     program = str((tmp_path / "p.ngc").resolve())
     wanted = {"request": "arm", "program": program, "method": "mirror", "whole": True, "token": token, "progress": True}
-    wanted["config_digest"] = load(machine).digest
+    wanted["config_digest"] = load_config(machine).digest
     assert requests == [wanted]
 
 

@@ -10,8 +10,8 @@ import pytest
 from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError, DriveFault
+from tests.drivers.frame_builder import build_machine_config
 from tests.drivers.peer import DrivePeer
-from tests.drivers.wire import machine
 
 Frames = list[tuple[int, bytes]]
 NOT_VALID = 0x80000401
@@ -22,10 +22,10 @@ class Spoilt(DrivePeer):
 
     spoil: Callable[[int, bytes], bytes | Frames | None] = staticmethod(lambda _id, data: data)
 
-    def take(self, can_id: int, data: bytes) -> Frames:
+    def handle_frame(self, can_id: int, data: bytes) -> Frames:
         changed = self.spoil(can_id, data)
         if isinstance(changed, bytes):
-            return super().take(can_id, changed)
+            return super().handle_frame(can_id, changed)
         return changed or []
 
     def rpdo(self) -> int:
@@ -43,7 +43,7 @@ pytestmark = pytest.mark.usefixtures("quick_commissioning")
 @pytest.fixture
 def peer() -> Iterator[tuple[Spoilt, MachineConfig]]:
     bus: dict[str, object] = {"interface": "virtual", "channel": uuid.uuid4().hex}
-    settings = machine(bus=bus, feedforward={})
+    settings = build_machine_config(bus=bus, feedforward={})
     with Spoilt(settings) as running:
         yield running, settings
 

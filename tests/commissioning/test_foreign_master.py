@@ -40,8 +40,8 @@ from tests.commissioning.foreign_nc import (
     moves,
     offset_of,
 )
+from tests.drivers.frame_builder import build_machine_config
 from tests.drivers.peer import DrivePeer
-from tests.drivers.wire import machine
 from tests.integration.conftest import sign_off
 from tests.tiers import sampled
 from tests.virtual_threads import VirtualThreads
@@ -86,7 +86,7 @@ def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
     sections: dict[str, Any] = {"guard": {"clock": "sync", "heartbeat_s": 0.1}, "play": {"heartbeat_s": 0.5}}
     sections |= getattr(request, "param", {})
     bus: dict[str, object] = {"interface": "virtual", "channel": uuid.uuid4().hex}
-    config = machine(tmp_path, bus=bus, **sections)
+    config = build_machine_config(tmp_path, bus=bus, **sections)
     with DrivePeer(config) as peer:
         yield Rig(peer, config)
 
@@ -253,5 +253,5 @@ def test_no_frame_leaves_before_the_bus_was_listened_to(rig: Rig) -> None:
     with rig.nc("SYNC", lambda _frame: True) as nc:
         nc.on = True
         with Master(rig.config, "X") as master, pytest.raises(ForeignMaster):
-            master.sdo.read(0x1000)
+            master.sdo.read_bytes(0x1000)
         assert nc.sent == []

@@ -13,7 +13,7 @@ from fdhil.commissioning.init.hal_pins import current_gains, propose_axis
 from fdhil.commissioning.init.linuxcnc import Machine, read_linuxcnc
 from fdhil.commissioning.init.linuxcnc_text import Hal, Ini, parse_hal
 from fdhil.commissioning.init.making import conclude, make
-from fdhil.config import MachineConfig, parse, toml_document
+from fdhil.config import MachineConfig, parse_config, parse_toml
 from fdhil.errors import ConfigError
 
 SERVO_INI = """
@@ -81,7 +81,7 @@ def made(
     tmp_path: Path, nc: Machine, given: dict[str, Any], pins: list[str] | None = None
 ) -> tuple[Draft, MachineConfig]:
     draft = make(tmp_path / "mill.toml", given, nc, pins=pins or [])
-    return draft, parse(toml_document(conclude(draft, tmp_path / "mill.toml").encode(), "made"))
+    return draft, parse_config(parse_toml(conclude(draft, tmp_path / "mill.toml").encode(), "made"))
 
 
 def test_pins_and_gains_are_taken_from_the_files(tmp_path: Path) -> None:

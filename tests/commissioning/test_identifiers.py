@@ -20,12 +20,12 @@ from fdhil.commissioning.record import CommissioningRecord, save_record
 from fdhil.commissioning.steps import commission
 from fdhil.commissioning.survey import survey
 from fdhil.config import MachineConfig
-from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.errors import ConfigError, DriveFault
 from tests.bench import bench_document
-from tests.drivers.cia402.eds_text import COMMON, CURRENT, OFFSETS, U8, Variable, eds_text, pdos
+from tests.drivers.cia402.eds_text import COMMON, CURRENT, OFFSETS, U8, Variable, build_pdo_objects, format_eds
+from tests.drivers.frame_builder import build_machine_config
 from tests.drivers.peer import DrivePeer
-from tests.drivers.wire import machine
 
 pytestmark = pytest.mark.usefixtures("quick_commissioning")
 RECORD = CommissioningRecord(
@@ -43,9 +43,9 @@ MAPPED = {
 
 def dcf_of_node_5(folder: Path, offset_rpdo: int) -> Path:
     """Write a DCF of node 5 with a fixed mapping and absolute COB-IDs; RPDO2 carries the offset."""
-    variables: list[Variable] = [*COMMON, *OFFSETS, *CURRENT, *pdos(4, 2, "ro", MAPPED)]
+    variables: list[Variable] = [*COMMON, *OFFSETS, *CURRENT, *build_pdo_objects(4, 2, "ro", MAPPED)]
     lines = ["[DeviceComissioning]", "NodeID=5"]
-    for line in eds_text(
+    for line in format_eds(
         [(*each[:5], 1) if each[2] == U8 and each[1] == 2 else each for each in variables]
     ).splitlines():
         lines.append(line)
@@ -64,7 +64,7 @@ def config_of(folder: Path, offset_rpdo: int, axes: str = "X", **second: Any) ->
     document["axis"]["X"]["drive"]["node_id"] = 5
     for axis in axes[1:]:
         document["axis"][axis].setdefault("drive", {}).update(second)
-    return machine_config.parse(document, folder=folder)
+    return machine_config.parse_config(document, folder=folder)
 
 
 def test_guard_of_a_dcf_sends_what_the_file_says(tmp_path: Path) -> None:
@@ -113,13 +113,13 @@ def test_axes_of_one_device_share_no_identifier() -> None:
     document = bench_document("XYZ")
     for axis, logical, node in (("X", 1, 1), ("Y", 2, 1), ("Z", 1, 3)):
         document["axis"][axis]["drive"] = {"node_id": node, "logical_axis": logical}
-    config = machine_config.parse(document)
+    config = machine_config.parse_config(document)
     assert [find_clash(config, axis) for axis in "XYZ"] == [None] * 3
 
 
 def test_nothing_is_sent_to_a_drive_whose_identifiers_are_anothers(monkeypatch: pytest.MonkeyPatch) -> None:
     """A node that is not configured uses 0x301: its heartbeat is received while the drive is off."""
-    settings = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex}, guard={"clock": "sync"})
+    settings = build_machine_config(bus={"interface": "virtual", "channel": uuid.uuid4().hex}, guard={"clock": "sync"})
     plain = load_profile(settings.axis["X"].drive)
     moved = replace(plain, rpdos=(plain.rpdos[0], replace(plain.rpdos[1], cob_base=0x308)))
     monkeypatch.setattr("fdhil.commissioning.identifiers.load_profile", lambda _drive: moved)
@@ -134,7 +134,9 @@ def test_nothing_is_sent_to_a_drive_whose_identifiers_are_anothers(monkeypatch: 
 
 
 def test_commissioning_is_refused_beside_the_owner_of_an_identifier(monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = machine(axes="XY", bus={"interface": "virtual", "channel": uuid.uuid4().hex}, guard={"clock": "sync"})
+    settings = build_machine_config(
+        axes="XY", bus={"interface": "virtual", "channel": uuid.uuid4().hex}, guard={"clock": "sync"}
+    )
     profile = load_profile(settings.axis["X"].drive)
     elsewhere = replace(profile, rpdos=(replace(profile.rpdos[0], cob_base=0x201), *profile.rpdos[1:]))
     monkeypatch.setattr("fdhil.commissioning.master.load_profile", lambda _drive: elsewhere)
@@ -152,7 +154,7 @@ def test_guard_does_not_start_beside_the_owner_of_an_identifier(tmp_path: Path) 
     channel = uuid.uuid4().hex
     document["bus"] = {"can0": {"interface": "virtual", "channel": channel}}
     document["axis"]["X"]["drive"] = config_of(tmp_path, 0x309).axis["X"].drive.model_dump(exclude_unset=True)
-    config = machine_config.parse(document, folder=tmp_path)
+    config = machine_config.parse_config(document, folder=tmp_path)
     save_record(RECORD, config.store.directory)
     with can.Bus(interface="virtual", channel=channel) as bus, pytest.MonkeyPatch.context() as patch:
         heard = can.Message(arbitration_id=0x709, data=b"\x05", is_extended_id=False)

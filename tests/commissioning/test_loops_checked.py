@@ -28,7 +28,7 @@ def loops(*warnings: Reason) -> LoopEstimate:
 
 
 def test_what_the_rapids_showed_is_compared_with_the_configuration(tmp_path: Path) -> None:
-    config = configuration.parse(bench_document() | {"store": {"directory": str(tmp_path)}})
+    config = configuration.parse_config(bench_document() | {"store": {"directory": str(tmp_path)}})
     assert not list(compare_loops(config, "X"))  # before the first identification
     for found, same in ((loops(), True), (loops(DIFFER), False)):
         history = History.open(tmp_path)

@@ -15,8 +15,8 @@ from fdhil.commissioning.steps import enable, prepare, rolled_back
 from fdhil.config import MachineConfig
 from fdhil.errors import DriveFault
 from fdhil.records import Float
+from tests.drivers.frame_builder import build_machine_config
 from tests.drivers.peer import DrivePeer
-from tests.drivers.wire import machine
 
 pytestmark = pytest.mark.usefixtures("quick_commissioning")
 SPEED_MM_S, ACCELERATION_MM_S2 = 20.0, 4000.0  # slow enough that a delay of the host by a second changes nothing
@@ -35,7 +35,7 @@ class Enabled:
 
 @pytest.fixture
 def enabled() -> Iterator[Enabled]:
-    config = machine(
+    config = build_machine_config(
         bus={"interface": "virtual", "channel": uuid.uuid4().hex}, guard={"clock": "sync"}, drive={"sign": -1}
     )
     with DrivePeer(config) as peer, Master(config, "X") as master, rolled_back(master):
@@ -87,7 +87,7 @@ def test_a_drive_that_trips_ends_the_motion(enabled: Enabled) -> None:
 
 
 def test_nothing_is_moved_that_is_not_held() -> None:
-    config = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
+    config = build_machine_config(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
     with (
         Master(config, "X") as master,
         pytest.raises(DriveFault, match="it holds no position"),

@@ -22,12 +22,12 @@ from fdhil.commissioning.record import CommissioningRecord, save_record
 from fdhil.commissioning.steps import check_axis, commission
 from fdhil.commissioning.survey import Survey, survey
 from fdhil.commissioning.void import is_void
-from fdhil.config import MachineConfig, parse
+from fdhil.config import MachineConfig, parse_config
 from fdhil.errors import DriveFault
 from fdhil.sim.drive.eds import eds_text
 from tests.bench import bench_document
+from tests.drivers.frame_builder import build_machine_config
 from tests.drivers.peer import DrivePeer
-from tests.drivers.wire import machine
 
 pytestmark = pytest.mark.usefixtures("quick_commissioning")
 RECORD = CommissioningRecord(
@@ -37,7 +37,9 @@ POSITION_OFFSET, SPEED_OFFSET, TORQUE_OFFSET, OUTPUTS = 0x60B00020, 0x60B10020, 
 
 
 def config(**sections: Any) -> MachineConfig:
-    return machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex}, guard={"clock": "sync"}, **sections)
+    return build_machine_config(
+        bus={"interface": "virtual", "channel": uuid.uuid4().hex}, guard={"clock": "sync"}, **sections
+    )
 
 
 @pytest.fixture
@@ -64,7 +66,7 @@ def give_rpdo(peer: DrivePeer, number: int, cob_id: int, words: Sequence[int], c
 
 def corrected(folder: Path) -> MachineConfig:
     document = bench_document("X") | {"bus": {"can0": {"interface": "virtual", "channel": uuid.uuid4().hex}}}
-    return parse(document | {"guard": {"clock": "sync"}}, folder=folder)
+    return parse_config(document | {"guard": {"clock": "sync"}}, folder=folder)
 
 
 def survey_bench_drive(settings: MachineConfig) -> tuple[Survey, Finding]:
@@ -218,7 +220,7 @@ def test_drive_of_another_bus_makes_no_identifier_harmless(tmp_path: Path) -> No
     document["axis"]["Y"]["drive"] = {**document["axis"]["Y"].get("drive", {}), "bus": "can1", "node_id": 1}
     document["axis"]["Y"]["table"] = {"cob_id": 0x501}
     del document["axis"]["Y"]["correction"]
-    settings = parse(document, folder=tmp_path)
+    settings = parse_config(document, folder=tmp_path)
     assert settings_of(settings, "can0", tmp_path, "").axes[0].writers == (0x401, 0x501)
 
 

@@ -14,18 +14,20 @@ from fdhil.commissioning.master import Master
 from fdhil.commissioning.pdo_setup import SetUp, set_up_pdos
 from fdhil.commissioning.survey import read_pdos, survey
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.sdo import SdoLink
+from fdhil.drivers.can.sdo_channel import SdoChannel
 from fdhil.errors import DriveFault
-from tests.dressed.wardrobe import OUTFITS, Outfit, dressed
+from tests.drivers.frame_builder import build_machine_config
 from tests.drivers.peer import DrivePeer
-from tests.drivers.wire import machine
 from tests.tiers import sampled
+from tests.vendor_drives.vendor_machines import OUTFITS, VendorDrive, build_vendor_config
 
 pytestmark = pytest.mark.usefixtures("quick_commissioning")
 
 
 def config(**sections: Any) -> MachineConfig:
-    return machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex}, guard={"clock": "sync"}, **sections)
+    return build_machine_config(
+        bus={"interface": "virtual", "channel": uuid.uuid4().hex}, guard={"clock": "sync"}, **sections
+    )
 
 
 @pytest.fixture
@@ -74,8 +76,10 @@ def test_type_of_a_fixed_mapping_is_set(peer: tuple[DrivePeer, MachineConfig]) -
 
 
 @pytest.mark.parametrize("outfit", sampled(OUTFITS, every=3), ids=lambda outfit: outfit.name)
-def test_a_drive_of_every_make_is_set_up_as_it_comes(outfit: Outfit, tmp_path: Path) -> None:
-    settings = dressed(outfit, tmp_path, bus={"can0": {"interface": "virtual", "channel": uuid.uuid4().hex}})
+def test_a_drive_of_every_make_is_set_up_as_it_comes(outfit: VendorDrive, tmp_path: Path) -> None:
+    settings = build_vendor_config(
+        outfit, tmp_path, bus={"can0": {"interface": "virtual", "channel": uuid.uuid4().hex}}
+    )
     with DrivePeer(settings), Master(settings, "X") as master:
         done = set_up_pdos(master)
         assert done.written
@@ -118,11 +122,11 @@ def test_an_enabled_drive_is_not_touched(peer: tuple[DrivePeer, MachineConfig]) 
 def test_the_objects_of_a_second_axis_are_asked_0x800_higher(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
 
-    def upload(_link: SdoLink, index: int, _sub: int) -> bytes:
+    def upload(_link: SdoChannel, index: int, _sub: int) -> bytes:
         asked.append(index)
         return bytes(2)
 
-    monkeypatch.setattr(SdoLink, "_upload", upload)
+    monkeypatch.setattr(SdoChannel, "_upload_object", upload)
     with Master(config(drive={"logical_axis": 2, "node_id": 1}), "X") as master:
         for index in (0x6041, 0x68B0, 0x1018):
             master.sdo.read_int(index)

@@ -21,7 +21,7 @@ import pytest
 
 from fdhil.commissioning.play import Bench, Played, Signals
 from fdhil.commissioning.void import is_void, void_record
-from fdhil.config import MachineConfig, load
+from fdhil.config import MachineConfig, load_config
 from tests.arming.guard_peer import Guard
 from tests.bench import axis_toml, bench_toml
 from tests.commissioning.foreign_nc import (
@@ -94,7 +94,7 @@ def floor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Iterator[Floor]
     text += '[guard]\nclock = "sync"\n'
     path = tmp_path / "machine.toml"
     path.write_text(text)
-    config = load(path)
+    config = load_config(path)
     with DrivePeer(config, "X") as x, DrivePeer(config, "Y") as y:
         sign_off(config)
         x.heard.clear()

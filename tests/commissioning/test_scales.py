@@ -12,7 +12,7 @@ import pytest
 from fdhil.commissioning.compare_scales import compare_scales
 from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.master import Master
-from fdhil.config import parse
+from fdhil.config import parse_config
 from fdhil.sim.drive.servo import Drive
 from tests.bench import bench_document
 from tests.drivers.peer import DrivePeer
@@ -28,7 +28,7 @@ def compared(sheet: str, folder: Path, objects: Mapping[tuple[int, int], int], *
     document["guard"] = {"clock": "sync"}
     document["axis"]["X"]["drive"] = {"eds": str(eds), **drive}
     document["sim"] = {"axis": {"X": {"eds": str(eds)}}}
-    config = parse(document)
+    config = parse_config(document)
     with DrivePeer(config) as peer:
         for (index, sub), value in objects.items():
             peer.drive.set_object(index, sub, value)

@@ -22,12 +22,12 @@ from fdhil.commissioning.scan import BusScanner, Description, EdsMatch, printabl
 from fdhil.commissioning.steps import check_axis
 from fdhil.commissioning.survey import Identity, compare_identity
 from fdhil.config import Drive, MachineConfig
-from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, frames_of
-from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.drivers.can.frame_ring import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, pack_frames
+from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.errors import ConnectError, DriveFault, ForeignMaster
 from fdhil.sim.drive.dictionary import AbortCode, TransferAbort
+from tests.drivers.frame_builder import FrameBuilder, Row, build_machine_config
 from tests.drivers.peer import DrivePeer
-from tests.drivers.wire import Row, Wire, machine
 from tests.short_waits import shorten_waits
 from tests.virtual_threads import VirtualThreads
 
@@ -41,14 +41,14 @@ def quick(virtual_threads: object, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def peer() -> Iterator[tuple[DrivePeer, MachineConfig]]:
-    settings = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
+    settings = build_machine_config(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
     with DrivePeer(settings) as running:
         yield running, settings
 
 
 def traffic(*rows: Row) -> Traffic:
     heard = Traffic()
-    heard.take(frames_of(rows))
+    heard.take(pack_frames(rows))
     return heard
 
 
@@ -101,7 +101,7 @@ def test_a_node_that_comes_while_it_is_looked_who_is_there_disturbs_nobody(
     ids = range(0x181, 0x1FF)
     for _ in range(30):
         heard = Traffic()
-        coming = threading.Thread(target=heard.take, args=(frames_of([(0, can_id, bytes(8)) for can_id in ids]),))
+        coming = threading.Thread(target=heard.take, args=(pack_frames([(0, can_id, bytes(8)) for can_id in ids]),))
         coming.start()
         while coming.is_alive():
             assert len(heard.nodes) <= len(ids)
@@ -167,7 +167,7 @@ def test_a_node_that_lacks_objects_is_listed_all_the_same(
     assert answers.is_drive
     with BusScanner("can0", settings.bus["can0"]) as bus:
         assert bus.read(1, 0x5FFF) is None
-        monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.01)  # receives nothing
+        monkeypatch.setattr("fdhil.drivers.can.sdo_channel.RESPONSE_TIMEOUT_S", 0.01)  # receives nothing
         assert bus.read(9, 0x1000) is None
 
 
@@ -190,7 +190,7 @@ def test_nothing_is_asked_once_a_master_is_heard(peer: tuple[DrivePeer, MachineC
 
 
 def test_a_silent_bus_is_told() -> None:
-    settings = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
+    settings = build_machine_config(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
     with pytest.raises(ConnectError, match="no node sent a frame and none answered"):
         scan_bus("can0", settings, [])
 
@@ -320,7 +320,7 @@ def test_a_drive_says_so_itself_or_as_the_first_of_several_devices(
 def test_a_bus_of_another_bit_rate_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     for where in ("scan", "config_check"):
         monkeypatch.setattr(f"fdhil.commissioning.{where}.LISTEN_S", 2.0)
-    settings = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
+    settings = build_machine_config(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as loud:
         stop = threading.Event()
 
@@ -343,12 +343,12 @@ def test_a_bus_of_another_bit_rate_is_not_asked(monkeypatch: pytest.MonkeyPatch)
         assert loud.recv(0) is None
 
 
-def heard(config: MachineConfig, wire: Wire, *more: Row) -> dict[str, Finding]:
-    return {finding.point: finding for finding in compare_heard(traffic(*wire.rows(), *more), config, "X")}
+def heard(config: MachineConfig, wire: FrameBuilder, *more: Row) -> dict[str, Finding]:
+    return {finding.point: finding for finding in compare_heard(traffic(*wire.build_rows(), *more), config, "X")}
 
 
 def test_what_an_ncs_traffic_shows_is_compared() -> None:
-    found = heard(machine(), Wire(400), *((int(k * 1e8), 0x701, b"\x05") for k in range(4)))
+    found = heard(build_machine_config(), FrameBuilder(400), *((int(k * 1e8), 0x701, b"\x05") for k in range(4)))
     assert {point for point, finding in found.items() if finding.ok} == {
         "drive", "heartbeat", "identifiers", "offset writers",
         "TPDO1", "TPDO2", "TPDO3", "TPDO4", "RPDO1", "rapid signal",
@@ -357,12 +357,12 @@ def test_what_an_ncs_traffic_shows_is_compared() -> None:
 
 
 def test_a_drive_on_another_node_id_is_told() -> None:
-    found = heard(machine(), Wire(400, node_id=5))
+    found = heard(build_machine_config(), FrameBuilder(400, node_id=5))
     assert found["drive"].ok is False
     assert found["TPDO1"].cause == "TPDO1 (181) was received 0 times in 400 SYNC, 400 are due"
 
 
 @pytest.mark.parametrize(("bit", "state"), [(16, "on now"), (3, "off now")])
 def test_the_rapid_signal_is_shown(bit: int, state: str) -> None:
-    config = machine(g0={"source": "digital_input", "input_bit": bit})
-    assert heard(config, Wire(400))["rapid signal"].found == state
+    config = build_machine_config(g0={"source": "digital_input", "input_bit": bit})
+    assert heard(config, FrameBuilder(400))["rapid signal"].found == state

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdhil.commissioning.set_points import ROUNDING, Bounds, SetPoints, straight
-from tests.drivers.wire import machine
+from tests.drivers.frame_builder import build_machine_config
 
 LOW, HIGH, SPEED, ACCELERATION = -40_000.0, 60_000.0, 1638.0, 13.1
 X = Bounds("X", LOW, HIGH, SPEED, ACCELERATION, 16_384.0)
@@ -143,7 +143,7 @@ def test_rows_that_come_after_a_stop_are_ignored_and_the_axes_rest() -> None:
 
 
 def test_a_drive_that_counts_against_the_axis_has_its_travel_turned() -> None:
-    axis = machine(drive={"sign": -1}).axis["X"]
+    axis = build_machine_config(drive={"sign": -1}).axis["X"]
     bounds = Bounds.of("X", axis, 0.001, (-10.0, 100.0), speed_mm_s=50.0)
     assert (bounds.low, bounds.high) == (-327_680.0, 32_768.0)
     assert bounds.speed == pytest.approx(0.05 * 3276.8)

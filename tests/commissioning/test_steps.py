@@ -32,8 +32,8 @@ from fdhil.commissioning.steps import (
 from fdhil.commissioning.watchdog import FEEDING_TRIES, watchdog_test
 from fdhil.config import CorrectionLimits, MachineConfig
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, DriveFault, ProtocolError
+from tests.drivers.frame_builder import build_machine_config
 from tests.drivers.peer import DrivePeer
-from tests.drivers.wire import machine
 from tests.tiers import sampled
 
 pytestmark = pytest.mark.usefixtures("quick_commissioning")
@@ -42,7 +42,7 @@ pytestmark = pytest.mark.usefixtures("quick_commissioning")
 def config(**sections: Any) -> MachineConfig:
     """The drive shares a busy computer: it is waited for like any simulated drive, and tolerates a late heartbeat."""
     sections = {"guard": {"clock": "sync", "heartbeat_s": 0.1}, **sections}
-    return machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex}, **sections)
+    return build_machine_config(bus={"interface": "virtual", "channel": uuid.uuid4().hex}, **sections)
 
 
 @pytest.fixture
@@ -89,12 +89,12 @@ def test_a_drive_that_boots_while_it_is_commissioned_is_not_signed_off(peer: tup
 class SleepyPeer(DrivePeer):
     """A simulated drive whose process occasionally sleeps, as on a busy computer, until its watchdog is tested."""
 
-    def take(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
+    def handle_frame(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
         """Sleep longer than any averaging time at every 40th of the first 400 SYNCs."""
         count = self.heard.count(0x080)
         if can_id == 0x080 and count % 40 == 0 and count <= 400:
             time.sleep(0.15)
-        return super().take(can_id, data)
+        return super().handle_frame(can_id, data)
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -111,11 +111,11 @@ class SlowPeer(DrivePeer):
 
     sleeping_s = 0.0
 
-    def take(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
+    def handle_frame(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
         if can_id == 0x080 and self.sleeping_s:
             time.sleep(self.sleeping_s)
             self.sleeping_s = 0.0
-        return super().take(can_id, data)
+        return super().handle_frame(can_id, data)
 
     def _send(self, frames: list[tuple[int, bytes]]) -> None:
         for frame in frames:
@@ -475,7 +475,7 @@ def test_an_nc_on_the_bus_is_left_alone(can_id: int, shown: str, peer: tuple[Dri
 
 @pytest.mark.fault("A29")
 def test_on_a_silent_bus_the_drive_alone_is_asked_what_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.01)  # receives nothing
+    monkeypatch.setattr("fdhil.drivers.can.sdo_channel.RESPONSE_TIMEOUT_S", 0.01)  # receives nothing
     settings = config()
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as other:
         with pytest.raises(ConnectError, match=r"no frame was received on the bus and node-ID 1 did not answer; check"):
@@ -511,7 +511,7 @@ def test_a_drive_without_a_heartbeat_is_commissioned(peer: tuple[DrivePeer, Mach
 
 
 def test_a_drive_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.01)  # receives nothing
+    monkeypatch.setattr("fdhil.drivers.can.sdo_channel.RESPONSE_TIMEOUT_S", 0.01)  # receives nothing
     settings = config(drive={"node_id": 9})
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as other:
         other.send(can.Message(arbitration_id=0x701, data=[5], is_extended_id=False))
@@ -548,13 +548,13 @@ class KeptOffsets(DrivePeer):
         self.offsets = [0]
         self.interrupt_at: int | None = interrupt_at
 
-    def take(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
+    def handle_frame(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
         if can_id == 0x301:
             self.offsets.append(int.from_bytes(data[:4], "little", signed=True))
             if self.offsets[-1] == self.interrupt_at:
                 self.interrupt_at = None
                 signal.raise_signal(signal.SIGINT)
-        return super().take(can_id, data)
+        return super().handle_frame(can_id, data)
 
 
 def enabled_and_rolled_back(settings: MachineConfig, step: Callable[[Master], object]) -> None:

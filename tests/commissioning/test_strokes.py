@@ -5,16 +5,16 @@ from __future__ import annotations
 import pytest
 
 from fdhil.commissioning.strokes import Room, plan_jog, plan_rapid, require_single_drive
-from fdhil.config import Axis, parse
+from fdhil.config import Axis, parse_config
 from fdhil.errors import DriveFault
 from tests.bench import rotary_and_gantry_document
-from tests.drivers import wire
+from tests.drivers import frame_builder
 
 
 @pytest.fixture
 def axis() -> Axis:
     """500 mm/s with 4000 mm/s2."""
-    return wire.machine().axis["X"]
+    return frame_builder.build_machine_config().axis["X"]
 
 
 def test_a_jog_is_short_slow_and_toward_the_side_with_room(axis: Axis) -> None:
@@ -54,7 +54,7 @@ def test_what_would_be_no_rapid_is_refused_with_the_room_it_needs(axis: Axis) ->
 
 
 def test_strokes_of_a_rotary_axis_take_room_and_are_told_in_degrees() -> None:
-    axis = parse(rotary_and_gantry_document()).axis["A"]
+    axis = parse_config(rotary_and_gantry_document()).axis["A"]
     rapid = plan_rapid("A", axis, Room(-10.0, 300.0))
     assert rapid.speed_mm_s == pytest.approx(280.0 * axis.mm_per_unit)
     assert str(rapid).endswith("deg toward plus at 280 deg/s")
@@ -65,7 +65,7 @@ def test_strokes_of_a_rotary_axis_take_room_and_are_told_in_degrees() -> None:
 
 @pytest.mark.parametrize("axis", ["Y", "Y2"])
 def test_no_drive_of_a_gantry_axis_is_moved_alone(axis: str) -> None:
-    machine = parse(rotary_and_gantry_document())
+    machine = parse_config(rotary_and_gantry_document())
     with pytest.raises(DriveFault, match=f"drive {axis}: Y and Y2 move one beam, which one alone would skew"):
         require_single_drive(machine, axis)
     require_single_drive(machine, "X")

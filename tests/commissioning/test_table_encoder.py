@@ -7,18 +7,18 @@ import pytest
 from fdhil.commissioning.bus_listener import Traffic
 from fdhil.commissioning.config_check import compare_heard
 from fdhil.config import TableEncoder
-from fdhil.drivers.can.frames import frames_of
-from tests.drivers.wire import Wire, machine
+from fdhil.drivers.can.frame_ring import pack_frames
+from tests.drivers.frame_builder import FrameBuilder, build_machine_config
 
 
 @pytest.mark.parametrize(("every", "ok"), [(1, True), (5, False), (1000, False)])
 def test_whether_its_tpdo_comes_with_every_sync(every: int, ok: bool) -> None:
-    config = machine()
+    config = build_machine_config()
     section = config.axis["X"].model_copy(update={"table": TableEncoder(cob_id=0x2A0)})
     config = config.model_copy(update={"axis": {"X": section}})
     traffic = Traffic()
-    rows = Wire(400).rows()
-    traffic.take(frames_of([*rows, *((rows[0][0] + 1000 * k, 0x2A0, bytes(4)) for k in range(0, 400, every))]))
+    rows = FrameBuilder(400).build_rows()
+    traffic.take(pack_frames([*rows, *((rows[0][0] + 1000 * k, 0x2A0, bytes(4)) for k in range(0, 400, every))]))
     (found,) = [finding for finding in compare_heard(traffic, config, "X") if finding.point == "table encoder"]
     assert found.ok is ok
     assert "2A0" in found.cause

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fdhil.commissioning.timing import judge_answers, judge_sync, measure
-from fdhil.drivers.can.frames import Frames, frames_of
+from fdhil.drivers.can.frame_ring import Frames, pack_frames
 
 PERIOD_S = 0.001
 TPDO = 0x181
@@ -18,7 +18,7 @@ def heard(answer_us: int = 200, hole: int = 0) -> Frames:
     for k in range(200):
         t_ns = 1_000_000 * (k + (hole if k > 100 else 0)) + (3000 if k % 2 else 0)
         rows += [(t_ns, 0x080, b""), (t_ns + 1000 * answer_us, TPDO, bytes(8)), (t_ns + 5000, 0x701, b"\x05")]
-    return frames_of(sorted(rows))
+    return pack_frames(sorted(rows))
 
 
 def test_an_even_sync_passes_and_its_jitter_is_told() -> None:

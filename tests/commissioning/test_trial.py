@@ -16,8 +16,8 @@ from fdhil.commissioning.trial import Operator, Trial, try_axis
 from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError, DriveFault, ForeignMaster
 from tests.commissioning.foreign_nc import A_FEW, FOREIGN, NMT, SDO, SYNC, TARGET, ForeignNc, Frame, moves
+from tests.drivers.frame_builder import build_machine_config
 from tests.drivers.peer import DrivePeer
-from tests.drivers.wire import machine
 from tests.integration.conftest import sign_off
 
 ROOM = Room(-2.0, 130.0)
@@ -68,7 +68,7 @@ def quick_trial(quick_commissioning: None, monkeypatch: pytest.MonkeyPatch) -> N
 def bench(quick_trial: None, tmp_path: Path) -> Iterator[Bench]:
     bus: dict[str, object] = {"interface": "virtual", "channel": uuid.uuid4().hex}
     period = {"name": "bench", "sync_period_s": 0.002}
-    config = machine(tmp_path, bus=bus, guard={"clock": "sync"}, machine=period)
+    config = build_machine_config(tmp_path, bus=bus, guard={"clock": "sync"}, machine=period)
     with DrivePeer(config) as peer:
         sign_off(config)
         record = load_record(config.store.directory, "X")

@@ -99,7 +99,7 @@ def test_another_drive_is_told_by_what_differs(found: Survey, told: str) -> None
 def test_before_the_guard_starts_each_record_is_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     document = bench_document("XYZ")
     document["axis"]["Z"].pop("correction")
-    config = machine_config.parse(document, folder=tmp_path)
+    config = machine_config.parse_config(document, folder=tmp_path)
     store, told = config.store.directory, list[str]()
     compared, nc = list[str](), [True]
 

@@ -38,7 +38,7 @@ def test_every_axis_gets_an_offset_per_row_that_the_guard_lets_pass(planned_corr
     _, correction = planned_correction
     assert list(correction.offset_um) == list(REFERENCE.position_mm)
     for axis, offset in correction.offset_um.items():
-        limits = PlanLimits.of(CONFIG.axis[axis], CONFIG.machine.sync_period_s)
+        limits = PlanLimits.compute_effective(CONFIG.axis[axis], CONFIG.machine.sync_period_s)
         increments = offset / limits.um_per_increment
         assert offset.shape == REFERENCE.position_mm[axis].shape
         assert np.allclose(increments, np.rint(increments), atol=1e-6)
@@ -69,7 +69,7 @@ def test_a_method_keeps_the_limits_by_itself(name: str) -> None:
     wanted = tables.load_entry(tables.CORRECTIONS, name)(REFERENCE, MODELS, CONFIG, predict(REFERENCE, MODELS, CONFIG))
     assert wanted.refused == ()
     for axis, offset in wanted.offset_um.items():
-        limits = PlanLimits.of(CONFIG.axis[axis], CONFIG.machine.sync_period_s)
+        limits = PlanLimits.compute_effective(CONFIG.axis[axis], CONFIG.machine.sync_period_s)
         increments = offset / limits.um_per_increment
         assert np.allclose(increments, np.rint(increments), atol=1e-6)
         assert check(np.rint(increments).astype(np.int64), limits) == []
@@ -80,6 +80,6 @@ def test_without_its_section_nothing_is_planned(name: str) -> None:
     document = copy.deepcopy(bench_document())
     for axis in document["axis"].values():
         del axis["correction"]
-    refused = plan(REFERENCE, MODELS, configuration.parse(document), name)
+    refused = plan(REFERENCE, MODELS, configuration.parse_config(document), name)
     assert {reason.code for reason in refused.refused} == {"WritingOff"}
     assert not any(offset.any() for offset in refused.offset_um.values())

@@ -39,7 +39,7 @@ def scattered(seed: int) -> dict[str, Parameters]:
 
 def assert_within_limits(correction: Correction) -> None:
     for axis, offset in correction.offset_um.items():
-        limits = PlanLimits.of(CONFIG.axis[axis], 0.001)
+        limits = PlanLimits.compute_effective(CONFIG.axis[axis], 0.001)
         increments = offset / limits.um_per_increment
         assert np.allclose(increments, np.rint(increments), atol=1e-6)
         whole = np.rint(increments).astype(np.int64)
@@ -207,7 +207,7 @@ def test_narrow_limits_are_kept() -> None:
     correction = plan(trajectory(bench_demand(5)), MODELS, config, "inverse")
     assert correction.refused == ()
     for axis, offset in correction.offset_um.items():
-        limits = PlanLimits.of(config.axis[axis], 0.001)
+        limits = PlanLimits.compute_effective(config.axis[axis], 0.001)
         assert check(np.rint(offset / limits.um_per_increment).astype(np.int64), limits) == []
     assert rms(correction.before.contour_um) > 4 * rms(correction.after.contour_um)
 

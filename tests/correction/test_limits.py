@@ -14,7 +14,7 @@ from fdhil.correction.limits import fit, to_increments, variation
 from tests.bench import bench_config
 
 AXIS = bench_config("X").axis["X"]
-BENCH = PlanLimits.of(AXIS, 0.001)
+BENCH = PlanLimits.compute_effective(AXIS, 0.001)
 NARROW = PlanLimits(160.0, 6.5, 0.82, 9830.0, 1000, 0.305)  # 50 um, 2 mm/s, 250 mm/s2
 
 
@@ -22,10 +22,12 @@ def test_limits_are_those_of_the_configuration_and_the_axis() -> None:
     assert pytest.approx(250.0 / BENCH.um_per_increment) == BENCH.offset
     assert pytest.approx(20.0 / BENCH.um_per_increment) == BENCH.rate
     slow = AXIS.model_copy(update={"rapid_speed_mm_s": 100.0, "max_acceleration_mm_s2": 1000.0})
-    assert PlanLimits.of(slow, 0.001).rate == 20.0  # of 10 mm/s; with 500 mm/s2 that is what can be braked in 20 ms
-    assert pytest.approx(0.5 / BENCH.um_per_increment) == PlanLimits.of(slow, 0.001).acceleration
+    assert (
+        PlanLimits.compute_effective(slow, 0.001).rate == 20.0
+    )  # of 10 mm/s; with 500 mm/s2 that is what can be braked in 20 ms
+    assert pytest.approx(0.5 / BENCH.um_per_increment) == PlanLimits.compute_effective(slow, 0.001).acceleration
     with pytest.raises(ValueError, match="off"):
-        PlanLimits.of(AXIS.model_copy(update={"correction": None}), 0.001)
+        PlanLimits.compute_effective(AXIS.model_copy(update={"correction": None}), 0.001)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ def changed(**regulators: Any) -> configuration.MachineConfig:
     document = copy.deepcopy(bench_document())
     for axis in document["axis"].values():
         axis["regulators"] |= regulators
-    return configuration.parse(document)
+    return configuration.parse_config(document)
 
 
 @pytest.mark.parametrize(("feed", "rms_um", "max_um"), [(10, 3.5, 20.3), (20, 7.0, 32.0)])
@@ -35,7 +35,7 @@ def test_mirror_leaves_what_the_bench_says(feed: float, rms_um: float, max_um: f
     assert [reason.code for reason in correction.warnings if reason.code != "NearLimit"] == ["HarmPredicted"]
     assert correction.after.contour_um.max() == pytest.approx(max_um, rel=0.02)
     for axis, offset in correction.offset_um.items():
-        limits = PlanLimits.of(CONFIG.axis[axis], 0.001)
+        limits = PlanLimits.compute_effective(CONFIG.axis[axis], 0.001)
         assert np.abs(offset + correction.before.error_um[axis]).max() <= 0.55 * limits.um_per_increment
         increments = offset / limits.um_per_increment
         assert np.allclose(increments, np.rint(increments), atol=1e-6)
@@ -83,7 +83,7 @@ def test_nearness_to_a_limit_warns_and_does_not_refuse() -> None:
 def test_writing_is_off_without_limits() -> None:
     document = bench_document()
     del document["axis"]["Y"]["correction"]
-    correction = plan(bench_trajectory(10), MODELS, configuration.parse(document), "mirror")
+    correction = plan(bench_trajectory(10), MODELS, configuration.parse_config(document), "mirror")
     assert [reason.code for reason in correction.refused] == ["WritingOff"]
     assert "[axis.Y.correction]" in correction.refused[0].advice
 

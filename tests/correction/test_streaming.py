@@ -102,9 +102,9 @@ def test_seams_do_not_show() -> None:
     for axis in "XY":
         joined = (
             np.concatenate([block[axis] for block in offsets])
-            / PlanLimits.of(CONFIG.axis[axis], 0.001).um_per_increment
+            / PlanLimits.compute_effective(CONFIG.axis[axis], 0.001).um_per_increment
         )
-        assert check(np.rint(joined).astype(np.int64), PlanLimits.of(CONFIG.axis[axis], 0.001)) == []
+        assert check(np.rint(joined).astype(np.int64), PlanLimits.compute_effective(CONFIG.axis[axis], 0.001)) == []
 
 
 @pytest.mark.usefixtures("long_computation")

@@ -38,8 +38,8 @@ BENCH = HEAD + AXIS + AXIS.replace(".X", ".Y")
 
 
 WAITS = {
-    "drivers.can.sdo.RESPONSE_TIMEOUT_S": 20.0,
-    "drivers.can.sdo.DEADLINE_S": 20.0,
+    "drivers.can.sdo_channel.RESPONSE_TIMEOUT_S": 20.0,
+    "drivers.can.sdo_channel.DEADLINE_S": 20.0,
     "commissioning.survey.LISTEN_S": 0.3,
     "commissioning.steps.SETTLE_CYCLES": 100,
     "commissioning.steps.AVERAGE_CYCLES": 60,
@@ -129,7 +129,7 @@ def opened(folder: Path, bench: str = BENCH) -> Iterator[MachineRig]:
         machine = folder / "machine.toml"
         place = f'channel = "{bus["channel"]}"\nhost = "{bus["host"]}"\nport = {bus["port"]}\n'
         machine.write_text(f'{bench}[bus.can0]\ninterface = "socketcand"\n{place}')
-        yield MachineRig(folder, twin, machine, machine_config.load(machine))
+        yield MachineRig(folder, twin, machine, machine_config.load_config(machine))
 
 
 def fdhil(*arguments: str | Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:

@@ -23,7 +23,7 @@ NOMINAL = AXIS["nominal"]
 
 def config_of(folder: Path, axes: Sequence[str] = ("X",), **sections: Any) -> MachineConfig:
     document = {"machine": {"name": "bench"}, "axis": dict.fromkeys(axes, bench_axis()), **sections}
-    return machine_config.parse(document, "test", folder)
+    return machine_config.parse_config(document, "test", folder)
 
 
 def rapids(config: MachineConfig, axis: str = "X", count: int = 2, first_tick: int = 0) -> list[Record]:

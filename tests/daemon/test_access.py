@@ -249,7 +249,7 @@ async def test_other_user_is_identified_by_the_kernel(role: Role, open_folder: P
 def test_audit_command_shows_entries_and_tampering(tmp_path: Path) -> None:
     config = tmp_path / "machine.toml"
     config.write_text((CONFIGS / "sim.toml").read_text())
-    folder = machine_config.load(config).store.directory
+    folder = machine_config.load_config(config).store.directory
     folder.mkdir()
     for program in ("a.ngc", "b.ngc"):
         audit.append(

@@ -9,8 +9,8 @@ import pytest
 
 from fdhil.arming.guard_link import GUARD_TRIPPED, _changes
 from fdhil.daemon import black_box
-from fdhil.drivers.can.frame_history import FrameHistory, candump
-from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, frames_of
+from fdhil.drivers.can.frame_history import FrameHistory, format_candump
+from fdhil.drivers.can.frame_ring import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, pack_frames
 
 
 def status(state: str, code: str = "") -> dict[str, Any]:
@@ -54,18 +54,20 @@ def test_record_voided_by_the_guard_is_reported_once() -> None:
 
 def test_frame_history_keeps_ten_seconds() -> None:
     history = FrameHistory(kept_s=10.0)
-    history.add(frames_of([]))
+    history.add_frames(pack_frames([]))
     for k in range(400):
-        history.add(frames_of([(k * 50_000_000 + 1, 0x80, bytes([k % 240])), (k * 50_000_000 + 2, 0x181, b"\x01")]))
-    kept = history.frames()
+        history.add_frames(
+            pack_frames([(k * 50_000_000 + 1, 0x80, bytes([k % 240])), (k * 50_000_000 + 2, 0x181, b"\x01")])
+        )
+    kept = history.get_frames()
     stamps = kept["t_ns"]
     assert 10.0 <= (int(stamps[-1]) - int(stamps[0])) * 1e-9 <= 10.1
     assert kept.size == pytest.approx(402, abs=4)
-    assert FrameHistory().frames().size == 0
+    assert FrameHistory().get_frames().size == 0
 
 
 def test_log_has_the_format_of_candump() -> None:
-    frames = frames_of(
+    frames = pack_frames(
         [
             (1_500_000_250, 0x080, b""),
             (2_000_001_000, 0x301, b"\x01\xff"),
@@ -76,7 +78,7 @@ def test_log_has_the_format_of_candump() -> None:
             (7_000, EXTENDED_FLAG | REMOTE_FLAG | 0x18FF1234, bytes(2)),
         ]
     )
-    assert candump("can0", frames).splitlines() == [
+    assert format_candump("can0", frames).splitlines() == [
         "(1.500000) can0 080#",
         "(2.000001) can0 301#01FF",
         "(0.000000) can0 20000040#0000000000000000",

@@ -26,7 +26,7 @@ from fdhil.sim.wire.hub import encode
 from tests.bench import bench_axis
 from tests.daemon.simulated_machine import SimulatedMachine, config_of, rapids
 from tests.daemon.test_daemon_service import serving, status_when
-from tests.drivers.wire import Wire
+from tests.drivers.frame_builder import FrameBuilder
 
 WRONG = {"SyncPeriodSuspect", "NodeNeverHeard"}
 STEP_S = 0.002  # of the SYNC on the wire, where the config says 1 ms
@@ -54,7 +54,7 @@ class Line:
 
     def _send(self, peer: socket.socket) -> None:
         begun_s, sent = time.time(), 0
-        rows = Wire(WIRED, period_ns=round(STEP_S * 1e9), start_ns=0).rows()
+        rows = FrameBuilder(WIRED, period_ns=round(STEP_S * 1e9), start_ns=0).build_rows()
         while not self._cut.is_set():
             text = b""
             while True:
@@ -236,7 +236,7 @@ def fed(config: MachineConfig, records: list[Record], windows: int = 0) -> dict[
 
 def other(folder: Path, **axis: Any) -> MachineConfig:
     document = {"machine": {"name": "bench"}, "axis": {"X": bench_axis(**axis)}}
-    return machine_config.parse(document, "test", folder)
+    return machine_config.parse_config(document, "test", folder)
 
 
 def test_unused_moves_are_reported_with_their_reason(tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdhil.drivers.can.frames import frames_of
-from fdhil.drivers.can.node_watch import NodeWatch
+from fdhil.drivers.can.frame_ring import pack_frames
+from fdhil.drivers.can.node_monitor import NodeMonitor
 from fdhil.pipeline import Record
 from fdhil.records import AxisSamples, MoveEvent, Notice, TickTimes, freeze_integers
 from tests.daemon.simulated_machine import SimulatedMachine, config_of, rapids
@@ -85,13 +85,13 @@ async def test_further_rapids_and_clients_do_not_grow_memory(tmp_path: Path, mon
 
 @pytest.mark.fault("A21", "F10")
 def test_flood_of_emergencies_is_counted_without_growing_memory() -> None:
-    watch = NodeWatch("X", 1)
+    watch = NodeMonitor("X", 1)
     rng = np.random.default_rng(1)
     result, blocks = [], []
     for start in range(0, EMERGENCIES, 1000):
         codes = rng.integers(0x0100, 0xFFFF, 1000).tolist()
         flood = [(start * 1000, EMERGENCY, code.to_bytes(2, "little") + bytes(6)) for code in codes]
-        result += watch.feed(frames_of(flood), start)
+        result += watch.watch_frames(pack_frames(flood), start)
         del flood, codes
         blocks.append(sys.getallocatedblocks())
     assert watch.emcy_count == EMERGENCIES

@@ -18,7 +18,7 @@ import pytest
 from fdhil.cli.demo.toml import to_toml
 from fdhil.cli.doctor.devices import examine_daemon
 from fdhil.commissioning.void import void_path
-from fdhil.config import MachineConfig, load
+from fdhil.config import MachineConfig, load_config
 from fdhil.daemon.bus_health import BusHealth
 from fdhil.daemon.daemon_service import DaemonService, InternalError, run_daemon_service
 from fdhil.daemon.daemon_socket import ask_daemon
@@ -94,14 +94,14 @@ async def test_edited_configuration_is_reported_with_the_limits_in_force(
 ) -> None:
     file = tmp_path / "machine.toml"
     file.write_text(to_toml(bench_document()))
-    async with serving(load(file), SimulatedMachine()):
+    async with serving(load_config(file), SimulatedMachine()):
         document = bench_document()
         document["axis"]["X"]["correction"]["max_offset_um"] = 5.0
         file.write_text(to_toml(document))
         (tmp_path / "p.ngc").write_text("G0 X1")
         asked = [("status",), ("status", "--json"), ("arm", tmp_path / "p.ngc"), ("arm", tmp_path / "p.ngc", "--json")]
         answers = [await asyncio.to_thread(fdhil, command, file, *more, capsys=capsys) for command, *more in asked]
-        (trouble,) = await asyncio.to_thread(lambda: list(examine_daemon(load(file))))
+        (trouble,) = await asyncio.to_thread(lambda: list(examine_daemon(load_config(file))))
     assert trouble.code == "ConfigDiffers"
     output = [" ".join((out + err).split()) for _, out, err in answers]
     assert [("configuration file has changed" in text, "X 250 um" in text) for text in output] == [(True, True)] * 4

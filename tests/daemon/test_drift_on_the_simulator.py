@@ -41,7 +41,7 @@ def rig(tmp_path: Path) -> Iterator[MachineRig]:
         place = "\n".join(f"{key} = {json.dumps(bus[key])}" for key in ("channel", "host", "port"))
         machine = tmp_path / "machine.toml"
         machine.write_text(f'{bench}[axis.X.temperature]\n{expected}\n[bus.can0]\ninterface = "socketcand"\n{place}\n')
-        yield MachineRig(tmp_path, twin, machine, machine_config.load(machine))
+        yield MachineRig(tmp_path, twin, machine, machine_config.load_config(machine))
 
 
 def test_drift_tracks_warming_and_load_change(rig: MachineRig, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fdhil.config import parse
+from fdhil.config import parse_config
 from fdhil.daemon.gantry_watch import GantryWatch
 from fdhil.records import AxisSamples, freeze_array, freeze_integers
 from tests.bench import rotary_and_gantry_document
@@ -23,7 +23,7 @@ def samples(axis: str, first: int, error_um: float, zero_mm: float = 0.0, rows: 
 
 @pytest.fixture
 def watch() -> GantryWatch:
-    return GantryWatch(parse(rotary_and_gantry_document()))
+    return GantryWatch(parse_config(rotary_and_gantry_document()))
 
 
 def test_equal_lag_of_both_drives_is_not_a_skew(watch: GantryWatch) -> None:

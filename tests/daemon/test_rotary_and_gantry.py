@@ -150,7 +150,7 @@ def test_skewed_gantry_ends_the_correction(tmp_path: Path) -> None:
 @pytest.mark.parametrize("document", [rotary(), gantry()], ids=["rotary", "gantry"])
 def test_each_drive_is_commissioned(document: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     shorten_waits(monkeypatch)
-    config = machine_config.parse(document | on_a_bus(uuid.uuid4().hex))
+    config = machine_config.parse_config(document | on_a_bus(uuid.uuid4().hex))
     with ExitStack() as peers:
         for axis in config.axis:
             peers.enter_context(DrivePeer(config, axis))

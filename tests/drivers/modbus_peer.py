@@ -39,7 +39,7 @@ class SensorPeer:
             return self.frozen_at
         return int((time.monotonic() - self.start) * self.rate_hz) - 1
 
-    def latch(self) -> None:
+    def latch_samples(self) -> None:
         newest = self.newest
         fresh = newest + 1 - self.latched
         self.status = 2 if fresh > 100 else 1
@@ -47,7 +47,7 @@ class SensorPeer:
         self.block = list(range(newest + 1 - count, newest + 1))
         self.latched = newest + 1
 
-    def registers(self) -> list[int]:
+    def build_registers(self) -> list[int]:
         first = self.block[0] if self.block else self.latched
         head = struct.pack(">fIfff", 1.0, max(self.newest, 0), self.rate_hz, VOLTS_PER_COUNT, 21.5)
         words = list(struct.unpack(">10H", head))
@@ -55,7 +55,7 @@ class SensorPeer:
         words += [counter % 1000 for counter in self.block]
         return words + [0] * (116 - len(words))
 
-    def answer(self, request: bytes) -> bytes:
+    def answer_request(self, request: bytes) -> bytes:
         function, address, value = struct.unpack(">BHH", request[:5])
         if self.mode == "exception":
             return bytes([function | 0x80, 2])
@@ -66,9 +66,9 @@ class SensorPeer:
         if self.mode == "busy":
             return bytes([function | 0x80, 6])
         if function == 6:
-            self.latch()
+            self.latch_samples()
             return request
-        words = list(self.served or self.registers())[address : address + value]
+        words = list(self.served or self.build_registers())[address : address + value]
         if self.mode == "short":
             words = words[:-2]
         if self.mode == "nan":
@@ -77,7 +77,7 @@ class SensorPeer:
             words[14] = 101
         return struct.pack(f">BB{len(words)}H", function, 2 * len(words), *words)
 
-    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def serve_requests(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.connections[writer] = asyncio.Event()
         with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
             while True:
@@ -88,7 +88,7 @@ class SensorPeer:
                     continue
                 if self.mode == "hang up":
                     break
-                body = self.answer(request)
+                body = self.answer_request(request)
                 if self.mode == "other unit":
                     unit = self.other_unit
                 writer.write(struct.pack(">HHHB", transaction, 0, len(body) + 1, unit) + body)
@@ -99,10 +99,10 @@ class SensorPeer:
 
 
 @asynccontextmanager
-async def sensor_peer(rate_hz: float = 1000.0) -> AsyncIterator[SensorPeer]:
+async def run_sensor_peer(rate_hz: float = 1000.0) -> AsyncIterator[SensorPeer]:
     """Serve a sensor on a free port of the loopback."""
     peer = SensorPeer(rate_hz)
-    server = await asyncio.start_server(peer.serve, "127.0.0.1", 0)
+    server = await asyncio.start_server(peer.serve_requests, "127.0.0.1", 0)
     peer.port = int(server.sockets[0].getsockname()[1])
     try:
         yield peer

@@ -34,9 +34,9 @@ class DrivePeer:
             self._send(self.drive.wall_clock(drive_s))
             if message is not None:
                 self.heard.append(message.arbitration_id)
-                self._send(self.take(message.arbitration_id, bytes(message.data)))
+                self._send(self.handle_frame(message.arbitration_id, bytes(message.data)))
 
-    def take(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
+    def handle_frame(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
         """Give one frame to the drive and return its answers."""
         return self.drive.receive(can_id, data)
 

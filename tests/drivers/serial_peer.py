@@ -18,20 +18,20 @@ from unittest.mock import patch
 from pymodbus.framer import FramerRTU
 
 from fdhil.drivers.modbus import rtu_line
-from fdhil.drivers.serial import byte_stream, port
+from fdhil.drivers.serial import byte_stream, serial_port
 
 LOOK_S = 0.01
 Spoil = Callable[[bytes], list[bytes]]
 """What really comes on the line instead of an answer: pieces, one after the other."""
 
 
-def framed(unit: int, body: bytes) -> bytes:
+def build_frame(unit: int, body: bytes) -> bytes:
     """Return a frame with its checksum."""
     frame = bytes([unit]) + body
     return frame + struct.pack(">H", FramerRTU.compute_CRC(frame))
 
 
-async def until(condition: Callable[[], object]) -> None:
+async def wait_until(condition: Callable[[], object]) -> None:
     """Wait until a condition holds; fail after a minute."""
     for _ in range(12_000):
         if condition():
@@ -64,7 +64,7 @@ class _OftenLooking(selectors.DefaultSelector):
         return super().select(None if timeout is None else min(timeout, LOOK_S))
 
 
-def patiently(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
+def run_patiently(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
     """Run a test and its serial line in the time of a patient loop; missing answers still time out soon."""
 
     @wraps(test)
@@ -72,7 +72,7 @@ def patiently(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., N
         loop = PatientLoop()
         with (
             patch.object(rtu_line, "time", loop),
-            patch.object(port, "time", loop),
+            patch.object(serial_port, "time", loop),
             patch.object(byte_stream, "time", loop),
             asyncio.Runner(loop_factory=lambda: loop) as runner,
         ):
@@ -100,13 +100,13 @@ class SerialPeer:
             data = os.read(self.fd, 4096)
             self.requests.append(data)
             self.came_ns.append(time.monotonic_ns())
-            self.take(data)
+            self.receive_bytes(data)
             self.heard.set()
 
-    def take(self, data: bytes) -> None:
+    def receive_bytes(self, data: bytes) -> None:
         """Handle the bytes received."""
 
-    def put(self, data: bytes) -> None:
+    def send_bytes(self, data: bytes) -> None:
         """Send bytes on the line."""
         self.left_ns.append(time.monotonic_ns())
         os.write(self.fd, data)
@@ -133,12 +133,12 @@ class RtuPeer(SerialPeer):
         self.pause_s = 0.0
         self.written: list[tuple[int, int]] = []
 
-    def take(self, data: bytes) -> None:
+    def receive_bytes(self, data: bytes) -> None:
         """Answer as the addressed unit."""
         unit = data[0]
         if unit not in self.units:
             return
-        assert framed(unit, data[1:-2]) == data
+        assert build_frame(unit, data[1:-2]) == data
         function, address, value = struct.unpack(">BHH", data[1:6])
         if function == 6:
             self.written.append((address, value))
@@ -147,13 +147,13 @@ class RtuPeer(SerialPeer):
             body = bytes([function | 0x80, 2])
         else:
             body = struct.pack(f">BB{value}H", function, 2 * value, *self.units[unit][address : address + value])
-        pieces = self.spoil.pop(0)(framed(unit, body)) if self.spoil else [framed(unit, body)]
+        pieces = self.spoil.pop(0)(build_frame(unit, body)) if self.spoil else [build_frame(unit, body)]
         for piece in pieces:
-            self.put(piece)
+            self.send_bytes(piece)
 
 
 @asynccontextmanager
-async def rtu_peer(**units: list[int]) -> AsyncIterator[RtuPeer]:
+async def run_rtu_peer(**units: list[int]) -> AsyncIterator[RtuPeer]:
     """Serve units ``u1``, ``u2``... on a pseudo terminal."""
     peer = RtuPeer({int(name[1:]): registers for name, registers in units.items()})
     try:

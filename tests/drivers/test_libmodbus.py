@@ -16,12 +16,12 @@ import pytest
 
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.tick_clock import TickClock
-from fdhil.drivers.modbus.link import ModbusLink
-from fdhil.drivers.sensor_source import sensors_of
+from fdhil.drivers.modbus.modbus_unit import ModbusUnit
+from fdhil.drivers.sensor_source import create_sensors
 from fdhil.errors import DeviceTimeout, ProtocolError
 from fdhil.records import VoltageSamples
-from tests.drivers.test_meters import shop
-from tests.drivers.wire import machine
+from tests.drivers.frame_builder import build_machine_config
+from tests.drivers.test_meters import run_sensor_bench
 
 pytestmark = pytest.mark.debian
 PATIENT = {"timeout_s": 60.0}  # another process answers
@@ -35,7 +35,7 @@ READ_AS: tuple[dict[str, Any], ...] = (
 
 
 @pytest.fixture(scope="module")
-def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def libmodbus_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Compile the peer."""
     made = tmp_path_factory.mktemp("libmodbus") / "peer"
     command = ["gcc", "-Wall", "-Werror", "-I/usr/include/modbus", str(SOURCE), "-o", str(made), "-lmodbus"]
@@ -44,7 +44,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def peer(program: Path, *arguments: str) -> Iterator[str]:
+def start_peer(program: Path, *arguments: str) -> Iterator[str]:
     """Run the peer and yield the line that it prints once it serves."""
     with subprocess.Popen([program, *arguments], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -79,22 +79,22 @@ class Cable:
 
 
 @asynccontextmanager
-async def units_on_a_line(program: Path, **volts: float) -> AsyncIterator[str]:
+async def run_units_on_a_line(program: Path, **volts: float) -> AsyncIterator[str]:
     """Connect a unit for each of ``u1 = volts`` to one line and yield the device at its other end."""
     cable = Cable(1 + len(volts))
     with ExitStack() as units:
         for device, (name, value) in zip(cable.devices[1:], volts.items(), strict=True):
-            assert units.enter_context(peer(program, "rtu-unit", device, name[1:], str(value))) == "ready"
+            assert units.enter_context(start_peer(program, "rtu-unit", device, name[1:], str(value))) == "ready"
         yield cable.devices[0]
     cable.cut()
 
 
-async def read(config: MachineConfig) -> list[float]:
-    sensor = sensors_of("X", config)["voltage"]
+async def read_registers(config: MachineConfig) -> list[float]:
+    sensor = create_sensors("X", config)["voltage"]
     await sensor.link.connect()
     volts: list[float] = []
     for _ in range(20):  # what a busy host asks too slowly has no place in time
-        records = await sensor.poll(TickClock(0.001))
+        records = await sensor.poll_samples(TickClock(0.001))
         volts = [float(v) for r in records if isinstance(r, VoltageSamples) for v in r.voltage_v]
         if volts:
             break
@@ -103,50 +103,52 @@ async def read(config: MachineConfig) -> list[float]:
 
 
 @pytest.mark.parametrize("read_as", READ_AS, ids=lambda keys: keys.get("type", "little"))
-async def test_its_units_over_tcp(program: Path, read_as: dict[str, Any]) -> None:
-    with peer(program, "tcp-unit") as port:
-        volts = await read(machine(voltage={"source": "modbus", "port": int(port), **PATIENT, **read_as}))
+async def test_libmodbus_units_are_read_over_tcp(libmodbus_program: Path, read_as: dict[str, Any]) -> None:
+    with start_peer(libmodbus_program, "tcp-unit") as port:
+        volts = await read_registers(
+            build_machine_config(voltage={"source": "modbus", "port": int(port), **PATIENT, **read_as})
+        )
     assert volts
     np.testing.assert_allclose(volts, -12.34, atol=0.011)
 
 
 @pytest.mark.parametrize("read_as", READ_AS, ids=lambda keys: keys.get("type", "little"))
-async def test_its_units_on_a_serial_line(program: Path, read_as: dict[str, Any]) -> None:
-    async with units_on_a_line(program, u7=-12.34) as device:
+async def test_libmodbus_units_are_read_on_a_serial_line(libmodbus_program: Path, read_as: dict[str, Any]) -> None:
+    async with run_units_on_a_line(libmodbus_program, u7=-12.34) as device:
         line = {"source": "modbus", "device": device, "parity": "none", "baud_rate": 115200, "unit": 7}
-        volts = await read(machine(voltage={**line, **PATIENT, **read_as}))
+        volts = await read_registers(build_machine_config(voltage={**line, **PATIENT, **read_as}))
     assert volts
     np.testing.assert_allclose(volts, -12.34, atol=0.011)
 
 
-async def test_two_of_its_units_on_one_line(program: Path) -> None:
-    async with units_on_a_line(program, u1=10.0, u2=-20.0) as device:
+async def test_two_libmodbus_units_share_a_line(libmodbus_program: Path) -> None:
+    async with run_units_on_a_line(libmodbus_program, u1=10.0, u2=-20.0) as device:
         line = {"source": "modbus", "type": "float32", "device": device, "parity": "none", "baud_rate": 115200}
         asked_twice = {"timeout_s": 10.0}  # libmodbus takes what follows an unanswered request for its answer
         units = ({"unit": 1, **asked_twice}, {"unit": 2, **asked_twice}, {"unit": 3})  # nobody is unit 3
-        settings = [machine(voltage={**line, **unit}).axis["X"].voltage for unit in units]
-        links = [ModbusLink(f"unit {place.unit}", place) for place in settings]
+        settings = [build_machine_config(voltage={**line, **unit}).axis["X"].voltage for unit in units]
+        links = [ModbusUnit(f"unit {place.unit}", place) for place in settings]
         for link in links:
             await link.connect()
         for _ in range(3):
-            both = await asyncio.gather(*(link.read_input(0, 2) for link in links[:2]))
+            both = await asyncio.gather(*(link.read_input_registers(0, 2) for link in links[:2]))
             assert both == [[0x4120, 0], [0xC1A0, 0]]
         with pytest.raises(ProtocolError, match="illegal register address"):
-            await links[0].read_input(100, 2)
+            await links[0].read_input_registers(100, 2)
         with pytest.raises(DeviceTimeout):
-            await links[2].read_input(0, 2)
-        await links[1].write(7, 99)
-        assert await links[1].read(3, 7, 1) == [99]
+            await links[2].read_input_registers(0, 2)
+        await links[1].write_register(7, 99)
+        assert await links[1].read_registers(3, 7, 1) == [99]
         for link in links:
             link.close()
 
 
-async def test_its_master_reads_the_twin_s_sensors(program: Path, tmp_path: Path) -> None:
+async def test_libmodbus_master_reads_the_simulated_sensors(libmodbus_program: Path, tmp_path: Path) -> None:
     value = {"source": "modbus", "type": "float32"}
     on_a_line = {**value, "device": str(tmp_path / "meter"), "unit": 9, "baud_rate": 115200}
-    async with shop(value, on_a_line) as served:
+    async with run_sensor_bench(value, on_a_line) as served:
         port = str(served.wires.ready["X"]["port"])
         for arguments in (("tcp-master", "127.0.0.1", port, "0"), ("rtu-master", str(tmp_path / "meter"), "9", "0")):
-            master = await asyncio.create_subprocess_exec(program, *arguments, stdout=subprocess.PIPE)
+            master = await asyncio.create_subprocess_exec(libmodbus_program, *arguments, stdout=subprocess.PIPE)
             said, _ = await master.communicate()
             assert said == b"-12.3400\n"

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from fdhil.drivers.can import sdo
-from fdhil.drivers.can.sdo import SdoLink
+from fdhil.drivers.can import sdo_channel
+from fdhil.drivers.can.sdo_channel import SdoChannel
 from fdhil.errors import ProtocolError, SdoAbort, SdoTimeout, SdoToggle, SdoTooLarge
 
 
@@ -28,38 +28,38 @@ class SlowNode:
         if data[1:3] == b"\x16\x10":
             self.waiting.append(answer)
             return
-        self.arrive()
-        self.link.deliver(answer)
+        self.deliver_answers()
+        self.link.deliver_response(answer)
 
-    def arrive(self, _seconds: float = 0.0) -> None:
+    def deliver_answers(self, _seconds: float = 0.0) -> None:
         """Deliver the late answers."""
         for answer in self.waiting:
-            self.link.deliver(answer)
+            self.link.deliver_response(answer)
         self.waiting = []
 
 
 @pytest.mark.fault("A26")
-def test_the_roll_back_is_not_spoilt_by_a_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sdo, "RESPONSE_TIMEOUT_S", 0.02)
+def test_roll_back_is_not_corrupted_by_a_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sdo_channel, "RESPONSE_TIMEOUT_S", 0.02)
     node = SlowNode()
-    link = SdoLink("drive X", 1, node.send)
+    link = SdoChannel("drive X", 1, node.send)
     node.link = link
-    monkeypatch.setattr(sdo, "QUIET_S", 0.0)
+    monkeypatch.setattr(sdo_channel, "QUIET_S", 0.0)
     with pytest.raises(SdoTimeout):
         link.read_int(0x1016, 1)
-    monkeypatch.setattr("fdhil.drivers.can.sdo.time.sleep", node.arrive)
+    monkeypatch.setattr("fdhil.drivers.can.sdo_channel.time.sleep", node.deliver_answers)
     assert link.read_int(0x60B0) == 7
     assert link.read_int(0x6041) == 7
 
 
 @pytest.mark.fault("A26")
-def test_an_answer_to_what_another_program_asked_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sdo, "QUIET_S", 0.0)
+def test_answer_to_another_programs_request_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sdo_channel, "QUIET_S", 0.0)
     node = SlowNode()
-    node.link = link = SdoLink("drive X", 1, node.send)
+    node.link = link = SdoChannel("drive X", 1, node.send)
     node.waiting = [b"\x60\x16\x10\x01" + bytes(4)]  # a download's, of a program that has ended
     assert link.read_int(0x1018, 2) == 7
-    link = SdoLink("drive X", 1, lambda can_id, data: link.deliver(b"\x60\x16\x10\x01" + bytes(4)))
+    link = SdoChannel("drive X", 1, lambda can_id, data: link.deliver_response(b"\x60\x16\x10\x01" + bytes(4)))
     with pytest.raises(ProtocolError, match="got a wrong answer"):
         link.read_int(0x1018, 2)
 
@@ -67,13 +67,13 @@ def test_an_answer_to_what_another_program_asked_is_not_taken(monkeypatch: pytes
 @pytest.mark.parametrize(
     ("command", "size"), [(0x4B, 2), (0x43, 4), (0x4F, 1), (0x42, None)], ids=["two", "four", "one", "not told"]
 )
-def test_size_of_an_object_is_what_the_drive_says(command: int, size: int | None) -> None:
+def test_object_size_is_read_from_the_answer(command: int, size: int | None) -> None:
     """CiA 301, 7.2.4.3.5: an expedited answer need not give how many of its four bytes are data."""
 
     def send(_can_id: int, data: bytes) -> None:
-        link.deliver(bytes([command]) + data[1:4] + bytes(4))
+        link.deliver_response(bytes([command]) + data[1:4] + bytes(4))
 
-    link = SdoLink("drive X", 1, send)
+    link = SdoChannel("drive X", 1, send)
     assert link.read_size(0x6041) == size
 
 
@@ -91,10 +91,10 @@ class SegmentedNode:
         if data[0] == 0x80:
             self.aborts.append(int.from_bytes(data[4:], "little"))
         elif data[0] == 0x40:
-            self.link.deliver(b"\x41" + data[1:4] + struct.pack("<I", self.declares))
+            self.link.deliver_response(b"\x41" + data[1:4] + struct.pack("<I", self.declares))
         else:
             self.segments += 1
-            self.link.deliver(bytes([data[0] & 0x10 if self.toggles else 0x10 & ~data[0]]) + bytes(7))
+            self.link.deliver_response(bytes([data[0] & 0x10 if self.toggles else 0x10 & ~data[0]]) + bytes(7))
 
 
 @pytest.mark.fault("A27")
@@ -107,33 +107,33 @@ class SegmentedNode:
     ],
     ids=["toggle", "endless", "declares too much"],
 )
-def test_segments_that_are_wrong_or_without_end_are_aborted(
+def test_wrong_or_endless_segments_are_aborted(
     node: SegmentedNode, says: str, code: int, error: type[ProtocolError], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sdo, "QUIET_S", 0.0)
-    node.link = SdoLink("drive X", 1, node.send, patience=100.0)
+    monkeypatch.setattr(sdo_channel, "QUIET_S", 0.0)
+    node.link = SdoChannel("drive X", 1, node.send, patience=100.0)
     with pytest.raises(error, match=f"(?i){says}"):
-        node.link.read(0x1008)
+        node.link.read_bytes(0x1008)
     assert set(node.aborts) == {code}
     assert node.segments <= 65536 // 7 + 2
 
 
 @pytest.mark.fault("A27")
-def test_segments_that_take_too_long_are_aborted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sdo, "DEADLINE_S", 0.0)
+def test_slow_segments_are_aborted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sdo_channel, "DEADLINE_S", 0.0)
     node = SegmentedNode(toggles=True)
-    node.link = SdoLink("drive X", 1, node.send)
+    node.link = SdoChannel("drive X", 1, node.send)
     with pytest.raises(SdoTooLarge, match="was not finished after 0 s"):
-        node.link.read(0x1008)
+        node.link.read_bytes(0x1008)
     assert node.aborts == [0x05040000]
 
 
 @pytest.mark.fault("A25")
-def test_an_abort_of_the_drive_is_told_with_its_code() -> None:
+def test_drives_abort_is_reported_with_its_code() -> None:
     for code in (0x06090030, 0x08000022):
-        link = SdoLink("drive X", 1, lambda can_id, data: None)
+        link = SdoChannel("drive X", 1, lambda can_id, data: None)
         link._send = (
-            lambda can_id, data, to=link, code=code: to.deliver(  # type: ignore[misc] # the loop's own
+            lambda can_id, data, to=link, code=code: to.deliver_response(  # type: ignore[misc] # the loop's own
                 b"\x80" + data[1:4] + struct.pack("<I", code)
             )
         )

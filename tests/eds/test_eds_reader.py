@@ -75,22 +75,22 @@ QUIRKS = {
 }
 
 
-def defaults_of(file: EdsFile) -> dict[tuple[int, int], str]:
+def collect_defaults(file: EdsFile) -> dict[tuple[int, int], str]:
     """Return the defaults of all entries by (index, sub-index), as written."""
     return {(entry.index, entry.sub): entry.default for item in file.objects for entry in item.entries}
 
 
 @pytest.mark.parametrize("quirk", QUIRKS)
-def test_quirk_is_mended(quirk: str) -> None:
-    defaults = defaults_of(parse_eds(QUIRKS[quirk], "drive.eds"))
+def test_field_quirk_is_accepted(quirk: str) -> None:
+    defaults = collect_defaults(parse_eds(QUIRKS[quirk], "drive.eds"))
     assert read_expression(defaults[0x1800, 1]) == (0x40000180, True)
     assert read_expression(defaults[0x1000, 0]) == (0x20192, False)
 
 
-def test_a_file_is_read(tmp_path: Path) -> None:
+def test_file_is_read(tmp_path: Path) -> None:
     path = tmp_path / "a.eds"
     path.write_text(GOOD)
-    assert defaults_of(read_eds(path))[0x1800, 1] == "$NODEID+0x40000180"
+    assert collect_defaults(read_eds(path))[0x1800, 1] == "$NODEID+0x40000180"
 
 
 @pytest.mark.parametrize("sheet", SHEETS)
@@ -123,13 +123,13 @@ def test_reader_agrees_with_the_canopen_library(sheet: str, tmp_path: Path) -> N
     ],
 )
 @pytest.mark.fault("G5")
-def test_what_cannot_be_read_is_one_error(raw: bytes, says: str) -> None:
+def test_unreadable_file_is_one_error_with_its_line(raw: bytes, says: str) -> None:
     with pytest.raises(EdsError, match=r"bad\.eds") as caught:
         parse_eds(raw, "bad.eds")
     assert says in str(caught.value)
 
 
-def test_a_missing_file_is_the_same_error(tmp_path: Path) -> None:
+def test_missing_file_is_an_eds_error(tmp_path: Path) -> None:
     with pytest.raises(EdsError, match="cannot be read"):
         read_eds(tmp_path / "none.eds")
 
@@ -138,7 +138,7 @@ def test_a_missing_file_is_the_same_error(tmp_path: Path) -> None:
 @settings(deadline=None, max_examples=60)
 @given(st.data())
 @pytest.mark.fault("G5")
-def test_damage_never_escapes_as_another_error(data: st.DataObject) -> None:
+def test_damaged_file_raises_only_eds_errors(data: st.DataObject) -> None:
     raw = bytearray(GOOD.encode())
     for _ in range(data.draw(st.integers(1, 6))):
         at = data.draw(st.integers(0, len(raw) - 1))

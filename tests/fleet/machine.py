@@ -32,7 +32,7 @@ class Machine:
     """Stores its records at once, through the daemon's own store."""
 
     def __init__(self, file: Path, keep_unsent: int | None = None, *, quiet: bool = False) -> None:
-        self.config: MachineConfig = machine_config.load(file)
+        self.config: MachineConfig = machine_config.load_config(file)
         if quiet:  # as before [uplink] was set
             self.config = self.config.model_copy(update={"uplink": None})
         if keep_unsent is not None and self.config.uplink is not None:  # fewer than a configuration may say

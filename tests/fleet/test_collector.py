@@ -16,7 +16,7 @@ import nats.errors
 import psycopg
 import pytest
 
-from fdhil.config.fleet import Fleet, Objects
+from fdhil.config.fleet_config import Fleet, Objects
 from fdhil.errors import StoreError
 from fdhil.fleet import objects
 from fdhil.fleet.collector import Collector, Received, _fetch, _give_back, _next

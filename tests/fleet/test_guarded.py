@@ -12,8 +12,8 @@ import nats.errors
 import pytest
 from nats.aio.client import Client
 
-from fdhil.config.fleet import Stream
-from fdhil.config.uplink import NatsServer
+from fdhil.config.fleet_config import Stream
+from fdhil.config.uplink_section import NatsServer
 from fdhil.fleet import transport, uplink
 from fdhil.fleet.message import decode
 from fdhil.fleet.transport import connected

@@ -13,7 +13,7 @@ import nats.errors
 import nkeys
 import pytest
 
-from fdhil.config.uplink import NatsServer
+from fdhil.config.uplink_section import NatsServer
 from fdhil.errors import ConnectError
 from fdhil.fleet import transport
 from tests.fleet import servers

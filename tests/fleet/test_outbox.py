@@ -204,9 +204,9 @@ def test_a_row_that_is_damaged_or_gone_is_told_as_that(machine: Machine) -> None
 def test_an_uplink_is_not_the_machine(tmp_path: Path) -> None:
     """Adding an uplink requires no new commissioning."""
     document = bench_document()
-    plain = machine_config.parse(document)
+    plain = machine_config.parse_config(document)
     document["uplink"] = {"labels": {"type": "V-800"}}
-    assert machine_config.parse(document).digest == plain.digest
+    assert machine_config.parse_config(document).digest == plain.digest
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def test_an_uplink_is_not_the_machine(tmp_path: Path) -> None:
 )
 def test_a_wrong_uplink_is_refused(uplink: dict[str, Any], told: str) -> None:
     with pytest.raises(ConfigError) as error:
-        machine_config.parse(bench_document() | {"uplink": uplink})
+        machine_config.parse_config(bench_document() | {"uplink": uplink})
     assert told in str(error.value)
 
 
@@ -260,7 +260,7 @@ def test_what_was_recorded_before_is_told_once_in_its_order(older: Path) -> None
 
 
 def test_a_clock_that_was_set_back_turns_nothing_round(older: Path) -> None:
-    config = machine_config.load(older)
+    config = machine_config.load_config(older)
     assert config.uplink is not None
     with closing(sqlite3.connect(config.store.directory / HISTORY_FILE_NAME)) as db:
         db.execute("UPDATE revisions SET wall_s = 1000 - id")

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from fdhil.config import Identification
-from fdhil.config.fleet import load
+from fdhil.config.fleet_config import load_fleet_config
 from fdhil.errors import StoreError
 from fdhil.fleet import objects, reanalysis
 from fdhil.fleet.sets import entered
@@ -218,7 +218,7 @@ def slowly(file: str) -> None:
 
 def resumed(file: Path, crew: WindowCrew, progress: reanalysis.Progress) -> None:
     """Complete the revision of the old method."""
-    fleet = load(file)
+    fleet = load_fleet_config(file)
     method = Method(BEFORE, {}, fleet.objects.directory.resolve(), code_digest())
     reanalysis.reanalyse(fleet, method, reanalysis.Scope(), crew, progress)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.config.fleet import Fleet, Retention
+from fdhil.config.fleet_config import Fleet, Retention
 from fdhil.errors import ConfigError
 from fdhil.fleet import objects
 from fdhil.fleet.collector import Received

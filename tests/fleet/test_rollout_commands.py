@@ -45,7 +45,7 @@ def file(works: Works, tmp_path: Path) -> Path:
 
 def lay(works: Works, file: Path, **changes: Any) -> MachineConfig:
     """Place an offer where the uplink would."""
-    config = machine_config.load(file)
+    config = machine_config.load_config(file)
     config.offers_directory.mkdir(parents=True, exist_ok=True)
     version = changes.get("version", 3)
     (config.offers_directory / f"friction-{version}.offer").write_bytes(works.document(**changes))
@@ -121,7 +121,7 @@ def test_the_newest_of_a_name_is_meant(works: Works, file: Path, capsys: Any) ->
     lay(works, file)
     lay(works, file, version=10, values={"axis.X.nominal.ft": 0.07})
     assert fdhil("offers", "accept", file, "friction", "--by", "Bert", capsys=capsys)[0] == 0
-    assert machine_config.load(file).axis["X"].nominal.ft == 0.07
+    assert machine_config.load_config(file).axis["X"].nominal.ft == 0.07
 
 
 def test_a_limit_that_is_loosened_has_its_own_line(works: Works, file: Path, capsys: Any) -> None:
@@ -146,7 +146,7 @@ def test_a_machine_that_trusts_nobody_is_told_so(works: Works, file: Path, capsy
     lay(works, file)
     file.write_text(file.read_text().partition("# what follows")[0])
     assert "which is not listed in [offers] trust" in fdhil("offers", "list", file, capsys=capsys)[1]
-    assert OfferWatch(machine_config.load(file)).find_new_offers() == []
+    assert OfferWatch(machine_config.load_config(file)).find_new_offers() == []
 
 
 def test_the_daemon_tells_of_an_offer_once_until_it_is_answered(works: Works, file: Path, capsys: Any) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.cli.main import cli, run_safely
-from fdhil.config.editing import edited
+from fdhil.config.toml_editing import edit_toml
 from fdhil.errors import ConfigError, FdhilError, StoreError
 from fdhil.store.atomic import write_file
 from fdhil.store.offers import read_answers
@@ -70,7 +70,7 @@ class Acceptances(Plain):
         A kernel that falsely confirms a write leaves an invalid file, which is detected when read: StoreError.
         """
         try:
-            machine_config.load(self.file)
+            machine_config.load_config(self.file)
         except ConfigError as error:
             raise StoreError(f"{error}; bring the old one back") from None
         texts = [self._text(version) for version in STATES]
@@ -84,7 +84,7 @@ class Acceptances(Plain):
 
     def _text(self, version: int) -> str:
         note = f"friction version {version}"
-        return edited(self.first, {KEY: self.value(version)}, note) if version else self.first
+        return edit_toml(self.first, {KEY: self.value(version)}, note) if version else self.first
 
 
 @pytest.fixture

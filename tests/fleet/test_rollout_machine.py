@@ -110,7 +110,7 @@ def test_what_is_accepted_stands_in_the_file_and_the_old_one_beside_it(works: Wo
     assert done.offer is not None
     assert kept_file(file, done.offer).read_bytes() == before
     assert {path.stat().st_mode & 0o777 for path in (file, kept_file(file, done.offer))} == {0o640}
-    config = machine_config.load(file)
+    config = machine_config.load_config(file)
     assert config.axis["X"].nominal.ft == 0.061
     (answer,) = read_answers(config.store.directory)
     assert (answer.answer, answer.by, answer.version, answer.config_digest) == ("accepted", "Bert", 3, config.digest)
@@ -291,8 +291,8 @@ def test_two_do_not_answer_at_once(works: Works, file: Path) -> None:
 
 
 def test_what_a_machine_says_of_itself_does_not_depend_on_whom_it_trusts(works: Works, file: Path) -> None:
-    trusting = machine_config.load(file)
+    trusting = machine_config.load_config(file)
     text = file.read_text()
     file.write_text(text[: text.index("# what follows")])
-    assert machine_config.load(file).digest == trusting.digest
-    assert TOLD["machines"] == (trusting.works_name,)
+    assert machine_config.load_config(file).digest == trusting.digest
+    assert TOLD["machines"] == (trusting.plant_name,)

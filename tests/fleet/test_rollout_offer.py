@@ -10,9 +10,9 @@ import nkeys
 import pytest
 from pydantic import ValidationError
 
-from fdhil.config.from_afar import FROM_AFAR, NEVER, loosens, never
-from fdhil.config.offers import Offers
-from fdhil.config.template import sections
+from fdhil.config.config_template import list_tables
+from fdhil.config.offers_section import Offers
+from fdhil.config.remote_change_policy import FROM_AFAR, NEVER, explain_refusal, is_loosening
 from fdhil.errors import ConfigError
 from fdhil.fleet.offer import SCHEMA, Offer, OfferRefused, canonical, make_key, public_key, read, sign
 from tests.fleet.offers import TOLD, Works
@@ -131,22 +131,26 @@ def test_a_value_that_no_machine_could_have_is_not_signed(works: Works) -> None:
 
 def test_every_key_of_the_configuration_is_decided_upon() -> None:
     """A new section needs a policy for itself or for a table above it."""
-    for table in sections():
+    for table in list_tables():
         for key, _ in table.keys:
             path = f"{table.path}.{key}"
-            assert never(path) != "no remote change of it is allowed", path
-    assert all(never(path.replace("*", "X")) for path in NEVER)
-    assert not any(never(path.replace("axis.*", "axis.Z")) for path in FROM_AFAR)
-    assert never("nothing.of_the_kind")
+            assert explain_refusal(path) != "no remote change of it is allowed", path
+    assert all(explain_refusal(path.replace("*", "X")) for path in NEVER)
+    assert not any(explain_refusal(path.replace("axis.*", "axis.Z")) for path in FROM_AFAR)
+    assert explain_refusal("nothing.of_the_kind")
 
 
 def test_a_larger_limit_loosens_and_a_smaller_one_does_not() -> None:
     path = "axis.X.correction.max_offset_um"
-    assert (loosens(path, 50.0, 60.0), loosens(path, 50.0, 40.0), loosens(path, 50.0, 50.0)) == (True, False, False)
-    assert loosens("correction.learning", False, True)
-    assert not loosens("correction.learning", True, False)
-    assert loosens("identification.tolerance_um", None, 1.0)  # which of the two is larger depends
-    assert not loosens("axis.X.nominal.ft", 1.0, 2.0)
+    assert (is_loosening(path, 50.0, 60.0), is_loosening(path, 50.0, 40.0), is_loosening(path, 50.0, 50.0)) == (
+        True,
+        False,
+        False,
+    )
+    assert is_loosening("correction.learning", False, True)
+    assert not is_loosening("correction.learning", True, False)
+    assert is_loosening("identification.tolerance_um", None, 1.0)  # which of the two is larger depends
+    assert not is_loosening("axis.X.nominal.ft", 1.0, 2.0)
 
 
 def test_a_key_is_its_owner_s_alone(tmp_path: Path) -> None:

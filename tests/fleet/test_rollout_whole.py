@@ -14,8 +14,8 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.config import MachineConfig
-from fdhil.config import fleet as fleet_config
-from fdhil.config.fleet import Stream
+from fdhil.config import fleet_config as fleet_config
+from fdhil.config.fleet_config import Stream
 from fdhil.fleet import delivery
 from fdhil.fleet.delivery import Letterbox
 from fdhil.fleet.offer import Offer
@@ -60,7 +60,7 @@ class Shop:
         self.files = {name: machine_of(self.works, folder / name, machine=name, **told) for name in MACHINES}
 
     def config(self, name: str) -> MachineConfig:
-        return machine_config.load(self.files[name])
+        return machine_config.load_config(self.files[name])
 
     def fdhil(self, code: int, *words: object) -> Any:
         """Run a command with --json and return its document."""
@@ -98,7 +98,7 @@ async def shop(tmp_path: Path, database: Postgres, capsys: Any) -> AsyncIterator
         shop = Shop(tmp_path, database, server, capsys)
         for file in shop.files.values():
             machine = Machine(file)
-            await gather(fleet_config.load(shop.fleet), told_by(machine))
+            await gather(fleet_config.load_fleet_config(shop.fleet), told_by(machine))
             machine.close()
         yield shop
 
@@ -206,7 +206,7 @@ def server(tmp_path: Path) -> Iterator[NatsServer]:
 async def look(config: MachineConfig, letterbox: Letterbox | None = None, timeout_s: float = 60.0) -> list[str]:
     """Let a machine fetch offers, and return those present."""
     assert config.uplink is not None
-    async with connected(config.uplink, f"fdhil-{config.works_name}", "uplink") as client:
+    async with connected(config.uplink, f"fdhil-{config.plant_name}", "uplink") as client:
         await (letterbox or Letterbox(config)).look(client.jetstream(timeout=timeout_s), "5" * 32)
     return sorted(path.name for path in lying(config.offers_directory))
 
@@ -215,7 +215,7 @@ async def test_a_machine_fetches_its_own_offers_and_no_others(server: NatsServer
     works = Works(tmp_path)
     keys = {"server": server.url, "password_file": str(tmp_path / "password"), "tls_ca_file": str(tmp_path / "ca.pem")}
     files = {name: machine_of(works, tmp_path / name, machine=name, user=name, **keys) for name in MACHINES[:2]}
-    first, second = (machine_config.load(file) for file in files.values())
+    first, second = (machine_config.load_config(file) for file in files.values())
     async with connected(entering(server, tmp_path, "works"), "fdhil-offers", "server") as client:
         stream = client.jetstream(timeout=60.0)
         await prepare_stream(stream, Stream(max_bytes=1 << 26))
@@ -255,7 +255,7 @@ async def test_without_the_right_or_the_stream_what_lies_there_stays(
     works = Works(tmp_path)
     keys = {"server": server.url, "password_file": str(tmp_path / "password"), "tls_ca_file": str(tmp_path / "ca.pem")}
     file = machine_of(works, tmp_path / "mill-1", machine="mill-1", user="mill-1", **keys)
-    config = machine_config.load(file)
+    config = machine_config.load_config(file)
     config.offers_directory.mkdir(parents=True)
     (config.offers_directory / "friction-3.offer").write_bytes(works.document())
     letterbox = Letterbox(config)

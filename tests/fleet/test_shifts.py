@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.config.fleet import Fleet
+from fdhil.config.fleet_config import Fleet
 from fdhil.fleet import due as forecasts
 from fdhil.fleet import migrations
 from fdhil.fleet.collector import Received

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.config.uplink import NatsServer
+from fdhil.config.uplink_section import NatsServer
 from fdhil.fleet import transport
 from fdhil.fleet.transport import connected
 from tests.ports import free_port

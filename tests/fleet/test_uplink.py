@@ -11,7 +11,7 @@ import nats.errors
 import pytest
 from nats.js import JetStreamContext
 
-from fdhil.config.uplink import NatsServer
+from fdhil.config.uplink_section import NatsServer
 from fdhil.fleet import uplink
 from fdhil.fleet.message import Record, decode
 from fdhil.fleet.transport import connected

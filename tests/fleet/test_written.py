@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fdhil.config.fleet import Fleet
+from fdhil.config.fleet_config import Fleet
 from fdhil.fleet.collector import Received
 from fdhil.fleet.message import Record
 from tests.fleet.machine import Machine, written

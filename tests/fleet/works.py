@@ -10,7 +10,7 @@ from pathlib import Path
 import psycopg
 
 from fdhil.config import MachineConfig
-from fdhil.config.fleet import Database, Fleet, Objects
+from fdhil.config.fleet_config import Database, Fleet, Objects
 from fdhil.fleet import migrations
 from fdhil.fleet.collector import _INCOMING, Collector, Received
 from fdhil.fleet.message import Message, Record, decode, of_entry, of_machine
@@ -37,7 +37,7 @@ def told_by_store(config: MachineConfig, with_windows: bool = False) -> list[Mes
     """Return the messages of a machine's store."""
     settings = config.uplink
     assert settings is not None
-    name = settings.name_of(config.machine.name)
+    name = settings.get_plant_name(config.machine.name)
     with OutboxReader(config.store.directory) as reader:
         windows = {
             entry.number: (config.store.directory / WINDOWS_FOLDER / entry.row["file"]).read_bytes()

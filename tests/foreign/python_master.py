@@ -13,7 +13,7 @@ import canopen
 TOWARD = ((0x4F, 0x40, 0x06), (0x6F, 0x21, 0x07), (0x6F, 0x23, 0x0F), (0x6F, 0x27, 0x0F))  # CiA 402-2, 6.3
 
 
-def tell(event: str, **more: Any) -> None:
+def print_event(event: str, **more: Any) -> None:
     """Write one event."""
     print(json.dumps({"event": event, **more}), flush=True)  # noqa: T201
 
@@ -29,7 +29,7 @@ def main() -> None:
     network.add_node(drive)
     drive.sdo.RESPONSE_TIMEOUT = 60.0
     device_type = int.from_bytes(drive.sdo.upload(0x1000, 0), "little")
-    tell("identity", device_type=device_type, name=drive.sdo.upload(0x1008, 0).decode())
+    print_event("identity", device_type=device_type, name=drive.sdo.upload(0x1008, 0).decode())
     drive.sdo.download(0x6060, 0, bytes([8]))
     position = int.from_bytes(drive.sdo.upload(0x6064, 0), "little", signed=True)
     words = {"status": 0, "control": 0}
@@ -57,7 +57,7 @@ def main() -> None:
         network.send_message(0x200 + node, struct.pack("<Hi", words["control"], position))
         if not told and words["status"] & 0x6F == 0x27:
             told = True
-            tell("enabled", statusword=words["status"], position=position)
+            print_event("enabled", statusword=words["status"], position=position)
         while not (answered.wait(period_s) or ended.is_set()):
             pass
     network.disconnect()

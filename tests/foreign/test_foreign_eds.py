@@ -20,7 +20,7 @@ pytestmark = pytest.mark.debian
 
 
 @pytest.mark.parametrize("sheet", [None, *SHEETS])
-def test_it_is_read_as_it_is_meant(sheet: str | None, tmp_path: Path) -> None:
+def test_foreign_eds_files_are_read_as_intended(sheet: str | None, tmp_path: Path) -> None:
     worn: dict[str, Any] = {} if sheet is None else {"eds": str(write_sheet(sheet, tmp_path))}
     drive = Rig(machine(**worn)).drive
     path = write_eds(drive, tmp_path / "drive.eds")

@@ -23,7 +23,7 @@ MAKES = [pytest.param("master.js", marks=pytest.mark.debian), "python_master.py"
 
 
 @pytest.fixture
-def twin(tmp_path: Path) -> Iterator[tuple[TwinProcess, Path]]:
+def simulator_process(tmp_path: Path) -> Iterator[tuple[TwinProcess, Path]]:
     """A simulated drive without an NC, and the configuration of the machine that listens to it."""
     path = write_config(tmp_path, bus='interface = "socketcand"\nport = 0', axes="X", sim="nc = false")
     text = path.read_text().replace("sync_period_s = 0.001", f"sync_period_s = {PERIOD_MS / 1e3}")
@@ -33,16 +33,16 @@ def twin(tmp_path: Path) -> Iterator[tuple[TwinProcess, Path]]:
         yield running, path
 
 
-def master(make: str, twin: TwinProcess) -> ForeignProcess:
+def start_master(make: str, twin: TwinProcess) -> ForeignProcess:
     """SYNC with a counter up to 10, where the master has a counter."""
     settings = {"node": twin.ready["drives"]["X"]["node_id"], "own_node": 100, "period_ms": PERIOD_MS, "overflow": 10}
     return ForeignProcess(make, twin.bus_settings, **settings)
 
 
 @pytest.mark.parametrize("make", MAKES)
-async def test_a_drive_that_a_foreign_master_runs_is_sampled(make: str, twin: tuple[TwinProcess, Path]) -> None:
-    process, path = twin
-    records, lost = await sampled(make, process, path)
+async def test_drive_run_by_a_foreign_master_is_sampled(make: str, simulator_process: tuple[TwinProcess, Path]) -> None:
+    process, path = simulator_process
+    records, lost = await collect_samples(make, process, path)
     codes = {record.code for record in records if isinstance(record, Notice)}
     assert not codes & {"SyncCollision", "ForeignProducer", "DemandMismatch", "PdoLength", "PdoMissing"}
     assert set(lost) == {lost[0]}
@@ -50,7 +50,7 @@ async def test_a_drive_that_a_foreign_master_runs_is_sampled(make: str, twin: tu
     assert int(enabled[-1].statusword[-1]) & 0x6F == 0x27
 
 
-async def sampled(make: str, process: TwinProcess, path: Path) -> tuple[list[Record], list[int]]:
+async def collect_samples(make: str, process: TwinProcess, path: Path) -> tuple[list[Record], list[int]]:
     """Let a master run the drive until 300 samples came; return all records, and what was lost.
 
     That is counted from the hundredth sample on: a counter that does not go up to 240 is known from its second turn.
@@ -68,9 +68,9 @@ async def sampled(make: str, process: TwinProcess, path: Path) -> tuple[list[Rec
         if samples >= 300:
             enough.set()
 
-    async with open_machine(machine_config.load(path)) as source:
+    async with open_machine(machine_config.load_config(path)) as source:
         running = asyncio.create_task(source.run(take))
-        with master(make, process) as nc:
+        with start_master(make, process) as nc:
             identity = await asyncio.to_thread(nc.event, "identity")
             assert (identity["device_type"] & 0xFFFF, identity["name"]) == (402, "fdhil twin drive")
             assert identity.get("by_block", identity["name"]) == identity["name"]
@@ -81,12 +81,15 @@ async def sampled(make: str, process: TwinProcess, path: Path) -> tuple[list[Rec
 
 
 @pytest.mark.parametrize("make", MAKES)
-def test_beside_a_foreign_master_nothing_is_asked(
-    make: str, twin: tuple[TwinProcess, Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+def test_no_request_is_sent_next_to_a_foreign_master(
+    make: str,
+    simulator_process: tuple[TwinProcess, Path],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 60.0)  # it ends with the master's first frame
-    process, path = twin
-    with master(make, process) as nc, process.join() as bus:
+    process, path = simulator_process
+    with start_master(make, process) as nc, process.join() as bus:
         nc.event("enabled")
         while bus.recv(0) is not None:
             pass  # what the master itself asked

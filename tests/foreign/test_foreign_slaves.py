@@ -51,19 +51,19 @@ MAKES = [pytest.param("slave.js", marks=pytest.mark.debian), "python_slave.py"]
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorter waits than on a real machine where nothing is sent, longer ones where something is."""
     monkeypatch.setattr("fdhil.commissioning.scan.LISTEN_S", 0.4)
     monkeypatch.setattr("fdhil.commissioning.config_check.LISTEN_S", 0.4)
     monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.4)
     # the slave is a process of its own, on a computer that is busy
     monkeypatch.setattr("fdhil.commissioning.scan.ANSWER_S", 2.0)
-    monkeypatch.setattr(BusScanner, "answering", until_it_answers)
-    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 60.0)
-    monkeypatch.setattr("fdhil.drivers.can.sdo.DEADLINE_S", 60.0)
+    monkeypatch.setattr(BusScanner, "answering", wait_for_answer)
+    monkeypatch.setattr("fdhil.drivers.can.sdo_channel.RESPONSE_TIMEOUT_S", 60.0)
+    monkeypatch.setattr("fdhil.drivers.can.sdo_channel.DEADLINE_S", 60.0)
 
 
-def until_it_answers(
+def wait_for_answer(
     scanner: BusScanner, answering: Callable[[BusScanner], set[int]] = BusScanner.answering
 ) -> set[int]:
     """Scan all nodes until the drive has answered; it is certainly on the bus."""
@@ -81,17 +81,17 @@ def hub() -> Iterator[Hub]:
 @pytest.fixture
 def machine(hub: Hub, tmp_path: Path) -> Path:
     """The configuration of a machine whose only drive is the slave under test."""
-    return configuration(tmp_path, f'interface = "socketcand"\nport = {hub.port}')
+    return write_configuration(tmp_path, f'interface = "socketcand"\nport = {hub.port}')
 
 
-def configuration(folder: Path, bus: str) -> Path:
+def write_configuration(folder: Path, bus: str) -> Path:
     (folder / "foreign.eds").write_text(EDS)
     path = write_config(folder, bus=bus, axes="X")
     path.write_text(path.read_text() + f"[axis.X.drive]\nnode_id = {NODE}\n")
     return path
 
 
-def slave(make: str, hub: Hub, settings: dict[str, Any]) -> ForeignProcess:
+def start_slave(make: str, hub: Hub, settings: dict[str, Any]) -> ForeignProcess:
     return ForeignProcess(make, hub.settings, **settings)
 
 
@@ -118,20 +118,20 @@ def assert_compared(machine: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("make", MAKES)
-def test_a_foreign_drive_is_found_compared_and_refused(
+def test_foreign_drive_is_found_compared_and_refused(
     make: str, hub: Hub, machine: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with slave(make, hub, DRIVE) as peer:
+    with start_slave(make, hub, DRIVE) as peer:
         peer.event("ready")
         assert_compared(machine, capsys)
 
 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("make", MAKES)
-def test_a_foreign_module_is_told_to_be_no_drive(
+def test_foreign_io_module_is_not_a_drive(
     make: str, hub: Hub, machine: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with slave(make, hub, MODULE) as peer:
+    with start_slave(make, hub, MODULE) as peer:
         peer.event("ready")
         code, out, _ = fdhil("check", machine, "--json", capsys=capsys)
         differ = [point["point"] for point in json.loads(out)["points"] if point["state"] == "differs"]
@@ -143,13 +143,13 @@ def test_a_foreign_module_is_told_to_be_no_drive(
 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("make", MAKES)
-def test_a_foreign_drive_without_the_profiles_tpdos_is_told_and_loses_nothing(
+def test_foreign_drive_without_the_profiles_tpdos_is_reported(
     make: str, hub: Hub, machine: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With a master that starts it: TPDO1 is the profile's, TPDO2 is too short, the others are never sent."""
-    monkeypatch.setattr("fdhil.drivers.cia402.pdo_watch.PATIENCE_S", 0.2)
-    source = BusSource("can0", machine_config.load(machine))
-    with slave(make, hub, DRIVE) as peer, joined(hub) as (master,):
+    monkeypatch.setattr("fdhil.drivers.cia402.pdo_monitor.PATIENCE_S", 0.2)
+    source = BusSource("can0", machine_config.load_config(machine))
+    with start_slave(make, hub, DRIVE) as peer, joined(hub) as (master,):
         peer.event("ready")
         source.open()
         try:
@@ -160,48 +160,46 @@ def test_a_foreign_drive_without_the_profiles_tpdos_is_told_and_loses_nothing(
                 while (message := master.recv(100.0)) is not None and message.arbitration_id != 0x280 + NODE:
                     pass  # the drive has answered this SYNC
                 assert message is not None
-            while source.counters()["frames"] < 901:
-                out += source.step(0)
-            out += source.step(0)
+            while source.read_counters()["frames"] < 901:
+                out += source.process_frames(0)
+            out += source.process_frames(0)
         finally:
             source.close()
     told = {record.code: record.text for record in out if isinstance(record, Notice)}
     assert set(told) == {"PdoLength", "PdoMissing"}
     assert "never sent TPDO3 (385), TPDO4 (485) though SYNC runs" in told["PdoMissing"]
-    assert source.decoder.counters()["pdo_lost"] == 0
+    assert source.decoder.read_counters()["pdo_lost"] == 0
     assert sum(record.tick.size for record in out if isinstance(record, AxisSamples)) == 0
 
 
 @pytest.mark.socketcan
-def test_a_foreign_drive_is_found_and_compared_on_the_kernels_own_bus(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    machine = configuration(tmp_path, 'interface = "socketcan"\nchannel = "vcan0"')
+def test_foreign_drive_is_found_and_compared_on_socketcan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    machine = write_configuration(tmp_path, 'interface = "socketcan"\nchannel = "vcan0"')
     with ForeignProcess("python_slave.py", {"interface": "socketcan", "channel": "vcan0"}, **DRIVE) as peer:
         peer.event("ready")
         assert_compared(machine, capsys)
 
 
 @pytest.mark.debian
-def test_the_daemon_waits_for_a_foreign_drive_that_says_nothing(hub: Hub, machine: Path, tmp_path: Path) -> None:
+def test_daemon_waits_for_a_silent_foreign_drive(hub: Hub, machine: Path, tmp_path: Path) -> None:
     """With the NC off, a drive without a heartbeat is silent: the daemon waits and samples once the NC starts."""
     log = tmp_path / "daemon.log"
-    with slave("slave.js", hub, DRIVE) as peer, joined(hub) as (master,):
+    with start_slave("slave.js", hub, DRIVE) as peer, joined(hub) as (master,):
         peer.event("ready")
         with Process("daemon", ["fdhil", "run", str(machine)], log) as daemon:
-            _wait(daemon, lambda: "BusSilent: No frame is received on bus can0" in log.read_text())
+            _wait_until(daemon, lambda: "BusSilent: No frame is received on bus can0" in log.read_text())
             master.send(can.Message(arbitration_id=0, data=[1, NODE], is_extended_id=False))
 
             def heard_again() -> bool:
                 master.send(can.Message(arbitration_id=0x80, is_extended_id=False))
                 return "BusSilent: Bus can0 is active again" in log.read_text()
 
-            _wait(daemon, heard_again)
+            _wait_until(daemon, heard_again)
             assert daemon.stop() == 0
     assert "ready: bench, axes X; listening, sending nothing" in log.read_text()
 
 
-def _wait(process: Process, done: Callable[[], bool]) -> None:
+def _wait_until(process: Process, done: Callable[[], bool]) -> None:
     while not done():
         process.check()
         time.sleep(0.05)

@@ -84,17 +84,21 @@ def test_planner_and_guard_limits_agree_and_keep_the_ceilings(document: dict[str
         assert any(words in machine for words in ("too coarse", "from the largest offset to zero", "feed drives have"))
         return
     axis, period = machine.axis["X"], machine.machine.sync_period_s
-    if OffsetBounds.of(axis, period).too_coarse:
+    if OffsetBounds.compute_effective(axis, period).is_too_coarse:
         with pytest.raises(ConfigError, match="too coarse"):
             settings_of(machine, "can0", Path(), "")
         assert writing_off(["X"], machine)[0].code == "CoarseIncrements"
         return
-    assert OffsetBounds.of(axis, period).time_to_safe_s(period) <= 0.120 + 1e-9
+    assert OffsetBounds.compute_effective(axis, period).compute_time_to_safe_s(period) <= 0.120 + 1e-9
     whole = settings_of(machine, "can0", Path(), "").axes[0].limits
-    planned = PlanLimits.of(axis, period)
-    assert (whole.offset, whole.rate, whole.acceleration, whole.variation, whole.window) == OffsetBounds.of(
-        axis, period
-    ).whole
+    planned = PlanLimits.compute_effective(axis, period)
+    assert (
+        whole.offset,
+        whole.rate,
+        whole.acceleration,
+        whole.variation,
+        whole.window,
+    ) == OffsetBounds.compute_effective(axis, period).whole_increments
     per_mm = axis.scaling.increments_per_mm
     assert whole.offset <= planned.offset + 1e-6 <= CEILING_OFFSET_UM * 1e-3 * per_mm + 1e-3
     assert whole.rate <= max(1.0, planned.rate) + 1e-6  # one increment is the least that can be sent
@@ -112,7 +116,7 @@ def test_planner_and_guard_limits_agree_and_keep_the_ceilings(document: dict[str
 
 def parsed(document: dict[str, Any]) -> machine_config.MachineConfig | str:
     try:
-        return machine_config.parse(document)
+        return machine_config.parse_config(document)
     except ConfigError as error:
         return str(error)
 

@@ -40,7 +40,7 @@ class Rig:
     ) -> None:
         self.peer = Peer(DEMAND)
         self.peer.start()
-        self.config = machine_config.load(write_config(folder, self.peer.port, clock))
+        self.config = machine_config.load_config(write_config(folder, self.peer.port, clock))
         self.run_directory = folder
         self.program = program
         self.settings = folder / "guard.json"

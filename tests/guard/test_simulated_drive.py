@@ -101,7 +101,7 @@ def play(twin: SimulatedDriveRig, guard: GuardClient, folder: Path) -> dict[str,
 
 def test_each_row_is_applied_at_its_own_cycle(tmp_path: Path) -> None:
     twin = SimulatedDriveRig(tmp_path)
-    config = machine_config.load(twin.config)
+    config = machine_config.load_config(twin.config)
     bus = config.bus["can0"].model_copy(update={"port": twin.port})
     settings = tmp_path / "guard.json"
     made = settings_of(config, "can0", tmp_path, hashlib.sha256(TOKEN.encode()).hexdigest())

@@ -11,7 +11,7 @@ import pytest
 from fdhil.api.analysis import FileResult
 from fdhil.cli.batch import analyse_file
 from fdhil.config import Identification
-from fdhil.config.reading import load
+from fdhil.config.config_loader import load_config
 from fdhil.identification.current_means import reading_lag
 from studies.zoo.examination import write_machine
 from studies.zoo.machines import KINDS, Axis, machine
@@ -24,7 +24,7 @@ def _axis(name: str) -> Axis:
 
 def _identified(axis: Axis, folder: Path) -> FileResult:
     write_machine(folder, {"X": axis}, 3)
-    return analyse_file(folder / "X.csv", Identification(), load(folder / "machine.toml"))
+    return analyse_file(folder / "X.csv", Identification(), load_config(folder / "machine.toml"))
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -47,7 +47,7 @@ def test_lag_of_readings_is_that_of_a_drive_that_steps(tmp_path: Path) -> None:
     steady = np.abs(acceleration) > 0.9 * np.abs(acceleration).max()
     beyond = (moved.current_mean - moved.current)[steady] / acceleration[steady]
     write_machine(tmp_path, {"X": axis}, 3)
-    section = load(tmp_path / "machine.toml").axis["X"]
+    section = load_config(tmp_path / "machine.toml").axis["X"]
     assert reading_lag(section, period_s) == pytest.approx(float(np.median(beyond)), rel=0.2)
 
 

@@ -29,7 +29,7 @@ def bench_axis(**regulators: Any) -> Axis:
     """Return the bench's X axis with other regulators."""
     document = bench_document()
     document["axis"]["X"]["regulators"] |= regulators
-    return configuration.parse(document).axis["X"]
+    return configuration.parse_config(document).axis["X"]
 
 
 def shuttle(moves: int, way: float, speed: float, rest_s: float = 0.25, step_s: float = PERIOD) -> Float:

@@ -127,7 +127,7 @@ def bench(transport: str, sections: dict[str, Any], tmp_path: Path, monkeypatch:
     document = bench_document() | sections
     TRANSPORTS[transport](document)
     events: queue.Queue[dict[str, Any]] = queue.Queue()
-    config = machine_config.parse(document, folder=tmp_path)
+    config = machine_config.parse_config(document, folder=tmp_path)
     service = SimService(config, events.put, load_trajectory)
     thread = threading.Thread(target=service.run, name="twin")
     thread.start()
@@ -138,7 +138,7 @@ def bench(transport: str, sections: dict[str, Any], tmp_path: Path, monkeypatch:
             document["bus"][name] |= {k: v for k, v in place.items() if v is not None}
         for axis, place in bench.ready["modbus"].items():
             document["axis"][axis].setdefault("voltage", {}).update(place)
-        bench.config = machine_config.parse(document, folder=tmp_path)
+        bench.config = machine_config.parse_config(document, folder=tmp_path)
         yield bench
     finally:
         service.stop()

@@ -30,7 +30,7 @@ def test_default_daemon_sends_no_frame_and_opens_no_port(
     peer: Peer, tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:
     config = write_config(tmp_path, peer.port, corrected=False)
-    socket = machine_config.load(config).run_directory / SOCKET_NAME
+    socket = machine_config.load_config(config).run_directory / SOCKET_NAME
 
     def listening() -> bool:
         try:

@@ -53,7 +53,7 @@ def client(bench: Bench, short_settling_time: None, tmp_path: Path) -> Iterator[
     for axis in "XY":
         record = commission(bench.config, axis)
         save_record(record, bench.config.store.directory)
-        assert record.options["1402"] == 0x400 + bench.config.node_id(axis)
+        assert record.options["1402"] == 0x400 + bench.config.get_node_id(axis)
     path = tmp_path / "machine.toml"
     path.write_text(toml(json.loads(bench.config.model_dump_json(exclude_none=True))), "utf-8")
     run = bench.config.store.run_directory

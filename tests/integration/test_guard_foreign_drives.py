@@ -9,10 +9,10 @@ import canopen
 import pytest
 
 from tests.bench import bench_axis
-from tests.dressed.wardrobe import set_up
 from tests.eds import write_eds
 from tests.integration.conftest import Bench
 from tests.integration.test_guard import every_offset_is_applied_in_its_own_cycle, guarded
+from tests.vendor_drives.vendor_machines import set_up_drive
 
 pytestmark = pytest.mark.usefixtures("processes")
 
@@ -35,13 +35,13 @@ def test_every_offset_is_applied_in_its_own_cycle(bench: Bench, tmp_path: Path) 
     network.connect()
     try:
         for axis in bench.config.axis:
-            node = network.add_node(bench.config.node_id(axis), str(tmp_path / "epos4.eds"))
+            node = network.add_node(bench.config.get_node_id(axis), str(tmp_path / "epos4.eds"))
             node.sdo.RESPONSE_TIMEOUT = 60.0
 
             def write(index: int, sub: int, value: int, size: int, node: canopen.RemoteNode = node) -> None:
                 node.sdo.download(index, sub, value.to_bytes(size, "little"))
 
-            set_up(bench.config, axis, node.object_dictionary.__contains__, write)
+            set_up_drive(bench.config, axis, node.object_dictionary.__contains__, write)
     finally:
         network.disconnect()
     with guarded(bench, tmp_path) as client:

@@ -34,7 +34,7 @@ def machine(feedforward: float, plant: dict[str, dict[str, float]]) -> MachineCo
         axis["regulators"]["speed_feedforward"] = feedforward
     quiet = {"voltage_v": 0.0, "current_a": 0.0, "speed_rad_s": 0.0}
     document["sim"] = {"noise": quiet, "modbus": False, "axis": plant}
-    return machine_config.parse(document)
+    return machine_config.parse_config(document)
 
 
 def table(config: MachineConfig, program: Path, folder: Path) -> Float:

@@ -75,7 +75,7 @@ def test_four_axes_are_recorded_sample_by_sample(period_s: float, tmp_path: Path
     document["machine"]["sync_period_s"] = period_s
     document["bus"] = {"can0": {"interface": "virtual", "channel": f"slow-{period_s}"}}
     document["sim"] = {"pace": "lockstep", "modbus": False}
-    config = machine_config.parse(document, folder=tmp_path)
+    config = machine_config.parse_config(document, folder=tmp_path)
     events: queue.Queue[dict[str, Any]] = queue.Queue()
     service = SimService(config, events.put, move_back_and_forth)
     thread = threading.Thread(target=service.run, name="twin")
@@ -98,7 +98,7 @@ def test_four_axes_are_recorded_sample_by_sample(period_s: float, tmp_path: Path
 
 
 def test_shipped_four_axis_config_fits_its_bus_but_not_at_1_ms() -> None:
-    config = machine_config.load(ROOT / "configs" / "four-axes.toml")
+    config = machine_config.load_config(ROOT / "configs" / "four-axes.toml")
     load = Machine(config).describe(dict.fromkeys(config.axis, Path()))["bus_load_worst"]["can0"]
     assert 0.3 < load < 0.6
     assert load * config.machine.sync_period_s / 0.001 > 1.5

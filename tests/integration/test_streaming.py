@@ -112,7 +112,7 @@ def test_streamed_rows_end_before_a_refused_position(bench: Bench, client: Guard
     assert stream.end == checked.rows
     assert client.status()["cause"]["code"] == "TableStarved"
     trace = np.genfromtxt(tmp_path / "trace.csv", delimiter=",", names=True)
-    limits = PlanLimits.of(bench.config.axis["X"], 0.001)
+    limits = PlanLimits.compute_effective(bench.config.axis["X"], 0.001)
     for axis in "XY":
         sent = np.rint(trace[f"{axis}_offset_um"] / limits.um_per_increment)
         assert np.any(sent[: checked.rows - 1_000])

@@ -15,10 +15,10 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.frames import frames_of
+from fdhil.drivers.can.frame_ring import pack_frames
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.cia402.bus_decoder import BusDecoder
-from fdhil.drivers.serial.lines import TextLine
+from fdhil.drivers.serial.text_lines import TextLine
 from fdhil.drivers.table.accelerometer import StreamedAccelerometer
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
@@ -39,7 +39,7 @@ def config() -> MachineConfig:
     document["axis"]["Y"]["accelerometer"] = {"device": "/dev/none", "rate_hz": 800.0}
     reality = {axis: {"reality": {"resonance_hz": hz, "position_encoder": "motor"}} for axis, hz in TRUE.items()}
     document["sim"] = {"modbus": False, "axis": reality}
-    return machine_config.parse(document)
+    return machine_config.parse_config(document)
 
 
 def move_back_and_forth() -> np.ndarray[Any, Any]:
@@ -77,9 +77,9 @@ def recorded() -> dict[str, list[WindowOutcome]]:
         lines += [TextLine(line, now_ns + LATE_NS) for line in came]
         if k % DRAIN_CYCLES:
             continue
-        for record in (*decoder.feed(frames_of(frames), now_ns), *sensor.accept(lines, ticks)):
+        for record in (*decoder.decode_frames(pack_frames(frames), now_ns), *sensor.accept_lines(lines, ticks)):
             if isinstance(record, TickTimes):
-                ticks.add(record)
+                ticks.add_arrivals(record)
             if isinstance(record, AxisSamples | TableSamples):
                 recent[record.axis].add(record)
         frames, lines = [], []

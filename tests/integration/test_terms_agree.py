@@ -46,7 +46,7 @@ def machine(case: str, *, told: bool) -> MachineConfig:
         axis["nominal"] |= PLANT.get(case, {})
     quiet = {"voltage_v": 0.0, "current_a": 0.0, "speed_rad_s": 0.0}
     document["sim"] = {"noise": quiet, "modbus": False, "axis": {axis: {"reality": REALITY[case]} for axis in "XY"}}
-    return machine_config.parse(document)
+    return machine_config.parse_config(document)
 
 
 def predicted(config: MachineConfig, terms: dict[str, float]) -> Float:

@@ -19,7 +19,7 @@ from fdhil.bridges import hal_bus
 from fdhil.cli.demo.toml import to_toml
 from fdhil.commissioning.init.hal_file import correction_hal, splices_of
 from fdhil.commissioning.init.linuxcnc_text import Hal, Ini, parse_hal
-from fdhil.config.axis import HAL_INCREMENTS
+from fdhil.config.axis_section import HAL_INCREMENTS
 from fdhil.records import Float
 from tests.linuxcnc.hal_plant import (
     CURRENT_KI,
@@ -106,7 +106,7 @@ class HalMachine(LinuxCnc):
         file.write_text(to_toml(text))
         axes = "".join(motors)
         base = machine_hal(axes, motors)
-        config, hal = machine_config.load(file), plant_hal(base)
+        config, hal = machine_config.load_config(file), plant_hal(base)
         splices = splices_of(hal, {letter: joint for joint, letter in enumerate(axes)}, axes)
         text_of_hal = correction_hal(config, "{folder}/machine.toml", len(axes), splices, hal)
         beside = {"fdhil.hal": text_of_hal, "machine.toml": file.read_text()}

@@ -126,7 +126,7 @@ def beside(path: Path, twin: TwinProcess, port: int) -> MachineConfig:
     text = path.read_text().replace("[bus.can0]\n", f"[bus.can0]\nport = {bus['port']}\n")
     listener = path.with_name("listener.toml")
     listener.write_text(f'{text}[g0]\nsource = "linuxcnc"\n[nc_source.linuxcnc]\nport = {port}\n')
-    return machine_config.load(listener)
+    return machine_config.load_config(listener)
 
 
 def hal_of(port: int) -> str:

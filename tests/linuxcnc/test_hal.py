@@ -19,7 +19,7 @@ import pytest
 from fdhil import config as machine_config
 from fdhil.bridges import hal_bus
 from fdhil.cli.demo.processes import Process
-from fdhil.config.axis import HAL_INCREMENTS
+from fdhil.config.axis_section import HAL_INCREMENTS
 from fdhil.daemon.daemon_socket import SOCKET_NAME
 from fdhil.prediction import contour_error_um
 from fdhil.records import Float
@@ -95,7 +95,7 @@ def test_the_second_cut_is_corrected_by_hal_pins_alone(shop: HalShop, plant: str
             started = stack.enter_context(Process(name, [*command, str(shop.file)], tmp_path / f"{name}.log"))
             if name == "guard":
                 shop.nc.prioritise(started.pid)
-        run_directory = machine_config.load(shop.file).store.run_directory
+        run_directory = machine_config.load_config(shop.file).store.run_directory
         assert run_directory is not None
         until((run_directory / SOCKET_NAME).exists)
         for _ in range(2):

@@ -61,7 +61,7 @@ def shop(tmp_path: Path) -> Iterator[Shop]:
         fdhil("commission", file, "--yes")
         for name, command in (("guard", ["fdhil.cli.guard"]), ("daemon", ["fdhil", "run"])):
             stack.enter_context(Process(name, [*command, str(file)], tmp_path / f"{name}.log"))
-        run_directory = machine_config.load(file).store.run_directory
+        run_directory = machine_config.load_config(file).store.run_directory
         assert run_directory is not None
         until((run_directory / SOCKET_NAME).exists)
         yield Shop(file, twin, document["nc_source"]["linuxcnc"]["port"])
@@ -82,6 +82,6 @@ def test_the_second_cut_of_a_program_is_corrected(shop: Shop) -> None:
             if repeated(shop.status()):
                 break
     shop.twin.event("finished")
-    before, *_, after = contour_of_each_cut(shop.trace, load_trajectory(part, machine_config.load(shop.file)))
+    before, *_, after = contour_of_each_cut(shop.trace, load_trajectory(part, machine_config.load_config(shop.file)))
     assert promised["contour"]["rms_um"] == pytest.approx(before, rel=0.05)
     assert after < before / 50

@@ -11,9 +11,9 @@ from typing import IO
 import numpy as np
 
 from fdhil import config
-from fdhil.drivers.can.filters import passing
-from fdhil.drivers.can.frames import Frames, frames_of
-from fdhil.drivers.can.port import Filter, Stamps
+from fdhil.drivers.can.filters import filter_frames
+from fdhil.drivers.can.frame_ring import Frames, pack_frames
+from fdhil.drivers.can.receive_port import Filter, Stamps
 from fdhil.errors import ConnectError
 from fdhil.guard.can_socket import MOST_FRAMES, BusDown, CanSocket, Frame
 from fdhil.sim.frame_faults import FrameFaults
@@ -56,7 +56,7 @@ class MemoryBus:
     def flush(self) -> None:
         if not self._rows:
             return
-        frames = frames_of(self._rows)
+        frames = pack_frames(self._rows)
         self._rows.clear()
         self.frames += frames.size
         self.digest.update(frames.tobytes())
@@ -85,20 +85,20 @@ class BusListener:
         self._bus, self._filters, self._count = bus, filters, 0
 
     @property
-    def ended(self) -> str | None:
+    def end_reason(self) -> str | None:
         """Why no more frames come."""
         return "the interface is down" if self._bus.is_down else None
 
-    def drain(self) -> Frames:
+    def drain_frames(self) -> Frames:
         self._bus.flush()
         blocks, self.blocks = self.blocks, []
-        frames = passing(np.concatenate(blocks), self._filters) if blocks else frames_of(())
+        frames = filter_frames(np.concatenate(blocks), self._filters) if blocks else pack_frames(())
         self._count += frames.size
         if frames.size:
             self.last_frame_ns = int(frames["t_ns"][-1])
         return frames
 
-    def counters(self) -> dict[str, int]:
+    def read_counters(self) -> dict[str, int]:
         """Return frames received and lost."""
         return {"frames": self._count, "ring_overflow": 0, "kernel_drops": 0, "lost": 0}
 

@@ -78,7 +78,7 @@ class Machine:
         self.folder = Path(self._temporary.name) if self._temporary is not None else folder or Path()
         made = dict(config or document())
         made["sim"] = {"pace": "lockstep", "modbus": False, **made.get("sim", {}), "seed": seed}
-        self.config: MachineConfig = machine_config.parse(made, folder=self.folder)
+        self.config: MachineConfig = machine_config.parse_config(made, folder=self.folder)
         if store is not None:
             shutil.copytree(store, self.config.store.directory)
         self.clock = _MachineClock(self)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fdhil.config import parse
+from fdhil.config import parse_config
 from fdhil.model import closed_loop, loops
 from fdhil.records import PARAMETERS, Float, Parameters
 from tests.bench import bench_config, bench_document
@@ -106,7 +106,7 @@ def test_leaps_give_what_steps_give(structure: str, seed: int) -> None:
         "setpoint_filter_s": 0.001 * (seed in (2, 4, 6)),
         "torque_feedforward": 0.5 * (seed in (2, 3, 4)),
     }
-    axis = parse(document).axis["X"]
+    axis = parse_config(document).axis["X"]
     model = replace(NOMINAL, Cd=0.0 if seed == 7 else NOMINAL.Cd, Jt=NOMINAL.Jt * random.uniform(0.7, 1.4))
     drive = closed_loop.prepare(model, axis, PERIOD)
     assert isinstance(drive, loops.Drive)

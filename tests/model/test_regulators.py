@@ -56,7 +56,7 @@ def bench(structure: str, **regulators: Any) -> configuration.MachineConfig:
         given = GAINS[structure] | regulators
         lacks = NOT_OF_LINUXCNC if structure == "linuxcnc_pid" else ()
         axis["regulators"] |= {"structure": structure} | {k: v for k, v in given.items() if k not in lacks}
-    return configuration.parse(document)
+    return configuration.parse_config(document)
 
 
 def run(axis: Axis, demand: Float, **more: Any) -> closed_loop.Response:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.config import Axis, parse
+from fdhil.config import Axis, parse_config
 from fdhil.model import closed_loop, loops, terms
 from fdhil.records import Float, Parameters
 from studies import real_plant
@@ -46,7 +46,7 @@ TERMS: dict[str, dict[str, float]] = {
 def bench(**regulators: Any) -> Axis:
     document = bench_document("X")
     document["axis"]["X"]["regulators"] |= regulators
-    return parse(document).axis["X"]
+    return parse_config(document).axis["X"]
 
 
 def there_and_back(n: int, smoothed_s: tuple[float, float] = (0.020, 0.010)) -> Float:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fdhil import correction
-from fdhil.config import MachineConfig, parse
+from fdhil.config import MachineConfig, parse_config
 from fdhil.prediction import contour_std_um, predict, sensitivity_um
 from fdhil.prediction.models import nominal_models
 from fdhil.program import interpret, plan
@@ -22,7 +22,7 @@ def rotary(radius_mm: float) -> MachineConfig:
     document = bench_document("X")
     document["axis"]["A"] = rotary_axis(radius_mm)
     document["axis"]["A"].pop("correction")
-    return parse(document)
+    return parse_config(document)
 
 
 def test_contour_error_of_a_table_that_turns_alone_grows_with_the_radius() -> None:
@@ -48,7 +48,7 @@ def test_contour_error_of_a_mixed_move_is_that_of_x_and_of_the_angle_times_the_r
 
 
 def test_gantry_axis_with_equal_drives_is_predicted_as_one_drive() -> None:
-    one, two = parse(bench_document("XY")), parse(rotary_and_gantry_document())
+    one, two = parse_config(bench_document("XY")), parse_config(rotary_and_gantry_document())
     text = "F6000|G1 X30 Y20|X0"
     single, double = (predict(demand(text, c), nominal_models(c), c) for c in (one, two))
     assert double.contour_um == pytest.approx(single.contour_um, abs=1e-9)
@@ -56,7 +56,7 @@ def test_gantry_axis_with_equal_drives_is_predicted_as_one_drive() -> None:
 
 
 def test_gantry_axis_with_unequal_drives_is_at_their_mean() -> None:
-    config = parse(rotary_and_gantry_document())
+    config = parse_config(rotary_and_gantry_document())
     models = nominal_models(config)
     models["Y2"] = models["Y2"].replace_values(Jt=0.1, Cd=8.0)
     reference = demand("F3000|G1 Y20|Y0", config)
@@ -70,7 +70,7 @@ def test_gantry_axis_with_unequal_drives_is_at_their_mean() -> None:
 
 
 def test_deviation_and_sensitivity_share_a_gantry_axis_between_its_drives() -> None:
-    one, two = parse(bench_document("XY")), parse(rotary_and_gantry_document())
+    one, two = parse_config(bench_document("XY")), parse_config(rotary_and_gantry_document())
     std, rise = [], []
     for config in (one, two):
         reference, models = demand("F6000|G1 Y20|Y0", config), nominal_models(config)
@@ -86,7 +86,7 @@ def test_deviation_and_sensitivity_share_a_gantry_axis_between_its_drives() -> N
 
 @pytest.mark.parametrize(("method", "gain"), [("inverse", 20.0), ("mirror", 3.0)])
 def test_correction_of_a_rotary_and_a_gantry_axis_helps_and_keeps_its_limits(method: str, gain: float) -> None:
-    config = parse(rotary_and_gantry_document())
+    config = parse_config(rotary_and_gantry_document())
     models = nominal_models(config)
     models["Y2"] = models["Y2"].replace_values(Jt=0.09)
     planned = correction.plan(demand("F1500|G1 X20 Y10 A20|X0 A0|Y0", config), models, config, method)

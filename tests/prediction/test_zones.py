@@ -46,7 +46,7 @@ def lagging(y_gain: float) -> MachineConfig:
     for axis in document["axis"].values():
         axis["regulators"]["speed_feedforward"] = 0.9
     document["axis"]["Y"]["regulators"]["position_gain_per_s"] = y_gain
-    return configuration.parse(document)
+    return configuration.parse_config(document)
 
 
 def at(zone: Zone) -> Float:
@@ -107,7 +107,7 @@ def test_saturation() -> None:
     document = bench_document()
     for axis in document["axis"].values():
         axis["regulators"]["current_limit_a"] = 20.0
-    found = zones(line((0.0, 0.0), (60.0, 0.0), (60.0, 60.0)), NOMINAL, configuration.parse(document))
+    found = zones(line((0.0, 0.0), (60.0, 0.0), (60.0, 60.0)), NOMINAL, configuration.parse_config(document))
     largest = max(found, key=lambda zone: zone.max_um)
     assert largest.cause == "saturation"
     assert largest.max_um > 2 * max(z.max_um for z in zones(line((0.0, 0.0), (60.0, 0.0), (60.0, 60.0)), NOMINAL))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdhil.config import parse
+from fdhil.config import parse_config
 from fdhil.errors import ProgramError
 from fdhil.program import Budget, Dwell, Feed, Motion, interpret
 from fdhil.program.motions import BLEND, Corner
@@ -218,7 +218,7 @@ def test_outputs_of_any_number_order_no_motion() -> None:
 def test_budgets_of_the_configuration_name_line_and_word(text: str, line: int, word: str) -> None:
     document = bench_document()
     document["nc"] = {"max_blocks": 3000, "max_repeated_blocks": 1001, "max_call_depth": 7}
-    budget = Budget.of(parse(document).nc)
+    budget = Budget.of(parse_config(document).nc)
     with pytest.raises(ProgramError) as caught:
         list(interpret(text.splitlines(), budget))
     assert (caught.value.line, caught.value.word) == (line, word)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.config import MachineConfig, parse
+from fdhil.config import MachineConfig, parse_config
 from fdhil.program import interpret, plan
 from fdhil.program.limit_notes import limit_notes
 from fdhil.records import Float, Reason, Trajectory, freeze_array, freeze_integers
@@ -21,7 +21,7 @@ def config_of(profile: str = "linuxcnc", **nc: Any) -> MachineConfig:
     for axis in "XY":
         document["axis"][axis] |= {"rapid_speed_mm_s": 100.0, "max_acceleration_mm_s2": 2000.0}
     document["nc"] = {"profile": profile, **nc}
-    return parse(document)
+    return parse_config(document)
 
 
 def notes_of(x_mm: Float, y_mm: Float, config: MachineConfig) -> tuple[Reason, ...]:

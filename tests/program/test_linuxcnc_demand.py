@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from fdhil.config import MachineConfig, parse
+from fdhil.config import MachineConfig, parse_config
 from fdhil.correction import mirror
 from fdhil.correction import plan as correct
 from fdhil.prediction import predict_corrected
@@ -48,7 +48,7 @@ def machine(acceleration_mm_s2: float, profile: str = "trapezoidal") -> MachineC
     for axis in document["axis"].values():
         axis["max_acceleration_mm_s2"] = acceleration_mm_s2
     document["nc"] = {"profile": profile, "rapid_stop": False, "end_rest_s": 0.0}
-    return parse(document)
+    return parse_config(document)
 
 
 def ours(text: str, acceleration_mm_s2: float = ACCELERATION_MM_S2, profile: str = "trapezoidal") -> Float:

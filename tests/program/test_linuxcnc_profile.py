@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from fdhil.config import MachineConfig, parse
+from fdhil.config import MachineConfig, parse_config
 from fdhil.program import Arc, Dwell, Feed, Motion, Rapid, interpret, plan
 from fdhil.program.motions import Corner
 from fdhil.program.planner import stream
@@ -32,7 +32,7 @@ def machine(**keys: object) -> MachineConfig:
     for axis in document["axis"].values():
         axis["max_acceleration_mm_s2"] = ACCELERATION_MM_S2
     document["nc"] = {"profile": "linuxcnc", "end_rest_s": 0.0, **keys}
-    return parse(document)
+    return parse_config(document)
 
 
 def rows_of(moves: list[Motion], **keys: object) -> Float:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from fdhil.config import parse
+from fdhil.config import parse_config
 from fdhil.program import interpret, plan
 from tests.bench import bench_document, rotary_axis
 from tests.program.test_linuxcnc_demand import ACCELERATION_MM_S2, Theirs, recorder
@@ -43,7 +43,7 @@ def test_linuxcnc_profile_plans_the_demand_of_a_rotary_axis(
     for axis in "XY":
         document["axis"][axis]["max_acceleration_mm_s2"] = ACCELERATION_MM_S2
     document["nc"] = {"profile": "linuxcnc", "rapid_stop": False, "end_rest_s": 0.0}
-    config = parse(document)
+    config = parse_config(document)
     planned = plan(interpret(text.splitlines()), config).position_mm
     a = np.column_stack([planned[axis] / config.axis[axis].mm_per_unit for axis in "XYA"])
     b = theirs(text, len(a))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from fdhil.config import MachineConfig, parse
+from fdhil.config import MachineConfig, parse_config
 from fdhil.correction import plan as correct
 from fdhil.correction import streaming
 from fdhil.prediction.models import nominal_models
@@ -36,7 +36,7 @@ def machine(profile: str, axes: str = "XY", **keys: object) -> MachineConfig:
     document["nc"] = {"profile": profile, **keys}
     document["axis"]["Y"]["max_acceleration_mm_s2"] = 2500.0  # so that the axes differ
     document["axis"]["X"]["max_jerk_mm_s3"] = 150_000.0
-    return parse(document)
+    return parse_config(document)
 
 
 def cornered(moves: Sequence[Motion], corner: Corner) -> list[Motion]:
@@ -129,7 +129,7 @@ def test_a_wider_tolerance_is_faster(profile: str) -> None:
 def test_a_trapezoid_takes_its_time() -> None:
     document = bench_document()
     document["nc"] = {"profile": "trapezoidal", "end_rest_s": 0.0}
-    reference = plan([Feed(3, (100.0, 0.0, 0.0), 6000.0)], parse(document))
+    reference = plan([Feed(3, (100.0, 0.0, 0.0), 6000.0)], parse_config(document))
     assert reference.time_s[-1] == pytest.approx(100.0 / 100.0 + 100.0 / 4000.0, abs=2e-3)
     t = reference.time_s
     np.testing.assert_allclose(reference.position_mm["X"][:26], 2000.0 * t[:26] ** 2, atol=1e-9)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from fdhil.config import MachineConfig, parse
+from fdhil.config import MachineConfig, parse_config
 from fdhil.errors import ProgramError
 from fdhil.program import Arc, Dwell, Feed, Motion, Rapid, interpret, plan
 from fdhil.program.planner import stream
@@ -29,7 +29,7 @@ PROFILES = ("fir", "trapezoidal", "jerk_limited", "linuxcnc")
 def profiled(profile: str) -> MachineConfig:
     document = bench_document()
     document["nc"] = {"profile": profile}
-    return parse(document)
+    return parse_config(document)
 
 
 def test_a_feed_is_the_programmed_speed_through_two_moving_averages() -> None:
@@ -51,7 +51,7 @@ def test_an_arc_is_slowed_only_by_the_axes_that_it_moves(profile: str) -> None:
     document["nc"] = {"profile": profile}
     document["axis"]["Z"]["rapid_speed_mm_s"] = 50.0
     arc = [Arc(1, (200.0, 0.0, 0.0), (100.0, 0.0, None), 1, "XY", 6000.0)]
-    reference = plan(arc, parse(document))
+    reference = plan(arc, parse_config(document))
     speed = np.hypot(np.diff(reference.position_mm["X"]), np.diff(reference.position_mm["Y"])) / 1e-3
     assert speed.max() == pytest.approx(100.0, rel=0.01)
 
@@ -59,7 +59,7 @@ def test_an_arc_is_slowed_only_by_the_axes_that_it_moves(profile: str) -> None:
 def test_the_path_is_run_at_the_programmed_feed_without_a_stop_between_feeds() -> None:
     document = bench_document()
     document["nc"] = {"smoothing_s": [], "end_rest_s": 0.0}
-    reference = plan(MOVES[:4], parse(document))
+    reference = plan(MOVES[:4], parse_config(document))
     x, y = reference.position_mm["X"], reference.position_mm["Y"]
     speed = np.hypot(np.diff(x), np.diff(y)) / 1e-3
     length = 55 + 100 + 50 * math.pi + 50
@@ -74,7 +74,7 @@ def test_rapids_keep_each_axis_within_its_limits_and_run_straight() -> None:
     document = bench_document()
     document["nc"] = {"smoothing_s": []}
     document["axis"]["Y"]["max_acceleration_mm_s2"] = 1000.0
-    reference = plan([Rapid(1, (300.0, 200.0, 0.0))], parse(document))
+    reference = plan([Rapid(1, (300.0, 200.0, 0.0))], parse_config(document))
     x, y = reference.position_mm["X"], reference.position_mm["Y"]
     np.testing.assert_allclose(y, x * 2 / 3, atol=1e-9)
     assert np.abs(np.diff(x)).max() <= 0.5 + 1e-9
@@ -96,7 +96,7 @@ def test_rapid_and_feed_are_parted_by_an_exact_stop() -> None:
 def test_exact_stop_between_feeds_is_an_option() -> None:
     document = bench_document()
     document["nc"] = {"corner": "exact_stop", "settle_s": 0.01}
-    reference = plan(MOVES[:2], parse(document))
+    reference = plan(MOVES[:2], parse_config(document))
     corner = np.hypot(reference.position_mm["X"], reference.position_mm["Y"] - 55.0)
     assert np.count_nonzero(corner < 1e-9) >= 10
 
@@ -176,7 +176,9 @@ def test_the_path_is_run_no_faster_than_the_nc_allows(profile: str, text: str, m
     document["nc"] = {"profile": profile, "max_path_speed_mm_s": most, "end_rest_s": 0.0}
     for axis in document["axis"].values():
         axis |= {"rapid_speed_mm_s": 100.0, "max_acceleration_mm_s2": 2000.0}
-    step_mm = np.linalg.norm(np.diff(plan(list(interpret(text.split("|"))), parse(document)).path_mm, axis=0), axis=1)
+    step_mm = np.linalg.norm(
+        np.diff(plan(list(interpret(text.split("|"))), parse_config(document)).path_mm, axis=0), axis=1
+    )
     assert step_mm.max() / 0.001 == pytest.approx(most, rel=1e-3)
     moving = np.flatnonzero(step_mm > 0.0)
     if profile == "linuxcnc":
@@ -188,7 +190,7 @@ def test_a_motion_of_an_axis_that_is_not_planned_is_refused_with_its_line(profil
     """Missing, or configured in mm; a word that keeps the axis in place orders nothing."""
     document = bench_document("XYA")
     document["nc"] = {"profile": profile}
-    config = parse(document)
+    config = parse_config(document)
     assert plan(list(interpret(["G0 X10 A0", "G1 Y5 A0 F1000"])), config).position_mm["A"].max() == 0.0
     for text in ("A5", "X20 A5", "B1"):
         with pytest.raises(ProgramError, match=f"line 2, '{text[-2]}': moves axis {text[-2]}, which.*unit = \"deg\""):

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, reject
 from hypothesis import strategies as st
 
-from fdhil.config import MachineConfig, PositionRange, parse
+from fdhil.config import MachineConfig, PositionRange, parse_config
 from fdhil.errors import ConfigError, ProgramError, RecordingError
 from fdhil.program import load_trajectory, plan
 from fdhil.program.interpreter import interpret
@@ -30,7 +30,7 @@ def fine_config(per_mm: float = 1e6, sign: int = 1, corrected: bool = True, **nc
     if not corrected:
         del document["axis"]["X"]["correction"]
     document["nc"] = nc
-    return parse(document)
+    return parse_config(document)
 
 
 @given(
@@ -48,23 +48,23 @@ def test_no_position_that_fits_wraps_around_with_any_offset_and_the_next_one_is_
     document["axis"]["X"] |= {"screw_pitch_mm": pitch_mm, "drive": {"increments_per_rev": per_rev, "sign": sign}}
     document["axis"]["X"]["correction"]["max_offset_um"] = most_um
     try:
-        config = parse(document)
+        config = parse_config(document)
     except ConfigError:  # limits that no such drive can keep
         reject()
-    reach = PositionRange.of("X", config.axis["X"], 0.001)
+    reach = PositionRange.build_for_axis("X", config.axis["X"], 0.001)
     scaling, most = config.axis["X"].scaling, math.floor(most_um * 1e-3 * per_rev / pitch_mm)
     position_mm = (end * (1 << 31) + away) / (scaling.sign * scaling.increments_per_mm)
     target = scaling.convert_to_increments(position_mm)
     fits = all(-(1 << 31) <= target + offset < 1 << 31 for offset in (-most, 0, most))
-    assert reach.fits(position_mm) or not fits or most == 0
-    if reach.fits(position_mm):
+    assert reach.can_reach(position_mm) or not fits or most == 0
+    if reach.can_reach(position_mm):
         for offset in (-most, most):
             wrapped = struct.unpack("<i", struct.pack("<I", target + offset & 0xFFFFFFFF))[0]
             assert wrapped == target + offset
         return
-    assert reach.fits(reach.last_mm(position_mm))
+    assert reach.can_reach(reach.find_last_mm(position_mm))
     room_mm = (abs(away) + 2) / scaling.increments_per_mm + most_um * 1e-3 + 1e-4
-    assert abs(reach.last_mm(position_mm) - position_mm) <= room_mm
+    assert abs(reach.find_last_mm(position_mm) - position_mm) <= room_mm
     found = first_beyond({"X": np.array([0.0, position_mm, 0.0])}, config)
     assert found is not None
     assert (found.row, found.axis) == (1, "X")
@@ -86,7 +86,7 @@ def test_an_arc_between_two_ends_that_fit_is_refused_where_it_does_not() -> None
     document = bench_document("XY")
     for axis in "XY":
         document["axis"][axis]["drive"] = {"increments_per_rev": (1 << 31) - 1}  # 107 million per mm: +-19.75 mm
-    config = parse(document)
+    config = parse_config(document)
     program = ["G1 X19 Y0 F300", "G3 X19 Y2 J1 I0", "G1 X0"]
     with pytest.raises(ProgramError, match=r"line 2, 'X': axis X at 19\.75\d* mm: .* is 19\.75 mm"):
         plan(list(interpret(program)), config)
@@ -111,7 +111,7 @@ def test_a_demand_beyond_32_bits_is_refused_with_its_line(sign: int, tmp_path: P
 
 
 def test_the_message_can_be_followed() -> None:
-    reach = PositionRange.of("X", fine_config().axis["X"], 0.001)
-    told = re.search(r"is (\S+) mm;", reach.fault(1e6))
+    reach = PositionRange.build_for_axis("X", fine_config().axis["X"], 0.001)
+    told = re.search(r"is (\S+) mm;", reach.describe_fault(1e6))
     assert told is not None
-    assert reach.fits(float(told[1]))
+    assert reach.can_reach(float(told[1]))

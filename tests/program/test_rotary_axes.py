@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdhil.config import MachineConfig, parse
+from fdhil.config import MachineConfig, parse_config
 from fdhil.errors import ProgramError, RecordingError
 from fdhil.program import Budget, Rapid, interpret, plan
 from fdhil.program.demand_csv import read_demand_csv, write_demand_csv
@@ -18,7 +18,7 @@ PROFILES = ("fir", "trapezoidal", "jerk_limited", "linuxcnc")
 
 
 def machine(profile: str = "fir", **nc: object) -> MachineConfig:
-    return parse(rotary_and_gantry_document(profile=profile, **nc))
+    return parse_config(rotary_and_gantry_document(profile=profile, **nc))
 
 
 def planned(text: str, config: MachineConfig) -> Trajectory:
@@ -111,7 +111,7 @@ def test_position_beyond_32_bits_is_refused_in_degrees() -> None:
 @pytest.mark.parametrize("axis", ["U", "V", "W"])
 def test_further_linear_axes_are_planned(axis: str) -> None:
     document = bench_document(f"X{axis}")
-    demand = planned(f"F600|G1 X10 {axis}5", parse(document))
+    demand = planned(f"F600|G1 X10 {axis}5", parse_config(document))
     assert demand.position_mm[axis][-1] == pytest.approx(5.0)
 
 
@@ -165,7 +165,7 @@ def test_demand_beyond_the_limits_of_a_rotary_axis_is_noted_in_degrees(tmp_path:
     document["nc"] = {"profile": "trapezoidal"}
     path = tmp_path / "demand.csv"
     path.write_text("time_s,X_mm,Y_mm,A_deg\n" + "".join(f"{k / 1000:.3f},0,0,{0.4 * k}\n" for k in range(99)))
-    texts = [note.text for note in read_demand_csv(path, parse(document)).notes]
+    texts = [note.text for note in read_demand_csv(path, parse_config(document)).notes]
     assert any(text.startswith("axis A moves at 400 deg/s at") and "rapid_speed_deg_s is 280" in text for text in texts)
 
 

@@ -77,7 +77,7 @@ async def host_application(port: int, **more: object) -> AsyncIterator[Listening
 async def test_real_broker_receives_birth_data_and_death(tmp_path: Path) -> None:
     port = free_port()
     file = written(tmp_path, port)
-    config = machine_config.load(file)
+    config = machine_config.load_config(file)
     machine = SimulatedMachine()
     async with broker(tmp_path, open_to_all(port), port), host_application(port) as listening:
         async with publisher(file) as first:

@@ -14,8 +14,8 @@ from typing import Any, cast
 import aiomqtt
 import pytest
 
-from fdhil.config.credentials import password_of, tls_of
-from fdhil.config.publish import MqttBroker
+from fdhil.config.credentials import create_tls_context, read_password
+from fdhil.config.publish_sections import MqttBroker
 from fdhil.errors import ConnectError
 from fdhil.shopfloor import mqtt_publisher
 from fdhil.shopfloor.mqtt_publisher import HostGone, MqttSession
@@ -269,14 +269,16 @@ def _counted(tried: asyncio.Queue[None], client: Callable[..., Any]) -> Callable
 def test_unusable_credentials_are_named(tmp_path: Path) -> None:
     missing = tmp_path / "missing"
     with pytest.raises(ConnectError, match=r"password_file .*missing cannot be used: No such file"):
-        password_of(MqttBroker(user="fdhil", password_file=missing), *mqtt_publisher.BROKER)
+        read_password(MqttBroker(user="fdhil", password_file=missing), *mqtt_publisher.BROKER)
     with pytest.raises(ConnectError, match=r"tls_ca_file .*missing cannot be used: No such file"):
-        tls_of(MqttBroker(tls_ca_file=missing), *mqtt_publisher.BROKER)
+        create_tls_context(MqttBroker(tls_ca_file=missing), *mqtt_publisher.BROKER)
     certify(tmp_path)
     ca, empty = tmp_path / "ca.pem", tmp_path / "empty"
     empty.touch()
     with pytest.raises(ConnectError, match=r"tls_certificate_file .*empty cannot be used"):
-        tls_of(MqttBroker(tls_ca_file=ca, tls_certificate_file=empty, tls_key_file=empty), *mqtt_publisher.BROKER)
+        create_tls_context(
+            MqttBroker(tls_ca_file=ca, tls_certificate_file=empty, tls_key_file=empty), *mqtt_publisher.BROKER
+        )
 
 
 @pytest.mark.parametrize(
@@ -296,5 +298,5 @@ def test_invalid_settings_are_refused(settings: dict[str, Any], words: str) -> N
 
 
 def test_node_name_is_the_machine_name_without_topic_characters() -> None:
-    assert MqttBroker().node_name("mill #3 / hall +1") == "mill _3 _ hall _1"
-    assert MqttBroker(node="m3").node_name("mill") == "m3"
+    assert MqttBroker().get_node_name("mill #3 / hall +1") == "mill _3 _ hall _1"
+    assert MqttBroker(node="m3").get_node_name("mill") == "m3"

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdhil.config.publish import MtConnectAdapter
+from fdhil.config.publish_sections import MtConnectAdapter
 from fdhil.errors import ConnectError
 from fdhil.shopfloor import mtconnect_adapter
 from fdhil.shopfloor.mtconnect_adapter import MAX_AGENTS, ShdrAdapter

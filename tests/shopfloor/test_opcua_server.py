@@ -19,7 +19,7 @@ from asyncua.ua.uaerrors import (
 )
 
 from fdhil.config import MachineConfig
-from fdhil.config.users import hashed, write_users
+from fdhil.config.user_file import hash_password, write_users
 from fdhil.errors import ConnectError
 from fdhil.shopfloor.opcua_access import MOST_CONNECTIONS, OpcUaUserManager
 from fdhil.shopfloor.opcua_address_space import OWN
@@ -29,7 +29,7 @@ from fdhil.shopfloor.published_items import AXIS, BUS, MACHINE
 from fdhil.shopfloor.status_poller import StatusPoller
 from tests.daemon.simulated_machine import SimulatedMachine, config_of
 from tests.daemon.test_daemon_service import serving as daemon_serving
-from tests.drivers.nc.test_opcua import certificates
+from tests.drivers.nc.test_opcua import write_certificates
 from tests.shopfloor.status_documents import NOW_MS, VALUES, notice, publishing, said, status, trouble
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
@@ -333,9 +333,9 @@ async def test_connections_of_one_address_do_not_block_others(server_rig: Stage)
 
 @asynccontextmanager
 async def guarded(folder: Path, **keys: Any) -> AsyncIterator[str]:
-    theirs = await certificates(folder, "server", "urn:fdhil:bench")
+    theirs = await write_certificates(folder, "server", "urn:fdhil:bench")
     users = folder / "users.json"
-    write_users(users, {"scada": hashed(PASSWORD, "watch")})
+    write_users(users, {"scada": hash_password(PASSWORD, "watch")})
     files = {"certificate_file": str(theirs[0]), "private_key_file": str(theirs[1]), "users_file": str(users)}
     config = config_of(folder, publish={"opcua": {"port": 0, **files, **keys}})
     async with serve_opcua(config) as served:
@@ -343,7 +343,7 @@ async def guarded(folder: Path, **keys: Any) -> AsyncIterator[str]:
 
 
 async def entered(url: str, folder: Path, name: str, user: str | None, password: str = "") -> Any:
-    ours = await certificates(folder, name, f"urn:{name}") if not (folder / f"{name}.der").exists() else None
+    ours = await write_certificates(folder, name, f"urn:{name}") if not (folder / f"{name}.der").exists() else None
     certificate, key = ours or (folder / f"{name}.der", folder / f"{name}.pem")
     client = Client(url, PATIENCE_S)
     client.application_uri = f"urn:{name}"
@@ -376,7 +376,7 @@ async def test_client_is_authenticated_by_certificate_and_password(
     monkeypatch.setattr(OpcUaUserManager, "get_user", asked)
     trusted = tmp_path / "trusted"
     trusted.mkdir()
-    ours = await certificates(tmp_path, "scada", "urn:scada")
+    ours = await write_certificates(tmp_path, "scada", "urn:scada")
     (trusted / "scada.der").write_bytes(ours[0].read_bytes())
     async with guarded(tmp_path, trusted_clients=str(trusted)) as url:
         assert await entered(url, tmp_path, "scada", "scada", PASSWORD) == "Good"
@@ -398,7 +398,7 @@ async def test_removed_user_and_certificate_lose_access(tmp_path: Path) -> None:
     trusted = tmp_path / "trusted"
     trusted.mkdir()
     for name in ("scada", "mes"):
-        certificate, _ = await certificates(tmp_path, name, f"urn:{name}")
+        certificate, _ = await write_certificates(tmp_path, name, f"urn:{name}")
         (trusted / f"{name}.der").write_bytes(certificate.read_bytes())
     async with guarded(tmp_path, trusted_clients=str(trusted)) as url:
         client = Client(url, PATIENCE_S)
@@ -413,7 +413,7 @@ async def test_removed_user_and_certificate_lose_access(tmp_path: Path) -> None:
             assert (await wait_for_event(state)).StatusCode.name == "Good"
             write_users(tmp_path / "users.json", {})
             assert await refused(wait_for_event(state)) == BadUserAccessDenied.__name__
-        write_users(tmp_path / "users.json", {"scada": hashed(PASSWORD, "watch")})
+        write_users(tmp_path / "users.json", {"scada": hash_password(PASSWORD, "watch")})
         assert await entered(url, tmp_path, "mes", "scada", PASSWORD) == "Good"
         (trusted / "mes.der").unlink()
         assert await refused(entered(url, tmp_path, "mes", "scada", PASSWORD)) != "let in"

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.config.users import UsersFile, hashed, write_users
+from fdhil.config.user_file import UsersFile, hash_password, write_users
 from fdhil.errors import ConfigError
 from fdhil.shopfloor.opcua_access import MOST_FAILURES, OpcUaUserManager
 from fdhil.shopfloor.opcua_values import UNITS, make_unit
@@ -23,8 +23,8 @@ def test_every_unit_has_a_common_code() -> None:
 
 
 def test_password_guessing_is_blocked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("fdhil.shopfloor.opcua_access.matches", lambda user, password: password == PASSWORD)
-    write_users(tmp_path / "users.json", {"scada": hashed(PASSWORD, "watch")})
+    monkeypatch.setattr("fdhil.shopfloor.opcua_access.verify_password", lambda user, password: password == PASSWORD)
+    write_users(tmp_path / "users.json", {"scada": hash_password(PASSWORD, "watch")})
     door = OpcUaUserManager(UsersFile(tmp_path / "users.json"))
     assert door.get_user(None, "scada", PASSWORD) is not None
     for _ in range(MOST_FAILURES):

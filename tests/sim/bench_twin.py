@@ -23,7 +23,7 @@ def twin_config(axes: str = "XY", *, sim: Mapping[str, Any] | None = None, **axi
     for axis in document["axis"].values():
         axis.update(axis_keys)
     document["sim"] = {"noise": {"voltage_v": 0.0, "current_a": 0.0, "speed_rad_s": 0.0}, **(sim or {})}
-    return config.parse(document)
+    return config.parse_config(document)
 
 
 def smooth(points_mm: Float, widths: tuple[int, ...] = (60, 30)) -> Float:

@@ -26,7 +26,7 @@ def machine(axes: str = "X", noise: bool = False, **sim_axis: Any) -> config.Mac
     """Return the bench with simulator settings; noiseless sensors unless ``noise``."""
     document = bench_document(axes)
     document["sim"] = {"axis": {axes[0]: sim_axis}} | ({} if noise else {"noise": NO_NOISE})
-    return config.parse(document)
+    return config.parse_config(document)
 
 
 class Rig:

@@ -12,14 +12,14 @@ import can
 import pytest
 from can.interfaces.socketcand import socketcand
 
-from fdhil.config import CanBus, parse
-from fdhil.drivers.can import bus
+from fdhil.config import CanBus, parse_config
+from fdhil.drivers.can import bus_listener
 from fdhil.errors import ConnectError
 from fdhil.pytest_plugin import FeedDriveBench
 from fdhil.sim import fault_script
 from fdhil.sim.frame_faults import FrameFault
 from tests.bench import bench_document
-from tests.drivers.test_ports import wait_for
+from tests.drivers.test_receive_ports import wait_for
 from tests.sim.bench_twin import TwinInHand
 
 STRANGER = 0x123
@@ -100,18 +100,18 @@ def test_a_bus_that_goes_down_hangs_up_and_takes_everybody_again(bench: FeedDriv
     place = CanBus(**bench.bus_arguments)
     bench.command("nc", on=True)
     bench.wait_for("nc")
-    with bus.ListeningBus("can0", place) as listening:
-        wait_for(lambda: listening.counters()["frames"] > 20)
+    with bus_listener.ListeningBus("can0", place) as listening:
+        wait_for(lambda: listening.read_counters()["frames"] > 20)
         bench.fault("bus_down", None, duration_s=0.1)
-        wait_for(lambda: listening.ended is not None)
-    assert "the CAN hub ended the connection" in str(listening.ended)
+        wait_for(lambda: listening.end_reason is not None)
+    assert "the CAN hub ended the connection" in str(listening.end_reason)
     wait_for(lambda: _joins(place))
 
 
 def _joins(place: CanBus) -> bool:
-    with contextlib.suppress(ConnectError), bus.ListeningBus("can0", place) as listening:
-        wait_for(lambda: listening.counters()["frames"] > 20 or listening.ended is not None)
-        return listening.ended is None
+    with contextlib.suppress(ConnectError), bus_listener.ListeningBus("can0", place) as listening:
+        wait_for(lambda: listening.read_counters()["frames"] > 20 or listening.end_reason is not None)
+        return listening.end_reason is None
     return False
 
 
@@ -119,7 +119,7 @@ def _joins(place: CanBus) -> bool:
 def test_lockstep_does_not_wait_for_what_a_fault_took(listed: list[str]) -> None:
     document = bench_document("X")
     document["sim"] = {"pace": "lockstep", "lockstep_rpdo": listed}
-    twin = TwinInHand(parse(document))
+    twin = TwinInHand(parse_config(document))
     twin.switch_on()
     for _ in range(3):
         twin.send(0x301, bytes(4))

@@ -20,7 +20,7 @@ from fdhil.sim.drive.eds import eds_text as own_eds_text
 from fdhil.sim.drive.objects import serial_number
 from fdhil.sim.drive.sheet import Sheet, read_sheet
 from tests.bench import bench_document
-from tests.eds import SHEETS, eds_text, write_eds
+from tests.eds import SHEETS, format_eds, write_eds
 from tests.sim.bench_twin import TwinInHand, corner
 from tests.sim.canopen_peer import direct
 from tests.sim.rig import NO_NOISE, Abort, Rig, machine
@@ -33,7 +33,7 @@ def dressed(eds: Path, **axis: Any) -> config.MachineConfig:
     document = bench_document("X")
     document["axis"]["X"].update(axis)
     document["sim"] = {"axis": {"X": {"eds": str(eds)}}, "noise": NO_NOISE}
-    return config.parse(document)
+    return config.parse_config(document)
 
 
 @pytest.fixture
@@ -129,7 +129,7 @@ def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
         read_sheet(tmp_path / "none.eds", 1)
 
 
-LINES = st.sampled_from([line for sheet in SHEETS for line in eds_text(sheet).splitlines() if line])
+LINES = st.sampled_from([line for sheet in SHEETS for line in format_eds(sheet).splitlines() if line])
 ODD = st.sampled_from(
     [
         "DataType=0x0009",
@@ -159,7 +159,7 @@ ODD = st.sampled_from(
 @given(st.lists(LINES | ODD, min_size=1, max_size=60), st.integers(0, 500))
 def test_a_drive_can_wear_whatever_a_file_says(tmp_path: Path, lines: list[str], place: int) -> None:
     """Otherwise the file is refused in one sentence."""
-    whole = eds_text("nanotec").splitlines()
+    whole = format_eds("nanotec").splitlines()
     path = tmp_path / "odd.eds"
     path.write_text("\n".join([*whole[:place], *lines, *whole[place:]]), encoding="utf-8")
     try:
@@ -273,7 +273,7 @@ def test_the_unit_of_speed_can_be_changed_and_stored(epos4: Rig) -> None:
 
 
 def test_vendor_objects_do_not_touch_the_twins_own(tmp_path: Path) -> None:
-    text = eds_text("epos4") + "".join(VAR.format(index, "3", "1") for index in ("2101", "2110", "2121"))
+    text = format_eds("epos4") + "".join(VAR.format(index, "3", "1") for index in ("2101", "2110", "2121"))
     path = tmp_path / "clash.eds"
     path.write_text(text, encoding="utf-8")
     rig = Rig(dressed(path))

@@ -127,7 +127,7 @@ def test_sync_parameters_change_in_pre_operational_only() -> None:
 def test_other_sync_periods(period_s: float, value: int, exponent: int) -> None:
     document = bench_document("X")
     document["machine"]["sync_period_s"] = period_s
-    rig = Rig(config.parse(document))
+    rig = Rig(config.parse_config(document))
     assert (rig.read(0x60C2, 1), rig.read(0x60C2, 2, signed=True)) == (value, exponent)
     assert rig.read(0x1006) == round(period_s * 1e6)
     assert rig.drive.physics.voltage_v.size == round(period_s / 3.125e-5)

@@ -51,7 +51,7 @@ def test_other_delays(delay: int) -> None:
     document = bench_document("X")
     document["axis"]["X"]["drive"] = {"setpoint_delay_cycles": delay}
     document["sim"] = {"noise": {"voltage_v": 0, "current_a": 0, "speed_rad_s": 0}}
-    rig = Rig(config.parse(document))
+    rig = Rig(config.parse_config(document))
     rig.enable()
     demands = []
     for n in range(12):
@@ -104,7 +104,7 @@ def test_a_drive_that_counts_against_the_axis() -> None:
     document = bench_document("X")
     document["axis"]["X"]["drive"] = {"sign": -1}
     document["sim"] = {"axis": {"X": {"start_mm": 5.0}}}
-    rig = Rig(config.parse(document))
+    rig = Rig(config.parse_config(document))
     assert rig.read(0x6064, signed=True) == round(-5 * INC_PER_MM)
     rig.enable(round(-5 * INC_PER_MM))
     rig.follow(range(round(-5 * INC_PER_MM), round(-7 * INC_PER_MM), -50))

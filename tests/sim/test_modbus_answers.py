@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from fdhil.config.sensors import ModbusPlace
+from fdhil.config.sensor_sections import ModbusDevice
 from fdhil.drivers.modbus import rtu_line
-from fdhil.drivers.modbus.link import ModbusLink
+from fdhil.drivers.modbus.modbus_unit import ModbusUnit
 from fdhil.errors import DeviceError
 from fdhil.sim.wire.modbus_answers import ANSWER_FAULTS, answer, spoilt
 from fdhil.sim.wire.modbus_tcp import SensorServers
 from fdhil.sim.wire.sensor_faults import SensorFaults
 from fdhil.sim.wire.serial_lines import RtuUnits, SerialLines
-from tests.drivers.serial_peer import framed
+from tests.drivers.serial_peer import build_frame
 from tests.sim.test_modbus_sensor import a_sensor
 
 READ = struct.pack(">BHH", 4, 0, 2)
@@ -71,10 +71,10 @@ def test_the_trigger_is_written_either_way(written: bytes) -> None:
 def test_a_share_of_the_answers_is_spoilt_by_the_same_seed() -> None:
     def pieces() -> list[list[bytes]]:
         registers, faults = Counted(), SensorFaults(answers={"flipped": 20.0})
-        return [spoilt(faults, framed, 1, body(registers, faults)) for _ in range(500)]
+        return [spoilt(faults, build_frame, 1, body(registers, faults)) for _ in range(500)]
 
     registers, faults = Counted(), SensorFaults()
-    clean = [[framed(1, body(registers, faults))] for _ in range(500)]
+    clean = [[build_frame(1, body(registers, faults))] for _ in range(500)]
     assert pieces() == pieces()
     assert sum(a != b for a, b in zip(pieces(), clean, strict=True)) == pytest.approx(100, abs=40)
 
@@ -101,9 +101,9 @@ def test_a_torn_number_has_words_of_two_moments() -> None:
 def test_units_on_a_line_answer_every_function_as_over_tcp(request_: str, answered: str) -> None:
     party, (registers, faults) = RtuUnits(), (Counted(), SensorFaults())
     party.units[1] = registers, faults
-    (frame,) = party.take(framed(1, bytes.fromhex(request_)[1:]))
+    (frame,) = party.take(build_frame(1, bytes.fromhex(request_)[1:]))
     assert frame.hex().startswith(f"01{answered}")
-    assert framed(1, frame[1:-2]) == frame
+    assert build_frame(1, frame[1:-2]) == frame
     assert answer(registers, faults, bytes.fromhex(request_)[1:])[:1] == frame[1:2]
 
 
@@ -111,21 +111,21 @@ def test_units_on_a_line_answer_every_function_as_over_tcp(request_: str, answer
 
 
 @pytest.fixture
-def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[ModbusPlace, SensorFaults]]:
+def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[ModbusDevice, SensorFaults]]:
     """A served unit, with its address and faults."""
     registers = Counted()
     if request.param == "tcp":
         sensor = a_sensor()
         servers = SensorServers({"X": sensor}, {"X": ("127.0.0.1", 0)}, {"X": registers})
         servers.start()
-        yield ModbusPlace(port=servers.ports["X"], timeout_s=60.0), sensor.faults
+        yield ModbusDevice(port=servers.ports["X"], timeout_s=60.0), sensor.faults
         servers.stop()
         return
     party, faults = RtuUnits(), SensorFaults()
     party.units[1] = registers, faults
     lines = SerialLines({str(tmp_path / "line"): party})
     lines.start()
-    yield ModbusPlace(device=str(tmp_path / "line"), timeout_s=60.0, baud_rate=115200), faults
+    yield ModbusDevice(device=str(tmp_path / "line"), timeout_s=60.0, baud_rate=115200), faults
     lines.stop()
 
 
@@ -141,11 +141,11 @@ NOT_MET = {("tcp", "flipped"), ("rtu", "stale"), ("tcp", "torn"), ("rtu", "torn"
     indirect=["unit"],
 )
 async def test_an_answer_that_is_spoilt_is_got_over_or_told_and_the_next_one_is_right(
-    kind: str, unit: tuple[ModbusPlace, SensorFaults], monkeypatch: pytest.MonkeyPatch
+    kind: str, unit: tuple[ModbusDevice, SensorFaults], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place, faults = unit
     wire = "rtu" if place.device else "tcp"
-    link = ModbusLink("sensor", place)
+    link = ModbusUnit("sensor", place)
     await link.connect()
     before = await number(link)
     faults.answers[kind] = 100.0
@@ -169,8 +169,8 @@ async def test_an_answer_that_is_spoilt_is_got_over_or_told_and_the_next_one_is_
     link.close()
 
 
-async def number(link: ModbusLink) -> int:
-    high, low = await link.read_input(0, 2)
+async def number(link: ModbusUnit) -> int:
+    high, low = await link.read_input_registers(0, 2)
     return high << 16 | low
 
 

@@ -67,7 +67,7 @@ def test_axes_with_different_delays_still_follow_the_same_row() -> None:
     document = bench_document()
     document["axis"]["X"]["drive"] = {"setpoint_delay_cycles": 4}
     document["axis"]["Y"]["drive"] = {"setpoint_delay_cycles": 1}
-    twin = TwinInHand(config.parse(document))
+    twin = TwinInHand(config.parse_config(document))
     twin.switch_on()
     twin.play(corner())
     worst = []

@@ -238,7 +238,7 @@ def test_a_slow_sync_that_the_drive_was_told_of_leads_it(mode: int) -> None:
 def test_the_interpolation_time_is_whole_cycles_of_the_drive() -> None:
     document = bench_document("X")
     document["machine"]["sync_period_s"] = 0.0005
-    rig = Rig(config.parse(document))
+    rig = Rig(config.parse_config(document))
     rig.write(0x60C2, 1, 20, 1)
     for value in (0, 7):
         with pytest.raises(Abort) as abort:

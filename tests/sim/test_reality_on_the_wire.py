@@ -65,7 +65,7 @@ def test_a_weight_pulls_against_the_axis_whichever_way_the_drive_counts(sign: in
     document = bench_document("X")
     document["axis"]["X"]["drive"] = {"sign": sign}
     document["sim"] = {"noise": NO_NOISE, "axis": {"X": {"reality": {"load_nm": 8.0}}}}
-    rig = Rig(config.parse(document))
+    rig = Rig(config.parse_config(document))
     for _ in range(50):
         rig.sync()
     assert rig.drive.table_mm < -0.05  # no brake: it falls

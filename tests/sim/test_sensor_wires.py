@@ -12,7 +12,7 @@ import pytest
 from pymodbus.client import ModbusSerialClient
 
 from fdhil.cli.sim import _ready_lines
-from fdhil.config import parse
+from fdhil.config import parse_config
 from fdhil.errors import ConnectError
 from fdhil.sim.service import SimService
 from fdhil.sim.wire.registers import packed
@@ -33,7 +33,9 @@ def document(folder: Path) -> dict[str, Any]:
 
 def test_units_of_one_line_and_what_is_said_of_them(tmp_path: Path) -> None:
     events: queue.Queue[dict[str, Any]] = queue.Queue()
-    service = SimService(parse(document(tmp_path), folder=tmp_path), events.put, lambda *_: pytest.fail("no file"))
+    service = SimService(
+        parse_config(document(tmp_path), folder=tmp_path), events.put, lambda *_: pytest.fail("no file")
+    )
     running = threading.Thread(target=service.run)
     running.start()
     try:

@@ -61,7 +61,7 @@ def running(
     document["bus"] = {"can0": bus}
     document["sim"] = {"pace": pace}
     document["store"] = {"directory": str(folder)}
-    thread = ServiceThread(config.parse(document), load)
+    thread = ServiceThread(config.parse_config(document), load)
     try:
         yield thread
     finally:

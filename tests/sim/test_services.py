@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.config import parse
+from fdhil.config import parse_config
 from fdhil.sim.drive.dictionary import AbortCode, DataType, Dictionary, var
 from fdhil.sim.drive.objects import serial_number
 from fdhil.sim.drive.sdo import SdoServer
@@ -393,7 +393,7 @@ def test_objects_that_drives_have() -> None:
 
 def test_drives_of_two_machines_have_serial_numbers_of_their_own() -> None:
     """A commissioning record of another simulator's drive is invalid here."""
-    machines = [parse(bench_document("XY") | {"machine": {"name": name}}) for name in "AB"]
+    machines = [parse_config(bench_document("XY") | {"machine": {"name": name}}) for name in "AB"]
     numbers = [serial_number(machine, axis) for machine in machines for axis in "XY"]
     assert len(set(numbers)) == 4
     assert numbers == [serial_number(machine, axis) for machine in machines for axis in "XY"]

@@ -171,7 +171,7 @@ def _play_here(path: Path, demand: Path, trace: Path, script: Path) -> None:
         if event["event"] == "finished":
             service.stop()
 
-    service = SimService(config.load(path), emit, load_trajectory, faults=fault_script.load(script, ("X", "Y")))
+    service = SimService(config.load_config(path), emit, load_trajectory, faults=fault_script.load(script, ("X", "Y")))
     service.run(demand, trace)
 
 

@@ -16,7 +16,7 @@ def test_other_regulators_are_refused() -> None:
     document = bench_document("X")
     document["axis"]["X"]["regulators"] |= {"structure": "pid", "speed_ki": 0.0, "torque_feedforward": 1.0}
     with pytest.raises(ConfigError) as caught:
-        Drive("X", config.parse(document), np.random.default_rng(0))
+        Drive("X", config.parse_config(document), np.random.default_rng(0))
     assert [fault.path for fault in caught.value.faults] == [
         "axis.X.regulators.structure",
         "axis.X.regulators.torque_feedforward",

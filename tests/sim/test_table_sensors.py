@@ -79,7 +79,7 @@ def twin(tmp_path: Path) -> MachineConfig:
     quiet = {"voltage_v": 0.0, "current_a": 0.0, "speed_rad_s": 0.0, "table_um": 0.0, "table_m_s2": 0.0}
     reality = {"resonance_hz": 60.0, "position_encoder": "motor"}
     document["sim"] = {"noise": quiet, "modbus": False, "axis": {"X": {"reality": reality}}}
-    return machine_config.parse(document)
+    return machine_config.parse_config(document)
 
 
 def test_both_see_the_table_and_not_the_motor(tmp_path: Path) -> None:

@@ -9,8 +9,8 @@ import pytest
 
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import CanBus as BusSettings
-from fdhil.drivers.can.bus import ListeningBus
-from fdhil.drivers.can.error_frames import ErrorWatch
+from fdhil.drivers.can.bus_listener import ListeningBus
+from fdhil.drivers.can.error_frames import ErrorFrameMonitor
 from fdhil.errors import DeviceError
 from fdhil.guard.can_socket import ERROR, BusDown, RawCan
 from tests.socketcan.interface import CAN_FRAME, SerialAdapter, raw_socket, send, set_up
@@ -44,13 +44,13 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 
 def test_each_controller_state_and_error_is_reported(adapter: SerialAdapter) -> None:
-    watch, received = ErrorWatch(), 0
+    watch, received = ErrorFrameMonitor(), 0
     with ListeningBus("can0", settings_of(adapter)) as bus:
         for line, expected in SAID:
             adapter.say(line)
             received += 1
-            wait_for(lambda: bus.counters()["frames"] >= received)  # noqa: B023 - it is asked now
-            notices = watch.feed(bus.drain(), time.monotonic_ns())
+            wait_for(lambda: bus.read_counters()["frames"] >= received)  # noqa: B023 - it is asked now
+            notices = watch.watch_frames(bus.drain_frames(), time.monotonic_ns())
             assert [(notice.code, notice.severity) for notice in notices] == expected, line
     assert watch.count == len(SAID)
 
@@ -59,10 +59,10 @@ def test_each_controller_state_and_error_is_reported(adapter: SerialAdapter) -> 
 def test_unplugged_controller_ends_the_bus(adapter: SerialAdapter) -> None:
     with ListeningBus("can0", settings_of(adapter)) as bus:
         adapter.say("t1812AABB")
-        wait_for(lambda: bus.counters()["frames"] == 1)
+        wait_for(lambda: bus.read_counters()["frames"] == 1)
         adapter.unplug()
-        wait_for(lambda: bus.ended is not None)
-        assert "is down or gone" in str(bus.ended)
+        wait_for(lambda: bus.end_reason is not None)
+        assert "is down or gone" in str(bus.end_reason)
 
 
 def test_full_transmit_queue_is_reported_at_once(adapter: SerialAdapter) -> None:

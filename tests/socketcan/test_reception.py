@@ -19,13 +19,13 @@ import pytest
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import CanBus as BusSettings
 from fdhil.drivers.bus_source import BusSource
-from fdhil.drivers.can.bus import ListeningBus
-from fdhil.drivers.can.filters import drive_filters
-from fdhil.drivers.can.frames import FrameRing
-from fdhil.drivers.can.socketcan import SocketCanPort
+from fdhil.drivers.can.bus_listener import ListeningBus
+from fdhil.drivers.can.filters import build_drive_filters
+from fdhil.drivers.can.frame_ring import FrameRing
+from fdhil.drivers.can.socketcan_port import SocketCanPort
 from fdhil.errors import ConnectError
 from fdhil.records import Notice
-from tests.drivers.wire import machine
+from tests.drivers.frame_builder import build_machine_config
 from tests.socketcan.interface import CAN_FRAME, raw_socket, send, set_up
 
 pytestmark = pytest.mark.socketcan
@@ -52,7 +52,7 @@ with raw_socket() as raw, open(file, "rb") as shared, mmap.mmap(shared.fileno(),
 READER = """
 import sys, time
 from fdhil.config import CanBus as BusSettings
-from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.bus_listener import CanBus
 with CanBus("can0", BusSettings(interface="socketcan", channel="vcan0")) as bus:
     print("ready", flush=True)
     sys.stdin.readline()
@@ -93,10 +93,10 @@ def test_frames_arrive_in_order_with_kernel_stamps(sender: socket.socket) -> Non
         for number in range(2000):
             send(sender, number)
             if number % 100 == 99:  # a receive buffer that may not be enlarged holds 278
-                wait_for(lambda number=number: bus.counters()["frames"] == number + 1)  # type: ignore[misc]
+                wait_for(lambda number=number: bus.read_counters()["frames"] == number + 1)  # type: ignore[misc]
         after = time.monotonic_ns()
-        frames = bus.drain()
-        counters = bus.counters()
+        frames = bus.drain_frames()
+        counters = bus.read_counters()
         assert bus.stamps == "kernel"
     assert frames["data"].tolist() == list(range(2000))
     assert counters["lost"] == 0
@@ -113,12 +113,12 @@ def test_full_bus_loses_no_frame(tmp_path: Path) -> None:
         arguments = [sys.executable, "-c", SENDER, str(MANY), str(FULL_BUS), str(surely_held(bus)), str(file)]
         with subprocess.Popen(arguments) as process:
             while process.poll() is None:
-                numbers += bus.drain()["data"].tolist()
+                numbers += bus.drain_frames()["data"].tolist()
                 received[:8] = len(numbers).to_bytes(8, "little")
                 time.sleep(0.05)
-        wait_for(lambda: bus.counters()["frames"] + bus.counters()["lost"] >= MANY)
-        numbers += bus.drain()["data"].tolist()
-        assert bus.counters() == {"frames": MANY, "ring_overflow": 0, "kernel_drops": 0, "lost": 0}
+        wait_for(lambda: bus.read_counters()["frames"] + bus.read_counters()["lost"] >= MANY)
+        numbers += bus.drain_frames()["data"].tolist()
+        assert bus.read_counters() == {"frames": MANY, "ring_overflow": 0, "kernel_drops": 0, "lost": 0}
     assert numbers == list(range(MANY))
 
 
@@ -130,8 +130,8 @@ def test_frames_dropped_by_the_kernel_are_counted(sender: socket.socket) -> None
     for first in range(0, 3000, 600):
         for number in range(first, first + 600):
             send(sender, number)
-        port.receive(ring, 0.05)
-        assert ring.received + port.kernel_drops == first + 600
+        port.receive_frames(ring, 0.05)
+        assert ring.received_count + port.kernel_drops == first + 600
         drops.append(port.kernel_drops)
     assert drops == sorted(set(drops))
     assert drops[0] > 0
@@ -160,12 +160,12 @@ def test_stopped_reader_counts_missed_frames(sender: socket.socket) -> None:
 
 
 def test_kernel_filter_passes_only_the_drives_frames(sender: socket.socket) -> None:
-    with ListeningBus("can0", SETTINGS, filters=drive_filters([1, 4], [0x33])) as bus:
+    with ListeningBus("can0", SETTINGS, filters=build_drive_filters([1, 4], [0x33])) as bus:
         wanted = [0x000, 0x080, 0x081, 0x181, 0x201, 0x304, 0x581, 0x601, 0x704, 0x033]
         for can_id in [0x182, 0x7FF, 0x032, 0x80000001, 0x80000033, *wanted]:
             send(sender, 1, can_id)
-        wait_for(lambda: bus.counters()["frames"] >= len(wanted))
-        assert bus.drain()["id"].tolist() == wanted
+        wait_for(lambda: bus.read_counters()["frames"] >= len(wanted))
+        assert bus.drain_frames()["id"].tolist() == wanted
 
 
 def test_missing_or_down_interface_is_refused() -> None:
@@ -181,7 +181,7 @@ def test_missing_or_down_interface_is_refused() -> None:
 
 @pytest.mark.fault("A4")
 async def test_reception_resumes_after_the_interface_returns(tmp_path: Path) -> None:
-    source = BusSource("can0", machine(tmp_path, bus={"interface": "socketcan", "channel": "vcan0"}))
+    source = BusSource("can0", build_machine_config(tmp_path, bus={"interface": "socketcan", "channel": "vcan0"}))
     source.open()
     result: list[str] = []
 
@@ -198,7 +198,7 @@ async def test_reception_resumes_after_the_interface_returns(tmp_path: Path) -> 
             with raw_socket() as sender:
                 for number in range(50):
                     send(sender, number)
-            await until(lambda: source.counters()["frames"] == 50 * (turn + 1))  # noqa: B023 - it is asked now
+            await until(lambda: source.read_counters()["frames"] == 50 * (turn + 1))  # noqa: B023 - it is asked now
             set_up("vcan0", False)
             await until(lambda: sum("is down or gone (Network is down)" in text for text in result) == turn + 1)  # noqa: B023
             await asyncio.sleep(0.2)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdhil.config.uplink import Uplink
+from fdhil.config.uplink_section import Uplink
 from fdhil.identification.loops import DIFFER
 from fdhil.records import LoopEstimate, Reason, Verdict, freeze_array
 from fdhil.store import schema

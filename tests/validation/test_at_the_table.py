@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fdhil.config import Axis, Identification
-from fdhil.config.axis import Nominal
+from fdhil.config.axis_section import Nominal
 from fdhil.config.regulators import Regulators
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse

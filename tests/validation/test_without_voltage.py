@@ -52,7 +52,7 @@ def test_without_a_torque_constant_nothing_is_believed_and_the_way_out_is_told()
 
 def _axis(source: str) -> Axis:
     document = {"machine": {"name": "screw", "sync_period_s": 0.001}, "axis": {"X": bench_axis(**SECTION)}}
-    axis = config.parse(document).axis["X"]
+    axis = config.parse_config(document).axis["X"]
     return axis.model_copy(update={"voltage": axis.voltage.model_copy(update={"source": source})})
 
 
@@ -163,7 +163,7 @@ def test_a_running_machine_without_a_voltage_publishes_sets_that_predict_its_mov
         "machine": {"name": "screw", "sync_period_s": 0.001},
         "axis": {"X": bench_axis(**{**SECTION, "nominal": nominal})},
     }
-    pipeline = AxisPipeline("X", config.parse(document))
+    pipeline = AxisPipeline("X", config.parse_config(document))
     outcomes = [
         outcome
         for window in screw_windows()

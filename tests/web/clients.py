@@ -14,7 +14,7 @@ from fastapi import FastAPI
 
 from fdhil import config as machine_config
 from fdhil.config import MachineConfig
-from fdhil.config.users import Role, User, hashed, write_users
+from fdhil.config.user_file import Role, User, hash_password, write_users
 from fdhil.daemon.daemon_access import ClientProcess
 from fdhil.daemon.daemon_socket import SOCKET_NAME, ControlServer
 from fdhil.web.access import Access
@@ -27,7 +27,7 @@ OWN = {"X-Fdhil": "1"}
 
 @cache
 def user(role: Role) -> User:
-    return hashed(PASSWORD, role)
+    return hash_password(PASSWORD, role)
 
 
 def machine_of(folder: Path, users: bool = True, **web: Any) -> MachineConfig:

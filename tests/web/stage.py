@@ -171,7 +171,7 @@ def opened(folder: Path, rapids: int = 84, acting: bool = True) -> Iterator[Stag
     with Twin(folder / "twin.toml", folder / "twin.log") as twin:
         path = folder / "machine.toml"
         path.write_text(to_toml(_joined(asked, twin, acting)), "utf-8")
-        stage = Stage(folder, path, machine_config.load(path), twin)
+        stage = Stage(folder, path, machine_config.load_config(path), twin)
         try:
             _prepare(stage, rapids)
             stage.start_guard()

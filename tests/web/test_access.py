@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.config.users import Role, User, matches, read_users, write_users
+from fdhil.config.user_file import Role, User, read_users, verify_password, write_users
 from fdhil.errors import ConfigError
 from fdhil.web.access import (
     FREE_GUESSES,
@@ -46,9 +46,9 @@ def access(tmp_path: Path, clock: Clock) -> Access:
 
 
 def test_a_password_fits_its_user_and_nobody_else() -> None:
-    assert matches(user("operate"), PASSWORD)
-    assert not matches(user("operate"), PASSWORD + "x")
-    assert not matches(None, PASSWORD)
+    assert verify_password(user("operate"), PASSWORD)
+    assert not verify_password(user("operate"), PASSWORD + "x")
+    assert not verify_password(None, PASSWORD)
 
 
 def test_the_users_file_holds_no_password_and_is_closed_to_others(tmp_path: Path) -> None:
@@ -147,7 +147,7 @@ async def test_guesses_are_slowed_down_by_user_and_by_address(
         looked.append(password)
         return password == PASSWORD
 
-    monkeypatch.setattr("fdhil.web.access.matches", fits)
+    monkeypatch.setattr("fdhil.web.access.verify_password", fits)
     for k in range(FREE_GUESSES):
         with pytest.raises(Refused, match="wrong name or password"):
             await access.log_in("op", f"guess {k}", "192.0.2.1")
@@ -187,7 +187,7 @@ async def test_a_name_that_there_is_not_costs_as_much_as_a_wrong_password(
 async def test_a_stranger_does_not_lock_out_who_has_logged_in_where_he_is(
     access: Access, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fdhil.web.access.matches", lambda _, password: password == PASSWORD)
+    monkeypatch.setattr("fdhil.web.access.verify_password", lambda _, password: password == PASSWORD)
     await access.log_in("op", PASSWORD, "192.0.2.1")
     for k in range(FREE_GUESSES):
         with pytest.raises(Refused, match="wrong name or password"):
@@ -204,7 +204,7 @@ async def test_a_stranger_does_not_lock_out_who_has_logged_in_where_he_is(
 async def test_a_guess_from_each_of_many_addresses_locks_nobody_out(
     access: Access, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fdhil.web.access.matches", lambda _, password: password == PASSWORD)
+    monkeypatch.setattr("fdhil.web.access.verify_password", lambda _, password: password == PASSWORD)
 
     async def guess(k: int) -> str:
         try:
@@ -241,7 +241,7 @@ async def test_passwords_are_checked_in_order_of_wrong_ones_and_one_who_leaves_d
 async def test_one_computer_is_one_place_however_many_addresses_it_has(
     access: Access, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fdhil.web.access.matches", lambda *_: False)
+    monkeypatch.setattr("fdhil.web.access.verify_password", lambda *_: False)
     for k in range(FREE_GUESSES):
         with pytest.raises(Refused, match="wrong name or password"):
             await access.log_in(f"name{k}", "a guess", f"2001:db8::{k}")

@@ -17,7 +17,7 @@ from anyio import to_thread
 
 from fdhil.arming.token import ensure_token
 from fdhil.config import MachineConfig
-from fdhil.config.users import Role, write_users
+from fdhil.config.user_file import Role, write_users
 from fdhil.web.app import make_app
 from tests.daemon.simulated_machine import SimulatedMachine
 from tests.daemon.test_daemon_service import serving

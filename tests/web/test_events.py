@@ -11,14 +11,14 @@ import pytest
 
 from fdhil.config import MachineConfig
 from fdhil.daemon import black_box
-from fdhil.drivers.can.frame_history import candump
+from fdhil.drivers.can.frame_history import format_candump
 from fdhil.records import Notice
 from fdhil.store.history import History
 from fdhil.store.rows import Acknowledgement, Stamp
 from fdhil.web.app import make_app
 from tests.daemon.simulated_machine import SimulatedMachine
 from tests.daemon.test_daemon_service import _skip_kernel_warmup, serving, status_when  # noqa: F401 (a fixture)
-from tests.drivers.wire import Wire
+from tests.drivers.frame_builder import FrameBuilder
 from tests.web.clients import OWN, client_of, machine_of
 
 DAY_S = 86_400.0
@@ -132,7 +132,7 @@ async def test_without_a_daemon_it_is_said_and_nothing_is_acknowledged(client: h
 async def test_a_black_box_is_listed_drawn_and_given_as_it_is(
     client: httpx.AsyncClient, machine: MachineConfig
 ) -> None:
-    log = candump("can0", Wire(n=900).frames())
+    log = format_candump("can0", FrameBuilder(n=900).build_frames())
     black_box.write_black_box(machine.store.directory, "EchoMismatch", lambda: {"can0": log})
     (machine.store.directory / black_box.BLACK_BOX_FOLDER / "notes.log").write_text("no black box")
     (box,) = (await client.get("/api/events/black-boxes")).json()

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from fdhil.config.users import write_users
-from fdhil.config.web import Web
+from fdhil.config.user_file import write_users
+from fdhil.config.web_section import Web
 from fdhil.errors import ConnectError
 from fdhil.web.app import STATIC
 from fdhil.web.fleet_app import KEPT_S, MOST_KEPT, MOST_SETS, Answers, make_fleet_app

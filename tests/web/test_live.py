@@ -19,7 +19,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from fdhil.config import Access, MachineConfig
-from fdhil.config.users import hashed, write_users
+from fdhil.config.user_file import hash_password, write_users
 from fdhil.daemon.daemon_socket import SOCKET_NAME, ControlServer
 from fdhil.daemon.live_stream import LiveStream
 from fdhil.web.app import make_app
@@ -262,7 +262,7 @@ def test_an_owner_of_all_places_makes_room_for_another_owner(monkeypatch: pytest
 async def test_a_stranger_is_told_nothing_and_a_login_that_ends_ends_the_stream(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_users(tmp_path / "users.json", {"ann": hashed(PASSWORD, "watch")})
+    write_users(tmp_path / "users.json", {"ann": hash_password(PASSWORD, "watch")})
     config = config_of(tmp_path, web={"users_file": "users.json"})
     async with (
         pages(config) as place,

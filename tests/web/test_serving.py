@@ -13,8 +13,8 @@ import pytest
 
 from fdhil.cli.demo.processes import Process
 from fdhil.cli.demo.toml import to_toml
-from fdhil.config.users import matches, read_users
-from fdhil.config.web import Web, is_loopback
+from fdhil.config.user_file import read_users, verify_password
+from fdhil.config.web_section import Web, is_loopback
 from fdhil.errors import ConfigError, FdhilError
 from fdhil.web import serving
 from tests.bench import bench_axis
@@ -88,7 +88,7 @@ def test_users_come_and_go(tmp_path: Path, capsys: Capture, monkeypatch: pytest.
 
     code, said = run(f"{CANARY} long enough", "op", "--role", "operate")
     assert (code, CANARY in said) == (0, False)
-    assert matches(read_users(users)["op"], f"{CANARY} long enough")
+    assert verify_password(read_users(users)["op"], f"{CANARY} long enough")
     assert read_users(users)["op"].role == "operate"
     assert run("short", "ann")[0] == 2
     assert run(f"{CANARY} of ann", "a/b")[0] == 2

@@ -109,7 +109,7 @@ def _start_twin(out: Path, realtime: bool, say: Say, stack: ExitStack, document:
     (out / "machine.toml").write_text(to_toml(document), "utf-8")
     folder = Path(__file__).parent
     programs = {label: folder / name for label, name in PROGRAMS.items()}
-    return Stage(out, machine_config.load(out / "machine.toml"), twin, say, programs)
+    return Stage(out, machine_config.load_config(out / "machine.toml"), twin, say, programs)
 
 
 def _alive(stage: Stage) -> bool:

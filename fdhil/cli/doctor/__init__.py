@@ -37,7 +37,7 @@ def doctor(config: Path, offline: bool, seconds: float | None, as_json: bool) ->
     again. Only reads (--latency stores its result). If an NC runs the bus, nothing is sent; with the NC off, the drives
     are read as by fdhil check.
     """
-    machine = machine_config.load(config)
+    machine = machine_config.load_config(config)
     from fdhil.cli.doctor.latency import examine_latency, histogram_lines, latency_text
 
     latency = _measure(machine, seconds) if seconds is not None else None

@@ -11,8 +11,8 @@ from urllib.parse import urlsplit
 from fdhil.cli.doctor.storage import may_write
 from fdhil.cli.doctor.trouble import Trouble
 from fdhil.config import MachineConfig
-from fdhil.config.credentials import password_of, secret_in, tls_of
-from fdhil.config.uplink import Uplink
+from fdhil.config.credentials import create_tls_context, read_password, read_secret
+from fdhil.config.uplink_section import Uplink
 from fdhil.errors import ConnectError, StoreError
 from fdhil.store.outbox import POSITION_FILE, OutboxReader, Position, read_position
 
@@ -29,9 +29,9 @@ def examine_uplink(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
     yield from _folder(config)
     yield from _outbox(config)
     try:
-        tls_of(config.uplink, "NATS server", "uplink")
-        password_of(config.uplink, "NATS server", "uplink")
-        secret_in(config.uplink.credentials_file, "NATS server", "[uplink] credentials_file")
+        create_tls_context(config.uplink, "NATS server", "uplink")
+        read_password(config.uplink, "NATS server", "uplink")
+        read_secret(config.uplink.credentials_file, "NATS server", "[uplink] credentials_file")
     except ConnectError as error:
         yield Trouble.create_from_error("UplinkCredentials", PLACE, error, "nothing is sent")
     if not offline:

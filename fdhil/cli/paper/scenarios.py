@@ -80,7 +80,7 @@ def machine(name: str = "") -> MachineConfig:
         for part in tables:
             table = table.setdefault(part, {})
         table[last] = value
-    return configuration.parse(document, f"scenario {name}", made_up=True)
+    return configuration.parse_config(document, f"scenario {name}", made_up=True)
 
 
 RECORDINGS: Mapping[str, Scenario] = {

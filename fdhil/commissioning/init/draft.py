@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from fdhil.commissioning.init.told import Told
-from fdhil.config.reading import checked_value, field_at
+from fdhil.config.config_loader import check_value, find_field
 from fdhil.errors import ConfigError, ConfigFault
 
 OPERATOR = "entered by the operator"
@@ -55,7 +55,7 @@ class Draft:
     def _take(self, path: str, value: Any) -> None:
         if not isinstance(value, Mapping) and ".options." not in path:  # python-can checks its own options
             try:
-                value = checked_value(path, value)
+                value = check_value(path, value)
             except ConfigError as error:
                 self.missing += error.faults
         self.values[path] = Told(value, ANSWERS)
@@ -84,10 +84,10 @@ class Draft:
         if proposal is not None and not proposal.guessed:
             self.values[path] = proposal
             return
-        key = field_at(path)
+        key = find_field(path)
         meaning = key.description or "" if key is not None else ""
         if self.ask is not None:
-            answer = self.ask(Asked(path, meaning, where, proposal, check or partial(checked_value, path)))
+            answer = self.ask(Asked(path, meaning, where, proposal, check or partial(check_value, path)))
             proposal = proposal if answer is None else Told(answer, OPERATOR)
         if proposal is None:
             self.missing.append(ConfigFault(path, f"is unknown: {meaning}", where))

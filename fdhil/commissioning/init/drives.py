@@ -14,10 +14,10 @@ from fdhil.commissioning.compare_scales import Read, increments_told
 from fdhil.commissioning.init.told import Told, rounded
 from fdhil.commissioning.scan import Answers, BusScanner, Description, best_description, scan_nodes
 from fdhil.config import CanBus
-from fdhil.drivers.cia402.abilities import GENERIC_PROFILE, suggest_profile
-from fdhil.drivers.cia402.device import read_device
-from fdhil.drivers.cia402.profile import DriveProfile, speed_unit_of
-from fdhil.drivers.cia402.profile_file import read_profile
+from fdhil.drivers.cia402.capabilities import GENERIC_PROFILE, suggest_profile
+from fdhil.drivers.cia402.device_description import read_device
+from fdhil.drivers.cia402.drive_profile import DriveProfile, decode_speed_unit
+from fdhil.drivers.cia402.drive_profile_file import read_profile
 
 TWIN, TWIN_VENDOR = "fdhil_twin", 0x46444849
 MOST_AXES = 8
@@ -120,7 +120,7 @@ def told_by(read: Read, profile: DriveProfile | None) -> Iterator[tuple[str, Tol
     """Yield what a drive reports of its scales and limits, by key within [axis.X]."""
     if (turn := increments_told(read)) is not None and turn[0] >= 4:
         yield "drive.increments_per_rev", Told(round(turn[0]), f"the drive: {turn[1]}")
-    unit = speed_unit_of(read(Object.VELOCITY_UNIT, 0))
+    unit = decode_speed_unit(read(Object.VELOCITY_UNIT, 0))
     if profile is not None and unit is not None and unit != profile.speed_unit:
         yield "drive.speed_unit", Told(unit, "the drive: 0x60A9")
     yield from _ratings(read, "permille_of_rated" if profile is None else profile.current_unit)

@@ -13,12 +13,12 @@ from fdhil.commissioning.init.linuxcnc import Machine, Scale
 from fdhil.commissioning.init.questions import PITCH, QUESTIONS, Question
 from fdhil.commissioning.init.told import Told, rounded
 from fdhil.config import Drive, is_second_drive
-from fdhil.config.axis import HalPins
-from fdhil.config.axis_tables import angular, linear
-from fdhil.config.reading import checked
-from fdhil.drivers.cia402.abilities import GENERIC_PROFILE
-from fdhil.drivers.cia402.profile import DriveProfile
-from fdhil.drivers.cia402.profile_file import NO_OFFSET_ADVICE, load_profile, no_offset
+from fdhil.config.axis_section import HalPins
+from fdhil.config.axis_tables import convert_key_to_degrees, convert_key_to_mm
+from fdhil.config.config_loader import check_section
+from fdhil.drivers.cia402.capabilities import GENERIC_PROFILE
+from fdhil.drivers.cia402.drive_profile import DriveProfile
+from fdhil.drivers.cia402.drive_profile_file import NO_OFFSET_ADVICE, explain_missing_offset, load_profile
 from fdhil.errors import ConfigError, ConfigFault, EdsError
 
 UNITS_OF_CURRENT = {
@@ -265,7 +265,7 @@ def _profile(draft: Draft, path: str, folder: Path) -> DriveProfile | None:
     given = {key: value for key in keys if (value := draft.get(f"{path}.{key}")) is not None}
     if "profile" not in given or (given["profile"] == GENERIC_PROFILE and "eds" not in given):
         return None
-    return load_profile(checked(Drive, given, path).placed(folder))
+    return load_profile(check_section(Drive, given, path).resolve_paths(folder))
 
 
 def _from(path: Path, folder: Path) -> str:
@@ -301,7 +301,7 @@ def _is_rotary(draft: Draft, axis: str) -> bool:
 
 
 def _path(draft: Draft, axis: str, key: str) -> str:
-    return f"axis.{axis}.{angular(key) if _is_rotary(draft, axis) else key}"
+    return f"axis.{axis}.{convert_key_to_degrees(key) if _is_rotary(draft, axis) else key}"
 
 
 def _applies(key: str, profile: DriveProfile | None, rotary: bool) -> bool:
@@ -329,7 +329,9 @@ def _settle(draft: Draft, axis: str, question: Question, others: Sequence[str]) 
 def _guess(draft: Draft, axis: str, question: Question) -> Told | None:
     here = f"axis.{axis}."
     own = {path: value.value for path, value in draft.values.items() if path.startswith(here)}
-    known = {linear(path.removeprefix(here)): value for path, value in own.items()}  # guesses use ratios of lengths
+    known = {
+        convert_key_to_mm(path.removeprefix(here)): value for path, value in own.items()
+    }  # guesses use ratios of lengths
     try:
         value: Any = question.guess(known) if question.guess is not None else None
     except (KeyError, TypeError, ZeroDivisionError):  # too little is known, or an answer is not a number
@@ -358,5 +360,5 @@ def _settle_correction(draft: Draft, axis: str, profile: DriveProfile | None) ->
         draft.settle(path, where, no, partial(_one_of, path, ("yes", "no")))
         if draft.values.pop(path).value == "yes":
             draft.values[path] = Told({}, OPERATOR)
-    if draft.has_table(path) and profile is not None and not profile.takes_offset:
-        draft.notes.append(f"axis {axis}: {no_offset(profile)}; {NO_OFFSET_ADVICE}")
+    if draft.has_table(path) and profile is not None and not profile.can_take_offset:
+        draft.notes.append(f"axis {axis}: {explain_missing_offset(profile)}; {NO_OFFSET_ADVICE}")

@@ -10,11 +10,11 @@ from fdhil.commissioning.init.drives import FoundBus
 from fdhil.commissioning.init.interview import Found, axis_names, settle_axis, settle_hal_axis, settle_machine
 from fdhil.commissioning.init.linuxcnc import ROTARY, Machine
 from fdhil.commissioning.init.told import Told
-from fdhil.config import CanBus, CorrectionLimits, is_second_drive, parse, toml_document, unlikely
-from fdhil.config.axis import Axis
-from fdhil.config.offset_bounds import limit_faults
-from fdhil.config.reading import checked
-from fdhil.config.template import filled
+from fdhil.config import CanBus, CorrectionLimits, find_unlikely_values, is_second_drive, parse_config, parse_toml
+from fdhil.config.axis_section import Axis
+from fdhil.config.config_loader import check_section
+from fdhil.config.config_template import write_filled_template
+from fdhil.config.offset_bounds import find_limit_faults
 from fdhil.errors import ConfigError, ConfigFault
 from fdhil.records import PARAMETERS
 
@@ -110,7 +110,7 @@ def _buses(draft: Draft, interface: Told | None, *, offline: bool) -> Iterator[t
     if draft.missing:
         raise ConfigError("bus", draft.missing)
     for name, settings in draft.document.get("bus", {}).items():
-        yield name, checked(CanBus, settings, f"bus.{name}")
+        yield name, check_section(CanBus, settings, f"bus.{name}")
 
 
 def _fit_limits(draft: Draft, axis: str) -> None:
@@ -120,10 +120,10 @@ def _fit_limits(draft: Draft, axis: str) -> None:
         return
     document = draft.document
     table = {key: value for key, value in document["axis"][axis].items() if key != "correction"}
-    bare = checked(Axis, table, f"axis.{axis}")
+    bare = check_section(Axis, table, f"axis.{axis}")
     for limits in LIMITS:
         tried = bare.model_copy(update={"correction": CorrectionLimits(**limits)})
-        if not limit_faults(tried, float(draft.get("machine.sync_period_s"))):
+        if not find_limit_faults(tried, float(draft.get("machine.sync_period_s"))):
             if limits:
                 del draft.values[path]
             for key, value in limits.items():
@@ -144,7 +144,7 @@ def conclude(draft: Draft, file: Path) -> str:
     while True:
         text = text_of(draft, file)
         try:
-            config = parse(toml_document(text.encode(), str(file)), str(file), file.parent)
+            config = parse_config(parse_toml(text.encode(), str(file)), str(file), file.parent)
         except ConfigError as error:
             wrong = [fault for fault in error.faults if fault.path in draft.values]
             if draft.ask is None or not wrong:
@@ -152,7 +152,7 @@ def conclude(draft: Draft, file: Path) -> str:
             for fault in wrong:
                 draft.ask_again(fault.path, fault.what)
         else:
-            draft.notes += unlikely(config)
+            draft.notes += find_unlikely_values(config)
             return text
 
 
@@ -162,4 +162,4 @@ def text_of(draft: Draft, file: Path) -> str:
         f"{file.name}, written by fdhil init. Each value is followed by its source; {draft.guessed} are guessed: check "
         "them. A line that begins with # and no space is a setting at its default."
     )
-    return filled(draft.document, {path: value.source for path, value in draft.values.items()}, head)
+    return write_filled_template(draft.document, {path: value.source for path, value in draft.values.items()}, head)

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-from fdhil.drivers.can.frames import EXTENDED_FLAG, REMOTE_FLAG
+from fdhil.drivers.can.frame_ring import EXTENDED_FLAG, REMOTE_FLAG
 from fdhil.drivers.can.logged_frame import (
     CLASSIC_BYTES,
     ERROR_STATE,
@@ -14,14 +14,14 @@ from fdhil.drivers.can.logged_frame import (
     RATE_SWITCH,
     LoggedFrame,
     LogHeader,
-    bus_name,
-    decimal_ns,
-    error_frame,
-    lines_of,
-    micros,
-    name_remarks,
-    named_by,
-    reason_of,
+    create_error_frame,
+    explain_parse_error,
+    format_bus_name,
+    format_name_remarks,
+    parse_decimal_ns,
+    parse_name_remark,
+    read_lines,
+    round_to_us,
 )
 from fdhil.errors import RecordingError
 
@@ -47,7 +47,7 @@ _DATE = re.compile(
 _REMOTE, _FD, _RATE_SWITCH, _ERROR_STATE = 1 << 4, 1 << 12, 1 << 13, 1 << 14  # of a CANFD event
 
 
-def date_ns(text: str) -> int | None:
+def parse_date_ns(text: str) -> int | None:
     """Parse a header's date, local time, into ns since 1970; None where it is invalid.
 
     >>> date_ns("Wed May  1 10:00:00 2024") == date_ns("Mit Mai 1 10:00:00.000 am 2024")
@@ -66,7 +66,7 @@ def date_ns(text: str) -> int | None:
         return None
 
 
-class _Head:
+class _AscHeader:
     def __init__(self) -> None:
         self.names: dict[int, str] = {}
         self.base = 16
@@ -76,20 +76,20 @@ class _Head:
         self._trigger_ns: int | None = None
         self._from_trigger = False
 
-    def take(self, line: str) -> None:
-        self.names |= dict(named_by(line))
+    def read_line(self, line: str) -> None:
+        self.names |= dict(parse_name_remark(line))
         match = _HEAD.match(line)
         if match is None:
             return
         if match["start"]:
-            self._exact_ns = decimal_ns(match["start"])
+            self._exact_ns = parse_decimal_ns(match["start"])
         elif match["base"]:
             self.base = 16 if match["base"].lower() == "hex" else 10
             self.relative = (match["times"] or "").lower() == "relative"
         elif match["date"]:
-            self._date_ns = date_ns(match["date"])
+            self._date_ns = parse_date_ns(match["date"])
         elif self._trigger_ns is None:
-            self._trigger_ns = date_ns(match["trigger"])
+            self._trigger_ns = parse_date_ns(match["trigger"])
 
     def begin_measurement(self) -> None:
         """Count times from the trigger's date."""
@@ -104,15 +104,15 @@ class _Head:
         return next((date for date in dates if date is not None), None)
 
 
-def read(path: Path, skipped: Counter[str]) -> Iterator[LoggedFrame]:
+def read_frames(path: Path, skipped: Counter[str]) -> Iterator[LoggedFrame]:
     """Yield the frames of a log; RecordingError names the first line of a frame that cannot be read."""
-    head, now_ns, begun = _Head(), 0, False
-    for number, line in lines_of(path, "utf-8"):
+    head, now_ns, begun = _AscHeader(), 0, False
+    for number, line in read_lines(path, "utf-8"):
         event = _EVENT.match(line)
         if event is None:
-            head.take(line)
+            head.read_line(line)
             continue
-        now_ns = now_ns + decimal_ns(event[1]) if head.relative else decimal_ns(event[1])
+        now_ns = now_ns + parse_decimal_ns(event[1]) if head.relative else parse_decimal_ns(event[1])
         if event[2].lower().startswith("start of measurement"):
             head.begin_measurement()
             continue
@@ -120,32 +120,32 @@ def read(path: Path, skipped: Counter[str]) -> Iterator[LoggedFrame]:
             skipped[NO_DATE] += 1
         begun = True
         try:
-            frame = _frame(event[2].split(), (head.start_ns or 0) + now_ns, head)
+            frame = _parse_event(event[2].split(), (head.start_ns or 0) + now_ns, head)
         except (ValueError, IndexError) as error:
-            raise RecordingError(f"{path}, line {number}: {reason_of(error)}; copy the log again") from None
+            raise RecordingError(f"{path}, line {number}: {explain_parse_error(error)}; copy the log again") from None
         if frame is None:
             skipped[OTHER_EVENTS] += 1
         else:
             yield frame
 
 
-def _frame(words: Sequence[str], t_ns: int, head: _Head) -> LoggedFrame | None:
+def _parse_event(words: Sequence[str], t_ns: int, head: _AscHeader) -> LoggedFrame | None:
     is_fd = words[0] == "CANFD"
     words = words[1:] if is_fd else words
     if not words[0].isdecimal() or len(words) < 2:
         return None
-    bus = head.names.get(int(words[0])) or bus_name(int(words[0]))
+    bus = head.names.get(int(words[0])) or format_bus_name(int(words[0]))
     if "errorframe" in (word.lower() for word in words[1:3]):
-        return error_frame(t_ns, bus)
+        return create_error_frame(t_ns, bus)
     name, way = (words[2], words[1]) if is_fd else (words[1], words[2] if len(words) > 2 else "")
     if way not in ("Rx", "Tx"):
         return None
     can_id = int(name.rstrip("xX"), head.base) | (EXTENDED_FLAG if name[-1] in "xX" else 0)
-    parse = _fd_frame if is_fd else _classic_frame
+    parse = _parse_fd_frame if is_fd else _parse_classic_frame
     return parse(words[3:], t_ns, bus, can_id, head.base, way == "Tx")
 
 
-def _classic_frame(words: Sequence[str], t_ns: int, bus: str, can_id: int, base: int, sent: bool) -> LoggedFrame:
+def _parse_classic_frame(words: Sequence[str], t_ns: int, bus: str, can_id: int, base: int, sent: bool) -> LoggedFrame:
     if words[0] == "r":
         asked = int(words[1], base) if len(words) > 1 and words[1] != "Length" else 0
         return LoggedFrame(t_ns, bus, can_id | REMOTE_FLAG, asked, sent=sent)
@@ -156,7 +156,7 @@ def _classic_frame(words: Sequence[str], t_ns: int, bus: str, can_id: int, base:
     return LoggedFrame(t_ns, bus, can_id, dlc, data, sent=sent)
 
 
-def _fd_frame(words: Sequence[str], t_ns: int, bus: str, can_id: int, base: int, sent: bool) -> LoggedFrame:
+def _parse_fd_frame(words: Sequence[str], t_ns: int, bus: str, can_id: int, base: int, sent: bool) -> LoggedFrame:
     words = words if words[0] in ("0", "1") else words[1:]  # a symbolic name
     dlc, length = int(words[2], 16), int(words[3])
     data, rest = bytes(int(word, base) for word in words[4 : 4 + length]), words[4 + length :]
@@ -167,7 +167,7 @@ def _fd_frame(words: Sequence[str], t_ns: int, bus: str, can_id: int, base: int,
     return LoggedFrame(t_ns, bus, can_id, dlc, data, fd if flags & _FD else None, sent)
 
 
-def write(path: Path, frames: Iterable[LoggedFrame], header: LogHeader) -> None:
+def write_frames(path: Path, frames: Iterable[LoggedFrame], header: LogHeader) -> None:
     """Write a log with absolute times, counted from the date in its header."""
     start = datetime.fromtimestamp(header.start_ns // 1_000_000_000, UTC).astimezone()
     month = next(name for name, number in _MONTHS.items() if number == start.month)
@@ -176,17 +176,17 @@ def write(path: Path, frames: Iterable[LoggedFrame], header: LogHeader) -> None:
     date = f"{day} {month} {start:%d %H:%M:%S}.{part:03d} {start.year}"
     exact = f"fdhil: start {header.start_ns // 1_000_000_000}.{part:03d} s since 1970, UTC"
     lines = [f"date {date}", "base hex  timestamps absolute", "internal events logged"]
-    lines += [f"// {remark}" for remark in (exact, *name_remarks(header))]
+    lines += [f"// {remark}" for remark in (exact, *format_name_remarks(header))]
     lines += [f"Begin Triggerblock {date}", "   0.000000 Start of measurement"]
     with path.open("w", encoding="utf-8") as file:
         file.writelines(f"{line}\n" for line in lines)
         for frame in frames:
-            second, micro = divmod(micros(frame.t_ns - header.start_ns), 1_000_000)
-            file.write(f"{second:4d}.{micro:06d} {_event(frame, header.buses[frame.bus])}\n")
+            second, micro = divmod(round_to_us(frame.t_ns - header.start_ns), 1_000_000)
+            file.write(f"{second:4d}.{micro:06d} {_format_event(frame, header.buses[frame.bus])}\n")
         file.write("End TriggerBlock\n")
 
 
-def _event(frame: LoggedFrame, bus: int) -> str:
+def _format_event(frame: LoggedFrame, bus: int) -> str:
     way = "Tx" if frame.sent else "Rx"
     name = f"{frame.identifier:X}{'x' if frame.is_extended else ''}"
     data = frame.data.hex(" ").upper()

@@ -4,7 +4,7 @@ from typing import Literal
 
 import numpy as np
 
-from fdhil.drivers.can.frames import ERROR_FLAG, Frames
+from fdhil.drivers.can.frame_ring import ERROR_FLAG, Frames
 from fdhil.records import Bool, Notice
 
 # classes of an error frame's id
@@ -80,10 +80,10 @@ _OF_CONTROLLER: tuple[tuple[int, str, Severity, str], ...] = (
 )
 
 
-def error_notices(frames: Frames) -> list[Notice]:
+def translate_error_frames(frames: Frames) -> list[Notice]:
     """Translate error frames into notices, each code at most once per block.
 
-    >>> from fdhil.drivers.can.frames import frames_of
+    >>> from fdhil.drivers.can.frame_ring import frames_of
     >>> [n.code for n in error_notices(frames_of([(0, ERROR_FLAG | ERROR_BUS_OFF, bytes(8))]))]
     ['BusOff']
     """
@@ -92,72 +92,72 @@ def error_notices(frames: Frames) -> list[Notice]:
         return []
     classes = int(np.bitwise_or.reduce(errors["id"] & 0x1FFFFFFF))
     found = [row[1:] for row in _WHOLE if classes & row[0]]
-    found += [row[1:] for row in _OF_CONTROLLER if _detail(errors, ERROR_CONTROLLER, 1) & row[0]]
+    found += [row[1:] for row in _OF_CONTROLLER if _combine_data_byte(errors, ERROR_CONTROLLER, 1) & row[0]]
     if classes & (ERROR_PROTOCOL | ERROR_BUS):
-        found.append(("BusErrors", "minor", _damage(_detail(errors, ERROR_PROTOCOL, 2))))
+        found.append(("BusErrors", "minor", _describe_damage(_combine_data_byte(errors, ERROR_PROTOCOL, 2))))
     notices: dict[str, Notice] = {}
     for code, severity, text in found:  # the gravest of a code comes first
         notices.setdefault(code, Notice(code, severity, text))
     return list(notices.values())
 
 
-def _detail(errors: Frames, of_class: int, byte: int) -> int:
+def _combine_data_byte(errors: Frames, of_class: int, byte: int) -> int:
     data = errors["data"][errors["id"] & of_class != 0]
     return int(np.bitwise_or.reduce(data) >> 8 * byte & 0xFF) if data.size else 0
 
 
-def _damage(kinds: int) -> str:
+def _describe_damage(kinds: int) -> str:
     named = ", ".join(name for bit, name in _DAMAGE.items() if kinds & bit)
     how = f" ({named} errors)" if named else ""
     return f"Frames on the bus are damaged{how} and sent again; check termination, shield and bit rate."
 
 
-class ErrorWatch:
+class ErrorFrameMonitor:
     """Reports each error code when it first occurs, and when it has ended; repeated frames are only counted."""
 
     def __init__(self) -> None:
         self.count = 0
-        self._told: dict[str, Notice] = {}
+        self._reported: dict[str, Notice] = {}
         self._newest_ns: dict[str, int] = {}
         self._lasting: set[str] = set()
 
-    def feed(self, frames: Frames, now_ns: int) -> list[Notice]:
+    def watch_frames(self, frames: Frames, now_ns: int) -> list[Notice]:
         """Take a block of frames; ``now_ns`` is the host's monotonic time."""
-        found = error_notices(frames)
+        found = translate_error_frames(frames)
         self.count += int(np.count_nonzero(frames["id"] & ERROR_FLAG))
-        fresh = [notice for notice in found if self._is_news(notice)]
+        fresh = [notice for notice in found if self._is_new(notice)]
         for notice in found:
             self._newest_ns[notice.code] = int(frames["t_ns"][-1])
-        if self._told and frames.size:
-            self._follow(frames)
-        return [*fresh, *self._over(now_ns)]
+        if self._reported and frames.size:
+            self._track_controller(frames)
+        return [*fresh, *self._report_recovery(now_ns)]
 
-    def _is_news(self, notice: Notice) -> bool:
-        reported = self._told.get(notice.code)
+    def _is_new(self, notice: Notice) -> bool:
+        reported = self._reported.get(notice.code)
         if reported is not None and (reported.severity == "MAJOR" or notice.severity == "minor"):
             return False
-        self._told[notice.code] = notice
+        self._reported[notice.code] = notice
         return True
 
-    def _follow(self, frames: Frames) -> None:
+    def _track_controller(self, frames: Frames) -> None:
         """Track the controller: bus-off ends with a received frame, error-passive when it reports so."""
         error = frames["id"] & ERROR_FLAG != 0
         of_class = np.where(error, frames["id"], 0)
         detail = np.where(of_class & ERROR_CONTROLLER, frames["data"] >> np.uint64(8), 0)
         active = (detail & CONTROLLER_ACTIVE != 0) | (of_class & ERROR_RESTARTED != 0)
         passive = detail & (CONTROLLER_WARNING | CONTROLLER_PASSIVE) != 0
-        self._last_of("BusOff", of_class & ERROR_BUS_OFF != 0, active | ~error)
-        self._last_of("ErrorPassive", passive, active)
+        self._track_condition("BusOff", of_class & ERROR_BUS_OFF != 0, active | ~error)
+        self._track_condition("ErrorPassive", passive, active)
 
-    def _last_of(self, code: str, begins: Bool, ends: Bool) -> None:
+    def _track_condition(self, code: str, begins: Bool, ends: Bool) -> None:
         began, ended = (int(np.flatnonzero(which)[-1]) if which.any() else -1 for which in (begins, ends))
         if began > ended:
             self._lasting.add(code)
         elif ended >= 0:
             self._lasting.discard(code)
 
-    def _over(self, now_ns: int) -> list[Notice]:
+    def _report_recovery(self, now_ns: int) -> list[Notice]:
         over = [c for c, t_ns in self._newest_ns.items() if c not in self._lasting and now_ns - t_ns > _QUIET_NS]
         for code in over:
-            del self._newest_ns[code], self._told[code]
+            del self._newest_ns[code], self._reported[code]
         return [Notice(code, "info", _RECOVERED[code]) for code in over if code in _RECOVERED]

@@ -4,14 +4,14 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, Frames
-from fdhil.drivers.can.port import Filter
+from fdhil.drivers.can.frame_ring import ERROR_FLAG, EXTENDED_FLAG, Frames
+from fdhil.drivers.can.receive_port import Filter
 
 _NODE = 0x07F
 _COB_ID = 0x7FF
 
 
-def drive_filters(node_ids: Iterable[int], cob_ids: Iterable[int]) -> list[Filter]:
+def build_drive_filters(node_ids: Iterable[int], cob_ids: Iterable[int]) -> list[Filter]:
     """Return filters for NMT, SYNC and TIME, for the whole predefined connection set of these nodes (SDO and EMCY
     included, for the black box), and for ``cob_ids``.
 
@@ -23,7 +23,7 @@ def drive_filters(node_ids: Iterable[int], cob_ids: Iterable[int]) -> list[Filte
     return [(node, EXTENDED_FLAG | _NODE) for node in nodes] + [(i, EXTENDED_FLAG | _COB_ID) for i in others]
 
 
-def passing(frames: Frames, filters: Sequence[Filter]) -> Frames:
+def filter_frames(frames: Frames, filters: Sequence[Filter]) -> Frames:
     """Return the frames that pass a filter, and all error frames; without filters, all frames."""
     if not filters:
         return frames

@@ -15,9 +15,9 @@ class WallClock:
     def __init__(self) -> None:
         self._ahead_ns: int | None = None
 
-    def ahead_ns(self) -> int:
+    def measure_ahead_ns(self) -> int:
         """Return by how much the wall clock is ahead now."""
-        spread, ahead = min(self._reading() for _ in range(3))
+        spread, ahead = min(self._read_clocks() for _ in range(3))
         if self._ahead_ns is not None and spread > self._SPREAD_NS:
             return self._ahead_ns  # interrupted between the clocks: the reading is useless
         if self._ahead_ns is None or abs(ahead - self._ahead_ns) > self._SET_NS:
@@ -27,20 +27,20 @@ class WallClock:
         return self._ahead_ns
 
     @staticmethod
-    def _reading() -> tuple[int, int]:
+    def _read_clocks() -> tuple[int, int]:
         before = time.monotonic_ns()
         wall = time.time_ns()
         after = time.monotonic_ns()
         return after - before, wall - (before + after) // 2
 
 
-def monotonic_ns(wall_ns: int, wall_ahead_ns: int) -> int:
+def convert_to_monotonic_ns(wall_ns: int, wall_ahead_ns: int) -> int:
     """Convert a wall-clock stamp to the monotonic clock; return now, when the wall clock was set since the stamp."""
     now_ns, stamp_ns = time.monotonic_ns(), wall_ns - wall_ahead_ns
     return stamp_ns if now_ns - 1_000_000_000 < stamp_ns <= now_ns + 5_000_000 else now_ns
 
 
-class DistantClock:
+class RemoteClock:
     """A remote clock (of a CAN controller, of a hub) against the monotonic one, by its quickest recent reading.
 
     No reading arrives before it was sent, so the one that seems furthest ahead was the quickest. Readings older than
@@ -54,7 +54,7 @@ class DistantClock:
         self._window_ns = round(window_s * 1e9)
         self._readings: deque[tuple[int, int]] = deque()  # (time, ahead), in descending order of ahead
 
-    def ahead_ns(self, stamp_ns: int, now_ns: int) -> int:
+    def track_ahead_ns(self, stamp_ns: int, now_ns: int) -> int:
         """Add a reading; return by how much the remote clock is ahead."""
         ahead, kept = stamp_ns - now_ns, self._readings
         if kept and ahead < kept[0][1] - self._SET_BACK_NS:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
+from fdhil.drivers.can.frame_ring import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
 from fdhil.errors import RecordingError
 
 IDENTIFIER_MASK = 0x1FFFFFFF
@@ -19,7 +19,7 @@ _MOST_CHARACTERS = 4096  # of a line
 _BY_NUMBER = re.compile(r"can(0|[1-9]\d{0,2})")
 
 
-def fd_dlc(count: int) -> int:
+def encode_fd_dlc(count: int) -> int:
     """Return the data length code of a CAN FD frame; ValueError for an impossible byte count."""
     if count not in FD_LENGTHS:
         raise ValueError(f"{count} bytes in a CAN FD frame, which has 0 to 8, 12, 16, 20, 24, 32, 48 or 64")
@@ -69,7 +69,7 @@ class LoggedFrame:
         return bool(self.can_id & EXTENDED_FLAG)
 
 
-def error_frame(t_ns: int, bus: str, sent: bool | None = None) -> LoggedFrame:
+def create_error_frame(t_ns: int, bus: str, sent: bool | None = None) -> LoggedFrame:
     return LoggedFrame(t_ns, bus, BUS_ERROR, CLASSIC_BYTES, bytes(CLASSIC_BYTES), sent=sent)
 
 
@@ -83,7 +83,7 @@ class LogHeader:
     digits: int = 6
 
 
-def number_buses(names: Iterable[str]) -> dict[str, int]:
+def assign_bus_numbers(names: Iterable[str]) -> dict[str, int]:
     """Number the buses from 1: ``can0`` is 1, as in can-utils; other names get the free numbers.
 
     >>> number_buses(["vcan0", "can1", "can0"])
@@ -100,7 +100,7 @@ def number_buses(names: Iterable[str]) -> dict[str, int]:
     return numbers | dict(zip(others, free, strict=False))
 
 
-def bus_name(number: int) -> str:
+def format_bus_name(number: int) -> str:
     """Return the name of a bus by its number from 1; some programs write 0 for an unknown bus."""
     return f"can{number - 1}" if number > 0 else "can"
 
@@ -108,25 +108,27 @@ def bus_name(number: int) -> str:
 _REMARK = re.compile(r"\W*fdhil: bus (\d+) is (\S+)")
 
 
-def name_remarks(header: LogHeader) -> list[str]:
+def format_name_remarks(header: LogHeader) -> list[str]:
     """Return remarks with the names of those buses that their number does not imply."""
-    return [f"fdhil: bus {number} is {name}" for name, number in header.buses.items() if bus_name(number) != name]
+    return [
+        f"fdhil: bus {number} is {name}" for name, number in header.buses.items() if format_bus_name(number) != name
+    ]
 
 
-def named_by(line: str) -> Iterator[tuple[int, str]]:
+def parse_name_remark(line: str) -> Iterator[tuple[int, str]]:
     """Yield number and name of a bus if the line is such a remark."""
     if (match := _REMARK.match(line)) is not None:
         yield int(match[1]), match[2]
 
 
-def reason_of(error: Exception) -> str:
+def explain_parse_error(error: Exception) -> str:
     text = str(error)
     if text.startswith("invalid literal for int()"):  # Python's own words
         return f"{text.rpartition(': ')[2][:40]} where a number belongs (record with numbers, not names)"
     return text if isinstance(error, ValueError) else "it ends in the middle of a frame"
 
 
-def lines_of(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
+def read_lines(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
     """Yield the lines of a log with their numbers; RecordingError for an overlong line."""
     try:
         with path.open(encoding=encoding, errors="replace") as file:
@@ -141,7 +143,7 @@ def lines_of(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); check the file and its permissions") from None
 
 
-def decimal_ns(seconds: str) -> int:
+def parse_decimal_ns(seconds: str) -> int:
     """Convert a decimal number of seconds to ns, exactly.
 
     >>> decimal_ns("1714557600.249713")
@@ -151,5 +153,5 @@ def decimal_ns(seconds: str) -> int:
     return int(whole) * 1_000_000_000 + int(fraction[:9].ljust(9, "0"))
 
 
-def micros(ns: int) -> int:
+def round_to_us(ns: int) -> int:
     return (ns + 500) // 1000

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fdhil.cia402 import COB_SYNC
-from fdhil.drivers.can.frames import Frames
-from fdhil.drivers.can.sync_producers import SyncProducers
+from fdhil.drivers.can.frame_ring import Frames
+from fdhil.drivers.can.sync_producers import SyncProducerMonitor
 from fdhil.records import Int, Notice, TickTimes
 
 COUNTER_RANGE = 240
@@ -24,7 +24,7 @@ _UNCOUNTED = 8  # SYNCs without a counter, one after the other, until the produc
 
 
 @dataclass(frozen=True, slots=True)
-class Ticked:
+class TickedFrames:
     """Frames as columns (n,): ``can_id``, ``length``, ``data`` and ``tick``, and the SYNCs among them: ``syncs``.
 
     ``last_tick`` is the newest SYNC's, -1 before the first one.
@@ -46,7 +46,7 @@ class SyncGrid:
         self._period_ns = sync_period_s * 1e9
         self._realtime = realtime
         self._longest_silence = round(LONGEST_SILENCE_S / sync_period_s)
-        self._unheard_left = self._longest_silence
+        self._silence_left = self._longest_silence
         self._last_tick = -1
         self._last_counter: int | None = None
         self._last_ns: int | None = None
@@ -54,32 +54,32 @@ class SyncGrid:
         self._range = COUNTER_RANGE
         self._wrapped_at: int | None = None
         self._uncounted_run = 0
-        self._producers = SyncProducers(sync_period_s, realtime)
+        self._producers = SyncProducerMonitor(sync_period_s, realtime)
         self._collision = False
         self.missed = 0
         self.duplicates = 0
         self.out_of_order = 0
 
-    def feed(self, frames: Frames) -> Ticked:
+    def assign_ticks(self, frames: Frames) -> TickedFrames:
         """Give every frame its tick; a SYNC has the tick that it starts."""
         # contiguous: compared and shifted once per PDO
         can_id, length, data = (np.ascontiguousarray(frames[name]) for name in ("id", "dlc", "data"))
         where = np.flatnonzero(can_id == COB_SYNC)
         before = self._last_tick
-        self._unheard_left = self._longest_silence
+        self._silence_left = self._longest_silence
         if where.size == 0:
             empty = TickTimes(np.empty(0, np.int64), np.empty(0, np.int64))
-            return Ticked(can_id, length, data, np.full(frames.size, before, np.int64), empty, before)
+            return TickedFrames(can_id, length, data, np.full(frames.size, before, np.int64), empty, before)
         syncs = frames[where]
-        ticks = self._ticks(syncs)
+        ticks = self._count_syncs(syncs)
         kept = ticks >= 0
         where, ticks, stamps = where[kept], ticks[kept], syncs["t_ns"][kept].astype(np.int64)
         starts = np.concatenate([[before], ticks])
         tick = starts[np.searchsorted(where, np.arange(frames.size), side="right")]
-        notices = self._collisions(stamps)
-        return Ticked(can_id, length, data, tick, TickTimes(ticks, stamps), self._last_tick, notices)
+        notices = self._detect_collision(stamps)
+        return TickedFrames(can_id, length, data, tick, TickTimes(ticks, stamps), self._last_tick, notices)
 
-    def _ticks(self, syncs: Frames) -> Int:
+    def _count_syncs(self, syncs: Frames) -> Int:
         """Return the tick of every SYNC, -1 for a duplicate or one out of order."""
         counters = (syncs["data"] & np.uint64(0xFF)).astype(np.int64)
         counted = syncs["dlc"] > 0
@@ -87,53 +87,53 @@ class SyncGrid:
         if self._last_tick < 0 and self._last_counter is None and counted[0]:
             self._last_counter = (int(counters[0]) - 2) % self._range + 1
         if self._last_counter is None and not counted.any():
-            self._finish(regular, None, syncs)
+            self._accept_regular_block(regular, None, syncs)
             return regular
         if self._last_counter is not None and counted.all():
             expected = (self._last_counter + np.arange(syncs.size)) % self._range + 1
-            if np.array_equal(expected, counters) and not self._long_pause(syncs):
-                self._finish(regular, int(counters[-1]), syncs)
+            if np.array_equal(expected, counters) and not self._has_long_pause(syncs):
+                self._accept_regular_block(regular, int(counters[-1]), syncs)
                 return regular
         ticks = [
-            self._step(int(c) if has else None, int(t))
+            self._count_irregular_sync(int(c) if has else None, int(t))
             for c, has, t in zip(counters, counted, syncs["t_ns"], strict=True)
         ]
         return np.array(ticks, np.int64)
 
-    def _long_pause(self, syncs: Frames) -> bool:
+    def _has_long_pause(self, syncs: Frames) -> bool:
         """Return whether the counter may have wrapped fully between two of these SYNCs."""
         before = syncs["t_ns"][0] if self._last_ns is None else self._last_ns
         stamps = np.concatenate([[before], syncs["t_ns"]])
         return self._realtime and bool(np.diff(stamps).max() > self._range // 2 * self._period_ns)
 
-    def _finish(self, ticks: Int, counter: int | None, syncs: Frames) -> None:
+    def _accept_regular_block(self, ticks: Int, counter: int | None, syncs: Frames) -> None:
         self._last_tick = int(ticks[-1])
         self._last_counter = counter
         self._last_ns = int(syncs["t_ns"][-1])
         self._suspect = None
         self._uncounted_run = 0
-        self._producers.regular(syncs.size, counter)
+        self._producers.note_regular_block(syncs.size, counter)
 
-    def _step(self, counter: int | None, t_ns: int) -> int:
-        self._producers.irregular(counter, self._range)
+    def _count_irregular_sync(self, counter: int | None, t_ns: int) -> int:
+        self._producers.note_irregular_sync(counter, self._range)
         if counter is None or self._last_counter is None:
-            return self._uncounted(counter, t_ns)
+            return self._count_uncounted_sync(counter, t_ns)
         self._uncounted_run = 0
         self._learn_range(counter, t_ns)
         ahead = (counter - self._last_counter) % self._range
-        whole_turns = self._whole_turns(ahead, t_ns)
+        whole_turns = self._count_missed_turns(ahead, t_ns)
         if ahead == 0 and whole_turns == 0:
             self.duplicates += 1
             return -1
         backward = self._range >= _SHORT_RANGE and ahead > self._range // 2
-        if backward and whole_turns == 0 and not self._continues(counter):
+        if backward and whole_turns == 0 and not self._is_restarted(counter):
             self.out_of_order += 1
             self._suspect = counter
             return -1
         self._suspect = None
         ahead += self._range * whole_turns
         self.missed += ahead - 1
-        return self._advance(ahead, counter, t_ns)
+        return self._advance_tick(ahead, counter, t_ns)
 
     def _learn_range(self, counter: int, t_ns: int) -> None:
         """Learn the counter's range (0x1019) from where it wraps to 1: by time, or at the second wrap."""
@@ -149,27 +149,27 @@ class SyncGrid:
             self._range = last
         self._wrapped_at = last
 
-    def _uncounted(self, counter: int | None, t_ns: int) -> int:
+    def _count_uncounted_sync(self, counter: int | None, t_ns: int) -> int:
         self._uncounted_run = self._uncounted_run + 1 if counter is None else 0
         if counter is None and self._last_counter is not None and self._uncounted_run < _UNCOUNTED:
             # a second producer without a counter next to the one that counts
             self.out_of_order += 1
             return -1
         if counter is None:
-            self._producers.regular(1, None)
-        return self._advance(1, counter, t_ns)
+            self._producers.note_regular_block(1, None)
+        return self._advance_tick(1, counter, t_ns)
 
-    def _advance(self, ahead: int, counter: int | None, t_ns: int) -> int:
+    def _advance_tick(self, ahead: int, counter: int | None, t_ns: int) -> int:
         self._last_tick += ahead
         self._last_counter = counter
         self._last_ns = t_ns
         return self._last_tick
 
-    def _continues(self, counter: int) -> bool:
+    def _is_restarted(self, counter: int) -> bool:
         """Return whether a counter that went backwards counts on from there: its producer was restarted."""
         return self._suspect is not None and (counter - self._suspect) % self._range == 1
 
-    def _whole_turns(self, ahead: int, t_ns: int) -> int:
+    def _count_missed_turns(self, ahead: int, t_ns: int) -> int:
         """Return the full turns of the counter that were not received.
 
         The elapsed time must fit a whole number of turns within 2 %; a simulated machine that was paused fits none. The
@@ -182,13 +182,13 @@ class SyncGrid:
         fits = max(min(2.0, self._range / 8), 0.02 * elapsed)
         if turns <= 0 or abs(elapsed - ahead - turns * self._range) > fits:
             return 0
-        counted = max(1, min(turns, self._unheard_left // self._range))
-        self._unheard_left -= counted * self._range
+        counted = max(1, min(turns, self._silence_left // self._range))
+        self._silence_left -= counted * self._range
         return counted
 
-    def _collisions(self, stamps: Int) -> tuple[Notice, ...]:
-        self._producers.stamped(stamps)
-        was, self._collision = self._collision, self._producers.two
+    def _detect_collision(self, stamps: Int) -> tuple[Notice, ...]:
+        self._producers.note_stamps(stamps)
+        was, self._collision = self._collision, self._producers.has_two_producers
         if not self._collision or was:
             return ()
         text = "Two nodes send SYNC: the sampling grid is invalid; leave only one SYNC producer on the bus."

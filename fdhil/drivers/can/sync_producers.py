@@ -16,7 +16,7 @@ _EVEN = 0.1  # of a period: difference of the two intervals that jitter may caus
 _SURE = 4.0  # standard errors
 
 
-class SyncProducers:
+class SyncProducerMonitor:
     """Monitors the SYNC of one bus; ``has_two_producers`` is evaluated after each block."""
 
     def __init__(self, sync_period_s: float, realtime: bool) -> None:
@@ -27,12 +27,12 @@ class SyncProducers:
         self._returned: deque[bool] = deque(maxlen=HISTORY)
         self._stamps_ns: deque[int] = deque(maxlen=HISTORY + 1)
 
-    def regular(self, count: int, newest: int | None) -> None:
+    def note_regular_block(self, count: int, newest: int | None) -> None:
         """Note that a block of SYNC continued its series (None: without counter)."""
         self._newest = newest
         self._returned.extend([False] * min(count, HISTORY))
 
-    def irregular(self, counter: int | None, overflow: int) -> None:
+    def note_irregular_sync(self, counter: int | None, overflow: int) -> None:
         """Note one SYNC of an irregular block, and whether it continues the series before the newest one."""
         if counter is None:
             self._returned.append(self._newest is not None)
@@ -45,16 +45,16 @@ class SyncProducers:
         self._newest = counter
         self._returned.append(same or (returns and not goes_on))
 
-    def stamped(self, stamps_ns: Int) -> None:
+    def note_stamps(self, stamps_ns: Int) -> None:
         self._stamps_ns.extend(stamps_ns.tolist())
 
     @property
-    def two(self) -> bool:
+    def has_two_producers(self) -> bool:
         if len(self._returned) < HISTORY:
             return False
-        return sum(self._returned) > HISTORY // 3 or (self._newest is None and self._early_and_late())
+        return sum(self._returned) > HISTORY // 3 or (self._newest is None and self._is_alternating())
 
-    def _early_and_late(self) -> bool:
+    def _is_alternating(self) -> bool:
         if not self._realtime or len(self._stamps_ns) <= HISTORY:
             return False
         steps = np.diff(np.array(self._stamps_ns, dtype=np.int64)) / self._period_ns

@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fdhil.cia402 import PdoEntry
-from fdhil.drivers.can.sync_grid import Ticked
-from fdhil.drivers.cia402.profile import PdoSpec
+from fdhil.drivers.can.sync_grid import TickedFrames
+from fdhil.drivers.cia402.drive_profile import PdoSpec
 from fdhil.records import Bool, Int
 
 JUDGED_TICKS = 1000
@@ -16,7 +16,7 @@ MOST = 0.75
 Words = npt.NDArray[np.uint64]
 
 
-def decode(entry: PdoEntry, data: Words) -> Int:
+def decode_entry(entry: PdoEntry, data: Words) -> Int:
     """Return the integers (n,) that ``entry`` maps in the frames' data words (n,): little-endian, sign-extended."""
     top = data << np.uint64(64 - entry.bits - entry.bit_offset)
     right = 64 - entry.bits
@@ -57,7 +57,7 @@ class PdoQueue:
     def __post_init__(self) -> None:
         self.length = self.spec.length
 
-    def add(self, ticked: Ticked, counters: DecoderCounters) -> None:
+    def add_frames(self, ticked: TickedFrames, counters: DecoderCounters) -> None:
         """Add this PDO's frames of a block; a short one is discarded, of a long one the mapped bytes are used."""
         mine = (ticked.can_id == self.cob_id).nonzero()[0]
         if mine.size == 0:
@@ -73,7 +73,7 @@ class PdoQueue:
         self.tick = np.concatenate([self.tick, ticked.tick[mine]])
         self.data = np.concatenate([self.data, ticked.data[mine]])
 
-    def lost(self, missing: Int, due: Int, first: int) -> int:
+    def count_lost(self, missing: Int, due: Int, first: int) -> int:
         """Return the frames lost on samples (n,) from tick ``first`` on: those ``missing`` of the ``due`` ones.
 
         None counts as lost before the first received frame, nor while the PDO is not synchronous.
@@ -88,26 +88,26 @@ class PdoQueue:
             self._due = self._gone = 0
         return gone if self.synchronous else 0
 
-    def forget(self, before_tick: int) -> None:
+    def drop_before(self, before_tick: int) -> None:
         """Drop frames older than ``before_tick``."""
         start = int(np.searchsorted(self.tick, before_tick))
         if start:
             self.tick, self.data = self.tick[start:], self.data[start:]
 
-    def between(self, first: int, stop: int) -> tuple[Int, Words]:
+    def select_ticks(self, first: int, stop: int) -> tuple[Int, Words]:
         """Return tick and data of the frames of ticks [first, stop)."""
         low, high = self.tick.searchsorted((first, stop))
         return self.tick[low:high], self.data[low:high]
 
-    def gapless(self, first: int, stop: int) -> Words | None:
+    def get_gapless_data(self, first: int, stop: int) -> Words | None:
         """Return the data of ticks [first, stop) when exactly one frame came in each of them, else None."""
-        tick, data = self.between(first, stop)
+        tick, data = self.select_ticks(first, stop)
         regular = tick.size == stop - first and bool((tick == np.arange(first, stop)).all())
         return data if regular else None
 
 
 @dataclass(frozen=True, slots=True)
-class Dense:
+class DensePdo:
     """A PDO on every tick of [first, first + n): data ``words`` (n,), ``present`` (n,) and ``ambiguous`` (n,).
 
     Of equal frames in one tick the first is used; different ones are ambiguous (one may be late, or another
@@ -119,11 +119,11 @@ class Dense:
     ambiguous: Bool
     count: Int
 
-    def certain(self, between: Int) -> Bool:
+    def find_certain_ticks(self, between: Int) -> Bool:
         """Return the ticks (n,) whose frame surely is theirs; the next SYNC came ``between`` (n,) periods later."""
         return self.present & ((between <= 1) | (self.count >= between))
 
-    def balance(self, due: Int) -> tuple[Int, Int, Int]:
+    def balance_frames(self, due: Int) -> tuple[Int, Int, Int]:
         """Return the numbers of missing, late and surplus frames, each (n - 1,), where ``due`` (n,) were expected.
 
         A late frame came after the next received SYNC: one too few before it, one too many behind it.
@@ -135,13 +135,13 @@ class Dense:
         return (missing - late)[:-1], late[:-1], spare[:-1]
 
 
-def dense(queue: PdoQueue, first: int, stop: int) -> Dense:
+def lay_on_grid(queue: PdoQueue, first: int, stop: int) -> DensePdo:
     """Lay the queue's frames of ticks [first, stop) on the grid."""
     n = stop - first
-    regular = queue.gapless(first, stop)
+    regular = queue.get_gapless_data(first, stop)
     if regular is not None:
-        return Dense(regular, np.ones(n, np.bool_), np.zeros(n, np.bool_), np.ones(n, np.int64))
-    tick, data = queue.between(first, stop)
+        return DensePdo(regular, np.ones(n, np.bool_), np.zeros(n, np.bool_), np.ones(n, np.int64))
+    tick, data = queue.select_ticks(first, stop)
     place = tick - first
     words = np.zeros(n, np.uint64)
     words[place[::-1]] = data[::-1]
@@ -149,11 +149,11 @@ def dense(queue: PdoQueue, first: int, stop: int) -> Dense:
     ambiguous = np.zeros(n, np.bool_)
     if tick.size > np.count_nonzero(count):
         ambiguous[place[data != words[place]]] = True
-    return Dense(words, (count > 0) & ~ambiguous, ambiguous, count)
+    return DensePdo(words, (count > 0) & ~ambiguous, ambiguous, count)
 
 
 @dataclass(frozen=True, slots=True)
-class SetpointRows:
+class SetpointSamples:
     """A set-point on samples [first, stop): ``value`` (n,), ``certain`` (n,), and the number of lost frames."""
 
     value: Int
@@ -161,7 +161,7 @@ class SetpointRows:
     lost: int
 
 
-class Setpoint:
+class SniffedSetpoint:
     """A sniffed set-point: latched at each SYNC, held while none comes, uncertain where one may have been lost.
 
     ``held`` is the value in force before the frames in the queue, None while it is unknown.
@@ -176,19 +176,19 @@ class Setpoint:
         self.shift = delay + 1  # a frame after SYNC j is latched at SYNC j+1 and in force ``delay`` cycles later
         self._reach = delay + 2  # a gap is bridged as far as frames are there when its sample is released
 
-    def rows(self, first: int, stop: int) -> SetpointRows | None:
+    def compute_samples(self, first: int, stop: int) -> SetpointSamples | None:
         """Return the set-point in force on samples [first, stop); None while it is unknown."""
-        regular = self.queue.gapless(first - self.shift, stop - self.shift)
+        regular = self.queue.get_gapless_data(first - self.shift, stop - self.shift)
         if regular is not None:
-            return SetpointRows(decode(self._entry, regular), np.ones(stop - first, np.bool_), 0)
-        ticks, words, doubtful, crowded = self._latched()
-        values = decode(self._entry, words)
+            return SetpointSamples(decode_entry(self._entry, regular), np.ones(stop - first, np.bool_), 0)
+        ticks, words, doubtful, crowded = self._select_latched()
+        values = decode_entry(self._entry, words)
         wanted = np.arange(first - self.shift, stop - self.shift)
         at = np.searchsorted(ticks, wanted, side="right") - 1
         if self.held is None and (ticks.size == 0 or at[-1] < 0):
             return None
         if ticks.size == 0:
-            return SetpointRows(np.full(wanted.size, self.held, np.int64), np.ones(wanted.size, np.bool_), 0)
+            return SetpointSamples(np.full(wanted.size, self.held, np.int64), np.ones(wanted.size, np.bool_), 0)
         now = np.maximum(at, 0)
         value = np.where(at >= 0, values[now], self.held if self.held is not None else 0)
         exact = (at >= 0) & (ticks[now] == wanted)
@@ -200,9 +200,9 @@ class Setpoint:
             certain &= at >= 0
         before_gap = np.where(at >= 0, crowded[now], self._held_crowded)
         lost = int(np.count_nonzero(gap & ~before_gap))
-        return SetpointRows(value, certain, lost)
+        return SetpointSamples(value, certain, lost)
 
-    def _latched(self) -> tuple[Int, Words, Bool, Bool]:
+    def _select_latched(self) -> tuple[Int, Words, Bool, Bool]:
         """Return tick and last word of each tick, whether its frames differed, and whether there were several."""
         tick, data = self.queue.tick, self.queue.data
         if tick.size == 0:
@@ -214,12 +214,12 @@ class Setpoint:
             doubtful[np.unique(group[data != data[last][group]])] = True
         return tick[last], data[last], doubtful, np.diff(last, prepend=-1) > 1
 
-    def forget(self, row: int) -> None:
+    def drop_before(self, row: int) -> None:
         """Drop frames that no sample from ``row`` on needs; the newest of them is held."""
         keep = row - self.shift
         count = int(np.searchsorted(self.queue.tick, keep))
         if count:
-            self.held = int(decode(self._entry, self.queue.data[count - 1 : count])[0])
+            self.held = int(decode_entry(self._entry, self.queue.data[count - 1 : count])[0])
             self._held_crowded = count > 1 and bool(self.queue.tick[count - 2] == self.queue.tick[count - 1])
             self._streaming = int(self.queue.tick[count - 1]) >= keep - self._reach
-            self.queue.forget(keep)
+            self.queue.drop_before(keep)

@@ -20,7 +20,7 @@ _SLOPE_QUERIES = 32
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class CounterLine:
     """Sample c begins at ``start`` + ``step`` * (c - ``origin``) of the timeline, to +- ``error``."""
 
     origin: int
@@ -28,7 +28,7 @@ class Line:
     step: float
     error: float
 
-    def at(self, counter: int) -> float:
+    def locate_sample(self, counter: int) -> float:
         """Return where sample ``counter`` begins."""
         return self.start + self.step * (counter - self.origin)
 
@@ -40,7 +40,7 @@ class CounterClock:
         self._step = step
         self._queries: deque[tuple[int, float, float]] = deque(maxlen=KEPT_QUERIES)
 
-    def add(self, counter: int, asked: float, answered: float) -> None:
+    def add_query(self, counter: int, asked: float, answered: float) -> None:
         """Add one query: ``counter`` is the newest complete sample, ``asked`` <= ``answered`` lie on the timeline.
 
         A counter that decreased means that the sensor was restarted: earlier queries are dropped.
@@ -49,19 +49,19 @@ class CounterClock:
             self._queries.clear()
         self._queries.append((counter, asked, answered))
 
-    def line(self) -> Line | None:
+    def estimate_line(self) -> CounterLine | None:
         """Return the middle of the band on which most queries agree, None before the first query."""
         if not self._queries:
             return None
         counter, asked, answered = (np.array(column) for column in zip(*self._queries, strict=True))
         origin = int(counter[-1])
-        step, slope_error = self._rate(counter, asked, answered)
+        step, slope_error = self._estimate_slope(counter, asked, answered)
         begun = step * (counter - origin)
         # sample c is complete at start + step (c - origin + 1), sample c + 1 is not
-        low, high = _agreed(asked - begun - 2 * step, answered - begun - step)
-        return Line(origin, (low + high) / 2, step, max((high - low) / 2, step * 1e-3) + slope_error)
+        low, high = _intersect_intervals(asked - begun - 2 * step, answered - begun - step)
+        return CounterLine(origin, (low + high) / 2, step, max((high - low) / 2, step * 1e-3) + slope_error)
 
-    def _rate(self, counter: Int, asked: Float, answered: Float) -> tuple[float, float]:
+    def _estimate_slope(self, counter: Int, asked: Float, answered: Float) -> tuple[float, float]:
         """Return the slope through the quickest half of the queries, limited to quartz tolerance about the nominal
         step, and twice its standard error over the span of all queries."""
         span = float(counter[-1] - counter[0])
@@ -83,7 +83,7 @@ class CounterClock:
         return float(np.clip(slope, low, high)), error
 
 
-def _agreed(low: Float, high: Float) -> tuple[float, float]:
+def _intersect_intervals(low: Float, high: Float) -> tuple[float, float]:
     """Return the smallest span common to the most of the intervals [low, high] (n,): Marzullo's algorithm.
 
     A few wrong queries (a stamp that was late because the computer was busy) are outvoted.

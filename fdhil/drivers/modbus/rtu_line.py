@@ -15,21 +15,21 @@ from collections import Counter
 from collections.abc import MutableSet
 from weakref import WeakSet
 
-from fdhil.config.sensors import ModbusPlace
-from fdhil.drivers.modbus.line import Answer, DamagedAnswer, ModbusRefused, Request, no_answer
-from fdhil.drivers.modbus.owed_answers import OwedAnswers
-from fdhil.drivers.modbus.rtu import (
+from fdhil.config.sensor_sections import ModbusDevice
+from fdhil.drivers.modbus.modbus_line import DamagedAnswer, ModbusAnswer, ModbusRefused, ModbusRequest, make_timeout
+from fdhil.drivers.modbus.outstanding_answers import OutstandingAnswers
+from fdhil.drivers.modbus.rtu_frames import (
     ERROR,
     WRITE_REGISTER,
-    answer_bytes,
-    fault_in,
+    build_frame,
+    classify_fault,
+    count_answer_bytes,
     find_answer,
-    framed,
     is_damaged,
-    numbers_in,
+    unpack_values,
 )
 from fdhil.drivers.serial.byte_stream import ByteStream
-from fdhil.drivers.serial.port import SerialPort
+from fdhil.drivers.serial.serial_port import SerialPort
 from fdhil.drivers.serial.server_port import ServerPort
 
 RETRIES = 2
@@ -45,23 +45,23 @@ MOST_BYTES = 512  # two longest frames: kept of invalid bytes
 class RtuLine:
     """The units on one serial device, or behind a serial server that passes their frames over TCP."""
 
-    def __init__(self, place: ModbusPlace) -> None:
+    def __init__(self, place: ModbusDevice) -> None:
         over_tcp = not place.device
         self._port: ByteStream = ServerPort(place.host, place.port) if over_tcp else SerialPort(place)
         self.place = f"Modbus RTU {place.device or f'{place.host}:{place.port}'}"
         self._advice = "check the device and its line" + ("; framing = 'tcp' is for Modbus TCP" if over_tcp else "")
         self._apart_s = NETWORK_S if over_tcp else None
         self.users: MutableSet[object] = WeakSet()
-        self.counted: Counter[str] = Counter()
+        self.fault_counts: Counter[str] = Counter()
         self._turn = asyncio.Lock()
         fast = place.baud_rate > FASTEST_BY_CHARACTERS
         self.silence_s = SILENT_ABOVE_19200_S if fast else SILENT_CHARACTERS * self._port.character_s
         self._busy_until_ns = 0
-        self._owed = OwedAnswers()
+        self._outstanding = OutstandingAnswers()
         self._late_until_ns = 0
 
     @property
-    def connected(self) -> bool:
+    def is_connected(self) -> bool:
         return self._port.is_open
 
     async def connect(self, name: str, timeout_s: float) -> None:
@@ -69,75 +69,75 @@ class RtuLine:
             if not self._port.is_open:
                 await self._port.connect(name, timeout_s)
 
-    async def ask(self, request: Request) -> Answer:
+    async def send_request(self, request: ModbusRequest) -> ModbusAnswer:
         """Send the request and return the answer; it is repeated after a damaged answer, not after a missing one."""
         async with self._turn:
             for left in range(RETRIES, -1, -1):
                 try:
-                    return await self._exchange(request)
+                    return await self._exchange_frames(request)
                 except DamagedAnswer as error:
                     if error.kind == "ModbusUnit":  # already counted, and waited for
                         raise
-                    self.counted[error.kind] += 1
+                    self.fault_counts[error.kind] += 1
                     if not left:
                         raise
         raise AssertionError("unreachable")
 
-    async def _exchange(self, request: Request) -> Answer:
-        await self._late_answers(request.name)
-        if self._owed.hide(request):
-            await self._resynchronise(request)
-        return await self._transact(request)
+    async def _exchange_frames(self, request: ModbusRequest) -> ModbusAnswer:
+        await self._drain_late_answers(request.name)
+        if self._outstanding.is_ambiguous(request):
+            await self._probe_unit(request)
+        return await self._send_and_receive(request)
 
-    async def _resynchronise(self, request: Request) -> None:
+    async def _probe_unit(self, request: ModbusRequest) -> None:
         """Have the unit answer a probe of unmistakable shape; DeviceTimeout while it does not."""
-        probe = self._owed.probe_for(request)
+        probe = self._outstanding.find_probe(request)
         if probe is not None:
             with contextlib.suppress(ModbusRefused):
-                await self._transact(probe)
+                await self._send_and_receive(probe)
             return
         self._late_until_ns = time.monotonic_ns() + round(request.timeout_s * 1e9)
-        await self._late_answers(request.name)
-        if self._owed.hide(request):
-            raise no_answer(request, self._advice)
+        await self._drain_late_answers(request.name)
+        if self._outstanding.is_ambiguous(request):
+            raise make_timeout(request, self._advice)
 
-    async def _transact(self, request: Request) -> Answer:
-        await self._fall_silent()
+    async def _send_and_receive(self, request: ModbusRequest) -> ModbusAnswer:
+        await self._wait_for_silence()
         body = struct.pack(">BHH", request.function, request.address, request.value)
-        frame = framed(request.unit, body)
+        frame = build_frame(request.unit, body)
         sent_ns = self._port.send(request.name, frame)
-        self._busy_until_ns = asked_ns = sent_ns + self._port.wire_ns(_REQUEST_BYTES)
-        self._owed.add(request, sent_ns)  # the caller may be cancelled before the answer
+        self._busy_until_ns = asked_ns = sent_ns + self._port.compute_wire_ns(_REQUEST_BYTES)
+        self._outstanding.add_request(request, sent_ns)  # the caller may be cancelled before the answer
         self._late_until_ns = asked_ns + round(2 * request.timeout_s * 1e9)
         echo = b"" if request.function == WRITE_REGISTER else frame
-        answer, answered_ns = await self._answer(request, asked_ns, echo)
+        answer, answered_ns = await self._receive_answer(request, asked_ns, echo)
         refused = answer[0] == request.function | ERROR
-        self._owed.settle_unit(request.unit, certain=not refused)
+        self._outstanding.settle_unit(request.unit, certain=not refused)
         if refused:
             raise ModbusRefused(request.name, request.address, answer[1])
-        registers = numbers_in(answer[2:], request.function, request.count) if request.count else ()
-        return Answer(registers, min(asked_ns, answered_ns), answered_ns)
+        registers = unpack_values(answer[2:], request.function, request.count) if request.count else ()
+        return ModbusAnswer(registers, min(asked_ns, answered_ns), answered_ns)
 
-    async def _late_answers(self, name: str) -> None:
-        stale, data = bool(self._port.discard()), b""
-        self._owed.forget(time.monotonic_ns())
-        while self._owed and time.monotonic_ns() < self._late_until_ns:
-            chunk = await self._port.receive(name, self._late_until_ns)
+    async def _drain_late_answers(self, name: str) -> None:
+        stale, data = bool(self._port.discard_input()), b""
+        self._outstanding.drop_expired(time.monotonic_ns())
+        while self._outstanding and time.monotonic_ns() < self._late_until_ns:
+            chunk = await self._port.receive_chunk(name, self._late_until_ns)
             data = (data + (chunk.data if chunk is not None else b""))[-MOST_BYTES:]
-            if self._owed.settle(data):
+            if self._outstanding.settle_answer(data):
                 stale, data = True, b""
-        self.counted["ModbusStale"] += stale or bool(data)
+        self.fault_counts["ModbusStale"] += stale or bool(data)
 
-    async def _fall_silent(self) -> None:
+    async def _wait_for_silence(self) -> None:
         while True:
             last_ns = max(self._busy_until_ns, self._port.last_ns)
             left_ns = last_ns + round(self.silence_s * 1e9) - time.monotonic_ns()
             if left_ns <= 0:
                 break
             await asyncio.sleep(left_ns / 1e9)
-        self._port.discard()
+        self._port.discard_input()
 
-    async def _answer(self, request: Request, asked_ns: int, echo: bytes) -> tuple[bytes, int]:
+    async def _receive_answer(self, request: ModbusRequest, asked_ns: int, echo: bytes) -> tuple[bytes, int]:
         """Return the answer and the arrival of its first character; DamagedAnswer, DeviceTimeout.
 
         ``echo``: the request as an adapter may receive it back, which is skipped.
@@ -146,14 +146,14 @@ class RtuLine:
         data, first_ns = b"", 0
         noise: DamagedAnswer | None = None
         foreign: DamagedAnswer | None = None
-        wanted = answer_bytes(function, count)
-        deadline_ns = asked_ns + round(request.timeout_s * 1e9) + port.wire_ns(wanted)
+        wanted = count_answer_bytes(function, count)
+        deadline_ns = asked_ns + round(request.timeout_s * 1e9) + port.compute_wire_ns(wanted)
         pause_ns = round((self.silence_s + (self._apart_s or ADAPTER_S)) * 1e9)
         while True:
             until_ns = min(deadline_ns, time.monotonic_ns() + pause_ns) if data else deadline_ns
-            chunk = await port.receive(request.name, until_ns)
+            chunk = await port.receive_chunk(request.name, until_ns)
             if chunk is not None:
-                first_ns = first_ns or chunk.t_ns - port.wire_ns(len(chunk.data))
+                first_ns = first_ns or chunk.t_ns - port.compute_wire_ns(len(chunk.data))
                 data = (data + chunk.data).removeprefix(echo)
                 # earlier bytes were already searched: the line may babble for long
                 found = find_answer(data[-(len(chunk.data) + wanted) :], unit, function, count)
@@ -162,20 +162,20 @@ class RtuLine:
                 data = data[-MOST_BYTES:]
                 continue
             if data:
-                damaged = DamagedAnswer(request.name, *fault_in(data, unit, function, count))
-                if self._owed.settle(data):
-                    self.counted["ModbusStale"] += 1  # our answer is still to come
+                damaged = DamagedAnswer(request.name, *classify_fault(data, unit, function, count))
+                if self._outstanding.settle_answer(data):
+                    self.fault_counts["ModbusStale"] += 1  # our answer is still to come
                 elif damaged.kind == "ModbusUnit":
-                    self.counted[damaged.kind] += 1  # another master may have asked: ours may still come
+                    self.fault_counts[damaged.kind] += 1  # another master may have asked: ours may still come
                     foreign = damaged
                 elif is_damaged(data, unit, function, count):
-                    self._owed.settle_unit(unit, certain=False)
+                    self._outstanding.settle_unit(unit, certain=False)
                     raise damaged
                 else:
                     noise = damaged
                 data, first_ns = b"", 0
             if time.monotonic_ns() >= deadline_ns:
-                raise noise or foreign or no_answer(request, self._advice)
+                raise noise or foreign or make_timeout(request, self._advice)
 
     def close(self) -> None:
         self._port.close()

@@ -4,7 +4,7 @@ from typing import ClassVar, Protocol
 
 from fdhil import tables
 from fdhil.config import MachineConfig
-from fdhil.drivers.cia402.drive import InputSamples
+from fdhil.drivers.cia402.pdo_decoder import InputSamples
 from fdhil.records import AxisSamples, MoveEvent, NcState, TickTimes
 
 
@@ -21,7 +21,7 @@ class EventSource(Protocol):
     def __init__(self, axis: str, config: MachineConfig) -> None:
         pass
 
-    def feed(self, record: AxisSamples | InputSamples | TickTimes | NcState) -> list[MoveEvent]:
+    def detect_moves(self, record: AxisSamples | InputSamples | TickTimes | NcState) -> list[MoveEvent]:
         """Take a block, or a state of the NC; return the detected moves."""
 
 

@@ -27,7 +27,7 @@ class NcSource(Protocol):
     async def __aexit__(self, *_: object) -> None:
         """Disconnect; raises nothing."""
 
-    async def read(self) -> Sequence[NcState]:
+    async def read_states(self) -> Sequence[NcState]:
         """Wait for new states and return them, the oldest first; DeviceError when the NC is lost or its answer is
         invalid.
 

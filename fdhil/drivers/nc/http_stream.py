@@ -29,9 +29,9 @@ class Response:
         self.status = 0
         self.headers: dict[str, str] = {}
 
-    async def head(self) -> None:
+    async def read_head(self) -> None:
         """Read the head; ConnectError, ProtocolError."""
-        lines = (await self._until(b"\r\n\r\n")).split(b"\r\n")
+        lines = (await self._read_until(b"\r\n\r\n")).split(b"\r\n")
         found = _STATUS.match(lines[0])
         if found is None:
             raise ProtocolError(self._name, f"answers {lines[0][:40]!r}, which is not HTTP; compare host and port")
@@ -43,15 +43,15 @@ class Response:
         length = self.headers.get("content-length", "")
         self._left = 0 if self._chunked else int(length) if length.isdecimal() and len(length) <= MOST_DIGITS else None
 
-    async def _until(self, end: bytes) -> bytes:
+    async def _read_until(self, end: bytes) -> bytes:
         while end not in self._rest:
             if len(self._rest) > MOST_HEAD_BYTES:
                 raise ProtocolError(self._name, "sends a head without an end; compare host and port")
-            self._rest += await self._received()
+            self._rest += await self._receive_bytes()
         found, _, self._rest = self._rest.partition(end)
         return found
 
-    async def _received(self) -> bytes:
+    async def _receive_bytes(self) -> bytes:
         try:
             came = await self._reader.read(READ_BYTES)
         except OSError as error:
@@ -60,24 +60,24 @@ class Response:
             raise ConnectError(self._name, "it ended the connection; is it still running?")
         return came
 
-    async def some(self) -> bytes:
+    async def read_some(self) -> bytes:
         """Return the next bytes of the body, none at its end; ConnectError, ProtocolError."""
-        if self._left == 0 and not (self._chunked and await self._next_chunk()):
+        if self._left == 0 and not (self._chunked and await self._begin_chunk()):
             return b""
         if not self._rest:
             if self._left is None and self._reader.at_eof():
                 return b""
-            self._rest = await self._received()
+            self._rest = await self._receive_bytes()
         size = len(self._rest) if self._left is None else min(self._left, len(self._rest))
         came, self._rest = self._rest[:size], self._rest[size:]
         if self._left is not None:
             self._left -= size
             if self._chunked and not self._left:
-                await self._until(b"\r\n")
+                await self._read_until(b"\r\n")
         return came
 
-    async def _next_chunk(self) -> bool:
-        size = (await self._until(b"\r\n")).partition(b";")[0].strip()
+    async def _begin_chunk(self) -> bool:
+        size = (await self._read_until(b"\r\n")).partition(b";")[0].strip()
         try:
             self._left = int(size, 16)
         except ValueError:
@@ -88,11 +88,11 @@ class Response:
             self._chunked = False
         return bool(self._left)
 
-    async def document(self) -> bytes:
+    async def read_document(self) -> bytes:
         """Return the whole body; ProtocolError if it is too large."""
         whole = b""
         try:
-            while came := await self.some():
+            while came := await self.read_some():
                 whole += came
                 if len(whole) > MOST_BYTES:
                     raise ProtocolError(self._name, f"sends more than {MOST_BYTES >> 20} MiB as one document")
@@ -102,7 +102,7 @@ class Response:
         return whole
 
 
-class Parts:
+class MultipartSplitter:
     """Splits the body of a multipart answer into its parts. Pure."""
 
     def __init__(self, name: str, content_type: str) -> None:
@@ -114,24 +114,24 @@ class Parts:
         self._mark = b"--" + found[1].encode().removeprefix(b"--")
         self._rest = b""
 
-    def feed(self, came: bytes) -> list[bytes]:
+    def split_parts(self, came: bytes) -> list[bytes]:
         """Add bytes; return the completed parts. ProtocolError for invalid ones."""
         self._rest += came
         parts = []
-        while (part := self._next()) is not None:
+        while (part := self._take_part()) is not None:
             parts.append(part)
         if len(self._rest) > MOST_BYTES + MOST_HEAD_BYTES:
             raise ProtocolError(self._name, f"sends more than {MOST_BYTES >> 20} MiB as one document")
         return parts
 
-    def _next(self) -> bytes | None:
+    def _take_part(self) -> bytes | None:
         at = self._rest.find(self._mark)
         if at < 0:
-            self._lost_if(len(self._rest) > MOST_HEAD_BYTES)
+            self._refuse_if(len(self._rest) > MOST_HEAD_BYTES)
             return None
         end = self._rest.find(b"\r\n\r\n", at)
         if end < 0:
-            self._lost_if(len(self._rest) - at > MOST_HEAD_BYTES)
+            self._refuse_if(len(self._rest) - at > MOST_HEAD_BYTES)
             return None
         length = re.search(rb"content-length:\s*(\d{1,12})", self._rest[at:end], re.IGNORECASE)
         if length is None or int(length[1]) > MOST_BYTES:
@@ -142,13 +142,13 @@ class Parts:
         part, self._rest = self._rest[begin : begin + size], self._rest[begin + size :]
         return part
 
-    def _lost_if(self, lost: bool) -> None:
+    def _refuse_if(self, lost: bool) -> None:
         if lost:
             raise ProtocolError(self._name, "sends a stream without parts; is a proxy in between?")
 
 
 @asynccontextmanager
-async def get(name: str, url: str, timeout_s: float) -> AsyncIterator[Response]:
+async def open_document(name: str, url: str, timeout_s: float) -> AsyncIterator[Response]:
     """Request a document; its head has arrived on entry. ConnectError, DeviceTimeout, ProtocolError."""
     parts = urlsplit(url)
     host, port = parts.hostname or "", parts.port or 80
@@ -163,7 +163,7 @@ async def get(name: str, url: str, timeout_s: float) -> AsyncIterator[Response]:
                     "User-Agent: fdhil\r\nConnection: close\r\n\r\n".encode("ascii", "replace")
                 )
                 response = Response(name, reader)
-                await response.head()
+                await response.read_head()
         except TimeoutError:
             text = f"{host}:{port} does not answer within {timeout_s:g} s; is it switched on and the agent running?"
             raise DeviceTimeout(name, text) if writer else ConnectError(name, text) from None

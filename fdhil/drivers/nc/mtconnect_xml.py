@@ -57,59 +57,61 @@ def read_streams(document: bytes, name: str) -> Streams:
         root = ElementTree.fromstring(document)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise ProtocolError(name, f"does not answer with an MTConnect document ({error}); compare url") from None
-    if _local(root) == "MTConnectError":
-        raise ProtocolError(name, f"refuses: {_refusal(root)}; compare url, device and path with its /probe")
-    header = next((child for child in root if _local(child) == "Header"), None)
-    if _local(root) != "MTConnectStreams" or header is None:
-        raise ProtocolError(name, f"answers with a {_local(root)[:40]} document; compare url")
+    if _get_local_name(root) == "MTConnectError":
+        raise ProtocolError(name, f"refuses: {_describe_refusal(root)}; compare url, device and path with its /probe")
+    header = next((child for child in root if _get_local_name(child) == "Header"), None)
+    if _get_local_name(root) != "MTConnectStreams" or header is None:
+        raise ProtocolError(name, f"answers with a {_get_local_name(root)[:40]} document; compare url")
     try:
         follows, size = int(header.get("nextSequence", "")), int(header.get("bufferSize", "0"))
     except ValueError:
         raise ProtocolError(name, "sends no nextSequence in its header; the agent is too old") from None
-    return Streams(header.get("instanceId", ""), follows, size, tuple(_components(root, name)))
+    return Streams(header.get("instanceId", ""), follows, size, tuple(_parse_components(root, name)))
 
 
-def _refusal(root: ElementTree.Element) -> str:
-    errors = [each for each in root.iter() if _local(each) == "Error"]
+def _describe_refusal(root: ElementTree.Element) -> str:
+    errors = [each for each in root.iter() if _get_local_name(each) == "Error"]
     return "; ".join(f"{each.get('errorCode', '')} {(each.text or '').strip()}"[:200] for each in errors) or "unknown"
 
 
-def _components(root: ElementTree.Element, name: str) -> Iterator[Component]:
-    for device in (each for each in root.iter() if _local(each) == "DeviceStream"):
+def _parse_components(root: ElementTree.Element, name: str) -> Iterator[Component]:
+    for device in (each for each in root.iter() if _get_local_name(each) == "DeviceStream"):
         identity = device.get("name", ""), device.get("uuid", "")
         for stream in device:
             kind = stream.get("component", "")
             if kind in _COMPONENTS:
                 names = stream.get("name", ""), stream.get("componentId", "")
-                yield Component(identity, kind, names, tuple(_observations(stream, name)))
+                yield Component(identity, kind, names, tuple(_parse_observations(stream, name)))
 
 
-def _observations(stream: ElementTree.Element, name: str) -> Iterator[Observation]:
-    for holder in (each for each in stream if _local(each) in _HOLDERS):
+def _parse_observations(stream: ElementTree.Element, name: str) -> Iterator[Observation]:
+    for holder in (each for each in stream if _get_local_name(each) in _HOLDERS):
         for each in holder:
             try:
                 sequence = int(each.get("sequence", ""))
             except ValueError:
-                raise ProtocolError(name, f"sends a {_local(each)[:40]} without a sequence number") from None
+                raise ProtocolError(name, f"sends a {_get_local_name(each)[:40]} without a sequence number") from None
             text = (each.text or "").strip()
             sub_type = each.get("subType", "")
-            element = f"{_local(each)}:{sub_type}" if sub_type else _local(each)
+            element = f"{_get_local_name(each)}:{sub_type}" if sub_type else _get_local_name(each)
             shown = None if text == UNAVAILABLE else text
-            yield Observation(sequence, each.get("dataItemId", ""), element, shown, _time_s(each.get("timestamp", "")))
+            yield Observation(
+                sequence, each.get("dataItemId", ""), element, shown, _parse_time_s(each.get("timestamp", ""))
+            )
 
 
-def _time_s(text: str) -> float | None:
+def _parse_time_s(text: str) -> float | None:
     try:
         return datetime.fromisoformat(text).timestamp()
     except (ValueError, OverflowError, OSError):
         return None
 
 
-def _local(element: ElementTree.Element) -> str:
+def _get_local_name(element: ElementTree.Element) -> str:
     return str(element.tag).rpartition("}")[2]
 
 
-def chosen(components: Sequence[Component], device: str, path: str, name: str) -> tuple[Component, ...]:
+def select_components(components: Sequence[Component], device: str, path: str, name: str) -> tuple[Component, ...]:
     """Return the configured path and the controllers of its device; ProtocolError where the choice is ambiguous."""
     paths = [each for each in components if each.kind == "Path" and (not device or device in each.device)]
     devices = {each.device for each in paths}
@@ -124,7 +126,7 @@ def chosen(components: Sequence[Component], device: str, path: str, name: str) -
     return (paths[0], *(each for each in components if each.kind == "Controller" and each.device == owner))
 
 
-def items_at(components: Sequence[Component], places: str) -> str | None:
+def find_data_item(components: Sequence[Component], places: str) -> str | None:
     """Return the dataItemId of the first of these places (``Line``, ``PathFeedrate:ACTUAL``, ``@id``) that exists."""
     observed = [each for component in components for each in component.observed]
     for place in places.split("|"):

@@ -51,15 +51,15 @@ class ByteStream(ABC):
     def close(self) -> None:
         """Close the line."""
 
-    def wire_ns(self, count: int) -> int:
+    def compute_wire_ns(self, count: int) -> int:
         """Return the time that ``count`` characters take on the wire."""
         return round(count * self.character_s * 1e9)
 
-    async def receive(self, name: str, until_ns: int) -> Chunk | None:
+    async def receive_chunk(self, name: str, until_ns: int) -> Chunk | None:
         """Return the next bytes, None when none have come by ``until_ns``; ConnectError when the line is gone."""
         while not self._chunks:
             if not self.is_open:
-                raise self._lost(name)
+                raise self._make_gone_error(name)
             self._came.clear()
             try:
                 async with asyncio.timeout((until_ns - time.monotonic_ns()) / 1e9):
@@ -71,13 +71,13 @@ class ByteStream(ABC):
         self._kept -= len(chunk.data)
         return chunk
 
-    def discard(self) -> int:
+    def discard_input(self) -> int:
         """Discard received bytes; return their number."""
         kept, self._kept = self._kept, 0
         self._chunks.clear()
         return kept
 
-    def _take(self, data: bytes) -> None:
+    def _store_bytes(self, data: bytes) -> None:
         self.last_ns = time.monotonic_ns()
         self._chunks.append(Chunk(data, self.last_ns))
         self._kept += len(data)
@@ -86,10 +86,10 @@ class ByteStream(ABC):
             self._kept -= len(self._chunks.popleft().data)
         self._came.set()
 
-    def _end(self, why: str) -> None:
+    def _end_stream(self, why: str) -> None:
         self._gone = why
         self._came.set()
 
-    def _lost(self, name: str) -> ConnectError:
+    def _make_gone_error(self, name: str) -> ConnectError:
         why = self._gone or "it is not open"
         return ConnectError(name, f"{self.where} is gone ({why}); check the adapter and its cable")

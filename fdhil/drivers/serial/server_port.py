@@ -26,7 +26,7 @@ class ServerPort(ByteStream, asyncio.Protocol):
     def is_open(self) -> bool:
         return self._transport is not None and not self._gone
 
-    def wire_ns(self, count: int) -> int:
+    def compute_wire_ns(self, count: int) -> int:
         """Return 0: the time on the wire is part of the answer's delay."""
         return 0
 
@@ -43,15 +43,15 @@ class ServerPort(ByteStream, asyncio.Protocol):
         self._transport = cast("asyncio.WriteTransport", transport)
 
     def data_received(self, data: bytes) -> None:
-        self._take(data)
+        self._store_bytes(data)
 
     def connection_lost(self, error: Exception | None) -> None:
         if self._transport is not None:
-            self._end(str(error) if error else "the server closed it")
+            self._end_stream(str(error) if error else "the server closed it")
 
     def send(self, name: str, data: bytes) -> int:
         if self._transport is None or self._gone:
-            raise self._lost(name)
+            raise self._make_gone_error(name)
         self._transport.write(data)
         return time.monotonic_ns()
 
@@ -59,4 +59,4 @@ class ServerPort(ByteStream, asyncio.Protocol):
         transport, self._transport, self._gone = self._transport, None, ""
         if transport is not None:
             transport.close()
-        self.discard()
+        self.discard_input()

@@ -4,9 +4,9 @@ import numpy as np
 
 from fdhil.cia402 import PdoEntry
 from fdhil.config import TableEncoder
-from fdhil.config.table import IN_A_FRAME
-from fdhil.drivers.can.sync_grid import Ticked
-from fdhil.drivers.cia402.pdo_queue import decode
+from fdhil.config.table_sensor_sections import IN_A_FRAME
+from fdhil.drivers.can.sync_grid import TickedFrames
+from fdhil.drivers.cia402.pdo_queue import decode_entry
 from fdhil.records import Notice, TableSamples, freeze_array
 
 SILENT_TICKS = 3000  # of SYNC without that TPDO until it is reported
@@ -24,10 +24,10 @@ class TpdoEncoder:
         bits = IN_A_FRAME[settings.type]
         self._entry = PdoEntry(0, 0, bits, settings.type.startswith("int"), 8 * settings.byte)
         self._newest = -1
-        self._heard_at: int | None = None
+        self._received_at: int | None = None
         self._silent = False
 
-    def feed(self, ticked: Ticked) -> list[TableSamples | Notice]:
+    def decode_frames(self, ticked: TickedFrames) -> list[TableSamples | Notice]:
         """Return the samples of a block, and notices. Two frames after one SYNC are ambiguous, and neither is used."""
         out: list[TableSamples | Notice] = []
         mine = (ticked.can_id == self.cob_id).nonzero()[0]
@@ -37,17 +37,17 @@ class TpdoEncoder:
         tick, first, count = np.unique(ticked.tick[mine], return_index=True, return_counts=True)
         sure = (count == 1) & (tick > self._newest)
         if tick.size:
-            self._newest = self._heard_at = int(tick[-1])
+            self._newest = self._received_at = int(tick[-1])
         if sure.any():
-            counts = decode(self._entry, ticked.data[mine[first[sure]]])
+            counts = decode_entry(self._entry, ticked.data[mine[first[sure]]])
             values = freeze_array(counts * self._settings.scale + self._settings.offset)
             out.append(TableSamples(self.axis, "table_mm", freeze_array(tick[sure]), 0.0, values))
-        return out + self._silence(ticked.last_tick)
+        return out + self._check_silence(ticked.last_tick)
 
-    def _silence(self, last_tick: int) -> list[Notice]:
-        if self._heard_at is None:
-            self._heard_at = last_tick
-        was, self._silent = self._silent, last_tick - self._heard_at > SILENT_TICKS
+    def _check_silence(self, last_tick: int) -> list[Notice]:
+        if self._received_at is None:
+            self._received_at = last_tick
+        was, self._silent = self._silent, last_tick - self._received_at > SILENT_TICKS
         if self._silent and not was:
             text = (
                 f"No TPDO {self.cob_id:#x} with the position of table {self.axis} is received: its compliance "

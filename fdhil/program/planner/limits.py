@@ -42,7 +42,7 @@ class AxisLimits:
             return tuple(math.inf if axis is None else getattr(axis, key) / axis.mm_per_unit for axis in axes)
 
         found = zip(ALL_AXES, axes, strict=True)
-        ranges = tuple(None if axis is None else PositionRange.of(name, axis, dt_s) for name, axis in found)
+        ranges = tuple(None if axis is None else PositionRange.build_for_axis(name, axis, dt_s) for name, axis in found)
         return AxisLimits(
             each("rapid_speed_mm_s"),
             each("max_acceleration_mm_s2"),
@@ -70,8 +70,8 @@ class AxisLimits:
             if moves and speed == math.inf:
                 raise ProgramError(motion.line, name, f"moves axis {name}, {self._missing(name)}")
         for reach, at in zip(self.ranges, end, strict=True):
-            if reach is not None and not reach.fits(at * reach.mm_per_unit):
-                raise ProgramError(motion.line, reach.axis, reach.fault(at * reach.mm_per_unit))
+            if reach is not None and not reach.can_reach(at * reach.mm_per_unit):
+                raise ProgramError(motion.line, reach.axis, reach.describe_fault(at * reach.mm_per_unit))
 
     def _missing(self, axis: str) -> str:
         if axis in self.linear:

@@ -59,7 +59,7 @@ class Ratings:
     def of(cls, config: MachineConfig, axis: str) -> Ratings:
         section = config.axis[axis]
         return cls(
-            node_id=config.node_id(axis),
+            node_id=config.get_node_id(axis),
             sync_period_s=config.machine.sync_period_s,
             increments_per_rev=section.drive.increments_per_rev,
             increments_per_mm=section.drive.increments_per_rev / section.screw_pitch_mm,

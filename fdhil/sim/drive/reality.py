@@ -18,7 +18,7 @@ BRISTLE_DAMPING = 1.0  # half of the bristles' critical damping: they ring once
 
 def real_loops(reality: Reality, regulators: Regulators) -> Regulators:
     """Return the regulators with the deviations of the real drive."""
-    return regulators.model_copy(update=reality.loops())
+    return regulators.model_copy(update=reality.list_loop_settings())
 
 
 def is_plain(reality: Reality, regulators: Regulators) -> bool:

@@ -61,7 +61,7 @@ class NcController:
             DriveLink(
                 name,
                 axis.drive.bus,
-                config.node_id(name),
+                config.get_node_id(name),
                 axis.drive.sign * axis.drive.increments_per_rev / axis.screw_pitch_mm,
                 axis.drive.setpoint_delay_cycles,
             )

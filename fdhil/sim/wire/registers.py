@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from fdhil.config import TableEncoder, Thermometer, Voltage
-from fdhil.config.sensors import VoltageBlock
+from fdhil.config.sensor_sections import VoltageBlock
 
 _FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f", "float64": ">d"}
 

@@ -35,7 +35,7 @@ class SensorWires:
                 self._on_a_line(axis, table)
             if thermometer is not None and thermometer.device:
                 self._on_a_line(axis, thermometer)
-            if voltage.separate and voltage.device:
+            if voltage.is_separate and voltage.device:
                 self._on_a_line(axis, voltage)
                 continue
             registers = map_of(voltage, sensor, sensor)

@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from fdhil.config import MachineConfig
 from fdhil.daemon.black_box import BLACK_BOX_FOLDER, find_black_boxes
-from fdhil.drivers.cia402.candump_samples import LARGEST_LOG, samples_of_log
+from fdhil.drivers.cia402.candump_samples import LARGEST_LOG, decode_candump
 from fdhil.records import AxisSamples, Float
 from fdhil.store.named_file import open_named
 from fdhil.web.pages.rapid_signals import round_digits
@@ -74,7 +74,7 @@ def opened(store: Path, name: str) -> BinaryIO:
 def envelope(store: Path, name: str, config: MachineConfig) -> Envelope:
     """Return the drives' signals in a black box. Raises StoreError, RecordingError."""
     with opened(store, name) as file:
-        found = samples_of_log(file.read(LARGEST_LOG + 1), config)
+        found = decode_candump(file.read(LARGEST_LOG + 1), config)
     last = max((int(samples.tick[-1]) for samples in found.values()), default=0)
     period_s = config.machine.sync_period_s
     return Envelope(name=name, axes=[_axis(samples, last, period_s) for samples in found.values()])

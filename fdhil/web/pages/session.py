@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 
-from fdhil.config.users import LONGEST_PASSWORD, Role
+from fdhil.config.user_file import LONGEST_PASSWORD, Role
 from fdhil.web.access import LIFE_S
 from fdhil.web.context import LoginDependency
 from fdhil.web.gate import token_of

@@ -33,7 +33,7 @@ OFFSETS: tuple[Variable, ...] = (
 CURRENT: tuple[Variable, ...] = ((0x6075, 0, U32, "rw", 0, 5000), (0x6078, 0, I16, "ro", 1, None))
 
 
-def pdos(
+def build_pdo_objects(
     count: int = 4, room: int = 8, access: str = "rw", mapped: Mapping[int, Sequence[int]] | None = None
 ) -> list[Variable]:
     """Return communication and mapping parameters; ``mapped`` are the words of 1600, 1601, ... and 1A00, ..."""
@@ -52,10 +52,10 @@ def pdos(
     return found
 
 
-SERVO: tuple[Variable, ...] = (*COMMON, *OFFSETS, *CURRENT, *pdos())
+SERVO: tuple[Variable, ...] = (*COMMON, *OFFSETS, *CURRENT, *build_pdo_objects())
 
 
-def eds_text(
+def format_eds(
     variables: Sequence[Variable], vendor: str = "A Maker", vendor_id: int = 0x12, product: str = "A Drive"
 ) -> str:
     """Return the file; COB-IDs of PDOs get $NODEID."""
@@ -64,15 +64,15 @@ def eds_text(
     for index in indices:
         subs = sorted(variable for variable in variables if variable[0] == index)
         if len(subs) == 1 and subs[0][1] == 0:
-            lines += [f"[{index:04X}]", "ObjectType=7", *_variable(subs[0])]
+            lines += [f"[{index:04X}]", "ObjectType=7", *_format_variable(subs[0])]
             continue
         lines += [f"[{index:04X}]", f"ParameterName=Object {index:04X}", "ObjectType=9", f"SubNumber={len(subs)}"]
         for each in subs:
-            lines += [f"[{index:04X}sub{each[1]:X}]", *_variable(each)]
+            lines += [f"[{index:04X}sub{each[1]:X}]", *_format_variable(each)]
     return "\n".join([*lines, ""])
 
 
-def _variable(each: Variable) -> list[str]:
+def _format_variable(each: Variable) -> list[str]:
     index, sub, kind, access, mappable, default = each
     lines = [f"ParameterName={NAMES.get((index, sub), f'Object {index:04X} {sub}')}", f"DataType={kind}"]
     lines += [f"AccessType={access}", f"PDOMapping={mappable}"]
@@ -90,8 +90,8 @@ NAMES: Mapping[tuple[int, int], str] = {
 }
 
 
-def eds_file(folder: Path, variables: Sequence[Variable], vendor: str = "A Maker", vendor_id: int = 0x12) -> Path:
+def write_eds_file(folder: Path, variables: Sequence[Variable], vendor: str = "A Maker", vendor_id: int = 0x12) -> Path:
     """Write the file and return its path."""
     path = folder / "drive.eds"
-    path.write_text(eds_text(variables, vendor, vendor_id))
+    path.write_text(format_eds(variables, vendor, vendor_id))
     return path

@@ -9,40 +9,41 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdhil.drivers.cia402.abilities import abilities
-from fdhil.drivers.cia402.device import Device, PdoPlace, read_device
-from fdhil.drivers.cia402.profile_file import read_profile
+from fdhil.drivers.cia402.capabilities import assess_capabilities
+from fdhil.drivers.cia402.device_description import DeviceDescription, PdoSlot, read_device
+from fdhil.drivers.cia402.drive_profile_file import read_profile
 from fdhil.eds import MAX_SECTIONS, parse_eds, read_expression
 from fdhil.errors import EdsError
 from fdhil.sim.drive.sheet import read_sheet
-from tests.drivers.cia402.eds_text import COMMON, CURRENT, SERVO, U16, U32, Variable, eds_text, pdos
+from tests.drivers.cia402.eds_text import COMMON, CURRENT, SERVO, U16, U32, Variable, build_pdo_objects, format_eds
 
 TARGETS = {0x1600: (0x60400010, 0x607A0020), 0x1A00: (0x60640020, 0x606C0020), 0x1A01: (0x60410010, 0x60780010)}
 DEFAULT_BASES = [0x200, 0x300, 0x400, 0x500], [0x180, 0x280, 0x380, 0x480]
 
 
-def device_of(text: str, folder: Path, name: str = "drive.eds") -> Device:
+def read_device_text(text: str, folder: Path, name: str = "drive.eds") -> DeviceDescription:
     path = folder / name
     path.write_text(text)
     return read_device(path)
 
 
-def bases(device: Device) -> tuple[list[int | None], list[int | None]]:
+def list_cob_bases(device: DeviceDescription) -> tuple[list[int | None], list[int | None]]:
     return [place.cob_base for place in device.rpdos], [place.cob_base for place in device.tpdos]
 
 
-def answers(text: str, folder: Path, name: str) -> dict[str, str]:
+def list_capabilities(text: str, folder: Path, name: str) -> dict[str, str]:
     """Return the points that ``fdhil eds`` prints for a file."""
-    device = device_of(text, folder, name)
+    device = read_device_text(text, folder, name)
     return {
-        each.what: f"{each.answer}: {each.why}" for each in abilities(device, read_profile("cia402", folder / name))
+        each.what: f"{each.answer}: {each.why}"
+        for each in assess_capabilities(device, read_profile("cia402", folder / name))
     }
 
 
-def as_dcf(node: int, commissioning: str) -> str:
+def build_dcf(node: int, commissioning: str) -> str:
     """Return the servo's EDS as a DCF: each PDO has its absolute COB-ID for that node."""
     lines = []
-    for line in eds_text(SERVO).splitlines():
+    for line in format_eds(SERVO).splitlines():
         lines.append(line)
         if line.startswith("DefaultValue=$NODEID+"):
             lines.append(f"ParameterValue={int(line.partition('+')[2], 16) + node:#x}")
@@ -60,31 +61,31 @@ def as_dcf(node: int, commissioning: str) -> str:
     ],
 )
 def test_absolute_cob_ids_of_a_dcf_belong_to_its_own_node(commissioning: str, tmp_path: Path) -> None:
-    assert bases(device_of(as_dcf(5, commissioning), tmp_path)) == DEFAULT_BASES
-    any_node = answers(eds_text(SERVO), tmp_path, "any.eds")
-    assert answers(as_dcf(5, commissioning), tmp_path, "node5.dcf") == any_node
+    assert list_cob_bases(read_device_text(build_dcf(5, commissioning), tmp_path)) == DEFAULT_BASES
+    any_node = list_capabilities(format_eds(SERVO), tmp_path, "any.eds")
+    assert list_capabilities(build_dcf(5, commissioning), tmp_path, "node5.dcf") == any_node
 
 
 @pytest.mark.parametrize("node", ["", "[DeviceComissioning]\nNodeID=\n", "[DeviceComissioning]\nNodeID=255\n"])
 def test_absolute_cob_ids_of_an_unknown_node_are_none(node: str, tmp_path: Path) -> None:
-    assert bases(device_of(as_dcf(5, node), tmp_path)) == ([None] * 4, [None] * 4)
+    assert list_cob_bases(read_device_text(build_dcf(5, node), tmp_path)) == ([None] * 4, [None] * 4)
 
 
-def test_a_dcf_of_an_impossible_node_is_refused() -> None:
+def test_dcf_with_invalid_node_id_is_refused() -> None:
     with pytest.raises(EdsError, match="NodeID is '128', not from 1 to 127"):
-        parse_eds(as_dcf(5, "[DeviceComissioning]\nNodeID=128").encode(), "a.dcf")
+        parse_eds(build_dcf(5, "[DeviceComissioning]\nNodeID=128").encode(), "a.dcf")
 
 
 @pytest.mark.parametrize("second", ["NodeID=6", "[DeviceCommissioning]\nNodeId=0x06", "NODEID=0"])
-def test_a_dcf_of_two_nodes_is_refused(second: str) -> None:
+def test_dcf_with_two_node_ids_is_refused(second: str) -> None:
     with pytest.raises(EdsError, match="and '5' in a line above: its COB-IDs belong to one of these nodes"):
-        parse_eds(as_dcf(5, f"[DeviceComissioning]\nNodeID=5\n{second}").encode(), "a.dcf")
-    parse_eds(as_dcf(5, "[DeviceComissioning]\nNodeID=5\nNodeID=0x05").encode(), "a.dcf")
+        parse_eds(build_dcf(5, f"[DeviceComissioning]\nNodeID=5\n{second}").encode(), "a.dcf")
+    parse_eds(build_dcf(5, "[DeviceComissioning]\nNodeID=5\nNodeID=0x05").encode(), "a.dcf")
 
 
-def test_a_cob_id_below_the_node_id_contains_none(tmp_path: Path) -> None:
-    text = as_dcf(5, "[DeviceComissioning]\nNodeID=5").replace("ParameterValue=0x185", "ParameterValue=0x3")
-    assert device_of(text, tmp_path).tpdos[0].cob_base is None
+def test_cob_id_below_the_node_id_has_no_base(tmp_path: Path) -> None:
+    text = build_dcf(5, "[DeviceComissioning]\nNodeID=5").replace("ParameterValue=0x185", "ParameterValue=0x3")
+    assert read_device_text(text, tmp_path).tpdos[0].cob_base is None
 
 
 @pytest.mark.parametrize(
@@ -103,8 +104,8 @@ def test_a_cob_id_below_the_node_id_contains_none(tmp_path: Path) -> None:
     ],
 )
 def test_expression_of_a_cob_id_is_evaluated(written: str, base: int | None, valid: bool, tmp_path: Path) -> None:
-    text = eds_text(SERVO).replace("DefaultValue=$NODEID+0x180", f"DefaultValue={written}")
-    place = device_of(text, tmp_path).tpdos[0]
+    text = format_eds(SERVO).replace("DefaultValue=$NODEID+0x180", f"DefaultValue={written}")
+    place = read_device_text(text, tmp_path).tpdos[0]
     assert (place.cob_base, place.valid) == (base, valid)
 
 
@@ -117,7 +118,7 @@ def test_expression_of_a_cob_id_is_evaluated(written: str, base: int | None, val
     ],
 )
 def test_cob_id_that_cannot_be_read_is_refused(written: str, says: str) -> None:
-    text = eds_text(SERVO).replace("DefaultValue=$NODEID+0x180", f"DefaultValue={written}")
+    text = format_eds(SERVO).replace("DefaultValue=$NODEID+0x180", f"DefaultValue={written}")
     with pytest.raises(EdsError, match=says):
         parse_eds(text.encode(), "a.eds")
 
@@ -135,12 +136,12 @@ def test_sum_of_numbers_and_node_id_is_read_in_any_order(numbers: list[int], rel
 
 
 @pytest.mark.parametrize(("written", "value", "doubt"), [("0100", 100, "64 if"), ("0090", 90, ""), ("007", 7, "")])
-def test_number_with_leading_zeros_is_not_absent(written: str, value: int, doubt: str, tmp_path: Path) -> None:
-    text = eds_text(SERVO).replace("[1017]", f"[1017]\nParameterValue={written}")
-    device = device_of(text, tmp_path)
-    assert device.default(0x1017) == value
-    assert [doubt in each for each in device.doubts] == [True] * bool(doubt)
-    assert answers(text, tmp_path, "a.eds")["heartbeat"] == f"yes: 1017 is {value} ms"
+def test_number_with_leading_zeros_is_read_as_decimal(written: str, value: int, doubt: str, tmp_path: Path) -> None:
+    text = format_eds(SERVO).replace("[1017]", f"[1017]\nParameterValue={written}")
+    device = read_device_text(text, tmp_path)
+    assert device.get_default(0x1017) == value
+    assert [doubt in each for each in device.ambiguities] == [True] * bool(doubt)
+    assert list_capabilities(text, tmp_path, "a.eds")["heartbeat"] == f"yes: 1017 is {value} ms"
 
 
 @pytest.mark.parametrize(
@@ -153,28 +154,27 @@ def test_number_with_leading_zeros_is_not_absent(written: str, value: int, doubt
         ("[DeviceInfo]\nVendorNumber=1", "[DeviceInfo]\nVendorNumber=0123"),
     ],
 )
-def test_number_in_two_readings_that_decides_the_pdos_is_refused_by_both_readers(
-    line: str, other: str, tmp_path: Path
-) -> None:
+def test_ambiguous_pdo_number_is_refused_by_drivers_and_simulator(line: str, other: str, tmp_path: Path) -> None:
     for written, refused in ((line, False), (other, True)):
-        (tmp_path / "drive.eds").write_text(f"{eds_text(SERVO)}\n{written}\n")
+        (tmp_path / "drive.eds").write_text(f"{format_eds(SERVO)}\n{written}\n")
         for read in (lambda path: read_device(path), lambda path: read_sheet(path, 5)):
             with pytest.raises(EdsError, match=r"as octal 0x.*, as decimal 0x") if refused else nullcontext():
                 read(tmp_path / "drive.eds")
 
 
 @pytest.mark.parametrize("written", ["64h", "100 ms", "0x"])
-def test_default_that_is_no_number_is_noted(written: str, tmp_path: Path) -> None:
-    text = eds_text(SERVO).replace("[1017]", f"[1017]\nParameterValue={written}")
-    device = device_of(text, tmp_path)
-    assert device.default(0x1017) is None
-    assert device.doubts == (f"1017:00 is written {written}, which is not a number: ignored",)
+def test_invalid_default_is_ignored_and_reported(written: str, tmp_path: Path) -> None:
+    text = format_eds(SERVO).replace("[1017]", f"[1017]\nParameterValue={written}")
+    device = read_device_text(text, tmp_path)
+    assert device.get_default(0x1017) is None
+    assert device.ambiguities == (f"1017:00 is written {written}, which is not a number: ignored",)
 
 
-def test_heartbeat_that_the_file_does_not_give_is_not_zero(tmp_path: Path) -> None:
+def test_missing_heartbeat_default_is_unknown_not_zero(tmp_path: Path) -> None:
     variables = [each for each in SERVO if each[0] != 0x1017] + [(0x1017, 0, U16, "rw", 0, None)]
     assert (
-        answers(eds_text(variables), tmp_path, "a.eds")["heartbeat"] == "yes: its EDS does not give its period (1017)"
+        list_capabilities(format_eds(variables), tmp_path, "a.eds")["heartbeat"]
+        == "yes: its EDS does not give its period (1017)"
     )
 
 
@@ -200,35 +200,35 @@ NrOfEntries=2
 """
 
 
-def without(index: int) -> list[Variable]:
+def remove_objects(index: int) -> list[Variable]:
     return [each for each in SERVO if each[0] != index]
 
 
 @pytest.mark.parametrize("kind", ["0x8", "0x9", "0x7"])
-def test_compact_values_are_the_mapping(kind: str, tmp_path: Path) -> None:
-    device = device_of(eds_text(without(0x1A00)) + MAPPING.format(kind=kind), tmp_path)
+def test_compact_value_list_gives_the_mapping(kind: str, tmp_path: Path) -> None:
+    device = read_device_text(format_eds(remove_objects(0x1A00)) + MAPPING.format(kind=kind), tmp_path)
     assert device.tpdos[0].mapped == (0x60410010, 0x60640020, 0x60610008)
     assert device.tpdos[0].room == 8
     names = [device.objects[0x1A00, sub].name for sub in (1, 2, 3)]
     assert names == ["TPDO1 mapping: status", "TPDO1 mapping: TPDO1 mapping 2", "TPDO1 mapping: mode"]
 
 
-def test_list_of_values_overrides_written_out_sub_objects(tmp_path: Path) -> None:
-    text = eds_text(SERVO) + "[1A00Value]\nNrOfEntries=2\n0=1\n1=0x60640020\n[1800Value]\nNrOfEntries=1\n2=1\n"
-    place = device_of(text, tmp_path).tpdos[0]
+def test_value_list_overrides_explicit_sub_objects(tmp_path: Path) -> None:
+    text = format_eds(SERVO) + "[1A00Value]\nNrOfEntries=2\n0=1\n1=0x60640020\n[1800Value]\nNrOfEntries=1\n2=1\n"
+    place = read_device_text(text, tmp_path).tpdos[0]
     assert (place.mapped, place.kind) == ((0x60640020,), 1)
 
 
-def test_compact_pdos_are_those_of_the_device_info(tmp_path: Path) -> None:
+def test_compact_pdos_follow_device_info(tmp_path: Path) -> None:
     variables = [each for each in SERVO if not 0x1400 <= each[0] < 0x1C00]
     head = "[DeviceInfo]\nCompactPDO=23\nGranularity=8\nNrOfRXPDO=2\nNrOfTXPDO=5\n"
     text = (
         head
-        + eds_text(variables)
+        + format_eds(variables)
         + "[1A01Value]\nNrOfEntries=1\n1=0x60640020\n[1A01sub0]\nDataType=5\nDefaultValue=1\n"
     )
-    device = device_of(text, tmp_path)
-    free = PdoPlace(1, 0x200, True, None, 8, (), fixed=False)
+    device = read_device_text(text, tmp_path)
+    free = PdoSlot(1, 0x200, True, None, 8, (), fixed=False)
     assert device.rpdos[0] == free
     assert [place.cob_base for place in device.tpdos] == [0x180, 0x280, 0x380, 0x480, None]
     assert [place.valid for place in device.tpdos] == [True, True, True, True, False]
@@ -246,20 +246,24 @@ def test_compact_objects_beyond_the_limit_are_refused() -> None:
 # fixed mappings
 
 
-def fixed_mapping(kind_access: str) -> list[Variable]:
+def build_fixed_mapping(kind_access: str) -> list[Variable]:
     found = []
-    for index, sub, kind, access, mappable, default in (*COMMON, *CURRENT, *pdos(2, access="ro", mapped=TARGETS)):
+    for index, sub, kind, access, mappable, default in (
+        *COMMON,
+        *CURRENT,
+        *build_pdo_objects(2, access="ro", mapped=TARGETS),
+    ):
         type_of_pdo = 0x1400 <= index < 0x1C00 and sub == 2 and kind != U32
         found.append((index, sub, kind, kind_access if type_of_pdo else access, mappable, default))
     return found
 
 
-def test_fixed_mapping_of_writable_type_is_set_to_every_sync(tmp_path: Path) -> None:
-    found = answers(eds_text(fixed_mapping("rw")), tmp_path, "a.eds")
+def test_fixed_mapping_with_writable_type_is_set_to_every_sync(tmp_path: Path) -> None:
+    found = list_capabilities(format_eds(build_fixed_mapping("rw")), tmp_path, "a.eds")
     assert found["listen"].startswith("yes")
     assert found["mapping"] == "yes: RPDO1, TPDO1, TPDO2 must be set up: the defaults differ"
 
 
-def test_fixed_mapping_of_fixed_type_is_not_listened_to(tmp_path: Path) -> None:
-    found = answers(eds_text(fixed_mapping("ro")), tmp_path, "a.eds")
+def test_fixed_mapping_with_fixed_type_cannot_be_recorded(tmp_path: Path) -> None:
+    found = list_capabilities(format_eds(build_fixed_mapping("ro")), tmp_path, "a.eds")
     assert found["listen"].startswith("no: no TPDO with every SYNC can carry its position")

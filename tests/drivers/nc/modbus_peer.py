@@ -63,12 +63,12 @@ class ModbusPeer:
         self._server.serving.cancel()
         self._server.close()
 
-    async def say(self, motion: MoveKind, **fields: Any) -> None:
+    async def set_state(self, motion: MoveKind, **fields: Any) -> None:
         self.coils |= {place: kind is motion for kind, place in COILS.items()}
         for name, value in fields.items():
             scale = 100 if name.endswith("override") else 1
             self.registers[REGISTERS[name]] = round(scale * value)
 
-    async def talk_nonsense(self) -> None:
+    async def send_invalid_data(self) -> None:
         self.coils = dict.fromkeys(COILS.values(), True)
         self.registers = dict.fromkeys(REGISTERS.values(), 0xFFFF)

@@ -47,9 +47,9 @@ class MtConnectPeer:
         self.nonsense: bytes | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         for item in ITEMS:
-            self.show(item, "UNAVAILABLE")
+            self.set_values(item, "UNAVAILABLE")
 
-    def show(self, item: str, text: str, later_s: float = 0.0) -> None:
+    def set_values(self, item: str, text: str, later_s: float = 0.0) -> None:
         """Set an item's text; the agent's time stamp is ``later_s`` later."""
         self.changes.append((self.sequence, item, text, time.time() + later_s))
         self.sequence += 1
@@ -144,12 +144,12 @@ class MtConnectPeer:
     def _send(self, data: bytes, writer: asyncio.StreamWriter) -> None:
         writer.write(b"%x\r\n%b\r\n" % (len(data), data) if self.chunked else data)
 
-    async def say(self, motion: MoveKind, **fields: Any) -> None:
+    async def set_state(self, motion: MoveKind, **fields: Any) -> None:
         for name, value in fields.items():
             item, scale = OF_FIELD[name]
-            self.show(item, value if isinstance(value, str) else repr(value if scale == 1.0 else scale * value))
-        self.show("block", BLOCKS.get(motion, "UNAVAILABLE"))
-        self.show("exec", {MoveKind.HOLD: "FEED_HOLD", MoveKind.REST: "READY"}.get(motion, "ACTIVE"))
+            self.set_values(item, value if isinstance(value, str) else repr(value if scale == 1.0 else scale * value))
+        self.set_values("block", BLOCKS.get(motion, "UNAVAILABLE"))
+        self.set_values("exec", {MoveKind.HOLD: "FEED_HOLD", MoveKind.REST: "READY"}.get(motion, "ACTIVE"))
 
-    async def talk_nonsense(self) -> None:
+    async def send_invalid_data(self) -> None:
         self.nonsense = b"SSH-2.0-OpenSSH_9.2\r\n"

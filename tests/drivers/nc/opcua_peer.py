@@ -12,7 +12,7 @@ from asyncua import Node, Server, ua
 from asyncua.server.address_space import AttributeValue, NodeData
 from asyncua.server.internal_server import InternalServer
 
-from fdhil.drivers.nc.profile_file import read_nc_profile
+from fdhil.drivers.nc.nc_profile_file import read_nc_profile
 from fdhil.records import MoveKind
 
 logging.getLogger("asyncua").setLevel(logging.CRITICAL)
@@ -96,13 +96,13 @@ class OpcUaPeer:
     async def __aexit__(self, *exception: object) -> None:
         await self.server.stop()
 
-    async def say(self, motion: MoveKind, **fields: Any) -> None:
+    async def set_state(self, motion: MoveKind, **fields: Any) -> None:
         for name, value in fields.items():
             await self.nodes[name].write_value(value if isinstance(value, str) else value / self._signals[name].scale)
         status, function = SHOWN[motion]
         await self.nodes["g_group_1"].write_value(function)
         await self.nodes["status"].write_value(float(status))
 
-    async def talk_nonsense(self) -> None:
+    async def send_invalid_data(self) -> None:
         await self.nodes["feed_override"].write_value(1e9)
         await self.nodes["status"].write_value(3.0)

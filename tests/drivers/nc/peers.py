@@ -29,10 +29,10 @@ class Peer(Protocol):
     def settings(self) -> Mapping[str, Any]: ...
     async def __aenter__(self) -> Self: ...
     async def __aexit__(self, *exception: object) -> None: ...
-    async def say(self, motion: MoveKind, **fields: Any) -> None:
+    async def set_state(self, motion: MoveKind, **fields: Any) -> None:
         """Set the NC's state; ``fields`` are those of NcState."""
 
-    async def talk_nonsense(self) -> None:
+    async def send_invalid_data(self) -> None:
         """Answer with invalid content from now on."""
 
 
@@ -53,7 +53,7 @@ class BridgePeer:
         return {"port": self._port}
 
     async def __aenter__(self) -> Self:
-        self._server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
+        self._server = await asyncio.start_server(self._serve_client, "127.0.0.1", 0)
         self._port = self._server.sockets[0].getsockname()[1]
         return self
 
@@ -63,7 +63,7 @@ class BridgePeer:
             writer.close()
         await self._server.wait_closed()
 
-    async def _serve(self, _: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _serve_client(self, _: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._writers.append(writer)
         try:
             writer.write(json.dumps({"schema": "fdhil-linuxcnc-1", "servo_period_s": 0.001}).encode() + b"\n")
@@ -79,10 +79,10 @@ class BridgePeer:
         finally:
             writer.close()
 
-    async def say(self, motion: MoveKind, **fields: Any) -> None:
+    async def set_state(self, motion: MoveKind, **fields: Any) -> None:
         self._now = {"motion": motion.value, **fields}
 
-    async def talk_nonsense(self) -> None:
+    async def send_invalid_data(self) -> None:
         self._nonsense = True
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from fdhil.drivers.cia402.abilities import abilities, suggest_profile
-from fdhil.drivers.cia402.device import read_device
-from fdhil.drivers.cia402.profile_file import read_profile
+from fdhil.drivers.cia402.capabilities import assess_capabilities, suggest_profile
+from fdhil.drivers.cia402.device_description import read_device
+from fdhil.drivers.cia402.drive_profile_file import read_profile
 from fdhil.errors import EdsError
 from tests.fuzz.tasting import Target
 
@@ -26,7 +26,7 @@ def taste(data: bytes) -> None:
         assert len(str(error)) < 1000
         return
     suggest_profile(device)
-    abilities(device, _PROFILE)
+    assess_capabilities(device, _PROFILE)
 
 
 def target() -> Target:

@@ -9,15 +9,15 @@ from collections import Counter
 import numpy as np
 
 from fdhil.daemon.bus_health import BusHealth
-from fdhil.drivers.can.frames import EXTENDED_FLAG, FrameRing, Frames, frames_of
-from fdhil.drivers.can.socketcand import HubClock, SocketcandPort
+from fdhil.drivers.can.frame_ring import EXTENDED_FLAG, FrameRing, Frames, pack_frames
+from fdhil.drivers.can.socketcand_port import HubClock, SocketcandPort
 from fdhil.drivers.cia402.bus_decoder import BusDecoder
 from fdhil.drivers.moves import load_event_source
 from fdhil.records import AxisSamples, TickTimes
-from tests.drivers.wire import Row, Wire, machine
+from tests.drivers.frame_builder import FrameBuilder, Row, build_machine_config
 from tests.fuzz.tasting import Target
 
-CONFIG = machine(axes="X")
+CONFIG = build_machine_config(axes="X")
 FLAGS = (0, 0, 0, 0, 0, 0x20000000, 0x40000000, EXTENDED_FLAG)
 _ROW = struct.Struct("<hHBB8s")  # time since the previous frame, identifier, length, flags and unit, data
 SILENCES = 8
@@ -34,20 +34,20 @@ def taste(data: bytes) -> None:
         _text(data[1:], ring)
     else:
         for row in _rows(data[1:])[: 1 << 10]:
-            ring.append(*row)
-    frames = ring.drain()
+            ring.append_frame(*row)
+    frames = ring.drain_frames()
     now_ns = 2_000_000_000
     for block in _blocks(frames, len(data) % 2):
         now_ns = max(now_ns + 400_000_000, int(block["t_ns"].max(initial=0)))
-        for record in decoder.feed(block, now_ns):
+        for record in decoder.decode_frames(block, now_ns):
             if isinstance(record, AxisSamples | TickTimes):
                 for source in sources:
-                    source.feed(record)
+                    source.detect_moves(record)
             hearing.take_record(record, now_ns * 1e-9)  # type: ignore[arg-type] # inputs and tables pass it by
         hearing.take_counters(Counter({"frames": int(frames.size), "can0.frames": int(frames.size)}), now_ns * 1e-9)
         hearing.build_status(now_ns * 1e-9)
         hearing.find_lasting_troubles({}, now_ns * 1e-9)
-    decoder.counters()
+    decoder.read_counters()
 
 
 def _blocks(frames: Frames, halved: int) -> list[Frames]:
@@ -60,7 +60,7 @@ def _text(data: bytes, ring: FrameRing) -> None:
     port = object.__new__(SocketcandPort)  # it would connect
     port._rest, port._clock, port.malformed = b"", HubClock(), 0
     for piece in (data[: len(data) // 2], data[len(data) // 2 :]):
-        port._split(piece, ring, time.monotonic_ns())
+        port._parse_chunk(piece, ring, time.monotonic_ns())
 
 
 def _rows(data: bytes) -> list[Row]:
@@ -74,7 +74,7 @@ def _rows(data: bytes) -> list[Row]:
 def target() -> Target:
     seeds = []
     for counter in (True, False):
-        rows, at_ns, packed = Wire(6, counter=counter).rows(), 1_000_000_000, b""
+        rows, at_ns, packed = FrameBuilder(6, counter=counter).build_rows(), 1_000_000_000, b""
         for t_ns, can_id, payload in rows:
             packed += _ROW.pack((t_ns - at_ns) // 10_000, can_id, len(payload), 0, payload)
             at_ns = t_ns
@@ -84,7 +84,7 @@ def target() -> Target:
     outage = [(2, 5), (2, 5), (2, 5), (2, 5), (200, 5), (2, 0), (2, 5), (200, 5)]  # 60 ms and 6 s, state
     beats = b"".join(_ROW.pack(later, 0x701, 1, 3 << 3, bytes([state])) for later, state in outage)
     emergency = _ROW.pack(1, 0x81, 8, 0, bytes(8)) + _ROW.pack(1, 0x701, 1, 0, b"\0") + _ROW.pack(1, 4, 8, 5, b"\0\x30")
-    assert frames_of([(0, 0x80, b"")]).size == 1
+    assert pack_frames([(0, 0x80, b"")]).size == 1
     return Target(
         "hearing",
         [*seeds, b"\1" + emergency, b"\1" + beats],

@@ -26,8 +26,8 @@ operate = ["root"]
 
 def taste(data: bytes) -> None:
     try:
-        read = config.parse(config.toml_document(data, "machine.toml"), "machine.toml")
-        config.unlikely(read)
+        read = config.parse_config(config.parse_toml(data, "machine.toml"), "machine.toml")
+        config.find_unlikely_values(read)
     except ConfigError as error:
         assert error.faults
         assert len(str(error)) < 100_000

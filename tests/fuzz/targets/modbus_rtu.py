@@ -5,16 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Coroutine, Sequence
 
-from fdhil.config.sensors import ModbusPlace
-from fdhil.drivers.modbus.line import Answer, Request
-from fdhil.drivers.modbus.rtu import READ_COILS, READ_HOLDING, READ_INPUT, WRITE_REGISTER, framed
+from fdhil.config.sensor_sections import ModbusDevice
+from fdhil.drivers.modbus.modbus_line import ModbusAnswer, ModbusRequest
+from fdhil.drivers.modbus.rtu_frames import READ_COILS, READ_HOLDING, READ_INPUT, WRITE_REGISTER, build_frame
 from fdhil.drivers.modbus.rtu_line import RtuLine
 from fdhil.drivers.serial.byte_stream import Chunk
 from fdhil.errors import DeviceError
 from tests.fuzz.tasting import Target
 
 FUNCTIONS = (READ_INPUT, READ_HOLDING, READ_COILS, WRITE_REGISTER)
-PLACE = ModbusPlace(device="/dev/none")
+PLACE = ModbusDevice(device="/dev/none")
 
 
 class _Port:
@@ -38,12 +38,12 @@ class _Port:
         return Chunk(self._pieces.pop(0), time.monotonic_ns()) if self._pieces else None
 
 
-def _at_once(asking: Coroutine[None, None, Answer]) -> Answer:
+def _at_once(asking: Coroutine[None, None, ModbusAnswer]) -> ModbusAnswer:
     """Run a coroutine that never waits, without a loop."""
     try:
         asking.send(None)
     except StopIteration as end:
-        assert isinstance(end.value, Answer)
+        assert isinstance(end.value, ModbusAnswer)
         return end.value
     raise AssertionError("it waits, though all has come")
 
@@ -51,12 +51,12 @@ def _at_once(asking: Coroutine[None, None, Answer]) -> Answer:
 def taste(data: bytes) -> None:
     """Send the request in the first two bytes; receive the rest in pieces of the length in the third."""
     kind, count, size = (*data[:3], 0, 0, 0)[:3]
-    request = Request("sensor", 1 + kind % 3, FUNCTIONS[kind % 4], 100, 1 + count % 9, 0.0)
+    request = ModbusRequest("sensor", 1 + kind % 3, FUNCTIONS[kind % 4], 100, 1 + count % 9, 0.0)
     came, size = data[3:], 1 + size
     line = RtuLine(PLACE)
     line._port, line.silence_s = _Port([came[k : k + size] for k in range(0, len(came), size)]), 0.0  # type: ignore[assignment] # stands for it
     try:
-        answer = _at_once(line.ask(request))
+        answer = _at_once(line.send_request(request))
     except DeviceError as error:
         assert len(str(error)) < 500
         return
@@ -77,14 +77,14 @@ def _is_frame_of(data: bytes, unit: int) -> bool:
 
 
 def target() -> Target:
-    read = framed(1, b"\x04\x02\x01\x00")
+    read = build_frame(1, b"\x04\x02\x01\x00")
     seeds = [
         b"\0\0\xff" + read,
         b"\0\0\2" + b"\xff\xff" + read,
-        b"\1\1\xff" + framed(2, b"\x03\x04" + bytes(4)),
-        b"\2\7\xff" + framed(3, b"\x01\x01\x55"),
-        b"\3\0\xff" + framed(1, b"\x06\x00\x64\x00\x01"),
-        b"\0\0\xff" + framed(1, b"\x84\x02"),
-        b"\0\0\xff" + framed(2, b"\x04\x02\x01\x00") + read,
+        b"\1\1\xff" + build_frame(2, b"\x03\x04" + bytes(4)),
+        b"\2\7\xff" + build_frame(3, b"\x01\x01\x55"),
+        b"\3\0\xff" + build_frame(1, b"\x06\x00\x64\x00\x01"),
+        b"\0\0\xff" + build_frame(1, b"\x84\x02"),
+        b"\0\0\xff" + build_frame(2, b"\x04\x02\x01\x00") + read,
     ]
     return Target("modbus_rtu", seeds, taste, [read, read[-2:], b"\x84\x02", b"\x01\x04"], 300)

@@ -7,9 +7,9 @@ from typing import Any
 
 from pymodbus.client import AsyncModbusTcpClient
 
-from fdhil.drivers.modbus.line import Request
-from fdhil.drivers.modbus.rtu import READ_COILS, READ_HOLDING, READ_INPUT, WRITE_REGISTER
-from fdhil.drivers.modbus.tcp_line import LIBRARYS_OWN_S, TcpLine, _end_waiting_at_nonsense
+from fdhil.drivers.modbus.modbus_line import ModbusRequest
+from fdhil.drivers.modbus.rtu_frames import READ_COILS, READ_HOLDING, READ_INPUT, WRITE_REGISTER
+from fdhil.drivers.modbus.tcp_line import LIBRARYS_OWN_S, TcpLine, _end_wait_at_unreadable_bytes
 from fdhil.errors import DeviceError
 from tests.fuzz.tasting import Target
 
@@ -45,14 +45,14 @@ class _Wire:
 
 async def _asked(data: bytes) -> None:
     kind, count = (*data[:2], 0, 0)[:2]
-    request = Request("sensor", 1, FUNCTIONS[kind % 4], 100, 1 + count % 9, 0.0)
+    request = ModbusRequest("sensor", 1, FUNCTIONS[kind % 4], 100, 1 + count % 9, 0.0)
     line = TcpLine("127.0.0.1", 502)
     client = AsyncModbusTcpClient("127.0.0.1", port=502, timeout=LIBRARYS_OWN_S, retries=0, reconnect_delay=0)
     client.ctx.transport = _Wire(client, data[2:])  # type: ignore[assignment] # stands for it
-    _end_waiting_at_nonsense(client)
+    _end_wait_at_unreadable_bytes(client)
     line._client = client
     try:
-        answer = await line.ask(request)
+        answer = await line.send_request(request)
     except DeviceError as error:
         assert len(str(error)) < 500
     else:

@@ -10,21 +10,21 @@ from contextlib import suppress
 import numpy as np
 
 from fdhil.daemon.nc_watch import NcWatch
-from fdhil.drivers.moves.told import ToldG0
-from fdhil.drivers.nc.http_stream import Parts, Response
-from fdhil.drivers.nc.linuxcnc import SCHEMA, LinuxCnc
-from fdhil.drivers.nc.mtconnect import MtConnect
+from fdhil.drivers.moves.nc_reported_moves import NcReportedMoves
+from fdhil.drivers.nc.http_stream import MultipartSplitter, Response
+from fdhil.drivers.nc.linuxcnc_source import SCHEMA, LinuxCncSource
+from fdhil.drivers.nc.mtconnect_source import MtConnectSource
 from fdhil.drivers.nc.mtconnect_xml import read_streams
 from fdhil.errors import DeviceError
 from fdhil.records import AxisSamples, TickTimes, freeze_array, freeze_integers
 from fdhil.shopfloor.mtconnect_adapter import ShdrAdapter
 from fdhil.shopfloor.published_items import list_published_values
 from fdhil.shopfloor.sparkplug import is_rebirth_command, parse_host_state
-from tests.drivers.wire import machine
+from tests.drivers.frame_builder import build_machine_config
 from tests.fuzz.tasting import Target
 
-CONFIG = machine(axes="X", g0={"source": "linuxcnc"})
-AGENT = machine(axes="X", g0={"source": "mtconnect"})
+CONFIG = build_machine_config(axes="X", g0={"source": "linuxcnc"})
+AGENT = build_machine_config(axes="X", g0={"source": "mtconnect"})
 _LOOP = asyncio.new_event_loop()
 
 
@@ -57,39 +57,39 @@ def _reader(data: bytes) -> asyncio.StreamReader:
 
 
 async def _linuxcnc(data: bytes) -> None:
-    bridge, moves, watch = LinuxCnc(CONFIG), ToldG0("X", CONFIG), NcWatch()
+    bridge, moves, watch = LinuxCncSource(CONFIG), NcReportedMoves("X", CONFIG), NcWatch()
     for record in HEARD:
-        moves.feed(record)
+        moves.detect_moves(record)
     bridge._reader = _reader(data)
-    bridge._greet(await bridge._next())
+    bridge._check_greeting(await bridge._next_message())
     try:
         while True:
-            for state in await bridge.read():
-                moves.feed(state)
+            for state in await bridge.read_states():
+                moves.detect_moves(state)
                 watch.take_state(state, 1.0)
                 json.dumps(watch.build_status(1.0), allow_nan=False)
                 list_published_values(("X",), ("can0",), {"nc": watch.build_status(1.0)}, 1)
     finally:
         for record in LATER:
-            moves.feed(record)
+            moves.detect_moves(record)
 
 
 async def _http(data: bytes) -> None:
     response = Response("agent", _reader(data))
-    await response.head()
+    await response.read_head()
     if response.headers.get("content-type", "").startswith("multipart"):
-        parts = Parts("agent", response.headers["content-type"])
-        while came := await response.some():
-            for part in parts.feed(came):
+        parts = MultipartSplitter("agent", response.headers["content-type"])
+        while came := await response.read_some():
+            for part in parts.split_parts(came):
                 read_streams(part, "agent")
     else:
-        await _xml(await response.document())
+        await _xml(await response.read_document())
 
 
 async def _xml(data: bytes) -> None:
-    streams, agent = read_streams(data, "agent"), MtConnect(AGENT)
-    agent._choose(streams)
-    for state in agent._states(streams):
+    streams, agent = read_streams(data, "agent"), MtConnectSource(AGENT)
+    agent._select_signals(streams)
+    for state in agent._build_states(streams):
         json.dumps(
             list_published_values(("X",), ("can0",), {"nc": {"line": state.line, "heard_s_ago": 0.0}}, 1)[-1].value
         )

@@ -7,7 +7,7 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
-from fdhil.config.editing import NotEditable, edited
+from fdhil.config.toml_editing import NotEditable, edit_toml
 from fdhil.errors import FdhilError
 from fdhil.fleet.delivery import parted
 from fdhil.fleet.offer import Offer, _parsed, canonical, make_key, read, sign
@@ -33,7 +33,7 @@ def _of_message(data: bytes) -> None:
 
 def _of_text(data: bytes) -> None:
     with suppress(NotEditable, ValueError):
-        edited(data.decode(), {"axis.X.nominal.ft": 0.061, "maintenance.ft": 0.5}, "friction version 3")
+        edit_toml(data.decode(), {"axis.X.nominal.ft": 0.061, "maintenance.ft": 0.5}, "friction version 3")
 
 
 def _of_answers(data: bytes) -> None:
