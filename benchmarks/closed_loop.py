@@ -19,11 +19,11 @@ import numpy as np
 
 from fdhil.config import parse_config
 from fdhil.model import closed_loop
-from fdhil.model.loops import Drive
+from fdhil.model.closed_loop_drive import DriveModel
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Float
 from tests.bench import bench_config, bench_document
-from tests.paths import bench_demand
+from tests.paths import build_bench_demand
 
 REPEATS = 40
 # what an ordinary machine has
@@ -78,11 +78,11 @@ def measure(terms: Mapping[str, float] | None = None) -> dict[str, float]:
     """
     config = bench_config()
     axis, model = config.axis["X"], nominal_models(config)["X"].replace_values(**terms or {})
-    reference = np.ascontiguousarray(bench_demand(10.0)[:, 0])
-    drive = closed_loop.prepare(model, axis, 0.001)
-    assert isinstance(drive, Drive)
+    reference = np.ascontiguousarray(build_bench_demand(10.0)[:, 0])
+    drive = closed_loop.prepare_drive(model, axis, 0.001)
+    assert isinstance(drive, DriveModel)
     stepping, commands = replace(drive, leap=drive.leap[:0]), closed_loop.Commands(reference)
-    start, n = closed_loop.standing(model, axis, float(reference[0])), reference.size
+    start, n = closed_loop.create_standstill_state(model, axis, float(reference[0])), reference.size
     with tempfile.TemporaryDirectory() as folder:
         library = compiled(Path(folder))
         out, state = np.empty((7, n)), np.zeros(12)
@@ -105,14 +105,14 @@ def measure(terms: Mapping[str, float] | None = None) -> dict[str, float]:
 
 def structures() -> dict[str, float]:
     """Return how many times faster than real time each regulator structure runs with all its options on."""
-    reference = np.ascontiguousarray(bench_demand(10.0)[:, 0])
+    reference = np.ascontiguousarray(build_bench_demand(10.0)[:, 0])
     found = {}
     for name, own in (("p_pi_pi", {}), ("double_pi", {"position_ki_per_s2": 300.0}), ("pid", {"speed_ki": 0.0})):
         document = bench_document("X")
         document["axis"]["X"]["regulators"] |= OPTIONS | own | {"structure": name}
         config = parse_config(document)
         axis, model = config.axis["X"], nominal_models(config)["X"]
-        seconds = best(partial(closed_loop.simulate, model, axis, 0.001, reference))
+        seconds = best(partial(closed_loop.simulate_axis, model, axis, 0.001, reference))
         found[name] = reference.size * 0.001 / seconds
     return found
 

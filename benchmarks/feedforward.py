@@ -20,15 +20,15 @@ from fdhil.model import closed_loop
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Float
 from tests.correction.test_planning import changed
-from tests.paths import bench_demand, jerky_demand
+from tests.paths import build_bench_demand, build_jerky_demand
 
 PLANTS = 10
 CASES = (
-    ("bench, 10 m/min", bench_demand(10), 1.0, 3),
-    ("bench, 20 m/min", bench_demand(20), 1.0, 3),
-    ("lag (Kff 0.5), 10 m/min", bench_demand(10), 0.5, 50),
-    ("lag (Kff 0.5), 20 m/min", bench_demand(20), 0.5, 50),
-    ("jerky, 10 m/min", jerky_demand(10), 1.0, 0),
+    ("bench, 10 m/min", build_bench_demand(10), 1.0, 3),
+    ("bench, 20 m/min", build_bench_demand(20), 1.0, 3),
+    ("lag (Kff 0.5), 10 m/min", build_bench_demand(10), 0.5, 50),
+    ("lag (Kff 0.5), 20 m/min", build_bench_demand(20), 0.5, 50),
+    ("jerky, 10 m/min", build_jerky_demand(10), 1.0, 0),
 )
 
 

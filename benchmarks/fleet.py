@@ -25,16 +25,16 @@ import psycopg
 from nats.aio.client import Client
 
 from fdhil.config.fleet_config import Database, Fleet, Objects, Server, Stream
-from fdhil.fleet import migrations
-from fdhil.fleet.collector import _AT_ONCE, _COLUMNS, Collector, _rows
-from fdhil.fleet.message import Message, Record, decode, joined, of_entry
-from fdhil.fleet.transport import connected, prepare_stream
-from fdhil.fleet.uplink import BATCH, MESSAGE_BYTES, Sender
+from fdhil.fleet import schema_migrations
+from fdhil.fleet.collector import _AT_ONCE, _COLUMNS, Collector, _format_copy_rows
+from fdhil.fleet.nats_transport import connect_to_server, prepare_record_stream
+from fdhil.fleet.record_message import Message, Record, decode_message, encode_entry, join_messages
+from fdhil.fleet.record_uplink import BATCH, MESSAGE_BYTES, OutboxSender
 from fdhil.store.outbox import POSITION_FILE, OutboxReader
 from studies import fleet_day
 from studies.fleet_parts import of_database, processor_s
-from tests.fleet.servers import NatsServer, Postgres, postgres
-from tests.fleet.servers import nats as nats_server
+from tests.fleet.servers import NatsServer, Postgres, run_postgres
+from tests.fleet.servers import run_nats as nats_server
 
 ROUNDS = 3  # of each way in turn; the best is told, which other work on this computer disturbed the least
 TOGETHER = 10_000  # rows in a transaction
@@ -85,7 +85,7 @@ class Bench:
         """Make the stream anew; the old one would know the messages again."""
         with suppress(nats.js.errors.NotFoundError):
             await self.client.jetstream().delete_stream(self.fleet.stream.name)
-        await prepare_stream(self.client.jetstream(), self.fleet.stream)
+        await prepare_record_stream(self.client.jetstream(), self.fleet.stream)
 
 
 def main() -> None:
@@ -94,7 +94,7 @@ def main() -> None:
     parser.add_argument("--machines", type=int, default=20)
     parser.add_argument("--records", type=int, default=1500)
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as place, postgres() as database, nats_server(Path(place)) as server:
+    with tempfile.TemporaryDirectory() as place, run_postgres() as database, nats_server(Path(place)) as server:
         asyncio.run(run(Path(place), options.machines, options.records, server, database))
 
 
@@ -103,7 +103,7 @@ async def run(folder: Path, machines: int, records: int, server: NatsServer, dat
     day = fleet_day.machine(folder / "day", "day", server.url)
     fleet_day.record(day, records)
     configs = fleet_day.copied([day], folder, machines, server.url)
-    senders = [Sender(config, config.uplink) for config in configs if config.uplink is not None]
+    senders = [OutboxSender(config, config.uplink) for config in configs if config.uplink is not None]
     print(f"{machines} machines with {records} records each; servers and clients on the same computer")
     fleet = Fleet(
         server=Server(server=server.url),
@@ -112,7 +112,7 @@ async def run(folder: Path, machines: int, records: int, server: NatsServer, dat
         stream=Stream(max_bytes=4 << 30),
     )
     async with (
-        connected(fleet.server, "bench", "server") as client,
+        connect_to_server(fleet.server, "bench", "server") as client,
         await psycopg.AsyncConnection.connect(database.connection, autocommit=True) as db,
     ):
         bench = Bench(fleet, server, database, client, db)
@@ -120,7 +120,7 @@ async def run(folder: Path, machines: int, records: int, server: NatsServer, dat
         await collected(bench, senders)
 
 
-async def published(bench: Bench, senders: Sequence[Sender]) -> None:
+async def published(bench: Bench, senders: Sequence[OutboxSender]) -> None:
     """Print what goes into the stream."""
     messages = [message for sender in senders for message in messages_of(sender)]
     together = together_of(senders)
@@ -138,15 +138,15 @@ async def published(bench: Bench, senders: Sequence[Sender]) -> None:
     print(*(way.line(ours) for way in (ours, each, same)), sep="\n")
 
 
-async def collected(bench: Bench, senders: Sequence[Sender]) -> None:
+async def collected(bench: Bench, senders: Sequence[OutboxSender]) -> None:
     """Print what goes out of the stream and into the database."""
     messages = [message for sender in senders for message in messages_of(sender)]
     together = together_of(senders)
     rows = rows_of(together)
     gc.freeze()  # what a collector does not have, and would be looked through again and again
-    await migrations.bring_up(bench.db)
+    await schema_migrations.upgrade_schema(bench.db)
     first = datetime.fromtimestamp(fleet_day.MIDNIGHT_S, UTC)
-    await migrations.add_months(bench.db, {(first.year, first.month)})
+    await schema_migrations.add_month_partitions(bench.db, {(first.year, first.month)})
     await bench.db.execute("CREATE TABLE bare (LIKE fleet.records)")
     ours, same = Way("collected by one collector"), Way("by COPY of ready rows into the history's own table")
     plain = Way("by COPY of ready rows into a table without key and index")
@@ -167,22 +167,22 @@ async def collected(bench: Bench, senders: Sequence[Sender]) -> None:
     print(*(way.line(ours) for way in (ours, read, same, both, plain)), sep="\n")
 
 
-def messages_of(sender: Sender) -> Iterator[Message]:
+def messages_of(sender: OutboxSender) -> Iterator[Message]:
     """Yield all that a machine has to tell, each record for itself."""
     with OutboxReader(sender._store) as reader:
         for entry in reader.entries(0, 10_000_000):
-            yield of_entry(entry, sender.machine, reader.store, None)
+            yield encode_entry(entry, sender.machine, reader.store, None)
 
 
-def together_of(senders: Sequence[Sender]) -> list[Message]:
+def together_of(senders: Sequence[OutboxSender]) -> list[Message]:
     """Return the messages that uplinks send."""
-    return [message for sender in senders for message, _ in joined(messages_of(sender), MESSAGE_BYTES)]
+    return [message for sender in senders for message, _ in join_messages(messages_of(sender), MESSAGE_BYTES)]
 
 
 def rows_of(messages: Sequence[Message]) -> list[str]:
     """Return what is in messages as a database takes it."""
-    told = [told for message in messages for told in decode(message.subject, message.payload)]
-    return list(_rows([(record, LISTED) for record in told if isinstance(record, Record)]))
+    told = [told for message in messages for told in decode_message(message.subject, message.payload)]
+    return list(_format_copy_rows([(record, LISTED) for record in told if isinstance(record, Record)]))
 
 
 async def publish(client: Client, messages: Sequence[Message]) -> None:
@@ -198,7 +198,7 @@ async def publish(client: Client, messages: Sequence[Message]) -> None:
 
 async def take(bench: Bench, count: int) -> None:
     """Take messages out of the stream, answer for them, and do nothing with them."""
-    reader = await prepare_stream(bench.client.jetstream(), bench.fleet.stream)
+    reader = await prepare_record_stream(bench.client.jetstream(), bench.fleet.stream)
     while count > 0:
         messages = await reader.fetch(1000, timeout=10)
         for message in messages:
@@ -206,22 +206,23 @@ async def take(bench: Bench, count: int) -> None:
         count -= len(messages)
 
 
-async def send(senders: Sequence[Sender]) -> None:
+async def send(senders: Sequence[OutboxSender]) -> None:
     """Send all outboxes, each over its own connection."""
     async with AsyncExitStack() as stack:
         clients = [
-            await stack.enter_async_context(connected(sender._settings, sender.machine, "uplink")) for sender in senders
+            await stack.enter_async_context(connect_to_server(sender._settings, sender.machine, "uplink"))
+            for sender in senders
         ]
         await asyncio.gather(*(send_one(*pair) for pair in zip(senders, clients, strict=True)))
 
 
-async def send_one(sender: Sender, client: Client) -> None:
+async def send_one(sender: OutboxSender, client: Client) -> None:
     """Send an outbox to its end."""
     stream = client.jetstream()
     while True:
-        position, entries = await sender._next(stream)
+        position, entries = await sender._read_next_entries(stream)
         if entries:
-            await sender._send(stream, position, entries, client.max_payload)
+            await sender._send_entries(stream, position, entries, client.max_payload)
         if len(entries) < BATCH:
             return
 

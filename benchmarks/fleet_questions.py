@@ -15,9 +15,9 @@ from collections.abc import Callable
 import psycopg
 
 from fdhil.config.fleet_config import Database, Fleet
-from fdhil.fleet import migrations, questions, sets
-from fdhil.fleet.sets import Db
-from tests.fleet.servers import Postgres, postgres
+from fdhil.fleet import fleet_queries, parameter_sets, schema_migrations
+from fdhil.fleet.parameter_sets import Db
+from tests.fleet.servers import Postgres, run_postgres
 
 FIRST = "timestamptz '2027-01-04Z'"
 COLUMNS = "machine, message, recorded_at, store, sequence, axis, kind, stored_at, window_name, record"
@@ -58,11 +58,11 @@ KINDS = (
 HEARD = """INSERT INTO fleet.heard SELECT machine, store, count(*) FILTER (WHERE sequence > 0), max(sequence),
   min(stored_at), max(stored_at) FROM fleet.records GROUP BY machine, store"""
 ASKED: dict[str, Callable[[Db], object]] = {
-    "status": questions.status,
-    "outliers --by type": lambda db: questions.outliers(db, "type", None),
-    "compare --parameter ft": lambda db: questions.compare(db, "ft", "type", None),
-    "trend of one axis": lambda db: questions.trend(db, "mill-00007", "X", "ft"),
-    "services": questions.QUERIES["services"],
+    "status": fleet_queries.read_fleet_status,
+    "outliers --by type": lambda db: fleet_queries.find_outliers(db, "type", None),
+    "compare --parameter ft": lambda db: fleet_queries.compare_parameter(db, "ft", "type", None),
+    "trend of one axis": lambda db: fleet_queries.compute_trend(db, "mill-00007", "X", "ft"),
+    "services": fleet_queries.QUERIES["services"],
 }
 
 
@@ -74,7 +74,7 @@ def main() -> None:
     parser.add_argument("--a-day", type=int, default=4, help="parameter sets of an axis")
     parser.add_argument("--rounds", type=int, default=2)
     options = parser.parse_args()
-    with postgres() as database:
+    with run_postgres() as database:
         made_s, rows, size = make(database, vars(options))
         print(f"{options.machines} machines with 3 axes, {options.days} days, {options.a_day} sets of an axis a day: "
               f"{rows} records, {size / 1e9:.1f} GB, made in {made_s:.0f} s")  # fmt: skip
@@ -93,7 +93,7 @@ def make(database: Postgres, given: dict[str, int]) -> tuple[float, int, int]:
         for kind in KINDS:
             db.execute(kind.encode(), {**given, "covariance": str(COVARIANCE)})
         db.execute(HEARD)
-        db.execute(migrations.FILL_SHIFTS)
+        db.execute(schema_migrations.FILL_SHIFTS)
         db.execute("VACUUM ANALYZE")
         row = db.execute("SELECT count(*), pg_database_size(current_database()) FROM fleet.records").fetchone()
     assert row is not None
@@ -103,14 +103,14 @@ def make(database: Postgres, given: dict[str, int]) -> tuple[float, int, int]:
 async def prepare(database: Postgres, days: int) -> None:
     """Make tables and months."""
     async with await psycopg.AsyncConnection.connect(database.connection, autocommit=True) as db:
-        await migrations.bring_up(db)
-        await migrations.add_months(db, {(2027 + k // 12, k % 12 + 1) for k in range(days // 28 + 2)})
+        await schema_migrations.upgrade_schema(db)
+        await schema_migrations.add_month_partitions(db, {(2027 + k // 12, k % 12 + 1) for k in range(days // 28 + 2)})
 
 
 def asked_s(fleet: Fleet, ask: Callable[[Db], object]) -> float:
     """Return how long an answer takes, the connection included."""
     begin_s = time.perf_counter()
-    with sets.asking(fleet) as db:
+    with parameter_sets.open_read_only(fleet) as db:
         ask(db)
     return time.perf_counter() - begin_s
 

@@ -20,18 +20,18 @@ from psycopg.types.json import Jsonb
 
 from fdhil.config import Identification
 from fdhil.config.fleet_config import Database, Fleet, Objects
-from fdhil.fleet import migrations, objects, reanalysis
-from fdhil.fleet.changes import changes
-from fdhil.fleet.sets import asking, entered
-from fdhil.fleet.window_work import Method, code_digest
-from fdhil.fleet.workers import workers
+from fdhil.fleet import reanalysis, schema_migrations, window_files
+from fdhil.fleet.parameter_sets import open_database, open_read_only
+from fdhil.fleet.reanalysis_changes import summarise_changes
+from fdhil.fleet.window_reanalysis import AnalysisMethod, compute_code_digest
+from fdhil.fleet.worker_pools import open_worker_pool
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.store.history import described
 from fdhil.store.recording_csv import parse_recording
 from fdhil.store.windows import encode_window
 from studies import bench
-from tests.fleet.servers import Postgres, postgres
+from tests.fleet.servers import Postgres, run_postgres
 
 BEGIN = datetime(2027, 1, 1, tzinfo=UTC)
 NOISE = 0.003
@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("--windows", type=int, default=1000)
     parser.add_argument("--method", default="maximum_likelihood")
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as place, postgres() as database:
+    with tempfile.TemporaryDirectory() as place, run_postgres() as database:
         measure(Path(place), options.windows, options.method, database)
 
 
@@ -53,20 +53,20 @@ def measure(folder: Path, windows: int, method: str, database: Postgres) -> None
     fleet = Fleet(database=Database(connection=database.connection), objects=Objects(directory=folder))
     stored_bytes = asyncio.run(gathered(fleet, windows))
     print(f"{windows} windows of {stored_bytes / windows / 1024:.1f} KiB, method {method}")
-    asked = Method(Identification(method=method), {}, folder, code_digest())
+    asked = AnalysisMethod(Identification(method=method), {}, folder, compute_code_digest())
     rates: dict[int, list[float]] = {}
     digests = set()
     for count in CREWS:
-        with entered(fleet) as db:
+        with open_database(fleet) as db:
             db.execute("TRUNCATE fleet.reanalyses CASCADE")
         begin_s = time.perf_counter()
-        with workers(None, count) as crew:
+        with open_worker_pool(None, count) as crew:
             up_s = time.perf_counter() - begin_s
-            revision = reanalysis.reanalyse(fleet, asked, reanalysis.Scope(), crew)
+            revision = reanalysis.reanalyse_windows(fleet, asked, reanalysis.WindowScope(), crew)
             took_s = time.perf_counter() - begin_s - up_s
-        with asking(fleet) as db:
+        with open_read_only(fleet) as db:
             begin_s = time.perf_counter()
-            told = changes(db, revision, "type")
+            told = summarise_changes(db, revision, "type")
             asked_s = time.perf_counter() - begin_s
         assert told["windows"] == windows
         digests.add(told["digest"])
@@ -82,13 +82,13 @@ async def gathered(fleet: Fleet, windows: int) -> int:
     """Bring windows into folder and database as collectors do, analysed by the fast method; return their bytes."""
     size = 0
     async with await psycopg.AsyncConnection.connect(fleet.database.connection, autocommit=True) as db:
-        await migrations.bring_up(db)
-        await migrations.add_months(db, {(BEGIN.year, BEGIN.month)})
+        await schema_migrations.upgrade_schema(db)
+        await schema_migrations.add_month_partitions(db, {(BEGIN.year, BEGIN.month)})
         for k, signals in enumerate(recorded(windows)):
             (window,) = find_windows(parse_recording(bench.as_csv(signals, NOISE, k)))
             content = encode_window(window, "benchmark")
             name = hashlib.sha256(content).hexdigest()
-            objects.keep(fleet.objects.directory, name, content)
+            window_files.store_window(fleet.objects.directory, name, content)
             size += len(content)
             found = analyse(window, Identification(method="least_squares"))
             record = {

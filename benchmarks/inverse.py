@@ -14,13 +14,13 @@ import numpy as np
 
 from fdhil.correction import mirror, plan
 from fdhil.correction.streaming import stream
-from fdhil.model import closed_loop, kernels
+from fdhil.model import closed_loop, closed_loop_kernels
 from fdhil.prediction import contour_error_um, predict, predict_corrected
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Float, Parameters
 from tests.bench import bench_config
 from tests.correction.test_planning import changed
-from tests.paths import bench_demand, jerky_demand, rms, rounded_demand, trajectory
+from tests.paths import build_bench_demand, build_jerky_demand, build_rounded_demand, build_trajectory, compute_rms
 
 CONFIG = bench_config()
 MODELS = nominal_models(CONFIG)
@@ -42,13 +42,13 @@ class Case:
 
 
 CASES = (
-    Case("bench, 10 m/min, 60 + 30 ms", bench_demand(10, FAST), 60, 8),
-    Case("bench, 20 m/min, 60 + 30 ms", bench_demand(20, FAST), 60, 8),
-    Case("bench, 10 m/min, 30 + 15 ms", bench_demand(10, SHARP), 60, 8),
-    Case("rounded, 10 m/min, 60 + 30 ms", rounded_demand(10, FAST), 0, 0),
-    Case("rounded, 20 m/min, 60 + 30 ms", rounded_demand(20, FAST), 0, 0),
-    Case("jerky, 10 m/min, 2 m/s2", jerky_demand(10), 14, 2),
-    Case("jerky, 20 m/min, 2 m/s2", jerky_demand(20), 14, 2),
+    Case("bench, 10 m/min, 60 + 30 ms", build_bench_demand(10, FAST), 60, 8),
+    Case("bench, 20 m/min, 60 + 30 ms", build_bench_demand(20, FAST), 60, 8),
+    Case("bench, 10 m/min, 30 + 15 ms", build_bench_demand(10, SHARP), 60, 8),
+    Case("rounded, 10 m/min, 60 + 30 ms", build_rounded_demand(10, FAST), 0, 0),
+    Case("rounded, 20 m/min, 60 + 30 ms", build_rounded_demand(20, FAST), 0, 0),
+    Case("jerky, 10 m/min, 2 m/s2", build_jerky_demand(10), 14, 2),
+    Case("jerky, 20 m/min, 2 m/s2", build_jerky_demand(20), 14, 2),
 )
 # (Kff, feed in m/min): what a lagging drive can still have, and where it is refused
 LAGS = ((0.5, 2.0), (0.5, 4.0), (0.5, 10.0), (0.0, 1.0), (0.0, 2.0), (0.0, 10.0))
@@ -69,7 +69,7 @@ def _pieces(demand: Float, size: int = 50) -> Iterator[Mapping[str, Float]]:
 
 def _for_long(seconds: float) -> Iterator[Mapping[str, Float]]:
     """The bench path there and back, again and again, made while it is used."""
-    there = bench_demand(10)
+    there = build_bench_demand(10)
     loop = np.concatenate([there, there[::-1]])
     for _ in range(round(seconds / (len(loop) * 0.001))):
         yield from _pieces(loop)
@@ -77,7 +77,7 @@ def _for_long(seconds: float) -> Iterator[Mapping[str, Float]]:
 
 def first_block() -> tuple[float, float]:
     """Return the shortest wall and processor time from the last row of the first 2.5 s of path to the first block."""
-    demand = bench_demand(10)[:2550]
+    demand = build_bench_demand(10)[:2550]
     begun = [0.0, 0.0]
 
     def arriving() -> Iterator[Mapping[str, Float]]:
@@ -107,7 +107,7 @@ def throughput(seconds: float) -> tuple[float, float, float]:
 
 def seams() -> float:
     """Return by how much (um) the error is larger within 0.1 s of a seam than it is there with seams elsewhere."""
-    there = bench_demand(10)
+    there = build_bench_demand(10)
     path = np.concatenate([there, there[::-1], there])
     shift = 731  # rows of rest ahead move every seam to another place of the path
     later = np.concatenate([np.repeat(path[:1], shift, axis=0), path])
@@ -123,7 +123,7 @@ def gains(demand: Float) -> tuple[Float, tuple[float, float]]:
 
     Also the RMS (um) before and after on the plant that is the model.
     """
-    reference = trajectory(demand)
+    reference = build_trajectory(demand)
     correction = plan(reference, MODELS, CONFIG, "inverse")
     assert not correction.refused, correction.refused
     mirrored = mirror.plan(reference, MODELS, CONFIG, correction.before).offset_um  # ungated: also where it harms
@@ -140,8 +140,15 @@ def gains(demand: Float) -> tuple[Float, tuple[float, float]]:
             after[(reference.time_s >= z.start_s) & (reference.time_s < z.end_s)].max() - z.max_um for z in before.zones
         ]
         worse = float((after - before.contour_um).max())
-        rows.append((rms(before.contour_um) / rms(after), rms(other) / rms(after), worse, max(zones, default=-np.inf)))
-    return np.array(rows), (rms(correction.before.contour_um), rms(correction.after.contour_um))
+        rows.append(
+            (
+                compute_rms(before.contour_um) / compute_rms(after),
+                compute_rms(other) / compute_rms(after),
+                worse,
+                max(zones, default=-np.inf),
+            )
+        )
+    return np.array(rows), (compute_rms(correction.before.contour_um), compute_rms(correction.after.contour_um))
 
 
 def held_at_start(share: float) -> tuple[float, float]:
@@ -149,17 +156,19 @@ def held_at_start(share: float) -> tuple[float, float]:
 
     The plan takes the regulators as empty there: what the last move before the program left in them it cannot know.
     """
-    demand = bench_demand(10)
-    offsets = plan(trajectory(demand), MODELS, CONFIG, "inverse").offset_um
+    demand = build_bench_demand(10)
+    offsets = plan(build_trajectory(demand), MODELS, CONFIG, "inverse").offset_um
     places = []
     for a, name in enumerate("XY"):
-        model, state = MODELS[name], closed_loop.start(float(demand[0, a]))
-        state[[kernels.CURRENT, kernels.SPEED_INTEGRAL, kernels.CURRENT_DEMAND]] = share * model.Cd / model.K
-        state[kernels.CURRENT_INTEGRAL] = model.R * state[kernels.CURRENT]
+        model, state = MODELS[name], closed_loop.create_zero_state(float(demand[0, a]))
+        state[[closed_loop_kernels.CURRENT, closed_loop_kernels.SPEED_INTEGRAL, closed_loop_kernels.CURRENT_DEMAND]] = (
+            share * model.Cd / model.K
+        )
+        state[closed_loop_kernels.CURRENT_INTEGRAL] = model.R * state[closed_loop_kernels.CURRENT]
         commanded = demand[:, a] + offsets[name] * 1e-3
-        places.append(closed_loop.simulate(model, CONFIG.axis[name], 0.001, commanded, state=state).position_mm)
+        places.append(closed_loop.simulate_axis(model, CONFIG.axis[name], 0.001, commanded, state=state).position_mm)
     errors = contour_error_um(demand, np.column_stack(places), 0.001)
-    return rms(errors), float(errors.max())
+    return compute_rms(errors), float(errors.max())
 
 
 def _print_cases() -> None:
@@ -175,9 +184,13 @@ def _print_cases() -> None:
 def _print_lags() -> None:
     print("\na drive without its speed feed-forward, bench path")
     for feedforward, feed in LAGS:
-        correction = plan(trajectory(bench_demand(feed)), MODELS, changed(speed_feedforward=feedforward), "inverse")
+        correction = plan(
+            build_trajectory(build_bench_demand(feed)), MODELS, changed(speed_feedforward=feedforward), "inverse"
+        )
         said = "; ".join(f"{r.code}: {r.text}; {r.advice}" for r in correction.refused[:1])
-        left = f"{rms(correction.before.contour_um):.1f} -> {rms(correction.after.contour_um):.2f} um RMS"
+        left = (
+            f"{compute_rms(correction.before.contour_um):.1f} -> {compute_rms(correction.after.contour_um):.2f} um RMS"
+        )
         print(f"Kff {feedforward:.1f}, {feed:4.1f} m/min: {said or left}")
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from fdhil import config
 from tests.integration.conftest import sign_off
-from tests.sim.twin_process import write_config
+from tests.sim.simulator_process import write_config
 
 HERE = Path(__file__).parent
 SETPOINTS = "[axis.{}.setpoints]\ntravel_mm = [-50.0, 50.0]\n"

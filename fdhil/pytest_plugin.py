@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import can
 
     from fdhil.sim.frame_faults import FrameFault
-    from fdhil.sim.service import SimService
+    from fdhil.sim.simulator_service import SimulatorService
 
 BUSES = ("virtual", "hub")  # any other name is that of a CAN interface, as vcan0
 DEFAULT_PATIENCE_S = 60.0
@@ -80,7 +80,7 @@ class FeedDriveBench:
         self.folder = folder
         self._document, self._patience_s = document, patience_s
         self._events: queue.Queue[dict[str, Any]] = queue.Queue()
-        self._service: SimService | None = None
+        self._service: SimulatorService | None = None
         self._thread: threading.Thread | None = None
         self._joined: list[can.BusABC] = []
         self.ready: Mapping[str, Any] = {}
@@ -88,9 +88,11 @@ class FeedDriveBench:
     def __enter__(self) -> FeedDriveBench:
         from fdhil import config
         from fdhil.program import load_trajectory
-        from fdhil.sim.service import SimService
+        from fdhil.sim.simulator_service import SimulatorService
 
-        service = SimService(config.parse_config(self._document, folder=self.folder), self._events.put, load_trajectory)
+        service = SimulatorService(
+            config.parse_config(self._document, folder=self.folder), self._events.put, load_trajectory
+        )
         self._service = service
         self._thread = threading.Thread(target=service.run, name="feed drive bench")
         self._thread.start()
@@ -159,7 +161,7 @@ class FeedDriveBench:
         A command that the machine refuses fails the test.
         """
         assert self._service is not None
-        if wrong := self._service.command(json.dumps({"command": command, **more})):
+        if wrong := self._service.execute_command(json.dumps({"command": command, **more})):
             pytest.fail(f"the feed drive bench failed: {wrong}")
 
     def fault(self, name: str, axis: str | None = "X", **more: Any) -> None:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fdhil.guard.offset_limits import OffsetLimits
-from fdhil.sim.frame import Frame
+from fdhil.sim.frame_types import Frame
 
 Rng = np.random.Generator
 Tamper = Callable[[int, Frame], list[Frame]]

@@ -20,13 +20,13 @@ from typing import Any
 import psycopg
 
 from fdhil.config import MachineConfig
-from fdhil.fleet.message import of_entry
+from fdhil.fleet.record_message import encode_entry
 from fdhil.store.outbox import OutboxReader
 from studies import fleet_day, pages
 from studies.fleet_cut import Network
 from studies.fleet_page import page as page
 from studies.fleet_parts import Process, counted, of_database, parts_of, processor_s, wait_for
-from tests.fleet.servers import NatsServer, Postgres, nats, postgres
+from tests.fleet.servers import NatsServer, Postgres, run_nats, run_postgres
 
 GROUPS, COLLECTORS = 4, 2
 MINUTES = 60  # of the work that is recorded while the network is away
@@ -62,7 +62,7 @@ def gathered(folder: Path, machines: Sequence[MachineConfig], server: NatsServer
 def killed(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Send all that the machines have recorded while what is between is killed at random."""
     chance = random.Random(options.seed)
-    with postgres() as database, nats(folder) as server:
+    with run_postgres() as database, run_nats(folder) as server:
         days = [fleet_day.machine(folder / f"day-{k}", f"day-{k}", server.url) for k in range(fleet_day.DAYS)]
         for k, day in enumerate(days):
             fleet_day.record(day, options.records, seed=options.seed + k)
@@ -128,8 +128,8 @@ def sizes(day: MachineConfig, database: Postgres, total: int) -> dict[str, Any]:
         ((history,),) = reader._ask("SELECT sum(pgsize) FROM dbstat WHERE name <> 'outbox'", ())
         wire: dict[str, list[int]] = {}
         for entry in entries:
-            wire.setdefault(entry.kind, []).append(len(of_entry(entry, "mill-000", reader.store, None).payload))
-    table, index, whole = database.ask(SIZES)[0]
+            wire.setdefault(entry.kind, []).append(len(encode_entry(entry, "mill-000", reader.store, None).payload))
+    table, index, whole = database.execute_query(SIZES)[0]
     return {
         "wire": {kind: {"records": len(each), "bytes": sum(each) / len(each)} for kind, each in wire.items()},
         "a_record": {
@@ -142,7 +142,7 @@ def sizes(day: MachineConfig, database: Postgres, total: int) -> dict[str, Any]:
 
 def calm(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Send recorded days with nothing killed; return rates, and the processor's time of each part for a record."""
-    with postgres() as database, nats(folder) as server:
+    with run_postgres() as database, run_nats(folder) as server:
         day = fleet_day.machine(folder / "day", "day", server.url)
         fleet_day.record(day, options.calm_records)
         machines = fleet_day.copied([day], folder, options.calm_machines, server.url)
@@ -165,7 +165,7 @@ def calm(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
 def cut(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Cut the network while each machine records an hour of work; return how long it takes to catch up."""
-    with postgres() as database, nats(folder) as server:
+    with run_postgres() as database, run_nats(folder) as server:
         network = Network(server.port)
         away = f"nats://127.0.0.1:{network.port}"
         machines = [fleet_day.machine(folder / f"mill-{k}", f"mill-{k}", away) for k in range(options.cut_machines)]
@@ -187,8 +187,8 @@ def cut(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
             first_s = wait_for(lambda: counted(database) > before, "the first come again")
             all_s = first_s + wait_for(lambda: counted(database) >= total, "all are there")
         network.close()
-        left_out = database.ask("SELECT sum(missing), sum(records) FROM fleet.machines")[0]
-        order = database.ask(ORDER)[0][0]
+        left_out = database.execute_query("SELECT sum(missing), sum(records) FROM fleet.machines")[0]
+        order = database.execute_query(ORDER)[0][0]
     return {
         "machines": len(machines), "cut_s": options.cut_s, "records": total - before, "through": through,
         "first_s": first_s, "all_s": all_s, "lost": int(left_out[0]) + total - int(left_out[1]), "out_of_order": order,

@@ -16,7 +16,7 @@ from fdhil.store import HISTORY_FILE
 from fdhil.store.history import History
 from fdhil.store.outbox import Outbox
 from fdhil.store.rows import Stamp
-from tests.fleet.machine import written
+from tests.fleet.recording_machine import write_history
 from tests.store.made import BENCH, outcome, published, window
 
 AXES = ("X", "Y", "Z")
@@ -28,7 +28,7 @@ MIDNIGHT_S = 1_800_000_000.0
 
 def machine(folder: Path, name: str, server: str) -> MachineConfig:
     """Return a machine with [uplink] that has recorded nothing."""
-    return machine_config.load_config(written(folder, name, server=server, windows="none", machine=name))
+    return machine_config.load_config(write_history(folder, name, server=server, windows="none", machine=name))
 
 
 def record(config: MachineConfig, records: int, first: int = 0, seed: int = 1) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 import psycopg
 
 from fdhil import config as machine_config
-from fdhil.fleet import uplink
+from fdhil.fleet import record_uplink
 from tests.fleet.servers import NatsServer, Postgres
 
 Part = tuple[Callable[[], None], Callable[[], None]]  # how it is killed, and started again
@@ -82,15 +82,15 @@ def parts_of(
     named = {f"uplinks {k + 1}": each for k, each in enumerate(uplinks)}
     named |= {f"collector {k + 1}": each for k, each in enumerate(collectors)}
     parts: dict[str, Part] = {name: (each.kill, each.start) for name, each in named.items()}
-    parts["nats-server"] = (lambda: server.stop(signal.SIGKILL), server.start)
-    parts["PostgreSQL"] = (lambda: kill_database(database), database.start)
+    parts["nats-server"] = (lambda: server.stop_server(signal.SIGKILL), server.start_server)
+    parts["PostgreSQL"] = (lambda: kill_database(database), database.start_server)
     return parts
 
 
 def counted(database: Postgres) -> int:
     """Return how many records of machines the database has; 0 while it has no tables or does not answer."""
     try:
-        return int(database.ask("SELECT coalesce(sum(records), 0) FROM fleet.heard")[0][0])
+        return int(database.execute_query("SELECT coalesce(sum(records), 0) FROM fleet.heard")[0][0])
     except psycopg.Error:
         return 0
 
@@ -107,7 +107,7 @@ def wait_for(holds: Callable[[], bool], what: str, patience_s: float = 1200.0) -
 
 async def _send(files: Sequence[str]) -> None:
     configs = [machine_config.load_config(Path(file)) for file in files]
-    await asyncio.gather(*(uplink.send(config, lambda _: None) for config in configs))
+    await asyncio.gather(*(record_uplink.send_records(config, lambda _: None) for config in configs))
 
 
 if __name__ == "__main__":

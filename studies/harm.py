@@ -73,5 +73,5 @@ def beside_the_path(models: Sequence[Parameters], scene: Scene) -> list[str]:
 
 
 def _missed(model: Parameters, axis: Axis, demand_mm: Float, position_mm: Float) -> tuple[float, float]:
-    told = closed_loop.simulate(model, axis, drives.CYCLE_S, demand_mm).position_mm
+    told = closed_loop.simulate_axis(model, axis, drives.CYCLE_S, demand_mm).position_mm
     return 1e3 * compute_rms(position_mm - told), 1e3 * compute_rms(position_mm - demand_mm)

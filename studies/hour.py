@@ -29,10 +29,10 @@ from fdhil.cli.demo.processes import Process
 from fdhil.cli.demo.toml import to_toml
 from fdhil.daemon.daemon_socket import SOCKET_NAME
 from fdhil.program import load_trajectory
+from tests.free_ports import find_free_port
 from tests.linuxcnc.beside import PART, SHUTTLE, TRIES, contour_of_each_cut, record, repeated, until
 from tests.linuxcnc.machine import LinuxCnc, write_machine
-from tests.ports import free_port
-from tests.sim.twin_process import TwinProcess
+from tests.sim.simulator_process import SimulatorProcess
 
 ROOT = Path(__file__).resolve().parent.parent
 SPEED_MM_S, ACCELERATION_MM_S2 = 500.0, 2000.0
@@ -105,7 +105,7 @@ def twin_of(folder: Path) -> Path:
     return folder / "twin.toml"
 
 
-def answers_of(folder: Path, twin: TwinProcess, port: int) -> dict[str, str]:
+def answers_of(folder: Path, twin: SimulatorProcess, port: int) -> dict[str, str]:
     """Write the answers from the data sheets; return each with its source."""
     sheet = machine_document()["axis"]
     told: dict[str, Any] = {
@@ -132,7 +132,7 @@ def answers_of(folder: Path, twin: TwinProcess, port: int) -> dict[str, str]:
     return known
 
 
-def set_up(hour: Retrofit, twin: TwinProcess, port: int) -> None:
+def set_up(hour: Retrofit, twin: SimulatorProcess, port: int) -> None:
     """From the answers to commissioned drives."""
     mill = hour.folder / "mill"
     mill.mkdir()
@@ -173,7 +173,7 @@ def cut(hour: Retrofit, nc: LinuxCnc) -> None:
         print("  LinuxCNC has ordered something else than before, the guard has ramped to zero: once more")
 
 
-def beside_linuxcnc(hour: Retrofit, twin: TwinProcess, port: int, stack: ExitStack) -> None:
+def beside_linuxcnc(hour: Retrofit, twin: SimulatorProcess, port: int, stack: ExitStack) -> None:
     """Daemon, guard and LinuxCNC run; cut."""
     with hour.step("fdhil run, fdhil-guard"):
         for name, command in (("guard", ["fdhil.cli.guard"]), ("daemon", ["fdhil", "run"])):
@@ -215,17 +215,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--install", action="store_true", help="begin with pip install into a fresh environment")
     options = parser.parse_args()
-    port = free_port()
+    port = find_free_port()
     with interrupt_on_stop_signals(), tempfile.TemporaryDirectory(prefix="fdhil-hour-") as name:
         hour = Retrofit(Path(name))
         trace = hour.folder / "trace.csv"
         if options.install:
             install(hour)
-        with TwinProcess(twin_of(hour.folder), "--demand", "-", "--trace", trace) as twin:
+        with SimulatorProcess(twin_of(hour.folder), "--demand", "-", "--trace", trace) as twin:
             set_up(hour, twin, port)
             with ExitStack() as stack:
                 beside_linuxcnc(hour, twin, port, stack)
-            twin.event("finished")
+            twin.wait_for_event("finished")
         config = machine_config.load_config(hour.file)
         before_um, *_, after_um = contour_of_each_cut(trace, load_trajectory(hour.folder / "part.csv", config))
         tell(hour, before_um, after_um)

@@ -24,10 +24,10 @@ from fdhil.drivers.modbus.modbus_line import ModbusRequest
 from fdhil.drivers.serial import byte_stream, serial_port
 from fdhil.errors import DeviceError
 from fdhil.sim.frame_faults import FrameFault, FrameFaults
-from fdhil.sim.wire.modbus_answers import answer, spoilt
+from fdhil.sim.wire.modbus_answers import answer_request, apply_answer_faults
 from fdhil.sim.wire.sensor_faults import SensorFaults
 from tests.drivers.serial_peer import build_frame
-from tests.machine.virtual_time import VirtualLoop, run
+from tests.machine.virtual_time import VirtualLoop, run_virtual
 
 TIMEOUT_S = 0.2
 PROMPT_S = 0.005
@@ -45,11 +45,11 @@ class Questioned:
     def __init__(self) -> None:
         self.question = 0
 
-    def words(self) -> dict[int, int]:
+    def list_words(self) -> dict[int, int]:
         """Return eight registers."""
         return dict.fromkeys(range(8), self.question & 0xFFFF)
 
-    def latch(self) -> None:
+    def latch_samples(self) -> None:
         """There is nothing to latch."""
 
 
@@ -74,12 +74,12 @@ class LatePort(serial_port.SerialPort):
 
     def send(self, name: str, data: bytes) -> int:
         """Answer in time, or late by up to ``most_late`` time-outs."""
-        body = answer(self.device_now, self.faults, data[1:-2])
+        body = answer_request(self.device_now, self.faults, data[1:-2])
         delay_s = PROMPT_S
         if self._rng.random() < LATE:
             delay_s = TIMEOUT_S * self._rng.uniform(0.0, self._most_late)
             self.late += delay_s > TIMEOUT_S
-        pieces = spoilt(self.faults, build_frame, data[0], body)
+        pieces = apply_answer_faults(self.faults, build_frame, data[0], body)
         self.spoilt += pieces != [build_frame(data[0], body)]
         for place, piece in enumerate(pieces):
             self._virtual.call_later(delay_s + 0.002 * place, self._arrive, piece)
@@ -133,7 +133,7 @@ def modbus(
         patch.object(rtu_line, "time", clock),
         patch.object(byte_stream, "time", clock),
     ):
-        run(ask(), loop)
+        run_virtual(ask(), loop)
     seen["late"], seen["spoilt"] = wire.late, wire.spoilt
     return seen
 
@@ -150,7 +150,7 @@ class Node:
         """Answer an expedited upload; an abort has no answer."""
         if data[0] == 0x40:
             told = b"\x43" + data[1:4] + struct.pack("<I", self.question)
-            self._deliver(self._faults.take((0x581, told), "received", self.now_s))
+            self._deliver(self._faults.process_frame((0x581, told), "received", self.now_s))
 
     def _deliver(self, passed: list[Any]) -> None:
         assert self.link is not None
@@ -160,9 +160,9 @@ class Node:
     def sleep(self, seconds: float) -> None:
         """Let time pass; what is late arrives meanwhile."""
         until_s = self.now_s + seconds
-        while (at_s := self._faults.due_s()) <= until_s:
+        while (at_s := self._faults.find_next_due_s()) <= until_s:
             self.now_s = max(self.now_s, at_s)
-            self._deliver(self._faults.due("received", self.now_s))
+            self._deliver(self._faults.release_due("received", self.now_s))
         self.now_s = until_s
 
 

@@ -29,9 +29,9 @@ from fdhil.config import MachineConfig
 from fdhil.guard.guard_settings import GuardSettings, encode_settings
 from fdhil.guard.transmit_socket import greet_hub, open_transmit_socket
 from fdhil.records import Float, Trajectory
-from fdhil.sim.frame import Frame
-from fdhil.sim.machine import Machine
-from fdhil.sim.wire.attach import attach
+from fdhil.sim.frame_types import Frame
+from fdhil.sim.simulated_machine import SimulatedMachine
+from fdhil.sim.wire.can_buses import attach_bus
 from tests.bench import bench_document
 from tests.guard.frame_checks import Wire
 from tests.guard.simulated_bus import FACTS_GIVEN, commissioned
@@ -166,8 +166,8 @@ class LiveGuard:
             "bus": {"can0": bus},
         }
         self.config: MachineConfig = machine_config.parse_config(document, folder=folder)
-        self.machine = Machine(self.config)
-        self._bus = attach("can0", self.config.bus["can0"])
+        self.machine = SimulatedMachine(self.config)
+        self._bus = attach_bus("can0", self.config.bus["can0"])
         place = {key: value for key, value in self._bus.settings.items() if key in ("port", "host")}
         self._place = self.config.bus["can0"].model_copy(update=place)
         made = settings_of(self.config, "can0", folder, hashlib.sha256(TOKEN.encode()).hexdigest())
@@ -192,7 +192,7 @@ class LiveGuard:
         self.waits, self.tamper, self.insert = True, None, []
         self._next_s = self._heard_s = 0.0
         self._send([frame for _, frame in self.machine.power_on()])
-        self.machine.nc.switch(True)
+        self.machine.nc.switch_on_off(True)
         self.until(lambda: self.machine.nc.phase.name == "READY", "the NC has the drives")
 
     tamper: Tamper | None
@@ -204,7 +204,7 @@ class LiveGuard:
         """Send one SYNC with all that belongs to it, and wait for what the guard answers."""
         self.tick += 1
         before, self.heard = self.heard, {}
-        frames = [frame for _, frame in self.machine.cycle()]
+        frames = [frame for _, frame in self.machine.run_nc_cycle()]
         if self.tamper is not None:
             k = self.tick - self.changed_at
             frames = [heard for frame in frames for heard in self.tamper(k, frame)]
@@ -220,8 +220,8 @@ class LiveGuard:
         self.trace.append((self.tick, tuple(self.offsets)))
 
     def _send(self, frames: list[Frame]) -> None:
-        self._bus.send(frames)
-        self._bus.flush(time.monotonic())
+        self._bus.queue_frames(frames)
+        self._bus.flush_frames(time.monotonic())
 
     def _listen(self, before: Mapping[int, int]) -> None:
         """Receive until a period has passed and, of a guard that continues sending, until its frames have arrived.
@@ -246,12 +246,12 @@ class LiveGuard:
             self._turn(0.0)
 
     def _turn(self, wait_s: float) -> None:
-        readers: list[Any] = [*self._bus.readers(), self._journal]
+        readers: list[Any] = [*self._bus.list_readers(), self._journal]
         if self.daemon is not None and not self.daemon.armed:
             readers.append(self.daemon)
-        ready, _, _ = select.select(readers, self._bus.writers(), (), wait_s)
-        self._bus.pump(ready, self._take)
-        self._bus.flush(time.monotonic())
+        ready, _, _ = select.select(readers, self._bus.list_writers(), (), wait_s)
+        self._bus.receive_frames(ready, self._take)
+        self._bus.flush_frames(time.monotonic())
         if self.daemon is not None and self.daemon in ready:
             self.daemon.heard()
         if self._journal in ready:
@@ -263,7 +263,7 @@ class LiveGuard:
             self.sent += 1
         if cob_id in self._nodes:
             self._judge(self._nodes[cob_id], int.from_bytes(data, "little", signed=True))
-        self._send(self.machine.receive("can0", frame))
+        self._send(self.machine.receive_frame("can0", frame))
 
     def _read_journal(self) -> None:
         """Follow the guard's state to decide whether to wait for a frame; no check depends on it."""
@@ -295,7 +295,7 @@ class LiveGuard:
 
     def held(self) -> list[int]:
         """Return the offsets that the drives hold, in increments."""
-        return [unit.drive.dictionary.number(0x60B0, 0) for unit in self.machine.units.values()]
+        return [unit.drive.dictionary.get_number(0x60B0, 0) for unit in self.machine.units.values()]
 
     def forget(self) -> None:
         """Begin a new trace with what is on the wire now."""
@@ -317,7 +317,7 @@ class LiveGuard:
     def foreign(self, cob_id: int, data: bytes) -> None:
         """Another node's offset."""
         axis, value = self._nodes[cob_id], int.from_bytes(data, "little", signed=True)
-        self._send([(cob_id, data), *self.machine.receive("can0", (cob_id, data))])
+        self._send([(cob_id, data), *self.machine.receive_frame("can0", (cob_id, data))])
         self.wires[axis].foreign(value)
         self.offsets[axis] = value
         self.trace = [(self.tick, tuple(self.offsets))]
@@ -384,8 +384,8 @@ class LiveGuard:
 
     def arm(self) -> None:
         """Start a new daemon, armed for the next program from the current position."""
-        self.machine.nc.stop()
-        self.until(lambda: not self.machine.nc.busy, "the NC stands")
+        self.machine.nc.stop_path()
+        self.until(lambda: not self.machine.nc.is_busy, "the NC stands")
         self.run(5)
         here = self.machine.nc.in_force
         assert here is not None
@@ -405,7 +405,7 @@ class LiveGuard:
 
     def play(self) -> None:
         """Let the NC play the program of the last arming."""
-        self.machine.nc.play("program", self.program)
+        self.machine.nc.play_demand("program", self.program)
         self.playing = True
 
     def into_the_cut(self) -> None:
@@ -439,6 +439,6 @@ class LiveGuard:
             os.kill(self.guard, signal.SIGKILL)
             self.guard_ended()
         self._bus.close()
-        self.machine.close()
+        self.machine.abandon_trace()
         os.close(self._journal)
         os.close(self._journal_end)

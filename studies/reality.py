@@ -23,7 +23,7 @@ from fdhil.correction.limits import fit_all
 from fdhil.correction.planning import plan
 from fdhil.identification.loops import with_loops
 from fdhil.identification.windows import find_windows
-from fdhil.model.terms import with_resonance
+from fdhil.model.model_terms import add_resonance
 from fdhil.pipeline import analyse, pool
 from fdhil.pipeline.identified_loops import better_axis, explained
 from fdhil.prediction.contour import contour_error_um
@@ -268,7 +268,7 @@ def contour(
     if loops is not None:
         axes = {name: with_loops(axis, loops) for name, axis in config.axis.items()}
         config = config.model_copy(update={"axis": axes})
-    models = {axis: with_resonance(model, config.axis[axis]) for axis in reference.axes}
+    models = {axis: add_resonance(model, config.axis[axis]) for axis in reference.axes}
     planned = plan(reference, models, config).offset_um
 
     def error_um(places: Array) -> Array:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.fleet.outliers import Course, judge
+from fdhil.fleet.outliers import ParameterHistory, assess_peers
 from fdhil.records import Float, freeze_array
 from studies import pages
 from studies.pages import grid, paragraph
@@ -29,15 +29,15 @@ PER_K, PER_MONTH = -0.01, 0.005
 SHIFTS = (3, 4, 5, 6, 7, 8, 10, 12, 15, 20, 25, 30, 40, 60)  # spreads
 FOUND = 0.9
 ALARMS = 0.99  # of groups without an outlier that have none
-Draw = Callable[[np.random.Generator, int], list[Course]]
+Draw = Callable[[np.random.Generator, int], list[ParameterHistory]]
 
 
-def single(name: str, value: float, std: float = 0.0, axis: str = "X") -> Course:
+def single(name: str, value: float, std: float = 0.0, axis: str = "X") -> ParameterHistory:
     """Return an axis with one known set, without temperature."""
-    return Course(name, axis, freeze_array([value]), freeze_array([np.nan]), freeze_array([0.0]), std)
+    return ParameterHistory(name, axis, freeze_array([value]), freeze_array([np.nan]), freeze_array([0.0]), std)
 
 
-def by_one_set(rng: np.random.Generator, count: int) -> list[Course]:
+def by_one_set(rng: np.random.Generator, count: int) -> list[ParameterHistory]:
     """Return axes with one known set."""
     return [single(str(k), 1.0 + SPREAD * z) for k, z in enumerate(rng.normal(size=count))]
 
@@ -48,7 +48,7 @@ def drawn(
     spread: float = SPREAD,
     per_k: float = PER_K,
     per_month: float = PER_MONTH,
-) -> list[Course]:
+) -> list[ParameterHistory]:
     """Return machines whose friction differs by ``spread``, each at a temperature and an age of its own that move."""
     courses = []
     for k in range(count):
@@ -56,11 +56,13 @@ def drawn(
         age = rng.uniform(0, 24) + np.linspace(0.0, 1.0, SETS)
         own = 0.05 * (1 + spread * rng.normal())
         values = own * (1 + per_k * (at_c - 20.0) + per_month * age) * (1 + 1e-3 * rng.normal(size=SETS))
-        courses.append(Course(f"mill-{k}", "X", freeze_array(values), freeze_array(at_c), freeze_array(age), 1e-4))
+        courses.append(
+            ParameterHistory(f"mill-{k}", "X", freeze_array(values), freeze_array(at_c), freeze_array(age), 1e-4)
+        )
     return courses
 
 
-def in_steady_halls(rng: np.random.Generator, count: int) -> list[Course]:
+def in_steady_halls(rng: np.random.Generator, count: int) -> list[ParameterHistory]:
     """Return machines in halls of constant temperature: their own sets do not show its effect."""
     courses = []
     for course in drawn(rng, count):
@@ -70,13 +72,13 @@ def in_steady_halls(rng: np.random.Generator, count: int) -> list[Course]:
     return courses
 
 
-def half_without_thermometer(rng: np.random.Generator, count: int) -> list[Course]:
+def half_without_thermometer(rng: np.random.Generator, count: int) -> list[ParameterHistory]:
     """Return machines of which every second has no thermometer."""
     unknown = freeze_array(np.full(SETS, np.nan))
     return [replace(c, temperatures_c=unknown) if k % 2 else c for k, c in enumerate(drawn(rng, count))]
 
 
-def with_a_busy_one(rng: np.random.Generator, count: int) -> list[Course]:
+def with_a_busy_one(rng: np.random.Generator, count: int) -> list[ParameterHistory]:
     """Return machines with a peer that has a hundred times the sets and another slope: only that may be reported."""
     courses = drawn(rng, count)
     at_c = freeze_array(rng.uniform(15, 35, SETS_OF_THE_BUSY))
@@ -94,9 +96,9 @@ KINDS: Mapping[str, tuple[str, Draw]] = {
 }
 
 
-def scores(courses: Sequence[Course]) -> dict[str, float]:
+def scores(courses: Sequence[ParameterHistory]) -> dict[str, float]:
     """Return by how many of its bounds each axis is off."""
-    found = judge(courses)
+    found = assess_peers(courses)
     assert found is not None
     return {level.machine: abs(level.score) / found.bound for level in found.levels}
 

@@ -24,7 +24,7 @@ from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
 from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
 from fdhil.errors import ConnectError, FdhilError
-from tests.ports import free_port
+from tests.free_ports import find_free_port
 
 PATIENCE_S = 600.0
 LOOK_S = 0.1
@@ -45,10 +45,10 @@ def document_of(folder: Path, period_s: float, lockstep: bool) -> dict[str, Any]
         "run_directory": str(folder / "run"),
         "keep_windows": KEPT_WINDOWS,
     }
-    document["bus"] = {"can0": {"interface": "socketcand", "host": "127.0.0.1", "port": free_port()}}
-    document["publish"] = {"prometheus": {"port": free_port()}}
+    document["bus"] = {"can0": {"interface": "socketcand", "host": "127.0.0.1", "port": find_free_port()}}
+    document["publish"] = {"prometheus": {"port": find_free_port()}}
     for axis in document["axis"].values():
-        axis["voltage"] = {"host": "127.0.0.1", "port": free_port()}  # of the drive; a thermometer is beside it
+        axis["voltage"] = {"host": "127.0.0.1", "port": find_free_port()}  # of the drive; a thermometer is beside it
         axis["temperature"] = {**axis["voltage"], "period_s": 1.0}
     return document
 

@@ -28,8 +28,8 @@ from typing import Any
 
 from fdhil.errors import DeviceError
 from studies import pages
-from tests.machine.invariants import Judge
-from tests.machine.whole_machine import Machine, document, shuttle
+from tests.machine.complete_machine import CompleteMachine, build_document, build_shuttle_program
+from tests.machine.invariants import InvariantChecker
 
 ROOM_MM = 120.0
 FIRST_S = 3.0  # of rest after the last fault, until the drives must be at zero
@@ -51,8 +51,8 @@ class Life:
 
     seed: int
     seconds: float
-    machine: Machine
-    judge: Judge
+    machine: CompleteMachine
+    judge: InvariantChecker
     rng: random.Random
     happened: Counter[str] = field(default_factory=Counter)
     parts: int = 0
@@ -66,11 +66,11 @@ class Life:
         """Let the machine learn its models, then work under faults until its time is over, and settle."""
         machine = self.machine
         end_s = machine.clock.now_s() + self.seconds
-        machine.start("guard")
-        machine.start("daemon")
-        machine.nc(on=True)
-        machine.play(shuttle(machine.config.axis), "shuttle.ngc")
-        machine.run(0.5)
+        machine.start_processes("guard")
+        machine.start_processes("daemon")
+        machine.switch_nc(on=True)
+        machine.play_program(build_shuttle_program(machine.config.axis), "shuttle.ngc")
+        machine.run_for(0.5)
         while machine.clock.now_s() < end_s:
             self.cut()
             self.restore()
@@ -83,27 +83,29 @@ class Life:
         text, name = self.program(), f"part{self.parts % 4}.ngc"
         if rng.random() < 0.8:
             method = rng.choice((None, None, None, "mirror"))
-            answer = machine.arm(machine.write(text, name), **({} if method is None else {"method": method}))
+            answer = machine.arm_program(
+                machine.write_program(text, name), **({} if method is None else {"method": method})
+            )
             self.happened["armed" if answer["ok"] else f"refused: {answer['code']}"] += 1
             if not answer["ok"] and answer["code"] == "PoorSkill" and rng.random() < 0.5:
-                machine.play(shuttle(machine.config.axis), "shuttle.ngc")
+                machine.play_program(build_shuttle_program(machine.config.axis), "shuttle.ngc")
             if rng.random() < 0.05:
-                machine.ask("disarm")
+                machine.request_daemon("disarm")
                 self.happened["disarmed"] += 1
-        machine.play(text, name, wait=False)
+        machine.play_program(text, name, wait=False)
         for _ in range(rng.choice((0, 1, 1, 1, 2, 3))):
-            machine.run(rng.uniform(0.01, 1.2))
+            machine.run_for(rng.uniform(0.01, 1.2))
             what = rng.choice(list(EVENTS))
             self.happened[what] += 1
             EVENTS[what](self)
-        machine.run(rng.uniform(0.2, 3.0))
+        machine.run_for(rng.uniform(0.2, 3.0))
         if machine.service is not None and rng.random() < 0.5:
-            self.judge.status()
+            self.judge.check_status()
 
     def start(self, name: str) -> None:
         """Start a process, once there is a bus that can be opened."""
         self.machine.run_until(lambda: not self.machine.bus.is_down)
-        self.machine.start(name)
+        self.machine.start_processes(name)
 
     def program(self) -> str:
         """Draw a program of a few moves from and to zero: lines, rectangles and circles, with rests between."""
@@ -129,38 +131,38 @@ class Life:
         """Do what an operator does before the next part: end faults, restart dead processes, adopt residual offsets."""
         machine = self.machine
         with contextlib.suppress(RuntimeError):
-            machine.run_until(lambda: machine.plant.faults.idle, FAULTS_END_S)
+            machine.run_until(lambda: machine.plant.faults.is_idle, FAULTS_END_S)
         for name, runs in (("guard", machine.guard), ("daemon", machine.service)):
             if runs is None:
                 self.start(name)
-        machine.plant.nc.feed_hold(False)
+        machine.plant.nc.set_feed_hold(False)
         machine.plant.nc.set_override(100.0)
         if machine.plant.nc.phase.name != "READY":
             with contextlib.suppress(RuntimeError):
-                machine.nc(on=True)
-        machine.plant.nc.stop()
-        machine.run(0.8)
-        if machine.guard_state == "FROZEN" or any(machine.held_um().values()):
-            answer = machine.adopt()
+                machine.switch_nc(on=True)
+        machine.plant.nc.stop_path()
+        machine.run_for(0.8)
+        if machine.read_guard_state == "FROZEN" or any(machine.read_offset_um().values()):
+            answer = machine.adopt_offset()
             self.happened["adopted" if answer["ok"] else "adoption refused"] += 1
-            machine.run(1.0)
+            machine.run_for(1.0)
         with contextlib.suppress(DeviceError):
-            machine.attest()
+            machine.attest_facts()
 
     def rest(self) -> None:
         """End all faults, and verify that the drives come to zero with only the actions that the messages advise."""
         machine = self.machine
         for _ in range(3):
             self.restore()
-            machine.run(FIRST_S)
-            if not any(machine.held_um().values()):
+            machine.run_for(FIRST_S)
+            if not any(machine.read_offset_um().values()):
                 break
             for axis in machine.plant.units:  # what may not be adopted is gone with the drive's power
-                machine.fault("reboot", axis=axis)
-        self.judge.status()
-        machine.stop("daemon")
-        machine.stop("guard")
-        self.judge.end()
+                machine.inject_fault("reboot", axis=axis)
+        self.judge.check_status()
+        machine.stop_processes("daemon")
+        machine.stop_processes("guard")
+        self.judge.check_end()
 
 
 def fault(kind: str, low: float | None = None, high: float | None = None, **fields: Any) -> Callable[[Life], None]:
@@ -177,7 +179,7 @@ def fault(kind: str, low: float | None = None, high: float | None = None, **fiel
         if given.pop("offset_frame", False):
             given["can_id"] = life.rng.choice((0x301, 0x302))
             given["data"] = rng.randint(-900, 900).to_bytes(4, "little", signed=True).hex()
-        life.machine.fault(kind, duration_s=math.exp(rng.uniform(math.log(0.001), math.log(1.0))), **given)
+        life.machine.inject_fault(kind, duration_s=math.exp(rng.uniform(math.log(0.001), math.log(1.0))), **given)
 
     return begin
 
@@ -189,8 +191,8 @@ def kill(name: str) -> Callable[[Life], None]:
         machine = life.machine
         if (machine.guard if name == "guard" else machine.service) is None:
             return
-        machine.kill(name)
-        machine.run(life.rng.choice((0.0, 0.02, 0.3, 1.5)))
+        machine.kill_process(name)
+        machine.run_for(life.rng.choice((0.0, 0.02, 0.3, 1.5)))
         life.start(name)
 
     return act
@@ -201,7 +203,7 @@ def restart(name: str) -> Callable[[Life], None]:
 
     def act(life: Life) -> None:
         if (life.machine.guard if name == "guard" else life.machine.service) is not None:
-            life.machine.stop(name)
+            life.machine.stop_processes(name)
             life.start(name)
 
     return act
@@ -214,7 +216,7 @@ def foreign_offset(life: Life) -> None:
     value = rng.randint(-900, 900).to_bytes(4, "little", signed=True)
     node = unit.drive.node_id
     frame = (0x300 + node, value) if rng.random() < 0.5 else (0x600 + node, b"\x23\xb0\x60\x00" + value)
-    life.machine.send(*frame)
+    life.machine.send_frame(*frame)
 
 
 def set_clock(life: Life) -> None:
@@ -224,21 +226,21 @@ def set_clock(life: Life) -> None:
 
 def feed_hold(life: Life) -> None:
     """Hold the feed, and release it."""
-    life.machine.plant.nc.feed_hold(True)
-    life.machine.run(life.rng.uniform(0.05, 1.0))
-    life.machine.plant.nc.feed_hold(False)
+    life.machine.plant.nc.set_feed_hold(True)
+    life.machine.run_for(life.rng.uniform(0.05, 1.0))
+    life.machine.plant.nc.set_feed_hold(False)
 
 
 def emergency_stop(life: Life) -> None:
     """Cut the drives' power, as an emergency stop does."""
     for axis in life.machine.plant.units:
-        life.machine.fault("power_off", axis=axis, duration_s=0.5)
+        life.machine.inject_fault("power_off", axis=axis, duration_s=0.5)
 
 
 def disarm(life: Life) -> None:
     """Disarm."""
     if life.machine.service is not None:
-        life.machine.ask("disarm")
+        life.machine.request_daemon("disarm")
 
 
 EVENTS: Mapping[str, Callable[[Life], None]] = {
@@ -265,7 +267,7 @@ EVENTS: Mapping[str, Callable[[Life], None]] = {
     "current sensor stuck": fault("current_stuck"),
     "speed sensor dead": fault("speed_gain", 0, 0),
     "load torque": fault("load_torque", -40.0, 40.0),
-    "NC stopped": lambda life: life.machine.plant.nc.stop(),
+    "NC stopped": lambda life: life.machine.plant.nc.stop_path(),
     "feed held": feed_hold,
     "override": lambda life: life.machine.plant.nc.set_override(life.rng.choice((30.0, 70.0, 120.0))),
     "emergency stop": emergency_stop,
@@ -275,7 +277,7 @@ EVENTS: Mapping[str, Callable[[Life], None]] = {
 
 def drawn(rng: random.Random) -> dict[str, Any]:
     """Draw a machine."""
-    made = document(rng.choice(AXES))
+    made = build_document(rng.choice(AXES))
     made["machine"]["sync_period_s"] = rng.choice(SYNC_PERIODS_S)
     for axis in made["axis"].values():
         axis["nominal"]["Jt"] *= rng.uniform(0.9, 1.1)
@@ -284,14 +286,14 @@ def drawn(rng: random.Random) -> dict[str, Any]:
     return made
 
 
-def life_of(seed: int, seconds: float, folder: Path) -> tuple[list[str], Counter[str], Machine]:
+def life_of(seed: int, seconds: float, folder: Path) -> tuple[list[str], Counter[str], CompleteMachine]:
     """Let the machine of a seed live in a folder; return what was wrong, what was counted, and the machine."""
     rng = random.Random(seed)
-    machine = Machine(seed, drawn(rng), folder=folder)
+    machine = CompleteMachine(seed, drawn(rng), folder=folder)
     with machine:
         begun_s = machine.clock.now_s()
         kind = f"{'+'.join(machine.config.axis)}, SYNC every {1e3 * machine.config.machine.sync_period_s:g} ms"
-        life = Life(seed, seconds, machine, Judge(machine), rng)
+        life = Life(seed, seconds, machine, InvariantChecker(machine), rng)
         _expired.clear()
         signal.setitimer(signal.ITIMER_PROF, MOST_CPU_S * seconds, MOST_CPU_S * seconds)
         try:
@@ -302,7 +304,7 @@ def life_of(seed: int, seconds: float, folder: Path) -> tuple[list[str], Counter
             machine.wrong.append(f"{machine.clock.now_s():.3f} s: {type(error).__name__}: {error}"[:3000])
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         machine.wrong += _expired[:1]  # told even where a library made its own of the exception
-        machine.bus.flush()
+        machine.bus.deliver_frames()
         counted = life.judge.counted + Counter({f"event {name}": n for name, n in life.happened.items()})
         counted["frames"] += machine.bus.frames
         counted[f"axes {kind}"] += 1

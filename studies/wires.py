@@ -24,7 +24,7 @@ from fdhil.drivers.modbus.modbus_unit import ModbusUnit
 from fdhil.errors import DeviceError
 from fdhil.sim.frame_faults import FrameFault, FrameFaults
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
-from fdhil.sim.wire.modbus_tcp import SensorServers
+from fdhil.sim.wire.modbus_tcp_servers import SensorServers
 from studies import pages
 from studies.late_answers import Questioned, modbus, sdo_reads
 from tests.drivers.frame_builder import FrameBuilder, build_machine_config
@@ -94,7 +94,9 @@ def _decoded(wire: FrameBuilder, faults: FrameFaults, decoder: BusDecoder, seen:
     """Yield the samples of a bus whose frames pass the faults, some at a time."""
     rows = wire.build_rows()
     seen["frames"] += len(rows)
-    left = [(t, i, d) for t, can_id, data in rows for (i, d), _ in faults.take((can_id, data), "received", 0.0)]
+    left = [
+        (t, i, d) for t, can_id, data in rows for (i, d), _ in faults.process_frame((can_id, data), "received", 0.0)
+    ]
     for start in range(0, len(left), 350):
         block = pack_frames(left[start : start + 350])
         for record in decoder.decode_frames(block, int(block["t_ns"][-1])):

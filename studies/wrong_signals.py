@@ -251,7 +251,7 @@ def _beside_path(estimate: Estimate, plant: Plant) -> Iterator[str]:
 def _predicted(estimate: Estimate, plant: Plant, demand_mm: Array) -> Array:
     values = estimate.build_parameters().as_dict()
     winding = {name: getattr(plant.axis.nominal, name) for name in ("R", "L") if not np.isfinite(values[name])}
-    return closed_loop.simulate(
+    return closed_loop.simulate_axis(
         estimate.build_parameters().replace_values(**winding), plant.axis, 1e-3, demand_mm
     ).position_mm
 

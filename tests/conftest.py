@@ -41,7 +41,7 @@ def no_thread_left() -> Iterator[None]:
     before = set(threading.enumerate())
     yield
     deadline = time.monotonic() + 30.0
-    while (left := _ours(set(threading.enumerate()) - before)) and time.monotonic() < deadline:
+    while (left := _list_own_handlers(set(threading.enumerate()) - before)) and time.monotonic() < deadline:
         time.sleep(0.01)
     assert not left, f"threads left behind: {[thread.name for thread in left]}"
 
@@ -68,6 +68,6 @@ def handlers() -> Iterator[None]:
     gc.enable()
 
 
-def _ours(threads: set[threading.Thread]) -> list[threading.Thread]:
+def _list_own_handlers(threads: set[threading.Thread]) -> list[threading.Thread]:
     pools = ("asyncio_", "ThreadPoolExecutor", "pyarrow", "Dask-Offload")
     return [t for t in threads if t.is_alive() and not t.name.startswith(pools)]

@@ -161,18 +161,18 @@ ROWS: dict[str, Row] = {row.id: row for row in map(_row, TEXT.strip().splitlines
 
 
 @cache
-def marked() -> dict[str, tuple[Path, ...]]:
+def mark_rows() -> dict[str, tuple[Path, ...]]:
     """Return the files with a test of each row, found in their text: nothing is imported."""
     found: dict[str, set[Path]] = {}
     for path in TESTS.rglob("*.py"):
         text = path.read_text("utf-8")
         if "mark.fault(" in text:
-            for row in _rows_of(ast.parse(text)):
+            for row in _list_rows(ast.parse(text)):
                 found.setdefault(row, set()).add(path)
     return {row: tuple(sorted(paths)) for row, paths in found.items()}
 
 
-def _rows_of(tree: ast.Module) -> set[str]:
+def _list_rows(tree: ast.Module) -> set[str]:
     calls = (node for node in ast.walk(tree) if isinstance(node, ast.Call))
     marks = (call for call in calls if ast.unparse(call.func) == "pytest.mark.fault")
     return {str(arg.value) for mark in marks for arg in mark.args if isinstance(arg, ast.Constant)}

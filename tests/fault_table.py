@@ -50,7 +50,7 @@ class FaultTable:
         if real:
             self.document: dict[str, Any] = json.loads(self.figures.read_text("utf-8"))
         else:
-            self.document = {"run": provenance(), "rows": {row: blank() for row in ROWS}, "goals": {}}
+            self.document = {"run": read_provenance(), "rows": {row: create_blank() for row in ROWS}, "goals": {}}
         for told in self.document["rows"].values():
             told |= {self._passed: 0, self._failed: []}
         self._rows_of: dict[str, tuple[str, ...]] = {}
@@ -60,8 +60,8 @@ class FaultTable:
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
         """Record what each test proves."""
         for item in items:
-            self._rows_of[item.nodeid] = rows_proven(item)
-            self._goals_of[item.nodeid] = goals_proven(item)
+            self._rows_of[item.nodeid] = count_proven_rows(item)
+            self._goals_of[item.nodeid] = count_proven_goals(item)
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Count a completed test, and one that failed in set-up or tear-down."""
@@ -75,24 +75,24 @@ class FaultTable:
                 told["sync_to_zero"] += [seen["sync_to_zero"]] if "sync_to_zero" in seen else []
         for goal in self._goals_of.get(report.nodeid, ()):
             if report.failed:
-                self._tell(goal, False, f"{report.nodeid} failed")
+                self._record_outcome(goal, False, f"{report.nodeid} failed")
             elif report.passed and report.when == "call" and "goal" in seen:
-                self._tell(goal, True, str(seen["goal"]))
+                self._record_outcome(goal, True, str(seen["goal"]))
 
-    def _tell(self, goal: str, met: bool, figure: str) -> None:
+    def _record_outcome(self, goal: str, met: bool, figure: str) -> None:
         run = self.document["run"]
         entry = {"met": met, "figure": figure, "by": goals.SOURCE, "date": run["date"], "commit": run["commit"]}
         self.document["goals"].setdefault(goal, []).append(entry)
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         """Print the tables and write the page."""
-        gather(self.document, self.path.parent)
-        write(self.document, self.path)
+        gather_outcomes(self.document, self.path.parent)
+        write_page(self.document, self.path)
         terminalreporter.section("fault matrix")
-        for line in (*table(self.document), summary(self.document["rows"])):
+        for line in (*format_table(self.document), summarise_matrix(self.document["rows"])):
             terminalreporter.write_line(line)
         terminalreporter.section("goals")
-        for line in (*goals.lines(self.document["goals"]), goals.summary(self.document["goals"])):
+        for line in (*goals.format_goal_lines(self.document["goals"]), goals.summarise_goals(self.document["goals"])):
             terminalreporter.write_line(line)
 
 
@@ -107,7 +107,7 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(FaultTable(path, config.getoption("--on-socketcan")), "fault-table-rows")
 
 
-def rows_proven(item: pytest.Item) -> tuple[str, ...]:
+def count_proven_rows(item: pytest.Item) -> tuple[str, ...]:
     """Return the rows of a test; a parametrised case whose id begins with a row's proves that row alone."""
     rows = {row for mark in item.iter_markers("fault") for row in mark.args}
     if unknown := rows - ROWS.keys():
@@ -116,7 +116,7 @@ def rows_proven(item: pytest.Item) -> tuple[str, ...]:
     return (case,) if case in rows else tuple(sorted(rows))
 
 
-def goals_proven(item: pytest.Item) -> tuple[str, ...]:
+def count_proven_goals(item: pytest.Item) -> tuple[str, ...]:
     """Return the goals of a test."""
     proven = {goal for mark in item.iter_markers("goal") for goal in mark.args}
     if unknown := proven - goals.GOALS.keys():
@@ -124,31 +124,31 @@ def goals_proven(item: pytest.Item) -> tuple[str, ...]:
     return tuple(sorted(proven))
 
 
-def blank() -> Told:
+def create_blank() -> Told:
     """Return the entry of a row without any test."""
     return {"passed": 0, "failed": [], "real_passed": 0, "real_failed": [], "sync_to_zero": []}
 
 
-def gather(document: dict[str, Any], folder: Path) -> None:
+def gather_outcomes(document: dict[str, Any], folder: Path) -> None:
     """Combine the measurements of the studies in ``folder``, and R1 of the rows, with the goals proved by tests."""
     run, proven = document["run"], document["goals"]
     own = {goal: [each for each in told if each["by"] == goals.SOURCE] for goal, told in proven.items() if goal != "R1"}
-    figure, met = summary(document["rows"]), everything_survived(document["rows"])
+    figure, met = summarise_matrix(document["rows"]), has_survived_all(document["rows"])
     own["R1"] = [{"met": met, "figure": figure.rstrip("."), "by": goals.SOURCE, **run}]
-    studied = goals.of_studies(folder)
+    studied = goals.read_study_goals(folder)
     document["goals"] = {goal: told for goal in goals.GOALS if (told := [*own.get(goal, ()), *studied.get(goal, ())])}
     kills = folder / "kills.json"
     measured = json.loads(kills.read_text("utf-8"))["figures"] if kills.exists() else {}
     document["kills"] = {row: told for row, told in measured.get("sync_to_zero", {}).items() if row in ROWS}
 
 
-def everything_survived(rows: Mapping[str, Told]) -> bool:
+def has_survived_all(rows: Mapping[str, Told]) -> bool:
     """Whether every row was tested without failure, enough of them on a real interface."""
     real = sum(told["real_passed"] > 0 for told in rows.values())
-    return all(survived(told) == "yes" for told in rows.values()) and real >= LEAST_REAL
+    return all(has_survived(told) == "yes" for told in rows.values()) and real >= LEAST_REAL
 
 
-def survived(told: Told) -> str:
+def has_survived(told: Told) -> str:
     """Return yes, no, or that the row was tested on a real interface only, or not at all."""
     if told["failed"] or told["real_failed"]:
         return "**no**"
@@ -157,7 +157,7 @@ def survived(told: Told) -> str:
     return "on SocketCAN only" if told["real_passed"] else "not tested"
 
 
-def to_zero(own: Sequence[int], studied: Mapping[str, float] | None) -> str:
+def format_time_to_zero(own: Sequence[int], studied: Mapping[str, float] | None) -> str:
     """Return the median and the worst SYNC count from fault to zero, empty where none was counted."""
     if studied is not None:
         return f"{studied['median']:g}, at worst {studied['worst']:g} of {studied['trials']:,}"
@@ -166,44 +166,44 @@ def to_zero(own: Sequence[int], studied: Mapping[str, float] | None) -> str:
     return f"{own[0]}" if len(set(own)) == 1 else f"{median(own):g}, at worst {max(own)} of {len(own)}"
 
 
-def table(document: Mapping[str, Any]) -> list[str]:
+def format_table(document: Mapping[str, Any]) -> list[str]:
     """Return the table of the rows in Markdown."""
     head = ["| row | fault | class | tests | on SocketCAN | SYNC to zero | survived |", "|---|---|---|--:|--:|---|---|"]
-    return [*head, *(_line(row, told, document["kills"].get(row)) for row, told in document["rows"].items())]
+    return [*head, *(_format_line(row, told, document["kills"].get(row)) for row, told in document["rows"].items())]
 
 
-def _line(row: str, told: Told, studied: Mapping[str, float] | None) -> str:
+def _format_line(row: str, told: Told, studied: Mapping[str, float] | None) -> str:
     classes = ", ".join(f"`{name}`" for name in ROWS[row].classes)
     note = f"{classes} ({TOLD_OTHERWISE[row]})" if row in TOLD_OTHERWISE else classes
     tests = told["passed"] + len(told["failed"])
     real = told["real_passed"] + len(told["real_failed"])
-    zero = to_zero(told["sync_to_zero"], studied)
-    cells = (row, ROWS[row].fault, note, tests or "", real or "", zero, survived(told))
+    zero = format_time_to_zero(told["sync_to_zero"], studied)
+    cells = (row, ROWS[row].fault, note, tests or "", real or "", zero, has_survived(told))
     return "| " + " | ".join(map(str, cells)) + " |"
 
 
-def summary(rows: Mapping[str, Told]) -> str:
+def summarise_matrix(rows: Mapping[str, Told]) -> str:
     """Return the figures in one sentence."""
-    good = sum(survived(told) == "yes" for told in rows.values())
-    bad = sum(survived(told) == "**no**" for told in rows.values())
+    good = sum(has_survived(told) == "yes" for told in rows.values())
+    bad = sum(has_survived(told) == "**no**" for told in rows.values())
     real = sum(told["real_passed"] > 0 for told in rows.values())
     told = f"{good} of {len(rows)} rows survived, {bad} not, {len(rows) - good - bad} were not tested"
     return f"{told}; {real} were tested on a real SocketCAN interface too."
 
 
-def page(document: Mapping[str, Any]) -> str:
+def format_page(document: Mapping[str, Any]) -> str:
     run, found = document["run"], document["goals"]
-    told = f"{summary(document['rows'])} Measured on {run['date']} at commit {run['commit']}."
-    reached = (goals.summary(found), "", *goals.lines(found))
-    return "\n".join((HEAD, told, "", *table(document), "", GOALS, *reached, ""))
+    told = f"{summarise_matrix(document['rows'])} Measured on {run['date']} at commit {run['commit']}."
+    reached = (goals.summarise_goals(found), "", *goals.format_goal_lines(found))
+    return "\n".join((HEAD, told, "", *format_table(document), "", GOALS, *reached, ""))
 
 
-def write(document: Mapping[str, Any], path: Path) -> None:
+def write_page(document: Mapping[str, Any], path: Path) -> None:
     path.with_suffix(".json").write_text(json.dumps(document, separators=(",", ":")) + "\n", "utf-8")
-    path.write_text(page(document), "utf-8")
+    path.write_text(format_page(document), "utf-8")
 
 
-def provenance() -> dict[str, str]:
+def read_provenance() -> dict[str, str]:
     """Return the day and the commit."""
     command = ["git", "-C", str(TESTS), "rev-parse", "--short", "HEAD"]
     asked = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -212,9 +212,9 @@ def provenance() -> dict[str, str]:
 
 def main() -> None:
     document = json.loads(PAGE.with_suffix(".json").read_text("utf-8"))
-    gather(document, PAGE.parent)
-    write(document, PAGE)
-    sys.stdout.write(goals.summary(document["goals"]) + "\n")
+    gather_outcomes(document, PAGE.parent)
+    write_page(document, PAGE)
+    sys.stdout.write(goals.summarise_goals(document["goals"]) + "\n")
 
 
 if __name__ == "__main__":

@@ -41,13 +41,13 @@ GOALS: dict[str, tuple[str, str]] = {
 SOURCE = "make faults"
 
 
-def of_studies(folder: Path) -> dict[str, list[dict[str, Any]]]:
+def read_study_goals(folder: Path) -> dict[str, list[dict[str, Any]]]:
     """Return the goals of the studies' figures, with command, day and commit of each study."""
     found: dict[str, list[dict[str, Any]]] = {}
     for path in sorted(folder.glob("*.json")):
         document = json.loads(path.read_text("utf-8"))
         run = document.get("run", {})
-        for goal, told in _told(document).items():
+        for goal, told in _read_goals(document).items():
             if goal not in GOALS:
                 raise ValueError(f"{path.name} tells of a goal {goal} that there is not")
             when = {"by": run.get("command", ""), "date": run.get("date", ""), "commit": run.get("commit", "")}
@@ -55,15 +55,15 @@ def of_studies(folder: Path) -> dict[str, list[dict[str, Any]]]:
     return found
 
 
-def _told(document: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
+def _read_goals(document: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
     figures = document.get("figures", {})
     if document.get("study") == "verdicts":
-        return {"R10": of_verdicts(figures)}
+        return {"R10": evaluate_verdicts(figures)}
     told = figures.get("goals", {}) if isinstance(figures, Mapping) else {}
     return told if isinstance(told, Mapping) else {}
 
 
-def of_verdicts(figures: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[str, Any]:
+def evaluate_verdicts(figures: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[str, Any]:
     """Return R10: faulty recordings that were validated, and windows of clean ones that were refused.
 
     Only harmful outcomes count: a fault too small for any parameter may cause a warning with the model kept.
@@ -82,7 +82,7 @@ def of_verdicts(figures: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[
     return {"met": met, "figure": figure}
 
 
-def lines(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> Iterator[str]:
+def format_goal_lines(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> Iterator[str]:
     """Yield the table in Markdown; a goal is met if all its measurements agree."""
     yield "| goal | about | to reach | measured | met | by | on |"
     yield "|---|---|---|---|---|---|---|"
@@ -95,7 +95,7 @@ def lines(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> Iterator[str]:
         yield f"| {identity} | {goal} | {bar} | {measured} | {met} | {by} | {days} |"
 
 
-def summary(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+def summarise_goals(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     """Return the figures in one sentence."""
     met = sum(bool(told) and all(each["met"] for each in told) for told in found.values())
     return f"{met} of {len(GOALS)} goals are met, {len(found) - met} not, {len(GOALS) - len(found)} not measured."

@@ -23,27 +23,27 @@ def has_ended(pid: int) -> bool:
     return False
 
 
-async def test_documents_are_handed_over_and_the_exit_code_returned() -> None:
+async def test_documents_are_passed_on_and_exit_code_returned() -> None:
     taken: list[dict[str, Any]] = []
     assert await BoundedProcess(CHILD).run({"then": "end"}, taken.append) == 0
     assert [told["request"] for told in taken] == [{"then": "end"}]
 
 
-async def test_half_a_line_of_a_process_that_broke_off_is_no_document() -> None:
+async def test_partial_line_of_failed_process_is_discarded() -> None:
     taken: list[dict[str, Any]] = []
     assert await BoundedProcess(CHILD).run({"then": "break off"}, taken.append) == 3
     assert len(taken) == 1
 
 
-async def test_cancelled_run_ends_the_process() -> None:
+async def test_cancelled_run_ends_process() -> None:
     pids: list[int] = []
     begun = asyncio.Event()
 
-    def take(told: dict[str, Any]) -> None:
+    def receive_document(told: dict[str, Any]) -> None:
         pids.append(told["pid"])
         begun.set()
 
-    running = asyncio.create_task(BoundedProcess(CHILD).run({"then": "hang"}, take))
+    running = asyncio.create_task(BoundedProcess(CHILD).run({"then": "hang"}, receive_document))
     await begun.wait()
     running.cancel()
     with pytest.raises(asyncio.CancelledError):
@@ -57,12 +57,12 @@ async def test_process_killed_before_it_starts_does_not_run() -> None:
     assert await process.run({"then": "hang"}, lambda _: None) == -signal.SIGKILL
 
 
-async def test_error_in_what_takes_the_documents_ends_the_process() -> None:
+async def test_error_in_document_handler_ends_process() -> None:
     process = BoundedProcess(CHILD)
 
-    def refuse(told: dict[str, Any]) -> None:
+    def raise_error(told: dict[str, Any]) -> None:
         raise LookupError(told["pid"])
 
     with pytest.raises(LookupError):
-        await process.run({"then": "hang"}, refuse)
+        await process.run({"then": "hang"}, raise_error)
     assert process.pid is None

@@ -41,7 +41,7 @@ class Attempt:
             raise asyncio.CancelledError
 
 
-async def tried_again(attempt: Callable[[], Coroutine[Any, Any, None]], end_s: float) -> None:
+async def retry_loop(attempt: Callable[[], Coroutine[Any, Any, None]], end_s: float) -> None:
     while True:
         try:
             await run_attempt("can0", attempt(), end_s)
@@ -50,9 +50,9 @@ async def tried_again(attempt: Callable[[], Coroutine[Any, Any, None]], end_s: f
 
 
 @pytest.mark.parametrize("ends", ["orderly", "raises", "os error", "returns"])
-async def test_loop_ends_at_the_first_cancellation_whatever_its_attempt_raises(ends: str) -> None:
+async def test_loop_ends_at_first_cancellation_whatever_attempt_raises(ends: str) -> None:
     attempt = Attempt(ends)
-    loop = asyncio.create_task(tried_again(attempt, 60.0))
+    loop = asyncio.create_task(retry_loop(attempt, 60.0))
     await attempt.begun.wait()
     loop.cancel()
     await asyncio.wait([loop])
@@ -60,9 +60,9 @@ async def test_loop_ends_at_the_first_cancellation_whatever_its_attempt_raises(e
 
 
 @pytest.mark.parametrize("ends", ["deaf once", "deaf"])
-async def test_loop_ends_although_its_attempt_swallows_the_cancellation(ends: str) -> None:
+async def test_loop_ends_when_attempt_swallows_cancellation(ends: str) -> None:
     attempt = Attempt(ends)
-    loop = asyncio.create_task(tried_again(attempt, 0.02))
+    loop = asyncio.create_task(retry_loop(attempt, 0.02))
     await attempt.begun.wait()
     loop.cancel()
     await asyncio.wait([loop])
@@ -70,39 +70,39 @@ async def test_loop_ends_although_its_attempt_swallows_the_cancellation(ends: st
     attempt.release.set()
 
 
-async def test_failure_of_a_task_group_is_no_cancellation() -> None:
-    async def fail() -> None:
+async def test_task_group_failure_is_not_a_cancellation() -> None:
+    async def raise_failure() -> None:
         raise ConnectError("can0", "went away")
 
-    async def group() -> None:
+    async def run_group() -> None:
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(fail())
+            tasks.create_task(raise_failure())
 
     for _ in range(2):  # the first leaves the count of cancellations raised in Python 3.11
         with pytest.raises(ExceptionGroup):
-            await run_attempt("can0", group())
+            await run_attempt("can0", run_group())
 
 
-async def test_attempt_that_its_library_cancels_is_a_failure_to_be_tried_again() -> None:
-    async def given_up() -> None:
+async def test_attempt_cancelled_by_library_is_retried() -> None:
+    async def cancel_itself() -> None:
         raise asyncio.CancelledError
 
     with pytest.raises(GivenUp, match="library closed the connection"):
-        await run_attempt("can0", given_up())
+        await run_attempt("can0", cancel_itself())
 
 
-async def test_result_is_returned_and_errors_are_raised_as_they_are() -> None:
-    async def result(error: Exception | None = None) -> int:
+async def test_result_is_returned_and_errors_are_raised_unchanged() -> None:
+    async def return_result(error: Exception | None = None) -> int:
         if error:
             raise error
         return 7
 
-    assert await run_attempt("can0", result()) == 7
+    assert await run_attempt("can0", return_result()) == 7
     with pytest.raises(ConnectError):
-        await run_attempt("can0", result(ConnectError("can0", "went away")))
+        await run_attempt("can0", return_result(ConnectError("can0", "went away")))
 
 
-async def test_task_that_loses_a_cancellation_is_cancelled_again() -> None:
+async def test_task_that_ignores_cancellation_is_cancelled_again() -> None:
     attempt = Attempt("deaf once")
     task = asyncio.create_task(attempt())
     await attempt.begun.wait()
@@ -110,7 +110,7 @@ async def test_task_that_loses_a_cancellation_is_cancelled_again() -> None:
     assert task.cancelled()
 
 
-async def test_tasks_that_do_not_end_in_time_are_returned() -> None:
+async def test_unfinished_tasks_are_returned() -> None:
     attempt = Attempt("deaf")
     task = asyncio.create_task(attempt())
     await attempt.begun.wait()
@@ -121,7 +121,7 @@ async def test_tasks_that_do_not_end_in_time_are_returned() -> None:
 
 async def test_second_cancellation_does_not_end_the_wait_for_the_first() -> None:
     attempt = Attempt("deaf")
-    loop = asyncio.create_task(tried_again(attempt, 60.0))
+    loop = asyncio.create_task(retry_loop(attempt, 60.0))
     await attempt.begun.wait()
     for _ in range(2):
         loop.cancel()

@@ -27,7 +27,7 @@ sys.stdin.read()
 
 
 @pytest.fixture(autouse=True)
-def _hang_up_is_not_ignored() -> Iterator[None]:
+def _default_hangup() -> Iterator[None]:
     """Restore the default of SIGHUP, which nohup changes, also for child processes."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
@@ -35,7 +35,7 @@ def _hang_up_is_not_ignored() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, None])
-def test_child_ends_when_its_parent_ends(number: signal.Signals | None) -> None:
+def test_child_ends_with_parent(number: signal.Signals | None) -> None:
     parent = subprocess.Popen([sys.executable, "-c", PARENT], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert parent.stdin is not None
     assert parent.stdout is not None
@@ -50,7 +50,7 @@ def test_child_ends_when_its_parent_ends(number: signal.Signals | None) -> None:
     parent.wait()
 
 
-def test_child_of_a_parent_that_has_ended_already_is_not_started(tmp_path: Path) -> None:
+def test_child_of_dead_parent_is_not_started(tmp_path: Path) -> None:
     with subprocess.Popen(ENDED, stdin=subprocess.PIPE) as ended:
         ended.communicate()
     command = [*wrap_to_end_with_parent([])[:4], str(ended.pid), "15", "touch", str(tmp_path / "started")]
@@ -58,7 +58,7 @@ def test_child_of_a_parent_that_has_ended_already_is_not_started(tmp_path: Path)
     assert not [*tmp_path.iterdir()]
 
 
-def test_child_has_the_defaults_of_a_pipe_and_of_the_signal_that_ends_it() -> None:
+def test_child_has_default_signal_handlers() -> None:
     before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
     try:
         status = subprocess.check_output(wrap_to_end_with_parent(["cat", "/proc/self/status"]), text=True)
@@ -68,17 +68,17 @@ def test_child_has_the_defaults_of_a_pipe_and_of_the_signal_that_ends_it() -> No
     assert not ignored & (1 << (signal.SIGPIPE - 1) | 1 << (signal.SIGTERM - 1))
 
 
-def test_command_that_is_not_there_is_named() -> None:
+def test_missing_command_is_named() -> None:
     done = subprocess.run(wrap_to_end_with_parent(["/nowhere/tool"]), capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (1, "/nowhere/tool cannot be started: No such file or directory\n")
 
 
 @pytest.mark.parametrize("number", child_process.ENDING_SIGNALS)
-def test_first_signal_is_raised_and_a_second_does_not_disturb_what_ends(number: signal.Signals) -> None:
+def test_first_signal_is_raised_and_second_does_not_interrupt_cleanup(number: signal.Signals) -> None:
     before = {each: signal.getsignal(each) for each in child_process.ENDING_SIGNALS}
     ended = []
 
-    def interrupted() -> None:
+    def run_interrupted() -> None:
         try:
             os.kill(os.getpid(), number)
         finally:
@@ -87,12 +87,12 @@ def test_first_signal_is_raised_and_a_second_does_not_disturb_what_ends(number: 
             ended.append(True)
 
     with pytest.raises(KeyboardInterrupt), interrupt_on_stop_signals():
-        interrupted()
+        run_interrupted()
     assert ended
     assert {each: signal.getsignal(each) for each in child_process.ENDING_SIGNALS} == before
 
 
-def test_signal_that_is_ignored_stays_so() -> None:
+def test_ignored_signal_stays_ignored() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with interrupt_on_stop_signals():

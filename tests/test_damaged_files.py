@@ -35,7 +35,7 @@ HOSTILE = {
 }
 
 
-def flips(whole: bytes, most: int, seed: int) -> Iterator[bytes]:
+def flip_bits(whole: bytes, most: int, seed: int) -> Iterator[bytes]:
     """Return the content with single flipped bits at positions all over it."""
     rng = random.Random(seed)
     for byte in range(0, len(whole), max(1, len(whole) // most)):
@@ -45,11 +45,11 @@ def flips(whole: bytes, most: int, seed: int) -> Iterator[bytes]:
 
 
 @pytest.mark.usefixtures("real_time")
-def test_no_flipped_bit_of_the_guards_settings_is_believed(tmp_path: Path) -> None:
+def test_guard_settings_with_flipped_bit_are_refused(tmp_path: Path) -> None:
     path, true = tmp_path / "guard.json", settings()
     path.write_text(encode_settings(true))
     assert load_settings(path) == true
-    for flipped in flips(path.read_bytes(), 300, 1):
+    for flipped in flip_bits(path.read_bytes(), 300, 1):
         path.write_bytes(flipped)
         with pytest.raises(ConfigError, match=r"run fdhil-guard|let fdhil-guard write it"):
             load_settings(path)
@@ -57,7 +57,7 @@ def test_no_flipped_bit_of_the_guards_settings_is_believed(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("read", [load_settings, load_model_file])
 @pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE)
-def test_a_hostile_document_is_a_config_error(text: str, read: Callable[[Path], object], tmp_path: Path) -> None:
+def test_hostile_document_is_a_config_error(text: str, read: Callable[[Path], object], tmp_path: Path) -> None:
     """The guard's settings and a model file: any content gives one sentence of bounded length."""
     path = tmp_path / "document.json"
     path.write_text(text)
@@ -66,12 +66,12 @@ def test_a_hostile_document_is_a_config_error(text: str, read: Callable[[Path], 
     assert len(str(caught.value)) < 2000
 
 
-def test_a_model_file_with_a_flipped_bit_is_numbers_or_a_config_error(tmp_path: Path) -> None:
+def test_model_file_with_flipped_bit_is_valid_or_config_error(tmp_path: Path) -> None:
     """It is written by hand and has no digest; its values are checked all the same."""
     path = tmp_path / "model.json"
     values = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
     refused = 0
-    for flipped in flips(json.dumps({"X": values, "Y": values}).encode(), 1000, 2):
+    for flipped in flip_bits(json.dumps({"X": values, "Y": values}).encode(), 1000, 2):
         path.write_bytes(flipped)
         try:
             models = load_model_file(path).parameters
@@ -82,10 +82,10 @@ def test_a_model_file_with_a_flipped_bit_is_numbers_or_a_config_error(tmp_path: 
     assert refused > 50
 
 
-def test_a_token_with_a_flipped_bit_arms_nothing_and_is_no_traceback(tmp_path: Path) -> None:
+def test_token_with_flipped_bit_is_refused_without_traceback(tmp_path: Path) -> None:
     true = ensure_token(tmp_path)
     path = tmp_path / TOKEN_NAME
-    for flipped in flips(path.read_bytes(), 64, 3):
+    for flipped in flip_bits(path.read_bytes(), 64, 3):
         path.write_bytes(flipped)
         assert read_token(tmp_path) != true
     path.write_bytes(b"\xff" * 100_000)
@@ -93,7 +93,7 @@ def test_a_token_with_a_flipped_bit_arms_nothing_and_is_no_traceback(tmp_path: P
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_a_checked_program_with_a_flipped_bit_is_checked_again(tmp_path: Path) -> None:
+def test_program_check_with_flipped_bit_is_repeated(tmp_path: Path) -> None:
     """The guard's rows and their attestation."""
     rows = bytes(range(256)) * 16
     errors = {"before": {"rms_um": 1.0, "max_um": 2.0}, "after": {"rms_um": 0.1, "max_um": 0.2}}
@@ -101,18 +101,18 @@ def test_a_checked_program_with_a_flipped_bit_is_checked_again(tmp_path: Path) -
     header = {"schema": SCHEMA, "axes": ["X"], "code": code_digest(), "blocks": blocks, "files": {}, "rows": 512,
               "largest_um": 3.0, "refused": [], **errors}  # fmt: skip
 
-    def write(body: BinaryIO) -> dict[str, object]:
+    def write_check(body: BinaryIO) -> dict[str, object]:
         body.write(rows)
         return header
 
-    keep(tmp_path, "key", write)
+    keep(tmp_path, "key", write_check)
     found = CheckedProgram.find(tmp_path, "key", tmp_path)
     assert found is not None
     assert (found.rows, found.errors) == (512, errors)
     for file, most in ((f"key{HEADER}", 400), ("key.rows", 40)):
         path = tmp_path / file
         whole = path.read_bytes()
-        for flipped in flips(whole, most, 4):
+        for flipped in flip_bits(whole, most, 4):
             path.write_bytes(flipped)
             assert CheckedProgram.find(tmp_path, "key", tmp_path) is None
         path.write_bytes(whole)
@@ -126,7 +126,7 @@ def test_a_checked_program_with_a_flipped_bit_is_checked_again(tmp_path: Path) -
      "G1 X#" + "#" * 3000 + "1"],
     ids=lambda line: line[:10],
 )  # fmt: skip
-def test_a_number_of_thousands_of_digits_in_a_program_is_a_program_error(line: str) -> None:
+def test_huge_number_in_program_is_a_program_error(line: str) -> None:
     try:
         list(interpret([line, "M2"], Budget.of(Nc())))
     except ProgramError as error:
@@ -138,8 +138,8 @@ def test_a_number_of_thousands_of_digits_in_a_program_is_a_program_error(line: s
 
 
 @pytest.mark.parametrize("text", ["a = " + "[" * 100_000, "a = " + "9" * 5000, "a = 0x" + "f" * 5000])
-def test_a_hostile_fault_script_is_a_config_error(text: str, tmp_path: Path) -> None:
+def test_hostile_fault_script_is_a_config_error(text: str, tmp_path: Path) -> None:
     path = tmp_path / "faults.toml"
     path.write_text(text)
     with pytest.raises(FdhilError):
-        fault_script.load(path, ("X",))
+        fault_script.load_script(path, ("X",))

@@ -17,7 +17,7 @@ LOCK = (ROOT / "requirements.lock").read_text("utf-8")
 WHEEL = "harmless-1.0-py3-none-any.whl"
 
 
-def locked() -> dict[str, list[str]]:
+def read_lock() -> dict[str, list[str]]:
     """Return the hashes of each package of the lock."""
     entries = re.split(r"\n(?=[A-Za-z0-9])", LOCK.replace("\\\n", " "))
     named = {match[1].lower(): entry for entry in entries if (match := re.match(r"([A-Za-z0-9._-]+)==", entry.strip()))}
@@ -25,8 +25,8 @@ def locked() -> dict[str, list[str]]:
 
 
 @pytest.mark.fault("G14")
-def test_every_package_is_pinned_by_its_content() -> None:
-    packages = locked()
+def test_every_package_is_pinned_by_hash() -> None:
+    packages = read_lock()
     assert len(packages) > 100
     assert [name for name, hashes in packages.items() if not hashes] == []
 
@@ -36,7 +36,7 @@ def test_every_dependency_is_in_the_lock() -> None:
     wanted = [*project["project"]["dependencies"], *project["dependency-groups"]["dev"]]
     wanted += [each for extra in project["project"]["optional-dependencies"].values() for each in extra]
     names = {re.split(r"[\[<>=~! ]", each)[0].lower().replace("_", "-") for each in wanted}
-    assert names - set(locked()) == set()
+    assert names - set(read_lock()) == set()
 
 
 def make_wheel(folder: Path, says: str) -> str:
@@ -52,7 +52,7 @@ def make_wheel(folder: Path, says: str) -> str:
 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.fault("G14")
-def test_a_package_with_other_content_is_not_installed(tmp_path: Path) -> None:
+def test_package_with_wrong_hash_is_not_installed(tmp_path: Path) -> None:
     """With the options of the Makefile and of the unit's instructions."""
     honest = make_wheel(tmp_path, "print('good')")
     (tmp_path / "requirements.lock").write_text(f"harmless==1.0 --hash=sha256:{honest}\n")
@@ -73,7 +73,7 @@ def test_a_package_with_other_content_is_not_installed(tmp_path: Path) -> None:
     assert not (tmp_path / "b").exists()
 
 
-def test_the_makefile_and_the_instructions_install_by_hash() -> None:
+def test_makefile_and_instructions_install_by_hash() -> None:
     for name in ("Makefile", "docs/how-to/service.md"):
         text = (ROOT / name).read_text("utf-8")
         assert "--require-hashes -r requirements.lock" in text, name

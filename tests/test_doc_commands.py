@@ -19,8 +19,8 @@ from fdhil.cli.main import cli, leaves
 from fdhil.config.fleet_config import Fleet
 from fdhil.daemon.kernel_warmup import simulate_nominal_rapid
 from fdhil.daemon.outcome_store import OutcomeStore
-from fdhil.fleet.offer import Change
 from fdhil.fleet.rollout import ChangeFile
+from fdhil.fleet.signed_offer import ProposedChange
 from fdhil.store.column_map import ColumnMap
 from fdhil.store.windows import encode_window
 from studies import bench
@@ -229,7 +229,7 @@ def test_every_piece_of_a_configuration_can_be_put_into_one(page: Path) -> None:
         elif {"database", "retention"} & set(piece):
             Fleet.model_validate(piece)
         elif "set" in piece:
-            Change.model_validate(ChangeFile.model_validate(piece).change)
+            ProposedChange.model_validate(ChangeFile.model_validate(piece).proposed_fields)
         elif not {"fault", "tpdos", "base"} & set(piece):
             assert config.parse_config(merged(bench_document(), piece)).axis
     for text in blocks(page, "python"):

@@ -9,7 +9,7 @@ import pytest
 from studies.house_measure import count_lines, find_doors, read_budget, split_name
 
 
-def test_every_room_has_a_budget_and_every_budget_a_room() -> None:
+def test_rooms_and_budgets_match() -> None:
     assert set(read_budget()) == set(count_lines())
 
 
@@ -19,7 +19,7 @@ def test_room_stays_within_its_budget_of_lines(room: str) -> None:
     assert lines <= most, f"fdhil/{room} has {lines} lines, {most} are granted: delete as many as you add"
 
 
-def test_import_from_a_file_of_another_room_is_counted_as_past_the_door() -> None:
+def test_import_from_file_of_another_room_is_counted() -> None:
     tree = ast.parse(
         "from fdhil.config import MachineConfig, reading\n"
         "from fdhil.store.history import History\n"

@@ -19,7 +19,7 @@ LIMITS = "fdhil.guard.offset_limits"
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_the_mistakes_of_a_module_are_those_of_its_functions_properties_tables_and_constants() -> None:
+def test_mutants_cover_functions_properties_tables_and_constants() -> None:
     import_module("fdhil.guard.guard_step")  # only what is loaded is searched for who reads a table
     code = {mutant.name for mutant in of_code(LIMITS)}
     assert "limits.clamp: return min(max(value, low), high) -> return min(max(value, low), None)" in code
@@ -33,7 +33,7 @@ def test_the_mistakes_of_a_module_are_those_of_its_functions_properties_tables_a
     assert "AXIS_INTERLOCKS[StaleData]" in predicates
 
 
-def test_a_mistake_replaces_what_others_have_imported() -> None:
+def test_mutant_replaces_imported_names() -> None:
     from fdhil.guard.offset_limits import limit_value
 
     turned = Mutant(LIMITS, "clamp", "", "", "def clamp(value, low, high):\n    return max(max(value, low), high)\n")
@@ -47,7 +47,7 @@ def test_a_mistake_replaces_what_others_have_imported() -> None:
 
 
 @pytest.mark.usefixtures("processes")
-def test_mistakes_are_noticed_by_tests_that_call_the_place(tmp_path: Path) -> None:
+def test_mutants_are_detected_by_tests_of_the_function(tmp_path: Path) -> None:
     """The study on a small module: called and checked code is detected, uncalled code is reported."""
     options = ["--modules", "requests", "--every", "12", "--tests", "tests/guard/test_request_parsing.py"]
     command = [sys.executable, "-m", "studies.mutants", *options, "--out", str(tmp_path)]

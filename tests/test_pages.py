@@ -19,22 +19,22 @@ ROOT = Path(__file__).parents[1]
 Figures = dict[str, Any]
 
 
-def document(study: str) -> Figures:
+def load_document(study: str) -> Figures:
     told: Figures = json.loads((FOLDER / f"{study}.json").read_text("utf-8"))
     return told
 
 
-def prose(page: str) -> str:
+def extract_prose(page: str) -> str:
     """Return a page's text without its tables, in one line."""
     return " ".join(line for line in page.splitlines() if not line.startswith("|"))
 
 
 @pytest.mark.parametrize("study", STUDIES)
-def test_a_page_is_what_its_figures_say(study: str) -> None:
-    figures = document(study)
+def test_page_matches_figures(study: str) -> None:
+    figures = load_document(study)
     page = (FOLDER / f"{study}.md").read_text("utf-8")
     assert rendered(figures) == page
-    words = prose(page)
+    words = extract_prose(page)
     assert figures["study"] == study
     for told in ("command", "seeds", "commit", "date"):
         assert figures["run"][told] in words
@@ -44,17 +44,17 @@ def test_a_page_is_what_its_figures_say(study: str) -> None:
 
 
 @pytest.mark.parametrize("name", benchmarks.BENCHMARKS)
-def test_a_benchmark_finds_what_it_measures(name: str) -> None:
+def test_benchmark_finds_its_subject(name: str) -> None:
     assert import_module(f"benchmarks.{name}").__doc__
 
 
-def test_the_benchmarks_page_is_what_its_figures_say() -> None:
+def test_benchmarks_page_matches_figures() -> None:
     figures = json.loads(benchmarks.FIGURES.read_text("utf-8"))
     assert list(figures) == list(benchmarks.BENCHMARKS)
     assert benchmarks.page(figures) == (ROOT / "docs" / "benchmarks.md").read_text("utf-8")
 
 
-def _least_squares_without_bias(figures: Figures) -> None:
+def _remove_least_squares_bias(figures: Figures) -> None:
     """Figures in which raw least squares is right and the product's other choices are not."""
     names = figures["methods"]
     for case in figures["cases"]:
@@ -65,24 +65,24 @@ def _least_squares_without_bias(figures: Figures) -> None:
         case["rejected"] = [[[1.0] * 6] * len(names)] * len(figures["filters"])
 
 
-def _moments_win(figures: Figures) -> None:
+def _let_moments_win(figures: Figures) -> None:
     for part in figures["noises"]:
         part["methods"]["partial moments"]["rms"] = [1e-9] * 6
 
 
-def _history_blind(figures: Figures) -> None:
+def _blind_history(figures: Figures) -> None:
     figures["steps"] = [[[], 0, False] for _ in figures["steps"]]
     figures["due"] = [[False, False, None] for _ in figures["due"]]
 
 
-def _some_accepted(figures: Figures) -> None:
+def _accept_some(figures: Figures) -> None:
     (first, *_) = figures.values()
     for fault in first.values():
         fault |= {"accepted": 0, "harmful": 0, "silent": 0, "wrong": []}
     first["backlash"] |= {"accepted": 3, "silent": 3, "right": 0, "wrong": [24, 54, 84]}
 
 
-def _intervals_lie(figures: Figures) -> None:
+def _falsify_intervals(figures: Figures) -> None:
     figures["intervals"][0]["share"][3] = 0.02
     figures["verdicts"]["good"] |= {"refused": 77}
 
@@ -92,46 +92,46 @@ def _intervals_lie(figures: Figures) -> None:
     [
         (
             "comparison",
-            _least_squares_without_bias,
+            _remove_least_squares_bias,
             "",
             ("with 40 Hz in none of 9 cases (otherwise central in 9)", "With 150 Hz: unbiased", "100 / 100 with 40 Hz"),
         ),
-        ("estimators", _moments_win, "Smallest error: maximum likelihood", ("partial moments of R, L, K,",)),
+        ("estimators", _let_moments_win, "Smallest error: maximum likelihood", ("partial moments of R, L, K,",)),
         (
             "drift",
-            _history_blind,
+            _blind_history,
             "95 % interval holds",
             ("nothing: 100 of 100", "not within 5: 100", "in 0 of 100", "told in 0 of 60 histories."),
         ),
         (
             "verdicts",
-            _some_accepted,
+            _accept_some,
             "backlash (100%)",
             (" 3 accepted, 3 of them without a warning, 0 to harm (", "backlash (0%)", "backlash 24, 54, 84"),
         ),
-        ("slow_sensor", _intervals_lie, "", ("that of Jt holds the truth least often: 2 %", " 77 windows refused")),
+        ("slow_sensor", _falsify_intervals, "", ("that of Jt holds the truth least often: 2 %", " 77 windows refused")),
     ],
 )
-def test_other_figures_make_other_conclusions(
+def test_conclusions_follow_figures(
     study: str, other: Callable[[Figures], None], gone: str, told: tuple[str, ...]
 ) -> None:
-    figures = document(study)
-    before = prose(rendered(figures))
+    figures = load_document(study)
+    before = extract_prose(rendered(figures))
     other(changed := copy.deepcopy(figures["figures"]))
-    after = prose(rendered({**figures, "figures": changed}))
+    after = extract_prose(rendered({**figures, "figures": changed}))
     for words in told:
         assert words not in before
         assert words in after
     assert not gone or gone not in after
 
 
-def test_every_page_of_a_study_has_its_figures_beside_it() -> None:
+def test_every_study_page_has_figures_file() -> None:
     pages = {path.stem for path in FOLDER.glob("*.md")}
     assert pages >= set(STUDIES)
     assert pages == {path.stem for path in FOLDER.glob("*.json")}
 
 
 @pytest.mark.usefixtures("processes")
-def test_figures_survive_the_file() -> None:
+def test_figures_round_trip_through_file() -> None:
     assert plain({"a": (float("nan"), 1.23456789), "n": 3, "s": "R"}) == {"a": [None, 1.23457], "n": 3, "s": "R"}
     assert provenance("python -m studies.x")["versions"].startswith("Python 3.")

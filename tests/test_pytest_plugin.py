@@ -29,7 +29,7 @@ def test_what_it_cannot_do_fails_the_test(feed_drive_bench):
 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("bus", ["virtual", "hub"])
-def test_page_and_other_tests_run_in_a_suite_of_their_own(bus: str, pytester: pytest.Pytester) -> None:
+def test_documented_tests_run_in_separate_suite(bus: str, pytester: pytest.Pytester) -> None:
     shown = re.findall(r"^```python\n(.*?)^```", PAGE.read_text("utf-8"), re.MULTILINE | re.DOTALL)
     pytester.makepyfile("\n\n".join([*shown, OTHERS]))
     pytester.makeini("[pytest]\nasyncio_default_fixture_loop_scope = function\n")
@@ -39,7 +39,7 @@ def test_page_and_other_tests_run_in_a_suite_of_their_own(bus: str, pytester: py
     result.stdout.fnmatch_lines(["*the feed drive bench failed: *trip needs a value*"])
 
 
-def test_its_configuration_is_one_that_commands_take(tmp_path: Path) -> None:
+def test_plugin_configuration_is_accepted_by_commands(tmp_path: Path) -> None:
     from fdhil import config
     from fdhil.pytest_plugin import FeedDriveBench
 
@@ -49,21 +49,21 @@ def test_its_configuration_is_one_that_commands_take(tmp_path: Path) -> None:
     assert machine.axis["Z"].voltage.port == bench.ready["modbus"]["Z"]["port"]
 
 
-def test_the_package_tells_pytest_of_it() -> None:
+def test_package_registers_pytest_plugin() -> None:
     import tomllib
 
     document = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf-8"))
     assert document["project"]["entry-points"]["pytest11"] == {"fdhil": "fdhil.pytest_plugin"}
 
 
-def test_machine_that_does_not_get_ready_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_machine_that_never_becomes_ready_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its thread would prevent the end of the test run."""
     from fdhil.pytest_plugin import FeedDriveBench
 
-    def interrupted(_: FeedDriveBench, event: str) -> None:
+    def raise_interrupt(_: FeedDriveBench, event: str) -> None:
         raise KeyboardInterrupt(event)
 
-    monkeypatch.setattr(FeedDriveBench, "wait_for", interrupted)
+    monkeypatch.setattr(FeedDriveBench, "wait_for", raise_interrupt)
     bench = FeedDriveBench(tmp_path)
     with pytest.raises(KeyboardInterrupt, match="ready"):
         bench.__enter__()

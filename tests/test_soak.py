@@ -19,7 +19,7 @@ from studies.usage import BLOCKS, slope, used
 RUN = {"command": "python -m studies.soak", "date": "2026-01-01", "commit": "0123456", "versions": "", "seeds": "1"}
 
 
-def test_a_slope_is_found_within_its_interval_and_none_where_there_is_none() -> None:
+def test_slope_is_found_only_where_present() -> None:
     rng = np.random.default_rng(1)
     time, held, seen = np.arange(400.0), {0.0: 0, 0.01: 0}, 0
     for grows in held:
@@ -36,7 +36,7 @@ def test_a_slope_is_found_within_its_interval_and_none_where_there_is_none() -> 
 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.fault("F10")
-def test_what_a_process_uses_is_seen_from_outside() -> None:
+def test_process_usage_is_measured_from_outside() -> None:
     script = """
 import os, socket, subprocess, sys, threading
 print("before", flush=True); sys.stdin.readline()
@@ -61,7 +61,7 @@ print("after", flush=True); sys.stdin.readline()
     assert (after.children, after.zombies) == (1, 1)
 
 
-def samples(folder: Path, grown_mb: float, rounds: int, hour_s: float, emergencies: int) -> None:
+def build_samples(folder: Path, grown_mb: float, rounds: int, hour_s: float, emergencies: int) -> None:
     """Write a run in which the guard grows by this amount per round, and the daemon was restarted early."""
     folder.mkdir()
     (folder / "run.json").write_text(json.dumps(RUN))
@@ -88,11 +88,11 @@ def samples(folder: Path, grown_mb: float, rounds: int, hour_s: float, emergenci
         (0.0, 252, 400_000, False),
     ],
 )
-def test_the_goal_is_met_where_nothing_grows_for_long_enough(
+def test_goal_is_met_without_growth_over_required_time(
     grown_mb: float, rounds: int, emergencies: int, met: bool, tmp_path: Path
 ) -> None:
-    samples(tmp_path / "week", grown_mb, rounds, 4.0, emergencies)
-    samples(tmp_path / "hours", 0.0, 300, 120.0, emergencies)
+    build_samples(tmp_path / "week", grown_mb, rounds, 4.0, emergencies)
+    build_samples(tmp_path / "hours", 0.0, 300, 120.0, emergencies)
     week, hours = soak.figures_of(tmp_path / "week", per_day=False), [soak.figures_of(tmp_path / "hours", per_day=True)]
     assert week["processes"]["guard"]["samples"] == (rounds - 4) - (rounds - 4) // 2
     assert soak.goal(week, hours)["met"] is met
@@ -102,17 +102,17 @@ def test_the_goal_is_met_where_nothing_grows_for_long_enough(
     assert f"{rounds * RAPIDS:,} rapids" in page
 
 
-def test_without_real_hours_it_is_not_met(tmp_path: Path) -> None:
-    samples(tmp_path / "week", 0.0, 252, 4.0, 1_000_000)
+def test_goal_is_not_met_without_real_hours(tmp_path: Path) -> None:
+    build_samples(tmp_path / "week", 0.0, 252, 4.0, 1_000_000)
     told = soak.goal(soak.figures_of(tmp_path / "week", per_day=False), [])
     assert not told["met"]
     assert "0 of 8 real hours" in told["figure"]
 
 
-def test_real_hours_are_added_and_nothing_may_grow_in_them_for_certain(tmp_path: Path) -> None:
-    samples(tmp_path / "week", 0.0, 252, 4.0, 1_000_000)
-    samples(tmp_path / "flat", 0.0, 300, 48.0, 0)
-    samples(tmp_path / "grows", 0.1, 300, 48.0, 0)
+def test_real_hours_are_added_and_must_not_grow(tmp_path: Path) -> None:
+    build_samples(tmp_path / "week", 0.0, 252, 4.0, 1_000_000)
+    build_samples(tmp_path / "flat", 0.0, 300, 48.0, 0)
+    build_samples(tmp_path / "grows", 0.1, 300, 48.0, 0)
     week = soak.figures_of(tmp_path / "week", per_day=False)
     flat, grows = (soak.figures_of(tmp_path / name, per_day=True) for name in ("flat", "grows"))
     assert not soak.goal(week, [flat])["met"]
@@ -123,7 +123,7 @@ def test_real_hours_are_added_and_nothing_may_grow_in_them_for_certain(tmp_path:
     )
 
 
-def test_a_week_has_a_million_emergencies_and_every_event() -> None:
+def test_week_has_million_emergencies_and_every_event() -> None:
     rounds = 7 * soak.A_DAY // RAPIDS
     assert rounds * RAPIDS == 7 * soak.A_DAY
     restarting = int(soak.RESTARTING * rounds)

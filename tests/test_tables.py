@@ -16,15 +16,15 @@ TABLES: dict[str, Mapping[str, str]] = {
 
 
 @pytest.mark.parametrize(("table", "name"), [(table, name) for table in TABLES for name in TABLES[table]])
-def test_what_is_listed_is_there(table: str, name: str) -> None:
+def test_listed_entries_exist(table: str, name: str) -> None:
     assert tables.load_entry(TABLES[table], name) is not None
 
 
-def test_the_defaults_are_listed() -> None:
+def test_defaults_are_listed() -> None:
     assert tables.DEFAULT_ESTIMATOR in tables.ESTIMATORS
     assert tables.DEFAULT_CORRECTION in tables.CORRECTIONS
 
 
-def test_what_is_not_listed_is_a_key_error() -> None:
+def test_unlisted_name_is_key_error() -> None:
     with pytest.raises(KeyError):
         tables.load_entry(tables.CORRECTIONS, "none")

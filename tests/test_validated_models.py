@@ -23,7 +23,7 @@ from fdhil.records import PARAMETERS, Estimate, Result, Trajectory, Verdict, Win
 from studies import real_plant as real
 from tests.bench import bench_config
 from tests.identification.realistic import rapids
-from tests.paths import smooth, trajectory
+from tests.paths import build_trajectory, smooth_demand
 from tests.store.made import published
 from tests.tiers import sampled
 
@@ -47,7 +47,7 @@ PLANTS = {
 
 def short_move() -> Trajectory:
     way = np.concatenate([np.linspace(0.0, 5.0, 60), np.linspace(5.0, 0.0, 60), np.zeros(180)])
-    return trajectory(smooth(way[:, None], (0.060, 0.030), 0.001), "X")
+    return build_trajectory(smooth_demand(way[:, None], (0.060, 0.030), 0.001), "X")
 
 
 MOVE = short_move()

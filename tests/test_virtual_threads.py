@@ -14,15 +14,15 @@ import pytest
 from tests.virtual_threads import FIRST_S, VirtualThreads
 
 
-def test_threads_go_on_in_the_order_of_their_deadlines(virtual_threads: VirtualThreads) -> None:
+def test_threads_resume_in_order_of_deadlines(virtual_threads: VirtualThreads) -> None:
     seen: list[tuple[float, str]] = []
 
-    def turn(name: str, period_s: float) -> None:
+    def take_turn(name: str, period_s: float) -> None:
         for _ in range(3):
             time.sleep(period_s)
             seen.append((round(time.monotonic() - FIRST_S, 6), name))
 
-    threads = [threading.Thread(target=turn, args=each) for each in (("slow", 3600.0), ("quick", 1500.0))]
+    threads = [threading.Thread(target=take_turn, args=each) for each in (("slow", 3600.0), ("quick", 1500.0))]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -48,15 +48,15 @@ def test_queues_events_pools_and_event_loops_wait_on_virtual_time(virtual_thread
     assert time.monotonic() - FIRST_S == pytest.approx(240.0, abs=1e-3)
 
 
-def test_a_socket_is_waited_for_while_others_run(virtual_threads: VirtualThreads) -> None:
+def test_thread_waits_for_socket_while_others_run(virtual_threads: VirtualThreads) -> None:
     near, far = socket.socketpair()
     with near, far:
 
-        def answer() -> None:
+        def answer_client() -> None:
             time.sleep(60.0)
             far.sendall(b"late")
 
-        thread = threading.Thread(target=answer)
+        thread = threading.Thread(target=answer_client)
         thread.start()
         near.settimeout(30.0)
         with pytest.raises(TimeoutError):

@@ -11,7 +11,7 @@ import click
 
 # what a command needs -> its compiled modules, and about how many seconds each takes
 NEEDS: Mapping[str, Mapping[str, float]] = {
-    "predict": {"fdhil.model.kernels": 4, "fdhil.prediction.kernels": 1},
+    "predict": {"fdhil.model.closed_loop_kernels": 4, "fdhil.prediction.kernels": 1},
     "correct": {"fdhil.correction.kernels": 10},
     "identify": {
         "fdhil.identification.kalman": 12,

@@ -20,7 +20,7 @@ from fdhil.correction.inverse import AxisInverse, block_rows, common_delay_s
 from fdhil.correction.limits import check
 from fdhil.model import closed_loop
 from fdhil.model.closed_loop import State
-from fdhil.model.kernels import CURRENT
+from fdhil.model.closed_loop_kernels import CURRENT
 from fdhil.prediction.contour import contour_error_um
 from fdhil.prediction.model_terms import Band, band
 from fdhil.records import Float, Parameters, compute_rms, compute_table_path
@@ -82,7 +82,7 @@ class FirstBlock:
         if not any(self._differs(axis, rest[axis]) for axis in axes):
             return None
         self._used_a = {axis: rest[axis].current_a for axis in axes}
-        found = closed_loop.each_axis(lambda axis: self._solved(axis, rest[axis]), axes)
+        found = closed_loop.run_per_axis(lambda axis: self._solved(axis, rest[axis]), axes)
         if not all(one.allowed for one in found.values()) or not self._better(found):
             return None
         signs = {axis: self._config.axis[axis].scaling.sign for axis in axes}
@@ -183,7 +183,7 @@ def rest_state(rest: AtRest, start_mm: float, parameters: Parameters, axis: Axis
     off_mm = rest.position_mm - rest.demand_mm
     if abs(off_mm) * axis.scaling.increments_per_mm < 1.0:  # the drive itself sees none
         off_mm = 0.0
-    return closed_loop.standing(parameters, axis, start_mm + off_mm, rest.current_a, start_mm)
+    return closed_loop.create_standstill_state(parameters, axis, start_mm + off_mm, rest.current_a, start_mm)
 
 
 def _share(rows: int, period_s: float) -> Float:

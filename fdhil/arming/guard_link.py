@@ -140,7 +140,7 @@ class GuardLink:
     def arm(
         self, armament: Armament, token: str, given_up: Callable[[], bool], disarms: int | None
     ) -> Mapping[str, Any]:
-        """Load the table and arm (blocking), unless ``given_up`` by then; return the guard's answer.
+        """Load the table and arm (blocking), unless ``cancel_itself`` by then; return the guard's answer.
 
         A disarm that was answered in the meantime takes precedence; so does one that the guard counted after the first
         ``disarms``. Raises DeviceError if there is no guard.

@@ -21,7 +21,7 @@ from fdhil.config import MachineConfig
 from fdhil.correction import flatness_feedforward, gate
 from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.identification.loops import regulators_of
-from fdhil.model.terms import with_resonance
+from fdhil.model.model_terms import add_resonance
 from fdhil.prediction.gain import Gain, joint_held_out_um, largest_skill_um, with_held_out_um, worst_skill_um
 from fdhil.prediction.models import validated_models
 from fdhil.program import program_digest
@@ -122,7 +122,7 @@ def prepare(
     found = models_with_loops(tuple(config.axis), config, known)
     if isinstance(found, Refused):
         return found
-    models = {axis: with_resonance(model, config.axis[axis]) for axis, model in found[0].items()}
+    models = {axis: add_resonance(model, config.axis[axis]) for axis, model in found[0].items()}
     digest = program_digest(program)
     ahead = method in (None, "inverse") and _longer_than_ring(program, config, digest)
     if ahead and (off := gate.writing_off(list(config.axis), config) or gate.held_out(largest_um(known, models))):

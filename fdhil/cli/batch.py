@@ -14,7 +14,7 @@ from fdhil.child_process import request_parent_death_signal
 from fdhil.cli.failing import error_document
 from fdhil.config import Identification, MachineConfig
 from fdhil.errors import FdhilError, RecordingError
-from fdhil.fleet.spread import Crew
+from fdhil.fleet.task_pool import TaskPool
 from fdhil.records import Reason, Recording, Verdict, Window, WindowOutcome
 from fdhil.store import suffixes
 from fdhil.store.accelerometer_csv import with_accelerometer
@@ -52,8 +52,8 @@ def analyse_files(
     first = 0
     try:
         with _processes() as executor:
-            crew = Crew[_Numbered, FileResult](executor, CHUNK, 2 * _cores())
-            for task, results in crew.spread(work, enumerate(paths)):
+            crew = TaskPool[_Numbered, FileResult](executor, CHUNK, 2 * _cores())
+            for task, results in crew.run_tasks(work, enumerate(paths)):
                 progress(len(task))
                 ready |= {number: result for (number, _), result in zip(task, results, strict=True)}
                 while first in ready:

@@ -48,12 +48,12 @@ def uplink(config: Path, as_json: bool) -> None:
 
     machine = machine_config.load_config(config)
     with with_extra():
-        from fdhil.fleet.uplink import send
+        from fdhil.fleet.record_uplink import send_records
     from fdhil.daemon import service_log
     from fdhil.shopfloor.publisher_process import report_ready, run_publisher
 
     with service_log.write_lines_as_json(as_json):
-        run_publisher(lambda machine: send(machine, report_ready), machine)
+        run_publisher(lambda machine: send_records(machine, report_ready), machine)
 
 
 class Questions(SuggestingGroup):
@@ -93,7 +93,7 @@ def collect(fleet: Path, as_json: bool) -> None:
 
     settings = load_fleet_config(fleet)
     with with_extra():
-        from fdhil.fleet.collector import collect as gather
+        from fdhil.fleet.collector import collect_records as gather
     from fdhil.daemon import service_log
     from fdhil.shopfloor.publisher_process import report_ready, run_publisher
 
@@ -104,9 +104,9 @@ def collect(fleet: Path, as_json: bool) -> None:
 def query_database(settings: "Fleet", question: str, **given: str | None) -> dict[str, Any]:
     """Return the answer of the database to a question, which is the name of a command."""
     with with_extra():
-        from fdhil.fleet import questions, sets
-    with sets.asking(settings) as db:
-        return questions.QUERIES[question](db, **given)
+        from fdhil.fleet import fleet_queries, parameter_sets
+    with parameter_sets.open_read_only(settings) as db:
+        return fleet_queries.QUERIES[question](db, **given)
 
 
 def query_and_print(fleet: Path, question: str, as_json: bool, **given: str | None) -> dict[str, Any]:

@@ -70,22 +70,24 @@ def reanalyse(
         )
     settings, machines = load_fleet_config(fleet), _by_name(configs)
     with with_extra():
-        from fdhil.fleet import reanalysis, sets
-        from fdhil.fleet.changes import changes
-        from fdhil.fleet.window_work import Method, code_digest
-        from fdhil.fleet.workers import workers as entered
+        from fdhil.fleet import parameter_sets, reanalysis
+        from fdhil.fleet.reanalysis_changes import summarise_changes
+        from fdhil.fleet.window_reanalysis import AnalysisMethod, compute_code_digest
+        from fdhil.fleet.worker_pools import open_worker_pool as entered
     from fdhil.api.compiling import forewarn
     from fdhil.cli import fleet_reanalysis_view as view
     from fdhil.cli import fleet_view
 
-    chosen = Method(Identification(method=method), machines, settings.objects.directory.resolve(), code_digest())
-    scope = reanalysis.Scope(_utc(since), _utc(until), machine, axis)
+    chosen = AnalysisMethod(
+        Identification(method=method), machines, settings.objects.directory.resolve(), compute_code_digest()
+    )
+    scope = reanalysis.WindowScope(_utc(since), _utc(until), machine, axis)
     forewarn("identify")
     count = (os.cpu_count() or 1) if workers is None else workers
     with with_extra(), entered(scheduler, count) as pool, _bar() as progress:
-        revision = reanalysis.reanalyse(settings, chosen, scope, pool, progress)
-    with sets.asking(settings) as db:
-        answer = changes(db, revision, by)
+        revision = reanalysis.reanalyse_windows(settings, chosen, scope, pool, progress)
+    with parameter_sets.open_read_only(settings) as db:
+        answer = summarise_changes(db, revision, by)
     fleet_view.tell(answer, "reanalyse", as_json, view.changes)
     return UNREADABLE if answer["unreadable"] else 0
 
@@ -110,9 +112,9 @@ def _utc(at: datetime | None) -> datetime | None:
 @contextmanager
 def _bar() -> Iterator[Callable[[int, int], None]]:
     if not sys.stderr.isatty():
-        from fdhil.fleet.reanalysis import unseen
+        from fdhil.fleet.reanalysis import ignore_progress
 
-        yield unseen
+        yield ignore_progress
         return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

@@ -15,8 +15,8 @@ from fdhil.cli.fleet import with_extra
 from fdhil.cli.options import AS_JSON, FILE, FLEET, OutputFile, Writing
 
 if TYPE_CHECKING:
-    from fdhil.fleet.offer import Change, Offer
-    from fdhil.fleet.rollout import Standing, Told
+    from fdhil.fleet.rollout import MachineResponse, RolloutStatus
+    from fdhil.fleet.signed_offer import Offer, ProposedChange
 
 CHANGE = click.argument("change", type=FILE)
 MACHINES = click.option("--machine", "machines", multiple=True, help="Fleet name of a machine; repeatable.")
@@ -32,9 +32,9 @@ def key(file: Path, as_json: bool) -> None:
     [offers] trust. Anybody with access to FILE can sign in your name.
     """
     with with_extra():
-        from fdhil.fleet.offer import make_key, public_key
+        from fdhil.fleet.signed_offer import create_key, read_public_key
     made = not file.exists()
-    public = make_key(file) if made else public_key(file)
+    public = create_key(file) if made else read_public_key(file)
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-fleet-key-1", "file": str(file), "made": made, "public_key": public}))
         return
@@ -56,12 +56,12 @@ def sign(change: Path, key_file: Path, by: str, machines: tuple[str, ...], out: 
     the labels of CHANGE.
     """
     with with_extra():
-        from fdhil.fleet.offer import sign as signed
-        from fdhil.fleet.rollout import offer_of, read_change
+        from fdhil.fleet.rollout import create_offer, read_change
+        from fdhil.fleet.signed_offer import sign_offer as signed
     from fdhil.store.output import open_output
 
     proposal, days = read_change(change)
-    offer = offer_of(proposal, days, by, 1, machines)
+    offer = create_offer(proposal, days, by, 1, machines)
     document = signed(offer, key_file)
     with open_output(out) as file:
         file.write(document)
@@ -110,22 +110,24 @@ def stage(
     if key_file is not None and withdraw:
         raise click.UsageError("--withdraw and --key exclude each other; give only one of them")
 
-    async def work() -> tuple[Standing, Offer | None, list[str]]:
-        async with rollout.entered(settings) as db:
-            found = await rollout.standing(db, proposal)
+    async def work() -> tuple[RolloutStatus, Offer | None, list[str]]:
+        async with rollout.open_database(settings) as db:
+            found = await rollout.read_rollout_status(db, proposal)
             if key_file is None:
-                return found, None, await rollout.take_back(settings, found, proposal.name) if withdraw else []
-            names = rollout.chosen(found, count, machines, despite)
-            offer = rollout.offer_of(proposal, days, by, found.stage + 1, names)
+                return found, None, await rollout.withdraw_change(settings, found, proposal.name) if withdraw else []
+            names = rollout.choose_machines(found, count, machines, despite)
+            offer = rollout.create_offer(proposal, days, by, found.stage + 1, names)
             await rollout.open_stage(settings, db, offer, proposal, key_file, despite)
             return found, offer, []
 
     found, opened, withdrawn = asyncio.run(work())
     _tell(proposal, found, opened, withdrawn, as_json)
-    return 1 if any(each.against for each in found.offered) and opened is None and not withdraw else 0
+    return 1 if any(each.objection for each in found.offered) and opened is None and not withdraw else 0
 
 
-def _tell(change: Change, found: Standing, opened: Offer | None, withdrawn: Sequence[str], as_json: bool) -> None:
+def _tell(
+    change: ProposedChange, found: RolloutStatus, opened: Offer | None, withdrawn: Sequence[str], as_json: bool
+) -> None:
     from fdhil.daemon.service_log import escape_unprintable
 
     if as_json:
@@ -137,15 +139,15 @@ def _tell(change: Change, found: Standing, opened: Offer | None, withdrawn: Sequ
         click.echo(escape_unprintable(f"withdrawn from {_named(withdrawn)}; machines that accepted it keep it"))
 
 
-def _lines(change: Change, found: Standing, opened: Offer | None) -> Iterator[str]:
+def _lines(change: ProposedChange, found: RolloutStatus, opened: Offer | None) -> Iterator[str]:
     for each in found.offered:
-        yield f"stage {each.stage}  {each.machine}: {each.against or 'accepted and validated'}"
+        yield f"stage {each.stage}  {each.machine}: {each.objection or 'accepted and validated'}"
     if opened is not None:
         names = _named(opened.machines)
         yield f"{opened}, stage {opened.stage}, is proposed to {names}; their operators accept or reject it"
     else:
-        names = f" ({_named(found.left)})" if found.left else ""
-        yield f"{change.name} version {change.version}: {len(found.left)} machines remain{names}"
+        names = f" ({_named(found.remaining)})" if found.remaining else ""
+        yield f"{change.name} version {change.version}: {len(found.remaining)} machines remain{names}"
 
 
 def _named(machines: Sequence[str]) -> str:
@@ -153,11 +155,11 @@ def _named(machines: Sequence[str]) -> str:
     return f"{', '.join(machines[:10])}{more}"
 
 
-def _document(change: Change, found: Standing, opened: Offer | None) -> dict[str, Any]:
-    def of(each: Told) -> dict[str, Any]:
+def _document(change: ProposedChange, found: RolloutStatus, opened: Offer | None) -> dict[str, Any]:
+    def of(each: MachineResponse) -> dict[str, Any]:
         return {
             "machine": each.machine, "stage": each.stage, "answer": each.answer or None, "by": each.answered_by,
-            "reason": each.reason, "in_use": each.in_use, "notices": each.notices, "against": each.against,
+            "reason": each.reason, "in_use": each.in_use, "notices": each.notices, "against": each.objection,
         }  # fmt: skip
 
     return {
@@ -165,6 +167,6 @@ def _document(change: Change, found: Standing, opened: Offer | None) -> dict[str
         "name": change.name,
         "version": change.version,
         "offered": list(map(of, found.offered)),
-        "left": list(found.left),
+        "left": list(found.remaining),
         "opened": None if opened is None else {"stage": opened.stage, "machines": list(opened.machines)},
     }

@@ -35,12 +35,12 @@ def service(
     when = datetime.now(UTC).replace(microsecond=0) if at is None else at.replace(tzinfo=UTC)
     settings = load_fleet_config(fleet)
     with with_extra():
-        from fdhil.fleet import services, sets
-    with sets.entered(settings) as db:
+        from fdhil.fleet import axis_services, parameter_sets
+    with parameter_sets.open_database(settings) as db:
         if remove:
-            answer = services.remove(db, machine, axis or "", when)
+            answer = axis_services.remove_service(db, machine, axis or "", when)
         else:
-            answer = services.enter(db, machine, axis or "", when, note)
+            answer = axis_services.enter_service(db, machine, axis or "", when, note)
     fleet_view.tell(answer, "service", as_json)
 
 
@@ -67,9 +67,9 @@ def retain(fleet: Path, as_json: bool) -> None:
     """
     settings = load_fleet_config(fleet)
     with with_extra():
-        from fdhil.fleet import retention, sets
-    with sets.entered(settings) as db:
-        answer = retention.retain(db, settings, datetime.now(UTC), print_progress)
+        from fdhil.fleet import parameter_sets, retention
+    with parameter_sets.open_database(settings) as db:
+        answer = retention.apply_retention(db, settings, datetime.now(UTC), print_progress)
     fleet_view.tell(answer, "retain", as_json)
 
 
@@ -87,11 +87,11 @@ def export(fleet: Path, folder: Path, labels: tuple[str, ...], key: Path | None,
     """
     settings = load_fleet_config(fleet)
     with with_extra():
-        from fdhil.fleet import export as given_away
-        from fdhil.fleet import sets
-    with sets.asking(settings) as db:
-        answer = given_away.export(
-            db, folder, given_away.key_of(key or fleet.parent / "anonymous.key"), labels, print_progress
+        from fdhil.fleet import anonymous_export as given_away
+        from fdhil.fleet import parameter_sets
+    with parameter_sets.open_read_only(settings) as db:
+        answer = given_away.export_tables(
+            db, folder, given_away.load_or_create_key(key or fleet.parent / "anonymous.key"), labels, print_progress
         )
     fleet_view.tell(answer, "export", as_json)
 
@@ -111,7 +111,7 @@ def web(fleet: Path, host: str | None, port: int | None, as_json: bool) -> None:
 
     settings = load_fleet_config(fleet)
     with with_extra():
-        from fdhil.fleet import questions as _  # noqa: F401 - a missing library is reported before the start
+        from fdhil.fleet import fleet_queries as _  # noqa: F401 - a missing library is reported before the start
     from fdhil.web import serving
 
     serving.require()

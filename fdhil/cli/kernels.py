@@ -15,7 +15,7 @@ from fdhil.config import MachineConfig
 from fdhil.daemon.kernel_warmup import compile_kernels, simulate_nominal_rapid
 from fdhil.pipeline import analyse
 from fdhil.records import SlowVoltage, Window, freeze_array
-from fdhil.sim.machine import Machine
+from fdhil.sim.simulated_machine import SimulatedMachine
 
 SLOW_ROWS = 5
 
@@ -28,7 +28,7 @@ def compile_all() -> None:
     for window in _unusual(config):
         analyse(window, config.identification)
     for machine in (config, machine_config.parse_config(machine_document(REAL))):
-        Machine(machine).power_on()
+        SimulatedMachine(machine).power_on()
 
 
 def _unusual(config: MachineConfig) -> Iterator[Window]:

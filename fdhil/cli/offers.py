@@ -45,12 +45,12 @@ def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
     """
     machine_config.load_config(config)
     with with_extra():
-        from fdhil.fleet.offered import judge, present
+        from fdhil.fleet.offer_review import load_current_machine, review_offer
     from fdhil.cli import offers_view
     from fdhil.store.offers import lying
 
-    machine = present(config)
-    found = [judge(place, machine) for place in (*lying(machine.config.offers_directory), *files)]
+    machine = load_current_machine(config)
+    found = [review_offer(place, machine) for place in (*lying(machine.config.offers_directory), *files)]
     offers_view.tell(found, machine.config, as_json)
     return 1 if any(each.wrong for each in found if each.place in files) else 0
 
@@ -72,7 +72,7 @@ def accept(config: Path, offer: Path, by: str, may_loosen: bool, as_json: bool) 
     machine = machine_config.load_config(config)
     by, place = _text("--by", by, MOST_BY), _place(machine, offer)
     with with_extra():
-        from fdhil.fleet.offered import accept as write
+        from fdhil.fleet.offer_review import accept_offer as write
     from fdhil.cli import offers_view
 
     with audited(machine, "accept an offer", offer=str(offer), by=by) as ended:
@@ -95,7 +95,7 @@ def reject(config: Path, offer: Path, by: str, reason: str, as_json: bool) -> No
     machine = machine_config.load_config(config)
     by, place, reason = _text("--by", by, MOST_BY), _place(machine, offer), _text("--reason", reason, MOST_REASON)
     with with_extra():
-        from fdhil.fleet.offered import reject as note
+        from fdhil.fleet.offer_review import reject_offer as note
     with audited(machine, "reject an offer", offer=str(offer), by=by) as ended:
         done = note(place, config, by, reason)
         ended["text"] = reason

@@ -13,13 +13,13 @@ from fdhil.config import MachineConfig
 from fdhil.daemon.service_log import escape_unprintable
 
 if TYPE_CHECKING:
-    from fdhil.fleet.offered import Changed, Judged
+    from fdhil.fleet.offer_review import ReviewedOffer, ValueChange
 
 NOTHING_ARMED = "nothing is armed"
 RESTART = "restart the daemon, which still uses the old configuration: systemctl restart fdhil"
 
 
-def tell(found: Sequence[Judged], machine: MachineConfig, as_json: bool) -> None:
+def tell(found: Sequence[ReviewedOffer], machine: MachineConfig, as_json: bool) -> None:
     """Print all proposed changes."""
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-offered-1", "offers": [_document(each, machine) for each in found]}))
@@ -32,12 +32,12 @@ def tell(found: Sequence[Judged], machine: MachineConfig, as_json: bool) -> None
         click.echo(f"no proposed changes in {machine.offers_directory}{trusted}")
 
 
-def accepted(done: Judged, before: MachineConfig, file: Path, as_json: bool) -> None:
+def accepted(done: ReviewedOffer, before: MachineConfig, file: Path, as_json: bool) -> None:
     """Print the accepted changes and the next action."""
-    from fdhil.fleet.offered import kept_file
+    from fdhil.fleet.offer_review import build_backup_path
 
     assert done.offer is not None
-    kept = str(kept_file(file, done.offer)) if done.changes else None
+    kept = str(build_backup_path(file, done.offer)) if done.changes else None
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-offer-accepted-1", **_document(done, before), "kept": kept}))
         return
@@ -50,7 +50,7 @@ def accepted(done: Judged, before: MachineConfig, file: Path, as_json: bool) -> 
     click.echo(f"next: {RESTART}; {NOTHING_ARMED}")
 
 
-def in_short(done: Judged) -> str:
+def in_short(done: ReviewedOffer) -> str:
     """Return the changes in one line, for the audit log."""
     return "; ".join(map(_change, done.changes)) or "no value changes"
 
@@ -66,7 +66,7 @@ def voids(old: MachineConfig, new: MachineConfig) -> Iterator[str]:
         yield "the restart ends an active correction; arming is refused until the axes are identified again"
 
 
-def _lines(each: Judged, machine: MachineConfig) -> Iterator[str]:
+def _lines(each: ReviewedOffer, machine: MachineConfig) -> Iterator[str]:
     if each.offer is None:
         yield f"{each.place}: {each.wrong}"
         return
@@ -80,10 +80,10 @@ def _lines(each: Judged, machine: MachineConfig) -> Iterator[str]:
     yield from _changes(each, machine)
 
 
-def _changes(each: Judged, machine: MachineConfig) -> Iterator[str]:
+def _changes(each: ReviewedOffer, machine: MachineConfig) -> Iterator[str]:
     for changed in each.changes:
         yield f"  {_change(changed)}"
-    for changed in each.loosens:
+    for changed in each.loosened_values:
         yield f"  LOOSENS {_change(changed)}: more is permitted than before; accepting needs --loosens"
     for doubt in each.doubts:
         yield f"  implausible: {doubt}"
@@ -93,7 +93,7 @@ def _changes(each: Judged, machine: MachineConfig) -> Iterator[str]:
         yield from (f"  {line}" for line in voids(machine, each.config))
 
 
-def _change(changed: Changed) -> str:
+def _change(changed: ValueChange) -> str:
     return f"{changed.path} {_value(changed.old)} -> {_value(changed.new)}"
 
 
@@ -103,7 +103,7 @@ def _value(value: Any) -> str:
     return "(not set)" if value is None else str(value)
 
 
-def _document(each: Judged, machine: MachineConfig) -> dict[str, Any]:
+def _document(each: ReviewedOffer, machine: MachineConfig) -> dict[str, Any]:
     offer = each.offer
     changes = [{"key": c.path, "old": c.old, "new": c.new, "loosens": c.loosens} for c in each.changes]
     return {
@@ -112,7 +112,7 @@ def _document(each: Judged, machine: MachineConfig) -> dict[str, Any]:
         "wrong": each.wrong,
         "answers": [{"answer": a.answer, "by": a.by, "reason": a.reason, "at_s": a.at_s} for a in each.answers],
         "changes": changes,
-        "loosens": [_change(changed) for changed in each.loosens],
+        "loosens": [_change(changed) for changed in each.loosened_values],
         "doubts": list(each.doubts),
         "voids": list(voids(machine, each.config)) if each.config is not None else [],
     }

@@ -16,7 +16,7 @@ from fdhil.cli.options import CONFIG, FILE, OutputFile, Writing
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from fdhil.sim.service import SimService
+    from fdhil.sim.simulator_service import SimulatorService
 
 LINGER_S = 10.0
 LOOK_S = 0.1
@@ -65,12 +65,12 @@ def _serve(path: Path, as_json: bool, script: Path | None, play: Path | None, tr
     from fdhil import config
     from fdhil.program import load_trajectory
     from fdhil.sim import fault_script
-    from fdhil.sim.service import SimService
+    from fdhil.sim.simulator_service import SimulatorService
 
     machine = config.load_config(path)
-    entries = [] if script is None else fault_script.load(script, tuple(machine.axis))
+    entries = [] if script is None else fault_script.load_script(script, tuple(machine.axis))
 
-    service = SimService(
+    service = SimulatorService(
         machine, _tell_json if as_json else _tell, load_trajectory, panel_fd=_panel_descriptor(), faults=entries
     )
 
@@ -113,14 +113,14 @@ def _show_positions(shown: Positions) -> None:
             click.echo(line, err=True)
 
 
-def _stop_when_left(service: SimService, stop: Callable[[], None]) -> None:
+def _stop_when_left(service: SimulatorService, stop: Callable[[], None]) -> None:
     # keep running until guard and daemon have left the bus, so that a correction can ramp to zero; at most LINGER_S
     import signal
 
     end_s = time.monotonic() + LINGER_S
 
     def look(*_: object) -> None:
-        if not service.is_joined or time.monotonic() > end_s:
+        if not service.has_clients or time.monotonic() > end_s:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             stop()
 

@@ -16,8 +16,8 @@ from fdhil.config import Axis
 from fdhil.correction.limits import PlanLimits, check, fit
 from fdhil.correction.linear import Inverse
 from fdhil.correction.resting import Resting, run_with
-from fdhil.model.closed_loop import Ready, Response, State
-from fdhil.model.kernels import SPEED, TABLE_SPEED
+from fdhil.model.closed_loop import PreparedDrive, Response, State
+from fdhil.model.closed_loop_kernels import SPEED, TABLE_SPEED
 from fdhil.records import Bool, Float, Parameters
 
 ITERATIONS = 8
@@ -42,7 +42,7 @@ class AxisLoop:
     axis: Axis
     sync_period_s: float
     limits: PlanLimits
-    drive: Ready
+    drive: PreparedDrive
     inverse: Inverse
     resting: Resting
 
@@ -182,7 +182,7 @@ def _run(
             state, done = response.end, look
             continue
         row = done + stuck
-        state = response.state_at(stuck)
+        state = response.extract_state(stuck)
         if lead:
             _hold(loop, reference_mm, offset, state, row, stop)
         response = loop.run(reference_mm, offset, state, row, stop)
@@ -202,7 +202,7 @@ def _stuck(loop: AxisLoop, response: Response, target_mm: Float, first: int) -> 
     """Return the first row from ``first`` on at which dry friction holds the table near its target."""
     band = loop.resting.band_at(float(target_mm[first]))
     near: Bool = (
-        (response.states[TABLE_SPEED if response.parted else SPEED] == 0.0)
+        (response.states[TABLE_SPEED if response.has_separate_table else SPEED] == 0.0)
         & band.holds(loop.parameters.K * response.current_a, BAND)
         & (np.abs(response.table_mm - target_mm) <= STUCK_UM * 1e-3)
     )

@@ -71,7 +71,7 @@ def plan(reference: Trajectory, models: Mapping[str, Parameters], config: Machin
         walk = AxisInverse.of(models[axis], config, axis, float(path[0]))
         return walk.whole(path, delayed(path, tau / reference.dt_s))
 
-    found = closed_loop.each_axis(one, reference.axes)
+    found = closed_loop.run_per_axis(one, reference.axes)
     refused = too_large({axis: needed for axis, (_, needed) in found.items()}, models, config)
     return Plan(nothing if refused else {axis: offset for axis, (offset, _) in found.items()}, tau, refused)
 
@@ -93,11 +93,13 @@ class AxisInverse:
             drive,
             period,
             limits,
-            closed_loop.prepare(parameters, drive, period),
+            closed_loop.prepare_drive(parameters, drive, period),
             linear.inverse(parameters, drive, period, sum(block_rows(period))),
             Resting(parameters, drive, period, limits.um_per_increment * 1e-3),
         )
-        return AxisInverse(loop, Carry(closed_loop.standing(parameters, drive, start_mm), np.zeros(2), np.empty(0)))
+        return AxisInverse(
+            loop, Carry(closed_loop.create_standstill_state(parameters, drive, start_mm), np.zeros(2), np.empty(0))
+        )
 
     def block(self, reference_mm: Float, target_mm: Float, rows: int, ends: bool) -> Solution:
         """Solve the next ``rows`` with the known rows behind them, and advance.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fdhil.model.compiled import compiled
+from fdhil.model.numba_decorators import compile_kernel
 from fdhil.records import Float
 
 ITERATIONS = 60
@@ -14,7 +14,7 @@ ITERATIONS = 60
 DIFFERENCES = np.array([[1.0, 0.0, 0.0], [1.0, -1.0, 0.0], [1.0, -2.0, 1.0]])
 
 
-@compiled
+@compile_kernel
 def _differences(o: Float, start: Float, into: Float) -> None:
     """Write o and its differences into the rows of ``into`` (3, n); ``start`` = [o before, o before that]."""
     for k in range(o.size):
@@ -25,7 +25,7 @@ def _differences(o: Float, start: Float, into: Float) -> None:
         into[2, k] = o[k] - 2.0 * one + two
 
 
-@compiled
+@compile_kernel
 def _add_bound(force: Float, weight: Float, which: int, b: Float, diagonals: Float) -> None:
     """Add to the system C' ``force`` (n,) and C' diag(``weight``) C, with C the difference ``which``."""
     own = DIFFERENCES[which]
@@ -40,7 +40,7 @@ def _add_bound(force: Float, weight: Float, which: int, b: Float, diagonals: Flo
                 diagonals[j - i, k - j] += own[i] * own[j] * weight[k]
 
 
-@compiled
+@compile_kernel
 def _solve(d0: Float, d1: Float, d2: Float, b: Float) -> Float:
     """Solve a symmetric positive pentadiagonal system in place; d1[k], d2[k] couple row k to k + 1 and k + 2."""
     n = b.size
@@ -67,7 +67,7 @@ def _solve(d0: Float, d1: Float, d2: Float, b: Float) -> Float:
     return x
 
 
-@compiled
+@compile_kernel
 def _newton(value: Float, slack: Float, force: Float, limits: Float, mu: float, b: Float, diagonals: Float) -> float:
     """Add the bounds to the system (``b`` (n,), ``diagonals`` (3, n)); return by how much the worst one misses."""
     n = b.size
@@ -87,7 +87,7 @@ def _newton(value: Float, slack: Float, force: Float, limits: Float, mu: float, 
     return miss
 
 
-@compiled
+@compile_kernel
 def _advance(value: Float, step: Float, slack: Float, force: Float, limits: Float, mu: float) -> tuple[float, float]:
     """Move slacks and forces with the step, as far as each stays positive; return both shares of it."""
     n = value.shape[1]
@@ -109,7 +109,7 @@ def _advance(value: Float, step: Float, slack: Float, force: Float, limits: Floa
     return share[0], share[1]
 
 
-@compiled
+@compile_kernel
 def project(wanted: Float, limits: Float, start: Float) -> Float:
     """Return the nearest (n,) to ``wanted`` (least squares) whose value, first and second difference stay in +-limits.
 
@@ -145,7 +145,7 @@ def project(wanted: Float, limits: Float, start: Float) -> Float:
     return o
 
 
-@compiled
+@compile_kernel
 def extent(offset: Float, start: Float, acceleration: float, window: int) -> tuple[float, ...]:
     """Return the largest |value|, |first| and |second difference|, reach if it brakes, travel within ``window`` rows.
 
@@ -168,7 +168,7 @@ def extent(offset: Float, start: Float, acceleration: float, window: int) -> tup
     return highest, fastest, hardest, farthest, longest
 
 
-@compiled
+@compile_kernel
 def rounded(exact: Float, settled: int, uneven: float) -> Float:
     """Round (n,) with the error carried on; from row ``settled`` on change the increment as rarely as possible.
 

@@ -54,7 +54,7 @@ def delay_s(parameters: Parameters, axis: Axis, sync_period_s: float) -> float:
     """Return by how much the loop lags at constant speed: 0 with full feed-forward, (1 - Kff) / Kv with less."""
     linear, free = unlimited(parameters, axis)
     ramp = np.arange(round(RAMP_S / sync_period_s), dtype=np.float64) * (sync_period_s * RAMP_MM_S)
-    response = closed_loop.simulate(linear, free, sync_period_s, ramp)
+    response = closed_loop.simulate_axis(linear, free, sync_period_s, ramp)
     # the last rows depend on the reference beyond its end, where it is held
     return float((ramp[-8] - response.position_mm[-8]) / RAMP_MM_S)
 
@@ -65,7 +65,7 @@ def inverse(parameters: Parameters, axis: Axis, sync_period_s: float, rows: int)
     ahead = round(AHEAD_S / sync_period_s)
     impulse = np.zeros(ahead + round(IMPULSE_S / sync_period_s))
     impulse[ahead] = 1.0
-    answer = closed_loop.simulate(linear, free, sync_period_s, impulse).table_mm
+    answer = closed_loop.simulate_axis(linear, free, sync_period_s, impulse).table_mm
     pad = round(PAD_S / sync_period_s)
     size = int(2 ** np.ceil(np.log2(rows + 2 * pad)))
     around = np.zeros(size)

@@ -17,9 +17,9 @@ from scipy.linalg.lapack import dposv
 from fdhil.config import Axis
 from fdhil.correction import kernels
 from fdhil.correction.linear import unlimited
-from fdhil.model import closed_loop, terms
-from fdhil.model.closed_loop import Commands, Ready, Response, State
-from fdhil.model.kernels import CURRENT_DEMAND, POSITION, TABLE
+from fdhil.model import closed_loop, model_terms
+from fdhil.model.closed_loop import Commands, PreparedDrive, Response, State
+from fdhil.model.closed_loop_kernels import CURRENT_DEMAND, POSITION, TABLE
 from fdhil.prediction.model_terms import Band, band
 from fdhil.records import Float, Parameters
 
@@ -40,14 +40,14 @@ class Resting:
     """Holds one axis at rest; quantities that depend on its drive alone are computed once."""
 
     def __init__(self, parameters: Parameters, axis: Axis, sync_period_s: float, increment_mm: float) -> None:
-        self._held = closed_loop.prepare(*unlimited(parameters, axis, HELD_NM), sync_period_s)
-        self._parameters, self._rad_per_mm = parameters, terms.rad_per_mm(axis)
-        self._place = TABLE if terms.has_spring(parameters) else POSITION
+        self._held = closed_loop.prepare_drive(*unlimited(parameters, axis, HELD_NM), sync_period_s)
+        self._parameters, self._rad_per_mm = parameters, model_terms.rad_per_mm(axis)
+        self._place = TABLE if model_terms.has_spring(parameters) else POSITION
         self._period_s, self._increment_mm = sync_period_s, increment_mm
         self._free, self._again = round(FREE_S / sync_period_s), round(AGAIN_S / sync_period_s)
         impulse = np.zeros(round((FREE_S + WATCHED_S) / sync_period_s))
         impulse[2] = increment_mm
-        self._answer_a = _demand(self._held.run(Commands(impulse), closed_loop.start(0.0)))
+        self._answer_a = _demand(self._held.run(Commands(impulse), closed_loop.create_zero_state(0.0)))
         self._lead = _Lead(self._answer_a, self._free)
 
     def band_at(self, position_mm: float) -> Band:
@@ -81,7 +81,7 @@ class Resting:
 
 
 def run_with(
-    drive: Ready, reference_mm: Float, offset: Float, increment_mm: float, state: State, rows: int
+    drive: PreparedDrive, reference_mm: Float, offset: Float, increment_mm: float, state: State, rows: int
 ) -> Response:
     """Simulate a drive's next ``rows`` cycles with an offset in increments; both paths begin with the first of them."""
     ahead = min(rows + 2, reference_mm.size)  # a cycle depends on two further rows

@@ -20,7 +20,7 @@ from fdhil.correction.block import AxisLoop, Solution
 from fdhil.correction.inverse import AxisInverse, block_rows, common_delay_s, delayed
 from fdhil.correction.limits import check
 from fdhil.correction.mirror import lag_reason
-from fdhil.model.closed_loop import Commands, Response, State, standing
+from fdhil.model.closed_loop import Commands, Response, State, create_standstill_state
 from fdhil.prediction.contour import WINDOW_S, contour_error_um
 from fdhil.records import Float, Parameters, Reason, compute_table_path
 
@@ -100,7 +100,7 @@ def stream(
                 name: _Axis(
                     name,
                     AxisInverse.of(models[name], config, name, v[0]),
-                    standing(models[name], config.axis[name], v[0]),
+                    create_standstill_state(models[name], config.axis[name], v[0]),
                 )
                 for name, v in path.items()
             }

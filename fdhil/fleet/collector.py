@@ -25,10 +25,17 @@ from nats.js import JetStreamContext
 from fdhil.config.fleet_config import Fleet
 from fdhil.daemon import service_log
 from fdhil.errors import StoreError
-from fdhil.fleet import migrations, objects
-from fdhil.fleet.message import Record, Unread, decode
-from fdhil.fleet.migrations import NOTE_INCOMING, NOTE_SHIFTS
-from fdhil.fleet.transport import ERRORS, cause_of, check_credentials, connected, prepare_stream, try_for_good
+from fdhil.fleet import schema_migrations, window_files
+from fdhil.fleet.nats_transport import (
+    ERRORS,
+    check_credentials,
+    connect_to_server,
+    describe_cause,
+    prepare_record_stream,
+    retry_forever,
+)
+from fdhil.fleet.record_message import Record, UnreadableRecord, decode_message
+from fdhil.fleet.schema_migrations import NOTE_INCOMING, NOTE_SHIFTS
 
 BATCH = 100  # messages per transaction
 AHEAD = timedelta(days=1)  # tolerated lead of a machine's clock over the server's
@@ -67,19 +74,19 @@ WITH added AS (
 """
 _REFUSED = "INSERT INTO fleet.refused (subject, reason, payload) VALUES (%s, %s, %s)"
 Known = Sequence[tuple[Record, datetime]]
-Aside = Sequence[tuple[str, Unread]]
+Aside = Sequence[tuple[str, UnreadableRecord]]
 
 
-class Received(NamedTuple):
+class ReceivedRecord(NamedTuple):
     """One part of a message: a record, or a part that is not a valid record."""
 
     subject: str
     stored_at: datetime
-    content: Record | Unread
+    content: Record | UnreadableRecord
 
 
 @dataclass(slots=True)
-class Count:
+class StoreCounts:
     """Summary of a machine's history within a batch: number of records, first and last number, times of arrival."""
 
     first_stored_at: datetime
@@ -89,22 +96,22 @@ class Count:
     last: int = 0
 
 
-async def collect(fleet: Fleet, ready: Callable[[str], None]) -> NoReturn:
+async def collect_records(fleet: Fleet, ready: Callable[[str], None]) -> NoReturn:
     """Collect until cancelled; while the server or the database is unavailable, retry with growing delays.
 
     ConnectError where the credential files cannot be used, StoreError where the database's schema is newer or the
     folder of windows cannot be written.
     """
     check_credentials(fleet.server, "server")
-    objects.check_folder(fleet.objects.directory)
+    window_files.check_folder(fleet.objects.directory)
     collector = Collector(fleet)
     ready(f"records from {fleet.server.server} into the database '{fleet.database.connection}'")
 
-    async def attempt() -> str:
+    async def connect_and_collect() -> str:
         try:
             async with (
                 await psycopg.AsyncConnection.connect(fleet.database.connection, autocommit=True) as db,
-                connected(fleet.server, "fdhil-collector", "server") as client,
+                connect_to_server(fleet.server, "fdhil-collector", "server") as client,
             ):
                 await collector.run(client, db)
         except psycopg.Error as error:
@@ -114,10 +121,10 @@ async def collect(fleet: Fleet, ready: Callable[[str], None]) -> NoReturn:
                 raise
             return str(error)
         except ERRORS as error:
-            return f"{fleet.server.server}: {cause_of(error)}"
+            return f"{fleet.server.server}: {describe_cause(error)}"
 
     complaint = "no records are collected: {cause}; records wait at the server, retrying"
-    await try_for_good(attempt, lambda: collector.kept, complaint)
+    await retry_forever(connect_and_collect, lambda: collector.kept, complaint)
 
 
 class Collector:
@@ -130,103 +137,105 @@ class Collector:
 
     async def run(self, client: Client, db: psycopg.AsyncConnection) -> NoReturn:
         """Collect until a connection breaks: ERRORS, psycopg.Error; StoreError where a window cannot be written."""
-        await migrations.bring_up(db)
+        await schema_migrations.upgrade_schema(db)
         await db.execute(_INCOMING)
-        reader = await prepare_stream(client.jetstream(), self._fleet.stream)
+        reader = await prepare_record_stream(client.jetstream(), self._fleet.stream)
         service_log.write_line("connected to the server and the database")
-        coming = asyncio.ensure_future(_next(reader))
+        coming = asyncio.ensure_future(_receive_batch(reader))
         try:
             while True:
                 messages, received = await coming
-                coming = asyncio.ensure_future(_next(reader))  # while this batch is written
-                await self._take(messages, received, db)
+                coming = asyncio.ensure_future(_receive_batch(reader))  # while this batch is written
+                await self._store_and_acknowledge(messages, received, db)
                 if client.is_closed:
                     raise ConnectionResetError("the connection has ended")
         finally:
-            await _give_back(coming)
+            await _return_pending_batch(coming)
 
-    async def _take(self, messages: Sequence[Msg], received: Sequence[Received], db: psycopg.AsyncConnection) -> None:
+    async def _store_and_acknowledge(
+        self, messages: Sequence[Msg], received: Sequence[ReceivedRecord], db: psycopg.AsyncConnection
+    ) -> None:
         if not messages:
             return
         try:
-            await self._keep(received, db)
+            await self._store_or_set_aside(received, db)
         except (psycopg.Error, StoreError):
-            await _refuse(messages)
+            await _return_messages(messages)
             raise
         for message in messages:
             await message.ack()
         self.kept += len(received)
 
-    async def _keep(self, received: Sequence[Received], db: psycopg.AsyncConnection) -> None:
+    async def _store_or_set_aside(self, received: Sequence[ReceivedRecord], db: psycopg.AsyncConnection) -> None:
         """Store all; if the database rejects a record, bisect to find it and store it as unreadable."""
         try:
-            await self._write(received, db)
+            await self._write_transaction(received, db)
         except psycopg.DataError as error:
             first, rest = received[: len(received) // 2], received[len(received) // 2 :]
             if first:
-                await self._keep(first, db)
-                await self._keep(rest, db)
+                await self._store_or_set_aside(first, db)
+                await self._store_or_set_aside(rest, db)
             elif isinstance(record := rest[0].content, Record):
-                aside = Unread(" ".join(str(error).split()), record.payload)
-                await self._write([rest[0]._replace(content=aside)], db)
+                aside = UnreadableRecord(" ".join(str(error).split()), record.payload)
+                await self._write_transaction([rest[0]._replace(content=aside)], db)
             else:
                 raise
 
-    async def _write(self, received: Sequence[Received], db: psycopg.AsyncConnection) -> None:
+    async def _write_transaction(self, received: Sequence[ReceivedRecord], db: psycopg.AsyncConnection) -> None:
         known = [
-            (_dated(each.content, each.stored_at), each.stored_at)
+            (_limit_recorded_at(each.content, each.stored_at), each.stored_at)
             for each in received
             if isinstance(each.content, Record)
         ]
         for record, _ in known:
             if record.window is not None and record.window_name is not None:
-                objects.keep(self._fleet.objects.directory, record.window_name, record.window)
+                window_files.store_window(self._fleet.objects.directory, record.window_name, record.window)
         months = {(record.recorded_at.year, record.recorded_at.month) for record, _ in known} - self._months
-        await migrations.add_months(db, months)
+        await schema_migrations.add_month_partitions(db, months)
         self._months |= months
-        aside = [(each.subject, each.content) for each in received if isinstance(each.content, Unread)]
-        if not await _written(known, aside, db):
+        aside = [(each.subject, each.content) for each in received if isinstance(each.content, UnreadableRecord)]
+        if not await _copy_new_records(known, aside, db):
             async with db.transaction(), db.cursor() as cursor:
-                await _copy(cursor, "incoming", known)
+                await _copy_rows(cursor, "incoming", known)
                 await cursor.execute(_KEEP)
                 await cursor.execute(NOTE_INCOMING)
-                await _put_aside(cursor, aside)
+                await _insert_refused(cursor, aside)
         for subject, unread in aside:
             service_log.write_line(
                 f"part of a message of {subject} was refused and stored apart: {unread.reason}", "minor"
             )
 
 
-def _dated(record: Record, stored_at: datetime) -> Record:
+def _limit_recorded_at(record: Record, stored_at: datetime) -> Record:
     """Return a record; one dated in the future gets a common date, so that no clock creates partitions at will."""
-    return record if record.recorded_at <= stored_at + AHEAD else record._replace(recorded_at=migrations.FUTURE)
+    return record if record.recorded_at <= stored_at + AHEAD else record._replace(recorded_at=schema_migrations.FUTURE)
 
 
-async def _written(known: Known, aside: Aside, db: psycopg.AsyncConnection) -> bool:
+async def _copy_new_records(known: Known, aside: Aside, db: psycopg.AsyncConnection) -> bool:
     """Copy new records in one transaction; return False, with nothing written, if any is known or was dropped."""
-    counts = _counted(known)
+    counts = _count_by_store(known)
     numbered = [(*source, each.first, each.last) for source, each in counts.items() if each.records]
     with contextlib.suppress(psycopg.errors.UniqueViolation, psycopg.errors.DeadlockDetected):
         async with db.transaction(), db.cursor() as cursor:
-            await _copy(cursor, "fleet.records", known)
+            await _copy_rows(cursor, "fleet.records", known)
             rows = [(*source, c.records, c.last, c.first_stored_at, c.last_stored_at) for source, c in counts.items()]
-            await cursor.execute(_COUNT, _columns(rows, 6))
-            await cursor.execute(_DROPPED, _columns(numbered, 4))
+            await cursor.execute(_COUNT, _transpose_rows(rows, 6))
+            await cursor.execute(_DROPPED, _transpose_rows(numbered, 4))
             if cursor.rowcount:
                 raise psycopg.Rollback
-            await cursor.execute(NOTE_SHIFTS, _columns(_newest(known), 3))
-            await _put_aside(cursor, aside)
+            await cursor.execute(NOTE_SHIFTS, _transpose_rows(_select_newest_sets(known), 3))
+            await _insert_refused(cursor, aside)
             return True
     return False
 
 
-def _counted(known: Known) -> dict[tuple[str, str], Count]:
+def _count_by_store(known: Known) -> dict[tuple[str, str], StoreCounts]:
     """Return the counts of each history, in one order everywhere, which prevents deadlocks."""
-    counts: dict[tuple[str, str], Count] = {}
+    counts: dict[tuple[str, str], StoreCounts] = {}
     for record, stored_at in known:
         count = counts.get((record.machine, record.store))
         if count is None:
-            count = counts[record.machine, record.store] = Count(stored_at, stored_at)
+            count = counts[record.machine, record.store] = StoreCounts(stored_at, stored_at)
         count.first_stored_at = min(count.first_stored_at, stored_at)
         count.last_stored_at = max(count.last_stored_at, stored_at)
         if record.sequence > 0:
@@ -236,67 +245,70 @@ def _counted(known: Known) -> dict[tuple[str, str], Count]:
     return dict(sorted(counts.items()))
 
 
-def _newest(known: Known) -> list[tuple[str, str, datetime]]:
+def _select_newest_sets(known: Known) -> list[tuple[str, str, datetime]]:
     """Return the keys of the newest set of each axis and shift, in one order everywhere."""
     newest: dict[tuple[str, str, int], tuple[datetime, int, Record]] = {}
     for record, stored_at in known:
         if record.kind == "parameters" and '"revision"' in record.text:
-            at = stored_at if record.recorded_at < migrations.FIRST else min(record.recorded_at, stored_at)
-            key = record.machine, record.axis, int(at.timestamp() // migrations.SHIFT_S)
+            at = stored_at if record.recorded_at < schema_migrations.FIRST else min(record.recorded_at, stored_at)
+            key = record.machine, record.axis, int(at.timestamp() // schema_migrations.SHIFT_S)
             if key not in newest or (stored_at, record.sequence) > newest[key][:2]:
                 newest[key] = stored_at, record.sequence, record
     return [(of.machine, of.message, of.recorded_at) for _, (_, _, of) in sorted(newest.items())]
 
 
-def _columns(rows: Sequence[tuple[object, ...]], count: int) -> list[list[object]]:
+def _transpose_rows(rows: Sequence[tuple[object, ...]], count: int) -> list[list[object]]:
     return [[row[k] for row in rows] for k in range(count)]
 
 
-async def _copy(cursor: psycopg.AsyncCursor, table: LiteralString, known: Known) -> None:
-    rows = _rows(known)
+async def _copy_rows(cursor: psycopg.AsyncCursor, table: LiteralString, known: Known) -> None:
+    rows = _format_copy_rows(known)
     async with cursor.copy(_COPY.format(table)) as into:
         while some := "".join(islice(rows, _AT_ONCE)):
             await into.write(some)
 
 
-async def _put_aside(cursor: psycopg.AsyncCursor, aside: Aside) -> None:
+async def _insert_refused(cursor: psycopg.AsyncCursor, aside: Aside) -> None:
     for subject, unread in aside:
         await cursor.execute(_REFUSED, (subject.replace("\x00", ""), unread.reason, unread.payload))
 
 
-async def _next(reader: JetStreamContext.PullSubscription) -> tuple[list[Msg], list[Received]]:
-    messages, received = await _fetch(reader), list[Received]()
+async def _receive_batch(reader: JetStreamContext.PullSubscription) -> tuple[list[Msg], list[ReceivedRecord]]:
+    messages, received = await _fetch_messages(reader), list[ReceivedRecord]()
     try:
         for message in messages:
             stored_at = message.metadata.timestamp
-            received += [Received(message.subject, stored_at, part) for part in decode(message.subject, message.data)]
+            received += [
+                ReceivedRecord(message.subject, stored_at, part)
+                for part in decode_message(message.subject, message.data)
+            ]
             await asyncio.sleep(0)  # let the pending writes proceed
     except asyncio.CancelledError:
-        await _refuse(messages)
+        await _return_messages(messages)
         raise
     return messages, received
 
 
-async def _fetch(reader: JetStreamContext.PullSubscription) -> list[Msg]:
+async def _fetch_messages(reader: JetStreamContext.PullSubscription) -> list[Msg]:
     try:
         return await reader.fetch(BATCH, timeout=WAIT_S)
     except TimeoutError:  # the base class too: the client raises both
         return []
 
 
-async def _give_back(coming: asyncio.Future[tuple[list[Msg], list[Received]]]) -> None:
+async def _return_pending_batch(coming: asyncio.Future[tuple[list[Msg], list[ReceivedRecord]]]) -> None:
     coming.cancel()
     with contextlib.suppress(asyncio.CancelledError, *ERRORS):
         messages, _ = await coming
-        await _refuse(messages)
+        await _return_messages(messages)
 
 
-async def _refuse(messages: Sequence[Msg]) -> None:
+async def _return_messages(messages: Sequence[Msg]) -> None:
     for message in messages:
         await message.nak()
 
 
-def _rows(known: Known) -> Iterator[str]:
+def _format_copy_rows(known: Known) -> Iterator[str]:
     """Yield rows in COPY format; the fields of a record other than its text need no escaping."""
     before, stored = None, ""
     for record, stored_at in known:

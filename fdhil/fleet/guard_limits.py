@@ -12,7 +12,7 @@ from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError
 
 
-def guard_limits(machine: MachineConfig) -> Mapping[str, float]:
+def derive_guard_limits(machine: MachineConfig) -> Mapping[str, float]:
     """Return all limits of the corrected axes, by description; none where no guard could start with it."""
     found: dict[str, float] = {}
     try:

@@ -1,7 +1,7 @@
 """Finds axes that deviate from comparable axes: the same axis of machines of one kind, at one temperature and age.
 
 The level of an axis is the median of its newest values of a parameter, relative to the median of its peers. A mixed
-model (:mod:`fdhil.fleet.mixed`) accounts for temperature and age and estimates the remaining spread; the axis' own
+model (:mod:`fdhil.fleet.mixed_model`) accounts for temperature and age and estimates the remaining spread; the axis' own
 uncertainty, and that of an unknown temperature, are added. The bounds give a false alarm in one of a hundred groups
 without an outlier, whatever their size (found by simulation).
 """
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.fleet import mixed
+from fdhil.fleet import mixed_model
 from fdhil.records import Float
 
 LEAST_PEERS = 5
@@ -24,10 +24,10 @@ BOUNDS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class ParameterHistory:
     """The newest values of one parameter of an axis, oldest first, with temperatures (NaN where unknown), all (n,).
 
-    ``ages_months`` (n,) count from the first set, or from the newest service. ``std`` is the standard deviation of the
+    ``compute_ages_months`` (n,) count from the first set, or from the newest service. ``std`` is the standard deviation of the
     newest value.
     """
 
@@ -40,7 +40,7 @@ class Course:
 
 
 @dataclass(frozen=True, slots=True)
-class Level:
+class AxisDeviation:
     """Position of an axis among its peers: ``off`` 0.1 is 10 % above its expected value, ``score`` in deviations."""
 
     machine: str
@@ -52,7 +52,7 @@ class Level:
 
 
 @dataclass(frozen=True, slots=True)
-class Sisters:
+class PeerGroup:
     """A group of comparable axes: median, relative spread, slopes per kelvin and month, bound of the score, levels.
 
     ``temperature_c`` and ``age_months`` are the medians of the group.
@@ -65,10 +65,10 @@ class Sisters:
     temperature_c: float
     age_months: float
     bound: float
-    levels: tuple[Level, ...]
+    levels: tuple[AxisDeviation, ...]
 
 
-def judge(courses: Sequence[Course]) -> Sisters | None:
+def assess_peers(courses: Sequence[ParameterHistory]) -> PeerGroup | None:
     """Compare the axes of a group; None where they are too few, or their median is 0."""
     courses = [course for course in courses if np.isfinite(course.values[-1])]
     if len(courses) < LEAST_PEERS:
@@ -77,25 +77,31 @@ def judge(courses: Sequence[Course]) -> Sisters | None:
     median = float(np.median(levels))
     if median == 0.0:
         return None
-    at = np.array([[_newest(c.temperatures_c), _newest(c.ages_months)] for c in courses])
-    usual, apart, unknown = _filled(at)
-    shared = mixed.shared_slopes([axis for course in courses if (axis := _own(course)) is not None])
+    at = np.array([[_compute_recent_median(c.temperatures_c), _compute_recent_median(c.ages_months)] for c in courses])
+    usual, apart, unknown = _fill_unknown_covariates(at)
+    shared = mixed_model.estimate_shared_slopes(
+        [axis for course in courses if (axis := _normalise_history(course)) is not None]
+    )
     own = np.array([course.std / median if np.isfinite(course.std) else 0.0 for course in courses]) ** 2
-    found = mixed.fit(levels / median, apart, own, shared)
+    found = mixed_model.fit_mixed_model(levels / median, apart, own, shared)
     # an unknown temperature may be any of the others'
     own = own + (unknown**2) @ (found.slopes**2 + found.slope_stds**2)
-    scale = np.sqrt(found.spread**2 + found.doubts**2 + own)
+    scale = np.sqrt(found.spread**2 + found.deviation_stds**2 + own)
     bound = next(bound for least, bound in reversed(BOUNDS) if len(courses) >= least)
     levels_found = [
-        Level(course.machine, course.axis, float(course.values[-1]), float(o), float(o / s), bool(abs(o) > bound * s))
-        for course, o, s in zip(courses, found.off, scale, strict=True)
+        AxisDeviation(
+            course.machine, course.axis, float(course.values[-1]), float(o), float(o / s), bool(abs(o) > bound * s)
+        )
+        for course, o, s in zip(courses, found.deviations, scale, strict=True)
     ]
     levels_found.sort(key=lambda level: -abs(level.score))
     per_k, per_month = map(float, found.slopes)
-    return Sisters(median, found.spread, per_k, per_month, float(usual[0]), float(usual[1]), bound, tuple(levels_found))
+    return PeerGroup(
+        median, found.spread, per_k, per_month, float(usual[0]), float(usual[1]), bound, tuple(levels_found)
+    )
 
 
-def of_machines(groups: Sequence[Sisters]) -> dict[tuple[str, str], float]:
+def predict_from_other_axes(groups: Sequence[PeerGroup]) -> dict[tuple[str, str], float]:
     """Return the deviation expected of each axis from the deviations of the other axes of its machine.
 
     The groups are those of one parameter, one per axis letter. The correlation between the axes of a machine is
@@ -105,7 +111,7 @@ def of_machines(groups: Sequence[Sisters]) -> dict[tuple[str, str], float]:
     for group in groups:
         for level in group.levels:
             scores.setdefault(level.machine, {})[level.axis] = level.score
-    common = _in_common(list(scores.values()))
+    common = _estimate_common_correlation(list(scores.values()))
     spreads = {
         (level.machine, level.axis): level.off / level.score for g in groups for level in g.levels if level.score
     }
@@ -118,7 +124,7 @@ def of_machines(groups: Sequence[Sisters]) -> dict[tuple[str, str], float]:
     return expected
 
 
-def _in_common(machines: Sequence[Mapping[str, float]]) -> float:
+def _estimate_common_correlation(machines: Sequence[Mapping[str, float]]) -> float:
     """Return the correlation between the axes of a machine, 0 where too few machines have several."""
     several = [np.clip(list(scores.values()), -WINSOR, WINSOR) for scores in machines if len(scores) > 1]
     if len(several) < LEAST_PEERS:
@@ -128,12 +134,12 @@ def _in_common(machines: Sequence[Mapping[str, float]]) -> float:
     return float(np.clip(common / whole, 0.0, 0.95)) if whole > 0 else 0.0
 
 
-def _newest(values: Float) -> float:
+def _compute_recent_median(values: Float) -> float:
     known = values[-LEVEL_SETS:][np.isfinite(values[-LEVEL_SETS:])]
     return float(np.median(known)) if known.size else np.nan
 
 
-def _filled(at: Float) -> tuple[Float, Float, Float]:
+def _fill_unknown_covariates(at: Float) -> tuple[Float, Float, Float]:
     """Return the usual temperature and age (2,), each axis' difference (n, 2) and its uncertainty (n, 2).
 
     Unknown covariates are taken as usual, with the spread of the known ones as uncertainty.
@@ -144,7 +150,7 @@ def _filled(at: Float) -> tuple[Float, Float, Float]:
     return usual, np.where(known, at - usual, 0.0), np.where(known, 0.0, width)
 
 
-def _own(course: Course) -> tuple[Float, Float] | None:
+def _normalise_history(course: ParameterHistory) -> tuple[Float, Float] | None:
     """Return an axis' values relative to its median, with temperatures and ages, for the shared slopes.
 
     Sets of unknown temperature are left out: otherwise a seasonal warming would be taken for ageing.

@@ -20,10 +20,10 @@ from fdhil.config.fleet_config import Fleet
 from fdhil.config.section import Section
 from fdhil.config.uplink_section import Label, Labels
 from fdhil.errors import ConfigError, ConfigFault, ConnectError
-from fdhil.fleet import delivery, migrations
-from fdhil.fleet.offer import Change, Offer, OfferRefused, sign
-from fdhil.fleet.sets import unreachable
-from fdhil.fleet.transport import ERRORS, cause_of, connected
+from fdhil.fleet import offer_delivery, schema_migrations
+from fdhil.fleet.nats_transport import ERRORS, connect_to_server, describe_cause
+from fdhil.fleet.parameter_sets import build_connect_error
+from fdhil.fleet.signed_offer import Offer, OfferRefused, ProposedChange, sign_offer
 
 DAY_S = 86_400
 WAITS = "OfferWaits"  # the notice of a pending offer: it is no objection
@@ -54,21 +54,21 @@ class ChangeFile(Section):
     set: Mapping[str, Any]
 
     @property
-    def change(self) -> Mapping[str, Any]:
+    def proposed_fields(self) -> Mapping[str, Any]:
         """The fields of the change, with the values by their keys."""
         fields = {name: getattr(self, name) for name in ("name", "version", "text", "labels", "axis_labels")}
-        return {**fields, "values": _flat(self.set)}
+        return {**fields, "values": _flatten_tables(self.set)}
 
 
-def _flat(tables: Mapping[str, Any], place: str = "") -> dict[str, Any]:
+def _flatten_tables(tables: Mapping[str, Any], place: str = "") -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in tables.items():
-        found |= _flat(value, f"{place}{key}.") if isinstance(value, dict) else {f"{place}{key}": value}
+        found |= _flatten_tables(value, f"{place}{key}.") if isinstance(value, dict) else {f"{place}{key}": value}
     return found
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class MachineResponse:
     machine: str
     stage: int
     answer: str
@@ -78,7 +78,7 @@ class Told:
     notices: int
 
     @property
-    def against(self) -> str:
+    def objection(self) -> str:
         """Why no further stage should be opened; empty: no objection."""
         if self.answer == "rejected":
             return f"rejected by {self.answered_by}: {self.reason}"
@@ -90,11 +90,11 @@ class Told:
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class RolloutStatus:
     """The progress of a roll-out: the machines it was offered to, and the remaining ones."""
 
-    offered: Sequence[Told]
-    left: Sequence[str]
+    offered: Sequence[MachineResponse]
+    remaining: Sequence[str]
 
     @property
     def stage(self) -> int:
@@ -102,13 +102,13 @@ class Standing:
         return max((each.stage for each in self.offered), default=0)
 
 
-def read_change(path: Path) -> tuple[Change, int]:
+def read_change(path: Path) -> tuple[ProposedChange, int]:
     """Return the change defined by a file, and its validity in days; ConfigError."""
     file = load_section_file(ChangeFile, path, "a change to offer")
-    return check_section_file(Change, file.change, str(path)), file.valid_days
+    return check_section_file(ProposedChange, file.proposed_fields, str(path)), file.valid_days
 
 
-def offer_of(change: Change, days: int, by: str, stage: int, machines: Sequence[str]) -> Offer:
+def create_offer(change: ProposedChange, days: int, by: str, stage: int, machines: Sequence[str]) -> Offer:
     """Return the offer of a change to these machines; ConfigError."""
     now_s = int(time.time())
 
@@ -117,28 +117,28 @@ def offer_of(change: Change, days: int, by: str, stage: int, machines: Sequence[
 
 
 @asynccontextmanager
-async def entered(fleet: Fleet) -> AsyncIterator[Db]:
+async def open_database(fleet: Fleet) -> AsyncIterator[Db]:
     """Open the database with its tables up to date; ConnectError where that fails."""
     try:
         connection = fleet.database.connection
         async with await psycopg.AsyncConnection.connect(connection, row_factory=dict_row, autocommit=True) as db:
-            await migrations.bring_up(db)
+            await schema_migrations.upgrade_schema(db)
             yield db
     except psycopg.Error as error:
-        raise unreachable(error) from None
+        raise build_connect_error(error) from None
 
 
-async def standing(db: Db, change: Change) -> Standing:
+async def read_rollout_status(db: Db, change: ProposedChange) -> RolloutStatus:
     """Return the progress of a change; OfferRefused where its version is another change's, or an old one."""
 
     arguments = {"name": change.name, "version": change.version, "waits": WAITS}
     query = "SELECT version, change FROM fleet.offers WHERE name = %(name)s ORDER BY version DESC LIMIT 1"
     newest = await (await db.execute(query, arguments)).fetchone()
     if newest is not None:
-        _require_new(change, newest["version"], newest["change"])
+        _require_newer_version(change, newest["version"], newest["change"])
     rows = await (await db.execute(_OFFERED, arguments)).fetchall()
     offered = [
-        Told(
+        MachineResponse(
             row["machine"], row["stage"], row["answer"] or "", row["answered_by"] or "", row["reason"] or "",
             row["in_use"], row["notices"],
         )
@@ -151,10 +151,10 @@ async def standing(db: Db, change: Change) -> Standing:
         labels = (row["about"] or {}).get("labels") or {}
         if row["machine"] not in known and change.labels.items() <= labels.items():
             left.append(row["machine"])
-    return Standing(offered, left)
+    return RolloutStatus(offered, left)
 
 
-def _require_new(change: Change, version: int, digest: str) -> None:
+def _require_newer_version(change: ProposedChange, version: int, digest: str) -> None:
     if change.version < version:
         text = f"version {version} of {change.name} was already offered, and machines accept no older one"
         raise OfferRefused(f"{text}; set version = {version + 1} in the file")
@@ -163,55 +163,55 @@ def _require_new(change: Change, version: int, digest: str) -> None:
         raise OfferRefused(f"{text}; set version = {version + 1} in the file")
 
 
-def chosen(found: Standing, count: int | None, names: Sequence[str], despite: str) -> list[str]:
+def choose_machines(found: RolloutStatus, count: int | None, names: Sequence[str], despite: str) -> list[str]:
     """Return the machines of the next stage; OfferRefused where an earlier machine objects."""
-    against = [f"{each.machine}: {each.against}" for each in found.offered if each.against]
+    against = [f"{each.machine}: {each.objection}" for each in found.offered if each.objection]
     if against and not despite:
         text = "machines of earlier stages do not use it yet, or have problems"
         raise OfferRefused(f"{text} ({'; '.join(against[:5])}); wait, or give a reason to proceed: --despite")
-    unknown = sorted(set(names) - set(found.left))
+    unknown = sorted(set(names) - set(found.remaining))
     if unknown:
         raise OfferRefused(f"{', '.join(unknown)}: no machine with these labels, or already offered; see the list")
-    machines = list(dict.fromkeys(names)) or list(found.left[:count])
+    machines = list(dict.fromkeys(names)) or list(found.remaining[:count])
     if not machines:
         raise OfferRefused("no machine with these labels remains")
     return machines
 
 
-async def open_stage(fleet: Fleet, db: Db, offer: Offer, change: Change, key: Path, despite: str) -> bytes:
+async def open_stage(fleet: Fleet, db: Db, offer: Offer, change: ProposedChange, key: Path, despite: str) -> bytes:
     """Sign an offer, store it and publish it to its machines; nothing is stored where that fails. ConnectError."""
-    document = sign(offer, key)
+    document = sign_offer(offer, key)
     values = (offer.name, offer.version, offer.stage, change.digest, list(offer.machines), offer.by, despite, document)
     try:
-        async with db.transaction(), connected(fleet.server, "fdhil-offers", "server") as client:
+        async with db.transaction(), connect_to_server(fleet.server, "fdhil-offers", "server") as client:
             await db.execute(
                 "INSERT INTO fleet.offers (name, version, stage, change, machines, opened_by, despite, document)"
                 " VALUES (%s, %s, %s, %s, %s, %s, %s, %s)",
                 values,
             )
             stream = client.jetstream()
-            await delivery.prepare(stream, fleet.stream.replicas)
+            await offer_delivery.prepare_offer_stream(stream, fleet.stream.replicas)
             for machine in offer.machines:
-                await delivery.publish(stream, machine, document, offer)
+                await offer_delivery.publish_offer(stream, machine, document, offer)
     except psycopg.errors.UniqueViolation:
         fault = ConfigFault(
             str(offer), f"stage {offer.stage} was just opened by another user", "check the roll-out again"
         )
         raise ConfigError("fleet", [fault]) from None
     except ERRORS as error:
-        raise ConnectError("NATS server", f"{cause_of(error)}; the stage was not opened, try again") from None
+        raise ConnectError("NATS server", f"{describe_cause(error)}; the stage was not opened, try again") from None
     return document
 
 
-async def take_back(fleet: Fleet, found: Standing, name: str) -> list[str]:
+async def withdraw_change(fleet: Fleet, found: RolloutStatus, name: str) -> list[str]:
     """Withdraw a change from the machines that have not accepted it, and return them. ConnectError."""
     machines = [each.machine for each in found.offered if each.answer != "accepted"]
     try:
-        async with connected(fleet.server, "fdhil-offers", "server") as client:
+        async with connect_to_server(fleet.server, "fdhil-offers", "server") as client:
             for machine in machines:
-                await delivery.withdraw(client.jetstream(), machine, name)
+                await offer_delivery.withdraw_offer(client.jetstream(), machine, name)
     except ERRORS as error:
         raise ConnectError(
-            "NATS server", f"{cause_of(error)}; some machines may still have the offer, try again"
+            "NATS server", f"{describe_cause(error)}; some machines may still have the offer, try again"
         ) from None
     return machines

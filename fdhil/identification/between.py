@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.model.compiled import compiled
+from fdhil.model.numba_decorators import compile_kernel
 from fdhil.records import PARAMETERS, Float
 
 HISTORY_WINDOWS = 24  # windows: older ones say little about the present warming
@@ -212,4 +212,4 @@ def _bank(owns: Float, levels: Float, values: Float, places: Float, pairs: Float
     return likely
 
 
-_likelihoods = compiled(_bank)
+_likelihoods = compile_kernel(_bank)

@@ -16,7 +16,7 @@ from fdhil.identification.filtering import moving_mean
 from fdhil.identification.signals import mended
 from fdhil.identification.slow_rows import STEPPED_ROW_S
 from fdhil.identification.windows import bridged, carried
-from fdhil.model.closed_loop import simulate
+from fdhil.model.closed_loop import simulate_axis
 from fdhil.records import Float, Parameters, Window, compute_rms, make_read_only_view
 
 SURELY = 0.6  # of the other replay's residual: largest of the right one
@@ -64,7 +64,7 @@ def _left_mm(window: Window, settings: Identification, axis: Axis, sync_period_s
     late = -axis.regulators.speed_feedforward * window.dt_s / 2 * np.gradient(rate, window.dt_s)
 
     def left(speed_offset: Float | None) -> float:
-        moved = simulate(model, axis, window.dt_s, demand, offset, speed_offset_rad_s=speed_offset).position_mm
+        moved = simulate_axis(model, axis, window.dt_s, demand, offset, speed_offset_rad_s=speed_offset).position_mm
         return compute_rms((moved - moved[0] - position + position[0])[known])
 
     return left(None), left(late)

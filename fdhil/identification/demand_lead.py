@@ -10,7 +10,7 @@ import numpy as np
 
 from fdhil.config import Axis
 from fdhil.identification.windows import bridged
-from fdhil.model.closed_loop import simulate
+from fdhil.model.closed_loop import simulate_axis
 from fdhil.records import Float, Parameters, Window, compute_rms, make_read_only_view
 
 LEAST_FEEDFORWARD = 0.5  # with less, the lag at constant speed is the position loop's
@@ -44,7 +44,7 @@ def _lead(window: Window, axis: Axis, sync_period_s: float | None) -> tuple[floa
         return 0.0, 0.0
     demand, position = bridged(window.demand_mm), bridged(window.position_mm)
     offset = None if window.offset_mm is None else np.nan_to_num(window.offset_mm)
-    moved = simulate(Parameters(**axis.nominal.model_dump()), axis, window.dt_s, demand, offset).position_mm
+    moved = simulate_axis(Parameters(**axis.nominal.model_dump()), axis, window.dt_s, demand, offset).position_mm
     ahead = (moved - moved[0] - position + position[0])[known]
     way = np.gradient(position)[known]  # travel in a cycle
     power = float(way @ way)

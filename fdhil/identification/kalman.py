@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fdhil.identification.motion import BROKEN_MODE, DIFFUSE, UNKNOWN_MODE, Modes, Motion
-from fdhil.model.compiled import compiled
-from fdhil.model.feed_drive import transition
+from fdhil.model.feed_drive import compute_transition
+from fdhil.model.numba_decorators import compile_kernel
 from fdhil.records import Bool, Float, make_read_only_view
 
 Rows = npt.NDArray[np.int64]
@@ -91,7 +91,7 @@ class SlowSensor(NamedTuple):
     marks: Marks
 
 
-@compiled
+@compile_kernel
 def interval_steps(theta: Float, dt: float, emf_share: float) -> Float:
     """Return the transition coefficients (2, 11) over an interval of unknown friction, and of known friction.
 
@@ -102,7 +102,7 @@ def interval_steps(theta: Float, dt: float, emf_share: float) -> Float:
         a = np.array([[-theta[R] / theta[L], -theta[K] / theta[L]], [theta[K] / theta[JT], -theta[FT] / theta[JT]]])
         if not known:
             a[1, :] = 0.0
-        phi, mean, ramp = transition(a, dt)
+        phi, mean, ramp = compute_transition(a, dt)
         u = 1.0 / theta[L]
         f = -1.0 / theta[JT] if known else 0.0  # else the speed is a random walk, whatever the friction
         to_i = np.array([phi[0, 0], phi[0, 1], mean[0, 0] * u, mean[0, 1] * f])
@@ -116,7 +116,7 @@ def interval_steps(theta: Float, dt: float, emf_share: float) -> Float:
     return steps
 
 
-@compiled
+@compile_kernel
 def _moved(steps: Float, known: int, i: float, w: float, u: float, torque: float, rise: float) -> tuple[float, float]:
     s = steps[known]
     return (
@@ -125,7 +125,7 @@ def _moved(steps: Float, known: int, i: float, w: float, u: float, torque: float
     )
 
 
-@compiled
+@compile_kernel
 def _spread(
     steps: Float, known: int, p11: float, p12: float, p22: float, vu: float, walk: float
 ) -> tuple[float, float, float]:
@@ -144,7 +144,7 @@ def _spread(
     )
 
 
-@compiled
+@compile_kernel
 def _whiten_one(
     theta: Float, variances: Float, readings: Readings, mean_v: Float, load: Float, white: Float, gains: Float
 ) -> float:
@@ -201,7 +201,7 @@ def _whiten_one(
     return float(logdet + np.log(product) - counted * np.log(unit))
 
 
-@compiled
+@compile_kernel
 def whiten(
     thetas: Float, variances: Float, readings: Readings, mean_v: Float, loads: Float, gains: Float
 ) -> tuple[Float, Float]:
@@ -220,7 +220,7 @@ def whiten(
     return white, logdet
 
 
-@compiled
+@compile_kernel
 def respond(
     theta: Float, readings: Readings, signals: Float, kind: int, courses: Float, rises: Float, gains: Float
 ) -> Float:
@@ -262,7 +262,7 @@ def respond(
     return white
 
 
-@compiled
+@compile_kernel
 def _take(x: Float, p: Float, h: Float, value: float, noise: float) -> tuple[float, float]:
     """Update with a measurement ``value`` = h x of variance ``noise``; return its innovation and variance."""
     error, variance = value, noise
@@ -282,7 +282,7 @@ def _take(x: Float, p: Float, h: Float, value: float, noise: float) -> tuple[flo
     return error, variance
 
 
-@compiled
+@compile_kernel
 def _advance(theta: Float, x: Float, p: Float, h: float, known: bool, push: float, walk: float, period: float) -> None:
     """Propagate ``x`` (4,) and ``p`` (4, 4) by ``h`` seconds; Jt w' = K i - ft w + Jt ``push`` where friction is known.
 
@@ -318,7 +318,7 @@ def _advance(theta: Float, x: Float, p: Float, h: float, known: bool, push: floa
     p[STATE_SUM, STATE_SUM] += drop * drop * third * h * h * 0.3
 
 
-@compiled
+@compile_kernel
 def slow_innovations(
     theta: Float, readings: Readings, sensor: SlowSensor, noise: Float, spread: Float, load: Float, slope_walk: Float
 ) -> tuple[Float, Float]:
@@ -367,7 +367,7 @@ def slow_innovations(
     return values, variance
 
 
-@compiled
+@compile_kernel
 def departure(
     theta: Float, dt: float, mode: Modes, load: Float, y: Float, variance: Float, walks: Float, signal: int
 ) -> tuple[float, float]:

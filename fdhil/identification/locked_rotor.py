@@ -13,7 +13,7 @@ from fdhil.identification.identifiability import RELATIVE_STD_LIMIT
 from fdhil.identification.motion import noise_levels
 from fdhil.identification.normal import inverse_gram
 from fdhil.identification.windows import carried
-from fdhil.model.feed_drive import interval_shape
+from fdhil.model.feed_drive import compute_voltage_ramps
 from fdhil.records import PARAMETERS, Estimate, Float, Reason, Result, Window
 
 NAME = "locked_rotor"
@@ -34,7 +34,7 @@ def is_locked(window: Window) -> bool:
 def estimate_locked(window: Window) -> Estimate:
     """Return R and L of a window with a measured voltage; the other parameters are NaN with a reason."""
     assert window.voltage_v is not None
-    voltage = interval_shape(carried(window.voltage_v), window.voltage_sampling)[0]
+    voltage = compute_voltage_ramps(carried(window.voltage_v), window.voltage_sampling)[0]
     current = carried(window.current_a)
 
     def left(logarithms: Float) -> Float:

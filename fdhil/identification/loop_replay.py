@@ -9,7 +9,7 @@ from fdhil.config import Axis, Regulators
 from fdhil.identification.filtering import all_about, moving_mean
 from fdhil.identification.motion import surely_moving
 from fdhil.identification.windows import bridged
-from fdhil.model import closed_loop, kernels
+from fdhil.model import closed_loop, closed_loop_kernels
 from fdhil.records import Bool, Float, Parameters, Window, make_read_only_view
 
 LEAST_ROWS = 50
@@ -193,7 +193,9 @@ def _run(rapid: Rapid, axis: Axis, delay_cycles: int) -> Float:
     # a load is a torque offset of the opposite sign, except in the current, which includes it
     offset = -rapid.load_nm * (axis.nominal.K / rapid.plant.K)
     start = standing(rapid, drive)
-    answer = closed_loop.simulate(rapid.plant, drive, rapid.dt_s, rapid.demand_mm, torque_offset_nm=offset, state=start)
+    answer = closed_loop.simulate_axis(
+        rapid.plant, drive, rapid.dt_s, rapid.demand_mm, torque_offset_nm=offset, state=start
+    )
     return np.stack((answer.position_mm, answer.current_a + rapid.load_nm / rapid.plant.K))
 
 
@@ -204,17 +206,17 @@ def standing(rapid: Rapid, axis: Axis) -> closed_loop.State:
     lag = (rapid.demand_mm[0] - rapid.standstill_mm) * rad_per_mm
     current = rapid.standstill_a - rapid.load_nm[0] / rapid.plant.K
     held = rapid.standstill_a - g.speed_kp * (g.position_gain_per_s * lag - speed)
-    state = closed_loop.start(rapid.standstill_mm)
-    state[[kernels.CURRENT, kernels.CURRENT_DEMAND]] = current
-    state[[kernels.SPEED, kernels.SPEED_FILTERED]] = speed
+    state = closed_loop.create_zero_state(rapid.standstill_mm)
+    state[[closed_loop_kernels.CURRENT, closed_loop_kernels.CURRENT_DEMAND]] = current
+    state[[closed_loop_kernels.SPEED, closed_loop_kernels.SPEED_FILTERED]] = speed
     if g.structure == "pid":
-        state[kernels.POSITION_INTEGRAL] = held / g.speed_kp
-        state[kernels.POSITION_BEFORE] -= rapid.creep_mm_s * g.speed_period_s
+        state[closed_loop_kernels.POSITION_INTEGRAL] = held / g.speed_kp
+        state[closed_loop_kernels.POSITION_BEFORE] -= rapid.creep_mm_s * g.speed_period_s
     else:
-        state[kernels.SPEED_INTEGRAL] = held
+        state[closed_loop_kernels.SPEED_INTEGRAL] = held
     voltage = rapid.plant.R * current + rapid.plant.K * speed
-    state[kernels.CURRENT_INTEGRAL] = voltage
-    state[kernels.WAITING : kernels.WAITING + g.current_delay_cycles] = voltage
+    state[closed_loop_kernels.CURRENT_INTEGRAL] = voltage
+    state[closed_loop_kernels.WAITING : closed_loop_kernels.WAITING + g.current_delay_cycles] = voltage
     return state
 
 

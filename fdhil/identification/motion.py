@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from fdhil.identification.filtering import all_about, moving_mean
 from fdhil.identification.windows import RUN_SHARE, bridged, carried, noise_of, runs_of
-from fdhil.model.feed_drive import interval_shape
+from fdhil.model.feed_drive import compute_voltage_ramps
 from fdhil.records import Bool, Float, SlowVoltage, VoltageSampling, Window
 
 UNKNOWN_MODE = 0  # stuck, reversing or about to move: the friction torque is unknown
@@ -163,7 +163,7 @@ def prepare(window: Window) -> Motion:
         mean, rise = carried(slow.voltage_v), np.zeros(slow.voltage_v.size)
     elif window.voltage_v is not None:
         mode[~np.isfinite(window.voltage_v)] = BROKEN_MODE
-        mean, rise = interval_shape(carried(window.voltage_v), window.voltage_sampling)
+        mean, rise = compute_voltage_ramps(carried(window.voltage_v), window.voltage_sampling)
     speed, current = carried(window.speed_rad_s), carried(window.current_a)
     return Motion(
         dt_s=window.dt_s,

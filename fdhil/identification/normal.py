@@ -7,7 +7,7 @@ here.
 
 import numpy as np
 
-from fdhil.model.compiled import compiled
+from fdhil.model.numba_decorators import compile_kernel
 from fdhil.records import Float
 
 NIL = 1e-15  # of the largest power: below it a direction is rounding
@@ -41,7 +41,7 @@ def root_of(information: Float) -> Float:
     return root
 
 
-@compiled
+@compile_kernel
 def _turned(matrix: Float) -> tuple[Float, Float]:
     """Return eigenvalues (k,) and eigenvectors (k, k) of a symmetric matrix by Jacobi rotations."""
     a = matrix.copy()
@@ -69,7 +69,7 @@ def _turned(matrix: Float) -> tuple[Float, Float]:
     return np.diag(a).copy(), axes
 
 
-@compiled
+@compile_kernel
 def _parted(gram: Float) -> tuple[Float, float, bool]:
     """Return a root (k, r) of the inverse, the condition number, and whether all is finite.
 
@@ -99,7 +99,7 @@ def _parted(gram: Float) -> tuple[Float, float, bool]:
     return root[:, :kept], condition, True
 
 
-@compiled
+@compile_kernel
 def _inverse(gram: Float) -> tuple[Float, float]:
     root, condition, _ = _parted(gram)
     k = gram.shape[0]

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdhil.model.physical import Bound, bounds
+from fdhil.model.physical_limits import ParameterBound, list_bounds
 from fdhil.records import Estimate, Float, freeze_array
 
 SIGNIFICANT = 3.0  # standard deviations beyond a bound
@@ -33,7 +33,7 @@ def nearest(names: Sequence[str], values: Float, covariance: Float) -> Float:
     usable = np.isfinite(values) & np.isfinite(np.diag(covariance))
     rows = [k for k in range(len(names)) if usable[k]]
     known = [names[k] for k in rows]
-    listed = [b for b in bounds(known) if set(b.weights) <= set(known)]
+    listed = [b for b in list_bounds(known) if set(b.weights) <= set(known)]
     start = values[rows]
     if not _broken(listed, known, start):
         return values
@@ -43,16 +43,16 @@ def nearest(names: Sequence[str], values: Float, covariance: Float) -> Float:
     return within
 
 
-def beyond_chance(names: Sequence[str], values: Float, covariance: Float) -> list[tuple[Bound, float]]:
+def beyond_chance(names: Sequence[str], values: Float, covariance: Float) -> list[tuple[ParameterBound, float]]:
     """Return the bounds that values (k,) violate significantly, each with the sum that should not be below it."""
     named = _told(names, values)
     found = []
-    for bound in bounds([name for name, value in named.items() if np.isfinite(value)]):
+    for bound in list_bounds([name for name, value in named.items() if np.isfinite(value)]):
         row = _row(bound, names)
         known = np.flatnonzero(row)
         std = float(np.sqrt(row[known] @ covariance[np.ix_(known, known)] @ row[known]))
-        if bound.beyond(named) > SIGNIFICANT * std:
-            found.append((bound, bound.least - bound.beyond(named)))
+        if bound.compute_violation(named) > SIGNIFICANT * std:
+            found.append((bound, bound.least - bound.compute_violation(named)))
     return found
 
 
@@ -60,26 +60,26 @@ def _told(names: Sequence[str], values: Float) -> dict[str, float]:
     return dict(zip(names, values.tolist(), strict=True))
 
 
-def _row(bound: Bound, names: Sequence[str]) -> Float:
+def _row(bound: ParameterBound, names: Sequence[str]) -> Float:
     return np.array([bound.weights.get(name, 0.0) for name in names])
 
 
-def _broken(listed: Sequence[Bound], names: Sequence[str], values: Float) -> list[Bound]:
+def _broken(listed: Sequence[ParameterBound], names: Sequence[str], values: Float) -> list[ParameterBound]:
     named = _told(names, values)
-    return [bound for bound in listed if bound.beyond(named) > 0.0]
+    return [bound for bound in listed if bound.compute_violation(named) > 0.0]
 
 
-def _projected(listed: Sequence[Bound], names: Sequence[str], start: Float, covariance: Float) -> Float:
+def _projected(listed: Sequence[ParameterBound], names: Sequence[str], start: Float, covariance: Float) -> Float:
     """Return the values within the bounds nearest to ``start`` in the covariance metric, by an active-set method."""
-    values, active = start, list[Bound]()
+    values, active = start, list[ParameterBound]()
     for _ in range(2 * len(listed)):
         broken = [b for b in _broken(listed, names, values) if b not in active]
         if not broken:
             break
-        active.append(max(broken, key=lambda b: b.beyond(_told(names, values))))
+        active.append(max(broken, key=lambda b: b.compute_violation(_told(names, values))))
         while active:
             rows = np.stack([_row(b, names) for b in active])
-            missing = np.array([b.beyond(_told(names, start)) for b in active])
+            missing = np.array([b.compute_violation(_told(names, start)) for b in active])
             pull = np.linalg.lstsq(rows @ covariance @ rows.T, missing, rcond=None)[0]
             if pull.min() >= 0.0:
                 break
@@ -88,11 +88,13 @@ def _projected(listed: Sequence[Bound], names: Sequence[str], start: Float, cova
     return _settled(names, values, listed, active)
 
 
-def _settled(names: Sequence[str], values: Float, listed: Sequence[Bound], active: Sequence[Bound]) -> Float:
+def _settled(
+    names: Sequence[str], values: Float, listed: Sequence[ParameterBound], active: Sequence[ParameterBound]
+) -> Float:
     """Return the values exactly on their ``active`` bounds, to the last bit."""
     named = _told(names, values)
     for bound in listed:
-        if bound in active or bound.beyond(named) > 0.0:
+        if bound in active or bound.compute_violation(named) > 0.0:
             others = sum(weight * named[name] for name, weight in bound.weights.items() if name != bound.moves)
             named[bound.moves] = (bound.least - others) / bound.weights[bound.moves]
     return np.array([*named.values()])

@@ -26,7 +26,7 @@ from fdhil.identification.noise import fit_noise
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import in_order
 from fdhil.identification.terms import Candidate, candidates
-from fdhil.model.physical import bounds
+from fdhil.model.physical_limits import list_bounds
 from fdhil.records import Estimate, Float
 
 Rows = npt.NDArray[np.intp]
@@ -86,7 +86,7 @@ def _weak(wider: Fit, chosen: Sequence[Candidate], base: Fit, estimate_of: Calla
         weak.add(LATE)
     low = estimate.get_value("stribeck") if "stribeck" in estimate.names else 0.0
     friction = {"Cd": estimate.get_value("Cd"), "stribeck": low}
-    if low and any(bound.beyond(friction) > 0.0 for bound in bounds(tuple(friction))):
+    if low and any(bound.compute_violation(friction) > 0.0 for bound in list_bounds(tuple(friction))):
         weak.add("stribeck" if "stribeck" in terms else chosen[-1].family)
     return weak
 

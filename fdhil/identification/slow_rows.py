@@ -18,7 +18,7 @@ from fdhil.config import Axis
 from fdhil.identification.kalman import CD, FT, JT, LOAD, VOLTAGE, K, L, R
 from fdhil.identification.motion import Course, Motion, Within
 from fdhil.identification.windows import RUN_SHARE
-from fdhil.model.closed_loop import simulate
+from fdhil.model.closed_loop import simulate_axis
 from fdhil.records import PARAMETERS, Float, Parameters, Window, compute_rms
 
 LEAST_ROW_S = 0.003  # in shorter samples the first two are less than the regulator's own effect
@@ -77,7 +77,7 @@ def with_known_course(motion: Motion, theta: Float, axis: Axis, demand_mm: Float
 def beyond_line_a(theta: Float, axis: Axis, demand_mm: Float, row_s: float) -> Float:
     """Return by how much each sample's mean current (n,) exceeds that of its ends; 0 where friction is unknown."""
     p = _moving_parameters(theta)
-    response = simulate(p, axis, row_s, demand_mm)
+    response = simulate_axis(p, axis, row_s, demand_mm)
     speed, current = response.speed_rad_s, response.current_a
     mean = (speed[1:] + speed[:-1]) / 2
     torque = p.Jt * np.diff(speed) / row_s + p.ft * mean + p.Cd * np.sign(mean)
@@ -88,7 +88,7 @@ def beyond_line_a(theta: Float, axis: Axis, demand_mm: Float, row_s: float) -> F
 
 def left_at_the_table_mm(theta: Float, axis: Axis, window: Window) -> float:
     """Return the RMS difference between measured position and the closed loop with ``theta`` (k,)."""
-    response = simulate(_moving_parameters(theta), axis, window.dt_s, window.demand_mm)
+    response = simulate_axis(_moving_parameters(theta), axis, window.dt_s, window.demand_mm)
     return compute_rms(window.position_mm - response.position_mm)
 
 

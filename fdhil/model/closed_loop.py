@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from fdhil import tables
 from fdhil.config import Axis
-from fdhil.model import kernels, terms
+from fdhil.model import closed_loop_kernels, model_terms
 from fdhil.records import Float, Parameters
 
 State = npt.NDArray[np.float64]
@@ -48,42 +48,44 @@ class Response:
     limited: Float
     end: State
     sync_period_s: float
-    parted: bool = False
+    has_separate_table: bool = False
     """Whether table and motor are separate masses."""
 
     @property
     def position_mm(self) -> Float:
         """Position reported by the drive's encoder, (n,): the table's, unless a resonance separates the two."""
-        return np.asarray(self.states[kernels.POSITION])
+        return np.asarray(self.states[closed_loop_kernels.POSITION])
 
     @property
     def table_mm(self) -> Float:
         """Table position, (n,), without the deflection under a constant load."""
-        return np.asarray(self.states[kernels.TABLE if self.parted else kernels.POSITION])
+        return np.asarray(
+            self.states[closed_loop_kernels.TABLE if self.has_separate_table else closed_loop_kernels.POSITION]
+        )
 
     @property
     def speed_rad_s(self) -> Float:
         """Motor speed, (n,)."""
-        return np.asarray(self.states[kernels.SPEED])
+        return np.asarray(self.states[closed_loop_kernels.SPEED])
 
     @property
     def current_a(self) -> Float:
         """Motor current, (n,)."""
-        return np.asarray(self.states[kernels.CURRENT])
+        return np.asarray(self.states[closed_loop_kernels.CURRENT])
 
     @property
     def limited_s(self) -> float:
         """Total time in which a limit acts."""
         return float(self.limited.sum() * self.sync_period_s)
 
-    def state_at(self, row: int) -> State:
+    def extract_state(self, row: int) -> State:
         """Return the state at the start of cycle ``row``."""
-        state = np.zeros(kernels.STATES)
+        state = np.zeros(closed_loop_kernels.STATES)
         state[: len(self.states)] = self.states[:, row]
         return state
 
 
-def simulate(
+def simulate_axis(
     parameters: Parameters,
     axis: Axis,
     sync_period_s: float,
@@ -114,33 +116,37 @@ def simulate(
         raise ValueError("the reference must be a one-dimensional array of finite positions")
     if state is None:
         # at rest on the reference without offset: an offset at sample 0 is a step
-        state = standing(parameters, axis, float(reference_mm[0]))
-    return prepare(parameters, axis, sync_period_s).run(commands, state, first, rows)
+        state = create_standstill_state(parameters, axis, float(reference_mm[0]))
+    return prepare_drive(parameters, axis, sync_period_s).run(commands, state, first, rows)
 
 
-class Ready(Protocol):
+class PreparedDrive(Protocol):
     """A drive of some regulator structure, prepared to be run repeatedly."""
 
     def run(self, commands: Commands, state: State, first: int = 0, rows: int | None = None) -> Response:
         """Run ``rows`` SYNC cycles (default: all) from sample ``first``, as :func:`simulate` does, without checks."""
 
 
-def prepare(parameters: Parameters, axis: Axis, sync_period_s: float) -> Ready:
+def prepare_drive(parameters: Parameters, axis: Axis, sync_period_s: float) -> PreparedDrive:
     """Prepare the drive of an axis for repeated runs."""
-    drive: Ready = tables.load_entry(tables.REGULATORS, axis.regulators.structure)(parameters, axis, sync_period_s)
+    drive: PreparedDrive = tables.load_entry(tables.REGULATORS, axis.regulators.structure)(
+        parameters, axis, sync_period_s
+    )
     return drive
 
 
-def start(position_mm: float) -> State:
+def create_zero_state(position_mm: float) -> State:
     """Return the state of an axis at rest at ``position_mm``: no current, no speed, all integrals 0."""
-    state = np.zeros(kernels.STATES)
+    state = np.zeros(closed_loop_kernels.STATES)
     # the memories of differences and filters start at the position of the axis
-    state[[kernels.POSITION, kernels.SET_POINT_BEFORE, kernels.POSITION_BEFORE]] = position_mm
-    state[[kernels.FILTERED, kernels.FILTERED + 3, kernels.TABLE]] = position_mm
+    state[[closed_loop_kernels.POSITION, closed_loop_kernels.SET_POINT_BEFORE, closed_loop_kernels.POSITION_BEFORE]] = (
+        position_mm
+    )
+    state[[closed_loop_kernels.FILTERED, closed_loop_kernels.FILTERED + 3, closed_loop_kernels.TABLE]] = position_mm
     return state
 
 
-def standing(
+def create_standstill_state(
     parameters: Parameters,
     axis: Axis,
     position_mm: float,
@@ -153,23 +159,25 @@ def standing(
     current measured at standstill; by default it is what load and ripples need, the middle of the dry-friction band.
     The drive's outer integral holds that current, and the integral of the current loop holds the voltage.
     """
-    g, state = axis.regulators, start(position_mm)
+    g, state = axis.regulators, create_zero_state(position_mm)
     if set_point_mm is not None:
-        state[[kernels.SET_POINT_BEFORE, kernels.FILTERED, kernels.FILTERED + 3]] = set_point_mm
-    angle = np.array([position_mm * terms.rad_per_mm(axis)])
-    pull_nm = float(terms.torque(parameters, np.zeros(1), angle)[0]) if parameters.terms else 0.0
+        state[
+            [closed_loop_kernels.SET_POINT_BEFORE, closed_loop_kernels.FILTERED, closed_loop_kernels.FILTERED + 3]
+        ] = set_point_mm
+    angle = np.array([position_mm * model_terms.rad_per_mm(axis)])
+    pull_nm = float(model_terms.compute_friction_torque(parameters, np.zeros(1), angle)[0]) if parameters.terms else 0.0
     held_a = pull_nm / parameters.K if current_a is None else current_a
-    voltage_v = parameters.R * held_a + terms.dead_time_v(parameters, axis, held_a)
-    state[[kernels.CURRENT, kernels.CURRENT_DEMAND]] = held_a
-    state[kernels.CURRENT_INTEGRAL] = state[kernels.WAITING :] = voltage_v
-    state[kernels.BRISTLE] = parameters.K * held_a - pull_nm
+    voltage_v = parameters.R * held_a + model_terms.compute_dead_time_v(parameters, axis, held_a)
+    state[[closed_loop_kernels.CURRENT, closed_loop_kernels.CURRENT_DEMAND]] = held_a
+    state[closed_loop_kernels.CURRENT_INTEGRAL] = state[closed_loop_kernels.WAITING :] = voltage_v
+    state[closed_loop_kernels.BRISTLE] = parameters.K * held_a - pull_nm
     if g.speed_ki > 0:
-        state[kernels.SPEED_INTEGRAL] = held_a
+        state[closed_loop_kernels.SPEED_INTEGRAL] = held_a
     elif g.structure in ("pid", "linuxcnc_pid") and g.position_ki_per_s2 > 0:
-        state[kernels.POSITION_INTEGRAL] = held_a / g.speed_kp
-    if terms.has_spring(parameters):  # friction at the table bends the spring
-        stiffness = terms.spring(parameters)[0] * terms.rad_per_mm(axis)
-        state[kernels.TABLE] -= (parameters.K * held_a - pull_nm) / stiffness
+        state[closed_loop_kernels.POSITION_INTEGRAL] = held_a / g.speed_kp
+    if model_terms.has_spring(parameters):  # friction at the table bends the spring
+        stiffness = model_terms.compute_spring(parameters)[0] * model_terms.rad_per_mm(axis)
+        state[closed_loop_kernels.TABLE] -= (parameters.K * held_a - pull_nm) / stiffness
     return state
 
 
@@ -184,8 +192,8 @@ def simulate_axes(
 ) -> dict[str, Response]:
     """Simulate several axes in parallel, one thread each: the kernels run without the interpreter's lock."""
 
-    def one(name: str) -> Response:
-        return simulate(
+    def simulate_one_axis(name: str) -> Response:
+        return simulate_axis(
             models[name],
             axes[name],
             sync_period_s,
@@ -195,10 +203,10 @@ def simulate_axes(
             torque_offset_nm=(torque_offset_nm or {}).get(name),
         )
 
-    return each_axis(one, reference_mm)
+    return run_per_axis(simulate_one_axis, reference_mm)
 
 
-def each_axis(work: Callable[[str], Work], axes: Collection[str]) -> dict[str, Work]:
+def run_per_axis(work: Callable[[str], Work], axes: Collection[str]) -> dict[str, Work]:
     """Return the result of ``work`` for each axis, one thread each."""
     if len(axes) <= 1:
         return {name: work(name) for name in axes}

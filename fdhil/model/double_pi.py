@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from functools import partial
 
-from fdhil.model import kernels, loops
+from fdhil.model import closed_loop_drive, closed_loop_kernels
 
-prepare = partial(loops.prepare, kernels.CASCADE, kernels.SET_POINT_BEFORE)
+prepare = partial(
+    closed_loop_drive.prepare_drive_model, closed_loop_kernels.CASCADE, closed_loop_kernels.SET_POINT_BEFORE
+)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.model.compiled import compiled, inlined
+from fdhil.model.numba_decorators import compile_inline_kernel, compile_kernel
 from fdhil.records import Float, Parameters, VoltageSampling, make_read_only_view
 
 SUBSTEP_S = 6.25e-5  # interval at which stick and slip are decided; the linear part needs no substep
@@ -21,7 +21,7 @@ _SERIES_NORM = 0.4  # below it the series of _SERIES_TERMS terms is exact to the
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class PlantStep:
     """One exact step of dx/dt = A x + b over h: x(h) = phi x(0) + mean b_mean + ramp b_ramp for x = [i, w].
 
     ``phi`` (2, 2); ``mean`` (2, 2) is the integral of exp(A s); ``ramp`` (2, 2) answers an input that rises linearly
@@ -33,8 +33,8 @@ class Step:
     ramp: Float
 
 
-@inlined
-def _product(a: Float, b: Float) -> Float:
+@compile_inline_kernel
+def _multiply_2x2(a: Float, b: Float) -> Float:
     """Return the product of two (2, 2) matrices; at this size a library call takes ten times longer."""
     out = np.empty((2, 2))
     out[0, 0] = a[0, 0] * b[0, 0] + a[0, 1] * b[1, 0]
@@ -44,8 +44,8 @@ def _product(a: Float, b: Float) -> Float:
     return out
 
 
-@compiled
-def transition(a: Float, h: float) -> tuple[Float, Float, Float]:
+@compile_kernel
+def compute_transition(a: Float, h: float) -> tuple[Float, Float, Float]:
     """Return phi = exp(A h), its integral over h, and the response to a ramp from -1/2 to 1/2 (all (2, 2))."""
     norm = np.abs(a).sum() * h
     halvings = 0
@@ -59,32 +59,32 @@ def transition(a: Float, h: float) -> tuple[Float, Float, Float]:
     power = np.eye(2)
     factor = 1.0
     for k in range(1, _SERIES_TERMS):
-        power = _product(power, a)
+        power = _multiply_2x2(power, a)
         factor *= step / k
         phi += power * factor
         mean += power * (factor * step / (k + 1))
         first += power * (factor * step * step / ((k + 1) * (k + 2)))
     for _ in range(halvings):
-        first = _product(phi, first) + first + mean * step
-        mean = mean + _product(phi, mean)
-        phi = _product(phi, phi)
+        first = _multiply_2x2(phi, first) + first + mean * step
+        mean = mean + _multiply_2x2(phi, mean)
+        phi = _multiply_2x2(phi, phi)
         step *= 2.0
     return phi, mean, first / h - mean * 0.5
 
 
-def system_matrix(parameters: Parameters) -> Float:
+def build_system_matrix(parameters: Parameters) -> Float:
     """Return A (2, 2) of dx/dt = A x + [u/L, -Cd sign(w)/Jt] for x = [i, w]."""
     p = parameters
     return np.array([[-p.R / p.L, -p.K / p.L], [p.K / p.Jt, -p.ft / p.Jt]])
 
 
-def discretise(parameters: Parameters, dt_s: float) -> Step:
+def discretise_plant(parameters: Parameters, dt_s: float) -> PlantStep:
     """Return the exact step of the moving drive over ``dt_s``; the inputs are u/L and -Cd sign(w)/Jt."""
-    return Step(*transition(system_matrix(parameters), dt_s))
+    return PlantStep(*compute_transition(build_system_matrix(parameters), dt_s))
 
 
-@compiled
-def _simulate(
+@compile_kernel
+def _simulate_plant_steps(
     a: Float, gains: Float, mean_v: Float, rise_v: Float, dt: float, substeps: int, start: Float
 ) -> tuple[Float, Float]:
     """Step through the intervals; ``gains`` = [1/L, Cd/Jt, K, Cd]; ``rise_v`` is the voltage rise over each."""
@@ -92,7 +92,7 @@ def _simulate(
     current = np.empty(n)
     speed = np.empty(n)
     h = dt / substeps
-    phi, whole, ramp = transition(a, h)
+    phi, whole, ramp = compute_transition(a, h)
     still = np.exp(a[0, 0] * h)
     still_gain = -(1.0 - still) / a[0, 0] if a[0, 0] != 0.0 else h
     i = start[0]
@@ -117,7 +117,7 @@ def _simulate(
     return current, speed
 
 
-def interval_shape(voltage_v: Float, sampling: VoltageSampling) -> tuple[Float, Float]:
+def compute_voltage_ramps(voltage_v: Float, sampling: VoltageSampling) -> tuple[Float, Float]:
     """Return mean (n,) and rise (n,) in V of the voltage over each [t_k, t_k + dt).
 
     Between samples a drive's voltage is closer to a ramp than to a hold. The rise of an interval mean is half the
@@ -148,8 +148,8 @@ def simulate_plant(
     ``SUBSTEP_S``.
     """
     p = parameters
-    mean, rise = interval_shape(np.ascontiguousarray(voltage_v, dtype=np.float64), sampling)
+    mean, rise = compute_voltage_ramps(np.ascontiguousarray(voltage_v, dtype=np.float64), sampling)
     substeps = max(1, int(np.ceil(dt_s / SUBSTEP_S - 1e-9)))
     gains = np.array([1 / p.L, p.Cd / p.Jt, p.K, p.Cd])
     start = np.array([current0_a, speed0_rad_s])
-    return _simulate(system_matrix(p), gains, make_read_only_view(mean), rise, dt_s, substeps, start)
+    return _simulate_plant_steps(build_system_matrix(p), gains, make_read_only_view(mean), rise, dt_s, substeps, start)

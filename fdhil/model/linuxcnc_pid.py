@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from functools import partial
 
-from fdhil.model import kernels, loops
+from fdhil.model import closed_loop_drive, closed_loop_kernels
 
-prepare = partial(loops.prepare, kernels.LINUXCNC, kernels.SPEED_FILTERED)
+prepare = partial(
+    closed_loop_drive.prepare_drive_model, closed_loop_kernels.LINUXCNC, closed_loop_kernels.SPEED_FILTERED
+)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from functools import partial
 
-from fdhil.model import kernels, loops
+from fdhil.model import closed_loop_drive, closed_loop_kernels
 
-prepare = partial(loops.prepare, kernels.CASCADE, kernels.POSITION_INTEGRAL)
+prepare = partial(
+    closed_loop_drive.prepare_drive_model, closed_loop_kernels.CASCADE, closed_loop_kernels.POSITION_INTEGRAL
+)

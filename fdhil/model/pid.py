@@ -12,6 +12,6 @@ from __future__ import annotations
 
 from functools import partial
 
-from fdhil.model import kernels, loops
+from fdhil.model import closed_loop_drive, closed_loop_kernels
 
-prepare = partial(loops.prepare, kernels.PID, kernels.FILTERED)
+prepare = partial(closed_loop_drive.prepare_drive_model, closed_loop_kernels.PID, closed_loop_kernels.FILTERED)

@@ -46,7 +46,7 @@ def held_share(reference: Trajectory, models: Mapping[str, Parameters], config: 
             scaled = path[0] + share * (path - path[0])
             if max(one.max() for one in required(scaled, models[axis], config.axis[axis], reference.dt_s)) > 1.0:
                 return False
-            if closed_loop.simulate(models[axis], config.axis[axis], reference.dt_s, scaled).limited_s > 0.0:
+            if closed_loop.simulate_axis(models[axis], config.axis[axis], reference.dt_s, scaled).limited_s > 0.0:
                 return False
         return True
 

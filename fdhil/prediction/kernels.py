@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from fdhil.model.compiled import compiled
+from fdhil.model.numba_decorators import compile_kernel
 from fdhil.records import Float
 
 
-@compiled
+@compile_kernel
 def _segment(path: Float, j: int, point: Float) -> float:
     """Return the distance from ``point`` (d,) to the segment from row j of ``path`` to row j + 1."""
     length = 0.0
@@ -25,7 +25,7 @@ def _segment(path: Float, j: int, point: Float) -> float:
     return float(np.sqrt(square))
 
 
-@compiled
+@compile_kernel
 def _row(path: Float, j: int, point: Float) -> float:
     square = 0.0
     for a in range(point.size):
@@ -33,7 +33,7 @@ def _row(path: Float, j: int, point: Float) -> float:
     return float(np.sqrt(square))
 
 
-@compiled
+@compile_kernel
 def _beyond(arc: Float, reach: float, begin: int, end: int) -> int:
     """Return the first row from ``begin`` to ``end`` (in either direction) that is farther along than ``reach``.
 
@@ -56,7 +56,7 @@ def _beyond(arc: Float, reach: float, begin: int, end: int) -> int:
     return begin + way * high
 
 
-@compiled
+@compile_kernel
 def contour(path: Float, actual: Float, half_window: int, first: int) -> Float:
     """Return (m,) the distance of each row of ``actual`` (m, d) to the polyline of ``path`` (n, d) within the window.
 

@@ -20,8 +20,8 @@ from fdhil import config as configuration
 from fdhil.config import MachineConfig, Regulators
 from fdhil.errors import ConfigError, ConfigFault
 from fdhil.identification.physical_bounds import beyond_chance, nearest
-from fdhil.model import physical
-from fdhil.model.terms import with_resonance
+from fdhil.model import physical_limits
+from fdhil.model.model_terms import add_resonance
 from fdhil.prediction.model_terms import families, values_of
 from fdhil.records import PARAMETERS, UNITS, Parameters, ParameterSet, Trajectory, get_unit
 
@@ -152,7 +152,7 @@ def _physical_model(axis: str, published: ParameterSet, faults: list[ConfigFault
     """Return the parameters of a set, moved into the physical bounds that an earlier fdhil exceeded by chance."""
     by_name, covariance = values_of(published.parameters), published.covariance
     names, values = tuple(by_name), np.array([*by_name.values()])
-    if all(bound.beyond(by_name) <= 0.0 for bound in physical.bounds(names)):
+    if all(bound.compute_violation(by_name) <= 0.0 for bound in physical_limits.list_bounds(names)):
         return published.parameters
     if covariance.shape != (len(names), len(names)) or beyond_chance(names, values, covariance):
         text = "Unphysical: friction in the newest set would drive the axis, or a value must not be negative"
@@ -225,7 +225,11 @@ def _term_faults(axis: str, terms: Mapping[str, Any], dry_nm: Any) -> list[Confi
         faults.append(ConfigFault(f"{place}.stribeck", "requires stribeck_speed", "in rad/s"))
     if not faults and "stribeck" in terms and _fault("Cd", dry_nm) is None:
         friction = {"Cd": dry_nm, **terms}
-        if any(bound.beyond(friction) > 0.0 for bound in physical.bounds(tuple(friction)) if len(bound.weights) > 1):
+        if any(
+            bound.compute_violation(friction) > 0.0
+            for bound in physical_limits.list_bounds(tuple(friction))
+            if len(bound.weights) > 1
+        ):
             text = "exceeds the dry friction: at standstill friction would be below 0"
             faults.append(ConfigFault(f"{place}.stribeck", text, "in N.m"))
     return faults
@@ -236,12 +240,12 @@ def _fault(name: str, value: Any) -> str | None:
         return f"must be a number, not {_shown(value)}"
     if abs(value) > LARGEST or not math.isfinite(value) or 0 < abs(value) < SMALLEST:
         return f"must be a finite number of this physical quantity, not {_shown(value)}"
-    if name in physical.ABOVE_ZERO and value <= 0:
+    if name in physical_limits.ABOVE_ZERO and value <= 0:
         return f"must be above 0, not {_shown(value)}"
-    if name in physical.NOT_NEGATIVE and value < 0:
+    if name in physical_limits.NOT_NEGATIVE and value < 0:
         return f"must be at least 0, not {_shown(value)}"
-    if name == "resonance_share" and not physical.LEAST_SHARE <= value <= 1 - physical.LEAST_SHARE:
-        return f"must be from {physical.LEAST_SHARE} to {1 - physical.LEAST_SHARE}, not {_shown(value)}"
+    if name == "resonance_share" and not physical_limits.LEAST_SHARE <= value <= 1 - physical_limits.LEAST_SHARE:
+        return f"must be from {physical_limits.LEAST_SHARE} to {1 - physical_limits.LEAST_SHARE}, not {_shown(value)}"
     return None
 
 
@@ -265,4 +269,4 @@ def models_for(
     ]
     if faults:
         raise ConfigError(source, faults)
-    return {axis: with_resonance(given.get(axis, nominal[axis]), config.axis[axis]) for axis in reference.axes}
+    return {axis: add_resonance(given.get(axis, nominal[axis]), config.axis[axis]) for axis in reference.axes}

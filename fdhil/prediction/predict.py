@@ -8,7 +8,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
-from fdhil.model.closed_loop import Response, simulate, simulate_axes
+from fdhil.model.closed_loop import Response, simulate_axes, simulate_axis
 from fdhil.prediction.contour import contour_error_um
 from fdhil.prediction.model_terms import without_dry_friction
 from fdhil.prediction.zones import find_zones
@@ -80,7 +80,7 @@ def ahead_of_motor_mm(
     for axis, path_mm in position_mm.items():
         if models[axis].get_term("resonance"):
             offset_mm = offset_um[axis] * 1e-3
-            response = simulate(models[axis], config.axis[axis], period_s, path_mm, offset_mm)
+            response = simulate_axis(models[axis], config.axis[axis], period_s, path_mm, offset_mm)
             found[axis] = response.table_mm - response.position_mm
     return found
 

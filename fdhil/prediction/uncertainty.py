@@ -40,12 +40,12 @@ def _positions(
         path = reference.position_mm[axis]
         changed, steps = zip(*(_changed(models[axis], name) for name in values_of(models[axis])), strict=True)
         here, *moved = (
-            closed_loop.simulate(model, config.axis[axis], reference.dt_s, path, offset_mm).table_mm
+            closed_loop.simulate_axis(model, config.axis[axis], reference.dt_s, path, offset_mm).table_mm
             for model in (models[axis], *changed)
         )
         return np.array(moved), np.array(steps), here
 
-    return closed_loop.each_axis(one, reference.axes)
+    return closed_loop.run_per_axis(one, reference.axes)
 
 
 def contour_std_um(

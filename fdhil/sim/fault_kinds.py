@@ -13,9 +13,9 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from fdhil.sim.axis_unit import AxisUnit
-from fdhil.sim.drive.sensors import SIGNALS
+from fdhil.sim.drive.drive_sensors import SIGNALS
 from fdhil.sim.frame_faults import VALUES, FaultValue, FrameFault, Way
+from fdhil.sim.simulated_axis import SimulatedAxis
 from fdhil.sim.wire.modbus_answers import ANSWER_FAULTS
 
 _MODBUS_CODES = frozenset({1, 2, 3, 4, 5, 6, 7, 8, 10, 11})
@@ -41,7 +41,7 @@ class FaultEntry(BaseModel):
     percent: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
 
     @property
-    def at(self) -> tuple[float | None, int | None, int | None]:
+    def start_conditions(self) -> tuple[float | None, int | None, int | None]:
         """When it starts, by time, SYNC or row."""
         return self.at_s, self.at_sync, self.at_row
 
@@ -57,28 +57,28 @@ class FaultEntry(BaseModel):
 
     @field_validator("fault")
     @classmethod
-    def _known(cls, name: str) -> str:
+    def _validate_fault_name(cls, name: str) -> str:
         if name not in FAULTS:
-            raise ValueError(_unknown(name))
+            raise ValueError(_describe_unknown_fault(name))
         return name
 
     @field_validator("data")
     @classmethod
-    def _bytes(cls, text: str | None) -> str | None:
+    def _validate_data(cls, text: str | None) -> str | None:
         if text is not None and len(bytes.fromhex(text)) > 8:
             raise ValueError("a CAN frame has at most 8 bytes")
         return text
 
     @model_validator(mode="after")
-    def _whole(self) -> FaultEntry:
+    def _validate_entry(self) -> FaultEntry:
         kind = FAULTS[self.fault]
-        if sum(at is not None for at in self.at) > 1:
+        if sum(at is not None for at in self.start_conditions) > 1:
             raise ValueError("give one of at_s, at_sync and at_row")
         if kind.needs_axis and self.axis is None:
             raise ValueError(f"{self.fault} needs an axis")
         if kind.value is not None and self.value is None:
             raise ValueError(f"{self.fault} needs a value: {kind.value.meaning}")
-        if kind.value is not None and (wrong := kind.value.fault(self.number)):
+        if kind.value is not None and (wrong := kind.value.find_fault(self.number)):
             raise ValueError(f"the value of {self.fault} ({kind.value.meaning}) is invalid: {wrong}")
         if self.fault == "object" and self.index is None:
             raise ValueError("object needs the index (and sub) of the object to overwrite")
@@ -91,53 +91,55 @@ class FaultEntry(BaseModel):
 class FaultKind:
     """A fault by name: ``apply(unit, entry, on)`` starts and ends it; a fault with a ``value`` needs one."""
 
-    apply: Callable[[AxisUnit, FaultEntry, bool], None]
+    apply: Callable[[SimulatedAxis, FaultEntry, bool], None]
     value: FaultValue | None = None
     needs_axis: bool = True
 
 
-def _attribute(owner: Callable[[AxisUnit], object], name: str, off: Any, value: FaultValue | None = None) -> FaultKind:
+def _create_attribute_fault(
+    owner: Callable[[SimulatedAxis], object], name: str, off: Any, value: FaultValue | None = None
+) -> FaultKind:
     """Return a fault that sets an attribute of a fault state to its value (True without one), and back to ``off``."""
 
-    def apply(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
+    def apply_attribute(unit: SimulatedAxis, entry: FaultEntry, on: bool) -> None:
         wanted = True if value is None else int(entry.number) if value.whole else entry.number
         setattr(owner(unit), name, wanted if on else off)
 
-    return FaultKind(apply, value)
+    return FaultKind(apply_attribute, value)
 
 
-_drive = partial(_attribute, lambda unit: unit.drive.faults)
-_sensor = partial(_attribute, lambda unit: unit.sensor.faults)
-_sensor_signal = partial(_attribute, lambda unit: unit.sensor.faults.signal)
+_drive = partial(_create_attribute_fault, lambda unit: unit.drive.faults)
+_sensor = partial(_create_attribute_fault, lambda unit: unit.sensor.faults)
+_sensor_signal = partial(_create_attribute_fault, lambda unit: unit.sensor.faults.signal)
 
 
-def _signal(signal: str, name: str, off: Any, value: FaultValue | None) -> FaultKind:
-    return _attribute(lambda unit: unit.drive.faults.signal(signal), name, off, value)
+def _create_signal_fault(signal: str, name: str, off: Any, value: FaultValue | None) -> FaultKind:
+    return _create_attribute_fault(lambda unit: unit.drive.faults.get_signal_fault(signal), name, off, value)
 
 
-def _drop_tpdo(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
+def _drop_tpdo(unit: SimulatedAxis, entry: FaultEntry, on: bool) -> None:
     if on:
         unit.drive.faults.drop_tpdo[int(entry.number)] = -1
     else:
         unit.drive.faults.drop_tpdo.pop(int(entry.number), None)
 
 
-def _trip(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
+def _trip_drive(unit: SimulatedAxis, entry: FaultEntry, on: bool) -> None:
     if on:
-        unit.drive.trip(int(entry.number))
+        unit.drive.trip_fault(int(entry.number))
 
 
-def _reboot(unit: AxisUnit, _: FaultEntry, on: bool) -> None:
+def _reboot_drive(unit: SimulatedAxis, _: FaultEntry, on: bool) -> None:
     if on:
-        unit.power(False)
-        unit.power(True)
+        unit.switch_power(False)
+        unit.switch_power(True)
 
 
-def _sync_lost(unit: AxisUnit, _: FaultEntry, on: bool) -> None:
+def _suppress_sync(unit: SimulatedAxis, _: FaultEntry, on: bool) -> None:
     unit.sync_on = not on
 
 
-def _frame(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
+def _inject_frame(unit: SimulatedAxis, entry: FaultEntry, on: bool) -> None:
     can_id = entry.can_id or 0
     if on:
         unit.injected[can_id] = (unit.bus, bytes.fromhex(entry.data or ""))
@@ -145,7 +147,7 @@ def _frame(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
         unit.injected.pop(can_id, None)
 
 
-def _spoil_answers(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
+def _corrupt_answers(unit: SimulatedAxis, entry: FaultEntry, on: bool) -> None:
     answers, kind = unit.sensor.faults.answers, entry.fault.removeprefix("sensor_")
     if on:
         answers[kind] = entry.share
@@ -153,9 +155,9 @@ def _spoil_answers(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
         answers.pop(kind, None)
 
 
-def _frames_of(unit: AxisUnit, entry: FaultEntry) -> FrameFault:
+def _build_frame_fault(unit: SimulatedAxis, entry: FaultEntry) -> FrameFault:
     """Return the frame fault of an entry: for one COB-ID, else for the axis' drive, else for all frames."""
-    node = None if entry.axis is None else _ids_of(unit.drive.node_id)
+    node = None if entry.axis is None else _list_cob_ids(unit.drive.node_id)
     can_ids = node if entry.can_id is None else frozenset({entry.can_id})
     kind = entry.fault.removeprefix("bus_")
     value = 1 if entry.value is None else entry.value
@@ -164,16 +166,16 @@ def _frames_of(unit: AxisUnit, entry: FaultEntry) -> FrameFault:
     return FrameFault(kind, value, can_ids, way, percent=entry.share, data=data)
 
 
-def _ids_of(node_id: int) -> frozenset[int]:
+def _list_cob_ids(node_id: int) -> frozenset[int]:
     return frozenset((*range(0x80 + node_id, 0x680, 0x80), 0x700 + node_id))
 
 
-def _bus_fault(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
+def _switch_bus_fault(unit: SimulatedAxis, entry: FaultEntry, on: bool) -> None:
     act = unit.wire.add if on else unit.wire.remove
-    act(_frames_of(unit, entry))
+    act(_build_frame_fault(unit, entry))
 
 
-def _bus_down(unit: AxisUnit, _: FaultEntry, on: bool) -> None:
+def _switch_bus_down(unit: SimulatedAxis, _: FaultEntry, on: bool) -> None:
     unit.wire.down = on
 
 
@@ -196,20 +198,20 @@ FAULTS: Mapping[str, FaultKind] = {
     "not_csp": _drive("not_csp", False),
     "no_heartbeat_consumer": _drive("no_heartbeat_consumer", False),
     "drop_tpdo": FaultKind(_drop_tpdo, _TPDO),
-    "trip": FaultKind(_trip, FaultValue("error code of the EMCY, such as 0x3210", 1, 0xFFFF, whole=True)),
-    "reboot": FaultKind(_reboot),
-    "power_off": FaultKind(lambda unit, _, on: unit.power(not on)),
-    "remap": FaultKind(lambda unit, entry, _: unit.turn_tpdo(int(entry.number)), _TPDO),
+    "trip": FaultKind(_trip_drive, FaultValue("error code of the EMCY, such as 0x3210", 1, 0xFFFF, whole=True)),
+    "reboot": FaultKind(_reboot_drive),
+    "power_off": FaultKind(lambda unit, _, on: unit.switch_power(not on)),
+    "remap": FaultKind(lambda unit, entry, _: unit.reverse_tpdo_mapping(int(entry.number)), _TPDO),
     "object": FaultKind(
-        lambda unit, entry, on: unit.overwrite(entry.index or 0, entry.sub, int(entry.number), on),
+        lambda unit, entry, on: unit.overwrite_object(entry.index or 0, entry.sub, int(entry.number), on),
         FaultValue("number written to the object", -(2**31), 2**32 - 1, whole=True),
     ),
     "digital_input": FaultKind(
-        lambda unit, entry, on: unit.set_input(int(entry.number), on),
+        lambda unit, entry, on: unit.set_digital_input(int(entry.number), on),
         FaultValue("bit of 0x60FD, 0 and 1 are the limit switches", 0, 31, whole=True),
     ),
     **{
-        f"{signal}_{name}": _signal(signal, attribute, off, value)
+        f"{signal}_{name}": _create_signal_fault(signal, attribute, off, value)
         for signal in SIGNALS
         for name, attribute, off, value in _SIGNAL_FAULTS
     },
@@ -218,24 +220,24 @@ FAULTS: Mapping[str, FaultKind] = {
     "sensor_exception": _sensor(
         "exception", 0, FaultValue("Modbus exception code", 1, 11, whole=True, among=_MODBUS_CODES)
     ),
-    **{f"sensor_{kind}": FaultKind(_spoil_answers) for kind in ANSWER_FAULTS},
+    **{f"sensor_{kind}": FaultKind(_corrupt_answers) for kind in ANSWER_FAULTS},
     "sensor_stuck": _sensor_signal("stuck", False),
     "sensor_delayed": _sensor_signal("delay_cycles", 0, FaultValue("samples", 0, 10000, whole=True)),
     "sensor_gain": _sensor_signal("gain", 1.0, _FACTOR),
     "sensor_offset": _sensor_signal("offset", 0.0, FaultValue("V")),
     **{
-        f"bus_{kind}": FaultKind(_bus_fault, value, needs_axis=False)
+        f"bus_{kind}": FaultKind(_switch_bus_fault, value, needs_axis=False)
         for kind, value in VALUES.items()
         if kind != "raise"  # raise concerns the holder of a bus object only
     },
-    "bus_down": FaultKind(_bus_down, needs_axis=False),
-    "sync_lost": FaultKind(_sync_lost, needs_axis=False),
-    "frame": FaultKind(_frame, needs_axis=False),
+    "bus_down": FaultKind(_switch_bus_down, needs_axis=False),
+    "sync_lost": FaultKind(_suppress_sync, needs_axis=False),
+    "frame": FaultKind(_inject_frame, needs_axis=False),
 }
 
 
 @lru_cache(16)
-def _unknown(name: str) -> str:
+def _describe_unknown_fault(name: str) -> str:
     """Return the message for an unknown name; cached, as a long script may repeat one mistake."""
     near = difflib.get_close_matches(name, FAULTS, n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""

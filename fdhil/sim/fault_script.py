@@ -17,11 +17,11 @@ from pydantic import ValidationError
 
 from fdhil.config import read_toml
 from fdhil.errors import ConfigError, ConfigFault
-from fdhil.sim.axis_unit import AxisUnit
 from fdhil.sim.fault_kinds import FAULTS, FaultEntry
+from fdhil.sim.simulated_axis import SimulatedAxis
 
 
-def load(path: Path, axes: tuple[str, ...]) -> list[FaultEntry]:
+def load_script(path: Path, axes: tuple[str, ...]) -> list[FaultEntry]:
     """Read a fault script for a machine with these axes; ConfigError with all errors."""
     document = read_toml(path, "a fault script")
     faults = [ConfigFault(key, "unknown key of a fault script", "use [[fault]]") for key in document if key != "fault"]
@@ -29,7 +29,7 @@ def load(path: Path, axes: tuple[str, ...]) -> list[FaultEntry]:
     listed = document.get("fault", [])
     for number, item in enumerate(listed if isinstance(listed, list) else [listed]):
         try:
-            entries.append(parse(item, axes))
+            entries.append(parse_entry(item, axes))
         except ConfigError as error:
             faults += [ConfigFault(f"fault[{number}].{f.path}", f.what, f.suggestion) for f in error.faults]
     if faults:
@@ -37,7 +37,7 @@ def load(path: Path, axes: tuple[str, ...]) -> list[FaultEntry]:
     return entries
 
 
-def parse(item: object, axes: tuple[str, ...]) -> FaultEntry:
+def parse_entry(item: object, axes: tuple[str, ...]) -> FaultEntry:
     """Check one entry; ConfigError with all errors."""
     try:
         entry = FaultEntry.model_validate(item)
@@ -55,38 +55,40 @@ def parse(item: object, axes: tuple[str, ...]) -> FaultEntry:
 class FaultSchedule:
     """Starts and ends faults by SYNC."""
 
-    def __init__(self, units: Mapping[str, AxisUnit], period_s: float) -> None:
+    def __init__(self, units: Mapping[str, SimulatedAxis], period_s: float) -> None:
         self._units, self._period_s = units, period_s
         self._waiting: list[FaultEntry] = []
         self._running: list[tuple[int, FaultEntry]] = []  # with the SYNC at which it ends
 
-    def add(self, entry: FaultEntry) -> None:
+    def add_entry(self, entry: FaultEntry) -> None:
         """Add an entry to the schedule; ConfigError when its object cannot hold its value."""
         if entry.fault == "object":
-            wrong = self._unit(entry).object_fault(entry.index or 0, entry.sub, int(entry.number))
+            wrong = self._select_axis(entry).explain_rejected_value(entry.index or 0, entry.sub, int(entry.number))
             if wrong:
                 raise ConfigError("fault", [ConfigFault("object", wrong, "see the drive's EDS for its objects")])
         self._waiting.append(entry)
 
     @property
-    def idle(self) -> bool:
+    def is_idle(self) -> bool:
         return not self._waiting and not self._running
 
-    def step(self, tick: int, row: int | None) -> list[FaultEntry]:
+    def run_due_faults(self, tick: int, row: int | None) -> list[FaultEntry]:
         """Start and end the faults due at this SYNC; return those started. ``row`` counts a played file's rows."""
         for end, entry in [item for item in self._running if item[0] <= tick]:
             self._running.remove((end, entry))
-            self._apply(entry, on=False)
-        return self._start([entry for entry in self._waiting if self._is_due(entry, tick, row)], tick)
+            self._apply_fault(entry, on=False)
+        return self._start_faults([entry for entry in self._waiting if self._is_due(entry, tick, row)], tick)
 
-    def at_once(self, tick: int) -> list[FaultEntry]:
+    def start_immediate_faults(self, tick: int) -> list[FaultEntry]:
         """Start the entries without a condition, where no SYNC may ever come; return them."""
-        return self._start([entry for entry in self._waiting if entry.at == (None, None, None)], tick)
+        return self._start_faults(
+            [entry for entry in self._waiting if entry.start_conditions == (None, None, None)], tick
+        )
 
-    def _start(self, due: list[FaultEntry], tick: int) -> list[FaultEntry]:
+    def _start_faults(self, due: list[FaultEntry], tick: int) -> list[FaultEntry]:
         for entry in due:
             self._waiting.remove(entry)
-            self._apply(entry, on=True)
+            self._apply_fault(entry, on=True)
             if entry.duration_s is not None:
                 self._running.append((tick + max(1, round(entry.duration_s / self._period_s)), entry))
         return due
@@ -97,8 +99,8 @@ class FaultSchedule:
         at = entry.at_sync if entry.at_sync is not None else round((entry.at_s or 0.0) / self._period_s)
         return tick >= at
 
-    def _apply(self, entry: FaultEntry, *, on: bool) -> None:
-        FAULTS[entry.fault].apply(self._unit(entry), entry, on)
+    def _apply_fault(self, entry: FaultEntry, *, on: bool) -> None:
+        FAULTS[entry.fault].apply(self._select_axis(entry), entry, on)
 
-    def _unit(self, entry: FaultEntry) -> AxisUnit:
+    def _select_axis(self, entry: FaultEntry) -> SimulatedAxis:
         return self._units[entry.axis if entry.axis is not None else next(iter(self._units))]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from random import Random
 from typing import Any, Literal
 
-from fdhil.sim.frame import Frame
+from fdhil.sim.frame_types import Frame
 
 SYNC = 0x80
 _NEVER = float("inf")
@@ -29,7 +29,7 @@ class FaultValue:
     whole: bool = False
     among: frozenset[int] = frozenset()
 
-    def fault(self, value: float) -> str:
+    def find_fault(self, value: float) -> str:
         """Return why a value is invalid, "" when it is valid."""
         if self.whole and value != int(value):
             return f"{value:g} is not a whole number"
@@ -79,7 +79,7 @@ class FrameFault:
         if self.kind not in VALUES:
             raise ValueError(f"unknown fault {self.kind!r}; the faults are {', '.join(VALUES)}")
         meaning = VALUES[self.kind]
-        if meaning is not None and (wrong := meaning.fault(self.value)):
+        if meaning is not None and (wrong := meaning.find_fault(self.value)):
             raise ValueError(f"the value of {self.kind} ({meaning.meaning}) is invalid: {wrong}")
         if not 0 < self.percent <= 100:
             raise ValueError(f"percent is {self.percent:g}; it must be above 0 and at most 100")
@@ -89,7 +89,7 @@ class FrameFault:
             raise ValueError("inject needs exactly one identifier")
 
 
-class BusRefuses(Exception):
+class PlannedBusError(Exception):
     """A planned error of the bus itself, by its error number."""
 
     def __init__(self, number: int) -> None:
@@ -98,12 +98,12 @@ class BusRefuses(Exception):
 
 
 @dataclass(slots=True)
-class _Active:
+class _ActiveFault:
     fault: FrameFault
     draws: Mapping[Way, Random]
     met: int = 0
 
-    def meets(self, can_id: int, way: Way, sync: int) -> bool:
+    def applies_to(self, can_id: int, way: Way, sync: int) -> bool:
         fault = self.fault
         if (fault.way is not None and way != fault.way) or (fault.can_ids is not None and can_id not in fault.can_ids):
             return False
@@ -120,7 +120,7 @@ class _Active:
 
 
 @dataclass(slots=True)
-class _Held:
+class _DelayedFrame:
     passed: Passed
     way: Way
     sync: float = _NEVER
@@ -139,8 +139,8 @@ class FrameFaults:
         self.counted: Counter[tuple[str, int]] = Counter()
         self.down = False
         self._seed, self._made = seed, 0
-        self._plan: list[_Active] = []
-        self._held: list[_Held] = []
+        self._plan: list[_ActiveFault] = []
+        self._held: list[_DelayedFrame] = []
         for fault in plan:
             self.add(fault)
 
@@ -149,14 +149,14 @@ class FrameFaults:
         ways: tuple[Way, ...] = ("sent", "received")
         draws = {way: Random(f"{self._seed}:{self._made}:{way}") for way in ways}
         self._made += 1
-        self._plan.append(_Active(fault, draws))
+        self._plan.append(_ActiveFault(fault, draws))
 
     def remove(self, fault: FrameFault) -> None:
         """End a fault; frames that it delays are still released in time."""
         self._plan.remove(next(active for active in self._plan if active.fault == fault))
 
     @property
-    def idle(self) -> bool:
+    def is_idle(self) -> bool:
         """Whether every frame passes unchanged."""
         return not self._plan and not self._held and not self.down
 
@@ -164,58 +164,58 @@ class FrameFaults:
         """Return how many frames were affected by this kind of fault, of these identifiers or of all."""
         return sum(n for (what, i), n in self.counted.items() if what == kind and (not can_ids or i in can_ids))
 
-    def take(self, frame: Frame, way: Way, now_s: float, origin: Any = None) -> list[Passed]:
-        """Return the frames that replace a frame, at once; BusRefuses for a planned error."""
+    def process_frame(self, frame: Frame, way: Way, now_s: float, origin: Any = None) -> list[Passed]:
+        """Return the frames that replace a frame, at once; PlannedBusError for a planned error."""
         if self.down:
             self.counted["down", frame[0]] += 1
             return []
         if frame[0] == SYNC:
             self.sync += 1
-        if self.idle:
+        if self.is_idle:
             return [(frame, origin)]
         passed: list[Passed] = [(frame, origin)]
         for active in self._plan:
             if active.fault.kind != "inject":
-                passed = [out for each in passed for out in self._spoilt(active, each, way, now_s)]
+                passed = [out for each in passed for out in self._apply_fault(active, each, way, now_s)]
         if self._held and passed:
-            passed += self._overtaken(way)
+            passed += self._release_overtaken(way)
         if frame[0] == SYNC:
-            self._inject()
-            passed += self.due(way, now_s)
+            self._inject_frames()
+            passed += self.release_due(way, now_s)
         return passed
 
-    def due(self, way: Way, now_s: float) -> list[Passed]:
-        return self._released(lambda held: held.way == way and (held.sync <= self.sync or held.at_s <= now_s))
+    def release_due(self, way: Way, now_s: float) -> list[Passed]:
+        return self._release_frames(lambda held: held.way == way and (held.sync <= self.sync or held.at_s <= now_s))
 
-    def due_s(self) -> float:
+    def find_next_due_s(self) -> float:
         """Return when :meth:`due` has a frame by time alone; infinite: never."""
         return min((held.at_s for held in self._held), default=_NEVER)
 
-    def _spoilt(self, active: _Active, passed: Passed, way: Way, now_s: float) -> list[Passed]:
+    def _apply_fault(self, active: _ActiveFault, passed: Passed, way: Way, now_s: float) -> list[Passed]:
         (can_id, data), origin = passed
         fault = active.fault
         swaps = fault.kind == "reorder" and any(held.way == way and held.overtaken < _NEVER for held in self._held)
-        if swaps or not active.meets(can_id, way, self.sync):  # one reordered frame at a time
+        if swaps or not active.applies_to(can_id, way, self.sync):  # one reordered frame at a time
             return [passed]
         self.counted[fault.kind, can_id] += 1
         if fault.kind == "raise":
-            raise BusRefuses(int(fault.value))
+            raise PlannedBusError(int(fault.value))
         if fault.kind == "duplicate":
             return [passed] * (1 + int(fault.value))
-        held = _held(fault, passed, way, self.sync, now_s)
+        held = _delay_frame(fault, passed, way, self.sync, now_s)
         if held is not None:
             self._held.append(held)
             return []
-        changed = _changed(fault, data, active.draws[way])
+        changed = _corrupt_data(fault, data, active.draws[way])
         return [] if changed is None else [((can_id, changed), origin)]
 
-    def _overtaken(self, way: Way) -> list[Passed]:
+    def _release_overtaken(self, way: Way) -> list[Passed]:
         for held in self._held:
             if held.way == way:
                 held.overtaken -= 1
-        return self._released(lambda held: held.overtaken <= 0)
+        return self._release_frames(lambda held: held.overtaken <= 0)
 
-    def _released(self, goes: Callable[[_Held], bool]) -> list[Passed]:
+    def _release_frames(self, goes: Callable[[_DelayedFrame], bool]) -> list[Passed]:
         if not self._held:
             return []
         out = [held.passed for held in self._held if goes(held)]
@@ -223,7 +223,7 @@ class FrameFaults:
             self._held = [held for held in self._held if not goes(held)]
         return out
 
-    def _inject(self) -> None:
+    def _inject_frames(self) -> None:
         for active in self._plan:
             fault = active.fault
             if fault.kind != "inject" or not active.is_due(self.sync):
@@ -234,19 +234,19 @@ class FrameFaults:
                     break
                 active.met += 1
                 self.counted["inject", can_id] += 1
-                self._held.append(_Held(((can_id, fault.data), None), fault.way or "received", sync=self.sync))
+                self._held.append(_DelayedFrame(((can_id, fault.data), None), fault.way or "received", sync=self.sync))
 
 
-def _held(fault: FrameFault, passed: Passed, way: Way, sync: int, now_s: float) -> _Held | None:
+def _delay_frame(fault: FrameFault, passed: Passed, way: Way, sync: int, now_s: float) -> _DelayedFrame | None:
     """Return the delayed frame of a fault, None for a fault without delay."""
     if fault.kind == "reorder":
-        return _Held(passed, way, overtaken=fault.value)
+        return _DelayedFrame(passed, way, overtaken=fault.value)
     if fault.kind == "delay":
-        return _Held(passed, way, sync=sync + fault.value)
-    return _Held(passed, way, at_s=now_s + fault.value) if fault.kind == "late" else None
+        return _DelayedFrame(passed, way, sync=sync + fault.value)
+    return _DelayedFrame(passed, way, at_s=now_s + fault.value) if fault.kind == "late" else None
 
 
-def _changed(fault: FrameFault, data: bytes, draw: Random) -> bytes | None:
+def _corrupt_data(fault: FrameFault, data: bytes, draw: Random) -> bytes | None:
     """Return the changed content of a frame, None for a dropped frame."""
     value = int(fault.value)
     if fault.kind == "mutate":

@@ -26,7 +26,7 @@ class SignalFault:
     _late: deque[float] = field(default_factory=deque, repr=False, compare=False)
     _held: float | None = field(default=None, repr=False, compare=False)
 
-    def apply(self, value: float, rng: np.random.Generator) -> float:
+    def apply_errors(self, value: float, rng: np.random.Generator) -> float:
         """Return the reported value for ``value``."""
         if self.delay_cycles:
             self._late.append(value)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from fdhil.config import Accelerometer, MachineConfig, TableEncoder
-from fdhil.sim.drive.servo import Drive
-from fdhil.sim.frame import BusFrame, Frame
+from fdhil.sim.drive.servo_drive import SimulatedDrive
+from fdhil.sim.frame_types import BusFrame, Frame
 from fdhil.sim.signal_fault import WhiteNoise
 
 OPERATIONAL, STOPPED, PRE_OPERATIONAL = 0x05, 0x04, 0x7F
@@ -44,7 +44,7 @@ class EncoderNode:
         self.nmt = OPERATIONAL
         return [(0x700 + self.node_id, b"\0")]
 
-    def receive(self, can_id: int, data: bytes) -> list[Frame]:
+    def receive_frame(self, can_id: int, data: bytes) -> list[Frame]:
         if can_id != 0 or len(data) != 2 or data[1] not in (0, self.node_id):
             return []
         if data[0] in (0x81, 0x82):
@@ -52,13 +52,13 @@ class EncoderNode:
         self.nmt = {0x01: OPERATIONAL, 0x02: STOPPED, 0x80: PRE_OPERATIONAL}.get(data[0], self.nmt)
         return []
 
-    def wall_clock(self, now_s: float) -> list[Frame]:
+    def run_timers(self, now_s: float) -> list[Frame]:
         if now_s < self._due_s:
             return []
         self._due_s = now_s + HEARTBEAT_S
         return [(0x700 + self.node_id, bytes([self.nmt]))]
 
-    def at_sync(self, table_mm: float) -> list[Frame]:
+    def send_position(self, table_mm: float) -> list[Frame]:
         """Return the TPDO with the position at this SYNC; counts beyond the type wrap around."""
         if self.nmt != OPERATIONAL:
             return []
@@ -87,17 +87,17 @@ class TableAccelerometer:
         self._count = 0
         self._lines: list[str] = []
 
-    def at_sync(self, speed_m_s: float) -> None:
+    def integrate_speed(self, speed_m_s: float) -> None:
         """Process the table's speed at a SYNC, interpolated linearly between SYNCs."""
         before, self._speed = self._speed, speed_m_s
         self._cycle += 1
         while self._next <= self._cycle:
             part = self._next - (self._cycle - 1)
             ended = before + (speed_m_s - before) * part
-            self._sample((ended - self._begun) / (self._step * self._period_s))
+            self._append_sample((ended - self._begun) / (self._step * self._period_s))
             self._begun, self._next = ended, self._next + self._step
 
-    def _sample(self, m_s2: float) -> None:
+    def _append_sample(self, m_s2: float) -> None:
         s = self._settings
         self._count += 1
         numbers = ["0"] * max(4, s.column, s.count_column)
@@ -107,7 +107,7 @@ class TableAccelerometer:
         if len(self._lines) < KEPT_LINES:
             self._lines.append(",".join(numbers))
 
-    def take(self) -> bytes:
+    def take_lines(self) -> bytes:
         if not self._lines:
             return b""
         lines, self._lines = self._lines, []
@@ -134,36 +134,38 @@ class TableSensors:
                 settings = section.accelerometer
                 self.accelerometers[axis] = TableAccelerometer(settings, period_s, noise.table_m_s2, rngs[1])
 
-    def frame_bytes(self, bus: str) -> list[int]:
+    def list_frame_bytes(self, bus: str) -> list[int]:
         """Return the sizes of the encoder frames of a bus per SYNC, bytes."""
         return [node.frame_bytes for axis, node in self._encoders.items() if self._bus[axis] == bus]
 
     def power_on(self) -> list[BusFrame]:
         return [(self._bus[axis], frame) for axis, node in self._encoders.items() for frame in node.power_on()]
 
-    def receive(self, bus: str, frame: Frame) -> list[Frame]:
+    def receive_frame(self, bus: str, frame: Frame) -> list[Frame]:
         if frame[0] != 0:
             return []
-        return [one for axis, node in self._encoders.items() if self._bus[axis] == bus for one in node.receive(*frame)]
+        return [
+            one for axis, node in self._encoders.items() if self._bus[axis] == bus for one in node.receive_frame(*frame)
+        ]
 
-    def wall_clock(self, now_s: float, alone: Sequence[Drive]) -> list[BusFrame]:
+    def run_timers(self, now_s: float, alone: Sequence[SimulatedDrive]) -> list[BusFrame]:
         """Return the due heartbeats; accelerometers of drives without SYNC keep streaming."""
         if self._synced:
             self._synced, self._streamed_s = False, now_s
         elif now_s - self._streamed_s > WITHOUT_SYNC_S:
             for drive in alone:
                 for _ in range(min(round((now_s - self._streamed_s) / self._period_s), MOST_CYCLES)):
-                    self._stream(drive.axis, drive.physics.table_speed_rad_s)
+                    self._feed_accelerometer(drive.axis, drive.physics.table_speed_rad_s)
             self._streamed_s = now_s
-        return [(self._bus[axis], one) for axis, node in self._encoders.items() for one in node.wall_clock(now_s)]
+        return [(self._bus[axis], one) for axis, node in self._encoders.items() for one in node.run_timers(now_s)]
 
-    def at_sync(self, drive: Drive, table_rad_s: float) -> list[Frame]:
+    def sample_axis(self, drive: SimulatedDrive, table_rad_s: float) -> list[Frame]:
         """Sample an axis at a SYNC with this table speed; return its encoder's frame."""
         self._synced = True
-        self._stream(drive.axis, table_rad_s)
+        self._feed_accelerometer(drive.axis, table_rad_s)
         encoder = self._encoders.get(drive.axis)
-        return [] if encoder is None else encoder.at_sync(drive.table_mm)
+        return [] if encoder is None else encoder.send_position(drive.table_mm)
 
-    def _stream(self, axis: str, table_rad_s: float) -> None:
+    def _feed_accelerometer(self, axis: str, table_rad_s: float) -> None:
         if axis in self.accelerometers:
-            self.accelerometers[axis].at_sync(table_rad_s * self._m_per_rad[axis])
+            self.accelerometers[axis].integrate_speed(table_rad_s * self._m_per_rad[axis])

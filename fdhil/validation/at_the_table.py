@@ -56,4 +56,4 @@ def _predicted(window: Window, parameters: Parameters | None, axis: Axis | None,
     if parameters is None or axis is None or not complete or not same_grid or not np.isfinite(window.demand_mm).all():
         return None
     offset = None if window.offset_mm is None else np.nan_to_num(window.offset_mm)
-    return closed_loop.simulate(parameters, axis, sync_period_s, window.demand_mm, offset).table_mm
+    return closed_loop.simulate_axis(parameters, axis, sync_period_s, window.demand_mm, offset).table_mm

@@ -11,7 +11,7 @@ from fdhil.config import Axis
 from fdhil.identification.motion import resolution
 from fdhil.identification.windows import moving_range
 from fdhil.model import closed_loop
-from fdhil.model.terms import with_resonance
+from fdhil.model.model_terms import add_resonance
 from fdhil.records import PARAMETERS, Float, Int, Parameters, Window, compute_rms
 
 LEAST_ROWS = 20
@@ -76,12 +76,12 @@ def replay(
     drive follows at row k; lost rows are NaN and not compared. ``standstill_a`` is the current that the regulators hold
     before the move (None: what they need). ValueError when fewer than ``LEAST_ROWS`` rows can be compared.
     """
-    parameters = with_resonance(parameters, axis)
+    parameters = add_resonance(parameters, axis)
     demand = _filled(demand_mm, "demand")
     offset = None if offset_mm is None else np.nan_to_num(offset_mm)
     position = float(_filled(position_mm, "position")[0])
-    start = closed_loop.standing(parameters, axis, position, standstill_a, float(demand[0]))
-    response = closed_loop.simulate(parameters, axis, sync_period_s, demand, offset, state=start)
+    start = closed_loop.create_standstill_state(parameters, axis, position, standstill_a, float(demand[0]))
+    response = closed_loop.simulate_axis(parameters, axis, sync_period_s, demand, offset, state=start)
     rows = np.flatnonzero(np.isfinite(demand_mm) & np.isfinite(position_mm))
     rows = rows[(rows >= _EDGE) & (rows < demand.size - _EDGE)]
     if rows.size < LEAST_ROWS:

@@ -10,7 +10,7 @@ from fdhil.identification.courses import voltage_terms_v
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.identifiability import untold
 from fdhil.identification.windows import carried
-from fdhil.model.feed_drive import discretise, simulate_plant
+from fdhil.model.feed_drive import discretise_plant, simulate_plant
 from fdhil.records import Estimate, Float, Parameters, Window
 
 LEAST_FIT_PERCENT = 80.0
@@ -96,7 +96,7 @@ def expected_fit_percent(window: Window, fit: Fit) -> float:
     noise = fit.problem.motions[0].noise
     own = fit.problem.noises[0].voltage_v
     p = Parameters(*fit.theta[:6])
-    step = discretise(p, fit.problem.motions[0].voltage_period_s)
+    step = discretise_plant(p, fit.problem.motions[0].voltage_period_s)
     push = step.mean[:, 0] / p.L * min(own, EXCESS * noise.voltage_v)
     # the steady state of P = phi P phi' + push push'
     spread = np.linalg.solve(np.eye(4) - np.kron(step.phi, step.phi), np.outer(push, push).ravel()).reshape(2, 2)

@@ -25,7 +25,7 @@ from fdhil.config import Axis, Identification
 from fdhil.config.nc_section import TOLERANCE_SHARE
 from fdhil.identification.filtering import moving_mean, quick_size
 from fdhil.identification.windows import carried
-from fdhil.model.terms import torque
+from fdhil.model.model_terms import compute_friction_torque
 from fdhil.records import Bool, Float, Parameters, Reason, Window, compute_rms
 from fdhil.validation.replay import Replay, replay_window
 
@@ -180,7 +180,7 @@ class Move:
         """Return the move of a window, with the friction of a model."""
         speed = carried(window.speed_rad_s)
         angle = 2 * math.pi / window.pitch_mm * carried(window.position_mm)
-        friction = np.where(side != 0, torque(parameters, np.abs(speed) * side, angle), 0.0)
+        friction = np.where(side != 0, compute_friction_torque(parameters, np.abs(speed) * side, angle), 0.0)
         moving = np.flatnonzero(side)
         first = int(moving[0]) if moving.size else 0
         begins = np.zeros(side.size, dtype=np.bool_)

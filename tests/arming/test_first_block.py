@@ -22,8 +22,8 @@ from fdhil.records import AxisSamples, Float, Parameters, freeze_array, freeze_i
 from studies import real_plant
 from studies.real_plant import Mechanics
 from tests.bench import bench_config
-from tests.model.slow_drive import SlowDrive
-from tests.paths import rms
+from tests.model.reference_drive import ReferenceDrive
+from tests.paths import compute_rms
 
 CONFIG = bench_config()
 MODELS = nominal_models(CONFIG)
@@ -52,11 +52,11 @@ def cut(program: Path, piece: Piece, amperes: dict[str, float], config: MachineC
     positions = []
     for axis, whole in reference.position_mm.items():
         path = whole[:CUT_ROWS]
-        drive = SlowDrive(MODELS[axis], config.axis[axis], 0.001)
+        drive = ReferenceDrive(MODELS[axis], config.axis[axis], 0.001)
         drive.i = drive.speed_sum = amperes[axis]
         drive.current_sum = MODELS[axis].R * amperes[axis]
         offset_mm = np.array(piece.offset[axis][:CUT_ROWS]) / config.axis[axis].scaling.increments_per_mm
-        positions.append(drive.run((path + config.axis[axis].drive.sign * offset_mm).tolist()))
+        positions.append(drive.follow_demand((path + config.axis[axis].drive.sign * offset_mm).tolist()))
     return contour_error_um(reference.path_mm, np.column_stack(positions), 0.001, 0)
 
 
@@ -73,8 +73,8 @@ def test_the_error_before_the_first_corner_is_gone(text: str, tmp_path: Path) ->
     anew = first.begin
     before, after = (cut(program, piece, amperes, CONFIG) for piece in (begin, anew))
     without = cut(program, begin, {"X": 0.0, "Y": 0.0}, CONFIG)
-    assert rms(after[:600]) < 0.2 * rms(before[:600])
-    assert rms(after) < 1.1 * rms(without)
+    assert compute_rms(after[:600]) < 0.2 * compute_rms(before[:600])
+    assert compute_rms(after) < 1.1 * compute_rms(without)
     assert anew.demand == begin.demand
     assert all(rows.offset[axis] == anew.offset[axis][: len(rows.offset[axis])] for axis in "XY")
     assert all(rows.demand[axis] == anew.demand[axis][: len(rows.offset[axis])] for axis in "XY")
@@ -105,7 +105,7 @@ def test_what_the_way_to_the_start_leaves_is_expected(tmp_path: Path) -> None:
     first.take(rows)
     amperes = {"X": -6.0, "Y": 5.0}
     before, after = (cut(program, piece, amperes, CONFIG) for piece in (begin, first.begin))
-    assert rms(after[:600]) < 0.3 * rms(before[:600])
+    assert compute_rms(after[:600]) < 0.3 * compute_rms(before[:600])
     assert first.renew(resting(amperes)) is None  # as it was expected
 
 
@@ -129,8 +129,8 @@ def test_a_load_shifts_what_the_axes_hold(tmp_path: Path) -> None:
             start = np.array([amperes[axis], 0.0, 0.0, 0.0, 0.0, amperes[axis], plant.R * amperes[axis]])
             positions.append(real_plant.run(plant, ordered * 1e-3, start=start).table_m * 1e3)
         error.append(contour_error_um(reference.path_mm, np.column_stack(positions), 0.001))
-    assert rms(error[1]) < 0.2 * rms(error[0])
-    assert rms(error[1]) < 0.3
+    assert compute_rms(error[1]) < 0.2 * compute_rms(error[0])
+    assert compute_rms(error[1]) < 0.3
 
 
 @pytest.mark.parametrize("rest", [{}, {"X": AtRest(0, 0, 3)}, {"X": AtRest(0, 0, 3), "Y": AtRest(5, 5, 3)}])

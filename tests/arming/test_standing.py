@@ -27,7 +27,7 @@ from fdhil.store import audit
 from tests.arming.guard_peer import Guard
 from tests.daemon.machine_rig import BENCH, fdhil
 from tests.daemon.simulated_machine import SimulatedMachine, config_of
-from tests.machine.virtual_time import HastyClock
+from tests.machine.virtual_time import ImpatientClock
 
 OFF: Mapping[str, Any] = {"ok": True, "state": "OFF", "cause": None, "may_stand_um": {"X": 0.0, "Y": 0.0}}
 ACTIVE = {**OFF, "state": "ACTIVE", "may_stand_um": {"X": -38.0, "Y": 0.0}}
@@ -214,7 +214,7 @@ async def test_disarm_is_ok_at_zero_only(config: MachineConfig, guard: Guard, fo
 
 async def test_disarm_that_never_reaches_zero_is_no(config: MachineConfig, guard: Guard, folder: Path) -> None:
     guard.says = lambda _kind: {**ACTIVE, "state": "RAMP_DOWN"}
-    desk = ArmingDesk(config, OutcomeStore(config), folder, HastyClock())
+    desk = ArmingDesk(config, OutcomeStore(config), folder, ImpatientClock())
     answer = await desk.disarm()
     assert (answer["ok"], answer["state"]) == (False, "RAMP_DOWN")
     assert "-38 um on axis X" in answer["text"]

@@ -22,7 +22,7 @@ from fdhil.program import program_digest
 from tests.arming.test_preparing import whole
 from tests.bench import bench_config, bench_document
 from tests.daemon.simulated_machine import config_of
-from tests.paths import bench_trajectory
+from tests.paths import build_bench_trajectory
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def test_rows_are_in_the_drives_increments_and_sign() -> None:
     document = copy.deepcopy(bench_document())
     document["axis"]["Y"]["drive"] = {"sign": -1}
     config = parse_config(document)
-    planned = correction.plan(bench_trajectory(10), nominal_models(config), config, "mirror")
+    planned = correction.plan(build_bench_trajectory(10), nominal_models(config), config, "mirror")
     position = planned.before.reference.position_mm
     rows = np.frombuffer(encoded(position, planned.offset_um, config), "<i4").reshape(-1, 4)
     per_mm = 65536 / 20

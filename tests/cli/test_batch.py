@@ -18,13 +18,13 @@ from fdhil.cli import batch
 from fdhil.cli.main import cli, run_safely
 from fdhil.config import Identification
 from fdhil.errors import FdhilError
-from fdhil.fleet import objects
-from fdhil.fleet.window_work import analyse_again
+from fdhil.fleet import window_files
+from fdhil.fleet.window_reanalysis import reanalyse_batch
 from fdhil.identification.windows import moving_range
 from fdhil.store.windows import read_window
 from studies import bench
 from tests.daemon.machine_rig import fdhil
-from tests.fleet import rapids
+from tests.fleet import stored_rapids
 from tests.identification.recorded import signals
 
 SETTINGS = Identification()
@@ -79,15 +79,15 @@ def test_a_folder_is_all_its_recordings_and_a_stored_window_the_bits_that_a_flee
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "objects"
-    windows = rapids.stored(folder, 1, 3)
+    windows = stored_rapids.store_rapids(folder, 1, 3)
     (folder / "notes.txt").write_text("no recording")
     code, out, _ = fdhil("identify", folder, "--method", "least_squares", "--json", capsys=capsys)
     files = {Path(file["file"]).stem: file for file in json.loads(out)["files"]}
     assert (code, sorted(files)) == (0, sorted(window.name for window in windows))
-    for again in analyse_again(windows, rapids.method(folder)):
+    for again in reanalyse_batch(windows, stored_rapids.create_method(folder)):
         (told,) = files[again.window.name]["windows"]
         fleet = json.loads(again.text)
-        window = read_window(objects.path_of(folder, again.window.name))
+        window = read_window(window_files.build_window_path(folder, again.window.name))
         assert told["start_s"] == round(window.start_s + moving_range(window)[0] * window.dt_s, 6)  # original time
         assert told["validated"] == fleet["accepted"]
         assert told["fit_percent"] == fleet["fit_percent"]

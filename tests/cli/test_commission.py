@@ -141,7 +141,7 @@ def test_what_was_stopped_goes_on_where_it_ended(bench: Bench, monkeypatch: pyte
 
     code, out, _ = bench.commission("--yes", "--dry-run")
     assert out.count("skipped if the drive is unchanged") == 3
-    bench.peer.drive.set_object(0x6085, 0, 1_000_000)  # changed by the vendor's tool
+    bench.peer.drive.overwrite_object(0x6085, 0, 1_000_000)  # changed by the vendor's tool
     code, out, _ = bench.commission("--yes")
     assert (code, "skipped" in out, "step 4 of 7, sign test: Moving" in out) == (0, False, True)
 
@@ -174,7 +174,7 @@ def test_an_axis_is_tried_where_the_operator_agrees_and_known_to_the_history(
 
     beats = bench.peer.heard.count(0x700 + machine_config.load_config(bench.file).play.node_id)
     assert beats > 4  # the drive stops by itself after this process ends
-    assert [bench.peer.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
+    assert [bench.peer.drive.dictionary.get_number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
 
     heard = len(bench.peer.heard)
     code, out, _ = bench.commission("--yes", "--json", "--room", "-2", "130")
@@ -213,7 +213,7 @@ def other_eds(bench: Bench) -> None:
 
 
 def set_object(index: int, sub: int, value: int) -> Callable[[Bench], None]:
-    return lambda bench: bench.peer.drive.set_object(index, sub, value)
+    return lambda bench: bench.peer.drive.overwrite_object(index, sub, value)
 
 
 def fault(name: str, value: object) -> Callable[[Bench], None]:
@@ -233,7 +233,7 @@ WRONG: dict[str, tuple[Callable[[Bench], None], str, bool]] = {
         said("node_id = 1\n", "node_id = 1\nincrements_per_rev = 16384\n"), "but the configuration has 16384", False),
     "rated current": (set_object(0x6075, 0, 10_000), "its rated current is 10 A (0x6075)", False),
     "mapping": (
-        lambda b: b.peer.drive.remap(0x1A01, [(0x6041, 0, 16), (0x2101, 0, 16), (0x6078, 0, 16)]),
+        lambda b: b.peer.drive.overwrite_mapping(0x1A01, [(0x6041, 0, 16), (0x2101, 0, 16), (0x6078, 0, 16)]),
         "TPDO2 maps 60410010, 21010010, 60780010", False),
     "offset of another node": (set_object(0x1401, 1, 0x305), "RPDO2 has the COB-ID 00000305", False),
     "other EDS": (other_eds, "choose another profile", False),
@@ -297,7 +297,7 @@ def test_a_wrong_set_up_is_refused(what: str, bench: Bench) -> None:
     assert "Traceback" not in err
     assert (0x080 in bench.peer.heard) is switched_on
     assert bench.peer.drive.power.state.name == "SWITCH_ON_DISABLED"
-    assert bench.peer.drive.dictionary.number(0x60B0) == 0
+    assert bench.peer.drive.dictionary.get_number(0x60B0) == 0
     assert load_record(bench.store, "X") is None
 
 

@@ -15,7 +15,7 @@ import can
 import numpy as np
 import pytest
 
-from tests.sim.twin_process import TwinProcess, write_config
+from tests.sim.simulator_process import SimulatorProcess, write_config
 
 pytestmark = pytest.mark.usefixtures("processes")
 
@@ -36,9 +36,9 @@ PATIENCE_S = 300.0
 
 
 @pytest.fixture(scope="module")
-def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TwinProcess, Path]]:
+def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[SimulatorProcess, Path]]:
     folder = tmp_path_factory.mktemp("twin")
-    with TwinProcess(write_config(folder, axes="X")) as running:
+    with SimulatorProcess(write_config(folder, axes="X")) as running:
         joined = folder / "joined"
         joined.mkdir()
         file = write_config(joined, bus=f'interface = "socketcand"\nport = {running.bus_settings["port"]}', axes="X")
@@ -47,11 +47,11 @@ def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TwinProcess
 
 
 @contextmanager
-def rapid(twin: tuple[TwinProcess, Path]) -> Iterator[tuple[subprocess.Popen[str], Callable[[], can.Message]]]:
+def rapid(twin: tuple[SimulatorProcess, Path]) -> Iterator[tuple[subprocess.Popen[str], Callable[[], can.Message]]]:
     running, file = twin
     command = [sys.executable, "-c", QUICK, "commission", str(file), "--yes", "--room", "-2", "150"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    with running.join() as bus, process:
+    with running.join_bus() as bus, process:
         deadline = time.monotonic() + PATIENCE_S
 
         def heard() -> can.Message:
@@ -74,7 +74,7 @@ def target_of(frame: can.Message) -> int | None:
     return struct.unpack("<Hi", frame.data)[1] if frame.arbitration_id == 0x201 else None
 
 
-def test_a_stopped_trial_brakes_and_switches_off(twin: tuple[TwinProcess, Path]) -> None:
+def test_a_stopped_trial_brakes_and_switches_off(twin: tuple[SimulatorProcess, Path]) -> None:
     with rapid(twin) as (process, heard):
         process.send_signal(signal.SIGTERM)
         targets: list[int] = []

@@ -25,11 +25,11 @@ from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.record import load_record
 from fdhil.commissioning.void import is_void, void_record
 from fdhil.config import load_config
-from fdhil.sim.drive.objects import serial_number
-from fdhil.sim.wire.hub import Hub
+from fdhil.sim.drive.drive_objects import compute_serial_number
+from fdhil.sim.wire.tcp_hub import TcpHub
 from tests.arming.guard_peer import Guard
 from tests.sim.hub_thread import HubThread
-from tests.sim.twin_process import TwinProcess, write_config
+from tests.sim.simulator_process import SimulatorProcess, write_config
 
 # other waits than on a real machine: module, name, value
 WAITS: tuple[tuple[str, str, float], ...] = (
@@ -56,7 +56,7 @@ main()
 
 @dataclass
 class Bench:
-    twin: TwinProcess
+    twin: SimulatorProcess
     folder: Path
 
     def config(
@@ -70,7 +70,7 @@ class Bench:
         return path
 
     def fault(self, index: int, value: int) -> None:
-        with self.twin.join() as bus:
+        with self.twin.join_bus() as bus:
             size = {0x6007: 2, 0x6065: 4, 0x1017: 2, 0x1801: 1}[index]
             head = 0x23 | (4 - size) << 2
             bus.send(message(0x601, bytes([head, index & 0xFF, index >> 8, 0]) + value.to_bytes(4, "little")))
@@ -124,7 +124,7 @@ def points(checked: dict[str, Any], state: str) -> dict[str, dict[str, str]]:
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory, processes: None) -> Iterator[Bench]:
     folder = tmp_path_factory.mktemp("bench")
-    with TwinProcess(write_config(folder)) as twin:
+    with SimulatorProcess(write_config(folder)) as twin:
         yield Bench(twin, folder)
 
 
@@ -143,7 +143,7 @@ def test_a_scan_lists_the_drives_with_their_eds(fdhil: Said, bench: Bench) -> No
         "vendor_id": 0x46444849,
         "product_code": 0x402,
         "revision": 0x10000,
-        "serial": serial_number(load_config(bench.config()), "Y"),
+        "serial": compute_serial_number(load_config(bench.config()), "Y"),
     }
     assert answers["name"] == "fdhil twin drive"
     assert answers["device_type"] & 0xFFFF == 402
@@ -337,7 +337,7 @@ def overheard(bench: Bench) -> Iterator[list[int]]:
     def keep(frame: can.Message) -> None:
         heard.append(frame.arbitration_id)
 
-    with bench.twin.join() as bus:
+    with bench.twin.join_bus() as bus:
         notifier = can.Notifier(bus, [keep], timeout=0.05)
         try:
             yield heard
@@ -359,7 +359,7 @@ def test_an_axis_is_commissioned_and_signed_off(fdhil: Said, bench: Bench) -> No
     assert record is not None
     assert (record.watchdog, record.serial, record.options["1017"]) == (
         "proven",
-        serial_number(load_config(config), "X"),
+        compute_serial_number(load_config(config), "X"),
         100,
     )
 
@@ -394,7 +394,7 @@ def test_a_stopped_commissioning_leaves_the_drive_off(fdhil: Said, bench: Bench)
         for line in process.stdout:
             if "sign test" in line:
                 break
-        with bench.twin.join() as bus:
+        with bench.twin.join_bus() as bus:
             process.send_signal(signal.SIGTERM)
             controlwords = words_until_pre_operational(bus)
         _, err = process.communicate()
@@ -425,7 +425,7 @@ def test_an_unknown_axis_is_told(fdhil: Said, bench: Bench) -> None:
 
 @pytest.mark.usefixtures("real_time")
 def test_a_bus_without_a_node_is_told(fdhil: Said, tmp_path: Path) -> None:
-    hub = HubThread(Hub("can0"))
+    hub = HubThread(TcpHub("can0"))
     hub.start()
     try:
         config = write_config(tmp_path, bus=f'interface = "socketcand"\nport = {hub.hub.settings["port"]}')
@@ -447,11 +447,11 @@ def test_help_tells_what_is_sent(fdhil: Said, command: str) -> None:
 def cut(fdhil: Said, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
     for module in ("scan", "config_check", "survey"):
         monkeypatch.setattr(f"fdhil.commissioning.{module}.LISTEN_S", LISTEN_S)
-    bench.twin.command("nc", on=True)
-    assert bench.twin.event("nc")["on"]
+    bench.twin.send_command("nc", on=True)
+    assert bench.twin.wait_for_event("nc")["on"]
     yield bench
-    bench.twin.command("nc", on=False)
-    assert not bench.twin.event("nc")["on"]
+    bench.twin.send_command("nc", on=False)
+    assert not bench.twin.wait_for_event("nc")["on"]
 
 
 def undisturbed(fdhil: Said, cut: Bench, *arguments: object, code: int = 0) -> str:

@@ -16,7 +16,7 @@ from fdhil.store.history import History
 from fdhil.store.rows import Stamp
 from tests.cli.test_predict import _bench as _bench
 from tests.cli.test_predict import invoke, remember
-from tests.paths import bench_trajectory, smooth, trajectory
+from tests.paths import build_bench_trajectory, build_trajectory, smooth_demand
 
 
 def one_corner(folder: Path) -> Path:
@@ -26,7 +26,7 @@ def one_corner(folder: Path) -> Path:
         [np.append(ramp, np.full(480, 30.0)), np.concatenate([np.zeros(180), ramp, np.full(300, 30.0)])]
     )
     path = folder / "corner.csv"
-    write_demand_csv(trajectory(smooth(corner, (0.060, 0.030), 0.001)), path)
+    write_demand_csv(build_trajectory(smooth_demand(corner, (0.060, 0.030), 0.001)), path)
     return path
 
 
@@ -48,7 +48,7 @@ def test_writes_json_and_csv(bench: Path) -> None:
 
 
 def test_a_refusal_writes_zeros_and_exits_1(bench: Path) -> None:
-    write_demand_csv(bench_trajectory(20, (0.030, 0.015)), bench / "fast.csv")
+    write_demand_csv(build_bench_trajectory(20, (0.030, 0.015)), bench / "fast.csv")
     out = bench / "out.csv"
     result = invoke("correct", bench / "fast.csv", "--config", bench / "bench.toml", "--json", "--out", out)
     assert result.exit_code == 1

@@ -25,8 +25,8 @@ from fdhil.store.history import HISTORY_FILE_NAME, History
 from fdhil.store.rows import Stamp
 from tests.bench import bench_document
 from tests.drivers.peer import DrivePeer
-from tests.heeding_modes import HEEDING_MODES
 from tests.short_waits import shorten_waits
+from tests.unprivileged_command import UNPRIVILEGED
 
 
 @pytest.fixture(autouse=True)
@@ -261,7 +261,7 @@ def test_what_could_be_better_comes_last_and_is_no_failure(pc: Pc, monkeypatch: 
 def test_a_store_that_may_not_be_entered_is_told_and_the_rest_examined(pc: Pc) -> None:
     pc.document["store"]["run_directory"] = str(pc.folder / "run")
     History.open(pc.store).close()
-    command = [*HEEDING_MODES, sys.executable, "-m", "fdhil", "doctor", str(pc.write()), "--json", "--offline"]
+    command = [*UNPRIVILEGED, sys.executable, "-m", "fdhil", "doctor", str(pc.write()), "--json", "--offline"]
     pc.store.chmod(0)
     try:
         done = subprocess.run(command, capture_output=True, text=True)

@@ -12,15 +12,15 @@ from fdhil import config as machine_config
 from fdhil.cli.doctor.offers import examine_offers
 from fdhil.config import MachineConfig
 from fdhil.store.offers import ANSWERS_FILE, Answer, add_answer, file_name
-from tests.fleet.offers import Works, machine_of
+from tests.fleet.offer_signing import OfferSigner, create_machine
 
 
 @pytest.fixture
 def machine(tmp_path: Path) -> MachineConfig:
-    works = Works(tmp_path)
-    config = machine_config.load_config(machine_of(works, tmp_path / "mill"))
+    works = OfferSigner(tmp_path)
+    config = machine_config.load_config(create_machine(works, tmp_path / "mill"))
     config.offers_directory.mkdir(parents=True)
-    (config.offers_directory / file_name("friction", 3)).write_bytes(works.document())
+    (config.offers_directory / file_name("friction", 3)).write_bytes(works.sign_document())
     return config
 
 
@@ -57,4 +57,4 @@ def test_where_no_works_is_trusted_nothing_is_looked_at(machine: MachineConfig) 
 
 
 def test_no_offer_is_no_trouble(tmp_path: Path) -> None:
-    assert told(machine_config.load_config(machine_of(Works(tmp_path), tmp_path / "mill"))) == []
+    assert told(machine_config.load_config(create_machine(OfferSigner(tmp_path), tmp_path / "mill"))) == []

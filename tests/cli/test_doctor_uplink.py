@@ -14,8 +14,8 @@ import pytest
 from fdhil.cli.doctor.uplink import examine_uplink
 from fdhil.store import HISTORY_FILE
 from fdhil.store.outbox import POSITION_FILE, OutboxReader, Position, write_position
-from tests.fleet.machine import Machine, written
-from tests.held_port import held_port
+from tests.fleet.recording_machine import RecordingMachine, write_history
+from tests.reserved_port import reserve_port
 
 JETSTREAM = b'INFO {"server_id":"A","jetstream":true}\r\n'
 
@@ -38,50 +38,50 @@ def answering(words: bytes) -> Iterator[tuple[str, list[bytes]]]:
         thread.join(10)
 
 
-def recorded(folder: Path, **uplink: str) -> Machine:
+def recorded(folder: Path, **uplink: str) -> RecordingMachine:
     """Return a machine with records that are marked as sent."""
-    machine = Machine(written(folder, **uplink))
-    machine.record(1)
+    machine = RecordingMachine(write_history(folder, **uplink))
+    machine.record_windows(1)
     machine.config.uplink_directory.mkdir()
     with OutboxReader(machine.config.store.directory) as reader:
         last = reader.entries(0, 100)[-1]
         write_position(machine.config.uplink_directory, Position(reader.store, last.number, last.message))
-    machine.close()
+    machine.close_store()
     return machine
 
 
-def codes(machine: Machine, offline: bool = True) -> list[str]:
+def codes(machine: RecordingMachine, offline: bool = True) -> list[str]:
     troubles = list(examine_uplink(machine.config, offline))
     assert all(trouble.what and trouble.means and trouble.mend for trouble in troubles)
     return [trouble.code for trouble in troubles]
 
 
-def change(machine: Machine, statement: str) -> None:
+def change(machine: RecordingMachine, statement: str) -> None:
     with closing(sqlite3.connect(machine.config.store.directory / HISTORY_FILE)) as db, db:
         db.execute(statement)
 
 
-def waits(machine: Machine) -> None:
+def waits(machine: RecordingMachine) -> None:
     (machine.config.uplink_directory / POSITION_FILE).unlink()
     change(machine, "DELETE FROM outbox WHERE of = 'windows'")
     change(machine, "UPDATE revisions SET wall_s = 5")  # damaged, with an invalid time
 
 
-def damaged_position(machine: Machine) -> None:
+def damaged_position(machine: RecordingMachine) -> None:
     (machine.config.uplink_directory / POSITION_FILE).write_text("{")
 
 
-def folder_is_a_file(machine: Machine) -> None:
+def folder_is_a_file(machine: RecordingMachine) -> None:
     (machine.config.uplink_directory / POSITION_FILE).unlink()
     machine.config.uplink_directory.rmdir()
     machine.config.uplink_directory.write_text("")
 
 
-def dropped(machine: Machine) -> None:
+def dropped(machine: RecordingMachine) -> None:
     change(machine, "UPDATE outbox_of SET dropped = 3")
 
 
-PLANTED: dict[Callable[[Machine], None], list[str]] = {
+PLANTED: dict[Callable[[RecordingMachine], None], list[str]] = {
     waits: ["UplinkWaits"],
     damaged_position: ["UplinkPosition"],
     folder_is_a_file: ["UplinkFolder"],
@@ -90,7 +90,7 @@ PLANTED: dict[Callable[[Machine], None], list[str]] = {
 
 
 @pytest.mark.parametrize("plant", PLANTED, ids=lambda plant: plant.__name__)
-def test_a_planted_trouble_is_told(plant: Callable[[Machine], None], tmp_path: Path) -> None:
+def test_a_planted_trouble_is_told(plant: Callable[[RecordingMachine], None], tmp_path: Path) -> None:
     machine = recorded(tmp_path)
     assert codes(machine) == []
     plant(machine)
@@ -137,5 +137,5 @@ def test_who_answers_is_heard_and_told_nothing(words: bytes, told: str, tmp_path
 
 
 def test_nobody_answers(tmp_path: Path) -> None:
-    with held_port() as port:
+    with reserve_port() as port:
         assert codes(recorded(tmp_path, server=f"nats://127.0.0.1:{port}"), offline=False) == ["UplinkServer"]

@@ -41,5 +41,5 @@ def test_exchanged_cascade_follows_a_rapid_alike() -> None:
     pid, exchanged = equivalent_loops(cascade)
     assert (pid["structure"], exchanged["structure"]) == ("pid", "p_pi_pi")
     other = axis.model_copy(update={"regulators": Regulators.model_validate(g.model_dump() | dict(exchanged))})
-    places = [closed_loop.simulate(model, each, 0.001, demand_mm).position_mm for each in (axis, other)]
+    places = [closed_loop.simulate_axis(model, each, 0.001, demand_mm).position_mm for each in (axis, other)]
     assert 1e3 * np.abs(places[1] - places[0]).max() < 0.02 * 1e3 * np.abs(places[0] - demand_mm).max()

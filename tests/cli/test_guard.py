@@ -26,7 +26,7 @@ from fdhil.guard.guard_settings import load_settings
 from fdhil.guard.offset_limits import OffsetLimits
 from tests.arming.test_guard_settings import RECORD
 from tests.guard.drive_peer import Peer, hold_demand, write_config
-from tests.held_port import held_port
+from tests.reserved_port import reserve_port
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -76,7 +76,7 @@ def test_without_a_correction_section_writing_is_off(
 def test_no_hub_is_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with held_port() as port:
+    with reserve_port() as port:
         assert run(monkeypatch, str(write_config(tmp_path, port))) == 3
     told = capsys.readouterr().err
     assert "start the hub first" in told

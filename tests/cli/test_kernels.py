@@ -31,7 +31,7 @@ print(*sorted({m.__file__ for m in modules if any(vars(m).get(name) is k for nam
 # one small kernel: how two processes keep it does not depend on its size
 ONE = """
 import numpy
-from fdhil.sim.drive.physics import _coast
+from fdhil.sim.drive.plant_physics import _coast
 _coast(numpy.zeros(6), 0.0, numpy.array([0.5, 0.005, 0.8, 0.075, 0.05, 5.0]), 6.25e-5)
 print(sum(_coast.stats.cache_hits.values()))
 """

@@ -23,7 +23,7 @@ from studies import real_plant as real
 from tests.bench import bench_toml
 from tests.cli.test_predict import invoke as run
 from tests.identification.test_loops import shuttle
-from tests.paths import bench_trajectory, rms
+from tests.paths import build_bench_trajectory, compute_rms
 from tests.store.made import published
 
 MECHANICS, LOOPS = real.Mechanics(), real.Loops(speed_filter_s=0.002)
@@ -97,7 +97,7 @@ def test_model_of_recordings_without_a_configuration_says_that_its_loops_are_not
 
 def assert_corrected(shop: Shop, *source: str | Path) -> None:
     """Plan a correction of the bench path with a model, and simulate the real drives with it."""
-    reference, out = bench_trajectory(10), shop.folder / "out.csv"
+    reference, out = build_bench_trajectory(10), shop.folder / "out.csv"
     write_demand_csv(reference, shop.folder / "demand.csv")
     result = invoke("correct", shop.folder / "demand.csv", "--config", shop.config, "--out", out, *source)
     assert result.exit_code == 0, result.output
@@ -106,8 +106,8 @@ def assert_corrected(shop: Shop, *source: str | Path) -> None:
     demand = np.column_stack([reference.position_mm[axis] for axis in "XY"])
     offset = np.column_stack([[float(row[f"{axis}_offset_um"]) / 1e3 for row in rows] for axis in "XY"])
     before, after = (contour_error_um(demand, table_mm(order), reference.dt_s) for order in (demand, demand + offset))
-    assert rms(before) > 30.0
-    assert rms(after) < 0.5
+    assert compute_rms(before) > 30.0
+    assert compute_rms(after) < 0.5
     assert (after - before).max() < WORSE_UM
 
 

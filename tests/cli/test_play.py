@@ -20,7 +20,7 @@ import pytest
 from fdhil import config as machine_config
 from fdhil.store import audit
 from tests.integration.conftest import sign_off
-from tests.sim.twin_process import TwinProcess, write_config
+from tests.sim.simulator_process import SimulatorProcess, write_config
 
 pytestmark = pytest.mark.usefixtures("processes")
 
@@ -74,7 +74,7 @@ class Relay:
 
 @dataclass
 class Shop:
-    twin: TwinProcess
+    twin: SimulatorProcess
     folder: Path
     bus: can.BusABC
 
@@ -153,7 +153,7 @@ class Shop:
 @pytest.fixture(scope="module")
 def shop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shop]:
     folder = tmp_path_factory.mktemp("play")
-    with TwinProcess(write_config(folder)) as twin, twin.join() as bus:
+    with SimulatorProcess(write_config(folder)) as twin, twin.join_bus() as bus:
         made = Shop(twin, folder, bus)
         sign_off(machine_config.load_config(made.config(twin.bus_settings["port"])))
         yield made

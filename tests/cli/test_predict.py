@@ -18,13 +18,13 @@ from fdhil.records import Parameters, ParameterSet, freeze_array
 from fdhil.store.history import History
 from fdhil.store.rows import Stamp
 from tests.bench import bench_toml
-from tests.paths import bench_trajectory
+from tests.paths import build_bench_trajectory
 
 
 @pytest.fixture(name="bench")
 def _bench(tmp_path: Path) -> Path:
     (tmp_path / "bench.toml").write_text(bench_toml())
-    write_demand_csv(bench_trajectory(10), tmp_path / "demand.csv")
+    write_demand_csv(build_bench_trajectory(10), tmp_path / "demand.csv")
     return tmp_path
 
 
@@ -56,7 +56,7 @@ def test_writes_json_and_csv(bench: Path) -> None:
         *(f"{axis}_{name}" for axis in "XY" for name in ("reference_mm", "predicted_mm", "error_um")),
         "contour_error_um",
     ]
-    assert len(rows) == len(bench_trajectory(10).time_s)
+    assert len(rows) == len(build_bench_trajectory(10).time_s)
     largest = max(float(row["contour_error_um"]) for row in rows)
     assert largest == pytest.approx(document["contour"]["max_um"], abs=1e-3)
     assert len(rows[0]["X_reference_mm"].split(".")[1]) >= 6

@@ -15,7 +15,7 @@ import pytest
 from fdhil import config as configuration
 from fdhil.program import load_trajectory
 from fdhil.records import Float, Trajectory
-from tests.sim.twin_process import TwinProcess, write_config
+from tests.sim.simulator_process import SimulatorProcess, write_config
 
 pytestmark = pytest.mark.usefixtures("processes")
 
@@ -24,16 +24,16 @@ NC = '[nc]\nprofile = "jerk_limited"\n'
 
 
 @pytest.fixture(scope="module")
-def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TwinProcess, Path]]:
+def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[SimulatorProcess, Path]]:
     folder = tmp_path_factory.mktemp("twin")
     path = write_config(folder, sim="modbus = false")
     path.write_text(path.read_text() + NC)
-    with TwinProcess(path) as process:
+    with SimulatorProcess(path) as process:
         place = process.ready["buses"]["can0"]
         joined = write_config(folder, bus=f'interface = "socketcand"\nport = {place["port"]}')
         joined.write_text(joined.read_text() + NC)
-        process.command("nc", on=True)
-        process.event("nc")
+        process.send_command("nc", on=True)
+        process.wait_for_event("nc")
         yield process, joined
 
 
@@ -53,12 +53,12 @@ def increments(reference: Trajectory) -> Float:
     return np.round(np.column_stack(list(reference.position_mm.values())) * (65536 / 20))
 
 
-def test_a_recorded_program_is_its_demand_to_the_increment(twin: tuple[TwinProcess, Path], tmp_path: Path) -> None:
+def test_a_recorded_program_is_its_demand_to_the_increment(twin: tuple[SimulatorProcess, Path], tmp_path: Path) -> None:
     process, config = twin
     program, out = tmp_path / "program.ngc", tmp_path / "demand.csv"
     program.write_text(PROGRAM)
     recording = Recording(config, out, "--rest", "0.6")
-    process.command("play", file=str(program))
+    process.send_command("play", file=str(program))
     code, document = recording.end()
     assert (code, document["complete"], document["gaps"]) == (0, True, []), document
     machine = configuration.load_config(config)
@@ -69,7 +69,7 @@ def test_a_recorded_program_is_its_demand_to_the_increment(twin: tuple[TwinProce
     np.testing.assert_array_equal(heard[:rows], ordered[first : first + rows])
 
 
-def test_without_a_motion_there_is_nothing_to_write(twin: tuple[TwinProcess, Path], tmp_path: Path) -> None:
+def test_without_a_motion_there_is_nothing_to_write(twin: tuple[SimulatorProcess, Path], tmp_path: Path) -> None:
     out = tmp_path / "demand.csv"
     recording = Recording(twin[1], out)
     recording.process.send_signal(signal.SIGINT)
@@ -79,13 +79,13 @@ def test_without_a_motion_there_is_nothing_to_write(twin: tuple[TwinProcess, Pat
     assert not out.exists()
 
 
-def test_a_demand_with_a_hole_is_not_written(twin: tuple[TwinProcess, Path], tmp_path: Path) -> None:
+def test_a_demand_with_a_hole_is_not_written(twin: tuple[SimulatorProcess, Path], tmp_path: Path) -> None:
     process, config = twin
     program, out = tmp_path / "program.ngc", tmp_path / "demand.csv"
     program.write_text("G1 X12 Y12 F6000\nM2\n")
     recording = Recording(config, out, "--rest", "0.3")
-    process.command("fault", axis="X", fault="drop_tpdo", value=1, duration_s=0.005, at_row=60)
-    process.command("play", file=str(program))
+    process.send_command("fault", axis="X", fault="drop_tpdo", value=1, duration_s=0.005, at_row=60)
+    process.send_command("play", file=str(program))
     code, document = recording.end()
     assert code == 1, document
     assert not document["complete"]

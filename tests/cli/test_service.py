@@ -26,9 +26,9 @@ from fdhil.records import Notice
 from fdhil.report.parameter_view import cell, half_of
 from tests.daemon.machine_rig import BENCH, fdhil
 from tests.daemon.simulated_machine import config_of
-from tests.heeding_modes import HEEDING_MODES
-from tests.held_port import held_port
+from tests.reserved_port import reserve_port
 from tests.store.made import outcome, published
+from tests.unprivileged_command import UNPRIVILEGED
 
 
 @pytest.fixture
@@ -210,7 +210,7 @@ def test_a_daemon_that_may_not_be_asked_is_not_told_to_be_away(machine: Path) ->
         server.bind(str(place))
         server.listen()
         place.chmod(0)
-        command = [*HEEDING_MODES, sys.executable, "-m", "fdhil", "status", str(machine)]
+        command = [*UNPRIVILEGED, sys.executable, "-m", "fdhil", "status", str(machine)]
         done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (3, "")
     assert "daemon: does not accept this user (Permission denied), so that it is unknown whether it runs" in done.stderr
@@ -234,7 +234,7 @@ def test_a_wrong_method_or_config_is_2(machine: Path, tmp_path: Path, capsys: An
 
 def test_run_on_a_bus_that_is_not_there_is_3_and_one_sentence(tmp_path: Path, capsys: Any) -> None:
     path = tmp_path / "machine.toml"
-    with held_port() as port:
+    with reserve_port() as port:
         path.write_text(f'{BENCH}[bus.can0]\ninterface = "socketcand"\nport = {port}\n')
         code, out, err = fdhil("run", path, "--method", "least_squares", capsys=capsys)
     assert (code, out) == (3, "")

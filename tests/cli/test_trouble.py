@@ -16,7 +16,7 @@ import pytest
 from fdhil.cli.main import cli, leaves
 from tests.bench import axis_toml, bench_toml
 from tests.daemon.machine_rig import fdhil
-from tests.held_port import held_port
+from tests.reserved_port import reserve_port
 
 DONE, USAGE, TROUBLE = 0, 2, 3
 LEAVES = dict(leaves(cli))
@@ -273,7 +273,7 @@ def test_a_port_that_is_taken_is_3(capsys: Any) -> None:
 
 @pytest.mark.parametrize("command", ["scan", "check", "commission", "record", "run"])
 def test_a_bus_that_is_not_there_is_3(command: str, capsys: Any) -> None:
-    with held_port() as port:
+    with reserve_port() as port:
         Path("absent_bus.toml").write_text(bench_toml() + f'[bus.can0]\ninterface = "socketcand"\nport = {port}\n')
         arguments = [text.format(config="absent_bus.toml") for text in WITH_CONFIG[command]]
         assert f"127.0.0.1:{port} cannot be reached" in told(capsys, TROUBLE, command, *arguments)

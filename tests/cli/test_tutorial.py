@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from fdhil.child_process import wrap_to_end_with_parent
-from tests.ports import free_port
+from tests.free_ports import find_free_port
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs/tutorial/an-hour.md"
@@ -66,7 +66,7 @@ class Terminal:
 
 class Desk:
     def __init__(self, folder: Path) -> None:
-        self._ports = {"29536": str(free_port()), "port = 5020": "port = 0", "port = 5021": "port = 0"}
+        self._ports = {"29536": str(find_free_port()), "port = 5020": "port = 0", "port = 5021": "port = 0"}
         shutil.copytree(ROOT / "configs", folder / "configs", symlinks=True)
         shipped = folder / "configs/sim.toml"
         shipped.write_text(self._with_free_ports(shipped.read_text("utf-8")), "utf-8")

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from fdhil.cli.main import cli, leaves
-from fdhil.sim.wire.hub import Hub
+from fdhil.sim.wire.tcp_hub import TcpHub
 from tests.daemon.machine_rig import fdhil
 from tests.sim.hub_thread import HubThread
-from tests.sim.twin_process import write_config
+from tests.sim.simulator_process import write_config
 
 Said = tuple[int, str, str]
 
@@ -147,7 +147,7 @@ def test_a_standard_error_that_takes_nothing_leaves_the_exit_code(command: str, 
 
 @pytest.mark.usefixtures("real_time")
 def test_a_bus_without_drives_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    hub = HubThread(Hub("can0"))
+    hub = HubThread(TcpHub("can0"))
     hub.start()
     try:
         port = hub.hub.settings["port"]
@@ -161,7 +161,7 @@ def test_a_bus_without_drives_is_told(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_a_sensor_that_is_not_there_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    hub = HubThread(Hub("can0"))
+    hub = HubThread(TcpHub("can0"))
     hub.start()
     try:
         bus = f'interface = "socketcand"\nport = {hub.hub.settings["port"]}'

@@ -30,11 +30,11 @@ class Spoilt(DrivePeer):
 
     def rpdo(self) -> int:
         """COB-ID of the RPDO with both offsets."""
-        return self.drive.dictionary.number(0x1402, 1)
+        return self.drive.dictionary.get_number(0x1402, 1)
 
     def held(self) -> tuple[int, int]:
         """Active speed and torque offset."""
-        return self.drive.dictionary.number(0x60B1), self.drive.dictionary.number(0x60B2)
+        return self.drive.dictionary.get_number(0x60B1), self.drive.dictionary.get_number(0x60B2)
 
 
 pytestmark = pytest.mark.usefixtures("quick_commissioning")
@@ -125,7 +125,7 @@ def test_another_mapping_is_refused_before_anything_is_written(
     entries: list[tuple[int, int, int]], peer: tuple[Spoilt, MachineConfig]
 ) -> None:
     drive, settings = peer
-    drive.drive.remap(0x1602, entries)
+    drive.drive.overwrite_mapping(0x1602, entries)
     with pytest.raises(DriveFault, match=r"FeedforwardOff: its RPDO3 maps .* instead of 60B1 and 60B2"):
         commission(settings, "X")
     assert drive.rpdo() == NOT_VALID

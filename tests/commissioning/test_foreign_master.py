@@ -70,7 +70,7 @@ class Rig:
             assert nc.count(LEFT_TO_IT[what]) <= 1
         if what != "offset":
             assert [offset_of(frame) for frame in nc.sent if frame[0] == OFFSET][-1:] in ([], [0])
-            assert self.holds(lambda: self.peer.drive.dictionary.number(0x60B0) == 0)
+            assert self.holds(lambda: self.peer.drive.dictionary.get_number(0x60B0) == 0)
         if what != "target":
             off = ("SWITCH_ON_DISABLED", "FAULT", "FAULT_REACTION_ACTIVE")
             assert self.holds(lambda: self.peer.drive.power.state.name in off)
@@ -230,7 +230,7 @@ def test_a_drive_that_an_nc_stops_and_starts_is_left_without_an_offset(rig: Rig)
     zeroed, thread = threading.Event(), threading.Thread(target=stop_and_start)
     with pytest.raises(ForeignMaster, match=r"NMT commands; .* axis X was left to that master, its offset set to zero"):
         led_through(rig.config, hold)
-    assert rig.holds(lambda: rig.peer.drive.dictionary.number(0x60B0) == 0)
+    assert rig.holds(lambda: rig.peer.drive.dictionary.get_number(0x60B0) == 0)
     zeroed.set()
     thread.join()
     assert rig.peer.heard.count(NMT) == 3  # our start, then the NC's own two

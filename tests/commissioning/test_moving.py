@@ -80,7 +80,7 @@ def test_a_drive_that_trips_ends_the_motion(enabled: Enabled) -> None:
     def trip() -> None:
         path = enabled.master.loop.path
         if path is not None and path.cycles > 30 and enabled.master.state() is PowerState.OPERATION_ENABLED:
-            enabled.peer.drive.trip(0x3210)
+            enabled.peer.drive.trip_fault(0x3210)
 
     with pytest.raises(DriveFault, match="its drive fell from Operation enabled"):
         move([enabled.master], [enabled.bounds], enabled.way(40.0), trip)

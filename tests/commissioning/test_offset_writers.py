@@ -24,7 +24,7 @@ from fdhil.commissioning.survey import Survey, survey
 from fdhil.commissioning.void import is_void
 from fdhil.config import MachineConfig, parse_config
 from fdhil.errors import DriveFault
-from fdhil.sim.drive.eds import eds_text
+from fdhil.sim.drive.eds_writer import format_eds
 from tests.bench import bench_document
 from tests.drivers.frame_builder import build_machine_config
 from tests.drivers.peer import DrivePeer
@@ -58,10 +58,10 @@ def give_rpdo(peer: DrivePeer, number: int, cob_id: int, words: Sequence[int], c
             dictionary.entries[index << 8 | entry.sub] = replace(entry, index=index)
             dictionary.numbers[index << 8 | entry.sub] = 0
         dictionary.indices.add(index)
-    peer.drive.set_object(0x1400 + number - 1, 1, cob_id)
+    peer.drive.overwrite_object(0x1400 + number - 1, 1, cob_id)
     for sub, word in enumerate(words, 1):
-        peer.drive.set_object(0x1600 + number - 1, sub, word)
-    peer.drive.set_object(0x1600 + number - 1, 0, len(words) if count is None else count)
+        peer.drive.overwrite_object(0x1600 + number - 1, sub, word)
+    peer.drive.overwrite_object(0x1600 + number - 1, 0, len(words) if count is None else count)
 
 
 def corrected(folder: Path) -> MachineConfig:
@@ -106,7 +106,7 @@ def test_second_writer_that_only_the_eds_names_is_found(tmp_path: Path) -> None:
         for index, subs in ((0x15FF, (1, 2)), (0x17FF, (0, 1))):
             more += f"\n[{index:04X}]\nParameterName=a\nObjectType=9\n"
             more += "".join(f"[{index:04X}sub{sub}]\nParameterName=a\nDataType=7\nAccessType=rw\n" for sub in subs)
-        eds.write_text(eds_text(drive.drive) + more)
+        eds.write_text(format_eds(drive.drive) + more)
     settings = config(drive={"eds": str(eds)})
     with DrivePeer(settings) as drive:
         give_rpdo(drive, 512, 0x7F, [POSITION_OFFSET])
@@ -310,8 +310,8 @@ def test_object_that_is_mapped_in_another_size_is_found(
 ) -> None:
     settings = config(drive=own_profile(tmp_path, entries))
     with DrivePeer(settings) as drive, Master(settings, "X") as master:
-        drive.drive.remap(0x1A01, mapped)
-        drive.drive.remap(0x1A03, [(0x6061, 0, 8)])
+        drive.drive.overwrite_mapping(0x1A01, mapped)
+        drive.drive.overwrite_mapping(0x1A03, [(0x6061, 0, 8)])
         findings = {each.point: each for each in survey(master).findings}
     assert findings["TPDO2"].ok is True  # drive and profile agree but are both wrong
     assert findings["object sizes"].ok is False

@@ -38,10 +38,13 @@ def peer() -> Iterator[tuple[DrivePeer, MachineConfig]]:
 
 
 SPOILT: Mapping[str, tuple[Callable[[DrivePeer], object], str]] = {
-    "order": (lambda p: p.drive.remap(0x1A01, [(0x6041, 0, 16), (0x2101, 0, 16), (0x6078, 0, 16)]), "TPDO2"),
-    "event driven": (lambda p: p.drive.set_object(0x1800, 2, 255), "TPDO1"),
-    "another COB-ID": (lambda p: p.drive.set_object(0x1401, 1, 0x305), "RPDO2"),
-    "switched off": (lambda p: p.drive.set_object(0x1401, 1, 0x80000301), "RPDO2"),
+    "order": (
+        lambda p: p.drive.overwrite_mapping(0x1A01, [(0x6041, 0, 16), (0x2101, 0, 16), (0x6078, 0, 16)]),
+        "TPDO2",
+    ),
+    "event driven": (lambda p: p.drive.overwrite_object(0x1800, 2, 255), "TPDO1"),
+    "another COB-ID": (lambda p: p.drive.overwrite_object(0x1401, 1, 0x305), "RPDO2"),
+    "switched off": (lambda p: p.drive.overwrite_object(0x1401, 1, 0x80000301), "RPDO2"),
 }
 
 
@@ -64,15 +67,15 @@ def test_type_of_a_fixed_mapping_is_set(peer: tuple[DrivePeer, MachineConfig]) -
     fixed = {key: replace(entry, access="ro") for key, entry in entries.items() if 0x1600 <= key >> 8 < 0x1800}
     fixed |= {key: replace(entry, access="ro") for key, entry in entries.items() if 0x1A00 <= key >> 8 < 0x1C00}
     entries |= fixed
-    drive.drive.set_object(0x1800, 2, 255)
+    drive.drive.overwrite_object(0x1800, 2, 255)
     with Master(settings, "X") as master:
         assert set_up_pdos(master).written == ("TPDO1",)
         assert set_up_pdos(master) == SetUp((), None)
-        drive.drive.set_object(0x1A00, 1, 0x60620020)
-        drive.drive.set_object(0x1800, 2, 255)
+        drive.drive.overwrite_object(0x1A00, 1, 0x60620020)
+        drive.drive.overwrite_object(0x1800, 2, 255)
         with pytest.raises(DriveFault, match="it refuses TPDO1 with 6064:00, 606C:00"):
             set_up_pdos(master)
-    assert drive.drive.dictionary.number(0x1800, 2) == 255
+    assert drive.drive.dictionary.get_number(0x1800, 2) == 255
 
 
 @pytest.mark.parametrize("outfit", sampled(OUTFITS, every=3), ids=lambda outfit: outfit.name)
@@ -112,11 +115,11 @@ def test_a_drive_that_refuses_an_object_keeps_all_its_pdos(tmp_path: Path) -> No
 
 def test_an_enabled_drive_is_not_touched(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
-    drive.drive.set_object(0x1800, 2, 255)
-    drive.drive.set_object(0x6041, 0, 0x1237)
+    drive.drive.overwrite_object(0x1800, 2, 255)
+    drive.drive.overwrite_object(0x6041, 0, 0x1237)
     with Master(settings, "X") as master, pytest.raises(DriveFault, match="Operation enabled"):
         set_up_pdos(master)
-    assert drive.drive.dictionary.number(0x1800, 2) == 255
+    assert drive.drive.dictionary.get_number(0x1800, 2) == 255
 
 
 def test_the_objects_of_a_second_axis_are_asked_0x800_higher(monkeypatch: pytest.MonkeyPatch) -> None:

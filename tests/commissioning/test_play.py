@@ -71,7 +71,7 @@ class Floor:
         drives = [peer.drive for peer in self.peers.values()]
         return all(
             drive.power.state.name in ("SWITCH_ON_DISABLED", "FAULT")
-            and not any(drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4))
+            and not any(drive.dictionary.get_number(0x1016, sub) for sub in (1, 2, 3, 4))
             for drive in drives
         )
 
@@ -136,7 +136,7 @@ def test_a_signal_brakes_the_axes_and_switches_them_off(floor: Floor) -> None:
 
 @pytest.mark.usefixtures("long_computation")
 def test_a_drive_that_trips_stops_the_others(floor: Floor) -> None:
-    thread = floor.while_it_plays(lambda: floor.peers["Y"].drive.trip(0x3210))
+    thread = floor.while_it_plays(lambda: floor.peers["Y"].drive.trip_fault(0x3210))
     code, document, _ = floor.play(STROKE, "--yes")
     thread.join()
     assert code == 1
@@ -203,7 +203,7 @@ def refused(floor: Floor, text: str = STROKE, *options: str) -> str:
 def test_what_is_not_as_it_must_be_is_refused(floor: Floor, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO())
     assert "not confirmed" in refused(floor)
-    floor.peers["X"].drive.set_object(0x6007, 0, 0)
+    floor.peers["X"].drive.overwrite_object(0x6007, 0, 0)
     assert "0x6007" in refused(floor, STROKE, "--yes")
     (floor.config.store.directory / "commissioning-X.void").write_text("{}")
     assert "run fdhil check" in refused(floor, STROKE, "--yes")

@@ -13,7 +13,7 @@ from fdhil.commissioning.compare_scales import compare_scales
 from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.master import Master
 from fdhil.config import parse_config
-from fdhil.sim.drive.servo import Drive
+from fdhil.sim.drive.servo_drive import SimulatedDrive
 from tests.bench import bench_document
 from tests.drivers.peer import DrivePeer
 from tests.eds import write_eds
@@ -31,7 +31,7 @@ def compared(sheet: str, folder: Path, objects: Mapping[tuple[int, int], int], *
     config = parse_config(document)
     with DrivePeer(config) as peer:
         for (index, sub), value in objects.items():
-            peer.drive.set_object(index, sub, value)
+            peer.drive.overwrite_object(index, sub, value)
         with Master(config, "X") as master:
             return {finding.point: finding for finding in compare_scales(master)}
 
@@ -58,7 +58,9 @@ def test_the_speeds_unit_is_compared(word: int, unit: str | None, ok: bool, says
 def test_the_dc_link_is_compared_where_the_duty_is_multiplied_by_it(
     counts: int, volts: float | None, ok: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Drive, Drive.wall_clock.__name__, lambda *_: [])  # its supply stays as it is set
+    monkeypatch.setattr(
+        SimulatedDrive, SimulatedDrive.run_timers.__name__, lambda *_: []
+    )  # its supply stays as it is set
     found = compared("epos4", tmp_path, {(0x2200, 1): counts}, profile="epos4", dc_link_v=volts).get("DC link")
     assert found is not None
     assert found.ok is ok

@@ -25,7 +25,7 @@ from fdhil.config import Drive, MachineConfig
 from fdhil.drivers.can.frame_ring import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, pack_frames
 from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.errors import ConnectError, DriveFault, ForeignMaster
-from fdhil.sim.drive.dictionary import AbortCode, TransferAbort
+from fdhil.sim.drive.object_dictionary import AbortCode, TransferAbort
 from tests.drivers.frame_builder import FrameBuilder, Row, build_machine_config
 from tests.drivers.peer import DrivePeer
 from tests.short_waits import shorten_waits
@@ -196,11 +196,11 @@ def test_a_silent_bus_is_told() -> None:
 
 
 DIFFERENT: dict[str, tuple[Callable[[DrivePeer], None], str]] = {
-    "heartbeat": (lambda p: p.drive.set_object(0x1017, 0, 0), "none"),
-    "TPDO1": (lambda p: p.drive.set_object(0x1800, 2, 255), "181, type 255: 60640020, 606C0020"),
-    "communication lost": (lambda p: p.drive.set_object(0x6007, 0, 0), "0x6007 = 0"),
-    "following error": (lambda p: p.drive.set_object(0x6065, 0, 0), "off"),
-    "mode": (lambda p: p.drive.set_object(0x6502, 0, 1), "0x6502 = 00000001"),
+    "heartbeat": (lambda p: p.drive.overwrite_object(0x1017, 0, 0), "none"),
+    "TPDO1": (lambda p: p.drive.overwrite_object(0x1800, 2, 255), "181, type 255: 60640020, 606C0020"),
+    "communication lost": (lambda p: p.drive.overwrite_object(0x6007, 0, 0), "0x6007 = 0"),
+    "following error": (lambda p: p.drive.overwrite_object(0x6065, 0, 0), "off"),
+    "mode": (lambda p: p.drive.overwrite_object(0x6502, 0, 1), "0x6502 = 00000001"),
 }
 
 
@@ -272,7 +272,7 @@ def test_a_drive_that_does_not_say_who_it_is_is_not_compared_with_a_makers_profi
 def test_a_drive_that_coasts_is_told_though_the_other_object_is_missing(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     lacking(drive, 0x605A)
-    drive.drive.set_object(0x605E, 0, 0)
+    drive.drive.overwrite_object(0x605E, 0, 0)
     (finding,) = [finding for _, finding in check_machine(settings) if not finding.ok]
     assert (finding.ok, finding.found) == (False, "0x605A = missing, 0x605E = 0")
 
@@ -291,7 +291,7 @@ def test_a_drive_without_a_following_error_window_is_not_commissioned(peer: tupl
 def test_a_device_that_is_no_drive_is_told_as_such(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     lacking(drive, 0x67FF)
-    drive.drive.set_object(0x1000, 0, 0x00030191)
+    drive.drive.overwrite_object(0x1000, 0, 0x00030191)
     found = {finding.point: finding for place, finding in check_machine(settings) if place == "axis X"}
     assert {point for point, finding in found.items() if finding.ok is False} == {"device"}
     assert found["device"].cause == "it is not a CiA 402 drive: 0x1000 reports CiA 401, an I/O module"
@@ -311,8 +311,8 @@ def test_a_drive_says_so_itself_or_as_the_first_of_several_devices(
     if first is not None:
         own = drive.drive.dictionary.entries[0x100000]
         drive.drive.dictionary.entries[0x67FF00] = replace(own, index=0x67FF)
-        drive.drive.set_object(0x67FF, 0, first)
-    drive.drive.set_object(0x1000, 0, device_type)
+        drive.drive.overwrite_object(0x67FF, 0, first)
+    drive.drive.overwrite_object(0x1000, 0, device_type)
     (finding,) = [finding for _, finding in check_machine(settings) if finding.point == "device"]
     assert finding.ok is ok
 

@@ -55,22 +55,22 @@ def peer() -> Iterator[tuple[DrivePeer, MachineConfig]]:
 @pytest.mark.usefixtures("long_computation")
 def test_a_good_drive_is_signed_off_and_left_as_it_was(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
-    consumers = [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)]
+    consumers = [drive.drive.dictionary.get_number(0x1016, sub) for sub in (1, 2, 3, 4)]
     steps: list[str] = []
     record = commission(settings, "X", steps.append)
     assert record.offset_in_feedforward is True
     assert record.watchdog == "proven"
     assert record.sign_test_um == pytest.approx(10.0, abs=3.0)
     assert record.options == {"6007": 1, "605A": 2, "605E": 2, "6065": 32768, "6085": 26214400, "1017": 100}
-    assert record.serial == drive.drive.dictionary.number(0x1018, 4)
+    assert record.serial == drive.drive.dictionary.get_number(0x1018, 4)
     assert record.following_error_window_um == 10_000.0
     assert steps[0] == "listen"
     assert steps[-1] == "restore"
     assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
     time.sleep(0.01)  # the peer has yet to process the last command
     assert drive.drive.nmt == 0x7F
-    assert drive.drive.dictionary.number(0x60B0) == 0
-    assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == consumers
+    assert drive.drive.dictionary.get_number(0x60B0) == 0
+    assert [drive.drive.dictionary.get_number(0x1016, sub) for sub in (1, 2, 3, 4)] == consumers
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -161,11 +161,11 @@ def test_software_limits_are_kept_where_the_drive_has_them(peer: tuple[DrivePeer
     drive, settings = peer
     with Master(settings, "X") as master:
         assert not {"607D01", "607D02"} & survey.read_options(master).keys()
-        drive.drive.set_object(0x607D, 1, -1000)
-        drive.drive.set_object(0x607D, 2, 820_000)
+        drive.drive.overwrite_object(0x607D, 1, -1000)
+        drive.drive.overwrite_object(0x607D, 2, 820_000)
         found = survey.read_options(master)
         assert (found["607D01"], found["607D02"]) == (-1000, 820_000)
-        drive.drive.set_object(0x607D, 2, -1000)  # both equal: switched off (CiA 402-2)
+        drive.drive.overwrite_object(0x607D, 2, -1000)  # both equal: switched off (CiA 402-2)
         assert "607D01" not in survey.read_options(master)
 
 
@@ -198,25 +198,28 @@ def run_steps(master: Master, last: Callable[[Master], object]) -> None:
 
 
 WRONG: dict[str, tuple[Callable[[DrivePeer], None], str]] = {
-    "goes on without communication": (lambda p: p.drive.set_object(0x6007, 0, 0), "0x6007 is 0"),
-    "disables voltage instead": (lambda p: p.drive.set_object(0x6007, 0, 2), "0x6007 is 2"),
-    "coasts": (lambda p: p.drive.set_object(0x605E, 0, 0), "coasts"),
-    "quick stop coasts": (lambda p: p.drive.set_object(0x605A, 0, 0), "coasts"),
-    "window off": (lambda p: p.drive.set_object(0x6065, 0, 0xFFFFFFFF), "0x6065 is off"),
-    "window zero": (lambda p: p.drive.set_object(0x6065, 0, 0), "0x6065 is off"),
-    "window too small": (lambda p: p.drive.set_object(0x6065, 0, 300), "too small"),
-    "gear x 10": (lambda p: p.drive.set_object(0x6091, 1, 10), "6553.6 position increments per motor revolution"),
-    "feed x 10": (lambda p: p.drive.set_object(0x6092, 1, 655360), "655360 position increments per motor revolution"),
+    "goes on without communication": (lambda p: p.drive.overwrite_object(0x6007, 0, 0), "0x6007 is 0"),
+    "disables voltage instead": (lambda p: p.drive.overwrite_object(0x6007, 0, 2), "0x6007 is 2"),
+    "coasts": (lambda p: p.drive.overwrite_object(0x605E, 0, 0), "coasts"),
+    "quick stop coasts": (lambda p: p.drive.overwrite_object(0x605A, 0, 0), "coasts"),
+    "window off": (lambda p: p.drive.overwrite_object(0x6065, 0, 0xFFFFFFFF), "0x6065 is off"),
+    "window zero": (lambda p: p.drive.overwrite_object(0x6065, 0, 0), "0x6065 is off"),
+    "window too small": (lambda p: p.drive.overwrite_object(0x6065, 0, 300), "too small"),
+    "gear x 10": (lambda p: p.drive.overwrite_object(0x6091, 1, 10), "6553.6 position increments per motor revolution"),
+    "feed x 10": (
+        lambda p: p.drive.overwrite_object(0x6092, 1, 655360),
+        "655360 position increments per motor revolution",
+    ),
     "mapping": (
-        lambda p: p.drive.remap(0x1A01, [(0x6041, 0, 16), (0x2101, 0, 16), (0x6078, 0, 16)]),
+        lambda p: p.drive.overwrite_mapping(0x1A01, [(0x6041, 0, 16), (0x2101, 0, 16), (0x6078, 0, 16)]),
         "TPDO2 maps 60410010, 21010010, 60780010",
     ),
-    "transmission type": (lambda p: p.drive.set_object(0x1800, 2, 255), "TPDO1 has transmission type 255"),
-    "COB-ID": (lambda p: p.drive.set_object(0x1401, 1, 0x305), "RPDO2 has the COB-ID 00000305"),
-    "PDO switched off": (lambda p: p.drive.set_object(0x1401, 1, 0x80000301), "RPDO2 has the COB-ID 80000301"),
-    "rated current": (lambda p: p.drive.set_object(0x6075, 0, 10_000), "rated current is 10 A"),
-    "no CSP": (lambda p: p.drive.set_object(0x6502, 0, 1), "no cyclic synchronous position"),
-    "other period": (lambda p: p.drive.set_object(0x60C2, 1, 2), "interpolates over 2 ms"),
+    "transmission type": (lambda p: p.drive.overwrite_object(0x1800, 2, 255), "TPDO1 has transmission type 255"),
+    "COB-ID": (lambda p: p.drive.overwrite_object(0x1401, 1, 0x305), "RPDO2 has the COB-ID 00000305"),
+    "PDO switched off": (lambda p: p.drive.overwrite_object(0x1401, 1, 0x80000301), "RPDO2 has the COB-ID 80000301"),
+    "rated current": (lambda p: p.drive.overwrite_object(0x6075, 0, 10_000), "rated current is 10 A"),
+    "no CSP": (lambda p: p.drive.overwrite_object(0x6502, 0, 1), "no cyclic synchronous position"),
+    "other period": (lambda p: p.drive.overwrite_object(0x60C2, 1, 2), "interpolates over 2 ms"),
 }
 
 
@@ -277,7 +280,7 @@ def test_a_drive_that_takes_offsets_otherwise_is_refused_and_disabled(
         run_steps(master, sign_test)
     assert says in str(caught.value)
     assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
-    assert drive.drive.dictionary.number(0x60B0) == 0
+    assert drive.drive.dictionary.get_number(0x60B0) == 0
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -290,7 +293,7 @@ def test_a_watchdog_that_does_nothing_is_refused(
     drive.drive.faults.no_heartbeat_consumer = True
     with Master(settings, "X") as master, pytest.raises(DriveFault, match="watchdog does not work"):
         run_steps(master, watchdog)
-    assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
+    assert [drive.drive.dictionary.get_number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
 
 
 class LateCycle(Cycle):
@@ -324,7 +327,7 @@ def fed(peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch) 
     with cycle:
         yield cycle
     assert drive.drive.power.state.name in ("SWITCH_ON_DISABLED", "FAULT")
-    assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
+    assert [drive.drive.dictionary.get_number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -346,7 +349,7 @@ def test_a_computer_that_is_always_late_is_told(fed: LateCycle) -> None:
 def test_a_drive_that_trips_while_it_is_fed_is_not_tried_again(
     fed: LateCycle, peer: tuple[DrivePeer, MachineConfig]
 ) -> None:
-    fed.trip = lambda: peer[0].drive.trip(0x3210)
+    fed.trip = lambda: peer[0].drive.trip_fault(0x3210)
     with pytest.raises(DriveFault, match="it fell from Operation enabled to Fault"):
         run_steps(fed.master, watchdog)
     assert fed.feedings == 1
@@ -360,7 +363,7 @@ def test_a_heartbeat_that_is_late_right_after_the_feeding_proves_as_much(
 
     def fed_and_late(master: Master, sub: int, entry: int, enable: Callable[[Master], None]) -> int:
         before = feed(master, sub, entry, enable)
-        peer[0].drive.trip(EMCY_HEARTBEAT)
+        peer[0].drive.trip_fault(EMCY_HEARTBEAT)
         master.wait_cycles(20)
         return before
 
@@ -453,7 +456,7 @@ def test_a_mean_over_cycles_that_this_computer_slept_through_is_of_what_came(
 def test_full_heartbeat_consumers_are_refused(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     for sub in (1, 2, 3, 4):
-        drive.drive.set_object(0x1016, sub, (10 + sub) << 16 | 500)
+        drive.drive.overwrite_object(0x1016, sub, (10 + sub) << 16 | 500)
     with Master(settings, "X") as master, pytest.raises(DriveFault, match="all entries of 0x1016 are in use"):
         watchdog(master)
 
@@ -505,7 +508,7 @@ def test_a_bus_of_another_bit_rate_gets_no_frame(monkeypatch: pytest.MonkeyPatch
 def test_a_drive_without_a_heartbeat_is_commissioned(peer: tuple[DrivePeer, MachineConfig]) -> None:
     """Many drives are delivered with 0x1017 = 0: with the NC off they send nothing until they are read."""
     drive, settings = peer
-    drive.drive.set_object(0x1017, 0, 0)
+    drive.drive.overwrite_object(0x1017, 0, 0)
     record = commission(settings, "X")
     assert (record.watchdog, record.options["1017"]) == ("proven", 0)
 
@@ -601,7 +604,7 @@ def test_ctrl_c_while_all_is_rolled_back_is_heard_once_that_is_done() -> None:
             enabled_and_rolled_back(settings, out)
         assert drive.offsets[-1] == 0
     assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
-    assert drive.drive.dictionary.number(0x60B0) == 0
+    assert drive.drive.dictionary.get_number(0x60B0) == 0
 
 
 def test_what_could_not_be_rolled_back_is_told_after_ctrl_c_too(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -50,7 +50,7 @@ class Bench:
             return try_axis(self.config, self.record, room, Operator(self.report, self.look), Progress(store, "X"))
         finally:
             assert self.peer.drive.power.state.name in ("SWITCH_ON_DISABLED", "FAULT")
-            assert self.peer.drive.dictionary.number(0x60B0) == 0
+            assert self.peer.drive.dictionary.get_number(0x60B0) == 0
 
     @property
     def stands_mm(self) -> float:
@@ -78,10 +78,10 @@ def bench(quick_trial: None, tmp_path: Path) -> Iterator[Bench]:
 
 @pytest.mark.usefixtures("long_computation")
 def test_a_wrong_sign_and_what_nobody_saw_end_it_before_a_rapid(bench: Bench) -> None:
-    bench.peer.drive.faults.signal("voltage").gain = -1.0
+    bench.peer.drive.faults.get_signal_fault("voltage").gain = -1.0
     with pytest.raises(DriveFault, match="SignOrScale: voltage times current, and times speed is negative"):
         bench.tried()
-    bench.peer.drive.faults.signal("voltage").gain, bench.saw = 1.0, False
+    bench.peer.drive.faults.get_signal_fault("voltage").gain, bench.saw = 1.0, False
     with pytest.raises(DriveFault, match=r"the table did not move as the drive reports; check drive.sign"):
         bench.tried()
     assert "test rapids" not in bench.steps
@@ -140,8 +140,8 @@ def test_no_room_sends_nothing(bench: Bench) -> None:
 
 @pytest.mark.usefixtures("long_computation")
 def test_software_limits_that_are_nearer_are_respected(bench: Bench) -> None:
-    bench.peer.drive.set_object(0x607D, 1, -3277)
-    bench.peer.drive.set_object(0x607D, 2, 820_000)
+    bench.peer.drive.overwrite_object(0x607D, 1, -3277)
+    bench.peer.drive.overwrite_object(0x607D, 2, 820_000)
     sign_off(bench.config)
     record = load_record(bench.config.store.directory, "X")
     assert record is not None
@@ -154,7 +154,7 @@ def test_software_limits_that_are_nearer_are_respected(bench: Bench) -> None:
 
 
 def test_a_drive_that_was_set_up_anew_is_not_moved(bench: Bench) -> None:
-    bench.peer.drive.set_object(0x6065, 0, 30_000)
+    bench.peer.drive.overwrite_object(0x6065, 0, 30_000)
     with pytest.raises(DeviceError, match="following-error window"):
         bench.tried()
     assert not {0x000, 0x080, 0x201} & set(bench.peer.heard)

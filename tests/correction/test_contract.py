@@ -15,11 +15,11 @@ from fdhil.prediction import predict
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Correction
 from tests.bench import bench_config, bench_document
-from tests.paths import bench_trajectory, rms, trajectory
+from tests.paths import build_bench_trajectory, build_trajectory, compute_rms
 
 CONFIG = bench_config()
 MODELS = nominal_models(CONFIG)
-REFERENCE = bench_trajectory(10)
+REFERENCE = build_bench_trajectory(10)
 
 
 @pytest.fixture(scope="module", params=list(tables.CORRECTIONS))
@@ -31,7 +31,7 @@ def test_the_path_is_better_with_it(planned_correction: tuple[str, Correction]) 
     name, correction = planned_correction
     assert correction.method == name
     assert correction.refused == ()
-    assert rms(correction.after.contour_um) < 0.2 * rms(correction.before.contour_um)
+    assert compute_rms(correction.after.contour_um) < 0.2 * compute_rms(correction.before.contour_um)
 
 
 def test_every_axis_gets_an_offset_per_row_that_the_guard_lets_pass(planned_correction: tuple[str, Correction]) -> None:
@@ -55,7 +55,7 @@ def test_position_offsets_or_an_on_line_feed_forward_never_both(planned_correcti
 
 @pytest.mark.parametrize("name", tables.CORRECTIONS)
 def test_at_rest_nothing_is_asked_for(name: str) -> None:
-    at_rest = trajectory(np.zeros((600, 2)))
+    at_rest = build_trajectory(np.zeros((600, 2)))
     before = predict(at_rest, MODELS, CONFIG)
     first, second = (tables.load_entry(tables.CORRECTIONS, name)(at_rest, MODELS, CONFIG, before) for _ in range(2))
     assert isinstance(first, Plan)

@@ -14,7 +14,7 @@ from fdhil.prediction.models import nominal_models
 from tests.bench import bench_config
 from tests.correction.test_inverse import scattered
 from tests.correction.test_planning import changed
-from tests.paths import bench_trajectory, rms
+from tests.paths import build_bench_trajectory, compute_rms
 
 CONFIG = bench_config()
 MODELS = nominal_models(CONFIG)
@@ -24,7 +24,7 @@ MODELS = nominal_models(CONFIG)
 def test_fifty_times_better_whatever_the_drives_feed_forward(feed: float, feedforward: float) -> None:
     """Includes drives whose lag is too large for position offsets; position offsets stay 0."""
     config = changed(speed_feedforward=feedforward)
-    reference = bench_trajectory(feed)
+    reference = build_bench_trajectory(feed)
     correction = plan(reference, MODELS, config, "flatness")
     assert correction.refused == ()
     assert not any(offset.any() for offset in correction.offset_um.values())
@@ -32,13 +32,13 @@ def test_fifty_times_better_whatever_the_drives_feed_forward(feed: float, feedfo
     before = predict(reference, plants, config).contour_um
     speed, torque = correction.speed_offset_rad_s, correction.torque_offset_nm
     after = predict_corrected(reference, plants, config, None, speed, torque).contour_um
-    assert rms(before) / rms(after) > 50
+    assert compute_rms(before) / compute_rms(after) > 50
 
 
 def test_offsets_are_whole_counts_of_the_drive() -> None:
     """0x60B1 in increments per second, 0x60B2 in 0.1 % of the rated torque."""
     axis = CONFIG.axis["X"]
-    speed, torque = offsets(np.asarray(bench_trajectory(10).position_mm["X"]), MODELS["X"], axis, 0.001)
+    speed, torque = offsets(np.asarray(build_bench_trajectory(10).position_mm["X"]), MODELS["X"], axis, 0.001)
     counts = speed * 65536 / (2 * np.pi)
     assert np.allclose(counts, np.rint(counts), atol=1e-6)
     counts = torque / (0.8 * 50.0 * 0.001)
@@ -48,7 +48,7 @@ def test_offsets_are_whole_counts_of_the_drive() -> None:
 
 def test_torque_is_told_in_the_drives_own_torque() -> None:
     axis = CONFIG.axis["X"]
-    path = np.asarray(bench_trajectory(10).position_mm["X"])
+    path = np.asarray(build_bench_trajectory(10).position_mm["X"])
     _, nominal = offsets(path, MODELS["X"], axis, 0.001)
     _, weaker = offsets(path, replace(MODELS["X"], K=0.72), axis, 0.001)
     assert np.abs(weaker).max() == pytest.approx(np.abs(nominal).max() * 0.8 / 0.72, rel=0.01)

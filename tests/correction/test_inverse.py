@@ -19,7 +19,15 @@ from fdhil.prediction.models import nominal_models
 from fdhil.records import Correction, Parameters, Trajectory
 from tests.bench import bench_config
 from tests.correction.test_planning import changed
-from tests.paths import bench_demand, bench_trajectory, jerky_demand, rms, rounded_demand, smooth, trajectory
+from tests.paths import (
+    build_bench_demand,
+    build_bench_trajectory,
+    build_jerky_demand,
+    build_rounded_demand,
+    build_trajectory,
+    compute_rms,
+    smooth_demand,
+)
 
 CONFIG = bench_config()
 MODELS = nominal_models(CONFIG)
@@ -50,7 +58,7 @@ def assert_within_limits(correction: Correction) -> None:
 @pytest.mark.parametrize(("feed", "smoothing"), [(10, (0.060, 0.030)), (20, (0.060, 0.030)), (10, (0.030, 0.015))])
 def test_sixty_times_better_with_an_identified_model(feed: float, smoothing: tuple[float, float]) -> None:
     """On scattered plants: RMS, no point worse by 2 um, no zone by 1 um, 8 times better than the mirror."""
-    reference = bench_trajectory(feed, smoothing)
+    reference = build_bench_trajectory(feed, smoothing)
     correction = plan(reference, MODELS, CONFIG, "inverse")
     mirror = plan(reference, MODELS, CONFIG, "mirror")
     assert correction.refused == ()
@@ -60,8 +68,8 @@ def test_sixty_times_better_with_an_identified_model(feed: float, smoothing: tup
         before = predict(reference, plants, CONFIG).contour_um
         after = predict_corrected(reference, plants, CONFIG, correction.offset_um).contour_um
         mirrored = predict_corrected(reference, plants, CONFIG, mirror.offset_um).contour_um
-        assert rms(before) / rms(after) > 60
-        assert rms(mirrored) / rms(after) > 8
+        assert compute_rms(before) / compute_rms(after) > 60
+        assert compute_rms(mirrored) / compute_rms(after) > 8
         assert (after - before).max() < 2.0
         for zone in predict(reference, plants, CONFIG).zones:
             rows = (reference.time_s >= zone.start_s) & (reference.time_s < zone.end_s)
@@ -71,7 +79,7 @@ def test_sixty_times_better_with_an_identified_model(feed: float, smoothing: tup
 @pytest.mark.parametrize("feed", [10, 20])
 def test_a_jerky_demand(feed: float) -> None:
     """Steps of acceleration, as by LinuxCNC: 14 times better, twice as good as the mirror."""
-    reference = trajectory(jerky_demand(feed))
+    reference = build_trajectory(build_jerky_demand(feed))
     correction = plan(reference, MODELS, CONFIG, "inverse")
     assert correction.refused == ()
     assert_within_limits(correction)
@@ -80,15 +88,15 @@ def test_a_jerky_demand(feed: float) -> None:
         plants = scattered(seed)
         before = predict(reference, plants, CONFIG).contour_um
         after = predict_corrected(reference, plants, CONFIG, correction.offset_um).contour_um
-        assert rms(before) / rms(after) > 14
-        assert rms(predict_corrected(reference, plants, CONFIG, mirrored).contour_um) / rms(after) > 2
+        assert compute_rms(before) / compute_rms(after) > 14
+        assert compute_rms(predict_corrected(reference, plants, CONFIG, mirrored).contour_um) / compute_rms(after) > 2
         assert (after - before).max() < 2.0
 
 
 @pytest.mark.parametrize("feed", [10, 20])
 def test_rounded_corners_leave_no_oscillation(feed: float) -> None:
     """Figure 20: with the mirror the error oscillates behind each arc; with the inverse no oscillation is visible."""
-    reference = trajectory(rounded_demand(feed))
+    reference = build_trajectory(build_rounded_demand(feed))
     correction = plan(reference, MODELS, CONFIG, "inverse")
     assert_within_limits(correction)
     mirrored = plan(reference, MODELS, CONFIG, "mirror").after
@@ -107,7 +115,7 @@ def swing(error_um: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
 
 def test_corners_do_not_oscillate() -> None:
     """Around a corner the corrected error stays below a micrometre; the mirror leaves 10 and more."""
-    reference = bench_trajectory(10)
+    reference = build_bench_trajectory(10)
     after = plan(reference, MODELS, CONFIG, "inverse").after
     for zone in predict(reference, MODELS, CONFIG).zones:
         rows = (reference.time_s >= zone.start_s - 0.05) & (reference.time_s < zone.end_s + 0.1)
@@ -116,17 +124,17 @@ def test_corners_do_not_oscillate() -> None:
 
 def test_a_model_that_is_far_off_still_helps() -> None:
     """Parameter errors of 5 to 10 % leave a few micrometres."""
-    reference = bench_trajectory(10, (0.030, 0.015))
+    reference = build_bench_trajectory(10, (0.030, 0.015))
     correction = plan(reference, MODELS, CONFIG, "inverse")
     off = replace(MODELS["X"], R=0.53, L=0.0053, K=0.78, Jt=0.079, ft=0.055, Cd=5.5)
     plants = {"X": off, "Y": off}
     before = predict(reference, plants, CONFIG).contour_um
     after = predict_corrected(reference, plants, CONFIG, correction.offset_um).contour_um
-    assert rms(before) / rms(after) > 8
+    assert compute_rms(before) / compute_rms(after) > 8
 
 
 def test_seams_between_blocks_do_not_show() -> None:
-    reference = bench_trajectory(10)
+    reference = build_bench_trajectory(10)
     correction = plan(reference, MODELS, CONFIG, "inverse")
     seam = np.abs(reference.time_s - BLOCK_S) < 0.1
     assert correction.after.contour_um[seam].max() < 0.5
@@ -142,19 +150,19 @@ def test_delay_is_that_of_the_position_loop(feedforward: float, expected: float)
 def test_a_slow_path_on_a_lagging_drive_needs_small_offsets() -> None:
     """With one delay for all axes only the corners need offsets: at 4 m/min these are small enough, the lag is not."""
     config = changed(speed_feedforward=0.5)
-    reference = bench_trajectory(4)
+    reference = build_bench_trajectory(4)
     correction = plan(reference, MODELS, config, "inverse")
     lag_um = max(float(np.abs(error).max()) for error in correction.before.error_um.values())
     assert lag_um > 600
     assert correction.refused == ()
     assert max(float(np.abs(offset).max()) for offset in correction.offset_um.values()) < 250
-    assert rms(correction.before.contour_um) / rms(correction.after.contour_um) > 20
+    assert compute_rms(correction.before.contour_um) / compute_rms(correction.after.contour_um) > 20
 
 
 @pytest.mark.parametrize("feedforward", [0.5, 0.0])
 def test_a_lag_beyond_the_ceiling_is_refused_with_the_advice_to_feed_forward(feedforward: float) -> None:
     """At 10 m/min even the corners alone exceed the largest offset."""
-    correction = plan(bench_trajectory(10), MODELS, changed(speed_feedforward=feedforward), "inverse")
+    correction = plan(build_bench_trajectory(10), MODELS, changed(speed_feedforward=feedforward), "inverse")
     assert {reason.code for reason in correction.refused} == {"LagTooLarge"}
     assert f"feed-forward (it is {feedforward:g})" in correction.refused[0].advice
     assert correction.after is correction.before
@@ -164,7 +172,7 @@ def test_axes_with_different_lags_are_refused() -> None:
     config = changed()
     slow = changed(speed_feedforward=0.5).axis["Y"]
     mixed = config.model_copy(update={"axis": {"X": config.axis["X"], "Y": slow}})
-    correction = plan(bench_trajectory(10), MODELS, mixed, "inverse")
+    correction = plan(build_bench_trajectory(10), MODELS, mixed, "inverse")
     assert {reason.code for reason in correction.refused} == {"LagTooLarge"}
 
 
@@ -174,7 +182,7 @@ def test_the_linear_inverse_undoes_the_linear_loop() -> None:
     undo = inverse(parameters, axis, 0.001, 2000)
     bump = 0.02 * np.exp(-(((np.arange(1500) - 700) / 40.0) ** 2))
     offset = undo.apply(bump)
-    response = closed_loop.simulate(parameters, axis, 0.001, np.zeros(1500), offset)
+    response = closed_loop.simulate_axis(parameters, axis, 0.001, np.zeros(1500), offset)
     assert np.abs(response.position_mm - bump).max() < 3e-5
 
 
@@ -187,7 +195,7 @@ def random_path(seed: int) -> Trajectory:
     path = np.cumsum(np.concatenate([speeds, np.zeros((200, 2))]) * 0.001, axis=0)
     path = np.concatenate([path[:1], path])
     path[0] = path[1]
-    return trajectory(smooth(path, (0.060, 0.030), 0.001))
+    return build_trajectory(smooth_demand(path, (0.060, 0.030), 0.001))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -196,7 +204,7 @@ def test_random_paths_get_better_within_the_limits(seed: int) -> None:
     correction = plan(reference, MODELS, CONFIG, "inverse")
     assert correction.refused == ()
     assert_within_limits(correction)
-    assert rms(correction.before.contour_um) > 20 * rms(correction.after.contour_um)
+    assert compute_rms(correction.before.contour_um) > 20 * compute_rms(correction.after.contour_um)
 
 
 def test_narrow_limits_are_kept() -> None:
@@ -204,17 +212,17 @@ def test_narrow_limits_are_kept() -> None:
     narrow = configuration.CorrectionLimits(max_offset_um=50.0, max_speed_mm_s=2.0, max_acceleration_mm_s2=250.0)
     axes = {name: axis.model_copy(update={"correction": narrow}) for name, axis in CONFIG.axis.items()}
     config = CONFIG.model_copy(update={"axis": axes})
-    correction = plan(trajectory(bench_demand(5)), MODELS, config, "inverse")
+    correction = plan(build_trajectory(build_bench_demand(5)), MODELS, config, "inverse")
     assert correction.refused == ()
     for axis, offset in correction.offset_um.items():
         limits = PlanLimits.compute_effective(config.axis[axis], 0.001)
         assert check(np.rint(offset / limits.um_per_increment).astype(np.int64), limits) == []
-    assert rms(correction.before.contour_um) > 4 * rms(correction.after.contour_um)
+    assert compute_rms(correction.before.contour_um) > 4 * compute_rms(correction.after.contour_um)
 
 
 @pytest.mark.parametrize("rows", [2, 3, 4, 40, 1999, 2000, 2001, 2500, 2501, 2502])
 def test_any_length_of_path(rows: int) -> None:
-    reference = trajectory(bench_demand(10)[300 : 300 + rows])
+    reference = build_trajectory(build_bench_demand(10)[300 : 300 + rows])
     correction = plan(reference, MODELS, CONFIG, "inverse")
     assert all(offset.size == rows for offset in correction.offset_um.values())
     assert_within_limits(correction)
@@ -222,18 +230,20 @@ def test_any_length_of_path(rows: int) -> None:
 
 @pytest.mark.parametrize("rest_s", [0.5, 2.0, 4.5])
 def test_a_rest_across_blocks(rest_s: float) -> None:
-    demand = bench_demand(10)[:1000]
+    demand = build_bench_demand(10)[:1000]
     pause = np.repeat(demand[-1:], round(rest_s / 0.001), axis=0)
-    there = smooth(np.concatenate([demand, pause, demand[::-1], np.repeat(demand[:1], 200, axis=0)]), (0.06,), 0.001)
-    correction = plan(trajectory(there), MODELS, CONFIG, "inverse")
+    there = smooth_demand(
+        np.concatenate([demand, pause, demand[::-1], np.repeat(demand[:1], 200, axis=0)]), (0.06,), 0.001
+    )
+    correction = plan(build_trajectory(there), MODELS, CONFIG, "inverse")
     assert correction.refused == ()
     assert_within_limits(correction)
-    assert rms(correction.before.contour_um) > 30 * rms(correction.after.contour_um)
+    assert compute_rms(correction.before.contour_um) > 30 * compute_rms(correction.after.contour_um)
 
 
 def test_an_offset_that_is_a_cycle_late_leaves_more_than_ten_times_the_error() -> None:
-    reference = bench_trajectory(10)
+    reference = build_bench_trajectory(10)
     correction = plan(reference, MODELS, CONFIG, "inverse")
     late = {axis: np.concatenate([[0.0], offset[:-1]]) for axis, offset in correction.offset_um.items()}
     shifted = predict_corrected(reference, MODELS, CONFIG, late)
-    assert rms(shifted.contour_um) > 10 * rms(correction.after.contour_um)
+    assert compute_rms(shifted.contour_um) > 10 * compute_rms(correction.after.contour_um)

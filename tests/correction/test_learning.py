@@ -16,7 +16,7 @@ from fdhil.prediction import contour_error_um
 from fdhil.records import Float, Parameters, Trajectory, compute_rms
 from studies.real_plant import Loops, Mechanics, at_rest, run
 from tests.bench import bench_config
-from tests.paths import bench_trajectory
+from tests.paths import build_bench_trajectory
 
 pytestmark = pytest.mark.usefixtures("long_computation")
 
@@ -35,7 +35,7 @@ def cut(mechanics: Mechanics, loops: Loops, reference: Trajectory, offset_um: Ma
 
 def passes(count: int, loops: Loops, wear: float = 0.0, disturbed: int = -1) -> tuple[list[float], list[float]]:
     """Return the RMS (um) of each pass with learning, and of the model alone on the same machine at that pass."""
-    config, reference = bench_config(), bench_trajectory(10)
+    config, reference = bench_config(), build_bench_trajectory(10)
     models = dict.fromkeys(reference.axes, Parameters.from_mapping(REAL.truth()).replace_values(Cd=5.2))
     offset = plan(reference, models, config).offset_um
     lesson, mechanics = Lesson.none(reference), REAL

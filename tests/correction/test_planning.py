@@ -14,7 +14,7 @@ from fdhil.model import closed_loop
 from fdhil.prediction import contour_error_um, predict
 from fdhil.prediction.models import nominal_models
 from tests.bench import bench_config, bench_document
-from tests.paths import bench_trajectory, rms, trajectory
+from tests.paths import build_bench_trajectory, build_trajectory, compute_rms
 
 CONFIG = bench_config()
 MODELS = nominal_models(CONFIG)
@@ -29,9 +29,9 @@ def changed(**regulators: Any) -> configuration.MachineConfig:
 
 @pytest.mark.parametrize(("feed", "rms_um", "max_um"), [(10, 3.5, 20.3), (20, 7.0, 32.0)])
 def test_mirror_leaves_what_the_bench_says(feed: float, rms_um: float, max_um: float) -> None:
-    correction = plan(bench_trajectory(feed), MODELS, CONFIG, "mirror")
+    correction = plan(build_bench_trajectory(feed), MODELS, CONFIG, "mirror")
     assert correction.refused == ()
-    assert rms(correction.after.contour_um) == pytest.approx(rms_um, rel=0.02)
+    assert compute_rms(correction.after.contour_um) == pytest.approx(rms_um, rel=0.02)
     assert [reason.code for reason in correction.warnings if reason.code != "NearLimit"] == ["HarmPredicted"]
     assert correction.after.contour_um.max() == pytest.approx(max_um, rel=0.02)
     for axis, offset in correction.offset_um.items():
@@ -45,7 +45,7 @@ def test_mirror_leaves_what_the_bench_says(feed: float, rms_um: float, max_um: f
 @pytest.mark.parametrize(("feedforward", "before_um", "after_um"), [(0.5, 85, 67), (0.0, 110, 233)])
 def test_mirror_on_a_lagging_drive(feedforward: float, before_um: float, after_um: float) -> None:
     """The largest error at D without limits: with H far from 1 the mirror hardly helps, or harms."""
-    reference, config = bench_trajectory(10), changed(speed_feedforward=feedforward)
+    reference, config = build_bench_trajectory(10), changed(speed_feedforward=feedforward)
     x, y = reference.position_mm["X"], reference.position_mm["Y"]
     at_d = np.hypot(x - 150, y - 5) < 20
     before = predict(reference, MODELS, config)
@@ -58,7 +58,7 @@ def test_mirror_on_a_lagging_drive(feedforward: float, before_um: float, after_u
 
 @pytest.mark.parametrize("method", ["mirror", "inverse"])
 def test_a_lagging_drive_is_refused(method: str) -> None:
-    correction = plan(bench_trajectory(10), MODELS, changed(speed_feedforward=0.5), method)
+    correction = plan(build_bench_trajectory(10), MODELS, changed(speed_feedforward=0.5), method)
     assert {reason.code for reason in correction.refused} == {"LagTooLarge"}
     assert "feed-forward" in correction.refused[0].advice
     assert all(not offset.any() for offset in correction.offset_um.values())
@@ -67,7 +67,7 @@ def test_a_lagging_drive_is_refused(method: str) -> None:
 @pytest.mark.parametrize("method", [None, "mirror"])
 def test_too_high_a_demand_is_refused_with_the_feed_that_can_be_held(method: str | None) -> None:
     """20 m/min with 30 + 15 ms needs 1.7 times the current limit; 9 to 11 m/min are feasible."""
-    correction = plan(bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG, method)
+    correction = plan(build_bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG, method)
     assert {reason.code for reason in correction.refused} == {"DemandTooHigh"}
     feed = float(correction.refused[0].advice.split()[4])
     assert 9 < feed < 11
@@ -76,25 +76,25 @@ def test_too_high_a_demand_is_refused_with_the_feed_that_can_be_held(method: str
 
 def test_nearness_to_a_limit_warns_and_does_not_refuse() -> None:
     """20 m/min with 60 + 30 ms reaches 99 % of the current limit."""
-    correction = plan(bench_trajectory(20), MODELS, CONFIG, "mirror")
+    correction = plan(build_bench_trajectory(20), MODELS, CONFIG, "mirror")
     assert "NearLimit" in {warning.code for warning in correction.warnings}
 
 
 def test_writing_is_off_without_limits() -> None:
     document = bench_document()
     del document["axis"]["Y"]["correction"]
-    correction = plan(bench_trajectory(10), MODELS, configuration.parse_config(document), "mirror")
+    correction = plan(build_bench_trajectory(10), MODELS, configuration.parse_config(document), "mirror")
     assert [reason.code for reason in correction.refused] == ["WritingOff"]
     assert "[axis.Y.correction]" in correction.refused[0].advice
 
 
 def test_nothing_to_correct_is_no_gain() -> None:
-    correction = plan(trajectory(np.zeros((200, 2))), MODELS, CONFIG, "mirror")
+    correction = plan(build_trajectory(np.zeros((200, 2))), MODELS, CONFIG, "mirror")
     assert [reason.code for reason in correction.refused] == ["NoGain"]
 
 
 def test_correction_is_refused_when_held_out_moves_show_errors_that_make_a_position_worse() -> None:
-    reference = bench_trajectory(10)
+    reference = build_bench_trajectory(10)
     refused, accepted = (plan(reference, MODELS, CONFIG, held_out_um=um) for um in (4.0, 1.0))
     assert [reason.code for reason in refused.refused] == ["HarmPredicted"]
     assert not any(offset.any() for offset in refused.offset_um.values())

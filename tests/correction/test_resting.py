@@ -7,7 +7,7 @@ import pytest
 
 from fdhil.correction.resting import Resting
 from fdhil.model import closed_loop
-from fdhil.model.kernels import CURRENT_DEMAND
+from fdhil.model.closed_loop_kernels import CURRENT_DEMAND
 from fdhil.prediction.models import nominal_models
 from tests.bench import bench_config
 
@@ -19,7 +19,7 @@ INCREMENT_MM = 20.0 / 65536
 @pytest.mark.parametrize("rows", [3, 4, 5, 12, 100, 299, 300, 301, 302, 303, 360, 900])
 def test_any_length_of_rest(rows: int) -> None:
     resting = Resting(MODELS["X"], CONFIG.axis["X"], 0.001, INCREMENT_MM)
-    state = closed_loop.start(0.0)
+    state = closed_loop.create_zero_state(0.0)
     offset = resting.quiet(np.zeros(rows), np.array([3.0, 2.0]), state)
     assert offset.size == rows
     assert offset[:2].tolist() == [3.0, 2.0]
@@ -29,13 +29,15 @@ def test_any_length_of_rest(rows: int) -> None:
 
 def test_the_current_comes_to_rest() -> None:
     axis, model = CONFIG.axis["X"], MODELS["X"]
-    moved = closed_loop.simulate(model, axis, 0.001, np.concatenate([np.linspace(0.0, 0.02, 40), np.full(62, 0.02)]))
+    moved = closed_loop.simulate_axis(
+        model, axis, 0.001, np.concatenate([np.linspace(0.0, 0.02, 40), np.full(62, 0.02)])
+    )
     state = moved.end
     resting = Resting(model, axis, 0.001, INCREMENT_MM)
     rest = np.full(900, 0.02)
     offset = resting.quiet(rest, np.zeros(2), state)
-    led = closed_loop.simulate(model, axis, 0.001, rest + offset * INCREMENT_MM, state=state)
-    left = closed_loop.simulate(model, axis, 0.001, rest, state=state)
+    led = closed_loop.simulate_axis(model, axis, 0.001, rest + offset * INCREMENT_MM, state=state)
+    left = closed_loop.simulate_axis(model, axis, 0.001, rest, state=state)
     assert np.ptp(led.position_mm[2:]) == 0.0
     band = model.Cd / model.K
     assert np.abs(led.states[CURRENT_DEMAND, 400:]).max() < 0.4 * band

@@ -14,7 +14,7 @@ from fdhil.prediction.models import nominal_models
 from fdhil.records import Float
 from tests.bench import bench_config
 from tests.correction.test_planning import changed
-from tests.paths import bench_demand, trajectory
+from tests.paths import build_bench_demand, build_trajectory
 
 CONFIG = bench_config()
 MODELS = nominal_models(CONFIG)
@@ -27,8 +27,8 @@ def pieces(demand: Float, size: int) -> Iterator[Mapping[str, Float]]:
 
 @pytest.mark.parametrize("size", [7, 500, 2500, 100_000])
 def test_streaming_gives_what_planning_gives(size: int) -> None:
-    demand = bench_demand(10)
-    whole = plan(trajectory(demand), MODELS, CONFIG, "inverse")
+    demand = build_bench_demand(10)
+    whole = plan(build_trajectory(demand), MODELS, CONFIG, "inverse")
     blocks = list(stream(pieces(demand, size), MODELS, CONFIG))
     assert [block.final for block in blocks] == [False, True]
     for axis in "XY":
@@ -39,7 +39,7 @@ def test_streaming_gives_what_planning_gives(size: int) -> None:
 
 def test_a_block_needs_only_its_look_ahead() -> None:
     """The first 2 s are available when 2.5 s and a row of the path are."""
-    demand = bench_demand(10)
+    demand = build_bench_demand(10)
     taken = 0
 
     def counted() -> Iterator[Mapping[str, Float]]:
@@ -55,7 +55,7 @@ def test_a_block_needs_only_its_look_ahead() -> None:
 
 
 def test_a_longer_path_keeps_the_offsets_of_its_settled_blocks() -> None:
-    demand = bench_demand(10)
+    demand = build_bench_demand(10)
     other = demand.copy()
     other[2501:] = demand[2500]
     first, changed_first = (next(stream(pieces(d, 50), MODELS, CONFIG)) for d in (demand, other))
@@ -63,20 +63,20 @@ def test_a_longer_path_keeps_the_offsets_of_its_settled_blocks() -> None:
 
 
 def test_a_refused_block_ends_the_stream() -> None:
-    blocks = list(stream(pieces(bench_demand(10), 500), MODELS, changed(speed_feedforward=0.5)))
+    blocks = list(stream(pieces(build_bench_demand(10), 500), MODELS, changed(speed_feedforward=0.5)))
     assert len(blocks) == 1
     assert "LagTooLarge" in {reason.code for reason in blocks[0].refused}
     assert not blocks[0].offset_um["X"].any()
 
 
 def test_saturation_ends_the_stream() -> None:
-    blocks = list(stream(pieces(bench_demand(20, (0.030, 0.015)), 500), MODELS, CONFIG))
+    blocks = list(stream(pieces(build_bench_demand(20, (0.030, 0.015)), 500), MODELS, CONFIG))
     assert "DemandTooHigh" in {reason.code for reason in blocks[-1].refused}
 
 
 def test_a_stream_that_goes_on_names_every_place() -> None:
-    calm = bench_demand(10)
-    shift, hard = calm[-1] - calm[0], bench_demand(20, (0.030, 0.015))
+    calm = build_bench_demand(10)
+    shift, hard = calm[-1] - calm[0], build_bench_demand(20, (0.030, 0.015))
     between = np.concatenate([calm, calm[::-1], calm]) + 2 * shift
     path = np.concatenate([calm, hard + shift, between, hard + 3 * shift])
     starts = np.cumsum([0, len(calm), len(hard), len(between)])
@@ -92,7 +92,7 @@ def test_a_stream_that_goes_on_names_every_place() -> None:
 
 def test_seams_do_not_show() -> None:
     """Near a seam the error is no larger than with the seams elsewhere, to 0.05 um."""
-    there = bench_demand(10)
+    there = build_bench_demand(10)
     shift = 731  # rows of rest ahead: every seam moves to another place of the path
     paths = there, np.concatenate([np.repeat(there[:1], shift, axis=0), there])
     one, other = (np.concatenate([block.after_um for block in stream(pieces(p, 500), MODELS, CONFIG)]) for p in paths)
@@ -109,7 +109,7 @@ def test_seams_do_not_show() -> None:
 
 @pytest.mark.usefixtures("long_computation")
 def test_memory_is_flat() -> None:
-    there = bench_demand(20)
+    there = build_bench_demand(20)
     loop = np.concatenate([there, there[::-1]])
 
     def long() -> Iterator[Mapping[str, Float]]:

@@ -17,11 +17,11 @@ from fdhil.records import Float, Parameters, Trajectory
 from studies import real_plant
 from studies.real_plant import Loops, Mechanics
 from tests.bench import bench_config
-from tests.paths import bench_trajectory, rms
+from tests.paths import build_bench_trajectory, compute_rms
 from tests.tiers import sampled
 
 CONFIG = bench_config()
-PATH = bench_trajectory(10)
+PATH = build_bench_trajectory(10)
 PLAIN = Parameters.from_mapping(Mechanics().truth())
 
 
@@ -81,7 +81,7 @@ def test_what_the_model_knows_is_predicted_and_corrected(effect: str) -> None:
     assert correction.refused == ()
     before, after = cut(plant), cut(plant, correction.offset_um)
     assert np.abs(correction.before.contour_um - before).max() < 0.1
-    assert rms(before) > least * rms(after)
+    assert compute_rms(before) > least * compute_rms(after)
     assert (after - before).max() < 1.0
 
 
@@ -96,7 +96,7 @@ def test_a_configured_resonance_need_not_be_exact(hertz: float) -> None:
     for share in (0.85, 1.15):
         model = PLAIN.replace_values(resonance=share * hertz, resonance_damping=0.03)
         after = cut(plant, plan(PATH, {"X": model, "Y": model}, CONFIG).offset_um)
-        assert rms(after) < 0.45 * rms(blind)
+        assert compute_rms(after) < 0.45 * compute_rms(blind)
 
 
 def test_a_resonance_beyond_the_drives_reach_is_told() -> None:
@@ -114,8 +114,8 @@ def test_loops_as_identified_are_used() -> None:
     models = {"X": PLAIN, "Y": PLAIN}
     before = cut(Mechanics(), None, loops)
     blind, seeing = (cut(Mechanics(), plan(PATH, models, config).offset_um, loops) for config in (CONFIG, known))
-    assert rms(before) < 5 * rms(blind)
-    assert rms(before) > 200 * rms(seeing)
+    assert compute_rms(before) < 5 * compute_rms(blind)
+    assert compute_rms(before) > 200 * compute_rms(seeing)
 
 
 def test_a_stream_takes_terms_as_a_plan_does() -> None:

@@ -26,7 +26,7 @@ from fdhil.guard.guard_access import Role
 from fdhil.store import audit
 from tests.daemon.simulated_machine import SimulatedMachine, config_of
 from tests.daemon.test_daemon_service import serving
-from tests.listening import tcp_ports
+from tests.listening_ports import list_tcp_ports
 from tests.machine.virtual_time import VirtualClock
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -276,9 +276,9 @@ def test_rights_of_users_do_not_change_the_config_digest(tmp_path: Path) -> None
 
 @pytest.mark.fault("G3")
 async def test_daemon_listens_at_no_tcp_port(tmp_path: Path) -> None:
-    before = tcp_ports(os.getpid())
+    before = list_tcp_ports(os.getpid())
     async with serving(config_of(tmp_path), SimulatedMachine()):
-        assert tcp_ports(os.getpid()) == before
+        assert list_tcp_ports(os.getpid()) == before
         server = await asyncio.start_server(lambda *_: None, "127.0.0.1", 0)
-        assert len(tcp_ports(os.getpid()) - before) == 1  # one that did would be seen
+        assert len(list_tcp_ports(os.getpid()) - before) == 1  # one that did would be seen
         server.close()

@@ -22,7 +22,7 @@ from fdhil.daemon.daemon_status import DaemonStatus
 from fdhil.drivers import open_machine
 from fdhil.pipeline import Record
 from fdhil.records import AxisSamples, Notice, TickTimes, freeze_array, freeze_integers
-from fdhil.sim.wire.hub import encode
+from fdhil.sim.wire.tcp_hub import encode_frames
 from tests.bench import bench_axis
 from tests.daemon.simulated_machine import SimulatedMachine, config_of, rapids
 from tests.daemon.test_daemon_service import serving, status_when
@@ -63,7 +63,7 @@ class Line:
                 at_s = again * WIRED * STEP_S + t_ns * 1e-9
                 if at_s > time.time() - begun_s:
                     break
-                text += encode([(can_id, data)], begun_s + at_s)
+                text += encode_frames([(can_id, data)], begun_s + at_s)
                 sent += 1
             peer.sendall(text)
             time.sleep(0.05)

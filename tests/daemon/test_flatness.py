@@ -16,7 +16,7 @@ import pytest
 from fdhil.guard.guard_step import SETTLED_CYCLES
 from tests.bench import AXIS, axis_toml
 from tests.daemon.machine_rig import HEAD, TO_AND_FRO, MachineRig, fdhil, opened
-from tests.paths import bench_demand
+from tests.paths import build_bench_demand
 
 Capture = pytest.CaptureFixture[str]
 pytestmark = [pytest.mark.timeout(1500), pytest.mark.usefixtures("processes")]
@@ -94,7 +94,7 @@ def feed_of(status: dict[str, Any]) -> dict[str, Any]:
 def largest_errors_um(shop: MachineRig, name: str) -> dict[str, float]:
     """Run the bench's path by the NC; return each axis' largest tracking error, um, by the simulator."""
     demand, trace = shop.folder / "path.csv", shop.folder / f"{name}.csv"
-    path = bench_demand(10, hold_s=0.2)
+    path = build_bench_demand(10, hold_s=0.2)
     lines = [f"{k * 0.001:.3f},{x:.9f},{y:.9f}" for k, (x, y) in enumerate(path)]
     demand.write_text("time_s,X_mm,Y_mm\n" + "\n".join(lines) + "\n", "utf-8")
     shop.twin.play(demand, trace=trace)

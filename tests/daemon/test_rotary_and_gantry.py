@@ -22,7 +22,7 @@ from fdhil.records import Parameters, compute_rms, compute_table_path
 from fdhil.store.history import History
 from tests.bench import rotary_axis
 from tests.drivers.peer import DrivePeer
-from tests.machine.whole_machine import Machine
+from tests.machine.complete_machine import CompleteMachine
 from tests.short_waits import shorten_waits
 
 pytestmark = pytest.mark.usefixtures("long_computation")
@@ -45,13 +45,13 @@ def program_of(lines: str) -> str:
 
 
 @contextmanager
-def shuttled(folder: Path, document: dict[str, Any], shuttle: str) -> Iterator[Machine]:
-    with Machine(config=document | on_a_bus("memory"), folder=folder) as machine:
-        machine.start("guard")
-        machine.start("daemon")
-        machine.nc(on=True)
-        machine.play(program_of(shuttle), "shuttle.ngc")
-        machine.run(1.0)
+def shuttled(folder: Path, document: dict[str, Any], shuttle: str) -> Iterator[CompleteMachine]:
+    with CompleteMachine(config=document | on_a_bus("memory"), folder=folder) as machine:
+        machine.start_processes("guard")
+        machine.start_processes("daemon")
+        machine.switch_nc(on=True)
+        machine.play_program(program_of(shuttle), "shuttle.ngc")
+        machine.run_for(1.0)
         yield machine
 
 
@@ -61,26 +61,26 @@ def on_a_bus(channel: str) -> dict[str, Any]:
 
 def run(folder: Path, document: dict[str, Any], path: str, shuttle: str) -> Whole:
     with shuttled(folder, document, shuttle) as machine:
-        config, program = machine.config, machine.write(program_of(path), "path.ngc")
+        config, program = machine.config, machine.write_program(program_of(path), "path.ngc")
         with History.read(config.store.directory) as history:
             found = {axis: history.revisions(axis, limit=1)[0].set.parameters for axis in config.axis}
         predicted = predict(load_trajectory(program, config), found, config)
         measured_um = cut(machine, path)
-        answer = machine.arm(program, method="inverse")
+        answer = machine.arm_program(program, method="inverse")
         assert answer["ok"], answer
         corrected_um = cut(machine, path)
-        machine.run(1.0)
-        status = machine.ask("status")
+        machine.run_for(1.0)
+        status = machine.request_daemon("status")
         assert status["guard"]["cause"]["code"] == "Finished"
         assert machine.wrong == []
         notices = tuple(notice["text"] for notice in status["notices"])
         return Whole(found, true_plants(config), predicted.rms_um, measured_um, corrected_um, notices)
 
 
-def cut(machine: Machine, path: str) -> float:
+def cut(machine: CompleteMachine, path: str) -> float:
     trace = machine.folder / "trace.csv"
-    machine.plant.trace(trace)
-    machine.play(program_of(path), "path.ngc")
+    machine.plant.record_next_file(trace)
+    machine.play_program(program_of(path), "path.ngc")
     axes = tuple(machine.config.axis)
     reference, table = (compute_table_path(axes, rows) for rows in read_trace(trace, axes))
     return compute_rms(contour_error_um(reference, table, 0.001))
@@ -135,13 +135,15 @@ def test_each_gantry_drive_is_identified_and_corrected_by_its_own_model(tmp_path
 
 def test_skewed_gantry_ends_the_correction(tmp_path: Path) -> None:
     with shuttled(tmp_path, gantry(max_difference_um=2.0), GANTRY_SHUTTLE) as machine:
-        assert any("the drives Y and Y2 are" in notice["text"] for notice in machine.ask("status")["notices"])
-        answer = machine.arm(machine.write(program_of(GANTRY), "path.ngc"), method="inverse")
+        assert any(
+            "the drives Y and Y2 are" in notice["text"] for notice in machine.request_daemon("status")["notices"]
+        )
+        answer = machine.arm_program(machine.write_program(program_of(GANTRY), "path.ngc"), method="inverse")
         assert answer["ok"], answer
         for unit in machine.plant.units.values():
-            unit.warm(26.0)
-        machine.play(program_of(GANTRY), "path.ngc")
-        status = machine.ask("status")
+            unit.set_temperature(26.0)
+        machine.play_program(program_of(GANTRY), "path.ngc")
+        status = machine.request_daemon("status")
         assert status["state"] == "OFF"
         assert status["guard"]["cause"]["code"] != "Finished"
         assert machine.wrong == []

@@ -11,14 +11,14 @@ import can
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.sim.drive.servo import Drive
+from fdhil.sim.drive.servo_drive import SimulatedDrive
 
 
 class DrivePeer:
     """Runs a twin drive on the ``virtual`` bus of the config; ``sent`` counts its frames, ``heard`` those of others."""
 
     def __init__(self, config: MachineConfig, axis: str = "X") -> None:
-        self.drive = Drive(axis, config, np.random.default_rng(1))
+        self.drive = SimulatedDrive(axis, config, np.random.default_rng(1))
         self._bus = can.Bus(interface="virtual", channel=next(iter(config.bus.values())).channel)
         self._stopping = threading.Event()
         self.heard: list[int] = []
@@ -31,14 +31,14 @@ class DrivePeer:
             message = self._bus.recv(0.001)
             now_s = time.monotonic()
             drive_s, last_s = drive_s + min(now_s - last_s, 0.008), now_s
-            self._send(self.drive.wall_clock(drive_s))
+            self._send(self.drive.run_timers(drive_s))
             if message is not None:
                 self.heard.append(message.arbitration_id)
                 self._send(self.handle_frame(message.arbitration_id, bytes(message.data)))
 
     def handle_frame(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
         """Give one frame to the drive and return its answers."""
-        return self.drive.receive(can_id, data)
+        return self.drive.receive_frame(can_id, data)
 
     def _send(self, frames: list[tuple[int, bytes]]) -> None:
         for can_id, data in frames:

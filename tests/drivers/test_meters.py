@@ -23,10 +23,10 @@ from fdhil.drivers.sensor_source import Record, Sensor, SensorSource, create_sen
 from fdhil.errors import ConfigError, DeviceTimeout, ProtocolError
 from fdhil.records import Notice, Temperature, VoltageSamples
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
-from fdhil.sim.wire.sensor_wires import SensorWires
+from fdhil.sim.wire.sensor_connections import SensorConnections
 from tests.bench import bench_axis
 from tests.drivers.modbus_peer import run_sensor_peer
-from tests.held_port import held_port
+from tests.reserved_port import reserve_port
 
 PATIENCE_S = 60.0  # with a busy computer
 TYPES = {"int16": 0.01, "uint16": 0.01, "int32": 1e-4, "uint32": 1e-4, "float32": 1.0, "float64": 1.0}
@@ -39,7 +39,7 @@ class SensorBench:
         self.document = document
         made = parse_config(document)
         self.memory = {axis: _build_memory(made, axis) for axis in made.axis}
-        self.wires = SensorWires(made, self.memory)
+        self.wires = SensorConnections(made, self.memory)
 
     def config(self) -> MachineConfig:
         """Return the configuration with the ports used."""
@@ -54,7 +54,7 @@ class SensorBench:
 def _build_memory(made: MachineConfig, axis: str) -> VoltageSensor:
     limit_v = made.axis[axis].regulators.voltage_limit_v
     sensor = VoltageSensor(1000.0, limit_v, 0.0, np.random.default_rng(1))
-    sensor.feed(-12.34)
+    sensor.feed_mean_voltage(-12.34)
     sensor.celsius = 21.5
     return sensor
 
@@ -152,7 +152,7 @@ async def test_two_meters_and_a_thermometer_share_a_line(tmp_path: Path) -> None
     line = {"source": "modbus", "device": str(tmp_path / "line"), "baud_rate": 115200, "type": "int16", "scale": 0.01}
     warmth = {"device": line["device"], "baud_rate": 115200, "unit": 3, "type": "int16", "scale": 0.1, "period_s": 0.02}
     async with run_sensor_bench({**line, "unit": 1}, {**line, "unit": 2}, temperature=warmth) as served:
-        served.memory["Y"].feed(45.6)
+        served.memory["Y"].feed_mean_voltage(45.6)
         found: list[Record] = []
 
         def take(record: Record) -> None:
@@ -250,13 +250,13 @@ async def test_block_of_numbered_samples_is_read(block: dict[str, Any]) -> None:
     voltage = {"source": "modbus", "scale": 0.01, "block": BLOCK | block}
     async with run_sensor_bench(voltage) as served:
         for _ in range(65530):
-            served.memory["X"].feed(0.0)
+            served.memory["X"].feed_mean_voltage(0.0)
         sensor = served.sensors()["voltage"]
         await sensor.link.connect()
         found: list[VoltageSamples] = []
         for step in range(4):
             for k in range(12):
-                served.memory["X"].feed(0.1 * (12 * step + k))
+                served.memory["X"].feed_mean_voltage(0.1 * (12 * step + k))
             found += [r for r in await sensor.poll_samples(TickClock(0.001)) if isinstance(r, VoltageSamples)]
         sensor.link.close()
     counter = np.concatenate([b.counter for b in found])
@@ -310,7 +310,7 @@ async def test_invalid_numbers_are_refused() -> None:
         sensor = served.sensors()["voltage"]
         await sensor.link.connect()
         for wrong in (math.nan, math.inf, -math.inf, 1e30):
-            served.memory["X"].feed(wrong)
+            served.memory["X"].feed_mean_voltage(wrong)
             with pytest.raises(ProtocolError, match="register 0 gives"):
                 await sensor.poll_samples(TickClock(0.001))
         sensor.link.close()
@@ -335,7 +335,7 @@ async def test_replugged_adapter_is_used_again(tmp_path: Path) -> None:
                 pass
         served.wires.stop()
         await until("ModbusPortGone", "MAJOR")
-        served.wires = SensorWires(served.config(), served.memory)
+        served.wires = SensorConnections(served.config(), served.memory)
         served.wires.start()
         await until("ModbusPortGone", "info")
         running.cancel()
@@ -404,9 +404,9 @@ def test_text_instrument_fulfils_the_sensor_contract(text: str) -> None:
 
 async def test_units_behind_one_gateway_share_its_connection() -> None:
     value = {"source": "modbus", "type": "float32"}
-    with held_port() as port:
+    with reserve_port() as port:
         async with run_sensor_bench(*({**value, "port": port, "unit": unit} for unit in (1, 2))) as served:
-            served.memory["Y"].feed(45.6)
+            served.memory["Y"].feed_mean_voltage(45.6)
             config = served.config()
             x, y = (create_sensors(axis, config)["voltage"] for axis in "XY")
             assert isinstance(x.link, ModbusUnit)

@@ -25,7 +25,7 @@ from fdhil.records import Notice, Temperature, TickTimes, VoltageSamples
 from tests.drivers.frame_builder import build_machine_config
 from tests.drivers.modbus_peer import VOLTS_PER_COUNT, SensorPeer, run_sensor_peer
 from tests.drivers.serial_peer import build_frame
-from tests.held_port import held_port
+from tests.reserved_port import reserve_port
 
 
 def build_config(port: int, **voltage: Any) -> MachineConfig:
@@ -184,7 +184,7 @@ async def test_source_cancelled_as_the_answer_comes_ends() -> None:
 
 
 async def test_unreachable_device_is_reported() -> None:
-    with held_port() as port, pytest.raises(ConnectError, match="cannot be reached"):
+    with reserve_port() as port, pytest.raises(ConnectError, match="cannot be reached"):
         await ModbusUnit("voltage sensor X", ModbusDevice(port=port)).connect()
 
 

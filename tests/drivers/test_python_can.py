@@ -25,7 +25,7 @@ from fdhil.drivers.cia402.bus_decoder import BusDecoder
 from fdhil.errors import ConfigError, ConnectError
 from fdhil.guard.transmit_socket import open_transmit_socket
 from fdhil.records import AxisSamples, Notice
-from fdhil.sim.wire.attach import attach
+from fdhil.sim.wire.can_buses import attach_bus
 from tests.bench import bench_document
 from tests.drivers.frame_builder import FrameBuilder, build_machine_config
 
@@ -187,7 +187,7 @@ def test_python_can_adapters_refuse_to_send(interface: str) -> None:
     with pytest.raises(ConnectError, match="for listening only"):
         open_transmit_socket("can0", settings)
     with pytest.raises(ConnectError, match="do not support the interface"):
-        attach("can0", settings)
+        attach_bus("can0", settings)
 
 
 def test_correction_on_a_receive_only_bus_is_refused() -> None:

@@ -21,7 +21,7 @@ from fdhil.drivers.can.frame_ring import ERROR_FLAG, EXTENDED_FLAG, FrameRing
 from fdhil.drivers.can.port_factory import PORTS
 from fdhil.drivers.can.socketcand_port import HubClock, SocketcandPort
 from fdhil.errors import ConnectError
-from tests.held_port import held_port
+from tests.reserved_port import reserve_port
 
 
 class MiniHub:
@@ -132,7 +132,7 @@ def test_server_that_is_not_a_hub_is_reported(greetings: tuple[bytes, ...]) -> N
 
 
 def test_unreachable_hub_is_reported() -> None:
-    with held_port() as port, pytest.raises(ConnectError, match="cannot be reached"):
+    with reserve_port() as port, pytest.raises(ConnectError, match="cannot be reached"):
         ListeningBus("can0", build_settings(port))
 
 

@@ -23,7 +23,7 @@ from fdhil.drivers.table.tpdo_encoder import SILENT_TICKS, TpdoEncoder
 from fdhil.errors import ConnectError, DeviceTimeout, ProtocolError
 from fdhil.records import Notice, TableSamples, TickTimes, freeze_integers
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
-from fdhil.sim.wire.sensor_wires import SensorWires
+from fdhil.sim.wire.sensor_connections import SensorConnections
 from tests.bench import bench_document
 from tests.drivers.modbus_peer import run_sensor_peer
 
@@ -239,7 +239,7 @@ async def test_the_simulated_module_on_a_serial_line_is_read(tmp_path: Path) -> 
     document["axis"]["X"]["table"] = keys | {"function": 3, "address": 30}
     config = machine_config.parse_config(document)
     sensor = VoltageSensor(1000.0, 300.0, 0.0, np.random.default_rng(1))
-    wires = SensorWires(config, {"X": sensor}, {"X": lambda: -123.4567})
+    wires = SensorConnections(config, {"X": sensor}, {"X": lambda: -123.4567})
     wires.start()
     settings = config.axis["X"].table
     assert settings is not None

@@ -23,7 +23,7 @@ from fdhil.records import VoltageSamples
 from tests.drivers.frame_builder import build_machine_config
 from tests.drivers.modbus_peer import SensorPeer, run_sensor_peer
 from tests.drivers.serial_peer import SerialPeer
-from tests.held_port import held_port
+from tests.reserved_port import reserve_port
 
 TEXT = {"serial"}
 SEPARATE = [name for name in tables.VOLTAGE_SOURCES if name != tables.DRIVE_VOLTAGE]
@@ -112,7 +112,7 @@ async def test_a_sensor_is_polled_and_read(name: str) -> None:
 
 @pytest.mark.parametrize("name", SEPARATE)
 async def test_missing_sensor_is_reported_with_its_address(name: str) -> None:
-    with held_port() as port:
+    with reserve_port() as port:
         config = build_config(name, port)
         where = config.axis["X"].voltage
         sensor = create_sensors("X", config)["voltage"]

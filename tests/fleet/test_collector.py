@@ -18,9 +18,9 @@ import pytest
 
 from fdhil.config.fleet_config import Fleet, Objects
 from fdhil.errors import StoreError
-from fdhil.fleet import objects
-from fdhil.fleet.collector import Collector, Received, _fetch, _give_back, _next
-from fdhil.fleet.message import Message, Unread, of_entry
+from fdhil.fleet import window_files
+from fdhil.fleet.collector import Collector, ReceivedRecord, _fetch_messages, _receive_batch, _return_pending_batch
+from fdhil.fleet.record_message import Message, UnreadableRecord, encode_entry
 from fdhil.store import atomic
 from fdhil.store.outbox import Entry
 
@@ -28,7 +28,7 @@ DIGEST, STORE = "a" * 64, "5" * 32
 
 
 @dataclass
-class Told:
+class FakeMessage:
     """A message of the stream; ``log`` records the answers."""
 
     subject: str
@@ -43,29 +43,29 @@ class Told:
         self.log.append("nak")
 
 
-class Reader:
+class FakeReader:
     """Returns its messages once."""
 
     nothing: type[Exception] = nats.errors.TimeoutError
 
-    def __init__(self, *messages: Told) -> None:
+    def __init__(self, *messages: FakeMessage) -> None:
         self._messages = messages
 
-    async def fetch(self, batch: int, timeout: float) -> Sequence[Told]:
+    async def fetch(self, batch: int, timeout: float) -> Sequence[FakeMessage]:
         if not self._messages:
             raise self.nothing
         given, self._messages = self._messages, ()
         return given
 
 
-def told(log: list[str], window: bytes | None = None) -> Told:
+def create_messages(log: list[str], window: bytes | None = None) -> FakeMessage:
     row = {"id": 1, "wall_s": 1_800_000_000.0, "accepted": 1}
-    message: Message = of_entry(Entry(1, "window", "X", DIGEST, row, "", False), "mill-1", STORE, window)
-    return Told(message.subject, message.payload, log)
+    message: Message = encode_entry(Entry(1, "window", "X", DIGEST, row, "", False), "mill-1", STORE, window)
+    return FakeMessage(message.subject, message.payload, log)
 
 
-async def take(collector: Collector, *messages: Told) -> None:
-    await collector._take(*await _next(cast(Any, Reader(*messages))), cast(Any, None))
+async def collect_messages(collector: Collector, *messages: FakeMessage) -> None:
+    await collector._store_and_acknowledge(*await _receive_batch(cast(Any, FakeReader(*messages))), cast(Any, None))
 
 
 @pytest.fixture
@@ -73,89 +73,89 @@ def collector(tmp_path: Path) -> Collector:
     return Collector(Fleet(objects=Objects(directory=tmp_path)))
 
 
-async def test_first_the_database_then_the_answer(collector: Collector, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_message_is_acknowledged_after_commit(collector: Collector, monkeypatch: pytest.MonkeyPatch) -> None:
     log: list[str] = []
 
-    async def write(self: Collector, received: Sequence[Received], db: object) -> None:
-        assert [each.content.reason for each in received if isinstance(each.content, Unread)] == [
+    async def record_write(self: Collector, received: Sequence[ReceivedRecord], db: object) -> None:
+        assert [each.content.reason for each in received if isinstance(each.content, UnreadableRecord)] == [
             "it has no fdhil-record-1 header"
         ]
         log.append("written")
 
-    monkeypatch.setattr(Collector, Collector._write.__name__, write)
-    await take(collector, told(log), Told("fdhil.v1.mill-1.records", b"{\n{}\n", log))
+    monkeypatch.setattr(Collector, Collector._write_transaction.__name__, record_write)
+    await collect_messages(collector, create_messages(log), FakeMessage("fdhil.v1.mill-1.records", b"{\n{}\n", log))
     assert log == ["written", "ack", "ack"]
     assert collector.kept == 2
-    await take(collector)  # nothing more is waiting
+    await collect_messages(collector)  # nothing more is waiting
     assert collector.kept == 2
 
 
-async def test_what_is_not_in_the_database_is_given_back(collector: Collector, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_message_is_returned_when_database_fails(collector: Collector, monkeypatch: pytest.MonkeyPatch) -> None:
     log: list[str] = []
 
-    async def write(self: Collector, received: Sequence[Received], db: object) -> None:
+    async def fail_write(self: Collector, received: Sequence[ReceivedRecord], db: object) -> None:
         raise psycopg.OperationalError("the disk is full")
 
-    monkeypatch.setattr(Collector, Collector._write.__name__, write)
+    monkeypatch.setattr(Collector, Collector._write_transaction.__name__, fail_write)
     with pytest.raises(psycopg.OperationalError):
-        await take(collector, told(log), told(log))
+        await collect_messages(collector, create_messages(log), create_messages(log))
     assert (log, collector.kept) == (["nak", "nak"], 0)
 
 
-async def test_a_window_that_cannot_be_kept_is_given_back(tmp_path: Path) -> None:
+async def test_message_is_returned_when_window_cannot_be_stored(tmp_path: Path) -> None:
     log: list[str] = []
     (tmp_path / "file").touch()
     collector = Collector(Fleet(objects=Objects(directory=tmp_path / "file")))
     with pytest.raises(StoreError):
-        await take(collector, told(log, b"PAR1"))
+        await collect_messages(collector, create_messages(log, b"PAR1"))
     assert log == ["nak"]
 
 
 @pytest.mark.parametrize("nothing", [nats.errors.TimeoutError, TimeoutError])
-async def test_that_nothing_came_is_no_fault(nothing: type[Exception]) -> None:
-    reader = Reader()
+async def test_empty_fetch_is_no_error(nothing: type[Exception]) -> None:
+    reader = FakeReader()
     reader.nothing = nothing
-    assert await _fetch(cast(Any, reader)) == []
+    assert await _fetch_messages(cast(Any, reader)) == []
 
 
-async def test_what_came_meanwhile_is_given_back_when_the_collector_ends() -> None:
+async def test_pending_messages_are_returned_when_collector_ends() -> None:
     log: list[str] = []
-    coming = asyncio.ensure_future(_next(cast(Any, Reader(told(log), told(log)))))
+    coming = asyncio.ensure_future(_receive_batch(cast(Any, FakeReader(create_messages(log), create_messages(log)))))
     await asyncio.wait([coming])
-    await _give_back(coming)
+    await _return_pending_batch(coming)
     assert log == ["nak", "nak"]
-    await _give_back(asyncio.get_running_loop().create_future())  # nothing came yet
+    await _return_pending_batch(asyncio.get_running_loop().create_future())  # nothing came yet
 
 
-def test_a_window_is_written_once_under_the_name_of_its_content(tmp_path: Path) -> None:
+def test_window_is_written_once_under_its_digest(tmp_path: Path) -> None:
     name = "ab" + "0" * 62
-    objects.check_folder(tmp_path)
+    window_files.check_folder(tmp_path)
     for _ in range(2):
-        objects.keep(tmp_path, name, b"PAR1")
-    assert objects.path_of(tmp_path, name).read_bytes() == b"PAR1"
+        window_files.store_window(tmp_path, name, b"PAR1")
+    assert window_files.build_window_path(tmp_path, name).read_bytes() == b"PAR1"
     assert sorted(path.name for path in tmp_path.rglob("*.part")) == []
 
 
-def test_a_collector_that_is_killed_spoils_no_window_that_another_one_keeps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_collector_does_not_corrupt_window_of_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     name, window, fsync = "ab" + "0" * 62, b"w" * 5_000, os.fsync
 
-    def killed(*_: object) -> None:
+    def kill_writer(*_: object) -> None:
         raise KeyboardInterrupt
 
-    def other_begins(descriptor: int) -> None:
+    def start_other_writer(descriptor: int) -> None:
         """Let another collector write the same window between this one's last byte and its rename."""
         fsync(descriptor)
         if stat.S_ISREG(os.fstat(descriptor).st_mode):
             with monkeypatch.context() as inner:
-                inner.setattr(atomic, "write_all", killed)
+                inner.setattr(atomic, "write_all", kill_writer)
                 with pytest.raises(KeyboardInterrupt):
-                    objects.keep(tmp_path, name, window)
+                    window_files.store_window(tmp_path, name, window)
 
     with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", other_begins)
-        objects.keep(tmp_path, name, window)
-    assert objects.path_of(tmp_path, name).read_bytes() == window
+        patch.setattr(os, "fsync", start_other_writer)
+        window_files.store_window(tmp_path, name, window)
+    assert window_files.build_window_path(tmp_path, name).read_bytes() == window
     left = [path.stem for path in tmp_path.rglob("*") if path.is_file() and path.stem != name]
-    assert [objects.path_of(tmp_path, each).is_file() for each in left] == [True], "retention finds what is left behind"
+    assert [window_files.build_window_path(tmp_path, each).is_file() for each in left] == [True], (
+        "retention finds what is left behind"
+    )

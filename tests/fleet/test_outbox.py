@@ -21,30 +21,30 @@ from fdhil.store import outbox
 from fdhil.store.history import HISTORY_FILE_NAME, History
 from fdhil.store.outbox import OutboxReader, Position, read_position, write_position
 from tests.bench import bench_document
-from tests.fleet.machine import Machine, written
+from tests.fleet.recording_machine import RecordingMachine, write_history
 
 
 @pytest.fixture
-def machine(tmp_path: Path) -> Iterator[Machine]:
-    made = Machine(written(tmp_path, windows="all"))
+def machine(tmp_path: Path) -> Iterator[RecordingMachine]:
+    made = RecordingMachine(write_history(tmp_path, windows="all"))
     yield made
-    made.close()
+    made.close_store()
 
 
 @contextmanager
-def reading(machine: Machine) -> Iterator[OutboxReader]:
+def read_outbox(machine: RecordingMachine) -> Iterator[OutboxReader]:
     with OutboxReader(machine.config.store.directory) as reader:
         yield reader
 
 
-def change(machine: Machine, statement: str) -> None:
+def change_database(machine: RecordingMachine, statement: str) -> None:
     with closing(sqlite3.connect(machine.config.store.directory / HISTORY_FILE_NAME)) as db, db:
         db.execute(statement)
 
 
-def test_everything_that_is_recorded_is_entered_in_order(machine: Machine) -> None:
-    count = machine.record(2)
-    with reading(machine) as reader:
+def test_all_records_enter_outbox_in_order(machine: RecordingMachine) -> None:
+    count = machine.record_windows(2)
+    with read_outbox(machine) as reader:
         entries = reader.entries(0, 1000)
     assert [entry.number for entry in entries] == list(range(1, count + 1))
     of_x = [entry.kind for entry in entries if entry.axis == "X"]
@@ -53,30 +53,30 @@ def test_everything_that_is_recorded_is_entered_in_order(machine: Machine) -> No
     assert entries[0].with_file
 
 
-def test_an_acknowledgement_is_told_too(machine: Machine) -> None:
-    machine.record(1)
+def test_acknowledgement_enters_outbox(machine: RecordingMachine) -> None:
+    machine.record_windows(1)
     machine.store.store_acknowledgement({"up_to": 1, "by": "Anna"})
-    with reading(machine) as reader:
+    with read_outbox(machine) as reader:
         assert reader.entries(0, 1000)[-1].kind == "acknowledgement"
 
 
-def test_without_an_uplink_nothing_is_kept_for_one(tmp_path: Path) -> None:
+def test_outbox_is_empty_without_uplink(tmp_path: Path) -> None:
     file = tmp_path / "machine.toml"
     file.write_text(to_toml(bench_document()))
-    machine = Machine(file)
-    machine.record(1)
-    machine.close()
-    with reading(machine) as reader:
+    machine = RecordingMachine(file)
+    machine.record_windows(1)
+    machine.close_store()
+    with read_outbox(machine) as reader:
         assert reader.waiting(0) == 0
 
 
-def test_neither_is_there_without_the_other(machine: Machine) -> None:
-    machine.record(1)
+def test_record_and_outbox_entry_are_written_together(machine: RecordingMachine) -> None:
+    machine.record_windows(1)
     when = "BEFORE INSERT ON outbox WHEN NEW.of = 'notices'"
-    change(machine, f"CREATE TRIGGER refuses {when} BEGIN SELECT RAISE(FAIL, 'no'); END")
+    change_database(machine, f"CREATE TRIGGER refuses {when} BEGIN SELECT RAISE(FAIL, 'no'); END")
     with pytest.raises(AssertionError):
-        machine.record(1)  # its notice is refused
-    with reading(machine) as reader, History.read(machine.config.store.directory) as history:
+        machine.record_windows(1)  # its notice is refused
+    with read_outbox(machine) as reader, History.read(machine.config.store.directory) as history:
         assert len(history.notices()) == 1
         assert [entry.kind for entry in reader.entries(0, 1000)].count("notice") == 1
         assert len(history.windows()) == 4
@@ -87,95 +87,95 @@ def test_neither_is_there_without_the_other(machine: Machine) -> None:
     [({"windows": "all"}, 12), ({"windows": "refused"}, 4), ({"windows": "some", "every_window": 4}, 4),
      ({"windows": "none"}, 0), ({}, 4)],
 )  # fmt: skip
-def test_windows_are_sent_whole_by_the_policy(policy: dict[str, Any], sent: int, tmp_path: Path) -> None:
-    machine = Machine(written(tmp_path, **policy))
-    machine.record(6)  # every third is refused
-    with reading(machine) as reader:
+def test_windows_are_sent_by_policy(policy: dict[str, Any], sent: int, tmp_path: Path) -> None:
+    machine = RecordingMachine(write_history(tmp_path, **policy))
+    machine.record_windows(6)  # every third is refused
+    with read_outbox(machine) as reader:
         assert sum(entry.with_file for entry in reader.entries(0, 1000)) == sent
-    machine.close()
+    machine.close_store()
 
 
 @pytest.fixture
-def often(monkeypatch: pytest.MonkeyPatch) -> None:
+def frequent_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outbox, "PRUNE_EVERY", 10)
 
 
 @pytest.mark.parametrize("running", [True, False])
-def test_an_older_copy_of_the_history_is_sent_under_an_identity_of_its_own(running: bool, machine: Machine) -> None:
-    machine.record(1)
+def test_restored_history_copy_gets_new_identity(running: bool, machine: RecordingMachine) -> None:
+    machine.record_windows(1)
     history = machine.config.store.directory / HISTORY_FILE_NAME
     shutil.copy(history, history.with_name("backup"))
-    machine.record(2)
-    with reading(machine) as reader:
+    machine.record_windows(2)
+    with read_outbox(machine) as reader:
         *_, last = reader.entries(0, 1000)
         sent = Position(reader.store, last.number, last.message)
-    write_position(folder_of(machine), sent)
+    write_position(find_folder(machine), sent)
     if running:
         history.with_name("backup").replace(history)
         assert [notice.code for notice in machine.store.store_outcomes([])] == ["StoreReplaced"]
     else:
-        machine.close()
+        machine.close_store()
         history.with_name("backup").replace(history)
-        with reading(machine) as reader, pytest.raises(StoreError, match="is an older copy"):
+        with read_outbox(machine) as reader, pytest.raises(StoreError, match="is an older copy"):
             reader.start(sent)
         assert [trouble.code for trouble in _outbox(machine.config)] == ["UplinkOutbox"]
         assert machine.store.open() == []
     machine.store.store_outcomes([Notice("A", "minor", "after")])
-    with reading(machine) as reader:
+    with read_outbox(machine) as reader:
         assert reader.store != sent.store
         assert reader.start(sent) == Position(reader.store)
         assert [(entry.number, entry.row["text"]) for entry in reader.entries(0, 1000)] == [(1, "after")]
 
 
-@pytest.mark.usefixtures("often")
-def test_what_was_sent_goes_and_the_last_stays_to_be_known_again(machine: Machine) -> None:
-    machine.record(3)
-    with reading(machine) as reader:
+@pytest.mark.usefixtures("frequent_windows")
+def test_sent_entries_are_removed_except_the_last(machine: RecordingMachine) -> None:
+    machine.record_windows(3)
+    with read_outbox(machine) as reader:
         last = reader.entries(0, 1000)[14]
         sent = Position(reader.store, last.number, last.message)
-    write_position(folder_of(machine), sent)
-    machine.record(3)
-    with reading(machine) as reader:
+    write_position(find_folder(machine), sent)
+    machine.record_windows(3)
+    with read_outbox(machine) as reader:
         assert reader.entries(0, 1)[0].number == last.number
-        assert reader.start(read_position(folder_of(machine))) == sent
+        assert reader.start(read_position(find_folder(machine))) == sent
         assert reader.dropped == 0
 
 
-def folder_of(machine: Machine) -> Path:
+def find_folder(machine: RecordingMachine) -> Path:
     folder = machine.config.uplink_directory
     folder.mkdir(exist_ok=True)
     return folder
 
 
-@pytest.mark.usefixtures("often")
-def test_when_it_is_full_the_oldest_go_and_are_counted(tmp_path: Path) -> None:
-    machine = Machine(written(tmp_path), keep_unsent=20)
-    count = sum(machine.record(1) for _ in range(9))
-    with reading(machine) as reader:
+@pytest.mark.usefixtures("frequent_windows")
+def test_full_outbox_drops_and_counts_oldest_entries(tmp_path: Path) -> None:
+    machine = RecordingMachine(write_history(tmp_path), keep_unsent=20)
+    count = sum(machine.record_windows(1) for _ in range(9))
+    with read_outbox(machine) as reader:
         kept = reader.entries(0, 5000)
         assert 20 <= len(kept) < 30
         assert kept[-1].number == count
         assert reader.dropped == count - len(kept)
-    machine.close()
+    machine.close_store()
 
 
-@pytest.mark.usefixtures("often")
+@pytest.mark.usefixtures("frequent_windows")
 @pytest.mark.parametrize(
     "content",
     ["", "{", "[]", "{}", '{"entry": "7"}', '{"store": 1, "entry": 3}', '{"entry": 1e9}', "[" * 2000,
      '{"entry": -1}', '{"entry": 9223372036854775808}'],
 )  # fmt: skip
-def test_a_damaged_position_is_the_beginning(content: str, machine: Machine) -> None:
-    machine.record(1)
-    (folder_of(machine) / outbox.POSITION_FILE).write_text(content)
-    with reading(machine) as reader:
-        assert reader.start(read_position(folder_of(machine))).entry == 0
-    machine.record(2)  # which lets go what was sent
+def test_damaged_position_restarts_from_beginning(content: str, machine: RecordingMachine) -> None:
+    machine.record_windows(1)
+    (find_folder(machine) / outbox.POSITION_FILE).write_text(content)
+    with read_outbox(machine) as reader:
+        assert reader.start(read_position(find_folder(machine))).entry == 0
+    machine.record_windows(2)  # which lets go what was sent
 
 
-def test_the_position_of_another_file_is_the_beginning(machine: Machine) -> None:
-    machine.record(1)
-    with reading(machine) as reader:
+def test_position_of_another_history_restarts_from_beginning(machine: RecordingMachine) -> None:
+    machine.record_windows(1)
+    with read_outbox(machine) as reader:
         third = reader.entries(0, 10)[2]
         good = Position(reader.store, third.number, third.message)
         assert reader.start(good) == good
@@ -183,12 +183,12 @@ def test_the_position_of_another_file_is_the_beginning(machine: Machine) -> None
             assert reader.start(other) == Position(reader.store)
 
 
-def test_a_row_that_is_damaged_or_gone_is_told_as_that(machine: Machine) -> None:
-    machine.record(1)
-    change(machine, "UPDATE revisions SET ft = 99 WHERE axis = 'X'")
-    change(machine, "DELETE FROM notices")
-    change(machine, "UPDATE outbox SET row = 2 WHERE of = 'skills' AND axis = 'X'")
-    with reading(machine) as reader:
+def test_damaged_or_deleted_row_is_reported_as_such(machine: RecordingMachine) -> None:
+    machine.record_windows(1)
+    change_database(machine, "UPDATE revisions SET ft = 99 WHERE axis = 'X'")
+    change_database(machine, "DELETE FROM notices")
+    change_database(machine, "UPDATE outbox SET row = 2 WHERE of = 'skills' AND axis = 'X'")
+    with read_outbox(machine) as reader:
         told = {(entry.axis, entry.kind): entry.left_out for entry in reader.entries(0, 10)}
     assert told == {
         ("X", "window"): "",
@@ -201,7 +201,7 @@ def test_a_row_that_is_damaged_or_gone_is_told_as_that(machine: Machine) -> None
     }
 
 
-def test_an_uplink_is_not_the_machine(tmp_path: Path) -> None:
+def test_uplink_settings_do_not_change_machine_digest(tmp_path: Path) -> None:
     """Adding an uplink requires no new commissioning."""
     document = bench_document()
     plain = machine_config.parse_config(document)
@@ -221,27 +221,27 @@ def test_an_uplink_is_not_the_machine(tmp_path: Path) -> None:
         ({"labels": {"Type": "V"}}, "uplink.labels"),
     ],
 )
-def test_a_wrong_uplink_is_refused(uplink: dict[str, Any], told: str) -> None:
+def test_invalid_uplink_is_refused(uplink: dict[str, Any], told: str) -> None:
     with pytest.raises(ConfigError) as error:
         machine_config.parse_config(bench_document() | {"uplink": uplink})
     assert told in str(error.value)
 
 
 @pytest.fixture
-def older(tmp_path: Path) -> Path:
+def older_history(tmp_path: Path) -> Path:
     """A machine's file whose store has four rounds recorded without [uplink]."""
-    file = written(tmp_path, windows="some", every_window=2)
-    machine = Machine(file, quiet=True)
-    machine.record(4)
+    file = write_history(tmp_path, windows="some", every_window=2)
+    machine = RecordingMachine(file, quiet=True)
+    machine.record_windows(4)
     machine.store.store_acknowledgement({"up_to": 1, "by": "Anna"})
-    machine.close()
+    machine.close_store()
     return file
 
 
-def test_what_was_recorded_before_is_told_once_in_its_order(older: Path) -> None:
+def test_earlier_records_are_sent_once_in_order(older_history: Path) -> None:
     for _ in range(2):
-        machine = Machine(older)
-        with reading(machine) as reader:
+        machine = RecordingMachine(older_history)
+        with read_outbox(machine) as reader:
             entries = reader.entries(0, 1000)
         assert [entry.number for entry in entries] == list(range(1, 30))
         assert {entry.left_out for entry in entries} == {""}
@@ -251,16 +251,16 @@ def test_what_was_recorded_before_is_told_once_in_its_order(older: Path) -> None
         assert entries[-1].kind == "acknowledgement"
         whole = [entry.with_file for entry in entries if entry.kind == "window"]
         assert whole == [True, False] * 4
-        machine.close()
-    machine = Machine(older)
-    machine.record(1)
-    with reading(machine) as reader:
+        machine.close_store()
+    machine = RecordingMachine(older_history)
+    machine.record_windows(1)
+    with read_outbox(machine) as reader:
         assert len(reader.entries(0, 1000)) == 29 + 7
-    machine.close()
+    machine.close_store()
 
 
-def test_a_clock_that_was_set_back_turns_nothing_round(older: Path) -> None:
-    config = machine_config.load_config(older)
+def test_clock_set_back_does_not_change_order(older_history: Path) -> None:
+    config = machine_config.load_config(older_history)
     assert config.uplink is not None
     with closing(sqlite3.connect(config.store.directory / HISTORY_FILE_NAME)) as db:
         db.execute("UPDATE revisions SET wall_s = 1000 - id")
@@ -270,10 +270,10 @@ def test_a_clock_that_was_set_back_turns_nothing_round(older: Path) -> None:
     assert len(rows) == 8
 
 
-def test_of_too_much_from_before_the_newest_is_told(older: Path) -> None:
-    machine = Machine(older, keep_unsent=5)
-    with reading(machine) as reader:
+def test_newest_of_too_many_earlier_records_are_sent(older_history: Path) -> None:
+    machine = RecordingMachine(older_history, keep_unsent=5)
+    with read_outbox(machine) as reader:
         kinds = [entry.kind for entry in reader.entries(0, 1000)]
     assert len(kinds) == 5
     assert kinds[-1] == "acknowledgement"
-    machine.close()
+    machine.close_store()

@@ -19,18 +19,18 @@ import pytest
 from fdhil.config import Identification
 from fdhil.config.fleet_config import load_fleet_config
 from fdhil.errors import StoreError
-from fdhil.fleet import objects, reanalysis
-from fdhil.fleet.sets import entered
-from fdhil.fleet.window_work import Method, code_digest
-from fdhil.fleet.workers import WindowCrew, workers
+from fdhil.fleet import reanalysis, window_files
+from fdhil.fleet.parameter_sets import open_database
+from fdhil.fleet.window_reanalysis import AnalysisMethod, compute_code_digest
+from fdhil.fleet.worker_pools import WindowCrew, open_worker_pool
 from fdhil.pipeline import analyse
 from fdhil.records import Reason, WindowOutcome
 from tests.daemon.machine_rig import fdhil
-from tests.fleet.machine import Machine, written
-from tests.fleet.servers import Postgres, children, listens, until
-from tests.fleet.works import fleet_of, gather, told_by
+from tests.fleet.fleet_database import build_fleet, collect_messages, list_messages
+from tests.fleet.recording_machine import RecordingMachine, write_history
+from tests.fleet.servers import Postgres, is_listening, list_children, wait_until
+from tests.free_ports import find_free_port
 from tests.identification.recorded import windows
-from tests.ports import free_port
 
 pytestmark = pytest.mark.debian
 BEFORE = Identification(method="least_squares")
@@ -39,23 +39,25 @@ ROWS = "SELECT machine, window_name, digest, result::text FROM fleet.reanalysed_
 
 
 @pytest.fixture
-def works(database: Postgres, tmp_path: Path) -> Path:
+def fleet_settings(database: Postgres, tmp_path: Path) -> Path:
     """Two machines whose windows are collected, analysed by the old method; the last of each was refused."""
     for k in range(2):
-        machine = Machine(written(tmp_path / str(k), f"mill-{k}", windows="all", labels={"type": "V-800"}))
+        machine = RecordingMachine(
+            write_history(tmp_path / str(k), f"mill-{k}", windows="all", labels={"type": "V-800"})
+        )
         for seed in range(EACH):
             window = windows(0.003, 100 * k + seed, moves=2)[seed % 2]
             found = analyse(window, BEFORE)
             assert found.verdict.accepted
-            assert machine.store.store_outcomes([found if seed < EACH - 1 else refused(found)]) == []
-        machine.close()
-        asyncio.run(gather(fleet_of(database, tmp_path), told_by(machine, with_windows=True)))
+            assert machine.store.store_outcomes([found if seed < EACH - 1 else run_refused(found)]) == []
+        machine.close_store()
+        asyncio.run(collect_messages(build_fleet(database, tmp_path), list_messages(machine, with_windows=True)))
     file = tmp_path / "fleet.toml"
     file.write_text(f'[database]\nconnection = "{database.connection}"\n[objects]\ndirectory = "objects"\n')
     return file
 
 
-def refused(found: WindowOutcome) -> WindowOutcome:
+def run_refused(found: WindowOutcome) -> WindowOutcome:
     """Return an outcome as an older fdhil may have refused it."""
     return replace(
         found, verdict=replace(found.verdict, accepted=False, reasons=(Reason("Unexplained", "12 um left"),))
@@ -71,11 +73,11 @@ def run_query(capsys: pytest.CaptureFixture[str], code: int, *words: object) -> 
     return document
 
 
-def test_a_new_method_is_a_revision_beside_what_was_found(
-    works: Path, database: Postgres, capsys: pytest.CaptureFixture[str]
+def test_new_method_creates_revision_next_to_results(
+    fleet_settings: Path, database: Postgres, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before = database.ask("SELECT * FROM fleet.records ORDER BY machine, message")
-    same = run_query(capsys, 0, works, "--method", "least_squares")
+    before = database.execute_query("SELECT * FROM fleet.records ORDER BY machine, message")
+    same = run_query(capsys, 0, fleet_settings, "--method", "least_squares")
     assert (same["windows"], same["without_config"], same["unreadable"]) == (12, 12, 0)
     assert {each["change"] for each in same["moved"]} == {0.0}  # the bits of the machine itself
     assert {each["windows"] for each in same["moved"]} == {10}
@@ -84,86 +86,97 @@ def test_a_new_method_is_a_revision_beside_what_was_found(
     ]
     assert {each["machine"] for each in same["listed"]} == {"mill-0", "mill-1"}
 
-    part = run_query(capsys, 0, works, "--machine", "mill-1", "--method", "partial_moments")
+    part = run_query(capsys, 0, fleet_settings, "--machine", "mill-1", "--method", "partial_moments")
     assert (part["revision"], part["windows"]) == (2, 6)
-    whole = run_query(capsys, 0, works, "--method", "partial_moments")
+    whole = run_query(capsys, 0, fleet_settings, "--method", "partial_moments")
     assert (whole["revision"], whole["windows"]) == (2, 12)
     of_ft = next(each for each in whole["moved"] if each["parameter"] == "ft")
     assert 0 < of_ft["off"] <= of_ft["most"]
     assert of_ft["unit"] == "N.m.s"
-    assert run_query(capsys, 0, works, "--method", "partial_moments")["digest"] == whole["digest"] != same["digest"]
-    assert database.ask("SELECT * FROM fleet.records ORDER BY machine, message") == before
-    assert database.ask("SELECT revision, count(*) FROM fleet.reanalysed GROUP BY 1 ORDER BY 1") == [(1, 12), (2, 12)]
+    assert (
+        run_query(capsys, 0, fleet_settings, "--method", "partial_moments")["digest"]
+        == whole["digest"]
+        != same["digest"]
+    )
+    assert database.execute_query("SELECT * FROM fleet.records ORDER BY machine, message") == before
+    assert database.execute_query("SELECT revision, count(*) FROM fleet.reanalysed GROUP BY 1 ORDER BY 1") == [
+        (1, 12),
+        (2, 12),
+    ]
 
-    code, text, _ = fdhil("fleet", "reanalyse", works, "--workers", "0", "--method", "partial_moments", capsys=capsys)
+    code, text, _ = fdhil(
+        "fleet", "reanalyse", fleet_settings, "--workers", "0", "--method", "partial_moments", capsys=capsys
+    )
     assert code == 0
     assert "revision 2: 12 windows analysed again, 12 of them without a configuration" in text
     assert "2 windows newly accepted, was refused for Unexplained" in text
 
 
-def test_the_time_and_the_axis_bound_it(works: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_query(capsys, 0, works, "--until", "2020-01-01", "--method", "least_squares")["windows"] == 0
-    assert run_query(capsys, 0, works, "--axis", "Y", "--method", "least_squares")["windows"] == 0
-    assert run_query(capsys, 0, works, "--since", "2020-01-01", "--method", "least_squares")["windows"] == 12
+def test_time_and_axis_limit_reanalysis(fleet_settings: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_query(capsys, 0, fleet_settings, "--until", "2020-01-01", "--method", "least_squares")["windows"] == 0
+    assert run_query(capsys, 0, fleet_settings, "--axis", "Y", "--method", "least_squares")["windows"] == 0
+    assert run_query(capsys, 0, fleet_settings, "--since", "2020-01-01", "--method", "least_squares")["windows"] == 12
 
 
-def test_with_the_configuration_of_its_machine_a_window_is_weighed(
-    works: Path, tmp_path: Path, database: Postgres, capsys: pytest.CaptureFixture[str]
+def test_window_is_assessed_with_machine_configuration(
+    fleet_settings: Path, tmp_path: Path, database: Postgres, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = run_query(capsys, 0, works, "--method", "least_squares", "--config", tmp_path / "1" / "machine.toml")
+    told = run_query(
+        capsys, 0, fleet_settings, "--method", "least_squares", "--config", tmp_path / "1" / "machine.toml"
+    )
     assert (told["windows"], told["without_config"]) == (12, 6)
     query = "SELECT DISTINCT machine, unexplained_um IS NULL FROM fleet.reanalysed ORDER BY 1"
-    assert database.ask(query) == [("mill-0", True), ("mill-1", False)]
+    assert database.execute_query(query) == [("mill-0", True), ("mill-1", False)]
 
 
-def test_what_cannot_be_read_is_told_and_tried_again(
-    works: Path, tmp_path: Path, database: Postgres, capsys: pytest.CaptureFixture[str]
+def test_unreadable_window_is_reported_and_retried(
+    fleet_settings: Path, tmp_path: Path, database: Postgres, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ((name,),) = database.ask(
+    ((name,),) = database.execute_query(
         "SELECT window_name FROM fleet.windows WHERE window_name > '' ORDER BY machine, number LIMIT 1"
     )
-    path = objects.path_of(tmp_path / "objects", name)
+    path = window_files.build_window_path(tmp_path / "objects", name)
     content = path.read_bytes()
     path.write_bytes(content[:-100])
-    told = run_query(capsys, 3, works, "--method", "least_squares")
+    told = run_query(capsys, 3, fleet_settings, "--method", "least_squares")
     assert (told["windows"], told["unreadable"]) == (12, 1)
     assert ["damaged" in (each["error"] or "") for each in told["listed"]].count(True) == 1
-    assert run_query(capsys, 3, works, "--method", "least_squares")["digest"] == told["digest"]
+    assert run_query(capsys, 3, fleet_settings, "--method", "least_squares")["digest"] == told["digest"]
     path.write_bytes(content)
-    again = run_query(capsys, 0, works, "--method", "least_squares")
+    again = run_query(capsys, 0, fleet_settings, "--method", "least_squares")
     assert (again["windows"], again["unreadable"]) == (12, 0)
 
 
-def test_killed_in_the_middle_it_goes_on_where_it_was_to_the_same_bytes(
-    works: Path, database: Postgres, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_killed_reanalysis_resumes_to_identical_results(
+    fleet_settings: Path, database: Postgres, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    whole = run_query(capsys, 0, works, "--method", "least_squares")
-    alone = database.ask(ROWS)
-    database.ask("TRUNCATE fleet.reanalyses RESTART IDENTITY CASCADE")
+    whole = run_query(capsys, 0, fleet_settings, "--method", "least_squares")
+    alone = database.execute_query(ROWS)
+    database.execute_query("TRUNCATE fleet.reanalyses RESTART IDENTITY CASCADE")
     code = f"""
 from tests.fleet.test_reanalysis import slowly
-slowly({str(works)!r})
+slowly({str(fleet_settings)!r})
 """
     process = subprocess.Popen([sys.executable, "-c", code])
-    until(lambda: len(database.ask(ROWS)) >= 4, "some windows are done")
-    helpers = children(process.pid)
+    wait_until(lambda: len(database.execute_query(ROWS)) >= 4, "some windows are done")
+    helpers = list_children(process.pid)
     assert len(helpers) >= 2
     process.send_signal(signal.SIGKILL)
     process.wait()
-    until(lambda: not any(map(runs, helpers)), "its workers have ended with it")
+    wait_until(lambda: not any(map(count_runs, helpers)), "its workers have ended with it")
     held = "SELECT 1 FROM pg_locks WHERE locktype = 'advisory'"
-    until(lambda: database.ask(held) == [], "the database has seen that it is gone")
-    done = len(database.ask(ROWS))
+    wait_until(lambda: database.execute_query(held) == [], "the database has seen that it is gone")
+    done = len(database.execute_query(ROWS))
     assert done == 4
     told: list[tuple[int, int]] = []
-    with workers(None, 0, per_task=1) as crew:
-        resumed(works, crew, lambda *far: told.append(far))
+    with open_worker_pool(None, 0, per_task=1) as crew:
+        resume_run(fleet_settings, crew, lambda *far: told.append(far))
     assert told == [(k, 12 - done) for k in range(13 - done)]  # what was done is not done again
-    assert database.ask(ROWS) == alone
-    assert run_query(capsys, 0, works, "--method", "least_squares")["digest"] == whole["digest"]
+    assert database.execute_query(ROWS) == alone
+    assert run_query(capsys, 0, fleet_settings, "--method", "least_squares")["digest"] == whole["digest"]
 
 
-def runs(pid: int) -> bool:
+def count_runs(pid: int) -> bool:
     """Whether a process runs; zombies do not."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
@@ -172,9 +185,9 @@ def runs(pid: int) -> bool:
 
 
 @contextmanager
-def cluster() -> Iterator[tuple[str, subprocess.Popen[bytes], subprocess.Popen[bytes]]]:
+def start_cluster() -> Iterator[tuple[str, subprocess.Popen[bytes], subprocess.Popen[bytes]]]:
     """Run a Dask scheduler and a worker as a user starts them; yield the address and the two processes."""
-    address = f"tcp://127.0.0.1:{free_port()}"
+    address = f"tcp://127.0.0.1:{find_free_port()}"
     place = ["--host", "127.0.0.1", "--no-dashboard"]
     words = [
         ["scheduler", "--port", address.rpartition(":")[2], *place],
@@ -183,7 +196,7 @@ def cluster() -> Iterator[tuple[str, subprocess.Popen[bytes], subprocess.Popen[b
     dask = [sys.executable, "-m", "dask"]
     processes = [subprocess.Popen([*dask, *told], stderr=subprocess.DEVNULL) for told in words]
     try:
-        until(lambda: listens(int(words[0][2])), "the scheduler listens")
+        wait_until(lambda: is_listening(int(words[0][2])), "the scheduler listens")
         yield address, processes[0], processes[1]
     finally:
         for process in processes:
@@ -191,18 +204,27 @@ def cluster() -> Iterator[tuple[str, subprocess.Popen[bytes], subprocess.Popen[b
             process.wait()
 
 
-def test_on_a_cluster_that_is_there_and_goes_away(
-    works: Path, database: Postgres, capsys: pytest.CaptureFixture[str]
+def test_reanalysis_survives_lost_cluster(
+    fleet_settings: Path, database: Postgres, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    alone = run_query(capsys, 0, works, "--method", "least_squares")
-    database.ask("TRUNCATE fleet.reanalyses RESTART IDENTITY CASCADE")
-    with cluster() as (address, scheduler, worker):
-        command = [sys.executable, "-m", "fdhil.cli.main", "fleet", "reanalyse", str(works), "--scheduler", address]
+    alone = run_query(capsys, 0, fleet_settings, "--method", "least_squares")
+    database.execute_query("TRUNCATE fleet.reanalyses RESTART IDENTITY CASCADE")
+    with start_cluster() as (address, scheduler, worker):
+        command = [
+            sys.executable,
+            "-m",
+            "fdhil.cli.main",
+            "fleet",
+            "reanalyse",
+            str(fleet_settings),
+            "--scheduler",
+            address,
+        ]
         told = subprocess.run([*command, "--method", "least_squares", "--json"], capture_output=True, check=True)
         assert json.loads(told.stdout)["digest"] == alone["digest"]
         worker.send_signal(signal.SIGSTOP)  # nothing gets done
         again = subprocess.Popen([*command, "--method", "partial_moments"], stderr=subprocess.PIPE, text=True)
-        until(lambda: len(database.ask("SELECT 1 FROM fleet.reanalyses")) == 2, "it is at work")
+        wait_until(lambda: len(database.execute_query("SELECT 1 FROM fleet.reanalyses")) == 2, "it is at work")
         scheduler.kill()
         _, err = again.communicate(timeout=180)
     assert again.returncode == 3
@@ -210,32 +232,32 @@ def test_on_a_cluster_that_is_there_and_goes_away(
     assert len(err.splitlines()) == 1
 
 
-def slowly(file: str) -> None:
+def analyse_slowly(file: str) -> None:
     """Reanalyse with two workers, one window per task, in a process to be killed: the fourth task never ends."""
-    with workers(None, 2, per_task=1) as crew:
-        resumed(Path(file), crew, lambda done, total: time.sleep(600 if done == 4 else 0))
+    with open_worker_pool(None, 2, per_task=1) as crew:
+        resume_run(Path(file), crew, lambda done, total: time.sleep(600 if done == 4 else 0))
 
 
-def resumed(file: Path, crew: WindowCrew, progress: reanalysis.Progress) -> None:
+def resume_run(file: Path, crew: WindowCrew, progress: reanalysis.Progress) -> None:
     """Complete the revision of the old method."""
     fleet = load_fleet_config(file)
-    method = Method(BEFORE, {}, fleet.objects.directory.resolve(), code_digest())
-    reanalysis.reanalyse(fleet, method, reanalysis.Scope(), crew, progress)
+    method = AnalysisMethod(BEFORE, {}, fleet.objects.directory.resolve(), compute_code_digest())
+    reanalysis.reanalyse_windows(fleet, method, reanalysis.WindowScope(), crew, progress)
 
 
-def test_one_alone_makes_a_revision(works: Path, database: Postgres, tmp_path: Path) -> None:
-    fleet = fleet_of(database, tmp_path)
-    method = Method(BEFORE, {}, fleet.objects.directory, code_digest())
-    with workers(None, 0) as crew:
-        revision = reanalysis.reanalyse(fleet, method, reanalysis.Scope(axis="Y"), crew)
-    with entered(fleet) as other, workers(None, 0) as crew:
+def test_only_one_process_works_on_a_revision(fleet_settings: Path, database: Postgres, tmp_path: Path) -> None:
+    fleet = build_fleet(database, tmp_path)
+    method = AnalysisMethod(BEFORE, {}, fleet.objects.directory, compute_code_digest())
+    with open_worker_pool(None, 0) as crew:
+        revision = reanalysis.reanalyse_windows(fleet, method, reanalysis.WindowScope(axis="Y"), crew)
+    with open_database(fleet) as other, open_worker_pool(None, 0) as crew:
         other.execute("SELECT pg_advisory_lock(%s, %s)", (reanalysis._LOCK, revision))
         with pytest.raises(StoreError, match="another fdhil fleet reanalyse"):
-            reanalysis.reanalyse(fleet, method, reanalysis.Scope(), crew)
+            reanalysis.reanalyse_windows(fleet, method, reanalysis.WindowScope(), crew)
 
 
-def test_what_a_machine_told_that_is_no_number_spoils_no_report(
-    works: Path, database: Postgres, capsys: pytest.CaptureFixture[str]
+def test_non_numeric_value_does_not_break_report(
+    fleet_settings: Path, database: Postgres, capsys: pytest.CaptureFixture[str]
 ) -> None:
     odd = [
         '{"ft": {"value": "x"}}',
@@ -245,9 +267,9 @@ def test_what_a_machine_told_that_is_no_number_spoils_no_report(
         "null",
     ]
     for k, text in enumerate(odd):
-        database.ask(
+        database.execute_query(
             f"""UPDATE fleet.records SET record = jsonb_set(record, '{{parameters}}', '{text}') || '{{"reasons": 7}}'
             WHERE kind = 'window' AND machine = 'mill-0' AND (record->>'number')::int = {k + 1}"""
         )
-    told = run_query(capsys, 0, works, "--method", "least_squares")
+    told = run_query(capsys, 0, fleet_settings, "--method", "least_squares")
     assert {each["windows"] for each in told["moved"]} == {5}

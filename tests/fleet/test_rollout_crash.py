@@ -19,17 +19,17 @@ from fdhil.store.offers import read_answers
 from tests.crash import call_faults, disks
 from tests.crash.loops import KINDS, Kind, tried
 from tests.crash.stored_records import Plain
-from tests.fleet.offers import Works, machine_of
+from tests.fleet.offer_signing import OfferSigner, create_machine
 
 KEY = "axis.X.nominal.ft"
 VERSIONS = (1, 2, 3, 4, 9)
 STATES = (0, *VERSIONS)
 
 
-class Refused(FdhilError): ...
+class RefusedAcceptance(FdhilError): ...
 
 
-class Acceptances(Plain):
+class AcceptanceScenario(Plain):
     """A machine that accepts successive versions, each by the command itself; a record is a version."""
 
     offers: Path
@@ -37,11 +37,11 @@ class Acceptances(Plain):
 
     @classmethod
     def prepare(cls, folder: Path) -> None:
-        works = Works(folder)
-        cls.first = machine_of(works, folder / "first").read_text()
+        works = OfferSigner(folder)
+        cls.first = create_machine(works, folder / "first").read_text()
         for version in VERSIONS:
             values = {KEY: cls.value(version)}
-            (folder / f"{version}.offer").write_bytes(works.document(version=version, values=values))
+            (folder / f"{version}.offer").write_bytes(works.sign_document(version=version, values=values))
         cls.offers = folder
 
     @staticmethod
@@ -62,7 +62,7 @@ class Acceptances(Plain):
             with contextlib.redirect_stdout(io.StringIO()):
                 code = run_safely(cli)
         if code:
-            raise Refused(said.getvalue().replace(" (check", "; check"))
+            raise RefusedAcceptance(said.getvalue().replace(" (check", "; check"))
 
     def found(self) -> set[int]:
         """Return the recorded accepted versions; AssertionError for a file that never existed in this form.
@@ -90,15 +90,17 @@ class Acceptances(Plain):
 @pytest.fixture
 def offers(tmp_path: Path) -> Path:
     folder = Path(tempfile.mkdtemp(dir=tmp_path))
-    Acceptances.prepare(folder)
+    AcceptanceScenario.prepare(folder)
     return folder
 
 
 @pytest.mark.debian
-def test_an_acceptance_is_whole_whatever_call_fails_or_is_the_last(
+def test_acceptance_is_atomic_at_any_failing_call(
     offers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(KINDS, "acceptances", Kind(Acceptances, partial(call_faults.keep_some, Acceptances)))
+    monkeypatch.setitem(
+        KINDS, "acceptances", Kind(AcceptanceScenario, partial(call_faults.keep_some, AcceptanceScenario))
+    )
     found = tried("acceptances", tmp_path / "tried", most=16)
     assert found.wrong == []
     assert found.acknowledged > 0
@@ -106,9 +108,9 @@ def test_an_acceptance_is_whole_whatever_call_fails_or_is_the_last(
 
 
 @pytest.mark.usefixtures("processes")
-def test_a_full_disk_takes_nothing_back(offers: Path, tmp_path: Path) -> None:
+def test_full_disk_undoes_no_acceptance(offers: Path, tmp_path: Path) -> None:
     (tmp_path / "disk").mkdir()
-    told = disks.filled(Acceptances, tmp_path / "disk", free_bytes=0)
+    told = disks.filled(AcceptanceScenario, tmp_path / "disk", free_bytes=0)
     assert (told.wrong, told.ended) == ([], True)
     assert set(told.kept) - {9} <= set(told.found)
     assert 1 in told.found

@@ -24,26 +24,26 @@ smoothing_s = [0.06, 0.03] # two
 """
 
 
-def test_a_value_is_changed_and_its_comment_stays() -> None:
+def test_value_is_changed_and_comment_kept() -> None:
     out = edit_toml(TEXT, {"axis.X.nominal.ft": 0.061, "nc.profile": "trapezoidal"}, "friction version 3")
     assert out == TEXT.replace("  ft = 0.05    #", "# offer friction version 3\n  ft = 0.061    #").replace(
         'profile = "fir # not a comment"', '# offer friction version 3\nprofile = "trapezoidal"'
     )
 
 
-def test_a_key_that_stands_at_its_default_is_put_below_it_and_a_new_table_at_the_end() -> None:
+def test_default_key_is_added_below_comment_and_new_table_at_end() -> None:
     out = edit_toml(TEXT, {"axis.X.nominal.R": 0.7, "axis.X.nominal.K": 0.8, "maintenance.ft": 1.5}, "n")
     assert "#R = 0.5\n# offer n\nR = 0.7\n" in out
     assert out.endswith("\n[maintenance]\n# offer n\nft = 1.5\n")
     assert tomllib.loads(out)["axis"]["X"]["nominal"] == {"ft": 0.05, "Cd": 5.0, "R": 0.7, "K": 0.8}
 
 
-def test_a_second_offer_takes_the_place_of_the_first_one_s_note() -> None:
+def test_second_offer_replaces_note_of_first() -> None:
     out = edit_toml(edit_toml(TEXT, {"axis.X.nominal.Cd": 4.0}, "one"), {"axis.X.nominal.Cd": 3.0}, "two")
     assert out == TEXT.replace("Cd=5.0", "# offer two\nCd=3.0")
 
 
-def test_lines_end_as_they_did() -> None:
+def test_line_endings_are_kept() -> None:
     out = edit_toml(TEXT.replace("\n", "\r\n"), {"axis.X.nominal.Cd": 4.0, "maintenance.ft": 1.5}, "n")
     assert out.count("\r\n") == out.count("\n")
 
@@ -60,13 +60,13 @@ def test_lines_end_as_they_did() -> None:
         '[axis.X.nominal]\n"ft" = 0.05\n',
     ],
 )
-def test_what_is_written_otherwise_is_left_to_a_person(text: str) -> None:
+def test_unusual_notation_is_not_edited(text: str) -> None:
     with pytest.raises(NotEditable, match="change them by hand"):
         edit_toml(text, {"axis.X.nominal.ft": 0.06}, "n")
 
 
 @pytest.mark.parametrize("text", [write_template(), bench_toml()])
-def test_each_key_of_a_whole_file_can_be_changed(text: str) -> None:
+def test_each_key_of_complete_file_can_be_changed(text: str) -> None:
     document = tomllib.loads(text)
     for axis in document["axis"]:
         for key, value in document["axis"][axis]["nominal"].items():
@@ -83,7 +83,7 @@ VALUES = st.one_of(
 
 @settings(max_examples=150, deadline=None)
 @given(st.lists(VALUES, min_size=3, max_size=3), VALUES, st.sampled_from(["", " # x", "  #", ' # "a = 1"']))
-def test_whatever_the_value_the_rest_is_as_it_was(old: list[object], new: object, comment: str) -> None:
+def test_edit_changes_nothing_else(old: list[object], new: object, comment: str) -> None:
     text = "".join(f"k{n} = {format_toml(value)}{comment}\n" for n, value in enumerate(old))
     text = f"[a.b]\n{text}[c]\nk1 = 7\n"
     out = edit_toml(text, {"a.b.k1": new}, "n")

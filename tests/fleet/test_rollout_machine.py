@@ -14,9 +14,16 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.errors import OutputError, StoreError
-from fdhil.fleet import offered
-from fdhil.fleet.offer import Offer, OfferRefused
-from fdhil.fleet.offered import Judged, accept, judge, kept_file, present, reject
+from fdhil.fleet import offer_review
+from fdhil.fleet.offer_review import (
+    ReviewedOffer,
+    accept_offer,
+    build_backup_path,
+    load_current_machine,
+    reject_offer,
+    review_offer,
+)
+from fdhil.fleet.signed_offer import Offer, OfferRefused
 from fdhil.store.atomic import write_file
 from fdhil.store.offers import (
     ANSWERS_FILE,
@@ -27,46 +34,46 @@ from fdhil.store.offers import (
     newest_accepted,
     read_answers,
 )
-from tests.fleet.offers import NOW, TOLD, Works, machine_of
+from tests.fleet.offer_signing import NOW, TOLD, OfferSigner, create_machine
 
 
 @pytest.fixture
-def works(tmp_path: Path) -> Works:
-    return Works(tmp_path)
+def offer_signer(tmp_path: Path) -> OfferSigner:
+    return OfferSigner(tmp_path)
 
 
 @pytest.fixture
-def file(works: Works, tmp_path: Path) -> Path:
-    return machine_of(works, tmp_path / "mill")
+def config_file(offer_signer: OfferSigner, tmp_path: Path) -> Path:
+    return create_machine(offer_signer, tmp_path / "mill")
 
 
-def judged(works: Works, file: Path, now_s: float | None = None, **changes: Any) -> Judged:
-    return judge(works.carried(**changes), present(file, now_s))
+def review(works: OfferSigner, file: Path, now_s: float | None = None, **changes: Any) -> ReviewedOffer:
+    return review_offer(works.write_document(**changes), load_current_machine(file, now_s))
 
 
-def changes_of(found: Judged) -> dict[str, tuple[Any, Any]]:
+def list_changes(found: ReviewedOffer) -> dict[str, tuple[Any, Any]]:
     assert found.wrong == ""
     return {each.path: (each.old, each.new) for each in found.changes}
 
 
-def test_an_offer_shows_what_it_changes_here(works: Works, file: Path) -> None:
+def test_offer_lists_changes_on_this_machine(offer_signer: OfferSigner, config_file: Path) -> None:
     values = {"axis.X.nominal.ft": 0.061, "axis.X.nominal.R": 0.5, "maintenance.ft": 0.8, "nc.smoothing_s": (0.05,)}
-    found = judged(works, file, values=values)
-    assert changes_of(found) == {
+    found = review(offer_signer, config_file, values=values)
+    assert list_changes(found) == {
         "axis.X.nominal.ft": (0.05, 0.061),
         "maintenance.ft": (1.0, 0.8),
         "nc.smoothing_s": ((0.06, 0.03), (0.05,)),
     }
-    assert found.loosens == []
+    assert found.loosened_values == []
     assert "ft = 0.061  # by the data sheet" in found.text
     assert "# what follows is the operator's" in found.text
 
 
-def test_a_model_for_a_kind_of_axis_reaches_those_axes_alone(works: Works, file: Path) -> None:
+def test_values_for_axis_labels_change_only_those_axes(offer_signer: OfferSigner, config_file: Path) -> None:
     values = {"axis.*.nominal.ft": 0.07, "axis.*.nominal.Cd": 4.0}
-    found = judged(works, file, values=values, axis_labels={"screw": "B"})
-    assert changes_of(found) == {"axis.Y.nominal.ft": (0.05, 0.07), "axis.Y.nominal.Cd": (5.0, 4.0)}
-    none = judged(works, file, values=values, axis_labels={"screw": "C"})
+    found = review(offer_signer, config_file, values=values, axis_labels={"screw": "B"})
+    assert list_changes(found) == {"axis.Y.nominal.ft": (0.05, 0.07), "axis.Y.nominal.Cd": (5.0, 4.0)}
+    none = review(offer_signer, config_file, values=values, axis_labels={"screw": "C"})
     assert "no axis of this machine" in none.wrong
 
 
@@ -84,90 +91,97 @@ def test_a_model_for_a_kind_of_axis_reaches_those_axes_alone(works: Works, file:
         ({"values": {"axis.X.regulators.position_ki_per_s2": 5.0}}, "set structure = 'double_pi'"),
     ],
 )
-def test_an_offer_that_does_not_fit_changes_nothing(
-    changes: dict[str, Any], words: str, works: Works, file: Path
+def test_unsuitable_offer_changes_nothing(
+    changes: dict[str, Any], words: str, offer_signer: OfferSigner, config_file: Path
 ) -> None:
-    before = file.read_bytes()
-    assert words in judged(works, file, **changes).wrong
+    before = config_file.read_bytes()
+    assert words in review(offer_signer, config_file, **changes).wrong
     with pytest.raises(OfferRefused, match="is not accepted"):
-        accept(works.carried(**changes), file, "Bert", may_loosen=True)
-    assert file.read_bytes() == before
-    assert read_answers(present(file).config.store.directory) == []
+        accept_offer(offer_signer.write_document(**changes), config_file, "Bert", may_loosen=True)
+    assert config_file.read_bytes() == before
+    assert read_answers(load_current_machine(config_file).config.store.directory) == []
 
 
-def test_without_uplink_a_machine_has_its_own_name_and_no_labels(works: Works, file: Path) -> None:
-    text = file.read_text()
+def test_machine_without_uplink_has_own_name_and_no_labels(offer_signer: OfferSigner, config_file: Path) -> None:
+    text = config_file.read_text()
     start = text.index("[uplink")
-    file.write_text(text[:start] + text[text.index("# what follows") :])
-    assert "label type" in judged(works, file).wrong
-    assert changes_of(judged(works, file, labels={})) == {"axis.X.nominal.ft": (0.05, 0.061)}
+    config_file.write_text(text[:start] + text[text.index("# what follows") :])
+    assert "label type" in review(offer_signer, config_file).wrong
+    assert list_changes(review(offer_signer, config_file, labels={})) == {"axis.X.nominal.ft": (0.05, 0.061)}
 
 
-def test_what_is_accepted_stands_in_the_file_and_the_old_one_beside_it(works: Works, file: Path) -> None:
-    before = file.read_bytes()
-    file.chmod(0o640)
-    done = accept(works.carried(), file, "Bert", may_loosen=False)
+def test_accepted_values_are_written_and_old_file_is_kept(offer_signer: OfferSigner, config_file: Path) -> None:
+    before = config_file.read_bytes()
+    config_file.chmod(0o640)
+    done = accept_offer(offer_signer.write_document(), config_file, "Bert", may_loosen=False)
     assert done.offer is not None
-    assert kept_file(file, done.offer).read_bytes() == before
-    assert {path.stat().st_mode & 0o777 for path in (file, kept_file(file, done.offer))} == {0o640}
-    config = machine_config.load_config(file)
+    assert build_backup_path(config_file, done.offer).read_bytes() == before
+    assert {path.stat().st_mode & 0o777 for path in (config_file, build_backup_path(config_file, done.offer))} == {
+        0o640
+    }
+    config = machine_config.load_config(config_file)
     assert config.axis["X"].nominal.ft == 0.061
     (answer,) = read_answers(config.store.directory)
     assert (answer.answer, answer.by, answer.version, answer.config_digest) == ("accepted", "Bert", 3, config.digest)
-    once_more = accept(works.carried(), file, "Bert", may_loosen=False)
+    once_more = accept_offer(offer_signer.write_document(), config_file, "Bert", may_loosen=False)
     assert once_more.changes == []
     assert len(read_answers(config.store.directory)) == 1
-    assert not list(file.parent.glob(".*"))
+    assert not list(config_file.parent.glob(".*"))
 
 
-def test_a_configuration_that_is_a_link_stays_one(works: Works, file: Path, tmp_path: Path) -> None:
+def test_linked_configuration_stays_a_link(offer_signer: OfferSigner, config_file: Path, tmp_path: Path) -> None:
     link = tmp_path / "link.toml"
-    link.symlink_to(file)
+    link.symlink_to(config_file)
     (tmp_path / "fdhil-data").mkdir()
-    accept(works.carried(), link, "Bert", may_loosen=False)
+    accept_offer(offer_signer.write_document(), link, "Bert", may_loosen=False)
     assert link.is_symlink()
-    assert tomllib.loads(file.read_text())["axis"]["X"]["nominal"]["ft"] == 0.061
+    assert tomllib.loads(config_file.read_text())["axis"]["X"]["nominal"]["ft"] == 0.061
 
 
-def test_an_older_version_never_follows_a_newer_one(works: Works, file: Path) -> None:
-    accept(works.carried(), file, "Bert", may_loosen=False)
-    assert "version 3 was already accepted" in judged(works, file, version=2).wrong
-    assert judged(works, file, version=2, name="other").wrong == ""
-    assert judged(works, file, version=4, values={"axis.X.nominal.ft": 0.05}).wrong == ""
-    lie = present(file).config.offers_directory
+def test_older_version_is_refused_after_newer_one(offer_signer: OfferSigner, config_file: Path) -> None:
+    accept_offer(offer_signer.write_document(), config_file, "Bert", may_loosen=False)
+    assert "version 3 was already accepted" in review(offer_signer, config_file, version=2).wrong
+    assert review(offer_signer, config_file, version=2, name="other").wrong == ""
+    assert review(offer_signer, config_file, version=4, values={"axis.X.nominal.ft": 0.05}).wrong == ""
+    lie = load_current_machine(config_file).config.offers_directory
     lie.mkdir(parents=True)
-    (lie / file_name("friction", 5)).write_bytes(works.document(version=5))
+    (lie / file_name("friction", 5)).write_bytes(offer_signer.sign_document(version=5))
     (lie / file_name("friction", 6)).write_bytes(b"no offer, whatever its name says")
     os.mkfifo(lie / file_name("friction", 7))
-    assert "version 5 of the fleet server replaces it" in judged(works, file, version=4).wrong
-    assert judge(lie / file_name("friction", 7), present(file)).wrong == "it is not a regular file; export it again"
-    assert judge(lie, present(file)).wrong == "it is not a regular file; export it again"
+    assert "version 5 of the fleet server replaces it" in review(offer_signer, config_file, version=4).wrong
+    assert (
+        review_offer(lie / file_name("friction", 7), load_current_machine(config_file)).wrong
+        == "it is not a regular file; export it again"
+    )
+    assert review_offer(lie, load_current_machine(config_file)).wrong == "it is not a regular file; export it again"
 
 
-def test_a_version_that_was_accepted_is_not_accepted_with_other_values(works: Works, file: Path) -> None:
-    accept(works.carried(), file, "Bert", may_loosen=False)
-    before = file.read_bytes()
+def test_accepted_version_with_other_values_is_refused(offer_signer: OfferSigner, config_file: Path) -> None:
+    accept_offer(offer_signer.write_document(), config_file, "Bert", may_loosen=False)
+    before = config_file.read_bytes()
     for other in ({"values": {"axis.X.nominal.ft": 0.09}}, {"values": {"axis.X.nominal.ft": 0.09}, "stage": 2}):
         with pytest.raises(OfferRefused, match="was accepted with other values by Bert"):
-            accept(works.carried(**other), file, "Bert", may_loosen=True)
-    assert file.read_bytes() == before
-    assert judged(works, file, stage=2).wrong == ""  # a later stage of the same change
-    kept_file(file, Offer(**TOLD)).replace(file)
-    accept(works.carried(), file, "Bert", may_loosen=False)  # the same document, after the old values were put back
-    assert file.read_bytes() == before
+            accept_offer(offer_signer.write_document(**other), config_file, "Bert", may_loosen=True)
+    assert config_file.read_bytes() == before
+    assert review(offer_signer, config_file, stage=2).wrong == ""  # a later stage of the same change
+    build_backup_path(config_file, Offer(**TOLD)).replace(config_file)
+    accept_offer(
+        offer_signer.write_document(), config_file, "Bert", may_loosen=False
+    )  # the same document, after the old values were put back
+    assert config_file.read_bytes() == before
 
 
-def test_a_loosened_limit_is_named_and_asked_for(works: Works, file: Path) -> None:
+def test_loosened_limit_needs_confirmation(offer_signer: OfferSigner, config_file: Path) -> None:
     loose: dict[str, Any] = {"values": {"axis.X.correction.max_offset_um": 240.0, "maintenance.ft": 2.0}}
-    tight = judged(works, file, **loose)
-    assert [each.path for each in tight.loosens] == ["maintenance.ft"]
-    file.write_text(file.read_text().replace("max_offset_um = 250.0", "max_offset_um = 5.0"))
-    found = judged(works, file, **loose)
+    tight = review(offer_signer, config_file, **loose)
+    assert [each.path for each in tight.loosened_values] == ["maintenance.ft"]
+    config_file.write_text(config_file.read_text().replace("max_offset_um = 250.0", "max_offset_um = 5.0"))
+    found = review(offer_signer, config_file, **loose)
     keys = ["axis.X.correction.max_offset_um", "maintenance.ft", "the guard: axis X, the offset's offset"]
-    assert [each.path for each in found.loosens] == keys
+    assert [each.path for each in found.loosened_values] == keys
     with pytest.raises(OfferRefused, match=r"it loosens axis.X.correction.max_offset_um; .*--loosens"):
-        accept(works.carried(**loose), file, "Bert", may_loosen=False)
-    assert accept(works.carried(**loose), file, "Bert", may_loosen=True).wrong == ""
+        accept_offer(offer_signer.write_document(**loose), config_file, "Bert", may_loosen=False)
+    assert accept_offer(offer_signer.write_document(**loose), config_file, "Bert", may_loosen=True).wrong == ""
 
 
 @pytest.mark.parametrize(
@@ -179,69 +193,73 @@ def test_a_loosened_limit_is_named_and_asked_for(works: Works, file: Path) -> No
         ({"axis.X.max_acceleration_mm_s2": 5000.0}, "the highest plausible acceleration"),
     ],
 )
-def test_what_loosens_the_guard_by_another_way_is_found(
-    values: dict[str, Any], limit: str, works: Works, file: Path
+def test_indirectly_loosened_guard_limit_is_found(
+    values: dict[str, Any], limit: str, offer_signer: OfferSigner, config_file: Path
 ) -> None:
     """An offer without any guard key can still loosen a limit of the guard."""
-    file.write_text(file.read_text().replace("[axis.X.regulators]", "[axis.X.feedforward]\n\n[axis.X.regulators]"))
-    found = judged(works, file, values=values)
-    assert f"the guard: axis X, {limit}" in [each.path for each in found.loosens]
+    config_file.write_text(
+        config_file.read_text().replace("[axis.X.regulators]", "[axis.X.feedforward]\n\n[axis.X.regulators]")
+    )
+    found = review(offer_signer, config_file, values=values)
+    assert f"the guard: axis X, {limit}" in [each.path for each in found.loosened_values]
     with pytest.raises(OfferRefused, match="--loosens"):
-        accept(works.carried(values=values), file, "Bert", may_loosen=False)
+        accept_offer(offer_signer.write_document(values=values), config_file, "Bert", may_loosen=False)
 
 
-def test_a_rejected_offer_changes_nothing_and_may_be_accepted_later(works: Works, file: Path) -> None:
-    before = file.read_bytes()
-    reject(works.carried(expires_s=NOW - 1), file, "Bert", "the screw was changed last week")
-    assert file.read_bytes() == before
-    store = present(file).config.store.directory
+def test_rejected_offer_changes_nothing_and_can_be_accepted_later(offer_signer: OfferSigner, config_file: Path) -> None:
+    before = config_file.read_bytes()
+    reject_offer(offer_signer.write_document(expires_s=NOW - 1), config_file, "Bert", "the screw was changed last week")
+    assert config_file.read_bytes() == before
+    store = load_current_machine(config_file).config.store.directory
     (answer,) = read_answers(store)
     assert (answer.answer, answer.reason) == ("rejected", "the screw was changed last week")
     assert newest_accepted([answer], "friction") == 0
-    accept(works.carried(), file, "Bert", may_loosen=False)
+    accept_offer(offer_signer.write_document(), config_file, "Bert", may_loosen=False)
     assert [each.answer for each in read_answers(store)] == ["rejected", "accepted"]
 
 
-def test_what_was_accepted_and_is_in_force_is_not_rejected(works: Works, file: Path) -> None:
+def test_offer_in_force_cannot_be_rejected(offer_signer: OfferSigner, config_file: Path) -> None:
     """Also after its expiry; once the old values are restored it may be rejected."""
-    before = file.read_bytes()
-    done = accept(works.carried(), file, "Bert", may_loosen=False)
+    before = config_file.read_bytes()
+    done = accept_offer(offer_signer.write_document(), config_file, "Bert", may_loosen=False)
     for expires_s in (NOW + 3600, NOW - 1):
         with pytest.raises(
             OfferRefused, match=r"accepted by Bert and .* in force: it is not rejected; restore the previous"
         ):
-            reject(works.carried(expires_s=expires_s), file, "Anna", "no")
+            reject_offer(offer_signer.write_document(expires_s=expires_s), config_file, "Anna", "no")
     assert done.offer is not None
-    file.write_bytes(kept_file(file, done.offer).read_bytes())
-    assert file.read_bytes() == before
-    reject(works.carried(), file, "Anna", "it was worse")
-    answers = read_answers(present(file).config.store.directory)
+    config_file.write_bytes(build_backup_path(config_file, done.offer).read_bytes())
+    assert config_file.read_bytes() == before
+    reject_offer(offer_signer.write_document(), config_file, "Anna", "it was worse")
+    answers = read_answers(load_current_machine(config_file).config.store.directory)
     assert [each.answer for each in answers] == ["accepted", "rejected"]
 
 
-def test_who_is_not_trusted_is_not_answered(works: Works, file: Path) -> None:
-    place = works.carried()
+def test_untrusted_offer_is_not_answered(offer_signer: OfferSigner, config_file: Path) -> None:
+    place = offer_signer.write_document()
     place.write_bytes(place.read_bytes().replace(b"0.061", b"0.062"))
     with pytest.raises(OfferRefused, match="changed after it was signed"):
-        reject(place, file, "Bert", "no")
-    assert not (present(file).config.store.directory / ANSWERS_FILE).exists()
+        reject_offer(place, config_file, "Bert", "no")
+    assert not (load_current_machine(config_file).config.store.directory / ANSWERS_FILE).exists()
 
 
 ANSWERS = b'{"schema": "fdhil-offers-1", "answers": [{"name": 1}]}'
 
 
 @pytest.mark.parametrize("damage", [b"", b"{", b"[]", b'{"schema": "x", "answers": []}', ANSWERS, b"[" * 9000])
-def test_where_the_answers_cannot_be_read_nothing_is_accepted(damage: bytes, works: Works, file: Path) -> None:
-    store = present(file).config.store.directory
+def test_offer_is_not_accepted_when_answers_are_unreadable(
+    damage: bytes, offer_signer: OfferSigner, config_file: Path
+) -> None:
+    store = load_current_machine(config_file).config.store.directory
     store.mkdir(exist_ok=True)
     (store / ANSWERS_FILE).write_bytes(damage)
-    before = file.read_bytes()
+    before = config_file.read_bytes()
     with pytest.raises(StoreError, match="older offers cannot be recognised"):
-        accept(works.carried(), file, "Bert", may_loosen=False)
-    assert file.read_bytes() == before
+        accept_offer(offer_signer.write_document(), config_file, "Bert", may_loosen=False)
+    assert config_file.read_bytes() == before
 
 
-def test_answers_of_wrong_kinds_are_damage(tmp_path: Path) -> None:
+def test_answers_of_wrong_types_are_damage(tmp_path: Path) -> None:
     right = Answer("a", 1, 1, "d", "accepted", "b", "", 1.5, "c")
     for wrong in (replace(right, version="1"), replace(right, at_s=1), replace(right, answer="maybe")):  # type: ignore[arg-type]
         write_file(tmp_path / ANSWERS_FILE, b"")
@@ -254,7 +272,7 @@ def test_answers_of_wrong_kinds_are_damage(tmp_path: Path) -> None:
             read_answers(tmp_path)
 
 
-def test_an_answer_for_which_there_is_no_room_is_refused_and_those_before_it_stay(tmp_path: Path) -> None:
+def test_answer_on_full_disk_is_refused_and_earlier_ones_kept(tmp_path: Path) -> None:
     first = Answer("a", 1, 1, "d", "accepted", "b", "", 1.5, "c")
     add_answer(tmp_path, first)
     with pytest.raises(StoreError, match="no room for another decision"):
@@ -262,37 +280,37 @@ def test_an_answer_for_which_there_is_no_room_is_refused_and_those_before_it_sta
     assert read_answers(tmp_path) == [first]
 
 
-def test_a_full_disk_leaves_the_configuration_as_it_was(
-    works: Works, file: Path, monkeypatch: pytest.MonkeyPatch
+def test_full_disk_leaves_configuration_unchanged(
+    offer_signer: OfferSigner, config_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = file.read_bytes()
+    before = config_file.read_bytes()
 
-    def full(path: Path, content: bytes, like: os.stat_result | None = None) -> None:
-        if path == file:
+    def fail_write(path: Path, content: bytes, like: os.stat_result | None = None) -> None:
+        if path == config_file:
             raise StoreError(f"{path} could not be written: the disk is full", "DiskFull")
         write_file(path, content, like)
 
-    monkeypatch.setattr(offered, "write_file", full)
+    monkeypatch.setattr(offer_review, "write_file", fail_write)
     with pytest.raises(OutputError, match="the disk is full; free some space; the configuration is unchanged"):
-        accept(works.carried(), file, "Bert", may_loosen=False)
-    assert file.read_bytes() == before
-    assert read_answers(present(file).config.store.directory) == []
+        accept_offer(offer_signer.write_document(), config_file, "Bert", may_loosen=False)
+    assert config_file.read_bytes() == before
+    assert read_answers(load_current_machine(config_file).config.store.directory) == []
     monkeypatch.undo()
-    accept(works.carried(), file, "Bert", may_loosen=False)
+    accept_offer(offer_signer.write_document(), config_file, "Bert", may_loosen=False)
 
 
-def test_two_do_not_answer_at_once(works: Works, file: Path) -> None:
-    held = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY)
+def test_concurrent_answers_are_refused(offer_signer: OfferSigner, config_file: Path) -> None:
+    held = os.open(config_file.parent, os.O_RDONLY | os.O_DIRECTORY)
     fcntl.flock(held, fcntl.LOCK_EX)
     with pytest.raises(OutputError, match="another command is answering"):
-        accept(works.carried(), file, "Bert", may_loosen=False)
+        accept_offer(offer_signer.write_document(), config_file, "Bert", may_loosen=False)
     os.close(held)
-    accept(works.carried(), file, "Bert", may_loosen=False)
+    accept_offer(offer_signer.write_document(), config_file, "Bert", may_loosen=False)
 
 
-def test_what_a_machine_says_of_itself_does_not_depend_on_whom_it_trusts(works: Works, file: Path) -> None:
-    trusting = machine_config.load_config(file)
-    text = file.read_text()
-    file.write_text(text[: text.index("# what follows")])
-    assert machine_config.load_config(file).digest == trusting.digest
+def test_machine_description_is_independent_of_trusted_keys(offer_signer: OfferSigner, config_file: Path) -> None:
+    trusting = machine_config.load_config(config_file)
+    text = config_file.read_text()
+    config_file.write_text(text[: text.index("# what follows")])
+    assert machine_config.load_config(config_file).digest == trusting.digest
     assert TOLD["machines"] == (trusting.plant_name,)

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from studies import fleet, fleet_day
+from tests.fleet.fleet_database import build_fleet, collect_messages, list_messages_of_store
 from tests.fleet.servers import Postgres
-from tests.fleet.works import fleet_of, gather, told_by_store
 
 QUICK = argparse.Namespace(machines=6, records=120, rest_s=4.0, seed=3)
 ONE = "machine = 'mill-001' AND sequence = 20"
@@ -38,21 +38,21 @@ WRONG: Mapping[str, tuple[str, dict[str, int]]] = {
 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("what", WRONG)
-def test_it_notices_what_is_wrong(what: str, database: Postgres, tmp_path: Path) -> None:
+def test_study_detects_lost_and_duplicated_records(what: str, database: Postgres, tmp_path: Path) -> None:
     days = [fleet_day.machine(tmp_path / f"day-{k}", f"day-{k}", "nats://127.0.0.1:4222") for k in range(2)]
     for k, day in enumerate(days):
         fleet_day.record(day, 30, seed=k)
     machines = fleet_day.copied(days, tmp_path, 3, "nats://127.0.0.1:4222")
     for config in machines:
-        asyncio.run(gather(fleet_of(database, tmp_path), told_by_store(config)))
+        asyncio.run(collect_messages(build_fleet(database, tmp_path), list_messages_of_store(config)))
     change, expected = WRONG[what]
-    database.ask(change)
+    database.execute_query(change)
     found = fleet.checked(database, machines, days)
     assert {name: count for name, count in found.items() if count} == expected
 
 
 @pytest.mark.debian
-def test_a_small_fleet_is_killed_and_loses_nothing(tmp_path: Path) -> None:
+def test_killed_small_fleet_loses_no_record(tmp_path: Path) -> None:
     found = fleet.killed(QUICK, tmp_path)
     assert sum(found["kills"].values()) >= 1
     wrong = {name: found[name] for name in ("lost", "doubled", "out_of_order", "refused", "miscounted")}

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from fdhil.sim.drive.dictionary import SIGNED
-from fdhil.sim.drive.eds import write_eds
+from fdhil.sim.drive.eds_writer import write_eds
+from fdhil.sim.drive.object_dictionary import SIGNED
 from tests.eds import SHEETS
 from tests.eds import write_eds as write_sheet
 from tests.foreign.peers import FOLDER, NODE
-from tests.sim.rig import Rig, machine
+from tests.sim.drive_rig import DriveRig, build_machine_config
 
 pytestmark = pytest.mark.debian
 
@@ -22,11 +22,11 @@ pytestmark = pytest.mark.debian
 @pytest.mark.parametrize("sheet", [None, *SHEETS])
 def test_foreign_eds_files_are_read_as_intended(sheet: str | None, tmp_path: Path) -> None:
     worn: dict[str, Any] = {} if sheet is None else {"eds": str(write_sheet(sheet, tmp_path))}
-    drive = Rig(machine(**worn)).drive
+    drive = DriveRig(build_machine_config(**worn)).drive
     path = write_eds(drive, tmp_path / "drive.eds")
     command = [NODE, str(FOLDER / "read_eds.js"), json.dumps({"file": str(path)})]
     read = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-    assert int(read["vendor"], 16) == drive.dress.vendor
+    assert int(read["vendor"], 16) == drive.emulation.vendor
     for entry in drive.dictionary.entries.values():
         found = read["objects"][f"{entry.index}:{entry.sub}"]
         assert found["type"] == entry.type

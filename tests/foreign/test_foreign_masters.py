@@ -14,7 +14,7 @@ from fdhil.drivers import Record, open_machine
 from fdhil.records import AxisSamples, Notice
 from tests.daemon.machine_rig import fdhil
 from tests.foreign.peers import ForeignProcess
-from tests.sim.twin_process import TwinProcess, write_config
+from tests.sim.simulator_process import SimulatorProcess, write_config
 
 pytestmark = pytest.mark.usefixtures("processes")
 
@@ -23,24 +23,26 @@ MAKES = [pytest.param("master.js", marks=pytest.mark.debian), "python_master.py"
 
 
 @pytest.fixture
-def simulator_process(tmp_path: Path) -> Iterator[tuple[TwinProcess, Path]]:
+def simulator_process(tmp_path: Path) -> Iterator[tuple[SimulatorProcess, Path]]:
     """A simulated drive without an NC, and the configuration of the machine that listens to it."""
     path = write_config(tmp_path, bus='interface = "socketcand"\nport = 0', axes="X", sim="nc = false")
     text = path.read_text().replace("sync_period_s = 0.001", f"sync_period_s = {PERIOD_MS / 1e3}")
     path.write_text('[guard]\nclock = "sync"\n' + text)  # time is the SYNC count
-    with TwinProcess(path) as running:
+    with SimulatorProcess(path) as running:
         path.write_text(path.read_text().replace("port = 0", f"port = {running.bus_settings['port']}", 1))
         yield running, path
 
 
-def start_master(make: str, twin: TwinProcess) -> ForeignProcess:
+def start_master(make: str, twin: SimulatorProcess) -> ForeignProcess:
     """SYNC with a counter up to 10, where the master has a counter."""
     settings = {"node": twin.ready["drives"]["X"]["node_id"], "own_node": 100, "period_ms": PERIOD_MS, "overflow": 10}
     return ForeignProcess(make, twin.bus_settings, **settings)
 
 
 @pytest.mark.parametrize("make", MAKES)
-async def test_drive_run_by_a_foreign_master_is_sampled(make: str, simulator_process: tuple[TwinProcess, Path]) -> None:
+async def test_drive_run_by_a_foreign_master_is_sampled(
+    make: str, simulator_process: tuple[SimulatorProcess, Path]
+) -> None:
     process, path = simulator_process
     records, lost = await collect_samples(make, process, path)
     codes = {record.code for record in records if isinstance(record, Notice)}
@@ -50,7 +52,7 @@ async def test_drive_run_by_a_foreign_master_is_sampled(make: str, simulator_pro
     assert int(enabled[-1].statusword[-1]) & 0x6F == 0x27
 
 
-async def collect_samples(make: str, process: TwinProcess, path: Path) -> tuple[list[Record], list[int]]:
+async def collect_samples(make: str, process: SimulatorProcess, path: Path) -> tuple[list[Record], list[int]]:
     """Let a master run the drive until 300 samples came; return all records, and what was lost.
 
     That is counted from the hundredth sample on: a counter that does not go up to 240 is known from its second turn.
@@ -83,13 +85,13 @@ async def collect_samples(make: str, process: TwinProcess, path: Path) -> tuple[
 @pytest.mark.parametrize("make", MAKES)
 def test_no_request_is_sent_next_to_a_foreign_master(
     make: str,
-    simulator_process: tuple[TwinProcess, Path],
+    simulator_process: tuple[SimulatorProcess, Path],
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 60.0)  # it ends with the master's first frame
     process, path = simulator_process
-    with start_master(make, process) as nc, process.join() as bus:
+    with start_master(make, process) as nc, process.join_bus() as bus:
         nc.event("enabled")
         while bus.recv(0) is not None:
             pass  # what the master itself asked

@@ -16,11 +16,11 @@ from fdhil.cli.demo.processes import Process
 from fdhil.commissioning.scan import BusScanner
 from fdhil.drivers.bus_source import BusSource
 from fdhil.records import AxisSamples, Notice
-from fdhil.sim.wire.hub import Hub
+from fdhil.sim.wire.tcp_hub import TcpHub
 from tests.daemon.machine_rig import fdhil
 from tests.foreign.peers import ForeignProcess
-from tests.sim.hub_thread import joined, serving
-from tests.sim.twin_process import write_config
+from tests.sim.hub_thread import join_clients, run_hub
+from tests.sim.simulator_process import write_config
 
 NODE = 5
 DRIVE = {
@@ -73,13 +73,13 @@ def wait_for_answer(
 
 
 @pytest.fixture
-def hub() -> Iterator[Hub]:
-    with serving(Hub("can0")) as running:
+def hub() -> Iterator[TcpHub]:
+    with run_hub(TcpHub("can0")) as running:
         yield running.hub
 
 
 @pytest.fixture
-def machine(hub: Hub, tmp_path: Path) -> Path:
+def machine(hub: TcpHub, tmp_path: Path) -> Path:
     """The configuration of a machine whose only drive is the slave under test."""
     return write_configuration(tmp_path, f'interface = "socketcand"\nport = {hub.port}')
 
@@ -91,7 +91,7 @@ def write_configuration(folder: Path, bus: str) -> Path:
     return path
 
 
-def start_slave(make: str, hub: Hub, settings: dict[str, Any]) -> ForeignProcess:
+def start_slave(make: str, hub: TcpHub, settings: dict[str, Any]) -> ForeignProcess:
     return ForeignProcess(make, hub.settings, **settings)
 
 
@@ -119,7 +119,7 @@ def assert_compared(machine: Path, capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("make", MAKES)
 def test_foreign_drive_is_found_compared_and_refused(
-    make: str, hub: Hub, machine: Path, capsys: pytest.CaptureFixture[str]
+    make: str, hub: TcpHub, machine: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with start_slave(make, hub, DRIVE) as peer:
         peer.event("ready")
@@ -129,7 +129,7 @@ def test_foreign_drive_is_found_compared_and_refused(
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("make", MAKES)
 def test_foreign_io_module_is_not_a_drive(
-    make: str, hub: Hub, machine: Path, capsys: pytest.CaptureFixture[str]
+    make: str, hub: TcpHub, machine: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with start_slave(make, hub, MODULE) as peer:
         peer.event("ready")
@@ -144,12 +144,12 @@ def test_foreign_io_module_is_not_a_drive(
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("make", MAKES)
 def test_foreign_drive_without_the_profiles_tpdos_is_reported(
-    make: str, hub: Hub, machine: Path, monkeypatch: pytest.MonkeyPatch
+    make: str, hub: TcpHub, machine: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With a master that starts it: TPDO1 is the profile's, TPDO2 is too short, the others are never sent."""
     monkeypatch.setattr("fdhil.drivers.cia402.pdo_monitor.PATIENCE_S", 0.2)
     source = BusSource("can0", machine_config.load_config(machine))
-    with start_slave(make, hub, DRIVE) as peer, joined(hub) as (master,):
+    with start_slave(make, hub, DRIVE) as peer, join_clients(hub) as (master,):
         peer.event("ready")
         source.open()
         try:
@@ -181,10 +181,10 @@ def test_foreign_drive_is_found_and_compared_on_socketcan(tmp_path: Path, capsys
 
 
 @pytest.mark.debian
-def test_daemon_waits_for_a_silent_foreign_drive(hub: Hub, machine: Path, tmp_path: Path) -> None:
+def test_daemon_waits_for_a_silent_foreign_drive(hub: TcpHub, machine: Path, tmp_path: Path) -> None:
     """With the NC off, a drive without a heartbeat is silent: the daemon waits and samples once the NC starts."""
     log = tmp_path / "daemon.log"
-    with start_slave("slave.js", hub, DRIVE) as peer, joined(hub) as (master,):
+    with start_slave("slave.js", hub, DRIVE) as peer, join_clients(hub) as (master,):
         peer.event("ready")
         with Process("daemon", ["fdhil", "run", str(machine)], log) as daemon:
             _wait_until(daemon, lambda: "BusSilent: No frame is received on bus can0" in log.read_text())

@@ -25,7 +25,7 @@ from fdhil.guard.guard_settings import encode_settings
 from tests.guard import short_timeouts
 from tests.guard.drive_peer import NEVER, Peer, open_bus, write_config
 from tests.guard.simulated_bus import DIGEST, FACTS_GIVEN, LIMITS, commissioned, smooth_path
-from tests.listening import tcp_ports
+from tests.listening_ports import list_tcp_ports
 
 pytestmark = pytest.mark.usefixtures("processes")
 
@@ -168,7 +168,7 @@ def test_guard_process_is_mute_until_armed_then_aligned_then_off(rig: Rig) -> No
     client = rig.connect()
     rig.peer.wait(lambda: client.status()["good_for"] > 200, "SYNC")
     assert rig.peer.sent == []
-    assert tcp_ports(rig.process.pid) == set()
+    assert list_tcp_ports(rig.process.pid) == set()
     rig.arm()
     rig.settle()
     rig.peer.playing = True

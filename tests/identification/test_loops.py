@@ -16,8 +16,8 @@ from fdhil.model import closed_loop
 from fdhil.records import Float, LoopEstimate, Parameters, Reason, Recording, Verdict, Window, freeze_array
 from studies import real_plant as real
 from tests.bench import bench_document
-from tests.model.slow_drive import SlowDrive
-from tests.paths import bench_demand, rms
+from tests.model.reference_drive import ReferenceDrive
+from tests.paths import build_bench_demand, compute_rms
 
 PERIOD = 0.001
 SETTINGS = Identification()
@@ -54,20 +54,20 @@ def rapids(loops: real.Loops, mechanics: real.Mechanics | None = None) -> list[W
     return find_windows(real.recording(run, mechanics, real.Sensors(), 0.5))
 
 
-class Observed(SlowDrive):
+class Observed(ReferenceDrive):
     """The independent drive, with voltage, current and speed recorded at every step of its current loop."""
 
     noted: list[tuple[float, float, float]]
 
-    def _integrate(self, u: float, h: float) -> None:
+    def _integrate_step(self, u: float, h: float) -> None:
         self.noted.append((u, self.i, self.w))
-        super()._integrate(u, h)
+        super()._integrate_step(u, h)
 
 
 def observed(axis: Axis, demand_m: Float, row_s: float = PERIOD) -> list[Window]:
     drive = Observed(NOMINAL, axis, row_s, increments=2**24)
     drive.noted = []
-    place = np.array(drive.run((demand_m * 1e3).tolist()))
+    place = np.array(drive.follow_demand((demand_m * 1e3).tolist()))
     noted = np.array(drive.noted).reshape(place.size, -1, 3)
     rng = np.random.default_rng(1)
     recording = Recording(
@@ -162,9 +162,12 @@ def test_the_path_is_predicted_though_the_machine_has_more_than_the_model() -> N
     mechanics = replace(real.ORDINARY_MECHANICS, load_nm=0.0)
     loops = replace(real.ORDINARY_LOOPS, speed_filter_s=0.001, speed_feedforward=0.95)
     own = with_loops(bench_axis(), found(rapids(loops, mechanics), bench_axis()))
-    demand = bench_demand(10)[:, 0]
+    demand = build_bench_demand(10)[:, 0]
     truth = real.run(mechanics, demand / 1e3, loops).motor_m * 1e3
-    off = [rms(closed_loop.simulate(NOMINAL, a, PERIOD, demand).position_mm - truth) for a in (bench_axis(), own)]
+    off = [
+        compute_rms(closed_loop.simulate_axis(NOMINAL, a, PERIOD, demand).position_mm - truth)
+        for a in (bench_axis(), own)
+    ]
     assert off[0] > 0.1
     assert off[1] < 1e-3
 

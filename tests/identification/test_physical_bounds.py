@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from fdhil.identification.identifiability import unphysical
 from fdhil.identification.physical_bounds import bounded
-from fdhil.model.physical import bounds
-from fdhil.model.terms import torque
+from fdhil.model.model_terms import compute_friction_torque
+from fdhil.model.physical_limits import list_bounds
 from fdhil.records import PARAMETERS, Estimate, Float, Result
 
 TERMS = ("load", "viscous_positive", "viscous_negative", "stribeck", "stribeck_speed")
@@ -74,7 +74,7 @@ def test_load_beyond_dry_friction_is_told_of_moves_in_one_direction() -> None:
         assert (within.get_value("Cd"), within.get_value("load")) == (0.0, -10.0 * direction)
         assert within.get_std("load") == pytest.approx(1e-3)
         speed = np.array([50.0 * direction])
-        assert torque(within.build_parameters(), speed, np.zeros(1)) == pytest.approx(
+        assert compute_friction_torque(within.build_parameters(), speed, np.zeros(1)) == pytest.approx(
             direction * (0.05 * 50.0 - 10.0)
         )  # the constraint is the same
 
@@ -86,4 +86,4 @@ def test_every_estimate_is_taken_within_all_bounds(seed: int) -> None:
     values = TRUE + rng.choice([0.1, 1.0, 3.0]) * root @ rng.normal(0.0, 1.0, len(NAMES))
     within = bounded(estimate(values, root @ root.T))
     told = dict(zip(NAMES, within.values.tolist(), strict=True))
-    assert all(bound.beyond(told) <= 0.0 for bound in bounds(NAMES))
+    assert all(bound.compute_violation(told) <= 0.0 for bound in list_bounds(NAMES))

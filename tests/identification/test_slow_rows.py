@@ -14,7 +14,7 @@ from fdhil.identification.slow_rows import beyond_line_a, with_open_course
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.records import Estimate, Float, Parameters, Recording, Window, freeze_array
-from fdhil.sim.drive.physics import Physics
+from fdhil.sim.drive.plant_physics import PlantPhysics
 from studies.bench import shuttle
 from tests.bench import bench_config
 from tests.identification.realistic import rapids
@@ -30,13 +30,13 @@ VALUES = np.array(list(TRUTH.as_dict().values()))
 def _rows(row_s: float) -> tuple[Float, Float]:
     """Return demand (n,), mm, and samples (4, n) of V, A, rad/s, mm of the simulated drive with such set-points."""
     demand = 1e3 * shuttle(moves=2)[:: round(row_s / 1e-3)]
-    physics = Physics(TRUTH, AXIS.regulators, row_s, INCREMENTS)
+    physics = PlantPhysics(TRUTH, AXIS.regulators, row_s, INCREMENTS)
     counts = np.append(demand, [demand[-1]] * 2) * INCREMENTS / AXIS.screw_pitch_mm
     rows = np.empty((4, demand.size))
     for k in range(demand.size):
         rows[1:, k] = physics.current_a, physics.speed_rad_s, physics.angle_rad * AXIS.screw_pitch_mm / (2 * np.pi)
         here, then, after = counts[k : k + 3]
-        physics.cycle(True, (here, then, (then - here) / row_s, (after - then) / row_s, 0.0, 0.0, 0.0, 0.0))
+        physics.run_cycle(True, (here, then, (then - here) / row_s, (after - then) / row_s, 0.0, 0.0, 0.0, 0.0))
         rows[0, k] = physics.voltage_mean_v
     return demand, rows
 

@@ -16,7 +16,7 @@ from studies import bench
 from studies.judging import GOOD
 from studies.slow_recordings import recording_of
 from studies.slow_sensor import slow_windows
-from tests.asked import asked_windows
+from tests.polled_voltage import build_polled_windows
 
 SETTINGS = Identification()
 TRUTH = np.array([bench.Plant().truth()[name] for name in PARAMETERS])
@@ -100,12 +100,12 @@ def test_a_delay_that_least_squares_took_for_a_negative_l_is_found(seed: int) ->
 
 def test_a_meter_that_was_asked_off_its_instants_tells_as_much_as_one_that_was_not() -> None:
     """Each value counts at its own time; assigning all to the regular instants would bias the inductance."""
-    on, off = (maximum_likelihood.estimate(asked_windows(timely=timely), SETTINGS) for timely in (True, False))
+    on, off = (maximum_likelihood.estimate(build_polled_windows(timely=timely), SETTINGS) for timely in (True, False))
     for estimate in (on, off):
         assert not estimate.missing
         assert (_errors_percent(estimate.values)[[0, 2, 3]] < (6.0, 0.6, 0.6)).all()
     assert off.get_std("R") == pytest.approx(on.get_std("R"), rel=0.5)
-    window = asked_windows()[0]
+    window = build_polled_windows()[0]
     assert window.slow_voltage is not None
     assert analyse(window, SETTINGS).verdict.accepted
     blind = replace(window, slow_voltage=replace(window.slow_voltage, late_s=None))

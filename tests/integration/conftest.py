@@ -21,8 +21,8 @@ from fdhil.config import MachineConfig
 from fdhil.pipeline import AxisPipeline
 from fdhil.program import load_trajectory
 from fdhil.records import Notice, Outcome
-from fdhil.sim import service as sim_service
-from fdhil.sim.service import LOCKSTEP_HOLDING_WAIT_S, SimService
+from fdhil.sim import simulator_service as sim_service
+from fdhil.sim.simulator_service import LOCKSTEP_HOLDING_WAIT_S, SimulatorService
 from tests.bench import bench_document
 
 PATIENCE_S = 500.0
@@ -32,7 +32,7 @@ _channel = itertools.count()
 @dataclass
 class Bench:
     config: MachineConfig
-    service: SimService
+    service: SimulatorService
     events: queue.Queue[dict[str, Any]]
     ready: Mapping[str, Any] = field(default_factory=dict)
 
@@ -44,7 +44,7 @@ class Bench:
                 return event
 
     def command(self, line: str) -> None:
-        self.service.command(line)
+        self.service.execute_command(line)
 
     def join(self) -> can.BusABC:
         place = {k: v for k, v in self.ready["buses"]["can0"].items() if v is not None}
@@ -128,7 +128,7 @@ def bench(transport: str, sections: dict[str, Any], tmp_path: Path, monkeypatch:
     TRANSPORTS[transport](document)
     events: queue.Queue[dict[str, Any]] = queue.Queue()
     config = machine_config.parse_config(document, folder=tmp_path)
-    service = SimService(config, events.put, load_trajectory)
+    service = SimulatorService(config, events.put, load_trajectory)
     thread = threading.Thread(target=service.run, name="twin")
     thread.start()
     bench = Bench(config, service, events)

@@ -11,8 +11,8 @@ import can
 import canopen
 import pytest
 
-from fdhil.sim.drive.modes import CYCLIC_POSITION
-from fdhil.sim.nc.drive_link import Wiring
+from fdhil.sim.drive.operation_modes import CYCLIC_POSITION
+from fdhil.sim.nc.drive_link import PdoWiring
 from tests.integration.conftest import Bench
 
 PATIENCE_S = 100.0
@@ -82,14 +82,14 @@ def test_reset_node_boots_and_can_be_started(bus: can.BusABC) -> None:
 def test_nc_takeover_from_another_thread_is_complete(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     of_axis = bench.service.machine.nc._wiring
 
-    def slow(axis: str) -> Wiring:
+    def slow(axis: str) -> PdoWiring:
         time.sleep(0.1)
         return of_axis(axis)
 
     monkeypatch.setattr(bench.service.machine.nc, "_wiring", slow)
     bench.command('{"command": "nc", "on": true}')
     bench.event("nc")
-    modes = [unit.drive.dictionary.number(0x6060) for unit in bench.service.machine.units.values()]
+    modes = [unit.drive.dictionary.get_number(0x6060) for unit in bench.service.machine.units.values()]
     assert modes == [CYCLIC_POSITION] * 2
 
 

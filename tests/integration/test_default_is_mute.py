@@ -12,7 +12,7 @@ from fdhil.cli.demo.processes import Process
 from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
 from fdhil.errors import DeviceError
 from tests.guard.drive_peer import Peer, hold_demand, write_config
-from tests.listening import tcp_ports
+from tests.listening_ports import list_tcp_ports
 
 pytestmark = pytest.mark.usefixtures("processes")
 
@@ -44,7 +44,7 @@ def test_default_daemon_sends_no_frame_and_opens_no_port(
         first = peer.tick
         peer.wait(lambda: peer.tick > first + CYCLES, "the cycles")
         assert ask_daemon(socket, {"request": "arm", "token": "any"})["ok"] is False
-        ports = tcp_ports(daemon.pid)
+        ports = list_tcp_ports(daemon.pid)
     finally:
         daemon.stop()
     assert (peer.sent, ports) == ([], set())

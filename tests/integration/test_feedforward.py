@@ -23,7 +23,7 @@ from fdhil.records import Float
 from tests.bench import bench_document
 from tests.integration.conftest import PATIENCE_S, Bench
 from tests.integration.test_guard import toml
-from tests.paths import bench_demand
+from tests.paths import build_bench_demand
 
 pytestmark = pytest.mark.usefixtures("processes")
 
@@ -94,7 +94,7 @@ def largest_errors_um(bench: Bench, client: GuardClient, demand: Path, trace: Pa
 
 def test_feedforward_reduces_the_largest_following_error(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
     demand = tmp_path / "demand.csv"
-    path = bench_demand(10)
+    path = build_bench_demand(10)
     lines = [f"{k * 0.001:.3f},{x:.9f},{y:.9f}" for k, (x, y) in enumerate(path)]
     demand.write_text("time_s,X_mm,Y_mm\n" + "\n".join(lines) + "\n", "utf-8")
     bench.command('{"command": "nc", "on": true}')

@@ -17,7 +17,7 @@ from fdhil.prediction import predict
 from fdhil.program import load_trajectory
 from fdhil.records import Float, Parameters
 from tests.bench import bench_document
-from tests.sim.bench_twin import TwinInHand
+from tests.sim.bench_simulator import SteppedSimulator
 
 pytestmark = pytest.mark.usefixtures("long_computation")
 
@@ -39,10 +39,10 @@ def machine(feedforward: float, plant: dict[str, dict[str, float]]) -> MachineCo
 
 def table(config: MachineConfig, program: Path, folder: Path) -> Float:
     reference = load_trajectory(program, config)
-    twin = TwinInHand(config)
+    twin = SteppedSimulator(config)
     twin.switch_on()
-    twin.machine.trace(folder / "trace.csv")
-    twin.machine.nc.play("bench", reference)
+    twin.machine.record_next_file(folder / "trace.csv")
+    twin.machine.nc.play_demand("bench", reference)
     twin.run_until("finished", limit=2 * reference.time_s.size + 5000)
     rows = np.genfromtxt(folder / "trace.csv", delimiter=",", names=True)
     return np.column_stack([rows["X_table_mm"], rows["Y_table_mm"]])

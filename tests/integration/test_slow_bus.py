@@ -16,8 +16,8 @@ from fdhil.config import MachineConfig
 from fdhil.drivers import open_machine
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import AxisSamples, Float, Trajectory, WindowOutcome, freeze_array
-from fdhil.sim.machine import Machine
-from fdhil.sim.service import SimService
+from fdhil.sim.simulated_machine import SimulatedMachine
+from fdhil.sim.simulator_service import SimulatorService
 from tests.bench import bench_document
 from tests.integration.conftest import PATIENCE_S, Bench, digested
 from tests.integration.test_loop import settled
@@ -77,7 +77,7 @@ def test_four_axes_are_recorded_sample_by_sample(period_s: float, tmp_path: Path
     document["sim"] = {"pace": "lockstep", "modbus": False}
     config = machine_config.parse_config(document, folder=tmp_path)
     events: queue.Queue[dict[str, Any]] = queue.Queue()
-    service = SimService(config, events.put, move_back_and_forth)
+    service = SimulatorService(config, events.put, move_back_and_forth)
     thread = threading.Thread(target=service.run, name="twin")
     thread.start()
     bench = Bench(config, service, events)
@@ -99,6 +99,6 @@ def test_four_axes_are_recorded_sample_by_sample(period_s: float, tmp_path: Path
 
 def test_shipped_four_axis_config_fits_its_bus_but_not_at_1_ms() -> None:
     config = machine_config.load_config(ROOT / "configs" / "four-axes.toml")
-    load = Machine(config).describe(dict.fromkeys(config.axis, Path()))["bus_load_worst"]["can0"]
+    load = SimulatedMachine(config).describe_drives(dict.fromkeys(config.axis, Path()))["bus_load_worst"]["can0"]
     assert 0.3 < load < 0.6
     assert load * config.machine.sync_period_s / 0.001 > 1.5

@@ -26,7 +26,7 @@ from fdhil.program import program_digest
 from fdhil.records import Float, Reason
 from tests.integration.conftest import PATIENCE_S, Bench
 from tests.integration.test_guard import DIGEST, client, sections
-from tests.paths import bench_demand
+from tests.paths import build_bench_demand
 
 pytestmark = pytest.mark.usefixtures("processes")
 
@@ -94,7 +94,7 @@ def play(bench: Bench, client: GuardClient, demand: Path, stream: RowStream) -> 
 
 
 def test_streamed_rows_end_before_a_refused_position(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
-    there, hard = bench_demand(10), bench_demand(20, (0.030, 0.015))
+    there, hard = build_bench_demand(10), build_bench_demand(20, (0.030, 0.015))
     path = np.concatenate([np.repeat(there[:1], 300, axis=0), *[there, there[::-1]] * 2, hard])
     place = len(path) - len(hard)
     demand = written(tmp_path, path)

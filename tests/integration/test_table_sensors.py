@@ -24,9 +24,9 @@ from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.pipeline.recent_samples import RecentSamples
 from fdhil.records import AxisSamples, Estimate, TableSamples, TickTimes, WindowOutcome
-from fdhil.sim.frame import Frame
+from fdhil.sim.frame_types import Frame
 from tests.bench import bench_document
-from tests.sim.bench_twin import TwinInHand, smooth
+from tests.sim.bench_simulator import SteppedSimulator, smooth_rows
 
 TRUE = {"X": 80.0, "Y": 60.0}  # Hz
 PERIOD_S, PERIOD_NS = 1e-3, 1_000_000
@@ -46,13 +46,13 @@ def move_back_and_forth() -> np.ndarray[Any, Any]:
     t = np.arange(0.0, 1.2, PERIOD_S)
     way = np.cumsum(np.clip(np.minimum(t * 4000, (0.725 - t) * 4000), 0, 500)) * PERIOD_S
     both = np.concatenate([np.zeros(200), way, way[-1] - way])
-    return smooth(np.column_stack([both, both]), (20, 10))
+    return smooth_rows(np.column_stack([both, both]), (20, 10))
 
 
-def cycles(hand: TwinInHand) -> Iterator[list[Frame]]:
+def cycles(hand: SteppedSimulator) -> Iterator[list[Frame]]:
     while not any(event["event"] == "finished" for event in hand.events):
         known = len(hand.wire)
-        hand.run(1)
+        hand.run_cycles(1)
         yield hand.wire[known:]
 
 
@@ -64,16 +64,16 @@ def recorded() -> dict[str, list[WindowOutcome]]:
     assert settings is not None
     sensor = StreamedAccelerometer("Y", settings, PERIOD_S)
     recent = {axis: RecentSamples(axis, section, 10_000, PERIOD_S) for axis, section in machine.axis.items()}
-    hand = TwinInHand(machine)
+    hand = SteppedSimulator(machine)
     hand.switch_on()
-    hand.play(move_back_and_forth())
-    hand.machine.tables.accelerometers["Y"].take()
+    hand.play_rows(move_back_and_forth())
+    hand.machine.tables.accelerometers["Y"].take_lines()
     frames: list[tuple[int, int, bytes]] = []
     lines: list[TextLine] = []
     for k, sent in enumerate(cycles(hand)):
         now_ns = k * PERIOD_NS
         frames += [(now_ns + 1000 * place, can_id, data) for place, (can_id, data) in enumerate(sent)]
-        came = hand.machine.tables.accelerometers["Y"].take().decode().splitlines()
+        came = hand.machine.tables.accelerometers["Y"].take_lines().decode().splitlines()
         lines += [TextLine(line, now_ns + LATE_NS) for line in came]
         if k % DRAIN_CYCLES:
             continue

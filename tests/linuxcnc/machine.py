@@ -22,7 +22,7 @@ import numpy as np
 
 from fdhil.child_process import wrap_to_end_with_parent
 from fdhil.records import Float
-from tests.sim.twin_process import TwinProcess
+from tests.sim.simulator_process import SimulatorProcess
 
 HERE = Path(__file__).parent
 PATIENCE_S = 300.0
@@ -195,7 +195,7 @@ class LinuxCnc:
         self.order("run", program=str(path))
 
     @contextmanager
-    def driving(self, twin: TwinProcess) -> Iterator[None]:
+    def driving(self, twin: SimulatorProcess) -> Iterator[None]:
         """Let the demand drive the simulated machine until the end of the block, which ends the demand.
 
         The complete demand up to the end of the block is transferred, however slow the host is.
@@ -327,7 +327,7 @@ class DemandRecorder(LinuxCnc):
         super().close()
 
 
-def _pour(rows: IO[bytes], twin: TwinProcess) -> None:
+def _pour(rows: IO[bytes], twin: SimulatorProcess) -> None:
     for line in rows:
         twin.send_line(line.decode().rstrip())
 

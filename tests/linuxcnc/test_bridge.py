@@ -19,9 +19,9 @@ from fdhil.config import MachineConfig
 from fdhil.drivers import Record, open_machine
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import AxisSamples, Float, Int, MoveEvent, MoveKind, NcState, Notice, WindowOutcome
+from tests.free_ports import find_free_port
 from tests.linuxcnc.machine import LinuxCnc
-from tests.ports import free_port
-from tests.sim.twin_process import TwinProcess, write_config
+from tests.sim.simulator_process import SimulatorProcess, write_config
 
 pytestmark = pytest.mark.debian
 
@@ -120,7 +120,7 @@ async def listening(config: MachineConfig) -> AsyncIterator[Heard]:
         await asyncio.gather(running, return_exceptions=True)
 
 
-def beside(path: Path, twin: TwinProcess, port: int) -> MachineConfig:
+def beside(path: Path, twin: SimulatorProcess, port: int) -> MachineConfig:
     """The simulator's machine in fdhil's configuration, with LinuxCNC's bridge as its source of rapids."""
     bus = twin.ready["buses"]["can0"]
     text = path.read_text().replace("[bus.can0]\n", f"[bus.can0]\nport = {bus['port']}\n")
@@ -157,8 +157,8 @@ def sampled(nc: LinuxCnc, path: Path) -> Iterator[None]:
 
 
 async def test_linuxcncs_own_sequence_is_recovered(tmp_path: Path) -> None:
-    port, path = free_port(), write_config(tmp_path, 'pace = "lockstep"\nmodbus = false')
-    with TwinProcess(path, "--demand", "-") as twin, LinuxCnc(hal=hal_of(port)) as nc:
+    port, path = find_free_port(), write_config(tmp_path, 'pace = "lockstep"\nmodbus = false')
+    with SimulatorProcess(path, "--demand", "-") as twin, LinuxCnc(hal=hal_of(port)) as nc:
         config = beside(path, twin, port)
         with sampled(nc, tmp_path / "truth"):
             async with listening(config) as heard:
@@ -189,8 +189,8 @@ def check_sequence(heard: Heard, axis: str, demand: Float, types: Sequence[int])
 
 
 async def test_overrides_and_holds_are_told_and_their_rapids_refused(tmp_path: Path) -> None:
-    port, path = free_port(), write_config(tmp_path, 'pace = "lockstep"\nmodbus = false')
-    with TwinProcess(path, "--demand", "-") as twin, LinuxCnc(hal=hal_of(port)) as nc:
+    port, path = find_free_port(), write_config(tmp_path, 'pace = "lockstep"\nmodbus = false')
+    with SimulatorProcess(path, "--demand", "-") as twin, LinuxCnc(hal=hal_of(port)) as nc:
         config = beside(path, twin, port)
         async with listening(config) as heard:
             with nc.driving(twin):

@@ -23,10 +23,10 @@ from fdhil.config.axis_section import HAL_INCREMENTS
 from fdhil.daemon.daemon_socket import SOCKET_NAME
 from fdhil.prediction import contour_error_um
 from fdhil.records import Float
+from tests.free_ports import find_free_port
 from tests.linuxcnc.beside import SHUTTLE, TRIES, fdhil, record, repeated, until
 from tests.linuxcnc.hal_machine import LEAD_CYCLES, HalMachine, HalTrace, document
 from tests.linuxcnc.hal_plant import MOTOR, OTHERS, PITCH_MM
-from tests.ports import free_port
 
 pytestmark = pytest.mark.debian
 # the first move overcomes the friction of both axes, and lasts longer than the offsets' lead
@@ -75,7 +75,7 @@ def plant() -> str:
 
 @pytest.fixture
 def shop(tmp_path: Path, plant: str) -> Iterator[HalShop]:
-    port, nc_port = free_port(), free_port()
+    port, nc_port = find_free_port(), find_free_port()
     with HalMachine(tmp_path / "machine.toml", document(tmp_path, port, nc_port), PLANTS[plant][0]) as nc:
         nc.prioritise()
         yield HalShop(tmp_path / "machine.toml", nc, port)

@@ -10,7 +10,7 @@ import pytest
 
 from fdhil.records import Float
 from tests.linuxcnc.machine import LinuxCnc
-from tests.sim.twin_process import TwinProcess, write_config
+from tests.sim.simulator_process import SimulatorProcess, write_config
 
 pytestmark = pytest.mark.debian
 RUNS, LEAST_SAME = 6, 3
@@ -42,11 +42,11 @@ def test_between_two_rests_runs_are_the_same_to_the_last_digit(tmp_path: Path) -
     unique. Therefore the identical runs are counted.
     """
     config = write_config(tmp_path, 'pace = "lockstep"\nmodbus = false')
-    with TwinProcess(config, "--demand", "-", "--trace", tmp_path / "trace.csv") as twin:
+    with SimulatorProcess(config, "--demand", "-", "--trace", tmp_path / "trace.csv") as twin:
         with LinuxCnc() as nc, nc.driving(twin):
             for _ in range(RUNS):
                 nc.run(PART)
-        assert twin.event("finished")["starved"] == 0
+        assert twin.wait_for_event("finished")["starved"] == 0
     table = np.genfromtxt(tmp_path / "trace.csv", delimiter=",", names=True)
     runs = motions(np.column_stack([table["X_reference_mm"], table["Y_reference_mm"]]))
     ordered = Counter(run.tobytes() for run in runs)

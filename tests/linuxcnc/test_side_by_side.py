@@ -17,10 +17,10 @@ from fdhil.cli.demo.processes import Process
 from fdhil.cli.demo.toml import to_toml
 from fdhil.daemon.daemon_socket import SOCKET_NAME
 from fdhil.program import load_trajectory
+from tests.free_ports import find_free_port
 from tests.linuxcnc.beside import PART, SHUTTLE, TRIES, contour_of_each_cut, fdhil, record, repeated, until
 from tests.linuxcnc.machine import LinuxCnc
-from tests.ports import free_port
-from tests.sim.twin_process import TwinProcess
+from tests.sim.simulator_process import SimulatorProcess
 
 pytestmark = pytest.mark.debian
 
@@ -30,7 +30,7 @@ class Shop:
     """The simulated machine with its trace, and fdhil commissioned and recording."""
 
     file: Path
-    twin: TwinProcess
+    twin: SimulatorProcess
     bridge_port: int
 
     @property
@@ -47,14 +47,14 @@ def shop(tmp_path: Path) -> Iterator[Shop]:
     document["sim"]["pace"] = "lockstep"
     document["nc"] = {"profile": "linuxcnc"}
     document["g0"] = {"source": "linuxcnc"}
-    document["nc_source"] = {"linuxcnc": {"port": free_port()}}
+    document["nc_source"] = {"linuxcnc": {"port": find_free_port()}}
     for axis in document["axis"].values():
         axis["max_acceleration_mm_s2"] = 2000.0
     (tmp_path / "twin.toml").write_text(to_toml(document))
     file = tmp_path / "machine.toml"
     with ExitStack() as stack:
         twin = stack.enter_context(
-            TwinProcess(tmp_path / "twin.toml", "--demand", "-", "--trace", tmp_path / "trace.csv")
+            SimulatorProcess(tmp_path / "twin.toml", "--demand", "-", "--trace", tmp_path / "trace.csv")
         )
         document["bus"] = twin.ready["buses"]
         file.write_text(to_toml(document))
@@ -81,7 +81,7 @@ def test_the_second_cut_of_a_program_is_corrected(shop: Shop) -> None:
             until(lambda: len(shop.status()["passes"]) == tried)  # noqa: B023 - called at once
             if repeated(shop.status()):
                 break
-    shop.twin.event("finished")
+    shop.twin.wait_for_event("finished")
     before, *_, after = contour_of_each_cut(shop.trace, load_trajectory(part, machine_config.load_config(shop.file)))
     assert promised["contour"]["rms_um"] == pytest.approx(before, rel=0.05)
     assert after < before / 50

@@ -13,7 +13,7 @@ from fdhil.guard.guard_protocol import AT_REST
 from fdhil.guard.offset_adoption import list_applied_offsets
 from fdhil.store.audit import entries
 from tests.guard.frame_checks import Wire
-from tests.machine.whole_machine import Machine
+from tests.machine.complete_machine import CompleteMachine
 
 OFFSET = 0x60B000
 LAG_SYNC = 150  # ten read-backs and more: by then the guard has seen what a drive holds
@@ -22,10 +22,10 @@ WINDOW_LINE = re.compile(r" ([A-Z]): G0 [+-] at ")
 TABLES = ("windows", "revisions", "notices", "skills", "loops")
 
 
-class Judge:
+class InvariantChecker:
     """Checks one machine and appends violations to its ``wrong``; ``counted`` is the number of checks."""
 
-    def __init__(self, machine: Machine) -> None:
+    def __init__(self, machine: CompleteMachine) -> None:
         self._machine = machine
         self.counted = Counter[str]()
         self._numbers = [unit.drive.dictionary.numbers for unit in machine.plant.units.values()]
@@ -34,99 +34,101 @@ class Judge:
         self._guard: object = None
         self._untrue = Counter[str]()
         self._held_since_s: float | None = None
-        machine.at_sync = self._at_sync
-        machine.at_guard_frame = self._guard_frame
-        machine.at_foreign_frame = self._foreign_frame
+        machine.at_sync = self._check_sync
+        machine.at_guard_frame = self._check_guard_frame
+        machine.at_foreign_frame = self._check_foreign_frame
 
-    def wrong(self, text: str) -> None:
+    def list_violations(self, text: str) -> None:
         """Report a violated invariant with the time."""
         self._machine.wrong.append(f"{self._machine.clock.now_s():.3f} s: {text}")
 
-    def _follow(self) -> None:
+    def _check_offset_step(self) -> None:
         guard = self._machine.guard
         if guard is self._guard or guard is None:
             return
         self._guard, self._wires = guard, {}
         for axis in guard.settings.axes:
             unit = self._machine.plant.units[axis.name]
-            self._wires[axis.offset.cob_id] = unit, Wire(axis.limits, self._held(unit))
+            self._wires[axis.offset.cob_id] = unit, Wire(axis.limits, self._has_offset(unit))
 
     @staticmethod
-    def _held(unit: Any) -> int:
+    def _has_offset(unit: Any) -> int:
         return int(unit.drive.dictionary.numbers[OFFSET])
 
     @property
-    def _any_held(self) -> bool:
+    def _has_any_offset(self) -> bool:
         return any(numbers[OFFSET] for numbers in self._numbers)
 
-    def _guard_frame(self, cob_id: int, data: bytes) -> None:
-        self._follow()
+    def _check_guard_frame(self, cob_id: int, data: bytes) -> None:
+        self._check_offset_step()
         if cob_id not in self._wires:
             return
         unit, wire = self._wires[cob_id]
         self.counted["offset frames"] += 1
         self._sent.add(cob_id)
         value = int.from_bytes(data, "little", signed=True)
-        if (wrong := wire.ours(value, self._held(unit))) is not None:
-            self.wrong(f"axis {unit.axis}: {wrong}")
+        if (wrong := wire.ours(value, self._has_offset(unit))) is not None:
+            self.list_violations(f"axis {unit.axis}: {wrong}")
 
-    def _foreign_frame(self, cob_id: int, data: bytes) -> None:
+    def _check_foreign_frame(self, cob_id: int, data: bytes) -> None:
         if cob_id in self._wires and len(data) >= 4:
             self._wires[cob_id][1].foreign(int.from_bytes(data[:4], "little", signed=True))
 
-    def _at_sync(self) -> None:
+    def _check_sync(self) -> None:
         self.counted["SYNC"] += 1
-        self._follow()
+        self._check_offset_step()
         for cob_id, (_, wire) in self._wires.items():
             if cob_id not in self._sent:
                 wire.nothing()
         self._sent.clear()
-        self._true_guard()
+        self._check_guard_status()
         now_s = self._machine.clock.time_s
-        if self._any_held:
+        if self._has_any_offset:
             self._held_since_s = now_s if self._held_since_s is None else self._held_since_s
         else:
             self._held_since_s = None
 
-    def _true_guard(self) -> None:
+    def _check_guard_status(self) -> None:
         """Check that an idle guard reports the drive's true offset once it has read it back."""
         guard = self._machine.guard
         if guard is None or guard.state.mode not in AT_REST or guard._silent:
             self._untrue.clear()
             return
         for (unit, _), reported in zip(self._wires.values(), list_applied_offsets(guard.state), strict=True):
-            held = self._held(unit)
+            held = self._has_offset(unit)
             is_true = reported in (None, held) or held == 0  # more than there is may be feared
             self._untrue[unit.axis] = 0 if is_true else self._untrue[unit.axis] + 1
             if self._untrue[unit.axis] == LAG_SYNC:
-                self.wrong(f"the guard reports that axis {unit.axis} holds {reported}, it holds {held}")
+                self.list_violations(f"the guard reports that axis {unit.axis} holds {reported}, it holds {held}")
 
-    def status(self) -> dict[str, Any]:
+    def check_status(self) -> dict[str, Any]:
         """Request the daemon's status; its report of applied offsets must be true."""
-        status = self._machine.ask("status")
+        status = self._machine.request_daemon("status")
         self.counted["statuses"] += 1
         now_s = self._machine.clock.now_s()
         since_s = now_s if self._held_since_s is None else self._held_since_s
         if status["may_stand"]["nothing"] and now_s - since_s > STATUS_LAG_S:
-            self.wrong(f"the daemon reports that nothing is applied, the drives hold {self._machine.held_um()} um")
+            self.list_violations(
+                f"the daemon reports that nothing is applied, the drives hold {self._machine.read_offset_um()} um"
+            )
         return status
 
-    def end(self) -> None:
+    def check_end(self) -> None:
         """Check the final state: drives at zero, no record lost or duplicated, no traceback in the log."""
         machine = self._machine
-        if self._any_held:
-            self.wrong(f"in the end the drives hold {machine.held_um()} um")
+        if self._has_any_offset:
+            self.list_violations(f"in the end the drives hold {machine.read_offset_um()} um")
         log = machine.log.getvalue()
         for word in ("Traceback", "InternalError"):
             if word in log:
-                self.wrong(f"the log has {word}: {log[log.index(word) - 200 : log.index(word) + 400]}")
+                self.list_violations(f"the log has {word}: {log[log.index(word) - 200 : log.index(word) + 400]}")
         for line in machine.journal.splitlines():
             event = json.loads(line)
             if event["event"] == "failed":
-                self.wrong(f"the guard's loop failed: {event['text']}")
-        self._records(log)
+                self.list_violations(f"the guard's loop failed: {event['text']}")
+        self._check_records(log)
 
-    def _records(self, log: str) -> None:
+    def _check_records(self, log: str) -> None:
         logged = Counter(WINDOW_LINE.findall(log))
         history = self._machine.config.store.directory / "history.sqlite"
         key = "axis, start_tick, monotonic_ns"
@@ -138,12 +140,12 @@ class Judge:
         self.counted["records"] += sum(map(len, rows.values()))
         for axis, count in logged.items():
             if kept[axis] < count:
-                self.wrong(f"axis {axis}: {count} windows were acknowledged, {kept[axis]} are in the history")
+                self.list_violations(f"axis {axis}: {count} windows were acknowledged, {kept[axis]} are in the history")
         if doubled:
-            self.wrong(f"doubled windows: {doubled}")
+            self.list_violations(f"doubled windows: {doubled}")
         if sound != "ok":
-            self.wrong(f"the history is damaged: {sound}")
+            self.list_violations(f"the history is damaged: {sound}")
         for entry, trouble in entries(self._machine.config.store.directory):
             self.counted["audit lines"] += 1
             if trouble is not None:
-                self.wrong(f"the audit: {trouble}: {entry}")
+                self.list_violations(f"the audit: {trouble}: {entry}")

@@ -42,7 +42,7 @@ class MemoryBus:
     def is_down(self) -> bool:
         return self.faults.down
 
-    def put(self, frames: Iterable[tuple[int, bytes]], *, of_guard: bool = False) -> None:
+    def put_frame(self, frames: Iterable[tuple[int, bytes]], *, of_guard: bool = False) -> None:
         """Deliver frames to all listeners; the guard does not receive its own."""
         now_s = self.now_s()
         t_ns = round(now_s * 1e9)
@@ -51,9 +51,9 @@ class MemoryBus:
         if self.guard is not None and not of_guard:
             self.guard.inbox += [(can_id, data, now_s) for _, can_id, data in rows if can_id in self.guard.wanted]
         if len(self._rows) >= MOST_ROWS:
-            self.flush()
+            self.deliver_frames()
 
-    def flush(self) -> None:
+    def deliver_frames(self) -> None:
         if not self._rows:
             return
         frames = pack_frames(self._rows)
@@ -65,11 +65,11 @@ class MemoryBus:
         if self.listener is not None:
             self.listener.blocks.append(frames)
 
-    def open(self, name: str, settings: config.CanBus, *, filters: Sequence[Filter] = ()) -> BusListener:
+    def open_listener(self, name: str, settings: config.CanBus, *, filters: Sequence[Filter] = ()) -> BusListener:
         """Open the bus for listening, like ``CanBus``; ConnectError while it is down."""
         if self.is_down:
             raise ConnectError(name, "the interface is down; switch it on")
-        self.flush()
+        self.deliver_frames()
         self.listener = BusListener(self, filters)
         return self.listener
 
@@ -90,7 +90,7 @@ class BusListener:
         return "the interface is down" if self._bus.is_down else None
 
     def drain_frames(self) -> Frames:
-        self._bus.flush()
+        self._bus.deliver_frames()
         blocks, self.blocks = self.blocks, []
         frames = filter_frames(np.concatenate(blocks), self._filters) if blocks else pack_frames(())
         self._count += frames.size

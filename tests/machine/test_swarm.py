@@ -12,16 +12,16 @@ import pytest
 
 from fdhil.guard import guard_step
 from studies import swarm
-from tests.machine.invariants import Judge
-from tests.machine.test_lives import into_the_cut
-from tests.machine.whole_machine import Machine
+from tests.machine.complete_machine import CompleteMachine
+from tests.machine.invariants import InvariantChecker
+from tests.machine.test_failures_in_cut import run_into_cut
 
-Begin = Callable[[], Machine]
+Begin = Callable[[], CompleteMachine]
 RUN = {"command": "python -m studies.swarm", "commit": "0123abcd", "date": "2026-11-28", "versions": "Python 3.11"}
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_a_seed_repeats_a_whole_life(tmp_path: Path) -> None:
+def test_seed_reproduces_complete_run(tmp_path: Path) -> None:
     lives = []
     for _ in range(2):
         folder = tmp_path / "life"
@@ -33,7 +33,7 @@ def test_a_seed_repeats_a_whole_life(tmp_path: Path) -> None:
     assert lives[0] == lives[1]
 
 
-def test_a_failure_names_the_command_that_repeats_it() -> None:
+def test_failure_names_reproducing_command() -> None:
     figures = swarm.nothing_run("code")
     swarm.add_life(figures, 17, 60.0, ["1.000 s: a step"], {"SYNC": 3, "frames": 9, "milliseconds": 70}, 2.0)
     page = swarm.page({**RUN, "seeds": "17 to 17"}, figures)
@@ -41,7 +41,7 @@ def test_a_failure_names_the_command_that_repeats_it() -> None:
     assert "Broken: in all 1 machines." in page
 
 
-def test_a_run_adds_to_what_the_same_code_has_run(tmp_path: Path) -> None:
+def test_run_adds_to_total_of_same_code(tmp_path: Path) -> None:
     path = tmp_path / "swarm.json"
     for seed in (1, 2):
         figures = swarm.resumed(path, "code")
@@ -56,7 +56,7 @@ def test_a_run_adds_to_what_the_same_code_has_run(tmp_path: Path) -> None:
     assert "140 machine-seconds in 4 s of processor time" in text
 
 
-def test_a_run_of_other_code_begins_again_and_lists_the_earlier_one(tmp_path: Path) -> None:
+def test_run_of_other_code_starts_new_total_and_lists_earlier_one(tmp_path: Path) -> None:
     path = tmp_path / "swarm.json"
     figures = swarm.nothing_run("before")
     swarm.add_life(figures, 1, 60.0, ["2.0 s: wrong"], {"milliseconds": 70_000}, 2.0)
@@ -66,7 +66,7 @@ def test_a_run_of_other_code_begins_again_and_lists_the_earlier_one(tmp_path: Pa
     assert again["earlier"] == [{"commit": "0123abcd", "machines": 1, "machine_s": 70.0, "failures": 1}]
 
 
-def test_a_life_that_does_not_end_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_endless_run_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(swarm, "MOST_CPU_S", 0.02)
     handler = signal.signal(signal.SIGPROF, swarm._too_long)
     try:
@@ -76,33 +76,33 @@ def test_a_life_that_does_not_end_is_a_finding(monkeypatch: pytest.MonkeyPatch) 
     assert any("more than 0.02 s of processor time" in each for each in wrong), wrong
 
 
-def test_every_event_can_happen_to_a_machine_that_cuts(begin: Begin) -> None:
-    machine = begin()
-    life = swarm.Life(1, 1.0, machine, Judge(machine), random.Random(1))
+def test_every_event_occurs_during_cut(start_machine: Begin) -> None:
+    machine = start_machine()
+    life = swarm.Life(1, 1.0, machine, InvariantChecker(machine), random.Random(1))
     for name in sorted(swarm.EVENTS.keys() - {"daemon restarted", "guard restarted", "feed held"}):
         swarm.EVENTS[name](life)
-        machine.run(0.002)
+        machine.run_for(0.002)
     assert machine.wrong == []
 
 
-def test_a_step_of_the_offset_is_seen_by_the_judge(begin: Begin, monkeypatch: pytest.MonkeyPatch) -> None:
-    machine = begin()
-    Judge(machine)
-    into_the_cut(machine, 0.3)
+def test_checker_detects_offset_step(start_machine: Begin, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = start_machine()
+    InvariantChecker(machine)
+    run_into_cut(machine, 0.3)
     monkeypatch.setattr(guard_step, "move_toward_goal", lambda _limits, _offset, _rate, wanted, _rate_wanted: wanted)
     monkeypatch.setattr(guard_step, "find_limit_violation", lambda _limits, _before, _rate, _offset: None)
-    machine.run(0.1)
-    machine.kill("daemon")
-    machine.run(0.1)
+    machine.run_for(0.1)
+    machine.kill_process("daemon")
+    machine.run_for(0.1)
     assert any("a step" in each for each in machine.wrong), machine.wrong
 
 
-def test_an_offset_that_stays_and_is_denied_is_seen_by_the_judge(begin: Begin) -> None:
-    machine = begin()
-    judge = Judge(machine)
-    machine.fault("object", axis="X", index=0x60B0, value=100)
-    machine.fault("drop_tpdo", axis="X", value=3)
-    machine.run(1.8)
-    judge.status()
-    judge.end()
+def test_checker_detects_unreported_residual_offset(start_machine: Begin) -> None:
+    machine = start_machine()
+    judge = InvariantChecker(machine)
+    machine.inject_fault("object", axis="X", index=0x60B0, value=100)
+    machine.inject_fault("drop_tpdo", axis="X", value=3)
+    machine.run_for(1.8)
+    judge.check_status()
+    judge.check_end()
     assert any("in the end the drives hold" in each for each in machine.wrong), machine.wrong

@@ -47,14 +47,14 @@ class VirtualClock(Clock):
         raise RuntimeError("nothing in this program can make the connection readable")
 
 
-class HastyClock(VirtualClock):
+class ImpatientClock(VirtualClock):
     """A clock without sleep: time advances at once; answers of other threads are awaited in real time."""
 
     def wait_readable(self, connection: socket.socket, seconds: float) -> bool:
         return Clock.wait_readable(self, connection, seconds)
 
 
-class Killed(BaseException):
+class ProcessKilled(BaseException):
     """Raised by any call of a killed process."""
 
 
@@ -66,7 +66,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
     def __init__(self, clock: VirtualClock | None = None) -> None:
         self.clock = clock or VirtualClock()
-        super().__init__(_Advancing(self.clock))
+        super().__init__(_AdvancingSelector(self.clock))
         self._handlers: dict[int, Callable[[], object]] = {}
         self.dead = False
 
@@ -83,11 +83,11 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         done = self.create_future()
         try:
             if self.dead:
-                raise Killed
+                raise ProcessKilled
             done.set_result(call(*given))
         except StopIteration as error:
             done.set_exception(RuntimeError(repr(error)))
-        except (Exception, Killed) as error:  # noqa: BLE001 - whatever it is, the waiting coroutine gets it
+        except (Exception, ProcessKilled) as error:  # noqa: BLE001 - whatever it is, the waiting coroutine gets it
             done.set_exception(error)
         return done
 
@@ -129,20 +129,20 @@ class _CheckInProcess(asyncio.SubprocessTransport):
         return self
 
     def write(self, data: bytes) -> None:
-        def say(answer: Mapping[str, Any]) -> None:
+        def report_result(answer: Mapping[str, Any]) -> None:
             line = json.dumps(answer).encode() + b"\n"
             self._loop.call_soon(self._protocol.pipe_data_received, 1, line)
 
-        program_check.answer_request(json.loads(data), say)
-        self._loop.call_soon(self._end)
+        program_check.answer_request(json.loads(data), report_result)
+        self._loop.call_soon(self._finish)
 
-    def _end(self) -> None:
+    def _finish(self) -> None:
         self._code = 0
         self._ended.set()
         self._protocol.pipe_connection_lost(1, None)
         self._protocol.process_exited()
 
-    async def _wait(self) -> int:
+    async def _wait_for_end(self) -> int:
         await self._ended.wait()
         return self._code or 0
 
@@ -155,7 +155,7 @@ class _CheckInProcess(asyncio.SubprocessTransport):
         return self._code is not None
 
 
-class _Advancing(selectors.DefaultSelector):
+class _AdvancingSelector(selectors.DefaultSelector):
     def __init__(self, clock: VirtualClock) -> None:
         super().__init__()
         self._clock = clock
@@ -168,7 +168,7 @@ class _Advancing(selectors.DefaultSelector):
         return super().select(0)
 
 
-def run(main: Coroutine[Any, Any, Any], loop: VirtualLoop) -> Any:
+def run_virtual(main: Coroutine[Any, Any, Any], loop: VirtualLoop) -> Any:
     try:
         return loop.run_until_complete(main)
     finally:

@@ -19,7 +19,7 @@ from fdhil.program import Dwell, Feed, interpret
 from fdhil.program.budget import Budget
 from fdhil.records import Float, Parameters, Trajectory, freeze_integers
 from tests.bench import bench_config
-from tests.paths import trajectory
+from tests.paths import build_trajectory
 
 CONFIG = bench_config()
 MODELS = nominal_models(CONFIG)
@@ -181,7 +181,7 @@ def made(errors: Callable[[Mapping[int, float]], list[float]]) -> tuple[Source, 
     def at(shares: Mapping[int, float]) -> Trajectory:
         asked.append(shares)
         n = len(errors(shares))
-        return replace(trajectory(np.zeros((n, 1)), "X"), line=freeze_integers(1 + np.arange(n)))
+        return replace(build_trajectory(np.zeros((n, 1)), "X"), line=freeze_integers(1 + np.arange(n)))
 
     source = Source(at, line=lambda k: k, feed_mm_min=lambda _: 1000.0, after_s=0.0)
     return source, lambda _: np.array(errors(asked[-1]))

@@ -12,7 +12,7 @@ from fdhil.prediction.forecast import Course, course, crossing, last_step, step_
 from fdhil.prediction.models import nominal_models
 from fdhil.records import PARAMETERS, Parameters, ParameterSet, Trajectory, freeze_array, freeze_integers
 from tests.bench import bench_config
-from tests.paths import bench_trajectory
+from tests.paths import build_bench_trajectory
 
 CONFIG = bench_config()
 NOMINAL = nominal_models(CONFIG)["X"]
@@ -32,7 +32,7 @@ def with_lines(reference: Trajectory) -> Trajectory:
 
 def test_a_fixture_costs_what_the_prediction_without_it_says() -> None:
     """Jt + 13 % on X: the largest rise of the contour error, at its line; Y has not changed."""
-    reference = with_lines(bench_trajectory(10))
+    reference = with_lines(build_bench_trajectory(10))
     now = {"X": published("X", 4, Jt=0.085), "Y": published("Y", 9)}
     earlier = {"X": published("X", 3), "Y": published("Y", 8)}
     models = {axis: known.parameters for axis, known in now.items()}
@@ -47,7 +47,7 @@ def test_a_fixture_costs_what_the_prediction_without_it_says() -> None:
 
 
 def test_zones_that_came_and_went_are_told_with_what_did_it() -> None:
-    reference = with_lines(bench_trajectory(10))
+    reference = with_lines(build_bench_trajectory(10))
     earlier = {"X": NOMINAL, "Y": replace(NOMINAL, Cd=1.0, Jt=0.06)}
     models = {"X": replace(NOMINAL, Jt=0.085), "Y": NOMINAL}
     predicted, then = predict(reference, models, CONFIG), predict(reference, earlier, CONFIG)
@@ -71,7 +71,7 @@ def test_zones_that_came_and_went_are_told_with_what_did_it() -> None:
 
 
 def test_a_change_to_the_better_saves() -> None:
-    reference = bench_trajectory(10)
+    reference = build_bench_trajectory(10)
     low, usual = {"X": published("X", 2, ft=0.01, Cd=1.0)}, {"X": published("X", 1)}
     costs = []
     for earlier, now in ((usual, low), (low, usual)):
@@ -95,7 +95,7 @@ def test_the_last_step_is_found_and_drift_is_none() -> None:
 
 def test_the_day_on_which_a_zone_leaves_the_tolerance() -> None:
     """Jt rises by 0.1 % a day: with that day's parameters the predicted error equals the tolerance."""
-    reference = bench_trajectory(10)
+    reference = build_bench_trajectory(10)
     days = np.arange(-20.0, 1.0)
     random = np.random.default_rng(3)
     sets = [published("Y", k, Jt=0.075 * (1 + 0.001 * day) + random.normal(0, 3e-5)) for k, day in enumerate(days)]
@@ -123,7 +123,7 @@ def only_jt(known: Course) -> Course:
 
 
 def test_what_may_stand_still_is_not_foreseen() -> None:
-    reference = bench_trajectory(10)
+    reference = build_bench_trajectory(10)
     models = {"X": NOMINAL, "Y": NOMINAL}
     predicted = predict(reference, models, CONFIG)
     k = next(k for k, zone in enumerate(predicted.zones) if zone.cause == "corner")
@@ -153,7 +153,7 @@ def test_a_parameter_set_without_covariance_still_has_steps() -> None:
 
 def test_a_term_that_joined_or_left_is_told_as_a_whole() -> None:
     """The effect of falling friction since a prediction without it, and the reverse."""
-    reference = bench_trajectory(10)
+    reference = build_bench_trajectory(10)
     rich = NOMINAL.replace_values(stribeck=2.0, stribeck_speed=10.0)
     for earlier, now in ((NOMINAL, rich), (rich, NOMINAL)):
         models = {"X": now, "Y": now}

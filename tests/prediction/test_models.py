@@ -15,7 +15,7 @@ from fdhil.errors import ConfigError
 from fdhil.prediction.models import load_model_file, models_for, nominal_models, validated_models, with_loops
 from fdhil.records import Float, ParameterSet
 from tests.bench import bench_config
-from tests.paths import trajectory
+from tests.paths import build_trajectory
 from tests.store.made import BENCH, published
 
 GOOD: dict[str, Any] = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.0, "Cd": 5}
@@ -110,7 +110,7 @@ def test_a_configured_resonance_is_in_the_model() -> None:
     config = bench_config()
     axis = config.axis["X"].model_copy(update={"resonance_hz": 80.0, "resonance_damping": 0.05})
     config = config.model_copy(update={"axis": {**config.axis, "X": axis}})
-    path = trajectory(np.column_stack([np.linspace(0, 1, 10), np.zeros(10)]))
+    path = build_trajectory(np.column_stack([np.linspace(0, 1, 10), np.zeros(10)]))
     nominal = nominal_models(config)
     found = models_for(path, nominal, config, "m.json")
     assert dict(found["X"].terms) == {"resonance": 80.0, "resonance_damping": 0.05}
@@ -143,9 +143,9 @@ def test_an_axis_that_stands_still_needs_no_model() -> None:
     config = bench_config()
     demand = np.column_stack([np.linspace(0, 1, 10), np.zeros(10)])
     nominal = nominal_models(config)
-    assert set(models_for(trajectory(demand), {"X": nominal["X"]}, config, "m.json")) == {"X", "Y"}
+    assert set(models_for(build_trajectory(demand), {"X": nominal["X"]}, config, "m.json")) == {"X", "Y"}
     with pytest.raises(ConfigError, match="X: moves and has no model"):
-        models_for(trajectory(demand), {"Y": nominal["Y"]}, config, "m.json")
+        models_for(build_trajectory(demand), {"Y": nominal["Y"]}, config, "m.json")
 
 
 CONFIG = bench_config()

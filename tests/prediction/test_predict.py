@@ -16,7 +16,7 @@ from fdhil.prediction import contour_error_um, predict, skill
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Float, Skill, Window
 from tests.bench import bench_config
-from tests.paths import bench_trajectory, rms, trajectory
+from tests.paths import build_bench_trajectory, build_trajectory, compute_rms
 
 CONFIG = bench_config()
 MODELS = nominal_models(CONFIG)
@@ -28,13 +28,13 @@ MODELS = nominal_models(CONFIG)
 )
 def test_bench_figures(feed: float, smoothing: tuple[float, float], rms_um: float, max_um: float) -> None:
     """The contour errors of the bench path, reference held for 0.5 s at its end."""
-    prediction = predict(bench_trajectory(feed, smoothing), MODELS, CONFIG)
-    assert rms(prediction.contour_um) == pytest.approx(rms_um, rel=0.02)
+    prediction = predict(build_bench_trajectory(feed, smoothing), MODELS, CONFIG)
+    assert compute_rms(prediction.contour_um) == pytest.approx(rms_um, rel=0.02)
     assert prediction.contour_um.max() == pytest.approx(max_um, rel=0.01)
 
 
 def test_zones_name_place_and_cause() -> None:
-    zones = predict(bench_trajectory(10), MODELS, CONFIG).zones
+    zones = predict(build_bench_trajectory(10), MODELS, CONFIG).zones
     corners = [zone.where for zone in zones if zone.cause == "corner"]
     expected = [(0, 55), (100, 55), (200, 55), (250, 55)]
     assert len(corners) == 4
@@ -48,7 +48,7 @@ def test_zones_name_place_and_cause() -> None:
 
 def test_saturation_is_named() -> None:
     """20 m/min with short smoothing exceeds the current limit."""
-    prediction = predict(bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG)
+    prediction = predict(build_bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG)
     assert prediction.limited_s["X"] > 0.1
     assert {zone.cause for zone in prediction.zones} == {"saturation"}
 
@@ -61,7 +61,7 @@ def test_drifts_change_the_path(
     drift: dict[str, float], at_e_um: tuple[float, float], largest_um: tuple[float, float]
 ) -> None:
     """Figures 14 and 15: a drift on one axis moves the path, near E by little (friction) or much (inertia)."""
-    reference = bench_trajectory(10)
+    reference = build_bench_trajectory(10)
     healthy = predict(reference, MODELS, CONFIG)
     drifted = predict(reference, MODELS | {"X": MODELS["X"].replace_values(**drift)}, CONFIG)
     moved = np.abs(healthy.predicted_mm["X"] - drifted.predicted_mm["X"]) * 1e3
@@ -73,9 +73,9 @@ def test_drifts_change_the_path(
 
 def test_an_axis_without_model_is_a_config_error() -> None:
     with pytest.raises(ConfigError, match=r"model\.Y"):
-        predict(bench_trajectory(10), {"X": MODELS["X"]}, CONFIG)
+        predict(build_bench_trajectory(10), {"X": MODELS["X"]}, CONFIG)
     with pytest.raises(ConfigError, match=r"axis\.Y"):
-        predict(bench_trajectory(10), MODELS, bench_config("X"))
+        predict(build_bench_trajectory(10), MODELS, bench_config("X"))
 
 
 def brute_force(reference: Float, actual: Float, half: int) -> Float:
@@ -162,13 +162,13 @@ def test_skill_is_not_known_of_a_move_that_begins_while_the_axis_still_settles()
 
 
 def test_one_axis_alone() -> None:
-    demand = bench_trajectory(10).position_mm["Y"][:, None]
-    prediction = predict(trajectory(np.asarray(demand), "Y"), MODELS, CONFIG)
+    demand = build_bench_trajectory(10).position_mm["Y"][:, None]
+    prediction = predict(build_trajectory(np.asarray(demand), "Y"), MODELS, CONFIG)
     assert prediction.contour_um.max() < np.abs(prediction.error_um["Y"]).max()
 
 
 def test_a_model_that_overflows_is_told() -> None:
-    reference = bench_trajectory(10)
+    reference = build_bench_trajectory(10)
     wild = MODELS | {"X": MODELS["X"].replace_values(viscous_positive=1e9)}
     with pytest.raises(ConfigError, match="overflows"):
         predict(reference, wild, CONFIG)

@@ -18,7 +18,7 @@ from fdhil.program import interpret
 from fdhil.program.budget import Budget
 from fdhil.records import Float, Trajectory, freeze_array
 from tests.bench import bench_config
-from tests.paths import bench_trajectory, jerky_demand, trajectory
+from tests.paths import build_bench_trajectory, build_jerky_demand, build_trajectory
 
 CONFIG = bench_config()
 MODELS = nominal_models(CONFIG)
@@ -53,20 +53,20 @@ def test_a_slower_demand_is_what_the_nc_would_order(share: float, decimals: int,
 
 def test_the_averages_are_known_again_and_others_are_not() -> None:
     averages = Averages((0.060, 0.030), 0.001)
-    path = np.column_stack([bench_trajectory(10).position_mm[axis] for axis in "XY"])
+    path = np.column_stack([build_bench_trajectory(10).position_mm[axis] for axis in "XY"])
     under = averages.taken_off(path)
     assert under is not None
     speeds = np.linalg.norm(np.diff(under, axis=0), axis=1)
     assert speeds.max() == pytest.approx(10 / 60, rel=0.01)  # m/min in mm per ms, without ramps
     assert Averages((0.050, 0.030), 0.001).taken_off(path) is None
-    assert averages.taken_off(jerky_demand(10)) is None
+    assert averages.taken_off(build_jerky_demand(10)) is None
     assert averages.taken_off(np.zeros((300, 2))) is not None
 
 
 @pytest.mark.parametrize("profile", ["fir", "trapezoidal"])
 def test_at_the_feed_as_recorded_it_is_the_demand(profile: str) -> None:
     config = CONFIG.model_copy(update={"nc": CONFIG.nc.model_copy(update={"profile": profile})})
-    for reference in (bench_trajectory(10), trajectory(jerky_demand(10))):
+    for reference in (build_bench_trajectory(10), build_trajectory(build_jerky_demand(10))):
         for source in filter(None, demand_sources(reference, MODELS, config, 30.0)):
             again = source.at({1: 1.0 - 1e-12})  # so that the rules are at work
             path = again.position_mm["X"][: reference.time_s.size]
@@ -74,7 +74,7 @@ def test_at_the_feed_as_recorded_it_is_the_demand(profile: str) -> None:
 
 
 def test_rules_differ_in_what_falls_with_the_feed() -> None:
-    path = np.asarray(jerky_demand(10)[:300, 1:])
+    path = np.asarray(build_jerky_demand(10)[:300, 1:])
     averages, stretch, share = Averages((), 0.001), np.ones(len(path), dtype=np.int64), np.full(len(path), 0.5)
 
     def acceleration(moved: Float) -> float:
@@ -93,7 +93,7 @@ def test_rules_differ_in_what_falls_with_the_feed() -> None:
 )
 def test_each_zone_of_a_demand_has_its_feed(config: MachineConfig) -> None:
     """Zones in the order of time, each with its own feed; together they keep the tolerance, 5 % more do not."""
-    reference = trajectory(jerky_demand(10))
+    reference = build_trajectory(build_jerky_demand(10))
     sure, hopeful = demand_sources(reference, MODELS, config, 20.0)
     assert hopeful is not None
     advice = advise(sure, MODELS, config, 20.0)

@@ -14,7 +14,7 @@ from fdhil.program import Budget, interpret
 from fdhil.program import plan as plan_program
 from fdhil.records import Correction, Trajectory
 from tests.bench import bench_config
-from tests.paths import rms
+from tests.paths import compute_rms
 
 CONFIG = bench_config("XYZ")
 MODELS = nominal_models(CONFIG)
@@ -57,12 +57,12 @@ def test_the_correction_corrects_all_of_them(correction: Correction) -> None:
     """60 times smaller on the model, within the limits on all three axes, also if only Z drifted."""
     assert correction.refused == ()
     assert all(np.abs(correction.offset_um[axis]).max() > 5 for axis in "XYZ")
-    assert rms(correction.before.contour_um) > 60 * rms(correction.after.contour_um)
+    assert compute_rms(correction.before.contour_um) > 60 * compute_rms(correction.after.contour_um)
     reference = correction.before.reference
     drifted = MODELS | {"Z": replace(MODELS["Z"], Jt=0.085)}
     again = plan_correction(reference, drifted, CONFIG)
     assert again.before.contour_um.max() > correction.before.contour_um.max()
-    assert rms(again.before.contour_um) > 60 * rms(again.after.contour_um)
+    assert compute_rms(again.before.contour_um) > 60 * compute_rms(again.after.contour_um)
 
 
 def test_uncertainty_and_sensitivity_know_the_third_axis(reference: Trajectory, correction: Correction) -> None:

@@ -12,7 +12,7 @@ from fdhil.prediction.models import nominal_models
 from fdhil.prediction.uncertainty import contour_std_um, sensitivity_um
 from fdhil.records import PARAMETERS, Parameters
 from tests.bench import bench_config
-from tests.paths import bench_trajectory
+from tests.paths import build_bench_trajectory
 
 CONFIG = bench_config()
 MODELS = nominal_models(CONFIG)
@@ -28,7 +28,7 @@ def test_standard_deviation_is_that_of_drawn_plants() -> None:
 
     95 % of the draws are within 1.96 of it.
     """
-    reference = bench_trajectory(10)
+    reference = build_bench_trajectory(10)
     told = contour_std_um(reference, MODELS, {"X": COVARIANCE, "Y": COVARIANCE}, CONFIG)
     random = np.random.default_rng(5)
     drawn = []
@@ -46,13 +46,13 @@ def test_standard_deviation_is_that_of_drawn_plants() -> None:
 
 def test_an_exact_model_has_no_uncertainty() -> None:
     """Covariances of 0 or NaN (an undetermined parameter, taken as known) add nothing."""
-    reference = bench_trajectory(10)
+    reference = build_bench_trajectory(10)
     assert contour_std_um(reference, MODELS, {"X": np.zeros((6, 6)), "Y": np.full((6, 6), np.nan)}, CONFIG).max() == 0.0
 
 
 def test_inertia_drives_the_corners() -> None:
     """At the corners the inertia has the largest effect: that of a prediction with 1 % more."""
-    reference = bench_trajectory(10)
+    reference = build_bench_trajectory(10)
     prediction = predict(reference, MODELS, CONFIG)
     sensitivities = sensitivity_um(prediction, MODELS, CONFIG)
     assert len(sensitivities) == len(prediction.zones)
@@ -67,7 +67,7 @@ def test_inertia_drives_the_corners() -> None:
 
 def test_terms_have_their_share_of_the_uncertainty() -> None:
     """Falling friction known to 0.5 N.m adds its effect; a covariance of the six alone omits it."""
-    reference = bench_trajectory(10)
+    reference = build_bench_trajectory(10)
     models = {axis: MODELS[axis].replace_values(stribeck=1.0, stribeck_speed=10.0) for axis in "XY"}
     six, eight = np.zeros((6, 6)), np.zeros((8, 8))
     eight[6, 6] = 0.25
@@ -82,7 +82,7 @@ def test_terms_have_their_share_of_the_uncertainty() -> None:
 
 
 def test_a_term_is_named_where_it_drives_a_zone() -> None:
-    reference = bench_trajectory(10)
+    reference = build_bench_trajectory(10)
     rich = MODELS["X"].replace_values(stribeck=2.0, stribeck_speed=10.0, ripple_screw_1=0.5, ripple_screw_1_phase=1.0)
     models = {"X": rich, "Y": MODELS["Y"]}
     prediction = predict(reference, models, CONFIG)

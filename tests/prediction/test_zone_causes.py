@@ -14,7 +14,7 @@ from fdhil.program import Budget, interpret
 from fdhil.program import plan as plan_program
 from fdhil.records import Trajectory, Zone
 from tests.bench import bench_config
-from tests.paths import bench_trajectory, rounded_demand, trajectory
+from tests.paths import build_bench_trajectory, build_rounded_demand, build_trajectory
 
 CONFIG = bench_config()
 LINUXCNC = CONFIG.model_copy(update={"nc": CONFIG.nc.model_copy(update={"profile": "linuxcnc"})})
@@ -53,7 +53,7 @@ def seconds(zones: tuple[Zone, ...], cause: str) -> float:
 def test_the_bench_has_four_corners_however_wide_the_nc_blends_them(feed: int, mode: str, widest_mm: float) -> None:
     """Blends of 2 to 200 ms: large errors are corners, each near its position; the half circle is not."""
     if mode == "fir":
-        zones = zones_of(bench_trajectory(feed))
+        zones = zones_of(build_bench_trajectory(feed))
     else:
         zones = zones_of(plan_test_program(BENCH.format(mode=mode, feed=1000 * feed), LINUXCNC), LINUXCNC)
     large = [zone for zone in zones if zone.max_um > 46.0 and zone.cause != "stop"]
@@ -69,13 +69,13 @@ def test_the_bench_has_four_corners_however_wide_the_nc_blends_them(feed: int, m
 def test_the_stick_at_the_bottom_is_a_reversal_until_the_lag_is_more() -> None:
     """At 10 m/min dry friction leaves 10 um there and the lag 5; at 20 the lag leaves 13."""
     for feed, cause in ((10, "reversal"), (20, "circular lag")):
-        bottom = [zone for zone in zones_of(bench_trajectory(feed)) if nearest(zone, ((150, 5),)) < 2.0]
+        bottom = [zone for zone in zones_of(build_bench_trajectory(feed)) if nearest(zone, ((150, 5),)) < 2.0]
         assert {zone.cause for zone in bottom} == {cause}
 
 
 @pytest.mark.parametrize("feed", [10, 20])
 def test_a_rounded_path_errs_where_its_arcs_begin_and_end(feed: int) -> None:
-    zones = zones_of(trajectory(rounded_demand(feed)))
+    zones = zones_of(build_trajectory(build_rounded_demand(feed)))
     assert {zone.cause for zone in sorted(zones, key=lambda z: -z.max_um)[:2]} == {"corner"}
     lag = [zone for zone in zones if zone.cause == "circular lag"]
     assert all(zone.max_um < 0.3 * max(z.max_um for z in zones) for zone in lag)

@@ -24,7 +24,7 @@ from fdhil.program import Dwell, interpret, plan
 from fdhil.records import Float
 from tests.bench import bench_config, bench_document
 from tests.linuxcnc.machine import DemandRecorder
-from tests.paths import rms, trajectory
+from tests.paths import build_trajectory, compute_rms
 from tests.program.test_look_ahead import dense_path
 
 pytestmark = pytest.mark.debian
@@ -180,12 +180,12 @@ def test_the_correction_stands_the_jerky_demand(theirs: Theirs) -> None:
     """The bench path by G64 without P: steps of acceleration, rounded to the drives' increments."""
     text = "G21 G90 G17 G64\nF10000\nG1 Y55\nX100\nG3 X200 I50\nG1 X250\nY0\nM2\n"
     rows = theirs(text, math.inf)[:, :2]
-    reference = trajectory(np.round(np.concatenate([rows, np.repeat(rows[-1:], 500, axis=0)]) * 3276.8) / 3276.8)
+    reference = build_trajectory(np.round(np.concatenate([rows, np.repeat(rows[-1:], 500, axis=0)]) * 3276.8) / 3276.8)
     config = bench_config()
     models = nominal_models(config)
     correction = correct(reference, models, config, "inverse")
     assert not correction.refused
     mirrored = mirror.plan(reference, models, config, correction.before).offset_um
-    left = rms(correction.after.contour_um)
-    assert rms(correction.before.contour_um) >= 14 * left
-    assert rms(predict_corrected(reference, models, config, mirrored).contour_um) >= 2 * left
+    left = compute_rms(correction.after.contour_um)
+    assert compute_rms(correction.before.contour_um) >= 14 * left
+    assert compute_rms(predict_corrected(reference, models, config, mirrored).contour_um) >= 2 * left

@@ -23,7 +23,7 @@ from fdhil.program.planner.limits import AxisLimits
 from fdhil.program.planner.pieces import LENGTH, piece, points
 from fdhil.records import Float, Trajectory
 from tests.bench import bench_config, bench_document
-from tests.paths import rms
+from tests.paths import compute_rms
 from tests.program.test_planner import MOVES, check_blocks
 
 DT_S = 1e-3
@@ -242,5 +242,5 @@ def test_a_jerky_demand_is_corrected_while_it_is_planned() -> None:
     after = np.concatenate([block.after_um for block in blocks])
     whole = correct(plan(moves, config), models, config, "inverse")
     assert before.size == whole.after.contour_um.size
-    assert rms(before) >= 14 * rms(after)
-    assert rms(after) == pytest.approx(rms(whole.after.contour_um), rel=0.2, abs=0.05)
+    assert compute_rms(before) >= 14 * compute_rms(after)
+    assert compute_rms(after) == pytest.approx(compute_rms(whole.after.contour_um), rel=0.2, abs=0.05)

@@ -18,7 +18,7 @@ from fdhil.report import figures, maps, write
 from fdhil.report.drawing import drawing
 from fdhil.report.path import APART_MM, correction_page, nearest_mm, planes, prediction_page, worst_places
 from tests.bench import bench_config
-from tests.paths import bench_trajectory, smooth, trajectory
+from tests.paths import build_bench_trajectory, build_trajectory, smooth_demand
 
 CONFIG = bench_config()
 MODELS = nominal_models(CONFIG)
@@ -26,7 +26,7 @@ MODELS = nominal_models(CONFIG)
 
 @pytest.fixture(scope="module", name="correction")
 def _correction() -> Correction:
-    return plan(bench_trajectory(10), MODELS, CONFIG)
+    return plan(build_bench_trajectory(10), MODELS, CONFIG)
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -60,7 +60,7 @@ def test_what_is_magnified_is_the_contour_error(correction: Correction) -> None:
 @pytest.mark.usefixtures("long_computation")
 def test_a_refused_correction_says_why() -> None:
     """The page shows the uncorrected path and the advice."""
-    refused = plan(bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG)
+    refused = plan(build_bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG)
     page = correction_page("part.ngc", "bench", refused)
     assert ("correction", "refused") in page.headline
     assert "lower the feed to" in page.sections[0].text
@@ -78,11 +78,11 @@ def test_the_worst_places_are_apart_and_in_order(correction: Correction) -> None
 
 def test_planes_of_three_axes_and_of_one() -> None:
     """The plane with most of the path comes first; a single axis has no map, but still a page."""
-    flat = bench_trajectory(10)
+    flat = build_bench_trajectory(10)
     z = 30 * np.sin(flat.time_s)
     solid = replace(flat, position_mm={**flat.position_mm, "Z": freeze_array(z)})
     assert planes(solid) == [("X", "Y"), ("X", "Z")]
-    alone = trajectory(np.asarray(flat.position_mm["Y"])[:, None], "Y")
+    alone = build_trajectory(np.asarray(flat.position_mm["Y"])[:, None], "Y")
     assert planes(alone) == []
     page = prediction_page("up.ngc", "bench", predict(alone, MODELS, CONFIG))
     assert [caption for caption, _ in page.sections[0].figures] == ["Contour error over time"]
@@ -91,8 +91,8 @@ def test_planes_of_three_axes_and_of_one() -> None:
 def test_one_axis_alone_is_enlarged_over_time() -> None:
     """At a reversal, the error of the axis is drawn over time."""
     there = np.linspace(0.0, 60.0, 360)
-    path = smooth(np.concatenate([there, there[::-1], np.zeros(300)])[:, None], (0.060, 0.030), 0.001)
-    page = prediction_page("up.ngc", "bench", predict(trajectory(path, "Y"), MODELS, CONFIG))
+    path = smooth_demand(np.concatenate([there, there[::-1], np.zeros(300)])[:, None], (0.060, 0.030), 0.001)
+    page = prediction_page("up.ngc", "bench", predict(build_trajectory(path, "Y"), MODELS, CONFIG))
     (caption, svg), *_ = page.sections[1].figures
     assert "reversal" in caption
     assert "Y ahead of the desired (um)" in svg
@@ -104,10 +104,10 @@ def test_a_long_path_is_drawn_by_points_and_its_zones_are_cut(tmp_path: Path) ->
     """Each position has the colour of its own error, and no other pass is in its picture; equal positions appear a few
     times.
     """
-    once = np.column_stack([bench_trajectory(10).position_mm[axis] for axis in "XY"])
+    once = np.column_stack([build_bench_trajectory(10).position_mm[axis] for axis in "XY"])
     both = np.concatenate([once, once[::-1]])
     path = np.concatenate([both + np.array([0.0, 0.5 * k]) for k in range(14)])
-    predicted = predict(trajectory(path), MODELS, CONFIG)
+    predicted = predict(build_trajectory(path), MODELS, CONFIG)
     assert len(predicted.zones) > 50
     page = prediction_page("long.ngc", "bench", predicted)
     along, places, zones = page.sections
@@ -143,7 +143,7 @@ def test_a_small_error_beside_a_large_one_is_seen() -> None:
 
 
 def test_a_path_without_error_has_a_page() -> None:
-    still = trajectory(np.zeros((300, 2)))
+    still = build_trajectory(np.zeros((300, 2)))
     page = prediction_page("nothing.ngc", "bench", predict(still, MODELS, CONFIG))
     assert page.sections[1].text == page.sections[2].text == "No zone stands out."
     assert ("predicted, largest", "below 0.001 um") in page.headline

@@ -18,7 +18,7 @@ from fdhil import config as machine_config
 from tests.daemon.machine_rig import BENCH
 from tests.daemon.simulated_machine import SimulatedMachine, rapids
 from tests.daemon.test_daemon_service import serving, status_when
-from tests.ports import free_port
+from tests.free_ports import find_free_port
 from tests.shopfloor.mosquitto import broker, certify, guarded, open_to_all
 from tests.shopfloor.sparkplug_host import Host, command
 
@@ -75,7 +75,7 @@ async def host_application(port: int, **more: object) -> AsyncIterator[Listening
 
 
 async def test_real_broker_receives_birth_data_and_death(tmp_path: Path) -> None:
-    port = free_port()
+    port = find_free_port()
     file = written(tmp_path, port)
     config = machine_config.load_config(file)
     machine = SimulatedMachine()
@@ -114,7 +114,7 @@ async def test_real_broker_receives_birth_data_and_death(tmp_path: Path) -> None
 
 
 async def test_publisher_reconnects_after_a_broker_restart(tmp_path: Path) -> None:
-    port = free_port()
+    port = find_free_port()
     async with publisher(written(tmp_path, port)):
         await _said(tmp_path, "check host and port, and whether it runs")
         for _ in range(2):
@@ -125,7 +125,7 @@ async def test_publisher_reconnects_after_a_broker_restart(tmp_path: Path) -> No
 
 
 async def test_publisher_connects_over_tls_with_a_private_password(tmp_path: Path) -> None:
-    port = free_port()
+    port = find_free_port()
     own = f'tls_certificate_file = "{tmp_path}/client.pem"\ntls_key_file = "{tmp_path}/client.key"\n'
     user = f'user = "mill"\npassword_file = "{tmp_path}/secret"\n'
     file, secret = written(tmp_path, port, f'tls_ca_file = "{tmp_path}/ca.pem"\n{own}{user}'), tmp_path / "secret"
@@ -145,7 +145,7 @@ async def test_publisher_connects_over_tls_with_a_private_password(tmp_path: Pat
 
 
 async def test_broker_with_a_wrong_certificate_receives_nothing(tmp_path: Path) -> None:
-    port = free_port()
+    port = find_free_port()
     (another := tmp_path / "another").mkdir()
     certify(another)
     tls = f'tls_ca_file = "{another}/ca.pem"\nuser = "mill"\npassword_file = "{tmp_path}/secret"\n'
@@ -155,7 +155,7 @@ async def test_broker_with_a_wrong_certificate_receives_nothing(tmp_path: Path) 
 
 
 async def test_publisher_waits_for_the_primary_host(tmp_path: Path) -> None:
-    port = free_port()
+    port = find_free_port()
     file = written(tmp_path, port, 'primary_host = "scada"\n')
     async with broker(tmp_path, open_to_all(port), port), host_application(port) as listening, publisher(file):
         await _said(tmp_path, "connected to the broker")

@@ -24,7 +24,7 @@ from fdhil.shopfloor.prometheus_metrics import MetricsCollector
 from fdhil.shopfloor.status_poller import StatusPoller, StatusUpdate
 from tests.daemon.simulated_machine import SimulatedMachine, config_of, rapids
 from tests.daemon.test_daemon_service import serving, status_when
-from tests.ports import free_port
+from tests.free_ports import find_free_port
 from tests.shopfloor.mosquitto import certify
 from tests.shopfloor.status_documents import NOW_MS, notice, publishing, said, status, trouble
 
@@ -280,7 +280,7 @@ async def test_real_prometheus_scrapes_and_raises_an_alert(tmp_path: Path, capsy
         text = text.replace("127.0.0.1:9837", target).replace("15s", "1s")
         (tmp_path / "prometheus.yml").write_text(text)
         (tmp_path / "fdhil-alerts.yml").write_text(ALERTS.read_text().replace("for: 1m", "for: 0s"))
-        port = free_port()
+        port = find_free_port()
         command = [
             "prometheus", f"--config.file={tmp_path / 'prometheus.yml'}", f"--storage.tsdb.path={tmp_path / 'data'}",
             f"--web.listen-address=127.0.0.1:{port}", "--log.level=error",

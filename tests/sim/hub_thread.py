@@ -10,26 +10,26 @@ from contextlib import contextmanager
 
 import can
 
-from fdhil.sim.frame import Frame
-from fdhil.sim.wire.hub import Hub
+from fdhil.sim.frame_types import Frame
+from fdhil.sim.wire.tcp_hub import TcpHub
 
 
 class HubThread(threading.Thread):
     """Serves a hub until stopped; ``twin`` is called in the hub's thread with every received frame."""
 
-    def __init__(self, hub: Hub, twin: Callable[[Hub, Frame], None] = lambda hub, frame: None) -> None:
+    def __init__(self, hub: TcpHub, twin: Callable[[TcpHub, Frame], None] = lambda hub, frame: None) -> None:
         super().__init__(name="hub")
         self.hub = hub
-        self.each_turn: Callable[[Hub], None] = lambda hub: None
+        self.each_turn: Callable[[TcpHub], None] = lambda hub: None
         self._twin = twin
         self._ending = False
 
     def run(self) -> None:
         while not self._ending:
-            ready, _, _ = select.select(self.hub.readers(), self.hub.writers(), (), 0.002)
-            self.hub.pump(ready, lambda frame: self._twin(self.hub, frame))
+            ready, _, _ = select.select(self.hub.list_readers(), self.hub.list_writers(), (), 0.002)
+            self.hub.receive_frames(ready, lambda frame: self._twin(self.hub, frame))
             self.each_turn(self.hub)
-            self.hub.flush(time.monotonic())
+            self.hub.flush_frames(time.monotonic())
 
     def stop(self) -> None:
         self._ending = True
@@ -38,7 +38,7 @@ class HubThread(threading.Thread):
 
 
 @contextmanager
-def serving(hub: Hub, twin: Callable[[Hub, Frame], None] = lambda hub, frame: None) -> Iterator[HubThread]:
+def run_hub(hub: TcpHub, twin: Callable[[TcpHub, Frame], None] = lambda hub, frame: None) -> Iterator[HubThread]:
     thread = HubThread(hub, twin)
     thread.start()
     try:
@@ -48,7 +48,7 @@ def serving(hub: Hub, twin: Callable[[Hub, Frame], None] = lambda hub, frame: No
 
 
 @contextmanager
-def joined(hub: Hub, count: int = 1) -> Iterator[list[can.BusABC]]:
+def join_clients(hub: TcpHub, count: int = 1) -> Iterator[list[can.BusABC]]:
     buses: list[can.BusABC] = []
     try:
         for _ in range(count):
@@ -59,7 +59,7 @@ def joined(hub: Hub, count: int = 1) -> Iterator[list[can.BusABC]]:
             bus.shutdown()
 
 
-def frames_of(bus: can.BusABC, count: int, timeout_s: float = 100.0) -> list[Frame]:
+def receive_frames(bus: can.BusABC, count: int, timeout_s: float = 100.0) -> list[Frame]:
     """Receive ``count`` frames, fewer on a time-out."""
     frames: list[Frame] = []
     deadline = time.monotonic() + timeout_s

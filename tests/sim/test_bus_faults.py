@@ -20,7 +20,7 @@ from fdhil.sim import fault_script
 from fdhil.sim.frame_faults import FrameFault
 from tests.bench import bench_document
 from tests.drivers.test_receive_ports import wait_for
-from tests.sim.bench_twin import TwinInHand
+from tests.sim.bench_simulator import SteppedSimulator
 
 STRANGER = 0x123
 
@@ -31,11 +31,11 @@ def bench(tmp_path: Path) -> Iterator[FeedDriveBench]:
         yield running
 
 
-def message(can_id: int, data: bytes = b"") -> can.Message:
+def build_message(can_id: int, data: bytes = b"") -> can.Message:
     return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
 
 
-def until(party: can.BusABC, can_id: int, data: bytes | None = None) -> list[can.Message]:
+def receive_until(party: can.BusABC, can_id: int, data: bytes | None = None) -> list[can.Message]:
     heard: list[can.Message] = []
     for each in party:
         heard.append(each)
@@ -44,22 +44,22 @@ def until(party: can.BusABC, can_id: int, data: bytes | None = None) -> list[can
     raise AssertionError
 
 
-def cycles(bench: FeedDriveBench, party: can.BusABC, count: int) -> list[list[int]]:
+def record_cycles(bench: FeedDriveBench, party: can.BusABC, count: int) -> list[list[int]]:
     """Run the NC for this number of cycles; return the identifiers received in each."""
     bench.command("nc", on=True)
     bench.wait_for("nc")
-    until(party, 0x80)
-    found = [[each.arbitration_id for each in until(party, 0x80)[:-1]] for _ in range(count)]
+    receive_until(party, 0x80)
+    found = [[each.arbitration_id for each in receive_until(party, 0x80)[:-1]] for _ in range(count)]
     return [[can_id for can_id in cycle if can_id < 0x700] for cycle in found]
 
 
-def test_what_the_machine_sends_is_lost_delayed_and_made_up_for_everybody(bench: FeedDriveBench) -> None:
+def test_machine_frames_are_dropped_delayed_and_injected_for_all_clients(bench: FeedDriveBench) -> None:
     buses = [bench.join(), bench.join()]
     bench.fault("bus_drop", None, can_id=0x181)
     bench.fault("bus_inject", None, can_id=0x81, data="1032", value=3)
     bench.fault("bus_delay", None, can_id=0x201, value=1, way="sent")
     for party in buses:
-        heard = cycles(bench, party, 8)
+        heard = record_cycles(bench, party, 8)
         for cycle in heard[2:]:
             assert 0x181 not in cycle
             assert 0x281 in cycle
@@ -68,7 +68,7 @@ def test_what_the_machine_sends_is_lost_delayed_and_made_up_for_everybody(bench:
     bench.command("nc", on=False)
 
 
-def test_what_another_sends_is_spoilt_for_the_drives_and_for_all_others_but_not_heard_by_himself(
+def test_client_frames_are_corrupted_for_drives_and_other_clients(
     bench: FeedDriveBench,
 ) -> None:
     sender, other = bench.join(), bench.join()
@@ -76,27 +76,27 @@ def test_what_another_sends_is_spoilt_for_the_drives_and_for_all_others_but_not_
     bench.fault("bus_late", None, can_id=STRANGER + 1, value=0.05)
     for _ in range(2):
         bench.wait_for("fault")
-    together = [message(can_id, b"\1\2") for can_id in (STRANGER, STRANGER + 1, STRANGER + 2)]
+    together = [build_message(can_id, b"\1\2") for can_id in (STRANGER, STRANGER + 1, STRANGER + 2)]
     line: Any = sender
     line._tcp_send("".join(map(socketcand.convert_can_message_to_ascii_message, together)))
-    heard = until(other, STRANGER + 1)
+    heard = receive_until(other, STRANGER + 1)
     told = [(each.arbitration_id, bytes(each.data)) for each in heard if each.arbitration_id < 0x700]
     assert told == [(STRANGER, b"\1"), (STRANGER + 2, b"\1\2"), (STRANGER + 1, b"\1\2")]
-    sender.send(message(0x601, bytes.fromhex("40 00 10 00 00 00 00 00")))
-    assert not [each for each in until(sender, 0x581) if STRANGER <= each.arbitration_id <= STRANGER + 2]
+    sender.send(build_message(0x601, bytes.fromhex("40 00 10 00 00 00 00 00")))
+    assert not [each for each in receive_until(sender, 0x581) if STRANGER <= each.arbitration_id <= STRANGER + 2]
 
 
-def test_an_axis_means_all_frames_of_its_drive(bench: FeedDriveBench) -> None:
+def test_fault_on_axis_applies_to_all_frames_of_its_drive(bench: FeedDriveBench) -> None:
     party = bench.join()
     bench.fault("bus_drop", "X", way="received", duration_s=0.02)
     for _ in range(3):
-        party.send(message(0x601, bytes.fromhex("40 00 10 00 00 00 00 00")))
-    assert {can_id for cycle in cycles(bench, party, 40) for can_id in cycle} >= {0x181, 0x201}
-    party.send(message(0x601, bytes.fromhex("40 18 10 01 00 00 00 00")))
-    assert bytes(until(party, 0x581)[-1].data[1:4]) == b"\x18\x10\x01"
+        party.send(build_message(0x601, bytes.fromhex("40 00 10 00 00 00 00 00")))
+    assert {can_id for cycle in record_cycles(bench, party, 40) for can_id in cycle} >= {0x181, 0x201}
+    party.send(build_message(0x601, bytes.fromhex("40 18 10 01 00 00 00 00")))
+    assert bytes(receive_until(party, 0x581)[-1].data[1:4]) == b"\x18\x10\x01"
 
 
-def test_a_bus_that_goes_down_hangs_up_and_takes_everybody_again(bench: FeedDriveBench) -> None:
+def test_bus_down_disconnects_clients_and_accepts_them_afterwards(bench: FeedDriveBench) -> None:
     place = CanBus(**bench.bus_arguments)
     bench.command("nc", on=True)
     bench.wait_for("nc")
@@ -105,10 +105,10 @@ def test_a_bus_that_goes_down_hangs_up_and_takes_everybody_again(bench: FeedDriv
         bench.fault("bus_down", None, duration_s=0.1)
         wait_for(lambda: listening.end_reason is not None)
     assert "the CAN hub ended the connection" in str(listening.end_reason)
-    wait_for(lambda: _joins(place))
+    wait_for(lambda: _can_receive(place))
 
 
-def _joins(place: CanBus) -> bool:
+def _can_receive(place: CanBus) -> bool:
     with contextlib.suppress(ConnectError), bus_listener.ListeningBus("can0", place) as listening:
         wait_for(lambda: listening.read_counters()["frames"] > 20 or listening.end_reason is not None)
         return listening.end_reason is None
@@ -116,27 +116,27 @@ def _joins(place: CanBus) -> bool:
 
 
 @pytest.mark.parametrize("listed", [[], ["X:2"]])
-def test_lockstep_does_not_wait_for_what_a_fault_took(listed: list[str]) -> None:
+def test_lockstep_does_not_wait_for_frames_lost_by_fault(listed: list[str]) -> None:
     document = bench_document("X")
     document["sim"] = {"pace": "lockstep", "lockstep_rpdo": listed}
-    twin = TwinInHand(parse_config(document))
+    twin = SteppedSimulator(parse_config(document))
     twin.switch_on()
     for _ in range(3):
-        twin.send(0x301, bytes(4))
-        twin.run(1)
-    assert twin.machine.waits()
-    twin.machine.lost("can0", 0x301)
-    assert not twin.machine.waits()
-    twin.run(1)
-    assert twin.machine.waits()  # the next one may come
+        twin.send_frame(0x301, bytes(4))
+        twin.run_cycles(1)
+    assert twin.machine.is_waiting_for_rpdo()
+    twin.machine.mark_frame_lost("can0", 0x301)
+    assert not twin.machine.is_waiting_for_rpdo()
+    twin.run_cycles(1)
+    assert twin.machine.is_waiting_for_rpdo()  # the next one may come
 
 
 @pytest.mark.usefixtures("real_time")
-def test_what_the_page_shows_is_a_script_and_a_plan(tmp_path: Path) -> None:
+def test_script_and_plan_in_documentation_are_valid(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs" / "how-to" / "rehearse-a-fault.md").read_text("utf-8")
     (script,) = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     (tmp_path / "faults.toml").write_text(script, "utf-8")
-    entries = fault_script.load(tmp_path / "faults.toml", ("X", "Y"))
+    entries = fault_script.load_script(tmp_path / "faults.toml", ("X", "Y"))
     assert [entry.fault for entry in entries] == ["bus_drop", "bus_delay", "sensor_flipped"]
     (program,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     told: list[str] = []
@@ -144,8 +144,8 @@ def test_what_the_page_shows_is_a_script_and_a_plan(tmp_path: Path) -> None:
     assert told == ["0 frames were lost by plan"]
 
 
-def test_one_party_alone_meets_the_faults_of_its_own_connection(bench: FeedDriveBench) -> None:
+def test_faults_of_one_connection_do_not_affect_other_clients(bench: FeedDriveBench) -> None:
     party = bench.join([FrameFault("drop", can_ids={0x181}, way="received")])
     other = bench.join()
-    assert all(0x181 not in cycle and 0x281 in cycle for cycle in cycles(bench, party, 4)[1:])
-    assert all(0x181 in cycle for cycle in cycles(bench, other, 4)[1:])
+    assert all(0x181 not in cycle and 0x281 in cycle for cycle in record_cycles(bench, party, 4)[1:])
+    assert all(0x181 in cycle for cycle in record_cycles(bench, other, 4)[1:])

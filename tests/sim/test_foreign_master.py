@@ -11,17 +11,17 @@ from typing import Any
 import canopen
 import pytest
 
-from tests.sim.test_service import load_corner, running
+from tests.sim.test_simulator_service import load_corner_demand, run_service
 
 PATIENCE = 20_000  # polls; each waits for its answer
 TARGET_REACHED, ATTAINED = 1 << 10, 1 << 12
 
 
 @contextmanager
-def master(folder: Path) -> Iterator[Any]:
+def start_master(folder: Path) -> Iterator[Any]:
     """Return the machine and its first node, enabled without a mode."""
-    with running(load_corner, folder, "realtime", interface="virtual", channel="foreign-master") as twin:
-        eds = twin.event("ready")["drives"]["X"]["eds"]
+    with run_service(load_corner_demand, folder, "realtime", interface="virtual", channel="foreign-master") as twin:
+        eds = twin.wait_for_event("ready")["drives"]["X"]["eds"]
         network = canopen.Network()
         network.connect(interface="virtual", channel="foreign-master")
         try:
@@ -43,7 +43,7 @@ def wait_for(node: Any, bits: int) -> None:
 
 
 def test_profile_position_homing_velocity_and_quick_stop_without_sync(tmp_path: Path) -> None:
-    with master(tmp_path) as node:
+    with start_master(tmp_path) as node:
         node.sdo[0x6060].raw = 1
         node.sdo[0x607A].raw = 16384
         node.sdo[0x6040].raw = 0x1F
@@ -67,9 +67,9 @@ def test_profile_position_homing_velocity_and_quick_stop_without_sync(tmp_path: 
         assert node.sdo[0x6041].raw & 0x4F == 0x40
 
 
-def test_it_is_guarded_and_a_fault_is_told_without_sync(tmp_path: Path) -> None:
+def test_node_guarding_and_emergency_work_without_sync(tmp_path: Path) -> None:
     told = threading.Event()
-    with master(tmp_path) as node:
+    with start_master(tmp_path) as node:
         node.emcy.add_callback(lambda _: told.set())
         node.nmt.start_node_guarding(0.02)
         node.sdo[0x100C].raw = 60_000

@@ -14,17 +14,17 @@ from fdhil.config.sensor_sections import ModbusDevice
 from fdhil.drivers.modbus import rtu_line
 from fdhil.drivers.modbus.modbus_unit import ModbusUnit
 from fdhil.errors import DeviceError
-from fdhil.sim.wire.modbus_answers import ANSWER_FAULTS, answer, spoilt
-from fdhil.sim.wire.modbus_tcp import SensorServers
+from fdhil.sim.wire.modbus_answers import ANSWER_FAULTS, answer_request, apply_answer_faults
+from fdhil.sim.wire.modbus_tcp_servers import SensorServers
 from fdhil.sim.wire.sensor_faults import SensorFaults
 from fdhil.sim.wire.serial_lines import RtuUnits, SerialLines
 from tests.drivers.serial_peer import build_frame
-from tests.sim.test_modbus_sensor import a_sensor
+from tests.sim.test_modbus_sensor import create_sensor
 
 READ = struct.pack(">BHH", 4, 0, 2)
 
 
-class Counted:
+class CountingRegisters:
     """Two registers with a 32-bit number that grows with each read; 10 may be written."""
 
     trigger: int | None = 10
@@ -32,16 +32,16 @@ class Counted:
     def __init__(self) -> None:
         self.read = 0x0001_FFF0
 
-    def words(self) -> dict[int, int]:
+    def list_words(self) -> dict[int, int]:
         self.read += 7
         return {0: self.read >> 16, 1: self.read & 0xFFFF, 10: 0}
 
-    def latch(self) -> None:
+    def latch_samples(self) -> None:
         self.read = 0
 
 
-def body(registers: Counted, faults: SensorFaults) -> bytes:
-    return answer(registers, faults, READ)
+def build_body(registers: CountingRegisters, faults: SensorFaults) -> bytes:
+    return answer_request(registers, faults, READ)
 
 
 @pytest.mark.parametrize(
@@ -57,31 +57,33 @@ def body(registers: Counted, faults: SensorFaults) -> bytes:
         (struct.pack(">BHHBHH", 16, 10, 2, 4, 1, 1), 2),
     ],
 )
-def test_what_a_unit_does_not_do_is_refused_by_its_code(request_body: bytes, code: int) -> None:
-    assert answer(Counted(), SensorFaults(), request_body) == bytes([request_body[0] | 0x80, code])
+def test_unsupported_requests_return_exception_code(request_body: bytes, code: int) -> None:
+    assert answer_request(CountingRegisters(), SensorFaults(), request_body) == bytes([request_body[0] | 0x80, code])
 
 
 @pytest.mark.parametrize("written", [struct.pack(">BHH", 6, 10, 1), struct.pack(">BHHBH", 16, 10, 1, 2, 1)])
-def test_the_trigger_is_written_either_way(written: bytes) -> None:
-    registers = Counted()
-    assert answer(registers, SensorFaults(), written) == written[:5]
+def test_trigger_accepts_single_and_multiple_write(written: bytes) -> None:
+    registers = CountingRegisters()
+    assert answer_request(registers, SensorFaults(), written) == written[:5]
     assert registers.read == 0
 
 
-def test_a_share_of_the_answers_is_spoilt_by_the_same_seed() -> None:
-    def pieces() -> list[list[bytes]]:
-        registers, faults = Counted(), SensorFaults(answers={"flipped": 20.0})
-        return [spoilt(faults, build_frame, 1, body(registers, faults)) for _ in range(500)]
+def test_same_seed_corrupts_same_share_of_answers() -> None:
+    def collect_pieces() -> list[list[bytes]]:
+        registers, faults = CountingRegisters(), SensorFaults(answers={"flipped": 20.0})
+        return [apply_answer_faults(faults, build_frame, 1, build_body(registers, faults)) for _ in range(500)]
 
-    registers, faults = Counted(), SensorFaults()
-    clean = [[build_frame(1, body(registers, faults))] for _ in range(500)]
-    assert pieces() == pieces()
-    assert sum(a != b for a, b in zip(pieces(), clean, strict=True)) == pytest.approx(100, abs=40)
+    registers, faults = CountingRegisters(), SensorFaults()
+    clean = [[build_frame(1, build_body(registers, faults))] for _ in range(500)]
+    assert collect_pieces() == collect_pieces()
+    assert sum(a != b for a, b in zip(collect_pieces(), clean, strict=True)) == pytest.approx(100, abs=40)
 
 
-def test_a_torn_number_has_words_of_two_moments() -> None:
-    registers, faults = Counted(), SensorFaults(answers={"torn": 100.0})
-    told = [spoilt(faults, lambda _unit, data: data, 1, body(registers, faults))[0] for _ in range(4)]
+def test_torn_number_mixes_words_of_two_instants() -> None:
+    registers, faults = CountingRegisters(), SensorFaults(answers={"torn": 100.0})
+    told = [
+        apply_answer_faults(faults, lambda _unit, data: data, 1, build_body(registers, faults))[0] for _ in range(4)
+    ]
     numbers = [int.from_bytes(data[2:], "big") for data in told]
     assert numbers == [0x1FFF7, 0x1FFFE, 0x10005, 0x2000C]  # the high word of the answer before, the low one of now
 
@@ -98,24 +100,24 @@ def test_a_torn_number_has_words_of_two_moments() -> None:
         ("0100", "8001"),
     ],
 )
-def test_units_on_a_line_answer_every_function_as_over_tcp(request_: str, answered: str) -> None:
-    party, (registers, faults) = RtuUnits(), (Counted(), SensorFaults())
+def test_serial_units_answer_every_function_like_tcp(request_: str, answered: str) -> None:
+    party, (registers, faults) = RtuUnits(), (CountingRegisters(), SensorFaults())
     party.units[1] = registers, faults
-    (frame,) = party.take(build_frame(1, bytes.fromhex(request_)[1:]))
+    (frame,) = party.receive_bytes(build_frame(1, bytes.fromhex(request_)[1:]))
     assert frame.hex().startswith(f"01{answered}")
     assert build_frame(1, frame[1:-2]) == frame
-    assert answer(registers, faults, bytes.fromhex(request_)[1:])[:1] == frame[1:2]
+    assert answer_request(registers, faults, bytes.fromhex(request_)[1:])[:1] == frame[1:2]
 
 
 # -- through the driver
 
 
 @pytest.fixture
-def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[ModbusDevice, SensorFaults]]:
+def serial_unit(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[ModbusDevice, SensorFaults]]:
     """A served unit, with its address and faults."""
-    registers = Counted()
+    registers = CountingRegisters()
     if request.param == "tcp":
-        sensor = a_sensor()
+        sensor = create_sensor()
         servers = SensorServers({"X": sensor}, {"X": ("127.0.0.1", 0)}, {"X": registers})
         servers.start()
         yield ModbusDevice(port=servers.ports["X"], timeout_s=60.0), sensor.faults
@@ -136,46 +138,46 @@ NOT_MET = {("tcp", "flipped"), ("rtu", "stale"), ("tcp", "torn"), ("rtu", "torn"
 
 @pytest.mark.usefixtures("real_time")
 @pytest.mark.parametrize(
-    ("unit", "kind"),
+    ("serial_unit", "kind"),
     [(wire, kind) for wire in HARMLESS for kind in ANSWER_FAULTS if (wire, kind) not in NOT_MET],
-    indirect=["unit"],
+    indirect=["serial_unit"],
 )
-async def test_an_answer_that_is_spoilt_is_got_over_or_told_and_the_next_one_is_right(
-    kind: str, unit: tuple[ModbusDevice, SensorFaults], monkeypatch: pytest.MonkeyPatch
+async def test_corrupted_answer_is_retried_or_reported_and_next_is_correct(
+    kind: str, serial_unit: tuple[ModbusDevice, SensorFaults], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place, faults = unit
+    place, faults = serial_unit
     wire = "rtu" if place.device else "tcp"
     link = ModbusUnit("sensor", place)
     await link.connect()
-    before = await number(link)
+    before = await read_number(link)
     faults.answers[kind] = 100.0
     if kind in HARMLESS[wire]:
         monkeypatch.setattr(rtu_line, "ADAPTER_S", 10.0)  # the other thread may take its time between two pieces
-        assert before < await number(link) < before + 100
+        assert before < await read_number(link) < before + 100
         monkeypatch.undo()
     else:
         link._timeout_s = 0.3
         with pytest.raises(DeviceError, match="sensor"):
-            await number(link)
+            await read_number(link)
         link._timeout_s = 60.0
     faults.answers.clear()
     for _ in range(3):
         with contextlib.suppress(DeviceError):
             await link.connect()
-            assert before < await number(link) < before + 200
+            assert before < await read_number(link) < before + 200
             break
     else:
         raise AssertionError(kind)
     link.close()
 
 
-async def number(link: ModbusUnit) -> int:
+async def read_number(link: ModbusUnit) -> int:
     high, low = await link.read_input_registers(0, 2)
     return high << 16 | low
 
 
-def test_whoever_speaks_no_modbus_is_let_go() -> None:
-    servers = SensorServers({"X": a_sensor()}, {"X": ("127.0.0.1", 0)})
+def test_client_violating_modbus_is_disconnected() -> None:
+    servers = SensorServers({"X": create_sensor()}, {"X": ("127.0.0.1", 0)})
     servers.start()
     try:
         for nonsense in (b"GET / HTTP/1.1\r\n\r\n", bytes(7), b"\0\1\0\0\xff\xff\1"):

@@ -16,7 +16,7 @@ from fdhil.store.export import table_of
 from fdhil.store.recording_csv import encode, parse_recording
 from fdhil.store.windows import decode_window, encode_window
 from studies.slow_sensor import slow_windows
-from tests.asked import asked_windows
+from tests.polled_voltage import build_polled_windows
 
 
 def test_the_sensors_own_grid_is_kept_bit_by_bit() -> None:
@@ -60,7 +60,7 @@ def test_samples_closer_than_the_rows_are_refused(period: str) -> None:
 
 
 def test_when_each_value_of_a_meter_was_true_is_kept_too() -> None:
-    window = asked_windows()[0]
+    window = build_polled_windows()[0]
     assert window.slow_voltage is not None
     assert window.slow_voltage.late_s is not None
     back = decode_window(encode_window(window, "digest")).slow_voltage
@@ -75,6 +75,6 @@ def test_when_each_value_of_a_meter_was_true_is_kept_too() -> None:
 
 @pytest.mark.parametrize("late", ["0.001", "nonsense", "0.009 " * 500])
 def test_times_that_do_not_fit_the_values_are_refused(late: str) -> None:
-    lines = [line for line in _lines(asked_windows()[0]) if not line.startswith("# voltage_late_s")]
+    lines = [line for line in _lines(build_polled_windows()[0]) if not line.startswith("# voltage_late_s")]
     with pytest.raises(RecordingError, match="invalid voltage_late_s for its voltage samples"):
         parse_recording("\n".join([f"# voltage_late_s: {late}", *lines]) + "\n")

@@ -32,7 +32,7 @@ SETTINGS = Identification()
 def moves(presliding_um: float) -> list[Window]:
     demand_mm = 1e3 * shuttle(moves=2)
     drive = TRUE.replace_values(**{TERM: presliding_um}) if presliding_um else TRUE
-    response = closed_loop.simulate(drive, AXIS, PERIOD_S, demand_mm)
+    response = closed_loop.simulate_axis(drive, AXIS, PERIOD_S, demand_mm)
     noise = 0.05e-3 * np.random.default_rng(1).standard_normal(demand_mm.size)
     return [_with_position(window, response.position_mm + noise, demand_mm) for window in rapids()]
 
@@ -88,7 +88,7 @@ def test_friction_that_builds_up_lets_the_table_creep_where_sharp_friction_holds
     axis = bench_config().axis["X"]
     demand_mm = np.linspace(0.0, 0.5e-3, 200)
     sharp, soft = (
-        closed_loop.simulate(model, axis, PERIOD_S, demand_mm).position_mm[-1]
+        closed_loop.simulate_axis(model, axis, PERIOD_S, demand_mm).position_mm[-1]
         for model in (TRUE, TRUE.replace_values(**{TERM: 10.0}))
     )
     assert abs(sharp) < 1e-6

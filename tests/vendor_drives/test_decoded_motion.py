@@ -13,7 +13,7 @@ from fdhil.drivers.moves.inferred_moves import InferredMoves
 from fdhil.pipeline import AxisPipeline
 from fdhil.program import load_trajectory
 from fdhil.records import AxisSamples, Float, TickTimes, WindowOutcome
-from tests.sim.bench_twin import TwinInHand
+from tests.sim.bench_simulator import SteppedSimulator
 from tests.vendor_drives.vendor_machines import LED, OUTFITS, VendorDrive, build_vendor_config, start_drives
 
 pytestmark = pytest.mark.usefixtures("long_computation")
@@ -23,12 +23,12 @@ CRUISE_A = (5.0 + 0.05 * CRUISE_RAD_S) / K
 IDENTIFIED = [o for o in OUTFITS if o.name in ("epos4", "nanotec", "trinamic", "technosoft", "cia402-ingenia")]
 
 
-def decode_motion(twin: TwinInHand, rounds: int, way_mm: float, folder: Path) -> list[AxisSamples | TickTimes]:
+def decode_motion(twin: SteppedSimulator, rounds: int, way_mm: float, folder: Path) -> list[AxisSamples | TickTimes]:
     """Run rapids out and back on the NC; return the records decoded from the frames."""
     config = twin.machine.config
     program = folder / "rapids.ngc"
     program.write_text("G21 G90 G94\n" + f"G0 X{way_mm:g}\nG4 P0.3\nG0 X0\nG4 P0.3\n" * rounds + "M2\n", "utf-8")
-    twin.machine.nc.play("rapids", load_trajectory(program, config))
+    twin.machine.nc.play_demand("rapids", load_trajectory(program, config))
     twin.run_until("finished")
     rows, t_ns = [], 1_000_000_000
     for can_id, data in twin.wire:

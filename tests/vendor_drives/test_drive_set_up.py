@@ -62,7 +62,7 @@ def test_vendor_drive_is_found_checked_and_commissioned(outfit: VendorDrive, tmp
         assert not faults
         (node,) = scan_bus("can0", config, descriptions).nodes
         assert node.answers is not None
-        assert node.answers.identity.vendor_id == peer.drive.dictionary.number(0x1018, 1)
+        assert node.answers.identity.vendor_id == peer.drive.dictionary.get_number(0x1018, 1)
         assert {k: v for k, v in list_differences(config).items() if k not in outfit.lacks} == {}
         if outfit.on_line:
             record = commission(config, "X")

@@ -12,13 +12,15 @@ from fdhil.arming.guard_settings import settings_of
 from fdhil.cia402 import pack_pdo
 from fdhil.prediction.contour import contour_error_um
 from fdhil.records import Float, Parameters, Trajectory, compute_rms, freeze_array
-from tests.sim.bench_twin import PERIOD_S, TwinInHand, corner, trajectory
+from tests.sim.bench_simulator import PERIOD_S, SteppedSimulator, build_corner_rows, build_trajectory
 from tests.vendor_drives.vendor_machines import LED, OUTFITS, VendorDrive, build_vendor_config, start_drives
 
 DELAY = 2
 
 
-def play_demand(twin: TwinInHand, demand: Trajectory, path: Float, offset_um: dict[str, Float] | None = None) -> float:
+def play_demand(
+    twin: SteppedSimulator, demand: Trajectory, path: Float, offset_um: dict[str, Float] | None = None
+) -> float:
     """Run a demand on the NC with the offsets of each cycle; return the contour error (RMS, um) to the path (n, 2)."""
     table: list[list[float]] = []
     senders = []
@@ -34,10 +36,10 @@ def play_demand(twin: TwinInHand, demand: Trajectory, path: Float, offset_um: di
         following = len(table) + DELAY  # the row whose target has just been sent
         for pdo, increments in senders:
             value = round(increments[following]) if following < increments.size else 0
-            twin.machine.receive("can0", (pdo.cob_id, pack_pdo(pdo.entries, [value])))
+            twin.machine.receive_frame("can0", (pdo.cob_id, pack_pdo(pdo.entries, [value])))
 
     twin.each_cycle = each_cycle
-    twin.machine.nc.play("cut", demand)
+    twin.machine.nc.play_demand("cut", demand)
     twin.run_until("finished")
     actual = np.array(table)[: len(path)]
     return compute_rms(contour_error_um(path, actual, PERIOD_S))
@@ -48,8 +50,8 @@ def play_demand(twin: TwinInHand, demand: Trajectory, path: Float, offset_um: di
 def test_corrected_cut_has_smaller_error(outfit: VendorDrive, tmp_path: Path) -> None:
     config = build_vendor_config(outfit, tmp_path, "XY")
     twin = start_drives(config)
-    path = np.vstack([np.zeros((40, 2)), corner(), np.tile(corner()[-1:], (100, 1))])
-    demand = trajectory(path)
+    path = np.vstack([np.zeros((40, 2)), build_corner_rows(), np.tile(build_corner_rows()[-1:], (100, 1))])
+    demand = build_trajectory(path)
     models = {axis: Parameters(**settings.nominal.model_dump()) for axis, settings in config.axis.items()}
     planned = correction.plan(demand, models, config, "inverse")
     before = play_demand(twin, demand, path)
@@ -65,6 +67,6 @@ def test_corrected_cut_has_smaller_error(outfit: VendorDrive, tmp_path: Path) ->
 @pytest.mark.parametrize("outfit", [o for o in OUTFITS if not o.led], ids=lambda outfit: outfit.name)
 def test_drive_without_cyclic_set_points_cannot_be_commanded(outfit: VendorDrive, tmp_path: Path) -> None:
     twin = start_drives(build_vendor_config(outfit, tmp_path))
-    twin.run(20)
+    twin.run_cycles(20)
     (text,) = [event["text"] for event in twin.events if event["event"] == "error"]
     assert text.startswith("drive X refuses 6060 = 8 with SDO abort 06090030")

@@ -30,8 +30,8 @@ from tests.bench import AXIS, bench_document
 from tests.daemon.machine_rig import fdhil
 from tests.drivers.peer import DrivePeer
 from tests.guard.simulated_bus import FACTS_GIVEN
-from tests.sim.bench_twin import PERIOD_S, TwinInHand, smooth, trajectory
-from tests.sim.rig import NO_NOISE
+from tests.sim.bench_simulator import PERIOD_S, SteppedSimulator, build_trajectory, smooth_rows
+from tests.sim.drive_rig import NO_NOISE
 from tests.vendor_drives.test_drive_set_up import run_on_a_bus, short_delays
 from tests.vendor_drives.vendor_machines import OUTFITS, VendorDrive, start_drives
 
@@ -103,7 +103,7 @@ def short_delays(monkeypatch: pytest.MonkeyPatch) -> None:
 class GuardThread:
     """The machine with the guard's core in this process: one decision after each SYNC, as in the guard's process."""
 
-    def __init__(self, twin: TwinInHand, config: MachineConfig, folder: Path, path: CorrectedPath) -> None:
+    def __init__(self, twin: SteppedSimulator, config: MachineConfig, folder: Path, path: CorrectedPath) -> None:
         self.settings = settings_of(config, "can0", folder, "")
         self.listener, self.state = FrameMonitor(self.settings), make_initial_state(self.settings)
         self.twin, self.path, self.outputs = twin, path, list[StepOutput]()
@@ -131,14 +131,14 @@ class GuardThread:
         self.outputs.append(output)
         if output.offsets is not None:
             for axis, offset in zip(self.settings.axes, output.offsets, strict=True):
-                self.twin.machine.receive("can0", (axis.offset.cob_id, pack_pdo(axis.offset.entries, [offset])))
+                self.twin.machine.receive_frame("can0", (axis.offset.cob_id, pack_pdo(axis.offset.entries, [offset])))
 
 
 def build_shuttle_demand() -> Trajectory:
     """A feed move out and back, at rest at both ends."""
     way = np.concatenate([np.linspace(0, 9, 120), np.linspace(9, 0, 120)])
     rest = np.zeros(70)
-    return trajectory(smooth(np.concatenate([rest, way, rest])[:, None]), axes="X")
+    return build_trajectory(smooth_rows(np.concatenate([rest, way, rest])[:, None]), axes="X")
 
 
 def plan_correction(config: MachineConfig, demand: Trajectory) -> Float:
@@ -149,10 +149,10 @@ def plan_correction(config: MachineConfig, demand: Trajectory) -> Float:
     return found.offset_um["X"]
 
 
-def compute_path_error_um(twin: TwinInHand, demand: Trajectory) -> float:
+def compute_path_error_um(twin: SteppedSimulator, demand: Trajectory) -> float:
     """Run the move; return the largest deviation of the table from the demand, without the constant delay."""
     begin = len(twin.table)
-    twin.machine.nc.play("move", demand)
+    twin.machine.nc.play_demand("move", demand)
     twin.run_until("finished")
     table, path = np.array(twin.table[begin:])[:, 0], demand.position_mm["X"]
     n = len(path) - 60
@@ -170,9 +170,9 @@ def run_online_correction(machine: MachineConfig, config: MachineConfig, folder:
     twin = start_drives(machine)
     before = compute_path_error_um(twin, demand)
     guard = GuardThread(twin, config, folder, path)
-    twin.run(200)
+    twin.run_cycles(200)
     guard.request = GuardRequest("arm", True, PROGRAM, FACTS_GIVEN)
-    twin.run(20)
+    twin.run_cycles(20)
     assert guard.state.mode is Mode.ARMED, guard.outputs[-20:]
     after = compute_path_error_um(twin, demand)
     assert any(output.offsets and any(output.offsets) for output in guard.outputs)

@@ -15,8 +15,8 @@ from fdhil.drivers.cia402.drive_profile import PdoSpec
 from fdhil.drivers.cia402.drive_profile_file import load_profile
 from tests.bench import bench_axis
 from tests.eds import write_eds
-from tests.sim.bench_twin import TwinInHand
-from tests.sim.rig import NO_NOISE, Rig
+from tests.sim.bench_simulator import SteppedSimulator
+from tests.sim.drive_rig import NO_NOISE, DriveRig
 
 INVALID = 1 << 31
 MILLIRPM = 0xFDB44700  # as 0x60A9 has it
@@ -83,11 +83,13 @@ def build_vendor_config(
     return machine_config.parse_config(document, folder=folder)
 
 
-def start_drives(config: MachineConfig) -> TwinInHand:
+def start_drives(config: MachineConfig) -> SteppedSimulator:
     """Return the machine with its drives set up and enabled."""
-    twin = TwinInHand(config)
+    twin = SteppedSimulator(config)
     for axis, unit in twin.machine.units.items():
-        set_up_drive(config, axis, unit.drive.dictionary.indices.__contains__, Rig.of(unit.drive).write)
+        set_up_drive(
+            config, axis, unit.drive.dictionary.indices.__contains__, DriveRig.wrap_drive(unit.drive).write_object
+        )
     twin.switch_on()
     return twin
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from fdhil.cli.demo.processes import Process
-from tests.fleet.machine import Machine, written
-from tests.fleet.servers import postgres
-from tests.fleet.works import at_days, fleet_of, keep
+from tests.fleet.fleet_database import build_fleet, spread_over_days, store_records
+from tests.fleet.recording_machine import RecordingMachine, write_history
+from tests.fleet.servers import run_postgres
 from tests.web.tab import WIDE, opened
 
 if TYPE_CHECKING:
@@ -27,14 +27,16 @@ DAYS = 20
 def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     folder = tmp_path_factory.mktemp("works")
     begin = datetime.now(UTC) - timedelta(days=DAYS + 1)
-    with postgres() as database:
+    with run_postgres() as database:
         for k in range(9):
-            machine = Machine(written(folder / str(k), f"mill-{k}", labels={"type": "V-800", "lubricant": "ISO 68"}))
+            machine = RecordingMachine(
+                write_history(folder / str(k), f"mill-{k}", labels={"type": "V-800", "lubricant": "ISO 68"})
+            )
             for day in range(DAYS):
                 worn = 0.05 * day if k == 2 else 0.8 if k == 4 else 0.001 * ((day * k) % 5)
-                machine.record(1, parameters={"ft": 0.05 * (1 + worn)})
-            machine.close()
-            asyncio.run(keep(fleet_of(database, folder), at_days(machine, begin)))
+                machine.record_windows(1, parameters={"ft": 0.05 * (1 + worn)})
+            machine.close_store()
+            asyncio.run(store_records(build_fleet(database, folder), spread_over_days(machine, begin)))
         file = folder / "fleet.toml"
         file.write_text(f'[database]\nconnection = "{database.connection}"\n')
         web = Process("web", ["fdhil", "fleet", "web", "--port", "0", "--json", str(file)], folder / "web.log")

@@ -23,7 +23,7 @@ from fdhil.errors import DeviceTimeout, FdhilError, RecordingError
 from fdhil.prediction import contour_error_um, predict
 from fdhil.program import load_trajectory
 from fdhil.records import PARAMETERS, Parameters, ParameterSet, Window
-from fdhil.sim.drive.physics import true_parameters
+from fdhil.sim.drive.plant_physics import build_plant_parameters
 from fdhil.store.history import History
 from fdhil.store.windows import read_window
 
@@ -203,7 +203,9 @@ def published_of(found: ParameterSet) -> Published:
 
 def true_plants(config: MachineConfig) -> dict[str, Parameters]:
     """Return the true parameters of each axis."""
-    return {axis: true_parameters(settings.nominal, config.sim.axis[axis]) for axis, settings in config.axis.items()}
+    return {
+        axis: build_plant_parameters(settings.nominal, config.sim.axis[axis]) for axis, settings in config.axis.items()
+    }
 
 
 def _analysed(stage: Stage) -> dict[str, int]:

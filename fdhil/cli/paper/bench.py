@@ -12,7 +12,7 @@ from fdhil.cli.paper.scenarios import machine
 from fdhil.config import Axis
 from fdhil.identification.windows import find_windows
 from fdhil.records import Float, Parameters, Recording, Window, freeze_array
-from fdhil.sim.drive.physics import Physics, true_parameters
+from fdhil.sim.drive.plant_physics import PlantPhysics, build_plant_parameters
 
 FULL_SCALE = 70.0  # V, A and rad/s: all three signals of figure 4 share its axis
 COLD_C, WARM_C = 20.0, 22.0
@@ -64,7 +64,7 @@ def plant(axis: str = "X", celsius: float = COLD_C) -> Parameters:
     config = machine()
     settings = config.sim.axis[axis]
     rise = celsius - config.sim.thermal.ambient_c
-    base = true_parameters(config.axis[axis].nominal, settings)
+    base = build_plant_parameters(config.axis[axis].nominal, settings)
     return base.replace_values(
         ft=base.ft * (1 + settings.ft_per_kelvin * rise), Cd=base.Cd * (1 + settings.Cd_per_kelvin * rise)
     )
@@ -85,7 +85,7 @@ def run(
     counts = np.concatenate([counts, counts[-1:], counts[-1:]])
     start = counts[0] * 2 * math.pi / per_rev
     backlash = trouble.backlash_um * 1e-3 / mm_per_rad
-    drive = Physics(parameters, axis.regulators, period_s, per_rev, angle_rad=start, backlash_rad=backlash)
+    drive = PlantPhysics(parameters, axis.regulators, period_s, per_rev, angle_rad=start, backlash_rad=backlash)
     rows = np.empty((4, demand_mm.size))
     for k in range(demand_mm.size):
         drive.load_torque_nm = trouble.load_nm + trouble.ripple_nm * math.sin(drive.angle_rad)
@@ -93,7 +93,7 @@ def run(
             drive.load_torque_nm += float(load_nm[k])
         rows[1:, k] = drive.current_a, drive.speed_rad_s, drive.table_rad * mm_per_rad
         p0, p1, p2 = counts[k : k + 3].tolist()
-        drive.cycle(True, (p0, p1, (p1 - p0) / period_s, (p2 - p1) / period_s, 0.0, 0.0, 0.0, 0.0))
+        drive.run_cycle(True, (p0, p1, (p1 - p0) / period_s, (p2 - p1) / period_s, 0.0, 0.0, 0.0, 0.0))
         rows[0, k] = drive.voltage_mean_v
     return Signals(*rows)
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 from fdhil.config import MachineConfig, Noise, SimAxis
 from fdhil.records import PARAMETERS, Parameters
+from fdhil.sim.drive.drive_objects import DriveRatings
 from fdhil.sim.drive.homing import Switches
-from fdhil.sim.drive.objects import Ratings
-from fdhil.sim.drive.physics import Physics, true_parameters
-from fdhil.sim.drive.reality import RealPhysics, is_plain
+from fdhil.sim.drive.plant_physics import PlantPhysics, build_plant_parameters
+from fdhil.sim.drive.real_plant import RealPlantPhysics, is_plain
 
 
 class AxisPlant:
@@ -19,8 +19,8 @@ class AxisPlant:
         self.mm_per_rad = section.drive.sign * section.screw_pitch_mm / (2 * math.pi)
         self._reference_c = self.celsius = config.sim.thermal.ambient_c
         self._per_kelvin = (sim_axis.ft_per_kelvin, sim_axis.Cd_per_kelvin)
-        self._parameters = true_parameters(section.nominal, sim_axis)
-        self.physics = _physics(self._parameters, config, axis, sim_axis, 1 / self.mm_per_rad)
+        self._parameters = build_plant_parameters(section.nominal, sim_axis)
+        self.physics = _create_physics(self._parameters, config, axis, sim_axis, 1 / self.mm_per_rad)
 
     def set_parameters(self, **values: float) -> None:
         """Change parameters at the reference temperature from the next cycle on; TypeError, ValueError if invalid."""
@@ -32,9 +32,9 @@ class AxisPlant:
             if not (math.isfinite(value) and value >= 0 and (value > 0 or name in ("ft", "Cd"))):
                 raise ValueError(f"{name} = {value} is unphysical; it must be finite and above 0")
         self._parameters = changed
-        self.warm(self.celsius)
+        self.set_temperature(self.celsius)
 
-    def warm(self, celsius: float) -> None:
+    def set_temperature(self, celsius: float) -> None:
         """Set the slide-way's temperature: ft and Cd follow it."""
         self.celsius = celsius
         rise = celsius - self._reference_c
@@ -45,27 +45,29 @@ class AxisPlant:
             self.physics.set_parameters(now)
 
 
-def _physics(parameters: Parameters, config: MachineConfig, axis: str, sim_axis: SimAxis, rad_per_mm: float) -> Physics:
+def _create_physics(
+    parameters: Parameters, config: MachineConfig, axis: str, sim_axis: SimAxis, rad_per_mm: float
+) -> PlantPhysics:
     """Create the axis' mechanics and loops: the paper's, or a real machine's where it is configured."""
     section = config.axis[axis]
     increments, period_s = section.drive.increments_per_rev, config.machine.sync_period_s
     start_rad, backlash_rad = sim_axis.start_mm * rad_per_mm, abs(sim_axis.backlash_um * 1e-3 * rad_per_mm)
     loops = section.regulators
     if is_plain(sim_axis.reality, loops):
-        return Physics(parameters, loops, period_s, increments, angle_rad=start_rad, backlash_rad=backlash_rad)
-    return RealPhysics(
+        return PlantPhysics(parameters, loops, period_s, increments, angle_rad=start_rad, backlash_rad=backlash_rad)
+    return RealPlantPhysics(
         parameters, loops, period_s, increments, sim_axis.reality,
         rad_per_mm=rad_per_mm, angle_rad=start_rad, backlash_rad=backlash_rad,
     )  # fmt: skip
 
 
-def sensor_noise(config: MachineConfig, sim_axis: SimAxis) -> Noise:
+def select_sensor_noise(config: MachineConfig, sim_axis: SimAxis) -> Noise:
     """Return the sensors' white noise; a speed derived from encoder positions has none of its own."""
     white = sim_axis.reality.speed_object == "shaft"
     return config.sim.noise if white else config.sim.noise.model_copy(update={"speed_rad_s": 0.0})
 
 
-def switches(sim_axis: SimAxis, ratings: Ratings) -> Switches:
+def locate_switches(sim_axis: SimAxis, ratings: DriveRatings) -> Switches:
     """Return the positions of the machine's switches, in the drive's own direction."""
     per_mm = ratings.sign * ratings.increments_per_mm
     home = None if sim_axis.home_switch_mm is None else sim_axis.home_switch_mm * per_mm

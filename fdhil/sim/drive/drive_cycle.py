@@ -3,14 +3,14 @@
 from collections.abc import Callable
 
 from fdhil.sim.drive.axis_plant import AxisPlant
-from fdhil.sim.drive.dictionary import Dictionary
+from fdhil.sim.drive.drive_objects import DriveRatings
+from fdhil.sim.drive.drive_sensors import DriveFaults
 from fdhil.sim.drive.feedback import Feedback
-from fdhil.sim.drive.motion import Motion
 from fdhil.sim.drive.motion_objects import NO_WINDOW
-from fdhil.sim.drive.objects import Ratings
-from fdhil.sim.drive.physics import Loops
-from fdhil.sim.drive.power import PowerStage, State
-from fdhil.sim.drive.sensors import DriveFaults
+from fdhil.sim.drive.object_dictionary import ObjectDictionary
+from fdhil.sim.drive.plant_physics import ClosedLoops
+from fdhil.sim.drive.power_stage import PowerStage, PowerState
+from fdhil.sim.drive.setpoint_selection import SetpointSelector
 
 _CREEP_RAD_S = 1e-6  # slower than this an unpowered axis is at standstill
 _NO_LIMIT = 0xFFFF
@@ -25,11 +25,11 @@ class DriveCycle:
 
     def __init__(
         self,
-        dictionary: Dictionary,
-        ratings: Ratings,
+        dictionary: ObjectDictionary,
+        ratings: DriveRatings,
         plant: AxisPlant,
         power: PowerStage,
-        motion: Motion,
+        motion: SetpointSelector,
         feedback: Feedback,
         faults: DriveFaults,
     ) -> None:
@@ -37,18 +37,18 @@ class DriveCycle:
         self._ratings = ratings
         self._plant = plant
         self._power, self._motion, self._feedback, self._faults = power, motion, feedback, faults
-        self._loops = Loops.POSITION
+        self._loops = ClosedLoops.POSITION
         self._limits = self._limit_objects
-        self.ended: Callable[[float], None] | None = None
+        self.on_cycle_end: Callable[[float], None] | None = None
         self.tick = 0
         self.table_mm = self._true_table_mm
-        self.reset()
+        self.reset_supervision()
 
-    def reset(self) -> None:
+    def reset_supervision(self) -> None:
         self._over_window = self._last_offset = 0
 
     @property
-    def stands(self) -> bool:
+    def is_at_standstill(self) -> bool:
         """Whether nothing can move: no current flows, and the axis is at standstill."""
         return not self._power.powered and abs(self._plant.physics.speed_rad_s) < _CREEP_RAD_S
 
@@ -58,14 +58,14 @@ class DriveCycle:
             self._numbers[0x60B000] = self._last_offset
         self._last_offset = self._numbers[0x60B000]
 
-    def begin(self) -> bool:
+    def begin_cycle(self) -> bool:
         """Apply the set-points and sample all objects; return whether the following error is too large."""
         self._motion.begin_cycle(self._feedback.actual)
-        tripped = self._is_beyond(self._feedback.sample(self.tick))
+        tripped = self._is_beyond(self._feedback.sample_objects(self.tick))
         self.table_mm = self._true_table_mm
         return tripped
 
-    def integrate(self) -> None:
+    def integrate_cycle(self) -> None:
         physics, motion = self._plant.physics, self._motion
         ended_v = physics.voltage_mean_v
         if motion.loops is not self._loops:
@@ -78,10 +78,10 @@ class DriveCycle:
         if motion.shift:
             command = (command[0] + motion.shift, command[1] + motion.shift, *command[2:])
         physics.load_torque_nm = float(self._faults.load_torque_nm)
-        physics.cycle(self._power.powered, command)
+        physics.run_cycle(self._power.powered, command)
         self.tick += 1
-        if self.ended is not None:
-            self.ended(ended_v)
+        if self.on_cycle_end is not None:
+            self.on_cycle_end(ended_v)
 
     @property
     def _true_table_mm(self) -> float:
@@ -100,4 +100,4 @@ class DriveCycle:
             return False
         self._over_window += 1
         over_ms = (self._over_window - 1) * self._ratings.sync_period_s * 1e3
-        return over_ms >= self._numbers[0x606600] and self._power.state is not State.FAULT_REACTION_ACTIVE
+        return over_ms >= self._numbers[0x606600] and self._power.state is not PowerState.FAULT_REACTION_ACTIVE

@@ -3,22 +3,22 @@
 import math
 
 from fdhil.config import Regulators
-from fdhil.sim.drive.dictionary import Dictionary
-from fdhil.sim.drive.dress import Gauge
-from fdhil.sim.drive.motion import Motion, Source
-from fdhil.sim.drive.objects import VOLTAGE_V_PER_COUNT, Ratings
-from fdhil.sim.drive.physics import Physics
-from fdhil.sim.drive.power import PowerStage
-from fdhil.sim.drive.sensors import Sensors
-from fdhil.sim.drive.speed_and_torque import Actual
-from fdhil.sim.drive.trace import TraceBuffer
+from fdhil.sim.drive.drive_objects import VOLTAGE_V_PER_COUNT, DriveRatings
+from fdhil.sim.drive.drive_sensors import DriveSensors
+from fdhil.sim.drive.object_dictionary import ObjectDictionary
+from fdhil.sim.drive.open_loop_modes import MeasuredState
+from fdhil.sim.drive.plant_physics import PlantPhysics
+from fdhil.sim.drive.power_stage import PowerStage
+from fdhil.sim.drive.setpoint_selection import SetpointSelector, SetpointSource
+from fdhil.sim.drive.trace_buffer import TraceBuffer
+from fdhil.sim.drive.vendor_emulation import VendorSignal
 
 _VOLTAGE_ENABLED, _REMOTE, _LIMIT, _FOLLOWING_ERROR = 1 << 4, 1 << 9, 1 << 11, 1 << 13
 _LIMIT_SWITCHES = 0b11
 INT16, INT32 = 0x7FFF, 0x7FFFFFFF
 
 
-def clip(value: float, highest: int) -> int:
+def clip_to_integer(value: float, highest: int) -> int:
     """Round to a signed integer and limit it to the range with this highest value."""
     whole = round(value)
     if -highest - 1 <= whole <= highest:
@@ -35,14 +35,14 @@ class Feedback:
 
     def __init__(
         self,
-        dictionary: Dictionary,
-        ratings: Ratings,
+        dictionary: ObjectDictionary,
+        ratings: DriveRatings,
         regulators: Regulators,
-        physics: Physics,
+        physics: PlantPhysics,
         power: PowerStage,
-        motion: Motion,
-        sensors: Sensors,
-        gauges: tuple[Gauge, ...] = (),
+        motion: SetpointSelector,
+        sensors: DriveSensors,
+        gauges: tuple[VendorSignal, ...] = (),
     ) -> None:
         self._numbers = dictionary.numbers
         self._physics = physics
@@ -50,7 +50,7 @@ class Feedback:
         self._motion = motion
         self._sensors = sensors
         self._gauges = gauges
-        self._switches = motion.homing.switches if motion.homing.switches.mounted else None
+        self._switches = motion.homing.switches if motion.homing.switches.has_switches else None
         self.trace = TraceBuffer()
         self._inc_per_rad = ratings.increments_per_rev / (2 * math.pi)
         self._counts_per_a = 1e3 / ratings.rated_current_a
@@ -62,51 +62,53 @@ class Feedback:
     @property
     def true_position(self) -> int:
         """Position feedback of the position loop, increments."""
-        return round(self._physics.seen.position_rad * self._inc_per_rad) - self._motion.shift
+        return round(self._physics.sensed.position_rad * self._inc_per_rad) - self._motion.shift
 
     @property
     def inputs(self) -> int:
         """Present value of 0x60FD."""
         if self._switches is None:
             return self.digital_inputs
-        return self.digital_inputs | self._switches.inputs(self.true_position + self._motion.shift)
+        return self.digital_inputs | self._switches.read_inputs(self.true_position + self._motion.shift)
 
     @property
-    def actual(self) -> Actual:
+    def actual(self) -> MeasuredState:
         """The drive's feedback without sensor noise."""
-        seen = self._physics.seen
-        return Actual(self.true_position, seen.speed_rad_s * self._inc_per_rad, seen.current_a, self.inputs)
+        seen = self._physics.sensed
+        return MeasuredState(self.true_position, seen.speed_rad_s * self._inc_per_rad, seen.current_a, self.inputs)
 
-    def sample(self, tick: int) -> int:
+    def sample_objects(self, tick: int) -> int:
         """Sample all objects; the voltage is the mean of the ended cycle. Return the following error."""
         physics, numbers = self._physics, self._numbers
         true_position = self.true_position
-        seen = physics.seen
-        position, speed, current, voltage = self._sensors.read(
+        seen = physics.sensed
+        position, speed, current, voltage = self._sensors.read_signals(
             true_position, seen.speed_rad_s, seen.current_a, seen.voltage_v
         )
-        demand = clip(self._motion.demand, INT32)
-        shown = clip(position, INT32)
-        speed_counts = clip(speed * self._inc_per_rad, INT32)
-        current_counts = clip(current * self._counts_per_a, INT16)
-        voltage_counts = clip(voltage / VOLTAGE_V_PER_COUNT, INT16)
+        demand = clip_to_integer(self._motion.demand, INT32)
+        shown = clip_to_integer(position, INT32)
+        speed_counts = clip_to_integer(speed * self._inc_per_rad, INT32)
+        current_counts = clip_to_integer(current * self._counts_per_a, INT16)
+        voltage_counts = clip_to_integer(voltage / VOLTAGE_V_PER_COUNT, INT16)
         numbers[0x606200] = numbers[0x60FC00] = demand
-        numbers[0x606300] = clip(physics.angle_rad * self._inc_per_rad - self._motion.shift, INT32)
+        numbers[0x606300] = clip_to_integer(physics.angle_rad * self._inc_per_rad - self._motion.shift, INT32)
         numbers[0x606400] = shown
-        numbers[0x606B00] = self._speed_demand(true_position)
+        numbers[0x606B00] = self._compute_speed_demand(true_position)
         numbers[0x606C00] = speed_counts
-        numbers[0x607400] = clip(seen.current_a * self._counts_per_a, INT16)  # the current loop leaves no difference
+        numbers[0x607400] = clip_to_integer(
+            seen.current_a * self._counts_per_a, INT16
+        )  # the current loop leaves no difference
         numbers[0x607700] = numbers[0x607800] = current_counts
         numbers[0x607900] = round(seen.bus * self._bus_mv)
         numbers[0x210100] = voltage_counts
-        numbers[0x60F400] = clip(demand - true_position, INT32)
+        numbers[0x60F400] = clip_to_integer(demand - true_position, INT32)
         numbers[0x60FD00] = self.inputs
         if self._gauges:
-            self._show(current, voltage, seen.bus * self._bus_mv * 1e-3)
-        self.trace.append(tick, demand, shown, speed_counts, current_counts, voltage_counts)
+            self._update_vendor_signals(current, voltage, seen.bus * self._bus_mv * 1e-3)
+        self.trace.append_row(tick, demand, shown, speed_counts, current_counts, voltage_counts)
         return demand - true_position
 
-    def _show(self, current_a: float, voltage_v: float, bus_v: float) -> None:
+    def _update_vendor_signals(self, current_a: float, voltage_v: float, bus_v: float) -> None:
         signals = {
             "current_a": current_a,
             "current_share": current_a * self._counts_per_a * 1e-3,
@@ -115,16 +117,16 @@ class Feedback:
             "duty": voltage_v / bus_v,
         }
         for gauge in self._gauges:
-            self._numbers[gauge.entry.place] = gauge.counts(signals[gauge.signal])
+            self._numbers[gauge.entry.storage_key] = gauge.convert_to_counts(signals[gauge.signal])
 
-    def _speed_demand(self, position: int) -> int:
+    def _compute_speed_demand(self, position: int) -> int:
         """Return the output of the position loop at t_k, increments/s."""
-        if self._motion.source is Source.OFF:
+        if self._motion.source is SetpointSource.OFF:
             return 0
         p0, _, f0, _, v0, _, _, _ = self._motion.command
-        return clip(self._kv * (p0 - position) + self._kff * f0 + v0 * self._inc_per_rad, INT32)
+        return clip_to_integer(self._kv * (p0 - position) + self._kff * f0 + v0 * self._inc_per_rad, INT32)
 
-    def show_state(self) -> None:
+    def update_status_objects(self) -> None:
         word = self._power.state | _VOLTAGE_ENABLED | _REMOTE
         if self._power.powered:
             word |= self._motion.status_bits

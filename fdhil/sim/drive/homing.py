@@ -13,14 +13,14 @@ NEGATIVE, POSITIVE, HOME = 0, 1, 2  # bits of 0x60FD
 _WATCHED = {-1: NEGATIVE, 1: POSITIVE}
 
 
-class Homing(Enum):
+class HomingState(Enum):
     IDLE = auto()
     RUNNING = auto()
     DONE = auto()
     ERROR = auto()
 
 
-class Leg(NamedTuple):
+class HomingMove(NamedTuple):
     """One move of a search: direction, speed, and the bit and state that end it; no bit: the index pulse."""
 
     direction: int
@@ -29,7 +29,7 @@ class Leg(NamedTuple):
     state: bool = False
 
 
-class _Method(NamedTuple):
+class _HomingEdge(NamedTuple):
     """The final edge of a method: moving in ``direction``, the switch changes to ``state``."""
 
     direction: int
@@ -39,35 +39,35 @@ class _Method(NamedTuple):
 
 # without index pulse; 1 to 6 are the same, followed by the pulse
 _EDGES = {
-    17: _Method(1, NEGATIVE, False),
-    18: _Method(-1, POSITIVE, False),
-    19: _Method(-1, HOME, False),
-    20: _Method(1, HOME, True),
-    21: _Method(1, HOME, False),
-    22: _Method(-1, HOME, True),
+    17: _HomingEdge(1, NEGATIVE, False),
+    18: _HomingEdge(-1, POSITIVE, False),
+    19: _HomingEdge(-1, HOME, False),
+    20: _HomingEdge(1, HOME, True),
+    21: _HomingEdge(1, HOME, False),
+    22: _HomingEdge(-1, HOME, True),
 }
 _PULSES = {33: -1, 34: 1}
 METHODS = frozenset({*_EDGES, *(method - 16 for method in _EDGES), *_PULSES, 35, 37})
 
 
-def legs(method: int, inputs: int) -> list[Leg]:
+def plan_moves(method: int, inputs: int) -> list[HomingMove]:
     """Return the moves of a method from a position with these inputs.
 
     >>> [leg.direction for leg in legs(17, 0)], [leg.direction for leg in legs(17, 1)]
     ([-1, 1], [1])
     """
     if method in _PULSES:
-        return [Leg(_PULSES[method], False, None)]
+        return [HomingMove(_PULSES[method], False, None)]
     edge = _EDGES.get(method, _EDGES.get(method + 16))
     if edge is None:
         return []
     direction, bit, state = edge
-    back, last = Leg(-direction, True, bit, not state), Leg(direction, False, bit, state)
+    back, last = HomingMove(-direction, True, bit, not state), HomingMove(direction, False, bit, state)
     if bool(inputs >> bit & 1) != state:  # on the side from which the final edge is approached
-        way = [last] if not state else [Leg(direction, True, bit, state), back._replace(fast=False), last]
+        way = [last] if not state else [HomingMove(direction, True, bit, state), back._replace(fast=False), last]
     else:
         way = [back, last]
-    return [*way, Leg(direction, False, None)] if method < 17 else way
+    return [*way, HomingMove(direction, False, None)] if method < 17 else way
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,16 +79,16 @@ class Switches:
     home: float | None = None
 
     @property
-    def mounted(self) -> bool:
+    def has_switches(self) -> bool:
         return (self.negative, self.positive, self.home) != (None, None, None)
 
-    def inputs(self, raw: float) -> int:
+    def read_inputs(self, raw: float) -> int:
         """Return the bits of 0x60FD at a position."""
         bits = int(self.negative is not None and raw <= self.negative)
         bits |= (self.positive is not None and raw >= self.positive) << POSITIVE
         return bits | (self.home is not None and raw >= self.home) << HOME
 
-    def has(self, bit: int | None) -> bool:
+    def has_switch(self, bit: int | None) -> bool:
         """Whether the switch of a bit is mounted; the index pulse always is."""
         return bit is None or (self.negative, self.positive, self.home)[bit] is not None
 
@@ -99,36 +99,36 @@ class HomingRun:
     def __init__(self, switches: Switches, increments_per_rev: int) -> None:
         self.switches = switches
         self._per_rev = increments_per_rev
-        self.reset()
+        self.reset_search()
 
-    def reset(self) -> None:
-        self.state = Homing.IDLE
+    def reset_search(self) -> None:
+        self.state = HomingState.IDLE
         self.home = 0.0
-        self._legs: list[Leg] = []
+        self._legs: list[HomingMove] = []
         self._before = 0.0
 
-    def start(self, method: int, raw: float, inputs: int) -> None:
+    def start_search(self, method: int, raw: float, inputs: int) -> None:
         """Start a search at ``raw``."""
-        self._legs = legs(method, inputs)
+        self._legs = plan_moves(method, inputs)
         self._before = raw
-        self.state = Homing.RUNNING
+        self.state = HomingState.RUNNING
         self.home = raw
-        if method not in METHODS or not all(self.switches.has(leg.bit) for leg in self._legs):
-            self._fail()
+        if method not in METHODS or not all(self.switches.has_switch(leg.bit) for leg in self._legs):
+            self._fail_search()
 
     @property
-    def leg(self) -> Leg | None:
+    def current_move(self) -> HomingMove | None:
         """The present move; None: come to rest."""
         return self._legs[0] if self._legs else None
 
-    def step(self, raw: float, inputs: int) -> None:
+    def update_search(self, raw: float, inputs: int) -> None:
         """Update the search at position ``raw``; go on to the next move when the present one is complete."""
-        leg = self.leg
+        leg = self.current_move
         if leg is None:
             return
         limit = _WATCHED[leg.direction]
         if leg.bit is None:
-            found, place = self._pulse(leg.direction, raw)
+            found, place = self._find_index_pulse(leg.direction, raw)
         else:
             found, place = bool(inputs >> leg.bit & 1) == leg.state, raw
         self._before = raw
@@ -136,21 +136,21 @@ class HomingRun:
             self.home = place
             self._legs.pop(0)
         elif limit != leg.bit and inputs >> limit & 1:
-            self._fail()
+            self._fail_search()
 
-    def rested(self) -> bool:
+    def finish_search(self) -> bool:
         """Complete the search at standstill; return True if it has just found home."""
-        if self.state is not Homing.RUNNING or self._legs:
+        if self.state is not HomingState.RUNNING or self._legs:
             return False
-        self.state = Homing.DONE
+        self.state = HomingState.DONE
         return True
 
-    def _pulse(self, direction: int, raw: float) -> tuple[bool, float]:
+    def _find_index_pulse(self, direction: int, raw: float) -> tuple[bool, float]:
         turn = self._per_rev
         first = math.floor(self._before / turn) + 1 if direction > 0 else math.ceil(self._before / turn) - 1
         place = float(first * turn)
         return (raw - place) * direction >= 0, place
 
-    def _fail(self) -> None:
+    def _fail_search(self) -> None:
         self._legs = []
-        self.state = Homing.ERROR
+        self.state = HomingState.ERROR

@@ -6,10 +6,10 @@ import struct
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from fdhil.sim.drive.modes import CYCLIC_POSITION
-from fdhil.sim.drive.pdo import Pdo
-from fdhil.sim.drive.power import State
-from fdhil.sim.frame import BusFrame
+from fdhil.sim.drive.operation_modes import CYCLIC_POSITION
+from fdhil.sim.drive.pdo_engine import Pdo
+from fdhil.sim.drive.power_stage import PowerState
+from fdhil.sim.frame_types import BusFrame
 
 CONTROLWORD, STATUSWORD, TARGET, POSITION, MODE = 0x604000, 0x604100, 0x607A00, 0x606400, 0x606000
 _OFFSETS = frozenset({0x60B000, 0x60B100, 0x60B200})
@@ -17,26 +17,26 @@ _SILENCE_CYCLES = 5
 ENABLED = 0x0F
 SHUTDOWN = 0x06
 _WORDS = {
-    State.SWITCH_ON_DISABLED: SHUTDOWN,
-    State.READY: 0x07,
-    State.SWITCHED_ON: ENABLED,
-    State.OPERATION_ENABLED: ENABLED,
-    State.QUICK_STOP_ACTIVE: 0x00,
+    PowerState.SWITCH_ON_DISABLED: SHUTDOWN,
+    PowerState.READY: 0x07,
+    PowerState.SWITCHED_ON: ENABLED,
+    PowerState.OPERATION_ENABLED: ENABLED,
+    PowerState.QUICK_STOP_ACTIVE: 0x00,
 }
 
 
-def power_state(statusword: int) -> State:
+def decode_power_state(statusword: int) -> PowerState:
     """Return the power state that a statusword shows (CiA 402-2, table 30)."""
     for mask in (0x6F, 0x4F):
         try:
-            return State(statusword & mask)
+            return PowerState(statusword & mask)
         except ValueError:
             continue
-    return State.NOT_READY
+    return PowerState.NOT_READY
 
 
 @dataclass(frozen=True, slots=True)
-class Wiring:
+class PdoWiring:
     """The PDOs by which the NC controls a drive, and its cyclic ``mode`` with the object to write it to.
 
     ``missing`` are the required objects that no valid PDO carries. A drive counts as silent without a statusword for
@@ -51,7 +51,7 @@ class Wiring:
     patience: float = float("inf")
 
     @classmethod
-    def of(cls, rpdos: Iterable[Pdo], tpdos: Iterable[Pdo], mode: int, mode_index: int) -> Wiring:
+    def choose_pdos(cls, rpdos: Iterable[Pdo], tpdos: Iterable[Pdo], mode: int, mode_index: int) -> PdoWiring:
         """Choose among a drive's PDOs: as few as possible, without offsets where another PDO suffices."""
         received = sorted(rpdos, key=lambda pdo: (CONTROLWORD not in pdo.keys, not _OFFSETS.isdisjoint(pdo.keys)))
         received.sort(key=lambda pdo: not {CONTROLWORD, TARGET}.issubset(pdo.keys))
@@ -84,17 +84,17 @@ class DriveLink:
     node_id: int
     increments_per_mm: float
     delay: int
-    wiring: Wiring = field(default_factory=Wiring)
+    wiring: PdoWiring = field(default_factory=PdoWiring)
     word: int = SHUTDOWN
     status: int | None = None
     position: int | None = None
     silent: int = 0
 
     @property
-    def state(self) -> State:
-        return State.NOT_READY if self.status is None else power_state(self.status)
+    def state(self) -> PowerState:
+        return PowerState.NOT_READY if self.status is None else decode_power_state(self.status)
 
-    def set_point(self, target: int) -> list[BusFrame]:
+    def build_setpoint_frames(self, target: int) -> list[BusFrame]:
         """Return controlword and target position; other objects in those RPDOs stay zero."""
         values = {CONTROLWORD: self.word, TARGET: target, MODE: self.wiring.mode}
         return [
@@ -102,7 +102,7 @@ class DriveLink:
             for pdo in self.wiring.setpoints
         ]
 
-    def hear(self, can_id: int, data: bytes) -> None:
+    def receive_tpdo(self, can_id: int, data: bytes) -> None:
         """Process a TPDO; one shorter than its mapping is ignored."""
         for pdo in self.wiring.answers:
             if pdo.cob_id != can_id or len(data) < pdo.codec.size:
@@ -113,15 +113,15 @@ class DriveLink:
                 elif key == POSITION:
                     self.position = value
 
-    def walk(self) -> list[BusFrame]:
+    def step_toward_enabled(self) -> list[BusFrame]:
         """Return one step toward Operation enabled, with the actual position as target."""
         if self.position is None:
             return []
-        if self.state is State.FAULT:  # a reset is a rising edge
+        if self.state is PowerState.FAULT:  # a reset is a rising edge
             self.word = 0x00 if self.word == 0x80 else 0x80
         else:
             self.word = _WORDS.get(self.state, self.word)
-        return self.set_point(self.position)
+        return self.build_setpoint_frames(self.position)
 
 
 @dataclass(slots=True)

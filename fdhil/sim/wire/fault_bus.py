@@ -14,8 +14,8 @@ from collections.abc import Sequence
 
 import can
 
-from fdhil.sim.frame import EXTENDED, Frame
-from fdhil.sim.frame_faults import BusRefuses, FrameFault, FrameFaults, Passed
+from fdhil.sim.frame_faults import FrameFault, FrameFaults, Passed, PlannedBusError
+from fdhil.sim.frame_types import EXTENDED, Frame
 
 _ERROR, _REMOTE = 1 << 29, 1 << 30
 _LOOK_S = 0.02  # polling interval for injected and delayed frames
@@ -40,35 +40,37 @@ class FaultBus(can.BusABC):
         """Send the message as changed by the plan."""
         now_s = time.monotonic()
         with self._lock:
-            passed = self._planned(msg, sent=True, now_s=now_s) + self.faults.due("sent", now_s)
+            passed = self._apply_plan(msg, sent=True, now_s=now_s) + self.faults.release_due("sent", now_s)
         for each in passed:
-            self._bus.send(_message(each), timeout)
+            self._bus.send(_convert_to_message(each), timeout)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         until_s = float("inf") if timeout is None else time.monotonic() + timeout
         while True:
             now_s = time.monotonic()
-            self._settle(now_s)
+            self._release_due_frames(now_s)
             if self._ready:
                 return self._ready.popleft(), False
             message = self._bus.recv(max(0.0, min(until_s - now_s, _LOOK_S)))
             if message is not None:
                 with self._lock:
-                    self._ready.extend(map(_message, self._planned(message, sent=False, now_s=time.monotonic())))
+                    self._ready.extend(
+                        map(_convert_to_message, self._apply_plan(message, sent=False, now_s=time.monotonic()))
+                    )
             elif now_s >= until_s:
                 return None, False
 
-    def _settle(self, now_s: float) -> None:
+    def _release_due_frames(self, now_s: float) -> None:
         with self._lock:
-            self._ready.extend(map(_message, self.faults.due("received", now_s)))
-            late = self.faults.due("sent", now_s)
+            self._ready.extend(map(_convert_to_message, self.faults.release_due("received", now_s)))
+            late = self.faults.release_due("sent", now_s)
         for each in late:
-            self._bus.send(_message(each))
+            self._bus.send(_convert_to_message(each))
 
-    def _planned(self, message: can.Message, *, sent: bool, now_s: float) -> list[Passed]:
+    def _apply_plan(self, message: can.Message, *, sent: bool, now_s: float) -> list[Passed]:
         try:
-            return self.faults.take(_frame(message), "sent" if sent else "received", now_s, message)
-        except BusRefuses as error:
+            return self.faults.process_frame(_convert_to_frame(message), "sent" if sent else "received", now_s, message)
+        except PlannedBusError as error:
             raise can.CanOperationError(os.strerror(error.number), error.number) from None
 
     def shutdown(self) -> None:
@@ -76,15 +78,15 @@ class FaultBus(can.BusABC):
         self._bus.shutdown()
 
 
-def _frame(message: can.Message) -> Frame:
+def _convert_to_frame(message: can.Message) -> Frame:
     flags = message.is_extended_id * EXTENDED | message.is_error_frame * _ERROR | message.is_remote_frame * _REMOTE
     return message.arbitration_id | flags, bytes(message.data)
 
 
-def _message(passed: Passed) -> can.Message:
+def _convert_to_message(passed: Passed) -> can.Message:
     (can_id, data), origin = passed
     message: can.Message | None = origin
-    if message is not None and _frame(message) == (can_id, data):
+    if message is not None and _convert_to_frame(message) == (can_id, data):
         return message
     return can.Message(
         timestamp=time.time() if message is None else message.timestamp,

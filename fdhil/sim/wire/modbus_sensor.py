@@ -45,18 +45,18 @@ class VoltageSensor:
         self._latched = 0  # samples latched or lost
         self._block = [0] * (REGISTERS - STATUS)
 
-    def feed(self, mean_v: float) -> None:
+    def feed_mean_voltage(self, mean_v: float) -> None:
         """Add the mean terminal voltage of one cycle; the last cycle of a sample completes it."""
         self._sum_v, self._summed = self._sum_v + mean_v, self._summed + 1
         if self._summed < self._cycles:
             return
         mean_v, self._sum_v, self._summed = self._sum_v / self._cycles, 0.0, 0
-        value = self.faults.signal.apply(mean_v + self._noise.draw(), self._rng)
+        value = self.faults.signal.apply_errors(mean_v + self._noise.draw(), self._rng)
         with self._lock:
             self._recent.append(value)
             self._count += 1
 
-    def latch(self) -> None:
+    def latch_samples(self) -> None:
         """Copy the newest samples not latched before into the block, at most 100."""
         with self._lock:
             fresh = self._count - self._latched
@@ -66,25 +66,25 @@ class VoltageSensor:
             first = self._count - number
         counts = [max(-32768, min(32767, round(v / self.volts_per_count))) & 0xFFFF for v in samples]
         status = 2 if fresh > number else 1
-        header = [status, *_words(struct.pack(">I", first & 0xFFFFFFFF)), number, 0]
+        header = [status, *_unpack_words(struct.pack(">I", first & 0xFFFFFFFF)), number, 0]
         self._block = header + counts + [0] * (BLOCK - number)
 
-    def registers(self) -> list[int]:
+    def read_registers(self) -> list[int]:
         with self._lock:
             newest, count = (self._recent[-1] if self._recent else 0.0), max(self._count - 1, 0)
         head = struct.pack(">fIfff", newest, count & 0xFFFFFFFF, self.rate_hz, self.volts_per_count, self.celsius)
-        return [*_words(head), 0, *self._block]
+        return [*_unpack_words(head), 0, *self._block]
 
     trigger: int | None = TRIGGER
 
-    def words(self) -> dict[int, int]:
-        return dict(enumerate(self.registers()))
+    def list_words(self) -> dict[int, int]:
+        return dict(enumerate(self.read_registers()))
 
-    def newest(self, number: int) -> tuple[int, list[float]]:
+    def read_newest(self, number: int) -> tuple[int, list[float]]:
         """Return the number of samples so far, and up to ``number`` of the newest, the oldest first."""
         with self._lock:
             return self._count, list(self._recent)[-number:]
 
 
-def _words(data: bytes) -> list[int]:
+def _unpack_words(data: bytes) -> list[int]:
     return list(struct.unpack(f">{len(data) // 2}H", data))

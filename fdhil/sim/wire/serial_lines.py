@@ -22,9 +22,9 @@ from pymodbus.framer import FramerRTU
 
 from fdhil.config import Thermometer, Voltage
 from fdhil.errors import ConnectError
-from fdhil.sim.wire.attachment import WakePipe
-from fdhil.sim.wire.modbus_answers import answer, spoilt
-from fdhil.sim.wire.registers import RegisterMap
+from fdhil.sim.wire.bus_attachment import WakePipe
+from fdhil.sim.wire.modbus_answers import answer_request, apply_answer_faults
+from fdhil.sim.wire.register_maps import RegisterMap
 from fdhil.sim.wire.sensor_faults import SensorFaults
 
 _REQUEST, _SHORTEST, _LONGEST = 8, 4, 256
@@ -33,16 +33,16 @@ _PIECES_S = 0.005
 _FRAME_END_S = 0.02  # a pause of this length ends a frame
 
 
-class Party(Protocol):
+class LineParticipant(Protocol):
     """A participant on a serial line."""
 
-    def take(self, data: bytes) -> list[bytes]:
+    def receive_bytes(self, data: bytes) -> list[bytes]:
         """Process received bytes and return the pieces of the answer, if any."""
 
-    def due_s(self) -> float:
+    def find_due_s(self) -> float:
         """Return when (monotonic) it sends something unprompted; infinite: never."""
 
-    def tell(self) -> list[bytes]:
+    def send_unprompted(self) -> list[bytes]:
         """Return the pieces that it sends unprompted now."""
 
 
@@ -55,65 +55,67 @@ class RtuUnits:
         self._last_s = 0.0
         self._late: deque[tuple[float, list[bytes]]] = deque()
 
-    def take(self, data: bytes) -> list[bytes]:
+    def receive_bytes(self, data: bytes) -> list[bytes]:
         """Answer a complete request; requests to other units are ignored."""
         now_s = time.monotonic()
         self._buffer = data if now_s - self._last_s > _FRAME_END_S else self._buffer + data
         self._last_s = now_s
-        request = self._whole_request()
+        request = self._extract_request()
         if not request or request[0] not in self.units:
             return []
         registers, faults = self.units[request[0]]
-        pieces = spoilt(faults, _framed, request[0], answer(registers, faults, request[1:-2]))
+        pieces = apply_answer_faults(
+            faults, _frame_answer, request[0], answer_request(registers, faults, request[1:-2])
+        )
         if not faults.slow_s:
             return pieces
         self._late.append((now_s + faults.slow_s, pieces))
         return []
 
-    def _whole_request(self) -> bytes:
+    def _extract_request(self) -> bytes:
         """Return a complete request with any function; empty while there is none."""
         for size in (_REQUEST, len(self._buffer)):
             request = self._buffer[:size]
-            if len(request) == size >= _SHORTEST and _sealed(request[:-2]) == request:
+            if len(request) == size >= _SHORTEST and _append_crc(request[:-2]) == request:
                 self._buffer = self._buffer[size:]
                 return request
         self._buffer = self._buffer[-_LONGEST:]
         return b""
 
-    def due_s(self) -> float:
+    def find_due_s(self) -> float:
         return self._late[0][0] if self._late else float("inf")
 
-    def tell(self) -> list[bytes]:
+    def send_unprompted(self) -> list[bytes]:
         return self._late.popleft()[1] if self._late else []
 
 
-def _framed(unit: int, body: bytes) -> bytes:
-    return _sealed(bytes([unit]) + body)
+def _frame_answer(unit: int, body: bytes) -> bytes:
+    return _append_crc(bytes([unit]) + body)
 
 
-def _sealed(frame: bytes) -> bytes:
+def _append_crc(frame: bytes) -> bytes:
     return frame + struct.pack(">H", FramerRTU.compute_CRC(frame))
 
 
 class TextInstrument:
     """An instrument that sends its value as a line: on request, or periodically."""
 
-    def __init__(self, settings: Voltage | Thermometer, read: Reading, faults: SensorFaults) -> None:
+    def __init__(self, settings: Voltage | Thermometer, read: ValueReader, faults: SensorFaults) -> None:
         self._settings, self._read, self._faults = settings, read, faults
         self._query = settings.query.encode()
         self._buffer = b""
         self._next_s = float("inf") if settings.query else time.monotonic()
 
-    def take(self, data: bytes) -> list[bytes]:
+    def receive_bytes(self, data: bytes) -> list[bytes]:
         if not self._query:
             return []
         *questions, self._buffer = (self._buffer + data).split(self._query)
-        return [line for _ in questions for line in self.tell()]
+        return [line for _ in questions for line in self.send_unprompted()]
 
-    def due_s(self) -> float:
+    def find_due_s(self) -> float:
         return self._next_s
 
-    def tell(self) -> list[bytes]:
+    def send_unprompted(self) -> list[bytes]:
         """Return a line; nothing while it is silent."""
         while not self._query and self._next_s <= time.monotonic():  # lines missed on a busy host are skipped
             self._next_s += self._settings.period_s
@@ -123,16 +125,16 @@ class TextInstrument:
         return [f"{value:+.4f}\r\n".encode()]
 
 
-class Reading(Protocol):
+class ValueReader(Protocol):
     """Returns the present value of an instrument."""
 
     def __call__(self) -> float: ...
 
 
-class _Terminal:
+class _PseudoTerminal:
     """One line: a pseudo terminal linked as ``device``."""
 
-    def __init__(self, device: str, party: Party) -> None:
+    def __init__(self, device: str, party: LineParticipant) -> None:
         self.party = party
         self._link = Path(device)
         self.fd, self._far = os.openpty()
@@ -150,11 +152,11 @@ class _Terminal:
             )
             raise ConnectError("serial sensor", text + "choose an unused name in an existing folder") from None
 
-    def read(self) -> None:
+    def read_input(self) -> None:
         with contextlib.suppress(OSError):
-            self.put(self.party.take(os.read(self.fd, 4096)))
+            self.write_pieces(self.party.receive_bytes(os.read(self.fd, 4096)))
 
-    def put(self, pieces: list[bytes]) -> None:
+    def write_pieces(self, pieces: list[bytes]) -> None:
         for place, piece in enumerate(pieces):
             if place:
                 time.sleep(_PIECES_S)
@@ -171,44 +173,44 @@ class _Terminal:
 class SerialLines:
     """The serial lines of a machine, in one thread, by device."""
 
-    def __init__(self, parties: Mapping[str, Party]) -> None:
+    def __init__(self, parties: Mapping[str, LineParticipant]) -> None:
         self._parties = parties
-        self._terminals: list[_Terminal] = []
+        self._terminals: list[_PseudoTerminal] = []
         self._ending = False
-        self._thread = threading.Thread(target=self._run, name="sim-serial", daemon=True)
+        self._thread = threading.Thread(target=self._run_loop, name="sim-serial", daemon=True)
 
     def start(self) -> None:
         """Create every device; ConnectError when one cannot be created."""
         self._pipe = WakePipe()
         try:
             for device, party in self._parties.items():
-                self._terminals.append(_Terminal(device, party))
+                self._terminals.append(_PseudoTerminal(device, party))
         except ConnectError:
-            self._release()
+            self._release_terminals()
             raise
         self._thread.start()
 
     def stop(self) -> None:
         self._ending = True
-        self._pipe.wake()
+        self._pipe.wake_reader()
         self._thread.join()
-        self._release()
+        self._release_terminals()
 
-    def _release(self) -> None:
+    def _release_terminals(self) -> None:
         for terminal in self._terminals:
             terminal.close()
         self._terminals.clear()
         self._pipe.close()
 
-    def _run(self) -> None:
+    def _run_loop(self) -> None:
         by_fd = {terminal.fd: terminal for terminal in self._terminals}
         while not self._ending:
             now_s = time.monotonic()
-            due_s = min((terminal.party.due_s() for terminal in self._terminals), default=now_s + _TURN_S)
+            due_s = min((terminal.party.find_due_s() for terminal in self._terminals), default=now_s + _TURN_S)
             wait_s = min(max(0.0, due_s - now_s), _TURN_S)
             ready = select.select([*by_fd, self._pipe.fileno()], (), (), wait_s)[0]
             for fd, terminal in by_fd.items():
                 if fd in ready:
-                    terminal.read()
-                if terminal.party.due_s() <= time.monotonic():
-                    terminal.put(terminal.party.tell())
+                    terminal.read_input()
+                if terminal.party.find_due_s() <= time.monotonic():
+                    terminal.write_pieces(terminal.party.send_unprompted())

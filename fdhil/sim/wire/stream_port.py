@@ -29,7 +29,7 @@ class StreamPort:
                 name, f"{device} cannot be created ({error.strerror}); choose a writable folder"
             ) from None
 
-    def send(self, data: bytes) -> None:
+    def send_lines(self, data: bytes) -> None:
         """Send as many whole lines as fit; the rest is lost."""
         for line in data.splitlines(keepends=True):
             try:

@@ -14,7 +14,7 @@ from fdhil.drivers.cia402.device_description import DeviceDescription, PdoSlot, 
 from fdhil.drivers.cia402.drive_profile_file import read_profile
 from fdhil.eds import MAX_SECTIONS, parse_eds, read_expression
 from fdhil.errors import EdsError
-from fdhil.sim.drive.sheet import read_sheet
+from fdhil.sim.drive.eds_file import read_eds_file
 from tests.drivers.cia402.eds_text import COMMON, CURRENT, SERVO, U16, U32, Variable, build_pdo_objects, format_eds
 
 TARGETS = {0x1600: (0x60400010, 0x607A0020), 0x1A00: (0x60640020, 0x606C0020), 0x1A01: (0x60410010, 0x60780010)}
@@ -157,7 +157,7 @@ def test_number_with_leading_zeros_is_read_as_decimal(written: str, value: int, 
 def test_ambiguous_pdo_number_is_refused_by_drivers_and_simulator(line: str, other: str, tmp_path: Path) -> None:
     for written, refused in ((line, False), (other, True)):
         (tmp_path / "drive.eds").write_text(f"{format_eds(SERVO)}\n{written}\n")
-        for read in (lambda path: read_device(path), lambda path: read_sheet(path, 5)):
+        for read in (lambda path: read_device(path), lambda path: read_eds_file(path, 5)):
             with pytest.raises(EdsError, match=r"as octal 0x.*, as decimal 0x") if refused else nullcontext():
                 read(tmp_path / "drive.eds")
 

@@ -17,7 +17,7 @@ def taste(data: bytes) -> None:
     path = Path(_FOLDER.name) / "faults.toml"
     path.write_bytes(data)
     try:
-        fault_script.load(path, ("X", "Y"))
+        fault_script.load_script(path, ("X", "Y"))
     except ConfigError as error:
         assert error.faults
         assert len(str(error)) < 100_000

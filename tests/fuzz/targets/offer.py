@@ -9,15 +9,15 @@ from pathlib import Path
 
 from fdhil.config.toml_editing import NotEditable, edit_toml
 from fdhil.errors import FdhilError
-from fdhil.fleet.delivery import parted
-from fdhil.fleet.offer import Offer, _parsed, canonical, make_key, read, sign
+from fdhil.fleet.offer_delivery import split_documents
+from fdhil.fleet.signed_offer import Offer, _parse_offer, create_key, encode_canonical, read_offer, sign_offer
 from fdhil.store.offers import ANSWERS_FILE, Answer, add_answer, read_answers
 from tests.bench import bench_toml
 from tests.fuzz.tasting import Target
 
 _FOLDER = tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None)
 FOLDER = Path(_FOLDER.name)
-TRUSTED = make_key(FOLDER / "key")
+TRUSTED = create_key(FOLDER / "key")
 TOLD = {
     "name": "friction", "version": 3, "text": "t", "labels": {"type": "V"}, "axis_labels": {"screw": "A"},
     "values": {"axis.*.nominal.ft": 0.061, "nc.smoothing_s": (0.06,), "nc.profile": "fir"}, "stage": 1,
@@ -26,9 +26,9 @@ TOLD = {
 
 
 def _of_message(data: bytes) -> None:
-    for document in parted(data):
+    for document in split_documents(data):
         with suppress(FdhilError):
-            read(document, {TRUSTED})
+            read_offer(document, {TRUSTED})
 
 
 def _of_text(data: bytes) -> None:
@@ -41,7 +41,7 @@ def _of_answers(data: bytes) -> None:
     read_answers(FOLDER)
 
 
-READERS = (_parsed, _of_message, _of_text, _of_answers)
+READERS = (_parse_offer, _of_message, _of_text, _of_answers)
 
 
 def taste(data: bytes) -> None:
@@ -54,8 +54,8 @@ def target() -> Target:
     offer = Offer.model_validate(TOLD)
     add_answer(FOLDER, Answer("friction", 3, 1, "d", "accepted", "Bert", "", 1.5, "c"))
     seeds = [
-        canonical(offer),
-        sign(offer, FOLDER / "key"),
+        encode_canonical(offer),
+        sign_offer(offer, FOLDER / "key"),
         bench_toml("X").encode(),
         (FOLDER / ANSWERS_FILE).read_bytes(),
     ]
