@@ -25,7 +25,7 @@ from fdhil.fleet.parameter_sets import open_database, open_read_only
 from fdhil.fleet.reanalysis_changes import summarise_changes
 from fdhil.fleet.window_reanalysis import AnalysisMethod, compute_code_digest
 from fdhil.fleet.worker_pools import open_worker_pool
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.store.history import described
 from fdhil.store.recording_csv import parse_recording

@@ -23,7 +23,7 @@ import numpy as np
 from fdhil import tables
 from fdhil.config import Identification
 from fdhil.daemon.kernel_warmup import simulate_nominal_rapid
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import AxisPipeline, analyse
 from fdhil.pipeline.identified_loops import analyse_windows
 from fdhil.records import Window

@@ -13,18 +13,18 @@ import os
 
 TYPE_CHECKING = False  # type checkers know it; importing typing takes longer than all of this
 if TYPE_CHECKING:
-    from fdhil.api.machine import Machine as Machine
-    from fdhil.api.machine import correct as correct
-    from fdhil.api.machine import plan as plan
-    from fdhil.api.machine import predict as predict
-    from fdhil.api.model import Model as Model
-    from fdhil.api.model import Simulation as Simulation
-    from fdhil.api.model import simulate as simulate
-    from fdhil.api.recordings import Recording as Recording
-    from fdhil.api.recordings import read as read
-    from fdhil.api.result import Parameter as Parameter
-    from fdhil.api.result import Result as Result
-    from fdhil.api.result import identify as identify
+    from fdhil.api.drive_model import Model as Model
+    from fdhil.api.drive_model import Simulation as Simulation
+    from fdhil.api.drive_model import simulate as simulate
+    from fdhil.api.identification_result import Parameter as Parameter
+    from fdhil.api.identification_result import Result as Result
+    from fdhil.api.identification_result import identify as identify
+    from fdhil.api.machine_interface import Machine as Machine
+    from fdhil.api.machine_interface import correct as correct
+    from fdhil.api.machine_interface import plan as plan
+    from fdhil.api.machine_interface import predict as predict
+    from fdhil.api.recording_interface import Recording as Recording
+    from fdhil.api.recording_interface import read as read
 
 _MODULES = {
     "Machine": "machine",

@@ -20,7 +20,7 @@ import numpy as np
 
 from fdhil.config import Identification
 from fdhil.identification.estimators import least_squares, maximum_likelihood, partial_moments
-from fdhil.identification.filtering import zero_phase
+from fdhil.identification.filtering import filter_zero_phase
 from fdhil.records import PARAMETERS, Recording, Window, freeze_array
 from fdhil.store.recording_csv import parse_recording
 from studies import bench, instrumental_variables, pages
@@ -49,13 +49,13 @@ def clean(period_s: float) -> Recording:
 def values_of(windows: Sequence[Window], lowpass_hz: float) -> list[Array]:
     """Return what each method but the last makes of the windows: [R, L, K, Jt, ft, Cd] (6,) each."""
     settings = Identification(lowpass_hz=lowpass_hz)
-    signals = [least_squares.align(w, settings) for w in windows]
+    signals = [least_squares.align_signals(w, settings) for w in windows]
     found = []
     for operator in OPERATORS.values():
-        parts = [least_squares.regressors(s, w.dt_s, operator) for s, w in zip(signals, windows, strict=True)]
+        parts = [least_squares.build_regressors(s, w.dt_s, operator) for s, w in zip(signals, windows, strict=True)]
         found.append(two_steps(parts))
-    steps = partial_moments.horizon_steps(settings, windows[0].dt_s)
-    found.append(two_steps([partial_moments.moments(w, steps) for w in windows]))
+    steps = partial_moments.count_horizon_steps(settings, windows[0].dt_s)
+    found.append(two_steps([partial_moments.compute_moments(w, steps) for w in windows]))
     paired = instrumental_variables.raw_values(windows, settings)
     found.append(np.full(6, np.nan) if paired is None else paired)
     return found
@@ -73,8 +73,8 @@ def voltage_left_raw(windows: Sequence[Window]) -> Array:
     half = [
         replace(
             w,
-            current_a=freeze_array(zero_phase(w.current_a, hz, w.dt_s)),
-            speed_rad_s=freeze_array(zero_phase(w.speed_rad_s, hz, w.dt_s)),
+            current_a=freeze_array(filter_zero_phase(w.current_a, hz, w.dt_s)),
+            speed_rad_s=freeze_array(filter_zero_phase(w.speed_rad_s, hz, w.dt_s)),
         )
         for w in windows
     ]

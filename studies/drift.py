@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from fdhil.config import Identification, MachineConfig, parse_config
-from fdhil.identification.trends import crossing, slope, steps
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
+from fdhil.identification.trends import find_crossing, find_steps, fit_slope
 from fdhil.pipeline import AxisPipeline, analyse, pool
 from fdhil.records import INTERVAL_95, PARAMETERS, Notice, ParameterSet, Window, WindowOutcome
 from fdhil.store.recording_csv import parse_recording
@@ -87,9 +87,9 @@ def warming(seed: int) -> Array:
     against = np.array([o.window.temperature_c for o in kept], dtype=np.float64)
     rows = []
     for k, truth in ((4, plant.ft * FT_PER_KELVIN), (5, plant.Cd * CD_PER_KELVIN)):
-        line = slope(values[:, k], against, stds[:, k])
+        line = fit_slope(values[:, k], against, stds[:, k])
         assert line is not None
-        low, high = line.interval()
+        low, high = line.compute_interval()
         rows.append([line.value / truth - 1, low <= truth <= high])
     return np.array(rows, dtype=np.float64)
 
@@ -114,7 +114,7 @@ def stepped(seed: int) -> tuple[tuple[str, ...], int, bool]:
         sets = [r for r in results if isinstance(r, ParameterSet)]
         if k >= before and not published and any(abs(s.parameters.Jt / loaded.Jt - 1) < 0.02 for s in sets):
             published = k - before + 1
-    found = steps(*told(outcomes))
+    found = find_steps(*told(outcomes))
     return codes[before], published, [(s.name, s.row) for s in found] == [("Jt", before)]
 
 
@@ -132,7 +132,7 @@ def quiet(seed: int) -> tuple[int, Counter[str], int]:
             results = pipeline.feed(replace(window, start_tick=10_000 * k))
             notices.update(r.code for r in results if isinstance(r, Notice))
             outcomes += [r for r in results if isinstance(r, WindowOutcome)]
-    return SHUTTLES, notices, len(steps(*told(outcomes)))
+    return SHUTTLES, notices, len(find_steps(*told(outcomes)))
 
 
 def sets(seed: int) -> Array:
@@ -181,8 +181,8 @@ def due(seed: int) -> tuple[bool, bool, float]:
     outcomes = [analyse(rapids(replace(plant, Cd=plant.Cd * (1 + 0.005 * d)), rng, 1)[0], SETTINGS) for d in days]
     values, stds = told(outcomes)
     kept = np.array([o.verdict.accepted for o in outcomes])
-    line = slope(values[:, 5], days[kept], stds[:, 5])
-    reached = crossing(line, 1.5 * plant.Cd) if line else None
+    line = fit_slope(values[:, 5], days[kept], stds[:, 5])
+    reached = find_crossing(line, 1.5 * plant.Cd) if line else None
     if reached is None:
         return False, False, np.nan
     return True, reached.low <= 100.0 <= reached.high, reached.at - 100.0

@@ -20,9 +20,9 @@ from scipy.signal import lfilter
 from fdhil import tables
 from fdhil.config import Identification
 from fdhil.identification.estimators import maximum_likelihood
-from fdhil.identification.estimators.maximum_likelihood import jacobian, pose, typical
-from fdhil.identification.motion import Noise, prepare
-from fdhil.identification.windows import find_windows
+from fdhil.identification.estimators.maximum_likelihood import build_problem, compute_jacobian, estimate_typical_sizes
+from fdhil.identification.prepared_motion import NoiseLevels, prepare_window
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.records import PARAMETERS, Estimate, Recording, Window
 from fdhil.store.recording_csv import parse_recording
 from studies import bench, instrumental_variables, pages
@@ -57,10 +57,12 @@ def noisy(recording: Recording, noise: float, seed: int) -> list[Window]:
 
 def bound(recording: Recording, noise: float) -> Array:
     """Return the standard deviations (6,) that the rows in which the drive surely moves allow."""
-    motion = prepare(find_windows(recording)[0])
-    problem = pose([motion], np.append(TRUTH, 0.0), [Noise(*(noise * SIZES))])
-    residuals = problem.residuals(np.append(TRUTH, 0.0))
-    slope = jacobian(problem, np.append(TRUTH, 0.0), residuals, range(6), typical(np.append(TRUTH, 0.0), [motion]))
+    motion = prepare_window(find_windows(recording)[0])
+    problem = build_problem([motion], np.append(TRUTH, 0.0), [NoiseLevels(*(noise * SIZES))])
+    residuals = problem.compute_residuals(np.append(TRUTH, 0.0))
+    slope = compute_jacobian(
+        problem, np.append(TRUTH, 0.0), residuals, range(6), estimate_typical_sizes(np.append(TRUTH, 0.0), [motion])
+    )
     deviations: Array = np.sqrt(np.diag(np.linalg.inv(slope.T @ slope)))
     return deviations
 

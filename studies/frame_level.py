@@ -31,7 +31,7 @@ SHARE = 0.15
 
 
 class LateListener(FrameMonitor):
-    """A listener whose SYNC comes ``late_s`` after its time."""
+    """A listener whose SYNC comes ``estimate_current_lag_s`` after its time."""
 
     late_s = 0.0
 

@@ -15,24 +15,28 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdhil.config import Identification
-from fdhil.identification.covariance import aliasing, coloured_meat, residual_gammas
-from fdhil.identification.derivatives import derivative
+from fdhil.identification.derivatives import differentiate_signal
 from fdhil.identification.estimators.least_squares import (
     OPEN_SHARE,
     PARAMETER_ORDER,
-    Signals,
-    align,
-    noise_through,
-    regressors,
-    residuals_of,
+    AlignedSignals,
+    align_signals,
+    build_regressors,
+    build_two_step_estimate,
+    compute_residuals,
+    propagate_sensor_noise,
+    refuse_short_windows,
     solve_two_steps,
-    too_short,
-    two_step_estimate,
 )
-from fdhil.identification.filtering import zero_phase
-from fdhil.identification.identifiability import empty_estimate
-from fdhil.identification.normal import solve
-from fdhil.identification.windows import carried
+from fdhil.identification.filtering import filter_zero_phase
+from fdhil.identification.identifiability import create_empty_estimate
+from fdhil.identification.normal_equations import solve_least_squares
+from fdhil.identification.rapid_windows import fill_forward
+from fdhil.identification.robust_covariance import (
+    compute_residual_autocovariances,
+    compute_score_covariance,
+    estimate_aliasing_doubt,
+)
 from fdhil.records import Estimate, Float, Reason, Result, Window
 
 NAME = "instrumental_variables"
@@ -74,14 +78,14 @@ def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
     usable = [w for w in windows if w.voltage_v is not None]
     rows = gather(usable, settings)
     if rows is None:
-        return too_short(NAME, 0)
+        return refuse_short_windows(NAME, 0)
     if not rows.finite:
         reason = Reason("NotFinite", "a filtered signal or the demand is not finite", "check the sensors")
-        return empty_estimate(NAME, Result.NOT_FINITE, reason)
+        return create_empty_estimate(NAME, Result.NOT_FINITE, reason)
     theta = fit(rows)
     if not np.isfinite(theta).all():
         reason = Reason("LowExcitation", "the demand does not move as the drive does", "record the demand with it")
-        return empty_estimate(NAME, Result.UNDER_EXCITED, reason)
+        return create_empty_estimate(NAME, Result.UNDER_EXCITED, reason)
     return _finish(rows, theta, usable, settings)
 
 
@@ -95,10 +99,10 @@ def gather(windows: Sequence[Window], settings: Identification) -> Rows | None:
     """Return the usable rows of the windows with what their instruments are made of; None when there are too few."""
     parts = []
     for window in windows:
-        signals = align(window, settings)
+        signals = align_signals(window, settings)
         motion = _demanded(window, signals, settings.lowpass_hz)
-        di, dw = derivative(signals.current, window.dt_s), derivative(signals.speed, window.dt_s)
-        electrical, mechanical = regressors(signals, window.dt_s)
+        di, dw = differentiate_signal(signals.current, window.dt_s), differentiate_signal(signals.speed, window.dt_s)
+        electrical, mechanical = build_regressors(signals, window.dt_s)
         rows = signals.usable & np.isfinite(di) & np.isfinite(dw)
         # the demand's second derivative reaches further than the rows that least squares takes
         kept = np.isfinite(motion.sum(axis=1)[rows])
@@ -110,23 +114,23 @@ def gather(windows: Sequence[Window], settings: Identification) -> Rows | None:
     return Rows(electrical, mechanical, motion, tuple(part[0].shape[0] for part in parts))
 
 
-def _demanded(window: Window, signals: Signals, lowpass_hz: float) -> Float:
+def _demanded(window: Window, signals: AlignedSignals, lowpass_hz: float) -> Float:
     """Return [w, Dw, DDw, sign w] (n, 4) that the demand gives: through a low-pass, and the drive's lag.
 
     The lag is what three coefficients on the demanded speed and its derivatives make of it; they are fitted to the
     measured speed over the whole window, which leaves nothing of its noise in the instruments.
     """
     dt = window.dt_s
-    speed = np.append(np.diff(carried(window.demand_mm)), 0.0) / dt * (2 * math.pi / window.pitch_mm)
-    speed = zero_phase(speed, min(lowpass_hz, SMOOTH_HZ), dt)
-    rate = derivative(speed, dt)
-    jerk = derivative(rate, dt)
+    speed = np.append(np.diff(fill_forward(window.demand_mm)), 0.0) / dt * (2 * math.pi / window.pitch_mm)
+    speed = filter_zero_phase(speed, min(lowpass_hz, SMOOTH_HZ), dt)
+    rate = differentiate_signal(speed, dt)
+    jerk = differentiate_signal(rate, dt)
     basis = np.column_stack([speed, rate, jerk])
     known = np.isfinite(basis).all(axis=1) & np.isfinite(signals.speed)
-    share = solve(basis[known], signals.speed[known])[0] if known.any() else np.zeros(3)
+    share = solve_least_squares(basis[known], signals.speed[known])[0] if known.any() else np.zeros(3)
     followed = basis @ share
-    rate = derivative(followed, dt)
-    return np.column_stack([followed, rate, derivative(rate, dt), np.sign(followed)])
+    rate = differentiate_signal(followed, dt)
+    return np.column_stack([followed, rate, differentiate_signal(rate, dt), np.sign(followed)])
 
 
 def fit(rows: Rows) -> Float:
@@ -166,27 +170,27 @@ def _condition(instruments: Float, regressor: Float) -> float:
 def _finish(rows: Rows, theta: Float, windows: Sequence[Window], settings: Identification) -> Estimate:
     """Return the checked estimate with the sandwich covariance of both steps."""
     one, two = rows.instruments(theta)
-    residuals = residuals_of(theta, rows.electrical, rows.mechanical)
+    residuals = compute_residuals(theta, rows.electrical, rows.mechanical)
     window = windows[0]
-    noise, impulse, slope = noise_through(windows, settings)
+    noise, impulse, slope = propagate_sensor_noise(windows, settings)
     gammas = _gammas(theta, residuals, impulse, slope, noise)
     bread = _bread(rows, one, two)
-    covariance = bread @ coloured_meat([one, two], gammas, rows.lengths) @ bread.T
+    covariance = bread @ compute_score_covariance([one, two], gammas, rows.lengths) @ bread.T
     covariance += np.diag(np.square(OPEN_SHARE * theta))
-    alias = aliasing(window.voltage_sampling, window.dt_s)
+    alias = estimate_aliasing_doubt(window.voltage_sampling, window.dt_s)
     covariance += np.diag(np.square(alias[PARAMETER_ORDER] * theta))
     condition = max(_condition(one, rows.electrical[:, 1:]), _condition(two, rows.mechanical[:, 1:]))
-    return two_step_estimate(NAME, theta, covariance, residuals, condition, rows.mechanical)
+    return build_two_step_estimate(NAME, theta, covariance, residuals, condition, rows.mechanical)
 
 
 def _gammas(
     theta: Float, residuals: tuple[Float, Float], impulse: Float, slope: Float, noise: Float
 ) -> list[list[Float]]:
     """Return the residuals' covariances by lag: sensor noise through known filters, larger if residuals show so."""
-    others = residual_gammas(theta, impulse, slope, np.append(0.0, noise[1:]))[0][0].max()
+    others = compute_residual_autocovariances(theta, impulse, slope, np.append(0.0, noise[1:]))[0][0].max()
     shown = float(np.mean(residuals[0] ** 2) - others) / float(impulse @ impulse)
     noise = np.append(max(shown, LEAST_VOLTAGE_SHARE * noise[0]), noise[1:])
-    gammas = residual_gammas(theta, impulse, slope, noise)
+    gammas = compute_residual_autocovariances(theta, impulse, slope, noise)
     expected = [gammas[k][k][gammas[k][k].size // 2] for k in (0, 1)]
     excess = [max(1.0, float(np.mean(e * e) / g)) for e, g in zip(residuals, expected, strict=True)]
     return [[gammas[a][b] * math.sqrt(excess[a] * excess[b]) for b in (0, 1)] for a in (0, 1)]

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from scipy.stats import beta
 
 from fdhil.config import Identification
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse, pool
 from fdhil.records import WindowOutcome
 from studies import drives, faults, harm

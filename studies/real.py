@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from fdhil.config import Identification
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.records import PARAMETERS, Recording, WindowOutcome, freeze_array, get_unit
 from studies import pages

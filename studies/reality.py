@@ -21,8 +21,8 @@ from fdhil.config import Axis, MachineConfig, parse_config
 from fdhil.correction.learning import Lesson, learn
 from fdhil.correction.limits import fit_all
 from fdhil.correction.planning import plan
-from fdhil.identification.loops import with_loops
-from fdhil.identification.windows import find_windows
+from fdhil.identification.drive_loops.loop_identification import apply_loops
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.model.model_terms import add_resonance
 from fdhil.pipeline import analyse, pool
 from fdhil.pipeline.identified_loops import better_axis, explained
@@ -266,7 +266,7 @@ def contour(
     """
     reference, config = path(machine.base), config_of(machine)
     if loops is not None:
-        axes = {name: with_loops(axis, loops) for name, axis in config.axis.items()}
+        axes = {name: apply_loops(axis, loops) for name, axis in config.axis.items()}
         config = config.model_copy(update={"axis": axes})
     models = {axis: add_resonance(model, config.axis[axis]) for axis in reference.axes}
     planned = plan(reference, models, config).offset_um

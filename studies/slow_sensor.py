@@ -19,7 +19,7 @@ import numpy as np
 
 from fdhil.config import Identification
 from fdhil.identification.estimators import maximum_likelihood
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.records import PARAMETERS, SlowVoltage, VoltageSampling, Window, freeze_array
 from fdhil.store.recording_csv import parse_recording
 from studies import bench, pages

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from fdhil.config import Axis, Identification
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.model import closed_loop
 from fdhil.pipeline import analyse, pool
 from fdhil.records import PARAMETERS, Estimate, Parameters, Recording, Window, compute_rms, freeze_array

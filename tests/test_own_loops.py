@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from fdhil.config import Identification
-from fdhil.identification.loops import DIFFER
-from fdhil.identification.windows import find_windows
+from fdhil.identification.drive_loops.loop_identification import DIFFER
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import AxisPipeline, Known, analyse, pool
 from fdhil.pipeline.identified_loops import OwnLoops, better_axis, loops_of, mechanics_of, suspected
 from fdhil.records import LoopEstimate, ParameterSet, Reason, Verdict, WindowOutcome, freeze_array

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from fdhil.config import MachineConfig
 from fdhil.daemon.kernel_warmup import simulate_nominal_rapid
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import AxisPipeline, Record, analyse
 from fdhil.pipeline.axis import WAITING_RAPIDS
 from fdhil.pipeline.recent_samples import RecentSamples

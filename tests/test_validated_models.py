@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from fdhil import correction
-from fdhil.api.analysis import FileResult
-from fdhil.api.documents import file_document
+from fdhil.api.identification_json import build_file_document
+from fdhil.api.recording_analysis import FileResult
 from fdhil.cli.model_file import write_model
 from fdhil.config import Identification
 from fdhil.pipeline import analyse, pool
@@ -22,7 +22,7 @@ from fdhil.prediction.models import load_model_file, validated_models
 from fdhil.records import PARAMETERS, Estimate, Result, Trajectory, Verdict, WindowOutcome
 from studies import real_plant as real
 from tests.bench import bench_config
-from tests.identification.realistic import rapids
+from tests.identification.realistic_rapids import simulate_rapids
 from tests.paths import build_trajectory, smooth_demand
 from tests.store.made import published
 from tests.tiers import sampled
@@ -56,7 +56,7 @@ MOVE = short_move()
 @cache
 def identified(plant: real.Mechanics) -> FileResult:
     loops = real.SLOW_LOOPS if plant.Jt < 0.05 else None
-    outcomes = [analyse(window, Identification()) for window in rapids(plant, None, loops, moves=4, seed=3)]
+    outcomes = [analyse(window, Identification()) for window in simulate_rapids(plant, None, loops, moves=4, seed=3)]
     estimate, verdict = pool(outcomes, Identification())
     return FileResult("recording.csv", "X", tuple(outcomes), estimate, verdict)
 
@@ -75,7 +75,7 @@ def model_of(told: dict[str, Any]) -> dict[str, Any]:
 @pytest.mark.parametrize("plant", sampled(PLANTS, every=4))
 def test_validated_model_is_taken(plant: str, tmp_path: Path) -> None:
     result = identified(PLANTS[plant])
-    document = file_document(result, {}, with_loops=False)
+    document = build_file_document(result, {}, with_loops=False)
     told = [each for each in (*document["windows"], document["pooled"]) if each["validated"]]
     path = tmp_path / "model.json"
     for each in told:
@@ -96,7 +96,7 @@ def test_pool_whose_friction_at_standstill_chance_made_negative_is_taken(tmp_pat
     values = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 4.95, -6.4, 8.0])
     covariance = np.diag([1e-8, 1e-10, 1e-8, 1e-10, 1e-6, 0.25, 2.8**2, 1.0])
     told = Estimate("maximum_likelihood", names, values, covariance, {}, Result.OK)
-    outcomes = [WindowOutcome(window, told, Verdict(True, 99.0)) for window in rapids(moves=2)]
+    outcomes = [WindowOutcome(window, told, Verdict(True, 99.0)) for window in simulate_rapids(moves=2)]
     estimate, verdict = pool(outcomes, Identification())
     assert verdict.accepted
     assert estimate is not None

@@ -17,7 +17,7 @@ from PIL import Image, ImageChops
 
 from fdhil.cli.demo.loop import read_trace
 from fdhil.report import figures, find_browser
-from fdhil.report.maps import error_colours
+from fdhil.report.path_maps import make_error_colormap
 from fdhil.report.pdf import run_browser
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -71,7 +71,9 @@ def draw_corner() -> None:
             if colour == 0:
                 axes.plot(*reference.T, color=figures.REFERENCE, lw=3.0, label="desired")
                 centre = reference[np.argmin(np.hypot(*(reference - (200.0, 55.0)).T))]
-            axes.plot(*figures.magnified(reference, table, 20).T, color=figures.COLOURS[colour], label=label, lw=1.5)
+            axes.plot(
+                *figures.magnify_deviation(reference, table, 20).T, color=figures.COLOURS[colour], label=label, lw=1.5
+            )
         axes.set_xlim(centre[0] - 1.1 * HALF_WIDTH_MM, centre[0] + 1.4 * HALF_WIDTH_MM)
         axes.set_ylim(centre[1] - 0.85 * HALF_WIDTH_MM, centre[1] + 0.45 * HALF_WIDTH_MM)
         axes.set_xlabel("X (mm)")
@@ -92,7 +94,7 @@ def screenshot(browser: str, folder: Path, page: Path, picture: Path, width: int
     assert used is not None
     cropped = image.crop((0, 0, width, min(SHOWN.get(page.stem, TALLEST), used[3] + 20)))
     often = (cropped.quantize(COLOURS).getpalette() or [])[: 3 * COLOURS]
-    scale = 255 * error_colours()(np.linspace(0, 1, OF_SCALE))[:, :3]
+    scale = 255 * make_error_colormap()(np.linspace(0, 1, OF_SCALE))[:, :3]
     palette = Image.new("P", (1, 1))
     palette.putpalette([*often, *scale.round().astype(int).ravel().tolist()])
     cropped.quantize(palette=palette, dither=Image.Dither.NONE).save(picture, optimize=True)

@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from fdhil.identification.loops import better_loops
+from fdhil.identification.drive_loops.loop_identification import is_better_than_configured
 from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, Temperature
 from fdhil.store.rows import Revision
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
@@ -58,7 +58,7 @@ class Knowledge:
             elif isinstance(outcome, Skill):
                 self._axes[outcome.axis].skills.append(outcome)
             elif isinstance(outcome, LoopEstimate):
-                self._axes[outcome.axis].loops = outcome if better_loops(outcome) else None
+                self._axes[outcome.axis].loops = outcome if is_better_than_configured(outcome) else None
             elif isinstance(outcome, Notice) and outcome.code == "LoadChanged" and outcome.severity == "MAJOR":
                 self._axes[outcome.axis].load_changed = True
 

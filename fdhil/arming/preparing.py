@@ -20,7 +20,7 @@ from fdhil.commissioning.record import CommissioningRecord, holds, load_record
 from fdhil.config import MachineConfig
 from fdhil.correction import flatness_feedforward, gate
 from fdhil.drivers.cia402.drive_profile_file import load_profile
-from fdhil.identification.loops import regulators_of
+from fdhil.identification.drive_loops.loop_identification import get_regulator_values
 from fdhil.model.model_terms import add_resonance
 from fdhil.prediction.gain import Gain, joint_held_out_um, largest_skill_um, with_held_out_um, worst_skill_um
 from fdhil.prediction.models import validated_models
@@ -149,7 +149,7 @@ def models_with_loops(
             return _not_validated(name)
         sets[name] = axis.published
         if axis.loops is not None:  # found by this daemon, with this configuration
-            sets[name] = replace(axis.published, loops=regulators_of(axis.loops), config_digest=config.digest)
+            sets[name] = replace(axis.published, loops=get_regulator_values(axis.loops), config_digest=config.digest)
     return validated_models(sets, config, "the identified loops")
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from fdhil.api.compiling import forewarn
+from fdhil.api.compilation_notice import announce_compilation
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, CONFIG, FILE, OutputFile, Positive, Writing
 
@@ -51,11 +51,11 @@ def acceptance(config: Path, out: Path, pdf: Path | None, as_json: bool, **optio
     from fdhil import config as machine_config
     from fdhil.cli.acceptance_findings import NO_LIMIT, Asked, document_of, find
     from fdhil.cli.acceptance_page import page_of
-    from fdhil.report import require, write_page_or_pdf
+    from fdhil.report import require_libraries, write_page_or_pdf
 
-    require()
+    require_libraries()
     machine = machine_config.load_config(config)
-    forewarn("predict", "correct")
+    announce_compilation("predict", "correct")
     found = find(machine, config, Asked(**options))
     document = document_of(found)
     write_page_or_pdf(page_of(found, document), out, pdf)

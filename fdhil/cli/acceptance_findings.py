@@ -26,8 +26,8 @@ from fdhil.errors import RecordingError, StoreError
 from fdhil.prediction.circular import Circular, circle_program, evaluate
 from fdhil.program import program_digest
 from fdhil.records import PARAMETERS, UNITS, Correction, Float, Prediction
-from fdhil.report.history_course import AxisHistory
-from fdhil.report.history_reading import PASS_CODE, by_axis, read_history, read_notices, read_passes
+from fdhil.report.history_charts import AxisHistory
+from fdhil.report.history_reader import PASS_CODE, group_by_axis, read_history, read_notices, read_passes
 
 SCHEMA = "fdhil-acceptance-1"
 NO_LIMIT = "no limit was set: give the required accuracy with --circle-um and --contour-um"
@@ -92,7 +92,7 @@ def find(machine: MachineConfig, config: Path, options: Asked) -> Findings:
     passes: Sequence[Mapping[str, Any]] = []
     notices: Sequence[Mapping[str, Any]] = []
     try:
-        histories = by_axis(machine, *read_history(machine, tell=partial(click.echo, err=True)))
+        histories = group_by_axis(machine, *read_history(machine, tell=partial(click.echo, err=True)))
         passes = read_passes(machine)[-NEWEST_PASSES:]
         notices = [n for n in read_notices(machine) if n["acknowledged"] is None and n["code"] != PASS_CODE]
     except StoreError as error:

@@ -6,10 +6,10 @@ from typing import Any
 from fdhil.cli.acceptance_findings import NO_LIMIT, AxisProof, Findings
 from fdhil.cli.doctor.latency import latency_text
 from fdhil.report import Page, Section, Table
-from fdhil.report.circular import polar
-from fdhil.report.history_verdict import LATEST_HEAD, latest_rows
-from fdhil.report.parameter_view import INTERVAL_MEANING, minute
-from fdhil.report.path import correction_page
+from fdhil.report.circular_plot import draw_polar
+from fdhil.report.condition_summary import LATEST_HEAD, build_latest_rows
+from fdhil.report.parameter_format import INTERVAL_MEANING, format_minute
+from fdhil.report.path_report import build_correction_page
 
 CIRCLE_ROWS = (
     "G, counter-clockwise (um)", "G, clockwise (um)", "G(b), both runs (um)", "H, between the runs (um)",
@@ -31,7 +31,7 @@ def page_of(found: Findings, document: Mapping[str, Any]) -> Page:
         sections.append(_circular(found))
     sections.append(_running(found))
     if found.path is not None and found.asked.program is not None:
-        page = correction_page(found.asked.program.name, "", found.path)
+        page = build_correction_page(found.asked.program.name, "", found.path)
         sections += [Section(f"Program {found.asked.program.name}: {s.title}", s.text, s.tables, s.figures)
                      for s in page.sections]  # fmt: skip
     commissioned = sum(not proof.against for proof in found.proofs.values())
@@ -98,7 +98,7 @@ def _proof_column(proof: AxisProof) -> list[str]:
 
 def _parameters(found: Findings) -> Section:
     shares = found.machine.maintenance.model_dump()
-    tables = [Table(LATEST_HEAD, latest_rows(history, shares), f"Axis {history.axis}")
+    tables = [Table(LATEST_HEAD, build_latest_rows(history, shares), f"Axis {history.axis}")
               for history in found.histories if history.rows]  # fmt: skip
     text = (
         f"The newest published parameters, identified from rapid moves; {INTERVAL_MEANING}."
@@ -117,7 +117,7 @@ def _circular(found: Findings) -> Section:
     rows = [[what, *cells] for what, *cells in zip(CIRCLE_ROWS, *columns, strict=True)]
     whose = "identified" if found.identified else "nominal"
     pictures = [
-        (f"Circular test, {label}: radius {options.radius_mm:g} mm", polar(circle, found.plane or ("X", "Y")))
+        (f"Circular test, {label}: radius {options.radius_mm:g} mm", draw_polar(circle, found.plane or ("X", "Y")))
         for label, circle in found.circles.items()
     ]
     return Section(
@@ -134,13 +134,14 @@ def _circular(found: Findings) -> Section:
 def _running(found: Findings) -> Section:
     head = ("time", "severity", "what")
     passes, notices = (
-        [[minute(n["time"]), n["severity"], n["text"]] for n in entries] for entries in (found.passes, found.notices)
+        [[format_minute(n["time"]), n["severity"], n["text"]] for n in entries]
+        for entries in (found.passes, found.notices)
     )
     tables = [Table(head, rows, title) for rows, title in
               ((passes, "Passes with the correction"), (notices, "Open notices")) if rows]  # fmt: skip
     late = "The latency of this PC was not measured: run fdhil doctor --latency 600."
     if found.latency is not None:
-        late = f"This PC, measured {minute(found.latency['time'])}: {latency_text(found.latency)}."
+        late = f"This PC, measured {format_minute(found.latency['time'])}: {latency_text(found.latency)}."
     none = [what for what, rows in (("No pass with the correction.", passes), ("No open notices.", notices))
             if not rows]  # fmt: skip
     return Section("In operation", " ".join([*none, late]), tables)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fdhil.api.compiling import forewarn
+from fdhil.api.compilation_notice import announce_compilation
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FROM_HISTORY, MODEL, PROGRAM, OutputFile, Positive, Writing
 from fdhil.cli.prediction import inputs
@@ -59,7 +59,7 @@ def advise(
     from fdhil.correction.result_documents import advised, entry
 
     corrects = all(config.axis[axis].correction is not None for axis in reference.axes)
-    forewarn("predict", *(["correct"] if corrects else []))
+    announce_compilation("predict", *(["correct"] if corrects else []))
     sure, hopeful = _sources(program, reference, models, config, tolerance_um)
     sure, hopeful = _telling(sure), hopeful and _telling(hopeful)
     advice, most = advised(sure, hopeful, models, config, tolerance_um)

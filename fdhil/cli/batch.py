@@ -8,8 +8,8 @@ from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
 
-from fdhil.api.analysis import FileResult, Progress, analyse_recordings, ignore_progress
-from fdhil.api.compiling import forewarn
+from fdhil.api.compilation_notice import announce_compilation
+from fdhil.api.recording_analysis import FileResult, Progress, analyse_recordings, ignore_progress
 from fdhil.child_process import request_parent_death_signal
 from fdhil.cli.failing import error_document
 from fdhil.config import Identification, MachineConfig
@@ -45,7 +45,7 @@ def analyse_files(
         for path in paths:
             yield analyse_file(path, settings, machine, progress, accelerometer, columns, any_move)
         return
-    forewarn("identify")
+    announce_compilation("identify")
     analyse = partial(analyse_file, settings=settings, machine=machine, columns=columns, any_move=any_move)
     work = partial(_analyse_some, analyse=analyse)
     ready: dict[int, FileResult] = {}
@@ -85,7 +85,7 @@ def analyse_file(
         reason = Reason(type(error).__name__, str(error))
         return FileResult(str(path), None, (), None, Verdict(False, None, (reason,)), error_document(error))
     if multiprocessing.parent_process() is None:
-        forewarn("identify")
+        announce_compilation("identify")
     return analyse_recordings(
         [recorded], str(path), settings, machine, any_move=any_move, spread=_outcomes, progress=progress
     )

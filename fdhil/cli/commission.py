@@ -140,7 +140,7 @@ def _progress_of(machine: MachineConfig, axis: str) -> Progress:
 
 
 def _tell_plan(machine: MachineConfig, axes: list[str], options: Asked) -> int:
-    from fdhil.report.parameter_view import minute
+    from fdhil.report.parameter_format import format_minute
 
     plans: dict[str, list[dict[str, Any]]] = {}
     refused = None
@@ -155,7 +155,11 @@ def _tell_plan(machine: MachineConfig, axes: list[str], options: Asked) -> int:
     for axis, steps in plans.items():
         options.say(f"axis {axis}, planned steps (nothing is sent now):")
         for number, step in enumerate(steps, 1):
-            done = f" Done {minute(step['done_utc'])}, skipped if the drive is unchanged." if step["done_utc"] else ""
+            done = (
+                f" Done {format_minute(step['done_utc'])}, skipped if the drive is unchanged."
+                if step["done_utc"]
+                else ""
+            )
             options.say(f"  {number} of {len(steps)}, {step['step']}: {told(step['does'], step['moves'])}{done}")
     if refused is not None:
         click.echo(f"refused: {refused}", err=True)

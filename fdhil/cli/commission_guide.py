@@ -58,9 +58,9 @@ class Guide:
 
     def kept(self, name: str, step: Step) -> None:
         """Report that a completed step is skipped, with its result."""
-        from fdhil.report.parameter_view import minute
+        from fdhil.report.parameter_format import format_minute
 
-        self._say(f"{self._head(name)}: skipped, done {minute(step.done_utc)}; {result_text(name, step.found)}")
+        self._say(f"{self._head(name)}: skipped, done {format_minute(step.done_utc)}; {result_text(name, step.found)}")
 
     def result(self, step: str, found: Found) -> None:
         """Report the result of a step."""

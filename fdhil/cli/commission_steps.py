@@ -70,11 +70,11 @@ def result_text(step: str, found: Mapping[str, Any]) -> str:
 
 def _figure(name: str, value: Mapping[str, Any]) -> str:
     from fdhil.records import INTERVAL_95
-    from fdhil.report.parameter_view import DISPLAY_UNITS, cell
+    from fdhil.report.parameter_format import DISPLAY_UNITS, format_cell
 
     if value["std"] is None:
         return f"{value['value']:.4g} {value['unit']} (given, not identified)"
-    return f"{cell(name, value['value'], INTERVAL_95 * value['std'], ' ')} {DISPLAY_UNITS[name][0]}"
+    return f"{format_cell(name, value['value'], INTERVAL_95 * value['std'], ' ')} {DISPLAY_UNITS[name][0]}"
 
 
 def tried_by_moving(machine: MachineConfig, axis: str) -> bool:

@@ -26,7 +26,7 @@ def try_commissioned(
     machine: MachineConfig, record: CommissioningRecord, options: Asked, progress: Progress, guide: Guide
 ) -> dict[str, Any] | None:
     """Run the trial of a commissioned axis; None without a room. Raises DriveFault if it is refused."""
-    from fdhil.api.compiling import forewarn
+    from fdhil.api.compilation_notice import announce_compilation
     from fdhil.commissioning.trial import Operator, try_axis
 
     axis, room = record.axis, options.room
@@ -58,7 +58,7 @@ def try_commissioned(
 
     settings = machine.axis[axis]
     operator = Operator(report, saw, result, lambda mm: guide.show_position(settings.format_in_unit(mm, form=".3f")))
-    forewarn("identify")
+    announce_compilation("identify")
     with _history(machine, axis) as (known, keep):
         tried = try_axis(machine, record, room, operator, progress, known)
         keep(tried.outcomes)

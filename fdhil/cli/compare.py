@@ -161,7 +161,7 @@ def _show(document: Mapping[str, Any]) -> None:
     from rich.markup import escape
 
     from fdhil.cli.status_view import narrow_table, open_console
-    from fdhil.report.parameter_view import cell, half_of, head
+    from fdhil.report.parameter_format import compute_half_width, format_cell, format_heading
 
     out, files = open_console(), [Path(document[when]["file"]).name for when in ("before", "after")]
     if document["kind"] == "pass":
@@ -186,6 +186,11 @@ def _show(document: Mapping[str, Any]) -> None:
             table.add_column(text, justify="right")
         for name, told in parameters.items():
             change = told["change_percent"]
-            cells = [cell(name, told[when]["value"], half_of(told[when]), " ") for when in ("before", "after")]
-            table.add_row(head(name).replace("\n", ", "), *cells, "-" if change is None else f"{change:+.1f} %")
+            cells = [
+                format_cell(name, told[when]["value"], compute_half_width(told[when]), " ")
+                for when in ("before", "after")
+            ]
+            table.add_row(
+                format_heading(name).replace("\n", ", "), *cells, "-" if change is None else f"{change:+.1f} %"
+            )
         out.print(table)

@@ -74,7 +74,7 @@ def reanalyse(
         from fdhil.fleet.reanalysis_changes import summarise_changes
         from fdhil.fleet.window_reanalysis import AnalysisMethod, compute_code_digest
         from fdhil.fleet.worker_pools import open_worker_pool as entered
-    from fdhil.api.compiling import forewarn
+    from fdhil.api.compilation_notice import announce_compilation
     from fdhil.cli import fleet_reanalysis_view as view
     from fdhil.cli import fleet_view
 
@@ -82,7 +82,7 @@ def reanalyse(
         Identification(method=method), machines, settings.objects.directory.resolve(), compute_code_digest()
     )
     scope = reanalysis.WindowScope(_utc(since), _utc(until), machine, axis)
-    forewarn("identify")
+    announce_compilation("identify")
     count = (os.cpu_count() or 1) if workers is None else workers
     with with_extra(), entered(scheduler, count) as pool, _bar() as progress:
         revision = reanalysis.reanalyse_windows(settings, chosen, scope, pool, progress)

@@ -252,7 +252,7 @@ def crossings(
 
     ``state`` is over, foreseen, not_foreseen (within ``within_days``) or not_enough_history (of ``span_days``).
     """
-    from fdhil.identification.trends import reach_days
+    from fdhil.identification.trends import limit_forecast_days
     from fdhil.prediction import forecast
 
     newest = max((found[-1].stamp.wall_s for found in past.revisions.values() if found), default=0.0)
@@ -262,7 +262,7 @@ def crossings(
         if past.revisions.get(axis)
     }
     span_days = forecast.span_days(courses)
-    within_days = min(reach_days(span_days), FAR_DAYS)
+    within_days = min(limit_forecast_days(span_days), FAR_DAYS)
     entries: list[dict[str, Any]] = []
     for zone, per_axis in zip(predicted.zones, um_per_percent, strict=True):
         if zone.max_um > tolerance_um:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fdhil.errors import FdhilError
-from fdhil.report.history_course import AxisHistory, over_time
-from fdhil.report.typography import typeset
+from fdhil.report.history_charts import AxisHistory, build_time_chart
+from fdhil.report.typography import typeset_text
 from fdhil.store.output import open_output
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ def figure_of(histories: Sequence[AxisHistory]) -> Figure:
 
     from fdhil.report import chart
 
-    names = list(dict.fromkeys(name for history in histories for name in history.names()))
+    names = list(dict.fromkeys(name for history in histories for name in history.list_parameters()))
     with style.context(Path(chart.__file__).with_name("fdhil.mplstyle")):
         tall = HEIGHT * len(names) + HEAD + FOOT
         figure = Figure(figsize=(WIDTH * len(histories), tall))
@@ -37,9 +37,9 @@ def figure_of(histories: Sequence[AxisHistory]) -> Figure:
         for column, history in zip(panels.T, histories, strict=True):
             column[0].set_title(f"axis {history.axis}", loc="left", fontweight="bold")
             for panel, name in zip(column, names, strict=True):
-                course = over_time(history, name)
-                chart.draw(panel, course.panels[0], course)
-                panel.set_ylabel(typeset(course.panels[0].y_label))
+                course = build_time_chart(history, name)
+                chart.draw_panel(panel, course.panels[0], course)
+                panel.set_ylabel(typeset_text(course.panels[0].y_label))
         named = panels[0, 0].get_legend_handles_labels()
         figure.legend(*named, loc="upper right", ncols=3 if len(histories) > 1 else 1, fontsize=8)
     return figure
@@ -47,7 +47,7 @@ def figure_of(histories: Sequence[AxisHistory]) -> Figure:
 
 def write_plot(histories: Sequence[AxisHistory], path: Path) -> None:
     """Write the trends as PNG, SVG or PDF, by suffix. Raises FdhilError if there is nothing to plot."""
-    shown = [history for history in histories if history.names()]
+    shown = [history for history in histories if history.list_parameters()]
     if not shown:
         raise FdhilError("nothing to plot: no parameters are published yet; run the daemon while the axes make rapids")
     figure = figure_of(shown)

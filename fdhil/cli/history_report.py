@@ -6,11 +6,23 @@ from typing import Any
 
 from fdhil.config import MachineConfig
 from fdhil.report import Page, Section, Table, write_page_or_pdf
-from fdhil.report.chart import svg
-from fdhil.report.history_course import DAY_PERCENTILES, MOST_SINGLE_ESTIMATES, AxisHistory, over_temperature, over_time
-from fdhil.report.history_trends import moved, slope_rows
-from fdhil.report.history_verdict import IN_ORDER, LATEST_HEAD, Refusals, latest_rows, sentences
-from fdhil.report.parameter_view import DISPLAY_UNITS, INTERVAL_MEANING, PARAMETER_MEANINGS, cell, half_of
+from fdhil.report.chart import render_svg
+from fdhil.report.condition_summary import IN_ORDER, LATEST_HEAD, Refusals, build_latest_rows, describe_condition
+from fdhil.report.drive_health import build_slope_rows, describe_change
+from fdhil.report.history_charts import (
+    DAY_PERCENTILES,
+    MOST_SINGLE_ESTIMATES,
+    AxisHistory,
+    build_temperature_chart,
+    build_time_chart,
+)
+from fdhil.report.parameter_format import (
+    DISPLAY_UNITS,
+    INTERVAL_MEANING,
+    PARAMETER_MEANINGS,
+    compute_half_width,
+    format_cell,
+)
 
 MOST_REVISIONS = 50
 MOST_NOTICES = 30
@@ -39,19 +51,19 @@ def write_report(
 
 
 def _span(histories: Sequence[AxisHistory]) -> str:
-    times = [window["time"] for history in histories for window in (history.told or {}).get("windows", ())]
+    times = [window["time"] for history in histories for window in (history.health or {}).get("windows", ())]
     times += [row["time"] for history in histories for row in history.rows]
     return f"from {min(times)[:10]} to {max(times)[:10]}" if times else "nothing identified yet"
 
 
 def _tile(history: AxisHistory, refused: Refusals) -> tuple[str, str]:
-    limits = (history.told or {}).get("limits", {})
+    limits = (history.health or {}).get("limits", {})
     if any(limit["reached"] for limit in limits.values()):
         return f"axis {history.axis}", "limit reached"
-    if not (history.told or {}).get("windows") and not history.rows:
+    if not (history.health or {}).get("windows") and not history.rows:
         return f"axis {history.axis}", "not identified"
     first = min((limit["date"] for limit in limits.values()), default=None)
-    verdict = sentences(history, refused)[0]
+    verdict = describe_condition(history, refused)[0]
     return (
         f"axis {history.axis}",
         f"limit {first[:10]}" if first else "in order" if verdict == IN_ORDER else "see below",
@@ -61,9 +73,9 @@ def _tile(history: AxisHistory, refused: Refusals) -> tuple[str, str]:
 def _verdict(machine: MachineConfig, histories: Sequence[AxisHistory], refused: Mapping[str, Refusals]) -> Section:
     shares = machine.maintenance.model_dump()
     rows = [[history.axis, text] for history in histories
-            for text in sentences(history, refused.get(history.axis, Refusals()))]  # fmt: skip
+            for text in describe_condition(history, refused.get(history.axis, Refusals()))]  # fmt: skip
     latest = [
-        Table(LATEST_HEAD, latest_rows(history, shares), f"Axis {history.axis}: the newest published parameters")
+        Table(LATEST_HEAD, build_latest_rows(history, shares), f"Axis {history.axis}: the newest published parameters")
         for history in histories
         if history.rows
     ]
@@ -71,25 +83,28 @@ def _verdict(machine: MachineConfig, histories: Sequence[AxisHistory], refused: 
 
 
 def _axis_section(history: AxisHistory, refused: Refusals) -> Section:
-    many = max((len(history.estimates(name)) for name in history.names()), default=0) > MOST_SINGLE_ESTIMATES
+    many = (
+        max((len(history.list_estimates(name)) for name in history.list_parameters()), default=0)
+        > MOST_SINGLE_ESTIMATES
+    )
     shown = "" if not many else (
         f"With more than {MOST_SINGLE_ESTIMATES} rapids the plots show the median of each day, and a band from the {DAY_PERCENTILES[0]:.0f}th to "
         f"the {DAY_PERCENTILES[1]:.0f}th percentile."
     )  # fmt: skip
-    tables = [*_health_tables(history.told), *_refused_tables(refused), *_revision_tables(history.rows)]
+    tables = [*_health_tables(history.health), *_refused_tables(refused), *_revision_tables(history.rows)]
     return Section(f"Axis {history.axis}", shown, tables, _pictures(history))
 
 
 def _pictures(history: AxisHistory) -> list[tuple[str, str]]:
     pictures = []
-    for name in history.names():
+    for name in history.list_parameters():
         what = f"{name.partition('_')[0]}, {PARAMETER_MEANINGS[name]}"
-        pictures.append((f"{what}, over time", svg(over_time(history, name), WIDTH, HEIGHT)))
-    for name in history.names():
-        if (course := over_temperature(history, name)) is not None:
+        pictures.append((f"{what}, over time", render_svg(build_time_chart(history, name), WIDTH, HEIGHT)))
+    for name in history.list_parameters():
+        if (course := build_temperature_chart(history, name)) is not None:
             what = f"{name.partition('_')[0]}, {PARAMETER_MEANINGS[name]}"
             caption = f"{what}, over the temperature of the slide-way, with which it varies"
-            pictures.append((caption, svg(course, WIDTH, HEIGHT)))
+            pictures.append((caption, render_svg(course, WIDTH, HEIGHT)))
     return pictures
 
 
@@ -98,12 +113,12 @@ def _health_tables(health: Mapping[str, Any] | None) -> list[Table]:
         return []
     slopes = Table(
         head=["parameter", "per kelvin", "per day", "maintenance limit"],
-        rows=slope_rows(health),
+        rows=build_slope_rows(health),
         caption=f"Slopes since the last change; {INTERVAL_MEANING}",
     )
     changes = Table(
         head=["time", "window", "parameters that changed", "likely cause"],
-        rows=[[_minute(c["time"]), str(c["window"]), moved(c), c["cause"]] for c in health["changes"]],
+        rows=[[_minute(c["time"]), str(c["window"]), describe_change(c), c["cause"]] for c in health["changes"]],
         caption="Changes",
     )
     return [table for table in (slopes, changes) if table.rows]
@@ -130,7 +145,7 @@ def _revision_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
             _minute(row["time"]),
             "" if row["temperature_c"] is None else f"{row['temperature_c']:.2f}",
             str(row["windows_used"]),
-            *(cell(name, its["value"], half_of(its), " ") for name, its in row["parameters"].items()),
+            *(format_cell(name, its["value"], compute_half_width(its), " ") for name, its in row["parameters"].items()),
         ]
         for row in newest
     ]

@@ -7,8 +7,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from fdhil.cli.status_view import narrow_table, open_console
-from fdhil.report.history_trends import moved, slope_rows
-from fdhil.report.parameter_view import minute
+from fdhil.report.drive_health import build_slope_rows, describe_change
+from fdhil.report.parameter_format import format_minute
 
 SHOWN_OPEN, SHOWN_DONE = 10, 5
 
@@ -17,7 +17,7 @@ def show_health(told: Mapping[str, Mapping[str, Any]], console: Console | None =
     """Print slopes, limits and changes of every axis that has some."""
     out = console or open_console()
     for axis, its in told.items():
-        if rows := slope_rows(its):
+        if rows := build_slope_rows(its):
             table = narrow_table(f"axis {axis}: slopes")
             for text in ("parameter", "per kelvin of\nthe slide-way", "per day", "maintenance limit"):
                 table.add_column(text)
@@ -25,9 +25,9 @@ def show_health(told: Mapping[str, Mapping[str, Any]], console: Console | None =
                 table.add_row(*row)
             out.print(table)
         for change in its["changes"]:
-            at = minute(change["time"])
+            at = format_minute(change["time"])
             out.print(f"axis {axis}, window {change['window']} at {at}: {change['cause']}", highlight=False)
-            out.print(f"  {moved(change)}", highlight=False)
+            out.print(f"  {describe_change(change)}", highlight=False)
 
 
 def show_notices(notices: Sequence[Mapping[str, Any]], console: Console | None = None) -> None:
@@ -42,11 +42,11 @@ def show_notices(notices: Sequence[Mapping[str, Any]], console: Console | None =
     for notice in done[-SHOWN_DONE:]:
         given = notice["acknowledged"]
         note = f": {given['note']}" if given["note"] else ""
-        text = f"{_line(notice)}\n    acknowledged by {given['who']} on {minute(given['time'])}{note}"
+        text = f"{_line(notice)}\n    acknowledged by {given['who']} on {format_minute(given['time'])}{note}"
         out.print(escape(text), highlight=False)
 
 
 def _line(notice: Mapping[str, Any]) -> str:
     where = f"{notice['axis']}: " if notice["axis"] else ""
     number = "" if notice["number"] is None else f"{notice['number']:>5}  "
-    return f"{number}{minute(notice['time'])}  {notice['severity']:5}  {where}{notice['code']}: {notice['text']}"
+    return f"{number}{format_minute(notice['time'])}  {notice['severity']:5}  {where}{notice['code']}: {notice['text']}"

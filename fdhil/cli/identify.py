@@ -17,12 +17,12 @@ from fdhil import tables
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, FILE, OutputFile, Picture, Writing
 from fdhil.records import INTERVAL_95, get_unit
-from fdhil.report.parameter_view import INTERVAL_MEANING, cell, head
+from fdhil.report.parameter_format import INTERVAL_MEANING, format_cell, format_heading
 from fdhil.store import suffixes
 from fdhil.store.output import open_output
 
 if TYPE_CHECKING:
-    from fdhil.api.analysis import FileResult
+    from fdhil.api.recording_analysis import FileResult
     from fdhil.config import Axis, Identification, MachineConfig
     from fdhil.records import Estimate, Verdict
     from fdhil.store.column_map import ColumnMap
@@ -101,29 +101,29 @@ def identify(
         if value is not None and len(recordings) > 1:
             raise click.UsageError(f"{option} applies to one recording; give a single RECORDING")
     if report is not None or plot is not None:
-        reports.require()
+        reports.require_libraries()
     settings, machine = _settings(config_path, method)
     axes = machine.axis if machine is not None else {}
     column_map = _column_map(columns, recordings, as_json=as_json)
     if columns is not None and column_map is None:
         return 1
     results = _analyse(recordings, settings, machine, accelerometer, column_map, any_move=any_move)
-    from fdhil.api.analysis import compare_with_data_sheet
-    from fdhil.api.documents import identification_document
+    from fdhil.api.identification_json import build_identification_document
+    from fdhil.api.recording_analysis import compare_with_data_sheet
 
     if machine is not None:
         results = [compare_with_data_sheet(result, axes) for result in results]
     if with_loops:
-        from fdhil.api.loops import with_all_loops
+        from fdhil.api.loop_comparison import identify_all_loops
 
-        results = with_all_loops(results, settings, machine)
+        results = identify_all_loops(results, settings, machine)
     if model is not None:
         from fdhil.cli.model_file import write_model
 
         write_model(results, axes, model)
     _draw(results[0], report, plot)
     if as_json:
-        click.echo(json.dumps(identification_document(results, axes, with_loops=with_loops), allow_nan=False))
+        click.echo(json.dumps(build_identification_document(results, axes, with_loops=with_loops), allow_nan=False))
     else:
         _show(results, axes, with_loops)
     if any(result.error for result in results):
@@ -161,10 +161,10 @@ def _column_map(columns: Path | None, recordings: Sequence[Path], *, as_json: bo
 def _draw(result: FileResult, report: Path | None, plot: Path | None) -> None:
     if result.error is not None or (report is None and plot is None):
         return
-    from fdhil.report.identification import identification_page, save_picture
+    from fdhil.report.identification_page import build_identification_page, save_picture
 
     if report is not None:
-        reports.write(identification_page(result), report)
+        reports.write_page(build_identification_page(result), report)
     if plot is not None:
         save_picture(result, Path(result.file).with_suffix(".png") if str(plot) == BESIDE else plot)
 
@@ -232,10 +232,10 @@ def _show(results: Sequence[FileResult], axes: Mapping[str, Axis], with_loops: b
     from rich import box
     from rich.table import Table
 
-    from fdhil.api.documents import usable_estimate, windows_used
+    from fdhil.api.identification_json import count_windows_used, select_usable_estimate
     from fdhil.cli.console import PrintableConsole
     from fdhil.cli.loops_view import show_loops
-    from fdhil.identification.windows import moving_range
+    from fdhil.identification.rapid_windows import find_moving_range
     from fdhil.records import PARAMETERS
 
     console = PrintableConsole(highlight=False, markup=False)
@@ -250,7 +250,7 @@ def _show(results: Sequence[FileResult], axes: Mapping[str, Axis], with_loops: b
         console.print(f"{result.file}: axis {result.axis}; {INTERVAL_MEANING}", style="italic")
         table.add_column("rapid\ns", no_wrap=True)
         for name in PARAMETERS:
-            table.add_column(head(name), justify="right", no_wrap=True)
+            table.add_column(format_heading(name), justify="right", no_wrap=True)
         table.add_column("fit\n%", justify="right", no_wrap=True)
         has_table_error = any(outcome.verdict.unexplained_um is not None for outcome in result.outcomes)
         if has_table_error:  # um at the table that the model does not explain
@@ -258,12 +258,12 @@ def _show(results: Sequence[FileResult], axes: Mapping[str, Axis], with_loops: b
         table.add_column("valid", no_wrap=True)
         for outcome in result.outcomes:
             window = outcome.window
-            first, last = moving_range(window)
+            first, last = find_moving_range(window)
             span = f"{window.start_s + first * window.dt_s:.2f}-{window.start_s + last * window.dt_s:.2f}"
-            table.add_row(span, *_cells(usable_estimate(outcome), outcome.verdict, has_table_error))
+            table.add_row(span, *_cells(select_usable_estimate(outcome), outcome.verdict, has_table_error))
         table.add_section()
         table.add_row(
-            f"all {windows_used(result)}", *_cells(result.pooled, result.verdict, has_table_error), style="bold"
+            f"all {count_windows_used(result)}", *_cells(result.pooled, result.verdict, has_table_error), style="bold"
         )
         console.print(table)
         _show_terms(console, result)
@@ -291,16 +291,22 @@ def _cell(estimate: Estimate, name: str) -> str:
     if name in estimate.given and name != "K":
         return "-"  # from the data sheet, not determined by this recording
     value, half = estimate.get_value(name), INTERVAL_95 * estimate.get_std(name)
-    return cell(name, value, None).replace("(no ±)", "(given)") if name in estimate.given else cell(name, value, half)
+    return (
+        format_cell(name, value, None).replace("(no ±)", "(given)")
+        if name in estimate.given
+        else format_cell(name, value, half)
+    )
 
 
 def _show_terms(console: Any, result: FileResult) -> None:
-    from fdhil.api.documents import usable_estimate
+    from fdhil.api.identification_json import select_usable_estimate
 
-    each = ((f"{o.window.start_s:.2f} s", usable_estimate(o)) for o in result.outcomes)
+    each = ((f"{o.window.start_s:.2f} s", select_usable_estimate(o)) for o in result.outcomes)
     for who, estimate in each if result.pooled is None else (("all", result.pooled),):
         if estimate is not None and estimate.terms:
-            cells = (cell(n, estimate.get_value(n), INTERVAL_95 * estimate.get_std(n), " ") for n in estimate.terms)
+            cells = (
+                format_cell(n, estimate.get_value(n), INTERVAL_95 * estimate.get_std(n), " ") for n in estimate.terms
+            )
             named = (f"{n} {value} {get_unit(n)}" for n, value in zip(estimate.terms, cells, strict=True))
             console.print(f"  terms of {who}: {', '.join(named)}")
 
@@ -316,14 +322,14 @@ def _show_table(console: Any, result: FileResult) -> None:
 
 
 def _show_reasons(console: Any, result: FileResult) -> None:
-    from fdhil.api.documents import voltage_delay
+    from fdhil.api.identification_json import describe_voltage_delay
     from fdhil.validation.plausibility import warnings_of
 
     verdicts = [*(outcome.verdict for outcome in result.outcomes), result.verdict]
     reasons = [r for verdict in verdicts for r in (*verdict.reasons, *verdict.warnings)]
     reasons += [r for outcome in result.outcomes for r in warnings_of(outcome.window)]
     for outcome in result.outcomes:
-        delay = voltage_delay(outcome.estimate) if outcome.window.slow_voltage is not None else None
+        delay = describe_voltage_delay(outcome.estimate) if outcome.window.slow_voltage is not None else None
         if delay is not None:
             late_ms, half_ms = 1e3 * delay["value"], 1e3 * INTERVAL_95 * delay["std"]
             text = f"  voltage is delayed by {late_ms:.3f} ± {half_ms:.3f} ms from {outcome.window.start_s:.2f} s on"

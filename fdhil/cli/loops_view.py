@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from fdhil.records import INTERVAL_95
 
 if TYPE_CHECKING:
-    from fdhil.api.analysis import FileResult
+    from fdhil.api.recording_analysis import FileResult
     from fdhil.config import Axis
 
 
@@ -26,7 +26,7 @@ def show_loops(result: FileResult, axis: Axis | None, console: Any) -> None:
     from rich import box
     from rich.table import Table
 
-    from fdhil.api.loops import LOOP_UNITS, configured_value, equivalent_loops
+    from fdhil.api.loop_comparison import LOOP_UNITS, get_configured_value, list_equivalent_loops
 
     found = result.loops
     if found is None:
@@ -40,11 +40,11 @@ def show_loops(result: FileResult, axis: Axis | None, console: Any) -> None:
         table.add_column(head, justify="left" if head in ("regulators", "unit") else "right", no_wrap=True)
     for k, (name, value) in enumerate(zip(found.names, found.values.tolist(), strict=True)):
         std = math.sqrt(found.covariance[k, k])
-        configured = configured_value(regulators, name)
+        configured = get_configured_value(regulators, name)
         shown = "-" if configured is None else f"{configured:.5g}"
         table.add_row(name, f"{value:.4g} ± {INTERVAL_95 * std:.2g}", shown, LOOP_UNITS[name])
     console.print(table)
-    for same in equivalent_loops(found):
+    for same in list_equivalent_loops(found):
         gains = ", ".join(f"{key} {value:.4g}" for key, value in same.items() if not isinstance(value, str))
         console.print(f"  equivalent structure: {same['structure']}, {gains}")
     left = found.verdict.unexplained_um

@@ -9,9 +9,14 @@ from typing import Any
 
 import click
 
-from fdhil.api.analysis import FileResult
+from fdhil.api.recording_analysis import FileResult
 from fdhil.config import Axis
-from fdhil.identification.loops import better_loops, changed_regulators, regulators_of, with_loops
+from fdhil.identification.drive_loops.loop_identification import (
+    apply_loops,
+    find_changed_regulators,
+    get_regulator_values,
+    is_better_than_configured,
+)
 from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Reason
 from fdhil.store.output import open_output
 from fdhil.validation.table_error_budget import LOOPS_DIFFER
@@ -71,5 +76,7 @@ def _loops(found: LoopEstimate | None, axis: Axis | None) -> dict[str, Any] | No
     if found is None or not found.verdict.accepted:
         return None
     if axis is None or found.configured_um is None:
-        return {"loops": regulators_of(found)}
-    return {"loops": changed_regulators(axis, with_loops(axis, found))} if better_loops(found) else None
+        return {"loops": get_regulator_values(found)}
+    return (
+        {"loops": find_changed_regulators(axis, apply_loops(axis, found))} if is_better_than_configured(found) else None
+    )

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import tables
-from fdhil.api.compiling import forewarn
+from fdhil.api.compilation_notice import announce_compilation
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FROM_HISTORY, MODEL, PROGRAM, OutputFile, Positive, Writing
 from fdhil.records import INTERVAL_95
-from fdhil.report.parameter_view import INTERVAL_MEANING
+from fdhil.report.parameter_format import INTERVAL_MEANING
 
 if TYPE_CHECKING:
     from fdhil.cli.forecast import Past
@@ -46,9 +46,9 @@ def _shared(wanted: Callable[..., int | None]) -> Callable[..., int | None]:
     @functools.wraps(wanted)
     def command(**options: Any) -> int | None:
         if options["report"] or options["pdf"]:
-            from fdhil.report import require
+            from fdhil.report import require_libraries
 
-            require()  # before the computation
+            require_libraries()  # before the computation
         own = {name: value for name, value in options.items() if name not in Asked.__dataclass_fields__}
         return wanted(Asked(**{name: options[name] for name in Asked.__dataclass_fields__}), **own)
 
@@ -96,7 +96,7 @@ def predict(options: Asked, sensitivity: bool, tolerance_um: float | None, since
     from fdhil import prediction
     from fdhil.correction.result_documents import prediction_document
 
-    forewarn("predict")
+    announce_compilation("predict")
     predicted = prediction.predict(reference, models, config)
     columns = _prediction_columns(predicted)
     document = {"schema": "fdhil-predict-1", "program": str(options.program), **prediction_document(predicted, models)}
@@ -174,14 +174,14 @@ def correct(options: Asked, method: str | None) -> int:
     """
     reference, models, config = inputs(options.program, options.config_path, options.model_path, options.from_history)
     from fdhil import correction
-    from fdhil.api.machine import held_out_max_um
+    from fdhil.api.machine_interface import find_held_out_max_um
     from fdhil.correction.result_documents import correction_document
     from fdhil.prediction.models import load_model_file
     from fdhil.store.known_gain import predict_gain_from_history
 
-    forewarn("predict", "correct")
+    announce_compilation("predict", "correct")
     held_out_um = {} if options.model_path is None else load_model_file(options.model_path).held_out_um
-    largest_um = held_out_max_um(reference, config, "history" if options.from_history else options.model_path)
+    largest_um = find_held_out_max_um(reference, config, "history" if options.from_history else options.model_path)
     planned = correction.plan(reference, models, config, method, largest_um)
     predicted = predict_gain_from_history(planned, models, config, options.from_history, held_out_um)
     if options.out is not None:
@@ -201,7 +201,7 @@ def _report(
         return
     from fdhil.records import Prediction
     from fdhil.report import write_page_or_pdf
-    from fdhil.report.path import correction_page, prediction_page
+    from fdhil.report.path_report import build_correction_page, build_prediction_page
 
     name, machine = options.program.name, config.machine.name
     parameters = "the nominal parameters of the configuration"
@@ -210,9 +210,9 @@ def _report(
     elif options.model_path is not None:
         parameters = f"the parameters of {options.model_path.name}"
     if isinstance(found, Prediction):
-        page = prediction_page(name, machine, found, parameters)
+        page = build_prediction_page(name, machine, found, parameters)
     else:
-        page = correction_page(name, machine, found, parameters, predicted)
+        page = build_correction_page(name, machine, found, parameters, predicted)
     write_page_or_pdf(page, options.report, options.pdf)
 
 
@@ -222,7 +222,7 @@ def inputs(
     """Read configuration, model and reference, in this order; loops of the model replace those of the configuration."""
     if model_path is not None and from_history:
         raise click.UsageError("--model and --from-history exclude each other; give only one of them")
-    from fdhil.api.machine import Machine, read_inputs
+    from fdhil.api.machine_interface import Machine, read_inputs
 
     print_note = functools.partial(click.echo, err=True)
 

@@ -11,7 +11,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil import tables
-from fdhil.api.compiling import forewarn
+from fdhil.api.compilation_notice import announce_compilation
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, COLUMNS, CONFIG, FILE, OutputFile, Writing
 from fdhil.errors import RecordingError
@@ -75,7 +75,7 @@ def _replayed(
                     raise RecordingError(
                         f"{path} is of axis {window.axis}, which --config lacks; give the configuration of that machine"
                     )
-                forewarn("identify")
+                announce_compilation("identify")
                 pipelines[window.axis] = AxisPipeline(window.axis, settings, method, with_skill=machine is not None)
             outcomes += pipelines[window.axis].feed(window)
         replayed.append((path, outcomes))
@@ -90,7 +90,7 @@ def read_windows(path: Path) -> list[Window]:
 
         if not is_recording(path):
             return [read_window(path)]
-    from fdhil.identification.windows import find_windows
+    from fdhil.identification.rapid_windows import find_windows
     from fdhil.store.recordings import read_recording
 
     return find_windows(read_recording(path))
@@ -127,11 +127,11 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
     Lists revisions, slopes, changes, maintenance dates and notices.
     """
     machine = machine_config.load_config(config)
-    from fdhil.report import require
-    from fdhil.report.history_reading import by_axis, read_history, read_notices
+    from fdhil.report import require_libraries
+    from fdhil.report.history_reader import group_by_axis, read_history, read_notices
 
     if plot is not None:
-        require()
+        require_libraries()
     rows, health = read_history(machine, axis, partial(click.echo, err=True))
     notices = read_notices(machine, axis)
     if axis is not None and axis not in machine.axis and not rows:
@@ -141,7 +141,7 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
     if plot is not None:
         from fdhil.cli.history_plot import write_plot
 
-        write_plot(by_axis(machine, rows, health), plot)
+        write_plot(group_by_axis(machine, rows, health), plot)
     if as_json:
         parts = {key: {name: of_axis[key] for name, of_axis in health.items()} for key in HEALTH}
         click.echo(json.dumps({"schema": "fdhil-history-1", "revisions": rows, "notices": notices} | parts))
@@ -193,15 +193,15 @@ def export(recording: Path, out: Path, format_name: str | None, columns: Path | 
 @AS_JSON
 def report(config: Path, out: Path, pdf: Path | None, as_json: bool) -> None:
     """Write an HTML report of the history of CONFIG's machine."""
-    from fdhil.report import require
+    from fdhil.report import require_libraries
 
-    require()
+    require_libraries()
     machine = machine_config.load_config(config)
     from fdhil.cli.history_report import write_report
-    from fdhil.report.history_reading import by_axis, read_history, read_notices, read_refusals
+    from fdhil.report.history_reader import group_by_axis, read_history, read_notices, read_refusals
 
     rows, health = read_history(machine, tell=partial(click.echo, err=True))
     refused = read_refusals(machine)
-    write_report(machine, by_axis(machine, rows, health, refused), refused, out, pdf, read_notices(machine))
+    write_report(machine, group_by_axis(machine, rows, health, refused), refused, out, pdf, read_notices(machine))
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-report-1", "file": str(out), "revisions": len(rows)}))

@@ -45,11 +45,11 @@ def run(config: Path, method: str | None, as_json: bool) -> int:
     zero and stops.
     """
     machine = machine_config.load_config(config)
-    from fdhil.api.compiling import forewarn
+    from fdhil.api.compilation_notice import announce_compilation
     from fdhil.daemon import daemon_service, service_log  # late: --help imports nothing heavy
     from fdhil.drivers import open_machine
 
-    forewarn("identify", "predict", "correct")
+    announce_compilation("identify", "predict", "correct")
     with service_log.write_lines_as_json(as_json):
         residual = daemon_service.run_daemon_service(machine, open_machine, method)
     return 0 if residual.nothing else 3

@@ -12,7 +12,7 @@ from rich.table import Table
 from fdhil.cli.console import PrintableConsole
 from fdhil.cli.loops_view import loops_line
 from fdhil.records import PARAMETERS
-from fdhil.report.parameter_view import INTERVAL_MEANING, cell, half_of, head
+from fdhil.report.parameter_format import INTERVAL_MEANING, compute_half_width, format_cell, format_heading
 
 BARS = "▁▂▃▄▅▆▇█"
 COURSE = 7  # revisions in a sparkline, limited by the column width
@@ -201,7 +201,7 @@ def _unused(axis: Mapping[str, Any]) -> str:
 def believed(axis: Mapping[str, Any]) -> str:
     """Return additional terms, unexplained error at the table, and warnings of an axis as text."""
     terms = ", ".join(
-        f"{name} {cell(name, term['value'], half_of(term), ' ')} {term['unit']}"
+        f"{name} {format_cell(name, term['value'], compute_half_width(term), ' ')} {term['unit']}"
         for name, term in (axis.get("terms") or {}).items()
     )
     left, table = axis.get("unexplained_um"), (axis.get("last_window") or {}).get("at_table")
@@ -212,12 +212,14 @@ def believed(axis: Mapping[str, Any]) -> str:
 
 def _axes_table(axes: Mapping[str, Any]) -> Table:
     table = narrow_table()
-    for text in ("axis", "windows\nok/not", "rev", *map(head, PARAMETERS)):
+    for text in ("axis", "windows\nok/not", "rev", *map(format_heading, PARAMETERS)):
         table.add_column(text, no_wrap=True)
     for name, axis in axes.items():
         found = axis["parameters"]
         cells = (
-            [cell(p, found[p]["value"], half_of(found[p])) for p in PARAMETERS] if found else ["-"] * len(PARAMETERS)
+            [format_cell(p, found[p]["value"], compute_half_width(found[p])) for p in PARAMETERS]
+            if found
+            else ["-"] * len(PARAMETERS)
         )
         table.add_row(name, f"{axis['accepted']}/{axis['refused']}", str(axis["revision"] or "-"), *cells)
     return table
@@ -247,11 +249,14 @@ def show_history(rows: Sequence[Mapping[str, Any]], console: Console | None = No
         names = list(of_axis[0]["parameters"])
         first, last = (of_axis[k]["time"][:10] for k in (0, -1))
         table = narrow_table(f"axis {axis}: {len(of_axis)} revisions, {first} to {last}")
-        for text in ("rev", "time\nUTC", "degC", "win", *map(head, names)):
+        for text in ("rev", "time\nUTC", "degC", "win", *map(format_heading, names)):
             table.add_column(text, no_wrap=True)
         for row in of_axis[-newest:]:
             degrees = "-" if row["temperature_c"] is None else f"{row['temperature_c']:.1f}"
-            cells = [cell(name, found["value"], half_of(found)) for name, found in row["parameters"].items()]
+            cells = [
+                format_cell(name, found["value"], compute_half_width(found))
+                for name, found in row["parameters"].items()
+            ]
             time = row["time"][5:16].replace("T", "\n")
             table.add_row(str(row["revision"]), time, degrees, str(row["windows_used"]), *cells)
         courses = [sparkline([row["parameters"][name]["value"] for row in of_axis[-COURSE:]]) for name in names]

@@ -24,7 +24,7 @@ from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.drivers.moves import load_event_source
 from fdhil.drivers.sensor_source import Sensor, create_sensors
 from fdhil.errors import DeviceError, ForeignMaster, StoreError
-from fdhil.identification.loops import better_loops, differences
+from fdhil.identification.drive_loops.loop_identification import compare_with_configuration, is_better_than_configured
 from fdhil.store.history import History
 
 RATE_TOLERANCE = 0.1
@@ -142,10 +142,10 @@ def compare_loops(config: MachineConfig, axis: str) -> Iterator[Finding]:
         return
     for _, loops in identified:
         settings = config.axis[axis]
-        apart = [d for d in differences(settings, loops) if d.apart]
+        apart = [d for d in compare_with_configuration(settings, loops) if d.is_significant]
         found = ", ".join(f"{d.key} {d.found:.4g}" for d in apart) or "the same"
         reasons = (*loops.verdict.reasons, *loops.verdict.warnings)
-        same = loops.verdict.accepted and not better_loops(loops)
+        same = loops.verdict.accepted and not is_better_than_configured(loops)
         cause, advice = (reasons[0].text, reasons[0].advice) if reasons else ("", "")
         shown = "as configured" if same else f"{loops.structure}: {found}"
         yield Finding("loops", f"{settings.regulators.structure} as configured", shown, same, cause, advice)

@@ -7,8 +7,8 @@ from typing import Any
 
 from fdhil.config import Identification, MachineConfig
 from fdhil.errors import DriveFault
-from fdhil.identification.delay import delay_score
 from fdhil.identification.estimators.maximum_likelihood import fit_windows
+from fdhil.identification.voltage_delay import score_delay
 from fdhil.pipeline import AxisPipeline, Known, Record
 from fdhil.records import PARAMETERS, Outcome, ParameterSet, Skill, WindowOutcome, get_unit
 
@@ -82,7 +82,7 @@ def _late_s(outcome: WindowOutcome, settings: Identification) -> tuple[float, fl
     if not outcome.verdict.accepted or outcome.window.voltage_v is None:
         return None
     fit = fit_windows([outcome.window], settings)
-    return None if fit is None else delay_score(fit)
+    return None if fit is None else score_delay(fit)
 
 
 def accept(config: MachineConfig, rapids: Rapids) -> dict[str, Any]:

@@ -7,8 +7,8 @@ import numpy as np
 from fdhil import correction
 from fdhil.config import Axis, MachineConfig
 from fdhil.correction.kernels import project
-from fdhil.identification.covariance import robust
-from fdhil.identification.kalman import departure
+from fdhil.identification.kalman import compute_departure
+from fdhil.identification.robust_covariance import compute_robust_covariance
 from fdhil.model import closed_loop
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import Float, Parameters, Stages, Trajectory, Window, freeze_array, freeze_integers
@@ -44,9 +44,9 @@ def _warm_rare_kernels() -> None:
     """
     project(np.linspace(0.0, 2.0, 8), np.ones(3), np.zeros(2))
     theta, rows = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 5.0, 0.0]), np.ones((4, 3))
-    departure(theta, 0.001, np.ones(4, dtype=np.int8), np.ones(4), rows, rows, rows, 0)
+    compute_departure(theta, 0.001, np.ones(4, dtype=np.int8), np.ones(4), rows, rows, rows, 0)
     slopes = np.random.default_rng(1).normal(size=(256, 2, theta.size))
-    robust(np.eye(theta.size), [slopes[:, 0]], [(slopes, slopes[:, :, 0])])
+    compute_robust_covariance(np.eye(theta.size), [slopes[:, 0]], [(slopes, slopes[:, :, 0])])
 
 
 def simulate_nominal_rapid(name: str, axis: Axis, dt_s: float, direction: int = 1, seed: int = 1) -> Window:

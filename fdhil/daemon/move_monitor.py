@@ -10,7 +10,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.drivers.moves import load_event_source
-from fdhil.identification.windows import PLATEAU_BAND, PLATEAU_S, RAPID_SHARE, RUN_SHARE
+from fdhil.identification.rapid_windows import PLATEAU_BAND, PLATEAU_S, RAPID_SHARE, RUN_SHARE
 from fdhil.records import AxisSamples, Float, Int
 
 REST_S = 0.1  # standstill of the demand that completes a move

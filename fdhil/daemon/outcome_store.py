@@ -13,8 +13,8 @@ from fdhil.daemon import service_log
 from fdhil.daemon.notice_log import NEWEST, NotAcknowledged, NoticeLog, describe_numbers, parse_acknowledgement
 from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.errors import StoreError
-from fdhil.identification.between import HISTORY_WINDOWS, Member
-from fdhil.identification.drift import Point
+from fdhil.identification.between_window_variance import HISTORY_WINDOWS, PoolMember
+from fdhil.identification.parameter_drift import DriftPoint
 from fdhil.pipeline import POOL_WINDOWS, Known
 from fdhil.records import (
     PARAMETERS,
@@ -65,12 +65,12 @@ def _read_figures(window: StoredWindow, key: str) -> Float:
     )
 
 
-def _read_pool_members(windows: Sequence[StoredWindow]) -> tuple[Member, ...]:
+def _read_pool_members(windows: Sequence[StoredWindow]) -> tuple[PoolMember, ...]:
     members = []
     for place, window in enumerate(windows, start=1 - len(windows)):
         if (pooled := window.told) is not None:
             values, own, shared = (freeze_array(pooled[key]) for key in ("values", "own", "shared"))
-            members.append(Member(tuple(pooled["names"]), values, own, shared, place, window.direction))
+            members.append(PoolMember(tuple(pooled["names"]), values, own, shared, place, window.direction))
     return tuple(members)
 
 
@@ -192,7 +192,9 @@ class OutcomeStore:
             -HISTORY_WINDOWS:
         ]
         points = tuple(
-            Point(_read_figures(window, "value"), _read_figures(window, "std"), window.start_tick, window.direction)
+            DriftPoint(
+                _read_figures(window, "value"), _read_figures(window, "std"), window.start_tick, window.direction
+            )
             for window in windows[-4 * POOL_WINDOWS :]
         )
         published = newest[0].set if newest else None

@@ -10,7 +10,7 @@ import numpy as np
 
 from fdhil.errors import StoreError
 from fdhil.fleet.parameter_sets import Db, Row, format_time, read_std
-from fdhil.identification.trends import student_95
+from fdhil.identification.trends import compute_student_95
 from fdhil.records import PARAMETERS, Float, get_unit
 
 MOST_SETS = 20  # on either side of a service, within NEAR
@@ -101,7 +101,7 @@ def _estimate_change(rows: Sequence[Row], parameter: str, at: datetime) -> dict[
     stds = np.array([read_std(row, parameter) for row in rows])
     at_c = np.array([math.nan if row["temperature_c"] is None else row["temperature_c"] for row in rows])
     step = estimate_step(values, stds, since_days, at_c)
-    half = student_95(step.freedom) * step.std
+    half = compute_student_95(step.freedom) * step.std
     size = step.size if abs(step.size) > ROUNDING * half else 0.0
     figures = {"before": step.before, "change": size, "low": size - half, "high": size + half}
     return figures | {"sure": abs(size) > half, "at_constant_temperature": step.at_constant_temperature}

@@ -23,7 +23,7 @@ from fdhil.fleet.parameter_sets import (
     read_std,
 )
 from fdhil.records import PARAMETERS, get_unit
-from fdhil.report.history_trends import of_axis
+from fdhil.report.drive_health import assess_axis_health
 from fdhil.store.rows import Stamp, StoredWindow
 
 NEWEST_SETS, APART = 180, "1 day"  # half a year
@@ -85,7 +85,7 @@ def _forecast_limits(db: Db, axes: Sequence[Axis], shares: Mapping[str, Mapping[
             for name, share in shares[key[0]].items()
             if key in first and first[key][name]
         }
-        found[key] = of_axis(list(map(_convert_to_window, rows)), limits)["limits"]
+        found[key] = assess_axis_health(list(map(_convert_to_window, rows)), limits)["limits"]
     return found
 
 

@@ -11,11 +11,11 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.config import Axis, Identification
-from fdhil.identification.demand_lead import with_demand_on_time
-from fdhil.identification.filtering import moving_mean
-from fdhil.identification.signals import mended
-from fdhil.identification.slow_rows import STEPPED_ROW_S
-from fdhil.identification.windows import bridged, carried
+from fdhil.identification.demand_lead import align_demand_to_drive
+from fdhil.identification.filtering import compute_moving_mean
+from fdhil.identification.low_rate_voltage.within_sample import STEPPED_ROW_S
+from fdhil.identification.rapid_windows import fill_forward, interpolate_gaps
+from fdhil.identification.speed_alignment import align_speed_to_samples
 from fdhil.model.closed_loop import simulate_axis
 from fdhil.records import Float, Parameters, Window, compute_rms, make_read_only_view
 
@@ -27,7 +27,7 @@ SMOOTHING_S = 0.005
 SETTLED, LEAST_CYCLES = 8.0, 16  # time constants of the speed loop, and cycles, until the cycles repeat
 
 
-def with_current_means(
+def correct_current_to_means(
     windows: Sequence[Window], settings: Identification, axis: Axis | None, sync_period_s: float | None
 ) -> Sequence[Window]:
     """Return the windows of one drive with mean currents, where a replay of the ``axis``' loops shows a stepping speed.
@@ -37,43 +37,45 @@ def with_current_means(
     """
     if axis is None or not windows or windows[0].slow_voltage is not None or windows[0].current_off_a is not None:
         return windows
-    plain, stepped = _left_mm(windows[0], settings, axis, sync_period_s)
+    plain, stepped = _compare_replays_mm(windows[0], settings, axis, sync_period_s)
     if plain < SURELY * stepped and windows[0].dt_s < STEPPED_ROW_S:
         return windows  # no doubt to remove
     if plain < SURELY * stepped:
         return [replace(w, current_off_a=make_read_only_view(np.zeros(w.n))) for w in windows]
     if not stepped < SURELY * plain:
         return windows
-    lag = reading_lag(axis, windows[0].dt_s)
-    return [_moved(w, lag) for w in windows]
+    lag = simulate_reading_lag(axis, windows[0].dt_s)
+    return [_add_reading_lag(w, lag) for w in windows]
 
 
-def _left_mm(window: Window, settings: Identification, axis: Axis, sync_period_s: float | None) -> tuple[float, float]:
+def _compare_replays_mm(
+    window: Window, settings: Identification, axis: Axis, sync_period_s: float | None
+) -> tuple[float, float]:
     """Return the RMS residuals (mm) of replays without and with steps; NaN where nothing can be compared."""
     unknown = (math.nan, math.nan)
     if abs((sync_period_s or window.dt_s) / window.dt_s - 1.0) > SAME_GRID:
         return unknown
-    window = with_demand_on_time(mended(window, settings.speed_source), axis, sync_period_s)[0]
+    window = align_demand_to_drive(align_speed_to_samples(window, settings.speed_source), axis, sync_period_s)[0]
     known = np.isfinite(window.demand_mm) & np.isfinite(window.position_mm)
     if np.count_nonzero(known) < LEAST_ROWS or not np.ptp(window.demand_mm[known]) > 0.0:
         return unknown
-    demand, position = bridged(window.demand_mm), bridged(window.position_mm)
+    demand, position = interpolate_gaps(window.demand_mm), interpolate_gaps(window.position_mm)
     offset = None if window.offset_mm is None else np.nan_to_num(window.offset_mm)
     model = Parameters(**axis.nominal.model_dump())
     rate = np.gradient(demand, window.dt_s) * (2 * math.pi / axis.screw_pitch_mm)
     late = -axis.regulators.speed_feedforward * window.dt_s / 2 * np.gradient(rate, window.dt_s)
 
-    def left(speed_offset: Float | None) -> float:
+    def compute_residual_mm(speed_offset: Float | None) -> float:
         moved = simulate_axis(model, axis, window.dt_s, demand, offset, speed_offset_rad_s=speed_offset).position_mm
         return compute_rms((moved - moved[0] - position + position[0])[known])
 
-    return left(None), left(late)
+    return compute_residual_mm(None), compute_residual_mm(late)
 
 
-def _moved(window: Window, lag: float) -> Window:
+def _add_reading_lag(window: Window, lag: float) -> Window:
     """Return the window with ``lag`` (A per rad/s^2) times its acceleration added to its current readings."""
     width = 2 * round(SMOOTHING_S / window.dt_s / 2) + 1
-    beyond = lag * np.gradient(moving_mean(carried(window.speed_rad_s), width), window.dt_s)
+    beyond = lag * np.gradient(compute_moving_mean(fill_forward(window.speed_rad_s), width), window.dt_s)
     return replace(
         window,
         current_a=make_read_only_view(window.current_a + beyond),
@@ -81,7 +83,7 @@ def _moved(window: Window, lag: float) -> Window:
     )
 
 
-def reading_lag(axis: Axis, sync_period_s: float) -> float:
+def simulate_reading_lag(axis: Axis, sync_period_s: float) -> float:
     """Return by how much readings at SYNC are below the mean current, A per rad/s^2 of acceleration.
 
     Simulates the speed and current loops on a staircase of unit acceleration until the cycles repeat. The speed loop

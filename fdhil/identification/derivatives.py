@@ -11,7 +11,7 @@ _ROOT = math.sqrt(73.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Operator:
+class DerivativeStencil:
     """A derivative stencil: ascending ``offsets`` in samples, and ``weights`` before division by the period."""
 
     name: str
@@ -30,14 +30,14 @@ class Operator:
 
 
 # [DES] eq. 4 after [SOD 97]; exact: moments 0, 1, 0 and no |tau|^3 term, the root (7 - sqrt 73) / 12
-ZERO_FORCING_1 = Operator(
+ZERO_FORCING_1 = DerivativeStencil(
     "zero_forcing_1",
     (-2, -1, 0, 1),
     ((_ROOT - 5) / 12, (3 - _ROOT) / 4, (_ROOT - 5) / 4, (11 - _ROOT) / 12),
 )
 
 
-def derivative(values: Float, dt_s: float, operator: Operator = ZERO_FORCING_1) -> Float:
+def differentiate_signal(values: Float, dt_s: float, operator: DerivativeStencil = ZERO_FORCING_1) -> Float:
     """Return the derivative (n,) of ``values`` (n,) per second; NaN where the stencil leaves the array or meets NaN."""
     n = values.size
     result = np.full(n, np.nan)

@@ -16,7 +16,7 @@ SPAN_PERIODS = 6  # of the corner's period: beyond it the impulse response is ne
 PADDING_PERIODS = 3
 
 
-def zero_phase(values: Float, lowpass_hz: float, dt_s: float) -> Float:
+def filter_zero_phase(values: Float, lowpass_hz: float, dt_s: float) -> Float:
     """Return ``values`` (..., n) through a Butterworth low-pass run forward and backward: no delay, squared gain.
 
     The ends are extended by odd reflection, as usual for forward-backward filters.
@@ -28,12 +28,12 @@ def zero_phase(values: Float, lowpass_hz: float, dt_s: float) -> Float:
     before = 2 * values[..., :1] - values[..., pad:0:-1]
     after = 2 * values[..., -1:] - values[..., -2 : -pad - 2 : -1]
     extended = np.concatenate([before, values, after], axis=-1)
-    size = quick_size(extended.shape[-1])
-    spectrum = np.fft.rfft(_lengthened(extended, size)) * _gain(size, lowpass_hz, dt_s)
+    size = find_fft_size(extended.shape[-1])
+    spectrum = np.fft.rfft(_extend_periodically(extended, size)) * _compute_butterworth_gain(size, lowpass_hz, dt_s)
     return np.fft.irfft(spectrum, size)[..., pad : pad + n]
 
 
-def _lengthened(values: Float, size: int) -> Float:
+def _extend_periodically(values: Float, size: int) -> Float:
     """Return ``values`` (..., m) extended to ``size`` by a line back to the first value: the FFT is periodic."""
     missing = size - values.shape[-1]
     share = np.linspace(0.0, 1.0, missing + 2)[1:-1]
@@ -42,7 +42,7 @@ def _lengthened(values: Float, size: int) -> Float:
 
 
 @lru_cache(maxsize=256)
-def quick_size(least: int) -> int:
+def find_fft_size(least: int) -> int:
     """Return the smallest fast FFT size of at least ``least``: no prime factor above 5."""
     size = least
     while True:
@@ -56,7 +56,7 @@ def quick_size(least: int) -> int:
 
 
 @lru_cache(maxsize=64)
-def _gain(size: int, lowpass_hz: float, dt_s: float) -> Float:
+def _compute_butterworth_gain(size: int, lowpass_hz: float, dt_s: float) -> Float:
     corner = np.tan(np.pi * min(lowpass_hz * dt_s, 0.475))
     # the bilinear transform's frequency axis; at the highest one the gain is 0
     axis = np.tan(np.minimum(np.pi * np.fft.rfftfreq(size), np.pi / 2 * (1 - 1e-9)))
@@ -65,23 +65,23 @@ def _gain(size: int, lowpass_hz: float, dt_s: float) -> Float:
 
 
 @lru_cache(maxsize=32)
-def impulse_response(lowpass_hz: float, dt_s: float) -> Float:
+def compute_impulse_response(lowpass_hz: float, dt_s: float) -> Float:
     """Return the centred impulse response of the low-pass (odd length)."""
     half = max(8, round(SPAN_PERIODS / lowpass_hz / dt_s))
     size = 2 * half + 1
-    return np.roll(np.fft.irfft(_gain(size, lowpass_hz, dt_s), size), half)
+    return np.roll(np.fft.irfft(_compute_butterworth_gain(size, lowpass_hz, dt_s), size), half)
 
 
 @lru_cache(maxsize=32)
-def reach(lowpass_hz: float, dt_s: float) -> int:
+def compute_filter_reach(lowpass_hz: float, dt_s: float) -> int:
     """Return the half width of the low-pass in samples: 1 % of its impulse response lies beyond."""
-    answer = np.abs(impulse_response(lowpass_hz, dt_s))
+    answer = np.abs(compute_impulse_response(lowpass_hz, dt_s))
     half = answer.size // 2
     beyond = answer[half:][::-1].cumsum()[::-1] * 2 - answer[half]
     return int(np.argmax(beyond <= REACH_SHARE * answer.sum()))
 
 
-def moving_mean(values: Float, width: int) -> Float:
+def compute_moving_mean(values: Float, width: int) -> Float:
     """Return the centred mean (n,) over ``width`` (odd) samples; the end values are repeated beyond the ends."""
     if width <= 1 or values.size == 0:
         return values.copy()
@@ -90,7 +90,7 @@ def moving_mean(values: Float, width: int) -> Float:
     return np.convolve(padded, np.full(width, 1.0 / width), "valid")
 
 
-def all_about(flags: Bool, width: int, beyond: bool) -> Bool:
+def erode_flags(flags: Bool, width: int, beyond: bool) -> Bool:
     """Return where (n,) all ``width`` (odd) samples around one are set; samples beyond the ends count as ``beyond``."""
     half = width // 2
     ends = np.full(half, beyond)
@@ -99,9 +99,9 @@ def all_about(flags: Bool, width: int, beyond: bool) -> Bool:
     return together
 
 
-def through(columns: Float, kernel: Float) -> Float:
+def convolve_columns(columns: Float, kernel: Float) -> Float:
     """Return each column (m, k) convolved with a centred ``kernel`` (odd length)."""
     rows, half = columns.shape[0], kernel.size // 2
-    size = quick_size(rows + kernel.size - 1)
+    size = find_fft_size(rows + kernel.size - 1)
     spectrum = np.fft.rfft(columns, size, axis=0) * np.fft.rfft(kernel, size)[:, None]
     return np.fft.irfft(spectrum, size, axis=0)[half : half + rows]

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdhil.identification.physical_bounds import beyond_chance
+from fdhil.identification.physical_bounds import find_significant_violations
 from fdhil.records import PARAMETERS, Estimate, Float, Reason, Result
 
 CONDITION_LIMIT = 1e6
@@ -13,7 +13,7 @@ MOST_SHOWN_PERCENT = 999_999
 RELATIVE_STD_LIMIT: Mapping[str, float] = {"R": 0.10, "L": 0.25, "K": 0.05, "Jt": 0.10, "ft": 0.5, "Cd": 0.5}
 FRICTION_SHARE, TORQUE_SHARE = 0.25, 0.02
 SIGNALS = "check the scale, sign, timing and order of these signals"
-TOLD_BY_VOLTAGE = frozenset({"R", "L"})
+DETERMINED_BY_VOLTAGE = frozenset({"R", "L"})
 PHYSICAL: Mapping[str, tuple[float, float]] = {
     "R": (1e-3, 1e3),
     "L": (1e-6, 10.0),
@@ -34,12 +34,12 @@ ESTIMATED_FROM: Mapping[str, str] = {  # the signals of [1] and [2] that determi
 }
 
 
-def admissible(theta: Float) -> bool:
+def is_admissible(theta: Float) -> bool:
     """Return whether R, L, K and Jt of ``theta`` = [R, L, K, Jt, ...] are above 0 and all is finite."""
     return bool(np.isfinite(theta).all() and (theta[:4] > 0).all())
 
 
-def empty_estimate(method: str, result: Result, reason: Reason) -> Estimate:
+def create_empty_estimate(method: str, result: Result, reason: Reason) -> Estimate:
     """Return an estimate without values, each missing for ``reason``."""
     k = len(PARAMETERS)
     return Estimate(
@@ -53,7 +53,7 @@ def empty_estimate(method: str, result: Result, reason: Reason) -> Estimate:
     )
 
 
-def judge(estimate: Estimate, condition: float, top_rad_s: float, top_nm: float = 0.0) -> Estimate:
+def withhold_unidentifiable(estimate: Estimate, condition: float, top_rad_s: float, top_nm: float = 0.0) -> Estimate:
     """Return the estimate with its result set, and NaN with a reason for each parameter that the data do not determine.
 
     ``condition`` is that of the regressor with columns of equal length, ``top_rad_s`` the largest speed, ``top_nm`` the
@@ -62,12 +62,12 @@ def judge(estimate: Estimate, condition: float, top_rad_s: float, top_nm: float 
     if not np.isfinite(condition) or condition > CONDITION_LIMIT:
         text = f"the regressor is rank deficient (condition number {condition:.1e})"
         reason = Reason("RankDeficient", text, "record a rapid with acceleration and cruise")
-        return empty_estimate(estimate.method, Result.ILL_CONDITIONED, reason)
+        return create_empty_estimate(estimate.method, Result.ILL_CONDITIONED, reason)
     if not (np.isfinite(estimate.values).all() and np.isfinite(estimate.covariance).all()):
-        return empty_estimate(
+        return create_empty_estimate(
             estimate.method, Result.NOT_FINITE, Reason("NotFinite", "the fit is not finite", "record again")
         )
-    missing = _unknown(estimate, top_rad_s, top_nm)
+    missing = _find_uncertain_parameters(estimate, top_rad_s, top_nm)
     values, covariance = estimate.values.copy(), estimate.covariance.copy()
     for name in missing:
         k = estimate.names.index(name)
@@ -76,7 +76,7 @@ def judge(estimate: Estimate, condition: float, top_rad_s: float, top_nm: float 
     return replace(estimate, values=values, covariance=covariance, missing=missing, result=result)
 
 
-def _unknown(estimate: Estimate, top_rad_s: float, top_nm: float) -> dict[str, Reason]:
+def _find_uncertain_parameters(estimate: Estimate, top_rad_s: float, top_nm: float) -> dict[str, Reason]:
     missing = {}
     friction = abs(estimate.get_value("ft")) * top_rad_s + abs(estimate.get_value("Cd"))
     # a friction coefficient may be zero: its interval is compared with the total friction torque, or, since a weight
@@ -95,18 +95,18 @@ def _unknown(estimate: Estimate, top_rad_s: float, top_nm: float) -> dict[str, R
     return missing
 
 
-def untold(estimate: Estimate, *, slow: bool) -> list[Reason]:
+def list_missing_reasons(estimate: Estimate, *, slow: bool) -> list[Reason]:
     """Return the reasons why an estimate with missing parameters is not accepted, each once.
 
     Only the voltage's waveform determines R and L. A ``slow`` sensor may leave them open in a good window: they are
     null with their reasons, and the other parameters remain valid.
     """
-    if slow and set(estimate.missing) <= TOLD_BY_VOLTAGE and estimate.result is Result.UNDER_EXCITED:
+    if slow and set(estimate.missing) <= DETERMINED_BY_VOLTAGE and estimate.result is Result.UNDER_EXCITED:
         return []
     return list({r.text: r for r in estimate.missing.values()}.values())
 
 
-def unphysical(estimate: Estimate, *, one_way: bool = False) -> list[Reason]:
+def find_unphysical_values(estimate: Estimate, *, one_way: bool = False) -> list[Reason]:
     """Return a reason for each value outside the range of feed drives; a NaN has its own reason.
 
     Friction may be negligible, so only a significantly negative one is unphysical. In ``one_way`` moves a constant load
@@ -118,7 +118,7 @@ def unphysical(estimate: Estimate, *, one_way: bool = False) -> list[Reason]:
         if np.isfinite(value) and not low <= value <= high:
             text = f"{name} = {value:.4g} lies outside {max(low, 0):.3g} to {high:.3g}: {ESTIMATED_FROM[name]} disagree"
             reasons.append(Reason("Unphysical", text, SIGNALS))
-    for bound, value in beyond_chance(estimate.names, estimate.values, estimate.covariance):
+    for bound, value in find_significant_violations(estimate.names, estimate.values, estimate.covariance):
         if one_way and "Cd" in bound.weights:
             continue
         name = " + ".join(bound.weights)

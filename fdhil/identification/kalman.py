@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fdhil.identification.motion import BROKEN_MODE, DIFFUSE, UNKNOWN_MODE, Modes, Motion
+from fdhil.identification.prepared_motion import BROKEN_MODE, DIFFUSE, UNKNOWN_MODE, Modes, Motion
 from fdhil.model.feed_drive import compute_transition
 from fdhil.model.numba_decorators import compile_kernel
 from fdhil.records import Bool, Float, make_read_only_view
@@ -57,7 +57,7 @@ class Readings(NamedTuple):
     walk: float
 
     @classmethod
-    def of(cls, motion: Motion, emf_share: float = 1.0) -> Readings:
+    def from_motion(cls, motion: Motion, emf_share: float = 1.0) -> Readings:
         """Return the readings of a prepared window.
 
         Within an interval mean only the back-EMF's ramp is certain: the regulator's part depends on the drive, and
@@ -69,7 +69,7 @@ class Readings(NamedTuple):
         return cls(motion.dt_s, motion.mode, motion.observed, current, speed, rise_v, share, motion.speed_walk)
 
 
-class Marks(NamedTuple):
+class SampleMarks(NamedTuple):
     """Where the samples of a low-rate voltage begin and end among the drive's samples, in order of time (b,).
 
     Mark b follows the drive's sample ``row``, at ``time_s``; there the voltage sample ``sample`` ends (-1: none
@@ -88,11 +88,11 @@ class SlowSensor(NamedTuple):
     instant: bool
     period_s: float
     shape_variance: Float
-    marks: Marks
+    marks: SampleMarks
 
 
 @compile_kernel
-def interval_steps(theta: Float, dt: float, emf_share: float) -> Float:
+def compute_interval_steps(theta: Float, dt: float, emf_share: float) -> Float:
     """Return the transition coefficients (2, 11) over an interval of unknown friction, and of known friction.
 
     They include ``emf_share`` of the back-EMF's rise over the interval, which is linear in the same quantities.
@@ -117,7 +117,9 @@ def interval_steps(theta: Float, dt: float, emf_share: float) -> Float:
 
 
 @compile_kernel
-def _moved(steps: Float, known: int, i: float, w: float, u: float, torque: float, rise: float) -> tuple[float, float]:
+def _propagate_state(
+    steps: Float, known: int, i: float, w: float, u: float, torque: float, rise: float
+) -> tuple[float, float]:
     s = steps[known]
     return (
         s[I_I] * i + s[I_W] * w + (s[I_U] * u + s[I_T] * torque + s[I_RISE] * rise),
@@ -126,7 +128,7 @@ def _moved(steps: Float, known: int, i: float, w: float, u: float, torque: float
 
 
 @compile_kernel
-def _spread(
+def _propagate_covariance(
     steps: Float, known: int, p11: float, p12: float, p22: float, vu: float, walk: float
 ) -> tuple[float, float, float]:
     """Return variance of current, covariance, and variance of speed at the end of an interval.
@@ -145,11 +147,11 @@ def _spread(
 
 
 @compile_kernel
-def _whiten_one(
+def _whiten_window(
     theta: Float, variances: Float, readings: Readings, mean_v: Float, load: Float, white: Float, gains: Float
 ) -> float:
     """Fill ``white`` (n, 2), and ``gains`` (n, 7) unless it is empty; return the innovations' log determinant."""
-    steps = interval_steps(theta, readings.dt_s, readings.emf_share)
+    steps = compute_interval_steps(theta, readings.dt_s, readings.emf_share)
     mode, observed, rise_v = readings.mode, readings.observed, readings.rise_v
     current, speed = readings.current, readings.speed
     vu, vi, vw = variances
@@ -195,14 +197,14 @@ def _whiten_one(
         if still < SETTLED_ROWS:  # else the gains are constant
             if observed[k]:
                 p11, p12, p22 = g11 * vi, g12 * vw, g22 * vw
-            p11, p12, p22 = _spread(steps, known, p11, p12, p22, vu, 0.0 if known else readings.walk)
+            p11, p12, p22 = _propagate_covariance(steps, known, p11, p12, p22, vu, 0.0 if known else readings.walk)
         rise = rise_v[k] if rise_v.size else 0.0
-        i, w = _moved(steps, known, i, w, mean_v[k], load[k], rise)
+        i, w = _propagate_state(steps, known, i, w, mean_v[k], load[k], rise)
     return float(logdet + np.log(product) - counted * np.log(unit))
 
 
 @compile_kernel
-def whiten(
+def whiten_for_parameters(
     thetas: Float, variances: Float, readings: Readings, mean_v: Float, loads: Float, gains: Float
 ) -> tuple[Float, Float]:
     """Return whitened innovations (q, n, 2) and log determinants (q,) for the rows of ``thetas`` (q, 7).
@@ -216,12 +218,12 @@ def whiten(
     logdet = np.zeros(q)
     for c in range(q):
         mean, load = mean_v[min(c, mean_v.shape[0] - 1)], loads[min(c, loads.shape[0] - 1)]
-        logdet[c] = _whiten_one(thetas[c], variances[c], readings, mean, load, white[c], gains)
+        logdet[c] = _whiten_window(thetas[c], variances[c], readings, mean, load, white[c], gains)
     return white, logdet
 
 
 @compile_kernel
-def respond(
+def compute_filter_response(
     theta: Float, readings: Readings, signals: Float, kind: int, courses: Float, rises: Float, gains: Float
 ) -> Float:
     """Return the whitened innovations (n, 2, q) by the filter of ``gains`` (n, 7), linear in all signals.
@@ -229,7 +231,7 @@ def respond(
     The signal ``kind`` of ``signals`` (4, n) is replaced by each of ``courses`` (q, n), with ``rises`` (q, n) of the
     voltage within the intervals, or none. The load is friction and all other torque against the positive direction.
     """
-    steps, q = interval_steps(theta, readings.dt_s, readings.emf_share), len(courses)
+    steps, q = compute_interval_steps(theta, readings.dt_s, readings.emf_share), len(courses)
     mode, observed = readings.mode, readings.observed
     white, course, rise = np.empty((mode.size, 2, q)), np.ascontiguousarray(courses.T), np.zeros(q)
     risen = np.ascontiguousarray(rises.T)
@@ -263,7 +265,7 @@ def respond(
 
 
 @compile_kernel
-def _take(x: Float, p: Float, h: Float, value: float, noise: float) -> tuple[float, float]:
+def _apply_measurement(x: Float, p: Float, h: Float, value: float, noise: float) -> tuple[float, float]:
     """Update with a measurement ``value`` = h x of variance ``noise``; return its innovation and variance."""
     error, variance = value, noise
     s0 = p[0, 0] * h[0] + p[0, 1] * h[1] + p[0, 2] * h[2] + p[0, 3] * h[3]
@@ -283,7 +285,9 @@ def _take(x: Float, p: Float, h: Float, value: float, noise: float) -> tuple[flo
 
 
 @compile_kernel
-def _advance(theta: Float, x: Float, p: Float, h: float, known: bool, push: float, walk: float, period: float) -> None:
+def _advance_state(
+    theta: Float, x: Float, p: Float, h: float, known: bool, push: float, walk: float, period: float
+) -> None:
     """Propagate ``x`` (4,) and ``p`` (4, 4) by ``h`` seconds; Jt w' = K i - ft w + Jt ``push`` where friction is known.
 
     ``walk`` is the variance of di/dt per second; terms of third order in h ft/Jt are negligible and left out.
@@ -319,7 +323,7 @@ def _advance(theta: Float, x: Float, p: Float, h: float, known: bool, push: floa
 
 
 @compile_kernel
-def slow_innovations(
+def run_low_rate_filter(
     theta: Float, readings: Readings, sensor: SlowSensor, noise: Float, spread: Float, load: Float, slope_walk: Float
 ) -> tuple[Float, Float]:
     """Return innovations (2 n + m,) of the drive's samples and of a low-rate voltage (m,), and their variances.
@@ -341,34 +345,34 @@ def slow_innovations(
     of_voltage = np.array([theta[R], theta[K], theta[L], 0.0]) if instant else np.array([lever, 0.0, 0.0, 1.0])
     for k in range(n):
         if spread[k, 0] < np.inf:
-            values[2 * k], variance[2 * k] = _take(x, p, of_current, current[k], spread[k, 0])
+            values[2 * k], variance[2 * k] = _apply_measurement(x, p, of_current, current[k], spread[k, 0])
         if spread[k, 1] < np.inf:
-            values[2 * k + 1], variance[2 * k + 1] = _take(x, p, of_speed, speed[k], spread[k, 1])
+            values[2 * k + 1], variance[2 * k + 1] = _apply_measurement(x, p, of_speed, speed[k], spread[k, 1])
         known, now = mode[k] != UNKNOWN_MODE, k * dt
         push = -(theta[CD] * mode[k] + (load[k] if load.size else 0.0)) / theta[JT] if known else 0.0
         stray = 0.0 if known else readings.walk * readings.walk / dt
         while b < row.size and row[b] == k:
-            _advance(theta, x, p, time[b] - now, known, push, slope_walk[k], period)
+            _advance_state(theta, x, p, time[b] - now, known, push, slope_walk[k], period)
             p[STATE_W, STATE_W] += stray * (time[b] - now)
             now = time[b]
             j = sample[b]
             if j != NO_SAMPLE:
                 at = 2 * n + j
                 noisy = noise[OF_VOLTAGE] + sensor.shape_variance[j]
-                values[at], variance[at] = _take(x, p, of_voltage, voltage[j], noisy)
+                values[at], variance[at] = _apply_measurement(x, p, of_voltage, voltage[j], noisy)
             if not instant:  # a sample begins: its sum starts at - L i / T of the present current
                 x[STATE_SUM] = -lever * x[STATE_I]
                 for a in range(STATE_SUM):
                     p[STATE_SUM, a] = p[a, STATE_SUM] = -lever * p[STATE_I, a]
                 p[STATE_SUM, STATE_SUM] = lever * lever * p[STATE_I, STATE_I]
             b += 1
-        _advance(theta, x, p, (k + 1) * dt - now, known, push, slope_walk[k], period)
+        _advance_state(theta, x, p, (k + 1) * dt - now, known, push, slope_walk[k], period)
         p[STATE_W, STATE_W] += stray * ((k + 1) * dt - now)
     return values, variance
 
 
 @compile_kernel
-def departure(
+def compute_departure(
     theta: Float, dt: float, mode: Modes, load: Float, y: Float, variance: Float, walks: Float, signal: int
 ) -> tuple[float, float]:
     """Return the squares, in units of ``variance``, by which readings ``y`` (n, 3) depart from the smoothed signals.
@@ -378,7 +382,7 @@ def departure(
     is as in the whitening filter; ``walks`` (n, 3) are the variances that speed (where friction is unknown) and voltage
     gain over each interval, and of the voltage's rise within it.
     """
-    steps = interval_steps(theta, dt, 0.0)
+    steps = compute_interval_steps(theta, dt, 0.0)
     x, p, of_signal = np.zeros(STATES), np.zeros((STATES, STATES)), np.eye(STATES)
     rises = (steps[1, I_RISE], steps[1, W_RISE])
     x[:3], total, news = y[0], 0.0, 0.0
@@ -388,7 +392,7 @@ def departure(
         for j in range(3):
             if math.isfinite(variance[k, j]):
                 before = p[j, j]
-                error, spread = _take(x, p, of_signal[j], y[k, j], variance[k, j])
+                error, spread = _apply_measurement(x, p, of_signal[j], y[k, j], variance[k, j])
                 total += error * error / spread
                 news += before / spread if j == signal else 0.0
         known = 0 if mode[k] == UNKNOWN_MODE else 1
@@ -406,5 +410,5 @@ def departure(
         for a in range(2):
             for b in range(2):
                 p[a, b] += walks[k, 2] * rises[a] * rises[b]
-        x[STATE_I], x[STATE_W] = _moved(steps, known, x[STATE_I], x[STATE_W], x[STATE_U], load[k], 0.0)
+        x[STATE_I], x[STATE_W] = _propagate_state(steps, known, x[STATE_I], x[STATE_W], x[STATE_U], load[k], 0.0)
     return total, news

@@ -10,9 +10,9 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from fdhil.identification.identifiability import RELATIVE_STD_LIMIT
-from fdhil.identification.motion import noise_levels
-from fdhil.identification.normal import inverse_gram
-from fdhil.identification.windows import carried
+from fdhil.identification.normal_equations import invert_gram
+from fdhil.identification.prepared_motion import estimate_noise_levels
+from fdhil.identification.rapid_windows import fill_forward
 from fdhil.model.feed_drive import compute_voltage_ramps
 from fdhil.records import PARAMETERS, Estimate, Float, Reason, Result, Window
 
@@ -24,20 +24,20 @@ OPEN_SHARE = np.array([5e-4, 1e-3])  # of R and L: doubt of the voltage's wavefo
 TOO_SLOW = "the current changes too little, or too slowly, to determine {}"
 
 
-def is_locked(window: Window) -> bool:
+def is_rotor_locked(window: Window) -> bool:
     """Return whether the speed of a laboratory recording is only noise while a current flows."""
-    speed, current = np.abs(carried(window.speed_rad_s)).max(), np.abs(carried(window.current_a)).max()
-    noise = noise_levels(window)
+    speed, current = np.abs(fill_forward(window.speed_rad_s)).max(), np.abs(fill_forward(window.current_a)).max()
+    noise = estimate_noise_levels(window)
     return not window.is_rapid and bool(speed <= TURNING * noise.speed_rad_s and current > TURNING * noise.current_a)
 
 
-def estimate_locked(window: Window) -> Estimate:
+def estimate_locked_rotor(window: Window) -> Estimate:
     """Return R and L of a window with a measured voltage; the other parameters are NaN with a reason."""
     assert window.voltage_v is not None
-    voltage = compute_voltage_ramps(carried(window.voltage_v), window.voltage_sampling)[0]
-    current = carried(window.current_a)
+    voltage = compute_voltage_ramps(fill_forward(window.voltage_v), window.voltage_sampling)[0]
+    current = fill_forward(window.current_a)
 
-    def left(logarithms: Float) -> Float:
+    def compute_current_residuals(logarithms: Float) -> Float:
         resistance, inductance = np.exp(logarithms)
         keeps = math.exp(-resistance / inductance * window.dt_s)
         made = lfilter([0.0, 1.0], [1.0, -keeps], voltage * (1.0 - keeps) / resistance)
@@ -45,13 +45,13 @@ def estimate_locked(window: Window) -> Estimate:
 
     start_ohm = max(abs(float(voltage @ current)) / float(current @ current), 1e-3)
     with np.errstate(over="ignore", under="ignore"):
-        found = least_squares(left, np.log([start_ohm, START_L_H]), bounds=(-14.0, 7.0))
+        found = least_squares(compute_current_residuals, np.log([start_ohm, START_L_H]), bounds=(-14.0, 7.0))
     spread = (
-        inverse_gram(np.asarray(found.jac, dtype=np.float64))[0]
+        invert_gram(np.asarray(found.jac, dtype=np.float64))[0]
         * float(found.fun @ found.fun)
         / max(1, current.size - 2)
     )
-    shares = np.sqrt(np.diag(spread) * correlation_factor(found.fun) + OPEN_SHARE**2)
+    shares = np.sqrt(np.diag(spread) * compute_correlation_factor(found.fun) + OPEN_SHARE**2)
     values, covariance = np.full(6, np.nan), np.full((6, 6), np.nan)
     still = "the rotor does not turn, so {} cannot be determined"
     missing = {name: Reason("LowExcitation", still.format(name), ADVICE) for name in PARAMETERS}
@@ -65,7 +65,7 @@ def estimate_locked(window: Window) -> Estimate:
     return Estimate(NAME, PARAMETERS, values, covariance, {"electrical": found.fun}, Result.UNDER_EXCITED, missing)
 
 
-def correlation_factor(residuals: Float) -> float:
+def compute_correlation_factor(residuals: Float) -> float:
     """Return the variance inflation of correlated residuals (m,), at least 1: 1 + 2 sum of their correlations."""
     power, total = float(residuals @ residuals), 1.0
     for lag in range(1, min(200, residuals.size // 4)):

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from fdhil.identification.fit import Fit
 from fdhil.identification.kalman import CD, FT, K, L, R
+from fdhil.identification.likelihood_fit import LikelihoodFit
 from fdhil.records import Float
 
 SHARES: Mapping[int, float] = {R: 0.008, L: 0.03, K: 0.0003}
@@ -18,7 +18,7 @@ CURVE_SHARE = 0.004  # of the friction at top speed: its deviation from a straig
 CROSSING = 1.5  # top speed over the one at which the straight line meets the curve again
 
 
-def model_doubts(result: Fit) -> Float:
+def estimate_model_doubts(result: LikelihoodFit) -> Float:
     """Return (k, 4) standard deviations of theta for unmodelled deviations shaped like R, L, K or friction."""
     theta, top = result.theta, max(float(np.abs(m.speed).max()) for m in result.problem.motions)
     doubts = np.zeros((theta.size, 4))

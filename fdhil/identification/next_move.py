@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.identification.motion import Noise, noise_levels
-from fdhil.identification.normal import inverse_of
-from fdhil.identification.windows import carried
+from fdhil.identification.normal_equations import invert_symmetric
+from fdhil.identification.prepared_motion import NoiseLevels, estimate_noise_levels
+from fdhil.identification.rapid_windows import fill_forward
 from fdhil.model.feed_drive import simulate_plant
 from fdhil.records import PARAMETERS, Estimate, Float, Parameters, Window
 
@@ -38,25 +38,25 @@ def predict_next_moves(window: Window, estimate: Estimate) -> list[NextMove]:
     """
     if window.voltage_v is None:
         return []
-    parameters, noise = estimate.build_parameters(), noise_levels(window)
-    current, speed = carried(window.current_a), carried(window.speed_rad_s)
-    now = information(parameters, noise, window.dt_s, current, speed)
-    known = np.diag(inverse_of(now)[0])
+    parameters, noise = estimate.build_parameters(), estimate_noise_levels(window)
+    current, speed = fill_forward(window.current_a), fill_forward(window.speed_rad_s)
+    now = compute_information(parameters, noise, window.dt_s, current, speed)
+    known = np.diag(invert_symmetric(now)[0])
     stays = np.maximum(np.square([estimate.get_std(name) for name in PARAMETERS]) - known, 0.0)
 
-    def left(variances: Float) -> Mapping[str, float]:
+    def compute_remaining_shares(variances: Float) -> Mapping[str, float]:
         return dict(zip(PARAMETERS, np.sqrt((variances + stays) / (known + stays)).tolist(), strict=True))
 
-    moves = [NextMove("the same recording again", left(0.5 * known))]
+    moves = [NextMove("the same recording again", compute_remaining_shares(0.5 * known))]
     top_v, share = float(np.nanmax(np.abs(window.voltage_v))), np.arange(window.n) / window.n
     for name, course in MOVES.items():
         current, speed = simulate_plant(parameters, top_v * course(share), window.dt_s, "interval_mean")
-        after = inverse_of(now + information(parameters, noise, window.dt_s, current, speed))[0]
-        moves.append(NextMove(name, left(np.diag(after))))
+        after = invert_symmetric(now + compute_information(parameters, noise, window.dt_s, current, speed))[0]
+        moves.append(NextMove(name, compute_remaining_shares(np.diag(after))))
     return moves
 
 
-def information(p: Parameters, noise: Noise, dt_s: float, current: Float, speed: Float) -> Float:
+def compute_information(p: Parameters, noise: NoiseLevels, dt_s: float, current: Float, speed: Float) -> Float:
     """Return the information (6, 6) on R, L, K, Jt, ft, Cd of a move's current (n,) and speed (n,)."""
     di, dw, zero = np.gradient(current, dt_s), np.gradient(speed, dt_s), np.zeros(current.size)
     slope_i, slope_w = np.sqrt(2.0) * noise.current_a / dt_s, np.sqrt(2.0) * noise.speed_rad_s / dt_s

@@ -19,10 +19,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from fdhil.identification.courses import FIRST_COURSE
-from fdhil.identification.filtering import quick_size
+from fdhil.identification.filtering import find_fft_size
 from fdhil.identification.kalman import CD, FT, JT, LOAD, K
-from fdhil.identification.motion import Course, Motion
+from fdhil.identification.prepared_motion import Motion, TermRegressor
+from fdhil.identification.term_regressors import FIRST_TERM
 from fdhil.records import Float
 
 Spectrum = npt.NDArray[np.complex128]
@@ -44,7 +44,7 @@ class Spring:
     share: float
     damping: float
 
-    def moved(self, hertz: float, share: float) -> Spring:
+    def apply_step(self, hertz: float, share: float) -> Spring:
         """Return the spring moved in f and s, within physical limits."""
         near = float(np.clip(hertz, -MOST_STEP * self.hertz, MOST_STEP * self.hertz))
         part = float(np.clip(self.share + share, LEAST_SHARE, MOST_SHARE))
@@ -52,7 +52,7 @@ class Spring:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class SpringResponse:
     """Frequency response (w,) of a spring to torques: ``swing`` H and ``motor`` G.
 
     Current and acceleration both measure the torque on the motor, each with noise; ``of_current`` is the weight of the
@@ -80,13 +80,13 @@ class Answer:
         """What a torque against the table adds to itself."""
         return self.shaped * (1.0 - self.swing) - 1.0
 
-    def added(self, motor: Spectrum, table: Spectrum) -> Spectrum:
+    def compute_added_torque(self, motor: Spectrum, table: Spectrum) -> Spectrum:
         """Return the torque against the positive direction that the spring adds to torques on motor and table."""
         return -self.swing * (self.ratio * motor + table)
 
 
 @dataclass(frozen=True, slots=True)
-class Torques:
+class SpringTorques:
     """Spectra (w,) of a window's torques, N.m, and the noise power of the motor's torque.
 
     ``motor`` is the current's torque less viscous friction, ``table`` the dry friction, both of the six alone, and
@@ -106,95 +106,98 @@ class Torques:
     visible: Float
 
     @classmethod
-    def of(cls, motion: Motion, theta: Float) -> Torques:
+    def from_motion(cls, motion: Motion, theta: Float) -> SpringTorques:
         """Return the torques of a window; at standstill friction balances any torque."""
         moving, dt_s = np.abs(motion.mode) == 1, motion.dt_s
-        motor = theta[K] * _means(motion.current) - theta[FT] * _means(motion.speed)
+        motor = theta[K] * _average_neighbours(motion.current) - theta[FT] * _average_neighbours(motion.speed)
         held = np.clip(motor, -abs(theta[CD]), abs(theta[CD]))
         table = np.where(moving, theta[CD] * motion.mode, held)
         motor_whole, table_whole = motor.copy(), table.copy()
-        for course, amplitude in zip(motion.courses, theta[FIRST_COURSE:], strict=False):
-            if course.kind == LOAD and of_motor(course):
+        for course, amplitude in zip(motion.courses, theta[FIRST_TERM:], strict=False):
+            if course.kind == LOAD and is_motor_term(course):
                 motor_whole -= amplitude * course.values
             elif course.kind == LOAD:
                 table_whole += amplitude * course.values
-        size = 2 * quick_size((motion.n + math.ceil(RINGS_S / dt_s) + 1) // 2)
+        size = 2 * find_fft_size((motion.n + math.ceil(RINGS_S / dt_s) + 1) // 2)
         turn = np.asarray(2 * math.pi * np.fft.rfftfreq(size), dtype=np.float64)
         return cls(
             n=motion.n,
             p=(1j * turn / dt_s).astype(np.complex128),
-            motor=_spectrum(motor, size),
-            table=_spectrum(table, size),
-            motor_whole=_spectrum(motor_whole, size),
-            table_whole=_spectrum(table_whole, size),
-            inertial=_spectrum(theta[JT] * np.diff(motion.speed, append=motion.speed[-1]) / dt_s, size),
+            motor=_transform_signal(motor, size),
+            table=_transform_signal(table, size),
+            motor_whole=_transform_signal(motor_whole, size),
+            table_whole=_transform_signal(table_whole, size),
+            inertial=_transform_signal(theta[JT] * np.diff(motion.speed, append=motion.speed[-1]) / dt_s, size),
             noise_current=np.square(theta[K] * motion.noise.current_a * np.cos(turn / 2)),
             noise_speed=np.square(theta[JT] * motion.noise.speed_rad_s * 2 * np.sin(turn / 2) / dt_s),
             visible=np.asarray(1.0 / (1.0 + (turn / (2 * math.pi * MOST_OF_ROWS)) ** SEEN_ORDER), dtype=np.float64),
         )
 
-    def answer(self, spring: Spring) -> Answer:
+    def compute_response(self, spring: Spring) -> SpringResponse:
         """Return a spring's frequency response."""
-        ratio, swing = spring.share / (1.0 - spring.share), self._swing(spring)
+        ratio, swing = spring.share / (1.0 - spring.share), self._compute_swing(spring)
         motor = 1.0 + ratio * swing
         noise = np.square(np.abs(motor)) * self.noise_current
-        return Answer(ratio, swing, motor, self.noise_speed / np.maximum(self.noise_speed + noise, 1e-300))
+        return SpringResponse(ratio, swing, motor, self.noise_speed / np.maximum(self.noise_speed + noise, 1e-300))
 
-    def _swing(self, spring: Spring) -> Spectrum:
+    def _compute_swing(self, spring: Spring) -> Spectrum:
         w, square = 2 * math.pi * spring.hertz, self.p**2
         return self.visible * square / (square + (2 * spring.damping * w) * self.p + w**2)
 
-    def best(self, answer: Answer) -> Spectrum:
+    def combine_torque(self, answer: SpringResponse) -> Spectrum:
         """Return the torque on the motor, combined from current and acceleration."""
         by_motion = (self.inertial + self.table_whole * (1.0 - answer.swing)) / answer.motor
         return by_motion + answer.of_current * (self.motor_whole - by_motion)
 
-    def begun(self, springs: Sequence[Spring]) -> list[Float]:
+    def predict_added_torques(self, springs: Sequence[Spring]) -> list[Float]:
         """Return the torque (n,) that each spring would add to a rigid mass."""
         still = Spring(springs[0].hertz, 0.0, springs[0].damping)
-        motor = self.best(self.answer(still))
+        motor = self.combine_torque(self.compute_response(still))
         ratios = [one.share / (1.0 - one.share) for one in springs]
         return [
-            self.back(-self._swing(one) * (ratio * motor + self.table_whole))
+            self.transform_back(-self._compute_swing(one) * (ratio * motor + self.table_whole))
             for one, ratio in zip(springs, ratios, strict=True)
         ]
 
-    def felt(self, answer: Answer) -> Float:
+    def compute_felt_torque(self, answer: SpringResponse) -> Float:
         """Return the torque (n,) that the spring adds by the six alone; the terms' regressors include their own."""
         own = (answer.shaped - 1.0) * self.inertial - answer.on_motor * self.motor + answer.on_table * self.table
-        return self.back(own)
+        return self.transform_back(own)
 
-    def slope(self, answer: Answer, high: Spring, low: Spring) -> Float:
+    def compute_torque_difference(self, answer: SpringResponse, high: Spring, low: Spring) -> Float:
         """Return the torque (n,) by which two springs differ, linearised about the one with this response."""
-        torque = self.best(answer)
-        added = (self.answer(one).added(torque, self.table_whole) for one in (high, low))
-        return self.back(answer.shaped * (next(added) - next(added)))
+        torque = self.combine_torque(answer)
+        added = (self.compute_response(one).compute_added_torque(torque, self.table_whole) for one in (high, low))
+        return self.transform_back(answer.shaped * (next(added) - next(added)))
 
-    def squeezed(self, answer: Answer) -> float:
+    def compute_scaling_cost(self, answer: SpringResponse) -> float:
         """Return minus twice the log of the scaling of the innovations against those of a rigid mass.
 
         It corrects the likelihood, because the innovations are measured on another scale.
         """
         return -2.0 * self.n * float(np.log(np.maximum(np.abs(answer.shaped), 1e-12)).mean())
 
-    def with_answer(self, course: Course, answer: Answer) -> Course:
+    def apply_response(self, course: TermRegressor, answer: SpringResponse) -> TermRegressor:
         """Return the regressor of a term as rigid masses would feel it."""
         if course.kind != LOAD:
             return course
-        gain = answer.on_motor if of_motor(course) else answer.on_table
-        return replace(course, values=course.values + self.back(gain * _spectrum(course.values, 2 * (self.p.size - 1))))
+        gain = answer.on_motor if is_motor_term(course) else answer.on_table
+        return replace(
+            course,
+            values=course.values + self.transform_back(gain * _transform_signal(course.values, 2 * (self.p.size - 1))),
+        )
 
-    def back(self, spectrum: Spectrum) -> Float:
+    def transform_back(self, spectrum: Spectrum) -> Float:
         """Return the signal (n,) of a spectrum."""
         return np.fft.irfft(spectrum, 2 * (self.p.size - 1))[: self.n]
 
 
-def of_motor(course: Course) -> bool:
+def is_motor_term(course: TermRegressor) -> bool:
     """Return whether a term acts on the motor: a ripple of the motor, or of the screw's bearing and nut."""
     return course.name.startswith("ripple")
 
 
-def _spectrum(values: Float, size: int) -> Spectrum:
+def _transform_signal(values: Float, size: int) -> Spectrum:
     """Return the spectrum (w,) of a signal (n,), extended by a smooth return to its first value."""
     n = values.size
     whole = np.zeros(size)
@@ -203,6 +206,6 @@ def _spectrum(values: Float, size: int) -> Spectrum:
     return np.fft.rfft(whole).astype(np.complex128)
 
 
-def _means(values: Float) -> Float:
+def _average_neighbours(values: Float) -> Float:
     means: Float = (values + np.append(values[1:], values[-1])) / 2
     return means

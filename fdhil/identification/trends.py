@@ -53,9 +53,9 @@ class Slope:
     level_std: float = 0.0
     freedom: float = math.inf
 
-    def interval(self) -> tuple[float, float]:
+    def compute_interval(self) -> tuple[float, float]:
         """Return the slope's 95 % interval."""
-        half = student_95(self.freedom) * self.std
+        half = compute_student_95(self.freedom) * self.std
         return self.value - half, self.value + half
 
 
@@ -79,7 +79,7 @@ class Step:
     before: float
 
 
-def student_95(freedom: float) -> float:
+def compute_student_95(freedom: float) -> float:
     """Return the quantile of Student's t that leaves 2.5 % on either side (Cornish-Fisher; within 1 % from 3 on)."""
     if math.isinf(freedom):
         return INTERVAL_95
@@ -88,7 +88,7 @@ def student_95(freedom: float) -> float:
     return sum(term / v**k for k, term in enumerate(terms))
 
 
-def slope(points: Float, against: Float, stds: Float | None = None, covariate: Float | None = None) -> Slope | None:
+def fit_slope(points: Float, against: Float, stds: Float | None = None, covariate: Float | None = None) -> Slope | None:
     """Fit a line to ``points`` (n,) over ``against`` (n,), weighted by ``stds`` (n,); None without a slope.
 
     The effect of the ``covariate`` (n,) does not count towards the slope. The standard deviation is the larger of
@@ -108,7 +108,7 @@ def slope(points: Float, against: Float, stds: Float | None = None, covariate: F
     whole = float(lever @ lever)
     if covariate is not None:
         other = covariate[known] - np.average(covariate[known], weights=weights)
-        lever, left = (_without(root * other, column) for column in (lever, left))
+        lever, left = (_remove_component(root * other, column) for column in (lever, left))
     spread = float(lever @ lever)
     if not spread > COLLINEAR * whole:
         return None
@@ -121,12 +121,12 @@ def slope(points: Float, against: Float, stds: Float | None = None, covariate: F
     return Slope(value, math.sqrt(inflation / spread), at, level, level_std, freedom)
 
 
-def _without(other: Float, column: Float) -> Float:
+def _remove_component(other: Float, column: Float) -> Float:
     length = float(other @ other)
     return column - other * (float(other @ column) / length if length > 0 else 0.0)
 
 
-def without_direction(points: Float, direction: Float) -> Float:
+def remove_direction_bias(points: Float, direction: Float) -> Float:
     """Return ``points`` (n,) less the effect of the ``direction`` (n,), 1 or -1: a constant load, a screw's bias.
 
     It is half the median difference between consecutive windows of opposite directions, which excludes drift and steps;
@@ -141,9 +141,9 @@ def without_direction(points: Float, direction: Float) -> Float:
     return points - load * direction
 
 
-def crossing(line: Slope, limit: float) -> Crossing | None:
+def find_crossing(line: Slope, limit: float) -> Crossing | None:
     """Return where the line reaches ``limit``, by Fieller's theorem; None for an insignificant slope."""
-    sure = student_95(line.freedom) ** 2
+    sure = compute_student_95(line.freedom) ** 2
     if line.value**2 <= sure * (SURE_SLOPE / INTERVAL_95 * line.std) ** 2:
         return None
     apart = limit - line.level
@@ -154,56 +154,62 @@ def crossing(line: Slope, limit: float) -> Crossing | None:
     return Crossing(line.at + apart / line.value, line.at + (b - root) / a, line.at + (b + root) / a)
 
 
-def reach_days(span_days: float) -> float:
+def limit_forecast_days(span_days: float) -> float:
     """Return how many days ahead a slope observed over ``span_days`` may be extrapolated; 0 for too short a span."""
     return FARTHEST_SPANS * span_days if span_days >= LEAST_DAYS else 0.0
 
 
-def steps(
+def find_steps(
     values: Float, stds: Float, temperature: Float | None = None, names: Sequence[str] = PARAMETERS
 ) -> list[Step]:
     """Return the steps of the parameters ``names`` (n, k) with ``stds`` (n, k), by row; rows are windows in order.
 
     Steady drift, a slow curve and the effect of ``temperature`` (n,) are not steps.
     """
-    found = [s for k, name in enumerate(names) for s in _steps_of(name, values[:, k], stds[:, k], temperature)]
+    found = [
+        s for k, name in enumerate(names) for s in _find_parameter_steps(name, values[:, k], stds[:, k], temperature)
+    ]
     return sorted(found, key=lambda step: (step.row, names.index(step.name)))
 
 
-def _steps_of(name: str, values: Float, stds: Float, temperature: Float | None) -> list[Step]:
+def _find_parameter_steps(name: str, values: Float, stds: Float, temperature: Float | None) -> list[Step]:
     known = np.flatnonzero(np.isfinite(values) & np.isfinite(stds) & (stds > 0))
     y, n = values[known], known.size
     if n < LEAST_STRETCH + NEWEST:
         return []
     weights = 1.0 / stds[known]
-    columns = _courses(n, None if temperature is None else temperature[known])
+    columns = _build_smooth_columns(n, None if temperature is None else temperature[known])
     rows: list[int] = []
     least = LEAST_STEP[name] * float(np.median(np.abs(y)))
-    while (row := _best_row(y * weights, weights, [*columns, *_jumps(n, rows)], rows)) is not None:
-        theta, covariance = _fit(y * weights, weights, [*columns, *_jumps(n, [*rows, row])])
+    while (row := _find_best_row(y * weights, weights, [*columns, *_build_step_columns(n, rows)], rows)) is not None:
+        theta, covariance = _fit_weighted(y * weights, weights, [*columns, *_build_step_columns(n, [*rows, row])])
         sure = abs(theta[-1]) >= max(least, BEYOND_CHANCE * math.sqrt(covariance[-1, -1]))
-        if not (sure and _stands_out(y, weights, row, theta[-1])):
+        if not (sure and _is_locally_visible(y, weights, row, theta[-1])):
             break
         rows.append(row)
     if not rows:
         return []
-    theta, covariance = _fit(y * weights, weights, [*columns, *_jumps(n, rows)])
+    theta, covariance = _fit_weighted(y * weights, weights, [*columns, *_build_step_columns(n, rows)])
     stepped = zip(rows, theta[len(columns) :], np.sqrt(np.diag(covariance))[len(columns) :], strict=True)
-    base = np.column_stack([*columns, *_jumps(n, rows)]) @ theta
+    base = np.column_stack([*columns, *_build_step_columns(n, rows)]) @ theta
     return [Step(name, int(known[r]), float(s), float(d), float(base[r] - s)) for r, s, d in stepped if abs(s) >= least]
 
 
-def _stands_out(y: Float, weights: Float, row: int, size: float) -> bool:
+def _is_locally_visible(y: Float, weights: Float, row: int, size: float) -> bool:
     """Return whether the rows near a step show it too: a smooth curve that is not a parabola has none there."""
     first, last = max(0, row - NEAR), min(y.size, row + NEAR)
-    columns = [np.ones(last - first), np.linspace(-1.0, 1.0, last - first), *_jumps(last - first, [row - first])]
+    columns = [
+        np.ones(last - first),
+        np.linspace(-1.0, 1.0, last - first),
+        *_build_step_columns(last - first, [row - first]),
+    ]
     if last - first < ENOUGH_FOR_DRIFT:
         del columns[1]
-    theta, _ = _fit(y[first:last] * weights[first:last], weights[first:last], columns)
+    theta, _ = _fit_weighted(y[first:last] * weights[first:last], weights[first:last], columns)
     return bool(theta[-1] * size > 0 and abs(theta[-1]) >= abs(size) / 2)
 
 
-def _courses(n: int, temperature: Float | None) -> list[Float]:
+def _build_smooth_columns(n: int, temperature: Float | None) -> list[Float]:
     order = np.linspace(-1.0, 1.0, n)
     columns = [np.ones(n)]
     if n >= ENOUGH_FOR_DRIFT:
@@ -215,11 +221,11 @@ def _courses(n: int, temperature: Float | None) -> list[Float]:
     return columns
 
 
-def _jumps(n: int, rows: Sequence[int]) -> list[Float]:
+def _build_step_columns(n: int, rows: Sequence[int]) -> list[Float]:
     return [(np.arange(n) >= row).astype(np.float64) for row in rows]
 
 
-def _fit(y: Float, weights: Float, columns: Sequence[Float]) -> tuple[Float, Float]:
+def _fit_weighted(y: Float, weights: Float, columns: Sequence[Float]) -> tuple[Float, Float]:
     phi = np.column_stack(columns) * weights[:, None]
     inverse = np.linalg.pinv(phi.T @ phi)
     theta = inverse @ (phi.T @ y)
@@ -228,7 +234,7 @@ def _fit(y: Float, weights: Float, columns: Sequence[Float]) -> tuple[Float, Flo
     return theta, inverse * max(1.0, scatter)
 
 
-def _best_row(y: Float, weights: Float, columns: Sequence[Float], taken: Sequence[int]) -> int | None:
+def _find_best_row(y: Float, weights: Float, columns: Sequence[Float], taken: Sequence[int]) -> int | None:
     n = y.size
     base = np.linalg.qr(np.column_stack(columns) * weights[:, None])[0]
     left = y - base @ (base.T @ y)

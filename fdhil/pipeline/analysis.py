@@ -9,15 +9,15 @@ from functools import lru_cache
 import numpy as np
 
 from fdhil.config import Axis, Identification
-from fdhil.identification.compliance import beside_the_config, compliance, joined
-from fdhil.identification.demand_lead import with_demand_on_time
-from fdhil.identification.estimators import chosen, maximum_likelihood
-from fdhil.identification.fit import Fit
-from fdhil.identification.identifiability import empty_estimate
-from fdhil.identification.signals import mended
-from fdhil.identification.spring import sprung
-from fdhil.identification.without_voltage import fit as fit_torque
-from fdhil.identification.without_voltage import told
+from fdhil.identification.demand_lead import align_demand_to_drive
+from fdhil.identification.estimators import maximum_likelihood, select_estimator
+from fdhil.identification.identifiability import create_empty_estimate
+from fdhil.identification.likelihood_fit import LikelihoodFit
+from fdhil.identification.speed_alignment import align_speed_to_samples
+from fdhil.identification.spring_fit import fit_with_compliance
+from fdhil.identification.table_compliance import check_configured_resonance, estimate_compliance, merge_compliance
+from fdhil.identification.torque_fit import build_torque_estimate
+from fdhil.identification.torque_fit import fit_torque as fit_torque
 from fdhil.records import Estimate, Parameters, Reason, Result, Verdict, Window, WindowOutcome
 from fdhil.validation.at_the_table import at_the_table
 from fdhil.validation.data_sheet import gain_error, scale_convention
@@ -54,7 +54,7 @@ def analyse(
     rapid is replayed through the closed loop, whose set-points come every ``sync_period_s`` (default: every row).
     """
     axis = own(window, axis)
-    aligned, cycles = with_demand_on_time(mended(window, settings.speed_source), axis, sync_period_s)
+    aligned, cycles = align_demand_to_drive(align_speed_to_samples(window, settings.speed_source), axis, sync_period_s)
     signals = WindowSignals(aligned, settings, axis, sync_period_s, recorded=window)
     outcome = replace(_with_table(_analysed(signals), signals), window=window)
     return _with_lead(outcome, cycles) if cycles else outcome
@@ -86,14 +86,14 @@ def _with_table(outcome: WindowOutcome, signals: WindowSignals) -> WindowOutcome
         return _with_table(replace(outcome, verdict=replace(outcome.verdict, warnings=warnings)), signals)
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            found = compliance(window, estimate.build_parameters())
+            found = estimate_compliance(window, estimate.build_parameters())
     except GAVE_UP:  # signals that are no table's motion
         found = None
     if found is not None:
         if axis is not None:
-            outcome = _analysed(replace(signals, axis=axis.model_copy(update=found.keys())))
-        warnings = (*outcome.verdict.warnings, *beside_the_config(found, axis))
-        estimate = joined(outcome.estimate or estimate, found)
+            outcome = _analysed(replace(signals, axis=axis.model_copy(update=found.get_config_values())))
+        warnings = (*outcome.verdict.warnings, *check_configured_resonance(found, axis))
+        estimate = merge_compliance(outcome.estimate or estimate, found)
         outcome = replace(outcome, estimate=estimate, verdict=replace(outcome.verdict, warnings=warnings))
     seen = at_the_table(window, estimate.build_parameters(), axis, signals.sync_period_s)
     return outcome if seen is None else replace(outcome, at_table=seen)
@@ -136,18 +136,18 @@ def estimated(signals: WindowSignals) -> WindowFit:
     if not signals.has_voltage:
         torque = fit_torque(window, settings)
         known = {} if axis is None else {"R": axis.nominal.R, "L": axis.nominal.L, "K": axis.nominal.K}
-        return WindowFit(signals, told(window, torque, known), torque=torque)
-    name, estimator = chosen(settings)
+        return WindowFit(signals, build_torque_estimate(window, torque, known), torque=torque)
+    name, estimator = select_estimator(settings)
     fit = _fitted(window, settings)
     if fit is not None and axis is not None:
-        fit = maximum_likelihood.with_loops(fit, window, settings, axis, signals.sync_period_s)
+        fit = maximum_likelihood.refit_with_loops(fit, window, settings, axis, signals.sync_period_s)
     if name == maximum_likelihood.MAXIMUM_LIKELIHOOD and fit is not None:
-        return _with_spring(WindowFit(signals, maximum_likelihood.finish(fit), fit))
+        return _with_spring(WindowFit(signals, maximum_likelihood.build_estimate(fit), fit))
     return WindowFit(signals, estimator([window], settings), fit)
 
 
 @lru_cache(maxsize=KEPT_FITS)
-def _fitted(window: Window, settings: Identification) -> Fit | None:
+def _fitted(window: Window, settings: Identification) -> LikelihoodFit | None:
     """Return the fit of a window, the same for each section of the axis with which it is analysed."""
     return maximum_likelihood.fit_windows([window], settings)
 
@@ -164,10 +164,10 @@ def _with_spring(stiff: WindowFit) -> WindowFit:
         return stiff
     if axis is None and weight.unexplained_um < NOTICED * weight.limit_um:
         return stiff
-    found = sprung(stiff.fit, axis)
+    found = fit_with_compliance(stiff.fit, axis)
     if found is None:
         return stiff
-    soft = WindowFit(stiff.signals, maximum_likelihood.finish(found), found)
+    soft = WindowFit(stiff.signals, maximum_likelihood.build_estimate(found), found)
     budget = TableAssessment(soft).budget
     left = math.inf if budget is None else budget.unexplained_um
     return soft if left < max(weight.limit_um, weight.unexplained_um) else stiff
@@ -179,7 +179,7 @@ def gave_up(error: BaseException, advice: str) -> Reason:
 
 
 def _none(settings: Identification, result: Result, reason: Reason) -> Estimate:
-    return empty_estimate(chosen(settings)[0], result, reason)
+    return create_empty_estimate(select_estimator(settings)[0], result, reason)
 
 
 def _speed_lag(window: Window) -> Reason | None:

@@ -12,10 +12,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from fdhil.config import MachineConfig
-from fdhil.identification.between import HISTORY_WINDOWS, Member
-from fdhil.identification.drift import LEAST_JUMP, DriftTracker, Point
-from fdhil.identification.pooling import change_covariance, member
-from fdhil.identification.windows import find_windows
+from fdhil.identification.between_window_variance import HISTORY_WINDOWS, PoolMember
+from fdhil.identification.parameter_drift import LEAST_JUMP, DriftPoint, DriftTracker
+from fdhil.identification.rapid_windows import find_windows
+from fdhil.identification.window_pool import build_pool_member, compute_change_covariance
 from fdhil.pipeline.identified_loops import OwnLoops
 from fdhil.pipeline.recent_samples import RecentSamples
 from fdhil.pipeline.validated_pool import one_sided, refuses_the_model, together
@@ -74,15 +74,15 @@ class Known:
 
     first: Mapping[int, Parameters] = field(default_factory=dict)
     newest: ParameterSet | None = None
-    points: tuple[Point, ...] = ()
-    members: tuple[Member, ...] = ()
+    points: tuple[DriftPoint, ...] = ()
+    members: tuple[PoolMember, ...] = ()
     loops: LoopEstimate | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class _Pooled:
     outcome: WindowOutcome
-    member: Member
+    member: PoolMember
 
 
 def newest(found: Sequence[_Pooled]) -> list[_Pooled]:
@@ -125,7 +125,7 @@ class AxisPipeline:
         self._published = known.newest
         self._tracker = DriftTracker(config.maintenance, axis)
         self._tracker.resume(known.first, known.points)
-        self._history: deque[Member] = deque(_since_jump(known), maxlen=HISTORY_WINDOWS)
+        self._history: deque[PoolMember] = deque(_since_jump(known), maxlen=HISTORY_WINDOWS)
         self._with_skill = with_skill
         # without it the axis' section is invented
         self._loops = OwnLoops(config.axis[axis] if with_skill else None, self._settings, self._period_s, known.loops)
@@ -217,7 +217,7 @@ class AxisPipeline:
             self._refused.pop(window.direction, None)
             notices = self._track(outcome, outcome.estimate)
             outcomes += notices
-            if not self._tracker.holding:
+            if not self._tracker.is_holding_back:
                 outcomes += self._publish(window)
         judged = self._judge(window, before or self._published)
         return [*outcomes, judged] if judged else outcomes
@@ -226,10 +226,10 @@ class AxisPipeline:
         """Hold back a window with a parameter jump; once further ones agree with it they are the new pool."""
         window = outcome.window
         self._place += 1
-        found = _Pooled(outcome, member(window, estimate, self._place))
-        covariance = change_covariance(window, estimate)
+        found = _Pooled(outcome, build_pool_member(window, estimate, self._place))
+        covariance = compute_change_covariance(window, estimate)
         notices = self._tracker.update(estimate.build_parameters(), covariance, window.start_tick, window.direction)
-        if self._tracker.holding:
+        if self._tracker.is_holding_back:
             self._held.append(found)
             return notices
         if any(notice.code in JUMPS for notice in notices):
@@ -299,7 +299,7 @@ class AxisPipeline:
         return skill(window, published.parameters, axis, self._period_s)
 
 
-def _since_jump(known: Known) -> Sequence[Member]:
+def _since_jump(known: Known) -> Sequence[PoolMember]:
     """Return the newest windows after the last one that does not agree with the newest published set."""
     if known.newest is None:
         return known.members

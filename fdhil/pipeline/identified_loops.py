@@ -14,9 +14,14 @@ from functools import partial
 import numpy as np
 
 from fdhil.config import Axis, Identification
-from fdhil.identification.current_means import with_current_means
-from fdhil.identification.loops import better_loops, changed_regulators, identify_loops, with_loops
-from fdhil.identification.physical_bounds import bounded
+from fdhil.identification.current_means import correct_current_to_means
+from fdhil.identification.drive_loops.loop_identification import (
+    apply_loops,
+    find_changed_regulators,
+    identify_loops,
+    is_better_than_configured,
+)
+from fdhil.identification.physical_bounds import bound_estimate
 from fdhil.pipeline.analysis import analyse, own
 from fdhil.records import LoopEstimate, Parameters, Window, WindowOutcome
 from fdhil.validation.replay import replay_window
@@ -107,7 +112,7 @@ def mechanics_of(outcome: WindowOutcome, axis: Axis | None) -> Parameters | None
     """Return the parameters of a window's estimate, its winding completed; None without K, Jt, ft or Cd."""
     if outcome.estimate is None:
         return None
-    found = bounded(outcome.estimate, outcome.window.direction).build_parameters()
+    found = bound_estimate(outcome.estimate, outcome.window.direction).build_parameters()
     values = found.as_dict()
     winding = {"R": UNKNOWN_R, "L": UNKNOWN_L} if axis is None else {"R": axis.nominal.R, "L": axis.nominal.L}
     filled = {name: winding.get(name, value) if value != value else value for name, value in values.items()}
@@ -127,7 +132,11 @@ def suspected(outcomes: Sequence[WindowOutcome]) -> bool:
 
 def better_axis(axis: Axis | None, found: LoopEstimate | None) -> Axis | None:
     """Return the axis with the loops that were found, if they explain what the configured ones do not; else None."""
-    return with_loops(axis, found) if axis is not None and found is not None and better_loops(found) else None
+    return (
+        apply_loops(axis, found)
+        if axis is not None and found is not None and is_better_than_configured(found)
+        else None
+    )
 
 
 def softened(outcomes: Collection[WindowOutcome], axis: Axis | None, sync_period_s: float | None) -> Axis | None:
@@ -191,13 +200,13 @@ class OwnLoops:
         """The keys of the regulators by which the best known loops differ from the configured ones."""
         if self._configured is None or self.axis is None:
             return None
-        return changed_regulators(self._configured, self.axis)
+        return find_changed_regulators(self._configured, self.axis)
 
     def analyse(self, window: Window) -> tuple[WindowOutcome, LoopEstimate | None]:
         """Return a window's outcome, and the loops if they were identified again."""
         if self._configured is not None:
             known = own(window, self._configured)
-            (window,) = with_current_means([window], self._settings, known, self._period_s)
+            (window,) = correct_current_to_means([window], self._settings, known, self._period_s)
         outcome = analyse(window, self._settings, self.axis, self._period_s)
         if self._configured is None:
             return outcome, None
@@ -244,7 +253,7 @@ def analyse_windows(
     ``spread`` may use further processes, in order; ``done`` is called after each window.
     """
     if windows:
-        windows = with_current_means(windows, settings, own(windows[0], axis), sync_period_s)
+        windows = correct_current_to_means(windows, settings, own(windows[0], axis), sync_period_s)
     work = partial(analyse, settings=settings, axis=axis, sync_period_s=sync_period_s)
 
     def told() -> Iterator[WindowOutcome]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.identification.signals import mended
+from fdhil.identification.speed_alignment import align_speed_to_samples
 from fdhil.pipeline.analysis import GAVE_UP, analyse, estimated, own
 from fdhil.pipeline.identified_loops import OwnLoops
 from fdhil.records import LoopEstimate, Result, Window, WindowOutcome
@@ -42,7 +42,7 @@ def lay_over(window: Window, config: MachineConfig, loops: LoopEstimate | None =
     settings, period_s = config.identification, config.machine.sync_period_s
     section = OwnLoops(config.axis.get(window.axis), settings, period_s, loops).axis
     outcome = analyse(window, settings, section, period_s)
-    aligned, axis = mended(window, settings.speed_source), own(window, section)
+    aligned, axis = align_speed_to_samples(window, settings.speed_source), own(window, section)
     bare = Overlay(aligned, outcome)
     if outcome.estimate is None or outcome.estimate.result in NO_MODEL:
         return bare

@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 
 from fdhil.config import Axis
-from fdhil.identification.windows import spans
+from fdhil.identification.rapid_windows import find_runs
 from fdhil.pipeline.table_samples import Motion, RecentTable
 from fdhil.records import (
     AxisSamples,
@@ -127,7 +127,7 @@ class RecentSamples:
             voltage_sampling=self._section.voltage.sampling,
             pitch_mm=self._section.screw_pitch_mm,
             rapid_speed_rad_s=self._section.rapid_speed_rad_s,
-            gaps=tuple((int(a), int(b)) for a, b in spans(~np.isfinite(speed))),
+            gaps=tuple((int(a), int(b)) for a, b in find_runs(~np.isfinite(speed))),
             slow_voltage=slow,
             start_tick=start,
             voltage_delay_s=delay,

@@ -10,13 +10,18 @@ from typing import NamedTuple
 import numpy as np
 
 from fdhil.config import Axis, Identification
-from fdhil.identification.between import ALIKE, Between, Member, between
-from fdhil.identification.demand_lead import with_demand_on_time
-from fdhil.identification.estimators import chosen
-from fdhil.identification.identifiability import unphysical, untold
-from fdhil.identification.loops import identify_loops
-from fdhil.identification.physical_bounds import bounded
-from fdhil.identification.pooling import member, pooled
+from fdhil.identification.between_window_variance import (
+    NO_BETWEEN_VARIANCE,
+    BetweenWindowVariance,
+    PoolMember,
+    estimate_between_window_variance,
+)
+from fdhil.identification.demand_lead import align_demand_to_drive
+from fdhil.identification.drive_loops.loop_identification import identify_loops
+from fdhil.identification.estimators import select_estimator
+from fdhil.identification.identifiability import find_unphysical_values, list_missing_reasons
+from fdhil.identification.physical_bounds import bound_estimate
+from fdhil.identification.window_pool import build_pool_member, pool_estimates
 from fdhil.pipeline.analysis import GAVE_UP, gave_up, own
 from fdhil.pipeline.identified_loops import better_axis
 from fdhil.records import (
@@ -78,15 +83,17 @@ def pool(
     if not outcomes:
         advice = "record moves at 60 % of the rapid speed or more, or identify from any move with --any-move"
         return None, Verdict(False, None, (Reason("NoWindow", "the recording holds no rapid move", advice),))
-    members = [member(o.window, o.estimate, k) for k, o in enumerate(outcomes) if o.verdict.accepted and o.estimate]
+    members = [
+        build_pool_member(o.window, o.estimate, k) for k, o in enumerate(outcomes) if o.verdict.accepted and o.estimate
+    ]
     estimate, verdict = together(outcomes, members, members, settings, refit=refit)
     estimate = estimate and _with_drift(estimate, members)
     refuted = _loops_refuted(outcomes) if verdict.accepted else []
     return estimate, replace(verdict, accepted=False, reasons=tuple(refuted)) if refuted else verdict
 
 
-def _with_drift(estimate: Estimate, members: Sequence[Member]) -> Estimate:
-    apart = between(members)
+def _with_drift(estimate: Estimate, members: Sequence[PoolMember]) -> Estimate:
+    apart = estimate_between_window_variance(members)
     if not apart.walk.get(WARMING):
         return estimate
     covariance, k = estimate.covariance.copy(), estimate.names.index(WARMING)
@@ -97,8 +104,8 @@ def _with_drift(estimate: Estimate, members: Sequence[Member]) -> Estimate:
 
 def together(
     outcomes: Sequence[WindowOutcome],
-    members: Sequence[Member],
-    history: Sequence[Member],
+    members: Sequence[PoolMember],
+    history: Sequence[PoolMember],
     settings: Identification,
     *,
     refit: bool = False,
@@ -116,28 +123,35 @@ def together(
     estimate = estimates[0][1]
     if len(estimates) > 1:
         try:
-            estimate = _estimated(estimates, members, between(history), settings, refit=refit)
+            estimate = _estimated(estimates, members, estimate_between_window_variance(history), settings, refit=refit)
         except GAVE_UP as error:
             return None, Verdict(False, None, (gave_up(error, "inspect the windows"),))
         # with a slow voltage, or without one, R and L may be undetermined
         slow = any(window.slow_voltage is not None or window.voltage_v is None for window, _ in estimates)
-        reasons += untold(estimate, slow=slow)
-    beyond = unphysical(estimate)
-    return (estimate if beyond else bounded(estimate)), _verdict(accepted, [*reasons, *beyond, *moved(estimates)])
+        reasons += list_missing_reasons(estimate, slow=slow)
+    beyond = find_unphysical_values(estimate)
+    return (estimate if beyond else bound_estimate(estimate)), _verdict(
+        accepted, [*reasons, *beyond, *moved(estimates)]
+    )
 
 
 def _estimated(
-    estimates: WindowEstimates, members: Sequence[Member], apart: Between, settings: Identification, *, refit: bool
+    estimates: WindowEstimates,
+    members: Sequence[PoolMember],
+    apart: BetweenWindowVariance,
+    settings: Identification,
+    *,
+    refit: bool,
 ) -> Estimate:
     """Return the estimate of all samples if the windows are of one kind, else the mixed model's."""
     first = estimates[0][1]
-    quick = pooled(members, first, apart)
+    quick = pool_estimates(members, first, apart)
     whole = all(set(PARAMETERS) <= set(m.names) for m in members)
     voltageless = all(window.voltage_v is None and window.slow_voltage is None for window, _ in estimates)
     if voltageless or quick.terms or apart.surely or (whole and not refit):
         return quick
-    again = chosen(settings)[1]([window for window, _ in estimates], settings)
-    same = pooled(members, first, ALIKE)
+    again = select_estimator(settings)[1]([window for window, _ in estimates], settings)
+    same = pool_estimates(members, first, NO_BETWEEN_VARIANCE)
     if not again.names == same.names == quick.names:
         return again
     wider = np.nan_to_num(quick.covariance - same.covariance)  # zero where a slow voltage leaves R or L undetermined
@@ -286,7 +300,7 @@ def _on_time(outcome: WindowOutcome, axis: Axis, sync_period_s: float) -> Window
     """Return the window with the demand that the drive follows, where the recorded one is ahead of it."""
     if all(warning.code != "SampleTiming" for warning in outcome.verdict.warnings):
         return outcome.window
-    return with_demand_on_time(outcome.window, axis, sync_period_s)[0]
+    return align_demand_to_drive(outcome.window, axis, sync_period_s)[0]
 
 
 def _is_doubtful(outcome: WindowOutcome) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.identification import trends
-from fdhil.identification.trends import LEAST_STEP, Slope, reach_days, slope
+from fdhil.identification.trends import LEAST_STEP, Slope, fit_slope, limit_forecast_days
 from fdhil.prediction.model_terms import all_names, families, put_back
 from fdhil.prediction.predict import contour_um, predict
 from fdhil.records import PARAMETERS, Float, Parameters, ParameterSet, Prediction, Zone, compute_rms
@@ -205,7 +205,7 @@ def course(sets: Sequence[ParameterSet], days: Float) -> Course:
     for k, name in enumerate(PARAMETERS):
         values = np.array([getattr(s.parameters, name) for s in newest])
         stds = np.array([np.sqrt(max(float(np.nan_to_num(s.covariance[k, k])), 0.0)) for s in newest])
-        line = slope(values, days[first:], stds if (stds > 0).all() else None, celsius_known)
+        line = fit_slope(values, days[first:], stds if (stds > 0).all() else None, celsius_known)
         if line is not None:
             found[name] = line
     return Course(found, float(np.ptp(days[first:])))
@@ -243,8 +243,8 @@ def crossing(
         return None
     freedom = min(line.freedom for known in courses.values() for line in known.slopes.values())
     line = Slope(rate, float(np.sqrt(variance)), at=0.0, level=zone.max_um, freedom=freedom)
-    found = trends.crossing(line, tolerance_um)
-    if found is None or found.at > reach_days(span_days(courses)):
+    found = trends.find_crossing(line, tolerance_um)
+    if found is None or found.at > limit_forecast_days(span_days(courses)):
         return None
     axis, name = max(rates, key=rates.__getitem__)
     return Crossing(found.at, found.low, found.high, axis, name)

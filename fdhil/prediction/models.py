@@ -19,7 +19,7 @@ import numpy as np
 from fdhil import config as configuration
 from fdhil.config import MachineConfig, Regulators
 from fdhil.errors import ConfigError, ConfigFault
-from fdhil.identification.physical_bounds import beyond_chance, nearest
+from fdhil.identification.physical_bounds import find_significant_violations, project_to_bounds
 from fdhil.model import physical_limits
 from fdhil.model.model_terms import add_resonance
 from fdhil.prediction.model_terms import families, values_of
@@ -44,7 +44,7 @@ Loops = Mapping[str, Mapping[str, float | str]]
 class ModelFile(NamedTuple):
     """The contents of a model file by axis; an axis without a table of loops has none in ``loops``.
 
-    ``held_out_um`` is the model's RMS residual, um, of moves that it was not identified on, and ``held_out_max_um`` the
+    ``held_out_um`` is the model's RMS residual, um, of moves that it was not identified on, and ``find_held_out_max_um`` the
     largest error in any of them, where they are given.
     """
 
@@ -154,11 +154,11 @@ def _physical_model(axis: str, published: ParameterSet, faults: list[ConfigFault
     names, values = tuple(by_name), np.array([*by_name.values()])
     if all(bound.compute_violation(by_name) <= 0.0 for bound in physical_limits.list_bounds(names)):
         return published.parameters
-    if covariance.shape != (len(names), len(names)) or beyond_chance(names, values, covariance):
+    if covariance.shape != (len(names), len(names)) or find_significant_violations(names, values, covariance):
         text = "Unphysical: friction in the newest set would drive the axis, or a value must not be negative"
         faults.append(ConfigFault(axis, text, "record rapids in both directions, and identify the axis again"))
         return published.parameters
-    return Parameters.from_mapping(dict(zip(names, nearest(names, values, covariance).tolist(), strict=True)))
+    return Parameters.from_mapping(dict(zip(names, project_to_bounds(names, values, covariance).tolist(), strict=True)))
 
 
 def _cannot(path: Path, what: str, suggestion: str) -> ConfigError:

@@ -12,7 +12,17 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from fdhil.records import Float
-from fdhil.report.drawing import BELOW, COLOURS, INK, LEFT, LEGEND_LINE, RIGHT, drawing, legend_above, legend_rows
+from fdhil.report.svg_drawing import (
+    BELOW,
+    COLOURS,
+    INK,
+    LEFT,
+    LEGEND_LINE,
+    RIGHT,
+    compute_legend_layout,
+    open_drawing,
+    place_legend_above,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,7 +73,7 @@ class Chart:
     marks: Sequence[tuple[str, float]] = ()
 
 
-def thinned(x: Float, y: Float, most: int = MOST_POINTS) -> tuple[Float, Float]:
+def decimate_curve(x: Float, y: Float, most: int = MOST_POINTS) -> tuple[Float, Float]:
     """Return a curve (m,) of at most ``most`` points that keeps the lowest and the highest of each stretch."""
     if x.size <= most:
         return x, y
@@ -77,33 +87,33 @@ def thinned(x: Float, y: Float, most: int = MOST_POINTS) -> tuple[Float, Float]:
     return x[kept], y[kept]
 
 
-def svg(chart: Chart, width: float = 6.4, height: float = 3.6) -> str:
+def render_svg(chart: Chart, width: float = 6.4, height: float = 3.6) -> str:
     """Return the chart as inline SVG that contains its data."""
     from matplotlib.ticker import MaxNLocator
 
-    columns, rows = legend_rows([trace.label for trace in chart.panels[0].traces], width - LEFT - RIGHT)
+    columns, rows = compute_legend_layout([trace.label for trace in chart.panels[0].traces], width - LEFT - RIGHT)
     if shown := sum(bool(trace.label) for trace in chart.panels[0].traces) > 1:
         height += max(0, rows - 1) * LEGEND_LINE
     above = rows * LEGEND_LINE + 0.15 if shown else 0.15
-    with drawing(width, height, above) as made:
-        places = _places(chart, height, above)
+    with open_drawing(width, height, above) as made:
+        places = _lay_out_panels(chart, height, above)
         every = [made.axes, *(made.figure.add_axes((0, 0, 1, 1), sharex=made.axes) for _ in chart.panels[1:])]
         left, across = made.axes.get_position().x0, made.axes.get_position().width
         for axes, panel, (bottom, tall) in zip(every, chart.panels, places, strict=True):
             axes.set_position((left, bottom, across, tall))
-            draw(axes, panel, chart)
+            draw_panel(axes, panel, chart)
             if axes is not every[-1]:
                 axes.tick_params(labelbottom=False)
             if not panel.log:
                 axes.yaxis.set_major_locator(MaxNLocator(max(2, round(5 * tall * height / 2.5)), min_n_ticks=2))
         every[-1].set_xlabel(chart.x_label)
         if shown:
-            legend_above(made.axes, columns)
-        made.alt, made.data = chart.alt, told(chart)
+            place_legend_above(made.axes, columns)
+        made.alt, made.data = chart.alt, export_chart(chart)
     return made.svg
 
 
-def _places(chart: Chart, height: float, above: float) -> list[tuple[float, float]]:
+def _lay_out_panels(chart: Chart, height: float, above: float) -> list[tuple[float, float]]:
     free = height - BELOW - above - PANEL_GAP * (len(chart.panels) - 1)
     whole = sum(panel.share for panel in chart.panels)
     top, places = height - above, []
@@ -114,7 +124,7 @@ def _places(chart: Chart, height: float, above: float) -> list[tuple[float, floa
     return places
 
 
-def draw(axes: Axes, panel: Panel, chart: Chart) -> None:
+def draw_panel(axes: Axes, panel: Panel, chart: Chart) -> None:
     """Draw one panel on matplotlib's axes."""
     for trace in panel.traces:
         _draw_trace(axes, trace, chart.in_time)
@@ -129,24 +139,24 @@ def draw(axes: Axes, panel: Panel, chart: Chart) -> None:
     if panel.log:
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")
-        axes.set_ylim(bottom=_decade_below(panel))
+        axes.set_ylim(bottom=_find_decade_below(panel))
     else:
         axes.ticklabel_format(axis="y", useOffset=False, style="plain")
         if panel.from_zero:
             axes.set_ylim(bottom=0.0)
     if chart.in_time:
-        _dates(axes)
+        _format_date_axis(axes)
     else:
         axes.locator_params(axis="x", nbins=6)
 
 
-def _decade_below(panel: Panel) -> float:
+def _find_decade_below(panel: Panel) -> float:
     least = min(float(np.nanmin(trace.y)) for trace in panel.traces)
     return float(10.0 ** math.floor(math.log10(least)))
 
 
 def _draw_trace(axes: Axes, trace: Trace, in_time: bool) -> None:
-    x, y = (trace.x, trace.y) if trace.low is not None else thinned(trace.x, trace.y)
+    x, y = (trace.x, trace.y) if trace.low is not None else decimate_curve(trace.x, trace.y)
     x = x / DAY_S if in_time else x
     if trace.style == "points":
         bars = None
@@ -161,7 +171,7 @@ def _draw_trace(axes: Axes, trace: Trace, in_time: bool) -> None:
     axes.plot(x, y, color=trace.colour, lw=WIDTHS[trace.style], ls=dash, label=trace.label)
 
 
-def _dates(axes: Axes) -> None:
+def _format_date_axis(axes: Axes) -> None:
     from matplotlib import dates
 
     make_locator: Any = dates.AutoDateLocator
@@ -171,50 +181,50 @@ def _dates(axes: Axes) -> None:
     axes.xaxis.set_major_formatter(make_formatter(locator))
 
 
-def told(chart: Chart) -> dict[str, Any]:
+def export_chart(chart: Chart) -> dict[str, Any]:
     """Return the chart in the format of the page's script (``page.js``)."""
     grids: list[list[float | None]] = []
-    panels = [_told_panel(panel, grids) for panel in chart.panels]
+    panels = [_export_panel(panel, grids) for panel in chart.panels]
     return {
         "kind": "chart",
         "x": chart.x_label,
         "time": chart.in_time,
-        "marks": [[label, _short(at)] for label, at in chart.marks],
+        "marks": [[label, _round_value(at)] for label, at in chart.marks],
         "grids": grids,
         "panels": panels,
     }
 
 
-def _told_panel(panel: Panel, grids: list[list[float | None]]) -> dict[str, Any]:
+def _export_panel(panel: Panel, grids: list[list[float | None]]) -> dict[str, Any]:
     return {
         "y": panel.y_label,
         "share": panel.share,
         "log": panel.log,
         "zero": panel.from_zero,
-        "levels": [[label, _short(level)] for label, level in panel.levels],
-        "traces": [_told_trace(trace, grids) for trace in panel.traces],
+        "levels": [[label, _round_value(level)] for label, level in panel.levels],
+        "traces": [_export_trace(trace, grids) for trace in panel.traces],
     }
 
 
-def _told_trace(trace: Trace, grids: list[list[float | None]]) -> dict[str, Any]:
+def _export_trace(trace: Trace, grids: list[list[float | None]]) -> dict[str, Any]:
     """Return a trace whose ``x`` is the number of its grid; traces share grids."""
     order = np.argsort(trace.x, kind="stable")
     columns: Mapping[str, Float | None] = {"low": trace.low, "high": trace.high}
-    bounds = {name: _shortened(values[order]) for name, values in columns.items() if values is not None}
+    bounds = {name: _round_values(values[order]) for name, values in columns.items() if values is not None}
     x, y = trace.x[order], trace.y[order]
-    x, y = (x, y) if bounds else thinned(x, y)
-    grid = _shortened(x)
+    x, y = (x, y) if bounds else decimate_curve(x, y)
+    grid = _round_values(x)
     if grid not in grids:
         grids.append(grid)
     look = {"label": trace.label, "colour": trace.colour, "style": trace.style}
-    return look | {"x": grids.index(grid), "y": _shortened(y)} | bounds
+    return look | {"x": grids.index(grid), "y": _round_values(y)} | bounds
 
 
-def _shortened(values: Float) -> list[float | None]:
-    return [_short(value) for value in values.tolist()]
+def _round_values(values: Float) -> list[float | None]:
+    return [_round_value(value) for value in values.tolist()]
 
 
-def _short(value: float) -> float | None:
+def _round_value(value: float) -> float | None:
     if not math.isfinite(value):
         return None
     kept = round(value) if abs(value) >= 1e6 else float(f"{value:.{DIGITS}g}")

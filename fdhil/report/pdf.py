@@ -9,7 +9,7 @@ from typing import IO
 
 from fdhil.child_process import wrap_to_end_with_parent
 from fdhil.errors import FdhilError
-from fdhil.report.page import Page, html, write
+from fdhil.report.report_page import Page, render_html, write_page
 from fdhil.store.output import open_output
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "microsoft-edge", "brave-browser")
@@ -27,7 +27,7 @@ MISSING = (
 def write_page_or_pdf(page: Page, html_file: Path | None, pdf_file: Path | None) -> None:
     """Write the page to the requested files. FdhilError or OutputError."""
     if html_file is not None:
-        write(page, html_file)
+        write_page(page, html_file)
     if pdf_file is not None:
         write_pdf(page, pdf_file)
 
@@ -46,7 +46,7 @@ def write_pdf(page: Page, path: Path) -> None:
     with tempfile.TemporaryDirectory(prefix="fdhil-pdf-") as name:
         folder = Path(name)
         source, printed = folder / "page.html", folder / "page.pdf"
-        source.write_text(html(page), "utf-8")
+        source.write_text(render_html(page), "utf-8")
         message = run_browser(browser, folder, f"--print-to-pdf={printed}", source.as_uri())
         if not printed.is_file():
             raise FdhilError(f"{browser} printed nothing ({message}); print the HTML page from a browser instead")

@@ -28,7 +28,7 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _TEXT = re.compile(r">[^<>]+<|aria-label=\"[^\"]*\"")
 
 
-def typeset(text: str) -> str:
+def typeset_text(text: str) -> str:
     """Return plain text with typeset units and signs; file names stay unchanged."""
     text = _EXPONENT.sub(lambda found: "·10" + found[1].translate(_RAISED), text)
     return _TIMES.sub(" ×", _ALONE.sub(lambda found: _PRINTED[found[0]], text))
@@ -36,4 +36,4 @@ def typeset(text: str) -> str:
 
 def typeset_markup(markup: str) -> str:
     """Return a picture's markup with its text typeset."""
-    return _TEXT.sub(lambda found: typeset(found[0]), markup)
+    return _TEXT.sub(lambda found: typeset_text(found[0]), markup)

@@ -12,8 +12,8 @@ import numpy as np
 
 from fdhil.csv_text import read_csv_text
 from fdhil.errors import RecordingError
-from fdhil.identification.filtering import quick_size, zero_phase
-from fdhil.identification.windows import bridged
+from fdhil.identification.filtering import filter_zero_phase, find_fft_size
+from fdhil.identification.rapid_windows import interpolate_gaps
 from fdhil.records import Float, Recording, freeze_array
 
 LEAST_ROWS = 100
@@ -27,7 +27,7 @@ M_PER_MM = 1e-3
 def with_accelerometer(recording: Recording, path: Path) -> Recording:
     """Return the recording with the table's acceleration from a file. RecordingError if they differ in their moves."""
     time_s, axes = _read(path)
-    wanted = np.gradient(bridged(recording.speed_rad_s), recording.dt_s) * recording.pitch_mm / (2e3 * np.pi)
+    wanted = np.gradient(interpolate_gaps(recording.speed_rad_s), recording.dt_s) * recording.pitch_mm / (2e3 * np.pi)
     grid = np.arange(0.0, time_s[-1] - time_s[0], recording.dt_s)
     measured = [np.interp(grid, time_s - time_s[0], values) for values in axes.T]
     found = [_placed(wanted, values - np.median(values), recording.dt_s) for values in measured]
@@ -66,8 +66,8 @@ def _read(path: Path) -> tuple[Float, Float]:
 
 def _placed(wanted: Float, measured: Float, dt: float) -> tuple[float, float]:
     """Return the largest correlation, and the time (s) at which ``measured`` then begins on the clock of ``wanted``."""
-    both = [zero_phase(values - values.mean(), CORNER_HZ, dt) for values in (wanted, measured)]
-    size = quick_size(wanted.size + measured.size)
+    both = [filter_zero_phase(values - values.mean(), CORNER_HZ, dt) for values in (wanted, measured)]
+    size = find_fft_size(wanted.size + measured.size)
     product = np.fft.irfft(np.fft.rfft(both[0], size) * np.conj(np.fft.rfft(both[1], size)), size)
     power = float(np.sqrt((both[0] @ both[0]) * (both[1] @ both[1])))
     k = int(np.argmax(np.abs(product)))

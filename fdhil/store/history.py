@@ -18,7 +18,7 @@ from types import MappingProxyType
 from typing import Any
 
 from fdhil.errors import StoreError
-from fdhil.identification.pooling import friction_at, member
+from fdhil.identification.window_pool import build_pool_member, estimate_friction_at
 from fdhil.records import LoopEstimate, Notice, ParameterSet, Reason, Skill, WindowOutcome
 from fdhil.store import HISTORY_FILE, schema
 from fdhil.store.atomic import make_folder
@@ -360,7 +360,7 @@ def _dumped(reasons: Sequence[Reason]) -> str:
 def _told(outcome: WindowOutcome) -> str | None:
     if not outcome.verdict.accepted or outcome.estimate is None:
         return None
-    entry = member(outcome.window, outcome.estimate)
+    entry = build_pool_member(outcome.window, outcome.estimate)
     arrays = {"values": entry.values.tolist(), "own": entry.own.tolist(), "shared": entry.shared.tolist()}
     return json.dumps({"names": entry.names, **arrays})
 
@@ -368,7 +368,7 @@ def _told(outcome: WindowOutcome) -> str | None:
 def friction_of(outcome: WindowOutcome) -> dict[str, float] | None:
     """Return a window's friction torque at the rapid speed for JSON; None if unknown."""
     speed = outcome.window.rapid_speed_rad_s
-    known = friction_at(outcome.estimate, speed) if outcome.estimate is not None else None
+    known = estimate_friction_at(outcome.estimate, speed) if outcome.estimate is not None else None
     return None if known is None else {"value": known[0], "std": known[1], "speed_rad_s": speed}
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from fdhil.identification.loops import better_loops, regulators_of
+from fdhil.identification.drive_loops.loop_identification import get_regulator_values, is_better_than_configured
 from fdhil.records import LoopEstimate
 from fdhil.store.history import HISTORY_FILE_NAME, History
 from fdhil.store.rows import Revision
@@ -37,7 +37,10 @@ def _with_newest_loops(revision: Revision, history: History) -> Revision:
     stamp, found = loops[0]
     if revision.set.loops is not None and not stamp.is_after(revision.stamp):
         return revision
-    return replace(revision, set=replace(revision.set, loops=regulators_of(found) if better_loops(found) else {}))
+    return replace(
+        revision,
+        set=replace(revision.set, loops=get_regulator_values(found) if is_better_than_configured(found) else {}),
+    )
 
 
 def newest_loops(history: History, axis: str, config_digest: str) -> LoopEstimate | None:
@@ -51,5 +54,5 @@ def newest_loops(history: History, axis: str, config_digest: str) -> LoopEstimat
     if newest is None or not loops or newest.set.config_digest != config_digest:
         return None
     stamp, found = loops[0]
-    outdated = newest.set.loops == {} and better_loops(found) and not stamp.is_after(newest.stamp)
+    outdated = newest.set.loops == {} and is_better_than_configured(found) and not stamp.is_after(newest.stamp)
     return None if outdated else found

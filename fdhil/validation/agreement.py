@@ -7,8 +7,8 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from fdhil.identification.drift import FRICTION_PARAMETERS, LEAST_JUMP
-from fdhil.identification.pooling import difference_covariance
+from fdhil.identification.parameter_drift import FRICTION_PARAMETERS, LEAST_JUMP
+from fdhil.identification.window_pool import compute_difference_covariance
 from fdhil.records import PARAMETERS, Estimate, Float, Reason, Window
 from fdhil.validation.significance import BUDGET
 
@@ -86,7 +86,7 @@ def _farthest(estimates: Sequence[tuple[Window, Estimate]], name: str) -> Pair |
         return None
     one, other = max(pairs, key=lambda pair: abs(pair[1][1].get_value(name) - pair[0][1].get_value(name)))
     k = PARAMETERS.index(name)
-    chance = BEYOND_CHANCE * float(np.sqrt(difference_covariance(one, other)[k, k]))
+    chance = BEYOND_CHANCE * float(np.sqrt(compute_difference_covariance(one, other)[k, k]))
     share = LEAST_JUMP[name] if name in WARMING else LEAST_CHANGE[name]
     least = share * abs(float(np.median([e.get_value(name) for _, e in known])))
     return (one, other) if abs(other[1].get_value(name) - one[1].get_value(name)) > max(chance, least) else None
@@ -110,7 +110,7 @@ def gain_change(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) ->
         names = [name for name in names if name not in FRICTION_PARAMETERS]
     rows = [PARAMETERS.index(name) for name in names]
     moved = np.log(after.values[rows] / before.values[rows])
-    apart = difference_covariance(one, other) / np.outer(before.values[:6], after.values[:6])
+    apart = compute_difference_covariance(one, other) / np.outer(before.values[:6], after.values[:6])
     spread = apart[np.ix_(rows, rows)] + np.diag(np.full(len(rows), MODEL_SHARE**2))
     weight: Float = np.asarray(np.linalg.inv(spread), dtype=np.float64)
     singles = np.eye(len(rows))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fdhil.config import Axis
-from fdhil.identification.windows import moving_range
+from fdhil.identification.rapid_windows import find_moving_range
 from fdhil.model import closed_loop
 from fdhil.records import AtTable, Float, Parameters, Window, compute_rms
 
@@ -26,7 +26,7 @@ def at_the_table(
     if window.table_mm is None:
         return None
     rows = np.isfinite(window.table_mm) & np.isfinite(window.demand_mm) & np.isfinite(window.position_mm)
-    first, last = moving_range(window)
+    first, last = find_moving_range(window)
     rows[:first] = rows[last:] = False
     if np.count_nonzero(rows) < LEAST_ROWS or np.abs(window.table_mm[rows]).max() > LONGEST_MM:
         return None
@@ -43,7 +43,7 @@ def _zero(window: Window) -> float:
     """Return the offset of the table's encoder from the drive's at standstill before the move, mm."""
     assert window.table_mm is not None
     apart = window.table_mm - window.position_mm
-    first = moving_range(window)[0]
+    first = find_moving_range(window)[0]
     known = apart[max(0, first - round(STANDSTILL_S / window.dt_s)) : first]
     known = known[np.isfinite(known)] if np.isfinite(known).any() else apart[np.isfinite(apart)][:1]
     return float(np.median(known))

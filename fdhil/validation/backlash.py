@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.identification.filtering import moving_mean
-from fdhil.identification.motion import noise_levels, resolution
-from fdhil.identification.windows import carried, moving_range
+from fdhil.identification.filtering import compute_moving_mean
+from fdhil.identification.prepared_motion import estimate_noise_levels, find_resolution
+from fdhil.identification.rapid_windows import fill_forward, find_moving_range
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.significance import BUDGET
 
@@ -79,22 +79,22 @@ class _Course:
 
 
 def _course(window: Window) -> _Course | None:
-    position = window.direction * carried(window.position_mm)
-    quantum = resolution(position)
+    position = window.direction * fill_forward(window.position_mm)
+    quantum = find_resolution(position)
     if quantum == 0.0 or not np.isfinite(window.current_a).any():
         return None
     to_mm = window.pitch_mm / (2 * math.pi)
-    levels = noise_levels(window)
+    levels = estimate_noise_levels(window)
     width = 2 * round(SMOOTHING_S / 2 / window.dt_s) + 1
-    current = window.direction * moving_mean(carried(window.current_a), width)
-    speed = window.direction * to_mm * carried(window.speed_rad_s)
+    current = window.direction * compute_moving_mean(fill_forward(window.current_a), width)
+    speed = window.direction * to_mm * fill_forward(window.speed_rad_s)
     noise = levels.speed_rad_s * window.dt_s * to_mm
     return _Course(position, speed, current, window.dt_s, quantum, noise, width, levels.current_a)
 
 
 def dead_band(window: Window) -> DeadBand | None:
     """Return how far the motor turns before the table follows; None without a recorded position or standstill."""
-    begin, end = moving_range(window)
+    begin, end = find_moving_range(window)
     course = _course(window)
     if course is None or window.stages.accelerate is None or begin < LEAST_ROWS:
         return None

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.identification.courses import terms_nm
-from fdhil.identification.filtering import moving_mean
-from fdhil.identification.fit import Fit
-from fdhil.identification.motion import UNKNOWN_MODE
+from fdhil.identification.filtering import compute_moving_mean
+from fdhil.identification.likelihood_fit import LikelihoodFit
+from fdhil.identification.prepared_motion import UNKNOWN_MODE
+from fdhil.identification.term_regressors import compute_term_torque_nm
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.significance import BUDGET
 
@@ -45,7 +45,7 @@ class Breakaway:
         return Reason("ValidationFailed", text, "lubricate the slide-way, or check for a clamp or backlash")
 
 
-def breakaway(window: Window, fit: Fit) -> Breakaway | None:
+def breakaway(window: Window, fit: LikelihoodFit) -> Breakaway | None:
     """Return the additional torque needed to begin the move; None if it is insignificant or small.
 
     From rest, Jt w(t) is the integral of the excess of K i over dry friction, less viscous friction. The current's
@@ -62,7 +62,7 @@ def breakaway(window: Window, fit: Fit) -> Breakaway | None:
         return None
     torque = side * theta[2] * motion.current[still:end]
     speed = side * motion.speed[still:end]
-    drag = theta[5] + side * terms_nm(motion, theta)[still:end]
+    drag = theta[5] + side * compute_term_torque_nm(motion, theta)[still:end]
     drag[: begin - still] = drag[begin - still]  # terms are known only where the shaft moves
     net = np.where(np.arange(still, end) < begin, np.maximum(torque - drag, 0.0), torque - drag)
     net = net - theta[4] * np.maximum(speed, 0.0)
@@ -78,13 +78,13 @@ def breakaway(window: Window, fit: Fit) -> Breakaway | None:
     return Breakaway(side * excess, lasted, begin, more=excess > 0.0)
 
 
-def _rest_before(fit: Fit, begin: int, side: int) -> int | None:
+def _rest_before(fit: LikelihoodFit, begin: int, side: int) -> int | None:
     """Return the last row before the move at which the torque cannot turn the shaft; None without one."""
     motion, noise = fit.problem.motions[0], fit.problem.noises[0]
     rows = max(8, round(0.010 / motion.dt_s))
     first = max(rows, begin - round(LONGEST_BREAKAWAY_S / motion.dt_s))
     width = 2 * round(0.0005 / motion.dt_s) + 1
-    torque = side * fit.theta[2] * moving_mean(motion.current, width)
+    torque = side * fit.theta[2] * compute_moving_mean(motion.current, width)
     holding = np.flatnonzero(torque[first:begin] < HELD_SHARE * fit.theta[5])
     if holding.size == 0:
         return None

@@ -15,9 +15,9 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.config import Axis, Identification
-from fdhil.identification.between import between
-from fdhil.identification.physical_bounds import bounded
-from fdhil.identification.pooling import member, pooled
+from fdhil.identification.between_window_variance import estimate_between_window_variance
+from fdhil.identification.physical_bounds import bound_estimate
+from fdhil.identification.window_pool import build_pool_member, pool_estimates
 from fdhil.records import Estimate, Float, HeldOut, Parameters, Reason, Window, freeze_array
 from fdhil.validation.replay import Replay, replay_setpoints
 
@@ -83,13 +83,17 @@ def predict_held_out(moves: Sequence[Move], model: Estimate, axis: Axis, sync_pe
     ``model`` is the pool of all: its presliding is used, and it predicts where the pool of the others is not a valid
     drive. A single move is predicted by ``model`` itself.
     """
-    members = [member(window, estimate, k) for k, (window, estimate) in enumerate(moves)]
+    members = [build_pool_member(window, estimate, k) for k, (window, estimate) in enumerate(moves)]
     build_up = {TERM: model.get_value(TERM)} if TERM in model.names else {}
     found = []
     for k, (window, _) in enumerate(moves):
         rest = [m for m in members if m.place != k]
         without = (
-            bounded(pooled(rest, model, between(rest))).build_parameters().replace_values(**build_up) if rest else None
+            bound_estimate(pool_estimates(rest, model, estimate_between_window_variance(rest)))
+            .build_parameters()
+            .replace_values(**build_up)
+            if rest
+            else None
         )
         usable = without if without is not None and _is_drive(without) else model.build_parameters()
         found.append(replay_setpoints(window, usable, axis, sync_period_s))

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fdhil.identification.filtering import moving_mean
-from fdhil.identification.windows import bridged, longest
+from fdhil.identification.filtering import compute_moving_mean
+from fdhil.identification.rapid_windows import find_longest_run, interpolate_gaps
 from fdhil.records import Float, NcMove, Reason, Window
 from fdhil.validation.window_signals import WindowSignals
 
@@ -91,11 +91,11 @@ def _course(position_mm: Float, window: Window, seconds: float = SMOOTHING_S) ->
     known = position_mm[np.isfinite(position_mm)]
     if known.size < 2 or np.ptp(known) == 0.0:
         return None
-    position = bridged(position_mm)  # constant speed across a gap
+    position = interpolate_gaps(position_mm)  # constant speed across a gap
     width = 2 * round(seconds / window.dt_s / 2) + 1
     if position.size < width:
         return None
-    course: Float = moving_mean(window.direction * np.gradient(position, window.dt_s), width)
+    course: Float = compute_moving_mean(window.direction * np.gradient(position, window.dt_s), width)
     return course
 
 
@@ -117,7 +117,7 @@ def _held(window: Window, seen: Float, plateau: float, begin: int) -> str | None
     rate = np.abs(seen[2 * reach :] - seen[: -2 * reach])
     middle = seen[reach:-reach]
     between = (middle > BETWEEN[0] * plateau) & (middle < BETWEEN[1] * plateau)
-    start, end = (row + reach for row in longest(between & (rate < HELD_RATE * rate.max())))
+    start, end = (row + reach for row in find_longest_run(between & (rate < HELD_RATE * rate.max())))
     if (end - start) * window.dt_s < HELD_S:
         return None
     level = float(np.median(seen[start:end]))

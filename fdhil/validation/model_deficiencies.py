@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from fdhil.identification.courses import FIRST_COURSE
-from fdhil.identification.delay import delay_direction
-from fdhil.identification.fit import Fit
+from fdhil.identification.candidate_terms import PHASE_SUFFIX
 from fdhil.identification.kalman import DELAY
-from fdhil.identification.normal import inverse_of, solve
-from fdhil.identification.terms import PHASE_SUFFIX
+from fdhil.identification.likelihood_fit import LikelihoodFit
+from fdhil.identification.normal_equations import invert_symmetric, solve_least_squares
+from fdhil.identification.term_regressors import FIRST_TERM
+from fdhil.identification.voltage_delay import differentiate_by_delay
 from fdhil.records import PARAMETERS, Estimate, Float, freeze_array
 from fdhil.validation.score_bench import Bench, Finding
 
@@ -48,7 +48,7 @@ class Lacking:
         return (self, *self.rivals)
 
 
-def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
+def lacking(fit: LikelihoodFit, findings: Sequence[Finding]) -> list[Lacking]:
     """Return the significant deficiencies of the model, the most significant first; none where all may be chance."""
     if not any(finding.sure for finding in findings):
         return []
@@ -60,7 +60,7 @@ def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
     similar: list[npt.NDArray[np.intp]] = []
     while len(taken) < len(findings):
         shares = (
-            information[:, taken] @ inverse_of(information[np.ix_(taken, taken)])[0]
+            information[:, taken] @ invert_symmetric(information[np.ix_(taken, taken)])[0]
             if taken
             else np.zeros((len(score), 0))
         )
@@ -72,11 +72,11 @@ def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
             break
         taken.append(best)
         similar.append(np.flatnonzero(np.square(statistic) > statistic[best] ** 2 - NO_WORSE**2))
-    moved = inverse_of(fit.information)[0] @ (fit.jacobian.T @ directions)
+    moved = invert_symmetric(fit.information)[0] @ (fit.jacobian.T @ directions)
 
     def beside_others(n: int, k: int) -> Lacking:
         places = [*taken[:n], k, *taken[n + 1 :]]
-        amplitude = float((inverse_of(information[np.ix_(places, places)])[0] @ score[places])[n])
+        amplitude = float((invert_symmetric(information[np.ix_(places, places)])[0] @ score[places])[n])
         finding = findings[k]
         load = None if finding.load_nm is None else amplitude * finding.load_nm
         # a sensor's own change has the opposite sign of its correction
@@ -91,7 +91,11 @@ def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
 
 
 def widened(
-    estimate: Estimate, fit: Fit, lacks: Sequence[Lacking], restless: Collection[str] = (), nameless: bool = False
+    estimate: Estimate,
+    fit: LikelihoodFit,
+    lacks: Sequence[Lacking],
+    restless: Collection[str] = (),
+    nameless: bool = False,
 ) -> Estimate:
     """Return the estimate with the shifts by all significant deficiencies added to its covariance.
 
@@ -111,23 +115,23 @@ def widened(
     return replace(estimate, covariance=freeze_array(covariance))
 
 
-def _lag(fit: Fit) -> Float:
+def _lag(fit: LikelihoodFit) -> Float:
     """Return the shift (k,) of a fit's free entries by a voltage that lags ``LAG_ROWS`` rows behind the current."""
     lag_s = LAG_ROWS * fit.problem.motions[0].dt_s
     others = [k for k, j in enumerate(fit.free) if j != DELAY]
     shift = np.zeros(len(fit.free))
-    shift[others] = -lag_s * solve(fit.but_delay, delay_direction(fit))[0]
+    shift[others] = -lag_s * solve_least_squares(fit.jacobian_without_delay, differentiate_by_delay(fit))[0]
     return shift
 
 
-def _worst(estimate: Estimate, fit: Fit, lack: Lacking) -> Float:
+def _worst(estimate: Estimate, fit: LikelihoodFit, lack: Lacking) -> Float:
     """Return the larger shift (k,) in standard deviations, of the deficiency or of an alternative."""
     shifts = [_of_names(estimate, fit, each.shift) for each in lack.with_rivals]
     deviations = np.sqrt(np.maximum(np.diag(estimate.covariance), np.finfo(np.float64).tiny))
     return max(shifts, key=lambda shift: float(np.abs(shift / deviations).max()))
 
 
-def _of_names(estimate: Estimate, fit: Fit, shift: Float) -> Float:
+def _of_names(estimate: Estimate, fit: LikelihoodFit, shift: Float) -> Float:
     """Return the shift (k,) of the estimate's names, from that of the fit's free entries.
 
     The parts of a ripple have no name of their own: their shift is left to their covariance.
@@ -135,7 +139,7 @@ def _of_names(estimate: Estimate, fit: Fit, shift: Float) -> Float:
     moved = np.zeros(len(estimate.names))
     courses = fit.problem.motions[0].courses
     for entry, by in zip(fit.free, shift, strict=True):
-        name = PARAMETERS[entry] if entry < DELAY else courses[entry - FIRST_COURSE].name if entry > DELAY else ""
+        name = PARAMETERS[entry] if entry < DELAY else courses[entry - FIRST_TERM].name if entry > DELAY else ""
         if name in estimate.names and f"{name}{PHASE_SUFFIX}" not in estimate.names and not name.endswith(PHASE_SUFFIX):
             moved[estimate.names.index(name)] = by
     return moved

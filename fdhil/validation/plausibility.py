@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from fdhil.identification.motion import resolution
-from fdhil.identification.windows import bridged, carried, longest
+from fdhil.identification.prepared_motion import find_resolution
+from fdhil.identification.rapid_windows import fill_forward, find_longest_run, interpolate_gaps
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.repeated_readings import beyond_chance
 from fdhil.validation.signal_consistency import position_confirms, travel_mm
@@ -110,7 +110,7 @@ def clipped(signals: WindowSignals) -> Iterator[Reason]:
         if not np.isfinite(values).any():
             continue
         for rail, side in ((np.nanmax(values), "upper"), (np.nanmin(values), "lower")):
-            start, end = longest(values == rail)
+            start, end = find_longest_run(values == rail)
             if rail == 0.0 or end - start < RAIL_SAMPLES or not beyond_chance(values, start, end - 1):
                 continue
             if position_confirms(signals.window, signal, start, end):
@@ -128,14 +128,14 @@ def position_parted(signals: WindowSignals) -> Iterator[Reason]:
     Both may differ by the backlash that the window shows.
     """
     window, play = signals.window, signals.backlash
-    if not np.isfinite(window.position_mm).any() or np.ptp(carried(window.position_mm)) == 0.0:
+    if not np.isfinite(window.position_mm).any() or np.ptp(fill_forward(window.position_mm)) == 0.0:
         return
     # lost rows are interpolated for this comparison alone
-    position, travel = bridged(window.position_mm), travel_mm(window.speed_rad_s, window.dt_s, window.pitch_mm)
+    position, travel = interpolate_gaps(window.position_mm), travel_mm(window.speed_rad_s, window.dt_s, window.pitch_mm)
     to_mm = window.dt_s * window.pitch_mm / (2 * math.pi)
     noise = signals.noise.speed_rad_s * to_mm
-    rounding = resolution(window.speed_rad_s[np.isfinite(window.speed_rad_s)]) / 2 * to_mm
-    quantum = max(resolution(position), 1e-6)
+    rounding = find_resolution(window.speed_rad_s[np.isfinite(window.speed_rad_s)]) / 2 * to_mm
+    quantum = max(find_resolution(position), 1e-6)
     error = position - position[0] - travel
     unit = _unit(travel, error)
     if unit is not None:

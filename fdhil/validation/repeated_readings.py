@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from fdhil.identification.motion import resolution
-from fdhil.identification.windows import noise_of
+from fdhil.identification.prepared_motion import find_resolution
+from fdhil.identification.rapid_windows import estimate_noise_std
 from fdhil.records import Bool, Float
 from fdhil.validation.significance import BUDGET
 
@@ -30,14 +30,14 @@ def beyond_chance(values: Float, start: int, end: int) -> bool:
     """
     length = end - start + 1
     chance = 0.0
-    same, step = np.diff(values) == 0.0, resolution(values[np.isfinite(values)])
+    same, step = np.diff(values) == 0.0, find_resolution(values[np.isfinite(values)])
     sides = (slice(max(0, start - SIDE * length), start), slice(end + 1, end + 1 + SIDE * length))
     for others in (values[sides[0]], values[sides[1]], np.concatenate([values[:start], values[end + 1 :]])):
         # the neighbouring rows may lie at the edge of a step, and the run in its middle
         chance = max(chance, likely_reading(others, step) ** length)
     for side in sides:
         # with noise of several steps no reading is frequent: rows with this one were clipped as well
-        if values[side].size >= length and noise_of(values[side]) < INFORMATIVE_STEPS * step:
+        if values[side].size >= length and estimate_noise_std(values[side]) < INFORMATIVE_STEPS * step:
             likely = all_within(length, values[side] == values[start]), all_within(length - 1, same[side])
             chance = max(chance, *likely)
     return values.size * chance < BUDGET["saturated"].chance

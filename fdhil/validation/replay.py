@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdhil.config import Axis
-from fdhil.identification.motion import resolution
-from fdhil.identification.windows import moving_range
+from fdhil.identification.prepared_motion import find_resolution
+from fdhil.identification.rapid_windows import find_moving_range
 from fdhil.model import closed_loop
 from fdhil.model.model_terms import add_resonance
 from fdhil.records import PARAMETERS, Float, Int, Parameters, Window, compute_rms
@@ -88,7 +88,7 @@ def replay(
         raise ValueError(f"a move with {rows.size} whole rows is too short to assess the model")
     difference = (position_mm - response.position_mm)[rows] * 1e3
     return Replay(
-        response, rows, difference, (position_mm - demand_mm)[rows] * 1e3, 1e3 * resolution(position_mm[rows])
+        response, rows, difference, (position_mm - demand_mm)[rows] * 1e3, 1e3 * find_resolution(position_mm[rows])
     )
 
 
@@ -102,7 +102,7 @@ def replay_window(window: Window, parameters: Parameters, axis: Axis, sync_perio
     """
     if not _rows_are_setpoints(window, sync_period_s):
         return None
-    signals, moving = (window.demand_mm, window.position_mm), moving_range(window)
+    signals, moving = (window.demand_mm, window.position_mm), find_moving_range(window)
     best: Replay | None = None
     for share in SHARES_OF_LOAD if not parameters.get_term("load") else (0.0,):
         parted = _parted(parameters, window.direction, _standstill_a(window), share)
@@ -124,7 +124,7 @@ def replay_setpoints(window: Window, parameters: Parameters, axis: Axis, sync_pe
 
     None too where the axis had not come to rest before: its regulators' state then is not recorded.
     """
-    begin = moving_range(window)[0]
+    begin = find_moving_range(window)[0]
     rest = slice(begin - math.ceil(REST_S / window.dt_s), begin)
     if not _rows_are_setpoints(window, sync_period_s) or not _stands(window, rest):
         return None
@@ -141,7 +141,7 @@ def replay_setpoints(window: Window, parameters: Parameters, axis: Axis, sync_pe
         )
     except ValueError:  # too few complete rows, or no valid drive
         return None
-    return replayed.during(*moving_range(window)) if np.isfinite(replayed.difference_um).all() else None
+    return replayed.during(*find_moving_range(window)) if np.isfinite(replayed.difference_um).all() else None
 
 
 def completed(parameters: Parameters, spare: Parameters) -> Parameters:
@@ -184,13 +184,13 @@ def _stands(window: Window, rest: slice) -> bool:
     """Return whether the axis stands in these rows, but for steps and noise of its position."""
     position = window.position_mm[max(rest.start, 0) : rest.stop]
     position = position[np.isfinite(position)]
-    limit_mm = max(REST_MM, REST_STEPS * resolution(window.position_mm))
+    limit_mm = max(REST_MM, REST_STEPS * find_resolution(window.position_mm))
     return rest.start >= 0 and position.size > 0 and float(np.ptp(position)) <= limit_mm
 
 
 def _standstill_a(window: Window) -> float:
     """Return the current that the drive holds in the first rows of a window, which begins at rest."""
-    rows = min(max(1, round(STANDSTILL_S / window.dt_s)), moving_range(window)[0])
+    rows = min(max(1, round(STANDSTILL_S / window.dt_s)), find_moving_range(window)[0])
     return _mean(window.current_a[:rows])
 
 

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fdhil.identification.courses import voltage_terms_v
 from fdhil.identification.estimators import maximum_likelihood
-from fdhil.identification.estimators.maximum_likelihood import Fit
-from fdhil.identification.motion import Noise
-from fdhil.identification.normal import inverse_of
-from fdhil.identification.windows import carried, smooth
+from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
+from fdhil.identification.normal_equations import invert_symmetric
+from fdhil.identification.prepared_motion import NoiseLevels
+from fdhil.identification.rapid_windows import fill_forward, smooth_samples
+from fdhil.identification.term_regressors import compute_term_voltage_v
 from fdhil.records import Reason, Window
 from fdhil.validation.significance import BUDGET
 from fdhil.validation.table_assessment import TableAssessment
@@ -53,7 +53,9 @@ def friction_at_rest(table: TableAssessment) -> Iterator[Reason]:
         yield table.append_cost(late.reason(), table.compute_breakaway_um(late))
 
 
-def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows, lost_v: float) -> Iterator[Reason]:
+def _contradiction(
+    window: Window, fit: LikelihoodFit, noise: NoiseLevels, rows: Rows, lost_v: float
+) -> Iterator[Reason]:
     """At standstill u = R i + L di/dt: the zero of current or voltage is off where they contradict each other.
 
     ``lost_v`` of the recorded voltage may not reach the motor.
@@ -62,7 +64,7 @@ def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows, lost_v: f
         return
     peak = float(np.nanmax(np.abs(window.current_a)))
     resistance, inductance, torque_constant = fit.theta[:3]
-    voltage = window.voltage_v + voltage_terms_v(fit.problem.motions[0], fit.theta)
+    voltage = window.voltage_v + compute_term_voltage_v(fit.problem.motions[0], fit.theta)
     settled, rising = round(SETTLING_S / window.dt_s), round(RISING_S / window.dt_s)
     for part in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
         still = part[settled:-rising]
@@ -86,15 +88,15 @@ def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows, lost_v: f
             return
 
 
-def _resistance_share(fit: Fit) -> float:
-    return maximum_likelihood.finish(fit).get_std("R") / float(fit.theta[0])
+def _resistance_share(fit: LikelihoodFit) -> float:
+    return maximum_likelihood.build_estimate(fit).get_std("R") / float(fit.theta[0])
 
 
-def _holding(window: Window, fit: Fit, rows: Rows) -> Iterator[Reason]:
+def _holding(window: Window, fit: LikelihoodFit, rows: Rows) -> Iterator[Reason]:
     """Report a shaft at rest although K i exceeds Cd: the model lacks friction or a load."""
-    held = float(fit.theta[2]) * float(np.median(smooth(carried(window.current_a), window.dt_s)[rows]))
+    held = float(fit.theta[2]) * float(np.median(smooth_samples(fill_forward(window.current_a), window.dt_s)[rows]))
     peak = abs(fit.theta[2]) * float(np.nanmax(np.abs(window.current_a)))
-    spread = float(np.sqrt(inverse_of(fit.information)[0][5, 5]))
+    spread = float(np.sqrt(invert_symmetric(fit.information)[0][5, 5]))
     limit = HOLDING_SHARE * max(fit.theta[5], 0.0) + SURE * spread + LEAST_TORQUE * peak
     if abs(held) <= limit:
         return

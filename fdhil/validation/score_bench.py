@@ -11,13 +11,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from fdhil.identification.covariance import aliasing
-from fdhil.identification.estimators.maximum_likelihood import Fit
-from fdhil.identification.filtering import moving_mean
-from fdhil.identification.innovations import CURRENT, LOAD, SPEED, VOLTAGE, answers, innovations
-from fdhil.identification.motion import Motion
-from fdhil.identification.normal import inverse_of
-from fdhil.identification.slow_voltage import innovations_of
+from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
+from fdhil.identification.filtering import compute_moving_mean
+from fdhil.identification.innovations import CURRENT, LOAD, SPEED, VOLTAGE, compute_innovations, compute_signal_response
+from fdhil.identification.low_rate_voltage.low_rate_innovations import compute_low_rate_innovations
+from fdhil.identification.normal_equations import invert_symmetric
+from fdhil.identification.prepared_motion import Motion
+from fdhil.identification.robust_covariance import estimate_aliasing_doubt
 from fdhil.records import Float, Reason
 from fdhil.validation.significance import BUDGET
 
@@ -32,7 +32,7 @@ class Finding:
     """The result of one alternative: its code and text, its statistic (standard deviations) and amplitude.
 
     ``least`` is the smallest amplitude that matters, in the amplitude's own unit. ``direction`` (m,) is the change of
-    the innovations per unit, and ``load_nm`` (n,) the unit's torque, where it is one.
+    the innovations per unit, and ``compute_load_nm`` (n,) the unit's torque, where it is one.
     """
 
     code: str
@@ -70,20 +70,20 @@ class Bench:
     (k + c,) are the sizes that the innovations show.
     """
 
-    fit: Fit
+    fit: LikelihoodFit
     imitating: Float
     inverse: Float
     held: Float
     coloured: float = 1.0
 
     @classmethod
-    def of(cls, fit: Fit) -> Bench:
+    def of(cls, fit: LikelihoodFit) -> Bench:
         """Return the score test of a window's fit."""
         imitating = np.column_stack([fit.jacobian, courses(fit)])
         gram, k = imitating.T @ imitating, fit.jacobian.shape[1]
         gram[:k, :k] = fit.information
         gram[range(k, len(gram)), range(k, len(gram))] += 1.0
-        inverse = inverse_of(gram)[0]
+        inverse = invert_symmetric(gram)[0]
         coloured = 1.0 + 2.0 * max(0.0, expected_correlation(fit)[0])
         return cls(fit, imitating, inverse, inverse @ (imitating.T @ fit.residuals), coloured)
 
@@ -104,7 +104,7 @@ class Bench:
     def gain_answers(self, motion: Motion, name: str, courses: Float) -> Float:
         """Return minus the change (m, q) of the innovations when the gain of ``name`` grows by ``courses`` (q, n)."""
         if name == "voltage":
-            at = np.array([motion.at_voltage(c) for c in courses])
+            at = np.array([motion.sample_at_voltage(c) for c in courses])
             return self._answers(VOLTAGE, motion.voltage_mean * at, motion.voltage_rise * at)
         return self._answers(_KINDS[name], getattr(motion, name) * courses, None)
 
@@ -115,12 +115,14 @@ class Bench:
         """
         motion, fit = self.motion, self.fit
         if motion.slow is None:
-            white, whiteners = fit.residuals.reshape(-1, 2), fit.problem.filters[0].whiteners
+            white, whiteners = fit.residuals.reshape(-1, 2), fit.problem.filters[0].whitening_factors
             safe = np.where(motion.observed[:, None], whiteners, 1.0)
             current = white[:, 0] / safe[:, 0]
             speed = (white[:, 1] - safe[:, 1] * current) / safe[:, 2]
             return replace(motion, current=motion.current - current, speed=motion.speed - speed)
-        made = innovations_of(motion, fit.theta, fit.problem.noises[0].vector() ** 2, float(fit.theta[6])).values
+        made = compute_low_rate_innovations(
+            motion, fit.theta, fit.problem.noises[0].to_array() ** 2, float(fit.theta[6])
+        ).values
         rows = made[: 2 * motion.n].reshape(-1, 2)
         return replace(
             motion,
@@ -134,7 +136,7 @@ class Bench:
         motion = self.motion
         if name != "voltage":
             return self._answers(_KINDS[name], courses, None)
-        at_samples = np.array([motion.at_voltage(c) for c in courses])
+        at_samples = np.array([motion.sample_at_voltage(c) for c in courses])
         return self._answers(VOLTAGE, at_samples, np.zeros_like(at_samples))
 
     def _answers(self, kind: int, courses: Float, rises: Float | None) -> Float:
@@ -143,8 +145,10 @@ class Bench:
             return np.column_stack([self._slow_answer(kind, course) for course in courses])
         if rises is not None and theta[6] != 0.0:
             both = zip(courses, rises, strict=True)
-            courses = np.array([replace(motion, voltage_mean=c, voltage_rise=r).delayed(theta[6]) for c, r in both])
-        answered: Float = -answers(motion, theta, gains, kind, courses, rises)
+            courses = np.array(
+                [replace(motion, voltage_mean=c, voltage_rise=r).compute_delayed_voltage(theta[6]) for c, r in both]
+            )
+        answered: Float = -compute_signal_response(motion, theta, gains, kind, courses, rises)
         return answered
 
     def _slow_answer(self, kind: int, course: Float) -> Float:
@@ -157,7 +161,7 @@ class Bench:
         elif kind == SPEED:
             motion = replace(motion, speed=motion.speed + course)
         load = course if kind == LOAD else None
-        change: Float = self.fit.residuals - innovations(motion, theta, gains, load)
+        change: Float = self.fit.residuals - compute_innovations(motion, theta, gains, load)
         return change
 
     def scores(self, directions: Float) -> tuple[Float, Float]:
@@ -189,29 +193,31 @@ class Bench:
 
 
 @lru_cache(maxsize=2)
-def courses(fit: Fit) -> Float:
+def courses(fit: LikelihoodFit) -> Float:
     """Return how the innovations (m, c) answer one standard deviation of the unknown course between voltage samples.
 
     Interval means leave the course within a sample open. Instants that are synchronous with a regulator which answers a
     rising back-EMF have an error in proportion to the acceleration, too; errors in proportion to current and its slope
     are imitated by R and L.
     """
-    shape = fit.problem.course_effects(fit.theta)
+    shape = fit.problem.compute_waveform_effects(fit.theta)
     motion, theta = fit.problem.motions[0], fit.theta
-    doubt = aliasing(motion.voltage_sampling, motion.voltage_period_s)[0]
+    doubt = estimate_aliasing_doubt(motion.voltage_sampling, motion.voltage_period_s)[0]
     if doubt == 0.0:
         return shape
-    rate = np.gradient(moving_mean(motion.speed, 2 * round(SLOPE_S / 2 / motion.dt_s) + 1), motion.dt_s)
+    rate = np.gradient(compute_moving_mean(motion.speed, 2 * round(SLOPE_S / 2 / motion.dt_s) + 1), motion.dt_s)
     missed = doubt * theta[0] * theta[3] / theta[2] * rate
     if motion.slow is not None:
-        moved = replace(motion, voltage_mean=motion.voltage_mean + motion.at_voltage(missed))
-        return np.column_stack([shape, innovations(moved, theta, fit.problem.filters[0]) - fit.residuals])
-    answer = answers(motion, theta, fit.problem.filters[0], VOLTAGE, missed[None], np.zeros((1, motion.n)))
+        moved = replace(motion, voltage_mean=motion.voltage_mean + motion.sample_at_voltage(missed))
+        return np.column_stack([shape, compute_innovations(moved, theta, fit.problem.filters[0]) - fit.residuals])
+    answer = compute_signal_response(
+        motion, theta, fit.problem.filters[0], VOLTAGE, missed[None], np.zeros((1, motion.n))
+    )
     return np.column_stack([shape, answer])
 
 
 @lru_cache(maxsize=2)
-def expected_correlation(fit: Fit) -> Float:
+def expected_correlation(fit: LikelihoodFit) -> Float:
     """Return the autocorrelation (LAGS,) of the current's innovations that instants of a noisy voltage cause.
 
     Two neighbouring intervals share the noise of the instant between them, which a filter for white noise ignores: with
@@ -225,7 +231,7 @@ def expected_correlation(fit: Fit) -> Float:
     pulse = np.zeros(motion.n)
     # noise beyond the sensor's is caused by the regulators, and is not shared in that way
     pulse[row] = min(fit.problem.noises[0].voltage_v, motion.noise.voltage_v)
-    answer = answers(motion, fit.theta, gains, VOLTAGE, pulse[None], np.zeros((1, motion.n)))
+    answer = compute_signal_response(motion, fit.theta, gains, VOLTAGE, pulse[None], np.zeros((1, motion.n)))
     h = np.zeros(3 * LAGS)
     part = answer.reshape(-1, 2)[row : row + h.size, 0]
     h[: part.size] = part

@@ -12,11 +12,11 @@ from functools import cached_property
 
 import numpy as np
 
-from fdhil.identification.courses import load_nm, voltage_v
-from fdhil.identification.estimators.maximum_likelihood import Fit
-from fdhil.identification.filtering import moving_mean
-from fdhil.identification.kalman import DELAY, departure
-from fdhil.identification.motion import BROKEN_MODE, Modes
+from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
+from fdhil.identification.filtering import compute_moving_mean
+from fdhil.identification.kalman import DELAY, compute_departure
+from fdhil.identification.prepared_motion import BROKEN_MODE, Modes
+from fdhil.identification.term_regressors import compute_load_nm, compute_motor_voltage_v
 from fdhil.records import Float
 
 NEIGHBOUR_S = 0.040  # around the doubted rows that are included: some time constants of a winding
@@ -30,19 +30,19 @@ SIGNALS = ("current", "speed", "voltage")
 class Bridge:
     """A fitted window: readings (n, 3) of current, speed and voltage, their variances, and the states' walks."""
 
-    fit: Fit
+    fit: LikelihoodFit
     readings: Float
     variances: Float
     walks: Float
 
     @classmethod
-    def over(cls, fit: Fit) -> Bridge:
+    def over(cls, fit: LikelihoodFit) -> Bridge:
         """Return the reconstruction of a fit's window."""
         motion, theta = fit.problem.motions[0], fit.theta
-        noise = np.maximum(fit.problem.noises[0].vector(), motion.noise.vector())[[1, 2, 0]]
-        voltage = voltage_v(motion, theta)
+        noise = np.maximum(fit.problem.noises[0].to_array(), motion.noise.to_array())[[1, 2, 0]]
+        voltage = compute_motor_voltage_v(motion, theta)
         width = 2 * round(SMOOTHING_S / motion.dt_s / 2) + 1
-        course = moving_mean(voltage, width)
+        course = compute_moving_mean(voltage, width)
         change = np.diff(course, append=course[-1]) ** 2
         about = np.maximum(change, np.maximum(np.roll(change, 1), np.roll(change, -1)))
         variances = np.tile(noise**2, (motion.n, 1))
@@ -73,7 +73,7 @@ class Bridge:
             theta,
             motion.dt_s,
             motion.mode[part],
-            load_nm(motion, theta)[part],
+            compute_load_nm(motion, theta)[part],
             self.readings[part],
             variances,
             self.walks[part],
@@ -121,7 +121,9 @@ class Crossing:
         return log_beyond(forced - free, max(news - other_news, 1.0))
 
     def _squares(self, readings: Float, variances: Float) -> tuple[float, float]:
-        return departure(self.theta, self.dt_s, self.mode, self.load_nm, readings, variances, self.walks, self.signal)
+        return compute_departure(
+            self.theta, self.dt_s, self.mode, self.load_nm, readings, variances, self.walks, self.signal
+        )
 
 
 def log_beyond(square: float, freedom: float) -> float:

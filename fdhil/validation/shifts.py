@@ -6,11 +6,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fdhil.identification.courses import voltage_v
-from fdhil.identification.filtering import moving_mean
-from fdhil.identification.fit import Fit
-from fdhil.identification.innovations import CURRENT, VOLTAGE, answers
-from fdhil.identification.normal import inverse_of
+from fdhil.identification.filtering import compute_moving_mean
+from fdhil.identification.innovations import CURRENT, VOLTAGE, compute_signal_response
+from fdhil.identification.likelihood_fit import LikelihoodFit
+from fdhil.identification.normal_equations import invert_symmetric
+from fdhil.identification.term_regressors import compute_motor_voltage_v
 from fdhil.records import Float, Reason
 from fdhil.validation.score_bench import Finding, courses, expected_correlation
 from fdhil.validation.significance import BUDGET
@@ -54,20 +54,20 @@ def late_findings(shown: tuple[Shift, Shift]) -> list[Finding]:
     ]  # fmt: skip
 
 
-def shifts(fit: Fit) -> tuple[Shift, Shift]:
+def shifts(fit: LikelihoodFit) -> tuple[Shift, Shift]:
     """Return the delay of voltage and of current that the innovations show, each as if it were the only one."""
     motion, gains = fit.problem.motions[0], fit.problem.filters[0]
     width = 2 * round(SMOOTHING_S / 2 / motion.dt_s) + 1
     found = []
-    jacobian = fit.but_delay
-    inverse, e = inverse_of(jacobian.T @ jacobian)[0], fit.residuals
+    jacobian = fit.jacobian_without_delay
+    inverse, e = invert_symmetric(jacobian.T @ jacobian)[0], fit.residuals
     coloured = 1.0 + 2.0 * max(0.0, float(expected_correlation(fit)[0]))
     whole = np.column_stack([e, courses(fit)])
     whole = whole - jacobian @ (inverse @ (jacobian.T @ whole))
-    for kind, values in ((VOLTAGE, voltage_v(motion, fit.theta)), (CURRENT, motion.current)):
-        slope = np.gradient(moving_mean(values, width))
+    for kind, values in ((VOLTAGE, compute_motor_voltage_v(motion, fit.theta)), (CURRENT, motion.current)):
+        slope = np.gradient(compute_moving_mean(values, width))
         rise = [np.zeros(motion.n)] if kind == VOLTAGE else None
-        answer = answers(motion, fit.theta, gains, kind, [slope], rise)[:, 0]
+        answer = compute_signal_response(motion, fit.theta, gains, kind, [slope], rise)[:, 0]
         rest = answer - jacobian @ (inverse @ (jacobian.T @ answer))
         power = float(rest @ rest)
         if not power > 0.0:

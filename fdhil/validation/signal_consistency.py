@@ -13,9 +13,9 @@ from itertools import combinations
 
 import numpy as np
 
-from fdhil.identification.motion import resolution
-from fdhil.identification.normal import solve
-from fdhil.identification.windows import bridged, carried, smooth
+from fdhil.identification.normal_equations import solve_least_squares
+from fdhil.identification.prepared_motion import find_resolution
+from fdhil.identification.rapid_windows import fill_forward, interpolate_gaps, smooth_samples
 from fdhil.records import Float, Reason, Recording, Window
 from fdhil.validation.window_signals import SensorSignal, WindowSignals
 
@@ -44,7 +44,7 @@ def recorded_signals(window: Window) -> dict[str, Float]:
 
 def travel_mm(speed_rad_s: Float, dt_s: float, pitch_mm: float) -> Float:
     """Return the integral (n,) of the speed in mm of the table; lost samples are interpolated."""
-    speed = bridged(speed_rad_s)
+    speed = interpolate_gaps(speed_rad_s)
     steps = (speed[1:] + speed[:-1]) * (dt_s * pitch_mm / (4 * math.pi))
     return np.concatenate([[0.0], np.cumsum(steps)])
 
@@ -76,10 +76,10 @@ def _stands_still(name: str, value: float, moved_mm: float) -> Reason:
 
 def _jump_of_demand(signals: WindowSignals, demand: Float) -> Iterator[Reason]:
     window = signals.window
-    speed_mm_s = float(np.abs(smooth(window.speed_rad_s, window.dt_s)).max()) * window.pitch_mm / (2 * math.pi)
-    steps = np.abs(np.diff(bridged(demand)))
+    speed_mm_s = float(np.abs(smooth_samples(window.speed_rad_s, window.dt_s)).max()) * window.pitch_mm / (2 * math.pi)
+    steps = np.abs(np.diff(interpolate_gaps(demand)))
     row = int(np.argmax(steps))
-    if steps[row] > speed_mm_s * max(LONGEST_CYCLE_S, 2.0 * window.dt_s) + resolution(demand[np.isfinite(demand)]):
+    if steps[row] > speed_mm_s * max(LONGEST_CYCLE_S, 2.0 * window.dt_s) + find_resolution(demand[np.isfinite(demand)]):
         takes = f"the axis takes {1e3 * steps[row] / speed_mm_s:.0f} ms for that" if speed_mm_s else "the speed is zero"
         jump = f"demand jumps by {steps[row]:.4g} mm at {signals.get_time_s(row):.3f} s"
         text = f"{jump}, as after a pause or lost samples: {takes}"
@@ -89,7 +89,7 @@ def _jump_of_demand(signals: WindowSignals, demand: Float) -> Iterator[Reason]:
 def copied_signals(signals: WindowSignals) -> Iterator[Reason]:
     """Yield a reason for each two signals of which one is the other times a constant in every row."""
     begin, end = signals.motion_range
-    moving = {name: carried(values)[begin:end] for name, values in recorded_signals(signals.window).items()}
+    moving = {name: fill_forward(values)[begin:end] for name, values in recorded_signals(signals.window).items()}
     for (one, values), (other, others) in combinations(moving.items(), 2):
         power = float(others @ others)
         if values.size < LEAST_SAMPLES or np.ptp(values) == 0.0 or not 0.0 < power < math.inf:
@@ -104,10 +104,10 @@ def unrelated_signals(signals: WindowSignals) -> Iterator[Reason]:
     """Yield a reason for voltage and current if speed and acceleration explain too little of them."""
     window = signals.window
     begin, end = signals.motion_range
-    speed = smooth(window.speed_rad_s, window.dt_s)
+    speed = smooth_samples(window.speed_rad_s, window.dt_s)
     motion = np.stack([np.ones(window.n), speed, np.gradient(speed, window.dt_s)])
     followed = {k: v for k, v in recorded_signals(window).items() if k in LEAST_FOLLOWED}
-    parts = {name: (motion[:, begin:end], smooth(v, window.dt_s)[begin:end]) for name, v in followed.items()}
+    parts = {name: (motion[:, begin:end], smooth_samples(v, window.dt_s)[begin:end]) for name, v in followed.items()}
     slow = window.slow_voltage
     if slow is not None:
         rows = slow.begin_s / window.dt_s + (np.arange(slow.voltage_v.size) + 0.5) * slow.period_s / window.dt_s
@@ -132,7 +132,7 @@ def _explained(values: Float, courses: Float) -> float:
     if not 0.0 < variance < math.inf or not (scale > 0.0).all():
         return 1.0
     columns = (courses / scale).T
-    weights, _ = solve(columns, values)
+    weights, _ = solve_least_squares(columns, values)
     return 1.0 - float(np.mean((values - columns @ weights) ** 2)) / variance
 
 
@@ -144,7 +144,7 @@ def table_faults(window: Window, moving: tuple[int, int]) -> Mapping[str, Reason
     rows = slice(*moving)
     found = {}
     if window.table_mm is not None and np.isfinite(window.position_mm).any():
-        motor = bridged(window.position_mm)[rows]
+        motor = interpolate_gaps(window.position_mm)[rows]
         difference = (window.table_mm[rows] - motor)[np.isfinite(window.table_mm[rows])]
         apart, travel = float(np.ptp(difference)) if difference.size else 0.0, float(np.ptp(motor))
         if apart > TABLE_MM + TABLE_SHARE * travel:
@@ -153,14 +153,14 @@ def table_faults(window: Window, moving: tuple[int, int]) -> Mapping[str, Reason
     if window.table_m_s2 is not None:
         known = np.isfinite(window.table_m_s2[rows])
         readings = window.table_m_s2[rows][known]
-        speed = smooth(window.speed_rad_s, window.dt_s)
+        speed = smooth_samples(window.speed_rad_s, window.dt_s)
         own = np.gradient(speed, window.dt_s)[rows][known] * window.pitch_mm / (2e3 * math.pi)
         if readings.size >= LEAST_SAMPLES and not np.ptp(readings) > 0.0:
             text = f"table acceleration is constant at {readings[0]:.4g} m/s2: it is not used"
             found["table_m_s2"] = Reason("StuckValue", text, "check the accelerometer")
         elif readings.size >= LEAST_SAMPLES and float(np.var(own)) > 0.0:
             courses = np.stack([np.ones(readings.size), own])
-            gain = float(solve(courses.T, readings)[0][1])
+            gain = float(solve_least_squares(courses.T, readings)[0][1])
             if _explained(readings, courses) > TABLE_FOLLOWS and not 1.0 / TABLE_GAIN < gain < TABLE_GAIN:
                 text = f"table acceleration is {gain:.3g} times that of the motor: it is not used"
                 found["table_m_s2"] = Reason("CalibrationSuspect", text, "check the accelerometer's scale and sign")
@@ -179,7 +179,7 @@ def position_confirms(window: Window, signal: SensorSignal, start: int, end: int
     to_mm = window.pitch_mm / (2 * math.pi) * window.dt_s
     rows = np.flatnonzero(known) - np.flatnonzero(known)[0]
     error_mm = position[known] - position[known][0] - signal.values[start] * to_mm * rows
-    steps = QUANTISATION_STEPS * resolution(window.position_mm[np.isfinite(window.position_mm)])
+    steps = QUANTISATION_STEPS * find_resolution(window.position_mm[np.isfinite(window.position_mm)])
     return bool((np.abs(error_mm) <= signal.step / 2 * to_mm * rows + steps).all())
 
 
@@ -193,6 +193,6 @@ def missing_move(recording: Recording) -> Reason | None:
     moved, integral = float(np.ptp(position)), float(np.ptp(travel))
     if max(moved, integral) < STILL_MM or abs(moved - integral) < 0.1 * max(moved, integral):
         return None
-    top = float(np.abs(smooth(speed, recording.dt_s)).max())
+    top = float(np.abs(smooth_samples(speed, recording.dt_s)).max())
     text = f"speed reaches {top:.3g} rad/s and its integral {integral:.3g} mm, the position travels {moved:.4g} mm"
     return Reason("Implausible", text, "check the sensor, the unit and the mapping of speed and position")

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdhil.identification.courses import voltage_terms_v
-from fdhil.identification.estimators.maximum_likelihood import Fit
-from fdhil.identification.identifiability import untold
-from fdhil.identification.windows import carried
+from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
+from fdhil.identification.identifiability import list_missing_reasons
+from fdhil.identification.rapid_windows import fill_forward
+from fdhil.identification.term_regressors import compute_term_voltage_v
 from fdhil.model.feed_drive import discretise_plant, simulate_plant
 from fdhil.records import Estimate, Float, Parameters, Window
 
@@ -28,7 +28,7 @@ class Simulated:
     measured_rad_s: Float
 
 
-def fit_percent(window: Window, estimate: Estimate, fit: Fit | None) -> float | None:
+def fit_percent(window: Window, estimate: Estimate, fit: LikelihoodFit | None) -> float | None:
     """Return 100 (1 - |w - what| / |w - mean w|) of the speed simulated from voltage; None without a model."""
     motion = simulated(window, estimate, fit)
     if motion is None:
@@ -37,7 +37,7 @@ def fit_percent(window: Window, estimate: Estimate, fit: Fit | None) -> float | 
     return _explained_percent(motion.measured_rad_s[known], motion.speed_rad_s[known])
 
 
-def simulated(window: Window, estimate: Estimate, fit: Fit | None) -> Simulated | None:
+def simulated(window: Window, estimate: Estimate, fit: LikelihoodFit | None) -> Simulated | None:
     """Simulate a window's current and speed from its voltage alone; None without a model or a voltage.
 
     An estimated delay of the voltage of up to one sample is removed first. Where a slow voltage leaves R or L
@@ -54,17 +54,17 @@ def simulated(window: Window, estimate: Estimate, fit: Fit | None) -> Simulated 
         return _slowly(window, p, estimate.delay_s or 0.0)
     assert window.voltage_v is not None
     row: Float = np.arange(window.n, dtype=np.float64)
-    voltage = carried(window.voltage_v)
+    voltage = fill_forward(window.voltage_v)
     if fit is not None:
-        voltage = voltage + voltage_terms_v(fit.problem.motions[0], fit.theta)
+        voltage = voltage + compute_term_voltage_v(fit.problem.motions[0], fit.theta)
     if estimate.delay_s and abs(estimate.delay_s) <= window.dt_s:
         voltage = np.interp(row + estimate.delay_s / window.dt_s, row, voltage)
     current, speed = simulate_plant(p, voltage, window.dt_s, window.voltage_sampling)
     return Simulated(row * window.dt_s, current, speed, window.speed_rad_s)
 
 
-def _complete(estimate: Estimate, fit: Fit | None) -> Estimate:
-    if fit is None or not estimate.missing or untold(estimate, slow=fit.problem.slow):
+def _complete(estimate: Estimate, fit: LikelihoodFit | None) -> Estimate:
+    if fit is None or not estimate.missing or list_missing_reasons(estimate, slow=fit.problem.has_slow_voltage):
         return estimate
     return replace(estimate, values=np.where(np.isnan(estimate.values), fit.theta[:6], estimate.values))
 
@@ -73,12 +73,12 @@ def _slowly(window: Window, parameters: Parameters, delay_s: float) -> Simulated
     slow = window.slow_voltage
     assert slow is not None
     begin: Float = slow.begin_s - delay_s + slow.period_s * np.arange(slow.voltage_v.size, dtype=np.float64)
-    voltage = carried(slow.voltage_v)
+    voltage = fill_forward(slow.voltage_v)
     if slow.late_s is not None:  # of a polled sensor: its values are interpolated to the grid, and across its gaps
         known = np.isfinite(slow.voltage_v)
         voltage = np.interp(begin, (begin + slow.late_s)[known], slow.voltage_v[known]) if known.any() else voltage
     current, speed = simulate_plant(parameters, voltage, slow.period_s, window.voltage_sampling)
-    measured = np.interp(begin, np.arange(window.n) * window.dt_s, carried(window.speed_rad_s))
+    measured = np.interp(begin, np.arange(window.n) * window.dt_s, fill_forward(window.speed_rad_s))
     return Simulated(begin, current, speed, measured)
 
 
@@ -89,7 +89,7 @@ def _explained_percent(measured: Float, speed: Float) -> float | None:
     return 100.0 * (1.0 - float(np.linalg.norm(measured - speed)) / spread)
 
 
-def expected_fit_percent(window: Window, fit: Fit) -> float:
+def expected_fit_percent(window: Window, fit: LikelihoodFit) -> float:
     """Return the least fit of a correct model, from the noise of speed and of the voltage that drives it."""
     if window.slow_voltage is not None:
         return LEAST_FIT_PERCENT  # the voltage's course within its samples is unknown

@@ -17,14 +17,14 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.identification.estimators import maximum_likelihood
-from fdhil.identification.estimators.maximum_likelihood import Fit
-from fdhil.identification.filtering import moving_mean
-from fdhil.identification.innovations import innovations
-from fdhil.identification.motion import Motion, resolution
-from fdhil.identification.normal import inverse_of
-from fdhil.identification.slow_start import sample_rows
-from fdhil.identification.slow_voltage import innovations_of
-from fdhil.identification.windows import carried, noise_of, runs_of, smooth
+from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
+from fdhil.identification.filtering import compute_moving_mean
+from fdhil.identification.innovations import compute_innovations
+from fdhil.identification.low_rate_voltage.low_rate_innovations import compute_low_rate_innovations
+from fdhil.identification.low_rate_voltage.starting_values import build_sample_regressors
+from fdhil.identification.normal_equations import invert_symmetric
+from fdhil.identification.prepared_motion import Motion, find_resolution
+from fdhil.identification.rapid_windows import estimate_noise_std, fill_forward, smooth_samples, sort_runs_by_length
 from fdhil.records import Float, Reason, SlowVoltage, Window
 from fdhil.validation.repeated_readings import alike
 from fdhil.validation.sensor_reconstruction import log_beyond
@@ -53,10 +53,10 @@ def slow_voltage_faults(window: Window) -> Iterator[Reason]:
         return
     volts, begins = slow.voltage_v, slow.begin_s + slow.period_s * np.arange(slow.voltage_v.size)
     speed = np.interp(
-        begins + slow.period_s / 2, np.arange(window.n) * window.dt_s, smooth(window.speed_rad_s, window.dt_s)
+        begins + slow.period_s / 2, np.arange(window.n) * window.dt_s, smooth_samples(window.speed_rad_s, window.dt_s)
     )
     rails = (float(np.nanmax(volts)), float(np.nanmin(volts)))
-    step = max(resolution(volts[np.isfinite(volts)]), 1e-12)
+    step = max(find_resolution(volts[np.isfinite(volts)]), 1e-12)
     same = likely_same(volts, step)
     for start, end in runs(volts):
         moving = np.abs(speed[start:end]) > MOVING * window.rapid_speed_rad_s
@@ -74,7 +74,7 @@ def slow_voltage_faults(window: Window) -> Iterator[Reason]:
 
 def runs(volts: Float) -> list[tuple[int, int]]:
     """Return the half-open runs of equal samples, the longest first."""
-    return [(start, end + 1) for start, end in runs_of(np.diff(volts) == 0.0, LEAST_SAMPLES - 1)]
+    return [(start, end + 1) for start, end in sort_runs_by_length(np.diff(volts) == 0.0, LEAST_SAMPLES - 1)]
 
 
 def _strange(window: Window, volts: Float, speed: Float, run: tuple[int, int], step: float, same: float) -> bool:
@@ -91,7 +91,7 @@ def _strange(window: Window, volts: Float, speed: Float, run: tuple[int, int], s
 
 def likely_same(volts: Float, step: float) -> float:
     """Return the probability that a constant mid-step is read there, by the noise of third differences."""
-    noise = math.sqrt(max(noise_of(carried(volts)) ** 2 - step**2 / 12.0, (LEAST_NOISE * step) ** 2))
+    noise = math.sqrt(max(estimate_noise_std(fill_forward(volts)) ** 2 - step**2 / 12.0, (LEAST_NOISE * step) ** 2))
     return alike(noise / step)
 
 
@@ -114,10 +114,10 @@ def _stuck(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
     """
     fit, volts = fitted.required_fit, slow.voltage_v
     motion = fit.problem.motions[0]
-    noise = fit.problem.noises[0].vector() ** 2
-    made = innovations_of(motion, fit.theta, noise, float(fit.theta[6]))
+    noise = fit.problem.noises[0].to_array() ** 2
+    made = compute_low_rate_innovations(motion, fit.theta, noise, float(fit.theta[6]))
     errors, spread = made.values[2 * motion.n :], np.sqrt(made.variance[2 * motion.n :])
-    step = resolution(volts[np.isfinite(volts)])
+    step = find_resolution(volts[np.isfinite(volts)])
     beyond = np.maximum(np.abs(errors) - step / 2, 0.0) / spread  # beyond its resolution
     limit = BUDGET["slow voltage"].log_chance
     same = math.log(max(likely_same(volts, max(step, 1e-12)), 1e-300))
@@ -139,7 +139,7 @@ def _off_at_rest(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
     """
     window, fit = fitted.window, fitted.required_fit
     theta = fit.theta
-    rows, begin = sample_rows(window, float(theta[6]), fitted.signals.settings.lowpass_hz)
+    rows, begin = build_sample_regressors(window, float(theta[6]), fitted.signals.settings.lowpass_hz)
     time, rest = np.arange(window.n) * window.dt_s, fitted.signals.standstill.astype(np.float64)
     lasts = slow.period_s if window.voltage_sampling == "interval_mean" else 0.0
     ends = [np.interp(at, time, rest) for at in (begin - window.dt_s, begin + lasts / 2, begin + lasts + window.dt_s)]
@@ -148,10 +148,12 @@ def _off_at_rest(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
         return
     left = still[:, 0] - still[:, 1:] @ theta[[1, 0, 2]]
     mean_a = float(np.mean(still[:, 2]))
-    of_r = float(np.sqrt(inverse_of(fit.information)[0][0, 0])) * mean_a
+    of_r = float(np.sqrt(invert_symmetric(fit.information)[0][0, 0])) * mean_a
     chance = BUDGET["standstill"].deviations * math.hypot(float(np.std(left, ddof=1)) / math.sqrt(len(left)), of_r)
     # a steady signal may be half a step from its reading
-    hidden = 0.5 * (resolution(rows[:, 0]) + theta[0] * resolution(window.current_a[np.isfinite(window.current_a)]))
+    hidden = 0.5 * (
+        find_resolution(rows[:, 0]) + theta[0] * find_resolution(window.current_a[np.isfinite(window.current_a)])
+    )
     off = float(np.mean(left))
     peak = min(float(np.nanmax(np.abs(slow.voltage_v))), theta[0] * float(np.nanmax(np.abs(window.current_a))))
     if abs(off) > max(LEAST_OFFSET * peak, chance) + hidden:
@@ -159,7 +161,7 @@ def _off_at_rest(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
         yield Reason("CalibrationSuspect", text, "set the zero of both sensors at standstill")
 
 
-def current_late(window: Window, fit: Fit, least_gain: float) -> Iterator[Reason]:
+def current_late(window: Window, fit: LikelihoodFit, least_gain: float) -> Iterator[Reason]:
     """Yield a reason if the current is late by more than a row, and the window likelier so by ``least_gain``.
 
     ``fit`` is the window's; the gain is one of twice the log likelihood.
@@ -174,7 +176,7 @@ def current_late(window: Window, fit: Fit, least_gain: float) -> Iterator[Reason
             break
         rows += step
         earlier = plain.current[np.clip(np.arange(plain.n) + rows, 0, plain.n - 1)]
-        last = maximum_likelihood.fit([replace(plain, current=earlier)], last.theta, last.free)
+        last = maximum_likelihood.fit_parameters_and_noise([replace(plain, current=earlier)], last.theta, last.free)
         if not (np.isfinite(last.residuals).all() and np.isfinite(last.information).all()):
             return
         found, _ = _shift(last)
@@ -182,20 +184,20 @@ def current_late(window: Window, fit: Fit, least_gain: float) -> Iterator[Reason
         yield build_delay_reason("current", "speed and voltage", rows * window.dt_s, window.dt_s)
 
 
-def _shift(fit: Fit) -> tuple[float, float]:
+def _shift(fit: LikelihoodFit) -> tuple[float, float]:
     """Return the current's delay by the innovations, in rows, and its standard deviation."""
     motion: Motion = fit.problem.motions[0]
     width = 2 * round(SMOOTHING_S / 2 / motion.dt_s) + 1
-    earlier = replace(motion, current=motion.current + np.gradient(moving_mean(motion.current, width)))
+    earlier = replace(motion, current=motion.current + np.gradient(compute_moving_mean(motion.current, width)))
     gains, theta = fit.problem.filters[0], fit.theta
-    answer = innovations(earlier, theta, gains) - innovations(motion, theta, gains)
-    rest = answer - fit.jacobian @ (inverse_of(fit.information)[0] @ (fit.jacobian.T @ answer))
+    answer = compute_innovations(earlier, theta, gains) - compute_innovations(motion, theta, gains)
+    rest = answer - fit.jacobian @ (invert_symmetric(fit.information)[0] @ (fit.jacobian.T @ answer))
     power = float(rest @ rest)
     return (-float(rest @ fit.residuals) / power, power**-0.5) if power > 0.0 else (0.0, np.inf)
 
 
-def _cost(fit: Fit) -> float:
+def _cost(fit: LikelihoodFit) -> float:
     """Return minus twice the log likelihood, without its constant."""
-    return innovations_of(
-        fit.problem.motions[0], fit.theta, fit.problem.noises[0].vector() ** 2, float(fit.theta[6])
+    return compute_low_rate_innovations(
+        fit.problem.motions[0], fit.theta, fit.problem.noises[0].to_array() ** 2, float(fit.theta[6])
     ).cost

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fdhil.identification.estimators.maximum_likelihood import Fit
-from fdhil.identification.motion import Motion
-from fdhil.identification.windows import carried
+from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
+from fdhil.identification.prepared_motion import Motion
+from fdhil.identification.rapid_windows import fill_forward
 from fdhil.records import Float
 from fdhil.validation.score_bench import Bench, Finding
 
@@ -27,7 +27,7 @@ CHANCE = 3.0  # standard deviations
 SATURATED = 0.02  # of the peak current, at which an inverter's dead time has its whole effect
 
 
-def findings(fit: Fit) -> list[Finding]:
+def findings(fit: LikelihoodFit) -> list[Finding]:
     """Return what the innovations of one window show beyond the model, the most significant first."""
     bench = Bench.of(fit)
     rows = np.flatnonzero(np.abs(bench.motion.mode) == 1)
@@ -119,7 +119,7 @@ def _of_the_voltage(bench: Bench, drift: Float) -> list[Finding]:
     Of these voltages only a part reaches the motor, or is needed there: each is tried as what is missing.
     """
     motion = bench.motion
-    current, volts = carried(motion.current), np.interp(*_places(motion), carried(motion.voltage_mean))
+    current, volts = fill_forward(motion.current), np.interp(*_places(motion), fill_forward(motion.voltage_mean))
     peak, most = float(np.abs(current).max()), float(np.abs(volts).max())
     power = np.maximum(volts * current, 0.0)
     tried = (
@@ -165,7 +165,7 @@ def _warms(finding: Finding, bench: Bench, drift: Float) -> bool:
 
 def _places(motion: Motion) -> tuple[Float, Float]:
     rows = np.arange(motion.n, dtype=np.float64)
-    return rows, motion.at_voltage(rows) if motion.slow is not None else rows
+    return rows, motion.sample_at_voltage(rows) if motion.slow is not None else rows
 
 
 def _low_speed_friction(bench: Bench) -> Finding:

@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from fdhil.identification.windows import runs_of
+from fdhil.identification.rapid_windows import sort_runs_by_length
 from fdhil.records import Bool, Float, Reason
 from fdhil.validation.plausibility import RAIL_SAMPLES
 from fdhil.validation.repeated_readings import LEAST_NOISE_ROWS, SIDE, alike, beyond_chance, wakes_with_a_jump
@@ -82,7 +82,7 @@ def stuck_values(fitted: WindowFit) -> Iterator[Reason]:
             yield Reason("StuckValue", text, "record it at the drive's own rate, or at the rate at which it changes")
             continue
         limit = BUDGET["stuck"].log_chance - math.log(np.count_nonzero(~same) + 2)
-        runs = ((begin + start, begin + last) for start, last in runs_of(same)[:LONGEST_RUNS])
+        runs = ((begin + start, begin + last) for start, last in sort_runs_by_length(same)[:LONGEST_RUNS])
         stuck = next((run for run in runs if _is_stuck(fitted, readings, *run, limit)), None)
         if stuck is not None:
             lasts_ms = 1e3 * (stuck[1] - stuck[0] + 1) * signals.window.dt_s
@@ -112,7 +112,7 @@ def clipped_peaks(fitted: WindowFit) -> Iterator[Reason]:
     for signal in signals.varying_sensors:
         noise, values = getattr(fit.problem.noises[0], NOISES[signal.name]), signal.values
         for rail in (np.nanmax(values), np.nanmin(values)):
-            runs = runs_of(values == rail, RAIL_SAMPLES) if rail != 0.0 else []
+            runs = sort_runs_by_length(values == rail, RAIL_SAMPLES) if rail != 0.0 else []
             if runs and beyond_chance(values, runs[0][0], runs[0][1] - 1):
                 continue  # found without a model already
             for start, end in runs:

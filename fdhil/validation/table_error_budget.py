@@ -23,8 +23,8 @@ import numpy as np
 
 from fdhil.config import Axis, Identification
 from fdhil.config.nc_section import TOLERANCE_SHARE
-from fdhil.identification.filtering import moving_mean, quick_size
-from fdhil.identification.windows import carried
+from fdhil.identification.filtering import compute_moving_mean, find_fft_size
+from fdhil.identification.rapid_windows import fill_forward
 from fdhil.model.model_terms import compute_friction_torque
 from fdhil.records import Bool, Float, Parameters, Reason, Window, compute_rms
 from fdhil.validation.replay import Replay, replay_window
@@ -81,7 +81,7 @@ class TableError:
         """Return the error at the table (q, n), um, by the integrals (q, n) of torques, N.m.s, rows dt apart."""
         n = momentum.shape[-1]
         settled = math.ceil(SETTLED_S / dt_s)
-        size = quick_size(n + 3 * settled)
+        size = find_fft_size(n + 3 * settled)
         # the transform is circular: the final momentum is held until the loop has settled, then faded out
         fading = np.cos(np.linspace(0.0, math.pi, settled)) / 2 + 0.5
         tail = np.concatenate([np.ones(settled), fading, np.zeros(size - n - 2 * settled)])
@@ -96,7 +96,7 @@ class TableError:
 
     def noise_um(self, white: float, walk: float, n: int, dt_s: float) -> float:
         """Return the RMS (um) by a momentum of white noise and one of a random walk, by their deviation per row."""
-        size = quick_size(n + 3 * math.ceil(SETTLED_S / dt_s))
+        size = find_fft_size(n + 3 * math.ceil(SETTLED_S / dt_s))
         power = np.abs(self.response(size, dt_s)[1:]) ** 2
         step = 2 * np.sin(math.pi * np.fft.rfftfreq(size)[1:])
         return math.sqrt(float(power @ (white**2 + (walk / step) ** 2)) * 2 / size)
@@ -178,14 +178,14 @@ class Move:
     @classmethod
     def of(cls, window: Window, parameters: Parameters, side: Float) -> Move:
         """Return the move of a window, with the friction of a model."""
-        speed = carried(window.speed_rad_s)
-        angle = 2 * math.pi / window.pitch_mm * carried(window.position_mm)
+        speed = fill_forward(window.speed_rad_s)
+        angle = 2 * math.pi / window.pitch_mm * fill_forward(window.position_mm)
         friction = np.where(side != 0, compute_friction_torque(parameters, np.abs(speed) * side, angle), 0.0)
         moving = np.flatnonzero(side)
         first = int(moving[0]) if moving.size else 0
         begins = np.zeros(side.size, dtype=np.bool_)
         begins[max(0, first - round(BEGINNING_S / window.dt_s)) : first] = True
-        return cls(carried(window.current_a), speed, side, friction, begins, window.dt_s)
+        return cls(fill_forward(window.current_a), speed, side, friction, begins, window.dt_s)
 
     def integral(self, torque_nm: Float) -> Float:
         """Return the integral (n,) of a torque (n,) over the rows in which the drive moves."""
@@ -212,7 +212,7 @@ class Move:
         way = self.side[rows[-1] + 1]
         width = 2 * round(SMOOTHING_S / 2 / self.dt_s) + 1
         held = way * self.friction[rows[-1] + 1]
-        net = way * p.K * moving_mean(self.current, width) - held - way * p.ft * self.speed
+        net = way * p.K * compute_moving_mean(self.current, width) - held - way * p.ft * self.speed
         push = np.where(self.begins, np.maximum(net, 0.0), 0.0) * self.dt_s
         gained = np.where(self.begins, np.append(np.diff(self.speed), 0.0), 0.0)
         made: Float = np.concatenate([[0.0], np.cumsum(way * push - p.Jt * gained)[:-1]])

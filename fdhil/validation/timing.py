@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from fdhil.identification.fit import Fit, but_delay, descend, with_delay
-from fdhil.identification.fit import fit as refit
+from fdhil.identification.likelihood_fit import LikelihoodFit, exclude_delay, run_gauss_newton, set_delay
+from fdhil.identification.likelihood_fit import fit_parameters_and_noise as refit
 from fdhil.records import Reason
 from fdhil.validation.shifts import LARGEST, Shift, build_delay_reason, shifts
 from fdhil.validation.significance import BUDGET
@@ -53,7 +53,7 @@ def timing_faults(fitted: WindowFit) -> Iterator[Reason]:
     yield from _short_winding(fit)
 
 
-def _short_winding(fit: Fit) -> Iterator[Reason]:
+def _short_winding(fit: LikelihoodFit) -> Iterator[Reason]:
     """Yield a reason if a short winding may as well be a late voltage: both make the current follow early.
 
     If the time constant found is less than a sample, the window is refused unless it is significantly likelier than
@@ -64,8 +64,8 @@ def _short_winding(fit: Fit) -> Iterator[Reason]:
         return
     least = float(fit.residuals @ fit.residuals) * (1.0 + BUDGET["timing"].deviations ** 2 / fit.residuals.size)
     for samples in LATE:
-        start = with_delay(theta, samples * motion.dt_s)
-        theta, residuals, _, _ = descend(fit.problem, start, but_delay(fit.free))
+        start = set_delay(theta, samples * motion.dt_s)
+        theta, residuals, _, _ = run_gauss_newton(fit.problem, start, exclude_delay(fit.free))
         if float(residuals @ residuals) < least:
             short_ms, long_ms = (1e3 * t[1] / t[0] for t in (fit.theta, theta))
             text = (
@@ -76,7 +76,7 @@ def _short_winding(fit: Fit) -> Iterator[Reason]:
             return
 
 
-def searched(fit: Fit, first: Shift) -> float | None:
+def searched(fit: LikelihoodFit, first: Shift) -> float | None:
     """Return the delay of the voltage in samples beyond which, all else fitted to it, the innovations show no more.
 
     ``first`` is their first estimate; where it shows no direction, the voltage is assumed late, as sensors are. None
@@ -88,7 +88,7 @@ def searched(fit: Fit, first: Shift) -> float | None:
 
     def left(delay: float) -> float:
         nonlocal last
-        last = refit([motion], with_delay(last.theta, delay * motion.dt_s), but_delay(last.free))
+        last = refit([motion], set_delay(last.theta, delay * motion.dt_s), exclude_delay(last.free))
         if not (np.isfinite(last.residuals).all() and np.isfinite(last.information).all()):
             return float("nan")
         return shifts(last)[0].samples - delay
@@ -99,7 +99,7 @@ def searched(fit: Fit, first: Shift) -> float | None:
     return found if found is not None and _deviance(fit) - _deviance(last) > BUDGET["timing"].deviations ** 2 else None
 
 
-def _deviance(fit: Fit) -> float:
+def _deviance(fit: LikelihoodFit) -> float:
     """Return minus twice the log likelihood, without its constant."""
     return float(fit.residuals @ fit.residuals) + fit.problem.filters[0].logdet
 

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fdhil.identification.covariance import aliasing
-from fdhil.identification.estimators.maximum_likelihood import Fit
-from fdhil.identification.normal import inverse_of
-from fdhil.identification.slow_voltage import left_open_v
+from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
+from fdhil.identification.low_rate_voltage.low_rate_innovations import estimate_open_voltage_v
+from fdhil.identification.normal_equations import invert_symmetric
+from fdhil.identification.robust_covariance import estimate_aliasing_doubt
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.score_bench import LAGS, expected_correlation
 from fdhil.validation.significance import BUDGET
@@ -20,7 +20,7 @@ LOOK = "the drive has an effect that the model lacks: inspect the residuals"
 _FIELDS = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
 
 
-def coloured(fit: Fit) -> Iterator[tuple[str, Reason]]:
+def coloured(fit: LikelihoodFit) -> Iterator[tuple[str, Reason]]:
     """Yield signal and reason if its innovations are autocorrelated beyond chance over all lags, and not by little."""
     motion = fit.problem.motions[0]
     rows = (np.abs(motion.mode) == 1) & motion.observed
@@ -45,14 +45,14 @@ def coloured(fit: Fit) -> Iterator[tuple[str, Reason]]:
             yield name, Reason("ValidationFailed", text, LOOK)
 
 
-def noisy(fit: Fit, window: Window) -> Iterator[tuple[str, Reason]]:
+def noisy(fit: LikelihoodFit, window: Window) -> Iterator[tuple[str, Reason]]:
     """Yield signal and reason if the fit needs more noise than the signal's own scatter from row to row.
 
     The effect of the voltage's course within its samples, which the parameters do not imitate, is no reason.
     """
     fitted = fit.problem.noises[0]
-    course = fit.problem.shape_effect(fit.theta)
-    course = course - fit.jacobian @ (inverse_of(fit.information)[0] @ (fit.jacobian.T @ course))
+    course = fit.problem.compute_shape_effect(fit.theta)
+    course = course - fit.jacobian @ (invert_symmetric(fit.information)[0] @ (fit.jacobian.T @ course))
     missed = np.sqrt(np.mean(course[: 2 * fit.problem.motions[0].n].reshape(-1, 2) ** 2, axis=0))
     for name, unit, wanted, values, shape in (
         ("voltage", "V", fitted.voltage_v, window.voltage_v, 0.0),
@@ -63,19 +63,19 @@ def noisy(fit: Fit, window: Window) -> Iterator[tuple[str, Reason]]:
         if name == "voltage":
             seen = float(np.hypot(seen, _aliased_v(fit, window)))
         seen = float(np.hypot(seen, shape * wanted))
-        if name == "voltage" and fit.problem.slow:  # the undetermined part of a sample hides its noise
+        if name == "voltage" and fit.problem.has_slow_voltage:  # the undetermined part of a sample hides its noise
             motion, theta = fit.problem.motions[0], fit.theta
-            open_v = left_open_v(motion, theta, fitted.vector() ** 2)
+            open_v = estimate_open_voltage_v(motion, theta, fitted.to_array() ** 2)
             wanted, seen = float(np.hypot(wanted, open_v)), float(np.hypot(seen, open_v))
         if wanted > NOISE_RATIO * seen:
             text = f"the model explains {name} to {wanted:.3g} {unit} only, while it scatters by {seen:.3g} {unit}"
             yield name, Reason("ValidationFailed", text, LOOK)
 
 
-def _aliased_v(fit: Fit, window: Window) -> float:
+def _aliased_v(fit: LikelihoodFit, window: Window) -> float:
     """Return the voltage that instants may miss of the course between them: the same uncertainty that R and L carry."""
     motion = fit.problem.motions[0]
-    doubt = aliasing(window.voltage_sampling, motion.voltage_period_s) * np.abs(fit.theta[:6])
+    doubt = estimate_aliasing_doubt(window.voltage_sampling, motion.voltage_period_s) * np.abs(fit.theta[:6])
     current = motion.current[np.isfinite(motion.current)]
     rate = np.gradient(current, motion.dt_s)
     missed = doubt[0] * np.sqrt(np.mean(current**2)), doubt[1] * np.sqrt(np.mean(rate**2))

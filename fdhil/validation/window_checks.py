@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from fdhil.identification.identifiability import unphysical, untold
+from fdhil.identification.identifiability import find_unphysical_values, list_missing_reasons
 from fdhil.records import Reason, Result
 from fdhil.validation.agreement import values_apart
 from fdhil.validation.interruptions import interruptions
@@ -119,12 +119,12 @@ def _check_estimate(table: TableAssessment) -> Iterator[Reason]:
     fitted, signals = table.fitted, table.signals
     estimate = fitted.estimate
     assert estimate is not None
-    missing = untold(estimate, slow=signals.window.slow_voltage is not None or not signals.has_voltage)
+    missing = list_missing_reasons(estimate, slow=signals.window.slow_voltage is not None or not signals.has_voltage)
     yield from missing
     unconverged = bool(estimate.missing) and not missing and fitted.fit is not None and not fitted.fit.converged
     if unconverged or estimate.result is Result.DIVERGED:
         yield Reason("SolverFailed", "the fit does not converge", "inspect the window's signals")
-    yield from unphysical(fitted.widened_estimate or estimate, one_way=True)
+    yield from find_unphysical_values(fitted.widened_estimate or estimate, one_way=True)
     for name in estimate.terms:
         if name in NEVER_NEGATIVE and estimate.get_value(name) < -SURE * estimate.get_std(name):
             text = f"{name} = {estimate.get_value(name):.4g} would add voltage: voltage or current has an offset"

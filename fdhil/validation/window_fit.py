@@ -7,10 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
-from fdhil.identification.delay import coarse_delay
 from fdhil.identification.estimators import least_squares
-from fdhil.identification.fit import Fit, but_delay, fit, with_delay
-from fdhil.identification.without_voltage import TorqueFit
+from fdhil.identification.likelihood_fit import LikelihoodFit, exclude_delay, fit_parameters_and_noise, set_delay
+from fdhil.identification.torque_fit import TorqueFit
+from fdhil.identification.voltage_delay import estimate_coarse_delay
 from fdhil.records import PARAMETERS, Estimate, Parameters, Reason, Window
 from fdhil.validation.breakaway import Breakaway, breakaway
 from fdhil.validation.model_deficiencies import Lacking, lacking, widened
@@ -33,7 +33,7 @@ class WindowFit:
 
     signals: WindowSignals
     estimate: Estimate | None = None
-    fit: Fit | None = None
+    fit: LikelihoodFit | None = None
     torque: TorqueFit | None = None
 
     @property
@@ -42,7 +42,7 @@ class WindowFit:
         return self.signals.window
 
     @property
-    def required_fit(self) -> Fit:
+    def required_fit(self) -> LikelihoodFit:
         """The fit; ValueError without one."""
         if self.fit is None:
             raise ValueError("the window has no fit")
@@ -79,15 +79,15 @@ class WindowFit:
         window = self.window
         if not self.voltage_delay_s or window.voltage_v is None:
             return bool(self.voltage_delay_s)
-        return coarse_delay(least_squares.align(window, self.signals.settings), window.dt_s) != 0.0
+        return estimate_coarse_delay(least_squares.align_signals(window, self.signals.settings), window.dt_s) != 0.0
 
     @cached_property
-    def aligned_fit(self) -> Fit:
+    def aligned_fit(self) -> LikelihoodFit:
         """The fit without a delay of more than a sample: other faults shift that delay, and have names of their own."""
         whole = self.required_fit
         if not self.voltage_delay_s:
             return whole
-        return fit(whole.problem.motions, with_delay(whole.theta, 0.0), but_delay(whole.free))
+        return fit_parameters_and_noise(whole.problem.motions, set_delay(whole.theta, 0.0), exclude_delay(whole.free))
 
     @cached_property
     def has_sound_fit(self) -> bool:
@@ -102,7 +102,7 @@ class WindowFit:
         if self.fit is None:
             return None
         motion, theta = self.fit.problem.motions[0], self.fit.theta
-        finite = bool(np.isfinite(theta).all() and np.isfinite(self.fit.problem.noises[0].vector()).all())
+        finite = bool(np.isfinite(theta).all() and np.isfinite(self.fit.problem.noises[0].to_array()).all())
         usable = motion.slow is None and finite and bool((theta[:4] > 0).all()) and abs(theta[6]) <= motion.dt_s
         return Bridge.over(self.fit) if usable else None
 

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from fdhil.config import Axis, Identification
-from fdhil.identification.motion import Noise, noise_levels, resolution
-from fdhil.identification.windows import carried, moving_range, smooth
+from fdhil.identification.prepared_motion import NoiseLevels, estimate_noise_levels, find_resolution
+from fdhil.identification.rapid_windows import fill_forward, find_moving_range, smooth_samples
 from fdhil.records import Bool, Float, Window
 from fdhil.validation.backlash import DeadBand, backlash
 
@@ -36,7 +36,7 @@ def collect_sensors(window: Window) -> tuple[SensorSignal, ...]:
         ("current", "A", window.current_a),
         ("speed", "rad/s", window.speed_rad_s),
     )
-    return tuple(SensorSignal(n, u, v, resolution(v[np.isfinite(v)])) for n, u, v in recorded if v is not None)
+    return tuple(SensorSignal(n, u, v, find_resolution(v[np.isfinite(v)])) for n, u, v in recorded if v is not None)
 
 
 @dataclass(frozen=True)
@@ -74,26 +74,26 @@ class WindowSignals:
         return self.window.voltage_v is not None or self.window.slow_voltage is not None
 
     @cached_property
-    def noise(self) -> Noise:
+    def noise(self) -> NoiseLevels:
         """The noise of the three sensors."""
-        return noise_levels(self.window)
+        return estimate_noise_levels(self.window)
 
     @cached_property
     def motion_range(self) -> tuple[int, int]:
         """The half-open range of samples of the move itself."""
-        return moving_range(self.window)
+        return find_moving_range(self.window)
 
     @cached_property
     def standstill(self) -> Bool:
         """The samples (n,) in which the table stands still, by position and smoothed speed."""
         window = self.window
-        position = carried(window.position_mm)
+        position = fill_forward(window.position_mm)
         reach = max(1, round(STILL_S / window.dt_s))
         ahead, behind = np.roll(position, -reach), np.roll(position, reach)
         still = (np.abs(ahead - position) < STILL_MM) & (np.abs(behind - position) < STILL_MM)
         still[:reach] &= np.abs(position[:reach] - position[0]) < STILL_MM
         still[-reach:] &= np.abs(position[-reach:] - position[-1]) < STILL_MM
-        slow = np.abs(smooth(window.speed_rad_s, window.dt_s)) < STILL_SHARE * window.rapid_speed_rad_s
+        slow = np.abs(smooth_samples(window.speed_rad_s, window.dt_s)) < STILL_SHARE * window.rapid_speed_rad_s
         return still & slow & np.isfinite(window.speed_rad_s)
 
     @cached_property

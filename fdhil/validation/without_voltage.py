@@ -7,8 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.identification.normal import inverse_gram
-from fdhil.identification.without_voltage import TorqueFit, candidates, effective_rows, late_s
+from fdhil.identification.normal_equations import invert_gram
+from fdhil.identification.torque_fit import (
+    TorqueFit,
+    count_effective_samples,
+    estimate_current_lag_s,
+    list_candidate_terms,
+)
 from fdhil.records import Reason, compute_rms
 from fdhil.validation.shifts import build_delay_reason
 from fdhil.validation.significance import BUDGET
@@ -23,7 +28,7 @@ IMITATED = 1e-6  # of a course's power, below which only rounding remains
 
 def torque_late(fitted: TorqueFit, dt: float) -> Iterator[Reason]:
     """Yield a reason if the current is late or early against the motion by significantly more than a row."""
-    late, std = late_s(fitted)
+    late, std = estimate_current_lag_s(fitted)
     if abs(late) > LATE_ROWS * dt + BUDGET["timing"].deviations * std:
         yield build_delay_reason("current", "the motion", late, dt)
 
@@ -58,8 +63,8 @@ def surest_load(fitted: TorqueFit) -> Load:
 
     Friction at low speed and ripples are no load, whether they were added to the model or not.
     """
-    design = np.column_stack([fitted.design, *(term.columns for term in candidates(fitted))])
-    inverse, _ = inverse_gram(design)
+    design = np.column_stack([fitted.design, *(term.columns for term in list_candidate_terms(fitted))])
+    inverse, _ = invert_gram(design)
     left = fitted.current - design @ (inverse @ (design.T @ fitted.current))
     edges = np.linspace(0, left.size, EDGES + 1).astype(int)
     # products of a step up to an edge with design and residual are sums up to that edge; a load is two steps
@@ -74,7 +79,7 @@ def surest_load(fitted: TorqueFit) -> Load:
     amplitude, begin, end = float(amplitudes[k]), int(edges[a[k]]), int(edges[b[k]])
     rest = left + amplitude * (design @ (inverse @ (shared[b[k]] - shared[a[k]])))
     rest[begin:end] -= amplitude
-    std = compute_rms(rest) * float(np.sqrt(rest.size / effective_rows(rest) / max(power[k], 1e-300)))
+    std = compute_rms(rest) * float(np.sqrt(rest.size / count_effective_samples(rest) / max(power[k], 1e-300)))
     return Load(amplitude, std, begin, end)
 
 

@@ -13,7 +13,7 @@ MODULES = ("recordings", "result", "machine", "model")
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_examples_of_docstrings_give_what_they_show(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_docstring_examples_give_the_shown_output(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     options = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
     done = doctest.testmod(import_module(f"fdhil.api.{name}"), optionflags=options)

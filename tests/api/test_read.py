@@ -12,29 +12,29 @@ import fdhil
 from fdhil.errors import RecordingError
 from fdhil.store.column_proposal import propose, propose_columns
 from fdhil.store.recording_table import RecordingTable
-from tests.api.foreign_motor import TRUTH
-from tests.api.moves import measured
+from tests.api.independent_motor import TRUTH
+from tests.api.motor_recordings import record_motor
 from tests.api.test_identify import assert_true_within_intervals
 
 
 def write_csv(path: Path, head: str, order: str = "tuiw", rpm: bool = False) -> Path:
-    m = measured("steps of voltage")
+    m = record_motor("steps of voltage")
     columns = {"t": m.time, "u": m.voltage, "i": m.current, "w": m.speed * (30 / np.pi if rpm else 1.0)}
     np.savetxt(path, np.column_stack([columns[k] for k in order]), delimiter=",", header=head, comments="", fmt="%.7g")
     return path
 
 
-def test_part_of_a_heading_is_enough_to_name_a_column(tmp_path: Path) -> None:
+def test_column_is_found_by_a_part_of_its_heading(tmp_path: Path) -> None:
     path = write_csv(
         tmp_path / "scope.csv", "Time (s),Terminal voltage (V),r78 Current actual (A),n_act (rpm)", rpm=True
     )
     names = {"time": "Time", "voltage": "voltage", "current": "r78", "speed": "n_act"}
     recording = fdhil.read(path, columns=names)
-    assert recording.speed == pytest.approx(measured("steps of voltage").speed, abs=1e-3)
+    assert recording.speed == pytest.approx(record_motor("steps of voltage").speed, abs=1e-3)
     assert_true_within_intervals(fdhil.identify(recording, any_move=True))
 
 
-def test_part_of_two_headings_is_refused_with_both(tmp_path: Path) -> None:
+def test_ambiguous_heading_is_refused_with_both_columns(tmp_path: Path) -> None:
     path = write_csv(tmp_path / "scope.csv", "Time (s),Channel 1,Channel 2,Channel 3")
     with pytest.raises(RecordingError, match="'Channel 1' and 'Channel 2' and 'Channel 3'"):
         fdhil.read(path, columns={"time": "Time", "voltage": "Chan", "current": "Channel 2", "speed": "Channel 3"})
@@ -55,8 +55,8 @@ def test_columns_are_proposed_by_headings_and_physics(head: str, order: str, tmp
     assert_true_within_intervals(fdhil.identify(fdhil.read(path, "?"), any_move=True))
 
 
-def test_position_waits_for_a_pitch_and_states_are_no_signals(tmp_path: Path) -> None:
-    m = measured("steps of voltage")
+def test_position_needs_a_pitch_and_states_are_not_signals(tmp_path: Path) -> None:
+    m = record_motor("steps of voltage")
     angle = np.cumsum(m.speed) * 1e-3
     state = (m.speed > 1.0).astype(float)
     table = np.column_stack([m.time, state, angle, m.voltage, m.current, m.speed, angle % 7.0])
@@ -71,7 +71,7 @@ def test_position_waits_for_a_pitch_and_states_are_no_signals(tmp_path: Path) ->
 
 
 def test_column_of_another_length_is_not_proposed() -> None:
-    m = measured("steps of voltage")
+    m = record_motor("steps of voltage")
     columns = {"t": m.time, "u": m.voltage, "i": m.current[1:], "w": m.speed}
     proposal = propose(RecordingTable({}, columns))
     assert [p.signal for p in proposal.columns] == ["time_s", "voltage_V", "speed_rad_per_s"]
@@ -87,7 +87,7 @@ def test_file_without_a_current_is_not_proposed_as_a_recording(tmp_path: Path) -
 
 
 def test_matlab_file_is_read_by_its_variables(tmp_path: Path) -> None:
-    m = measured("chirp")
+    m = record_motor("chirp")
     savemat(tmp_path / "lab.mat", {"t": m.time, "u": m.voltage, "i": m.current, "omega": m.speed})
     from fdhil.store.recording_mat import read as read_matlab
 
@@ -96,13 +96,13 @@ def test_matlab_file_is_read_by_its_variables(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("processes")
 def test_matlab_file_is_identified(tmp_path: Path) -> None:
-    m = measured("chirp")
+    m = record_motor("chirp")
     savemat(tmp_path / "lab.mat", {"t": m.time, "u": m.voltage, "i": m.current, "omega": m.speed})
     assert_true_within_intervals(fdhil.identify(fdhil.read(tmp_path / "lab.mat", "?"), any_move=True))
 
 
-def test_map_takes_an_angle_for_the_speed_and_a_torque_for_the_current(tmp_path: Path) -> None:
-    m = measured("rapids")
+def test_column_map_accepts_angle_for_speed_and_torque_for_current(tmp_path: Path) -> None:
+    m = record_motor("rapids")
     angle = np.concatenate([[0.0], np.cumsum((m.speed[1:] + m.speed[:-1]) / 2 * 1e-3)])
     counts, torque = np.rint(angle * 2**16 / (2 * np.pi)), 1e3 * TRUTH["K"] * m.current
     table = np.column_stack([m.time, counts, torque])

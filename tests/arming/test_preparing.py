@@ -33,7 +33,7 @@ from fdhil.commissioning.void import void_record
 from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.errors import ConfigError, ProgramError
-from fdhil.identification.loops import DIFFER
+from fdhil.identification.drive_loops.loop_identification import DIFFER
 from fdhil.program import loading, program_digest
 from fdhil.records import LoopEstimate, Notice, Reason, Skill, Verdict
 from fdhil.store.rows import Revision, Stamp

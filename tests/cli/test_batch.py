@@ -20,12 +20,12 @@ from fdhil.config import Identification
 from fdhil.errors import FdhilError
 from fdhil.fleet import window_files
 from fdhil.fleet.window_reanalysis import reanalyse_batch
-from fdhil.identification.windows import moving_range
+from fdhil.identification.rapid_windows import find_moving_range
 from fdhil.store.windows import read_window
 from studies import bench
 from tests.daemon.machine_rig import fdhil
 from tests.fleet import stored_rapids
-from tests.identification.recorded import signals
+from tests.identification.bench_recordings import simulate_bench_shuttle
 
 SETTINGS = Identification()
 
@@ -34,7 +34,7 @@ SETTINGS = Identification()
 def recordings(tmp_path: Path) -> list[Path]:
     paths = [tmp_path / f"{k}.csv" for k in range(2)]
     for k, path in enumerate(paths):
-        path.write_text(bench.as_csv(signals(moves=2), 0.003, seed=k))
+        path.write_text(bench.as_csv(simulate_bench_shuttle(moves=2), 0.003, seed=k))
     return paths
 
 
@@ -88,7 +88,7 @@ def test_a_folder_is_all_its_recordings_and_a_stored_window_the_bits_that_a_flee
         (told,) = files[again.window.name]["windows"]
         fleet = json.loads(again.text)
         window = read_window(window_files.build_window_path(folder, again.window.name))
-        assert told["start_s"] == round(window.start_s + moving_range(window)[0] * window.dt_s, 6)  # original time
+        assert told["start_s"] == round(window.start_s + find_moving_range(window)[0] * window.dt_s, 6)  # original time
         assert told["validated"] == fleet["accepted"]
         assert told["fit_percent"] == fleet["fit_percent"]
         for name, found in fleet["parameters"].items():

@@ -88,7 +88,7 @@ def test_missing_library_is_named_before_anything_is_started(
     arguments: tuple[str, ...], folder: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = set(folder.iterdir())
-    monkeypatch.setattr("fdhil.report.page.find_spec", lambda _name: None)
+    monkeypatch.setattr("fdhil.report.report_page.find_spec", lambda _name: None)
     code, out, err = fdhil(*arguments, capsys=capsys)
     assert (code != 0, out) == (True, "")
     assert err == "fdhil: a report needs two libraries (the extra 'report'): pip install jinja2 matplotlib\n"

@@ -22,7 +22,7 @@ from fdhil.cli.demo.report import Cut, Published
 from fdhil.config import Reality
 from fdhil.errors import ConnectError, DeviceTimeout, FdhilError
 from fdhil.records import PARAMETERS, Parameters
-from fdhil.report import Page, write
+from fdhil.report import Page, write_page
 
 SHIPPED = Path(__file__).parents[2] / "configs" / "realistic.toml"
 TRUE = Parameters(0.5, 0.005, 0.8, 0.075, 0.05, 5.0)
@@ -67,7 +67,7 @@ def test_a_refusal_is_told_with_its_reasons(tmp_path: Path) -> None:
     assert realistic_page.verdict_rows(refused)[0] == ["X", "0 of 4", "none published", "4 x Implausible"]
     assert realistic_page.parameter_rows(refused) == []
     assert ["load_nm", "", "2.5"] in realistic_page.effect_rows(refused)
-    write(Page("title", "subtitle", [realistic_page.headline(refused)], [section]), tmp_path / "report.html")
+    write_page(Page("title", "subtitle", [realistic_page.headline(refused)], [section]), tmp_path / "report.html")
     assert "0 of 4" in (tmp_path / "report.html").read_text("utf-8")
     told = _realistic(refused)
     assert told["axes"]["X"]["parameters"] is None

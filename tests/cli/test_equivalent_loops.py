@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fdhil.api.loops import equivalent_loops
+from fdhil.api.loop_comparison import list_equivalent_loops
 from fdhil.config.regulators import Regulators
 from fdhil.model import closed_loop
 from fdhil.records import LoopEstimate, Parameters, Verdict, freeze_array
@@ -21,14 +21,14 @@ def found(structure: str, names: tuple[str, ...], values: tuple[float, ...]) -> 
 
 
 def test_pid_is_reported_as_the_two_cascades_of_its_sum_and_product() -> None:
-    same = equivalent_loops(found("pid", NAMES, (84.0, 1.0, 20.0, 1760.0)))
+    same = list_equivalent_loops(found("pid", NAMES, (84.0, 1.0, 20.0, 1760.0)))
     assert [each["position_gain_per_s"] for each in same] == pytest.approx([40.0, 44.0])
     assert [each["speed_ki"] for each in same] == pytest.approx([880.0, 800.0])
 
 
 def test_no_cascade_is_the_same_without_real_gains_or_with_part_of_the_speed_fed_forward() -> None:
-    assert equivalent_loops(found("pid", NAMES, (40.0, 1.0, 20.0, 1760.0))) == []
-    assert equivalent_loops(found("pid", NAMES, (84.0, 0.5, 20.0, 1760.0))) == []
+    assert list_equivalent_loops(found("pid", NAMES, (40.0, 1.0, 20.0, 1760.0))) == []
+    assert list_equivalent_loops(found("pid", NAMES, (84.0, 0.5, 20.0, 1760.0))) == []
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -38,7 +38,7 @@ def test_exchanged_cascade_follows_a_rapid_alike() -> None:
     g = axis.regulators
     names = ("position_gain_per_s", "speed_feedforward", "speed_kp", "speed_ki")
     cascade = found("p_pi_pi", names, (g.position_gain_per_s, 1.0, g.speed_kp, g.speed_ki))
-    pid, exchanged = equivalent_loops(cascade)
+    pid, exchanged = list_equivalent_loops(cascade)
     assert (pid["structure"], exchanged["structure"]) == ("pid", "p_pi_pi")
     other = axis.model_copy(update={"regulators": Regulators.model_validate(g.model_dump() | dict(exchanged))})
     places = [closed_loop.simulate_axis(model, each, 0.001, demand_mm).position_mm for each in (axis, other)]

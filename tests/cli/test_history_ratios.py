@@ -17,7 +17,7 @@ from fdhil.store.history import History
 from fdhil.store.rows import Stamp
 from tests.daemon.machine_rig import BENCH, fdhil
 from tests.daemon.simulated_machine import config_of
-from tests.identification.recorded import windows
+from tests.identification.bench_recordings import find_noisy_windows
 
 START_S, DAYS, LOADED_ON_DAY = 1_800_000_000.0, 20, 12
 WEAR_PER_DAY = 0.01  # of Cd/K
@@ -29,7 +29,7 @@ def deaf(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tmp_path = tmp_path_factory.mktemp("deaf")
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)
-    analysed = analyse(replace(windows(0.003)[0], axis="X", voltage_v=None), Identification())
+    analysed = analyse(replace(find_noisy_windows(0.003)[0], axis="X", voltage_v=None), Identification())
     assert analysed.estimate is not None
     deviations = np.sqrt(np.diag(analysed.estimate.covariance))
     rng = np.random.default_rng(4)
@@ -65,7 +65,7 @@ def test_what_the_data_sheet_gives_has_no_trend(tmp_path: Path, capsys: Any) -> 
     path.write_text(BENCH)
     machine = config_of(tmp_path, ("X",))
     with History.open(machine.store.directory) as history:
-        for day, window in enumerate(windows(0.003, moves=4)):
+        for day, window in enumerate(find_noisy_windows(0.003, moves=4)):
             analysed = analyse(replace(window, voltage_v=None), Identification(), machine.axis["X"], 0.001)
             assert analysed.verdict.accepted, analysed.verdict
             history.add_window(analysed, "", Stamp(START_S + 86_400.0 * day, "boot", window.start_tick))

@@ -21,13 +21,13 @@ from fdhil.store.export import export_table, table_of
 from studies import bench
 from studies.slow_sensor import slow_windows
 from tests.bench import bench_toml
-from tests.identification.recorded import signals
+from tests.identification.bench_recordings import simulate_bench_shuttle
 
 
 @pytest.fixture
 def shuttle(tmp_path: Path) -> Path:
     path = tmp_path / "shuttle.csv"
-    path.write_text(bench.as_csv(signals(moves=2), 0.003))
+    path.write_text(bench.as_csv(simulate_bench_shuttle(moves=2), 0.003))
     return path
 
 
@@ -236,7 +236,7 @@ demand_m = { name = "Demand", unit = "mm" }
 
 def _trace(tmp_path: Path, every: int = 1, sampling: str = "interval_mean") -> tuple[Path, Path]:
     """Write an oscilloscope trace with decimal commas, quotes and a 16-bit position counter, and its column map."""
-    lines = bench.as_csv(signals(moves=2), 0.003).partition("time_s")[2].splitlines()[1::every]
+    lines = bench.as_csv(simulate_bench_shuttle(moves=2), 0.003).partition("time_s")[2].splitlines()[1::every]
     rows = ['"Time","Voltage","Current","Speed","Position","Demand"']
     for line in lines:
         time_s, voltage, current, speed, position_m, demand_m = map(float, line.split(","))

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from fdhil.cli.main import cli
 from studies import real_plant as real
 from tests.bench import bench_toml
-from tests.identification.test_loops import shuttle
+from tests.identification.test_loop_identification import build_shuttle_demand
 
 pytestmark = pytest.mark.usefixtures("long_computation")
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("long_computation")
 @pytest.fixture
 def filtered(tmp_path: Path) -> Path:
     mechanics = real.Mechanics()
-    run = real.run(mechanics, shuttle(2, 0.25, 0.5), real.Loops(speed_filter_s=0.001))
+    run = real.run(mechanics, build_shuttle_demand(2, 0.25, 0.5), real.Loops(speed_filter_s=0.001))
     path = tmp_path / "filtered.csv"
     path.write_text(real.as_csv(run, mechanics, real.Sensors(), 0.5))
     return path

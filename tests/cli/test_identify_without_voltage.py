@@ -12,14 +12,14 @@ from fdhil.prediction.models import load_model_file
 from studies import bench
 from tests.bench import bench_toml
 from tests.cli.test_identify import invoke, told_document
-from tests.identification.deaf import SCREW, SECTION, screw_csv
-from tests.identification.recorded import signals
+from tests.identification.bench_recordings import simulate_bench_shuttle
+from tests.identification.no_voltage_recordings import SCREW, SECTION, format_screw_csv
 
 
 @pytest.fixture
 def deaf(tmp_path: Path) -> Path:
     path = tmp_path / "deaf.csv"
-    path.write_text(screw_csv())
+    path.write_text(format_screw_csv())
     return path
 
 
@@ -84,6 +84,6 @@ def test_a_whole_model_needs_no_config_and_none_is_written_without_a_validated_p
     assert refused.return_value == 1
     assert "is not written" in refused.stderr
     assert not out.exists()
-    recording.write_text(bench.as_csv(signals(moves=2), 0.003))
+    recording.write_text(bench.as_csv(simulate_bench_shuttle(moves=2), 0.003))
     assert invoke(recording, "--write-model", out).return_value == 0
     assert load_model_file(out).parameters["X"].Jt == pytest.approx(0.075, rel=0.01)

@@ -19,7 +19,7 @@ from fdhil import config as machine_config
 from fdhil.cli.demo.toml import to_toml
 from fdhil.cli.main import cli, run_safely
 from fdhil.config.config_template import write_filled_template
-from fdhil.report.history_reading import by_axis
+from fdhil.report.history_reader import group_by_axis
 from tests.commissioning.test_linuxcnc_files import HAL_TEXT, INI, ROTARY_AND_GANTRY
 from tests.drivers.frame_builder import build_machine_config
 from tests.drivers.peer import DrivePeer
@@ -86,7 +86,7 @@ def test_linuxcncs_files_and_few_answers_make_a_machine(fdhil: Said, tmp_path: P
     assert (x.rapid_speed_mm_s, x.drive.increments_per_rev, x.drive.sign) == (400.0, 10000, 1)
     assert {"Cd", "ft"} <= set(x.guessed)
     assert "R" not in x.guessed
-    known = [history.nominal for history in by_axis(made, [], {}, ["X"])]
+    known = [history.nominal for history in group_by_axis(made, [], {}, ["X"])]
     assert known == [{name: value for name, value in x.nominal.model_dump().items() if name not in x.guessed}]
     assert (y.drive.increments_per_rev, y.drive.sign) == (8192, -1)
     assert (x.correction is not None, y.correction is not None) == (True, False)

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdhil.api.analysis import FileResult
+from fdhil.api.recording_analysis import FileResult
 from fdhil.cli.model_file import write_model
-from fdhil.identification.loops import DIFFER
+from fdhil.identification.drive_loops.loop_identification import DIFFER
 from fdhil.prediction.models import load_model_file, with_loops
 from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Reason, Result, Verdict, freeze_array
 from tests.bench import bench_config

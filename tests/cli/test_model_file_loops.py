@@ -22,7 +22,7 @@ from fdhil.store.rows import Stamp
 from studies import real_plant as real
 from tests.bench import bench_toml
 from tests.cli.test_predict import invoke as run
-from tests.identification.test_loops import shuttle
+from tests.identification.test_loop_identification import build_shuttle_demand
 from tests.paths import build_bench_trajectory, compute_rms
 from tests.store.made import published
 
@@ -48,7 +48,7 @@ class Shop:
 def shop(tmp_path_factory: pytest.TempPathFactory, long_computation: None) -> Shop:
     folder = tmp_path_factory.mktemp("filtered")
     shop = Shop(folder, folder / "filtered.csv", folder / "bench.toml", folder / "model.json")
-    run = real.run(MECHANICS, shuttle(2, 0.25, 0.5), LOOPS)
+    run = real.run(MECHANICS, build_shuttle_demand(2, 0.25, 0.5), LOOPS)
     shop.recording.write_text(real.as_csv(run, MECHANICS, real.Sensors(), 0.5))
     shop.config.write_text(bench_toml())
     result = invoke("identify", shop.recording, "--config", shop.config, "--write-model", shop.model)

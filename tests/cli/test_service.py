@@ -23,7 +23,7 @@ from fdhil.config import load_config
 from fdhil.daemon import service_log
 from fdhil.daemon.daemon_status import DaemonStatus
 from fdhil.records import Notice
-from fdhil.report.parameter_view import cell, half_of
+from fdhil.report.parameter_format import compute_half_width, format_cell
 from tests.daemon.machine_rig import BENCH, fdhil
 from tests.daemon.simulated_machine import config_of
 from tests.reserved_port import reserve_port
@@ -245,14 +245,14 @@ def test_run_on_a_bus_that_is_not_there_is_3_and_one_sentence(tmp_path: Path, ca
 def test_small_pictures() -> None:
     assert sparkline([1.0, 2.0, 3.0]) == "▁▅█"
     assert sparkline([1.0, 1.0]) == "▁▁"
-    assert cell("R", 0.5, half_of({"low": 0.488, "high": 0.512}), " ") == "500 ±12"
-    assert cell("K", 0.8, half_of({"low": None, "high": None}), " ") == "0.8 (no ±)"
-    assert cell("K", None, None) == "-"
+    assert format_cell("R", 0.5, compute_half_width({"low": 0.488, "high": 0.512}), " ") == "500 ±12"
+    assert format_cell("K", 0.8, compute_half_width({"low": None, "high": None}), " ") == "0.8 (no ±)"
+    assert format_cell("K", None, None) == "-"
     # value and half width end at the same digit
-    assert cell("bus_sag", 1.4234e-6, 6.4e-8, " ") == "(1.42 ±0.06)e-6"
-    assert cell("bus_sag", 0.0053, 2.3e-5, " ") == "0.00530 ±0.00002"
-    assert cell("bus_sag", 12_345.0, 234.0, " ") == "12300 ±200"
-    assert cell("bus_sag", 1.2345e7, 2.34e5, " ") == "(1.23 ±0.02)e7"
+    assert format_cell("bus_sag", 1.4234e-6, 6.4e-8, " ") == "(1.42 ±0.06)e-6"
+    assert format_cell("bus_sag", 0.0053, 2.3e-5, " ") == "0.00530 ±0.00002"
+    assert format_cell("bus_sag", 12_345.0, 234.0, " ") == "12300 ±200"
+    assert format_cell("bus_sag", 1.2345e7, 2.34e5, " ") == "(1.23 ±0.02)e7"
 
 
 def test_lines_of_the_daemon_as_json(capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,7 +19,7 @@ from fdhil.daemon import outcome_store
 from fdhil.daemon.outcome_json import build_outcome_document
 from fdhil.daemon.outcome_store import OutcomeStore, get_raw_scales
 from fdhil.errors import StoreError
-from fdhil.identification.pooling import member
+from fdhil.identification.window_pool import build_pool_member
 from fdhil.records import LoopEstimate, Notice, Outcome, Verdict, freeze_array
 from fdhil.store.history import HISTORY_FILE_NAME, History
 from fdhil.store.rows import Comparison, Stamp
@@ -152,7 +152,7 @@ def test_pool_data_of_windows_are_loaded_again(tmp_path: Path) -> None:
     assert [result.place for result in known.members] == [-2, -1, 0]
     made = outcome(of=window())
     assert made.estimate is not None
-    fresh = member(made.window, made.estimate)
+    fresh = build_pool_member(made.window, made.estimate)
     for name in ("values", "own", "shared"):
         assert getattr(known.members[0], name).tobytes() == getattr(fresh, name).tobytes()
 

@@ -10,7 +10,7 @@ from fdhil.config import Identification
 from fdhil.fleet import window_files
 from fdhil.fleet.window_reanalysis import AnalysisMethod, ReanalysedWindow, WindowReference, compute_code_digest
 from fdhil.store.windows import encode_window
-from tests.identification.recorded import windows
+from tests.identification.bench_recordings import find_noisy_windows
 
 
 def store_rapids(folder: Path, machines: int, each: int) -> list[WindowReference]:
@@ -23,7 +23,7 @@ def store_rapids(folder: Path, machines: int, each: int) -> list[WindowReference
 
 def _store_window(folder: Path, count: int, seed: int) -> Iterator[str]:
     for k in range(count):
-        content = encode_window(windows(0.003, seed + k, moves=2)[1], "of-the-machine")
+        content = encode_window(find_noisy_windows(0.003, seed + k, moves=2)[1], "of-the-machine")
         name = hashlib.sha256(content).hexdigest()
         window_files.store_window(folder, name, content)
         yield name

@@ -30,7 +30,7 @@ from tests.fleet.fleet_database import build_fleet, collect_messages, list_messa
 from tests.fleet.recording_machine import RecordingMachine, write_history
 from tests.fleet.servers import Postgres, is_listening, list_children, wait_until
 from tests.free_ports import find_free_port
-from tests.identification.recorded import windows
+from tests.identification.bench_recordings import find_noisy_windows
 
 pytestmark = pytest.mark.debian
 BEFORE = Identification(method="least_squares")
@@ -46,7 +46,7 @@ def fleet_settings(database: Postgres, tmp_path: Path) -> Path:
             write_history(tmp_path / str(k), f"mill-{k}", windows="all", labels={"type": "V-800"})
         )
         for seed in range(EACH):
-            window = windows(0.003, 100 * k + seed, moves=2)[seed % 2]
+            window = find_noisy_windows(0.003, 100 * k + seed, moves=2)[seed % 2]
             found = analyse(window, BEFORE)
             assert found.verdict.accepted
             assert machine.store.store_outcomes([found if seed < EACH - 1 else run_refused(found)]) == []

@@ -8,28 +8,33 @@ import numpy as np
 import pytest
 
 from fdhil.identification import kalman
-from fdhil.identification.innovations import answers, gains_of, innovations, whiten
-from fdhil.identification.motion import BROKEN_MODE, DIFFUSE, UNKNOWN_MODE, Motion, prepare
+from fdhil.identification.innovations import (
+    compute_filter_gains,
+    compute_innovations,
+    compute_signal_response,
+    whiten_innovations,
+)
+from fdhil.identification.prepared_motion import BROKEN_MODE, DIFFUSE, UNKNOWN_MODE, Motion, prepare_window
 from fdhil.records import Float, VoltageSampling
 from studies import bench
-from tests.identification.recorded import windows
+from tests.identification.bench_recordings import find_noisy_windows
 
 THETA = np.array([*bench.Plant().truth().values(), 0.0])
 
 
-def _motion(sampling: VoltageSampling) -> Motion:
+def _build_motion(sampling: VoltageSampling) -> Motion:
     """Return a rapid with three lost samples and an interval of unknown friction."""
-    motion = prepare(replace(windows(0.002)[0], voltage_sampling=sampling))
+    motion = prepare_window(replace(find_noisy_windows(0.002)[0], voltage_sampling=sampling))
     motion.mode[500] = BROKEN_MODE
     motion.observed[500:503] = False
     return motion
 
 
-def _textbook(motion: Motion, theta: Float) -> Float:
+def _whiten_by_matrices(motion: Motion, theta: Float) -> Float:
     """Return the whitened innovations (2 n,) by matrices, with the same transition coefficients."""
     means = motion.voltage_sampling == "interval_mean"
-    voltage, current, speed = motion.noise.vector() ** 2
-    steps = kalman.interval_steps(theta, motion.dt_s, 1.0 if means else 0.0)
+    voltage, current, speed = motion.noise.to_array() ** 2
+    steps = kalman.compute_interval_steps(theta, motion.dt_s, 1.0 if means else 0.0)
     measured = np.diag([current, speed])
     x, p = np.array([motion.current[0], motion.speed[0]]), DIFFUSE * measured
     white = np.zeros((motion.n, 2))
@@ -54,38 +59,40 @@ def _textbook(motion: Motion, theta: Float) -> Float:
 
 
 @pytest.mark.parametrize("sampling", ["interval_mean", "instant"])
-def test_the_written_out_filter_is_the_textbooks(sampling: VoltageSampling) -> None:
-    motion = _motion(sampling)
-    white, _ = whiten(motion, THETA[None], motion.noise.vector()[None] ** 2)
-    expected = _textbook(motion, THETA)
+def test_filter_matches_the_matrix_kalman_filter(sampling: VoltageSampling) -> None:
+    motion = _build_motion(sampling)
+    white, _ = whiten_innovations(motion, THETA[None], motion.noise.to_array()[None] ** 2)
+    expected = _whiten_by_matrices(motion, THETA)
     np.testing.assert_allclose(white[:, 0], expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("sampling", ["interval_mean", "instant"])
-def test_kept_gains_give_the_innovations_that_they_were_made_with(sampling: VoltageSampling) -> None:
-    motion = _motion(sampling)
-    white, logdet = whiten(motion, THETA[None], motion.noise.vector()[None] ** 2)
-    gains = gains_of(motion, THETA, motion.noise)
-    np.testing.assert_allclose(innovations(motion, THETA, gains), white[:, 0], rtol=1e-9, atol=1e-9)
+def test_stored_gains_reproduce_the_innovations(sampling: VoltageSampling) -> None:
+    motion = _build_motion(sampling)
+    white, logdet = whiten_innovations(motion, THETA[None], motion.noise.to_array()[None] ** 2)
+    gains = compute_filter_gains(motion, THETA, motion.noise)
+    np.testing.assert_allclose(compute_innovations(motion, THETA, gains), white[:, 0], rtol=1e-9, atol=1e-9)
     assert gains.logdet == logdet[0]
 
 
 @pytest.mark.parametrize("name", ["current", "speed"])
-def test_an_answer_is_the_change_of_the_innovations(name: str) -> None:
-    motion = _motion("interval_mean")
-    gains = gains_of(motion, THETA, motion.noise)
+def test_signal_response_equals_the_change_of_innovations(name: str) -> None:
+    motion = _build_motion("interval_mean")
+    gains = compute_filter_gains(motion, THETA, motion.noise)
     course = np.sin(np.arange(motion.n) / 50.0)
     changed = replace(motion, **{name: getattr(motion, name) + course})
     kind = kalman.CURRENT if name == "current" else kalman.SPEED
-    answer = answers(motion, THETA, gains, kind, course[None])[:, 0]
+    answer = compute_signal_response(motion, THETA, gains, kind, course[None])[:, 0]
     np.testing.assert_allclose(
-        answer, innovations(changed, THETA, gains) - innovations(motion, THETA, gains), atol=1e-6
+        answer, compute_innovations(changed, THETA, gains) - compute_innovations(motion, THETA, gains), atol=1e-6
     )
 
 
-def test_a_load_is_answered_as_one_that_is_there() -> None:
-    motion = _motion("interval_mean")
-    gains = gains_of(motion, THETA, motion.noise)
+def test_load_response_equals_an_actual_load() -> None:
+    motion = _build_motion("interval_mean")
+    gains = compute_filter_gains(motion, THETA, motion.noise)
     load = np.linspace(0.0, 1.0, motion.n)
-    there = innovations(motion, THETA, gains, load) - innovations(motion, THETA, gains)
-    np.testing.assert_allclose(answers(motion, THETA, gains, kalman.LOAD, load[None])[:, 0], there, atol=1e-6)
+    there = compute_innovations(motion, THETA, gains, load) - compute_innovations(motion, THETA, gains)
+    np.testing.assert_allclose(
+        compute_signal_response(motion, THETA, gains, kalman.LOAD, load[None])[:, 0], there, atol=1e-6
+    )

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdhil.identification.identifiability import unphysical
-from fdhil.identification.physical_bounds import bounded
+from fdhil.identification.identifiability import find_unphysical_values
+from fdhil.identification.physical_bounds import bound_estimate
 from fdhil.model.model_terms import compute_friction_torque
 from fdhil.model.physical_limits import list_bounds
 from fdhil.records import PARAMETERS, Estimate, Float, Result
@@ -18,7 +18,7 @@ NAMES = (*PARAMETERS, *TERMS)
 TRUE = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 5.0, 1.0, 0.06, 0.04, -2.0, 10.0])
 
 
-def estimate(values: Float, covariance: Float | None = None, names: tuple[str, ...] = NAMES) -> Estimate:
+def build_estimate(values: Float, covariance: Float | None = None, names: tuple[str, ...] = NAMES) -> Estimate:
     """Return an estimate, by default with uncertain friction."""
     deviations = 0.01 * np.abs(values)
     deviations[[names.index(name) for name in names if name in ("Cd", "stribeck", "ft")]] = 2.0
@@ -26,7 +26,7 @@ def estimate(values: Float, covariance: Float | None = None, names: tuple[str, .
     return Estimate("maximum_likelihood", names, values, made, {}, Result.OK)
 
 
-def changed(**values: float) -> Float:
+def replace_values(**values: float) -> Float:
     """Return the true values with some replaced."""
     told = TRUE.copy()
     for name, value in values.items():
@@ -34,43 +34,43 @@ def changed(**values: float) -> Float:
     return told
 
 
-def test_physical_estimate_is_left_as_it_is() -> None:
-    told = estimate(TRUE)
-    assert bounded(told) is told
-    assert bounded(told, -1) is told
+def test_physical_estimate_is_unchanged() -> None:
+    told = build_estimate(TRUE)
+    assert bound_estimate(told) is told
+    assert bound_estimate(told, -1) is told
 
 
-def test_friction_at_standstill_that_chance_made_negative_is_zero() -> None:
-    told = estimate(changed(Cd=4.95, stribeck=-6.4))
-    assert unphysical(told) == []
-    within = bounded(told)
+def test_insignificantly_negative_breakaway_friction_becomes_zero() -> None:
+    told = build_estimate(replace_values(Cd=4.95, stribeck=-6.4))
+    assert find_unphysical_values(told) == []
+    within = bound_estimate(told)
     assert within.get_value("Cd") + within.get_value("stribeck") == 0.0
     # both move, the more the less certain they are
     assert within.get_value("Cd") == pytest.approx(5.675)
     assert within.covariance is told.covariance
 
 
-def test_friction_at_standstill_that_is_surely_negative_is_refused() -> None:
-    told = estimate(changed(Cd=4.95, stribeck=-16.4))
-    (reason,) = unphysical(told)
+def test_significantly_negative_breakaway_friction_is_refused() -> None:
+    told = build_estimate(replace_values(Cd=4.95, stribeck=-16.4))
+    (reason,) = find_unphysical_values(told)
     assert (reason.code, "Cd + stribeck = -11.45" in reason.text) == ("Unphysical", True)
 
 
-def test_correlated_values_follow_the_one_that_is_bounded() -> None:
+def test_correlated_values_follow_the_bounded_one() -> None:
     names = PARAMETERS
     covariance = np.zeros((6, 6))
     covariance[4:, 4:] = [[1e-4, -9e-3], [-9e-3, 1.0]]  # ft and Cd nearly compensate each other
-    within = bounded(estimate(np.array([*TRUE[:4], -0.001, 6.0]), covariance, names))
+    within = bound_estimate(build_estimate(np.array([*TRUE[:4], -0.001, 6.0]), covariance, names))
     assert within.get_value("ft") == 0.0
     assert within.get_value("Cd") == pytest.approx(6.0 - 0.09)
 
 
-def test_load_beyond_dry_friction_is_told_of_moves_in_one_direction() -> None:
+def test_one_way_moves_report_a_load_beyond_dry_friction() -> None:
     names, covariance = PARAMETERS, np.diag([1e-6] * 6)
-    lowered = estimate(np.array([*TRUE[:5], -10.0]), covariance, names)
-    assert unphysical(lowered, one_way=True) == []
+    lowered = build_estimate(np.array([*TRUE[:5], -10.0]), covariance, names)
+    assert find_unphysical_values(lowered, one_way=True) == []
     for direction in (1, -1):
-        within = bounded(lowered, direction)
+        within = bound_estimate(lowered, direction)
         assert (within.get_value("Cd"), within.get_value("load")) == (0.0, -10.0 * direction)
         assert within.get_std("load") == pytest.approx(1e-3)
         speed = np.array([50.0 * direction])
@@ -80,10 +80,10 @@ def test_load_beyond_dry_friction_is_told_of_moves_in_one_direction() -> None:
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_every_estimate_is_taken_within_all_bounds(seed: int) -> None:
+def test_any_estimate_is_projected_within_all_bounds(seed: int) -> None:
     rng = np.random.default_rng(seed)
     root = rng.normal(0.0, 1.0, (len(NAMES), len(NAMES))) * np.abs(TRUE)
     values = TRUE + rng.choice([0.1, 1.0, 3.0]) * root @ rng.normal(0.0, 1.0, len(NAMES))
-    within = bounded(estimate(values, root @ root.T))
+    within = bound_estimate(build_estimate(values, root @ root.T))
     told = dict(zip(NAMES, within.values.tolist(), strict=True))
     assert all(bound.compute_violation(told) <= 0.0 for bound in list_bounds(NAMES))

@@ -20,7 +20,7 @@ from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.cia402.bus_decoder import BusDecoder
 from fdhil.drivers.serial.text_lines import TextLine
 from fdhil.drivers.table.accelerometer import StreamedAccelerometer
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.pipeline.recent_samples import RecentSamples
 from fdhil.records import AxisSamples, Estimate, TableSamples, TickTimes, WindowOutcome

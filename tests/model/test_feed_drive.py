@@ -9,7 +9,7 @@ from scipy.linalg import expm
 
 from fdhil.model.feed_drive import build_system_matrix, compute_voltage_ramps, discretise_plant, simulate_plant
 from fdhil.records import Float, Parameters, VoltageSampling
-from tests.identification.recorded import signals
+from tests.identification.bench_recordings import simulate_bench_shuttle
 
 BENCH = Parameters(R=0.5, L=0.005, K=0.8, Jt=0.075, ft=0.05, Cd=5.0)
 
@@ -36,14 +36,14 @@ def test_ramp_and_mean_responses_match_integration() -> None:
 
 
 def test_simulation_follows_the_bench_from_interval_means() -> None:
-    bench = signals()
+    bench = simulate_bench_shuttle()
     current, speed = simulate_plant(BENCH, bench.voltage, bench.dt_s, "interval_mean")
     assert np.abs(speed - bench.speed).max() < 2e-4 * np.abs(bench.speed).max()
     assert np.abs(current - bench.current).max() < 2e-3 * np.abs(bench.current).max()
 
 
 def test_simulation_continues_from_given_state() -> None:
-    bench = signals()
+    bench = simulate_bench_shuttle()
     k = 400
     start = (float(bench.current[k]), float(bench.speed[k]))
     _, speed = simulate_plant(BENCH, bench.voltage[k:700], bench.dt_s, "interval_mean", *start)
@@ -67,7 +67,7 @@ def test_motion_stops_and_stays_at_rest() -> None:
 
 @pytest.mark.parametrize("sampling", ["interval_mean", "instant"])
 def test_reversed_voltage_reverses_all_signals(sampling: VoltageSampling) -> None:
-    bench = signals()
+    bench = simulate_bench_shuttle()
     voltage = bench.voltage if sampling == "interval_mean" else bench.voltage_instant
     there = simulate_plant(BENCH, voltage, bench.dt_s, sampling)
     back = simulate_plant(BENCH, -voltage, bench.dt_s, sampling)

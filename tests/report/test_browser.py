@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdhil.report import Page, Section, Table, figures, find_browser, html, maps, write_pdf
+from fdhil.report import Page, Section, Table, figures, find_browser, path_maps, render_html, write_pdf
 from fdhil.report.pdf import run_browser
-from tests.report.test_report import PARAMETERS, curves, window
+from tests.report.test_report_page import PARAMETERS, build_window, extract_curves
 
 pytestmark = pytest.mark.debian
 
@@ -27,13 +27,13 @@ document.querySelectorAll("figure")[2].querySelector('[id*="-legend-1"]').dispat
 </script></body>"""
 
 
-def page() -> Page:
+def build_page() -> Page:
     """Return a page with one picture of each kind: a chart of two panels, a map, an enlarged detail."""
-    path = curves()[0].path_mm
+    path = extract_curves()[0].path_mm
     pictures = [
-        ("model", figures.model_against_drive(window(), PARAMETERS, 99.5)),
-        ("map", maps.error_map(path, np.linspace(0, 9, 200), 9.0)),
-        ("corner", figures.corner(curves(), (5.0, 5.0), 1.0)),
+        ("model", figures.draw_model_comparison(build_window(), PARAMETERS, 99.5)),
+        ("map", path_maps.draw_error_map(path, np.linspace(0, 9, 200), 9.0)),
+        ("corner", figures.draw_path_detail(extract_curves(), (5.0, 5.0), 1.0)),
     ]
     rows = [[str(k), f"{k} um"] for k in range(80)]
     return Page(
@@ -41,7 +41,7 @@ def page() -> Page:
     )
 
 
-def shown(text: str, folder: Path) -> str:
+def render_in_browser(text: str, folder: Path) -> str:
     """Return the browser's document after its scripts ran."""
     source, found = folder / "page.html", folder / "dom.html"
     source.write_text(text, "utf-8")
@@ -50,8 +50,8 @@ def shown(text: str, folder: Path) -> str:
     return found.read_text("utf-8")
 
 
-def test_pictures_come_alive(tmp_path: Path) -> None:
-    document = shown(html(page()).replace("</body>", USED), tmp_path)
+def test_charts_become_interactive_in_the_browser(tmp_path: Path) -> None:
+    document = render_in_browser(render_html(build_page()).replace("</body>", USED), tmp_path)
     assert document.count('class="uplot') == 2
     assert len(re.findall(r'<svg[^>]*class="still"', document)) == 1
     (reading,) = re.findall(r"<output>(X [^<]*)</output>", document)
@@ -60,8 +60,8 @@ def test_pictures_come_alive(tmp_path: Path) -> None:
     assert re.search(r'<g id="[^"]*trace-1" class="off"', document)
 
 
-def test_a_page_is_printed_with_pictures_that_were_drawn_for_it(tmp_path: Path) -> None:
-    whole = page()
+def test_printed_page_contains_the_static_pictures(tmp_path: Path) -> None:
+    whole = build_page()
     (section,) = whole.sections
     lines = replace(section, figures=[section.figures[0], section.figures[2]])  # a colour scale is an image
     write_pdf(replace(whole, sections=[lines]), tmp_path / "page.pdf")

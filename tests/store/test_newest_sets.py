@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fdhil.config.uplink_section import Uplink
-from fdhil.identification.loops import DIFFER
+from fdhil.identification.drive_loops.loop_identification import DIFFER
 from fdhil.records import LoopEstimate, Reason, Verdict, freeze_array
 from fdhil.store import schema
 from fdhil.store.history import HISTORY_FILE_NAME, History

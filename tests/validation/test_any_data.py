@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from fdhil import tables
 from fdhil.config import Identification
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse, pool
 from fdhil.records import Float, Window, WindowOutcome, freeze_array
-from tests.identification.recorded import recording, windows
+from tests.identification.bench_recordings import find_noisy_windows, record_noisy_shuttle
 
 FIELDS = ("voltage_v", "current_a", "speed_rad_s", "position_mm")
 EXTREMES = [0.0, 1e-300, 1e-12, 1e6, 1e300, -1e300, np.nan, np.inf, -np.inf]
@@ -51,7 +51,7 @@ def _spoilt(window: Window, name: str, start: int, length: int, value: float, sc
 def test_spoilt_windows_are_answered(
     name: str, start: int, length: int, value: float, scale: float, method: str
 ) -> None:
-    spoilt = _spoilt(windows(0.003)[0], name, start, length, value, scale)
+    spoilt = _spoilt(find_noisy_windows(0.003)[0], name, start, length, value, scale)
     chosen = Identification(method=method)
     outcome = analyse(spoilt, chosen)
     assert_answered(outcome)
@@ -62,7 +62,7 @@ def test_spoilt_windows_are_answered(
 @given(seed=st.integers(0, 2**32 - 1), rows=st.integers(1, 400), size=st.sampled_from([0.0, 1e-6, 1.0, 1e5]))
 def test_noise_alone_is_answered(seed: int, rows: int, size: float) -> None:
     rng = np.random.default_rng(seed)
-    whole = recording(0.0)
+    whole = record_noisy_shuttle(0.0)
     signals = [freeze_array(size * rng.standard_normal(rows)) for _ in range(5)]
     silent = replace(
         whole,
@@ -82,7 +82,7 @@ def test_noise_alone_is_answered(seed: int, rows: int, size: float) -> None:
 
 
 def test_short_windows_are_answered() -> None:
-    window = windows(0.003)[0]
+    window = find_noisy_windows(0.003)[0]
     for rows in (0, 1, 3, 31, 40, 120):
         arrays = {name: freeze_array(np.array(getattr(window, name))[:rows]) for name in (*FIELDS, "demand_mm")}
         short = Window(**{f: getattr(window, f) for f in window.__slots__} | arrays)
@@ -90,7 +90,7 @@ def test_short_windows_are_answered() -> None:
 
 
 def test_a_window_that_is_lost_whole_is_answered() -> None:
-    window = windows(0.003)[0]
+    window = find_noisy_windows(0.003)[0]
     nothing = freeze_array(np.full(window.n, np.nan))
     lost = Window(
         **{f: getattr(window, f) for f in window.__slots__}

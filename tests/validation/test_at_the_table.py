@@ -11,7 +11,7 @@ import pytest
 from fdhil.config import Axis, Identification
 from fdhil.config.axis_section import Nominal
 from fdhil.config.regulators import Regulators
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.pipeline.analysis import own
 from fdhil.records import PARAMETERS, Parameters, Window, WindowOutcome, compute_rms

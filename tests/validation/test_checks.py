@@ -16,7 +16,7 @@ from fdhil.validation.agreement import values_apart
 from fdhil.validation.significance import BUDGET
 from fdhil.validation.window_checks import FIT_CHECKS, SIGNAL_CHECKS, Check, run_checks
 from fdhil.validation.window_signals import WindowSignals
-from tests.identification.recorded import windows
+from tests.identification.bench_recordings import find_noisy_windows
 
 SETTINGS = Identification()
 
@@ -34,7 +34,7 @@ def test_what_explains_a_finding_stands_in_its_place() -> None:
     reason = Reason("Implausible", "first")
     first: Check[WindowSignals] = Check("first", lambda _: [reason])
     second: Check[WindowSignals] = Check("second", lambda _: [reason], unless=("first",))
-    signals = WindowSignals(windows(0.002)[0], SETTINGS)
+    signals = WindowSignals(find_noisy_windows(0.002)[0], SETTINGS)
     assert run_checks([first, second], signals, {}) == {"first": [reason]}
     assert run_checks([second], signals, {"first": []}) == {"first": [], "second": [reason]}
 
@@ -50,7 +50,7 @@ def test_the_budget_is_spent_once_and_gives_every_threshold() -> None:
 
 @pytest.mark.parametrize("method", ["least_squares", "partial_moments", "maximum_likelihood"])
 def test_the_values_of_a_method_are_judged_by_its_own_intervals(method: str) -> None:
-    window = windows(0.002)[0]
+    window = find_noisy_windows(0.002)[0]
     outcome, fit = analyse(window, Identification(method=method)), fit_windows([window], SETTINGS)
     assert outcome.verdict.accepted
     assert outcome.estimate is not None

@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 
 from fdhil.cli.main import cli
 from fdhil.config import Identification
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.records import PARAMETERS, Estimate, Parameters, Result, freeze_array
 from fdhil.store.recording_csv import parse_recording
 from fdhil.validation.data_sheet import TOLERANCE, gain_error, scale_convention
 from studies import bench
 from tests.bench import bench_toml
-from tests.identification.recorded import signals
+from tests.identification.bench_recordings import simulate_bench_shuttle
 
 NOMINAL = Parameters(0.5, 0.005, 0.8, 0.075, 0.05, 5.0)
 COLUMN = {"voltage": 1, "current": 2, "speed": 3}
@@ -45,7 +45,7 @@ def scaled(text: str, signal: str, gain: float) -> str:
 
 @pytest.fixture(scope="module")
 def shuttle() -> str:
-    return bench.as_csv(signals(moves=2), 0.003)
+    return bench.as_csv(simulate_bench_shuttle(moves=2), 0.003)
 
 
 def test_the_scales_of_the_model_are_what_an_identification_finds(shuttle: str) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fdhil.config import Identification
-from fdhil.identification.windows import find_windows, moving_range
+from fdhil.identification.rapid_windows import find_moving_range, find_windows
 from fdhil.pipeline import analyse
 from fdhil.records import NcMove, WindowOutcome
 from fdhil.validation.interruptions import interruptions
@@ -54,7 +54,7 @@ def test_rapids_are_found_among_feed_moves_under_load() -> None:
     assert [o.window.direction for o in outcomes] == [1, -1]
     for outcome in outcomes:
         assert outcome.verdict.accepted, outcome.verdict.reasons
-        a, b = moving_range(outcome.window)
+        a, b = find_moving_range(outcome.window)
         assert (b - a) * SCENE.dt_s == pytest.approx(rapid.size * 1e-3, abs=0.06)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.identification.estimators.maximum_likelihood import fit_windows
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse, pool
 from fdhil.records import Window, freeze_array
 from fdhil.validation.backlash import backlash, dead_band, overrun
@@ -19,7 +19,7 @@ from fdhil.validation.structure import findings
 from studies import drives, faults
 from studies.drives import Drive, Move
 from studies.scenes import Scene, demand_of, measured, recorded
-from tests.identification.recorded import windows
+from tests.identification.bench_recordings import find_noisy_windows
 from tests.validation.test_interruptions import DRIVE, SCENE
 
 SETTINGS = Identification()
@@ -45,7 +45,7 @@ def test_backlash_is_measured_in_micrometres_with_its_interval(um: float) -> Non
 @pytest.mark.parametrize("name", ["voltage", "current", "speed"])
 @pytest.mark.parametrize("fault", ["gain", "zero"])
 def test_a_sensor_that_drifts_is_named_with_its_amount(name: str, fault: str) -> None:
-    window = windows(0.002)[0]
+    window = find_noisy_windows(0.002)[0]
     field = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}[name]
     values = np.array(getattr(window, field))
     course = np.linspace(0.0, 1.0, values.size)
@@ -101,7 +101,7 @@ def test_a_gain_that_drifts_by_little_is_told_by_its_own_size_and_refused(study:
 
 @pytest.mark.parametrize(("field", "name"), [("voltage_v", "voltage"), ("current_a", "current")])
 def test_a_gain_that_moved_between_rapids_is_named_not_six_parameters(field: str, name: str) -> None:
-    there, back = windows(0.002, moves=2)
+    there, back = find_noisy_windows(0.002, moves=2)
     louder: Window = replace(back, **{field: freeze_array(1.06 * np.array(getattr(back, field)))})  # type: ignore[arg-type]
     _, verdict = pool([analyse(there, SETTINGS), analyse(louder, SETTINGS)], SETTINGS)
     (reason,) = verdict.reasons

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from fdhil.config import Identification
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse, pool
 from fdhil.records import Reason, Verdict, WindowOutcome
 from studies import bench, drives, faults, real_plant
 from studies.scenes import demand_of, measured, recorded
-from tests.identification.realistic import rapids
-from tests.identification.recorded import windows
+from tests.identification.bench_recordings import find_noisy_windows
+from tests.identification.realistic_rapids import simulate_rapids
 from tests.validation.test_interruptions import SCENE
 
 PLANT = real_plant.Mechanics()
@@ -23,7 +23,7 @@ PLANT = real_plant.Mechanics()
 @pytest.mark.parametrize("seed", range(3))
 def test_both_ways_of_pooling_agree_within_their_uncertainty(seed: int) -> None:
     settings = Identification()
-    outcomes = [analyse(window, settings) for window in windows(0.005, seed=seed, moves=4)]
+    outcomes = [analyse(window, settings) for window in find_noisy_windows(0.005, seed=seed, moves=4)]
     assert len(outcomes) >= 2
     fitted, verdict = pool(outcomes, settings)
     weighted, quick = pool(outcomes, settings, refit=False)
@@ -118,7 +118,7 @@ def test_a_counterweight_that_is_off_by_three_times_the_friction_is_told() -> No
 @pytest.mark.parametrize("number", [1, 2])
 def test_weight_that_moves_the_axis_is_not_told_from_one_direction(number: int) -> None:
     mechanics = real_plant.Mechanics(Cd=1.0, load_nm=5.8)
-    outcomes = [analyse(window, Identification()) for window in rapids(mechanics, moves=4)]
+    outcomes = [analyse(window, Identification()) for window in simulate_rapids(mechanics, moves=4)]
     lowered = [outcome for outcome in outcomes if outcome.window.direction < 0][:number]
     assert all(outcome.verdict.accepted for outcome in lowered)
     _, verdict = pool(lowered, Identification())

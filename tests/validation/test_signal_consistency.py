@@ -13,7 +13,7 @@ import pytest
 
 from fdhil.cli.batch import analyse_file
 from fdhil.config import Identification
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse, pool
 from fdhil.records import Recording, Window, freeze_array
 from fdhil.validation.signal_consistency import missing_move

@@ -7,8 +7,12 @@ import pytest
 
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import fit_windows
-from fdhil.identification.slow_descent import Likelihood, ascend, likelier_delay
-from fdhil.identification.windows import find_windows
+from fdhil.identification.low_rate_voltage.likelihood_ascent import (
+    LowRateLikelihood,
+    find_likelier_delay,
+    maximise_likelihood,
+)
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.validation.structure import findings
 from studies.judging import GOOD, judge
 from studies.slow_recordings import TO_AND_FRO, recording_of
@@ -41,7 +45,7 @@ def test_no_sample_near_a_row_passes_for_knowledge_of_the_delay() -> None:
         assert fit is not None
         column = fit.jacobian[:, 6]
         assert np.abs(column).max() ** 2 < 0.5 * (column @ column)
-        assert set(maximum_likelihood.finish(fit).missing) <= {"R", "L"}
+        assert set(maximum_likelihood.build_estimate(fit).missing) <= {"R", "L"}
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -65,11 +69,11 @@ def test_of_a_delays_tops_the_likeliest_is_found() -> None:
     fit = fit_windows([window], SETTINGS)
     assert fit is not None
     assert fit.theta[6] == pytest.approx(-1.7155e-3 * 2.0, abs=2e-4)
-    likelihood = Likelihood(fit.problem.motions, fit.problem.noises)
-    sizes = maximum_likelihood.typical(fit.theta, likelihood.motions)
+    likelihood = LowRateLikelihood(fit.problem.motions, fit.problem.noises)
+    sizes = maximum_likelihood.estimate_typical_sizes(fit.theta, likelihood.motions)
     for late_s in (-2.45e-3, -1.61e-3):
-        theta, *_ = ascend(likelihood, np.append(fit.theta[:6], late_s), range(6), sizes)
-        better = likelier_delay(likelihood, theta, fit.information, 2e-3)
+        theta, *_ = maximise_likelihood(likelihood, np.append(fit.theta[:6], late_s), range(6), sizes)
+        better = find_likelier_delay(likelihood, theta, fit.information, 2e-3)
         assert better is not None
         assert better[6] == pytest.approx(fit.theta[6], abs=3e-4)
-    assert likelier_delay(likelihood, fit.theta, fit.information, 2e-3) is None
+    assert find_likelier_delay(likelihood, fit.theta, fit.information, 2e-3) is None

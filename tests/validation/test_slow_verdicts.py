@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fdhil.identification.identifiability import untold
-from fdhil.identification.windows import find_windows
+from fdhil.identification.identifiability import list_missing_reasons
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse, pool
 from fdhil.records import Reason, Result, WindowOutcome, freeze_array
 from fdhil.validation.slow_voltage_checks import slow_voltage_faults
@@ -51,9 +51,9 @@ def test_nothing_but_r_and_l_may_stay_open_and_only_at_a_slow_sensor() -> None:
     outcome = _analysed(59, GOOD)
     assert outcome.estimate is not None
     reason = Reason("LowExcitation", "no")
-    assert untold(outcome.estimate, slow=False) != []
-    assert untold(replace(outcome.estimate, missing={"L": reason, "Jt": reason}), slow=True) == [reason]
-    assert untold(replace(outcome.estimate, result=Result.NOT_FINITE), slow=True) != []
+    assert list_missing_reasons(outcome.estimate, slow=False) != []
+    assert list_missing_reasons(replace(outcome.estimate, missing={"L": reason, "Jt": reason}), slow=True) == [reason]
+    assert list_missing_reasons(replace(outcome.estimate, result=Result.NOT_FINITE), slow=True) != []
 
 
 @pytest.mark.parametrize("seed", [147, 403])

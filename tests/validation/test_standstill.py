@@ -11,14 +11,14 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.identification.estimators import maximum_likelihood
-from fdhil.identification.windows import find_windows, moving_range
+from fdhil.identification.rapid_windows import find_moving_range, find_windows
 from fdhil.pipeline import analyse
 from fdhil.records import Float, Reason, Window, freeze_array
 from fdhil.validation.rest import rest_faults
 from fdhil.validation.window_fit import WindowFit
 from fdhil.validation.window_signals import WindowSignals
 from studies import faults
-from tests.identification.recorded import windows
+from tests.identification.bench_recordings import find_noisy_windows
 
 SETTINGS = Identification()
 
@@ -35,7 +35,7 @@ def _at_rest(window: Window) -> Sequence[Reason]:
 
 @pytest.mark.parametrize("share", [-0.02, 0.02])
 def test_a_current_that_is_not_the_voltages_over_resistance_at_standstill_has_a_wrong_zero(share: float) -> None:
-    window = windows(0.003)[0]
+    window = find_noisy_windows(0.003)[0]
     off = share * float(np.abs(window.current_a).max())
     (reason,) = _at_rest(replace(window, current_a=freeze_array(window.current_a + off)))
     assert reason.code == "CalibrationSuspect"
@@ -46,18 +46,18 @@ def test_a_current_that_is_not_the_voltages_over_resistance_at_standstill_has_a_
 
 @pytest.mark.parametrize("noise", [0.001, 0.003, 0.005])
 def test_right_zeros_are_believed(noise: float) -> None:
-    assert [_at_rest(window) for window in windows(noise, moves=2)] == [[], []]
+    assert [_at_rest(window) for window in find_noisy_windows(noise, moves=2)] == [[], []]
 
 
 @pytest.mark.parametrize("rows_before_its_end", [5, 20, 60])
 def test_samples_lost_while_the_table_still_moves_are_missed(rows_before_its_end: int) -> None:
-    window = windows(0.003)[0]
-    end = moving_range(window)[1] - rows_before_its_end
+    window = find_noisy_windows(0.003)[0]
+    end = find_moving_range(window)[1] - rows_before_its_end
     assert "StaleData" in {r.code for r in analyse(_lost(window, end, 30), SETTINGS).verdict.reasons}
 
 
 def test_samples_lost_at_standstill_are_not() -> None:
-    outcome = analyse(_lost(windows(0.003)[0], 10, 20), SETTINGS)
+    outcome = analyse(_lost(find_noisy_windows(0.003)[0], 10, 20), SETTINGS)
     assert "StaleData" not in {r.code for r in outcome.verdict.reasons}
 
 

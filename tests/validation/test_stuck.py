@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fdhil.config import Identification
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.records import Window, freeze_array
 from fdhil.validation.stuck import noise_steps, stuck_values
@@ -16,7 +16,7 @@ from fdhil.validation.window_fit import WindowFit
 from fdhil.validation.window_signals import WindowSignals
 from studies import drives, faults, signal_faults
 from studies.scenes import Sensor, demand_of, measured, recorded
-from tests.identification.recorded import windows
+from tests.identification.bench_recordings import find_noisy_windows
 from tests.validation.test_interruptions import SCENE
 
 SETTINGS = Identification()
@@ -61,7 +61,7 @@ def test_a_steady_signal_read_coarsely_repeats_itself_and_is_believed(name: str)
 
 @pytest.mark.parametrize("name", list(FIELDS))
 def test_a_sensor_that_sticks_on_the_plateau_is_seen_by_its_missing_noise(name: str) -> None:
-    window = windows(0.002)[0]
+    window = find_noisy_windows(0.002)[0]
     begin, end = window.stages.cruise or (0, 0)
     assert _codes(window) == []
     assert "StuckValue" in _codes(_stuck(window, name, (begin + end) // 2, 20))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from fdhil.config import Identification
 from fdhil.pipeline import analyse, pool
 from fdhil.records import Window, WindowOutcome, freeze_array
-from tests.identification.recorded import windows
+from tests.identification.bench_recordings import find_noisy_windows
 
 SETTINGS = Identification()
 ELECTRICAL = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0])  # powers of a voltage unit in R, L, K, Jt, ft, Cd
@@ -34,13 +34,13 @@ def _scaled(window: Window, voltage: float = 1.0, current: float = 1.0) -> Windo
 @settings(max_examples=6, deadline=None)
 @given(voltage=st.floats(0.2, 5.0), current=st.floats(0.2, 5.0))
 def test_units_scale_the_parameters_and_nothing_else(voltage: float, current: float) -> None:
-    window = windows(0.003)[0]
+    window = find_noisy_windows(0.003)[0]
     plain, other = _values(analyse(window, SETTINGS)), _values(analyse(_scaled(window, voltage, current), SETTINGS))
     assert other == pytest.approx(plain * voltage**ELECTRICAL * current**CURRENT, rel=2e-3)
 
 
 def test_the_other_direction_gives_the_same_drive() -> None:
-    window = windows(0.003)[0]
+    window = find_noisy_windows(0.003)[0]
     turned = replace(_scaled(window, -1.0, -1.0), direction=-window.direction)
     speed, position, demand = (freeze_array(-v) for v in (window.speed_rad_s, window.position_mm, window.demand_mm))
     turned = replace(turned, speed_rad_s=speed, position_mm=position, demand_mm=demand)
@@ -51,7 +51,7 @@ def test_the_other_direction_gives_the_same_drive() -> None:
 @settings(max_examples=4, deadline=None)
 @given(order=st.permutations(range(4)))
 def test_the_order_of_windows_changes_nothing(order: list[int]) -> None:
-    outcomes = [analyse(window, SETTINGS) for window in windows(0.003, moves=4)]
+    outcomes = [analyse(window, SETTINGS) for window in find_noisy_windows(0.003, moves=4)]
     first, _ = pool(outcomes, SETTINGS)
     again, verdict = pool([outcomes[k] for k in order], SETTINGS)
     assert verdict.accepted

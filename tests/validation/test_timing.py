@@ -10,7 +10,7 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.identification.estimators import maximum_likelihood
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.records import VoltageSampling, Window
 from fdhil.validation.score_bench import expected_correlation

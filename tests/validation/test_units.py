@@ -8,18 +8,18 @@ from dataclasses import replace
 import pytest
 
 from fdhil.config import Identification
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.records import Recording, Window, freeze_array
 from fdhil.store.recording_csv import parse_recording
 from fdhil.validation.plausibility import warnings_of
 from studies import bench
-from tests.identification.recorded import signals
+from tests.identification.bench_recordings import simulate_bench_shuttle
 
 
 @pytest.fixture(scope="module")
 def recording() -> Recording:
-    return parse_recording(bench.as_csv(signals(), 0.003))
+    return parse_recording(bench.as_csv(simulate_bench_shuttle(), 0.003))
 
 
 def window_of(recording: Recording) -> Window:

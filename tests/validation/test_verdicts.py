@@ -10,13 +10,13 @@ import pytest
 
 from fdhil import tables
 from fdhil.config import Identification
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse, pool
 from fdhil.records import Float, Window, WindowOutcome, freeze_array
 from fdhil.store.recording_csv import parse_recording
 from fdhil.validation.plausibility import warnings_of
 from studies import bench
-from tests.identification.recorded import windows
+from tests.identification.bench_recordings import find_noisy_windows
 
 SETTINGS = Identification()
 
@@ -35,7 +35,7 @@ def _changed(window: Window, **signals: Callable[[Float], Float]) -> Window:
 @pytest.mark.parametrize("noise", [0.001, 0.005])
 def test_good_windows_are_accepted(method: str | None, noise: float) -> None:
     settings = SETTINGS.model_copy(update={"method": method})
-    outcomes = [analyse(window, settings) for window in windows(noise, moves=2)]
+    outcomes = [analyse(window, settings) for window in find_noisy_windows(noise, moves=2)]
     for outcome in outcomes:
         assert outcome.verdict.accepted, outcome.verdict.reasons
         assert outcome.verdict.fit_percent is not None
@@ -75,7 +75,7 @@ def _gain_step(values: Float) -> Float:
 )
 @pytest.mark.fault("B11", "B12", "C1", "C8")
 def test_sensor_faults_are_named(field: str, change: Callable[[Float], Float], code: str) -> None:
-    outcome = analyse(_changed(windows(0.003)[0], **{field: change}), SETTINGS)
+    outcome = analyse(_changed(find_noisy_windows(0.003)[0], **{field: change}), SETTINGS)
     assert not outcome.verdict.accepted
     assert code in _codes(outcome)
 
@@ -130,7 +130,7 @@ def test_a_short_rapid_lacks_its_cruise() -> None:
 
 @pytest.mark.fault("D3")
 def test_swapped_columns_are_unphysical() -> None:
-    window = windows(0.003)[0]
+    window = find_noisy_windows(0.003)[0]
     assert window.voltage_v is not None
     swapped = replace(window, voltage_v=freeze_array(-window.voltage_v))
     assert "Unphysical" in _codes(analyse(swapped, SETTINGS))
@@ -138,14 +138,14 @@ def test_swapped_columns_are_unphysical() -> None:
 
 @pytest.mark.fault("C2")
 def test_not_finite_values_never_enter_a_fit() -> None:
-    outcome = analyse(_changed(windows()[0], current_a=lambda v: np.where(v > 50, np.inf, v)), SETTINGS)
+    outcome = analyse(_changed(find_noisy_windows()[0], current_a=lambda v: np.where(v > 50, np.inf, v)), SETTINGS)
     assert _codes(outcome) == {"NotFinite"}
     assert outcome.estimate is not None
     assert np.isnan(outcome.estimate.values).all()
 
 
 def test_a_window_without_voltage_is_told() -> None:
-    outcome = analyse(replace(windows()[0], voltage_v=None), SETTINGS)
+    outcome = analyse(replace(find_noisy_windows()[0], voltage_v=None), SETTINGS)
     assert not outcome.verdict.accepted
     told = outcome.estimate
     assert told is not None
@@ -156,7 +156,7 @@ def test_a_window_without_voltage_is_told() -> None:
 
 def test_a_sensor_with_its_own_clock_is_aligned_by_the_data() -> None:
     shifted = []
-    for window, share in zip(windows(0.001, moves=2), (0.3, -0.4), strict=True):
+    for window, share in zip(find_noisy_windows(0.001, moves=2), (0.3, -0.4), strict=True):
         assert window.voltage_v is not None
         rise = np.gradient(window.voltage_v)
         late_v = freeze_array(window.voltage_v - share * rise)
@@ -174,7 +174,7 @@ def test_a_sensor_with_its_own_clock_is_aligned_by_the_data() -> None:
 
 @pytest.mark.fault("C3")
 def test_coarse_steps_are_told_and_widen_the_intervals() -> None:
-    window = windows(0.001)[0]
+    window = find_noisy_windows(0.001)[0]
     coarse = _changed(window, current_a=lambda values: np.round(values / 8.0) * 8.0)
     (warning,) = warnings_of(coarse)
     assert warning.code == "Quantised"
@@ -190,7 +190,7 @@ def test_nothing_pooled_from_nothing() -> None:
     estimate, verdict = pool([], SETTINGS)
     assert estimate is None
     assert [reason.code for reason in verdict.reasons] == ["NoWindow"]
-    refused = analyse(_changed(windows()[0], voltage_v=_late), SETTINGS)
+    refused = analyse(_changed(find_noisy_windows()[0], voltage_v=_late), SETTINGS)
     estimate, verdict = pool([refused], SETTINGS)
     assert estimate is None
     assert not verdict.accepted
@@ -198,8 +198,8 @@ def test_nothing_pooled_from_nothing() -> None:
 
 
 def test_a_load_that_changed_between_the_windows_is_seen() -> None:
-    light = windows(0.003)[0]
-    heavy = windows(0.003, plant=bench.Plant(Jt=0.085))[0]
+    light = find_noisy_windows(0.003)[0]
+    heavy = find_noisy_windows(0.003, plant=bench.Plant(Jt=0.085))[0]
     _, verdict = pool([analyse(light, SETTINGS), analyse(heavy, SETTINGS)], SETTINGS)
     assert not verdict.accepted
     assert [reason.code for reason in verdict.reasons] == ["LoadChanged"]
@@ -210,7 +210,7 @@ def test_a_load_that_changed_between_the_windows_is_seen() -> None:
     "error", [np.linalg.LinAlgError("singular"), FloatingPointError("overflow"), ValueError("infs or NaNs")]
 )
 def test_a_solver_that_raises_costs_the_window_alone(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
-    good, bad = windows(0.003, moves=2)[:2]
+    good, bad = find_noisy_windows(0.003, moves=2)[:2]
 
     def fail(*_: object) -> None:
         raise error

@@ -14,13 +14,21 @@ from fdhil.pipeline import AxisPipeline, analyse, pool
 from fdhil.records import ParameterSet, Skill, Window, WindowOutcome, freeze_array
 from studies import real_plant
 from tests.bench import bench_axis
-from tests.identification.deaf import LOOPS, RAPID_M_S, SCREW, SECTION, SENSORS, screw_windows, to_and_fro
+from tests.identification.no_voltage_recordings import (
+    LOOPS,
+    RAPID_M_S,
+    SCREW,
+    SECTION,
+    SENSORS,
+    build_shuttle_demand,
+    find_screw_windows,
+)
 
 SETTINGS = Identification()
 
 
 def analysed(moves: int = 4) -> list[WindowOutcome]:
-    return [analyse(window, SETTINGS) for window in screw_windows(moves)]
+    return [analyse(window, SETTINGS) for window in find_screw_windows(moves)]
 
 
 def test_rapids_of_a_screw_with_a_load_and_friction_of_its_own_are_believed_and_so_is_their_pool() -> None:
@@ -44,7 +52,7 @@ def test_one_direction_is_a_pool_of_its_own(direction: int) -> None:
 
 
 def test_without_a_torque_constant_nothing_is_believed_and_the_way_out_is_told() -> None:
-    outcome = analyse(replace(screw_windows()[0], torque_constant_nm_per_a=None), SETTINGS)
+    outcome = analyse(replace(find_screw_windows()[0], torque_constant_nm_per_a=None), SETTINGS)
     (reason,) = outcome.verdict.reasons
     assert reason.code == "LowExcitation"
     assert "torque_constant_nm_per_a" in reason.advice
@@ -57,7 +65,7 @@ def _axis(source: str) -> Axis:
 
 
 def test_the_data_sheet_stands_in_for_a_drive_that_tells_no_voltage_and_not_for_a_sensor_that_failed() -> None:
-    window = replace(screw_windows()[0], torque_constant_nm_per_a=None)
+    window = replace(find_screw_windows()[0], torque_constant_nm_per_a=None)
     outcome = analyse(window, SETTINGS, _axis("drive"))
     assert outcome.verdict.accepted
     assert outcome.verdict.unexplained_um is not None
@@ -117,16 +125,16 @@ def _coarse(window: Window) -> Window:
 )
 @pytest.mark.fault("D5", "B11", "B12", "C1", "C6")
 def test_each_fault_refuses(fault: Callable[[Window], Window], code: str) -> None:
-    outcome = analyse(fault(screw_windows()[0]), SETTINGS)
+    outcome = analyse(fault(find_screw_windows()[0]), SETTINGS)
     assert code in [reason.code for reason in outcome.verdict.reasons]
 
 
 def test_an_aborted_move_is_refused() -> None:
-    whole = to_and_fro(1)
+    whole = build_shuttle_demand(1)
     cut = np.minimum(whole, 0.1)
     run = real_plant.run(SCREW, cut, LOOPS)
     read = real_plant.recording(run, SCREW, SENSORS, RAPID_M_S, voltage=False)
-    from fdhil.identification.windows import find_windows
+    from fdhil.identification.rapid_windows import find_windows
 
     (window,) = find_windows(replace(read, torque_constant_nm_per_a=SCREW.K))
     reasons = analyse(window, SETTINGS).verdict.reasons
@@ -138,7 +146,7 @@ def test_a_triangular_move_is_listed_with_its_parameters_and_not_believed() -> N
     demand = np.concatenate([np.zeros(300), np.cumsum(ramp) * 1e-3, np.full(300, ramp.sum() * 1e-3)])
     run = real_plant.run(SCREW, demand, LOOPS)
     read = real_plant.recording(run, SCREW, SENSORS, RAPID_M_S, voltage=False)
-    from fdhil.identification.windows import find_windows
+    from fdhil.identification.rapid_windows import find_windows
 
     (window,) = find_windows(replace(read, torque_constant_nm_per_a=SCREW.K))
     outcome = analyse(window, SETTINGS)
@@ -148,7 +156,7 @@ def test_a_triangular_move_is_listed_with_its_parameters_and_not_believed() -> N
 
 
 def test_a_drive_without_feed_forward_is_weighed_by_its_following_error() -> None:
-    window = screw_windows()[0]
+    window = find_screw_windows()[0]
     rng = np.random.default_rng(3)
     waves = 0.04 * np.abs(window.current_a).max() * np.sin(np.arange(window.n) / 15.0 + rng.uniform(0, 6))
     rough = replace(window, current_a=freeze_array(window.current_a + waves))
@@ -166,7 +174,7 @@ def test_a_running_machine_without_a_voltage_publishes_sets_that_predict_its_mov
     pipeline = AxisPipeline("X", config.parse_config(document))
     outcomes = [
         outcome
-        for window in screw_windows()
+        for window in find_screw_windows()
         for outcome in pipeline.feed(replace(window, torque_constant_nm_per_a=None))
     ]
     assert sum(isinstance(outcome, ParameterSet) for outcome in outcomes) == 4

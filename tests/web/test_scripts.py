@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from fdhil.report import typography
-from fdhil.report.drawing import COLOURS, SHADES
+from fdhil.report.svg_drawing import COLOURS, SHADES
 from fdhil.web.app import SHELL, STATIC
 
 SCRIPTS = sorted(STATIC.rglob("*.js"))

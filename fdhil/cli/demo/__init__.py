@@ -35,9 +35,9 @@ def demo(out: Path, realtime: bool, pdf: bool, as_json: bool) -> None:
     from fdhil.cli.demo.loop import run_loop
     from fdhil.cli.demo.realistic import running_realistic
     from fdhil.cli.demo.report import page
-    from fdhil.report import find_browser, require, write_page_or_pdf
+    from fdhil.report import find_browser, require_libraries, write_page_or_pdf
 
-    require()  # before the computation
+    require_libraries()  # before the computation
 
     def say(text: str) -> None:
         if not as_json or sys.stderr.isatty():

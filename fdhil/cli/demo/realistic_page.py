@@ -30,7 +30,7 @@ def section(realistic: Realistic) -> Section:
             Table(PARAMETER_HEAD, parameter_rows(realistic), "Identified"),
             Table(CUT_HEAD, cut_rows(realistic), "Contour error, 10 m/min, at the true table"),
         ],
-        figures=[("Contour error along the path, realistic machine", figures.contour_errors(period_s, errors))],
+        figures=[("Contour error along the path, realistic machine", figures.draw_contour_errors(period_s, errors))],
     )
 
 

@@ -22,7 +22,7 @@ from fdhil.records import (
 )
 from fdhil.report import Page, Section, Table, figures
 from fdhil.report.figures import Curve
-from fdhil.report.parameter_view import DISPLAY_UNITS, cell
+from fdhil.report.parameter_format import DISPLAY_UNITS, format_cell
 
 # named locations of the path, mm
 POINTS: Mapping[str, tuple[float, float]] = {
@@ -118,10 +118,10 @@ def identified_rows(axis: str, truth: Parameters, found: Published) -> list[list
     for name in PARAMETERS:
         true, value, std = getattr(truth, name), getattr(found.parameters, name), found.std[name]
         unit, factor = DISPLAY_UNITS[name]
-        found_text, deviation = cell(name, value, INTERVAL_95 * std, " "), f"{100 * (value / true - 1):+.2f} %"
+        found_text, deviation = format_cell(name, value, INTERVAL_95 * std, " "), f"{100 * (value / true - 1):+.2f} %"
         rows.append([axis, name, f"{true * factor:.5g} {unit}", found_text, deviation])
     for name, value in found.parameters.terms:
-        shown = cell(name, value, INTERVAL_95 * found.std[name], " ")
+        shown = format_cell(name, value, INTERVAL_95 * found.std[name], " ")
         rows.append([axis, name, "", f"{shown} {get_unit(name)}".rstrip(), ""])
     return rows
 
@@ -149,9 +149,9 @@ def _identified(loop: Loop) -> Section:
     for axis, (window, fit_percent) in loop.cold.items():
         found = loop.published[axis][0].parameters
         caption = f"Axis {axis}: voltage, current and speed of one rapid move, as measured (Figure 4 of the paper)"
-        pictures.append((caption, figures.signals(window)))
+        pictures.append((caption, figures.draw_signals(window)))
         caption = f"Axis {axis}: speed of model and drive for the measured voltage, and their difference (Figure 8)"
-        pictures.append((caption, figures.model_against_drive(window, found, fit_percent)))
+        pictures.append((caption, figures.draw_model_comparison(window, found, fit_percent)))
     received, lost = loop.frames
     return Section(
         "Identified during rapid moves",
@@ -169,12 +169,12 @@ def _drifted(loop: Loop) -> Section:
         cases = [(f"{found.temperature_c:.1f} degC", window, found.parameters)
                  for window, found in ((cold, first), (warm, last))]  # fmt: skip
         caption = f"Axis {axis}: torque of a rapid move with cold and with warm slide-ways, from the model (Figure 5)"
-        pictures.append((caption, figures.torque(cases)))
+        pictures.append((caption, figures.draw_torque(cases)))
     for symbol, meaning, number in (("ft", "Viscous friction", 6), ("Cd", "Coulomb friction", 7)):
         series = {axis: _series(sets, symbol) for axis, sets in loop.published.items()}
         what = f"{meaning} {symbol} over the temperature of the slide-ways"
         caption = f"{what}, with its 95 % intervals (Figure {number})"
-        pictures.append((caption, figures.drift(symbol, UNITS[symbol], series)))
+        pictures.append((caption, figures.draw_drift(symbol, UNITS[symbol], series)))
     return Section(
         "Drift with the slide-ways' temperature",
         "The slide-ways were warmed while the axes kept shuttling. Only rapids were used.",
@@ -204,8 +204,8 @@ def _path(loop: Loop) -> Section:
     return Section(
         "The programmed path",
         figures=[
-            ("The path and its named places (Figure 10)", figures.path(slow, POINTS)),
-            ("The rounded variant for a 40 mm cutter (Figure 19)", figures.path(rounded, {})),
+            ("The path and its named places (Figure 10)", figures.draw_path(slow, POINTS)),
+            ("The rounded variant for a 40 mm cutter (Figure 19)", figures.draw_path(rounded, {})),
         ],
     )
 
@@ -219,10 +219,10 @@ def _predicted(loop: Loop) -> Section:
         curves = [Curve("desired, 10 m/min", _xy(slow.position_mm))]
         for feed, answer in feeds.items():
             desired = _xy(answer.reference.position_mm)
-            curves.append(Curve(feed, figures.magnified(desired, _xy(answer.predicted_mm), MAGNIFIED)))
+            curves.append(Curve(feed, figures.magnify_deviation(desired, _xy(answer.predicted_mm), MAGNIFIED)))
         curves.append(Curve("desired, 20 m/min", _xy(loop.programs["20 m/min"].position_mm), dashed=True))
         caption = f"Predicted path at {place} for two feeds, errors {MAGNIFIED} times as large (Figure {number})"
-        pictures.append((caption, figures.corner(curves, POINTS[place], 8.0)))
+        pictures.append((caption, figures.draw_path_detail(curves, POINTS[place], 8.0)))
     for (label, change), number in zip(DRIFTS, (14, 15), strict=True):
         drifted = predict(slow, models | {"X": _drift(models["X"], change)}, loop.config)
         curves = [
@@ -230,7 +230,9 @@ def _predicted(loop: Loop) -> Section:
             Curve("as identified", _xy(feeds["10 m/min"].predicted_mm)),
             Curve(label, _xy(drifted.predicted_mm), dashed=True),
         ]
-        pictures.append((f"Effect at E of {label} (Figure {number})", figures.corner(curves, POINTS["E"], 0.2)))
+        pictures.append(
+            (f"Effect at E of {label} (Figure {number})", figures.draw_path_detail(curves, POINTS["E"], 0.2))
+        )
     worst = [[f"{z.start_s:.2f} to {z.end_s:.2f}", z.where, f"{z.max_um:.1f}", z.cause] for z in loop.predicted.zones]
     return Section(
         "Predicted before the cut",
@@ -250,7 +252,10 @@ def _corrected(loop: Loop) -> Section:
     before = loop.cuts[0]
     measured = [
         Curve("desired", before.reference_mm),
-        *(Curve(cut.label, figures.magnified(cut.reference_mm, cut.table_mm, ENLARGED)) for cut in loop.cuts[:3]),
+        *(
+            Curve(cut.label, figures.magnify_deviation(cut.reference_mm, cut.table_mm, ENLARGED))
+            for cut in loop.cuts[:3]
+        ),
     ]
     errors = {cut.label: cut.contour_um for cut in loop.cuts}
     rounded, inverse = (
@@ -265,24 +270,27 @@ def _corrected(loop: Loop) -> Section:
         figures=[
             (
                 "Contour error along the path, measured per pass (the loop of Figure 16, closed)",
-                figures.contour_errors(loop.config.machine.sync_period_s, errors),
+                figures.draw_contour_errors(loop.config.machine.sync_period_s, errors),
             ),
             *_maps((before, loop.cuts[2])),
-            (f"Area A, measured, {larger} (Figure 17)", figures.corner(measured, POINTS["A"], 6.0)),
-            (f"The straight after A, measured, {larger} (Figure 18)", figures.corner(measured, (20.0, 55.0), 12.0)),
-            (f"Area E, measured, {larger}", figures.corner(measured, POINTS["E"], 6.0)),
+            (f"Area A, measured, {larger} (Figure 17)", figures.draw_path_detail(measured, POINTS["A"], 6.0)),
+            (
+                f"The straight after A, measured, {larger} (Figure 18)",
+                figures.draw_path_detail(measured, (20.0, 55.0), 12.0),
+            ),
+            (f"Area E, measured, {larger}", figures.draw_path_detail(measured, POINTS["E"], 6.0)),
             (f"Rounded path at the end of A, simulated, {larger} (Figure 20)", _rounded_figure(rounded, inverse)),
         ],
     )
 
 
 def _maps(cuts: Sequence[Cut]) -> list[tuple[str, str]]:
-    largest, least = figures.common_scale([cut.contour_um for cut in cuts])
-    places = [figures.Place(name, *at) for name, at in POINTS.items()]
+    largest, least = figures.find_common_scale([cut.contour_um for cut in cuts])
+    places = [figures.MapPosition(name, *at) for name, at in POINTS.items()]
     return [
         (
             f"Where the error is, {cut.label}: {cut.max_um:.1f} um at most; both maps have the same colour scale",
-            figures.error_map(cut.reference_mm, cut.contour_um, largest, places=places, least_um=least),
+            figures.draw_error_map(cut.reference_mm, cut.contour_um, largest, places=places, least_um=least),
         )
         for cut in cuts
     ]
@@ -293,6 +301,7 @@ def _rounded_figure(mirror: Correction, inverse: Correction) -> str:
     cases = {"uncorrected": mirror.before, "mirror": mirror.after, "inverse": inverse.after}
     curves = [Curve("desired", desired)]
     curves += [
-        Curve(label, figures.magnified(desired, _xy(answer.predicted_mm), ENLARGED)) for label, answer in cases.items()
+        Curve(label, figures.magnify_deviation(desired, _xy(answer.predicted_mm), ENLARGED))
+        for label, answer in cases.items()
     ]
-    return figures.corner(curves, (20.0, 75.0), 12.0)
+    return figures.draw_path_detail(curves, (20.0, 75.0), 12.0)

@@ -37,10 +37,10 @@ def paper(out: Path, runs: int, pdf: bool, as_json: bool) -> None:
     from importlib.metadata import version
 
     from fdhil.cli.paper.page import document, page, write_pictures
-    from fdhil.report import find_browser, require, write_page_or_pdf
+    from fdhil.report import find_browser, require_libraries, write_page_or_pdf
     from fdhil.store.output import open_output
 
-    require()
+    require_libraries()
     if pdf:
         find_browser()  # before the computation
     _make(out)

@@ -10,7 +10,7 @@ import numpy as np
 
 from fdhil.cli.paper.scenarios import machine
 from fdhil.config import Axis
-from fdhil.identification.windows import find_windows
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.records import Float, Parameters, Recording, Window, freeze_array
 from fdhil.sim.drive.plant_physics import PlantPhysics, build_plant_parameters
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from fdhil.cli.paper.operators import OPERATORS
 from fdhil.records import INTERVAL_95, PARAMETERS, Bool, Float
-from fdhil.report.chart import Chart, Panel, Trace, svg
-from fdhil.report.drawing import COLOURS, INK, REFERENCE, drawing, legend_above, legend_rows
+from fdhil.report.chart import Chart, Panel, Trace, render_svg
+from fdhil.report.svg_drawing import COLOURS, INK, REFERENCE, compute_legend_layout, open_drawing, place_legend_above
 
 WIDTH = 6.4  # inches
 TALL = 4.8
@@ -64,7 +64,7 @@ def place(traced: Sequence[Traced], view: View, below: str = "error (um)") -> st
         if one.apart_um is not None:
             distances.append(Trace(one.label, x, one.apart_um[rows], colour))
     panels = [Panel(view.y_label, paths), Panel(below, distances, BELOW_SHARE, from_zero=True)]
-    return svg(Chart("X (mm)", panels, ""), height=TALL)
+    return render_svg(Chart("X (mm)", panels, ""), height=TALL)
 
 
 def operators() -> str:
@@ -78,13 +78,13 @@ def operators() -> str:
         traces.append(Trace(name.replace("_", " "), share, np.abs(answer / turned), colour))
     alt = "Zero forcing #1 overshoots by 9 % at a quarter of the sampling rate, central falls to nothing at half of it."
     panel = Panel("amplitude, operator / exact", traces, levels=[("exact", 1.0)])
-    return svg(Chart("frequency / sampling rate", [panel], alt))
+    return render_svg(Chart("frequency / sampling rate", [panel], alt))
 
 
 def over_bound(ratios: Float, labels: Sequence[str]) -> str:
     """Draw the ratio of RMS error and bound (methods, 6), one line per method, on a logarithmic axis."""
-    columns, rows = legend_rows(list(labels), WIDTH - 1.0)
-    with drawing(WIDTH, 3.9, 0.2 * rows + 0.15) as made:
+    columns, rows = compute_legend_layout(list(labels), WIDTH - 1.0)
+    with open_drawing(WIDTH, 3.9, 0.2 * rows + 0.15) as made:
         for row, label, colour in zip(ratios, labels, COLOURS, strict=False):
             made.axes.plot(range(len(PARAMETERS)), row, "o-", ms=4, lw=0.9, color=colour, label=label)
         made.axes.axhline(1.0, color=INK, lw=0.9)
@@ -92,7 +92,7 @@ def over_bound(ratios: Float, labels: Sequence[str]) -> str:
         made.axes.yaxis.set_major_formatter("{x:g}")
         made.axes.set_xticks(range(len(PARAMETERS)), PARAMETERS)
         made.axes.set_ylabel("RMS error / bound")
-        legend_above(made.axes, columns)
+        place_legend_above(made.axes, columns)
         worst = "; ".join(f"{label} up to {row.max():.2g}" for row, label in zip(ratios, labels, strict=True))
         made.alt = f"RMS error over the bound of Cramer and Rao: {worst}."
     return made.svg
@@ -106,7 +106,7 @@ def correlations(curves: Mapping[str, Float], bound: float) -> str:
     ]
     alt = "; ".join(f"{label}: {np.abs(values).max():.2f} at most" for label, values in curves.items())
     panel = Panel("correlation", traces, levels=[("white above", -bound), ("white below", bound)])
-    return svg(Chart("lag (samples)", [panel], f"Correlations. {alt}."), height=3.9)
+    return render_svg(Chart("lag (samples)", [panel], f"Correlations. {alt}."), height=3.9)
 
 
 def drift(
@@ -120,7 +120,7 @@ def drift(
         course = Trace("the paper's", celsius[[0, -1]], np.array(printed), REFERENCE, "wide")
         panels.append(Panel(f"{label}\n{symbol} ({unit})", [course, points]))
     alt = f"{symbol} falls from {printed[0]:g} to {printed[1]:g} {unit} as the slide-ways warm."
-    return svg(Chart("slide-way temperature (degC)", panels, alt), height=1.2 + 1.4 * len(panels))
+    return render_svg(Chart("slide-way temperature (degC)", panels, alt), height=1.2 + 1.4 * len(panels))
 
 
 def overlay(x: Float, x_label: str, y_label: str, both: Sequence[tuple[str, Float]]) -> str:
@@ -130,7 +130,7 @@ def overlay(x: Float, x_label: str, y_label: str, both: Sequence[tuple[str, Floa
     apart = Trace(f"{second} less {first}", x, other - one)
     alt = f"{first} and {second}; they are {np.abs(other - one).max():.2g} apart at most."
     panels = [Panel(y_label, above), Panel(y_label.replace(y_label.split(" (")[0], "difference"), [apart], BELOW_SHARE)]
-    return svg(Chart(x_label, panels, alt), height=TALL)
+    return render_svg(Chart(x_label, panels, alt), height=TALL)
 
 
 def axis_errors(time_s: Float, curves: Mapping[str, Float], label: str) -> str:
@@ -140,17 +140,17 @@ def axis_errors(time_s: Float, curves: Mapping[str, Float], label: str) -> str:
         for (name, values), colour in zip(curves.items(), COLOURS, strict=False)
     ]
     alt = "; ".join(f"{name} {np.abs(values).max():.0f} um at most" for name, values in curves.items())
-    return svg(Chart("time (s)", [Panel(label, traces, levels=[("", 0.0)])], f"{label}: {alt}."))
+    return render_svg(Chart("time (s)", [Panel(label, traces, levels=[("", 0.0)])], f"{label}: {alt}."))
 
 
 def shape(centre_mm: Float, shape_mm: Float) -> str:
     """Draw the path of a cutter's centre and the cut shape, both (n, 2), mm."""
-    with drawing(WIDTH, 3.2) as made:
+    with open_drawing(WIDTH, 3.2) as made:
         made.axes.plot(*shape_mm.T, color=REFERENCE, lw=1.2, label="shape")
         made.axes.plot(*centre_mm.T, color=COLOURS[0], label="centre of the cutter")
         made.axes.set_aspect("equal", adjustable="datalim")
         made.axes.set_xlabel("X (mm)")
         made.axes.set_ylabel("Y (mm)")
-        legend_above(made.axes, 2)
+        place_legend_above(made.axes, 2)
         made.alt = "The path of the cutter's centre runs 20 mm beside the shape, round its convex corners in arcs."
     return made.svg

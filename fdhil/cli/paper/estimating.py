@@ -9,7 +9,7 @@ from fdhil.cli.paper import bench, drawings, methods
 from fdhil.cli.paper.claims import Claim, Picture, Trial, make_claim
 from fdhil.cli.paper.scenarios import machine
 from fdhil.config import Identification
-from fdhil.identification.derivatives import ZERO_FORCING_1, derivative
+from fdhil.identification.derivatives import ZERO_FORCING_1, differentiate_signal
 from fdhil.identification.estimators import least_squares
 from fdhil.prediction.models import nominal_models
 from fdhil.records import PARAMETERS, Bool, Float, Recording, Window
@@ -104,7 +104,7 @@ def _operator() -> Claim:
 def _sine_error(period_s: float) -> float:
     rate = 2 * np.pi * 5.0
     times = np.arange(0.0, 1.0, period_s)
-    found = derivative(np.sin(rate * times), period_s)
+    found = differentiate_signal(np.sin(rate * times), period_s)
     return float(np.nanmax(np.abs(found - rate * np.cos(rate * times))))
 
 
@@ -112,10 +112,10 @@ def _submodels(study: Estimating) -> Claim:
     trials = []
     for name, noise in (("no-noise", QUIET), ("noise-0.1", 0.001), ("noise-0.5", 0.005)):
         (window,) = bench.noisy(study.recording, noise, 0)
-        signals = least_squares.align(window, Identification())
-        rows = least_squares.regressors(signals, window.dt_s)
+        signals = least_squares.align_signals(window, Identification())
+        rows = least_squares.build_regressors(signals, window.dt_s)
         theta, _ = least_squares.solve_two_steps(*rows)
-        left = least_squares.residuals_of(theta, *rows)
+        left = least_squares.compute_residuals(theta, *rows)
         whole = rows[0][:, 0], theta[2] * rows[1][:, 0]
         trials += [
             Trial(name, f"left of {what}", 100.0 * float(np.std(r) / np.sqrt(np.mean(y**2))), "%", most=5.0)

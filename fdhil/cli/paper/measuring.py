@@ -13,12 +13,12 @@ from fdhil.cli.paper.methods import vector
 from fdhil.cli.paper.scenarios import machine
 from fdhil.config import Identification
 from fdhil.identification.estimators import least_squares, maximum_likelihood
-from fdhil.identification.fit import fit
-from fdhil.identification.motion import prepare
+from fdhil.identification.likelihood_fit import fit_parameters_and_noise
+from fdhil.identification.prepared_motion import prepare_window
 from fdhil.pipeline.analysis import analyse
 from fdhil.records import UNITS, Estimate, Float, Window, WindowOutcome, compute_rms
 from fdhil.report import Table, figures
-from fdhil.report.parameter_view import DISPLAY_UNITS
+from fdhil.report.parameter_format import DISPLAY_UNITS
 from fdhil.validation.backlash import dead_band
 
 TEMPERATURES_C = (20.0, 20.5, 21.0, 21.5, 22.0)
@@ -121,14 +121,14 @@ def correlations(residual: Float) -> Float:
 
 def _left(window: Window) -> dict[str, Float]:
     # torque residuals of [6] by least squares, and innovations of the speed by maximum likelihood
-    signals = least_squares.align(window, Identification())
-    rows = least_squares.regressors(signals, window.dt_s)
+    signals = least_squares.align_signals(window, Identification())
+    rows = least_squares.build_regressors(signals, window.dt_s)
     theta, _ = least_squares.solve_two_steps(*rows)
-    motion = prepare(window)
-    found = fit([motion], np.append(theta[least_squares.PARAMETER_ORDER], 0.0), range(6))
+    motion = prepare_window(window)
+    found = fit_parameters_and_noise([motion], np.append(theta[least_squares.PARAMETER_ORDER], 0.0), range(6))
     surely = (np.abs(motion.mode) == 1) & motion.observed
     innovations = found.residuals[: 2 * motion.n].reshape(-1, 2)[surely, 1]
-    return {"residuals": least_squares.residuals_of(theta, *rows)[1], "innovations": innovations}
+    return {"residuals": least_squares.compute_residuals(theta, *rows)[1], "innovations": innovations}
 
 
 def _whiteness() -> Claim:
@@ -175,7 +175,7 @@ def _signals() -> Claim:
         pictures=[
             Picture(
                 "Voltage, current and speed of one rapid of the measured machine, noise of 0.1 % of 70 V, A and rad/s.",
-                figures.signals(bench.noisy(bench.rapid(bench.plant()), 0.001, 0)[0]),
+                figures.draw_signals(bench.noisy(bench.rapid(bench.plant()), 0.001, 0)[0]),
             )
         ],
     )
@@ -188,7 +188,7 @@ def _torques() -> Claim:
         found = maximum_likelihood.estimate([window], Identification()).build_parameters()
         cases.append((f"{celsius:g} °C", window, found))
         cruise.append(found.Cd + found.ft * RAPID_RAD_S)
-        speed = figures.simulated_speed(window, found)
+        speed = figures.simulate_speed(window, found)
         peak = float(np.max(found.Jt * np.gradient(speed, window.dt_s) + found.ft * speed + found.Cd))
         trials.append(Trial("noise-0.1", f"largest torque at {celsius:g} degC", peak, "N.m", 10.0, 14.0))
     trials.append(Trial("noise-0.1", "torque of the cruise, cold less warm", cruise[0] - cruise[1], "N.m", 0.3, 0.8))
@@ -198,7 +198,7 @@ def _torques() -> Claim:
         pictures=[
             Picture(
                 "Torque Jt dw/dt + ft w + Cd sign(w) of one rapid by the parameters identified cold and warm.",
-                figures.torque(cases),
+                figures.draw_torque(cases),
             )
         ],
     )
@@ -246,7 +246,7 @@ def _behaviour() -> Claim:
         outcome = _outcome(noise)
         assert outcome.estimate is not None
         window, model = outcome.window, outcome.estimate.build_parameters()
-        simulated = figures.simulated_speed(window, model)
+        simulated = figures.simulate_speed(window, model)
         missed = compute_rms(window.speed_rad_s - simulated)
         trials.append(
             Trial(name, "RMS between model and drive", 100.0 * missed / RAPID_RAD_S, "% of 60 rad/s", most=1.0)

@@ -8,11 +8,11 @@ import numpy as np
 from fdhil.cli.paper.bench import FULL_SCALE, noisy
 from fdhil.cli.paper.operators import OPERATORS
 from fdhil.config import Identification
-from fdhil.identification.derivatives import ZERO_FORCING_1, Operator
+from fdhil.identification.derivatives import ZERO_FORCING_1, DerivativeStencil
 from fdhil.identification.estimators import least_squares, maximum_likelihood, partial_moments
-from fdhil.identification.filtering import zero_phase
-from fdhil.identification.motion import Noise, prepare
-from fdhil.identification.windows import find_windows
+from fdhil.identification.filtering import filter_zero_phase
+from fdhil.identification.prepared_motion import NoiseLevels, prepare_window
+from fdhil.identification.rapid_windows import find_windows
 from fdhil.records import PARAMETERS, Bool, Float, Parameters, Recording, Window, freeze_array
 
 NOISES = (0.001, 0.005, 0.01)
@@ -62,23 +62,23 @@ def vector(parameters: Parameters) -> Float:
 
 def _two_steps(windows: Sequence[Window], lowpass_hz: float) -> list[Float]:
     found = [least_squares_of(windows, lowpass_hz, operator) for operator in OPERATORS.values()]
-    steps = partial_moments.horizon_steps(Identification(lowpass_hz=lowpass_hz), windows[0].dt_s)
-    return [*found, _solved([partial_moments.moments(window, steps) for window in windows])]
+    steps = partial_moments.count_horizon_steps(Identification(lowpass_hz=lowpass_hz), windows[0].dt_s)
+    return [*found, _solved([partial_moments.compute_moments(window, steps) for window in windows])]
 
 
 def least_squares_of(
     windows: Sequence[Window],
     lowpass_hz: float,
-    operator: Operator = ZERO_FORCING_1,
+    operator: DerivativeStencil = ZERO_FORCING_1,
     rows: Sequence[Bool] | None = None,
 ) -> Float:
     """Return [R, L, K, Jt, ft, Cd] (6,) by least squares, from all or selected ``rows`` (n,) of each window."""
     parts = []
     for k, window in enumerate(windows):
-        signals = least_squares.align(window, Identification(lowpass_hz=lowpass_hz))
+        signals = least_squares.align_signals(window, Identification(lowpass_hz=lowpass_hz))
         if rows is not None:
             signals = replace(signals, usable=signals.usable & rows[k])
-        parts.append(least_squares.regressors(signals, window.dt_s, operator))
+        parts.append(least_squares.build_regressors(signals, window.dt_s, operator))
     return _solved(parts)
 
 
@@ -93,8 +93,8 @@ def _voltage_left_raw(windows: Sequence[Window]) -> list[Window]:
     return [
         replace(
             window,
-            current_a=freeze_array(zero_phase(window.current_a, hz, window.dt_s)),
-            speed_rad_s=freeze_array(zero_phase(window.speed_rad_s, hz, window.dt_s)),
+            current_a=freeze_array(filter_zero_phase(window.current_a, hz, window.dt_s)),
+            speed_rad_s=freeze_array(filter_zero_phase(window.speed_rad_s, hz, window.dt_s)),
         )
         for window in windows
     ]
@@ -112,8 +112,8 @@ def left_raw_of(parameters: Parameters, recording: Recording, noise: float) -> t
 def bound(parameters: Parameters, recording: Recording, noise: float) -> Float:
     """Return the Cramer-Rao standard deviations (6,) for the samples in which the drive is certainly moving."""
     theta = np.append(vector(parameters), 0.0)
-    motion = prepare(find_windows(recording)[0])
-    problem = maximum_likelihood.pose([motion], theta, [Noise(*np.full(3, noise * FULL_SCALE).tolist())])
-    scales = maximum_likelihood.typical(theta, [motion])
-    slope = maximum_likelihood.jacobian(problem, theta, problem.residuals(theta), range(6), scales)
+    motion = prepare_window(find_windows(recording)[0])
+    problem = maximum_likelihood.build_problem([motion], theta, [NoiseLevels(*np.full(3, noise * FULL_SCALE).tolist())])
+    scales = maximum_likelihood.estimate_typical_sizes(theta, [motion])
+    slope = maximum_likelihood.compute_jacobian(problem, theta, problem.compute_residuals(theta), range(6), scales)
     return np.asarray(np.sqrt(np.diag(np.linalg.inv(slope.T @ slope))))

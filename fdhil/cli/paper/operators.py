@@ -3,14 +3,16 @@
 import math
 from collections.abc import Mapping
 
-from fdhil.identification.derivatives import ZERO_FORCING_1, Operator
+from fdhil.identification.derivatives import ZERO_FORCING_1, DerivativeStencil
 
-OPERATORS: Mapping[str, Operator] = {
+OPERATORS: Mapping[str, DerivativeStencil] = {
     operator.name: operator
     for operator in (
         ZERO_FORCING_1,
-        Operator("zero_forcing_3_tap", (-1, 0, 1), ((math.sqrt(2) - 1) / 2, -math.sqrt(2), (1 + math.sqrt(2)) / 2)),
-        Operator("central", (-1, 0, 1), (-0.5, 0.0, 0.5)),
-        Operator("backward", (-1, 0), (-1.0, 1.0)),
+        DerivativeStencil(
+            "zero_forcing_3_tap", (-1, 0, 1), ((math.sqrt(2) - 1) / 2, -math.sqrt(2), (1 + math.sqrt(2)) / 2)
+        ),
+        DerivativeStencil("central", (-1, 0, 1), (-0.5, 0.0, 0.5)),
+        DerivativeStencil("backward", (-1, 0), (-1.0, 1.0)),
     )
 }

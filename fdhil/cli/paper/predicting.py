@@ -132,7 +132,7 @@ def _path() -> Claim:
     return make_claim(
         "figure-10",
         trials,
-        pictures=[Picture("The programmed path and its named places.", figures.path(desired, PLACES))],
+        pictures=[Picture("The programmed path and its named places.", figures.draw_path(desired, PLACES))],
     )
 
 

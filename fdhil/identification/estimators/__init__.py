@@ -14,7 +14,7 @@ class Estimator(Protocol):
     def __call__(self, windows: Sequence[Window], settings: Identification) -> Estimate: ...
 
 
-def chosen(settings: Identification) -> tuple[str, Estimator]:
+def select_estimator(settings: Identification) -> tuple[str, Estimator]:
     """Return name and function of the estimator in the settings, else of the default."""
     name = settings.method or tables.DEFAULT_ESTIMATOR
     estimator: Estimator = tables.load_entry(tables.ESTIMATORS, name)

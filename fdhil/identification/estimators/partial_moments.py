@@ -13,11 +13,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from fdhil.config import Identification
-from fdhil.identification.covariance import aliasing
-from fdhil.identification.estimators.least_squares import fit_two_steps, too_short
-from fdhil.identification.motion import noise_levels, surely_moving
-from fdhil.identification.signals import mended
-from fdhil.identification.windows import carried
+from fdhil.identification.estimators.least_squares import fit_two_steps, refuse_short_windows
+from fdhil.identification.prepared_motion import detect_motion, estimate_noise_levels
+from fdhil.identification.rapid_windows import fill_forward
+from fdhil.identification.robust_covariance import estimate_aliasing_doubt
+from fdhil.identification.speed_alignment import align_speed_to_samples
 from fdhil.records import Estimate, Float, VoltageSampling, Window
 
 NAME = "partial_moments"
@@ -26,22 +26,22 @@ LEAST_STEPS = 8
 
 def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
     """Fit [1], then [2] with its K, by partial moments over a horizon of one period of the low-pass's corner."""
-    usable = [mended(w, settings.speed_source) for w in windows if w.voltage_v is not None]
-    parts = [moments(w, horizon_steps(settings, w.dt_s)) for w in usable]
+    usable = [align_speed_to_samples(w, settings.speed_source) for w in windows if w.voltage_v is not None]
+    parts = [compute_moments(w, count_horizon_steps(settings, w.dt_s)) for w in usable]
     if sum(p[0].shape[0] for p in parts) < 8:
-        return too_short(NAME, sum(p[0].shape[0] for p in parts))
-    noise = np.mean([noise_levels(w).vector() ** 2 for w in usable], axis=0)
-    moment, slope = kernels(horizon_steps(settings, usable[0].dt_s), usable[0].dt_s)
-    alias = aliasing(usable[0].voltage_sampling, usable[0].dt_s)
+        return refuse_short_windows(NAME, sum(p[0].shape[0] for p in parts))
+    noise = np.mean([estimate_noise_levels(w).to_array() ** 2 for w in usable], axis=0)
+    moment, slope = compute_moment_weights(count_horizon_steps(settings, usable[0].dt_s), usable[0].dt_s)
+    alias = estimate_aliasing_doubt(usable[0].voltage_sampling, usable[0].dt_s)
     return fit_two_steps(NAME, [p for p in parts if p[0].shape[0]], noise, moment, slope, alias)
 
 
-def horizon_steps(settings: Identification, dt_s: float) -> int:
+def count_horizon_steps(settings: Identification, dt_s: float) -> int:
     """Return the samples of a horizon: one period of the low-pass's corner, at least ``LEAST_STEPS``."""
     return max(LEAST_STEPS, round(1 / settings.lowpass_hz / dt_s))
 
 
-def kernels(steps: int, dt_s: float) -> tuple[Float, Float]:
+def compute_moment_weights(steps: int, dt_s: float) -> tuple[Float, Float]:
     """Return the weights (steps + 1,) of the first moment and of the derivative's, over samples t .. t + T.
 
     Both are divided by T^2/2, so that the moment of a constant is that constant.
@@ -57,34 +57,39 @@ def kernels(steps: int, dt_s: float) -> tuple[Float, Float]:
     return moment * whole, slope * whole
 
 
-def voltage_weights(steps: int, dt_s: float, sampling: VoltageSampling) -> Float:
+def compute_voltage_weights(steps: int, dt_s: float, sampling: VoltageSampling) -> Float:
     """Return the weights (steps + 1,) of the voltage's moment: exact over each interval for interval means."""
     if sampling == "instant":
-        return kernels(steps, dt_s)[0]
+        return compute_moment_weights(steps, dt_s)[0]
     horizon = steps * dt_s
     weights: Float = np.linspace(0.5, steps + 0.5, steps + 1) * dt_s * dt_s * 2 / horizon**2
     weights[-1] = 0.0
     return weights
 
 
-def moments(window: Window, steps: int) -> tuple[Float, Float]:
+def compute_moments(window: Window, steps: int) -> tuple[Float, Float]:
     """Return the moments (m, 4) of [u, i', i, w] and of [i, w', w, sign w]."""
     assert window.voltage_v is not None
     dt = window.dt_s
-    moment, slope = kernels(steps, dt)
-    over = voltage_weights(steps, dt, window.voltage_sampling)
-    current, speed = carried(window.current_a), carried(window.speed_rad_s)
-    moving = surely_moving(window.speed_rad_s, window.rapid_speed_rad_s)
+    moment, slope = compute_moment_weights(steps, dt)
+    over = compute_voltage_weights(steps, dt, window.voltage_sampling)
+    current, speed = fill_forward(window.current_a), fill_forward(window.speed_rad_s)
+    moving = detect_motion(window.speed_rad_s, window.rapid_speed_rad_s)
     known = np.isfinite(window.voltage_v) & np.isfinite(window.current_a) & np.isfinite(window.speed_rad_s)
     if window.n <= steps:
         return np.zeros((0, 4)), np.zeros((0, 4))
     usable = np.convolve(moving & known, np.ones(steps + 1), "valid")
     rows = np.flatnonzero(usable > steps + 0.5)
 
-    def through(values: Float, weights: Float) -> Float:
+    def apply_weights(values: Float, weights: Float) -> Float:
         return np.correlate(values, weights, "valid")[rows]
 
-    mean_current, mean_speed = through(current, moment), through(speed, moment)
-    electrical = [through(carried(window.voltage_v), over), through(current, slope), mean_current, mean_speed]
-    mechanical = [mean_current, through(speed, slope), mean_speed, np.sign(mean_speed)]
+    mean_current, mean_speed = apply_weights(current, moment), apply_weights(speed, moment)
+    electrical = [
+        apply_weights(fill_forward(window.voltage_v), over),
+        apply_weights(current, slope),
+        mean_current,
+        mean_speed,
+    ]
+    mechanical = [mean_current, apply_weights(speed, slope), mean_speed, np.sign(mean_speed)]
     return np.column_stack(electrical), np.column_stack(mechanical)

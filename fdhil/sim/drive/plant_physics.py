@@ -198,7 +198,7 @@ class SensedState(NamedTuple):
 class PlantPhysics:
     """One axis' mechanics and loops. Angles in rad, in the drive's own direction.
 
-    ``voltage_v`` (n,) holds the terminal voltage of each current step of the last cycle, ``voltage_mean_v`` their mean;
+    ``compute_motor_voltage_v`` (n,) holds the terminal voltage of each current step of the last cycle, ``voltage_mean_v`` their mean;
     ``seen`` are the drive's sensor values.
     """
 

@@ -25,8 +25,8 @@ from fdhil.prediction.models import models_for, nominal_models, validated_models
 from fdhil.program import Budget, interpret, planner
 from fdhil.program.demand_csv import read_demand_csv
 from fdhil.records import Correction, Parameters, Trajectory
-from fdhil.report.figures import LEAST_UM, common_scale
-from fdhil.report.path import planes, worst_places
+from fdhil.report.figures import LEAST_UM, find_common_scale
+from fdhil.report.path_report import find_worst_positions, list_planes
 from fdhil.store.known_gain import predict_gain_from_history
 from fdhil.store.newest_sets import read_newest_sets
 from fdhil.web.forecast import kept
@@ -58,7 +58,7 @@ def forecast(program: Path, name: str, config: MachineConfig, folder: Path, repo
         "sync_period_s": reference.dt_s,
         "axes": list(reference.table_axes),
         "moved": _reach(reference),
-        "planes": planes(reference) or _single(reference),
+        "planes": list_planes(reference) or _single(reference),
         "parameters": parameters,
         "has_lines": bool(reference.line.any()),
         "zones": zones(planned),
@@ -130,7 +130,7 @@ def zones(planned: Correction) -> list[dict[str, Any]]:
     """Return the largest zones, the worst first; ``place`` numbers those labelled in the map, in path order."""
     before, after = planned.before, planned.after
     reference = before.reference
-    numbers = {row: k for k, (_, row) in enumerate(worst_places(before), 1)}
+    numbers = {row: k for k, (_, row) in enumerate(find_worst_positions(before), 1)}
     largest = sorted(before.zones, key=lambda zone: -zone.max_um)
     listed = [zone for k, zone in enumerate(largest) if k < MOST_ZONES or before.find_worst_row(zone) in numbers]
     documents = []
@@ -160,7 +160,7 @@ def _feed_mm_min(reference: Trajectory, row: int) -> float:
 
 
 def _scale(planned: Correction) -> dict[str, float | None]:
-    largest_um, least_um = common_scale([planned.before.contour_um, planned.after.contour_um])
+    largest_um, least_um = find_common_scale([planned.before.contour_um, planned.after.contour_um])
     return {"largest_um": max(largest_um, LEAST_UM), "least_um": least_um}
 
 

@@ -5,8 +5,8 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Request
 
-from fdhil.report.history_reading import read_axes, read_notices
-from fdhil.report.history_verdict import Refusals
+from fdhil.report.condition_summary import Refusals
+from fdhil.report.history_reader import read_axes, read_notices
 from fdhil.web.answers import Refused
 from fdhil.web.context import Context, MachineDependency
 from fdhil.web.pages.history_courses import axis_document, axis_line, newest_first

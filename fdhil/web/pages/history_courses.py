@@ -5,37 +5,43 @@ from typing import Any, Literal
 
 from fdhil.config import MachineConfig
 from fdhil.records import INTERVAL_95
-from fdhil.report.chart import Chart, told
-from fdhil.report.drawing import COLOURS
-from fdhil.report.history_course import AxisHistory, over_temperature, over_time
-from fdhil.report.history_trends import moved
-from fdhil.report.history_verdict import IN_ORDER, NOT_IDENTIFIED, Refusals, latest_rows, sentences
-from fdhil.report.parameter_view import DISPLAY_UNITS, PARAMETER_MEANINGS, cell, half_of, spoken
+from fdhil.report.chart import Chart, export_chart
+from fdhil.report.condition_summary import IN_ORDER, NOT_IDENTIFIED, Refusals, build_latest_rows, describe_condition
+from fdhil.report.drive_health import describe_change
+from fdhil.report.history_charts import AxisHistory, build_temperature_chart, build_time_chart
+from fdhil.report.parameter_format import (
+    DISPLAY_UNITS,
+    PARAMETER_MEANINGS,
+    compute_half_width,
+    describe_name,
+    format_cell,
+)
+from fdhil.report.svg_drawing import COLOURS
 
 MOST_REVISIONS = 50
 MOST_ESTIMATES = 50
 LINE_COLOUR = 3
 LATEST = ("parameter", "latest", "unit", "nominal", "beside_nominal", "since_first", "may_change_by", "limit")
-"""The names of the cells of :func:`fdhil.report.history_verdict.latest_rows`."""
+"""The names of the cells of :func:`fdhil.report.condition_summary.build_latest_rows`."""
 State = Literal["good", "warn", "bad", "none"]
 
 
 def state_of(history: AxisHistory, refused: Refusals) -> State:
     """Return the state of an axis: good, to be checked, at a limit, or unknown."""
-    limits = (history.told or {}).get("limits", {})
+    limits = (history.health or {}).get("limits", {})
     if any(limit["reached"] for limit in limits.values()):
         return "bad"
-    findings = sentences(history, refused)
+    findings = describe_condition(history, refused)
     return "good" if findings == [IN_ORDER] else "none" if findings == [NOT_IDENTIFIED] else "warn"
 
 
 def axis_line(history: AxisHistory, refused: Refusals) -> dict[str, Any]:
     """Return the summary of an axis."""
-    windows = (history.told or {}).get("windows", ())
+    windows = (history.health or {}).get("windows", ())
     return {
         "axis": history.axis,
         "state": state_of(history, refused),
-        "says": sentences(history, refused),
+        "says": describe_condition(history, refused),
         "newest_time": windows[-1]["time"] if windows else None,
         "rapids_believed": len(windows),
         "rapids_refused": refused.refused,
@@ -45,11 +51,11 @@ def axis_line(history: AxisHistory, refused: Refusals) -> dict[str, Any]:
 
 def axis_document(machine: MachineConfig, history: AxisHistory, refused: Refusals) -> dict[str, Any]:
     """Return the complete document of an axis."""
-    health = history.told or {}
+    health = history.health or {}
     return {
         **axis_line(history, refused),
         "latest": [
-            dict(zip(LATEST, row, strict=True)) for row in latest_rows(history, machine.maintenance.model_dump())
+            dict(zip(LATEST, row, strict=True)) for row in build_latest_rows(history, machine.maintenance.model_dump())
         ],
         "limits": [_limit(name, limit) for name, limit in health.get("limits", {}).items()],
         "slopes": _slopes(health),
@@ -58,7 +64,7 @@ def axis_document(machine: MachineConfig, history: AxisHistory, refused: Refusal
             {"code": code, "count": count, "last_text": text, "last_time": time}
             for code, count, text, time in refused.reasons
         ],
-        "courses": [_course(history, name) for name in history.names()],
+        "courses": [_course(history, name) for name in history.list_parameters()],
         "revisions": [_revision(row) for row in history.rows[-MOST_REVISIONS:][::-1]],
         "revisions_kept": len(history.rows),
     }
@@ -67,7 +73,7 @@ def axis_document(machine: MachineConfig, history: AxisHistory, refused: Refusal
 def _limit(name: str, limit: Mapping[str, Any]) -> dict[str, Any]:
     unit, factor = DISPLAY_UNITS[name]
     dates = {key: limit[key] for key in ("reached", "date", "earliest", "latest")}
-    return {"parameter": name, "name": spoken(name), "value": limit["limit"] * factor, "unit": unit, **dates}
+    return {"parameter": name, "name": describe_name(name), "value": limit["limit"] * factor, "unit": unit, **dates}
 
 
 def _slopes(health: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -75,32 +81,41 @@ def _slopes(health: Mapping[str, Any]) -> list[dict[str, Any]]:
     for name in DISPLAY_UNITS:
         lines = {key: health.get(of, {}).get(name) for key, of in (("per_kelvin", "slopes"), ("per_day", "trends"))}
         if any(lines.values()):
-            shown = {key: line and cell(name, line[key], half_of(line), " ") for key, line in lines.items()}
-            found.append({"parameter": name, "name": spoken(name), "unit": DISPLAY_UNITS[name][0], **shown})
+            shown = {
+                key: line and format_cell(name, line[key], compute_half_width(line), " ") for key, line in lines.items()
+            }
+            found.append({"parameter": name, "name": describe_name(name), "unit": DISPLAY_UNITS[name][0], **shown})
     return found
 
 
 def _change(change: Mapping[str, Any]) -> dict[str, Any]:
-    return {"time": change["time"], "window": change["window"], "moved": moved(change), "cause": change["cause"]}
+    return {
+        "time": change["time"],
+        "window": change["window"],
+        "moved": describe_change(change),
+        "cause": change["cause"],
+    }
 
 
 def _course(history: AxisHistory, name: str) -> dict[str, Any]:
     unit, factor = DISPLAY_UNITS[name]
-    warming = over_temperature(history, name)
+    warming = build_temperature_chart(history, name)
     return {
         "parameter": name,
-        "name": spoken(name),
+        "name": describe_name(name),
         "unit": unit,
         "meaning": PARAMETER_MEANINGS[name],
-        "over_time": _chart(over_time(history, name)),
+        "over_time": _chart(build_time_chart(history, name)),
         "over_temperature": None if warming is None else _chart(warming),
-        "estimates": [_estimate(name, factor, window) for window in history.estimates(name)[-MOST_ESTIMATES:][::-1]],
+        "estimates": [
+            _estimate(name, factor, window) for window in history.list_estimates(name)[-MOST_ESTIMATES:][::-1]
+        ],
     }
 
 
 def _chart(chart: Chart) -> dict[str, Any]:
     """Return a chart for the browser: colours are numbers, so that they suit a dark page too."""
-    document = told(chart)
+    document = export_chart(chart)
     for trace in (trace for panel in document["panels"] for trace in panel["traces"]):
         trace["colour"] = COLOURS.index(trace["colour"]) + 1 if trace["colour"] in COLOURS else LINE_COLOUR
     return {**document, "words": chart.alt}
@@ -115,7 +130,7 @@ def _estimate(name: str, factor: float, window: Mapping[str, Any]) -> dict[str, 
         "temperature_celsius": window["temperature_c"],
         "value": figures["value"] * factor,
         "half_width_95": half * factor,
-        "shown": cell(name, figures["value"], half, " "),
+        "shown": format_cell(name, figures["value"], half, " "),
     }
 
 
@@ -126,7 +141,9 @@ def _revision(row: Mapping[str, Any]) -> dict[str, Any]:
         "time": row["time"],
         "temperature_celsius": row["temperature_c"],
         "windows_used": row["windows_used"],
-        "parameters": {name: cell(name, its["value"], half_of(its), " ") for name, its in parameters.items()},
+        "parameters": {
+            name: format_cell(name, its["value"], compute_half_width(its), " ") for name, its in parameters.items()
+        },
         "units": {name: DISPLAY_UNITS[name][0] for name in parameters},
     }
 

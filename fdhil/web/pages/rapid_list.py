@@ -7,8 +7,8 @@ from typing import Any, Literal
 from pydantic import BaseModel
 
 from fdhil.records import INTERVAL_95, get_unit
-from fdhil.report.parameter_view import DISPLAY_UNITS, cell
-from fdhil.report.typography import typeset
+from fdhil.report.parameter_format import DISPLAY_UNITS, format_cell
+from fdhil.report.typography import typeset_text
 from fdhil.store.history import History
 from fdhil.store.rows import StoredWindow
 from fdhil.web.answers import Refused
@@ -177,7 +177,7 @@ def rapid_of(window: StoredWindow, is_stored: Kept) -> Rapid:
 
 def _said(reason: str) -> Said:
     code, _, text = reason.partition(":")
-    return Said(code=code, text=typeset(text.strip()))
+    return Said(code=code, text=typeset_text(text.strip()))
 
 
 def told_of(history: History, window: StoredWindow, is_stored: Kept) -> RapidTold:
@@ -210,9 +210,9 @@ def figure_of(name: str, figures: dict[str, Any]) -> Figure:
         std=std,
         low=ends[0],
         high=ends[1],
-        reason=None if figures.get("reason") is None else typeset(str(figures["reason"])),
-        shown=typeset(cell(name, value, half, " ")),
-        shown_unit=typeset(DISPLAY_UNITS[name][0] if name in DISPLAY_UNITS else unit or ""),
+        reason=None if figures.get("reason") is None else typeset_text(str(figures["reason"])),
+        shown=typeset_text(format_cell(name, value, half, " ")),
+        shown_unit=typeset_text(DISPLAY_UNITS[name][0] if name in DISPLAY_UNITS else unit or ""),
     )
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel
 
-from fdhil.identification.windows import bridged, moving_range
+from fdhil.identification.rapid_windows import find_moving_range, interpolate_gaps
 from fdhil.pipeline.overlay import Overlay
 from fdhil.records import Float, Reason, Window, compute_rms
-from fdhil.report.typography import typeset
+from fdhil.report.typography import typeset_text
 from fdhil.web.pages.rapid_list import Said
 
 MOST_POINTS = 6000
@@ -89,7 +89,7 @@ class _Course:
 def signals_of(overlay: Overlay) -> RapidSignals:
     """Return the signals of a rapid with its model."""
     window = overlay.window
-    begin, end = moving_range(window)
+    begin, end = find_moving_range(window)
     every = max(1, -(-window.n // MOST_POINTS))
     frequency = np.fft.rfftfreq(window.n, window.dt_s)
     verdict = overlay.outcome.verdict
@@ -119,7 +119,7 @@ def _stages(window: Window) -> list[Stage]:
 
 
 def _said(reason: Reason) -> Said:
-    return Said(code=reason.code, text=typeset(reason.text), advice=typeset(reason.advice))
+    return Said(code=reason.code, text=typeset_text(reason.text), advice=typeset_text(reason.advice))
 
 
 def _courses(overlay: Overlay) -> list[_Course]:
@@ -178,7 +178,7 @@ def _signal(course: _Course, moving: slice, every: int) -> Signal:
     return Signal(
         name=course.name,
         unit=course.unit,
-        shown_unit=typeset(course.unit),
+        shown_unit=typeset_text(course.unit),
         model=course.model,
         measured=round_digits(measured[::every]),
         modelled=None if modelled is None else round_digits(modelled[::every]),
@@ -196,7 +196,7 @@ def spectrum(values: Float) -> Float:
     """
     if not np.isfinite(values).any():
         return np.full(0, math.nan)
-    known = bridged(np.where(np.isfinite(values), values, math.nan))
+    known = interpolate_gaps(np.where(np.isfinite(values), values, math.nan))
     taper = np.hanning(values.size + 1)[:-1]
     amplitude = 2.0 * np.abs(np.fft.rfft((known - known.mean()) * taper)) / max(float(taper.sum()), 1e-300)
     step = _step(amplitude.size)
