@@ -15,7 +15,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from studies.pages import ROOT, paragraph, provenance
+from studies.pages import ROOT, describe_provenance, wrap_paragraph
 
 FIGURES = ROOT / "docs" / "benchmarks.json"
 BENCHMARKS = {
@@ -42,7 +42,7 @@ BENCHMARKS = {
 def run(name: str, options: Sequence[str] = ()) -> dict[str, Any]:
     """Run one benchmark and return what it printed, and what it ran on; a failing one ends the run."""
     print(f"{name}: {BENCHMARKS[name]} ...", flush=True)
-    told = provenance(" ".join([f"python -m benchmarks.{name}", *options])) | {
+    told = describe_provenance(" ".join([f"python -m benchmarks.{name}", *options])) | {
         "host": f"{platform.machine()}, {os.cpu_count()} cores"
     }
     done = subprocess.run(
@@ -58,7 +58,7 @@ def run(name: str, options: Sequence[str] = ()) -> dict[str, Any]:
 def page(figures: Mapping[str, Any]) -> str:
     """Return the page of the benchmarks' figures."""
     lines = ["# Benchmarks", ""]
-    lines += paragraph(
+    lines += wrap_paragraph(
         """Written by `make bench` from [benchmarks.json](benchmarks.json). A host that is shared with other work
         measures less than it can: read the ratios, and compare within one run."""
     )
@@ -66,7 +66,7 @@ def page(figures: Mapping[str, Any]) -> str:
         if name in figures:
             told = figures[name]["run"]
             where = f"{told['date']}, commit {told['commit']}, {told['versions']}, {told['host']}."
-            lines += [f"## {title}", "", *paragraph(f"`{told['command']}`, {where}")]
+            lines += [f"## {title}", "", *wrap_paragraph(f"`{told['command']}`, {where}")]
             lines += ["```text", *figures[name]["output"], "```", ""]
     return "\n".join(lines).rstrip() + "\n"
 

@@ -30,7 +30,7 @@ CYCLES = 240
 STAMP = b"1700000000.000000"
 
 
-def machine(clock: str) -> MachineConfig:
+def make_machine(clock: str) -> MachineConfig:
     """The bench with two axes; ``clock`` "sync" for a bus that runs ahead of the time."""
     axis = {
         "screw_pitch_mm": 20.0, "rapid_speed_mm_s": 500.0, "max_acceleration_mm_s2": 4000.0,
@@ -43,7 +43,7 @@ def machine(clock: str) -> MachineConfig:
     return parse_config({"machine": {"name": "bench"}, "axis": dict.fromkeys(AXES, axis), "guard": {"clock": clock}})
 
 
-def cycle_frames(k: int) -> list[tuple[int, bytes]]:
+def make_cycle_frames(k: int) -> list[tuple[int, bytes]]:
     """What the bus carries in SYNC cycle k: 7 frames for three axes' worth of traffic, some more every tenth cycle."""
     frames = [(0x80, bytes([k % 240 + 1]))]
     for node in range(1, len(AXES) + 1):
@@ -62,12 +62,12 @@ def cycle_frames(k: int) -> list[tuple[int, bytes]]:
     return frames
 
 
-def hub(pipe: Connection) -> None:
+def serve_frames(pipe: Connection) -> None:
     """The other process: serve one client, send as ordered by (cycles, paced)."""
     texts = []
     for k in range(CYCLES):
         text = "".join(
-            f"< frame {i:03X} {STAMP.decode()} {d.hex().upper()}".ljust(62) + " >" for i, d in cycle_frames(k)
+            f"< frame {i:03X} {STAMP.decode()} {d.hex().upper()}".ljust(62) + " >" for i, d in make_cycle_frames(k)
         )
         texts.append(text.encode())
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -97,16 +97,16 @@ def fit_load(stopping: threading.Event) -> None:
         np.linalg.lstsq(matrix, right, rcond=None)
 
 
-def lost(bus: Bus, decoder: BusDecoder) -> int:
+def count_lost(bus: Bus, decoder: BusDecoder) -> int:
     """All that was lost so far."""
     counted = decoder.read_counters()
     return bus.read_counters()["lost"] + counted["pdo_lost"] + counted["sync_missed"]
 
 
-def acquire(bus: Bus, decoder: BusDecoder, pipe: Connection, cycles: int, paced: bool) -> dict[str, float]:
+def receive_cycles(bus: Bus, decoder: BusDecoder, pipe: Connection, cycles: int, paced: bool) -> dict[str, float]:
     """Receive and decode what the hub sends for ``cycles``; returns figures."""
-    frames_before, lost_before = bus.read_counters()["frames"], lost(bus, decoder)
-    expected = sum(len(cycle_frames(k % CYCLES)) for k in range(cycles))
+    frames_before, lost_before = bus.read_counters()["frames"], count_lost(bus, decoder)
+    expected = sum(len(make_cycle_frames(k % CYCLES)) for k in range(cycles))
     rows, wall, cpu = 0, time.perf_counter(), time.process_time()
     pipe.send((cycles, paced))
     while bus.read_counters()["frames"] - frames_before < expected:
@@ -120,7 +120,7 @@ def acquire(bus: Bus, decoder: BusDecoder, pipe: Connection, cycles: int, paced:
         "frames_per_s": expected / wall,
         "cpu_percent": 100 * cpu / wall,
         "us_per_frame": 1e6 * cpu / expected,
-        "lost": lost(bus, decoder) - lost_before,
+        "lost": count_lost(bus, decoder) - lost_before,
         "rows": rows,
     }
 
@@ -132,20 +132,20 @@ def main() -> None:
     arguments.add_argument("--seconds", type=float, default=20.0)
     options = arguments.parse_args()
     ours, theirs = mp.Pipe()
-    process = mp.get_context("fork").Process(target=hub, args=(theirs,), daemon=True)
+    process = mp.get_context("fork").Process(target=serve_frames, args=(theirs,), daemon=True)
     process.start()
     results: dict[str, Any] = {}
     with Bus("can0", CanBus(port=ours.recv()), ring_frames=1 << 18) as bus:
-        ahead, decoder = (BusDecoder("can0", machine(clock)) for clock in ("sync", "monotonic"))
-        per_cycle = sum(len(cycle_frames(k)) for k in range(CYCLES)) / CYCLES
+        ahead, decoder = (BusDecoder("can0", make_machine(clock)) for clock in ("sync", "monotonic"))
+        per_cycle = sum(len(make_cycle_frames(k)) for k in range(CYCLES)) / CYCLES
         cycles = CYCLES * round(options.frames / per_cycle / CYCLES)
         paced = CYCLES * max(1, round(options.seconds * 1000 / CYCLES))
-        results["flat out"] = acquire(bus, ahead, ours, cycles, paced=False)
-        results["paced 1 kHz"] = acquire(bus, decoder, ours, paced, paced=True)
+        results["flat out"] = receive_cycles(bus, ahead, ours, cycles, paced=False)
+        results["paced 1 kHz"] = receive_cycles(bus, decoder, ours, paced, paced=True)
         stopping = threading.Event()
         load = threading.Thread(target=fit_load, args=(stopping,))
         load.start()
-        results["paced, beside a fit"] = acquire(bus, decoder, ours, paced, paced=True)
+        results["paced, beside a fit"] = receive_cycles(bus, decoder, ours, paced, paced=True)
         stopping.set()
         load.join()
         ours.send(None)

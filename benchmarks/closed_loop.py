@@ -20,7 +20,7 @@ import numpy as np
 from fdhil.config import parse_config
 from fdhil.model import closed_loop
 from fdhil.model.closed_loop_drive import DriveModel
-from fdhil.prediction.models import nominal_models
+from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.records import Float
 from tests.bench import bench_config, bench_document
 from tests.paths import build_bench_demand
@@ -77,7 +77,7 @@ def measure(terms: Mapping[str, float] | None = None) -> dict[str, float]:
     Also the ratio of the last two, the real-time factor, and the largest difference in um.
     """
     config = bench_config()
-    axis, model = config.axis["X"], nominal_models(config)["X"].replace_values(**terms or {})
+    axis, model = config.axis["X"], build_nominal_models(config)["X"].replace_values(**terms or {})
     reference = np.ascontiguousarray(build_bench_demand(10.0)[:, 0])
     drive = closed_loop.prepare_drive(model, axis, 0.001)
     assert isinstance(drive, DriveModel)
@@ -111,7 +111,7 @@ def structures() -> dict[str, float]:
         document = bench_document("X")
         document["axis"]["X"]["regulators"] |= OPTIONS | own | {"structure": name}
         config = parse_config(document)
-        axis, model = config.axis["X"], nominal_models(config)["X"]
+        axis, model = config.axis["X"], build_nominal_models(config)["X"]
         seconds = best(partial(closed_loop.simulate_axis, model, axis, 0.001, reference))
         found[name] = reference.size * 0.001 / seconds
     return found

@@ -11,15 +11,15 @@ import timeit
 
 import numpy as np
 
-from benchmarks.inverse import scattered
+from benchmarks.inverse import scatter_plants
 from fdhil.config import MachineConfig
-from fdhil.correction.flatness_feedforward import law
+from fdhil.correction.flatness_feedforward import derive_feedforward_law
 from fdhil.guard.feedforward_law import Law
 from fdhil.guard.request_parsing import parse_law
 from fdhil.model import closed_loop
-from fdhil.prediction.models import nominal_models
+from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.records import Float
-from tests.correction.test_planning import changed
+from tests.correction.test_correction_planner import change_config
 from tests.paths import build_bench_demand, build_jerky_demand
 
 PLANTS = 10
@@ -34,12 +34,16 @@ CASES = (
 
 def guard_law(config: MachineConfig, axis: str) -> Law:
     """Return the law as it reaches the guard."""
-    found = parse_law(dict(law(nominal_models(config)[axis], config.axis[axis], config.machine.sync_period_s)))
+    found = parse_law(
+        dict(
+            derive_feedforward_law(build_nominal_models(config)[axis], config.axis[axis], config.machine.sync_period_s)
+        )
+    )
     assert found is not None
     return found
 
 
-def heard(config: MachineConfig, axis: str, path: Float) -> tuple[Float, Float]:
+def extract_offsets(config: MachineConfig, axis: str, path: Float) -> tuple[Float, Float]:
     """Return speed (rad/s) and torque offset (N.m), (n,): each row's from the targets before it, as on the bus."""
     own, drive = guard_law(config, axis), config.axis[axis].drive
     targets = np.rint(path * config.axis[axis].scaling.increments_per_mm).astype(np.int64).tolist()
@@ -51,22 +55,22 @@ def heard(config: MachineConfig, axis: str, path: Float) -> tuple[Float, Float]:
     return pairs[:, 0] * 2 * math.pi / drive.increments_per_rev, pairs[:, 1] * torque
 
 
-def errors_um(demand: Float, config: MachineConfig) -> tuple[float, list[float]]:
+def compute_errors_um(demand: Float, config: MachineConfig) -> tuple[float, list[float]]:
     """Return the largest tracking error without the feed-forward, and with it on each plant."""
     period = config.machine.sync_period_s
     paths = {axis: np.ascontiguousarray(demand[:, k]) for k, axis in enumerate("XY")}
-    offsets = {axis: heard(config, axis, path) for axis, path in paths.items()}
+    offsets = {axis: extract_offsets(config, axis, path) for axis, path in paths.items()}
     speed, torque = ({axis: pair[which] for axis, pair in offsets.items()} for which in (0, 1))
 
     def largest(responses: dict[str, closed_loop.Response]) -> float:
         return max(1e3 * float(np.abs(responses[axis].position_mm - path).max()) for axis, path in paths.items())
 
-    before = largest(closed_loop.simulate_axes(nominal_models(config), config.axis, period, paths))
+    before = largest(closed_loop.simulate_axes(build_nominal_models(config), config.axis, period, paths))
     random = np.random.default_rng(1)
     after = [
         largest(
             closed_loop.simulate_axes(
-                scattered(random), config.axis, period, paths, speed_offset_rad_s=speed, torque_offset_nm=torque
+                scatter_plants(random), config.axis, period, paths, speed_offset_rad_s=speed, torque_offset_nm=torque
             )
         )
         for _ in range(PLANTS)
@@ -79,9 +83,9 @@ def main() -> None:
     print(f"largest tracking error of {PLANTS} plants that scatter as identified models do")
     print(f"{'path':28}{'before um':>11}{'after um':>10}{'times':>8}{'wanted':>8}")
     for name, demand, feedforward, wanted in CASES:
-        before, after = errors_um(demand, changed(speed_feedforward=feedforward))
+        before, after = compute_errors_um(demand, change_config(speed_feedforward=feedforward))
         print(f"{name:28}{before:11.1f}{max(after):10.1f}{before / max(after):8.1f}{wanted:8}")
-    own = guard_law(changed(), "X")
+    own = guard_law(change_config(), "X")
     targets = list(range(0, 10 * own.depth, 10))
     turns = 20_000
     print(

@@ -32,7 +32,7 @@ from fdhil.fleet.record_message import Message, Record, decode_message, encode_e
 from fdhil.fleet.record_uplink import BATCH, MESSAGE_BYTES, OutboxSender
 from fdhil.store.outbox import POSITION_FILE, OutboxReader
 from studies import fleet_day
-from studies.fleet_parts import of_database, processor_s
+from studies.fleet_parts import measure_database_s, measure_processor_s
 from tests.fleet.servers import NatsServer, Postgres, run_postgres
 from tests.fleet.servers import run_nats as nats_server
 
@@ -79,9 +79,9 @@ class Bench:
     def _processor_s(self) -> float:
         server = self.server._process
         assert server is not None
-        return time.process_time() + processor_s(server.pid) + of_database(self.database)
+        return time.process_time() + measure_processor_s(server.pid) + measure_database_s(self.database)
 
-    async def empty(self) -> None:
+    async def reset_stream(self) -> None:
         """Make the stream anew; the old one would know the messages again."""
         with suppress(nats.js.errors.NotFoundError):
             await self.client.jetstream().delete_stream(self.fleet.stream.name)
@@ -100,9 +100,9 @@ def main() -> None:
 
 async def run(folder: Path, machines: int, records: int, server: NatsServer, database: Postgres) -> None:
     """Print what each way takes."""
-    day = fleet_day.machine(folder / "day", "day", server.url)
-    fleet_day.record(day, records)
-    configs = fleet_day.copied([day], folder, machines, server.url)
+    day = fleet_day.make_machine(folder / "day", "day", server.url)
+    fleet_day.record_day(day, records)
+    configs = fleet_day.copy_machines([day], folder, machines, server.url)
     senders = [OutboxSender(config, config.uplink) for config in configs if config.uplink is not None]
     print(f"{machines} machines with {records} records each; servers and clients on the same computer")
     fleet = Fleet(
@@ -116,33 +116,33 @@ async def run(folder: Path, machines: int, records: int, server: NatsServer, dat
         await psycopg.AsyncConnection.connect(database.connection, autocommit=True) as db,
     ):
         bench = Bench(fleet, server, database, client, db)
-        await published(bench, senders)
-        await collected(bench, senders)
+        await measure_publishing(bench, senders)
+        await measure_collecting(bench, senders)
 
 
-async def published(bench: Bench, senders: Sequence[OutboxSender]) -> None:
+async def measure_publishing(bench: Bench, senders: Sequence[OutboxSender]) -> None:
     """Print what goes into the stream."""
-    messages = [message for sender in senders for message in messages_of(sender)]
-    together = together_of(senders)
+    messages = [message for sender in senders for message in iterate_messages(sender)]
+    together = batch_messages(senders)
     gc.freeze()
     ours, each = Way("sent by the uplinks"), Way("by a bare client, each a message of its own")
     same = Way("by a bare client that has the uplinks' messages ready")
     for _ in range(ROUNDS):
         for way, many in ((each, messages), (same, together)):
-            await bench.empty()
+            await bench.reset_stream()
             await bench.measure(way, len(messages), lambda many=many: publish(bench.client, many))  # type: ignore[misc]
-        await bench.empty()
+        await bench.reset_stream()
         for sender in senders:
             (sender._folder / POSITION_FILE).unlink(missing_ok=True)
-        await bench.measure(ours, len(messages), lambda: send(senders))
+        await bench.measure(ours, len(messages), lambda: send_outboxes(senders))
     print(*(way.line(ours) for way in (ours, each, same)), sep="\n")
 
 
-async def collected(bench: Bench, senders: Sequence[OutboxSender]) -> None:
+async def measure_collecting(bench: Bench, senders: Sequence[OutboxSender]) -> None:
     """Print what goes out of the stream and into the database."""
-    messages = [message for sender in senders for message in messages_of(sender)]
-    together = together_of(senders)
-    rows = rows_of(together)
+    messages = [message for sender in senders for message in iterate_messages(sender)]
+    together = batch_messages(senders)
+    rows = convert_to_rows(together)
     gc.freeze()  # what a collector does not have, and would be looked through again and again
     await schema_migrations.upgrade_schema(bench.db)
     first = datetime.fromtimestamp(fleet_day.MIDNIGHT_S, UTC)
@@ -152,34 +152,34 @@ async def collected(bench: Bench, senders: Sequence[OutboxSender]) -> None:
     plain = Way("by COPY of ready rows into a table without key and index")
     read = Way("out of JetStream by a bare client, each a message of its own")
     for _ in range(ROUNDS):
-        await bench.empty()
+        await bench.reset_stream()
         await publish(bench.client, messages)
-        await bench.measure(read, len(messages), lambda: take(bench, len(messages)))
-        await bench.empty()
+        await bench.measure(read, len(messages), lambda: take_messages(bench, len(messages)))
+        await bench.reset_stream()
         await publish(bench.client, together)
         await bench.db.execute("TRUNCATE bare, fleet.records, fleet.heard")
-        await bench.measure(plain, len(rows), lambda: copy(bench.db, "bare", rows))
-        await bench.measure(same, len(rows), lambda: copy(bench.db, "fleet.records", rows))
+        await bench.measure(plain, len(rows), lambda: copy_rows(bench.db, "bare", rows))
+        await bench.measure(same, len(rows), lambda: copy_rows(bench.db, "fleet.records", rows))
         await bench.db.execute("TRUNCATE fleet.records")
-        await bench.measure(ours, len(rows), lambda: collect(bench, len(rows)))
+        await bench.measure(ours, len(rows), lambda: collect_all(bench, len(rows)))
     rate_of_both = 1.0 / (1.0 / read.records_a_s + 1.0 / same.records_a_s)
     both = Way("by these two, one after the other", rate_of_both, read.processor_us + same.processor_us)
     print(*(way.line(ours) for way in (ours, read, same, both, plain)), sep="\n")
 
 
-def messages_of(sender: OutboxSender) -> Iterator[Message]:
+def iterate_messages(sender: OutboxSender) -> Iterator[Message]:
     """Yield all that a machine has to tell, each record for itself."""
     with OutboxReader(sender._store) as reader:
         for entry in reader.entries(0, 10_000_000):
             yield encode_entry(entry, sender.machine, reader.store, None)
 
 
-def together_of(senders: Sequence[OutboxSender]) -> list[Message]:
+def batch_messages(senders: Sequence[OutboxSender]) -> list[Message]:
     """Return the messages that uplinks send."""
-    return [message for sender in senders for message, _ in join_messages(messages_of(sender), MESSAGE_BYTES)]
+    return [message for sender in senders for message, _ in join_messages(iterate_messages(sender), MESSAGE_BYTES)]
 
 
-def rows_of(messages: Sequence[Message]) -> list[str]:
+def convert_to_rows(messages: Sequence[Message]) -> list[str]:
     """Return what is in messages as a database takes it."""
     told = [told for message in messages for told in decode_message(message.subject, message.payload)]
     return list(_format_copy_rows([(record, LISTED) for record in told if isinstance(record, Record)]))
@@ -196,7 +196,7 @@ async def publish(client: Client, messages: Sequence[Message]) -> None:
     await asyncio.gather(*(some() for _ in range(IN_FLIGHT)))
 
 
-async def take(bench: Bench, count: int) -> None:
+async def take_messages(bench: Bench, count: int) -> None:
     """Take messages out of the stream, answer for them, and do nothing with them."""
     reader = await prepare_record_stream(bench.client.jetstream(), bench.fleet.stream)
     while count > 0:
@@ -206,7 +206,7 @@ async def take(bench: Bench, count: int) -> None:
         count -= len(messages)
 
 
-async def send(senders: Sequence[OutboxSender]) -> None:
+async def send_outboxes(senders: Sequence[OutboxSender]) -> None:
     """Send all outboxes, each over its own connection."""
     async with AsyncExitStack() as stack:
         clients = [
@@ -227,7 +227,7 @@ async def send_one(sender: OutboxSender, client: Client) -> None:
             return
 
 
-async def copy(db: psycopg.AsyncConnection, table: str, rows: Sequence[str]) -> None:
+async def copy_rows(db: psycopg.AsyncConnection, table: str, rows: Sequence[str]) -> None:
     """Copy rows into a table, as many in a transaction as a collector has."""
     statement = f"COPY {table} ({_COLUMNS}) FROM STDIN".encode()
     for first in range(0, len(rows), TOGETHER):
@@ -236,7 +236,7 @@ async def copy(db: psycopg.AsyncConnection, table: str, rows: Sequence[str]) -> 
                 await into.write("".join(rows[some : min(some + _AT_ONCE, first + TOGETHER)]))
 
 
-async def collect(bench: Bench, total: int) -> None:
+async def collect_all(bench: Bench, total: int) -> None:
     """Collect until all of it is there."""
     collector = Collector(bench.fleet)
     running = asyncio.create_task(collector.run(bench.client, bench.db))

@@ -26,7 +26,7 @@ from fdhil.fleet.reanalysis_changes import summarise_changes
 from fdhil.fleet.window_reanalysis import AnalysisMethod, compute_code_digest
 from fdhil.fleet.worker_pools import open_worker_pool
 from fdhil.identification.rapid_windows import find_windows
-from fdhil.pipeline import analyse
+from fdhil.pipeline import analyse_window
 from fdhil.store.history import described
 from fdhil.store.recording_csv import parse_recording
 from fdhil.store.windows import encode_window
@@ -51,7 +51,7 @@ def main() -> None:
 def measure(folder: Path, windows: int, method: str, database: Postgres) -> None:
     """Print what each number of workers takes."""
     fleet = Fleet(database=Database(connection=database.connection), objects=Objects(directory=folder))
-    stored_bytes = asyncio.run(gathered(fleet, windows))
+    stored_bytes = asyncio.run(gather_windows(fleet, windows))
     print(f"{windows} windows of {stored_bytes / windows / 1024:.1f} KiB, method {method}")
     asked = AnalysisMethod(Identification(method=method), {}, folder, compute_code_digest())
     rates: dict[int, list[float]] = {}
@@ -78,19 +78,19 @@ def measure(folder: Path, windows: int, method: str, database: Postgres) -> None
     print(f"the same bits in all {len(CREWS)} runs")
 
 
-async def gathered(fleet: Fleet, windows: int) -> int:
+async def gather_windows(fleet: Fleet, windows: int) -> int:
     """Bring windows into folder and database as collectors do, analysed by the fast method; return their bytes."""
     size = 0
     async with await psycopg.AsyncConnection.connect(fleet.database.connection, autocommit=True) as db:
         await schema_migrations.upgrade_schema(db)
         await schema_migrations.add_month_partitions(db, {(BEGIN.year, BEGIN.month)})
-        for k, signals in enumerate(recorded(windows)):
-            (window,) = find_windows(parse_recording(bench.as_csv(signals, NOISE, k)))
+        for k, signals in enumerate(record_rapids(windows)):
+            (window,) = find_windows(parse_recording(bench.format_as_csv(signals, NOISE, k)))
             content = encode_window(window, "benchmark")
             name = hashlib.sha256(content).hexdigest()
             window_files.store_window(fleet.objects.directory, name, content)
             size += len(content)
-            found = analyse(window, Identification(method="least_squares"))
+            found = analyse_window(window, Identification(method="least_squares"))
             record = {
                 "number": k,
                 "accepted": int(found.verdict.accepted),
@@ -105,9 +105,9 @@ async def gathered(fleet: Fleet, windows: int) -> int:
     return size
 
 
-def recorded(count: int) -> Sequence[bench.Signals]:
+def record_rapids(count: int) -> Sequence[bench.Signals]:
     """Return the signals of so many rapids, in either direction in turn; their noise makes each another."""
-    ways = [bench.run(bench.Plant(), bench.shuttle(moves=1, first=first)) for first in (1, -1)]
+    ways = [bench.simulate_bench(bench.Plant(), bench.make_shuttle_demand(moves=1, first=first)) for first in (1, -1)]
     return [ways[k % 2] for k in range(count)]
 
 

@@ -33,7 +33,7 @@ ROWS = 20
 TOKEN = "benchmark"
 
 
-def axis(name: str, node: int) -> AxisSettings:
+def make_axis(name: str, node: int) -> AxisSettings:
     """An axis with the default mapping."""
     tpdos = (
         Pdo(0x180 + node, ((0x6064, 0, 32, True), (0x606C, 0, 32, True))),
@@ -46,14 +46,14 @@ def axis(name: str, node: int) -> AxisSettings:
     return AxisSettings(name, node, target, offset, tpdos, 3276.8, 500.0, 4000.0, 1, LIMITS, 32768, 2)
 
 
-def settings(run_directory: str) -> GuardSettings:
+def make_settings(run_directory: str) -> GuardSettings:
     """Two axes in SYNC time."""
     digest = hashlib.sha256(TOKEN.encode()).hexdigest()
-    axes = (axis("X", 1), axis("Y", 2))
+    axes = (make_axis("X", 1), make_axis("Y", 2))
     return GuardSettings("can0", "socketcand", 0.001, "sync", 0.020, 100, digest, run_directory, axes)
 
 
-def frames(tick: int) -> list[tuple[int, bytes]]:
+def make_frames(tick: int) -> list[tuple[int, bytes]]:
     """What drives and NC send after a SYNC, at rest at 0."""
     made = []
     for node in (1, 2):
@@ -64,7 +64,7 @@ def frames(tick: int) -> list[tuple[int, bytes]]:
     return made
 
 
-def text(what: list[tuple[int, bytes]]) -> bytes:
+def format_frames(what: list[tuple[int, bytes]]) -> bytes:
     """Frames in the socketcand protocol."""
     return b"".join(f"< frame {cob_id:03X} 1.0 {data.hex()} >".encode() for cob_id, data in what)
 
@@ -76,20 +76,20 @@ class Hub:
         self.client = client
         self.tick = 0
 
-    def cycle(self, answers: int) -> float:
+    def run_cycle(self, answers: int) -> float:
         """One SYNC; the seconds until ``answers`` offset frames came back, then the rest of the cycle."""
         self.tick += 1
         start_s = time.perf_counter()
-        self.client.sendall(text([(0x080, bytes([(self.tick - 1) % 240 + 1]))]))
+        self.client.sendall(format_frames([(0x080, bytes([(self.tick - 1) % 240 + 1]))]))
         got = b""
         while got.count(b"send 30") < answers:
             got += self.client.recv(4096)
         taken_s = time.perf_counter() - start_s
-        self.client.sendall(text(frames(self.tick)))
+        self.client.sendall(format_frames(make_frames(self.tick)))
         return taken_s
 
 
-def latencies(cycles: int) -> list[float]:
+def measure_latencies(cycles: int) -> list[float]:
     """Seconds from SYNC to the second axis' offset frame, ``cycles`` of them, armed."""
     server = socket.create_server(("127.0.0.1", 0))
     with tempfile.TemporaryDirectory() as folder, server:
@@ -98,7 +98,7 @@ def latencies(cycles: int) -> list[float]:
         for end in (far, client):
             end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         file = Path(folder) / "guard.json"
-        file.write_text(encode_settings(settings(folder)))
+        file.write_text(encode_settings(make_settings(folder)))
         command = [sys.executable, "-m", "fdhil.guard", "--settings", str(file), "--descriptor", str(far.fileno())]
         with subprocess.Popen(command, pass_fds=[far.fileno()], stdout=subprocess.PIPE) as process, client:
             far.close()
@@ -115,7 +115,7 @@ def measure(hub: Hub, guard: GuardClient, cycles: int) -> list[float]:
     table = {name: [0] * ROWS for name in "XY"}
     guard.load("XY", table, table, "p")
     for _ in range(200):
-        hub.cycle(0)
+        hub.run_cycle(0)
         time.sleep(0.001)
     answer: dict[str, object] = {}
     arming = threading.Thread(
@@ -123,7 +123,7 @@ def measure(hub: Hub, guard: GuardClient, cycles: int) -> list[float]:
     )
     arming.start()
     while arming.is_alive():
-        hub.cycle(0)
+        hub.run_cycle(0)
         time.sleep(0.002)
     if not answer["ok"]:
         raise SystemExit(f"not armed: {answer}")
@@ -138,24 +138,24 @@ def measure(hub: Hub, guard: GuardClient, cycles: int) -> list[float]:
     for k in range(cycles):
         if k % 50 == 0:
             guard.alive()
-        taken.append(hub.cycle(2))
+        taken.append(hub.run_cycle(2))
     return taken
 
 
 def step_us(repeats: int = 2000) -> float:
     """Microseconds of processor time of one step while armed, two axes, the best of ten."""
-    made = settings("")
+    made = make_settings("")
     listener, state = FrameMonitor(made), make_initial_state(made)
     path = CorrectedPath(0, ([0] * ROWS,) * 2, ([0] * ROWS,) * 2, True, "p", 1)
     calls: list[tuple[GuardState, StepInputs]] = []
     for tick in range(1, 300):
-        seen, bus = listener.close_sync_cycle(bytes([(tick - 1) % 240 + 1]), tick * 1e-3, tick * 1e-3)
+        seen, bus = listener.receive_at_sync(bytes([(tick - 1) % 240 + 1]), tick * 1e-3, tick * 1e-3)
         request = GuardRequest("arm", True, "p", dict.fromkeys(FACTS, True)) if tick == 150 else None
         inputs = StepInputs(True, seen, bus, path=path, request=request)
         if tick > 160:
             calls.append((state, inputs))
         state, _ = guard_step.step_guard(state, inputs, made)
-        for cob_id, data in frames(tick):
+        for cob_id, data in make_frames(tick):
             listener.take_frame(cob_id, data, tick * 1e-3)
     best = float("inf")
     for _ in range(10):
@@ -171,7 +171,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--cycles", type=int, default=5000)
     options = parser.parse_args()
-    taken = sorted(latencies(options.cycles))
+    taken = sorted(measure_latencies(options.cycles))
     result = {
         "latency_median_us": round(taken[len(taken) // 2] * 1e6, 1),
         "latency_p99_us": round(taken[int(len(taken) * 0.99)] * 1e6, 1),

@@ -13,7 +13,7 @@ from itertools import product
 
 import numpy as np
 
-from benchmarks.inverse import gains
+from benchmarks.inverse import measure_gains
 from fdhil import config as configuration
 from fdhil.program import Arc, Feed, Motion, interpret, plan
 from fdhil.program.motions import Corner
@@ -29,7 +29,7 @@ MODES = ("G61", "G64 P0.05", "G64")
 PROFILES = {"fir": 100_000, "trapezoidal": 100_000, "jerk_limited": 100_000, "linuxcnc": 10_000}  # motions of each
 
 
-def machine(profile: str, acceleration_mm_s2: float = ACCELERATION_MM_S2) -> configuration.MachineConfig:
+def make_machine(profile: str, acceleration_mm_s2: float = ACCELERATION_MM_S2) -> configuration.MachineConfig:
     """The bench with another profile and acceleration of the NC."""
     document = bench_document()
     for axis in document["axis"].values():
@@ -38,7 +38,7 @@ def machine(profile: str, acceleration_mm_s2: float = ACCELERATION_MM_S2) -> con
     return configuration.parse_config(document)
 
 
-def chords(count: int) -> Iterator[Motion]:
+def make_chords(count: int) -> Iterator[Motion]:
     """A wavy line in chords of 0.2 mm and an arc now and then."""
     for number in range(1, count + 1):
         end = (0.2 * number, 5.0 * math.sin(0.02 * number), 0.0)
@@ -50,17 +50,17 @@ def chords(count: int) -> Iterator[Motion]:
             yield Arc(number, end, centre, 1, "XY", 6000.0, Corner("blend", 0.01))
 
 
-def speeds() -> None:
+def measure_speeds() -> None:
     """Motions and seconds of path per second."""
     for profile, moves in PROFILES.items():
         begun, rows = time.process_time(), 0
-        for block in stream(chords(moves), machine(profile), 1000):
+        for block in stream(make_chords(moves), make_machine(profile), 1000):
             rows += block.time_s.size
         took = time.process_time() - begun
         print(f"{profile}: {moves / took:.0f} motions/s, {rows * 0.001 / took:.0f} x real time on one core")
 
 
-def beside_linuxcnc(nc: DemandRecorder) -> None:
+def compare_with_linuxcnc(nc: DemandRecorder) -> None:
     """Difference of time, and the largest distance at the same millisecond, of two profiles beside LinuxCNC."""
     print("path, mode, feed: rows of LinuxCNC; difference of time, largest distance at the same millisecond")
     for path in BESIDE:
@@ -75,12 +75,12 @@ def beside_linuxcnc(nc: DemandRecorder) -> None:
             print(f"{path}, {mode}, {feed / 1000:g} m/min: {len(b)}; {'; '.join(told)}")
 
 
-def jerky(nc: DemandRecorder | None) -> Iterator[tuple[str, Float]]:
+def make_jerky_demands(nc: DemandRecorder | None) -> Iterator[tuple[str, Float]]:
     """Demands of the bench path with steps of acceleration of 2 m/s2, by name."""
     for feed in (10_000.0, 20_000.0):
         for mode in MODES:
             text = BENCH.format(mode=mode, feed=feed)
-            reference = plan(interpret(text.splitlines()), machine("trapezoidal"))
+            reference = plan(interpret(text.splitlines()), make_machine("trapezoidal"))
             name = f"{mode}, {feed / 1000:g} m/min"
             yield f"trapezoidal, {name}", np.column_stack(list(reference.position_mm.values()))
             if nc is not None:
@@ -88,13 +88,13 @@ def jerky(nc: DemandRecorder | None) -> Iterator[tuple[str, Float]]:
                 yield f"LinuxCNC, {name}", np.concatenate([rows, np.repeat(rows[-1:], 500, axis=0)])
 
 
-def corrections(nc: DemandRecorder | None) -> None:
+def measure_gains(nc: DemandRecorder | None) -> None:
     """Gains of the inverse correction on jerky demands as the drives get them, rounded to increments."""
     print("least gain over uncorrected (wanted: 14) and over mirror (2) on 40 scattered plants; RMS on the nominal one")
     per_mm = next(iter(bench_config().axis.values())).scaling.increments_per_mm
-    for name, rows in jerky(nc):
+    for name, rows in make_jerky_demands(nc):
         rounded = np.round(rows * per_mm) / per_mm
-        found, (before, after) = gains(rounded)
+        found, (before, after) = measure_gains(rounded)
         least = found.min(axis=0)
         print(
             f"{name}: {least[0]:.0f}, over mirror {least[1]:.1f}, point worse by {found[:, 2].max():.2f} um; "
@@ -104,14 +104,14 @@ def corrections(nc: DemandRecorder | None) -> None:
 
 def main() -> None:
     """Print the figures."""
-    speeds()
+    measure_speeds()
     if shutil.which("linuxcnc") is None:
         print("LinuxCNC is not installed: apt-get install linuxcnc-uspace")
-        corrections(None)
+        measure_gains(None)
         return
     with DemandRecorder(acceleration_mm_s2=ACCELERATION_MM_S2) as nc:
-        beside_linuxcnc(nc)
-        corrections(nc)
+        compare_with_linuxcnc(nc)
+        measure_gains(nc)
 
 
 if __name__ == "__main__":

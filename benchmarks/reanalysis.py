@@ -34,10 +34,12 @@ def main() -> None:
 
 def _recordings(folder: Path, files: int) -> list[Path]:
     folder.mkdir()
-    signals = bench.run(bench.Plant(), bench.shuttle(distance=DISTANCE_M, moves=WINDOWS // files))
+    signals = bench.simulate_bench(
+        bench.Plant(), bench.make_shuttle_demand(distance=DISTANCE_M, moves=WINDOWS // files)
+    )
     paths = [folder / f"{k:04d}.csv" for k in range(files)]
     for seed, path in enumerate(paths):
-        path.write_text(bench.as_csv(signals, NOISE, seed))
+        path.write_text(bench.format_as_csv(signals, NOISE, seed))
     return paths
 
 

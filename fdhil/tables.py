@@ -14,9 +14,9 @@ ESTIMATORS: Mapping[str, str] = {
 }
 DEFAULT_ESTIMATOR = "maximum_likelihood"
 CORRECTIONS: Mapping[str, str] = {
-    "mirror": "fdhil.correction.mirror:plan",
-    "flatness": "fdhil.correction.flatness_feedforward:plan",
-    "inverse": "fdhil.correction.inverse:plan",
+    "mirror": "fdhil.correction.mirror:plan_mirror_offsets",
+    "flatness": "fdhil.correction.flatness_feedforward:plan_feedforward",
+    "inverse": "fdhil.correction.inverse:plan_inverse_offsets",
 }
 DEFAULT_CORRECTION = "inverse"
 REGULATORS: Mapping[str, str] = {

@@ -135,7 +135,7 @@ def _run_plain(p: Array, pitch: float, r: Array, load: Array, every: int) -> tup
 _run: Callable[..., tuple[Array, ...]] = njit(cache=True, nogil=True)(_run_plain)
 
 
-def shuttle(
+def make_shuttle_demand(
     distance: float = 0.4,
     speed: float = 0.5,
     acceleration: float = 4.0,
@@ -159,7 +159,7 @@ def shuttle(
     return np.concatenate([[0.0], np.cumsum(rates) * dt])
 
 
-def run(
+def simulate_bench(
     plant: Plant,
     demand: Array,
     pitch: float = 0.02,
@@ -181,7 +181,7 @@ def run(
     return Signals(dt_s, mean_u, now_u, current, speed, position, wanted, load)
 
 
-def as_csv(signals: Signals, noise: float = 0.005, seed: int = 0, **headers: str) -> str:
+def format_as_csv(signals: Signals, noise: float = 0.005, seed: int = 0, **headers: str) -> str:
     """Return the run as a recording's text with white noise of ``noise`` on 60 V, 50 A, 150 rad/s; 1 um positions."""
     rng = np.random.default_rng(seed)
     n = signals.speed.size
@@ -192,10 +192,10 @@ def as_csv(signals: Signals, noise: float = 0.005, seed: int = 0, **headers: str
         "position_m": signals.position,
         "demand_m": signals.demand,
     }
-    return table_text(signals.dt_s, columns, **headers)
+    return format_table(signals.dt_s, columns, **headers)
 
 
-def table_text(dt_s: float, columns: dict[str, Array], **headers: str) -> str:
+def format_table(dt_s: float, columns: dict[str, Array], **headers: str) -> str:
     """Return a recording's text from its columns; ``headers`` replace the usual ones."""
     known = {
         "format": "fdhil-recording-1",

@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from studies import pages
-from studies.crash_page import goals, page
+from studies.crash_page import evaluate_goals, page
 from tests.crash import clocks as wrong_clocks
 from tests.crash import disks as small_disks
 from tests.crash.loops import KINDS, tried
 from tests.crash.stored_records import KEEPERS
 from tests.integration import power_cuts
 
-__all__ = ["goals", "main", "page"]
+__all__ = ["evaluate_goals", "main", "page"]
 
 MOST_TOLD = 20
 FREE_BYTES = (1, 100, 1000, 5000, *range(0, 96 << 10, 4096))
@@ -32,21 +32,21 @@ Figures = Mapping[str, Any]
 Found = Iterator[tuple[str, dict[str, Any]]]
 
 
-def calls(options: argparse.Namespace, folder: Path) -> Found:
+def fail_calls(options: argparse.Namespace, folder: Path) -> Found:
     """Have each call fail in each way, kind by kind."""
     for name in options.kinds or KINDS:
         found = tried(name, folder / name, options.each)
         yield name, vars(found) | {"wrong": found.wrong[:MOST_TOLD], "wrongs": len(found.wrong)}
 
 
-def cuts(options: argparse.Namespace, folder: Path) -> Found:
+def cut_power(options: argparse.Namespace, folder: Path) -> Found:
     """Cut the power of a machine."""
     power_cuts.prepare()
     found = vars(power_cuts.cut_power(options.cuts, folder, seed=options.seed, pictures=options.pictures))
     yield f"seed {options.seed}", found | {"lost": found["lost"][:MOST_TOLD], "losts": len(found["lost"])}
 
 
-def disks(options: argparse.Namespace, folder: Path) -> Found:
+def fill_disks(options: argparse.Namespace, folder: Path) -> Found:
     """Keep records on disks with little room, and on one that is read-only."""
     for name in options.kinds or KEEPERS:
         make, wrong, kept, refused = KEEPERS[name], list[str](), 0, 0
@@ -60,7 +60,7 @@ def disks(options: argparse.Namespace, folder: Path) -> Found:
         yield name, {"disks": len(FREE_BYTES) + 1, "acknowledged": kept, "refused": refused, "wrong": wrong[:MOST_TOLD]}
 
 
-def clocks(options: argparse.Namespace, folder: Path) -> Found:
+def shift_clocks(options: argparse.Namespace, folder: Path) -> Found:
     """Have the guard ramp down while its clock is wrong, or is set."""
     del options
     usual = wrong_clocks.ramp(folder / "usual", wrong_clocks.NEVER_SET)
@@ -71,24 +71,24 @@ def clocks(options: argparse.Namespace, folder: Path) -> Found:
 
 
 PARTS: Mapping[str, Callable[[argparse.Namespace, Path], Found]] = {
-    "calls": calls,
-    "cuts": cuts,
-    "disks": disks,
-    "clocks": clocks,
+    "calls": fail_calls,
+    "cuts": cut_power,
+    "disks": fill_disks,
+    "clocks": shift_clocks,
 }
 
 
-def measured(options: argparse.Namespace) -> dict[str, Any]:
+def measure_parts(options: argparse.Namespace) -> dict[str, Any]:
     """Measure the requested parts; the others stay as they are in the file."""
     path = options.out / "crash.json"
     parts = json.loads(path.read_text("utf-8"))["figures"]["parts"] if path.exists() else {}
     for part in options.parts:
-        run = pages.provenance("")
+        run = pages.describe_provenance("")
         with tempfile.TemporaryDirectory(prefix="crash-") as folder:
             for name, found in PARTS[part](options, Path(folder)):
-                print(f"{part}, {name}: {pages.listed([f'{k} {v}' for k, v in found.items()])[:300]}", flush=True)
+                print(f"{part}, {name}: {pages.join_words([f'{k} {v}' for k, v in found.items()])[:300]}", flush=True)
                 parts.setdefault(part, {})[name] = found | {"date": run["date"], "commit": run["commit"]}
-    return {"parts": parts, "goals": goals(parts)}
+    return {"parts": parts, "goals": evaluate_goals(parts)}
 
 
 def main() -> None:
@@ -100,7 +100,7 @@ def main() -> None:
     parser.add_argument("--cuts", type=int, default=20)
     parser.add_argument("--pictures", type=int, default=15, help="of the disk, before each cut")
     parser.add_argument("--seed", type=int, default=1, help="of the power cuts")
-    found = pages.conduct("crash", parser, lambda options: str(options.seed), measured)
+    found = pages.run_study("crash", parser, lambda options: str(options.seed), measure_parts)
     sys.exit(not all(goal["met"] for goal in found["goals"].values()))
 
 

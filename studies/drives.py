@@ -130,7 +130,7 @@ def draw_move(rng: Rng) -> Move:
     return Move(distance, speed, acceleration, smoothing, int(rng.choice([1, -1])))
 
 
-def rates(move: Move, rate_of: Callable[[Array], Array] | None = None) -> Array:
+def compute_path_speeds(move: Move, rate_of: Callable[[Array], Array] | None = None) -> Array:
     """Return the path speed (m/s, 1 ms rows) of a move, smoothed twice; ``rate_of`` maps time to the override."""
     ramp = min(move.speed / move.acceleration, math.sqrt(move.distance / move.acceleration))
     top = ramp * move.acceleration
@@ -143,10 +143,12 @@ def rates(move: Move, rate_of: Callable[[Array], Array] | None = None) -> Array:
         shape = np.clip(np.minimum(path, duration - path) * move.acceleration, 0, top) * rate
     else:
         shape = np.clip(np.minimum(t, duration - t) * move.acceleration, 0, top)
-    return smoothed(np.concatenate([shape, np.zeros(round(2.5 * move.smoothing / CYCLE_S))]), move.smoothing)
+    return smooth_moving_average(
+        np.concatenate([shape, np.zeros(round(2.5 * move.smoothing / CYCLE_S))]), move.smoothing
+    )
 
 
-def smoothed(shape: Array, seconds: float) -> Array:
+def smooth_moving_average(shape: Array, seconds: float) -> Array:
     """Return ``shape`` after two causal moving averages, of ``seconds`` and half of that (an NC's jerk limit)."""
     for part in (seconds, seconds / 2):
         width = max(1, round(part / CYCLE_S))
@@ -159,7 +161,7 @@ def demand_of(parts: list[Array]) -> Array:
     return np.concatenate([[0.0], np.cumsum(np.concatenate(parts)) * CYCLE_S])
 
 
-def rest(seconds: float) -> Array:
+def make_standstill(seconds: float) -> Array:
     """Return path speeds of standstill."""
     return np.zeros(round(seconds / CYCLE_S))
 
@@ -258,7 +260,7 @@ def _run_plain(p: Array, r: Array, load: Array, every: int) -> tuple[Array, ...]
 _run: Callable[..., tuple[Array, ...]] = njit(cache=True, nogil=True)(_run_plain)
 
 
-def run(drive: Drive, demand: Array, dt_s: float, load: Array | None = None) -> Signals:
+def simulate_loop(drive: Drive, demand: Array, dt_s: float, load: Array | None = None) -> Signals:
     """Simulate the closed loop; rows every ``dt_s`` (a multiple of 31.25 us); ``load`` (n,) N.m per 1 ms cycle."""
     torque = np.zeros(demand.size) if load is None else load
     mean_u, now_u, current, speed, position = _run(drive.vector(), demand, torque, round(dt_s / STEP_S))
@@ -266,6 +268,6 @@ def run(drive: Drive, demand: Array, dt_s: float, load: Array | None = None) -> 
     return Signals(dt_s, mean_u, now_u, current, speed, position, wanted)
 
 
-def turned(move: Move) -> Move:
+def reverse_move(move: Move) -> Move:
     """Return the way back."""
     return replace(move, direction=-move.direction)

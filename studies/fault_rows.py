@@ -38,41 +38,41 @@ class Row:
     process: bool = True
 
 
-def _rewritten(cob_id: int, change: Callable[[bytes], bytes]) -> Callable[[Rng], Tamper]:
+def _rewrite_frames(cob_id: int, change: Callable[[bytes], bytes]) -> Callable[[Rng], Tamper]:
     def tamper(_k: int, frame: Frame) -> list[Frame]:
         return [(cob_id, change(frame[1]))] if frame[0] == cob_id else [frame]
 
     return lambda _rng: tamper
 
 
-def _statusword(word: int) -> Callable[[Rng], Tamper]:
-    return _rewritten(0x281, lambda data: struct.pack("<H", word) + data[2:])
+def _change_statusword(word: int) -> Callable[[Rng], Tamper]:
+    return _rewrite_frames(0x281, lambda data: struct.pack("<H", word) + data[2:])
 
 
-def _moved(by: int) -> Callable[[Rng], Tamper]:
+def _move_targets(by: int) -> Callable[[Rng], Tamper]:
     """The NC's targets for X are those of another path."""
-    return _rewritten(0x201, lambda data: data[:2] + _plus(data[2:], by))
+    return _rewrite_frames(0x201, lambda data: data[:2] + _add_offset(data[2:], by))
 
 
-def _plus(number: bytes, by: int) -> bytes:
+def _add_offset(number: bytes, by: int) -> bytes:
     return (int.from_bytes(number, "little", signed=True) + by).to_bytes(4, "little", signed=True)
 
 
-def _dropped(*cob_ids: int) -> Callable[[Rng], Tamper]:
+def _drop_frames(*cob_ids: int) -> Callable[[Rng], Tamper]:
     return lambda _rng: lambda _k, frame: [] if frame[0] in cob_ids else [frame]
 
 
-def _second_sync(rng: Rng) -> Tamper:
+def _send_second_sync(rng: Rng) -> Tamper:
     jump = int(rng.integers(4, 230))
     return lambda _k, frame: [(0x080, bytes([(frame[1][0] + jump - 1) % 240 + 1]))] if frame[0] == 0x080 else [frame]
 
 
-def _second_producer(rng: Rng) -> Tamper:
+def _start_second_producer(rng: Rng) -> Tamper:
     other = struct.pack("<Hhh", 0x1237, int(rng.integers(100, 200)), 7)
     return lambda _k, frame: [frame, (0x281, other)] if frame[0] == 0x281 else [frame]
 
 
-def _overridden(rng: Rng) -> Tamper:
+def _override_targets(rng: Rng) -> Tamper:
     """The targets go along the path at another rate: between those that were due since then."""
     rate, passed = float(rng.uniform(0.5, 0.9)), {0x201: list[int](), 0x202: list[int]()}
 
@@ -90,15 +90,15 @@ def _overridden(rng: Rng) -> Tamper:
     return tamper
 
 
-def _emergency(rng: Rng) -> list[Frame]:
+def _send_emergency(rng: Rng) -> list[Frame]:
     return [(0x081, struct.pack("<HB5x", 0x8130, 0x11)[: int(rng.integers(0, 9))])]
 
 
-def _flood(_rng: Rng) -> list[Frame]:
+def _flood_bus(_rng: Rng) -> list[Frame]:
     return [(0x081, struct.pack("<HBI", 0x7500, 0x11, k)) for k in range(2000)]
 
 
-def _hijack(rng: Rng) -> list[Frame]:
+def _write_foreign_offset(rng: Rng) -> list[Frame]:
     return [(HIJACK, int(rng.integers(-819, 820)).to_bytes(4, "little", signed=True))]
 
 
@@ -108,26 +108,26 @@ RAMPED: Mapping[str, Row] = {
     "A6": Row("RxOverflow", 1, process=False),
     "A7": Row("SyncLost", 1, process=False),
     "A8": Row("SyncJitter", 30, process=False),
-    "A9": Row("SyncCollision", 1, tamper=_second_sync),
-    "A10": Row("StaleData", 5, tamper=_dropped(0x181, 0x281, 0x381, 0x481)),
-    "A14": Row("Implausible", 4, tamper=_rewritten(0x181, lambda data: data[:4] + _plus(data[4:], 1 << 28))),
-    "A15": Row("PdoLength", 5, tamper=_rewritten(0x181, lambda data: data[:3])),
-    "A18": Row("ForeignProducer", 5, tamper=_second_producer),
-    "A19": Row("OffsetHijack", 61, insert=_hijack),
-    "A20": Row("DriveEmergency", 2, insert=_emergency),
-    "A21": Row("DriveEmergency", 2, insert=_flood),
-    "A22": Row("HeartbeatLost", 102, tamper=_dropped(0x701), process=False),
+    "A9": Row("SyncCollision", 1, tamper=_send_second_sync),
+    "A10": Row("StaleData", 5, tamper=_drop_frames(0x181, 0x281, 0x381, 0x481)),
+    "A14": Row("Implausible", 4, tamper=_rewrite_frames(0x181, lambda data: data[:4] + _add_offset(data[4:], 1 << 28))),
+    "A15": Row("PdoLength", 5, tamper=_rewrite_frames(0x181, lambda data: data[:3])),
+    "A18": Row("ForeignProducer", 5, tamper=_start_second_producer),
+    "A19": Row("OffsetHijack", 61, insert=_write_foreign_offset),
+    "A20": Row("DriveEmergency", 2, insert=_send_emergency),
+    "A21": Row("DriveEmergency", 2, insert=_flood_bus),
+    "A22": Row("HeartbeatLost", 102, tamper=_drop_frames(0x701), process=False),
     "E1": Row("OffsetLimit", 2, process=False),
     "E2": Row("OffsetRate", 2, process=False),
     "E4": Row("ModelStale", 2, order="model_fresh"),
     "E5": Row("ProgramMismatch", 1, process=False),
-    "E6": Row("Misaligned", 13, tamper=_moved(1500)),
-    "E9": Row("NotCsp", 12, tamper=_rewritten(0x481, lambda data: data[:4] + b"\x01" + data[5:])),
-    "E10": Row("DriveNotEnabled", 2, tamper=_statusword(0x0250)),
-    "E11": Row("LimitActive", 2, tamper=_statusword(0x1A37)),
-    "E12": Row("FollowingError", 2, tamper=_statusword(0x3237)),
-    "E15": Row("EchoMismatch", 22, tamper=_rewritten(0x381, lambda data: data[:4] + _plus(data[4:], 60))),
-    "E17": Row("OverrideChanged", 33, tamper=_overridden),
+    "E6": Row("Misaligned", 13, tamper=_move_targets(1500)),
+    "E9": Row("NotCsp", 12, tamper=_rewrite_frames(0x481, lambda data: data[:4] + b"\x01" + data[5:])),
+    "E10": Row("DriveNotEnabled", 2, tamper=_change_statusword(0x0250)),
+    "E11": Row("LimitActive", 2, tamper=_change_statusword(0x1A37)),
+    "E12": Row("FollowingError", 2, tamper=_change_statusword(0x3237)),
+    "E15": Row("EchoMismatch", 22, tamper=_rewrite_frames(0x381, lambda data: data[:4] + _add_offset(data[4:], 60))),
+    "E17": Row("OverrideChanged", 33, tamper=_override_targets),
     "E18": Row("Disarmed", 2, order="disarm"),
     "E19": Row("PoorSkill", 2, order="skill_enough"),
     "F3": Row("ReadOnlyStore", 2, order="journal_writable"),
@@ -152,7 +152,9 @@ class Descent(NamedTuple):
     within: bool
 
 
-def descent(series: Sequence[tuple[int, ...]], rate: int, limits: OffsetLimits, detected: int) -> Descent | None:
+def assess_ramp_down(
+    series: Sequence[tuple[int, ...]], rate: int, limits: OffsetLimits, detected: int
+) -> Descent | None:
     """Judge the offsets from the last before the fault on; None while they are not at zero to stay.
 
     ``rate`` is the largest first difference before the fault: what moved outward must be braked before it can shrink.

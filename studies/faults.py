@@ -11,23 +11,23 @@ from dataclasses import dataclass
 from studies import machine_faults, signal_faults
 from studies.drives import Rng
 from studies.machine_faults import of_demand, of_machine
-from studies.scenes import Spoilt, good
+from studies.scenes import FaultyRecording, make_good_recording
 from studies.signal_faults import of_signals
 
-__all__ = ["BETWEEN", "KINDS", "Kind", "Spoilt", "good"]
+__all__ = ["BETWEEN", "KINDS", "FaultyRecording", "Kind", "make_good_recording"]
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
     """A kind of fault: how a bad recording is made, the codes that name it rightly, the severity's unit."""
 
-    make: Callable[[Rng], Spoilt]
+    make: Callable[[Rng], FaultyRecording]
     named: frozenset[str]
     unit: str
     matrix: str
 
 
-def _kind(make: Callable[[Rng], Spoilt], named: str, unit: str, matrix: str) -> Kind:
+def _kind(make: Callable[[Rng], FaultyRecording], named: str, unit: str, matrix: str) -> Kind:
     return Kind(make, frozenset(named.split()), unit, matrix)
 
 

@@ -25,7 +25,14 @@ from fdhil.store.outbox import OutboxReader
 from studies import fleet_day, pages
 from studies.fleet_cut import Network
 from studies.fleet_page import page as page
-from studies.fleet_parts import Process, counted, of_database, parts_of, processor_s, wait_for
+from studies.fleet_parts import (
+    Process,
+    count_records,
+    list_killable_parts,
+    measure_database_s,
+    measure_processor_s,
+    wait_for,
+)
 from tests.fleet.servers import NatsServer, Postgres, run_nats, run_postgres
 
 GROUPS, COLLECTORS = 4, 2
@@ -41,7 +48,9 @@ SELECT sum(pg_relation_size(inhrelid)), sum(pg_indexes_size(inhrelid)), sum(pg_t
 
 
 @contextmanager
-def gathered(folder: Path, machines: Sequence[MachineConfig], server: NatsServer, database: Postgres) -> Iterator[Any]:
+def run_collectors(
+    folder: Path, machines: Sequence[MachineConfig], server: NatsServer, database: Postgres
+) -> Iterator[Any]:
     """Run uplinks and collectors; yields them."""
     works = folder / "fleet.toml"
     works.write_text(
@@ -59,20 +68,20 @@ def gathered(folder: Path, machines: Sequence[MachineConfig], server: NatsServer
             process.kill()
 
 
-def killed(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
+def measure_with_kills(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Send all that the machines have recorded while what is between is killed at random."""
     chance = random.Random(options.seed)
     with run_postgres() as database, run_nats(folder) as server:
-        days = [fleet_day.machine(folder / f"day-{k}", f"day-{k}", server.url) for k in range(fleet_day.DAYS)]
+        days = [fleet_day.make_machine(folder / f"day-{k}", f"day-{k}", server.url) for k in range(fleet_day.DAYS)]
         for k, day in enumerate(days):
-            fleet_day.record(day, options.records, seed=options.seed + k)
-        machines = fleet_day.copied(days, folder, options.machines, server.url)
+            fleet_day.record_day(day, options.records, seed=options.seed + k)
+        machines = fleet_day.copy_machines(days, folder, options.machines, server.url)
         total = options.machines * options.records
         kills: dict[str, int] = {}
         begin_s = time.monotonic()
-        with gathered(folder, machines, server, database) as (uplinks, collectors):
-            parts = parts_of(uplinks, collectors, server, database)
-            while counted(database) < total:
+        with run_collectors(folder, machines, server, database) as (uplinks, collectors):
+            parts = list_killable_parts(uplinks, collectors, server, database)
+            while count_records(database) < total:
                 victims = chance.sample(sorted(parts), chance.choice((1, 1, 2)))
                 for name in victims:
                     parts[name][0]()
@@ -80,27 +89,29 @@ def killed(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
                 time.sleep(chance.uniform(0, 2))
                 for name in victims:
                     parts[name][1]()
-                _rest(chance.uniform(2, options.rest_s), lambda: counted(database) >= total)
-                print(f"{counted(database)} of {total} after {sum(kills.values())} kills", flush=True)
+                _wait_for_rest(chance.uniform(2, options.rest_s), lambda: count_records(database) >= total)
+                print(f"{count_records(database)} of {total} after {sum(kills.values())} kills", flush=True)
         took_s = time.monotonic() - begin_s
-        found = checked(database, machines, days) | sizes(days[0], database, total)
+        found = check_records(database, machines, days) | measure_record_sizes(days[0], database, total)
     return found | {"machines": options.machines, "records": total, "kills": kills, "took_s": took_s}
 
 
-def _rest(pause_s: float, over: Any) -> None:
+def _wait_for_rest(pause_s: float, over: Any) -> None:
     end_s = time.monotonic() + pause_s
     while time.monotonic() < end_s and not over():
         time.sleep(0.5)
 
 
-def checked(database: Postgres, machines: Sequence[MachineConfig], days: Sequence[MachineConfig]) -> dict[str, int]:
+def check_records(
+    database: Postgres, machines: Sequence[MachineConfig], days: Sequence[MachineConfig]
+) -> dict[str, int]:
     """Compare each record in the database with those that the machines should have sent."""
     with psycopg.connect(database.connection, autocommit=True) as db:
         db.execute("CREATE TEMP TABLE told (day int, sequence bigint, message text)")
         db.execute("CREATE TEMP TABLE recorded (machine text, day int)")
         with db.cursor() as cursor, cursor.copy("COPY told FROM STDIN") as rows:
             for k, day in enumerate(days):
-                for number, message in fleet_day.told(day):
+                for number, message in fleet_day.list_expected_records(day):
                     rows.write_row((k, number, message))
         names = [(config.machine.name, k % len(days)) for k, config in enumerate(machines)]
         db.cursor().executemany("INSERT INTO recorded VALUES (%s, %s)", names)
@@ -120,7 +131,7 @@ def checked(database: Postgres, machines: Sequence[MachineConfig], days: Sequenc
         }
 
 
-def sizes(day: MachineConfig, database: Postgres, total: int) -> dict[str, Any]:
+def measure_record_sizes(day: MachineConfig, database: Postgres, total: int) -> dict[str, Any]:
     """Return what a record takes at each place."""
     with OutboxReader(day.store.directory) as reader:
         entries = reader.entries(0, 100_000)
@@ -140,22 +151,22 @@ def sizes(day: MachineConfig, database: Postgres, total: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def calm(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
+def measure_undisturbed(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Send recorded days with nothing killed; return rates, and the processor's time of each part for a record."""
     with run_postgres() as database, run_nats(folder) as server:
-        day = fleet_day.machine(folder / "day", "day", server.url)
-        fleet_day.record(day, options.calm_records)
-        machines = fleet_day.copied([day], folder, options.calm_machines, server.url)
+        day = fleet_day.make_machine(folder / "day", "day", server.url)
+        fleet_day.record_day(day, options.calm_records)
+        machines = fleet_day.copy_machines([day], folder, options.calm_machines, server.url)
         total = options.calm_machines * options.calm_records
-        with gathered(folder, machines, server, database) as (uplinks, collectors):
-            wait_for(lambda: counted(database) > 0, "some of it is there")
-            begun = counted(database)
-            took_s = wait_for(lambda: counted(database) >= total, "all are there")
+        with run_collectors(folder, machines, server, database) as (uplinks, collectors):
+            wait_for(lambda: count_records(database) > 0, "some of it is there")
+            begun = count_records(database)
+            took_s = wait_for(lambda: count_records(database) >= total, "all are there")
             spent = {
                 "uplinks": sum(each.processor_s for each in uplinks),
                 "collectors": sum(each.processor_s for each in collectors),
-                "nats-server": processor_s(server._process.pid) if server._process else 0.0,
-                "PostgreSQL": of_database(database),
+                "nats-server": measure_processor_s(server._process.pid) if server._process else 0.0,
+                "PostgreSQL": measure_database_s(database),
             }
     return {
         "machines": options.calm_machines, "records": total, "records_a_s": (total - begun) / took_s,
@@ -163,29 +174,31 @@ def calm(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def cut(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
+def measure_network_cut(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Cut the network while each machine records an hour of work; return how long it takes to catch up."""
     with run_postgres() as database, run_nats(folder) as server:
         network = Network(server.port)
         away = f"nats://127.0.0.1:{network.port}"
-        machines = [fleet_day.machine(folder / f"mill-{k}", f"mill-{k}", away) for k in range(options.cut_machines)]
+        machines = [
+            fleet_day.make_machine(folder / f"mill-{k}", f"mill-{k}", away) for k in range(options.cut_machines)
+        ]
         minute = 3 * 3 * fleet_day.A_DAY // (24 * MINUTES)  # records: three axes, of each rapid three
         for config in machines:
-            fleet_day.record(config, 100)
-        with gathered(folder, machines, server, database):
+            fleet_day.record_day(config, 100)
+        with run_collectors(folder, machines, server, database):
             before = 100 * len(machines)
-            wait_for(lambda: counted(database) == before, "the first are there")
+            wait_for(lambda: count_records(database) == before, "the first are there")
             network.cut = True
             begin_s = time.monotonic()
             for k in range(MINUTES):
                 for config in machines:
-                    fleet_day.record(config, minute, first=100 + minute * k)
+                    fleet_day.record_day(config, minute, first=100 + minute * k)
                 time.sleep(max(0.0, begin_s + options.cut_s * (k + 1) / MINUTES - time.monotonic()))
-            through = counted(database) - before
+            through = count_records(database) - before
             network.cut = False
             total = before + minute * MINUTES * len(machines)
-            first_s = wait_for(lambda: counted(database) > before, "the first come again")
-            all_s = first_s + wait_for(lambda: counted(database) >= total, "all are there")
+            first_s = wait_for(lambda: count_records(database) > before, "the first come again")
+            all_s = first_s + wait_for(lambda: count_records(database) >= total, "all are there")
         network.close()
         left_out = database.execute_query("SELECT sum(missing), sum(records) FROM fleet.machines")[0]
         order = database.execute_query(ORDER)[0][0]
@@ -195,16 +208,16 @@ def cut(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-PARTS = {"calm": calm, "cut": cut, "killed": killed}
+PARTS = {"calm": measure_undisturbed, "cut": measure_network_cut, "killed": measure_with_kills}
 
 
-def measured(options: argparse.Namespace) -> Mapping[str, Any]:
+def measure_parts(options: argparse.Namespace) -> Mapping[str, Any]:
     """Measure the requested parts; the others stay as they are in the file."""
     path = options.out / "fleet.json"
     found: dict[str, Any] = json.loads(path.read_text("utf-8"))["figures"] if path.exists() else {}
     for name in options.parts:
         with tempfile.TemporaryDirectory(prefix=f"fleet-{name}-") as folder:
-            run = pages.provenance("")
+            run = pages.describe_provenance("")
             found[name] = PARTS[name](options, Path(folder)) | {"date": run["date"], "commit": run["commit"]}
         print(f"{name}: {found[name]}", flush=True)
     return found
@@ -222,7 +235,7 @@ def main() -> None:
     parser.add_argument("--cut-machines", type=int, default=20)
     parser.add_argument("--cut-s", type=float, default=240.0, help="how long the network is away")
     parser.add_argument("--seed", type=int, default=1)
-    found = pages.conduct("fleet", parser, lambda options: str(options.seed), measured)
+    found = pages.run_study("fleet", parser, lambda options: str(options.seed), measure_parts)
     wrong = [found["killed"][name] for name in ("lost", "doubled", "out_of_order", "refused", "miscounted")]
     sys.exit(any(wrong) or bool(found["cut"]["lost"] or found["cut"]["out_of_order"]))
 

@@ -26,12 +26,12 @@ EACH_NOTICE = 10  # rapids of all axes to one notice
 MIDNIGHT_S = 1_800_000_000.0
 
 
-def machine(folder: Path, name: str, server: str) -> MachineConfig:
+def make_machine(folder: Path, name: str, server: str) -> MachineConfig:
     """Return a machine with [uplink] that has recorded nothing."""
     return machine_config.load_config(write_history(folder, name, server=server, windows="none", machine=name))
 
 
-def record(config: MachineConfig, records: int, first: int = 0, seed: int = 1) -> None:
+def record_day(config: MachineConfig, records: int, first: int = 0, seed: int = 1) -> None:
     """Let a machine record through its own store: of each rapid a window, a set and a prediction; at times a notice."""
     assert config.uplink is not None
     outbox = Outbox(config.uplink, config.uplink_directory)
@@ -54,9 +54,9 @@ def record(config: MachineConfig, records: int, first: int = 0, seed: int = 1) -
                 history.add_notice(Notice("Drift", "minor", "Friction rises; lubricate.", axis, rapid), stamp)
 
 
-def copied(days: Sequence[MachineConfig], folder: Path, machines: int, server: str) -> list[MachineConfig]:
+def copy_machines(days: Sequence[MachineConfig], folder: Path, machines: int, server: str) -> list[MachineConfig]:
     """Return machines that each have recorded one of ``days``, in a history of its own."""
-    made = [machine(folder / f"mill-{k:03d}", f"mill-{k:03d}", server) for k in range(machines)]
+    made = [make_machine(folder / f"mill-{k:03d}", f"mill-{k:03d}", server) for k in range(machines)]
     for k, config in enumerate(made):
         config.store.directory.mkdir(parents=True)
         file = config.store.directory / HISTORY_FILE
@@ -66,7 +66,7 @@ def copied(days: Sequence[MachineConfig], folder: Path, machines: int, server: s
     return made
 
 
-def told(config: MachineConfig) -> list[tuple[int, str]]:
+def list_expected_records(config: MachineConfig) -> list[tuple[int, str]]:
     """Return number and digest of each record that a machine should send."""
     with closing(sqlite3.connect(config.store.directory / HISTORY_FILE)) as db:
         return db.execute("SELECT id, message FROM outbox ORDER BY id").fetchall()

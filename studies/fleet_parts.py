@@ -44,21 +44,21 @@ class Process:
     @property
     def processor_s(self) -> float:
         """The processor's time that it has had since it was started."""
-        return processor_s(self._process.pid)
+        return measure_processor_s(self._process.pid)
 
 
-def processor_s(pid: int) -> float:
+def measure_processor_s(pid: int) -> float:
     """Return the processor's time that a process has had, and its children that have ended."""
     words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return sum(map(int, words[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
-def of_database(database: Postgres) -> float:
+def measure_database_s(database: Postgres) -> float:
     """Return the processor's time that PostgreSQL has had."""
     assert database._process is not None
     first = database._process.pid
     children = Path(f"/proc/{first}/task/{first}/children").read_text().split()
-    return sum(processor_s(pid) for pid in (first, *map(int, children)))
+    return sum(measure_processor_s(pid) for pid in (first, *map(int, children)))
 
 
 def kill_database(database: Postgres) -> None:
@@ -75,7 +75,7 @@ def kill_database(database: Postgres) -> None:
     database._process = None
 
 
-def parts_of(
+def list_killable_parts(
     uplinks: Sequence[Process], collectors: Sequence[Process], server: NatsServer, database: Postgres
 ) -> dict[str, Part]:
     """Return what can be killed."""
@@ -87,7 +87,7 @@ def parts_of(
     return parts
 
 
-def counted(database: Postgres) -> int:
+def count_records(database: Postgres) -> int:
     """Return how many records of machines the database has; 0 while it has no tables or does not answer."""
     try:
         return int(database.execute_query("SELECT coalesce(sum(records), 0) FROM fleet.heard")[0][0])

@@ -18,7 +18,7 @@ from fdhil.guard.frame_monitor import FrameMonitor
 from fdhil.guard.guard_protocol import Mode
 from fdhil.guard.guard_state import GuardRequest, StepInputs, StepOutput
 from fdhil.guard.interlocks import FACTS, Alarm
-from studies.fault_rows import HIJACK, RAMPED, Descent, Row, Tamper, descent
+from studies.fault_rows import HIJACK, RAMPED, Descent, Row, Tamper, assess_ramp_down
 from tests.guard import simulated_bus
 from tests.guard.frame_checks import Wire
 from tests.guard.simulated_bus import DIGEST, Bench
@@ -35,8 +35,8 @@ class LateListener(FrameMonitor):
 
     late_s = 0.0
 
-    def close_sync_cycle(self, data: bytes, stamp_s: float, now_s: float) -> tuple[Any, Any]:
-        return super().close_sync_cycle(data, stamp_s + self.late_s, now_s + self.late_s)
+    def receive_at_sync(self, data: bytes, stamp_s: float, now_s: float) -> tuple[Any, Any]:
+        return super().receive_at_sync(data, stamp_s + self.late_s, now_s + self.late_s)
 
 
 class Cut(Bench):
@@ -46,7 +46,7 @@ class Cut(Bench):
     changed_at = 0
     withdrawn: tuple[Alarm, ...] = ()
 
-    def begin(self) -> None:
+    def start_checks(self) -> None:
         """Judge from here on, with ears that can be late."""
         self.listener = LateListener(self.settings)
         self.wires = [Wire(axis.limits, 0) for axis in self.settings.axes]
@@ -60,7 +60,7 @@ class Cut(Bench):
         for frame in frames:
             super().receive_frames(*frame)
 
-    def step(self, inputs: StepInputs) -> StepOutput:
+    def decide_and_check(self, inputs: StepInputs) -> StepOutput:
         """Decide, and check the frames sent."""
         if inputs.unsent and self.outputs and self.outputs[-1].offsets is not None:
             for k in inputs.unsent:
@@ -68,7 +68,7 @@ class Cut(Bench):
             held = [self.series[-2 if k in inputs.unsent else -1][k] for k in range(len(self.wires))]
             self.series[-1] = tuple(held)
         held = [drive.offset for drive in self.drives]
-        output = super().step(inputs._replace(withdrawn=self.withdrawn))
+        output = super().decide_and_check(inputs._replace(withdrawn=self.withdrawn))
         for k, wire in enumerate(self.wires):
             if output.offsets is None:
                 wire.nothing()
@@ -77,7 +77,7 @@ class Cut(Bench):
         self.series.append(self.series[-1] if output.offsets is None else output.offsets)
         return output
 
-    def branch(self) -> Cut:
+    def copy_state(self) -> Cut:
         """Return a machine of one's own in this state; what cannot change is shared, what was is forgotten."""
         self.outputs, self.frames, self.held = self.outputs[-1:], self.frames[-1:], []
         self.series, self.heartbeats = self.series[-2:], []
@@ -91,12 +91,12 @@ class Cut(Bench):
         return super().run_sync(request, **how)
 
 
-def cutting(rng: np.random.Generator, clock: str) -> Cut:
+def start_cut(rng: np.random.Generator, clock: str) -> Cut:
     """A machine with a random program in which offsets are applied."""
     made = simulated_bus.bench(amplitude=int(rng.integers(100, 800)), **CLOCKS.get(clock, {}))
     axes = tuple(replace(axis, **MOTOR) for axis in made.settings.axes)
     cut = Cut(replace(made.settings, axes=axes), made.path, made.demand, made.drives)
-    cut.begin()
+    cut.start_checks()
     cut.settle()
     if refused := cut.arm():
         raise RuntimeError(f"cannot be armed: {refused}")
@@ -106,7 +106,7 @@ def cutting(rng: np.random.Generator, clock: str) -> Cut:
     return cut
 
 
-def faulty(cut: Cut, row: str, rng: np.random.Generator) -> Descent | None:
+def inject_fault(cut: Cut, row: str, rng: np.random.Generator) -> Descent | None:
     """Have a fault of this row, until zero; None when it was not reached."""
     of, k = RAMPED[row], 0
     first = len(cut.series) - 1
@@ -114,17 +114,17 @@ def faulty(cut: Cut, row: str, rng: np.random.Generator) -> Descent | None:
     cut.alarms.clear()
     _begin(cut, row, of, rng)
     if row == "F20":
-        _land(cut)
+        _ramp_down(cut)
     while row != "F20" and k < LIMIT and (cut.mode is not Mode.OFF or any(cut.series[-1])):
         k += 1
-        _one_sync(cut, row, k)
+        _run_one_sync(cut, row, k)
         if cut.mode is Mode.FROZEN:
             break
     codes = {alarm.code for alarm in cut.alarms}
     if of.code not in codes and row != "F20":
         cut.wrong.append(f"{row} was told as {sorted(codes)}")
     limits = cut.settings.axes[0].limits
-    return descent(cut.series[first:], rate, limits, of.detected)
+    return assess_ramp_down(cut.series[first:], rate, limits, of.detected)
 
 
 def _begin(cut: Cut, row: str, of: Row, rng: np.random.Generator) -> None:
@@ -142,7 +142,7 @@ def _begin(cut: Cut, row: str, of: Row, rng: np.random.Generator) -> None:
     if of.order in FACTS:
         cut.withdrawn = (Alarm(of.code),)
     if row in ("E1", "E2"):
-        _spoil(cut, 5000 if row == "E1" else 100)
+        _corrupt_offsets(cut, 5000 if row == "E1" else 100)
     assert cut.path is not None
     match row:
         case "A2":
@@ -182,25 +182,25 @@ class EverySync:
         self._far.close()
 
 
-def _land(cut: Cut) -> None:
+def _ramp_down(cut: Cut) -> None:
     """What the guard's supervisor does when the loop itself has failed."""
     bus = EverySync()
     ramp_to_zero(cut.state, (), cut.settings, cast(CanSocket, bus), SYSTEM)
     bus.close()
     values = [int.from_bytes(data, "little", signed=True) for _, data in bus.sent]
-    for offsets in batched(values, len(cut.wires)):
+    for offsets in batch_values(values, len(cut.wires)):
         for wire, offset, before in zip(cut.wires, offsets, cut.series[-1], strict=True):
             if (wrong := wire.ours(offset, before)) is not None:
                 cut.wrong.append(wrong)
         cut.series.append(offsets)
 
 
-def batched(values: Sequence[int], size: int) -> list[tuple[int, ...]]:
+def batch_values(values: Sequence[int], size: int) -> list[tuple[int, ...]]:
     """Return values in groups of ``size``."""
     return [tuple(values[k : k + size]) for k in range(0, len(values), size)]
 
 
-def _spoil(cut: Cut, by: int) -> None:
+def _corrupt_offsets(cut: Cut, by: int) -> None:
     """From the next row on the table asks for a step of this size, where there is room away from zero."""
     assert cut.path is not None
     row = cut.state.places[0].row + 1
@@ -212,7 +212,7 @@ def _spoil(cut: Cut, by: int) -> None:
     cut.path = CorrectedPath(0, cut.path.demand, tuple(columns), True, DIGEST, 1)
 
 
-def _one_sync(cut: Cut, row: str, k: int) -> None:
+def _run_one_sync(cut: Cut, row: str, k: int) -> None:
     match row:
         case "A7":
             cut.silence() if k < 100 else cut.run_sync()
@@ -230,7 +230,7 @@ def _one_sync(cut: Cut, row: str, k: int) -> None:
             cut.run_sync()
 
 
-def descents(row: str, times: int, seed: int) -> tuple[list[Descent | None], list[str], int]:
+def simulate_ramp_downs(row: str, times: int, seed: int) -> tuple[list[Descent | None], list[str], int]:
     """Inject a fault ``times`` times, each at a random SYNC with an offset applied, before the path ends by itself.
 
     Returns the descents, what was wrong, and the SYNC judged.
@@ -240,15 +240,15 @@ def descents(row: str, times: int, seed: int) -> tuple[list[Descent | None], lis
     wrong: list[str] = []
     judged = 0
     while len(found) < times:
-        cut = cutting(rng, row)
+        cut = start_cut(rng, row)
         while len(found) < times:
             cut.run_sync()
             if cut.mode is not Mode.ACTIVE:
                 break
             left = cut.path.end - cut.state.places[0].row if cut.path is not None else 0
             if left > RAMPED[row].detected and any(cut.series[-1]) and rng.random() < SHARE:
-                branch = cut.branch()
-                found.append(faulty(branch, row, rng))
+                branch = cut.copy_state()
+                found.append(inject_fault(branch, row, rng))
                 judged += len(branch.series) - len(cut.series)
                 wrong += [f"{row}: {each}" for each in branch.wrong[:1]]
     return found, wrong, judged

@@ -365,13 +365,13 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     """Return the study's page; its conclusion follows from the figures."""
     seen, wrong = figures["counts"], figures["violations"]
     count = f"{len(wrong)} frames broke a limit" if wrong else "no frame broke a limit"
-    lines = pages.head("The guard's invariants on random buses", "guard_invariants", run)
-    lines += pages.paragraph(
+    lines = pages.write_head("The guard's invariants on random buses", "guard_invariants", run)
+    lines += pages.wrap_paragraph(
         f"""{seen["sync"]:,} SYNC of two axes at random, {seen["frames"]:,} frames with position offsets and
         {seen["fed frames"]:,} with speed and torque offsets sent ({seen["fed frames that are not zero"]:,} of them not
         zero): **{count}**."""
     )
-    lines += pages.paragraph(
+    lines += pages.wrap_paragraph(
         f"""Each episode of some {EPISODE:,} SYNC begins with a guard that starts beside a drive that holds nothing, an
         offset within 250 um, or anything, with a commissioning record that holds, is void or is missing. Every frame is
         judged by the wire and by what the drive held, not by the guard's own state: it must be within 250 um, go on
@@ -383,8 +383,8 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     )
     happened = [[name, f"{seen.get(name, 0):,}"] for name in dict(HAPPENINGS)]
     moves = [[name, f"{times:,}"] for name, times in seen.items() if " to " in name]
-    lines += [*pages.grid(("what happened", "times"), happened), ""]
-    lines += [*pages.grid(("the guard's states", "times"), moves), ""]
+    lines += [*pages.write_table(("what happened", "times"), happened), ""]
+    lines += [*pages.write_table(("the guard's states", "times"), moves), ""]
     return "\n".join([*lines, *(f"* {each}" for each in wrong[:20])])
 
 
@@ -393,7 +393,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sync", type=int, default=10_000_000)
     parser.add_argument("--seed", type=int, default=1)
-    figures = pages.conduct("guard_invariants", parser, lambda options: str(options.seed), measure)
+    figures = pages.run_study("guard_invariants", parser, lambda options: str(options.seed), measure)
     sys.exit(bool(figures["violations"]))
 
 

@@ -10,7 +10,7 @@ from fdhil.config.axis_section import Nominal
 from fdhil.config.regulators import Regulators
 from fdhil.model import closed_loop
 from fdhil.records import PARAMETERS, Estimate, Float, Parameters, compute_rms
-from fdhil.validation.agreement import LEAST_CHANGE
+from fdhil.validation.estimate_agreement import LEAST_CHANGE
 from studies import drives
 from studies.drives import Drive
 from studies.scenes import Scene, demand_of
@@ -20,7 +20,7 @@ NEXT_SHARE = 0.3  # of the rapid speed: that of a program that is cut
 STEPS_UM = 0.5  # what set-points and positions are rounded to, and less
 
 
-def axis_of(scene: Scene) -> Axis:
+def make_axis(scene: Scene) -> Axis:
     """Return the section of a machine with this drive and its regulators."""
     d, move = scene.drive, scene.move
     gains = d.vector()
@@ -42,7 +42,7 @@ def axis_of(scene: Scene) -> Axis:
     )
 
 
-def off(estimate: Estimate, drive: Drive) -> list[str]:
+def find_deviating_parameters(estimate: Estimate, drive: Drive) -> list[str]:
     """Return the parameters that deviate from the drive's by more than their intervals, and by enough to matter."""
     found = []
     for name in PARAMETERS:
@@ -52,26 +52,26 @@ def off(estimate: Estimate, drive: Drive) -> list[str]:
     return found
 
 
-def beside_the_path(models: Sequence[Parameters], scene: Scene) -> list[str]:
+def measure_path_error_um(models: Sequence[Parameters], scene: Scene) -> list[str]:
     """Return the distance of the true machine's table from the prediction, at the rapid and when cutting.
 
     The tolerance is that of the rapid, in micrometres.
     """
     found: list[str] = []
-    axis, limit = axis_of(scene), 0.0
+    axis, limit = make_axis(scene), 0.0
     for share in (1.0, NEXT_SHARE):
         move = replace(scene.move, speed=share * scene.move.speed, distance=share * scene.move.distance)
-        there = move.direction * drives.rates(move)
+        there = move.direction * drives.compute_path_speeds(move)
         demand = demand_of(scene, there, -there)
-        true = drives.run(scene.drive, demand, drives.CYCLE_S)
+        true = drives.simulate_loop(scene.drive, demand, drives.CYCLE_S)
         for model in models:
-            missed, following = _missed(model, axis, 1e3 * demand, 1e3 * true.position)
+            missed, following = _compute_missed_torque(model, axis, 1e3 * demand, 1e3 * true.position)
             limit = limit or max(Identification().compute_tolerance_um(following), STEPS_UM)
             if missed > limit:
                 found.append(f"{missed:.2g} um of {following:.3g} um beside the path at {share:.0%} of the speed")
     return found
 
 
-def _missed(model: Parameters, axis: Axis, demand_mm: Float, position_mm: Float) -> tuple[float, float]:
+def _compute_missed_torque(model: Parameters, axis: Axis, demand_mm: Float, position_mm: Float) -> tuple[float, float]:
     told = closed_loop.simulate_axis(model, axis, drives.CYCLE_S, demand_mm).position_mm
     return 1e3 * compute_rms(position_mm - told), 1e3 * compute_rms(position_mm - demand_mm)

@@ -84,7 +84,7 @@ class Retrofit:
         self.steps.append(step)
         print(f"  {step.seconds / 60:.1f} min", flush=True)
 
-    def fdhil(self, *arguments: object, fine: tuple[int, ...] = (0,)) -> dict[str, Any]:
+    def run_command(self, *arguments: object, fine: tuple[int, ...] = (0,)) -> dict[str, Any]:
         """Run a command with --json; its own words end the study when its exit code is not ``fine``."""
         command = [self.python, "-m", "fdhil", *map(str, arguments), "--json"]
         done = subprocess.run(wrap_to_end_with_parent(command), capture_output=True, text=True, check=False)
@@ -92,12 +92,12 @@ class Retrofit:
             sys.exit(f"{' '.join(map(str, arguments))} failed: {done.stdout[-3000:]}{done.stderr[-3000:]}")
         return dict(json.loads(done.stdout))
 
-    def status(self) -> dict[str, Any]:
+    def query_status(self) -> dict[str, Any]:
         """Query the daemon's status."""
-        return self.fdhil("status", self.file)
+        return self.run_command("status", self.file)
 
 
-def twin_of(folder: Path) -> Path:
+def write_simulator_config(folder: Path) -> Path:
     """Write the simulator's own configuration: the real drives, hidden from fdhil."""
     document = machine_document()
     document["sim"]["pace"] = "lockstep"
@@ -105,7 +105,7 @@ def twin_of(folder: Path) -> Path:
     return folder / "twin.toml"
 
 
-def answers_of(folder: Path, twin: SimulatorProcess, port: int) -> dict[str, str]:
+def write_answers(folder: Path, twin: SimulatorProcess, port: int) -> dict[str, str]:
     """Write the answers from the data sheets; return each with its source."""
     sheet = machine_document()["axis"]
     told: dict[str, Any] = {
@@ -138,42 +138,42 @@ def set_up(hour: Retrofit, twin: SimulatorProcess, port: int) -> None:
     mill.mkdir()
     write_machine(mill, SPEED_MM_S, ACCELERATION_MM_S2, "", "XY")
     answers = hour.folder / "answers.toml"
-    known = answers_of(hour.folder, twin, port)
+    known = write_answers(hour.folder, twin, port)
     with hour.step("fdhil init, from LinuxCNC's files, the drives and the answers", **known):
-        hour.fdhil("init", hour.file, "--from-linuxcnc", mill / "machine.ini", "--answers", answers)
+        hour.run_command("init", hour.file, "--from-linuxcnc", mill / "machine.ini", "--answers", answers)
     with hour.step("fdhil doctor"):
-        hour.fdhil("doctor", hour.file, fine=(0, 1))  # this computer may have its own troubles
+        hour.run_command("doctor", hour.file, fine=(0, 1))  # this computer may have its own troubles
     with hour.step("fdhil check"):
-        hour.fdhil("check", hour.file)
+        hour.run_command("check", hour.file)
     with hour.step(
         "fdhil commission, with a jog, test rapids and identification",
         room="how far each axis is free to go from where it stands",
         yes="the machine's own safety functions are effective, nobody is in its way",
     ):
-        hour.fdhil("commission", hour.file, "--yes", "--room", *ROOM_MM)
+        hour.run_command("commission", hour.file, "--yes", "--room", *ROOM_MM)
 
 
-def cut(hour: Retrofit, nc: LinuxCnc) -> None:
+def run_first_cut(hour: Retrofit, nc: LinuxCnc) -> None:
     """Run from the first rapids to the corrected cut."""
     part = hour.folder / "part.csv"
     with hour.step("rapids of each axis, until fdhil believes what it has identified"):
         nc.run(SHUTTLE)
-        until(lambda: all(axis["accepted"] >= 4 for axis in hour.status()["axes"].values()))
+        until(lambda: all(axis["accepted"] >= 4 for axis in hour.query_status()["axes"].values()))
     for tried in range(1, TRIES + 1):
         with hour.step("air cut, recorded by fdhil record", rest="longer than the program's longest dwell"):
             record(hour.file, part, lambda: nc.run(PART))
         with hour.step("fdhil correct, fdhil arm"):
-            hour.fdhil("correct", part, "--config", hour.file, "--from-history")
-            hour.fdhil("arm", hour.file, part)
+            hour.run_command("correct", part, "--config", hour.file, "--from-history")
+            hour.run_command("arm", hour.file, part)
         with hour.step("the corrected cut"):
             nc.run(PART)
-            until(lambda: len(hour.status()["passes"]) == tried)  # noqa: B023 - called at once
-        if repeated(hour.status()):
+            until(lambda: len(hour.query_status()["passes"]) == tried)  # noqa: B023 - called at once
+        if repeated(hour.query_status()):
             return
         print("  LinuxCNC has ordered something else than before, the guard has ramped to zero: once more")
 
 
-def beside_linuxcnc(hour: Retrofit, twin: SimulatorProcess, port: int, stack: ExitStack) -> None:
+def run_with_linuxcnc(hour: Retrofit, twin: SimulatorProcess, port: int, stack: ExitStack) -> None:
     """Daemon, guard and LinuxCNC run; cut."""
     with hour.step("fdhil run, fdhil-guard"):
         for name, command in (("guard", ["fdhil.cli.guard"]), ("daemon", ["fdhil", "run"])):
@@ -185,7 +185,7 @@ def beside_linuxcnc(hour: Retrofit, twin: SimulatorProcess, port: int, stack: Ex
     with hour.step("LinuxCNC on and homed", loadusr="the line that `python -m fdhil.bridges` prints, in the HAL file"):
         nc = stack.enter_context(LinuxCnc(SPEED_MM_S, ACCELERATION_MM_S2, loads, "XY"))
         stack.enter_context(nc.driving(twin))
-    cut(hour, nc)
+    run_first_cut(hour, nc)
 
 
 def install(hour: Retrofit) -> None:
@@ -196,7 +196,7 @@ def install(hour: Retrofit) -> None:
         subprocess.run(wrap_to_end_with_parent([hour.python, "-m", "pip", "install", "-q", str(ROOT)]), check=True)
 
 
-def tell(hour: Retrofit, before_um: float, after_um: float) -> None:
+def print_report(hour: Retrofit, before_um: float, after_um: float) -> None:
     """Print the steps, the required knowledge, and the results."""
     print("\nminutes  step")
     for step in hour.steps:
@@ -221,14 +221,14 @@ def main() -> None:
         trace = hour.folder / "trace.csv"
         if options.install:
             install(hour)
-        with SimulatorProcess(twin_of(hour.folder), "--demand", "-", "--trace", trace) as twin:
+        with SimulatorProcess(write_simulator_config(hour.folder), "--demand", "-", "--trace", trace) as twin:
             set_up(hour, twin, port)
             with ExitStack() as stack:
-                beside_linuxcnc(hour, twin, port, stack)
+                run_with_linuxcnc(hour, twin, port, stack)
             twin.wait_for_event("finished")
         config = machine_config.load_config(hour.file)
         before_um, *_, after_um = contour_of_each_cut(trace, load_trajectory(hour.folder / "part.csv", config))
-        tell(hour, before_um, after_um)
+        print_report(hour, before_um, after_um)
     sys.exit(after_um >= before_um)
 
 

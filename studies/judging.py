@@ -13,10 +13,10 @@ from scipy.stats import beta
 
 from fdhil.config import Identification
 from fdhil.identification.rapid_windows import find_windows
-from fdhil.pipeline import analyse, pool
+from fdhil.pipeline import analyse_window, pool_windows
 from fdhil.records import WindowOutcome
 from studies import drives, faults, harm
-from studies.pages import grid, paragraph
+from studies.pages import wrap_paragraph, write_table
 from studies.scenes import Scene
 
 GOOD = "good"
@@ -65,22 +65,22 @@ class Tally:
     wrong: list[int] = field(default_factory=list)
 
     @classmethod
-    def of(cls, told: Mapping[str, Any]) -> Tally:
+    def parse(cls, told: Mapping[str, Any]) -> Tally:
         """Return the tally of a page's figures."""
         return cls(**{**told, "codes": Counter(told["codes"]), "left_open": Counter(told["left_open"])})
 
 
-def judge(
-    kind: str, seed: int, spoilt: faults.Spoilt, scene: Scene | None = None, *, configured: bool = False
+def assess_recording(
+    kind: str, seed: int, spoilt: faults.FaultyRecording, scene: Scene | None = None, *, configured: bool = False
 ) -> Judged:
     """Return the validation's verdict of one recording, ``configured`` with the machine's section.
 
     Of a ``scene`` with the true drive is told, too, what of that does harm.
     """
     settings = Identification()
-    axis = harm.axis_of(scene) if configured and scene is not None else None
-    outcomes = [analyse(window, settings, axis, drives.CYCLE_S) for window in find_windows(spoilt.recording)]
-    _, verdict = pool(outcomes, settings)
+    axis = harm.make_axis(scene) if configured and scene is not None else None
+    outcomes = [analyse_window(window, settings, axis, drives.CYCLE_S) for window in find_windows(spoilt.recording)]
+    _, verdict = pool_windows(outcomes, settings)
     reasons = [reason for outcome in outcomes for reason in outcome.verdict.reasons] + list(verdict.reasons)
     refused = sum(not outcome.verdict.accepted for outcome in outcomes)
     # what differs between two rapids is seen where both are believed
@@ -96,19 +96,19 @@ def judge(
         codes=tuple(sorted({reason.code for reason in reasons})),
         texts=tuple(dict.fromkeys(str(reason) for reason in reasons)),
         left_open=tuple(" and ".join(estimate.missing) for estimate in told if estimate.missing),
-        harm=() if scene is None or kind in faults.BETWEEN else _harm(outcomes, spoilt.scene or scene),
+        harm=() if scene is None or kind in faults.BETWEEN else _measure_harm(outcomes, spoilt.scene or scene),
         warned=tuple(sorted({warning.code for o in outcomes for warning in o.verdict.warnings})),
     )
 
 
-def _harm(outcomes: Iterable[WindowOutcome], scene: Scene) -> tuple[str, ...]:
+def _measure_harm(outcomes: Iterable[WindowOutcome], scene: Scene) -> tuple[str, ...]:
     told = [o.estimate for o in outcomes if o.verdict.accepted and o.estimate is not None]
-    wrong = [text for estimate in told for text in harm.off(estimate, scene.drive)]
+    wrong = [text for estimate in told for text in harm.find_deviating_parameters(estimate, scene.drive)]
     models = [p for p in (estimate.build_parameters() for estimate in told) if math.isfinite(sum(p.as_dict().values()))]
-    return (*wrong, *(harm.beside_the_path(models, scene) if models else ()))
+    return (*wrong, *(harm.measure_path_error_um(models, scene) if models else ()))
 
 
-def survey(seeds: Iterable[int], one: Callable[[int], Made], processes: int) -> Iterator[Made]:
+def assess_seeds(seeds: Iterable[int], one: Callable[[int], Made], processes: int) -> Iterator[Made]:
     """Yield the result of ``one`` for each seed."""
     if processes < 2:
         yield from map(one, seeds)
@@ -117,7 +117,7 @@ def survey(seeds: Iterable[int], one: Callable[[int], Made], processes: int) -> 
         yield from executor.map(one, seeds, chunksize=8)
 
 
-def tally(judged: Iterable[Judged], kinds: Mapping[str, faults.Kind]) -> dict[str, Tally]:
+def count_by_kind(judged: Iterable[Judged], kinds: Mapping[str, faults.Kind]) -> dict[str, Tally]:
     """Count by kind."""
     counted: dict[str, Tally] = {GOOD: Tally()} | {name: Tally() for name in kinds}
     for one in judged:
@@ -139,27 +139,27 @@ def tally(judged: Iterable[Judged], kinds: Mapping[str, faults.Kind]) -> dict[st
     return counted
 
 
-def report(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> list[str]:
+def describe_results(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> list[str]:
     """Return the results of valid and faulty recordings, in words and as a table."""
     fine, bad = counted[GOOD], [counted[name] for name in kinds]
     parts = ("count", "accepted", "harmful", "right")
     recordings, accepted, harmful, right = (sum(getattr(e, part) for e in bad) for part in parts)
     silent = sum(entry.accepted if entry.silent is None else entry.silent for entry in bad)
-    lines = paragraph(
+    lines = wrap_paragraph(
         f"""Good: {fine.windows} windows of {fine.count} recordings, {fine.refused} windows refused
-        ({_percent(fine.refused, fine.windows)}; {_at_most(fine.refused, fine.windows)}), {len(fine.wrong)} recordings
-        without a validated pool{_warned(fine)}. Reasons: {listed(fine.codes) or "none"}."""
+        ({_format_percent(fine.refused, fine.windows)}; {_compute_upper_bound(fine.refused, fine.windows)}), {len(fine.wrong)} recordings
+        without a validated pool{_count_warned(fine)}. Reasons: {count_codes(fine.codes) or "none"}."""
     )
     if fine.left_open:
         nulls = ", ".join(f"{count} without {names}" for names, count in fine.left_open.most_common())
-        lines += paragraph(f"{fine.left_open.total()} windows are accepted with a null and its reason: {nulls}.")
-    lines += paragraph(
+        lines += wrap_paragraph(f"{fine.left_open.total()} windows are accepted with a null and its reason: {nulls}.")
+    lines += wrap_paragraph(
         f"""Bad: {recordings} recordings, {accepted} accepted, {silent} of them without a warning, {harmful} to harm
-        ({_at_most(harmful, recordings)}), {_percent(right, recordings)} named rightly. {_worst(counted, kinds)}"""
+        ({_compute_upper_bound(harmful, recordings)}), {_format_percent(right, recordings)} named rightly. {_find_worst_kinds(counted, kinds)}"""
     )
     wrong = [f"{name} {', '.join(map(str, entry.wrong))}" for name, entry in counted.items() if entry.wrong]
-    lines += paragraph(f"Judged wrongly, or without a warning, by seed: {'; '.join(wrong) or 'none'}.")
-    rows = [_row(name, kind, counted[name]) for name, kind in kinds.items() if counted[name].count]
+    lines += wrap_paragraph(f"Judged wrongly, or without a warning, by seed: {'; '.join(wrong) or 'none'}.")
+    rows = [_format_row(name, kind, counted[name]) for name, kind in kinds.items() if counted[name].count]
     columns = [
         "fault",
         "matrix",
@@ -171,14 +171,14 @@ def report(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> li
         "named rightly",
         "reasons given",
     ]
-    return [*lines, *grid(columns, rows), ""]
+    return [*lines, *write_table(columns, rows), ""]
 
 
-def _warned(fine: Tally) -> str:
+def _count_warned(fine: Tally) -> str:
     return "" if fine.silent is None else f", {fine.accepted - fine.silent} accepted with a warning"
 
 
-def _row(name: str, kind: faults.Kind, entry: Tally) -> list[str]:
+def _format_row(name: str, kind: faults.Kind, entry: Tally) -> list[str]:
     least = f"{entry.least:.3g} {kind.unit}" if kind.unit else ""
     right = f"{entry.right / entry.count:.0%}"
     return [
@@ -190,11 +190,11 @@ def _row(name: str, kind: faults.Kind, entry: Tally) -> list[str]:
         str(entry.accepted if entry.silent is None else entry.silent),
         str(entry.harmful),
         right,
-        listed(entry.codes),
+        count_codes(entry.codes),
     ]
 
 
-def _worst(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> str:
+def _find_worst_kinds(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> str:
     """Name the kinds with the lowest rate of correct names."""
     shares = {name: counted[name].right / counted[name].count for name in kinds if counted[name].count}
     least = sorted((name for name, share in shares.items() if share < NAMED), key=shares.__getitem__)
@@ -202,17 +202,17 @@ def _worst(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> st
     return f"Named rightly in less than {NAMED:.0%}: {', '.join(told) or 'no kind'}."
 
 
-def _percent(part: int, whole: int) -> str:
+def _format_percent(part: int, whole: int) -> str:
     return f"{part / max(1, whole):.2%}"
 
 
-def _at_most(count: int, total: int) -> str:
+def _compute_upper_bound(count: int, total: int) -> str:
     """Return the share that is not exceeded with 95 % certainty (Clopper and Pearson)."""
     if count >= total:
         return "nothing can be told of the share"
     return f"with 95 % certainty less than {float(beta.ppf(0.95, count + 1, total - count)):.2%}"
 
 
-def listed(codes: Counter[str]) -> str:
+def count_codes(codes: Counter[str]) -> str:
     """Return codes with their counts, the most frequent first."""
     return ", ".join(f"{count} {code}" for code, count in codes.most_common())

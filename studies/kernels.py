@@ -9,10 +9,10 @@ from studies import bench, drives, real_plant
 
 def compile_all() -> None:
     """Move each plant by one rapid."""
-    demand_m = bench.shuttle()
-    bench.run(bench.Plant(), demand_m)
-    drives.run(drives.draw_drive(np.random.default_rng(1), 0.5, 4.0), demand_m, drives.CYCLE_S)
-    real_plant.run(real_plant.Mechanics(), demand_m)
+    demand_m = bench.make_shuttle_demand()
+    bench.simulate_bench(bench.Plant(), demand_m)
+    drives.simulate_loop(drives.draw_drive(np.random.default_rng(1), 0.5, 4.0), demand_m, drives.CYCLE_S)
+    real_plant.simulate_axis(real_plant.Mechanics(), demand_m)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ class Found:
     wrong: list[str] = field(default_factory=list)
     descents: dict[str, list[Descent | None]] = field(default_factory=dict)
 
-    def add(self, other: Found) -> None:
+    def merge(self, other: Found) -> None:
         """Add the results of another part."""
         self.frames += other.frames
         self.sync += other.sync
@@ -37,21 +37,21 @@ class Found:
             self.descents.setdefault(row, []).extend(found)
 
     @classmethod
-    def read(cls, document: Mapping[str, Any]) -> Found:
+    def parse(cls, document: Mapping[str, Any]) -> Found:
         """Return the result read from a document of its fields."""
         ways = {row: [way and Descent(*way) for way in found] for row, found in document["descents"].items()}
         return cls(**{**document, "counts": Counter(document["counts"]), "descents": ways})
 
 
-def figures_of(found: Mapping[str, Found]) -> dict[str, Any]:
+def compute_figures(found: Mapping[str, Found]) -> dict[str, Any]:
     """Return the study's figures."""
     live = Found()
     for name in LIVE:
-        live.add(found[name])
+        live.merge(found[name])
     rows = {}
     for row in RAMPED:
-        decided = _ways(found["frames"].descents.get(row, []))
-        processes = _ways(live.descents.get(row, []))
+        decided = _describe_ways(found["frames"].descents.get(row, []))
+        processes = _describe_ways(live.descents.get(row, []))
         rows[row] = {"decisions": decided, "processes": processes}
     both = {row: [*found["frames"].descents.get(row, []), *live.descents.get(row, [])] for row in RAMPED}
     parts = {
@@ -61,15 +61,15 @@ def figures_of(found: Mapping[str, Found]) -> dict[str, Any]:
         for name, part in found.items()
     }
     figures = {"rows": rows, "parts": parts}
-    zero = {row: _ways(ways) for row, ways in both.items() if ways}
+    zero = {row: _describe_ways(ways) for row, ways in both.items() if ways}
     figures["sync_to_zero"] = {
         row: {"median": way["zero_median"], "worst": way["zero_worst"], "trials": way["trials"]}
         for row, way in zero.items()
     }
-    return figures | {"goals": goals(figures)}
+    return figures | {"goals": evaluate_goals(figures)}
 
 
-def _ways(ways: list[Descent | None]) -> dict[str, Any]:
+def _describe_ways(ways: list[Descent | None]) -> dict[str, Any]:
     there = [way for way in ways if way is not None]
     if not there:
         return {"trials": len(ways), "within": 0}
@@ -82,7 +82,7 @@ def _ways(ways: list[Descent | None]) -> dict[str, Any]:
     }
 
 
-def goals(figures: Mapping[str, Any]) -> dict[str, Any]:
+def evaluate_goals(figures: Mapping[str, Any]) -> dict[str, Any]:
     """Return which goals were met, with the figure of each."""
     parts, rows = figures["parts"], figures["rows"]
     least = min(row["decisions"]["trials"] for row in rows.values())
@@ -96,28 +96,28 @@ def goals(figures: Mapping[str, Any]) -> dict[str, Any]:
     started, good = sum(again["counts"].get(s, 0) for s in set(STALE)), again["counts"].get("good", 0)
     noticing = f"shrinking within 8 SYNC, but where noticing takes longer ({', '.join(late) or 'none'})"
     return {
-        "R4": _goal(
+        "R4": _evaluate_goal(
             within == trials and least >= 1000 and live >= 1000,
             f"{within:,} of {trials:,} faults ({least:,} or more of each of {len(rows)} rows, {live:,} of them on "
             f"processes) at 0 within the bound; {noticing}",
         ),
-        "R5": _goal(
+        "R5": _evaluate_goal(
             hung["faults"] > 0 and not sent and not hung["broken"],
             f"{sent} frames after the first period in {hung['faults']} hangs of 0.05 to 5 s; {frozen} of them ended "
             "FROZEN at 0: the zeros were read back too late",
         ),
-        "R6": _goal(
+        "R6": _evaluate_goal(
             zero == killed["faults"] >= 1000 and not killed["steps"],
             f"{zero} of {killed['faults']} kills ended at 0, {killed['steps']} frames broke a limit",
         ),
-        "R7": _goal(
+        "R7": _evaluate_goal(
             good == started >= 500 and not again["broken"],
             f"{good} of {started} restarts as they must be, {again['broken']} steps or wrong outcomes",
         ),
     }
 
 
-def _goal(met: bool, figure: str) -> dict[str, Any]:
+def _evaluate_goal(met: bool, figure: str) -> dict[str, Any]:
     return {"met": met, "figure": figure}
 
 
@@ -125,20 +125,20 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     """Return the study's page."""
     parts = figures["parts"]
     broken = sum(part["broken"] for part in parts.values())
-    lines = pages.head("Kills, hangs and restarts while a correction runs", "kills", run)
+    lines = pages.write_head("Kills, hangs and restarts while a correction runs", "kills", run)
     sync, frames = (sum(parts[name][key] for name in LIVE) for key in ("sync", "frames"))
-    lines += pages.paragraph(
+    lines += pages.wrap_paragraph(
         f"""{sync:,} SYNC of guard and daemon as processes on a hub, {frames:,} offset frames judged by the wire and by
         what the drives held: **{broken or "no"} promises broken**."""
     )
-    lines += pages.grid(
+    lines += pages.write_table(
         ("goal", "figure", "met"),
         [[name, goal["figure"], "yes" if goal["met"] else "**no**"] for name, goal in figures["goals"].items()],
     )
     lines += ["", "## What was done", ""]
-    lines += pages.paragraph(HOW)
+    lines += pages.wrap_paragraph(HOW)
     counts = parts["restarts"]["counts"]
-    lines += pages.grid(("what the drives held when a guard started", "times", "what must happen"), [
+    lines += pages.write_table(("what the drives held when a guard started", "times", "what must happen"), [
         ["its own last value, the guard alone was killed", str(counts.get("own", 0)), "adopted, ramped to 0"],
         ["the same, the daemon was killed with it", str(counts.get("both killed", 0)), "adopted, ramped to 0"],
         ["another node's value within 250 um", str(counts.get("foreign", 0)), "adopted, ramped to 0"],
@@ -146,8 +146,8 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
         ["nothing", str(counts.get("zero", 0)), "OFF, not one frame"],
     ])  # fmt: skip
     lines += ["", "## Row by row: SYNC from the fault", ""]
-    lines += pages.paragraph(BOUNDS)
-    lines += pages.grid(
+    lines += pages.wrap_paragraph(BOUNDS)
+    lines += pages.write_table(
         (
             "row",
             "fault",
@@ -159,13 +159,13 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
             "times",
             "of these on processes",
         ),
-        [_line(row, of) for row, of in figures["rows"].items()],
+        [_format_line(row, of) for row, of in figures["rows"].items()],
     )
     wrong = [each for part in parts.values() for each in part["wrong"]]
     return "\n".join([*lines, "", *(f"* {each}" for each in wrong[:40])])
 
 
-def _line(row: str, of: Mapping[str, Any]) -> list[str]:
+def _format_line(row: str, of: Mapping[str, Any]) -> list[str]:
     levels = [of[level] for level in of if of[level].get("within")]
     whole = [max(level[key] for level in levels) if levels else "" for key in ("shrinking_worst", "zero_worst")]
     middle = of["decisions"].get("zero_median", "")

@@ -96,7 +96,7 @@ class LatePort(serial_port.SerialPort):
         self._came.set()
 
 
-def modbus(
+def measure_modbus(
     questions: int, seed: int, most_late: float, kinds: tuple[str, ...] = (), noise: float = 0.0
 ) -> Counter[str]:
     """Send requests over a line whose answers are late by up to ``most_late`` time-outs, and corrupted by ``kinds``.
@@ -181,7 +181,7 @@ def _waiting_in(node: Node) -> type[queue.Queue[bytes]]:
     return Waiting
 
 
-def sdo_reads(questions: int, seed: int, most_late_s: float) -> Counter[str]:
+def measure_sdo_reads(questions: int, seed: int, most_late_s: float) -> Counter[str]:
     """Read two objects repeatedly, with answers that are late, doubled or lost; count as above."""
     late = [FrameFault("late", seconds, percent=6) for seconds in SDO_LATE_S if seconds <= most_late_s]
     faults = FrameFaults([*late, FrameFault("duplicate", percent=3), FrameFault("drop", percent=3)], seed)

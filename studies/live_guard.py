@@ -53,7 +53,7 @@ Tamper = Callable[[int, Frame], list[Frame]]
 Column = list[int]
 
 
-def wave(rng: np.random.Generator, limit: int) -> tuple[Float, list[Column]]:
+def make_wave(rng: np.random.Generator, limit: int) -> tuple[Float, list[Column]]:
     """Return the way (0 to 1) and the offsets (increments) of a program: each axis its own height and waves.
 
     An offset's wave is at most as steep as a third of the rate allowed, so that it turns round in four SYNC, and three
@@ -87,7 +87,7 @@ class Daemon:
         """Return the pipe on which it reports that it has armed."""
         return self._told
 
-    def heard(self, word: bytes = b"armed") -> bool:
+    def receive_report(self, word: bytes = b"armed") -> bool:
         """Receive its report; it has armed when it reports so. RuntimeError for any other report."""
         text = os.read(self._told, 4096)
         if text != word:
@@ -95,13 +95,13 @@ class Daemon:
         self.armed = True
         return True
 
-    def order(self, word: bytes) -> None:
+    def send_request(self, word: bytes) -> None:
         """Have it ask the guard for something: ``disarm``, or the name of a fact that it no longer vouches for.
 
         Returns when the guard's socket holds it: until then no SYNC passes, however late the daemon gets the processor.
         """
         os.write(self._orders, word)
-        self.heard(b"asked")
+        self.receive_report(b"asked")
 
     def kill(self) -> None:
         """Kill it, and return when it is dead."""
@@ -193,14 +193,14 @@ class LiveGuard:
         self._next_s = self._heard_s = 0.0
         self._send([frame for _, frame in self.machine.power_on()])
         self.machine.nc.switch_on_off(True)
-        self.until(lambda: self.machine.nc.phase.name == "READY", "the NC has the drives")
+        self.run_until(lambda: self.machine.nc.phase.name == "READY", "the NC has the drives")
 
     tamper: Tamper | None
     insert: list[Frame]
 
     # --- one SYNC ---
 
-    def cycle(self) -> None:
+    def run_cycle(self) -> None:
         """Send one SYNC with all that belongs to it, and wait for what the guard answers."""
         self.tick += 1
         before, self.heard = self.heard, {}
@@ -237,32 +237,32 @@ class LiveGuard:
             answered = not (before and self.waits and self.sending) or len(self.heard) == len(self._nodes)
             if answered and now_s >= due_s:
                 return
-            self._turn(max(0.0, due_s - now_s) if answered else 0.1)
+            self._turn_over(max(0.0, due_s - now_s) if answered else 0.1)
 
     def drain(self) -> None:
         """Take what waits on the bus already: a computer that was held up has not read it yet."""
         before = -1
         while before != (before := self.sent):
-            self._turn(0.0)
+            self._turn_over(0.0)
 
-    def _turn(self, wait_s: float) -> None:
+    def _turn_over(self, wait_s: float) -> None:
         readers: list[Any] = [*self._bus.list_readers(), self._journal]
         if self.daemon is not None and not self.daemon.armed:
             readers.append(self.daemon)
         ready, _, _ = select.select(readers, self._bus.list_writers(), (), wait_s)
-        self._bus.receive_frames(ready, self._take)
+        self._bus.receive_frames(ready, self._receive_frame)
         self._bus.flush_frames(time.monotonic())
         if self.daemon is not None and self.daemon in ready:
-            self.daemon.heard()
+            self.daemon.receive_report()
         if self._journal in ready:
             self._read_journal()
 
-    def _take(self, frame: Frame) -> None:
+    def _receive_frame(self, frame: Frame) -> None:
         cob_id, data = frame
         if cob_id in self.settings.sent_ids:
             self.sent += 1
         if cob_id in self._nodes:
-            self._judge(self._nodes[cob_id], int.from_bytes(data, "little", signed=True))
+            self._check_frame(self._nodes[cob_id], int.from_bytes(data, "little", signed=True))
         self._send(self.machine.receive_frame("can0", frame))
 
     def _read_journal(self) -> None:
@@ -278,7 +278,7 @@ class LiveGuard:
         """Whether the guard sends offsets, as far as its journal was read."""
         return self.state not in ("", "OFF", "FROZEN")
 
-    def _judge(self, axis: int, value: int) -> None:
+    def _check_frame(self, axis: int, value: int) -> None:
         """Check a frame by those before it on the wire and by the drive's offset.
 
         One that goes on from rest where the offset was moving follows a cycle that the guard missed: it is counted.
@@ -286,18 +286,18 @@ class LiveGuard:
         self.frames += 1
         before, self.offsets[axis] = self.offsets[axis], value
         self.heard[axis], self._heard_s = value, time.monotonic()
-        wrong = self.wires[axis].ours(value, self.held()[axis])
+        wrong = self.wires[axis].ours(value, self.read_held_offsets()[axis])
         if wrong is not None and abs(value - before) <= self.settings.axes[axis].limits.hard_acceleration:
             self.stops += 1
             self.wires[axis].stood(before)
         elif wrong is not None:
             self.wrong.append(f"SYNC {self.tick}, {AXES[axis]}: {wrong}")
 
-    def held(self) -> list[int]:
+    def read_held_offsets(self) -> list[int]:
         """Return the offsets that the drives hold, in increments."""
         return [unit.drive.dictionary.get_number(0x60B0, 0) for unit in self.machine.units.values()]
 
-    def forget(self) -> None:
+    def start_new_trace(self) -> None:
         """Begin a new trace with what is on the wire now."""
         self.trace = [(self.tick, tuple(self.offsets))]
 
@@ -305,16 +305,16 @@ class LiveGuard:
         """The next SYNC waits for frames of the guard, though none came with the last."""
         self.heard = dict(enumerate(self.offsets))
 
-    def put(self, frames: list[Frame]) -> None:
+    def queue_foreign_frames(self, frames: list[Frame]) -> None:
         """Put another node's frames on the bus in the next cycle; the drives take an offset among them."""
         for frame in frames:
             if frame[0] in self._nodes:
-                self.foreign(*frame)
+                self.make_foreign_offset(*frame)
                 self.waits = False
             else:
                 self.insert.append(frame)
 
-    def foreign(self, cob_id: int, data: bytes) -> None:
+    def make_foreign_offset(self, cob_id: int, data: bytes) -> None:
         """Another node's offset."""
         axis, value = self._nodes[cob_id], int.from_bytes(data, "little", signed=True)
         self._send([(cob_id, data), *self.machine.receive_frame("can0", (cob_id, data))])
@@ -322,26 +322,26 @@ class LiveGuard:
         self.offsets[axis] = value
         self.trace = [(self.tick, tuple(self.offsets))]
 
-    def write(self, value: int) -> None:
+    def write_foreign_offset(self, value: int) -> None:
         """Another node's offset on the first axis, and the SYNC that latches it."""
-        self.foreign(self.settings.axes[0].offset.cob_id, value.to_bytes(4, "little", signed=True))
-        self.cycle()
+        self.make_foreign_offset(self.settings.axes[0].offset.cob_id, value.to_bytes(4, "little", signed=True))
+        self.run_cycle()
 
-    def was(self, states: str, since: int) -> bool:
+    def has_journal_state(self, states: str, since: int) -> bool:
         """Return whether the guard's journal reported one of these states after this many lines."""
         return any(event.get("state", "-") in states.split() for event in self.events[since:])
 
-    def run(self, cycles: int) -> None:
+    def run_cycles(self, cycles: int) -> None:
         """Run this many SYNC."""
         for _ in range(cycles):
-            self.cycle()
+            self.run_cycle()
 
-    def until(self, reached: Callable[[], bool], what: str, limit: int = 20_000) -> int:
+    def run_until(self, reached: Callable[[], bool], what: str, limit: int = 20_000) -> int:
         """SYNC until something has come about; how many. RuntimeError when it does not."""
         for taken in range(limit):
             if reached():
                 return taken
-            self.cycle()
+            self.run_cycle()
         raise RuntimeError(f"{what}: did not come about in {limit} SYNC; {self.events[-5:]}")
 
     # --- what is started, and what is done to it ---
@@ -352,8 +352,8 @@ class LiveGuard:
         self.guard = os.fork()
         if self.guard == 0:
             self._become_guard()
-        self.until(lambda: any(e["event"] == "ready" for e in self.events[seen:]), "the guard is ready")
-        self.run(ADOPTING)
+        self.run_until(lambda: any(e["event"] == "ready" for e in self.events[seen:]), "the guard is ready")
+        self.run_cycles(ADOPTING)
         self.idle = False
 
     def _become_guard(self) -> None:
@@ -385,11 +385,11 @@ class LiveGuard:
     def arm(self) -> None:
         """Start a new daemon, armed for the next program from the current position."""
         self.machine.nc.stop_path()
-        self.until(lambda: not self.machine.nc.is_busy, "the NC stands")
-        self.run(5)
+        self.run_until(lambda: not self.machine.nc.is_busy, "the NC stands")
+        self.run_cycles(5)
         here = self.machine.nc.in_force
         assert here is not None
-        part, offsets = wave(self.rng, self.settings.axes[0].limits.offset)
+        part, offsets = make_wave(self.rng, self.settings.axes[0].limits.offset)
         ways = [way if at < 0 else -way for way, at in zip(WAYS_MM, here.position_mm, strict=True)]
         demand = [at + way * part for at, way in zip(here.position_mm, ways, strict=True)]
         increments = [[round(mm * scale) for mm in column] for column, scale in zip(demand, self._scale, strict=True)]
@@ -400,25 +400,25 @@ class LiveGuard:
         self.idle = True  # whoever is to arm has the processor to himself
         seen = len(self.events)
         daemon = self.daemon = Daemon(self.folder, increments, offsets)
-        self.until(lambda: daemon.armed and self.was("ARMED", seen), "armed")
+        self.run_until(lambda: daemon.armed and self.has_journal_state("ARMED", seen), "armed")
         self.idle = False
 
-    def play(self) -> None:
+    def play_program(self) -> None:
         """Let the NC play the program of the last arming."""
         self.machine.nc.play_demand("program", self.program)
         self.playing = True
 
-    def into_the_cut(self) -> None:
+    def run_into_cut(self) -> None:
         """Armed, and at any place of the program where an offset is applied.
 
         A guard that was held up and lost frames ends a correction before it begins, as it should: it is armed again.
         """
         for _ in range(TRIES):
             self.arm()
-            self.play()
-            self.until(lambda: any(self.offsets) or not self.sending, "an offset")
+            self.play_program()
+            self.run_until(lambda: any(self.offsets) or not self.sending, "an offset")
             if any(self.offsets):
-                self.run(int(self.rng.integers(0, ROWS - 2 * RESTING - 40)))
+                self.run_cycles(int(self.rng.integers(0, ROWS - 2 * RESTING - 40)))
                 return
             self.give_up()
         raise RuntimeError(f"no program began in {TRIES} tries; {self.events[-5:]}")

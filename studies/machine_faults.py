@@ -9,19 +9,19 @@ import numpy as np
 
 from studies import drives
 from studies.drives import Array, Drive, Rng, Signals, log_uniform
-from studies.scenes import Rows, Scene, Spoilt, demand_of, draw_scene, measured, recorded
+from studies.scenes import FaultyRecording, Rows, Scene, demand_of, draw_scene, make_recording, measure_run
 from studies.signal_faults import sign
 
 SEAM_S = 0.2  # rest before the second of two joined runs
 
 
-def of_machine(change: Callable[[Rng, Scene], tuple[Scene, Array | None, float]]) -> Callable[[Rng], Spoilt]:
+def of_machine(change: Callable[[Rng, Scene], tuple[Scene, Array | None, float]]) -> Callable[[Rng], FaultyRecording]:
     """Return the maker of rapids of a machine that ``change`` corrupts (its scene, a load torque per cycle)."""
 
-    def make(rng: Rng) -> Spoilt:
+    def make(rng: Rng) -> FaultyRecording:
         scene, load, severity = change(rng, draw_scene(rng))
-        rows = measured(rng, scene, drives.run(scene.drive, demand_of(scene), scene.dt_s, load))
-        return Spoilt(recorded(scene, rows), severity, scene)
+        rows = measure_run(rng, scene, drives.simulate_loop(scene.drive, demand_of(scene), scene.dt_s, load))
+        return FaultyRecording(make_recording(scene, rows), severity, scene)
 
     return make
 
@@ -89,15 +89,15 @@ def backlash(rng: Rng, scene: Scene) -> tuple[Scene, None, float]:
     return replace(scene, drive=drive, move=replace(scene.move, direction=-1)), None, um
 
 
-def of_demand(shape: Callable[[Rng, Scene], tuple[Array, float]]) -> Callable[[Rng], Spoilt]:
+def of_demand(shape: Callable[[Rng, Scene], tuple[Array, float]]) -> Callable[[Rng], FaultyRecording]:
     """Return the maker of rapids whose path speed (m/s) ``shape`` gives."""
 
-    def make(rng: Rng) -> Spoilt:
+    def make(rng: Rng) -> FaultyRecording:
         scene = draw_scene(rng)
         rates, severity = shape(rng, scene)
         demand = demand_of(scene, scene.move.direction * rates)
-        rows = measured(rng, scene, drives.run(scene.drive, demand, scene.dt_s))
-        return Spoilt(recorded(scene, rows), severity)
+        rows = measure_run(rng, scene, drives.simulate_loop(scene.drive, demand, scene.dt_s))
+        return FaultyRecording(make_recording(scene, rows), severity)
 
     return make
 
@@ -108,7 +108,7 @@ def no_plateau(rng: Rng, scene: Scene) -> tuple[Array, float]:
     speed = share * scene.move.speed
     held = rng.uniform(0.0, 0.06)
     distance = speed * (speed / scene.move.acceleration + held)
-    return drives.rates(replace(scene.move, speed=speed, distance=distance)), share
+    return drives.compute_path_speeds(replace(scene.move, speed=speed, distance=distance)), share
 
 
 def override_changed(rng: Rng, scene: Scene) -> tuple[Array, float]:
@@ -120,7 +120,7 @@ def override_changed(rng: Rng, scene: Scene) -> tuple[Array, float]:
     def rate(t: Array) -> Array:
         return 1 - drop * np.clip((t - t1) / (drop * move.speed / move.acceleration), 0, 1)
 
-    return _trimmed(drives.rates(move, rate)), drop
+    return _trimmed(drives.compute_path_speeds(move, rate)), drop
 
 
 def hold_resumed(rng: Rng, scene: Scene) -> tuple[Array, float]:
@@ -134,13 +134,13 @@ def hold_resumed(rng: Rng, scene: Scene) -> tuple[Array, float]:
     def rate(t: Array) -> Array:
         return 1 - drop * np.clip(np.minimum((t - t1) / fall, (t1 + 2 * fall + held - t) / fall), 0, 1)
 
-    return _trimmed(drives.rates(move, rate)), drop
+    return _trimmed(drives.compute_path_speeds(move, rate)), drop
 
 
 def quick_stop(rng: Rng, scene: Scene) -> tuple[Array, float]:
     """How many times as hard as it accelerates an aborted rapid brakes."""
     factor = rng.uniform(2.5, 6.0)
-    rates = drives.rates(scene.move)
+    rates = drives.compute_path_speeds(scene.move)
     cut = int(rng.choice(np.flatnonzero(rates > 0.95 * rates.max())[-80:]))
     fall = rates[cut] - factor * scene.move.acceleration * drives.CYCLE_S * np.arange(1, 1000)
     return np.concatenate([rates[:cut], np.maximum(fall, 0.0), np.zeros(60)]), factor
@@ -150,11 +150,11 @@ def _trimmed(rates: Array) -> Array:
     return rates[: int(np.flatnonzero(rates > 0)[-1]) + 2]
 
 
-def left_behind(rng: Rng) -> Spoilt:
+def left_behind(rng: Rng) -> FaultyRecording:
     """Share of the travel at which the drive stops while the NC's demand goes on."""
     scene = draw_scene(rng)
     signals, share = stopped_short(rng, scene, scene.dt_s)
-    return Spoilt(recorded(scene, measured(rng, scene, signals)), share)
+    return FaultyRecording(make_recording(scene, measure_run(rng, scene, signals)), share)
 
 
 def stopped_short(rng: Rng, scene: Scene, dt_s: float) -> tuple[Signals, float]:
@@ -162,14 +162,14 @@ def stopped_short(rng: Rng, scene: Scene, dt_s: float) -> tuple[Signals, float]:
     share = rng.uniform(0.6, 0.95)
     whole = demand_of(scene)
     short = replace(scene.move, distance=share * scene.move.distance)
-    stopped = demand_of(scene, short.direction * drives.rates(short))
+    stopped = demand_of(scene, short.direction * drives.compute_path_speeds(short))
     stopped = np.concatenate([stopped, np.full(max(0, whole.size - stopped.size), stopped[-1])])[: whole.size]
-    signals = drives.run(scene.drive, stopped, dt_s)
+    signals = drives.simulate_loop(scene.drive, stopped, dt_s)
     wanted = np.interp(np.arange(signals.demand.size) * dt_s, np.arange(whole.size) * drives.CYCLE_S, whole)
     return replace(signals, demand=wanted), share
 
 
-def moved(rng: Rng) -> Spoilt:
+def moved(rng: Rng) -> FaultyRecording:
     """Share by which inertia, resistance or torque constant differs between two rapids of one recording."""
     scene = draw_scene(rng)
     other, amount = changed(rng, scene.drive)
@@ -184,20 +184,22 @@ def changed(rng: Rng, drive: Drive, names: Sequence[str] = ("Jt", "R", "K")) -> 
     return replace(drive, **{name: getattr(drive, name) * (1 + sign(rng) * amount)}), amount
 
 
-def gain_between(rng: Rng) -> Spoilt:
+def gain_between(rng: Rng) -> FaultyRecording:
     """Share by which a sensor's gain differs between two rapids of one recording."""
     scene = draw_scene(rng)
     name, factor = str(rng.choice(["voltage", "current"])), 1 + sign(rng) * (amount := log_uniform(rng, 0.04, 0.2))
-    return _two(rng, scene, scene.drive, lambda rows: rows.with_signals(**{name: rows.signals[name] * factor}), amount)
+    return _two(
+        rng, scene, scene.drive, lambda rows: rows.replace_signals(**{name: rows.signals[name] * factor}), amount
+    )
 
 
-def _two(rng: Rng, scene: Scene, other: Drive, spoil: Callable[[Rows], Rows], severity: float) -> Spoilt:
-    there = drives.run(scene.drive, demand_of(scene), scene.dt_s)
+def _two(rng: Rng, scene: Scene, other: Drive, spoil: Callable[[Rows], Rows], severity: float) -> FaultyRecording:
+    there = drives.simulate_loop(scene.drive, demand_of(scene), scene.dt_s)
     # the second run begins with no current: the seam is to lie outside the margins of the windows
-    back = replace(scene, drive=other, move=drives.turned(scene.move), lead_s=max(scene.lead_s, SEAM_S))
-    again = spoil(measured(rng, back, drives.run(other, demand_of(back), scene.dt_s)))
-    first = measured(rng, scene, there)
+    back = replace(scene, drive=other, move=drives.reverse_move(scene.move), lead_s=max(scene.lead_s, SEAM_S))
+    again = spoil(measure_run(rng, back, drives.simulate_loop(other, demand_of(back), scene.dt_s)))
+    first = measure_run(rng, scene, there)
     shift = float(first.signals["position"][-1] - again.signals["position"][0])
-    again = again.with_signals(position=again.signals["position"] + shift, demand=again.signals["demand"] + shift)
+    again = again.replace_signals(position=again.signals["position"] + shift, demand=again.signals["demand"] + shift)
     joined = {name: np.concatenate([values, again.signals[name]]) for name, values in first.signals.items()}
-    return Spoilt(recorded(scene, first.with_signals(**joined)), severity)
+    return FaultyRecording(make_recording(scene, first.replace_signals(**joined)), severity)

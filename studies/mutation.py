@@ -76,15 +76,16 @@ class _Visitor(MutationVisitor):
         return super()._skip_node_and_children(node)
 
 
-def of_code(name: str) -> Iterator[Mutant]:
+def mutate_code(name: str) -> Iterator[Mutant]:
     """Return all mutants of the functions of a module, including those in its tables."""
     file = str(Path(str(import_module(name).__file__)).resolve())
     wrapper = MetadataWrapper(cst.parse_module(Path(file).read_text("utf-8")), unsafe_skip_copy=True)
     visitor = _Visitor(mutation_operators, IgnoredCode(set(), set(), set()))
     tree, spans = wrapper.visit(visitor), wrapper.resolve(PositionProvider)
-    inside = {id(node): place for place, function, _ in _functions(tree) for node in _below(function)}
+    inside = {id(node): place for place, function, _ in _list_functions(tree) for node in _below(function)}
     functions = {
-        place: (function, tree.code_for_node(function), spans[whole]) for place, function, whole in _functions(tree)
+        place: (function, tree.code_for_node(function), spans[whole])
+        for place, function, whole in _list_functions(tree)
     }
     for mutation in visitor.mutations:
         if id(mutation.original_node) not in inside:
@@ -92,7 +93,7 @@ def of_code(name: str) -> Iterator[Mutant]:
         place = inside[id(mutation.original_node)]
         function, before, whole = functions[place]
         after = tree.code_for_node(function.deep_replace(mutation.original_node, mutation.mutated_node))
-        was, now = _difference(before, after)
+        was, now = _diff_lines(before, after)
         if was != now:
             lines = _lines(file, spans[mutation.original_node])
             yield Mutant(name, place, was, now, after, None, lines, _lines(file, whole))
@@ -102,7 +103,7 @@ def _lines(file: str, span: CodeRange) -> tuple[tuple[str, int], ...]:
     return tuple((file, line) for line in range(span.start.line, span.end.line + 1))
 
 
-def _functions(tree: cst.Module) -> Iterator[tuple[str, Any, cst.CSTNode]]:
+def _list_functions(tree: cst.Module) -> Iterator[tuple[str, Any, cst.CSTNode]]:
     """Return the functions and methods of a module, and the lambdas of tables whose rows are (name, lambda).
 
     Each comes with its node in the module; of a function that is itself with its decorators.
@@ -133,7 +134,7 @@ def _below(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
         yield from _below(child)
 
 
-def _difference(before: str, after: str) -> tuple[str, str]:
+def _diff_lines(before: str, after: str) -> tuple[str, str]:
     """Return the changed lines as they were and as they are."""
     old, new = before.splitlines(), after.splitlines()
     while old and new and old[0] == new[0]:
@@ -144,17 +145,17 @@ def _difference(before: str, after: str) -> tuple[str, str]:
     return was, now
 
 
-def of_values(name: str) -> Iterator[Mutant]:
+def mutate_values(name: str) -> Iterator[Mutant]:
     """Return the mistakes in a module's constants and tables: a number that is one higher, a row that is missing."""
     module = import_module(name)
     for place, value in list(vars(module).items()):
-        if place.isupper() and _defines(name, place):
-            lines = readers(name, place)  # what is read while modules are loaded cannot be changed any more
-            for was, now, changed in _changed(value) if lines else ():
+        if place.isupper() and _is_defining(name, place):
+            lines = find_readers(name, place)  # what is read while modules are loaded cannot be changed any more
+            for was, now, changed in _change_value(value) if lines else ():
                 yield Mutant(name, place, was, now, "", changed, lines)
 
 
-def _changed(value: Any) -> Iterator[tuple[str, str, Any]]:
+def _change_value(value: Any) -> Iterator[tuple[str, str, Any]]:
     """Return the old text, the new text, and the changed value."""
     if type(value) in (int, float):
         yield f"{value:g}", f"{value + 1:g}", value + 1
@@ -164,19 +165,19 @@ def _changed(value: Any) -> Iterator[tuple[str, str, Any]]:
                 other = type(row[0])((row[0] + 1) % len(type(row[0])))
                 yield f"{key}: {row[0].name}", other.name, {**value, key: (other, *row[1:])}
             else:
-                yield _shown(key), "no such row", {k: v for k, v in value.items() if k != key}
+                yield _show_value(key), "no such row", {k: v for k, v in value.items() if k != key}
     elif isinstance(value, tuple | frozenset):
         for item in value:
-            yield _shown(item), "no such row", type(value)(other for other in value if other is not item)
+            yield _show_value(item), "no such row", type(value)(other for other in value if other is not item)
 
 
-def _defines(name: str, place: str) -> bool:
+def _is_defining(name: str, place: str) -> bool:
     """Return whether a module defines a name, rather than importing it."""
     text = Path(str(sys.modules[name].__file__)).read_text("utf-8")
     return f"\n{place} = " in text or f"\n{place}: " in text
 
 
-def _shown(item: object) -> str:
+def _show_value(item: object) -> str:
     parts = item if isinstance(item, tuple) else (item,)
     return ", ".join(str(getattr(part, "name", part)) for part in parts if not isinstance(part, FunctionType))
 
@@ -184,7 +185,7 @@ def _shown(item: object) -> str:
 # --- a mistake in this process ---
 
 
-def function_of(module: str, place: str) -> FunctionType:
+def find_function(module: str, place: str) -> FunctionType:
     """Return the function at a place: of a property its getter, of a static method what is within."""
     table, _, row = place.partition("[")
     found: Any = import_module(module)
@@ -197,11 +198,11 @@ def function_of(module: str, place: str) -> FunctionType:
     return found
 
 
-def put(mutant: Mutant) -> None:
+def apply_mutant(mutant: Mutant) -> None:
     """Apply the mutant to this process; SyntaxError if it is not valid code."""
     if not mutant.text:
         return _put_value(mutant)
-    target = function_of(mutant.module, mutant.place)
+    target = find_function(mutant.module, mutant.place)
     owner, _, name = mutant.place.rpartition(".")
     space = dict(vars(sys.modules[mutant.module]))
     if "[" in mutant.place:
@@ -222,7 +223,7 @@ def _put_value(mutant: Mutant) -> None:
             setattr(module, mutant.place, mutant.value)
 
 
-def readers(home: str, place: str) -> tuple[tuple[str, int], ...]:
+def find_readers(home: str, place: str) -> tuple[tuple[str, int], ...]:
     """Return the lines of the package's functions that read a name of a module."""
     value, found = vars(sys.modules[home])[place], []
     for name, module in list(sys.modules.items()):

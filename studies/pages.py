@@ -27,7 +27,7 @@ DIGITS = 6
 Run = Mapping[str, str]
 
 
-def conduct(
+def run_study(
     name: str,
     parser: argparse.ArgumentParser,
     seeds: Callable[[argparse.Namespace], str],
@@ -41,57 +41,57 @@ def conduct(
     parser.add_argument("--out", type=Path, default=FOLDER)
     options = parser.parse_args()
     changed = [
-        f" --{key.replace('_', '-')}{_given(value)}"
+        f" --{key.replace('_', '-')}{_list_given_options(value)}"
         for key, value in vars(options).items()
         if key not in ("processes", "out", "folder", "done") and value != parser.get_default(key)
     ]
-    run = provenance(f"python -m studies.{name}{''.join(changed)}") | {"seeds": seeds(options)}
-    document = {"study": name, "run": run, "figures": plain(measure(options))}
+    run = describe_provenance(f"python -m studies.{name}{''.join(changed)}") | {"seeds": seeds(options)}
+    document = {"study": name, "run": run, "figures": convert_to_json(measure(options))}
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / f"{name}.json").write_text(json.dumps(document, separators=(",", ":")) + "\n", "utf-8")
     print(write_page(options.out / f"{name}.json"))
     return document["figures"]
 
 
-def _given(value: Any) -> str:
+def _list_given_options(value: Any) -> str:
     """Return what follows an option on the command line; nothing follows a switch."""
     return "" if value is True else f" {' '.join(map(str, value)) if isinstance(value, list) else value}"
 
 
-def provenance(command: str) -> dict[str, str]:
+def describe_provenance(command: str) -> dict[str, str]:
     """Return what a reader needs to measure the same again: command, commit, versions; and the day."""
     told = {"Python": platform.python_version()} | {name: version(name) for name in ("numpy", "scipy", "numba")}
     return {
         "command": command,
-        "commit": commit(),
+        "commit": read_commit(),
         "date": f"{datetime.now(UTC):%Y-%m-%d}",
         "versions": ", ".join(f"{name} {number}" for name, number in told.items()),
     }
 
 
-def commit() -> str:
+def read_commit() -> str:
     """Return the commit of the code that runs, and whether it was changed since (pages and figures do not count)."""
     try:
-        head = _git("rev-parse", "--short", "HEAD")
-        dirty = _git("status", "--porcelain", "--", "fdhil", "studies", "benchmarks", "tests")
+        head = _run_git("rev-parse", "--short", "HEAD")
+        dirty = _run_git("status", "--porcelain", "--", "fdhil", "studies", "benchmarks", "tests")
     except (OSError, subprocess.CalledProcessError):
         return "unknown, outside of a repository"
     return f"{head} with local changes" if dirty else head
 
 
-def _git(*arguments: str) -> str:
+def _run_git(*arguments: str) -> str:
     done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True)
     return done.stdout.strip()
 
 
-def plain(value: Any) -> Any:
+def convert_to_json(value: Any) -> Any:
     """Return figures as JSON has them: lists, six significant digits, null for what is no number."""
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): convert_to_json(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
+        return convert_to_json(value.tolist())
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [convert_to_json(item) for item in value]
     if isinstance(value, float):
         return float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None
     return value
@@ -100,7 +100,7 @@ def plain(value: Any) -> Any:
 def write_page(path: Path) -> str:
     """Write the page and the plot of the figures in ``path`` next to it; return the page."""
     document = json.loads(path.read_text("utf-8"))
-    text = rendered(document)
+    text = render_page(document)
     path.with_suffix(".md").write_text(text, "utf-8")
     draw = getattr(import_module(f"studies.{document['study']}"), "draw", None)
     if draw is not None:
@@ -108,18 +108,18 @@ def write_page(path: Path) -> str:
     return text
 
 
-def rendered(document: Mapping[str, Any]) -> str:
+def render_page(document: Mapping[str, Any]) -> str:
     """Return the page of a study's document."""
     text: str = import_module(f"studies.{document['study']}").page(document["run"], document["figures"])
     return text.rstrip() + "\n"
 
 
-def head(title: str, name: str, run: Run) -> list[str]:
+def write_head(title: str, name: str, run: Run) -> list[str]:
     """Return the first lines of a page: title, and what wrote it."""
     return [
         f"# {title}",
         "",
-        *paragraph(
+        *wrap_paragraph(
             f"""Written by `{run["command"]}` on {run["date"]}, commit {run["commit"]}, {run["versions"]}. Seeds: {
                 run["seeds"]
             }. All figures: [{name}.json]({name}.json)."""
@@ -127,23 +127,23 @@ def head(title: str, name: str, run: Run) -> list[str]:
     ]
 
 
-def paragraph(words: str) -> list[str]:
+def wrap_paragraph(words: str) -> list[str]:
     """Return words as lines of a page, and the empty line after them."""
     return [*wrap(" ".join(words.split()), 120, break_on_hyphens=False, break_long_words=False), ""]
 
 
-def grid(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def write_table(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Return a table of a page."""
     told = ["| " + " | ".join(row) + " |" for row in (names, *rows)]
     return [told[0], "|---" * len(names) + "|", *told[1:]]
 
 
-def of(count: int, total: int) -> str:
+def format_share(count: int, total: int) -> str:
     """Return a share in words: in none, in all, in 3 of 9."""
     return f"in all {total}" if count == total else f"in none of {total}" if count == 0 else f"in {count} of {total}"
 
 
-def listed(words: Sequence[str], nothing: str = "none") -> str:
+def join_words(words: Sequence[str], nothing: str = "none") -> str:
     """Return words as a sentence lists them."""
     if len(words) < 2:
         return words[0] if words else nothing

@@ -16,11 +16,11 @@ import numpy as np
 
 from fdhil.config import Identification
 from fdhil.identification.rapid_windows import find_windows
-from fdhil.pipeline import analyse
+from fdhil.pipeline import analyse_window
 from fdhil.records import PARAMETERS, Recording, WindowOutcome, freeze_array, get_unit
 from studies import pages
 from studies.bench import Array
-from studies.pages import grid, paragraph
+from studies.pages import wrap_paragraph, write_table
 
 RATED_TORQUE_NM = 2.4  # assumed, of a 750 W motor: the recording does not say it
 PITCH_MM = 20.0
@@ -28,20 +28,20 @@ SHOWN = 2  # every so many rows of a plot
 RECORDINGS = ("mitsubishi_mr_j.csv", "hsm150_step.csv")
 
 
-def scope(path: Path) -> Recording:
+def read_scope_file(path: Path) -> Recording:
     """Return the scope's file: speed in rev/min, torque in per cent of the rated one, taken as a current of 1 N.m/A."""
     rows = np.genfromtxt(path, delimiter=",", skip_header=5, usecols=(0, 1, 2))
     dt_s = float(np.median(np.diff(rows[:, 0]))) * 1e-3
-    return told("Mitsubishi MR-J", dt_s, rows[:, 1] * 2 * np.pi / 60, rows[:, 2] / 100 * RATED_TORQUE_NM)
+    return make_recording("Mitsubishi MR-J", dt_s, rows[:, 1] * 2 * np.pi / 60, rows[:, 2] / 100 * RATED_TORQUE_NM)
 
 
-def bench_steps(path: Path) -> Recording:
+def read_bench_steps(path: Path) -> Recording:
     """Return the test bench's file: speed in rad/s, current in A."""
     rows = np.genfromtxt(path, delimiter=",", skip_header=1)
-    return told("HSM150", float(np.median(np.diff(rows[:, 0]))), rows[:, 1], rows[:, 2])
+    return make_recording("HSM150", float(np.median(np.diff(rows[:, 0]))), rows[:, 1], rows[:, 2])
 
 
-def told(axis: str, dt_s: float, speed_rad_s: Array, current_a: Array) -> Recording:
+def make_recording(axis: str, dt_s: float, speed_rad_s: Array, current_a: Array) -> Recording:
     """Return a recording of speed and current alone; the position is the speed's integral."""
     steps = (speed_rad_s[1:] + speed_rad_s[:-1]) / 2 * dt_s
     position = freeze_array(np.concatenate([[0.0], np.cumsum(steps)]) * PITCH_MM / (2 * np.pi))
@@ -61,19 +61,19 @@ def told(axis: str, dt_s: float, speed_rad_s: Array, current_a: Array) -> Record
     )
 
 
-def figures_of(recording: Recording) -> dict[str, Any]:
+def compute_figures(recording: Recording) -> dict[str, Any]:
     """Return the results of one recording, with the course of its torque and of the model's."""
-    outcomes = [analyse(window, Identification()) for window in find_windows(recording)]
+    outcomes = [analyse_window(window, Identification()) for window in find_windows(recording)]
     return {
         "axis": recording.axis,
         "rate_hz": 1 / recording.dt_s,
         "seconds": recording.time_s.size * recording.dt_s,
         "top_rad_s": float(np.abs(recording.speed_rad_s).max()),
-        "windows": [_window(outcome) for outcome in outcomes],
+        "windows": [_select_window(outcome) for outcome in outcomes],
     }
 
 
-def _window(outcome: WindowOutcome) -> dict[str, Any]:
+def _select_window(outcome: WindowOutcome) -> dict[str, Any]:
     window, estimate, verdict = outcome.window, outcome.estimate, outcome.verdict
     names = () if estimate is None else (*PARAMETERS, *estimate.terms)
     values = {n: (estimate.get_value(n), estimate.get_std(n), get_unit(n)) for n in names if estimate is not None}
@@ -84,11 +84,11 @@ def _window(outcome: WindowOutcome) -> dict[str, Any]:
         "believed": verdict.accepted,
         "reasons": [str(reason) for reason in verdict.reasons],
         "warnings": [str(reason) for reason in verdict.warnings],
-        "course": _course(outcome),
+        "course": _compute_torque(outcome),
     }
 
 
-def _course(outcome: WindowOutcome) -> dict[str, Array]:
+def _compute_torque(outcome: WindowOutcome) -> dict[str, Array]:
     """Return time s, speed rad/s, and torque measured and by the model, N.m, for a plot."""
     window, estimate = outcome.window, outcome.estimate
     if estimate is None or not np.isfinite(estimate.get_value("Jt")):
@@ -105,17 +105,17 @@ def _course(outcome: WindowOutcome) -> dict[str, Array]:
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Return the results of each recording."""
-    read = dict(zip(RECORDINGS, (scope, bench_steps), strict=True))
-    return {name: figures_of(read[name](options.folder / name)) for name in RECORDINGS}
+    read = dict(zip(RECORDINGS, (read_scope_file, read_bench_steps), strict=True))
+    return {name: compute_figures(read[name](options.folder / name)) for name in RECORDINGS}
 
 
 def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     """Return the study's page."""
-    lines = pages.head("Recordings of real axes", "real", run)
+    lines = pages.write_head("Recordings of real axes", "real", run)
     for name, found in figures.items():
         count = len(found["windows"])
         lines += [f"## {found['axis']}", ""]
-        lines += paragraph(
+        lines += wrap_paragraph(
             f"""`{name}`: {found["seconds"]:.2f} s at {found["rate_hz"]:.0f} Hz, up to {found["top_rad_s"]:.0f} rad/s,
             speed and {"torque" if "mitsubishi" in name else "current"} alone. {
                 "It holds no rapid, and nothing is said of its drive."
@@ -126,10 +126,10 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
         for window in found["windows"]:
             rows = [[n, f"{v:.4g}", f"{1.96 * s:.2g}", unit] for n, (v, s, unit) in window["values"].items()]
             if rows:
-                lines += [*grid(["", "value", "95 % within", "unit"], rows), ""]
+                lines += [*write_table(["", "value", "95 % within", "unit"], rows), ""]
             said = [*window["reasons"], *(f"(warning) {text}" for text in window["warnings"])]
-            lines += paragraph(("Believed. " if window["believed"] else "Not believed. ") + "; ".join(said))
-    lines += paragraph(
+            lines += wrap_paragraph(("Believed. " if window["believed"] else "Not believed. ") + "; ".join(said))
+    lines += wrap_paragraph(
         f"""The scope does not say the rated torque; {RATED_TORQUE_NM} N.m of a 750 W motor is assumed, so that inertia
         and friction stand in proportion to it."""
     )
@@ -160,7 +160,7 @@ def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, metavar="FOLDER")
-    pages.conduct("real", parser, lambda _: "none", measure)
+    pages.run_study("real", parser, lambda _: "none", measure)
 
 
 if __name__ == "__main__":

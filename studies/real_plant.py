@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from fdhil.records import Recording, VoltageSampling, freeze_array
-from studies.bench import Array, table_text
+from studies.bench import Array, format_table
 
 STEP_S = 3.125e-5
 SPEED_STEPS = 8
@@ -259,7 +259,7 @@ def _run_plain(m: Array, g: Array, r: Array, start: Array, every: int, warming: 
 _run: Callable[..., tuple[Array, Array]] = njit(cache=True, nogil=True)(_run_plain)
 
 
-def _vectors(mechanics: Mechanics, loops: Loops) -> tuple[Array, Array]:
+def _pack_parameters(mechanics: Mechanics, loops: Loops) -> tuple[Array, Array]:
     m, g = mechanics, loops
     stiffness = damper = 0.0
     if m.resonance_hz:
@@ -276,29 +276,29 @@ def _vectors(mechanics: Mechanics, loops: Loops) -> tuple[Array, Array]:
     return np.array(mechanical), np.array(drive)
 
 
-def at_rest(mechanics: Mechanics, loops: Loops, position_m: float) -> Array:
+def compute_rest_state(mechanics: Mechanics, loops: Loops, position_m: float) -> Array:
     """Return the state (7,) of an axis at standstill: its regulators hold the load that friction does not."""
-    mechanical, drive = _vectors(mechanics, loops)
+    mechanical, drive = _pack_parameters(mechanics, loops)
     angle = position_m / mechanics.pitch_m * 2 * np.pi
     start = np.array([0.0, 0.0, angle, 0.0, angle, 0.0, 0.0])
     return np.asarray(_run(mechanical, drive, np.full(1500, position_m), start, CYCLE_STEPS, 0.0)[1])
 
 
-def run(
+def simulate_axis(
     mechanics: Mechanics, demand_m: Array, loops: Loops | None = None, dt_s: float = CYCLE_S, start: Array | None = None
 ) -> Run:
     """Cut the demand (m, 1 ms rows); rows every ``dt_s`` (a multiple of 31.25 us), from rest unless ``start`` says."""
     loops = loops or Loops()
-    mechanical, drive = _vectors(mechanics, loops)
+    mechanical, drive = _pack_parameters(mechanics, loops)
     every = round(dt_s / STEP_S)
-    begin = at_rest(mechanics, loops, float(demand_m[0])) if start is None else start
+    begin = compute_rest_state(mechanics, loops, float(demand_m[0])) if start is None else start
     rows, _ = _run(mechanical, drive, np.ascontiguousarray(demand_m), begin, every, mechanics.warming)
     n = rows.shape[1]
     wanted = np.interp(np.arange(n) * dt_s, np.arange(demand_m.size) * CYCLE_S, demand_m)
     return Run(dt_s, wanted, rows[2], rows[3], rows[1], rows[0], rows[4], rows[5], rows[6], float(begin[5]))
 
 
-def reported(run: Run, mechanics: Mechanics, sensors: Sensors, seed: int = 0) -> dict[str, Array]:
+def report_signals(run: Run, mechanics: Mechanics, sensors: Sensors, seed: int = 0) -> dict[str, Array]:
     """Return the columns of a recording as the drive reports them: V, A, rad/s, m."""
     rng = np.random.default_rng(seed)
     n = run.speed.size
@@ -325,11 +325,11 @@ def reported(run: Run, mechanics: Mechanics, sensors: Sensors, seed: int = 0) ->
     }
 
 
-def recording(
+def make_recording(
     run: Run, mechanics: Mechanics, sensors: Sensors, rapid_m_s: float, seed: int = 0, *, voltage: bool = True
 ) -> Recording:
     """Return the run as a recording is read from disk."""
-    told = reported(run, mechanics, sensors, seed)
+    told = report_signals(run, mechanics, sensors, seed)
     return Recording(
         axis="X",
         dt_s=run.dt_s,
@@ -345,19 +345,19 @@ def recording(
     )
 
 
-def as_csv(
+def format_as_csv(
     run: Run, mechanics: Mechanics, sensors: Sensors, rapid_m_s: float, seed: int = 0, *, voltage: bool = True
 ) -> str:
     """Return the run as a recording's text, without the column ``voltage_V`` where there is no ``voltage``."""
-    columns = reported(run, mechanics, sensors, seed)
+    columns = report_signals(run, mechanics, sensors, seed)
     headers = {"pitch_m_per_rev": f"{mechanics.pitch_m:g}", "rapid_speed_m_per_s": f"{rapid_m_s:g}"}
     if not voltage:
         del columns["voltage_V"]
         headers["torque_constant_nm_per_a"] = f"{mechanics.K:g}"
-    return table_text(run.dt_s, columns, **headers)
+    return format_table(run.dt_s, columns, **headers)
 
 
-def drawn(rng: np.random.Generator, base: Mechanics, share: float = 1.0) -> tuple[Mechanics, Loops, Sensors]:
+def draw_machine(rng: np.random.Generator, base: Mechanics, share: float = 1.0) -> tuple[Mechanics, Loops, Sensors]:
     """Draw an ordinary machine about ``base``: every effect at a level between none and ``share`` of what is usual."""
     level = share * rng.uniform(0.0, 1.0, 12)
     mechanics = replace(

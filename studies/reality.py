@@ -18,22 +18,22 @@ from typing import Any
 import numpy as np
 
 from fdhil.config import Axis, MachineConfig, parse_config
-from fdhil.correction.learning import Lesson, learn
-from fdhil.correction.limits import fit_all
-from fdhil.correction.planning import plan
+from fdhil.correction.correction_planner import plan_correction
+from fdhil.correction.learned_offsets import LearnedOffset, learn_from_pass
+from fdhil.correction.plan_limits import fit_all_axes
 from fdhil.identification.drive_loops.loop_identification import apply_loops
 from fdhil.identification.rapid_windows import find_windows
 from fdhil.model.model_terms import add_resonance
-from fdhil.pipeline import analyse, pool
-from fdhil.pipeline.identified_loops import better_axis, explained
-from fdhil.prediction.contour import contour_error_um
-from fdhil.prediction.predict import ahead_of_motor_mm
+from fdhil.pipeline import analyse_window, pool_windows
+from fdhil.pipeline.identified_loops import adopt_loops, reanalyse_with_loops
+from fdhil.prediction.contour_error import compute_contour_error_um
+from fdhil.prediction.path_prediction import compute_table_deflection_mm
 from fdhil.program.loading import load_trajectory
 from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Parameters, Trajectory, WindowOutcome, compute_rms
 from studies import pages
-from studies.bench import Array, shuttle
+from studies.bench import Array, make_shuttle_demand
 from studies.comparison import SURE_95
-from studies.pages import grid, paragraph
+from studies.pages import wrap_paragraph, write_table
 from studies.real_plant import (
     GOOD_LOOPS,
     GOOD_MECHANICS,
@@ -47,10 +47,10 @@ from studies.real_plant import (
     Loops,
     Mechanics,
     Sensors,
-    at_rest,
-    drawn,
-    recording,
-    run,
+    compute_rest_state,
+    draw_machine,
+    make_recording,
+    simulate_axis,
 )
 
 SHARES = (1.0, 0.7)  # of the rapid speed
@@ -114,7 +114,7 @@ BASES = {
 }
 
 
-def machines(base: str) -> list[Machine]:
+def list_machines(base: str) -> list[Machine]:
     """Return the machines with one effect each, and with all together."""
     m, g, *_ = BASES[base]
     s = Sensors()
@@ -141,11 +141,16 @@ def machines(base: str) -> list[Machine]:
         ("bus sag 5 %, command recorded", m, replace(g, bus_sag=0.05), replace(s, command=True)),
         ("winding warms by 5 %", replace(m, warming=0.05), g, s),
         ("current sensor +1 %", m, g, replace(s, current_gain=0.01)),
-        ("a good new machine", _like(GOOD_MECHANICS, m, scaled), replace(g, **_inverter(GOOD_LOOPS)), GOOD_SENSORS),
+        (
+            "a good new machine",
+            _scale_effects(GOOD_MECHANICS, m, scaled),
+            replace(g, **_scale_inverter(GOOD_LOOPS)),
+            GOOD_SENSORS,
+        ),
         (
             "an ordinary machine",
-            _like(ORDINARY_MECHANICS, m, scaled),
-            replace(g, **_inverter(ORDINARY_LOOPS)),
+            _scale_effects(ORDINARY_MECHANICS, m, scaled),
+            replace(g, **_scale_inverter(ORDINARY_LOOPS)),
             ORDINARY_SENSORS,
         ),
     ]
@@ -164,31 +169,31 @@ def machines(base: str) -> list[Machine]:
     return made + [Machine(name, base, m, replace(g, **values), s, g) for name, values in drives.items()]
 
 
-def _like(real: Mechanics, base: Mechanics, scaled: Mapping[str, float]) -> Mechanics:
+def _scale_effects(real: Mechanics, base: Mechanics, scaled: Mapping[str, float]) -> Mechanics:
     """Return the effects of ``real``, given as shares, on another base."""
     same = {"R": base.R, "L": base.L, "K": base.K, "Jt": base.Jt, "ft": base.ft, "Cd": base.Cd}
     ripple = scaled["motor_ripple_nm"] * real.motor_ripple_nm / 0.4
     return replace(real, **same, load_nm=real.load_nm / 5.0 * base.Cd, motor_ripple_nm=ripple)
 
 
-def _inverter(loops: Loops) -> dict[str, float]:
+def _scale_inverter(loops: Loops) -> dict[str, float]:
     return {"dead_time_v": loops.dead_time_v, "bus_sag": loops.bus_sag}
 
 
-def random_machines(count: int, seed: int) -> list[Machine]:
+def draw_machines(count: int, seed: int) -> list[Machine]:
     """Return machines with every effect at a random level, half of them on each base."""
     made = []
     for k in range(count):
         rng = np.random.default_rng([seed, k])
         base = list(BASES)[k % len(BASES)]
         m, g, *_ = BASES[base]
-        parts = drawn(rng, m)
+        parts = draw_machine(rng, m)
         told_hz = parts[0].resonance_hz * rng.uniform(1 - RESONANCE_OFF, 1 + RESONANCE_OFF)
         made.append(Machine("drawn at random", base, *parts, told=g, told_resonance_hz=told_hz))
     return made
 
 
-def config_of(machine: Machine) -> MachineConfig:
+def make_config(machine: Machine) -> MachineConfig:
     """Return the machine's configuration: the base's nominal values and the configured regulators."""
     m, _, rapid_m_s, acceleration_m_s2, _ = BASES[machine.base]
     gains = ("position_gain_per_s", "speed_feedforward", "speed_kp", "speed_ki", "current_kp", "current_ki")
@@ -207,7 +212,7 @@ def config_of(machine: Machine) -> MachineConfig:
 
 
 @lru_cache(maxsize=4)
-def path(base: str) -> Trajectory:
+def make_path(base: str) -> Trajectory:
     """Return the bench path at the base's feed."""
     feed = BASES[base][4]
     program = pages.ROOT / "configs" / "programs" / "bench_10m.ngc"
@@ -215,21 +220,21 @@ def path(base: str) -> Trajectory:
     written = pages.ROOT / "out" / f"bench_{feed:g}m.ngc"
     written.parent.mkdir(exist_ok=True)
     written.write_text(text, "utf-8")
-    return load_trajectory(written, config_of(machines(base)[0]))
+    return load_trajectory(written, make_config(list_machines(base)[0]))
 
 
-def outcomes_of(machine: Machine, seed: int) -> tuple[list[WindowOutcome], float, LoopEstimate | None]:
+def analyse_machine(machine: Machine, seed: int) -> tuple[list[WindowOutcome], float, LoopEstimate | None]:
     """Return the outcomes of the machine's rapids, the RMS following error in um, and loops other than configured."""
     _, _, rapid_m_s, acceleration_m_s2, _ = BASES[machine.base]
-    config = config_of(machine)
+    config = make_config(machine)
     outcomes: list[WindowOutcome] = []
     following = []
     for k, share in enumerate(SHARES):
-        demand = shuttle(0.4, share * rapid_m_s, acceleration_m_s2, RAPIDS)
-        moved = run(machine.mechanics, demand, machine.loops)
-        told = recording(moved, machine.mechanics, machine.sensors, rapid_m_s, 1000 * seed + k)
+        demand = make_shuttle_demand(0.4, share * rapid_m_s, acceleration_m_s2, RAPIDS)
+        moved = simulate_axis(machine.mechanics, demand, machine.loops)
+        told = make_recording(moved, machine.mechanics, machine.sensors, rapid_m_s, 1000 * seed + k)
         outcomes += [
-            analyse(w, config.identification, config.axis["X"], config.machine.sync_period_s)
+            analyse_window(w, config.identification, config.axis["X"], config.machine.sync_period_s)
             for w in find_windows(told)
         ]
         following.append(compute_rms((moved.motor_m - moved.demand) * 1e6))
@@ -237,54 +242,56 @@ def outcomes_of(machine: Machine, seed: int) -> tuple[list[WindowOutcome], float
     windows = [o.window for o in outcomes]
 
     def again(own: Axis) -> list[WindowOutcome]:
-        return [analyse(window, settings, own, period_s) for window in windows]
+        return [analyse_window(window, settings, own, period_s) for window in windows]
 
-    found, loops = explained(outcomes, axis, settings, period_s, again)
-    return list(found), float(np.mean(following)), loops if better_axis(axis, loops) is not None else None
+    found, loops = reanalyse_with_loops(outcomes, axis, settings, period_s, again)
+    return list(found), float(np.mean(following)), loops if adopt_loops(axis, loops) is not None else None
 
 
-def cut(machine: Machine, reference: Trajectory, offset_um: Mapping[str, Array] | None = None) -> tuple[Array, Array]:
+def simulate_cut(
+    machine: Machine, reference: Trajectory, offset_um: Mapping[str, Array] | None = None
+) -> tuple[Array, Array]:
     """Return the table's path (n, d) and that of the motors' encoders, in mm."""
     tables, motors = [], []
     step_mm = machine.mechanics.pitch_m * 1e3 / 65536
     for axis in reference.axes:
         wanted = np.asarray(reference.position_mm[axis])
         commanded = wanted if offset_um is None else wanted + offset_um[axis] * 1e-3
-        begin = at_rest(machine.mechanics, machine.loops, float(wanted[0]) * 1e-3)
-        moved = run(machine.mechanics, commanded * 1e-3, machine.loops, start=begin)
+        begin = compute_rest_state(machine.mechanics, machine.loops, float(wanted[0]) * 1e-3)
+        moved = simulate_axis(machine.mechanics, commanded * 1e-3, machine.loops, start=begin)
         tables.append(moved.table_m * 1e3)
         motors.append(np.round(moved.motor_m * 1e3 / step_mm) * step_mm)
     return np.column_stack(tables), np.column_stack(motors)
 
 
-def contour(
+def measure_contour_error(
     machine: Machine, model: Parameters, loops: LoopEstimate | None
 ) -> tuple[float, float, float, tuple[float, ...]]:
     """Return RMS um at the table without and with the correction, the largest degradation, and the passes' residuals.
 
     In these the machine learns from what its motors' encoders measure.
     """
-    reference, config = path(machine.base), config_of(machine)
+    reference, config = make_path(machine.base), make_config(machine)
     if loops is not None:
         axes = {name: apply_loops(axis, loops) for name, axis in config.axis.items()}
         config = config.model_copy(update={"axis": axes})
     models = {axis: add_resonance(model, config.axis[axis]) for axis in reference.axes}
-    planned = plan(reference, models, config).offset_um
+    planned = plan_correction(reference, models, config).offset_um
 
     def error_um(places: Array) -> Array:
-        return contour_error_um(reference.path_mm, places, reference.dt_s)
+        return compute_contour_error_um(reference.path_mm, places, reference.dt_s)
 
-    before = error_um(cut(machine, reference)[0])
-    lesson, wanted, passes = Lesson.none(reference), dict(planned), []
+    before = error_um(simulate_cut(machine, reference)[0])
+    lesson, wanted, passes = LearnedOffset.make_empty(reference), dict(planned), []
     for _ in range(PASSES + 1):
-        table, motor = cut(machine, reference, wanted)
+        table, motor = simulate_cut(machine, reference, wanted)
         passes.append(error_um(table))
-        ahead = ahead_of_motor_mm(reference.position_mm, wanted, models, config)
+        ahead = compute_table_deflection_mm(reference.position_mm, wanted, models, config)
         seen = motor + np.column_stack([ahead.get(axis, np.zeros(len(motor))) for axis in reference.axes])
         own = {axis: (reference.position_mm[axis] - seen[:, k]) * 1e3 for k, axis in enumerate(reference.axes)}
-        lesson = learn(lesson, own, compute_rms(error_um(seen)), models, config)
+        lesson = learn_from_pass(lesson, own, compute_rms(error_um(seen)), models, config)
         rough = {axis: planned[axis] + lesson.offset_um[axis] for axis in reference.axes}
-        wanted = fit_all(rough, config.axis, reference.dt_s)
+        wanted = fit_all_axes(rough, config.axis, reference.dt_s)
     after = passes[0]
     return (
         compute_rms(before),
@@ -294,7 +301,7 @@ def contour(
     )
 
 
-def errors_of(estimate: Estimate | None, truth: Array) -> tuple[Array, Array]:
+def compute_errors(estimate: Estimate | None, truth: Array) -> tuple[Array, Array]:
     """Return errors in per cent of the truth, and in the estimate's deviations, (6,) each."""
     if estimate is None:
         return np.full(6, np.nan), np.full(6, np.nan)
@@ -305,16 +312,16 @@ def errors_of(estimate: Estimate | None, truth: Array) -> tuple[Array, Array]:
     return 100 * shares, (values - truth) / stds
 
 
-def examine(machine: Machine, seed: int = 0) -> Found:
+def examine_machine(machine: Machine, seed: int = 0) -> Found:
     """Return the results of one machine."""
-    outcomes, following_um, loops = outcomes_of(machine, seed)
-    settings = config_of(machine).identification
-    estimate, verdict = pool(outcomes, settings)
-    told = [errors_of(o.estimate, machine.truth(o.window.direction)) for o in outcomes if o.verdict.accepted]
+    outcomes, following_um, loops = analyse_machine(machine, seed)
+    settings = make_config(machine).identification
+    estimate, verdict = pool_windows(outcomes, settings)
+    told = [compute_errors(o.estimate, machine.truth(o.window.direction)) for o in outcomes if o.verdict.accepted]
     candidates = [estimate, *(o.estimate for o in outcomes)]  # a refused model is cut with all the same
-    usable = [e.build_parameters() for e in candidates if e is not None and _whole(e)]
+    usable = [e.build_parameters() for e in candidates if e is not None and _examine_all(e)]
     nothing = (np.nan, np.nan, np.nan, ())
-    before_um, after_um, worse_um, passes_um = contour(machine, usable[0], loops) if usable else nothing
+    before_um, after_um, worse_um, passes_um = measure_contour_error(machine, usable[0], loops) if usable else nothing
     left = [o.verdict.unexplained_um for o in outcomes if o.verdict.unexplained_um is not None]
     reasons = Counter(reason.code for o in outcomes for reason in o.verdict.reasons)
     return Found(
@@ -323,7 +330,7 @@ def examine(machine: Machine, seed: int = 0) -> Found:
         len(outcomes),
         sum(o.verdict.accepted for o in outcomes),
         verdict.accepted,
-        *errors_of(estimate, machine.truth()),
+        *compute_errors(estimate, machine.truth()),
         np.array([e for e, _ in told]).reshape(-1, 6),
         np.array([d for _, d in told]).reshape(-1, 6),
         float(np.mean(left)) if left else None,
@@ -336,17 +343,17 @@ def examine(machine: Machine, seed: int = 0) -> Found:
     )
 
 
-def _whole(estimate: Estimate) -> bool:
+def _examine_all(estimate: Estimate) -> bool:
     values = np.array([estimate.get_value(name) for name in PARAMETERS])
     return bool(np.isfinite(values).all() and (values[:4] > 0).all() and (values[4:] >= 0).all())
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Return the results of every machine."""
-    alone = [machine for base in BASES for machine in machines(base)]
-    several = random_machines(options.machines, options.seed)
+    alone = [machine for base in BASES for machine in list_machines(base)]
+    several = draw_machines(options.machines, options.seed)
     with ProcessPoolExecutor(options.processes) as executor:
-        found = list(executor.map(examine, [*alone, *several], range(len(alone) + len(several))))
+        found = list(executor.map(examine_machine, [*alone, *several], range(len(alone) + len(several))))
     return {"alone": [asdict(f) for f in found[: len(alone)]], "random": [asdict(f) for f in found[len(alone) :]]}
 
 
@@ -356,8 +363,8 @@ def page(told: pages.Run, figures: Mapping[str, Any]) -> str:
     believed, windows = (sum(f[key] for f in several) for key in ("believed", "windows"))
     gains = np.array([f["before_um"] / f["after_um"] for f in several if f["after_um"]], dtype=np.float64)
     taught = np.array([f["before_um"] / f["passes_um"][-1] for f in several if f["passes_um"]], dtype=np.float64)
-    lines = pages.head("Machines as they are", "reality", told)
-    lines += paragraph(
+    lines = pages.write_head("Machines as they are", "reality", told)
+    lines += wrap_paragraph(
         f"""Of {len(several)} machines with every effect at a random level, {believed} of {windows} rapids are
         believed, and {sum(f["pooled"] for f in several)} pools. The contour error of the bench path at the table falls
         by {np.median(gains):.1f} times in the median, by {np.percentile(gains, 5):.1f} at the fifth percentile; no
@@ -366,30 +373,31 @@ def page(told: pages.Run, figures: Mapping[str, Any]) -> str:
     )
     lines += ["## What the intervals hold", ""]
     rows = [
-        [name, *(_coverage(several, key, k) for key in ("deviations", "window_deviations"))]
+        [name, *(_describe_coverage(several, key, k) for key in ("deviations", "window_deviations"))]
         for k, name in enumerate(PARAMETERS)
     ]
-    lines += [*grid(["", "pools: 95 % intervals that hold the truth", "believed rapids"], rows), ""]
-    short = [name for k, name in enumerate(PARAMETERS) if _held(several, "deviations", k)[0] < LEAST_HELD]
+    lines += [*write_table(["", "pools: 95 % intervals that hold the truth", "believed rapids"], rows), ""]
+    short = [name for k, name in enumerate(PARAMETERS) if _compute_coverage(several, "deviations", k)[0] < LEAST_HELD]
     if short:
-        lines += paragraph(
-            f"""The pools' intervals of {pages.listed(short)} are too narrow: what bends every rapid alike, a screw that
+        lines += wrap_paragraph(
+            f"""The pools' intervals of {pages.join_words(short)} are too narrow: what bends every rapid alike, a screw that
             gives or friction at low speed that none of them surely shows, does not average away."""
         )
     lines += ["## Each effect alone, and all together", ""]
     names = ["base", "machine", "rapids believed", "pool", "errors of R L K Jt ft Cd, %", "left of following error, um"]
-    lines += grid(
-        [*names, "contour RMS, um", "gain", "worst, um", "learned, um", "reasons"], [_row(f) for f in figures["alone"]]
+    lines += write_table(
+        [*names, "contour RMS, um", "gain", "worst, um", "learned, um", "reasons"],
+        [_format_row(f) for f in figures["alone"]],
     )
     return "\n".join(lines)
 
 
-def _coverage(found: Sequence[Mapping[str, Any]], key: str, k: int) -> str:
-    share, count = _held(found, key, k)
+def _describe_coverage(found: Sequence[Mapping[str, Any]], key: str, k: int) -> str:
+    share, count = _compute_coverage(found, key, k)
     return f"{100 * share:.0f} % of {count}" if count else "-"
 
 
-def _held(found: Sequence[Mapping[str, Any]], key: str, k: int) -> tuple[float, int]:
+def _compute_coverage(found: Sequence[Mapping[str, Any]], key: str, k: int) -> tuple[float, int]:
     """Return the share of a parameter's 95 % intervals that cover the truth, and their number."""
     values = np.array(
         [row[k] for f in found for row in ([f[key]] if key == "deviations" else f[key]) if row[k] is not None]
@@ -397,7 +405,7 @@ def _held(found: Sequence[Mapping[str, Any]], key: str, k: int) -> tuple[float, 
     return (float(np.mean(np.abs(values) < SURE_95)) if values.size else 0.0), int(values.size)
 
 
-def _row(f: Mapping[str, Any]) -> list[str]:
+def _format_row(f: Mapping[str, Any]) -> list[str]:
     errors = " ".join("-" if e is None else f"{e:+.1f}" for e in f["errors"])
     left = "-" if f["unexplained_um"] is None else f"{f['unexplained_um']:.2f} of {f['following_um']:.0f}"
     reasons = ", ".join(f"{count} {code}" for code, count in f["reasons"].items())
@@ -426,7 +434,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--machines", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
-    pages.conduct("reality", parser, lambda o: f"{o.seed}", measure)
+    pages.run_study("reality", parser, lambda o: f"{o.seed}", measure)
 
 
 if __name__ == "__main__":

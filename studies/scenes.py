@@ -23,13 +23,13 @@ class Sensor:
     noise: float
     step: float
 
-    def read(self, rng: Rng) -> Array:
+    def read_values(self, rng: Rng) -> Array:
         """Return its readings (n,)."""
         noisy = self.true + self.noise * rng.standard_normal(self.true.size)
         readings: Array = np.round(noisy / self.step) * self.step
         return readings
 
-    def moves(self, start: int, end: int) -> bool:
+    def is_moving_beyond(self, start: int, end: int) -> bool:
         """Return whether the truth moves by more over these rows than the error of a reading."""
         return float(np.ptp(self.true[start:end])) > MOVED * math.hypot(self.noise, self.step)
 
@@ -58,17 +58,17 @@ class Rows:
     moving: tuple[int, int]
     cruise: tuple[int, int]
 
-    def peak(self, name: str) -> float:
+    def find_peak(self, name: str) -> float:
         """Return the largest magnitude of a signal."""
         return float(np.abs(self.signals[name]).max())
 
-    def with_signals(self, **signals: Array) -> Rows:
+    def replace_signals(self, **signals: Array) -> Rows:
         """Return the rows with some signals replaced."""
         return replace(self, signals=self.signals | signals)
 
 
 @dataclass(frozen=True, slots=True)
-class Spoilt:
+class FaultyRecording:
     """A recording with its fault: the severity in ``unit``, and the scene where the fault is one of the machine."""
 
     recording: Recording
@@ -98,14 +98,14 @@ def draw_step(rng: Rng) -> float:
 
 def demand_of(scene: Scene, *rates: Array) -> Array:
     """Return the demand of one move (or the given path speeds) between standstills."""
-    moves = list(rates) or [scene.move.direction * drives.rates(scene.move)]
-    parts = [drives.rest(scene.lead_s)]
+    moves = list(rates) or [scene.move.direction * drives.compute_path_speeds(scene.move)]
+    parts = [drives.make_standstill(scene.lead_s)]
     for rate in moves:
-        parts += [rate, drives.rest(0.25)]
+        parts += [rate, drives.make_standstill(0.25)]
     return drives.demand_of(parts)
 
 
-def measured(rng: Rng, scene: Scene, signals: Signals) -> Rows:
+def measure_run(rng: Rng, scene: Scene, signals: Signals) -> Rows:
     """Return the sensors' readings of a run: noise, then resolution."""
     voltage = signals.voltage if scene.sampling == "interval_mean" else signals.voltage_instant
     sensors = {}
@@ -115,7 +115,7 @@ def measured(rng: Rng, scene: Scene, signals: Signals) -> Rows:
     ):
         peak = float(np.abs(true).max())
         sensors[name] = Sensor(true, scene.noise * size * peak, step * peak)
-    out = {name: sensor.read(rng) for name, sensor in sensors.items()}
+    out = {name: sensor.read_values(rng) for name, sensor in sensors.items()}
     out["position"] = np.round(signals.position / scene.position_step_m) * scene.position_step_m
     out["demand"] = np.round(signals.demand / 1e-6) * 1e-6
     speed = np.abs(signals.speed)
@@ -124,7 +124,7 @@ def measured(rng: Rng, scene: Scene, signals: Signals) -> Rows:
     return Rows(signals.dt_s, out, sensors, (int(moving[0]), int(moving[-1])), (int(top[0]), int(top[-1])))
 
 
-def recorded(scene: Scene, rows: Rows, *, says_rapid: bool = True) -> Recording:
+def make_recording(scene: Scene, rows: Rows, *, says_rapid: bool = True) -> Recording:
     """Return the rows as a recording; ``says_rapid``: its header contains the rapid speed."""
     s = rows.signals
     n = s["speed"].size
@@ -147,11 +147,11 @@ def recorded(scene: Scene, rows: Rows, *, says_rapid: bool = True) -> Recording:
     )
 
 
-def good(rng: Rng) -> Spoilt:
+def make_good_recording(rng: Rng) -> FaultyRecording:
     """Return a rapid, or one in each direction, without any fault."""
     scene = draw_scene(rng)
-    out = drives.rates(scene.move)
+    out = drives.compute_path_speeds(scene.move)
     ways = [out, -out][: int(rng.integers(1, 3))]
     demand = demand_of(scene, *[scene.move.direction * way for way in ways])
-    rows = measured(rng, scene, drives.run(scene.drive, demand, scene.dt_s))
-    return Spoilt(recorded(scene, rows, says_rapid=bool(rng.random() < 0.8)))
+    rows = measure_run(rng, scene, drives.simulate_loop(scene.drive, demand, scene.dt_s))
+    return FaultyRecording(make_recording(scene, rows, says_rapid=bool(rng.random() < 0.8)))

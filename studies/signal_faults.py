@@ -9,20 +9,20 @@ import numpy as np
 
 from studies import drives
 from studies.drives import Rng, log_uniform
-from studies.scenes import SENSORS, Rows, Spoilt, demand_of, draw_scene, measured, recorded
+from studies.scenes import SENSORS, FaultyRecording, Rows, demand_of, draw_scene, make_recording, measure_run
 
 LEAST_LATE_S = 1e-3
 SignalFault = Callable[[Rng, Rows], tuple[Rows, float]]
 
 
-def of_signals(fault: SignalFault) -> Callable[[Rng], Spoilt]:
+def of_signals(fault: SignalFault) -> Callable[[Rng], FaultyRecording]:
     """Return the maker of valid rapids whose recording is then corrupted."""
 
-    def make(rng: Rng) -> Spoilt:
+    def make(rng: Rng) -> FaultyRecording:
         scene = draw_scene(rng)
-        rows = measured(rng, scene, drives.run(scene.drive, demand_of(scene), scene.dt_s))
+        rows = measure_run(rng, scene, drives.simulate_loop(scene.drive, demand_of(scene), scene.dt_s))
         spoilt, severity = fault(rng, rows)
-        return Spoilt(recorded(scene, spoilt), severity)
+        return FaultyRecording(make_recording(scene, spoilt), severity)
 
     return make
 
@@ -39,8 +39,8 @@ def sign(rng: Rng) -> float:
 def clipped(rng: Rng, rows: Rows) -> tuple[Rows, float]:
     """Share of a sensor's peak that is cut off."""
     name, cut = _sensor(rng), rng.uniform(0.05, 0.5)
-    rail = (1 - cut) * rows.peak(name)
-    return rows.with_signals(**{name: np.clip(rows.signals[name], -rail, rail)}), cut
+    rail = (1 - cut) * rows.find_peak(name)
+    return rows.replace_signals(**{name: np.clip(rows.signals[name], -rail, rail)}), cut
 
 
 def gain_step(rng: Rng, rows: Rows) -> tuple[Rows, float]:
@@ -49,7 +49,7 @@ def gain_step(rng: Rng, rows: Rows) -> tuple[Rows, float]:
     values = rows.signals[name].copy()
     begin, end = rows.moving
     values[int(begin + rng.uniform(0.2, 0.8) * (end - begin)) :] *= 1 + sign(rng) * amount
-    return rows.with_signals(**{name: values}), amount
+    return rows.replace_signals(**{name: values}), amount
 
 
 def gain_drift(rng: Rng, rows: Rows) -> tuple[Rows, float]:
@@ -57,7 +57,7 @@ def gain_drift(rng: Rng, rows: Rows) -> tuple[Rows, float]:
     name, amount = _sensor(rng), log_uniform(rng, 0.04, 0.2)
     begin, end = rows.moving
     course = np.clip((np.arange(rows.signals[name].size) - begin) / (end - begin), 0, 1)
-    return rows.with_signals(**{name: rows.signals[name] * (1 + sign(rng) * amount * course)}), amount
+    return rows.replace_signals(**{name: rows.signals[name] * (1 + sign(rng) * amount * course)}), amount
 
 
 def offset(rng: Rng, rows: Rows) -> tuple[Rows, float]:
@@ -66,14 +66,16 @@ def offset(rng: Rng, rows: Rows) -> tuple[Rows, float]:
     The noisiest windows at 2 ms know a zero to 0.4 % of the peak: 5.5 deviations are the least that is told.
     """
     name, amount = _sensor(rng), log_uniform(rng, 0.022, 0.08)
-    return rows.with_signals(**{name: rows.signals[name] + sign(rng) * amount * rows.peak(name)}), amount
+    return rows.replace_signals(**{name: rows.signals[name] + sign(rng) * amount * rows.find_peak(name)}), amount
 
 
 def offset_drift(rng: Rng, rows: Rows) -> tuple[Rows, float]:
     """Share of a sensor's peak by which its zero drifts from the recording's begin to its end."""
     name, amount = _sensor(rng), log_uniform(rng, 0.03, 0.10)
     course = np.linspace(0, 1, rows.signals[name].size)
-    return rows.with_signals(**{name: rows.signals[name] + sign(rng) * amount * rows.peak(name) * course}), amount
+    return rows.replace_signals(
+        **{name: rows.signals[name] + sign(rng) * amount * rows.find_peak(name) * course}
+    ), amount
 
 
 def stuck(rng: Rng, rows: Rows) -> tuple[Rows, float]:
@@ -85,11 +87,11 @@ def stuck(rng: Rng, rows: Rows) -> tuple[Rows, float]:
         name, seconds = _sensor(rng), rng.uniform(0.02, 0.1)
         length = round(seconds / rows.dt_s)
         start = int(rng.uniform(rows.moving[0], rows.moving[1] - length))
-        if rows.sensors[name].moves(start, start + length):
+        if rows.sensors[name].is_moving_beyond(start, start + length):
             break
     values = rows.signals[name].copy()
     values[start : start + length] = values[start]
-    return rows.with_signals(**{name: values}), seconds
+    return rows.replace_signals(**{name: values}), seconds
 
 
 def voltage_late(rng: Rng, rows: Rows) -> tuple[Rows, float]:
@@ -99,14 +101,14 @@ def voltage_late(rng: Rng, rows: Rows) -> tuple[Rows, float]:
     """
     shift = max(int(rng.integers(2, 13)), math.ceil(LEAST_LATE_S / rows.dt_s))
     v = rows.signals["voltage"]
-    return rows.with_signals(voltage=np.concatenate([np.full(shift, v[0]), v[:-shift]])), float(shift)
+    return rows.replace_signals(voltage=np.concatenate([np.full(shift, v[0]), v[:-shift]])), float(shift)
 
 
 def current_late(rng: Rng, rows: Rows) -> tuple[Rows, float]:
     """Samples by which the current is late against voltage and speed."""
     shift = int(rng.integers(2, 9))
     i = rows.signals["current"]
-    return rows.with_signals(current=np.concatenate([np.full(shift, i[0]), i[:-shift]])), float(shift)
+    return rows.replace_signals(current=np.concatenate([np.full(shift, i[0]), i[:-shift]])), float(shift)
 
 
 def lagging_sensor(rng: Rng, rows: Rows) -> tuple[Rows, float]:
@@ -116,7 +118,7 @@ def lagging_sensor(rng: Rng, rows: Rows) -> tuple[Rows, float]:
     values = rows.signals[name].copy()
     for k in range(1, values.size):
         values[k] = pole * values[k - 1] + (1 - pole) * values[k]
-    return rows.with_signals(**{name: values}), samples
+    return rows.replace_signals(**{name: values}), samples
 
 
 def frames_lost(rng: Rng, rows: Rows) -> tuple[Rows, float]:
@@ -125,7 +127,7 @@ def frames_lost(rng: Rng, rows: Rows) -> tuple[Rows, float]:
     length = round(seconds / rows.dt_s)
     start = int(rng.uniform(rows.moving[0] + 0.3 * (rows.cruise[0] - rows.moving[0]), rows.cruise[1] - length))
     keep = np.r_[0:start, start + length : rows.signals["speed"].size]
-    return rows.with_signals(**{name: values[keep] for name, values in rows.signals.items()}), seconds
+    return rows.replace_signals(**{name: values[keep] for name, values in rows.signals.items()}), seconds
 
 
 def counted_gap(rng: Rng, rows: Rows) -> tuple[Rows, float]:
@@ -135,7 +137,7 @@ def counted_gap(rng: Rng, rows: Rows) -> tuple[Rows, float]:
     signals = {name: values.copy() for name, values in rows.signals.items()}
     for values in signals.values():
         values[start : start + length] = np.nan
-    return rows.with_signals(**signals), float(length)
+    return rows.replace_signals(**signals), float(length)
 
 
 def not_finite(rng: Rng, rows: Rows) -> tuple[Rows, float]:
@@ -143,43 +145,43 @@ def not_finite(rng: Rng, rows: Rows) -> tuple[Rows, float]:
     name, count = _sensor(rng), int(rng.integers(1, 20))
     values = rows.signals[name].copy()
     values[rng.integers(rows.moving[0], rows.moving[1], count)] = rng.choice([np.nan, np.inf, -np.inf])
-    return rows.with_signals(**{name: values}), float(count)
+    return rows.replace_signals(**{name: values}), float(count)
 
 
 def speed_scale(rng: Rng, rows: Rows) -> tuple[Rows, float]:
     """Share by which the speed's scale, or the pitch, is off."""
     amount = log_uniform(rng, 0.02, 0.15)
-    return rows.with_signals(speed=rows.signals["speed"] * (1 + sign(rng) * amount)), amount
+    return rows.replace_signals(speed=rows.signals["speed"] * (1 + sign(rng) * amount)), amount
 
 
 def wrong_sign(rng: Rng, rows: Rows) -> tuple[Rows, float]:
     """One signal has the wrong sign."""
     name = _sensor(rng)
-    return rows.with_signals(**{name: -rows.signals[name]}), 1.0
+    return rows.replace_signals(**{name: -rows.signals[name]}), 1.0
 
 
 def swapped_columns(rng: Rng, rows: Rows) -> tuple[Rows, float]:
     """Two columns are swapped."""
     one, other = rng.choice(SENSORS, 2, replace=False)
-    return rows.with_signals(**{str(one): rows.signals[str(other)], str(other): rows.signals[str(one)]}), 1.0
+    return rows.replace_signals(**{str(one): rows.signals[str(other)], str(other): rows.signals[str(one)]}), 1.0
 
 
 def late_trigger(rng: Rng, rows: Rows) -> tuple[Rows, float]:
     """Share of the acceleration that is not recorded."""
     missed = rng.uniform(0.3, 1.2)
     start = int(rows.moving[0] + missed * (rows.cruise[0] - rows.moving[0]))
-    return rows.with_signals(**{name: values[start:] for name, values in rows.signals.items()}), missed
+    return rows.replace_signals(**{name: values[start:] for name, values in rows.signals.items()}), missed
 
 
 def ends_early(rng: Rng, rows: Rows) -> tuple[Rows, float]:
     """Share of the cruise that is recorded, the braking not."""
     share = rng.uniform(0.3, 1.0)
     end = int(rows.cruise[0] + share * (rows.cruise[1] - rows.cruise[0]))
-    return rows.with_signals(**{name: values[:end] for name, values in rows.signals.items()}), share
+    return rows.replace_signals(**{name: values[:end] for name, values in rows.signals.items()}), share
 
 
 def constant_speed(_rng: Rng, rows: Rows) -> tuple[Rows, float]:
     """Nothing but full speed is recorded."""
     a, b = rows.cruise
     a += round(0.3 * (b - a))
-    return rows.with_signals(**{name: values[a:b] for name, values in rows.signals.items()}), 1.0
+    return rows.replace_signals(**{name: values[a:b] for name, values in rows.signals.items()}), 1.0

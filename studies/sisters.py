@@ -19,7 +19,7 @@ import numpy as np
 from fdhil.fleet.outliers import ParameterHistory, assess_peers
 from fdhil.records import Float, freeze_array
 from studies import pages
-from studies.pages import grid, paragraph
+from studies.pages import wrap_paragraph, write_table
 
 SIZES = (5, 6, 8, 10, 12, 20, 50)
 SPREAD = 0.05  # between axes that are as others
@@ -32,17 +32,17 @@ ALARMS = 0.99  # of groups without an outlier that have none
 Draw = Callable[[np.random.Generator, int], list[ParameterHistory]]
 
 
-def single(name: str, value: float, std: float = 0.0, axis: str = "X") -> ParameterHistory:
+def make_single_axis(name: str, value: float, std: float = 0.0, axis: str = "X") -> ParameterHistory:
     """Return an axis with one known set, without temperature."""
     return ParameterHistory(name, axis, freeze_array([value]), freeze_array([np.nan]), freeze_array([0.0]), std)
 
 
-def by_one_set(rng: np.random.Generator, count: int) -> list[ParameterHistory]:
+def draw_single_sets(rng: np.random.Generator, count: int) -> list[ParameterHistory]:
     """Return axes with one known set."""
-    return [single(str(k), 1.0 + SPREAD * z) for k, z in enumerate(rng.normal(size=count))]
+    return [make_single_axis(str(k), 1.0 + SPREAD * z) for k, z in enumerate(rng.normal(size=count))]
 
 
-def drawn(
+def draw_machines(
     rng: np.random.Generator,
     count: int = 12,
     spread: float = SPREAD,
@@ -62,25 +62,25 @@ def drawn(
     return courses
 
 
-def in_steady_halls(rng: np.random.Generator, count: int) -> list[ParameterHistory]:
+def draw_steady_halls(rng: np.random.Generator, count: int) -> list[ParameterHistory]:
     """Return machines in halls of constant temperature: their own sets do not show its effect."""
     courses = []
-    for course in drawn(rng, count):
+    for course in draw_machines(rng, count):
         at_c = freeze_array(np.full(SETS, course.temperatures_c[0]))
         values = course.values * (1 + PER_K * (at_c - course.temperatures_c))
         courses.append(replace(course, temperatures_c=at_c, values=freeze_array(values)))
     return courses
 
 
-def half_without_thermometer(rng: np.random.Generator, count: int) -> list[ParameterHistory]:
+def remove_thermometers(rng: np.random.Generator, count: int) -> list[ParameterHistory]:
     """Return machines of which every second has no thermometer."""
     unknown = freeze_array(np.full(SETS, np.nan))
-    return [replace(c, temperatures_c=unknown) if k % 2 else c for k, c in enumerate(drawn(rng, count))]
+    return [replace(c, temperatures_c=unknown) if k % 2 else c for k, c in enumerate(draw_machines(rng, count))]
 
 
-def with_a_busy_one(rng: np.random.Generator, count: int) -> list[ParameterHistory]:
+def add_busy_machine(rng: np.random.Generator, count: int) -> list[ParameterHistory]:
     """Return machines with a peer that has a hundred times the sets and another slope: only that may be reported."""
-    courses = drawn(rng, count)
+    courses = draw_machines(rng, count)
     at_c = freeze_array(rng.uniform(15, 35, SETS_OF_THE_BUSY))
     values = freeze_array(np.median(courses[0].values) * (1 - 3 * PER_K * (at_c - np.median(at_c))))
     ages = freeze_array(np.full(SETS_OF_THE_BUSY, courses[0].ages_months[0]))
@@ -88,52 +88,52 @@ def with_a_busy_one(rng: np.random.Generator, count: int) -> list[ParameterHisto
 
 
 KINDS: Mapping[str, tuple[str, Draw]] = {
-    "by_one_set": ("one set of each, no temperature", by_one_set),
-    "drawn": ("temperatures and ages of their own", drawn),
-    "in_steady_halls": ("each hall has one temperature, and keeps it", in_steady_halls),
-    "half_without_thermometer": ("every other has no thermometer", half_without_thermometer),
-    "with_a_busy_one": ("beside one with a hundred times the sets and another slope", with_a_busy_one),
+    "by_one_set": ("one set of each, no temperature", draw_single_sets),
+    "drawn": ("temperatures and ages of their own", draw_machines),
+    "in_steady_halls": ("each hall has one temperature, and keeps it", draw_steady_halls),
+    "half_without_thermometer": ("every other has no thermometer", remove_thermometers),
+    "with_a_busy_one": ("beside one with a hundred times the sets and another slope", add_busy_machine),
 }
 
 
-def scores(courses: Sequence[ParameterHistory]) -> dict[str, float]:
+def compute_scores(courses: Sequence[ParameterHistory]) -> dict[str, float]:
     """Return by how many of its bounds each axis is off."""
     found = assess_peers(courses)
     assert found is not None
     return {level.machine: abs(level.score) / found.bound for level in found.levels}
 
 
-def largest(kind: str, count: int, groups: int, seed: int = 0) -> Float:
+def find_largest_score(kind: str, count: int, groups: int, seed: int = 0) -> Float:
     """Return the largest score of each group without an outlier, in bounds."""
     rng = np.random.default_rng([seed, count, list(KINDS).index(kind)])
-    found = (scores(KINDS[kind][1](rng, count)) for _ in range(groups))
+    found = (compute_scores(KINDS[kind][1](rng, count)) for _ in range(groups))
     return np.array([max(score for name, score in told.items() if name != BUSY) for told in found])
 
 
-def share_found(count: int, worn: int, shift: float, groups: int, seed: int = 0) -> float:
+def compute_detected_share(count: int, worn: int, shift: float, groups: int, seed: int = 0) -> float:
     """Return the detected share of worn axes, where ``worn`` of a group are off by ``shift`` spreads."""
     rng = np.random.default_rng([seed, count, worn])
     found = 0
     for _ in range(groups):
-        courses = drawn(rng, count)
+        courses = draw_machines(rng, count)
         for k in range(worn):
             courses[k] = replace(courses[k], values=freeze_array(courses[k].values * (1 + shift * SPREAD)))
-        told = scores(courses)
+        told = compute_scores(courses)
         found += sum(told[f"mill-{k}"] > 1 for k in range(worn))
     return found / (groups * worn)
 
 
-def least_found(worn: Callable[[int], int], groups: int, count: int) -> int | None:
+def find_detection_limit(worn: Callable[[int], int], groups: int, count: int) -> int | None:
     """Return the deviation from which nine of ten are detected, in spreads; None beyond all tried values."""
-    return next((s for s in SHIFTS if share_found(count, worn(count), s, groups) >= FOUND), None)
+    return next((s for s in SHIFTS if compute_detected_share(count, worn(count), s, groups) >= FOUND), None)
 
 
-def one(_count: int) -> int:
+def count_one(_count: int) -> int:
     """Return the number of worn axes: one."""
     return 1
 
 
-def a_quarter(count: int) -> int:
+def count_quarter(count: int) -> int:
     """Return the number of worn axes: a quarter, and at least one."""
     return max(1, count // 4)
 
@@ -142,10 +142,10 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Return alarms and the correct bound for each size and kind, and the detection rate."""
     os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
     with ProcessPoolExecutor(options.processes) as pool:
-        kinds = {kind: pool.map(partial(largest, kind, groups=options.groups), SIZES) for kind in KINDS}
+        kinds = {kind: pool.map(partial(find_largest_score, kind, groups=options.groups), SIZES) for kind in KINDS}
         few = options.groups // 20
-        least = {name: pool.map(partial(least_found, worn, few), SIZES) for name, worn in
-                 (("one", one), ("a_quarter", a_quarter))}  # fmt: skip
+        least = {name: pool.map(partial(find_detection_limit, worn, few), SIZES) for name, worn in
+                 (("one", count_one), ("a_quarter", count_quarter))}  # fmt: skip
         tops = {kind: list(found) for kind, found in kinds.items()}
         return {
             "groups": options.groups,
@@ -165,30 +165,30 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     words = {"one": "one is worn", "a_quarter": "a quarter is worn"}
     power = [[words[name], *("-" if least is None else str(least) for least in figures["least_found"][name])]
              for name in words]  # fmt: skip
-    lines = pages.head("Outliers among sisters", "sisters", run)
-    lines += paragraph(
+    lines = pages.write_head("Outliers among sisters", "sisters", run)
+    lines += wrap_paragraph(
         f"""Fleets are drawn at random: axes that differ by {100 * SPREAD:.0f} %, each at a temperature between 15 and
         35 °C and an age of up to two years, {100 * PER_K:+.0f} % per kelvin, {100 * PER_MONTH:+.1f} % per month. They
         are judged as `fdhil fleet outliers` judges machines."""
     )
     lines += ["## False alarms", ""]
-    lines += paragraph(
+    lines += wrap_paragraph(
         f"""Of 100 groups in which nothing but chance differs, so many have an alarm ({figures["groups"]} groups each; 1
         is meant):"""
     )
-    lines += [*grid(head, alarms), "", "## What is found", ""]
-    lines += paragraph(
+    lines += [*write_table(head, alarms), "", "## What is found", ""]
+    lines += wrap_paragraph(
         f"""The deviation at which nine of ten worn axes are found, in standard deviations of axes that are as others
         ({figures["groups_of_power"]} groups each). Where axes differ by 5 %, 10 of them are 50 %."""
     )
-    return "\n".join([*lines, *grid(head, power)])
+    return "\n".join([*lines, *write_table(head, power)])
 
 
 def main() -> None:
     """Measure and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--groups", type=int, default=1200)
-    pages.conduct("sisters", parser, lambda _: "0", measure)
+    pages.run_study("sisters", parser, lambda _: "0", measure)
 
 
 if __name__ == "__main__":

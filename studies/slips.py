@@ -32,7 +32,7 @@ WRONG = ("unplaced", "elsewhere")
 Leaves = Mapping[str, Any]
 
 
-def slips(text: str) -> Iterator[tuple[int, str]]:
+def generate_slips(text: str) -> Iterator[tuple[int, str]]:
     """Yield the place and the text of every slip of one character."""
     for at, right in enumerate(text):
         yield at, text[:at] + text[at + 1 :]
@@ -42,16 +42,18 @@ def slips(text: str) -> Iterator[tuple[int, str]]:
                 yield at, text[:at] + wrong + text[at + 1 :]
 
 
-def sample(text: str, count: int, seed: int) -> list[tuple[int, str]]:
+def sample_slips(text: str, count: int, seed: int) -> list[tuple[int, str]]:
     """Return some of them."""
-    return random.Random(seed).sample(list(slips(text)), count)
+    return random.Random(seed).sample(list(generate_slips(text)), count)
 
 
-def leaves(document: Any, path: str = "") -> dict[str, Any]:
+def flatten_tables(document: Any, path: str = "") -> dict[str, Any]:
     """Return the values of nested tables by their path."""
     if not isinstance(document, Mapping):
         return {path: document}
-    return {key: value for name, inner in document.items() for key, value in leaves(inner, f"{path}.{name}").items()}
+    return {
+        key: value for name, inner in document.items() for key, value in flatten_tables(inner, f"{path}.{name}").items()
+    }
 
 
 class Reader:
@@ -65,49 +67,51 @@ class Reader:
     def _read(text: str) -> tuple[Leaves, Leaves]:
         """Return the parsed text, and the configuration made of it."""
         raw = config.parse_toml(text.encode("utf-8"), SAMPLE.name)
-        return leaves(raw), leaves(config.parse_config(raw, SAMPLE.name).model_dump(mode="json"))
+        return flatten_tables(raw), flatten_tables(config.parse_config(raw, SAMPLE.name).model_dump(mode="json"))
 
-    def outcome(self, at: int, text: str) -> str:
+    def classify_slip(self, at: int, text: str) -> str:
         """Return the outcome of a slip at a position, one of ``OUTCOMES``."""
         lines = self._text.splitlines()
         number = self._text.count("\n", 0, at)
-        words = {*_keys(lines[number]), *_keys(text.splitlines()[min(number, text.count(chr(10)))])}
-        around = {word for line in lines[max(0, number - 1) : number + 2] for word in _keys(line)} | words
+        words = {*_list_keys(lines[number]), *_list_keys(text.splitlines()[min(number, text.count(chr(10)))])}
+        around = {word for line in lines[max(0, number - 1) : number + 2] for word in _list_keys(line)} | words
         try:
             told, found = self._read(text)
         except ConfigError as error:
             said = str(error)
-            placed = any(word in said for word in around) or _line_told(said) in range(number, number + 4)
+            placed = any(word in said for word in around) or _describe_line(said) in range(number, number + 4)
             return "refused" if placed or "at end of document" in said else "unplaced"
         changed = {path for path in {*found, *self._true} if found.get(path) != self._true.get(path)}
         if not changed:
             return "same"
         if all({*path.split(".")} & words for path in changed):
             return "absent" if {*self._told} - {*told} else "value"
-        section = _section(lines, number)
+        section = _find_section(lines, number)
         return "absent" if all(section in path for path in changed) else "elsewhere"
 
 
-def _keys(line: str) -> set[str]:
+def _list_keys(line: str) -> set[str]:
     """Return the words of a line that a key or a table's name may be made of."""
     return {word for word in re.findall(r"\w+", line.partition("#")[0], re.ASCII) if not word.isdigit()} or {"\0"}
 
 
-def _section(lines: list[str], number: int) -> str:
+def _find_section(lines: list[str], number: int) -> str:
     heads = [line for line in lines[: number + 1] if line.startswith("[")]
     return "." + heads[-1].partition("]")[0][1:] if heads else "\0"
 
 
-def _line_told(told: str) -> int:
+def _describe_line(told: str) -> int:
     found = re.search(r"at line (\d+)", told)
     return int(found[1]) if found else -1
 
 
-def judged(chosen: Iterator[tuple[int, str]] | list[tuple[int, str]], text: str) -> tuple[Counter[str], list[str]]:
+def count_outcomes(
+    chosen: Iterator[tuple[int, str]] | list[tuple[int, str]], text: str
+) -> tuple[Counter[str], list[str]]:
     """Count the outcomes of slips, and list those that must not occur."""
     reader, counts, wrong = Reader(text), Counter[str](), []
     for at, slipped in chosen:
-        outcome = reader.outcome(at, slipped)
+        outcome = reader.classify_slip(at, slipped)
         counts[outcome] += 1
         if outcome in WRONG:
             number = text.count("\n", 0, at)

@@ -24,8 +24,8 @@ from typing import Any
 
 from studies import pages
 from studies.soak_life import EVENTS, NOTE_S, RAPIDS, RESTARTS, Life
-from studies.soak_shop import KEPT_WINDOWS, STORE_MB, Shop, document_of
-from studies.usage import Slope, slope
+from studies.soak_shop import KEPT_WINDOWS, STORE_MB, MachineRig, make_config
+from studies.usage import Slope, fit_slope
 
 PERIOD_S = 0.004
 A_DAY = 1440  # rapids of a machine in a day: one a minute, around the clock
@@ -45,22 +45,22 @@ FLAT = ("descriptors", "threads", "children")
 # -- running
 
 
-def at_speed_up(folder: Path, seed: int, rounds: int) -> None:
+def run_accelerated(folder: Path, seed: int, rounds: int) -> None:
     """Let a plant work for this many rounds at speed-up."""
     _provenance(folder, f"--rapids {rounds * RAPIDS} --hours 0", seed)
-    shop = Shop(folder, document_of(folder, PERIOD_S, lockstep=True))
-    with _open(shop):
+    shop = MachineRig(folder, make_config(folder, PERIOD_S, lockstep=True))
+    with _open_plant(shop):
         life = Life(shop, folder / "samples.jsonl", seed)
         while life.rounds < rounds:
             life.round({**EVENTS, **RESTARTS} if life.rounds < RESTARTING * rounds else EVENTS)
 
 
-def fill(folder: Path, seed: int) -> Path:
+def fill_store(folder: Path, seed: int) -> Path:
     """Return a store filled by an accelerated plant until the pages do not grow with another rapid."""
-    shop = Shop(folder, document_of(folder, PERIOD_S, lockstep=True))
+    shop = MachineRig(folder, make_config(folder, PERIOD_S, lockstep=True))
     kept = folder / "kept"
     if not kept.exists():
-        with _open(shop):
+        with _open_plant(shop):
             life = Life(shop, folder / "samples.jsonl", seed)
             while life.rounds * RAPIDS < SEEN * len(shop.config.axis):
                 life.round({})
@@ -70,11 +70,11 @@ def fill(folder: Path, seed: int) -> Path:
     return kept
 
 
-def by_the_clock(folder: Path, seed: int, hours: float, rest_s: float, filled: Path, command: str) -> None:
+def run_real_time(folder: Path, seed: int, hours: float, rest_s: float, filled: Path, command: str) -> None:
     """Let a plant with a filled store work by the clock, with a rest after each round but the first ones."""
     _provenance(folder, command, seed)
-    shop = Shop(folder, document_of(folder, PERIOD_S, lockstep=False), filled)
-    with _open(shop):
+    shop = MachineRig(folder, make_config(folder, PERIOD_S, lockstep=False), filled)
+    with _open_plant(shop):
         life = Life(shop, folder / "samples.jsonl", seed, BY_CLOCK)
         while life.at_s < 3600 * hours:
             life.round({**EVENTS, **RESTARTS} if life.rounds < RESTARTED else EVENTS)
@@ -82,13 +82,13 @@ def by_the_clock(folder: Path, seed: int, hours: float, rest_s: float, filled: P
                 life.rest(rest_s)
 
 
-def real(folder: Path, options: argparse.Namespace) -> None:
+def run_plants(folder: Path, options: argparse.Namespace) -> None:
     """Let this many plants work by the clock at the same time."""
     command = f"--rapids 0 --hours {options.hours:g} --rest {options.rest:g} --shops {options.shops}"
-    filled = fill(folder / "filled", options.seed)
+    filled = fill_store(folder / "filled", options.seed)
     common = options.hours, options.rest, filled, command
     shops = [
-        multiprocessing.Process(target=by_the_clock, args=(folder / f"hours{k}", options.seed + k, *common))
+        multiprocessing.Process(target=run_real_time, args=(folder / f"hours{k}", options.seed + k, *common))
         for k in range(options.shops)
     ]
     try:
@@ -103,12 +103,12 @@ def real(folder: Path, options: argparse.Namespace) -> None:
 
 def _provenance(folder: Path, what: str, seed: int) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    run = pages.provenance(f"python -m studies.soak {what}") | {"seeds": str(seed)}
+    run = pages.describe_provenance(f"python -m studies.soak {what}") | {"seeds": str(seed)}
     (folder / "run.json").write_text(json.dumps(run), "utf-8")
 
 
 @contextmanager
-def _open(shop: Shop) -> Iterator[None]:
+def _open_plant(shop: MachineRig) -> Iterator[None]:
     """Keep a shop open for the time of a with block; a termination ends all that was started."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     try:
@@ -121,13 +121,13 @@ def _open(shop: Shop) -> Iterator[None]:
 # -- concluding
 
 
-def read(folder: Path) -> list[dict[str, Any]]:
+def read_samples(folder: Path) -> list[dict[str, Any]]:
     """Return the samples of a run so far."""
     file = folder / "samples.jsonl"
     return [json.loads(line) for line in file.read_text("utf-8").splitlines()] if file.exists() else []
 
 
-def longest_life(samples: Sequence[Mapping[str, Any]], name: str, where: str) -> list[Mapping[str, Any]]:
+def select_longest_life(samples: Sequence[Mapping[str, Any]], name: str, where: str) -> list[Mapping[str, Any]]:
     """Return the samples of a part's process that lived longest, after its warm-up; ``where`` counts its life."""
     lives: dict[int, list[Mapping[str, Any]]] = {}
     for sample in samples:
@@ -140,9 +140,9 @@ def longest_life(samples: Sequence[Mapping[str, Any]], name: str, where: str) ->
     return [sample for sample in longest if sample[where] >= begin + WARM * (end - begin)]
 
 
-def figures_of(folder: Path, per_day: bool) -> dict[str, Any]:
+def compute_figures(folder: Path, per_day: bool) -> dict[str, Any]:
     """Return a run's figures: growth of each process per day of work (``per_day``: of the clock), and all counts."""
-    samples = read(folder)
+    samples = read_samples(folder)
     if not samples:
         return {}
     last = samples[-1]
@@ -150,9 +150,9 @@ def figures_of(folder: Path, per_day: bool) -> dict[str, Any]:
     where = "at_s" if per_day else "round"
     processes = {}
     for name in (*OURS, "machine"):
-        life = longest_life(samples, name, where)
+        life = select_longest_life(samples, name, where)
         if life:
-            processes[name] = _process(name, life, where, day)
+            processes[name] = _describe_process(name, life, where, day)
     return {
         "run": json.loads((folder / "run.json").read_text("utf-8")),
         "rounds": last["round"],
@@ -168,11 +168,11 @@ def figures_of(folder: Path, per_day: bool) -> dict[str, Any]:
     }
 
 
-def _process(name: str, life: Sequence[Mapping[str, Any]], where: str, day: float) -> dict[str, Any]:
+def _describe_process(name: str, life: Sequence[Mapping[str, Any]], where: str, day: float) -> dict[str, Any]:
     told = [sample["process"][name] for sample in life]
     over = [sample[where] for sample in life]
     grown = {
-        key: None if (found := slope(over, [each[key] for each in told])) is None else asdict(found.times(day))
+        key: None if (found := fit_slope(over, [each[key] for each in told])) is None else asdict(found.scale(day))
         for key in ("resident_mb", "anonymous_mb", *FLAT)
     }
     return {
@@ -184,7 +184,7 @@ def _process(name: str, life: Sequence[Mapping[str, Any]], where: str, day: floa
     }
 
 
-def goal(week: Mapping[str, Any], hours: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def evaluate_goal(week: Mapping[str, Any], hours: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return whether the goal is met, and its figure.
 
     In a few real hours a growth per day is known to some 10 MB: there nothing may grow for certain.
@@ -195,17 +195,17 @@ def goal(week: Mapping[str, Any], hours: Sequence[Mapping[str, Any]]) -> dict[st
         ([week] if week else [], f"{worked_h:.3g} of {WEEK_H:.0f} h of work at speed-up", False),
         (hours, f"{real_h:.3g} of {REAL_H:.0f} real hours", True),
     ):
-        growths = [(name, growth) for run in runs for name, growth in _growths(run)]
+        growths = [(name, growth) for run in runs for name, growth in _iterate_growth(run)]
         met &= {name for name, _ in growths} == set(OURS)
         met &= all((growth.low if certain else growth.value) < MOST_MB_A_DAY for _, growth in growths)
         name, growth = max(growths, key=lambda each: each[1].value, default=("nothing", None))
-        told.append(what + (f", steepest {name} {_said(growth)} MB a day" if growth else ""))
+        told.append(what + (f", steepest {name} {_describe_goal(growth)} MB a day" if growth else ""))
     emergencies = sum(run.get("happened", {}).get("emergencies", 0) for run in (week, *hours))
     met &= emergencies >= EMERGENCIES
     return {"met": met, "figure": f"{'; '.join(told)}; {emergencies:,} emergencies"}
 
 
-def _growths(run: Mapping[str, Any]) -> Iterator[tuple[str, Slope]]:
+def _iterate_growth(run: Mapping[str, Any]) -> Iterator[tuple[str, Slope]]:
     """Yield the growth of each of fdhil's processes that lived long enough."""
     for name in OURS:
         grown = run["processes"].get(name, {}).get("a_day", {}).get("resident_mb")
@@ -220,13 +220,13 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="fdhil-soak-") as temporary:
         folder = options.folder or Path(temporary)
         if options.rapids:
-            at_speed_up(folder / "week", options.seed, -(-options.rapids // RAPIDS))
+            run_accelerated(folder / "week", options.seed, -(-options.rapids // RAPIDS))
         if options.hours:
-            real(folder, options)
-        worked = figures_of(folder / "week", per_day=False) or before.get("week", {})
-        newest = [figures_of(shop, per_day=True) for shop in sorted(folder.glob("hours*"))]
+            run_plants(folder, options)
+        worked = compute_figures(folder / "week", per_day=False) or before.get("week", {})
+        newest = [compute_figures(shop, per_day=True) for shop in sorted(folder.glob("hours*"))]
         by_clock = [*before.get("hours", []), *filter(None, newest)]
-    return {"week": worked, "hours": by_clock, "goals": {"R13": goal(worked, by_clock)}}
+    return {"week": worked, "hours": by_clock, "goals": {"R13": evaluate_goal(worked, by_clock)}}
 
 
 # -- the page
@@ -235,13 +235,13 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     """Return the study's page."""
     goal = figures["goals"]["R13"]
-    lines = pages.head("Long life: a week at speed-up, and real hours", "soak", run)
-    lines += pages.paragraph(
+    lines = pages.write_head("Long life: a week at speed-up, and real hours", "soak", run)
+    lines += pages.wrap_paragraph(
         f"""Does anything grow? Goal: {WEEK_H:.0f} h of work at speed-up and {REAL_H:.0f} real hours with faults, memory
         below {MOST_MB_A_DAY:g} MB a day after the warm-up, descriptors and threads flat, {EMERGENCIES:,} emergencies
         absorbed. **{"Met" if goal["met"] else "Not met"}**: {goal["figure"]}."""
     )
-    lines += pages.paragraph(
+    lines += pages.wrap_paragraph(
         f"""The daemon, the guard, the pages, a publisher and the simulated machine of two axes (SYNC every
         {PERIOD_S * 1e3:g} ms) run as processes. After each round of rapids, and every {NOTE_S:.0f} s of a rest, it is
         noted what each of them uses. In the first {RESTARTING:.0%} of the week, and in the first {RESTARTED} rounds by
@@ -251,10 +251,15 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
         early."""
     )
     if figures["week"]:
-        lines += ["## A week at speed-up", "", *_week_words(figures["week"]), *_tables(figures["week"], "a day's work")]
+        lines += [
+            "## A week at speed-up",
+            "",
+            *_week_words(figures["week"]),
+            *_build_tables(figures["week"], "a day's work"),
+        ]
     if figures["hours"]:
         lines += ["## Real hours", ""]
-        lines += pages.paragraph(
+        lines += pages.wrap_paragraph(
             f"""What grows with each rapid is seen in the week, what grows by the clock alone is seen here: a round of
             {BY_CLOCK} rapids, then a rest, about as many as a machine makes in a day. The first {AT_ONCE} rounds follow
             each other at once, so that what an event takes when it happens for the first time, and what the pieces of
@@ -264,30 +269,32 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
             processes of its own; those of one command worked at the same time."""
         )
     for k, run in enumerate(figures["hours"], 1):
-        lines += [f"### Run {k}", "", *_hours_words(run), *_tables(run, "a day")]
+        lines += [f"### Run {k}", "", *_hours_words(run), *_build_tables(run, "a day")]
     return "\n".join(lines)
 
 
 def _week_words(week: Mapping[str, Any]) -> list[str]:
-    return pages.paragraph(
+    return pages.wrap_paragraph(
         f"""{week["rapids"]:,} rapids, {week["rapids"] / A_DAY:.2g} days of a machine that makes one a
         minute around the clock; it took {week["hours"]:.2g} h. Compressed: the standstill between rapids, and with it
         whatever grows by the clock alone. Not compressed: each rapid, its frames, its fit, what is stored and told of
-        it, and what happens between. {_measured(week)}"""
+        it, and what happens between. {_describe_measurement(week)}"""
     )
 
 
 def _hours_words(hours: Mapping[str, Any]) -> list[str]:
-    return pages.paragraph(f"{hours['hours']:.2f} h by the clock, {hours['rapids']:,} rapids. {_measured(hours)}")
+    return pages.wrap_paragraph(
+        f"{hours['hours']:.2f} h by the clock, {hours['rapids']:,} rapids. {_describe_measurement(hours)}"
+    )
 
 
-def _measured(run: Mapping[str, Any]) -> str:
+def _describe_measurement(run: Mapping[str, Any]) -> str:
     told = run["run"]
     return f"Measured by `{told['command']}` on {told['date']}, commit {told['commit']}."
 
 
-def _tables(run: Mapping[str, Any], day: str) -> list[str]:
-    rows = [_row(name, told) for name, told in run["processes"].items()]
+def _build_tables(run: Mapping[str, Any], day: str) -> list[str]:
+    rows = [_format_row(name, told) for name, told in run["processes"].items()]
     names = ("process", "samples", "memory, MB", f"MB in {day}", "descriptors", "threads", "children", "zombies")
     sizes = [[name, f"{first:.2f}", f"{last:.2f}"] for name, (first, last) in run["store_mb"].items()]
     sizes += [[f"log of {name}", "0.00", f"{size:.2f}"] for name, size in run["log_mb"].items()]
@@ -297,26 +304,26 @@ def _tables(run: Mapping[str, Any], day: str) -> list[str]:
         f"* {name} ended by itself {times} times and was started again" for name, times in run["restarts"].items()
     ]
     return [
-        *pages.grid(names, rows), "",
-        *pages.grid(("in the store", "MB at first", "MB at last"), sizes), "",
-        *pages.grid(("what happened", "times"), happened), "",
+        *pages.write_table(names, rows), "",
+        *pages.write_table(("in the store", "MB at first", "MB at last"), sizes), "",
+        *pages.write_table(("what happened", "times"), happened), "",
         *(["What did not answer as asked:", "", *failed, ""] if failed else []),
     ]  # fmt: skip
 
 
-def _row(name: str, told: Mapping[str, Any]) -> list[str]:
+def _format_row(name: str, told: Mapping[str, Any]) -> list[str]:
     first, last = told["resident_mb"]
     grown = told["a_day"]["resident_mb"]
-    slope = "too few samples" if grown is None else _said(Slope(**grown))
-    spans = [_span(*told[key]) for key in FLAT]
+    slope = "too few samples" if grown is None else _describe_goal(Slope(**grown))
+    spans = [_format_span(*told[key]) for key in FLAT]
     return [name, str(told["samples"]), f"{first:.1f} to {last:.1f}", slope, *spans, str(told["zombies"])]
 
 
-def _span(low: int, high: int) -> str:
+def _format_span(low: int, high: int) -> str:
     return str(low) if low == high else f"{low} to {high}"
 
 
-def _said(slope: Slope) -> str:
+def _describe_goal(slope: Slope) -> str:
     return f"{slope.value:+.2f} ({slope.low:+.2f} to {slope.high:+.2f})"
 
 
@@ -330,7 +337,7 @@ def main() -> None:
     parser.add_argument("--add", action="store_true", help="to the figures that are there")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--folder", type=Path, help="where samples, logs and sockets are kept; left out: nowhere")
-    pages.conduct("soak", parser, lambda options: str(options.seed), measure)
+    pages.run_study("soak", parser, lambda options: str(options.seed), measure)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from websockets.sync.client import connect
 
 from fdhil.daemon.daemon_socket import SOCKET_NAME
-from studies.soak_shop import Shop
+from studies.soak_shop import MachineRig
 
 WAIT_S = 60.0
 FLOOD_CHUNK = 2000  # frames that are written to the hub at once
@@ -26,7 +26,7 @@ PAGES = (
 )  # fmt: skip
 
 
-def get(url: str, path: str, method: str = "GET", body: bytes | None = None) -> tuple[int, bytes]:
+def fetch_page(url: str, path: str, method: str = "GET", body: bytes | None = None) -> tuple[int, bytes]:
     """Ask for a page as a browser does; return the status and the answer."""
     place = urlsplit(url)
     connection = http.client.HTTPConnection(str(place.hostname), place.port, timeout=WAIT_S)
@@ -38,9 +38,9 @@ def get(url: str, path: str, method: str = "GET", body: bytes | None = None) -> 
         connection.close()
 
 
-def browse(shop: Shop) -> int:
+def browse_pages(shop: MachineRig) -> int:
     """Open every page once and look at the live one for some messages; return how many answers were none."""
-    bad = sum(get(shop.url, path)[0] != 200 for path in PAGES)
+    bad = sum(fetch_page(shop.url, path)[0] != 200 for path in PAGES)
     address = shop.url.replace("http", "ws", 1) + "/api/live/stream?seconds=10&columns=400"
     with connect(address, subprotocols=["fdhil"], open_timeout=WAIT_S) as stream:  # type: ignore[list-item]
         for _ in range(6):
@@ -51,28 +51,28 @@ def browse(shop: Shop) -> int:
     return bad
 
 
-def look_at_a_rapid(shop: Shop) -> int:
+def look_at_a_rapid(shop: MachineRig) -> int:
     """Have the newest rapid replayed; return 1 where that failed."""
-    newest = json.loads(get(shop.url, "/api/rapids?limit=1")[1])["rapids"]
+    newest = json.loads(fetch_page(shop.url, "/api/rapids?limit=1")[1])["rapids"]
     if not newest:
         return 1
     rapid = newest[0]
-    return int(get(shop.url, f"/api/rapids/{rapid['axis']}/{rapid['id']}/signals")[0] != 200)
+    return int(fetch_page(shop.url, f"/api/rapids/{rapid['axis']}/{rapid['id']}/signals")[0] != 200)
 
 
-def drop_a_program(shop: Shop, name: str, text: str) -> int:
+def drop_a_program(shop: MachineRig, name: str, text: str) -> int:
     """Have a program forecast as the page does; return 1 where it was not taken."""
-    return int(get(shop.url, f"/api/program?name={name}", "POST", text.encode())[0] != 202)
+    return int(fetch_page(shop.url, f"/api/program?name={name}", "POST", text.encode())[0] != 202)
 
 
-def scrape(shop: Shop) -> int:
+def scrape_metrics(shop: MachineRig) -> int:
     """Read the metrics as Prometheus does; return 1 where there are none."""
     port = shop.document["publish"]["prometheus"]["port"]
-    return int(get(f"http://127.0.0.1:{port}", "/metrics")[0] != 200)
+    return int(fetch_page(f"http://127.0.0.1:{port}", "/metrics")[0] != 200)
 
 
 @contextlib.contextmanager
-def asking(shop: Shop, request: dict[str, Any]) -> Iterator[socket.socket]:
+def query_repeatedly(shop: MachineRig, request: dict[str, Any]) -> Iterator[socket.socket]:
     """Connect to the daemon's socket and send requests; the caller may read the answers or leave."""
     path: Path = shop.folder / "run" / SOCKET_NAME
     with socket.socket(socket.AF_UNIX) as client:
@@ -82,17 +82,17 @@ def asking(shop: Shop, request: dict[str, Any]) -> Iterator[socket.socket]:
         yield client
 
 
-def viewer_that_leaves(shop: Shop) -> int:
+def leave_live_stream(shop: MachineRig) -> int:
     """Read some of the live stream, then disconnect in the middle of a line."""
-    with asking(shop, {"request": "live"}) as client:
+    with query_repeatedly(shop, {"request": "live"}) as client:
         for _ in range(5):
             client.recv(1000)
     return 0
 
 
-def rude_client(shop: Shop) -> int:
+def send_invalid_requests(shop: MachineRig) -> int:
     """Send an invalid request, and leave a partial one."""
-    with asking(shop, {"request": "what?", "x": "\x1b[31m" * 200}) as client:
+    with query_repeatedly(shop, {"request": "what?", "x": "\x1b[31m" * 200}) as client:
         client.recv(100)
         client.sendall(b'{"request": "sta')
     return 0
@@ -104,18 +104,18 @@ class Silent:
     def __init__(self) -> None:
         self._stack = contextlib.ExitStack()
 
-    def come(self, shop: Shop) -> int:
+    def connect_silently(self, shop: MachineRig) -> int:
         """Connect once more, in place of the previous connection."""
-        self.leave()
-        self._stack.enter_context(asking(shop, {"request": "live"}))
+        self.disconnect()
+        self._stack.enter_context(query_repeatedly(shop, {"request": "live"}))
         return 0
 
-    def leave(self) -> None:
+    def disconnect(self) -> None:
         """Disconnect."""
         self._stack.close()
 
 
-def flood(shop: Shop, frames: int, node: int = 1) -> int:
+def flood_bus(shop: MachineRig, frames: int, node: int = 1) -> int:
     """Send so many emergencies of a drive on the bus, as fast as it takes them; return how many."""
     place = shop.document["bus"]["can0"]
     with socket.create_connection((place["host"], place["port"]), timeout=WAIT_S) as hub:
@@ -124,10 +124,10 @@ def flood(shop: Shop, frames: int, node: int = 1) -> int:
             hub.sendall(greeting)
         text = f"< send {EMERGENCY + node:03X} 8 10 81 11 0 0 0 0 0 >".encode() * FLOOD_CHUNK
         hub.settimeout(0.0)
-        return _pushed(hub, text, frames)
+        return _push_text(hub, text, frames)
 
 
-def _pushed(hub: socket.socket, text: bytes, frames: int) -> int:
+def _push_text(hub: socket.socket, text: bytes, frames: int) -> int:
     """Write the text again and again; what the hub sends meanwhile is read and dropped, until it has read all."""
     sent, left = 0, b""
     while sent < frames or left:

@@ -14,16 +14,16 @@ from pathlib import Path
 from fdhil.errors import FdhilError
 from studies.soak_clients import (
     Silent,
-    browse,
+    browse_pages,
     drop_a_program,
-    flood,
+    flood_bus,
+    leave_live_stream,
     look_at_a_rapid,
-    rude_client,
-    scrape,
-    viewer_that_leaves,
+    scrape_metrics,
+    send_invalid_requests,
 )
-from studies.soak_shop import Shop
-from studies.usage import size_mb, used
+from studies.soak_shop import MachineRig
+from studies.usage import measure_size_mb, measure_usage
 
 RAPIDS = 40  # in a round, of both axes together
 THERE_AND_BACK = "G0 X160 Y160\nG4 P0.2\nG0 X0 Y0\nG4 P0.2\n"  # four rapids
@@ -38,7 +38,7 @@ SIZES = ("windows", "history.sqlite", "history.sqlite-wal", "audit.jsonl", "blac
 class Life:
     """A shop at work; ``happened`` counts what happened, ``failed`` what did not answer as it must."""
 
-    shop: Shop
+    shop: MachineRig
     samples: Path
     seed: int
     rapids: int = RAPIDS
@@ -58,7 +58,7 @@ class Life:
     def round(self, events: Mapping[str, Event]) -> None:
         """Let the machine work for a round with what is due in it, and note what everybody uses after it."""
         self.rounds += 1
-        self.shop.attend()
+        self.shop.restart_ended()
         due = [name for name, event in events.items() if self.rounds % event.every == event.every // 2]
         during = [name for name in due if events[name].during]
 
@@ -66,7 +66,7 @@ class Life:
             for name in during:
                 self.happen(name, events[name])
 
-        whole = self.shop.play(self.shop.folder / "round.ngc", others)
+        whole = self.shop.play_program(self.shop.folder / "round.ngc", others)
         self.happened["rounds" if whole else "rounds that a fault stopped"] += 1
         self.settle()
         for name in due:
@@ -101,7 +101,7 @@ class Life:
         """Wait until the daemon has analysed what it received."""
         before, same = None, 0
         while same < SETTLED_LOOKS:
-            axes = self.shop.told("axes")
+            axes = self.shop.read_status_part("axes")
             now = {name: told["accepted"] + told["refused"] for name, told in axes.items()}
             same = same + 1 if now == before else 0
             before = now
@@ -109,11 +109,11 @@ class Life:
 
     def note(self) -> None:
         """Append what everybody uses, and what the daemon counts, to the file of samples."""
-        status = self.shop.status() or {}
+        status = self.shop.query_status() or {}
         process = {}
-        for name, pid in self.shop.pids().items():
+        for name, pid in self.shop.list_pids().items():
             try:
-                process[name] = {"pid": pid, **asdict(used(pid))}
+                process[name] = {"pid": pid, **asdict(measure_usage(pid))}
             except OSError:
                 continue
         axes = status.get("axes", {})
@@ -125,8 +125,8 @@ class Life:
             "dropped": status.get("dropped", {}),
             "unacknowledged": status.get("unacknowledged", {}).get("count"),
             "process": process,
-            "store_mb": {name: size_mb(self.shop.store / name) for name in SIZES},
-            "log_mb": {file.stem: size_mb(file) for file in sorted(self.shop.logs.glob("*.log"))},
+            "store_mb": {name: measure_size_mb(self.shop.store / name) for name in SIZES},
+            "log_mb": {file.stem: measure_size_mb(file) for file in sorted(self.shop.logs.glob("*.log"))},
             "happened": dict(self.happened),
             "failed": dict(self.failed),
             "restarts": dict(self.shop.restarts),
@@ -147,7 +147,7 @@ class Event:
 def clients(life: Life) -> int:
     """Run browsers and scrapers, a viewer that leaves in mid-line, and a client with invalid requests."""
     shop = life.shop
-    return browse(shop) + scrape(shop) + viewer_that_leaves(shop) + rude_client(shop)
+    return browse_pages(shop) + scrape_metrics(shop) + leave_live_stream(shop) + send_invalid_requests(shop)
 
 
 def arm(life: Life) -> bool:
@@ -155,10 +155,10 @@ def arm(life: Life) -> bool:
     shop = life.shop
     token = (shop.folder / "run" / "token").read_text("utf-8").strip()
     for code in ("OffsetStands", None):
-        answer = shop.ask("arm", program=str(shop.folder / "corner.ngc"), token=token)
+        answer = shop.query_daemon("arm", program=str(shop.folder / "corner.ngc"), token=token)
         if not code or answer.get("code") != code:
             break
-        adopted = shop.command("adopt", "--yes", fine=(0, 1, 3)).get("ok")
+        adopted = shop.run_command("adopt", "--yes", fine=(0, 1, 3)).get("ok")
         life.happened["adopted" if adopted else "an adoption refused"] += 1
     if not answer.get("ok"):
         life.failed[f"arm: {answer.get('code')}"] += 1
@@ -170,16 +170,16 @@ def armed(life: Life) -> int:
     shop = life.shop
     if not arm(life):
         return 0
-    shop.play(shop.folder / "corner.ngc")
-    shop.wait(lambda: shop.told("state") in ("OFF", "OFF(SHADOW)", "FROZEN"), "the guard comes to rest")
-    cause = (shop.told("guard").get("cause") or {}).get("code")
+    shop.play_program(shop.folder / "corner.ngc")
+    shop.wait(lambda: shop.read_status_part("state") in ("OFF", "OFF(SHADOW)", "FROZEN"), "the guard comes to rest")
+    cause = (shop.read_status_part("guard").get("cause") or {}).get("code")
     life.happened[f"cut ended by {cause}"] += 1
     return 0
 
 
 def armed_and_hurt(life: Life) -> int:
     """Arm, and lose TPDOs of a drive in the cut: the guard ramps down and a black box is written."""
-    life.shop.fault("drop_tpdo", axis="X", value=3, at_row=life.rng.randint(100, 300), duration_s=0.3)
+    life.shop.start_fault("drop_tpdo", axis="X", value=3, at_row=life.rng.randint(100, 300), duration_s=0.3)
     return armed(life)
 
 
@@ -188,56 +188,56 @@ def disarmed(life: Life) -> int:
     if not arm(life):
         return 0
     life.happened["disarmed"] += 1
-    return int(not life.shop.ask("disarm").get("ok"))
+    return int(not life.shop.query_daemon("disarm").get("ok"))
 
 
 def frames_lost(life: Life) -> int:
     """A drive's TPDOs are lost for a while."""
     axis = life.rng.choice("XY")
-    life.shop.fault("drop_tpdo", axis=axis, value=life.rng.choice((1, 2)), duration_s=life.rng.uniform(0.02, 0.4))
+    life.shop.start_fault("drop_tpdo", axis=axis, value=life.rng.choice((1, 2)), duration_s=life.rng.uniform(0.02, 0.4))
     return 0
 
 
 def sensor_silent(life: Life) -> int:
     """A thermometer answers nothing, or refuses."""
     axis = life.rng.choice("XY")
-    life.shop.fault("sensor_silent", axis=axis, duration_s=2.0)
+    life.shop.start_fault("sensor_silent", axis=axis, duration_s=2.0)
     return 0
 
 
 def emergencies(life: Life) -> int:
     """A drive floods the bus with emergencies."""
-    life.happened["emergencies"] += flood(life.shop, FLOOD)
+    life.happened["emergencies"] += flood_bus(life.shop, FLOOD)
     return 0
 
 
 def sync_lost(life: Life) -> int:
     """The NC's SYNC fails for a while."""
-    life.shop.fault("sync_lost", duration_s=0.5)
+    life.shop.start_fault("sync_lost", duration_s=0.5)
     return 0
 
 
 def reboot(life: Life) -> int:
     """A drive loses its power for a moment: the NC stops, the record is void until the drive is compared."""
     shop = life.shop
-    shop.fault("reboot", axis="X")
-    shop.nc(on=False)
-    shop.check()
+    shop.start_fault("reboot", axis="X")
+    shop.switch_nc(on=False)
+    shop.compare_drives()
     return 0
 
 
 def trip(life: Life) -> int:
     """A drive trips; the operator clears it."""
     shop = life.shop
-    shop.fault("trip", axis="Y", value=0x3210)
+    shop.start_fault("trip", axis="Y", value=0x3210)
     time.sleep(0.3)
-    shop.nc(on=True)
+    shop.switch_nc(on=True)
     return 0
 
 
 def machine_off(life: Life) -> int:
     """The machine is switched off and on."""
-    life.shop.machine_off_and_on()
+    life.shop.power_cycle()
     return 0
 
 
@@ -253,18 +253,18 @@ def disk_full(life: Life) -> int:
                 file.write(bytes(1 << 20))
     except OSError:
         pass
-    shop.play(shop.folder / "round.ngc")
+    shop.play_program(shop.folder / "round.ngc")
     life.settle()
-    told = shop.told("store").get("fault")
+    told = shop.read_status_part("store").get("fault")
     ballast.unlink()
-    shop.play(shop.folder / "round.ngc")
+    shop.play_program(shop.folder / "round.ngc")
     life.settle()
-    return int(told is None) + int(shop.told("store").get("fault") is not None)
+    return int(told is None) + int(shop.read_status_part("store").get("fault") is not None)
 
 
 def acknowledge(life: Life) -> int:
     """Acknowledge every notice."""
-    return int(not life.shop.ask("acknowledge", up_to=2**31, by="soak").get("ok"))
+    return int(not life.shop.query_daemon("acknowledge", up_to=2**31, by="soak").get("ok"))
 
 
 def again(name: str, number: int) -> Callable[[Life], int]:
@@ -284,7 +284,7 @@ def program(life: Life) -> int:
 
 EVENTS: Mapping[str, Event] = {
     "clients came and went": Event(1, clients, during=True),
-    "a viewer that never reads": Event(7, lambda life: life.silent.come(life.shop)),
+    "a viewer that never reads": Event(7, lambda life: life.silent.connect_silently(life.shop)),
     "a rapid was looked at": Event(3, lambda life: look_at_a_rapid(life.shop)),
     "a program was dropped in a browser": Event(11, program),
     "armed and cut": Event(5, armed),

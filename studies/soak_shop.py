@@ -34,7 +34,7 @@ KEPT_WINDOWS = 400
 STORE_MB = 512
 
 
-def document_of(folder: Path, period_s: float, lockstep: bool) -> dict[str, Any]:
+def make_config(folder: Path, period_s: float, lockstep: bool) -> dict[str, Any]:
     """Return the configuration: the demonstration's two axes, with a store of its own and all ports chosen."""
     document = machine_document()
     document["machine"]["sync_period_s"] = period_s
@@ -54,7 +54,7 @@ def document_of(folder: Path, period_s: float, lockstep: bool) -> dict[str, Any]
 
 
 @dataclass
-class Shop:
+class MachineRig:
     """All processes of one machine below ``folder``, whose store begins as ``filled`` is.
 
     ``restarts`` counts who ended by itself and was started again.
@@ -85,7 +85,7 @@ class Shop:
         """The folder of the processes' own words."""
         return self.folder / "logs"
 
-    def pids(self) -> Mapping[str, int]:
+    def list_pids(self) -> Mapping[str, int]:
         """Return the process of each part of fdhil, and the simulated machine's."""
         return {name: process.pid for name, process in self.processes.items()} | {"machine": self.twin.pid}
 
@@ -100,12 +100,12 @@ class Shop:
             self.store.mkdir(parents=True, exist_ok=True)
         else:
             shutil.copytree(self.filled, self.store)
-        self.start_twin()
+        self.start_simulator()
         for axis in self.config.axis:
             save_record(commission(self.config, axis), self.store, self.config.store.commissioning_key)
         for name in ("guard", "daemon", "pages", "publisher"):
             self.start(name)
-        self.nc(on=True)
+        self.switch_nc(on=True)
 
     def _mount(self) -> None:
         """Have a small disk of its own below the store, which can be full; only root may."""
@@ -113,7 +113,7 @@ class Shop:
             command = ["mount", "-t", "tmpfs", "-o", f"size={STORE_MB}m", "fdhil-soak", str(self.folder / "store")]
             self.mounted = subprocess.run(command, check=False, capture_output=True).returncode == 0
 
-    def start_twin(self) -> None:
+    def start_simulator(self) -> None:
         """Switch the machine on; it has the ports that it had before."""
         self.file.write_text(to_toml(self.document), "utf-8")
         self.config = machine_config.load_config(self.file)
@@ -132,7 +132,7 @@ class Shop:
         if name == "pages":
             self.url = process.event("ready")["url"]
         elif name == "daemon":
-            self.wait(lambda: self.status() is not None, "the daemon answers", process)
+            self.wait(lambda: self.query_status() is not None, "the daemon answers", process)
         elif name == "publisher":
             port = self.document["publish"]["prometheus"]["port"]
             self.wait(lambda: _listens(port), "the publisher listens", process)
@@ -140,7 +140,7 @@ class Shop:
             guard_socket = self.config.guard_directory / "guard.sock"
             self.wait(lambda: guard_socket.exists(), "the guard's socket is there", process)
 
-    def attend(self) -> None:
+    def restart_ended(self) -> None:
         """Restart processes that have ended, as systemd would, and count them."""
         for name, process in list(self.processes.items()):
             try:
@@ -158,15 +158,15 @@ class Shop:
         process.stop()
         self.start(name)
 
-    def machine_off_and_on(self) -> None:
+    def power_cycle(self) -> None:
         """Switch the machine off and on again: bus, drives, sensors and NC are gone meanwhile."""
         self.twin.stop()
         time.sleep(1.0)
         self.end_guard_without_bus()
-        self.start_twin()
-        self.attend()
-        self.wait(lambda: self.told("source").get("state") == "listening", "the daemon listens again")
-        self.check()
+        self.start_simulator()
+        self.restart_ended()
+        self.wait(lambda: self.read_status_part("source").get("state") == "listening", "the daemon listens again")
+        self.compare_drives()
 
     def end_guard_without_bus(self) -> None:
         """Let the guard end, which cannot be without a bus; one that waits with an offset is started again as well."""
@@ -179,14 +179,14 @@ class Shop:
 
     _guard_waits: bool = False
 
-    def check(self) -> None:
+    def compare_drives(self) -> None:
         """Have the drives compared with their commissioned state (they booted), then release them to the NC."""
         if self._guard_waits:
             self.start("guard")
             self._guard_waits = False
-        self.nc(on=False)
-        self.command("check", fine=(0, 1, 3))
-        self.nc(on=True)
+        self.switch_nc(on=False)
+        self.run_command("check", fine=(0, 1, 3))
+        self.switch_nc(on=True)
 
     def close(self) -> None:
         """End everything; the measurements stay."""
@@ -197,7 +197,7 @@ class Shop:
 
     # -- talking to it
 
-    def command(self, *arguments: object, fine: tuple[int, ...] = (0,)) -> dict[str, Any]:
+    def run_command(self, *arguments: object, fine: tuple[int, ...] = (0,)) -> dict[str, Any]:
         """Run a command of fdhil that answers in JSON."""
         command = ["python", "-m", "fdhil", str(arguments[0]), str(self.file), *map(str, arguments[1:]), "--json"]
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
@@ -205,20 +205,20 @@ class Shop:
             raise FdhilError(f"{' '.join(command)} ended with {done.returncode}: {done.stdout}{done.stderr}")
         return dict(json.loads(done.stdout)) if done.stdout else {}
 
-    def ask(self, request: str, **more: Any) -> dict[str, Any]:
+    def query_daemon(self, request: str, **more: Any) -> dict[str, Any]:
         """Send a request to the daemon."""
         return dict(ask_daemon(self.folder / "run" / SOCKET_NAME, {"request": request, **more}, timeout_s=PATIENCE_S))
 
-    def status(self) -> dict[str, Any] | None:
+    def query_status(self) -> dict[str, Any] | None:
         """Return the daemon's status, None while it does not answer."""
         try:
-            return self.ask("status")
+            return self.query_daemon("status")
         except FdhilError:
             return None
 
-    def told(self, key: str) -> Any:
+    def read_status_part(self, key: str) -> Any:
         """Return a part of the daemon's status, empty while there is none."""
-        return (self.status() or {}).get(key) or {}
+        return (self.query_status() or {}).get(key) or {}
 
     def wait(self, done: Callable[[], bool], what: str, process: Process | None = None) -> None:
         """Wait for a condition; FdhilError after ten minutes, or if a process has ended."""
@@ -229,20 +229,20 @@ class Shop:
                 raise FdhilError(f"waited in vain: {what}; see {self.logs}")
             time.sleep(LOOK_S)
 
-    def nc(self, on: bool) -> None:
+    def switch_nc(self, on: bool) -> None:
         """Switch the NC on or off, trying again while a drive is not ready for it."""
         for _ in range(TRIES):
             self.twin.command("nc", on=on)
-            if (told := self.event("nc")) and told["on"] is on:
+            if (told := self.read_event("nc")) and told["on"] is on:
                 return
             time.sleep(LOOK_S)
         raise FdhilError(f"the NC of the simulated machine does not get {'the drives' if on else 'out'}")
 
-    def fault(self, name: str, **keys: Any) -> None:
+    def start_fault(self, name: str, **keys: Any) -> None:
         """Start a fault of the simulated machine."""
         self.twin.command("fault", fault=name, **keys)
 
-    def event(self, kind: str) -> dict[str, Any] | None:
+    def read_event(self, kind: str) -> dict[str, Any] | None:
         """Return the machine's next event of a kind, None where it cannot; its other complaints are of the faults."""
         while True:
             try:
@@ -252,15 +252,15 @@ class Shop:
                 if CANNOT in str(error):
                     return None
 
-    def play(self, program: Path, meanwhile: Callable[[], None] = lambda: None) -> bool:
+    def play_program(self, program: Path, meanwhile: Callable[[], None] = lambda: None) -> bool:
         """Let the NC play a program; return whether no fault stopped it. An NC that has lost a drive is switched on."""
         self.twin.command("play", file=str(program))
         meanwhile()
-        finished = self.event("finished")
+        finished = self.read_event("finished")
         if finished is None:
-            self.nc(on=True)
+            self.switch_nc(on=True)
             self.twin.command("play", file=str(program))
-            finished = self.event("finished")
+            finished = self.read_event("finished")
         return finished is not None and not finished["stopped"]
 
 

@@ -62,7 +62,7 @@ class Life:
         """Any axis."""
         return self.rng.choice(list(self.machine.plant.units))
 
-    def live(self) -> None:
+    def run_life(self) -> None:
         """Let the machine learn its models, then work under faults until its time is over, and settle."""
         machine = self.machine
         end_s = machine.clock.now_s() + self.seconds
@@ -72,15 +72,15 @@ class Life:
         machine.play_program(build_shuttle_program(machine.config.axis), "shuttle.ngc")
         machine.run_for(0.5)
         while machine.clock.now_s() < end_s:
-            self.cut()
+            self.run_program()
             self.restore()
-        self.rest()
+        self.settle_idle()
 
-    def cut(self) -> None:
+    def run_program(self) -> None:
         """Run one program, most of them armed; in most something happens."""
         machine, rng = self.machine, self.rng
         self.parts += 1
-        text, name = self.program(), f"part{self.parts % 4}.ngc"
+        text, name = self.draw_program(), f"part{self.parts % 4}.ngc"
         if rng.random() < 0.8:
             method = rng.choice((None, None, None, "mirror"))
             answer = machine.arm_program(
@@ -107,7 +107,7 @@ class Life:
         self.machine.run_until(lambda: not self.machine.bus.is_down)
         self.machine.start_processes(name)
 
-    def program(self) -> str:
+    def draw_program(self) -> str:
         """Draw a program of a few moves from and to zero: lines, rectangles and circles, with rests between."""
         rng, axes = self.rng, list(self.machine.plant.units)
         lines = ["G21 G90 G94", f"G4 P{rng.choice((0.1, 0.3))}"]
@@ -149,7 +149,7 @@ class Life:
         with contextlib.suppress(DeviceError):
             machine.attest_facts()
 
-    def rest(self) -> None:
+    def settle_idle(self) -> None:
         """End all faults, and verify that the drives come to zero with only the actions that the messages advise."""
         machine = self.machine
         for _ in range(3):
@@ -275,7 +275,7 @@ EVENTS: Mapping[str, Callable[[Life], None]] = {
 }
 
 
-def drawn(rng: random.Random) -> dict[str, Any]:
+def draw_machine(rng: random.Random) -> dict[str, Any]:
     """Draw a machine."""
     made = build_document(rng.choice(AXES))
     made["machine"]["sync_period_s"] = rng.choice(SYNC_PERIODS_S)
@@ -286,10 +286,10 @@ def drawn(rng: random.Random) -> dict[str, Any]:
     return made
 
 
-def life_of(seed: int, seconds: float, folder: Path) -> tuple[list[str], Counter[str], CompleteMachine]:
+def run_machine_life(seed: int, seconds: float, folder: Path) -> tuple[list[str], Counter[str], CompleteMachine]:
     """Let the machine of a seed live in a folder; return what was wrong, what was counted, and the machine."""
     rng = random.Random(seed)
-    machine = CompleteMachine(seed, drawn(rng), folder=folder)
+    machine = CompleteMachine(seed, draw_machine(rng), folder=folder)
     with machine:
         begun_s = machine.clock.now_s()
         kind = f"{'+'.join(machine.config.axis)}, SYNC every {1e3 * machine.config.machine.sync_period_s:g} ms"
@@ -297,7 +297,7 @@ def life_of(seed: int, seconds: float, folder: Path) -> tuple[list[str], Counter
         _expired.clear()
         signal.setitimer(signal.ITIMER_PROF, MOST_CPU_S * seconds, MOST_CPU_S * seconds)
         try:
-            life.live()
+            life.run_life()
         except TooLong:
             pass
         except Exception as error:  # noqa: BLE001 - whatever ends a life is a finding
@@ -312,11 +312,11 @@ def life_of(seed: int, seconds: float, folder: Path) -> tuple[list[str], Counter
         return machine.wrong, counted, machine
 
 
-def judged(seed: int, seconds: float) -> tuple[int, list[str], dict[str, int], float]:
+def assess_life(seed: int, seconds: float) -> tuple[int, list[str], dict[str, int], float]:
     """Let one machine live; return its seed, violations, counts, and the processor time."""
     begun_s = time.process_time()
     with tempfile.TemporaryDirectory(prefix="swarm-") as folder:
-        wrong, counted, _ = life_of(seed, seconds, Path(folder))
+        wrong, counted, _ = run_machine_life(seed, seconds, Path(folder))
     gc.collect()
     return seed, wrong, dict(counted), time.process_time() - begun_s
 
@@ -336,25 +336,25 @@ def _too_long(*_: object) -> None:
     raise TooLong
 
 
-def replay(seed: int, seconds: float) -> str:
+def format_replay_command(seed: int, seconds: float) -> str:
     """Return the command that repeats a life."""
     return f"make swarm N=1 SEED={seed} SECONDS={seconds:g}"
 
 
-def code_digest() -> str:
+def compute_code_digest() -> str:
     """Return the digest of the code under test."""
     files = sorted(path for pattern in CODE for path in pages.ROOT.glob(pattern))
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:16]
 
 
-def nothing_run(code: str) -> dict[str, Any]:
+def make_empty_figures(code: str) -> dict[str, Any]:
     """Return the figures of a version of the code before its first life."""
     return {"code": code, "runs": [], "machines": 0, "counted": {}, "processor_s": 0.0, "failures": [], "earlier": []}
 
 
-def resumed(path: Path, code: str) -> dict[str, Any]:
+def load_figures(path: Path, code: str) -> dict[str, Any]:
     """Return the figures in a file, to be added to; those of another version of the code become one line of a new."""
-    figures = nothing_run(code)
+    figures = make_empty_figures(code)
     if not path.exists():
         return figures
     document = json.loads(path.read_text("utf-8"))
@@ -370,7 +370,7 @@ def resumed(path: Path, code: str) -> dict[str, Any]:
     return figures | {"earlier": [*before.get("earlier", []), line]}
 
 
-def next_seed(figures: Mapping[str, Any]) -> int:
+def find_next_seed(figures: Mapping[str, Any]) -> int:
     """Return the first seed that was not run."""
     return max((last for _, last, _ in figures["runs"]), default=0) + 1
 
@@ -380,10 +380,10 @@ def is_counted(figures: Mapping[str, Any], seed: int, seconds: float) -> bool:
     return any(first <= seed <= last and of == seconds for first, last, of in figures["runs"])
 
 
-def lives(options: argparse.Namespace, seeds: range) -> Iterator[tuple[int, list[str], dict[str, int], float]]:
+def run_lives(options: argparse.Namespace, seeds: range) -> Iterator[tuple[int, list[str], dict[str, int], float]]:
     """Let all machines live; yield of each its seed, what was wrong, what was counted and the processor time."""
     with ProcessPoolExecutor(options.processes, initializer=_begin_worker, max_tasks_per_child=25) as pool:
-        yield from pool.map(judged, seeds, [options.seconds] * len(seeds))
+        yield from pool.map(assess_life, seeds, [options.seconds] * len(seeds))
 
 
 def add_life(
@@ -399,22 +399,22 @@ def add_life(
     figures["counted"] = dict(sorted((Counter(figures["counted"]) + Counter(counted)).items()))
     figures["processor_s"] += used_s
     if wrong:
-        figures["failures"].append({"seed": seed, "wrong": wrong[:5], "replay": replay(seed, seconds)})
+        figures["failures"].append({"seed": seed, "wrong": wrong[:5], "replay": format_replay_command(seed, seconds)})
 
 
 def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     """Return the study's page."""
     counted, failures = figures["counted"], figures["failures"]
     lived_s = counted["milliseconds"] / 1e3
-    lines = pages.head("Swarm: random machines, programs and faults on one virtual clock", "swarm", run)
-    lines += pages.paragraph(
+    lines = pages.write_head("Swarm: random machines, programs and faults on one virtual clock", "swarm", run)
+    lines += pages.wrap_paragraph(
         f"""Each machine comes from one seed: its axes, programs, faults and their times. Daemon, guard, store,
         simulated drives and NC run in one process on one virtual clock (`tests/machine`), so that a seed gives the same
         frames, history and log each time. With this version of the code {figures["machines"]} machines lived
         {lived_s:.0f} machine-seconds in {figures["processor_s"]:.0f} s of processor time
         ({lived_s / figures["processor_s"]:.1f} times real time, judging included); the next run adds to it."""
     )
-    lines += pages.paragraph(
+    lines += pages.wrap_paragraph(
         f"""Judged: {counted["SYNC"]} SYNC with {counted["frames"]} frames, {counted.get("offset frames", 0)} offset
         frames of the guard, {counted.get("statuses", 0)} statuses, {counted.get("records", 0)} rows of the history and
         {counted.get("audit lines", 0)} lines of the audit."""
@@ -431,11 +431,11 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     ]
     lines += _table(counted, "axes ", "axes and SYNC")
     lines += _table(counted, "event ", "what happened")
-    lines += pages.paragraph(f"Broken: {pages.of(len(failures), figures['machines'])} machines.")
+    lines += pages.wrap_paragraph(f"Broken: {pages.format_share(len(failures), figures['machines'])} machines.")
     lines += [f"- `{each['replay']}`: {' '.join(each['wrong'][0].split())[:200]}" for each in failures[:SHOWN]]
     if figures["earlier"]:
         lines += ["", "Earlier versions of the code:", ""]
-        lines += pages.grid(
+        lines += pages.write_table(
             ("commit", "machines", "machine-seconds", "broken"),
             [
                 (each["commit"], str(each["machines"]), f"{each['machine_s']:.0f}", str(each["failures"]))
@@ -447,7 +447,7 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
 
 def _table(counted: Mapping[str, int], prefix: str, title: str) -> list[str]:
     rows = [(name.removeprefix(prefix), str(n)) for name, n in sorted(counted.items()) if name.startswith(prefix)]
-    return [*pages.grid((title, "times"), rows), ""]
+    return [*pages.write_table((title, "times"), rows), ""]
 
 
 def main() -> None:
@@ -460,26 +460,28 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=pages.FOLDER)
     options = parser.parse_args()
     path = options.out / "swarm.json"
-    figures = resumed(path, code_digest())
-    first = next_seed(figures) if options.first_seed is None else options.first_seed
-    run = pages.provenance(f"python -m studies.swarm --machines {options.machines} --seconds {options.seconds:g}")
+    figures = load_figures(path, compute_code_digest())
+    first = find_next_seed(figures) if options.first_seed is None else options.first_seed
+    run = pages.describe_provenance(
+        f"python -m studies.swarm --machines {options.machines} --seconds {options.seconds:g}"
+    )
     options.out.mkdir(parents=True, exist_ok=True)
     broken = False
-    for seed, wrong, counted, used_s in lives(options, range(first, first + options.machines)):
+    for seed, wrong, counted, used_s in run_lives(options, range(first, first + options.machines)):
         if wrong:
             broken = True
-            print(f"{replay(seed, options.seconds)}\n  " + "\n  ".join(wrong[:5]), flush=True)
+            print(f"{format_replay_command(seed, options.seconds)}\n  " + "\n  ".join(wrong[:5]), flush=True)
         if not is_counted(figures, seed, options.seconds):
             add_life(figures, seed, options.seconds, wrong, counted, used_s)
-        write(path, run, figures)
-    print(pages.rendered(json.loads(path.read_text("utf-8"))))
+        write_results(path, run, figures)
+    print(pages.render_page(json.loads(path.read_text("utf-8"))))
     sys.exit(broken)
 
 
-def write(path: Path, run: pages.Run, figures: Mapping[str, Any]) -> None:
+def write_results(path: Path, run: pages.Run, figures: Mapping[str, Any]) -> None:
     """Write figures and page, so that what was run is kept however the run ends."""
     seeds = ", ".join(f"{first} to {last} ({seconds:g} s each)" for first, last, seconds in figures["runs"])
-    document = {"study": "swarm", "run": {**run, "seeds": seeds}, "figures": pages.plain(figures)}
+    document = {"study": "swarm", "run": {**run, "seeds": seeds}, "figures": pages.convert_to_json(figures)}
     part = path.with_suffix(".part")
     part.write_text(json.dumps(document, separators=(",", ":")) + "\n", "utf-8")
     part.replace(path)

@@ -15,7 +15,7 @@ import pytest
 from _pytest.runner import runtestprotocol
 from coverage import Coverage
 
-from studies.mutation import Mutant, put
+from studies.mutation import Mutant, apply_mutant
 
 NOTICED, ENDLESS, UNNOTICED, UNCALLED = "noticed", "noticed: a test did not end", "not noticed", "no test comes there"
 PROCESSOR_TIMES, PROCESSOR_S = 20, 3
@@ -102,7 +102,7 @@ class Trial:
 
     def _judge(self, mutant: Mutant, tests: Sequence[str], into: int) -> int:
         try:
-            put(mutant)
+            apply_mutant(mutant)
         except SyntaxError:
             return NO_PROGRAM
         for test in tests:

@@ -27,13 +27,13 @@ class Used:
     zombies: int
 
 
-def used(pid: int) -> Used:
+def measure_usage(pid: int) -> Used:
     """Return what a process uses now; OSError when it is gone."""
     told = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text("utf-8").splitlines())
     if "VmRSS" not in told:  # it has ended, and nobody has waited for it yet
         raise ProcessLookupError(pid)
     resident, anonymous = (int(told[name].split()[0]) / 1024 for name in ("VmRSS", "RssAnon"))
-    states = children(pid)
+    states = list_children(pid)
     return Used(
         resident,
         anonymous,
@@ -44,7 +44,7 @@ def used(pid: int) -> Used:
     )
 
 
-def children(pid: int) -> list[str]:
+def list_children(pid: int) -> list[str]:
     """Return the states of a process' children, Z of one that nobody has waited for."""
     found = []
     for folder in Path("/proc").iterdir():
@@ -58,7 +58,7 @@ def children(pid: int) -> list[str]:
     return found
 
 
-def size_mb(path: Path) -> float:
+def measure_size_mb(path: Path) -> float:
     """Return what a file, or all files below a folder, hold."""
     files = [path] if path.is_file() else path.rglob("*")
     total = 0
@@ -78,12 +78,12 @@ class Slope:
     low: float
     high: float
 
-    def times(self, factor: float) -> Slope:
+    def scale(self, factor: float) -> Slope:
         """Return it for another unit."""
         return Slope(self.value * factor, self.low * factor, self.high * factor)
 
 
-def slope(over: Floats, values: Floats) -> Slope | None:
+def fit_slope(over: Floats, values: Floats) -> Slope | None:
     """Return the slope of a straight line through a series (n,), of which parts in a row are taken together.
 
     None where there are fewer samples than two for each part, or all at one place.

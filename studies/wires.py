@@ -26,7 +26,7 @@ from fdhil.sim.frame_faults import FrameFault, FrameFaults
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
 from fdhil.sim.wire.modbus_tcp_servers import SensorServers
 from studies import pages
-from studies.late_answers import Questioned, modbus, sdo_reads
+from studies.late_answers import Questioned, measure_modbus, measure_sdo_reads
 from tests.drivers.frame_builder import FrameBuilder, build_machine_config
 
 SPOILT = ("flipped", "noisy", "split", "wrong_unit", "short", "too_many")
@@ -38,7 +38,7 @@ EDGE = 20  # cycles at either end of a recording in which nothing is lost, so th
 TCP_TIMEOUT_S = 1.0
 
 
-def over_tcp(questions: int, kind: str) -> Counter[str]:
+def query_over_tcp(questions: int, kind: str) -> Counter[str]:
     """Query a unit on a real TCP connection whose answers are corrupted now and then; counts as in ``modbus``."""
     sensor, device = VoltageSensor(1000.0, 300.0, 0.0, np.random.default_rng(1)), Questioned()
     sensor.faults.answers[kind] = 100.0 / 3
@@ -70,7 +70,7 @@ def over_tcp(questions: int, kind: str) -> Counter[str]:
     return seen
 
 
-def losses(frames: int, seed: int, can_ids: set[int], percent: float) -> Counter[str]:
+def lose_frames(frames: int, seed: int, can_ids: set[int], percent: float) -> Counter[str]:
     """Lose some frames of a bus; count sent, lost and reported ones, and rows with another row's value."""
     seen: Counter[str] = Counter()
     while seen["frames"] < frames:
@@ -78,7 +78,7 @@ def losses(frames: int, seed: int, can_ids: set[int], percent: float) -> Counter
         fault = FrameFault("drop", can_ids=can_ids, percent=percent, from_sync=EDGE, until_sync=TICKS - EDGE)
         faults = FrameFaults([fault], seed + seen["frames"])
         decoder = BusDecoder("can0", build_machine_config())
-        for samples in _decoded(wire, faults, decoder, seen):
+        for samples in _decode_samples(wire, faults, decoder, seen):
             seen["rows"] += samples.tick.size
             for k, volts, amperes in zip(samples.tick, samples.voltage_v, samples.current_a, strict=True):
                 true = (wire.build_tpdo2(int(k) + 1)[2] * 0.02, wire.build_tpdo2(int(k))[1] * 0.05)
@@ -90,7 +90,7 @@ def losses(frames: int, seed: int, can_ids: set[int], percent: float) -> Counter
     return seen
 
 
-def _decoded(wire: FrameBuilder, faults: FrameFaults, decoder: BusDecoder, seen: Counter[str]) -> Iterator[Any]:
+def _decode_samples(wire: FrameBuilder, faults: FrameFaults, decoder: BusDecoder, seen: Counter[str]) -> Iterator[Any]:
     """Yield the samples of a bus whose frames pass the faults, some at a time."""
     rows = wire.build_rows()
     seen["frames"] += len(rows)
@@ -108,28 +108,28 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Return the counts of every part, and the goals by them."""
     n, seed = options.questions, options.seed
     promised = {
-        "Modbus RTU, late by up to 2 time-outs": modbus(5 * n // 2, seed, 2.0),
-        "Modbus RTU, late, spoilt and noise": modbus(n, seed + 1, 2.0, SPOILT, 0.3),
-        "Modbus RTU, a register too many": modbus(n, seed + 2, 0.5, ("too_many",)),
-        "Modbus RTU, cut short": modbus(n // 2, seed + 3, 0.5, ("short",)),
-        "Modbus TCP, the answer before comes first": over_tcp(n // 100, "stale"),
-        "Modbus TCP, a register too many": over_tcp(n // 100, "too_many"),
-        SDO: sdo_reads(3 * n // 10, seed, 1.45),
+        "Modbus RTU, late by up to 2 time-outs": measure_modbus(5 * n // 2, seed, 2.0),
+        "Modbus RTU, late, spoilt and noise": measure_modbus(n, seed + 1, 2.0, SPOILT, 0.3),
+        "Modbus RTU, a register too many": measure_modbus(n, seed + 2, 0.5, ("too_many",)),
+        "Modbus RTU, cut short": measure_modbus(n // 2, seed + 3, 0.5, ("short",)),
+        "Modbus TCP, the answer before comes first": query_over_tcp(n // 100, "stale"),
+        "Modbus TCP, a register too many": query_over_tcp(n // 100, "too_many"),
+        SDO: measure_sdo_reads(3 * n // 10, seed, 1.45),
     }
     beyond = {
-        "Modbus RTU, late by up to 10 time-outs": modbus(n // 10, seed + 4, 10.0),
-        "SDO, late by up to 6 s": sdo_reads(n // 10, seed + 1, 6.0),
+        "Modbus RTU, late by up to 10 time-outs": measure_modbus(n // 10, seed + 4, 10.0),
+        "SDO, late by up to 6 s": measure_sdo_reads(n // 10, seed + 1, 6.0),
     }
     cases = [(name, percent) for name in LOSSES for percent in PERCENT]
     each = -(-options.frames // len(cases))
     frames = [
-        [name, percent, losses(each, seed + 1000 * place, LOSSES[name], percent)]
+        [name, percent, lose_frames(each, seed + 1000 * place, LOSSES[name], percent)]
         for place, (name, percent) in enumerate(cases)
     ]
-    return {"promised": promised, "beyond": beyond, "frames": frames} | {"goals": goals(promised, frames)}
+    return {"promised": promised, "beyond": beyond, "frames": frames} | {"goals": evaluate_goals(promised, frames)}
 
 
-def goals(promised: Mapping[str, Mapping[str, int]], frames: list[list[Any]]) -> dict[str, Any]:
+def evaluate_goals(promised: Mapping[str, Mapping[str, int]], frames: list[list[Any]]) -> dict[str, Any]:
     """Return the goals R8 and R9 by the counts."""
     wrong, late, spoilt = (sum(seen.get(key, 0) for seen in promised.values()) for key in ("wrong", "late", "spoilt"))
     stale = promised.get(SDO, {}).get("late", 0)
@@ -147,24 +147,24 @@ def goals(promised: Mapping[str, Mapping[str, int]], frames: list[list[Any]]) ->
 def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     """Return the study's page; its conclusions follow from the figures."""
     told = figures["goals"]
-    lines = pages.head("Spoilt wires", "wires", run)
-    lines += pages.paragraph(f"**{told['R8']['figure']}; {told['R9']['figure']}.**")
-    lines += pages.paragraph(
+    lines = pages.write_head("Spoilt wires", "wires", run)
+    lines += pages.wrap_paragraph(f"**{told['R8']['figure']}; {told['R9']['figure']}.**")
+    lines += pages.wrap_paragraph(
         """What is asked for changes with every question, so an answer to another question is known by its value. Nine
         of ten answers on a serial line take a while, late is what came after the time-out. Where the row says how, more
         than half are spoilt; in the second row a sixth are, each in its way, and noise stands on the line in a third of
         the questions. Time is virtual on the serial line and for SDO (it passes by being waited for); the drivers are
         the product's own. The TCP connection is a real one."""
     )
-    lines += [*_answers(figures["promised"]), ""]
-    lines += pages.paragraph(
+    lines += [*_describe_answers(figures["promised"]), ""]
+    lines += pages.wrap_paragraph(
         """What no protocol on a serial line can tell: an answer names neither its question nor its time. fdhil hears
         the line out for a second time-out after a question that was not answered, and an SDO server for a second. What
         comes later than that may meet the next question of the same kind, so `timeout_s` must be at least half of the
         longest time that a device may take:"""
     )
-    lines += [*_answers(figures["beyond"]), ""]
-    lines += pages.paragraph(
+    lines += [*_describe_answers(figures["beyond"]), ""]
+    lines += pages.wrap_paragraph(
         """Frames that are lost between drive and decoder, SYNCs among them. A row is misplaced when it has the value of
         another row; late is what was taken for a frame that came too late or twice."""
     )
@@ -173,14 +173,16 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
         [name, f"{percent:g} %", *(f"{seen.get(key, 0):,}" for key in columns)]
         for name, percent, seen in figures["frames"]
     ]
-    lines += pages.grid(("lost at random", "share", "frames", "lost", "reported", "late", "rows misplaced"), rows)
+    lines += pages.write_table(
+        ("lost at random", "share", "frames", "lost", "reported", "late", "rows misplaced"), rows
+    )
     return "\n".join(lines)
 
 
-def _answers(parts: Mapping[str, Mapping[str, int]]) -> list[str]:
+def _describe_answers(parts: Mapping[str, Mapping[str, int]]) -> list[str]:
     names = ("asked", "answered", "refused", "late", "spoilt", "wrong")
     rows = [[name, *(f"{seen.get(key, 0):,}" for key in names)] for name, seen in parts.items()]
-    return pages.grid(("answers", *names), rows)
+    return pages.write_table(("answers", *names), rows)
 
 
 def main() -> None:
@@ -189,7 +191,7 @@ def main() -> None:
     parser.add_argument("--questions", type=int, default=100_000)
     parser.add_argument("--frames", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=1)
-    figures = pages.conduct("wires", parser, lambda options: str(options.seed), measure)
+    figures = pages.run_study("wires", parser, lambda options: str(options.seed), measure)
     sys.exit(not all(goal["met"] for goal in figures["goals"].values()))
 
 

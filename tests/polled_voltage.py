@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.records import SlowVoltage, Window, freeze_array
-from studies.slow_sensor import slow_windows
+from studies.slow_sensor import record_slow_windows
 
 FINE_S, FINE_IN_PERIOD, REACH = 0.002, 5, 2
 
@@ -15,7 +15,7 @@ FINE_S, FINE_IN_PERIOD, REACH = 0.002, 5, 2
 def build_polled_windows(*, noise: float = 0.005, timely: bool = False) -> list[Window]:
     """Return rapids polled every 10 ms: ``timely`` at the instants, else up to 4 ms off in either direction."""
     rng = np.random.default_rng(5)
-    return [_poll_window(window, rng, timely) for window in slow_windows(FINE_S, "instant", noise=noise)]
+    return [_poll_window(window, rng, timely) for window in record_slow_windows(FINE_S, "instant", noise=noise)]
 
 
 def _poll_window(window: Window, rng: np.random.Generator, timely: bool) -> Window:

@@ -130,10 +130,7 @@ def test_increments_too_coarse_for_the_limits_are_refused(
     if told:
         assert told in list_faults(document)
     else:
-        assert (
-            config.OffsetBounds.compute_effective(config.parse_config(document).axis["X"], 0.001).whole_increments[2]
-            == 1
-        )
+        assert config.OffsetBounds.derive(config.parse_config(document).axis["X"], 0.001).whole_increments[2] == 1
 
 
 def test_duplicate_node_id_is_refused() -> None:

@@ -18,7 +18,7 @@ from fdhil.arming.token import TOKEN_NAME, ensure_token, read_token
 from fdhil.config import Nc
 from fdhil.errors import ConfigError, FdhilError, ProgramError
 from fdhil.guard.guard_settings import encode_settings, load_settings
-from fdhil.prediction.models import load_model_file
+from fdhil.prediction.axis_models import load_model_file
 from fdhil.program import Budget, interpret
 from fdhil.sim import fault_script
 from tests.guard.simulated_bus import settings

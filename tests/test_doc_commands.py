@@ -205,7 +205,7 @@ def test_the_tutorial_says_what_becomes_of_a_spoilt_rapid(
     change: Callable[[list[list[str]]], list[list[str]]], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Without a data sheet a constant gain error looks like another drive; every other damage is refused by code."""
-    text = bench.as_csv(bench.run(bench.Plant(), bench.shuttle()), 0.001)
+    text = bench.format_as_csv(bench.simulate_bench(bench.Plant(), bench.make_shuttle_demand()), 0.001)
     assert text.partition("time_s")[2].startswith(",voltage_V,current_A,speed_rad_per_s,")
     (tmp_path / "rapid.csv").write_text(spoilt(text, change))
     code, out, _ = fdhil("identify", tmp_path / "rapid.csv", capsys=capsys)

@@ -11,7 +11,7 @@ import pytest
 
 from studies import zoo
 from studies.zoo import nc
-from studies.zoo.examination import examine
+from studies.zoo.examination import examine_machine
 from studies.zoo.machines import KINDS, machine
 from studies.zoo.plant import STEP_S, Drive, Plant, run
 
@@ -30,8 +30,8 @@ def test_zoo_shares_no_code_with_tested_modules(name: str) -> None:
 
 @pytest.mark.usefixtures("long_computation")
 def test_current_at_constant_speed_balances_friction_and_load() -> None:
-    rates = nc.move(0.3, 0.2, 4.0, 100.0, PERIOD_S)
-    moved = run(PLANT, DRIVE, nc.positions([rates], 0.3, PERIOD_S), PERIOD_S)
+    rates = nc.make_move(0.3, 0.2, 4.0, 100.0, PERIOD_S)
+    moved = run(PLANT, DRIVE, nc.make_set_points([rates], 0.3, PERIOD_S), PERIOD_S)
     cruise = slice(300 + rates.size // 2, 300 + rates.size // 2 + 200)
     speed = 0.2 / PLANT.pitch_m * 2 * math.pi
     expected = (PLANT.Cd + PLANT.ft * speed + PLANT.gravity_nm) / PLANT.K
@@ -40,7 +40,7 @@ def test_current_at_constant_speed_balances_friction_and_load() -> None:
 
 
 def test_moves_end_at_target_within_limits() -> None:
-    rates = nc.move(-0.2, 0.4, 4.0, 100.0, PERIOD_S)
+    rates = nc.make_move(-0.2, 0.4, 4.0, 100.0, PERIOD_S)
     assert rates.sum() * PERIOD_S == pytest.approx(-0.2)
     assert np.abs(rates).max() <= 0.4 * 1.01
     assert np.abs(np.diff(rates)).max() / PERIOD_S <= 4.0 * 1.05
@@ -49,7 +49,7 @@ def test_moves_end_at_target_within_limits() -> None:
 def test_distance_from_line_is_perpendicular() -> None:
     path = np.column_stack([np.linspace(0.0, 0.01, 50), np.zeros(50)])
     beside = path + np.array([1e-4, 3e-6])
-    assert nc.distance_um(path, beside, PERIOD_S)[10:40] == pytest.approx(np.full(30, 3.0))
+    assert nc.measure_distance_um(path, beside, PERIOD_S)[10:40] == pytest.approx(np.full(30, 3.0))
 
 
 def test_same_seed_draws_same_machines_on_their_grid() -> None:
@@ -61,7 +61,7 @@ def test_same_seed_draws_same_machines_on_their_grid() -> None:
 @pytest.mark.usefixtures("long_computation")
 def test_predicted_gain_of_vertical_axis_is_reached_at_table() -> None:
     kind = next(kind for kind in KINDS if "vertical" in kind.name)
-    found = examine(kind, 1)
+    found = examine_machine(kind, 1)
     correction = found["correction"]
     assert all(axis["pool"] for axis in found["axes"].values())
     assert correction["refused"] == []

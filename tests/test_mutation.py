@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from studies import mutants
-from studies.mutation import Mutant, function_of, of_code, of_values, put
+from studies.mutation import Mutant, apply_mutant, find_function, mutate_code, mutate_values
 from studies.trial import UNCALLED, UNNOTICED
 
 ROOT = Path(__file__).parent.parent
@@ -21,15 +21,15 @@ LIMITS = "fdhil.guard.offset_limits"
 @pytest.mark.usefixtures("long_computation")
 def test_mutants_cover_functions_properties_tables_and_constants() -> None:
     import_module("fdhil.guard.guard_step")  # only what is loaded is searched for who reads a table
-    code = {mutant.name for mutant in of_code(LIMITS)}
+    code = {mutant.name for mutant in mutate_code(LIMITS)}
     assert "limits.clamp: return min(max(value, low), high) -> return min(max(value, low), None)" in code
     assert "limits.Travel.total: return self.current + sum(self.past) -> return self.current - sum(self.past)" in code
-    assert "limits.CEILING_OFFSET_UM: 250 -> 251" in {mutant.name for mutant in of_values(LIMITS)}
-    assert not {mutant.place for mutant in of_values("fdhil.guard.state_transitions")} & {"SENT", "TRANSITIONS"}
-    rows = {mutant.name for mutant in of_values("fdhil.guard.interlocks")}
+    assert "limits.CEILING_OFFSET_UM: 250 -> 251" in {mutant.name for mutant in mutate_values(LIMITS)}
+    assert not {mutant.place for mutant in mutate_values("fdhil.guard.state_transitions")} & {"SENT", "TRANSITIONS"}
+    rows = {mutant.name for mutant in mutate_values("fdhil.guard.interlocks")}
     assert "interlocks.CATALOGUE: BusOff: FREEZE -> REFUSE" in rows
     assert "interlocks.FACTS: model_fresh -> no such row" in rows
-    predicates = {mutant.place for mutant in of_code("fdhil.guard.interlock_checks")}
+    predicates = {mutant.place for mutant in mutate_code("fdhil.guard.interlock_checks")}
     assert "AXIS_INTERLOCKS[StaleData]" in predicates
 
 
@@ -37,9 +37,9 @@ def test_mutant_replaces_imported_names() -> None:
     from fdhil.guard.offset_limits import limit_value
 
     turned = Mutant(LIMITS, "clamp", "", "", "def clamp(value, low, high):\n    return max(max(value, low), high)\n")
-    function, code = limit_value, function_of(LIMITS, "clamp").__code__
+    function, code = limit_value, find_function(LIMITS, "clamp").__code__
     try:
-        put(turned)
+        apply_mutant(turned)
         assert function(5, 1, 3) == 5
     finally:
         limit_value.__code__ = code
@@ -54,7 +54,7 @@ def test_mutants_are_detected_by_tests_of_the_function(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     figures = json.loads((tmp_path / "mutants.json").read_text("utf-8"))["figures"]
-    noticed, total = mutants.sums(figures["modules"], "code")
+    noticed, total = mutants.sum_detected(figures["modules"], "code")
     assert 0.3 * total < noticed < total
     assert {row["result"] for row in figures["left"]} == {UNNOTICED, UNCALLED}
     assert not figures["goals"]["R11"]["met"]

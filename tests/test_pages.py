@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks import __main__ as benchmarks
 from studies.__main__ import STUDIES
-from studies.pages import FOLDER, plain, provenance, rendered
+from studies.pages import FOLDER, convert_to_json, describe_provenance, render_page
 
 ROOT = Path(__file__).parents[1]
 Figures = dict[str, Any]
@@ -33,7 +33,7 @@ def extract_prose(page: str) -> str:
 def test_page_matches_figures(study: str) -> None:
     figures = load_document(study)
     page = (FOLDER / f"{study}.md").read_text("utf-8")
-    assert rendered(figures) == page
+    assert render_page(figures) == page
     words = extract_prose(page)
     assert figures["study"] == study
     for told in ("command", "seeds", "commit", "date"):
@@ -116,9 +116,9 @@ def test_conclusions_follow_figures(
     study: str, other: Callable[[Figures], None], gone: str, told: tuple[str, ...]
 ) -> None:
     figures = load_document(study)
-    before = extract_prose(rendered(figures))
+    before = extract_prose(render_page(figures))
     other(changed := copy.deepcopy(figures["figures"]))
-    after = extract_prose(rendered({**figures, "figures": changed}))
+    after = extract_prose(render_page({**figures, "figures": changed}))
     for words in told:
         assert words not in before
         assert words in after
@@ -133,5 +133,9 @@ def test_every_study_page_has_figures_file() -> None:
 
 @pytest.mark.usefixtures("processes")
 def test_figures_round_trip_through_file() -> None:
-    assert plain({"a": (float("nan"), 1.23456789), "n": 3, "s": "R"}) == {"a": [None, 1.23457], "n": 3, "s": "R"}
-    assert provenance("python -m studies.x")["versions"].startswith("Python 3.")
+    assert convert_to_json({"a": (float("nan"), 1.23456789), "n": 3, "s": "R"}) == {
+        "a": [None, 1.23457],
+        "n": 3,
+        "s": "R",
+    }
+    assert describe_provenance("python -m studies.x")["versions"].startswith("Python 3.")

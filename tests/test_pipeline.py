@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from fdhil.config import MachineConfig
 from fdhil.daemon.kernel_warmup import simulate_nominal_rapid
 from fdhil.identification.rapid_windows import find_windows
-from fdhil.pipeline import AxisPipeline, Record, analyse
-from fdhil.pipeline.axis import WAITING_RAPIDS
-from fdhil.pipeline.recent_samples import RecentSamples
+from fdhil.pipeline import AxisPipeline, Record, analyse_window
+from fdhil.pipeline.axis_pipeline import WAITING_RAPIDS
+from fdhil.pipeline.sample_buffer import SampleBuffer
 from fdhil.records import (
     AxisSamples,
     MoveEvent,
@@ -39,7 +39,7 @@ from fdhil.records import (
 )
 from fdhil.store.windows import decode_window, encode_window
 from studies.judging import GOOD
-from studies.slow_recordings import recording_of
+from studies.slow_recordings import make_study_recording
 from tests.daemon.simulated_machine import config_of, rapids
 from tests.store.made import bits, same
 
@@ -50,15 +50,15 @@ def config(tmp_path: Path) -> MachineConfig:
     return config_of(tmp_path, identification={"method": "least_squares"})
 
 
-def fed(pipeline: AxisPipeline, records: Sequence[Record]) -> list[Outcome]:
-    return [outcome for record in records for outcome in pipeline.feed(record)]
+def feed_records(pipeline: AxisPipeline, records: Sequence[Record]) -> list[Outcome]:
+    return [outcome for record in records for outcome in pipeline.process_record(record)]
 
 
-def windows_of(outcomes: Sequence[Outcome]) -> list[Window]:
+def select_windows(outcomes: Sequence[Outcome]) -> list[Window]:
     return [outcome.window for outcome in outcomes if isinstance(outcome, WindowOutcome)]
 
 
-def numbers(outcomes: Sequence[Outcome]) -> list[object]:
+def list_numbers(outcomes: Sequence[Outcome]) -> list[object]:
     told: list[object] = []
     for outcome in outcomes:
         if isinstance(outcome, WindowOutcome):
@@ -72,9 +72,9 @@ def numbers(outcomes: Sequence[Outcome]) -> list[object]:
     return told
 
 
-def test_each_rapid_becomes_one_window_from_rest_to_rest(config: MachineConfig) -> None:
-    outcomes = fed(AxisPipeline("X", config), rapids(config, count=2, first_tick=5000))
-    first, second = windows_of(outcomes)
+def test_each_rapid_yields_one_window(config: MachineConfig) -> None:
+    outcomes = feed_records(AxisPipeline("X", config), rapids(config, count=2, first_tick=5000))
+    first, second = select_windows(outcomes)
     assert (first.direction, second.direction) == (1, -1)
     for window, start in ((first, 5400), (second, 5400 + 850 + 400)):
         assert abs(window.start_tick - start) <= 60  # the margin of rest begins where the made one does
@@ -93,15 +93,15 @@ def test_each_rapid_becomes_one_window_from_rest_to_rest(config: MachineConfig) 
 
 @settings(deadline=None, max_examples=8)
 @given(cut=st.lists(st.integers(1, 160), min_size=1, max_size=12), seed=st.integers(0, 9))
-def test_the_sizes_of_blocks_change_nothing(cut: list[int], seed: int) -> None:
+def test_block_sizes_do_not_change_outcomes(cut: list[int], seed: int) -> None:
     config = config_of(Path(), identification={"method": "least_squares"})
     records = rapids(config, count=1)
-    assert numbers(fed(AxisPipeline("X", config), reblocked(records, cut))) == numbers(
-        fed(AxisPipeline("X", config), records)
+    assert list_numbers(feed_records(AxisPipeline("X", config), split_blocks(records, cut))) == list_numbers(
+        feed_records(AxisPipeline("X", config), records)
     )
 
 
-def reblocked(records: Sequence[Record], cut: Sequence[int]) -> list[Record]:
+def split_blocks(records: Sequence[Record], cut: Sequence[int]) -> list[Record]:
     blocks = [record for record in records if isinstance(record, AxisSamples)]
     names = ("tick", "demand_mm", "position_mm", "speed_rad_s", "current_a", "voltage_v", "offset_mm", "statusword")
     whole = {name: np.concatenate([getattr(block, name) for block in blocks]) for name in names}
@@ -115,15 +115,15 @@ def reblocked(records: Sequence[Record], cut: Sequence[int]) -> list[Record]:
     return out
 
 
-def test_a_replayed_window_gives_the_same_bits_through_a_file(config: MachineConfig) -> None:
-    live = fed(AxisPipeline("X", config), rapids(config, count=1))
-    (window,) = windows_of(live)
+def test_window_replayed_from_file_is_bit_identical(config: MachineConfig) -> None:
+    live = feed_records(AxisPipeline("X", config), rapids(config, count=1))
+    (window,) = select_windows(live)
     stored = decode_window(encode_window(window, config.digest))
     assert same(stored, window)
-    assert numbers(AxisPipeline("X", config).feed(stored)) == numbers(live)
+    assert list_numbers(AxisPipeline("X", config).process_record(stored)) == list_numbers(live)
 
 
-def test_a_gain_that_is_wrong_all_along_is_told_once_against_the_data_sheet(config: MachineConfig) -> None:
+def test_constant_gain_error_is_reported_once(config: MachineConfig) -> None:
     """No window can show it; the sets are published nevertheless, since the data sheet may be wrong."""
     records = [
         replace(r, voltage_v=freeze_array(1.2 * r.voltage_v))
@@ -131,20 +131,20 @@ def test_a_gain_that_is_wrong_all_along_is_told_once_against_the_data_sheet(conf
         else r
         for r in rapids(config, count=2)
     ]
-    outcomes = fed(AxisPipeline("X", config), records)
+    outcomes = feed_records(AxisPipeline("X", config), records)
     assert sum(isinstance(outcome, ParameterSet) for outcome in outcomes) == 2
     (notice,) = [outcome for outcome in outcomes if isinstance(outcome, Notice)]
     assert notice.code == "CalibrationSuspect"
     assert "the voltage is read 1.20 times as large as it is" in notice.text
-    assert not any(isinstance(o, Notice) for o in fed(AxisPipeline("X", config, with_skill=False), records))
+    assert not any(isinstance(o, Notice) for o in feed_records(AxisPipeline("X", config, with_skill=False), records))
 
 
-def test_lost_samples_are_nan_and_listed_and_refused(config: MachineConfig) -> None:
+def test_lost_samples_are_nan_and_refused(config: MachineConfig) -> None:
     records = rapids(config, count=1)
     lost = range(800, 812)
-    records = [without(record, lost) if isinstance(record, AxisSamples) else record for record in records]
-    outcomes = fed(AxisPipeline("X", config), records)
-    (window,) = windows_of(outcomes)
+    records = [drop_ticks(record, lost) if isinstance(record, AxisSamples) else record for record in records]
+    outcomes = feed_records(AxisPipeline("X", config), records)
+    (window,) = select_windows(outcomes)
     start = 800 - window.start_tick
     assert window.gaps == ((start, start + 12),)
     assert np.isnan(window.speed_rad_s[start : start + 12]).all()
@@ -152,60 +152,60 @@ def test_lost_samples_are_nan_and_listed_and_refused(config: MachineConfig) -> N
     assert np.isnan(window.voltage_v[start : start + 12]).all()
 
 
-def without(block: AxisSamples, ticks: range) -> AxisSamples:
+def drop_ticks(block: AxisSamples, ticks: range) -> AxisSamples:
     keep = ~np.isin(block.tick, list(ticks))
     names = ("tick", "demand_mm", "position_mm", "speed_rad_s", "current_a", "voltage_v", "offset_mm", "statusword")
     return replace(block, **{name: getattr(block, name)[keep] for name in names})
 
 
-def test_the_newest_temperature_goes_with_the_window_and_other_axes_are_ignored(config: MachineConfig) -> None:
+def test_window_has_newest_temperature(config: MachineConfig) -> None:
     pipeline = AxisPipeline("X", config)
-    pipeline.feed(Temperature("X", 0, 21.5, "slideway"))
-    pipeline.feed(Temperature("Y", 0, 99.0, "slideway"))
+    pipeline.process_record(Temperature("X", 0, 21.5, "slideway"))
+    pipeline.process_record(Temperature("Y", 0, 99.0, "slideway"))
     stranger = [replace(r, axis="Y") for r in rapids(config, count=1) if isinstance(r, AxisSamples)]
-    assert fed(pipeline, stranger) == []
-    (window,) = windows_of(fed(pipeline, rapids(config, count=1)))
+    assert feed_records(pipeline, stranger) == []
+    (window,) = select_windows(feed_records(pipeline, rapids(config, count=1)))
     assert window.temperature_c == 21.5
 
 
-def test_a_sync_count_that_begins_anew_forgets_the_old_one(config: MachineConfig) -> None:
+def test_restarted_sync_count_discards_old_samples(config: MachineConfig) -> None:
     pipeline = AxisPipeline("X", config)
     records = rapids(config, count=1, first_tick=70_000)
-    assert windows_of(fed(pipeline, records[: len(records) // 2])) == []
-    (window,) = windows_of(fed(pipeline, rapids(config, count=1)))
+    assert select_windows(feed_records(pipeline, records[: len(records) // 2])) == []
+    (window,) = select_windows(feed_records(pipeline, rapids(config, count=1)))
     assert window.start_tick < 500
 
 
-def test_a_changed_load_is_told_at_once_and_used_from_the_second_window(config: MachineConfig) -> None:
+def test_load_change_is_reported_at_once_and_used_from_second_window(config: MachineConfig) -> None:
     pipeline = AxisPipeline("X", config)
     axis = config.axis["X"]
     heavy = axis.model_copy(update={"nominal": axis.nominal.model_copy(update={"Jt": 0.085})})
 
-    def rapid(settings: object, k: int) -> Window:
+    def make_rapid(settings: object, k: int) -> Window:
         made = simulate_nominal_rapid("X", heavy if settings == "heavy" else axis, 0.001, 1 if k % 2 else -1, seed=k)
         return replace(made, start_tick=2000 * k)
 
     for k in range(1, 5):
-        assert any(isinstance(o, ParameterSet) for o in pipeline.feed(rapid("light", k)))
-    third = pipeline.feed(rapid("heavy", 5))
+        assert any(isinstance(o, ParameterSet) for o in pipeline.process_record(make_rapid("light", k)))
+    third = pipeline.process_record(make_rapid("heavy", 5))
     assert [o.code for o in third if isinstance(o, Notice)] == ["LoadChanged"]
     assert not any(isinstance(o, ParameterSet) for o in third)
     assert pipeline.published is not None
     assert pipeline.published.parameters.Jt == pytest.approx(0.075, rel=0.01)
-    fourth = pipeline.feed(rapid("heavy", 6))
+    fourth = pipeline.process_record(make_rapid("heavy", 6))
     (published,) = [o for o in fourth if isinstance(o, ParameterSet)]
     assert published.parameters.Jt == pytest.approx(0.085, rel=0.01)
     assert published.windows == 2  # the windows with the old load are no part of it
 
 
-def test_one_window_that_is_off_leaves_no_trace(config: MachineConfig) -> None:
+def test_single_outlier_window_has_no_effect(config: MachineConfig) -> None:
     pipeline = AxisPipeline("X", config)
     axis = config.axis["X"]
     odd = axis.model_copy(update={"nominal": axis.nominal.model_copy(update={"R": 0.7, "K": 0.9})})
     sets = []
     for k, real in enumerate((axis, axis, axis, odd, axis), start=1):
         window = replace(simulate_nominal_rapid("X", real, 0.001, seed=k), start_tick=2000 * k)
-        outcomes = pipeline.feed(window)
+        outcomes = pipeline.process_record(window)
         sets.append([o for o in outcomes if isinstance(o, ParameterSet)])
         assert [o.code for o in outcomes if isinstance(o, Notice)] == (["ParameterJump"] if k == 4 else [])
     assert [len(s) for s in sets] == [1, 1, 1, 0, 1]
@@ -214,24 +214,22 @@ def test_one_window_that_is_off_leaves_no_trace(config: MachineConfig) -> None:
     assert abs(last.K - 0.8) < 0.008
 
 
-def beside_a_sensor(config: MachineConfig) -> RecentSamples:
+def record_with_sensor(config: MachineConfig) -> SampleBuffer:
     axis = config.axis["X"]
     section = axis.model_copy(update={"voltage": axis.voltage.model_copy(update={"source": "modbus"})})
-    return RecentSamples("X", section, 20_000, 1e-3)
+    return SampleBuffer("X", section, 20_000, 1e-3)
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.0003, -0.0004])
 @pytest.mark.parametrize("ratio", [1, 4])
-def test_a_sensors_voltage_is_placed_by_its_count_however_late_the_host_is(
-    config: MachineConfig, ratio: int, late_s: float
-) -> None:
+def test_sensor_voltage_is_placed_by_count_at_any_host_delay(config: MachineConfig, ratio: int, late_s: float) -> None:
     period_ns, n = 1_000_000, 4000
     rng = np.random.default_rng(5)
-    recent = beside_a_sensor(config)
+    recent = record_with_sensor(config)
     tick = np.arange(100, 100 + n)
     # a host that is late by up to 5 ms, in bursts: arrivals are true only as a whole
     arrival = np.maximum.accumulate(tick * period_ns + rng.exponential(3e5, n).astype(np.int64))
-    recent.add(TickTimes(freeze_integers(tick), freeze_integers(arrival)))
+    recent.append_block(TickTimes(freeze_integers(tick), freeze_integers(arrival)))
     signal = np.sin(np.arange(n + 200) / 50)
     counter = np.arange(7 * ratio, (7 + n) * ratio)  # its sample 7 * ratio begins with tick 107, but for late_s
     begins = 107 + (counter - 7 * ratio) / ratio - late_s / 1e-3
@@ -239,62 +237,62 @@ def test_a_sensors_voltage_is_placed_by_its_count_however_late_the_host_is(
     volts = signal[np.minimum((begins - 100).round().astype(int).clip(0), n + 199)]
     for part in np.array_split(np.arange(counter.size), 80):
         block = (freeze_integers(counter[part]), freeze_integers(t_ns[part]), freeze_integers(np.full(part.size, 9)))
-        recent.add(VoltageSamples("s", "X", *block, freeze_array(volts[part]), 1000.0 * ratio))
-    recent.add(samples(np.arange(100, 100 + n)))
-    recording = recent.cut(1000, 2000)
+        recent.append_block(VoltageSamples("s", "X", *block, freeze_array(volts[part]), 1000.0 * ratio))
+    recent.append_block(make_samples(np.arange(100, 100 + n)))
+    recording = recent.extract_recording(1000, 2000)
     assert recording.voltage_v is not None
     left_over = late_s - round(late_s * 1e3 * ratio) / (1e3 * ratio)  # whole samples are placed
     assert recording.voltage_delay_s == pytest.approx(left_over, abs=1.2e-4 / ratio)
-    assert recent.voltage_reaches(3000)
-    assert not recent.voltage_reaches(5000)
+    assert recent.has_voltage_until(3000)
+    assert not recent.has_voltage_until(5000)
     if ratio == 1 and late_s == 0.0:
         assert np.array_equal(recording.voltage_v, signal[900:1900])
 
 
-def test_lost_sensor_samples_and_an_unfit_rate_stay_unknown(config: MachineConfig) -> None:
-    recent = beside_a_sensor(config)
+def test_lost_sensor_samples_stay_nan(config: MachineConfig) -> None:
+    recent = record_with_sensor(config)
     tick = np.arange(2000)
-    recent.add(TickTimes(freeze_integers(tick), freeze_integers(tick * 1_000_000)))
-    recent.add(samples(tick))
+    recent.append_block(TickTimes(freeze_integers(tick), freeze_integers(tick * 1_000_000)))
+    recent.append_block(make_samples(tick))
     counter = np.delete(np.arange(2000), np.arange(500, 510))
     block = (freeze_integers(counter), freeze_integers(counter * 1_000_000), freeze_integers(np.ones(counter.size)))
-    recent.add(VoltageSamples("s", "X", *block, freeze_array(np.ones(counter.size)), 1000.0))
-    recording = recent.cut(400, 600)
+    recent.append_block(VoltageSamples("s", "X", *block, freeze_array(np.ones(counter.size)), 1000.0))
+    recording = recent.extract_recording(400, 600)
     assert recording.voltage_v is not None
     assert np.flatnonzero(np.isnan(recording.voltage_v)).tolist() == list(range(100, 110))
-    unfit = beside_a_sensor(config)
-    unfit.add(TickTimes(freeze_integers(tick), freeze_integers(tick * 1_000_000)))
-    unfit.add(VoltageSamples("s", "X", *block, freeze_array(np.ones(counter.size)), 730.0))
-    assert unfit.cut(400, 600).voltage_v is None
+    unfit = record_with_sensor(config)
+    unfit.append_block(TickTimes(freeze_integers(tick), freeze_integers(tick * 1_000_000)))
+    unfit.append_block(VoltageSamples("s", "X", *block, freeze_array(np.ones(counter.size)), 730.0))
+    assert unfit.extract_recording(400, 600).voltage_v is None
 
 
-def samples(tick: np.ndarray) -> AxisSamples:
+def make_samples(tick: np.ndarray) -> AxisSamples:
     zeros = freeze_array(np.zeros(tick.size))
     ticks = freeze_integers(tick)
     return AxisSamples("X", ticks, zeros, zeros, zeros, zeros, None, zeros, freeze_integers(zeros))
 
 
-def test_memory_is_bounded(config: MachineConfig) -> None:
-    recent = RecentSamples("X", config.axis["X"], 1000, 1e-3)
+def test_buffer_memory_is_bounded(config: MachineConfig) -> None:
+    recent = SampleBuffer("X", config.axis["X"], 1000, 1e-3)
     for start in range(0, 100_000, 50):
         tick = np.arange(start, start + 50)
-        recent.add(samples(tick))
-        recent.add(TickTimes(freeze_integers(tick), freeze_integers(tick * 1_000_000)))
+        recent.append_block(make_samples(tick))
+        recent.append_block(TickTimes(freeze_integers(tick), freeze_integers(tick * 1_000_000)))
     assert len(recent._samples) <= 22
     assert len(recent._times) <= 22
-    assert math.isnan(recent.cut(0, 10).speed_rad_s[0])
+    assert math.isnan(recent.extract_recording(0, 10).speed_rad_s[0])
 
 
-def test_a_window_that_leaves_l_open_is_accepted_and_publishes_nothing(tmp_path: Path) -> None:
-    (open_end,) = find_windows(recording_of(59, 2, GOOD).recording)  # instants of a sensor of 200 Hz
-    (outcome,) = AxisPipeline("X", config_of(tmp_path)).feed(open_end)
+def test_window_without_l_is_accepted_but_not_published(tmp_path: Path) -> None:
+    (open_end,) = find_windows(make_study_recording(59, 2, GOOD).recording)  # instants of a sensor of 200 Hz
+    (outcome,) = AxisPipeline("X", config_of(tmp_path)).process_record(open_end)
     assert isinstance(outcome, WindowOutcome)
     assert outcome.verdict.accepted
     assert outcome.estimate is not None
     assert set(outcome.estimate.missing) == {"L"}
 
 
-def vertical(config: MachineConfig, k: int, load_nm: float) -> Window:
+def make_vertical_axis(config: MachineConfig, k: int, load_nm: float) -> Window:
     axis, side = config.axis["X"], 1 if k % 2 else -1
     nominal = axis.nominal.model_copy(update={"Cd": 5.0 + side * load_nm})
     made = simulate_nominal_rapid("X", axis.model_copy(update={"nominal": nominal}), 0.001, side, seed=k)
@@ -302,10 +300,10 @@ def vertical(config: MachineConfig, k: int, load_nm: float) -> Window:
 
 
 @pytest.mark.usefixtures("real_time")
-def test_a_load_is_published_and_no_set_flips_with_the_direction(config: MachineConfig) -> None:
+def test_published_load_is_independent_of_direction(config: MachineConfig) -> None:
     pipeline, sets = AxisPipeline("X", config), []
     for k in (1, 2, 3, 4, 5, 7, 9, 11, 13):  # from the fifth on all in one direction
-        outcomes = pipeline.feed(vertical(config, k, 1.0))
+        outcomes = pipeline.process_record(make_vertical_axis(config, k, 1.0))
         assert not any(isinstance(o, Notice) for o in outcomes)
         sets += [o for o in outcomes if isinstance(o, ParameterSet)]
     assert len(sets) == 9
@@ -319,28 +317,28 @@ def test_a_load_is_published_and_no_set_flips_with_the_direction(config: Machine
     assert sets[-1].window_ticks == (4000, 8000, 14000, 18000, 22000, 26000)
 
 
-def test_nothing_is_published_from_one_direction_while_the_other_is_refused(
+def test_nothing_is_published_if_one_direction_is_refused(
     config: MachineConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refusing(window: Window, *known: Any) -> WindowOutcome:
-        outcome = analyse(window, *known)
+    def refuse_direction(window: Window, *known: Any) -> WindowOutcome:
+        outcome = analyse_window(window, *known)
         reason = Reason("ValidationFailed", "the drive has an effect that the model lacks")
         return outcome if window.direction > 0 else replace(outcome, verdict=Verdict(False, 90.0, (reason,)))
 
-    monkeypatch.setattr("fdhil.pipeline.identified_loops.analyse", refusing)
+    monkeypatch.setattr("fdhil.pipeline.identified_loops.analyse_window", refuse_direction)
     pipeline, told = AxisPipeline("X", config), []
     for k in range(1, 7):
-        outcomes = pipeline.feed(vertical(config, k, 0.0))
+        outcomes = pipeline.process_record(make_vertical_axis(config, k, 0.0))
         told.append([type(o).__name__ for o in outcomes if isinstance(o, Notice | ParameterSet)])
     # the first came before the other direction was known to be refused; then it is said once
     assert told == [["ParameterSet"], [], ["Notice"], [], [], []]
 
 
-def test_rapids_whose_samples_never_come_are_bounded(config: MachineConfig) -> None:
+def test_rapids_without_samples_are_bounded(config: MachineConfig) -> None:
     pipeline = AxisPipeline("X", config)
     for k in range(2 * WAITING_RAPIDS):
         for kind, tick in ((MoveKind.RAPID, 2000 * k), (MoveKind.REST, 2000 * k + 800)):
-            assert pipeline.feed(MoveEvent("X", kind, tick, "test")) == []
+            assert pipeline.process_record(MoveEvent("X", kind, tick, "test")) == []
     assert len(pipeline._rapids) == WAITING_RAPIDS
     after = 4000 * WAITING_RAPIDS
-    assert len(windows_of(fed(pipeline, rapids(config, "X", 1, first_tick=after)))) == 1
+    assert len(select_windows(feed_records(pipeline, rapids(config, "X", 1, first_tick=after)))) == 1

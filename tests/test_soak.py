@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from studies import soak
-from studies.pages import plain
+from studies.pages import convert_to_json
 from studies.soak_life import EVENTS, RAPIDS, RESTARTS
-from studies.usage import BLOCKS, slope, used
+from studies.usage import BLOCKS, fit_slope, measure_usage
 
 RUN = {"command": "python -m studies.soak", "date": "2026-01-01", "commit": "0123456", "versions": "", "seeds": "1"}
 
@@ -24,14 +24,14 @@ def test_slope_is_found_only_where_present() -> None:
     time, held, seen = np.arange(400.0), {0.0: 0, 0.01: 0}, 0
     for grows in held:
         for _ in range(200):
-            found = slope(time, 5 + grows * time + rng.normal(0, 0.5, 400))
+            found = fit_slope(time, 5 + grows * time + rng.normal(0, 0.5, 400))
             assert found is not None
             held[grows] += found.low < grows < found.high
             seen += grows > 0 and found.low > 0
     assert all(180 <= count <= 198 for count in held.values()), held
     assert seen == 200
-    assert slope(time[: 2 * BLOCKS - 1], time[: 2 * BLOCKS - 1]) is None
-    assert slope(np.ones(100), time[:100]) is None
+    assert fit_slope(time[: 2 * BLOCKS - 1], time[: 2 * BLOCKS - 1]) is None
+    assert fit_slope(np.ones(100), time[:100]) is None
 
 
 @pytest.mark.usefixtures("processes")
@@ -50,11 +50,11 @@ print("after", flush=True); sys.stdin.readline()
         assert process.stdout is not None
         assert process.stdin is not None
         process.stdout.readline()
-        before = used(process.pid)
+        before = measure_usage(process.pid)
         process.stdin.write("\n")
         process.stdin.flush()
         process.stdout.readline()
-        after = used(process.pid)
+        after = measure_usage(process.pid)
         process.stdin.close()
     assert 28 < after.resident_mb - before.resident_mb < 40
     assert (after.descriptors - before.descriptors, after.threads - before.threads) == (2, 1)
@@ -93,10 +93,13 @@ def test_goal_is_met_without_growth_over_required_time(
 ) -> None:
     build_samples(tmp_path / "week", grown_mb, rounds, 4.0, emergencies)
     build_samples(tmp_path / "hours", 0.0, 300, 120.0, emergencies)
-    week, hours = soak.figures_of(tmp_path / "week", per_day=False), [soak.figures_of(tmp_path / "hours", per_day=True)]
+    week, hours = (
+        soak.compute_figures(tmp_path / "week", per_day=False),
+        [soak.compute_figures(tmp_path / "hours", per_day=True)],
+    )
     assert week["processes"]["guard"]["samples"] == (rounds - 4) - (rounds - 4) // 2
-    assert soak.goal(week, hours)["met"] is met
-    figures = plain({"week": week, "hours": hours, "goals": {"R13": soak.goal(week, hours)}})
+    assert soak.evaluate_goal(week, hours)["met"] is met
+    figures = convert_to_json({"week": week, "hours": hours, "goals": {"R13": soak.evaluate_goal(week, hours)}})
     page = soak.page(RUN, figures)
     assert ("**Met**" if met else "**Not met**") in page
     assert f"{rounds * RAPIDS:,} rapids" in page
@@ -104,7 +107,7 @@ def test_goal_is_met_without_growth_over_required_time(
 
 def test_goal_is_not_met_without_real_hours(tmp_path: Path) -> None:
     build_samples(tmp_path / "week", 0.0, 252, 4.0, 1_000_000)
-    told = soak.goal(soak.figures_of(tmp_path / "week", per_day=False), [])
+    told = soak.evaluate_goal(soak.compute_figures(tmp_path / "week", per_day=False), [])
     assert not told["met"]
     assert "0 of 8 real hours" in told["figure"]
 
@@ -113,13 +116,13 @@ def test_real_hours_are_added_and_must_not_grow(tmp_path: Path) -> None:
     build_samples(tmp_path / "week", 0.0, 252, 4.0, 1_000_000)
     build_samples(tmp_path / "flat", 0.0, 300, 48.0, 0)
     build_samples(tmp_path / "grows", 0.1, 300, 48.0, 0)
-    week = soak.figures_of(tmp_path / "week", per_day=False)
-    flat, grows = (soak.figures_of(tmp_path / name, per_day=True) for name in ("flat", "grows"))
-    assert not soak.goal(week, [flat])["met"]
-    assert soak.goal(week, [flat, flat])["met"]
-    assert not soak.goal(week, [flat, grows])["met"]
+    week = soak.compute_figures(tmp_path / "week", per_day=False)
+    flat, grows = (soak.compute_figures(tmp_path / name, per_day=True) for name in ("flat", "grows"))
+    assert not soak.evaluate_goal(week, [flat])["met"]
+    assert soak.evaluate_goal(week, [flat, flat])["met"]
+    assert not soak.evaluate_goal(week, [flat, grows])["met"]
     assert "### Run 2" in soak.page(
-        RUN, plain({"week": week, "hours": [flat, flat], "goals": {"R13": soak.goal(week, [])}})
+        RUN, convert_to_json({"week": week, "hours": [flat, flat], "goals": {"R13": soak.evaluate_goal(week, [])}})
     )
 
 

@@ -16,9 +16,9 @@ from fdhil.api.identification_json import build_file_document
 from fdhil.api.recording_analysis import FileResult
 from fdhil.cli.model_file import write_model
 from fdhil.config import Identification
-from fdhil.pipeline import analyse, pool
-from fdhil.prediction import predict
-from fdhil.prediction.models import load_model_file, validated_models
+from fdhil.pipeline import analyse_window, pool_windows
+from fdhil.prediction import predict_path
+from fdhil.prediction.axis_models import load_model_file, load_validated_models
 from fdhil.records import PARAMETERS, Estimate, Result, Trajectory, Verdict, WindowOutcome
 from studies import real_plant as real
 from tests.bench import bench_config
@@ -45,59 +45,61 @@ PLANTS = {
 }
 
 
-def short_move() -> Trajectory:
+def make_short_move() -> Trajectory:
     way = np.concatenate([np.linspace(0.0, 5.0, 60), np.linspace(5.0, 0.0, 60), np.zeros(180)])
     return build_trajectory(smooth_demand(way[:, None], (0.060, 0.030), 0.001), "X")
 
 
-MOVE = short_move()
+MOVE = make_short_move()
 
 
 @cache
-def identified(plant: real.Mechanics) -> FileResult:
+def identify_plant(plant: real.Mechanics) -> FileResult:
     loops = real.SLOW_LOOPS if plant.Jt < 0.05 else None
-    outcomes = [analyse(window, Identification()) for window in simulate_rapids(plant, None, loops, moves=4, seed=3)]
-    estimate, verdict = pool(outcomes, Identification())
+    outcomes = [
+        analyse_window(window, Identification()) for window in simulate_rapids(plant, None, loops, moves=4, seed=3)
+    ]
+    estimate, verdict = pool_windows(outcomes, Identification())
     return FileResult("recording.csv", "X", tuple(outcomes), estimate, verdict)
 
 
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.usefixtures("long_computation")
-def test_most_plants_are_validated() -> None:
-    assert sum(identified(plant).verdict.accepted for plant in PLANTS.values()) >= 9
+def test_most_random_plants_are_validated() -> None:
+    assert sum(identify_plant(plant).verdict.accepted for plant in PLANTS.values()) >= 9
 
 
-def model_of(told: dict[str, Any]) -> dict[str, Any]:
+def load_model(told: dict[str, Any]) -> dict[str, Any]:
     six = {name: figures["value"] for name, figures in told["parameters"].items()}
     return {**six, "terms": {name: figures["value"] for name, figures in told["terms"].items()}}
 
 
 @pytest.mark.parametrize("plant", sampled(PLANTS, every=4))
-def test_validated_model_is_taken(plant: str, tmp_path: Path) -> None:
-    result = identified(PLANTS[plant])
+def test_validated_model_is_used(plant: str, tmp_path: Path) -> None:
+    result = identify_plant(PLANTS[plant])
     document = build_file_document(result, {}, with_loops=False)
     told = [each for each in (*document["windows"], document["pooled"]) if each["validated"]]
     path = tmp_path / "model.json"
     for each in told:
-        path.write_text(json.dumps({"X": model_of(each)}))
-        predict(MOVE, load_model_file(path).parameters, CONFIG)
+        path.write_text(json.dumps({"X": load_model(each)}))
+        predict_path(MOVE, load_model_file(path).parameters, CONFIG)
     if not result.verdict.accepted or result.pooled is None:
         return
     write_model([result], CONFIG.axis, path)
     written = load_model_file(path).parameters
     newest = replace(published(1, "X", result.pooled.build_parameters()), covariance=result.pooled.covariance)
-    assert validated_models({"X": newest}, CONFIG, "store")[0] == written
-    assert correction.plan(MOVE, written, CONFIG).after.rms_um < 50.0
+    assert load_validated_models({"X": newest}, CONFIG, "store")[0] == written
+    assert correction.plan_correction(MOVE, written, CONFIG).after.rms_um < 50.0
 
 
-def test_pool_whose_friction_at_standstill_chance_made_negative_is_taken(tmp_path: Path) -> None:
+def test_pool_with_slightly_negative_friction_is_used(tmp_path: Path) -> None:
     """Each window hardly separates the friction from zero; together they have -6.4 +- 2.0 N.m at a Cd of 4.95."""
     names = (*PARAMETERS, "stribeck", "stribeck_speed")
     values = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 4.95, -6.4, 8.0])
     covariance = np.diag([1e-8, 1e-10, 1e-8, 1e-10, 1e-6, 0.25, 2.8**2, 1.0])
     told = Estimate("maximum_likelihood", names, values, covariance, {}, Result.OK)
     outcomes = [WindowOutcome(window, told, Verdict(True, 99.0)) for window in simulate_rapids(moves=2)]
-    estimate, verdict = pool(outcomes, Identification())
+    estimate, verdict = pool_windows(outcomes, Identification())
     assert verdict.accepted
     assert estimate is not None
     assert estimate.get_value("Cd") == pytest.approx(4.95 + 1.45 / (1 + 2.8**2 / 0.25), rel=1e-3)
@@ -105,4 +107,4 @@ def test_pool_whose_friction_at_standstill_chance_made_negative_is_taken(tmp_pat
     write_model([FileResult("recording.csv", "X", tuple(outcomes), estimate, verdict)], CONFIG.axis, path)
     written = load_model_file(path).parameters["X"]
     assert written.Cd + written.get_term("stribeck") == 0.0
-    predict(MOVE, {"X": written}, CONFIG)
+    predict_path(MOVE, {"X": written}, CONFIG)

@@ -11,8 +11,8 @@ import click
 
 # what a command needs -> its compiled modules, and about how many seconds each takes
 NEEDS: Mapping[str, Mapping[str, float]] = {
-    "predict": {"fdhil.model.closed_loop_kernels": 4, "fdhil.prediction.kernels": 1},
-    "correct": {"fdhil.correction.kernels": 10},
+    "predict": {"fdhil.model.closed_loop_kernels": 4, "fdhil.prediction.contour_kernels": 1},
+    "correct": {"fdhil.correction.offset_kernels": 10},
     "identify": {
         "fdhil.identification.kalman": 12,
         "fdhil.model.feed_drive": 2,

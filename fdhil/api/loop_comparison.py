@@ -8,7 +8,7 @@ from typing import Any
 from fdhil.api.recording_analysis import FileResult
 from fdhil.config import Axis, Identification, MachineConfig, Regulators
 from fdhil.daemon.outcome_json import build_loops_document
-from fdhil.pipeline.identified_loops import loops_of
+from fdhil.pipeline.identified_loops import identify_from_outcomes
 from fdhil.records import LoopEstimate
 
 ALL_FED = 0.01  # tolerance of a feed-forward share of 1
@@ -32,7 +32,9 @@ def identify_all_loops(
     axes = {} if machine is None else machine.axis
     period_s = None if machine is None else machine.machine.sync_period_s
     return [
-        r if r.loops else replace(r, loops=loops_of(r.outcomes, axes.get(r.axis or ""), settings, period_s))
+        r
+        if r.loops
+        else replace(r, loops=identify_from_outcomes(r.outcomes, axes.get(r.axis or ""), settings, period_s))
         for r in results
     ]
 

@@ -12,8 +12,8 @@ from fdhil import config, correction, prediction
 from fdhil.api.compilation_notice import announce_compilation
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault, StoreError
-from fdhil.prediction import models as model_files
-from fdhil.prediction.gain import joint_held_out_um, largest_skill_um, moving_axes
+from fdhil.prediction import axis_models as model_files
+from fdhil.prediction.correction_gain import combine_held_out_um, find_largest_error_um, find_moving_axes
 from fdhil.program import load_trajectory
 from fdhil.records import Correction, Parameters, Prediction, Trajectory
 from fdhil.store.known_gain import recent_skills
@@ -55,7 +55,7 @@ class Machine:
     @property
     def models(self) -> Mapping[str, Parameters]:
         """The nominal model of each axis."""
-        return model_files.nominal_models(self.config)
+        return model_files.build_nominal_models(self.config)
 
 
 def plan(program: str | Path | Trajectory, machine: Machine | str | Path) -> Trajectory:
@@ -75,7 +75,7 @@ def predict(program: str | Path | Trajectory, machine: Machine | str | Path, mod
     (True, True)
     """
     announce_compilation("predict")
-    return prediction.predict(*read_inputs(program, machine, models))
+    return prediction.predict_path(*read_inputs(program, machine, models))
 
 
 def correct(
@@ -92,17 +92,19 @@ def correct(
     """
     announce_compilation("predict", "correct")
     reference, given, settings = read_inputs(program, machine, models)
-    return correction.plan(reference, given, settings, method, find_held_out_max_um(reference, settings, models))
+    return correction.plan_correction(
+        reference, given, settings, method, find_held_out_max_um(reference, settings, models)
+    )
 
 
 def find_held_out_max_um(reference: Trajectory, settings: MachineConfig, models: Models) -> float | None:
     """Return the largest error (um) of the models in moves that they were not identified from; None where unknown."""
     found: Mapping[str, float] = {}
     if models == HISTORY:
-        found = largest_skill_um(recent_skills(settings))
+        found = find_largest_error_um(recent_skills(settings))
     elif isinstance(models, str | Path):
         found = model_files.load_model_file(Path(models)).held_out_max_um
-    return joint_held_out_um(found, moving_axes(reference))
+    return combine_held_out_um(found, find_moving_axes(reference))
 
 
 def read_inputs(
@@ -119,17 +121,17 @@ def read_inputs(
         source = str(settings.store.directory)
         newest = read_newest_sets(settings.store.directory, settings.axis, warn)
         sets = {axis: found.set for axis, found in newest.items()}
-        given, settings = model_files.validated_models(sets, settings, source)
+        given, settings = model_files.load_validated_models(sets, settings, source)
     elif isinstance(models, str | Path):
         source = str(models)
         file = model_files.load_model_file(Path(models))
         given = file.parameters
         _refuse_refuted_loops(settings, given.keys() - file.loops.keys(), source)
-        settings = model_files.with_loops(settings, file.loops, source)
+        settings = model_files.apply_loops(settings, file.loops, source)
     elif models is not None:
         given = {**given, **models}
     reference = program if isinstance(program, Trajectory) else load_trajectory(Path(program), settings)
-    return reference, model_files.models_for(reference, given, settings, source), settings
+    return reference, model_files.select_models(reference, given, settings, source), settings
 
 
 def _refuse_refuted_loops(config: MachineConfig, axes: Iterable[str], source: str) -> None:
@@ -138,7 +140,7 @@ def _refuse_refuted_loops(config: MachineConfig, axes: Iterable[str], source: st
     with contextlib.suppress(StoreError):
         for axis, newest in read_newest_sets(config.store.directory, config.axis.keys() & axes).items():
             loops, same = newest.set.loops or {}, newest.set.config_digest == config.digest
-            if same and (apart := model_files.loops_apart(loops, config.axis[axis].regulators)):
+            if same and (apart := model_files.describe_loop_differences(loops, config.axis[axis].regulators)):
                 text = f"LoopsDiffer: is missing, and the machine's rapids showed other loops than configured ({apart})"
                 advice = "write the model again with fdhil identify --write-model, or use --from-history"
                 faults.append(ConfigFault(f"{axis}.loops", text, advice))

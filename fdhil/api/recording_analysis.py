@@ -22,8 +22,8 @@ from fdhil.records import (
     make_read_only_view,
 )
 from fdhil.store.recording_table import COLUMN_SOURCES, IMPORT_NOTES, PITCH_KEY, RECORD_HZ, SLOW_HZ
-from fdhil.validation.data_sheet import gain_error
-from fdhil.validation.signal_consistency import missing_move
+from fdhil.validation.data_sheet import detect_gain_error
+from fdhil.validation.signal_consistency import explain_missing_move
 
 Work = Callable[[Window], WindowOutcome]
 Spread = Callable[[Work, Sequence[Window]], Iterable[WindowOutcome]]
@@ -79,7 +79,7 @@ def analyse_recordings(
     if windows and not turning:
         return _analyse_locked_rotor(windows, name, first.axis)
     outcomes, estimate, verdict, held_out, loops = pool_with_held_out(outcomes, settings, axis, loops, period_s)
-    if not windows and isinstance(first, Recording) and (hidden := missing_move(first)) is not None:
+    if not windows and isinstance(first, Recording) and (hidden := explain_missing_move(first)) is not None:
         verdict = replace(verdict, reasons=(*verdict.reasons, hidden))
     step()
     verdict = _add_reading_notes(first, verdict)
@@ -141,7 +141,7 @@ def compare_with_data_sheet(result: FileResult, axes: Mapping[str, Axis]) -> Fil
         return replace(result, verdict=replace(verdict, warnings=(*verdict.warnings, unknown)))
     if result.axis is None or result.pooled is None or not verdict.accepted:
         return result
-    reason = gain_error(result.pooled, Parameters(**axes[result.axis].nominal.model_dump()))
+    reason = detect_gain_error(result.pooled, Parameters(**axes[result.axis].nominal.model_dump()))
     if reason is None:
         return result
     return replace(result, verdict=replace(verdict, accepted=False, reasons=(reason,)))

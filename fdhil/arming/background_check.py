@@ -13,7 +13,7 @@ from fdhil.arming.code_digest import MAKER
 from fdhil.arming.program_check import SCHEMA, part_file
 from fdhil.bounded_process import BoundedProcess
 from fdhil.config import MachineConfig
-from fdhil.prediction.model_terms import values_of
+from fdhil.prediction.model_variants import list_values
 from fdhil.records import Parameters, Reason
 from fdhil.store.atomic import store_error
 
@@ -66,7 +66,7 @@ class BackgroundCheck:
         return found
 
     def _key(self, program_digest: str, models: Mapping[str, Parameters], config: MachineConfig) -> str:
-        parts = [SCHEMA, program_digest, config.digest, {axis: values_of(m) for axis, m in models.items()}]
+        parts = [SCHEMA, program_digest, config.digest, {axis: list_values(m) for axis, m in models.items()}]
         return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
     def _opened(self, key: str) -> CheckedProgram:
@@ -87,7 +87,7 @@ class BackgroundCheck:
             "program": str(program),
             "program_digest": digest,
             "config": config.model_dump(mode="json"),
-            "models": {axis: values_of(model) for axis, model in models.items()},
+            "models": {axis: list_values(model) for axis, model in models.items()},
             "folder": str(self._folder),
             "key": key,
         }

@@ -16,13 +16,13 @@ from fdhil.arming.checked_program import Piece
 from fdhil.arming.program_check import reference_blocks
 from fdhil.arming.standstill import AtRest
 from fdhil.config import Axis, MachineConfig
-from fdhil.correction.inverse import AxisInverse, block_rows, common_delay_s
-from fdhil.correction.limits import check
+from fdhil.correction.inverse import AxisInversePlanner, compute_common_delay_s, count_block_rows
+from fdhil.correction.plan_limits import check_offsets
 from fdhil.model import closed_loop
 from fdhil.model.closed_loop import State
 from fdhil.model.closed_loop_kernels import CURRENT
-from fdhil.prediction.contour import contour_error_um
-from fdhil.prediction.model_terms import Band, band
+from fdhil.prediction.contour_error import compute_contour_error_um
+from fdhil.prediction.model_variants import FrictionBand, compute_friction_band
 from fdhil.records import Float, Parameters, compute_rms, compute_table_path
 
 ALONE_S, JOINED_S = 0.9, 1.4  # begin and end of the blend into the checked rows
@@ -63,11 +63,13 @@ class FirstBlock:
         self._path = _first_rows(program, config, sha256)
         rapid = {axis: config.axis[axis].rapid_speed_mm_s for axis in begin.offset}
         # the lag of rows that lag on purpose depends on the whole path
-        self._fits = set(begin.offset) <= set(self._path) and common_delay_s(rapid, models, config)[0] == 0.0
+        self._fits = set(begin.offset) <= set(self._path) and compute_common_delay_s(rapid, models, config)[0] == 0.0
         self._walks = {}
         if self._fits:
             starts = {axis: float(self._path[axis][0]) for axis in begin.offset}
-            self._walks = {axis: AxisInverse.of(models[axis], config, axis, start) for axis, start in starts.items()}
+            self._walks = {
+                axis: AxisInversePlanner.prepare(models[axis], config, axis, start) for axis, start in starts.items()
+            }
         self._used_a = {axis: float(walk.carry.state[CURRENT]) for axis, walk in self._walks.items()}
         self._own: dict[str, Float] = {}
 
@@ -111,8 +113,10 @@ class FirstBlock:
         torque_nm = held.high if start_mm > rest.demand_mm else held.low
         return AtRest(start_mm, start_mm, torque_nm / model.K)
 
-    def _band(self, axis: str, position_mm: float) -> Band:
-        return band(self._models[axis], position_mm * 2 * np.pi / self._config.axis[axis].screw_pitch_mm)
+    def _band(self, axis: str, position_mm: float) -> FrictionBand:
+        return compute_friction_band(
+            self._models[axis], position_mm * 2 * np.pi / self._config.axis[axis].screw_pitch_mm
+        )
 
     def _stands(self, axis: str, rest: AtRest | None) -> bool:
         room_mm = AT_START_INCREMENTS / self._config.axis[axis].scaling.increments_per_mm
@@ -128,7 +132,7 @@ class FirstBlock:
         loop, state = walk.loop, rest_state(rest, float(path_mm[0]), self._models[name], axis)
         if name not in self._own:
             self._own[name] = self._block(name, walk.carry.state)
-        own, ends = self._own[name], path_mm.size <= sum(block_rows(self._period_s))
+        own, ends = self._own[name], path_mm.size <= sum(count_block_rows(self._period_s))
         rows = own.size if ends else round(JOINED_S / self._period_s)
         share = 1.0 if ends else _share(rows, self._period_s)
         more = np.rint((self._block(name, state)[:rows] - own[:rows]) * share)
@@ -138,28 +142,33 @@ class FirstBlock:
         )
         new = checked.copy()
         new[:rows] += more
-        allowed = not check(new[2:].astype(np.int64), loop.limits, (float(new[1]), float(new[0])))
+        allowed = not check_offsets(new[2:].astype(np.int64), loop.limits, (float(new[1]), float(new[0])))
         own = own[: new.size]
         old_mm, new_mm = (
-            loop.run(path_mm[: new.size], own + offset - checked, state, 0, rows).table_mm for offset in (begin, new)
+            loop.simulate_rows(path_mm[: new.size], own + offset - checked, state, 0, rows).table_mm
+            for offset in (begin, new)
         )
         return _Found(new[:rows], old_mm, new_mm, allowed)
 
     def _block(self, name: str, state: State) -> Float:
         walk, path_mm = self._walks[name], self._path[name]
-        block, ahead = block_rows(self._period_s)
+        block, ahead = count_block_rows(self._period_s)
         ends = path_mm.size <= block + ahead
         path_mm = np.ascontiguousarray(path_mm[: block + ahead])
         rows = path_mm.size if ends else block
         return (
-            AxisInverse(walk.loop, replace(walk.carry, state=state)).block(path_mm, path_mm, rows, ends).offset[:rows]
+            AxisInversePlanner(walk.loop, replace(walk.carry, state=state))
+            .solve_next_block(path_mm, path_mm, rows, ends)
+            .offset[:rows]
         )
 
     def _better(self, found: Mapping[str, _Found]) -> bool:
         around = compute_table_path((*found,), np.column_stack([self._path[axis] for axis in found]))
         old_um, new_um = (
             compute_rms(
-                contour_error_um(around, compute_table_path((*found,), np.column_stack(positions)), self._period_s, 0)
+                compute_contour_error_um(
+                    around, compute_table_path((*found,), np.column_stack(positions)), self._period_s, 0
+                )
             )
             for positions in ([one.old_mm for one in found.values()], [one.new_mm for one in found.values()])
         )
@@ -167,7 +176,7 @@ class FirstBlock:
 
 
 def _first_rows(program: Path, config: MachineConfig, sha256: str | None) -> dict[str, Float]:
-    block, ahead = block_rows(config.machine.sync_period_s)
+    block, ahead = count_block_rows(config.machine.sync_period_s)
     pieces: list[Mapping[str, Float]] = []
     rows = 0
     for part in reference_blocks(program, config, sha256):

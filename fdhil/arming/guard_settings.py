@@ -90,7 +90,7 @@ def limits_of(axis: Axis, sync_period_s: float) -> OffsetLimits:
     """Return the limits in whole increments per SYNC cycle, as the planner has them, rounded down. ConfigError."""
     if fault := find_share_fault(axis, sync_period_s):
         raise ConfigError("config", [ConfigFault("axis.*.correction", fault, "leave this axis uncorrected")])
-    return OffsetLimits(*OffsetBounds.compute_effective(axis, sync_period_s).whole_increments)
+    return OffsetLimits(*OffsetBounds.derive(axis, sync_period_s).whole_increments)
 
 
 def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:

@@ -15,11 +15,11 @@ from fdhil.arming.preparing import ArmRequest
 from fdhil.arming.program_check import encoded
 from fdhil.arming.whole_plan import in_memory
 from fdhil.config import MachineConfig
-from fdhil.correction.inverse import common_delay_s, delayed
-from fdhil.correction.learning import Lesson, learn
-from fdhil.correction.limits import fit_all
-from fdhil.prediction import contour_error_um
-from fdhil.prediction.predict import ahead_of_motor_mm
+from fdhil.correction.inverse import compute_common_delay_s, delay_path
+from fdhil.correction.learned_offsets import LearnedOffset, learn_from_pass
+from fdhil.correction.plan_limits import fit_all_axes
+from fdhil.prediction import compute_contour_error_um
+from fdhil.prediction.path_prediction import compute_table_deflection_mm
 from fdhil.records import Float, Parameters, Reason, compute_rms, compute_table_path
 from fdhil.store.lessons import lesson_path, read_lesson, write_lesson
 
@@ -35,9 +35,9 @@ class Pupil:
     demand_mm: Mapping[str, Float]
     models: Mapping[str, Parameters]
     config: MachineConfig
-    lesson: Lesson
+    lesson: LearnedOffset
 
-    def learn(self, demand_mm: Float, position_mm: Float) -> Lesson | None:
+    def learn(self, demand_mm: Float, position_mm: Float) -> LearnedOffset | None:
         """Learn from the rows (n, axes) of a whole pass; None if it was not as planned. StoreError if not stored."""
         planned = np.column_stack(list(self.demand_mm.values()))
         axes = [self.config.axis[axis] for axis in self.demand_mm]
@@ -46,14 +46,14 @@ class Pupil:
             return None
         period_s = self.config.machine.sync_period_s
         fastest = {axis: float(np.abs(np.diff(path)).max()) / period_s for axis, path in self.demand_mm.items()}
-        tau_s, _ = common_delay_s(fastest, self.models, self.config)
+        tau_s, _ = compute_common_delay_s(fastest, self.models, self.config)
         error_um = {
-            axis: (delayed(path, tau_s / period_s) - position_mm[:, k]) * 1e3
+            axis: (delay_path(path, tau_s / period_s) - position_mm[:, k]) * 1e3
             for k, (axis, path) in enumerate(self.demand_mm.items())
         }
         path, table = (compute_table_path((*self.demand_mm,), rows) for rows in (planned, position_mm))
-        left_um = compute_rms(contour_error_um(path, table, period_s))
-        lesson = learn(self.lesson, error_um, left_um, self.models, self.config)
+        left_um = compute_rms(compute_contour_error_um(path, table, period_s))
+        lesson = learn_from_pass(self.lesson, error_um, left_um, self.models, self.config)
         write_lesson(self.path, lesson)
         return lesson
 
@@ -70,12 +70,12 @@ def taught(checked: CheckedProgram, request: ArmRequest, machine: str) -> tuple[
     path = lesson_path(config.store.directory / "lessons", request.program_digest, machine)
     learned = read_lesson(path)
     if learned is None or any(learned.offset_um.get(axis, np.empty(0)).size != checked.rows for axis in demand_mm):
-        learned = Lesson(dict.fromkeys(demand_mm, np.zeros(checked.rows)))
+        learned = LearnedOffset(dict.fromkeys(demand_mm, np.zeros(checked.rows)))
     learner = Pupil(path, demand_mm, request.models, config, learned)
     if not any(np.any(offset) for offset in learned.offset_um.values()):
         return checked, learner
     total = {axis: offset + learned.offset_um[axis] for axis, offset in offset_um.items()}
-    fitting = fit_all(total, config.axis, config.machine.sync_period_s)
+    fitting = fit_all_axes(total, config.axis, config.machine.sync_period_s)
     return _with_offsets(checked, demand_mm, fitting, learned, config), learner
 
 
@@ -88,7 +88,7 @@ def compute_axis_deflections_mm(checked: CheckedProgram, request: ArmRequest) ->
     if not sprung or not checked.whole or checked.rows > MOST_ROWS:
         return None
     demand_mm, offset_um = _rows(checked, request.config)
-    ahead = ahead_of_motor_mm(demand_mm, offset_um, request.models, request.config)
+    ahead = compute_table_deflection_mm(demand_mm, offset_um, request.models, request.config)
     return np.column_stack([ahead.get(axis, np.zeros(checked.rows)) for axis in checked.axes])
 
 
@@ -106,7 +106,7 @@ def _with_offsets(
     checked: CheckedProgram,
     demand_mm: Mapping[str, Float],
     offset_um: Mapping[str, Float],
-    learned: Lesson,
+    learned: LearnedOffset,
     config: MachineConfig,
 ) -> CheckedProgram:
     replaced = in_memory(encoded(demand_mm, offset_um, config), config, checked.errors)

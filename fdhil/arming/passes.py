@@ -17,12 +17,12 @@ import numpy as np
 
 from fdhil.arming.lessons import Pupil
 from fdhil.config import MachineConfig
-from fdhil.correction import gate
-from fdhil.correction.learning import Lesson
+from fdhil.correction import correction_gate
+from fdhil.correction.learned_offsets import LearnedOffset
 from fdhil.errors import StoreError
-from fdhil.prediction import contour_error_um
-from fdhil.prediction.contour import WINDOW_S
-from fdhil.prediction.gain import format_upper_limit
+from fdhil.prediction import compute_contour_error_um
+from fdhil.prediction.contour_error import WINDOW_S
+from fdhil.prediction.correction_gain import format_upper_limit
 from fdhil.records import AxisSamples, Float, Int, MoveKind, NcState, Notice, Parameters, Reason, compute_table_path
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
@@ -153,7 +153,7 @@ class Passes:
         if (
             ended.cause == FINISHED
             and ended.running.disturbed is None
-            and report["measured"]["rms_um"] * gate.LEAST_GAIN > report["predicted_without"]["rms_um"]
+            and report["measured"]["rms_um"] * correction_gate.LEAST_GAIN > report["predicted_without"]["rms_um"]
         ):
             advice = "run a few rapids to identify the machine again, then arm"
             reason = Reason("PromiseBroken", f"{text}: the correction was withdrawn", advice)
@@ -249,7 +249,7 @@ class Pass:
             if self._ahead_mm is not None:
                 position = position + self._ahead_mm[self._rows : self._rows + len(position)]
             path, table = compute_table_path(self._axes, self._demand), compute_table_path(self._axes, position)
-            error = contour_error_um(path, table, self._dt_s, self._first)
+            error = compute_contour_error_um(path, table, self._dt_s, self._first)
             self._rows, self._left = self._rows + error.size, self._left - error.size
             self._squares += float(error @ error)
             self._max_um = max(self._max_um, float(error.max()))
@@ -272,7 +272,7 @@ class Pass:
             "following_rms_um": dict(zip(self._axes, following.tolist(), strict=True)),
         }
 
-    def learn(self) -> Lesson | None:
+    def learn(self) -> LearnedOffset | None:
         """Return what was learned from the completed pass; None without a learner, or if it was not as planned."""
         if self._learner is None or not self._learned_rows:
             return None
@@ -292,7 +292,7 @@ def disturbance(state: NcState) -> str | None:
     return None
 
 
-def _learned(ended: _Ended) -> tuple[Lesson | None, list[Notice]]:
+def _learned(ended: _Ended) -> tuple[LearnedOffset | None, list[Notice]]:
     if ended.cause != FINISHED or ended.running.disturbed is not None:
         return None, []
     try:
@@ -339,7 +339,7 @@ def _text(report: Mapping[str, Any]) -> str:
     return f"{text}; it ended early: {report['late'] or report['ended_by']}"
 
 
-def _lesson_text(learned: Lesson) -> str:
+def _lesson_text(learned: LearnedOffset) -> str:
     newest = " ".join(f"{left_um:.2f}" for left_um in learned.curve_um[-SHOWN_CURVE:])
     return f"; learned from {len(learned.curve_um)} passes; residuals of the last ones {newest} um"
 

@@ -18,12 +18,18 @@ from fdhil.commissioning.feedforward import feedforward_object
 from fdhil.commissioning.offset_writers import INVALID_COB_ID, identifier_of
 from fdhil.commissioning.record import CommissioningRecord, holds, load_record
 from fdhil.config import MachineConfig
-from fdhil.correction import flatness_feedforward, gate
+from fdhil.correction import correction_gate, flatness_feedforward
 from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.identification.drive_loops.loop_identification import get_regulator_values
 from fdhil.model.model_terms import add_resonance
-from fdhil.prediction.gain import Gain, joint_held_out_um, largest_skill_um, with_held_out_um, worst_skill_um
-from fdhil.prediction.models import validated_models
+from fdhil.prediction.axis_models import load_validated_models
+from fdhil.prediction.correction_gain import (
+    CorrectionGain,
+    add_held_out_um,
+    combine_held_out_um,
+    find_largest_error_um,
+    find_worst_rms_um,
+)
 from fdhil.program import program_digest
 from fdhil.records import Parameters, Reason, Skill
 
@@ -54,7 +60,7 @@ class Armament:
     """A correction ready for the guard: its first rows, the stream of rows that passed or will pass, and the facts.
 
     ``begun_um`` is the gain predicted for the rows that were checked at arming, ``half_um`` half the 95 % interval of
-    the residual error, and ``left_um`` the RMS error in held-out moves (None: unknown). ``first`` recomputes the first
+    the residual error, and ``residual_um`` the RMS error in held-out moves (None: unknown). ``first`` recomputes the first
     rows for the axes' actual standstill.
     """
 
@@ -73,11 +79,11 @@ class Armament:
         return self.stream.checked.rows if self.stream.checked.whole else None
 
     @property
-    def predicted(self) -> Gain:
+    def predicted(self) -> CorrectionGain:
         """The predicted gain of the rows checked so far, with the error of held-out moves."""
         errors = self.stream.checked.errors
-        after_um = with_held_out_um(errors["after"]["rms_um"], self.left_um)
-        return Gain(errors["before"]["rms_um"], after_um, self.half_um)
+        after_um = add_held_out_um(errors["after"]["rms_um"], self.left_um)
+        return CorrectionGain(errors["before"]["rms_um"], after_um, self.half_um)
 
     def standing_facts(self, config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> dict[str, bool]:
         """Return the facts that may be withdrawn while it runs; the gain is the whole program's once it is known."""
@@ -125,14 +131,17 @@ def prepare(
     models = {axis: add_resonance(model, config.axis[axis]) for axis, model in found[0].items()}
     digest = program_digest(program)
     ahead = method in (None, "inverse") and _longer_than_ring(program, config, digest)
-    if ahead and (off := gate.writing_off(list(config.axis), config) or gate.held_out(largest_um(known, models))):
+    if ahead and (
+        off := correction_gate.check_writing_enabled(list(config.axis), config)
+        or correction_gate.check_held_out_error(largest_um(known, models))
+    ):
         return Refused(off)
     return ArmRequest(program, digest, models, found[1], method, ahead)
 
 
 def largest_um(known: Mapping[str, AxisKnowledge], axes: Iterable[str]) -> float | None:
     """Return the largest error (um) of several axes together in the last moves; None if an axis has none."""
-    return joint_held_out_um(largest_skill_um({axis: known[axis].skills for axis in axes}), tuple(axes))
+    return combine_held_out_um(find_largest_error_um({axis: known[axis].skills for axis in axes}), tuple(axes))
 
 
 def models_with_loops(
@@ -150,7 +159,7 @@ def models_with_loops(
         sets[name] = axis.published
         if axis.loops is not None:  # found by this daemon, with this configuration
             sets[name] = replace(axis.published, loops=get_regulator_values(axis.loops), config_digest=config.digest)
-    return validated_models(sets, config, "the identified loops")
+    return load_validated_models(sets, config, "the identified loops")
 
 
 def _not_validated(axis: str) -> Refused:
@@ -194,7 +203,7 @@ def prepare_armament(
     stream, gain_um = RowStream(checked, request.program_digest, config.machine.sync_period_s), checked.gain_um
     facts = standing_facts(stream.axes, config, known, gain_um)
     facts |= _commissioned(stream.axes, checked.largest_um, config)
-    left_um = joint_held_out_um(worst_skill_um({axis: found.skills for axis, found in known.items()}), stream.axes)
+    left_um = combine_held_out_um(find_worst_rms_um({axis: found.skills for axis, found in known.items()}), stream.axes)
     half_um = left_um if checked.half_um is None else checked.half_um
     begin, first = stream.take(FIRST_S), None
     if checked.method == "inverse":
@@ -235,7 +244,10 @@ def prepare_feeding(config: MachineConfig, known: Mapping[str, AxisKnowledge]) -
     if isinstance(found, Refused):
         return found
     models, own = found
-    laws = {name: flatness_feedforward.law(models[name], own.axis[name], own.machine.sync_period_s) for name in axes}
+    laws = {
+        name: flatness_feedforward.derive_feedforward_law(models[name], own.axis[name], own.machine.sync_period_s)
+        for name in axes
+    }
     records = _records(axes, config)
     facts = feeding_facts(axes, config, known) | {
         "commissioned": all(holds(record, config, axis) for axis, record in records.items()),

@@ -23,8 +23,8 @@ import numpy as np
 from fdhil.arming.code_digest import code_digest
 from fdhil.bounded_process import limit_process, receive_request, report_to_parent
 from fdhil.config import MachineConfig
-from fdhil.correction import gate
-from fdhil.correction.streaming import StreamBlock, stream
+from fdhil.correction import correction_gate
+from fdhil.correction.block_streaming import StreamBlock, stream_blocks
 from fdhil.errors import FdhilError, ProgramError, StoreError
 from fdhil.program import planner, program_digest
 from fdhil.program.demand_csv import read_demand_csv, require_digest
@@ -149,7 +149,9 @@ class _Findings:
 
     def header(self) -> dict[str, Any]:
         errors = self.errors()
-        refused = self.refused or list(gate.gains(errors["before"]["rms_um"], errors["after"]["rms_um"]))
+        refused = self.refused or list(
+            correction_gate.check_gain(errors["before"]["rms_um"], errors["after"]["rms_um"])
+        )
         reasons = [asdict(reason) for reason in refused[:MOST_REFUSED]]
         return {"rows": self.rows, **errors, "largest_um": self.largest_um, "refused": reasons}
 
@@ -167,7 +169,7 @@ def check(
     source, opened = _opened(program, config, sha256)
     path, findings, files = _Path(source), _Findings(), _Files(program, sha256)
     code, blocks, pace = code_digest(), list[list[Any]](), _Pace(config.machine.sync_period_s)
-    for block in stream(path.pieces(), models, config, goes_on=True):
+    for block in stream_blocks(path.pieces(), models, config, goes_on=True):
         demand = path.positions(block.first_row, block.first_row + block.before_um.size)
         files.take(opened())
         findings.take(block)

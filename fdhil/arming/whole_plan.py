@@ -13,7 +13,7 @@ from fdhil.arming.preparing import ArmRequest, Refused, largest_um
 from fdhil.arming.program_check import encoded
 from fdhil.config import MachineConfig
 from fdhil.errors import StoreError
-from fdhil.prediction.gain import gain, moving_axes, worst_skill_um
+from fdhil.prediction.correction_gain import find_moving_axes, find_worst_rms_um, predict_gain
 from fdhil.program import load_trajectory
 from fdhil.records import Correction, Float, Reason, compute_rms
 
@@ -27,8 +27,8 @@ def plan_whole(request: ArmRequest, known: Mapping[str, AxisKnowledge]) -> Check
     """
     config = request.config
     reference = load_trajectory(request.program, config, request.program_digest)
-    held_out_um = largest_um(known, moving_axes(reference))
-    planned = correction.plan(reference, request.models, config, request.method, held_out_um)
+    held_out_um = largest_um(known, find_moving_axes(reference))
+    planned = correction.plan_correction(reference, request.models, config, request.method, held_out_um)
     if planned.refused:
         return Refused(planned.refused)
     if not any(np.any(offset) for offset in planned.offset_um.values()):
@@ -58,8 +58,8 @@ def _conclude(
     known: Mapping[str, AxisKnowledge],
 ) -> None:
     covariances = {axis: found.published.covariance for axis, found in known.items() if found.published is not None}
-    held_out_um = worst_skill_um({axis: found.skills for axis, found in known.items()})
-    checked.half_um = gain(planned, request.models, request.config, covariances, held_out_um).half_um
+    held_out_um = find_worst_rms_um({axis: found.skills for axis, found in known.items()})
+    checked.half_um = predict_gain(planned, request.models, request.config, covariances, held_out_um).half_um
     checked.method, checked.warnings = planned.method, planned.warnings + planned.before.reference.notes
     largest_um = max(float(np.abs(offset).max()) for offset in planned.offset_um.values())
     checked.conclude({**checked.errors, "largest_um": largest_um})

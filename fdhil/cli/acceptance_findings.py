@@ -23,7 +23,7 @@ from fdhil.commissioning.record import CommissioningRecord, holds, load_record
 from fdhil.commissioning.void import is_void
 from fdhil.config import MachineConfig
 from fdhil.errors import RecordingError, StoreError
-from fdhil.prediction.circular import Circular, circle_program, evaluate
+from fdhil.prediction.circle_evaluation import CircleDeviations, evaluate_circle, write_circle_program
 from fdhil.program import program_digest
 from fdhil.records import PARAMETERS, UNITS, Correction, Float, Prediction
 from fdhil.report.history_charts import AxisHistory
@@ -78,7 +78,7 @@ class Findings:
     histories: Sequence[AxisHistory]
     identified: bool
     plane: tuple[str, str] | None
-    circles: Mapping[str, Circular]
+    circles: Mapping[str, CircleDeviations]
     path: Correction | None
     passes: Sequence[Mapping[str, Any]]
     notices: Sequence[Mapping[str, Any]]
@@ -137,23 +137,23 @@ def _proof(machine: MachineConfig, axis: str) -> AxisProof:
 
 def _planned(program: Path, config: Path, from_history: bool) -> Correction:
     reference, models, machine = inputs(program, config, None, from_history)
-    return correction.plan(reference, models, machine)
+    return correction.plan_correction(reference, models, machine)
 
 
-def _circles(config: Path, options: Asked, plane: tuple[str, str], from_history: bool) -> dict[str, Circular]:
+def _circles(config: Path, options: Asked, plane: tuple[str, str], from_history: bool) -> dict[str, CircleDeviations]:
     with tempfile.TemporaryDirectory(prefix="fdhil-circle-") as folder:
         program = Path(folder) / "circle.ngc"
-        program.write_text(circle_program(plane, options.radius_mm, options.feed_mm_min), "ascii")
+        program.write_text(write_circle_program(plane, options.radius_mm, options.feed_mm_min), "ascii")
         planned = _planned(program, config, from_history)
     cases = {"predicted, uncorrected": planned.before}
     if not planned.refused:
         cases["predicted, corrected"] = planned.after
     found = {
-        label: evaluate(_table_mm(predicted, plane), options.radius_mm, (0.0, 0.0))
+        label: evaluate_circle(_table_mm(predicted, plane), options.radius_mm, (0.0, 0.0))
         for label, predicted in cases.items()
     }
     if options.measured_circle is not None:
-        found["measured"] = evaluate(read_path(options.measured_circle, plane), options.radius_mm)
+        found["measured"] = evaluate_circle(read_path(options.measured_circle, plane), options.radius_mm)
     return found
 
 
@@ -180,7 +180,7 @@ def read_path(path: Path, plane: tuple[str, str]) -> Float:
     return np.array(rows)
 
 
-def _beyond(options: Asked, circles: Mapping[str, Circular], path: Correction | None) -> list[str]:
+def _beyond(options: Asked, circles: Mapping[str, CircleDeviations], path: Correction | None) -> list[str]:
     # a limit without a result to compare is open as well
     points = []
     if options.circle_um is not None:
@@ -246,7 +246,7 @@ def _axis_document(found: Findings, axis: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _circle_document(circle: Circular) -> dict[str, Any]:
+def _circle_document(circle: CircleDeviations) -> dict[str, Any]:
     counter, clockwise = circle.deviations_um
     largest, least = circle.radial_um
     return {

@@ -19,8 +19,8 @@ from fdhil.cli.prediction import inputs
 
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig
-    from fdhil.prediction.advise import Advice
-    from fdhil.prediction.feed_search import Source
+    from fdhil.prediction.feed_advice import FeedAdvice
+    from fdhil.prediction.feed_search import FeedScaledPath
     from fdhil.records import Parameters, Trajectory
 
 UNHELD = "{} lines leave the tolerance at every feed tried, without the correction"
@@ -56,13 +56,13 @@ def advise(
     if out is not None and program.suffix.lower() == ".csv":
         raise click.UsageError("--out writes F words, which a demand does not have; give the NC program")
     reference, models, config = inputs(program, config_path, model_path, from_history)
-    from fdhil.correction.result_documents import advised, entry
+    from fdhil.correction.result_documents import advise_with_correction, build_advice_document
 
     corrects = all(config.axis[axis].correction is not None for axis in reference.axes)
     announce_compilation("predict", *(["correct"] if corrects else []))
     sure, hopeful = _sources(program, reference, models, config, tolerance_um)
     sure, hopeful = _telling(sure), hopeful and _telling(hopeful)
-    advice, most = advised(sure, hopeful, models, config, tolerance_um)
+    advice, most = advise_with_correction(sure, hopeful, models, config, tolerance_um)
     if sys.stderr.isatty():
         click.echo(err=True)
     if not as_json:
@@ -73,7 +73,7 @@ def advise(
         _write(program, advice, config, out)
     if as_json:
         document = {"schema": "fdhil-advise-1", "program": str(program), "tolerance_um": tolerance_um}
-        lines = [entry(a, most) for a in advice]
+        lines = [build_advice_document(a, most) for a in advice]
         written = None if out is None else str(out)
         click.echo(json.dumps(document | {"lines": lines, "written": written}, allow_nan=False))
     elif out is not None and (left := sum(a.plain.share is None for a in advice)):
@@ -81,13 +81,13 @@ def advise(
     return int(any(not _held(a, corrected=out is None) for a in advice))
 
 
-def _held(advice: Advice, corrected: bool) -> bool:
+def _held(advice: FeedAdvice, corrected: bool) -> bool:
     """Return whether some feed keeps the tolerance, without the correction or, if ``corrected``, with it."""
     ways = (advice.plain, advice.corrected) if corrected else (advice.plain,)
     return any(way is not None and way.share is not None for way in ways)
 
 
-def _write(program: Path, advice: Sequence[Advice], config: MachineConfig, out: Path) -> None:
+def _write(program: Path, advice: Sequence[FeedAdvice], config: MachineConfig, out: Path) -> None:
     from fdhil.program import Budget
     from fdhil.program.feed_words import with_feeds
     from fdhil.store.output import open_output
@@ -103,15 +103,15 @@ def _sources(
     models: Mapping[str, Parameters],
     config: MachineConfig,
     tolerance_um: float,
-) -> tuple[Source, Source | None]:
-    from fdhil.correction.result_documents import sources
+) -> tuple[FeedScaledPath, FeedScaledPath | None]:
+    from fdhil.correction.result_documents import make_feed_sources
     from fdhil.program import Budget, interpret
 
     motions = None if program.suffix.lower() == ".csv" else list(interpret(program, Budget.of(config.nc)))
-    return sources(motions, reference, models, config, tolerance_um)
+    return make_feed_sources(motions, reference, models, config, tolerance_um)
 
 
-def _telling(source: Source) -> Source:
+def _telling(source: FeedScaledPath) -> FeedScaledPath:
     if not sys.stderr.isatty():
         return source
     at, trials = source.at, itertools.count(1)

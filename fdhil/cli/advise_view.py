@@ -11,7 +11,7 @@ import click
 from fdhil.program.feed_words import cut
 
 if TYPE_CHECKING:
-    from fdhil.prediction.advise import Advice, Held
+    from fdhil.prediction.feed_advice import FeedAdvice, FeedResult
 
 BRACKETED = (
     "this demand does not match the averages of [nc] smoothing_s: the lower feed applies if the NC keeps its smoothing,"
@@ -19,12 +19,12 @@ BRACKETED = (
 )
 MANY = 20  # ranges shown
 SPREADS = (1.1, 1.5, 2.0, 4.0)  # highest to lowest feed within one range
-Range = list["Advice"]
+Range = list["FeedAdvice"]
 
 
 def show(
-    advice: Sequence[Advice],
-    most: Mapping[float, Advice] | None,
+    advice: Sequence[FeedAdvice],
+    most: Mapping[float, FeedAdvice] | None,
     tolerance_um: float,
     corrects: bool,
     feeds: Callable[[int], bool],
@@ -48,7 +48,7 @@ def show(
         click.echo("the correction was not evaluated: an axis lacks the section [axis.X.correction]")
 
 
-def ranges(advice: Sequence[Advice], feeds: Callable[[int], bool]) -> list[Range]:
+def ranges(advice: Sequence[FeedAdvice], feeds: Callable[[int], bool]) -> list[Range]:
     """Group consecutive lines of similar feeds, widening the feed spread until at most ``MANY`` ranges remain."""
     found: list[Range] = []
     for spread in SPREADS:
@@ -58,7 +58,7 @@ def ranges(advice: Sequence[Advice], feeds: Callable[[int], bool]) -> list[Range
     return found
 
 
-def _runs(advice: Sequence[Advice], feeds: Callable[[int], bool], spread: float) -> Iterator[Range]:
+def _runs(advice: Sequence[FeedAdvice], feeds: Callable[[int], bool], spread: float) -> Iterator[Range]:
     run: Range = []
     low = high = 0.0
     for a in advice:
@@ -72,21 +72,21 @@ def _runs(advice: Sequence[Advice], feeds: Callable[[int], bool], spread: float)
     yield run
 
 
-def _follows(before: Advice, after: Advice, feeds: Callable[[int], bool]) -> bool:
+def _follows(before: FeedAdvice, after: FeedAdvice, feeds: Callable[[int], bool]) -> bool:
     """Return whether no feed line lies between two lines; zones of a demand are never grouped."""
     return 0 < before.line < after.line and not any(map(feeds, range(before.line + 1, after.line)))
 
 
-def _alike(one: Advice, other: Advice) -> bool:
+def _alike(one: FeedAdvice, other: FeedAdvice) -> bool:
     """Return whether two lines have the same programmed feed, and both or neither keep the tolerance at a lower one."""
     return one.feed_mm_min == other.feed_mm_min and (one.plain.share is None) == (other.plain.share is None)
 
 
-def _worst(one: Range) -> Advice:
+def _worst(one: Range) -> FeedAdvice:
     return max(one, key=lambda a: a.error_um)
 
 
-def _show_range(one: Range, most: Mapping[float, Advice] | None) -> None:
+def _show_range(one: Range, most: Mapping[float, FeedAdvice] | None) -> None:
     worst, first, last = _worst(one), one[0], one[-1]
     at = f"at line {worst.line}, {worst.where}" if last is not first else f"at {worst.where}"
     name = f"lines {first.line}-{last.line}" if last is not first else f"line {first.line}"
@@ -115,9 +115,9 @@ def _span(feeds: Sequence[float]) -> str:
     return f"{high:g}" if cut(low) == cut(high) else f"{low:g}..{high:g}"
 
 
-def _told(held: Held, most: Held | None, feed_mm_min: float) -> str:
+def _told(held: FeedResult, most: FeedResult | None, feed_mm_min: float) -> str:
     if held.share is None:
-        left = f": an error of {held.left_um:.1f} um remains" if math.isfinite(held.left_um) else ""
+        left = f": an error of {held.residual_um:.1f} um remains" if math.isfinite(held.residual_um) else ""
         with_it = (
             f"; the other lines keep the tolerance with this one at {cut(held.run * feed_mm_min):g}"
             if held.run > held.tried
@@ -129,5 +129,5 @@ def _told(held: Held, most: Held | None, feed_mm_min: float) -> str:
     return f"at most {cut(held.share * feed_mm_min):g} mm/min{more}"
 
 
-def _hopes(held: Held, most: Held | None) -> bool:
+def _hopes(held: FeedResult, most: FeedResult | None) -> bool:
     return bool(most and most.share and held.share and most.share > 1.02 * held.share)

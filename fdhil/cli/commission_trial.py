@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from fdhil.commissioning.record import CommissioningRecord
     from fdhil.commissioning.strokes import Room
     from fdhil.config import MachineConfig
-    from fdhil.pipeline import Known
+    from fdhil.pipeline import PipelineState
     from fdhil.records import Notice, Outcome
 
 
@@ -83,14 +83,16 @@ def ask_room(axis: str, unit: str) -> Room | None:
 
 
 @contextmanager
-def _history(machine: MachineConfig, axis: str) -> Iterator[tuple[Known | None, Callable[[Sequence[Outcome]], None]]]:
+def _history(
+    machine: MachineConfig, axis: str
+) -> Iterator[tuple[PipelineState | None, Callable[[Sequence[Outcome]], None]]]:
     """Yield the history of the axis and a function that stores outcomes.
 
     While a daemon runs nothing is stored: it records the rapids itself.
     """
     from fdhil.daemon.machine_lock import BusLocked, lock_machine
     from fdhil.daemon.outcome_store import OutcomeStore
-    from fdhil.pipeline import Known
+    from fdhil.pipeline import PipelineState
 
     with ExitStack() as open_:
         try:
@@ -101,7 +103,10 @@ def _history(machine: MachineConfig, axis: str) -> Iterator[tuple[Known | None, 
         store = OutcomeStore(machine)
         open_.callback(store.close)
         _tell(store.open())
-        yield Known(newest=store.read_axis_history(axis).newest), lambda outcomes: _tell(store.store_outcomes(outcomes))
+        yield (
+            PipelineState(newest=store.read_axis_history(axis).newest),
+            lambda outcomes: _tell(store.store_outcomes(outcomes)),
+        )
 
 
 def _tell(notices: Sequence[Notice]) -> None:

@@ -65,7 +65,7 @@ def read_pass(path: Path) -> dict[str, Any]:
     import numpy as np
 
     from fdhil.csv_text import read_csv_text
-    from fdhil.prediction import contour_error_um
+    from fdhil.prediction import compute_contour_error_um
     from fdhil.records import compute_rms, compute_table_path
 
     names, *rows = read_csv_text(path).splitlines()
@@ -92,7 +92,7 @@ def read_pass(path: Path) -> dict[str, Any]:
     return {
         "file": str(path),
         "rows": int(time_s.size),
-        "contour": errors(contour_error_um(programmed, table, float(np.median(np.diff(time_s))))),
+        "contour": errors(compute_contour_error_um(programmed, table, float(np.median(np.diff(time_s))))),
         "axes": {axis: errors(1e3 * (actual - reference)[:, k]) for k, axis in enumerate(axes)},
     }
 
@@ -126,7 +126,7 @@ def _change_percent(before: Mapping[str, Any], after: Mapping[str, Any]) -> floa
 
 
 def _model_values(path: Path) -> Values:
-    from fdhil.prediction.models import load_model_file
+    from fdhil.prediction.axis_models import load_model_file
     from fdhil.records import PARAMETERS
 
     return {

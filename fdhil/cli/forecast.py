@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from fdhil.config import MachineConfig
-    from fdhil.prediction.forecast import Step, ZoneChange
+    from fdhil.prediction.error_forecast import ParameterStep, ZoneChange
     from fdhil.records import Float, Parameters, Prediction
     from fdhil.store.rows import Comparison, Revision, Stamp
 
@@ -96,7 +96,7 @@ def compared(
 
     None if there is no such prediction.
     """
-    from fdhil.prediction import forecast
+    from fdhil.prediction import error_forecast
     from fdhil.records import Zone
 
     before = next(((stamp, old) for stamp, old in past.comparisons if not _same(old, now)), None)
@@ -107,7 +107,7 @@ def compared(
     models = {axis: used.parameters for axis, used in now.used.items()}
     earlier = {axis: used.parameters for axis, used in old.used.items() if axis in models}
     same_settings = old.config_digest == now.config_digest
-    changes = forecast.zone_changes(predicted, models, earlier, std_um, recorded, config, same_settings)
+    changes = error_forecast.compare_zones(predicted, models, earlier, std_um, recorded, config, same_settings)
     return {
         "at": datetime.datetime.fromtimestamp(stamp.wall_s, datetime.UTC).isoformat(timespec="seconds"),
         "revisions": {axis: used.revision for axis, used in old.used.items()},
@@ -120,10 +120,10 @@ def compared(
 def _change_entry(
     change: ZoneChange, earlier: Mapping[str, Parameters], models: Mapping[str, Parameters]
 ) -> dict[str, Any]:
-    from fdhil.prediction.model_terms import values_of
+    from fdhil.prediction.model_variants import list_values
 
     both = {"before": earlier, "now": models}
-    values = {when: {axis: values_of(p) for axis, p in of.items()} for when, of in both.items()}
+    values = {when: {axis: list_values(p) for axis, p in of.items()} for when, of in both.items()}
     return {
         "line": change.line,
         "where": change.where,
@@ -149,7 +149,7 @@ def show_compared(found: Mapping[str, Any] | None) -> None:
     """Print the zones with significant changes, largest change first, and their causes."""
     if found is None:
         return
-    from fdhil.prediction.gain import format_half_interval
+    from fdhil.prediction.correction_gain import format_half_interval
 
     revisions = ", ".join(f"{axis} {revision}" for axis, revision in found["revisions"].items())
     since = f"since this program was predicted on {found['at'][:10]} (revisions {revisions})"
@@ -188,19 +188,19 @@ def steps(
     models: Mapping[str, Parameters],
     config: MachineConfig,
     since: int | None,
-) -> tuple[Step, ...]:
+) -> tuple[ParameterStep, ...]:
     """Return the cost of the parameter steps since revision ``since`` (default: since before each axis' last step).
 
     Raises click.UsageError if no axis has that revision.
     """
-    from fdhil.prediction import forecast
+    from fdhil.prediction import error_forecast
 
     now = {axis: found[-1].set for axis, found in past.revisions.items() if found}
     earlier = {}
     for axis, found in past.revisions.items():
         sets = [revision.set for revision in found]
         if since is None:
-            place = forecast.last_step(sets)
+            place = error_forecast.find_last_step(sets)
         else:
             place = next((k for k, one in enumerate(sets) if one.revision == since), None)
         if place is not None:
@@ -209,10 +209,10 @@ def steps(
         raise click.UsageError(
             f"--since: there is no revision {since} among the last {RECENT}; fdhil history lists them"
         )
-    return forecast.step_costs(predicted, models, earlier, now, config)
+    return error_forecast.compute_step_costs(predicted, models, earlier, now, config)
 
 
-def step_entries(found: Sequence[Step]) -> list[dict[str, Any]]:
+def step_entries(found: Sequence[ParameterStep]) -> list[dict[str, Any]]:
     """Return the steps as JSON entries."""
     return [
         {
@@ -229,7 +229,7 @@ def step_entries(found: Sequence[Step]) -> list[dict[str, Any]]:
     ]
 
 
-def show_steps(found: Sequence[Step]) -> None:
+def show_steps(found: Sequence[ParameterStep]) -> None:
     """Print one line per step: the change, its cost and its location."""
     for step in found:
         changed = ", ".join(f"{name} {old:.4g} -> {new:.4g}" for name, (old, new) in step.changed.items())
@@ -250,18 +250,20 @@ def crossings(
 ) -> list[dict[str, Any]]:
     """Return as JSON when each zone will leave the tolerance.
 
-    ``state`` is over, foreseen, not_foreseen (within ``within_days``) or not_enough_history (of ``span_days``).
+    ``state`` is over, foreseen, not_foreseen (within ``within_days``) or not_enough_history (of ``compute_observed_days``).
     """
     from fdhil.identification.trends import limit_forecast_days
-    from fdhil.prediction import forecast
+    from fdhil.prediction import error_forecast
 
     newest = max((found[-1].stamp.wall_s for found in past.revisions.values() if found), default=0.0)
     courses = {
-        axis: forecast.course([r.set for r in past.revisions[axis]], _days(past.revisions[axis], newest))
+        axis: error_forecast.fit_parameter_trend(
+            [r.set for r in past.revisions[axis]], _days(past.revisions[axis], newest)
+        )
         for axis in predicted.reference.axes
         if past.revisions.get(axis)
     }
-    span_days = forecast.span_days(courses)
+    span_days = error_forecast.compute_observed_days(courses)
     within_days = min(limit_forecast_days(span_days), FAR_DAYS)
     entries: list[dict[str, Any]] = []
     for zone, per_axis in zip(predicted.zones, um_per_percent, strict=True):
@@ -271,7 +273,7 @@ def crossings(
         if not within_days:
             entries.append({"state": "not_enough_history", "span_days": span_days})
             continue
-        found = forecast.crossing(zone, per_axis, models, courses, tolerance_um)
+        found = error_forecast.predict_tolerance_crossing(zone, per_axis, models, courses, tolerance_um)
         if found is None or found.days > within_days:
             entries.append({"state": "not_foreseen", "within_days": within_days})
             continue

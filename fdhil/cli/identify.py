@@ -323,11 +323,11 @@ def _show_table(console: Any, result: FileResult) -> None:
 
 def _show_reasons(console: Any, result: FileResult) -> None:
     from fdhil.api.identification_json import describe_voltage_delay
-    from fdhil.validation.plausibility import warnings_of
+    from fdhil.validation.signal_plausibility import collect_signal_warnings
 
     verdicts = [*(outcome.verdict for outcome in result.outcomes), result.verdict]
     reasons = [r for verdict in verdicts for r in (*verdict.reasons, *verdict.warnings)]
-    reasons += [r for outcome in result.outcomes for r in warnings_of(outcome.window)]
+    reasons += [r for outcome in result.outcomes for r in collect_signal_warnings(outcome.window)]
     for outcome in result.outcomes:
         delay = describe_voltage_delay(outcome.estimate) if outcome.window.slow_voltage is not None else None
         if delay is not None:

@@ -13,7 +13,7 @@ from fdhil import tables
 from fdhil.cli.demo.machines import REAL, machine_document
 from fdhil.config import MachineConfig
 from fdhil.daemon.kernel_warmup import compile_kernels, simulate_nominal_rapid
-from fdhil.pipeline import analyse
+from fdhil.pipeline import analyse_window
 from fdhil.records import SlowVoltage, Window, freeze_array
 from fdhil.sim.simulated_machine import SimulatedMachine
 
@@ -26,7 +26,7 @@ def compile_all() -> None:
     for method in (None, *tables.ESTIMATORS):
         compile_kernels(config, method)
     for window in _unusual(config):
-        analyse(window, config.identification)
+        analyse_window(window, config.identification)
     for machine in (config, machine_config.parse_config(machine_document(REAL))):
         SimulatedMachine(machine).power_on()
 

@@ -21,8 +21,8 @@ from fdhil.report.parameter_format import INTERVAL_MEANING
 if TYPE_CHECKING:
     from fdhil.cli.forecast import Past
     from fdhil.config import MachineConfig
-    from fdhil.prediction.forecast import Step
-    from fdhil.prediction.gain import Gain
+    from fdhil.prediction.correction_gain import CorrectionGain
+    from fdhil.prediction.error_forecast import ParameterStep
     from fdhil.records import Correction, Float, Parameters, Prediction, Trajectory
 
 MANY_ZONES = 12
@@ -94,18 +94,22 @@ def predict(options: Asked, sensitivity: bool, tolerance_um: float | None, since
         raise click.UsageError("--tolerance-um and --since need --from-history")
     reference, models, config = inputs(options.program, options.config_path, options.model_path, options.from_history)
     from fdhil import prediction
-    from fdhil.correction.result_documents import prediction_document
+    from fdhil.correction.result_documents import build_prediction_document
 
     announce_compilation("predict")
-    predicted = prediction.predict(reference, models, config)
+    predicted = prediction.predict_path(reference, models, config)
     columns = _prediction_columns(predicted)
-    document = {"schema": "fdhil-predict-1", "program": str(options.program), **prediction_document(predicted, models)}
+    document = {
+        "schema": "fdhil-predict-1",
+        "program": str(options.program),
+        **build_prediction_document(predicted, models),
+    }
     um_per_percent = None
     if sensitivity or tolerance_um is not None:
-        um_per_percent = prediction.sensitivity_um(predicted, models, config)
+        um_per_percent = prediction.compute_sensitivity_um(predicted, models, config)
         for zone, per_axis in zip(document["zones"], um_per_percent, strict=True):
             zone["um_per_percent"] = per_axis
-    steps: Sequence[Step] = ()
+    steps: Sequence[ParameterStep] = ()
     if options.from_history:
         std_um, steps = _with_history(
             document, options.program, predicted, models, config, since, um_per_percent, tolerance_um
@@ -133,7 +137,7 @@ def _with_history(
     since: int | None,
     um_per_percent: Sequence[Mapping[str, Mapping[str, float]]] | None,
     tolerance_um: float | None,
-) -> tuple[Float, Sequence[Step]]:
+) -> tuple[Float, Sequence[ParameterStep]]:
     """Add the history's results to the document and store this prediction.
 
     Returns the standard deviation of the contour error, (n,) um, and the parameter steps.
@@ -145,7 +149,7 @@ def _with_history(
     digest = program_digest(program)
     past = forecast.Past.read(config, digest)
     reference, zones = predicted.reference, document["zones"]
-    std_um = prediction.contour_std_um(reference, models, _covariances(reference, past), config)
+    std_um = prediction.compute_contour_std_um(reference, models, _covariances(reference, past), config)
     document["contour"]["max_std_um"] = float(std_um.max())
     for entry, zone in zip(zones, predicted.zones, strict=True):
         entry["std_um"] = float(std_um[predicted.find_worst_row(zone)])
@@ -175,27 +179,29 @@ def correct(options: Asked, method: str | None) -> int:
     reference, models, config = inputs(options.program, options.config_path, options.model_path, options.from_history)
     from fdhil import correction
     from fdhil.api.machine_interface import find_held_out_max_um
-    from fdhil.correction.result_documents import correction_document
-    from fdhil.prediction.models import load_model_file
+    from fdhil.correction.result_documents import build_correction_document
+    from fdhil.prediction.axis_models import load_model_file
     from fdhil.store.known_gain import predict_gain_from_history
 
     announce_compilation("predict", "correct")
     held_out_um = {} if options.model_path is None else load_model_file(options.model_path).held_out_um
     largest_um = find_held_out_max_um(reference, config, "history" if options.from_history else options.model_path)
-    planned = correction.plan(reference, models, config, method, largest_um)
+    planned = correction.plan_correction(reference, models, config, method, largest_um)
     predicted = predict_gain_from_history(planned, models, config, options.from_history, held_out_um)
     if options.out is not None:
         _write(options.out, _correction_columns(planned))
     _report(options, config, planned, predicted)
     if options.as_json:
-        click.echo(json.dumps(correction_document(str(options.program), planned, predicted, models), allow_nan=False))
+        click.echo(
+            json.dumps(build_correction_document(str(options.program), planned, predicted, models), allow_nan=False)
+        )
     else:
         _show_correction(planned, predicted, models)
     return 1 if planned.refused else 0
 
 
 def _report(
-    options: Asked, config: MachineConfig, found: Prediction | Correction, predicted: Gain | None = None
+    options: Asked, config: MachineConfig, found: Prediction | Correction, predicted: CorrectionGain | None = None
 ) -> None:
     if options.report is None and options.pdf is None:
         return
@@ -279,14 +285,14 @@ def _show_prediction(
 ) -> None:
     from fdhil.cli.forecast import crossing_text
     from fdhil.correction import result_documents
-    from fdhil.prediction.gain import format_half_interval
+    from fdhil.prediction.correction_gain import format_half_interval
 
-    contour, time_s = result_documents.contour(predicted), predicted.reference.time_s
+    contour, time_s = result_documents.build_contour_document(predicted), predicted.reference.time_s
     click.echo(
         f"{time_s[-1] - time_s[0]:.2f} s of path: contour error {contour['rms_um']:.1f} um RMS,"
         f" {contour['max_um']:.1f} um at most" + (f"; {INTERVAL_MEANING}" if zones and "std_um" in zones[0] else "")
     )
-    entries = result_documents.zones(predicted) if zones is None else zones
+    entries = result_documents.build_zone_documents(predicted) if zones is None else zones
     shown = sorted(sorted(entries, key=lambda zone: -zone["max_um"])[:MANY_ZONES], key=lambda zone: zone["start_s"])
     for note in predicted.reference.notes:
         click.echo(f"note, {note}; {note.advice}", err=True)
@@ -313,7 +319,7 @@ def _driver(per_axis: Mapping[str, Mapping[str, float]]) -> str:
     return f"1 % more {name} of axis {axis} changes the error by {rise:+.2f} um"
 
 
-def _show_correction(planned: Correction, predicted: Gain, models: Mapping[str, Parameters]) -> None:
+def _show_correction(planned: Correction, predicted: CorrectionGain, models: Mapping[str, Parameters]) -> None:
     from fdhil.correction import result_documents
 
     _show_prediction(planned.before)
@@ -323,9 +329,9 @@ def _show_correction(planned: Correction, predicted: Gain, models: Mapping[str, 
         click.echo(f"refused, {reason}; {reason.advice}")
     if not planned.refused:
         sure = "" if predicted.at_least is None else f", at least {predicted.at_least:.1f} times better"
-        most = f"{result_documents.contour(planned.after)['max_um']:.1f} um at most"
+        most = f"{result_documents.build_contour_document(planned.after)['max_um']:.1f} um at most"
         click.echo(f"predicted with the {planned.method} correction: {predicted}; {most}{sure}")
-        blind = [axis for axis, where in result_documents.seen_at(models).items() if where == "encoder"]
+        blind = [axis for axis, where in result_documents.list_prediction_points(models).items() if where == "encoder"]
         if blind:
             text = f"this applies at the encoders of {', '.join(blind)}, which do not measure oscillation of the table"
             click.echo(f"{text}; if the table oscillates behind its motor, set resonance_hz of the axis")

@@ -77,7 +77,7 @@ def _replayed(
                     )
                 announce_compilation("identify")
                 pipelines[window.axis] = AxisPipeline(window.axis, settings, method, with_skill=machine is not None)
-            outcomes += pipelines[window.axis].feed(window)
+            outcomes += pipelines[window.axis].process_record(window)
         replayed.append((path, outcomes))
     return replayed
 

@@ -55,7 +55,7 @@ class HalAxis:
             text = f"there is no [axis.{axis}.correction]: offsets are not allowed, so there is nothing to prove"
             raise DriveFault(self.device, f"{text}; add that section and write the HAL file again with fdhil init")
         self.per_mm = settings.scaling.increments_per_mm
-        self.bounds = OffsetBounds.compute_effective(settings, config.machine.sync_period_s)
+        self.bounds = OffsetBounds.derive(settings, config.machine.sync_period_s)
         profile, self._node_id = load_profile(settings.drive), config.get_node_id(axis)
         self._tpdos = {spec.cob_base + self._node_id: spec for spec in profile.tpdos}
         offset = profile.find_rpdo(profile.offset)

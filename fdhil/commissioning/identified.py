@@ -9,7 +9,7 @@ from fdhil.config import Identification, MachineConfig
 from fdhil.errors import DriveFault
 from fdhil.identification.estimators.maximum_likelihood import fit_windows
 from fdhil.identification.voltage_delay import score_delay
-from fdhil.pipeline import AxisPipeline, Known, Record
+from fdhil.pipeline import AxisPipeline, PipelineState, Record
 from fdhil.records import PARAMETERS, Outcome, ParameterSet, Skill, WindowOutcome, get_unit
 
 ACCEPTANCE_MOVES = 2
@@ -17,10 +17,12 @@ LEFT_SHARE = 0.25  # largest prediction error, as a share of the measured follow
 LEFT_INCREMENTS = 2.0  # resolution of the position
 
 
-def identify(config: MachineConfig, axis: str, records: Sequence[Record], known: Known | None = None) -> list[Outcome]:
+def identify(
+    config: MachineConfig, axis: str, records: Sequence[Record], known: PipelineState | None = None
+) -> list[Outcome]:
     """Return the outcomes of the daemon's own pipeline for these records."""
     pipeline = AxisPipeline(axis, config, known=known)
-    return [outcome for record in records for outcome in pipeline.feed(record)]
+    return [outcome for record in records for outcome in pipeline.process_record(record)]
 
 
 @dataclass(frozen=True, slots=True)

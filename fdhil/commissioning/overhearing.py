@@ -9,7 +9,7 @@ from fdhil.config import MachineConfig
 from fdhil.drivers import open_machine
 from fdhil.errors import DeviceError
 from fdhil.pipeline import Record
-from fdhil.pipeline.recent_samples import RecentSamples
+from fdhil.pipeline.sample_buffer import SampleBuffer
 from fdhil.records import AxisSamples, NcState, Notice, Recording, TableSamples, TickTimes, VoltageSamples
 
 LONGEST_S = 600.0
@@ -64,11 +64,11 @@ class Overhearing:
     def recording(self) -> Recording:
         """Return all samples received."""
         period_s = self._config.machine.sync_period_s
-        recent = RecentSamples(self.axis, self._config.axis[self.axis], round(LONGEST_S / period_s), period_s)
+        recent = SampleBuffer(self.axis, self._config.axis[self.axis], round(LONGEST_S / period_s), period_s)
         for record in self.records:
             if isinstance(record, AxisSamples | VoltageSamples | TableSamples | TickTimes):
-                recent.add(record)
-        return recent.cut(0, self.newest_tick + 1)
+                recent.append_block(record)
+        return recent.extract_recording(0, self.newest_tick + 1)
 
     def __enter__(self) -> Self:
         self._thread.start()

@@ -24,7 +24,7 @@ from fdhil.commissioning.watchdog import watched
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus_listener import ListeningBus
 from fdhil.errors import DeviceError, DriveFault, StoreError
-from fdhil.pipeline import Known
+from fdhil.pipeline import PipelineState
 from fdhil.records import Outcome, Recording
 
 TRIAL_RAPIDS = 6
@@ -67,7 +67,7 @@ def try_axis(
     room: Room,
     operator: Operator,
     progress: Progress,
-    known: Known | None = None,
+    known: PipelineState | None = None,
 ) -> Trial:
     """Run all steps that are not stored, return their results; nothing moves before ``report`` returns from ``jog``.
 

@@ -43,7 +43,7 @@ class OffsetBounds:
         )
 
     @staticmethod
-    def compute_effective(axis: Axis, sync_period_s: float) -> OffsetBounds:
+    def derive(axis: Axis, sync_period_s: float) -> OffsetBounds:
         """Return the effective limits: the configured ones within the axis' share, lowered until an offset can be
         removed in time.
 
@@ -112,7 +112,7 @@ def find_limit_faults(axis: Axis, sync_period_s: float) -> list[str]:
 
 def find_share_fault(axis: Axis, sync_period_s: float) -> str | None:
     """Explain why so slow an axis cannot be corrected: its share of speed or acceleration is below one increment."""
-    limits = OffsetBounds.compute_effective(axis, sync_period_s)
+    limits = OffsetBounds.derive(axis, sync_period_s)
     return _describe_coarse_limit(axis, limits) if limits.is_too_coarse else None
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fdhil.correction.limits import PlanLimits, check
-from fdhil.correction.planning import plan
+from fdhil.correction.correction_planner import plan_correction
+from fdhil.correction.plan_limits import PlanLimits, check_offsets
 
-__all__ = ["PlanLimits", "check", "plan"]
+__all__ = ["PlanLimits", "check_offsets", "plan_correction"]

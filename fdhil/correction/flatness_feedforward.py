@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from fdhil.config import Axis, MachineConfig
-from fdhil.correction.method import Plan
-from fdhil.prediction.model_terms import mean_friction, resisting
+from fdhil.correction.correction_method import MethodPlan
+from fdhil.prediction.model_variants import average_friction, split_resisting_torque
 from fdhil.records import Float, Parameters, Prediction, Trajectory
 
 STILL_RAD_S = 1e-6
@@ -33,27 +33,31 @@ DRY_INCREMENTS = 0.5  # per cycle: full dry friction from this speed on; below, 
 FEEDFORWARD_EARLY_CYCLES = 0.5  # by which the drive's own speed feed-forward leads the speed at its row
 
 
-def plan(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, _before: Prediction) -> Plan:
+def plan_feedforward(
+    reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, _before: Prediction
+) -> MethodPlan:
     """Return speed and torque offsets (n,) of every axis, in whole counts of the drive's objects."""
     speed, torque = {}, {}
     for axis in reference.axes:
         path = np.asarray(reference.position_mm[axis])
-        speed[axis], torque[axis] = offsets(path, models[axis], config.axis[axis], reference.dt_s)
+        speed[axis], torque[axis] = compute_feedforward_offsets(path, models[axis], config.axis[axis], reference.dt_s)
     zero = np.zeros(reference.time_s.size)
-    return Plan(dict.fromkeys(reference.axes, zero), speed_offset_rad_s=speed, torque_offset_nm=torque)
+    return MethodPlan(dict.fromkeys(reference.axes, zero), speed_offset_rad_s=speed, torque_offset_nm=torque)
 
 
-def offsets(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: float) -> tuple[Float, Float]:
+def compute_feedforward_offsets(
+    reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: float
+) -> tuple[Float, Float]:
     """Return the speed offset (rad/s) and torque offset (N.m), (n,) each, of one axis.
 
     The torque offset is in the drive's own torque: the drive converts N.m to current with the nominal torque constant.
     """
     p = parameters
-    lead = lead_s(parameters, axis)
+    lead = compute_current_lead_s(parameters, axis)
     demanded = np.gradient(reference_mm, dt_s) * 2 * np.pi / axis.screw_pitch_mm
     acceleration = np.gradient(demanded, dt_s)
     turning = np.where(np.abs(demanded) > STILL_RAD_S, demanded, 0.0)
-    smooth, dry = resisting(p, turning, reference_mm * 2 * np.pi / axis.screw_pitch_mm)
+    smooth, dry = split_resisting_torque(p, turning, reference_mm * 2 * np.pi / axis.screw_pitch_mm)
     # a load acts at rest too: there the speed loop's integral holds it
     current = (p.Jt * acceleration + smooth + dry - p.get_term("load")) / p.K
     times = np.arange(reference_mm.size) * dt_s
@@ -72,12 +76,12 @@ def offsets(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: float
     )
 
 
-def lead_s(parameters: Parameters, axis: Axis) -> float:
+def compute_current_lead_s(parameters: Parameters, axis: Axis) -> float:
     """Return the lead of the current command: the current loop's lag and half a hold."""
     return parameters.L / axis.regulators.current_kp + 0.5 * axis.regulators.speed_period_s
 
 
-def derivative_weights(rows: int, order: int, ahead: float, which: int) -> Float:
+def compute_derivative_weights(rows: int, order: int, ahead: float, which: int) -> Float:
     """Return (rows,) weights, newest first: the ``which``-th derivative, per cycle, ``ahead`` cycles from the newest.
 
     A polynomial of ``order`` is fitted to the rows by least squares.
@@ -87,18 +91,18 @@ def derivative_weights(rows: int, order: int, ahead: float, which: int) -> Float
     return np.asarray(np.array(at) @ np.linalg.pinv(powers))
 
 
-def law(parameters: Parameters, axis: Axis, sync_period_s: float) -> Mapping[str, Any]:
+def derive_feedforward_law(parameters: Parameters, axis: Axis, sync_period_s: float) -> Mapping[str, Any]:
     """Return the law of one axis in the guard's form: ``speed``, ``torque``, ``pace`` weights and ``dry``.
 
     In the drive's counts: increments/s, 0.1 % of the rated torque. The drive's own feed-forward is left to it. Friction
     is the mean of both directions; a load is held by the drive's own integral.
     """
-    p, g, period = mean_friction(parameters), axis.regulators, sync_period_s
-    later = AHEAD_CYCLES + lead_s(p, axis) / period
-    speed_now = derivative_weights(SPEED_ROWS, SPEED_ORDER, AHEAD_CYCLES, 1) / period
-    speed_later = derivative_weights(SPEED_ROWS, SPEED_ORDER, later, 1) / period
+    p, g, period = average_friction(parameters), axis.regulators, sync_period_s
+    later = AHEAD_CYCLES + compute_current_lead_s(p, axis) / period
+    speed_now = compute_derivative_weights(SPEED_ROWS, SPEED_ORDER, AHEAD_CYCLES, 1) / period
+    speed_later = compute_derivative_weights(SPEED_ROWS, SPEED_ORDER, later, 1) / period
     bend_now, bend_later = (
-        derivative_weights(ACCELERATION_ROWS, ACCELERATION_ORDER, ahead, 2) / period**2
+        compute_derivative_weights(ACCELERATION_ROWS, ACCELERATION_ORDER, ahead, 2) / period**2
         for ahead in (AHEAD_CYCLES, later)
     )
     early = FEEDFORWARD_EARLY_CYCLES * period * g.speed_feedforward
@@ -106,21 +110,23 @@ def law(parameters: Parameters, axis: Axis, sync_period_s: float) -> Mapping[str
     count_a = PER_MILLE * axis.drive.rated_current_a
     inertia = p.Jt / p.K - g.torque_feedforward * axis.nominal.Jt / axis.nominal.K
     return {
-        "speed": _whole(_added((1 - g.speed_feedforward) * speed_now, -early * bend_now)),
-        "torque": _whole(_added(inertia * rad / count_a * bend_later, p.ft / p.K * rad / count_a * speed_later)),
-        "pace": _whole(speed_later * period / DRY_INCREMENTS),
+        "speed": _quantise_weights(_add_weights((1 - g.speed_feedforward) * speed_now, -early * bend_now)),
+        "torque": _quantise_weights(
+            _add_weights(inertia * rad / count_a * bend_later, p.ft / p.K * rad / count_a * speed_later)
+        ),
+        "pace": _quantise_weights(speed_later * period / DRY_INCREMENTS),
         "dry": round(p.Cd / p.K / count_a),
     }
 
 
-def _added(one: Float, other: Float) -> Float:
+def _add_weights(one: Float, other: Float) -> Float:
     total = np.zeros(max(one.size, other.size))
     total[: one.size] += one
     total[: other.size] += other
     return total
 
 
-def _whole(weights: Float) -> list[int]:
+def _quantise_weights(weights: Float) -> list[int]:
     """Omit the newest row's weight: distances are counted from it, and the sum of all weights is 0."""
     scaled: Sequence[float] = (weights[1:] * ONE).tolist()
     return [round(weight) for weight in scaled]

@@ -227,7 +227,7 @@ class DaemonService:
             queue.mark_processed(len(batch))
 
     def _process_batch(self, axis: str, batch: Sequence[Record]) -> tuple[list[Outcome], list[Notice]]:
-        outcomes = [outcome for record in batch for outcome in self._pipelines[axis].feed(record)]
+        outcomes = [outcome for record in batch for outcome in self._pipelines[axis].process_record(record)]
         return outcomes, self._store.store_outcomes(outcomes) if outcomes else []
 
     # logging and storing ----------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import numpy as np
 
 from fdhil import correction
 from fdhil.config import Axis, MachineConfig
-from fdhil.correction.kernels import project
+from fdhil.correction.offset_kernels import project_onto_limits
 from fdhil.identification.kalman import compute_departure
 from fdhil.identification.robust_covariance import compute_robust_covariance
 from fdhil.model import closed_loop
@@ -22,7 +22,7 @@ def compile_kernels(config: MachineConfig, method: str | None = None) -> None:
         pipeline = AxisPipeline(name, config, method)
         for direction in (1, -1):
             windows[name] = simulate_nominal_rapid(name, axis, dt_s, direction)
-            pipeline.feed(windows[name])
+            pipeline.process_record(windows[name])
     rows = min(window.n for window in windows.values())
     demand = {name: freeze_array(0.2 * window.demand_mm[:rows]) for name, window in windows.items()}
     still = np.zeros(rows, dtype=np.int64)
@@ -30,7 +30,7 @@ def compile_kernels(config: MachineConfig, method: str | None = None) -> None:
         dt_s, freeze_array(np.arange(rows) * dt_s), demand, still.astype(np.bool_), freeze_integers(still)
     )
     models = {name: Parameters(**axis.nominal.model_dump()) for name, axis in config.axis.items()}
-    correction.plan(reference, models, config)
+    correction.plan_correction(reference, models, config)
     for name, model in models.items():
         for more in ({"load": 0.0}, {"resonance": 100.0}):
             closed_loop.simulate_axis(model.replace_values(**more), config.axis[name], dt_s, demand[name][:8])
@@ -42,7 +42,7 @@ def _warm_rare_kernels() -> None:
 
     The last one compiles nothing, but loads a library's code and buffers, over a megabyte, into memory from the start.
     """
-    project(np.linspace(0.0, 2.0, 8), np.ones(3), np.zeros(2))
+    project_onto_limits(np.linspace(0.0, 2.0, 8), np.ones(3), np.zeros(2))
     theta, rows = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 5.0, 0.0]), np.ones((4, 3))
     compute_departure(theta, 0.001, np.ones(4, dtype=np.int8), np.ones(4), rows, rows, rows, 0)
     slopes = np.random.default_rng(1).normal(size=(256, 2, theta.size))

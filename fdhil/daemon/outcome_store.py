@@ -15,7 +15,7 @@ from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.errors import StoreError
 from fdhil.identification.between_window_variance import HISTORY_WINDOWS, PoolMember
 from fdhil.identification.parameter_drift import DriftPoint
-from fdhil.pipeline import POOL_WINDOWS, Known
+from fdhil.pipeline import POOL_WINDOWS, PipelineState
 from fdhil.records import (
     PARAMETERS,
     Float,
@@ -179,10 +179,10 @@ class OutcomeStore:
             return []
         return [skill for axis in self._config.axis for skill in self._history.skills(axis, limit=SKILLS)]
 
-    def read_axis_history(self, axis: str) -> Known:
+    def read_axis_history(self, axis: str) -> PipelineState:
         """Return what an earlier run left: first values, newest set, estimates of the newest accepted windows."""
         if self._history is None:
-            return Known()
+            return PipelineState()
         newest = self._history.revisions(axis, limit=1)
         first = {
             direction: Parameters.from_mapping(dict(zip(PARAMETERS, _read_figures(window, "value"), strict=True)))
@@ -199,7 +199,7 @@ class OutcomeStore:
         )
         published = newest[0].set if newest else None
         loops = newest_loops(self._history, axis, self._config.digest)
-        return Known(first, published, points, _read_pool_members(windows), loops)
+        return PipelineState(first, published, points, _read_pool_members(windows), loops)
 
     def count_windows(self, axis: str) -> tuple[int, int]:
         """Return how many windows of an axis were ever accepted and refused."""

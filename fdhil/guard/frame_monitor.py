@@ -204,7 +204,7 @@ class FrameMonitor:
             )
         )
 
-    def close_sync_cycle(self, data: bytes, stamp_s: float, now_s: float) -> tuple[tuple[AxisInput, ...], BusView]:
+    def receive_at_sync(self, data: bytes, stamp_s: float, now_s: float) -> tuple[tuple[AxisInput, ...], BusView]:
         """Close the cycle at a SYNC with its frame time ``stamp_s``; return the inputs of the axes and of the bus."""
         self._check_sync_counter(data)
         regular = self._is_sync_regular(stamp_s, now_s)

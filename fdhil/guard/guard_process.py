@@ -225,7 +225,7 @@ class Guard:
 
     def _step_at_sync(self, data: bytes, stamp_s: float, now_s: float, late: bool) -> None:
         self._last_sync_s, self._silent, self._put_off = now_s, False, False
-        axes, bus = self._listener.close_sync_cycle(data, stamp_s, now_s)
+        axes, bus = self._listener.receive_at_sync(data, stamp_s, now_s)
         self._advance_core(StepInputs(True, axes, bus), late, now_s)
         clock, stamped = self._journal.clock, self.settings.transport == "can_raw"  # a hub may have another clock
         self._turns.count_turn(clock.wall_s() - stamp_s if stamped else clock.now_s() - now_s, late, now_s)

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from fdhil.pipeline.analysis import analyse
-from fdhil.pipeline.axis import POOL_WINDOWS, AxisPipeline, Known, Record
+from fdhil.pipeline.axis_pipeline import POOL_WINDOWS, AxisPipeline, PipelineState, Record
 from fdhil.pipeline.identified_loops import analyse_windows
-from fdhil.pipeline.validated_pool import pool, pool_with_held_out
+from fdhil.pipeline.validated_pool import pool_windows, pool_with_held_out
+from fdhil.pipeline.window_analysis import analyse_window
 
 __all__ = [
     "POOL_WINDOWS",
     "AxisPipeline",
-    "Known",
+    "PipelineState",
     "Record",
-    "analyse",
+    "analyse_window",
     "analyse_windows",
-    "pool",
+    "pool_windows",
     "pool_with_held_out",
 ]

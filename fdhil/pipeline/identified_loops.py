@@ -22,9 +22,9 @@ from fdhil.identification.drive_loops.loop_identification import (
     is_better_than_configured,
 )
 from fdhil.identification.physical_bounds import bound_estimate
-from fdhil.pipeline.analysis import analyse, own
+from fdhil.pipeline.window_analysis import analyse_window, select_matching_axis
 from fdhil.records import LoopEstimate, Parameters, Window, WindowOutcome
-from fdhil.validation.replay import replay_window
+from fdhil.validation.move_replay import replay_with_load_search
 from fdhil.validation.table_error_budget import LOOPS_DIFFER
 
 GRID = np.geomspace(40.0, 250.0, 14)  # Hz
@@ -43,7 +43,7 @@ Work = Callable[[Window], WindowOutcome]
 Spread = Callable[[Work, Sequence[Window]], Iterable[WindowOutcome]]
 
 
-def softer_axis(rapids: Rapids, axis: Axis, sync_period_s: float) -> Axis | None:
+def find_resonance(rapids: Rapids, axis: Axis, sync_period_s: float) -> Axis | None:
     """Return the axis with the resonance that the rapids show.
 
     None if one is configured already, if the rapids are explained, and if none explains them.
@@ -51,42 +51,42 @@ def softer_axis(rapids: Rapids, axis: Axis, sync_period_s: float) -> Axis | None
     rapids = [pair for pair in rapids if not pair[1].get_term("resonance")][-MOST_RAPIDS:]
     if axis.resonance_hz is not None or not rapids:
         return None
-    left, following = _left_um(rapids, axis, sync_period_s)
+    left, following = _compute_residual_um(rapids, axis, sync_period_s)
     if not left > NOTICED * following:
         return None
-    found = _best(rapids[-1:], axis, sync_period_s)
-    soft = _with(axis, found)
-    return soft if _left_um(rapids, soft, sync_period_s)[0] < BETTER * left else None
+    found = _search_frequency(rapids[-1:], axis, sync_period_s)
+    soft = _set_resonance(axis, found)
+    return soft if _compute_residual_um(rapids, soft, sync_period_s)[0] < BETTER * left else None
 
 
-def _best(rapids: Rapids, axis: Axis, sync_period_s: float) -> float:
+def _search_frequency(rapids: Rapids, axis: Axis, sync_period_s: float) -> float:
     left: dict[float, float] = {}
 
-    def tried(*resonances: float) -> float:
+    def evaluate(*resonances: float) -> float:
         for hertz in resonances:
-            left[hertz] = _left_um(rapids, _with(axis, hertz), sync_period_s)[0]
+            left[hertz] = _compute_residual_um(rapids, _set_resonance(axis, hertz), sync_period_s)[0]
         return min(left, key=left.__getitem__)
 
-    best, ratio = tried(*GRID.tolist()), float(GRID[1] / GRID[0])
+    best, ratio = evaluate(*GRID.tolist()), float(GRID[1] / GRID[0])
     for _ in range(HALVINGS):
         ratio **= 0.5
-        best = tried(best / ratio, best * ratio)
+        best = evaluate(best / ratio, best * ratio)
     return best
 
 
-def _with(axis: Axis, hertz: float) -> Axis:
+def _set_resonance(axis: Axis, hertz: float) -> Axis:
     return axis.model_copy(update={"resonance_hz": hertz})
 
 
-def _left_um(rapids: Rapids, axis: Axis, sync_period_s: float) -> tuple[float, float]:
+def _compute_residual_um(rapids: Rapids, axis: Axis, sync_period_s: float) -> tuple[float, float]:
     """Return the RMS residual of the rapids' replays, and of the following error; zero without any."""
-    replays = [replay_window(window, drive, axis, sync_period_s) for window, drive in rapids]
+    replays = [replay_with_load_search(window, drive, axis, sync_period_s) for window, drive in rapids]
     residuals = [(one.unexplained_um, one.measured_um) for one in replays if one is not None]
     left, following = np.sqrt(np.mean(np.square(residuals), axis=0)) if residuals else (0.0, 0.0)
     return float(left), float(following)
 
 
-def loops_of(
+def identify_from_outcomes(
     outcomes: Sequence[WindowOutcome],
     axis: Axis | None,
     settings: Identification,
@@ -99,8 +99,8 @@ def loops_of(
     Without ``growing`` no keys are tried but the configured ones. Unknown values of the winding are assumed: the
     current loop hides them. Accepted windows precede the others, and a section of another machine is ignored.
     """
-    axis = own(outcomes[0].window, axis) if outcomes else None
-    pairs = [(o, mechanics_of(o, axis)) for o in outcomes]
+    axis = select_matching_axis(outcomes[0].window, axis) if outcomes else None
+    pairs = [(o, complete_parameters(o, axis)) for o in outcomes]
     known = [(o, plant) for o, plant in pairs if plant is not None]
     accepted = [(o, plant) for o, plant in known if o.verdict.accepted]
     chosen = accepted or known
@@ -108,7 +108,7 @@ def loops_of(
     return identify_loops(windows, plants, axis, settings, sync_period_s, growing=growing)
 
 
-def mechanics_of(outcome: WindowOutcome, axis: Axis | None) -> Parameters | None:
+def complete_parameters(outcome: WindowOutcome, axis: Axis | None) -> Parameters | None:
     """Return the parameters of a window's estimate, its winding completed; None without K, Jt, ft or Cd."""
     if outcome.estimate is None:
         return None
@@ -121,7 +121,7 @@ def mechanics_of(outcome: WindowOutcome, axis: Axis | None) -> Parameters | None
     return found.replace_values(**filled)
 
 
-def suspected(outcomes: Sequence[WindowOutcome]) -> bool:
+def has_loop_mismatch(outcomes: Sequence[WindowOutcome]) -> bool:
     """Return whether some window is refused for its loops: the model explains its torque, and not its replay.
 
     A window with faulty signals says nothing of the loops.
@@ -130,7 +130,7 @@ def suspected(outcomes: Sequence[WindowOutcome]) -> bool:
     return any(LOOPS_DIFFER in found and not found & SIGNALS_AT_FAULT for found in codes)
 
 
-def better_axis(axis: Axis | None, found: LoopEstimate | None) -> Axis | None:
+def adopt_loops(axis: Axis | None, found: LoopEstimate | None) -> Axis | None:
     """Return the axis with the loops that were found, if they explain what the configured ones do not; else None."""
     return (
         apply_loops(axis, found)
@@ -139,16 +139,18 @@ def better_axis(axis: Axis | None, found: LoopEstimate | None) -> Axis | None:
     )
 
 
-def softened(outcomes: Collection[WindowOutcome], axis: Axis | None, sync_period_s: float | None) -> Axis | None:
+def search_resonance(
+    outcomes: Collection[WindowOutcome], axis: Axis | None, sync_period_s: float | None
+) -> Axis | None:
     """Return the axis with the resonance that explains outcomes that its loops do not, or all; else None."""
-    left = [o for o in outcomes if suspected([o])] or [o for o in outcomes if o.verdict.accepted]
-    if axis is None or sync_period_s is None or not left or own(left[0].window, axis) is None:
+    left = [o for o in outcomes if has_loop_mismatch([o])] or [o for o in outcomes if o.verdict.accepted]
+    if axis is None or sync_period_s is None or not left or select_matching_axis(left[0].window, axis) is None:
         return None
-    pairs = [(o.window, mechanics_of(o, axis)) for o in left]
-    return softer_axis([(w, plant) for w, plant in pairs if plant is not None], axis, sync_period_s)
+    pairs = [(o.window, complete_parameters(o, axis)) for o in left]
+    return find_resonance([(w, plant) for w, plant in pairs if plant is not None], axis, sync_period_s)
 
 
-def explained(
+def reanalyse_with_loops(
     outcomes: Sequence[WindowOutcome],
     axis: Axis | None,
     settings: Identification,
@@ -159,21 +161,21 @@ def explained(
 
     ``again`` analyses its windows with another section of the axis.
     """
-    softer = softened(outcomes, axis, sync_period_s)
+    softer = search_resonance(outcomes, axis, sync_period_s)
     if softer is not None:
         soft = again(softer)
-        if not suspected(soft):
+        if not has_loop_mismatch(soft):
             return soft, None
-    loops = loops_of(outcomes, axis, settings, sync_period_s) if suspected(outcomes) else None
-    better = better_axis(axis, loops)
+    loops = identify_from_outcomes(outcomes, axis, settings, sync_period_s) if has_loop_mismatch(outcomes) else None
+    better = adopt_loops(axis, loops)
     if better is None:
         return outcomes, loops
     outcomes = again(better)
-    softer = softened(outcomes, better, sync_period_s)
+    softer = search_resonance(outcomes, better, sync_period_s)
     return (outcomes if softer is None else again(softer)), loops
 
 
-class OwnLoops:
+class LoopTracker:
     """Tracks an axis' own loops as its rapids arrive one by one: each is analysed through the best known ones.
 
     They are fitted once after the first ``ENOUGH`` rapids, to be reported, and again when a replayed rapid is refused:
@@ -193,51 +195,53 @@ class OwnLoops:
         self._outcomes: deque[WindowOutcome] = deque(maxlen=KEPT)
         self._seen = self._refused = 0
         self._due = 1
-        self.axis = better_axis(axis, known) or axis
+        self.axis = adopt_loops(axis, known) or axis
 
     @property
-    def changed(self) -> dict[str, float | str] | None:
+    def changed_regulators(self) -> dict[str, float | str] | None:
         """The keys of the regulators by which the best known loops differ from the configured ones."""
         if self._configured is None or self.axis is None:
             return None
         return find_changed_regulators(self._configured, self.axis)
 
-    def analyse(self, window: Window) -> tuple[WindowOutcome, LoopEstimate | None]:
+    def analyse_rapid(self, window: Window) -> tuple[WindowOutcome, LoopEstimate | None]:
         """Return a window's outcome, and the loops if they were identified again."""
         if self._configured is not None:
-            known = own(window, self._configured)
+            known = select_matching_axis(window, self._configured)
             (window,) = correct_current_to_means([window], self._settings, known, self._period_s)
-        outcome = analyse(window, self._settings, self.axis, self._period_s)
+        outcome = analyse_window(window, self._settings, self.axis, self._period_s)
         if self._configured is None:
             return outcome, None
         self._outcomes.append(outcome)
         self._seen += 1
-        self._refused += suspected([outcome])
+        self._refused += has_loop_mismatch([outcome])
         wanted = self._refused >= self._due
         if wanted:
             self._refused, self._due = 0, 2 * self._due
         elif self._seen != ENOUGH:
             return outcome, None
-        softer = softened(self._outcomes, self.axis, self._period_s)
+        softer = search_resonance(self._outcomes, self.axis, self._period_s)
         if softer is not None:
-            soft = analyse(window, self._settings, softer, self._period_s)
-            if not suspected([soft]):
+            soft = analyse_window(window, self._settings, softer, self._period_s)
+            if not has_loop_mismatch([soft]):
                 self.axis, outcome, wanted = softer, soft, False
-        if suspected([outcome]) or self._seen == ENOUGH:
-            return self._through_loops(window, outcome, growing=wanted)
+        if has_loop_mismatch([outcome]) or self._seen == ENOUGH:
+            return self._reanalyse_with_loops(window, outcome, growing=wanted)
         return outcome, None
 
-    def _through_loops(
+    def _reanalyse_with_loops(
         self, window: Window, outcome: WindowOutcome, *, growing: bool
     ) -> tuple[WindowOutcome, LoopEstimate | None]:
-        found = loops_of(tuple(self._outcomes), self._configured, self._settings, self._period_s, growing=growing)
-        better = better_axis(self._configured, found)
+        found = identify_from_outcomes(
+            tuple(self._outcomes), self._configured, self._settings, self._period_s, growing=growing
+        )
+        better = adopt_loops(self._configured, found)
         if better is None and found is not None and found.verdict.accepted:
             better = self._configured  # which explain the rapids as well
         if better is None or self.axis is None:
             return outcome, found
         self.axis = better.model_copy(update={"resonance_hz": self.axis.resonance_hz})
-        return (analyse(window, self._settings, self.axis, self._period_s) if growing else outcome), found
+        return (analyse_window(window, self._settings, self.axis, self._period_s) if growing else outcome), found
 
 
 def analyse_windows(
@@ -253,15 +257,15 @@ def analyse_windows(
     ``spread`` may use further processes, in order; ``done`` is called after each window.
     """
     if windows:
-        windows = correct_current_to_means(windows, settings, own(windows[0], axis), sync_period_s)
-    work = partial(analyse, settings=settings, axis=axis, sync_period_s=sync_period_s)
+        windows = correct_current_to_means(windows, settings, select_matching_axis(windows[0], axis), sync_period_s)
+    work = partial(analyse_window, settings=settings, axis=axis, sync_period_s=sync_period_s)
 
-    def told() -> Iterator[WindowOutcome]:
+    def iterate_outcomes() -> Iterator[WindowOutcome]:
         for outcome in spread(work, windows):
             done()
             yield outcome
 
-    def again(better: Axis) -> Sequence[WindowOutcome]:
+    def reanalyse(better: Axis) -> Sequence[WindowOutcome]:
         return list(spread(partial(work, axis=better), windows))
 
-    return explained(list(told()), axis, settings, sync_period_s, again)
+    return reanalyse_with_loops(list(iterate_outcomes()), axis, settings, sync_period_s, reanalyse)

@@ -22,8 +22,8 @@ from fdhil.identification.estimators import select_estimator
 from fdhil.identification.identifiability import find_unphysical_values, list_missing_reasons
 from fdhil.identification.physical_bounds import bound_estimate
 from fdhil.identification.window_pool import build_pool_member, pool_estimates
-from fdhil.pipeline.analysis import GAVE_UP, gave_up, own
-from fdhil.pipeline.identified_loops import better_axis
+from fdhil.pipeline.identified_loops import adopt_loops
+from fdhil.pipeline.window_analysis import GAVE_UP, build_solver_reason, select_matching_axis
 from fdhil.records import (
     PARAMETERS,
     Estimate,
@@ -35,16 +35,16 @@ from fdhil.records import (
     WindowOutcome,
     freeze_array,
 )
-from fdhil.validation.agreement import WINDING_PARAMETERS, is_of_winding, moved
+from fdhil.validation.estimate_agreement import WINDING_PARAMETERS, find_parameter_jumps, is_winding_jump
 from fdhil.validation.held_out_moves import (
     Move,
-    held_out_reason,
+    check_held_out_limit,
+    fit_presliding,
     is_predicted,
     predict_held_out,
-    with_presliding,
-    worst_of,
+    summarise_worst,
 )
-from fdhil.validation.replay import Replay
+from fdhil.validation.move_replay import Replay
 from fdhil.validation.table_error_budget import LOOPS_DIFFER
 
 # causes of refusal that do not concern the model: the samples, or the course of the move
@@ -72,7 +72,7 @@ SCALE_UNPROVEN = Reason(
 )
 
 
-def pool(
+def pool_windows(
     outcomes: Sequence[WindowOutcome], settings: Identification, *, refit: bool = True
 ) -> tuple[Estimate | None, Verdict]:
     """Estimate from the accepted windows together; None and a refusal if there is none, or if they disagree.
@@ -86,13 +86,13 @@ def pool(
     members = [
         build_pool_member(o.window, o.estimate, k) for k, o in enumerate(outcomes) if o.verdict.accepted and o.estimate
     ]
-    estimate, verdict = together(outcomes, members, members, settings, refit=refit)
-    estimate = estimate and _with_drift(estimate, members)
-    refuted = _loops_refuted(outcomes) if verdict.accepted else []
+    estimate, verdict = estimate_together(outcomes, members, members, settings, refit=refit)
+    estimate = estimate and _add_resistance_drift(estimate, members)
+    refuted = _check_loop_refutations(outcomes) if verdict.accepted else []
     return estimate, replace(verdict, accepted=False, reasons=tuple(refuted)) if refuted else verdict
 
 
-def _with_drift(estimate: Estimate, members: Sequence[PoolMember]) -> Estimate:
+def _add_resistance_drift(estimate: Estimate, members: Sequence[PoolMember]) -> Estimate:
     apart = estimate_between_window_variance(members)
     if not apart.walk.get(WARMING):
         return estimate
@@ -102,7 +102,7 @@ def _with_drift(estimate: Estimate, members: Sequence[PoolMember]) -> Estimate:
     return replace(estimate, covariance=freeze_array(covariance))
 
 
-def together(
+def estimate_together(
     outcomes: Sequence[WindowOutcome],
     members: Sequence[PoolMember],
     history: Sequence[PoolMember],
@@ -119,23 +119,25 @@ def together(
         seen = dict.fromkeys(r for o in outcomes for r in o.verdict.reasons)
         return None, Verdict(False, None, tuple(seen))
     estimates: WindowEstimates = [(o.window, o.estimate) for o in accepted if o.estimate is not None]
-    reasons = list(one_sided(outcomes))
+    reasons = list(check_both_directions(outcomes))
     estimate = estimates[0][1]
     if len(estimates) > 1:
         try:
-            estimate = _estimated(estimates, members, estimate_between_window_variance(history), settings, refit=refit)
+            estimate = _estimate_pool(
+                estimates, members, estimate_between_window_variance(history), settings, refit=refit
+            )
         except GAVE_UP as error:
-            return None, Verdict(False, None, (gave_up(error, "inspect the windows"),))
+            return None, Verdict(False, None, (build_solver_reason(error, "inspect the windows"),))
         # with a slow voltage, or without one, R and L may be undetermined
         slow = any(window.slow_voltage is not None or window.voltage_v is None for window, _ in estimates)
         reasons += list_missing_reasons(estimate, slow=slow)
     beyond = find_unphysical_values(estimate)
-    return (estimate if beyond else bound_estimate(estimate)), _verdict(
-        accepted, [*reasons, *beyond, *moved(estimates)]
+    return (estimate if beyond else bound_estimate(estimate)), _build_verdict(
+        accepted, [*reasons, *beyond, *find_parameter_jumps(estimates)]
     )
 
 
-def _estimated(
+def _estimate_pool(
     estimates: WindowEstimates,
     members: Sequence[PoolMember],
     apart: BetweenWindowVariance,
@@ -158,14 +160,14 @@ def _estimated(
     return replace(again, covariance=freeze_array(again.covariance + wider))
 
 
-def one_sided(outcomes: Iterable[WindowOutcome]) -> list[Reason]:
+def check_both_directions(outcomes: Iterable[WindowOutcome]) -> list[Reason]:
     """Return the reason if windows of one direction are accepted while the model was refused in the other.
 
     A load that acts one way is part of dry friction then, by an unknown share.
     """
     listed = list(outcomes)
     directions = {o.window.direction for o in listed if o.verdict.accepted}
-    refused = [o for o in listed if o.window.direction not in directions and refuses_the_model(o)]
+    refused = [o for o in listed if o.window.direction not in directions and is_model_refused(o)]
     if len(directions) != 1 or not refused:
         return []
     way = "positive" if refused[0].window.direction > 0 else "negative"
@@ -177,7 +179,7 @@ def one_sided(outcomes: Iterable[WindowOutcome]) -> list[Reason]:
     return [Reason("OneDirection", text, cause.advice or "see why the other moves are refused")]
 
 
-def _loops_refuted(outcomes: Sequence[WindowOutcome]) -> list[Reason]:
+def _check_loop_refutations(outcomes: Sequence[WindowOutcome]) -> list[Reason]:
     """Return the reason if as many rapids refute the loops as were accepted with them.
 
     They concern the drive's loops, not its parameters: the model would be used with wrong loops.
@@ -191,13 +193,13 @@ def _loops_refuted(outcomes: Sequence[WindowOutcome]) -> list[Reason]:
     return [Reason(LOOPS_DIFFER, f"{text}: {cause.text}", cause.advice)]
 
 
-def refuses_the_model(outcome: WindowOutcome) -> bool:
+def is_model_refused(outcome: WindowOutcome) -> bool:
     """Return whether a window was refused for its drive's behaviour, not for its samples or an aborted move."""
     codes = [reason.code for reason in outcome.verdict.reasons]
     return not outcome.verdict.accepted and not any(part in code for code in codes for part in OF_THE_MOVE)
 
 
-def _verdict(accepted: Sequence[WindowOutcome], reasons: Sequence[Reason]) -> Verdict:
+def _build_verdict(accepted: Sequence[WindowOutcome], reasons: Sequence[Reason]) -> Verdict:
     """Return the pool's verdict: its own reasons, the worst of the windows' figures, each of their warnings once."""
     verdicts = [o.verdict for o in accepted]
     fits = [v.fit_percent for v in verdicts if v.fit_percent is not None]
@@ -239,39 +241,39 @@ def pool_with_held_out(
     moves in both directions separate a load from friction. A pool that does not predict each of its moves is not
     validated; one that does is not refused because the winding's R or L changes between them.
     """
-    estimate, verdict = pool(outcomes, settings)
-    mine = own(outcomes[0].window, axis) if outcomes else None
+    estimate, verdict = pool_windows(outcomes, settings)
+    mine = select_matching_axis(outcomes[0].window, axis) if outcomes else None
     if mine is None and verdict.accepted:
         verdict = replace(verdict, warnings=(*verdict.warnings, SCALE_UNPROVEN))
     if mine is None or sync_period_s is None:
         return HeldOutPool(outcomes, estimate, verdict, None, loops)
-    best = better_axis(mine, loops) or mine
-    trial = [_accepted(o) if _is_doubtful(o) else o for o in outcomes]
-    if any(map(_is_doubtful, outcomes)) and (all_moves := pool(trial, settings)[0]) is not None:
-        predicted = _judged(trial, all_moves, best, sync_period_s)[1]
+    best = adopt_loops(mine, loops) or mine
+    trial = [_accept_outcome(o) if _is_refused_by_replay(o) else o for o in outcomes]
+    if any(map(_is_refused_by_replay, outcomes)) and (all_moves := pool_windows(trial, settings)[0]) is not None:
+        predicted = _predict_each_move(trial, all_moves, best, sync_period_s)[1]
         if not all(is_predicted(p, settings) for o, p in zip(trial, predicted, strict=True) if o.verdict.accepted):
-            windows = [_on_time(o, mine, sync_period_s) for o in trial if o.verdict.accepted]
+            windows = [_align_demand(o, mine, sync_period_s) for o in trial if o.verdict.accepted]
             plants = [all_moves.build_parameters()] * len(windows)
             found = identify_loops(windows, plants, mine, settings, sync_period_s)
-            if (better := better_axis(mine, found)) is not None:
+            if (better := adopt_loops(mine, found)) is not None:
                 best, loops = better, found
-                predicted = _judged(trial, all_moves, best, sync_period_s)[1]
+                predicted = _predict_each_move(trial, all_moves, best, sync_period_s)[1]
         kept = [t if is_predicted(p, settings) else o for o, t, p in zip(outcomes, trial, predicted, strict=True)]
         outcomes = kept
-        estimate, verdict = pool(outcomes, settings)
-    estimate, predicted = _judged(outcomes, estimate, best, sync_period_s)
-    held = worst_of(predicted)
-    reason = None if held is None else held_out_reason(held, settings)
+        estimate, verdict = pool_windows(outcomes, settings)
+    estimate, predicted = _predict_each_move(outcomes, estimate, best, sync_period_s)
+    held = summarise_worst(predicted)
+    reason = None if held is None else check_held_out_limit(held, settings)
     if reason is not None and verdict.accepted:
         verdict = replace(verdict, accepted=False, reasons=(reason,))
-    elif held is not None and reason is None and all(map(is_of_winding, verdict.reasons)):
+    elif held is not None and reason is None and all(map(is_winding_jump, verdict.reasons)):
         if verdict.reasons and estimate is not None:
-            estimate = _with_spread(estimate, outcomes)
+            estimate = _add_winding_spread(estimate, outcomes)
         verdict = replace(verdict, accepted=True, reasons=(), warnings=(*verdict.warnings, *verdict.reasons))
     return HeldOutPool(outcomes, estimate, verdict, held, loops)
 
 
-def _with_spread(estimate: Estimate, outcomes: Sequence[WindowOutcome]) -> Estimate:
+def _add_winding_spread(estimate: Estimate, outcomes: Sequence[WindowOutcome]) -> Estimate:
     covariance = estimate.covariance.copy()
     for name in WINDING_PARAMETERS:
         values = [o.estimate.get_value(name) for o in outcomes if o.verdict.accepted and o.estimate is not None]
@@ -280,36 +282,36 @@ def _with_spread(estimate: Estimate, outcomes: Sequence[WindowOutcome]) -> Estim
     return replace(estimate, covariance=freeze_array(covariance))
 
 
-def _judged(
+def _predict_each_move(
     outcomes: Sequence[WindowOutcome], estimate: Estimate | None, axis: Axis, sync_period_s: float
 ) -> tuple[Estimate | None, list[Replay | None]]:
     """Return the pool with its presliding, and each accepted outcome's replay by the pool of the others."""
     moves: list[Move] = [
-        (_on_time(o, axis, sync_period_s), o.estimate)
+        (_align_demand(o, axis, sync_period_s), o.estimate)
         for o in outcomes
         if o.verdict.accepted and o.estimate is not None
     ]
     if estimate is None or not moves:
         return estimate, [None] * len(outcomes)
-    estimate = with_presliding(estimate, [window for window, _ in moves], axis, sync_period_s)
+    estimate = fit_presliding(estimate, [window for window, _ in moves], axis, sync_period_s)
     replays = iter(predict_held_out(moves, estimate, axis, sync_period_s))
     return estimate, [next(replays) if o.verdict.accepted and o.estimate is not None else None for o in outcomes]
 
 
-def _on_time(outcome: WindowOutcome, axis: Axis, sync_period_s: float) -> Window:
+def _align_demand(outcome: WindowOutcome, axis: Axis, sync_period_s: float) -> Window:
     """Return the window with the demand that the drive follows, where the recorded one is ahead of it."""
     if all(warning.code != "SampleTiming" for warning in outcome.verdict.warnings):
         return outcome.window
     return align_demand_to_drive(outcome.window, axis, sync_period_s)[0]
 
 
-def _is_doubtful(outcome: WindowOutcome) -> bool:
+def _is_refused_by_replay(outcome: WindowOutcome) -> bool:
     """Return whether a window was refused for its own model's replay alone: others may separate load and friction."""
     codes = {reason.code for reason in outcome.verdict.reasons}
     return outcome.estimate is not None and LOOPS_DIFFER in codes and codes <= OF_ONE_MOVE
 
 
-def _accepted(outcome: WindowOutcome) -> WindowOutcome:
+def _accept_outcome(outcome: WindowOutcome) -> WindowOutcome:
     verdict = outcome.verdict
     warnings = (*verdict.warnings, *verdict.reasons)
     return replace(outcome, verdict=replace(verdict, accepted=True, reasons=(), warnings=warnings))

@@ -6,12 +6,12 @@ import numpy as np
 
 from fdhil.config import Axis
 from fdhil.records import Float, Int, Parameters, Skill, Window, compute_rms
-from fdhil.validation.replay import replay_setpoints
+from fdhil.validation.move_replay import replay_setpoints
 
 LONGEST_DELAY = 8.0  # in SYNC cycles
 
 
-def skill(window: Window, parameters: Parameters, axis: Axis, sync_period_s: float) -> Skill | None:
+def assess_model_skill(window: Window, parameters: Parameters, axis: Axis, sync_period_s: float) -> Skill | None:
     """Compare the predicted with the measured following error of a recorded move, like held-out moves in a file.
 
     Lost rows are not compared. ``delay_ms`` is the shift of the prediction (positive: the drive is later) that explains
@@ -25,12 +25,12 @@ def skill(window: Window, parameters: Parameters, axis: Axis, sync_period_s: flo
         tick=window.start_tick,
         rms_um=compute_rms(replayed.difference_um),
         max_um=float(np.abs(replayed.difference_um).max()),
-        delay_ms=_delay(window.position_mm, replayed.predicted_mm, replayed.rows) * sync_period_s * 1e3,
+        delay_ms=_estimate_delay_cycles(window.position_mm, replayed.predicted_mm, replayed.rows) * sync_period_s * 1e3,
         measured_rms_um=replayed.measured_um,
     )
 
 
-def _delay(measured_mm: Float, predicted_mm: Float, rows: Int) -> float:
+def _estimate_delay_cycles(measured_mm: Float, predicted_mm: Float, rows: Int) -> float:
     """Return the shift in cycles that minimises the difference: Gauss-Newton on the prediction's slope."""
     grid = np.arange(predicted_mm.size, dtype=np.float64)
     slope = np.gradient(predicted_mm)

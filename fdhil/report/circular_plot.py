@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fdhil.prediction.circular import CIRCLE_POINTS, Circular
+from fdhil.prediction.circle_evaluation import CIRCLE_POINTS, CircleDeviations
 from fdhil.records import Float
 from fdhil.report.svg_drawing import COLOURS, INK, REFERENCE, open_drawing, place_legend_above
 
@@ -19,13 +19,13 @@ RINGS = 4  # divisions inside and outside of it
 DIVISIONS_UM = tuple(m * 10.0**e for e in range(-3, 5) for m in (1, 2, 5))
 
 
-def choose_division_um(test: Circular) -> float:
+def choose_division_um(test: CircleDeviations) -> float:
     """Return the division at which the deviations fill the plot."""
     largest = max(abs(value) for value in test.radial_um)
     return next((division for division in DIVISIONS_UM if largest <= (RINGS - 0.5) * division), DIVISIONS_UM[-1])
 
 
-def draw_polar(test: Circular, names: tuple[str, str] = ("X", "Y")) -> str:
+def draw_polar(test: CircleDeviations, names: tuple[str, str] = ("X", "Y")) -> str:
     """Draw both runs of a circular test about the programmed circle as inline SVG."""
     division = choose_division_um(test)
     angle = np.append(np.arange(CIRCLE_POINTS), 0) * 2 * np.pi / CIRCLE_POINTS

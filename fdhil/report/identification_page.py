@@ -13,7 +13,7 @@ from fdhil.report.chart import Chart, Panel, Trace, decimate_curve, render_svg
 from fdhil.report.parameter_format import INTERVAL_MEANING, PARAMETER_MEANINGS, format_cell, format_heading
 from fdhil.report.report_page import Page, Section, Table
 from fdhil.report.svg_drawing import COLOURS, INK, REFERENCE
-from fdhil.validation.simulation import simulated
+from fdhil.validation.open_loop_simulation import simulate_from_voltage
 
 MOST_WINDOWS = 6
 LAGS = 40
@@ -123,7 +123,7 @@ def _build_window_section(outcome: WindowOutcome) -> Section:
 def _build_signal_chart(outcome: WindowOutcome) -> Chart:
     window = outcome.window
     time_s = np.arange(window.n, dtype=np.float64) * window.dt_s
-    model = None if outcome.estimate is None else simulated(window, outcome.estimate, None)
+    model = None if outcome.estimate is None else simulate_from_voltage(window, outcome.estimate, None)
     panels = []
     if window.voltage_v is not None:
         panels.append(Panel("voltage (V)", [Trace("measured voltage", time_s, window.voltage_v, COLOURS[1])], 0.7))

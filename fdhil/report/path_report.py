@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fdhil.prediction.contour import nearest_points_mm
-from fdhil.prediction.gain import Gain
+from fdhil.prediction.contour_error import find_nearest_points_mm
+from fdhil.prediction.correction_gain import CorrectionGain
 from fdhil.records import Correction, Float, Prediction, Trajectory, Zone
 from fdhil.report import figures
 from fdhil.report.figures import Curve, MapPosition
@@ -40,7 +40,7 @@ def build_prediction_page(name: str, machine: str, predicted: Prediction, parame
 
 
 def build_correction_page(
-    name: str, machine: str, planned: Correction, parameters: str = "", predicted: Gain | None = None
+    name: str, machine: str, planned: Correction, parameters: str = "", predicted: CorrectionGain | None = None
 ) -> Page:
     """Build the page of a correction, before and after; a refused one with its reasons. ``parameters`` names their
     source.
@@ -69,7 +69,7 @@ def build_correction_page(
     )
 
 
-def _describe_predicted_gain(after: Prediction, predicted: Gain | None) -> list[tuple[str, str]]:
+def _describe_predicted_gain(after: Prediction, predicted: CorrectionGain | None) -> list[tuple[str, str]]:
     left, largest = _list_headline_figures("corrected, predicted", after)
     if predicted is None or predicted.half_um is None:
         return [left, largest, ("how well the model fits this machine", "not known here")]
@@ -225,7 +225,7 @@ def find_nearest_mm(predicted: Prediction, rows: slice) -> Float:
     """
     reference = predicted.reference
     actual = reference.compute_table_mm(predicted.predicted_mm)[rows]
-    return nearest_points_mm(reference.path_mm, actual, reference.dt_s, rows.start)
+    return find_nearest_points_mm(reference.path_mm, actual, reference.dt_s, rows.start)
 
 
 def _build_zone_section(before: Prediction, after: Prediction | None) -> Section:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from fdhil.config import MachineConfig
-from fdhil.prediction.gain import Gain, gain, worst_skill_um
+from fdhil.prediction.correction_gain import CorrectionGain, find_worst_rms_um, predict_gain
 from fdhil.records import Correction, Parameters, Skill
 from fdhil.store.history import History
 
@@ -16,17 +16,17 @@ def predict_gain_from_history(
     config: MachineConfig,
     from_history: bool,
     held_out_um: Mapping[str, float] | None = None,
-) -> Gain:
+) -> CorrectionGain:
     """Return the predicted gain; ``from_history`` uses the newest parameters' covariance and skill. StoreError.
 
     ``held_out_um`` is the error of externally given models in moves that they were not identified on.
     """
     if not from_history:
-        return gain(planned, models, config, {}, held_out_um or {})
+        return predict_gain(planned, models, config, {}, held_out_um or {})
     with History.read(config.store.directory) as history:
         newest = {axis: history.revisions(axis, limit=1) for axis in config.axis}
     covariances = {axis: found[0].set.covariance for axis, found in newest.items() if found}
-    return gain(planned, models, config, covariances, worst_skill_um(recent_skills(config)))
+    return predict_gain(planned, models, config, covariances, find_worst_rms_um(recent_skills(config)))
 
 
 def recent_skills(config: MachineConfig) -> dict[str, list[Skill]]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdhil.correction.learning import Lesson
+from fdhil.correction.learned_offsets import LearnedOffset
 from fdhil.store.atomic import keep_newest, make_folder, store_error, write_file
 from fdhil.store.recording_table import UNREADABLE
 
@@ -20,7 +20,7 @@ def lesson_path(folder: Path, program_digest: str, config_digest: str) -> Path:
     return folder / f"{program_digest[:32]}-{config_digest}.npz"
 
 
-def kept_lessons(folder: Path, config_digest: str) -> list[tuple[float, str, Lesson]]:
+def kept_lessons(folder: Path, config_digest: str) -> list[tuple[float, str, LearnedOffset]]:
     """Return the learned offsets for one configuration, newest first, each with its time (Unix, s) and program.
 
     The program is given by the first 32 digits of its digest. Unreadable files are left out.
@@ -37,7 +37,7 @@ def kept_lessons(folder: Path, config_digest: str) -> list[tuple[float, str, Les
     return sorted(found, key=lambda entry: -entry[0])
 
 
-def read_lesson(path: Path) -> Lesson | None:
+def read_lesson(path: Path) -> LearnedOffset | None:
     """Return the learned offsets; None if there are none or the file is invalid: learning then starts again."""
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as found:
@@ -45,14 +45,14 @@ def read_lesson(path: Path) -> Lesson | None:
                 return None
             offsets = {str(axis): np.asarray(found[f"offset_{axis}_um"], np.float64) for axis in found["axes"]}
             curve = tuple(float(value) for value in found["curve_um"])
-            learned = Lesson(offsets, float(found["without_um"]), float(found["gain"]), curve)
+            learned = LearnedOffset(offsets, float(found["without_um"]), float(found["gain"]), curve)
     except (zipfile.BadZipFile, *UNREADABLE):
         return None
     finite = all(u.ndim == 1 and np.isfinite(u).all() for u in offsets.values())
     return learned if offsets and finite and np.isfinite([learned.without_um, learned.gain]).all() else None
 
 
-def write_lesson(path: Path, lesson: Lesson) -> None:
+def write_lesson(path: Path, lesson: LearnedOffset) -> None:
     """Store learned offsets durably; the oldest of other programs are removed. Raises StoreError."""
     content = io.BytesIO()
     np.savez_compressed(

@@ -18,7 +18,7 @@ from fdhil.identification.filtering import compute_moving_mean
 from fdhil.identification.prepared_motion import estimate_noise_levels, find_resolution
 from fdhil.identification.rapid_windows import fill_forward, find_moving_range
 from fdhil.records import Float, Reason, Window
-from fdhil.validation.significance import BUDGET
+from fdhil.validation.false_alarm_budget import BUDGET
 
 LIKELY = 2.0  # of the first measurement, which the second may confirm
 LEAST_UM = 20.0  # wind-up of a screw before the table starts, which is no backlash
@@ -34,24 +34,24 @@ CROSSED_UM = 150.0  # travel of the coasting table at which the second measureme
 
 @dataclass(frozen=True, slots=True)
 class DeadBand:
-    """Dead band ``um`` at the table with its standard deviation ``std_um``."""
+    """Dead band ``um`` at the table with its standard deviation ``compute_std_um``."""
 
     um: float
     std_um: float
 
     @property
-    def sure(self) -> bool:
+    def is_significant(self) -> bool:
         """Return whether it is significant."""
         return abs(self.um) > BUDGET["play"].deviations * self.std_um
 
-    def reason(self) -> Reason:
+    def build_reason(self) -> Reason:
         """Return the dead band as a reason to refuse a window."""
         text = f"the motor turns {self.um:.0f} ± {self.std_um:.0f} um before the table follows (backlash)"
         return Reason("ValidationFailed", text, "check screw, nut, coupling and bearings for play")
 
 
 @dataclass(frozen=True, slots=True)
-class _Course:
+class _AxialMotion:
     """The move in its own direction: position (mm) and speed (mm/s) at the table (n,), and the current (n,)."""
 
     position_mm: Float
@@ -63,11 +63,11 @@ class _Course:
     width: int  # rows over which the current is smoothed
     current_noise: float  # before that
 
-    def parted_um(self, a: int, b: int, zero_mm_s: float) -> float:
+    def measure_lost_motion_um(self, a: int, b: int, zero_mm_s: float) -> float:
         turned = float(((self.speed_mm_s[a:b] + self.speed_mm_s[a + 1 : b + 1]) / 2 - zero_mm_s).sum()) * self.dt_s
         return 1e3 * (turned - float(self.position_mm[b] - self.position_mm[a]))
 
-    def std_um(self, a: int, b: int, zero_rows: float) -> float:
+    def compute_std_um(self, a: int, b: int, zero_rows: float) -> float:
         """Return the standard deviation of that, with a zero that is the mean of ``zero_rows``.
 
         The flanks may meet at any time between two samples of the speed, which drops there.
@@ -78,7 +78,7 @@ class _Course:
         return 1e3 * math.hypot(chance, max(drop, 0.0) / math.sqrt(12), self.quantum_mm / math.sqrt(6))
 
 
-def _course(window: Window) -> _Course | None:
+def _extract_axial_motion(window: Window) -> _AxialMotion | None:
     position = window.direction * fill_forward(window.position_mm)
     quantum = find_resolution(position)
     if quantum == 0.0 or not np.isfinite(window.current_a).any():
@@ -89,13 +89,13 @@ def _course(window: Window) -> _Course | None:
     current = window.direction * compute_moving_mean(fill_forward(window.current_a), width)
     speed = window.direction * to_mm * fill_forward(window.speed_rad_s)
     noise = levels.speed_rad_s * window.dt_s * to_mm
-    return _Course(position, speed, current, window.dt_s, quantum, noise, width, levels.current_a)
+    return _AxialMotion(position, speed, current, window.dt_s, quantum, noise, width, levels.current_a)
 
 
-def dead_band(window: Window) -> DeadBand | None:
+def measure_dead_band(window: Window) -> DeadBand | None:
     """Return how far the motor turns before the table follows; None without a recorded position or standstill."""
     begin, end = find_moving_range(window)
-    course = _course(window)
+    course = _extract_axial_motion(window)
     if course is None or window.stages.accelerate is None or begin < LEAST_ROWS:
         return None
     # from this row on the table moves
@@ -108,19 +108,22 @@ def dead_band(window: Window) -> DeadBand | None:
     stop = min(first + max(1, round(AFTER_S / window.dt_s)), end, window.n - 1)
     if not np.isfinite(window.speed_rad_s[:stop]).all() or start >= stop:
         return None
-    start = _torque_changes(course, start, first)
+    start = _find_torque_onset(course, start, first)
     # the axis may still settle from its last move, which is no offset of the speed; within its dead band that is
     # not observable after the move
-    return DeadBand(course.parted_um(start, stop, _zero(course, 0, start)), course.std_um(start, stop, start))
+    return DeadBand(
+        course.measure_lost_motion_um(start, stop, _measure_speed_offset(course, 0, start)),
+        course.compute_std_um(start, stop, start),
+    )
 
 
-def _zero(course: _Course, a: int, b: int) -> float:
+def _measure_speed_offset(course: _AxialMotion, a: int, b: int) -> float:
     """Return the speed's reading (mm/s) beyond the table's own motion from row ``a`` to ``b``."""
     moved = float(course.position_mm[b] - course.position_mm[a]) / ((b - a) * course.dt_s)
     return float(course.speed_mm_s[a:b].mean()) - moved
 
 
-def _torque_changes(course: _Course, start: int, first: int) -> int:
+def _find_torque_onset(course: _AxialMotion, start: int, first: int) -> int:
     """Return the last row from ``start`` to ``first`` with the current of standstill: no motor turns yet."""
     still, noise = course.current[:start], course.current_noise
     if still.size < 2 * course.width or float(np.ptp(still)) > 2 * CHANGED * noise:
@@ -130,13 +133,13 @@ def _torque_changes(course: _Course, start: int, first: int) -> int:
     return start + (int(same[-1]) if same.size else 0)
 
 
-def overrun(window: Window) -> DeadBand | None:
+def measure_overrun(window: Window) -> DeadBand | None:
     """Return how much more the table moves than the motor when braking begins; None where that is not observable.
 
     The force on the table reverses with the motor's torque: from there on the table would coast, and leads the motor by
     the second integral of the braking deceleration, until its other flank is reached.
     """
-    course = _course(window)
+    course = _extract_axial_motion(window)
     stages = window.stages
     if course is None or stages.accelerate is None or stages.cruise is None or stages.brake is None:
         return None
@@ -145,7 +148,7 @@ def overrun(window: Window) -> DeadBand | None:
     if not np.isfinite(window.speed_rad_s[a:last]).all():
         return None
     driven = np.flatnonzero(course.current[a:last] >= 0.0)
-    gain = _gain(course, *stages.accelerate, float(np.median(course.current[a:b])))
+    gain = _estimate_acceleration_gain(course, *stages.accelerate, float(np.median(course.current[a:b])))
     braking = np.flatnonzero(course.current[max(a, b - round(LONGEST_S / window.dt_s)) : last] < 0.0)
     if driven.size == 0 or braking.size == 0 or not gain > 0.0:
         return None
@@ -156,26 +159,26 @@ def overrun(window: Window) -> DeadBand | None:
         return None
     stop = min(start + int(crossed[0]) + 1, last)
     # gain and zero of the speed are those of the cruise before
-    zero = _zero(course, a, start)
-    return DeadBand(-course.parted_um(start, stop, zero), course.std_um(start, stop, start - a))
+    zero = _measure_speed_offset(course, a, start)
+    return DeadBand(-course.measure_lost_motion_um(start, stop, zero), course.compute_std_um(start, stop, start - a))
 
 
-def _gain(course: _Course, a: int, b: int, cruising: float) -> float:
+def _estimate_acceleration_gain(course: _AxialMotion, a: int, b: int, cruising: float) -> float:
     """Return the acceleration (mm/s2) of the whole drive per unit of current, friction taken from the cruise."""
     pushed = float((course.current[a:b] - cruising).sum()) * course.dt_s
     return float(course.speed_mm_s[b - 1] - course.speed_mm_s[a]) / pushed if pushed > 0.0 else 0.0
 
 
-def backlash(window: Window) -> DeadBand | None:
+def detect_backlash(window: Window) -> DeadBand | None:
     """Return the dead band if it is significant and larger than a screw's wind-up explains."""
-    found = dead_band(window)
+    found = measure_dead_band(window)
     if found is None or found.um <= LEAST_UM:
         return None
-    if found.sure:
+    if found.is_significant:
         return found
-    second = overrun(window)
+    second = measure_overrun(window)
     if found.um <= LIKELY * found.std_um or second is None or second.um <= WOUND_UP_UM:
         return None
     weights = found.std_um**-2, second.std_um**-2
     both = DeadBand((found.um * weights[0] + second.um * weights[1]) / sum(weights), sum(weights) ** -0.5)
-    return both if both.sure else None
+    return both if both.is_significant else None

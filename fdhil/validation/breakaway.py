@@ -11,7 +11,7 @@ from fdhil.identification.likelihood_fit import LikelihoodFit
 from fdhil.identification.prepared_motion import UNKNOWN_MODE
 from fdhil.identification.term_regressors import compute_term_torque_nm
 from fdhil.records import Float, Reason, Window
-from fdhil.validation.significance import BUDGET
+from fdhil.validation.false_alarm_budget import BUDGET
 
 SURE = BUDGET["standstill"].deviations
 LEAST_BREAKAWAY = 0.02  # of the peak torque
@@ -30,22 +30,22 @@ class Breakaway:
     excess_nm: float
     lasted_s: float
     begin: int
-    more: bool
+    exceeds_model: bool
 
-    def momentum(self, n: int) -> Float:
+    def integrate_torque(self, n: int) -> Float:
         """Return its integral over the rows (n,), N.m.s."""
         return np.where(np.arange(n) >= self.begin, self.excess_nm * self.lasted_s, 0.0)
 
-    def reason(self) -> Reason:
+    def build_reason(self) -> Reason:
         """Return the breakaway torque as a reason to refuse a window."""
         text = (
-            f"beginning to move takes {abs(self.excess_nm):.3g} N.m {'more' if self.more else 'less'} "
+            f"beginning to move takes {abs(self.excess_nm):.3g} N.m {'more' if self.exceeds_model else 'less'} "
             f"over {1e3 * self.lasted_s:.0f} ms than friction drags (Stribeck)"
         )
         return Reason("ValidationFailed", text, "lubricate the slide-way, or check for a clamp or backlash")
 
 
-def breakaway(window: Window, fit: LikelihoodFit) -> Breakaway | None:
+def measure_breakaway(window: Window, fit: LikelihoodFit) -> Breakaway | None:
     """Return the additional torque needed to begin the move; None if it is insignificant or small.
 
     From rest, Jt w(t) is the integral of the excess of K i over dry friction, less viscous friction. The current's
@@ -57,7 +57,7 @@ def breakaway(window: Window, fit: LikelihoodFit) -> Breakaway | None:
         return None
     begin, side = int(sure[0]), int(motion.mode[sure[0]])
     end = begin + round(AFTER_S / window.dt_s)
-    still = _rest_before(fit, begin, side)
+    still = _find_last_standstill_sample(fit, begin, side)
     if still is None:
         return None
     torque = side * theta[2] * motion.current[still:end]
@@ -75,10 +75,10 @@ def breakaway(window: Window, fit: LikelihoodFit) -> Breakaway | None:
     peak = theta[2] * float(np.abs(motion.current).max())
     if abs(excess) <= sure_by + LEAST_BREAKAWAY * peak:
         return None
-    return Breakaway(side * excess, lasted, begin, more=excess > 0.0)
+    return Breakaway(side * excess, lasted, begin, exceeds_model=excess > 0.0)
 
 
-def _rest_before(fit: LikelihoodFit, begin: int, side: int) -> int | None:
+def _find_last_standstill_sample(fit: LikelihoodFit, begin: int, side: int) -> int | None:
     """Return the last row before the move at which the torque cannot turn the shaft; None without one."""
     motion, noise = fit.problem.motions[0], fit.problem.noises[0]
     rows = max(8, round(0.010 / motion.dt_s))

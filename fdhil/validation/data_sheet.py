@@ -12,8 +12,8 @@ import math
 import numpy as np
 
 from fdhil.records import PARAMETERS, Estimate, Float, Parameters, Reason
-from fdhil.validation.agreement import GAINS
-from fdhil.validation.significance import BUDGET
+from fdhil.validation.estimate_agreement import GAINS
+from fdhil.validation.false_alarm_budget import BUDGET
 
 TOLERANCE = 0.15  # of a data sheet's R (cold), L, K, and of a computed inertia
 FRICTION_TOLERANCE = 0.30  # the same, where friction is compared too
@@ -29,7 +29,7 @@ CONVENTION_TOLERANCE = 0.08  # to which a data sheet's K agrees with one of them
 LEAST_BEYOND = 2  # a single one is a warm winding, a saturated core, another load
 
 
-def gain_error(estimate: Estimate, nominal: Parameters) -> Reason | None:
+def detect_gain_error(estimate: Estimate, nominal: Parameters) -> Reason | None:
     """Return the signals whose constant gain explains how the estimate differs from the data sheet; None for none.
 
     Without a voltage, K of the estimate comes from the data sheet: then inertia and friction reveal the current's gain.
@@ -51,7 +51,8 @@ def gain_error(estimate: Estimate, nominal: Parameters) -> Reason | None:
         return None
     suspects = [("current",)] if blind else [*((signal,) for signal in GAINS), ("voltage", "current")]
     found = [
-        (signals, _gains(apart, allowed, np.column_stack([GAINS[s][rows] for s in signals]))) for signals in suspects
+        (signals, _fit_gains(apart, allowed, np.column_stack([GAINS[s][rows] for s in signals])))
+        for signals in suspects
     ]
     known = [(len(signals), rest, signals, gains) for signals, (gains, rest) in found if gains is not None]
     if not known:
@@ -64,7 +65,7 @@ def gain_error(estimate: Estimate, nominal: Parameters) -> Reason | None:
     return Reason("CalibrationSuspect", text, advice)
 
 
-def scale_convention(estimate: Estimate, nominal: Parameters) -> Reason | None:
+def detect_scale_convention(estimate: Estimate, nominal: Parameters) -> Reason | None:
     """Return the convention by which a three-phase motor's current and voltage are recorded, if not the model's.
 
     The torque of a motor is its power over its speed, so that K of [1] is K of [2], in values that keep the power. Peak
@@ -90,7 +91,7 @@ def scale_convention(estimate: Estimate, nominal: Parameters) -> Reason | None:
     return Reason("CalibrationSuspect", text, advice)
 
 
-def _gains(apart: Float, allowed: Float, patterns: Float) -> tuple[tuple[float, ...] | None, float]:
+def _fit_gains(apart: Float, allowed: Float, patterns: Float) -> tuple[tuple[float, ...] | None, float]:
     """Return the gains (q,) that explain all differences, and the residual; None where they do not explain them.
 
     Each gain must exceed what values within their tolerance can produce.

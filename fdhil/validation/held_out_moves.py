@@ -19,7 +19,7 @@ from fdhil.identification.between_window_variance import estimate_between_window
 from fdhil.identification.physical_bounds import bound_estimate
 from fdhil.identification.window_pool import build_pool_member, pool_estimates
 from fdhil.records import Estimate, Float, HeldOut, Parameters, Reason, Window, freeze_array
-from fdhil.validation.replay import Replay, replay_setpoints
+from fdhil.validation.move_replay import Replay, replay_setpoints
 
 TERM = "presliding_um"
 TRIALS_UM = (1.0, 2.5, 6.0, 15.0, 40.0)
@@ -31,14 +31,14 @@ STEP = 0.35  # of the logarithm, for the curvature
 Move = tuple[Window, Estimate]
 
 
-def with_presliding(estimate: Estimate, windows: Sequence[Window], axis: Axis, sync_period_s: float) -> Estimate:
+def fit_presliding(estimate: Estimate, windows: Sequence[Window], axis: Axis, sync_period_s: float) -> Estimate:
     """Return the estimate with ``presliding_um`` if the recorded moves show it, else unchanged.
 
     The standard deviation is that of the replays' least squares, of samples ``INDEPENDENT_S`` apart.
     """
     chosen = list(windows)[-MOST_WINDOWS:]
 
-    def left(um: float) -> float:
+    def compute_residual_um2(um: float) -> float:
         """Return the mean square of the replays' residuals, um2; infinite where none can be run."""
         parameters = estimate.build_parameters()
         parameters = parameters.replace_values(**{TERM: um}) if um > 0.0 else parameters
@@ -46,26 +46,28 @@ def with_presliding(estimate: Estimate, windows: Sequence[Window], axis: Axis, s
         known = [each.unexplained_um**2 for each in found if each is not None]
         return float(np.mean(known)) if known else math.inf
 
-    sharp = left(0.0)
-    trials = [left(um) for um in TRIALS_UM] if math.isfinite(sharp) else []
+    sharp = compute_residual_um2(0.0)
+    trials = [compute_residual_um2(um) for um in TRIALS_UM] if math.isfinite(sharp) else []
     if not trials or not min(trials) < sharp:
         return estimate
     near = math.log(TRIALS_UM[int(np.argmin(trials))])
     from scipy.optimize import minimize_scalar  # slow to import
 
     reach = (near - 1.0, near + 1.0)
-    found = minimize_scalar(lambda log: left(math.exp(log)), bounds=reach, method="bounded", options={"xatol": 0.05})
+    found = minimize_scalar(
+        lambda log: compute_residual_um2(math.exp(log)), bounds=reach, method="bounded", options={"xatol": 0.05}
+    )
     best = float(found.fun)
     if sharp - best < max(LEAST_SHARE * sharp, LEAST_UM**2):
         return estimate
     value = math.exp(float(found.x))
-    around = left(value * math.exp(STEP)) + left(value * math.exp(-STEP)) - 2.0 * best
+    around = compute_residual_um2(value * math.exp(STEP)) + compute_residual_um2(value * math.exp(-STEP)) - 2.0 * best
     seconds = sum(window.n * window.dt_s for window in chosen)
     variance = 2.0 * best * STEP**2 / (max(around, 1e-12) * max(1.0, seconds / INDEPENDENT_S))
-    return _with_term(estimate, value, value * min(math.sqrt(variance), 1.0))
+    return _append_term(estimate, value, value * min(math.sqrt(variance), 1.0))
 
 
-def _with_term(estimate: Estimate, value: float, std: float) -> Estimate:
+def _append_term(estimate: Estimate, value: float, std: float) -> Estimate:
     n = len(estimate.names)
     covariance: Float = np.zeros((n + 1, n + 1))
     covariance[:n, :n] = estimate.covariance
@@ -104,7 +106,7 @@ def _is_drive(p: Parameters) -> bool:
     return bool(np.isfinite([p.K, p.Jt, p.ft, p.Cd]).all() and min(p.K, p.Jt) > 0.0)
 
 
-def worst_of(predicted: Sequence[Replay | None]) -> HeldOut | None:
+def summarise_worst(predicted: Sequence[Replay | None]) -> HeldOut | None:
     """Return the residual of the worst move; None where none could be compared."""
     compared = [one for one in predicted if one is not None]
     if not compared:
@@ -119,7 +121,7 @@ def is_predicted(found: Replay | None, settings: Identification) -> bool:
     return found is not None and found.unexplained_um <= settings.compute_tolerance_um(found.measured_um)
 
 
-def held_out_reason(found: HeldOut, settings: Identification) -> Reason | None:
+def check_held_out_limit(found: HeldOut, settings: Identification) -> Reason | None:
     """Return why a model is not validated if it does not predict the moves that it was not identified on."""
     limit_um = settings.compute_tolerance_um(found.following_um)
     if found.rms_um <= limit_um:

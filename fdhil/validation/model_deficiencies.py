@@ -22,7 +22,7 @@ from fdhil.identification.normal_equations import invert_symmetric, solve_least_
 from fdhil.identification.term_regressors import FIRST_TERM
 from fdhil.identification.voltage_delay import differentiate_by_delay
 from fdhil.records import PARAMETERS, Estimate, Float, freeze_array
-from fdhil.validation.score_bench import Bench, Finding
+from fdhil.validation.score_tests import Finding, ScoreTest
 
 NO_WORSE = 3.0  # standard deviations by which an alternative may explain less by chance
 UNKNOWN_BIAS = 2.0  # times an interval
@@ -30,7 +30,7 @@ LAG_ROWS = 3.0  # lag of a sensor that may go unreported: it looks like the wind
 
 
 @dataclass(frozen=True, slots=True)
-class Lacking:
+class Deficiency:
     """A deficiency of a model: a finding, the shift of the parameters by it (k,), and its torque (n,), N.m, or None.
 
     The parameters are those of the fit's jacobian, in its order. ``rivals`` explain the same nearly as well, and may be
@@ -40,21 +40,21 @@ class Lacking:
     finding: Finding
     shift: Float
     load_nm: Float | None
-    rivals: tuple[Lacking, ...] = ()
+    alternatives: tuple[Deficiency, ...] = ()
 
     @property
-    def with_rivals(self) -> tuple[Lacking, ...]:
+    def with_alternatives(self) -> tuple[Deficiency, ...]:
         """The finding, and its alternatives."""
-        return (self, *self.rivals)
+        return (self, *self.alternatives)
 
 
-def lacking(fit: LikelihoodFit, findings: Sequence[Finding]) -> list[Lacking]:
+def select_deficiencies(fit: LikelihoodFit, findings: Sequence[Finding]) -> list[Deficiency]:
     """Return the significant deficiencies of the model, the most significant first; none where all may be chance."""
-    if not any(finding.sure for finding in findings):
+    if not any(finding.is_significant for finding in findings):
         return []
-    bench = Bench.of(fit)
+    bench = ScoreTest.prepare(fit)
     directions = np.column_stack([finding.direction for finding in findings])
-    score, information = bench.scores(directions)
+    score, information = bench.compute_scores(directions)
     whole = np.einsum("mq,mq->q", directions, directions)
     taken: list[int] = []
     similar: list[npt.NDArray[np.intp]] = []
@@ -65,35 +65,35 @@ def lacking(fit: LikelihoodFit, findings: Sequence[Finding]) -> list[Lacking]:
             else np.zeros((len(score), 0))
         )
         rest = np.diag(information) - np.einsum("qt,qt->q", shares, information[:, taken])
-        statistic, _ = bench.tested(score - shares @ score[taken], rest, whole)
+        statistic, _ = bench.compute_statistics(score - shares @ score[taken], rest, whole)
         statistic[taken] = 0.0
         best = int(np.argmax(np.abs(statistic)))
-        if not replace(findings[best], statistic=float(statistic[best])).sure:
+        if not replace(findings[best], statistic=float(statistic[best])).is_significant:
             break
         taken.append(best)
         similar.append(np.flatnonzero(np.square(statistic) > statistic[best] ** 2 - NO_WORSE**2))
     moved = invert_symmetric(fit.information)[0] @ (fit.jacobian.T @ directions)
 
-    def beside_others(n: int, k: int) -> Lacking:
+    def build_deficiency(n: int, k: int) -> Deficiency:
         places = [*taken[:n], k, *taken[n + 1 :]]
         amplitude = float((invert_symmetric(information[np.ix_(places, places)])[0] @ score[places])[n])
         finding = findings[k]
         load = None if finding.load_nm is None else amplitude * finding.load_nm
         # a sensor's own change has the opposite sign of its correction
         signed = replace(finding, amplitude=amplitude if load is not None else -amplitude)
-        return Lacking(signed, amplitude * moved[:, k], load)
+        return Deficiency(signed, amplitude * moved[:, k], load)
 
     found = []
     for n, k in enumerate(taken):
-        rivals = tuple(beside_others(n, int(other)) for other in similar[n] if other not in taken)
-        found.append(replace(beside_others(n, k), rivals=rivals))
+        rivals = tuple(build_deficiency(n, int(other)) for other in similar[n] if other not in taken)
+        found.append(replace(build_deficiency(n, k), alternatives=rivals))
     return found
 
 
-def widened(
+def inflate_covariance(
     estimate: Estimate,
     fit: LikelihoodFit,
-    lacks: Sequence[Lacking],
+    lacks: Sequence[Deficiency],
     restless: Collection[str] = (),
     nameless: bool = False,
 ) -> Estimate:
@@ -105,17 +105,17 @@ def widened(
     """
     covariance = estimate.covariance
     for lack in lacks:
-        shift = _worst(estimate, fit, lack)
+        shift = _select_worst_shift(estimate, fit, lack)
         covariance = covariance + np.outer(shift, shift)
     if nameless:
         covariance = UNKNOWN_BIAS**2 * covariance
     if {"voltage", "current"} & set(restless):
-        shift = _of_names(estimate, fit, _lag(fit))
+        shift = _map_shift_to_names(estimate, fit, _compute_sensor_lag_shift(fit))
         covariance = covariance + np.outer(shift, shift)
     return replace(estimate, covariance=freeze_array(covariance))
 
 
-def _lag(fit: LikelihoodFit) -> Float:
+def _compute_sensor_lag_shift(fit: LikelihoodFit) -> Float:
     """Return the shift (k,) of a fit's free entries by a voltage that lags ``LAG_ROWS`` rows behind the current."""
     lag_s = LAG_ROWS * fit.problem.motions[0].dt_s
     others = [k for k, j in enumerate(fit.free) if j != DELAY]
@@ -124,14 +124,14 @@ def _lag(fit: LikelihoodFit) -> Float:
     return shift
 
 
-def _worst(estimate: Estimate, fit: LikelihoodFit, lack: Lacking) -> Float:
+def _select_worst_shift(estimate: Estimate, fit: LikelihoodFit, lack: Deficiency) -> Float:
     """Return the larger shift (k,) in standard deviations, of the deficiency or of an alternative."""
-    shifts = [_of_names(estimate, fit, each.shift) for each in lack.with_rivals]
+    shifts = [_map_shift_to_names(estimate, fit, each.shift) for each in lack.with_alternatives]
     deviations = np.sqrt(np.maximum(np.diag(estimate.covariance), np.finfo(np.float64).tiny))
     return max(shifts, key=lambda shift: float(np.abs(shift / deviations).max()))
 
 
-def _of_names(estimate: Estimate, fit: LikelihoodFit, shift: Float) -> Float:
+def _map_shift_to_names(estimate: Estimate, fit: LikelihoodFit, shift: Float) -> Float:
     """Return the shift (k,) of the estimate's names, from that of the fit's free entries.
 
     The parts of a ripple have no name of their own: their shift is left to their covariance.

@@ -9,7 +9,7 @@ import numpy as np
 from fdhil.identification.prepared_motion import find_resolution
 from fdhil.identification.rapid_windows import estimate_noise_std
 from fdhil.records import Bool, Float
-from fdhil.validation.significance import BUDGET
+from fdhil.validation.false_alarm_budget import BUDGET
 
 RESOLVED = 0.2  # of a step: noise below it hides in the resolution
 INFORMATIVE_STEPS = 1.0  # of noise, beyond which two of three readings differ
@@ -17,12 +17,12 @@ LEAST_NOISE_ROWS = 20
 SIDE = 3  # rows on either side of a run that are compared with it, in lengths of the run
 
 
-def alike(noise: float) -> float:
+def compute_repeat_probability(noise: float) -> float:
     """Return the probability that a constant in the middle of a step is read there; ``noise`` is in steps."""
     return math.erf(1.0 / (math.sqrt(8.0) * noise))
 
 
-def beyond_chance(values: Float, start: int, end: int) -> bool:
+def is_beyond_chance(values: Float, start: int, end: int) -> bool:
     """Return whether the equal readings of rows ``start`` to ``end`` are more than the neighbouring rows explain.
 
     Either side may explain them: by how often it has that very reading (a constant read coarsely), or by how often it
@@ -34,16 +34,19 @@ def beyond_chance(values: Float, start: int, end: int) -> bool:
     sides = (slice(max(0, start - SIDE * length), start), slice(end + 1, end + 1 + SIDE * length))
     for others in (values[sides[0]], values[sides[1]], np.concatenate([values[:start], values[end + 1 :]])):
         # the neighbouring rows may lie at the edge of a step, and the run in its middle
-        chance = max(chance, likely_reading(others, step) ** length)
+        chance = max(chance, estimate_repeat_probability(others, step) ** length)
     for side in sides:
         # with noise of several steps no reading is frequent: rows with this one were clipped as well
         if values[side].size >= length and estimate_noise_std(values[side]) < INFORMATIVE_STEPS * step:
-            likely = all_within(length, values[side] == values[start]), all_within(length - 1, same[side])
+            likely = (
+                compute_run_probability(length, values[side] == values[start]),
+                compute_run_probability(length - 1, same[side]),
+            )
             chance = max(chance, *likely)
     return values.size * chance < BUDGET["saturated"].chance
 
 
-def likely_reading(values: Float, step: float) -> float:
+def estimate_repeat_probability(values: Float, step: float) -> float:
     """Return the largest probability that a constant with the noise of ``values`` repeats its reading: mid-``step``."""
     third = np.diff(values, 3)
     third = third[np.isfinite(third)]
@@ -51,10 +54,10 @@ def likely_reading(values: Float, step: float) -> float:
         return 0.0
     # quantisation adds its own scatter
     variance = float(np.mean(third**2)) / 20.0 - step**2 / 12
-    return alike(math.sqrt(max(variance, (RESOLVED * step) ** 2)) / step)
+    return compute_repeat_probability(math.sqrt(max(variance, (RESOLVED * step) ** 2)) / step)
 
 
-def all_within(length: int, others: Bool) -> float:
+def compute_run_probability(length: int, others: Bool) -> float:
     """Return the probability that ``length`` given rows have what these and ``others`` have as often as they do.
 
     Exact for rows that may be exchanged for each other (Fisher): no level of noise is needed.
@@ -65,7 +68,7 @@ def all_within(length: int, others: Bool) -> float:
     return math.exp(log)
 
 
-def wakes_with_a_jump(part: Float, start: int, end: int) -> bool:
+def has_jump_after(part: Float, start: int, end: int) -> bool:
     """Return whether the signal resumes after a run of repeats by more than it ever changes otherwise."""
     change = np.abs(np.diff(part))
     if end >= change.size:

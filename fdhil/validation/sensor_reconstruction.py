@@ -27,7 +27,7 @@ SIGNALS = ("current", "speed", "voltage")
 
 
 @dataclass(frozen=True, slots=True)
-class Bridge:
+class SensorReconstruction:
     """A fitted window: readings (n, 3) of current, speed and voltage, their variances, and the states' walks."""
 
     fit: LikelihoodFit
@@ -36,7 +36,7 @@ class Bridge:
     walks: Float
 
     @classmethod
-    def over(cls, fit: LikelihoodFit) -> Bridge:
+    def prepare(cls, fit: LikelihoodFit) -> SensorReconstruction:
         """Return the reconstruction of a fit's window."""
         motion, theta = fit.problem.motions[0], fit.theta
         noise = np.maximum(fit.problem.noises[0].to_array(), motion.noise.to_array())[[1, 2, 0]]
@@ -52,7 +52,7 @@ class Bridge:
         walks = [np.full(motion.n, motion.speed_walk**2), np.maximum(about, float(change.mean())), RISES**2 * about]
         return cls(fit, np.column_stack([motion.current, motion.speed, voltage]), variances, np.column_stack(walks))
 
-    def crossing(self, name: str, start: int, end: int) -> Crossing | None:
+    def omit_readings(self, name: str, start: int, end: int) -> ReconstructedSpan | None:
         """Return rows ``start`` to ``end`` - 1 and those around them, without the readings of sensor ``name`` in them.
 
         None where samples are lost there, or no other sensor is read.
@@ -69,7 +69,7 @@ class Bridge:
         variances[max(0, start - part.start - mixed) : end - part.start + mixed, signal] = np.inf
         if not np.isfinite(variances.min(axis=0)).all():
             return None
-        return Crossing(
+        return ReconstructedSpan(
             theta,
             motion.dt_s,
             motion.mode[part],
@@ -84,7 +84,7 @@ class Bridge:
 
 
 @dataclass(frozen=True)
-class Crossing:
+class ReconstructedSpan:
     """The rows around a run whose readings of one ``signal`` are left out; they begin at row ``begin`` of the window.
 
     Readings within ``mixed`` rows of the run's ends mix samples from inside and outside the run.
@@ -102,11 +102,11 @@ class Crossing:
     mixed: int
 
     @cached_property
-    def free(self) -> tuple[float, float]:
+    def unconstrained_fit(self) -> tuple[float, float]:
         """Return the squares and the degrees of freedom of the best course that leaves the run out."""
-        return self._squares(self.readings, self.variances)
+        return self._compute_deviation(self.readings, self.variances)
 
-    def log_chance(self, start: int, end: int, level: float, deviation: float) -> float:
+    def compute_log_probability(self, start: int, end: int, level: float, deviation: float) -> float:
         """Return log p that a working sensor is as far from ``level`` in rows ``start`` to ``end`` - 1 of the window.
 
         It is that of the sum of squares by which these readings, each with a ``deviation``, make the best course of all
@@ -117,22 +117,22 @@ class Crossing:
             return 0.0
         readings, variances = self.readings.copy(), self.variances.copy()
         readings[first:beyond, self.signal], variances[first:beyond, self.signal] = level, deviation**2
-        (forced, news), (free, other_news) = self._squares(readings, variances), self.free
-        return log_beyond(forced - free, max(news - other_news, 1.0))
+        (forced, news), (free, other_news) = self._compute_deviation(readings, variances), self.unconstrained_fit
+        return compute_log_chi_square_tail(forced - free, max(news - other_news, 1.0))
 
-    def _squares(self, readings: Float, variances: Float) -> tuple[float, float]:
+    def _compute_deviation(self, readings: Float, variances: Float) -> tuple[float, float]:
         return compute_departure(
             self.theta, self.dt_s, self.mode, self.load_nm, readings, variances, self.walks, self.signal
         )
 
 
-def log_beyond(square: float, freedom: float) -> float:
+def compute_log_chi_square_tail(square: float, freedom: float) -> float:
     """Return the logarithm of the chance of a chi-square beyond ``square`` (Wilson and Hilferty)."""
     spread = 2.0 / (9.0 * freedom)
-    return log_below(-((max(square, 0.0) / freedom) ** (1 / 3) - (1.0 - spread)) / math.sqrt(spread))
+    return compute_log_normal_cdf(-((max(square, 0.0) / freedom) ** (1 / 3) - (1.0 - spread)) / math.sqrt(spread))
 
 
-def log_below(z: float) -> float:
+def compute_log_normal_cdf(z: float) -> float:
     """Return the logarithm of the normal distribution at ``z``."""
     if z < -25.0:
         return -0.5 * z * z - math.log(-z * math.sqrt(2.0 * math.pi))

@@ -30,7 +30,7 @@ LONGEST_CYCLE_S = 0.012  # longest cycle of an NC, in which its demand changes o
 STILL_MM = 1.0  # travel from which a recording contains a move
 
 
-def recorded_signals(window: Window) -> dict[str, Float]:
+def collect_recorded_signals(window: Window) -> dict[str, Float]:
     """Return the recorded signals (n,), by name; one that is missing throughout is left out."""
     signals = {
         "voltage": window.voltage_v,
@@ -42,39 +42,39 @@ def recorded_signals(window: Window) -> dict[str, Float]:
     return {name: values for name, values in signals.items() if values is not None and np.isfinite(values).any()}
 
 
-def travel_mm(speed_rad_s: Float, dt_s: float, pitch_mm: float) -> Float:
+def integrate_travel_mm(speed_rad_s: Float, dt_s: float, pitch_mm: float) -> Float:
     """Return the integral (n,) of the speed in mm of the table; lost samples are interpolated."""
     speed = interpolate_gaps(speed_rad_s)
     steps = (speed[1:] + speed[:-1]) * (dt_s * pitch_mm / (4 * math.pi))
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def dead_signals(signals: WindowSignals) -> Iterator[Reason]:
+def find_constant_signals(signals: WindowSignals) -> Iterator[Reason]:
     """Yield a reason for each signal that does not change while the axis moves, and for a demand that jumps."""
     window, (begin, end) = signals.recorded or signals.window, signals.motion_range
     if not np.isfinite(window.speed_rad_s).any():
         return
-    travel = travel_mm(window.speed_rad_s, window.dt_s, window.pitch_mm)
+    travel = integrate_travel_mm(window.speed_rad_s, window.dt_s, window.pitch_mm)
     part = travel[begin:end]
     moved_mm = float(part[-1] - part[0]) if part.size else 0.0
     if window.slow_voltage is not None:
         readings = window.slow_voltage.voltage_v[np.isfinite(window.slow_voltage.voltage_v)]
         if readings.size >= LEAST_SAMPLES and np.ptp(readings) == 0.0:
-            yield _stands_still("voltage", float(readings[0]), moved_mm)
-    for name, values in recorded_signals(window).items():
+            yield _build_constant_reason("voltage", float(readings[0]), moved_mm)
+    for name, values in collect_recorded_signals(window).items():
         moving = values[begin:end][np.isfinite(values[begin:end])]
         if moving.size >= LEAST_SAMPLES and np.ptp(moving) == 0.0:
-            yield _stands_still(name, float(moving[0]), moved_mm)
+            yield _build_constant_reason(name, float(moving[0]), moved_mm)
         elif name == "demand":
-            yield from _jump_of_demand(signals, values)
+            yield from _find_demand_jump(signals, values)
 
 
-def _stands_still(name: str, value: float, moved_mm: float) -> Reason:
+def _build_constant_reason(name: str, value: float, moved_mm: float) -> Reason:
     text = f"{name} stays at {value:.6g} {UNITS[name]} while the integral of speed travels {moved_mm:.4g} mm"
     return Reason("StuckValue", text, f"check the {name} sensor or the object's mapping")
 
 
-def _jump_of_demand(signals: WindowSignals, demand: Float) -> Iterator[Reason]:
+def _find_demand_jump(signals: WindowSignals, demand: Float) -> Iterator[Reason]:
     window = signals.window
     speed_mm_s = float(np.abs(smooth_samples(window.speed_rad_s, window.dt_s)).max()) * window.pitch_mm / (2 * math.pi)
     steps = np.abs(np.diff(interpolate_gaps(demand)))
@@ -86,10 +86,12 @@ def _jump_of_demand(signals: WindowSignals, demand: Float) -> Iterator[Reason]:
         yield Reason("StuckValue", text, "check where the demand is recorded, or the object's mapping")
 
 
-def copied_signals(signals: WindowSignals) -> Iterator[Reason]:
+def find_copied_signals(signals: WindowSignals) -> Iterator[Reason]:
     """Yield a reason for each two signals of which one is the other times a constant in every row."""
     begin, end = signals.motion_range
-    moving = {name: fill_forward(values)[begin:end] for name, values in recorded_signals(signals.window).items()}
+    moving = {
+        name: fill_forward(values)[begin:end] for name, values in collect_recorded_signals(signals.window).items()
+    }
     for (one, values), (other, others) in combinations(moving.items(), 2):
         power = float(others @ others)
         if values.size < LEAST_SAMPLES or np.ptp(values) == 0.0 or not 0.0 < power < math.inf:
@@ -100,13 +102,13 @@ def copied_signals(signals: WindowSignals) -> Iterator[Reason]:
             yield Reason("Implausible", text, "correct which column or object is which signal")
 
 
-def unrelated_signals(signals: WindowSignals) -> Iterator[Reason]:
+def find_unrelated_signals(signals: WindowSignals) -> Iterator[Reason]:
     """Yield a reason for voltage and current if speed and acceleration explain too little of them."""
     window = signals.window
     begin, end = signals.motion_range
     speed = smooth_samples(window.speed_rad_s, window.dt_s)
     motion = np.stack([np.ones(window.n), speed, np.gradient(speed, window.dt_s)])
-    followed = {k: v for k, v in recorded_signals(window).items() if k in LEAST_FOLLOWED}
+    followed = {k: v for k, v in collect_recorded_signals(window).items() if k in LEAST_FOLLOWED}
     parts = {name: (motion[:, begin:end], smooth_samples(v, window.dt_s)[begin:end]) for name, v in followed.items()}
     slow = window.slow_voltage
     if slow is not None:
@@ -115,7 +117,7 @@ def unrelated_signals(signals: WindowSignals) -> Iterator[Reason]:
         courses = [np.interp(rows[known], np.arange(window.n), course) for course in motion]
         parts["voltage"] = np.stack(courses), slow.voltage_v[known]
     for name, (courses_of_motion, values) in parts.items():
-        share = _explained(values, courses_of_motion)
+        share = _compute_explained_share(values, courses_of_motion)
         if share < LEAST_FOLLOWED[name]:
             text = (
                 f"{name} does not follow the speed: speed and acceleration explain {max(0.0, share):.0%} of it, in "
@@ -124,7 +126,7 @@ def unrelated_signals(signals: WindowSignals) -> Iterator[Reason]:
             yield Reason("Implausible", text, f"check which column or object is the {name}, and of which axis it is")
 
 
-def _explained(values: Float, courses: Float) -> float:
+def _compute_explained_share(values: Float, courses: Float) -> float:
     """Return the share of the variance of ``values`` (m,) that ``courses`` (q, m) explain; 1 if they are constant."""
     size = values.size
     variance = float(np.var(values)) if size >= LEAST_SAMPLES else 0.0
@@ -136,7 +138,7 @@ def _explained(values: Float, courses: Float) -> float:
     return 1.0 - float(np.mean((values - columns @ weights) ** 2)) / variance
 
 
-def table_faults(window: Window, moving: tuple[int, int]) -> Mapping[str, Reason]:
+def find_table_sensor_faults(window: Window, moving: tuple[int, int]) -> Mapping[str, Reason]:
     """Return why the sensors at the table are not used, by the window's field: they do not move as the motor does.
 
     Differences by the screw's deflection or a sensor's delay are below the tolerance, and not a fault.
@@ -161,13 +163,13 @@ def table_faults(window: Window, moving: tuple[int, int]) -> Mapping[str, Reason
         elif readings.size >= LEAST_SAMPLES and float(np.var(own)) > 0.0:
             courses = np.stack([np.ones(readings.size), own])
             gain = float(solve_least_squares(courses.T, readings)[0][1])
-            if _explained(readings, courses) > TABLE_FOLLOWS and not 1.0 / TABLE_GAIN < gain < TABLE_GAIN:
+            if _compute_explained_share(readings, courses) > TABLE_FOLLOWS and not 1.0 / TABLE_GAIN < gain < TABLE_GAIN:
                 text = f"table acceleration is {gain:.3g} times that of the motor: it is not used"
                 found["table_m_s2"] = Reason("CalibrationSuspect", text, "check the accelerometer's scale and sign")
     return found
 
 
-def position_confirms(window: Window, signal: SensorSignal, start: int, end: int) -> bool:
+def is_confirmed_by_position(window: Window, signal: SensorSignal, start: int, end: int) -> bool:
     """Return whether the position moves as by the speed that repeats one reading in rows ``start`` to ``end`` - 1.
 
     A quantised speed may be half a step from its reading, and the position one of its own.
@@ -183,13 +185,13 @@ def position_confirms(window: Window, signal: SensorSignal, start: int, end: int
     return bool((np.abs(error_mm) <= signal.step / 2 * to_mm * rows + steps).all())
 
 
-def missing_move(recording: Recording) -> Reason | None:
+def explain_missing_move(recording: Recording) -> Reason | None:
     """Return which signal hides the rapids of a recording in which none was found; None where there is no move."""
     position = recording.position_mm[np.isfinite(recording.position_mm)]
     speed = recording.speed_rad_s
     if position.size < 2 or not np.isfinite(speed).any():
         return None
-    travel = travel_mm(speed, recording.dt_s, recording.pitch_mm)
+    travel = integrate_travel_mm(speed, recording.dt_s, recording.pitch_mm)
     moved, integral = float(np.ptp(position)), float(np.ptp(travel))
     if max(moved, integral) < STILL_MM or abs(moved - integral) < 0.1 * max(moved, integral):
         return None

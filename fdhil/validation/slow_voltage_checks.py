@@ -26,11 +26,11 @@ from fdhil.identification.normal_equations import invert_symmetric
 from fdhil.identification.prepared_motion import Motion, find_resolution
 from fdhil.identification.rapid_windows import estimate_noise_std, fill_forward, smooth_samples, sort_runs_by_length
 from fdhil.records import Float, Reason, SlowVoltage, Window
-from fdhil.validation.repeated_readings import alike
-from fdhil.validation.sensor_reconstruction import log_beyond
-from fdhil.validation.shifts import LARGEST, SMOOTHING_S, build_delay_reason
-from fdhil.validation.significance import BUDGET
-from fdhil.validation.timing import SEARCH
+from fdhil.validation.false_alarm_budget import BUDGET
+from fdhil.validation.repeated_readings import compute_repeat_probability
+from fdhil.validation.sensor_reconstruction import compute_log_chi_square_tail
+from fdhil.validation.signal_delays import LARGEST, SMOOTHING_S, build_delay_reason
+from fdhil.validation.timing_checks import SEARCH
 from fdhil.validation.window_fit import WindowFit
 
 LEAST_SAMPLES = 3
@@ -46,7 +46,7 @@ LEAST_GAIN = BUDGET["timing"].deviations ** 2
 FIRST_SHARE = 0.1  # of the required gain that the score must show at first: it is too small for a long delay
 
 
-def slow_voltage_faults(window: Window) -> Iterator[Reason]:
+def check_slow_voltage_readings(window: Window) -> Iterator[Reason]:
     """Yield a reason if the samples of a slow voltage sensor repeat themselves, or stay at the sensor's limit."""
     slow = window.slow_voltage
     if slow is None or window.n == 0 or np.count_nonzero(np.isfinite(slow.voltage_v)) < LEAST_NOISE_SAMPLES:
@@ -57,10 +57,10 @@ def slow_voltage_faults(window: Window) -> Iterator[Reason]:
     )
     rails = (float(np.nanmax(volts)), float(np.nanmin(volts)))
     step = max(find_resolution(volts[np.isfinite(volts)]), 1e-12)
-    same = likely_same(volts, step)
-    for start, end in runs(volts):
+    same = compute_same_reading_probability(volts, step)
+    for start, end in find_equal_runs(volts):
         moving = np.abs(speed[start:end]) > MOVING * window.rapid_speed_rad_s
-        if not moving.all() or not _strange(window, volts, speed, (start, end), step, same):
+        if not moving.all() or not _is_implausible_run(window, volts, speed, (start, end), step, same):
             continue
         at, lasts = window.start_s + begins[start], 1e3 * (end - start) * slow.period_s
         if volts[start] in rails and rails[0] > rails[1]:
@@ -72,12 +72,14 @@ def slow_voltage_faults(window: Window) -> Iterator[Reason]:
         return
 
 
-def runs(volts: Float) -> list[tuple[int, int]]:
+def find_equal_runs(volts: Float) -> list[tuple[int, int]]:
     """Return the half-open runs of equal samples, the longest first."""
     return [(start, end + 1) for start, end in sort_runs_by_length(np.diff(volts) == 0.0, LEAST_SAMPLES - 1)]
 
 
-def _strange(window: Window, volts: Float, speed: Float, run: tuple[int, int], step: float, same: float) -> bool:
+def _is_implausible_run(
+    window: Window, volts: Float, speed: Float, run: tuple[int, int], step: float, same: float
+) -> bool:
     start, end = run
     peak = float(np.nanmax(np.abs(volts)))
     read = READ_STEPS * step / peak if peak else 0.0  # a sensor that only reads 0 shows no step
@@ -89,24 +91,24 @@ def _strange(window: Window, volts: Float, speed: Float, run: tuple[int, int], s
     return volts.size * same ** (end - start - 1) < BUDGET["slow voltage"].chance
 
 
-def likely_same(volts: Float, step: float) -> float:
+def compute_same_reading_probability(volts: Float, step: float) -> float:
     """Return the probability that a constant mid-step is read there, by the noise of third differences."""
     noise = math.sqrt(max(estimate_noise_std(fill_forward(volts)) ** 2 - step**2 / 12.0, (LEAST_NOISE * step) ** 2))
-    return alike(noise / step)
+    return compute_repeat_probability(noise / step)
 
 
-def slow_faults_beside(fitted: WindowFit) -> Iterator[Reason]:
+def check_slow_voltage_fit(fitted: WindowFit) -> Iterator[Reason]:
     """Yield the contradictions between the samples of a slow voltage and the model fitted to the window."""
     slow, fit = fitted.window.slow_voltage, fitted.required_fit
     if slow is None or np.count_nonzero(np.isfinite(slow.voltage_v)) < LEAST_NOISE_SAMPLES:
         return
     if not (np.isfinite(fit.theta).all() and (fit.theta[:4] > 0).all()):
         return
-    yield from _stuck(fitted, slow)
-    yield from _off_at_rest(fitted, slow)
+    yield from _find_stuck_samples(fitted, slow)
+    yield from _check_standstill_offset(fitted, slow)
 
 
-def _stuck(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
+def _find_stuck_samples(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
     """Yield a reason for a run of equal samples that neither the sensor's noise nor the model explains by chance.
 
     A working sensor needs both: its noise leaves the reading of a constant equal, and the model deviates from it by
@@ -120,11 +122,11 @@ def _stuck(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
     step = find_resolution(volts[np.isfinite(volts)])
     beyond = np.maximum(np.abs(errors) - step / 2, 0.0) / spread  # beyond its resolution
     limit = BUDGET["slow voltage"].log_chance
-    same = math.log(max(likely_same(volts, max(step, 1e-12)), 1e-300))
-    for start, end in runs(volts):
+    same = math.log(max(compute_same_reading_probability(volts, max(step, 1e-12)), 1e-300))
+    for start, end in find_equal_runs(volts):
         squares = float(beyond[start + 1 : end] @ beyond[start + 1 : end])
         count = end - start - 1
-        if math.log(volts.size) + count * same + min(log_beyond(squares, count), 0.0) < limit:
+        if math.log(volts.size) + count * same + min(compute_log_chi_square_tail(squares, count), 0.0) < limit:
             at = fitted.window.start_s + slow.begin_s + start * slow.period_s
             lasts = 1e3 * (end - start) * slow.period_s
             text = f"voltage repeats {volts[start]:.6g} V for {lasts:.0f} ms from {at:.3f} s, current and speed do not"
@@ -132,7 +134,7 @@ def _stuck(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
             return
 
 
-def _off_at_rest(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
+def _check_standstill_offset(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
     """Yield a reason if u = R i does not hold at standstill, where nothing else of the model is needed.
 
     The rows of the rapid itself hardly show an offset, since R and K imitate most of it.
@@ -161,13 +163,13 @@ def _off_at_rest(fitted: WindowFit, slow: SlowVoltage) -> Iterator[Reason]:
         yield Reason("CalibrationSuspect", text, "set the zero of both sensors at standstill")
 
 
-def current_late(window: Window, fit: LikelihoodFit, least_gain: float) -> Iterator[Reason]:
+def check_slow_current_delay(window: Window, fit: LikelihoodFit, least_gain: float) -> Iterator[Reason]:
     """Yield a reason if the current is late by more than a row, and the window likelier so by ``least_gain``.
 
     ``fit`` is the window's; the gain is one of twice the log likelihood.
     """
     plain, last, rows = fit.problem.motions[0], fit, 0
-    found, std = _shift(fit)
+    found, std = _estimate_current_delay(fit)
     if not (found / std) ** 2 > max(LEAST_GAIN, FIRST_SHARE * least_gain):
         return
     for _ in range(SEARCH):
@@ -179,12 +181,12 @@ def current_late(window: Window, fit: LikelihoodFit, least_gain: float) -> Itera
         last = maximum_likelihood.fit_parameters_and_noise([replace(plain, current=earlier)], last.theta, last.free)
         if not (np.isfinite(last.residuals).all() and np.isfinite(last.information).all()):
             return
-        found, _ = _shift(last)
-    if abs(rows) > LARGEST and _cost(fit) - _cost(last) > max(LEAST_GAIN, least_gain):
+        found, _ = _estimate_current_delay(last)
+    if abs(rows) > LARGEST and _compute_deviance(fit) - _compute_deviance(last) > max(LEAST_GAIN, least_gain):
         yield build_delay_reason("current", "speed and voltage", rows * window.dt_s, window.dt_s)
 
 
-def _shift(fit: LikelihoodFit) -> tuple[float, float]:
+def _estimate_current_delay(fit: LikelihoodFit) -> tuple[float, float]:
     """Return the current's delay by the innovations, in rows, and its standard deviation."""
     motion: Motion = fit.problem.motions[0]
     width = 2 * round(SMOOTHING_S / 2 / motion.dt_s) + 1
@@ -196,7 +198,7 @@ def _shift(fit: LikelihoodFit) -> tuple[float, float]:
     return (-float(rest @ fit.residuals) / power, power**-0.5) if power > 0.0 else (0.0, np.inf)
 
 
-def _cost(fit: LikelihoodFit) -> float:
+def _compute_deviance(fit: LikelihoodFit) -> float:
     """Return minus twice the log likelihood, without its constant."""
     return compute_low_rate_innovations(
         fit.problem.motions[0], fit.theta, fit.problem.noises[0].to_array() ** 2, float(fit.theta[6])

@@ -27,7 +27,7 @@ from fdhil.identification.filtering import compute_moving_mean, find_fft_size
 from fdhil.identification.rapid_windows import fill_forward
 from fdhil.model.model_terms import compute_friction_torque
 from fdhil.records import Bool, Float, Parameters, Reason, Window, compute_rms
-from fdhil.validation.replay import Replay, replay_window
+from fdhil.validation.move_replay import Replay, replay_with_load_search
 
 # of a drive with unknown regulators: corner of its speed loop, and its position gain
 ORDINARY_SPEED_HZ, ORDINARY_KV = 30.0, 30.0
@@ -44,7 +44,7 @@ NOISE_ROWS = 25.0e-3  # s: over which noise behind a position loop is correlated
 
 
 @dataclass(frozen=True, slots=True)
-class TableError:
+class TorqueToTableError:
     """The loop of one axis about one drive: gains (A.s/rad, A/rad, 1/s, 1/s2) and mechanics, and um per rad."""
 
     inertia: float
@@ -57,7 +57,7 @@ class TableError:
     um_per_rad: float
 
     @classmethod
-    def of(cls, parameters: Parameters, pitch_mm: float, axis: Axis | None) -> TableError:
+    def derive(cls, parameters: Parameters, pitch_mm: float, axis: Axis | None) -> TorqueToTableError:
         """Return the loop with the regulators of the axis' section, or with ordinary ones without a section."""
         to_um = UM_PER_MM * pitch_mm / (2 * math.pi)
         mechanics = parameters.Jt, max(parameters.ft, 0.0), parameters.K
@@ -68,7 +68,7 @@ class TableError:
         g = axis.regulators
         return cls(*mechanics, g.speed_kp, g.speed_ki, g.position_gain_per_s, g.position_ki_per_s2, to_um)
 
-    def response(self, size: int, dt_s: float) -> Float:
+    def compute_frequency_response(self, size: int, dt_s: float) -> Float:
         """Return the complex gain from momentum (N.m.s) to the table (um) at the frequencies of ``size`` rows."""
         s = 2j * math.pi * np.fft.rfftfreq(size, dt_s)
         s[0] = 1e-9j  # a constant torque has no lasting effect
@@ -77,7 +77,7 @@ class TableError:
         gain: Float = self.um_per_rad * s**3 / (free + self.torque_constant * speed * place)
         return gain
 
-    def um(self, momentum: Float, dt_s: float) -> Float:
+    def convert_momentum_to_um(self, momentum: Float, dt_s: float) -> Float:
         """Return the error at the table (q, n), um, by the integrals (q, n) of torques, N.m.s, rows dt apart."""
         n = momentum.shape[-1]
         settled = math.ceil(SETTLED_S / dt_s)
@@ -86,24 +86,24 @@ class TableError:
         fading = np.cos(np.linspace(0.0, math.pi, settled)) / 2 + 0.5
         tail = np.concatenate([np.ones(settled), fading, np.zeros(size - n - 2 * settled)])
         whole = np.concatenate([momentum, momentum[..., -1:] * tail], axis=-1)
-        out: Float = np.fft.irfft(np.fft.rfft(whole) * self.response(size, dt_s), size)[..., :n]
+        out: Float = np.fft.irfft(np.fft.rfft(whole) * self.compute_frequency_response(size, dt_s), size)[..., :n]
         return out
 
-    def lasting_um(self, dt_s: float) -> float:
+    def compute_step_peak_um(self, dt_s: float) -> float:
         """Return how far a step of 1 N.m moves the table before the loop has compensated it, um."""
         since: Float = dt_s * np.arange(math.ceil(SETTLED_S / dt_s), dtype=np.float64)
-        return float(np.abs(self.um(since, dt_s)).max())
+        return float(np.abs(self.convert_momentum_to_um(since, dt_s)).max())
 
-    def noise_um(self, white: float, walk: float, n: int, dt_s: float) -> float:
+    def compute_noise_um(self, white: float, walk: float, n: int, dt_s: float) -> float:
         """Return the RMS (um) by a momentum of white noise and one of a random walk, by their deviation per row."""
         size = find_fft_size(n + 3 * math.ceil(SETTLED_S / dt_s))
-        power = np.abs(self.response(size, dt_s)[1:]) ** 2
+        power = np.abs(self.compute_frequency_response(size, dt_s)[1:]) ** 2
         step = 2 * np.sin(math.pi * np.fft.rfftfreq(size)[1:])
         return math.sqrt(float(power @ (white**2 + (walk / step) ** 2)) * 2 / size)
 
 
 @dataclass(frozen=True, slots=True)
-class Weight:
+class TableErrorBudget:
     """The residual of a model on a rapid at the table, RMS um, and its limit: ``limit_um`` of ``whole_um``.
 
     ``torque_um`` is the effect of the unexplained torque. ``through`` is the loop used: a replay of the rapid, the
@@ -118,26 +118,26 @@ class Weight:
     too_soft: bool = False
     """Whether the replay explains the rapid without the configured resonance."""
 
-    def allows(self, um: float) -> bool:
+    def is_within_limit(self, um: float) -> bool:
         """Return whether that error at the table is within the limit."""
         return um <= self.limit_um
 
     @property
-    def in_um(self) -> bool:
+    def is_absolute(self) -> bool:
         """Return whether all figures are micrometres at the axis' own table."""
         return self.through != "ordinary loop"
 
     @property
-    def believed(self) -> bool:
+    def is_met(self) -> bool:
         """Return whether the model explains the rapid."""
-        return self.allows(self.unexplained_um)
+        return self.is_within_limit(self.unexplained_um)
 
-    def reason(self) -> Reason:
+    def build_reason(self) -> Reason:
         """Return why the model is not accepted."""
         advice = "the drive has an effect that the model lacks, or current and speed are not sampled at one instant"
         if self.through != "replay":
-            text = f"the torque that the model leaves unexplained causes {self.told(self.unexplained_um)} at the table"
-            return Reason("ValidationFailed", f"{text}, limit {self.told(self.limit_um)}", advice)
+            text = f"the torque that the model leaves unexplained causes {self.format_error(self.unexplained_um)} at the table"
+            return Reason("ValidationFailed", f"{text}, limit {self.format_error(self.limit_um)}", advice)
         text = (
             f"the closed loop with this model leaves {self.unexplained_um:.3g} um RMS of a following error of "
             f"{self.whole_um:.3g} um unexplained, limit {self.limit_um:.3g} um"
@@ -146,7 +146,7 @@ class Weight:
             return Reason(
                 "ValidationFailed", text, "the model explains it without resonance_hz: correct that value, or remove it"
             )
-        if self.allows(self.torque_um):
+        if self.is_within_limit(self.torque_um):
             advice = (
                 "the model explains the torque: the drive's loops differ from the configuration "
                 "(fdhil identify --loops), or "
@@ -155,13 +155,13 @@ class Weight:
             return Reason(LOOPS_DIFFER, text, advice)
         return Reason("ValidationFailed", text, advice)
 
-    def told(self, um: float) -> str:
+    def format_error(self, um: float) -> str:
         """Return an error at the table as text: in um, or as a share where the loops are unknown."""
-        return f"{um:.2g} um" if self.in_um else f"{um / self.whole_um:.1%} of the effect of all torque"
+        return f"{um:.2g} um" if self.is_absolute else f"{um / self.whole_um:.1%} of the effect of all torque"
 
 
 @dataclass(frozen=True, slots=True)
-class Move:
+class DriveMotion:
     """The rows of a window in which the drive moves to ``side`` (n,), +1 or -1, else 0; current and speed (n,).
 
     ``friction`` (n,) is the model's torque of friction and loads against the positive direction, N.m. ``begins`` (n,)
@@ -176,7 +176,7 @@ class Move:
     dt_s: float
 
     @classmethod
-    def of(cls, window: Window, parameters: Parameters, side: Float) -> Move:
+    def extract(cls, window: Window, parameters: Parameters, side: Float) -> DriveMotion:
         """Return the move of a window, with the friction of a model."""
         speed = fill_forward(window.speed_rad_s)
         angle = 2 * math.pi / window.pitch_mm * fill_forward(window.position_mm)
@@ -187,24 +187,24 @@ class Move:
         begins[max(0, first - round(BEGINNING_S / window.dt_s)) : first] = True
         return cls(fill_forward(window.current_a), speed, side, friction, begins, window.dt_s)
 
-    def integral(self, torque_nm: Float) -> Float:
+    def integrate_torque(self, torque_nm: Float) -> Float:
         """Return the integral (n,) of a torque (n,) over the rows in which the drive moves."""
         over = np.where(self.side[:-1] != 0, (torque_nm[1:] + torque_nm[:-1]) / 2, 0.0) * self.dt_s
         return np.concatenate([[0.0], np.cumsum(over)])
 
-    def turned(self, speed: Float) -> Float:
+    def accumulate_speed_gain(self, speed: Float) -> Float:
         """Return the speed (n,) gained in those rows."""
         return np.concatenate([[0.0], np.cumsum(np.where(self.side[:-1] != 0, np.diff(speed), 0.0))])
 
-    def left(self, p: Parameters) -> Float:
+    def compute_unexplained_momentum(self, p: Parameters) -> Float:
         """Return the momentum (n,) that the model leaves unexplained, N.m.s."""
         return (
-            self.integral(p.K * self.current - self.friction)
-            - p.Jt * self.turned(self.speed)
-            + self._at_the_beginning(p)
+            self.integrate_torque(p.K * self.current - self.friction)
+            - p.Jt * self.accumulate_speed_gain(self.speed)
+            + self._compute_breakaway_momentum(p)
         )
 
-    def _at_the_beginning(self, p: Parameters) -> Float:
+    def _compute_breakaway_momentum(self, p: Parameters) -> Float:
         """Return that momentum of the rows in which the move begins, by the torque beyond friction at rest."""
         rows = np.flatnonzero(self.begins)
         if rows.size == 0:
@@ -218,68 +218,77 @@ class Move:
         made: Float = np.concatenate([[0.0], np.cumsum(way * push - p.Jt * gained)[:-1]])
         return made
 
-    def whole(self, p: Parameters) -> Float:
+    def compute_total_momentum(self, p: Parameters) -> Float:
         """Return the momentum (n,) of all torque that the model has."""
-        return self.integral(self.friction) + p.Jt * self.turned(self.speed)
+        return self.integrate_torque(self.friction) + p.Jt * self.accumulate_speed_gain(self.speed)
 
-    def slower(self, p: Parameters, share: float) -> Move:
+    def scale_speed(self, p: Parameters, share: float) -> DriveMotion:
         """Return the move at a share of its speed, by the same model: a cut."""
         speed = share * self.speed
         friction = self.friction + p.ft * (speed - self.speed)
         current = (p.Jt * np.gradient(speed, self.dt_s) + friction) / p.K
         return replace(self, speed=speed, friction=friction, current=np.where(self.side != 0, current, self.current))
 
-    def of_shift(self, p: Parameters, shift: Float) -> Float:
+    def compute_bias_momentum(self, p: Parameters, shift: Float) -> Float:
         """Return the momentum (n,) by a shift of the parameters by ``shift`` (6,)."""
         _, _, of_k, of_jt, of_ft, of_cd = shift
         off = of_ft * self.speed + of_cd * self.side - of_k * self.current
-        made: Float = self.integral(off) + of_jt * self.turned(self.speed)
+        made: Float = self.integrate_torque(off) + of_jt * self.accumulate_speed_gain(self.speed)
         return made
 
 
-def to_and_fro(momentum: Float) -> Float:
+def append_return_move(momentum: Float) -> Float:
     """Return the momentum (2 n,) of a move and its immediate return, where dry and viscous friction differ."""
     return np.concatenate([momentum, momentum[-1] - momentum])
 
 
-def weigh(
+def assess_table_error(
     window: Window,
     settings: Identification,
     parameters: Parameters,
-    move: Move,
+    move: DriveMotion,
     noise: tuple[float, float],
     axis: Axis | None,
     sync_period_s: float,
-) -> Weight | None:
+) -> TableErrorBudget | None:
     """Return a model's residual of a window; ``noise`` are the deviations of current (A) and speed (rad/s)."""
-    if not _runs(parameters):
+    if not _can_simulate(parameters):
         return None
-    loop = TableError.of(parameters, window.pitch_mm, axis)
+    loop = TorqueToTableError.derive(parameters, window.pitch_mm, axis)
     whole, left = (
-        compute_rms(row) for row in loop.um(np.array([move.whole(parameters), move.left(parameters)]), window.dt_s)
+        compute_rms(row)
+        for row in loop.convert_momentum_to_um(
+            np.array([move.compute_total_momentum(parameters), move.compute_unexplained_momentum(parameters)]),
+            window.dt_s,
+        )
     )
-    left = _beyond_noise(left, loop, parameters, move, noise)
-    replayed = _replayed(window, parameters, axis, sync_period_s)
+    left = _subtract_noise(left, loop, parameters, move, noise)
+    replayed = _replay_if_configured(window, parameters, axis, sync_period_s)
     if replayed is None and axis is not None:
-        return Weight(left, settings.compute_tolerance_um(whole), whole, left, "own loop")
+        return TableErrorBudget(left, settings.compute_tolerance_um(whole), whole, left, "own loop")
     if replayed is None:
-        limit = min(TOLERANCE_SHARE * max(whole, _followed_um(window)), MOST_SHARE * whole)
-        return Weight(left, limit, whole, left, "ordinary loop")
+        limit = min(TOLERANCE_SHARE * max(whole, _measure_following_error_um(window)), MOST_SHARE * whole)
+        return TableErrorBudget(left, limit, whole, left, "ordinary loop")
     limit = settings.compute_tolerance_um(replayed.measured_um)
-    soft = replayed.unexplained_um > limit and _stiff_um(window, parameters, axis, sync_period_s) <= limit
-    return Weight(replayed.unexplained_um, limit, replayed.measured_um, left, "replay", soft)
+    soft = (
+        replayed.unexplained_um > limit
+        and _replay_without_resonance_um(window, parameters, axis, sync_period_s) <= limit
+    )
+    return TableErrorBudget(replayed.unexplained_um, limit, replayed.measured_um, left, "replay", soft)
 
 
-def _stiff_um(window: Window, parameters: Parameters, axis: Axis | None, sync_period_s: float) -> float:
+def _replay_without_resonance_um(
+    window: Window, parameters: Parameters, axis: Axis | None, sync_period_s: float
+) -> float:
     """Return the residual of a replay without the configured resonance; infinite where none is configured."""
     if axis is None or axis.resonance_hz is None:
         return math.inf
     stiff = replace(parameters, terms=tuple(pair for pair in parameters.terms if not pair[0].startswith("resonance")))
-    replayed = _replayed(window, stiff, axis.model_copy(update={"resonance_hz": None}), sync_period_s)
+    replayed = _replay_if_configured(window, stiff, axis.model_copy(update={"resonance_hz": None}), sync_period_s)
     return math.inf if replayed is None else replayed.unexplained_um
 
 
-def _followed_um(window: Window) -> float:
+def _measure_following_error_um(window: Window) -> float:
     """Return the RMS following error that was recorded beyond that at rest, um; 0 without a recorded demand."""
     apart = (window.position_mm - window.demand_mm)[np.isfinite(window.position_mm - window.demand_mm)]
     if apart.size == 0 or not np.nanmax(window.demand_mm) > np.nanmin(window.demand_mm):
@@ -287,19 +296,23 @@ def _followed_um(window: Window) -> float:
     return 1e3 * compute_rms(apart - apart[0])
 
 
-def _runs(parameters: Parameters) -> bool:
+def _can_simulate(parameters: Parameters) -> bool:
     values = np.array(list(parameters.as_dict().values()))
     return bool(np.isfinite(values).all() and (values[:4] > 0).all())
 
 
-def _replayed(window: Window, parameters: Parameters, axis: Axis | None, sync_period_s: float) -> Replay | None:
-    return None if axis is None else replay_window(window, parameters, axis, sync_period_s)
+def _replay_if_configured(
+    window: Window, parameters: Parameters, axis: Axis | None, sync_period_s: float
+) -> Replay | None:
+    return None if axis is None else replay_with_load_search(window, parameters, axis, sync_period_s)
 
 
-def _beyond_noise(left: float, loop: TableError, p: Parameters, move: Move, noise: tuple[float, float]) -> float:
+def _subtract_noise(
+    left: float, loop: TorqueToTableError, p: Parameters, move: DriveMotion, noise: tuple[float, float]
+) -> float:
     n, dt_s = move.speed.size, move.dt_s
     current_a, speed_rad_s = noise
     moving = float(np.mean(move.side != 0))
-    expected = loop.noise_um(p.Jt * speed_rad_s, p.K * current_a * dt_s, n, dt_s) * math.sqrt(moving)
+    expected = loop.compute_noise_um(p.Jt * speed_rad_s, p.K * current_a * dt_s, n, dt_s) * math.sqrt(moving)
     independent = max(1.0, moving * n * dt_s / max(NOISE_ROWS, dt_s))
     return math.sqrt(max(0.0, left**2 - expected**2 * (1.0 + SCATTER * math.sqrt(2.0 / independent))))

@@ -10,18 +10,29 @@ import numpy as np
 
 from fdhil.identification.identifiability import find_unphysical_values, list_missing_reasons
 from fdhil.records import Reason, Result
-from fdhil.validation.agreement import values_apart
-from fdhil.validation.interruptions import interruptions
-from fdhil.validation.plausibility import clipped, gaps, missing_plateau, missing_stages, not_finite, position_parted
-from fdhil.validation.rest import friction_at_rest, rest_faults
-from fdhil.validation.signal_consistency import copied_signals, dead_signals, unrelated_signals
-from fdhil.validation.simulation import expected_fit_percent
-from fdhil.validation.slow_voltage_checks import current_late, slow_faults_beside, slow_voltage_faults
-from fdhil.validation.stuck import clipped_peaks, stuck_values
+from fdhil.validation.estimate_agreement import find_deviating_values
+from fdhil.validation.interrupted_moves import find_interruptions
+from fdhil.validation.open_loop_simulation import compute_expected_fit_percent
+from fdhil.validation.signal_consistency import find_constant_signals, find_copied_signals, find_unrelated_signals
+from fdhil.validation.signal_plausibility import (
+    check_plateau,
+    compare_position_with_speed,
+    find_clipped_signals,
+    find_gaps,
+    find_invalid_values,
+    find_missing_stages,
+)
+from fdhil.validation.slow_voltage_checks import (
+    check_slow_current_delay,
+    check_slow_voltage_fit,
+    check_slow_voltage_readings,
+)
+from fdhil.validation.standstill_checks import check_sensor_offsets, check_standstill_friction
+from fdhil.validation.stuck_signal import find_clipped_peaks, find_stuck_sensors
 from fdhil.validation.table_assessment import TableAssessment
-from fdhil.validation.timing import timing_faults, voltage_late
+from fdhil.validation.timing_checks import check_fitted_delay, check_signal_delays
+from fdhil.validation.torque_checks import check_torque_delay, check_unexplained_torque, detect_intermittent_load
 from fdhil.validation.window_signals import LEAST_SAMPLES, WindowSignals
-from fdhil.validation.without_voltage import load_comes_and_goes, torque_late, torque_unexplained
 
 NEVER_NEGATIVE = ("dead_time",)
 PLATEAU = "plateau"  # assessed at the table where the rapid was run through the closed loop
@@ -81,7 +92,7 @@ def _check_sample_count(signals: WindowSignals) -> Iterator[Reason]:
 
 
 def _check_backlash(signals: WindowSignals) -> list[Reason]:
-    return [] if signals.backlash is None else [signals.backlash.reason()]
+    return [] if signals.backlash is None else [signals.backlash.build_reason()]
 
 
 def _check_voltage_recorded(signals: WindowSignals) -> Iterator[Reason]:
@@ -101,17 +112,17 @@ def _has_sound_fit(table: TableAssessment) -> bool:
 
 def _check_torque_delay(table: TableAssessment) -> Iterable[Reason]:
     torque = table.fitted.torque
-    return () if torque is None else torque_late(torque, table.fitted.window.dt_s)
+    return () if torque is None else check_torque_delay(torque, table.fitted.window.dt_s)
 
 
 def _check_intermittent_load(table: TableAssessment) -> Iterable[Reason]:
     torque = table.fitted.torque
-    return () if torque is None else load_comes_and_goes(torque, table.signals)
+    return () if torque is None else detect_intermittent_load(torque, table.signals)
 
 
 def _check_unexplained_torque(table: TableAssessment) -> Iterable[Reason]:
     torque = table.fitted.torque
-    return () if torque is None else torque_unexplained(torque)
+    return () if torque is None else check_unexplained_torque(torque)
 
 
 def _check_estimate(table: TableAssessment) -> Iterator[Reason]:
@@ -149,10 +160,10 @@ def _check_stick_slip(table: TableAssessment) -> Iterator[Reason]:
         yield Reason("ValidationFailed", f"friction at low speed is {more:.3g} N.m {text} slips", advice)
     elif budget is not None and resting is not None:
         beyond, um = SURE * resting.deviation_nm, SURE * resting.um
-        known = budget.allows(um) or budget.allows(table.rest_position_error_um)
+        known = budget.is_within_limit(um) or budget.is_within_limit(table.rest_position_error_um)
         if resting.deviation_nm < more <= least < more + beyond and not known:
             may = f"friction at low speed is {more:.3g} +- {beyond:.2g} N.m {text} may slip"
-            limit = f"its position at rest is known to {budget.told(um)}, limit {budget.told(budget.limit_um)}"
+            limit = f"its position at rest is known to {budget.format_error(um)}, limit {budget.format_error(budget.limit_um)}"
             yield Reason("ValidationFailed", f"{may}, and {limit}", advice)
 
 
@@ -162,7 +173,7 @@ def _check_fit_exists(table: TableAssessment) -> Iterator[Reason]:
 
 
 def _check_electrical_delay(table: TableAssessment) -> Iterable[Reason]:
-    return voltage_late(table.fitted) if table.fitted.is_electrically_delayed else ()
+    return check_fitted_delay(table.fitted) if table.fitted.is_electrically_delayed else ()
 
 
 def _check_current_delay(table: TableAssessment) -> Iterable[Reason]:
@@ -170,14 +181,14 @@ def _check_current_delay(table: TableAssessment) -> Iterable[Reason]:
     if fitted.window.slow_voltage is None:
         return ()
     others = max((finding.statistic**2 for finding in fitted.findings), default=0.0)
-    return current_late(fitted.window, fitted.aligned_fit, others)
+    return check_slow_current_delay(fitted.window, fitted.aligned_fit, others)
 
 
 def _check_structure(table: TableAssessment) -> Iterator[Reason]:
     """Yield what the model lacks, each with its cost at the table."""
     for lack in table.fitted.deficiencies:
-        if lack.finding.matters:
-            yield table.append_cost(lack.finding.reason(), table.compute_cost_um(lack))
+        if lack.finding.is_relevant:
+            yield table.append_cost(lack.finding.build_reason(), table.compute_cost_um(lack))
 
 
 def _check_whiteness(table: TableAssessment) -> Iterable[Reason]:
@@ -191,14 +202,14 @@ def _check_excess_noise(table: TableAssessment) -> Iterable[Reason]:
 def _check_voltage_delay(table: TableAssessment) -> Iterable[Reason]:
     fitted = table.fitted
     if fitted.voltage_delay_s:  # a deficiency explains it, where there is one
-        return voltage_late(fitted) if not fitted.deficiencies else ()
-    return timing_faults(fitted) if fitted.has_sound_fit else ()
+        return check_fitted_delay(fitted) if not fitted.deficiencies else ()
+    return check_signal_delays(fitted) if fitted.has_sound_fit else ()
 
 
 def _check_simulated_speed(table: TableAssessment) -> Iterator[Reason]:
     """Yield a reason where the model follows the speed worse than a correct one would."""
     fitted = table.fitted
-    reached, least = fitted.fit_percent, expected_fit_percent(fitted.window, fitted.required_fit)
+    reached, least = fitted.fit_percent, compute_expected_fit_percent(fitted.window, fitted.required_fit)
     if reached is not None and not reached >= least:
         text = f"the model simulated from the measured voltage follows the speed by {reached:.2f} %, not {least:.2f} %"
         yield Reason("ValidationFailed", text, "the drive has an effect that the model lacks")
@@ -206,32 +217,32 @@ def _check_simulated_speed(table: TableAssessment) -> Iterator[Reason]:
 
 def _check_values(table: TableAssessment) -> Iterable[Reason]:
     assert table.fitted.estimate is not None
-    return values_apart(table.fitted.estimate, table.fitted.required_fit.theta[:6])
+    return find_deviating_values(table.fitted.estimate, table.fitted.required_fit.theta[:6])
 
 
 DELAYS = ("late voltage", "late current")
 MODEL = ("estimate", "fit", *DELAYS, "structure", "whiteness", "excess noise", "standstill", "friction at rest")
 SIGNAL_CHECKS: Sequence[Check[WindowSignals]] = (
-    Check("finite", not_finite),
-    Check("stages", lambda signals: missing_stages(signals.window), _is_rapid),
-    Check(PLATEAU, lambda signals: missing_plateau(signals.window), _is_rapid),
-    Check("gaps", gaps, _has_enough_samples, ("finite",)),
-    Check("range", clipped, _has_enough_samples, ("finite",)),
-    Check("dead signal", dead_signals, _has_enough_samples, ("finite",)),
-    Check("copied signal", copied_signals, _has_enough_samples, ("finite",)),
-    Check("unrelated signal", unrelated_signals, _is_long_rapid, ("finite", "dead signal")),
-    Check("position", position_parted, _has_enough_samples, ("finite",)),
+    Check("finite", find_invalid_values),
+    Check("stages", lambda signals: find_missing_stages(signals.window), _is_rapid),
+    Check(PLATEAU, lambda signals: check_plateau(signals.window), _is_rapid),
+    Check("gaps", find_gaps, _has_enough_samples, ("finite",)),
+    Check("range", find_clipped_signals, _has_enough_samples, ("finite",)),
+    Check("dead signal", find_constant_signals, _has_enough_samples, ("finite",)),
+    Check("copied signal", find_copied_signals, _has_enough_samples, ("finite",)),
+    Check("unrelated signal", find_unrelated_signals, _is_long_rapid, ("finite", "dead signal")),
+    Check("position", compare_position_with_speed, _has_enough_samples, ("finite",)),
     # a position that contradicts the speed says nothing about the course of the move
-    Check("whole move", interruptions, _is_long_rapid, ("finite", "position")),
+    Check("whole move", find_interruptions, _is_long_rapid, ("finite", "position")),
     Check("play", _check_backlash, _has_enough_samples, ("finite",)),
-    Check("slow readings", lambda signals: slow_voltage_faults(signals.window)),
+    Check("slow readings", lambda signals: check_slow_voltage_readings(signals.window)),
     Check("voltage", _check_voltage_recorded),
     Check("rows", _check_sample_count, unless=("finite", "stages", PLATEAU, "slow readings", "voltage")),
 )
-STUCK_SENSOR: Check[TableAssessment] = Check("stuck", lambda table: stuck_values(table.fitted))
+STUCK_SENSOR: Check[TableAssessment] = Check("stuck", lambda table: find_stuck_sensors(table.fitted))
 FIT_CHECKS: Sequence[Check[TableAssessment]] = (
     STUCK_SENSOR,
-    Check("cut off", lambda table: clipped_peaks(table.fitted), _has_fit),
+    Check("cut off", lambda table: find_clipped_peaks(table.fitted), _has_fit),
     Check("late torque", _check_torque_delay),
     Check("load", _check_intermittent_load, unless=("late torque",)),
     Check("torque", _check_unexplained_torque, unless=("late torque", "load")),
@@ -244,11 +255,11 @@ FIT_CHECKS: Sequence[Check[TableAssessment]] = (
     Check("whiteness", _check_whiteness, _has_sound_fit, (*DELAYS, "structure"), weighed=True),
     Check("excess noise", _check_excess_noise, _has_sound_fit, (*DELAYS, "structure"), weighed=True),
     # a late current looks like a shaft that moves at rest
-    Check("standstill", lambda table: rest_faults(table.fitted), _has_sound_fit, DELAYS),
-    Check("friction at rest", friction_at_rest, _has_sound_fit, DELAYS, weighed=True),
+    Check("standstill", lambda table: check_sensor_offsets(table.fitted), _has_sound_fit, DELAYS),
+    Check("friction at rest", check_standstill_friction, _has_sound_fit, DELAYS, weighed=True),
     Check("delay", _check_voltage_delay, _has_fit, (*DELAYS, "standstill")),
     Check("simulation", _check_simulated_speed, _has_fit, (*MODEL, "delay"), weighed=True),
     Check("values", _check_values, _has_fit, (*MODEL, "delay")),
-    Check("slow sensor", lambda table: slow_faults_beside(table.fitted), _has_fit, ("range", "slow readings")),
+    Check("slow sensor", lambda table: check_slow_voltage_fit(table.fitted), _has_fit, ("range", "slow readings")),
 )
 WEIGHED = frozenset(check.name for check in FIT_CHECKS if check.weighed)

@@ -12,15 +12,15 @@ from fdhil.identification.likelihood_fit import LikelihoodFit, exclude_delay, fi
 from fdhil.identification.torque_fit import TorqueFit
 from fdhil.identification.voltage_delay import estimate_coarse_delay
 from fdhil.records import PARAMETERS, Estimate, Parameters, Reason, Window
-from fdhil.validation.breakaway import Breakaway, breakaway
-from fdhil.validation.model_deficiencies import Lacking, lacking, widened
-from fdhil.validation.replay import completed
-from fdhil.validation.score_bench import Finding
-from fdhil.validation.sensor_reconstruction import Bridge
-from fdhil.validation.shifts import Shift, late_findings, shifts
-from fdhil.validation.simulation import fit_percent
-from fdhil.validation.structure import DEAD_TIME, findings
-from fdhil.validation.whiteness import coloured, noisy
+from fdhil.validation.breakaway import Breakaway, measure_breakaway
+from fdhil.validation.model_deficiencies import Deficiency, inflate_covariance, select_deficiencies
+from fdhil.validation.move_replay import fill_missing_winding
+from fdhil.validation.open_loop_simulation import compute_fit_percent
+from fdhil.validation.residual_whiteness import find_autocorrelation, find_excess_noise
+from fdhil.validation.score_tests import Finding
+from fdhil.validation.sensor_reconstruction import SensorReconstruction
+from fdhil.validation.signal_delays import SignalDelay, build_delay_findings, estimate_delays
+from fdhil.validation.structure_tests import DEAD_TIME, run_structure_tests
 from fdhil.validation.window_signals import WindowSignals
 
 
@@ -55,16 +55,16 @@ class WindowFit:
             return None
         estimated = self.estimate.build_parameters()
         if self.fit is not None:
-            estimated = completed(estimated, Parameters(*self.fit.theta[:6]))
+            estimated = fill_missing_winding(estimated, Parameters(*self.fit.theta[:6]))
         if self.signals.axis is not None:
-            return completed(estimated, Parameters(**self.signals.axis.nominal.model_dump()))
+            return fill_missing_winding(estimated, Parameters(**self.signals.axis.nominal.model_dump()))
         # behind an ordinary current loop R and L, which need a voltage, have no effect
         return estimated if self.signals.has_voltage else estimated.replace_values(R=1.0, L=1.0)
 
     @cached_property
     def fit_percent(self) -> float | None:
         """Share of the measured speed that the estimate explains when it is simulated from the measured voltage, %."""
-        return None if self.estimate is None else fit_percent(self.window, self.estimate, self.fit)
+        return None if self.estimate is None else compute_fit_percent(self.window, self.estimate, self.fit)
 
     @cached_property
     def voltage_delay_s(self) -> float:
@@ -97,42 +97,42 @@ class WindowFit:
         return bool(np.isfinite(self.aligned_fit.residuals).all() and np.isfinite(self.aligned_fit.information).all())
 
     @cached_property
-    def reconstruction(self) -> Bridge | None:
+    def reconstruction(self) -> SensorReconstruction | None:
         """The fit by which one sensor is reconstructed from the others; None where the fit does not allow that."""
         if self.fit is None:
             return None
         motion, theta = self.fit.problem.motions[0], self.fit.theta
         finite = bool(np.isfinite(theta).all() and np.isfinite(self.fit.problem.noises[0].to_array()).all())
         usable = motion.slow is None and finite and bool((theta[:4] > 0).all()) and abs(theta[6]) <= motion.dt_s
-        return Bridge.over(self.fit) if usable else None
+        return SensorReconstruction.prepare(self.fit) if usable else None
 
     @cached_property
     def findings(self) -> list[Finding]:
         """What the innovations show beyond the model, the most significant first."""
-        return findings(self.aligned_fit)
+        return run_structure_tests(self.aligned_fit)
 
     @cached_property
-    def delays(self) -> tuple[Shift, Shift]:
+    def delays(self) -> tuple[SignalDelay, SignalDelay]:
         """The delays of voltage and current that the innovations show."""
-        return shifts(self.aligned_fit)
+        return estimate_delays(self.aligned_fit)
 
     @cached_property
-    def deficiencies(self) -> list[Lacking]:
+    def deficiencies(self) -> list[Deficiency]:
         """The significant findings, each in addition to those before it."""
         if not self.has_sound_fit:
             return []
-        late = late_findings(self.delays) if self.window.slow_voltage is None else []
-        return lacking(self.aligned_fit, [*self.findings, *late])
+        late = build_delay_findings(self.delays) if self.window.slow_voltage is None else []
+        return select_deficiencies(self.aligned_fit, [*self.findings, *late])
 
     @cached_property
     def autocorrelation(self) -> list[tuple[str, Reason]]:
         """The signals whose innovations are autocorrelated, each with its reason."""
-        return list(coloured(self.aligned_fit))
+        return list(find_autocorrelation(self.aligned_fit))
 
     @cached_property
     def excess_noise(self) -> list[tuple[str, Reason]]:
         """The signals for which the fit needs more noise than they scatter, each with its reason."""
-        return list(noisy(self.aligned_fit, self.window))
+        return list(find_excess_noise(self.aligned_fit, self.window))
 
     @cached_property
     def widened_estimate(self) -> Estimate | None:
@@ -140,14 +140,14 @@ class WindowFit:
         if self.estimate is None or not self.has_sound_fit:
             return self.estimate
         restless = {name for name, _ in (*self.autocorrelation, *self.excess_noise)}
-        named = any(each.finding.matters for each in self.deficiencies)
+        named = any(each.finding.is_relevant for each in self.deficiencies)
         nameless = bool(restless) and not named
-        return widened(self.estimate, self.aligned_fit, self.deficiencies, restless, nameless=nameless)
+        return inflate_covariance(self.estimate, self.aligned_fit, self.deficiencies, restless, nameless=nameless)
 
     @cached_property
     def breakaway(self) -> Breakaway | None:
         """The torque that the move takes to begin beyond the model's friction."""
-        return breakaway(self.window, self.aligned_fit) if self.has_sound_fit else None
+        return measure_breakaway(self.window, self.aligned_fit) if self.has_sound_fit else None
 
     @cached_property
     def lost_voltage_v(self) -> float:

@@ -12,7 +12,7 @@ from fdhil.config import Axis, Identification
 from fdhil.identification.prepared_motion import NoiseLevels, estimate_noise_levels, find_resolution
 from fdhil.identification.rapid_windows import fill_forward, find_moving_range, smooth_samples
 from fdhil.records import Bool, Float, Window
-from fdhil.validation.backlash import DeadBand, backlash
+from fdhil.validation.backlash import DeadBand, detect_backlash
 
 STILL_MM = 0.004  # travel of a table at standstill
 STILL_S, STILL_SHARE = 0.010, 0.02  # time over which that travel is measured, and share of the rapid speed
@@ -99,7 +99,7 @@ class WindowSignals:
     @cached_property
     def backlash(self) -> DeadBand | None:
         """The backlash that the window shows."""
-        return backlash(self.window)
+        return detect_backlash(self.window)
 
     def get_time_s(self, sample: int) -> float:
         """Return the time of a sample in its recording."""

@@ -15,7 +15,7 @@ from fdhil.bounded_process import limit_process, receive_requests
 from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import WINDOWS_FOLDER
 from fdhil.errors import FdhilError
-from fdhil.pipeline.overlay import lay_over
+from fdhil.pipeline.model_overlay import overlay_model
 from fdhil.store.history import History
 from fdhil.store.named_file import open_named
 from fdhil.store.newest_sets import newest_loops
@@ -47,7 +47,7 @@ class Replays:
             raise Refused(404, "NotKept", text, "see the notices of that time")
         with open_named(store / WINDOWS_FOLDER, file) as content:
             window = decode_window(content.read(MAX_FILE_BYTES), file)
-        return signals_of(lay_over(window, self._config, loops))
+        return signals_of(overlay_model(window, self._config, loops))
 
     def answer(self, request: Mapping[str, Any]) -> str:
         try:

@@ -24,4 +24,4 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=2, help="machines of each kind")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kind", default="", help="only kinds whose name contains this")
-    pages.conduct("zoo", parser, lambda o: f"{o.seed} to {o.seed + o.draws - 1}", measure)
+    pages.run_study("zoo", parser, lambda o: f"{o.seed} to {o.seed + o.draws - 1}", measure)

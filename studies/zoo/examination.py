@@ -18,9 +18,16 @@ from click.testing import CliRunner
 from fdhil.cli.main import cli
 from fdhil.errors import FdhilError
 from studies.zoo import peers
-from studies.zoo.files import cut, reported, table_m, write_configuration, write_demand, write_recording
+from studies.zoo.files import (
+    locate_table_m,
+    report_signals,
+    simulate_cut,
+    write_configuration,
+    write_demand,
+    write_recording,
+)
 from studies.zoo.machines import KINDS, Axis, Kind, machine
-from studies.zoo.nc import distance_um, path
+from studies.zoo.nc import make_path, measure_distance_um
 from studies.zoo.plant import Array
 
 NOTHING = {"gain": None, "refused": ["NoModel"]}
@@ -32,28 +39,28 @@ def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
     tasks = [(kind, options.seed + k) for kind in chosen for k in range(options.draws)]
     done = []
     with ProcessPoolExecutor(options.processes) as executor:
-        for found in executor.map(examine, *zip(*tasks, strict=True)):
+        for found in executor.map(examine_machine, *zip(*tasks, strict=True)):
             done.append(found)
             print(f"{len(done)} of {len(tasks)}: {found['kind']}", flush=True)
     return done
 
 
-def examine(kind: Kind, seed: int) -> dict[str, Any]:
+def examine_machine(kind: Kind, seed: int) -> dict[str, Any]:
     """Return the results of fdhil and the other methods for one machine."""
     axes = machine(kind, seed)
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         columns = write_machine(place, axes, seed)
-        identified = _asked("identify", *(f"{place}/{name}.csv" for name in axes), "--config", f"{place}/machine.toml",
+        identified = _run_command("identify", *(f"{place}/{name}.csv" for name in axes), "--config", f"{place}/machine.toml",
                             "--write-model", f"{place}/model.json")  # fmt: skip
         files = {document["axis"]: document for document in identified["files"]}
-        found = {name: _axis(files[name], axis, columns[name]) for name, axis in axes.items()}
+        found = {name: _examine_axis(files[name], axis, columns[name]) for name, axis in axes.items()}
         believed = all(axis["pool"] for axis in found.values())
-        corrected = _corrected(place, axes, place / "model.json") if believed else dict(NOTHING)
+        corrected = _assess_correction(place, axes, place / "model.json") if believed else dict(NOTHING)
         all_the_same = None
-        if corrected["refused"] and (model := _refused_model(files, axes)) is not None:
+        if corrected["refused"] and (model := _build_refused_model(files, axes)) is not None:
             (place / "refused.json").write_text(json.dumps(model), "utf-8")
-            all_the_same = _corrected(place, axes, place / "refused.json")
+            all_the_same = _assess_correction(place, axes, place / "refused.json")
     return {"kind": kind.name, "seed": seed, "axes": found, "correction": corrected, "with_refused": all_the_same}
 
 
@@ -61,15 +68,15 @@ def write_machine(place: Path, axes: Mapping[str, Axis], seed: int) -> dict[str,
     """Write all files of a machine; return the columns of its recordings by axis."""
     kind = next(iter(axes.values())).kind
     write_configuration(place / "machine.toml", axes)
-    write_demand(place / "demand.csv", path(kind.rapids.feed, kind.period_s), kind.period_s)
+    write_demand(place / "demand.csv", make_path(kind.rapids.feed, kind.period_s), kind.period_s)
     columns = {}
     for k, (name, axis) in enumerate(axes.items()):
-        columns[name] = reported(axis, kind.rapids.train(kind.period_s), 10 * seed + k)
+        columns[name] = report_signals(axis, kind.rapids.train(kind.period_s), 10 * seed + k)
         write_recording(place / f"{name}.csv", name, axis, columns[name])
     return columns
 
 
-def _asked(*words: str) -> dict[str, Any]:
+def _run_command(*words: str) -> dict[str, Any]:
     """Return the JSON document that a command of fdhil answers with."""
     answer = CliRunner().invoke(cli, [*words, "--json"])
     if isinstance(answer.exception, FdhilError):
@@ -78,7 +85,7 @@ def _asked(*words: str) -> dict[str, Any]:
     return document
 
 
-def _axis(document: Mapping[str, Any], axis: Axis, columns: Mapping[str, Array]) -> dict[str, Any]:
+def _examine_axis(document: Mapping[str, Any], axis: Axis, columns: Mapping[str, Array]) -> dict[str, Any]:
     """Return the results of one axis: windows, errors of the pool, errors of the other methods."""
     truth, windows, pooled = axis.truth(), document["windows"], document["pooled"]
     believed = [window for window in windows if window["validated"]]
@@ -87,16 +94,16 @@ def _axis(document: Mapping[str, Any], axis: Axis, columns: Mapping[str, Array])
         "windows": len(windows),
         "believed": len(believed),
         "pool": pooled["validated"],
-        "errors": _errors(pooled["parameters"], truth),
-        "window_errors": [_errors(window["parameters"], truth) for window in believed],
-        "reasons": _codes([r for window in windows for r in window["reasons"]]),
-        "pool_reasons": [] if pooled["validated"] else _codes(pooled["reasons"]),
+        "errors": _compute_errors(pooled["parameters"], truth),
+        "window_errors": [_compute_errors(window["parameters"], truth) for window in believed],
+        "reasons": _count_codes([r for window in windows for r in window["reasons"]]),
+        "pool_reasons": [] if pooled["validated"] else _count_codes(pooled["reasons"]),
         "unexplained_um": pooled["unexplained_um"],
-        "peers": {name: _peer(method, axis, columns) for name, method in peers.installed().items()},
+        "peers": {name: _assess_peer(method, axis, columns) for name, method in peers.installed().items()},
     }
 
 
-def _errors(parameters: Mapping[str, Any], truth: Mapping[str, float]) -> dict[str, tuple[float, float] | None]:
+def _compute_errors(parameters: Mapping[str, Any], truth: Mapping[str, float]) -> dict[str, tuple[float, float] | None]:
     """Return per parameter the error as a share of the truth, and in standard deviations."""
     found: dict[str, tuple[float, float] | None] = {}
     for name, true in truth.items():
@@ -105,12 +112,12 @@ def _errors(parameters: Mapping[str, Any], truth: Mapping[str, float]) -> dict[s
     return found
 
 
-def _codes(reasons: Sequence[str]) -> list[str]:
+def _count_codes(reasons: Sequence[str]) -> list[str]:
     """Return the codes of reasons, the most frequent first."""
     return [f"{count} {code}" for code, count in Counter(r.split(":")[0] for r in reasons).most_common(3)]
 
 
-def _peer(method: Any, axis: Axis, columns: Mapping[str, Array]) -> dict[str, float | None]:
+def _assess_peer(method: Any, axis: Axis, columns: Mapping[str, Array]) -> dict[str, float | None]:
     """Return the errors of another method as shares of the truth; None where it gives up."""
     try:
         with np.errstate(all="ignore"):
@@ -120,34 +127,35 @@ def _peer(method: Any, axis: Axis, columns: Mapping[str, Array]) -> dict[str, fl
     return {name: (found[name] - true) / true for name, true in axis.truth().items()}
 
 
-def _corrected(place: Path, axes: Mapping[str, Axis], model: Path) -> dict[str, Any]:
+def _assess_correction(place: Path, axes: Mapping[str, Axis], model: Path) -> dict[str, Any]:
     """Return the result of ``correct`` for the program, and the error at the machine's table."""
     kind = next(iter(axes.values())).kind
-    planned = _asked("correct", f"{place}/demand.csv", "--config", f"{place}/machine.toml", "--model", str(model),
+    planned = _run_command("correct", f"{place}/demand.csv", "--config", f"{place}/machine.toml", "--model", str(model),
                      "--out", f"{place}/offsets.csv")  # fmt: skip
     if "error" in planned:
         return {"gain": None, "refused": [planned["error"]["class"]]}
     rows = np.genfromtxt(place / "offsets.csv", delimiter=",", names=True)
     offsets = {name: rows[f"{name}_offset_um"] for name in axes}
-    wanted = path(kind.rapids.feed, kind.period_s)
+    wanted = make_path(kind.rapids.feed, kind.period_s)
     before, after = (
-        distance_um(wanted, table_m(axes, cut(axes, wanted, each)), kind.period_s) for each in (None, offsets)
+        measure_distance_um(wanted, locate_table_m(axes, simulate_cut(axes, wanted, each)), kind.period_s)
+        for each in (None, offsets)
     )
     return {
         "gain": planned["gain"],
         "said": [planned["before"]["rms_um"], planned["after"]["rms_um"]],
-        "got": [rms(before), rms(after)],
+        "got": [compute_rms(before), compute_rms(after)],
         "worse_um": float((after - before).max()),
         "refused": [reason["code"] for reason in planned["refused"]],
     }
 
 
-def rms(values: Array) -> float:
+def compute_rms(values: Array) -> float:
     """Return the root of the mean square."""
     return math.sqrt(float(np.mean(np.square(values))))
 
 
-def _refused_model(files: Mapping[str, Any], axes: Mapping[str, Axis]) -> dict[str, Any] | None:
+def _build_refused_model(files: Mapping[str, Any], axes: Mapping[str, Axis]) -> dict[str, Any] | None:
     """Return the model that was refused: of each axis the median of its windows, where they have values."""
     model = {}
     for name in axes:

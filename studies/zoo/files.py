@@ -13,26 +13,26 @@ from studies.zoo.machines import Axis
 from studies.zoo.plant import Array, Motion, run
 
 
-def reported(axis: Axis, setpoint_m: Array, seed: int) -> dict[str, Array]:
+def report_signals(axis: Axis, setpoint_m: Array, seed: int) -> dict[str, Array]:
     """Return the columns of a recording of one motion, SI units."""
     kind, rng = axis.kind, np.random.default_rng(seed)
     ahead = kind.reports.ahead
     followed = np.concatenate([np.full(ahead, setpoint_m[0]), setpoint_m[: len(setpoint_m) - ahead]])
     moved = run(axis.plant, axis.drive, followed, kind.period_s)
     return {
-        "voltage_V": _noisy(getattr(moved, kind.reports.voltage) * kind.reports.scale, kind.reports.noise, rng),
-        "current_A": _noisy(getattr(moved, kind.reports.current) * kind.reports.scale, kind.reports.noise, rng),
+        "voltage_V": _add_noise(getattr(moved, kind.reports.voltage) * kind.reports.scale, kind.reports.noise, rng),
+        "current_A": _add_noise(getattr(moved, kind.reports.current) * kind.reports.scale, kind.reports.noise, rng),
         "speed_rad_per_s": moved.speed,
-        "position_m": metres(axis, moved.motor),
+        "position_m": convert_to_metres(axis, moved.motor),
         "demand_m": setpoint_m,
     }
 
 
-def _noisy(values: Array, share: float, rng: np.random.Generator) -> Array:
+def _add_noise(values: Array, share: float, rng: np.random.Generator) -> Array:
     return values + share * float(np.abs(values).max()) * rng.standard_normal(values.size)
 
 
-def metres(axis: Axis, angle_rad: Array) -> Array:
+def convert_to_metres(axis: Axis, angle_rad: Array) -> Array:
     """Return the travel (n,) in m of an angle at the motor."""
     return angle_rad * axis.plant.pitch_m / (2 * math.pi)
 
@@ -59,16 +59,16 @@ def write_configuration(path: Path, axes: Mapping[str, Axis]) -> None:
     period_s = next(iter(axes.values())).kind.period_s
     lines = ["[machine]", 'name = "zoo"', f"sync_period_s = {period_s}"]
     for name, axis in axes.items():
-        lines += _table(f"axis.{name}", axis.section)
+        lines += _format_table(f"axis.{name}", axis.section)
     path.write_text("\n".join(lines) + "\n", "utf-8")
 
 
-def _table(name: str, values: Mapping[str, Any]) -> list[str]:
+def _format_table(name: str, values: Mapping[str, Any]) -> list[str]:
     lines = [f"[{name}]"]
     lines += [f"{key} = {value!r}".replace("'", '"') for key, value in values.items() if not isinstance(value, dict)]
     for key, value in values.items():
         if isinstance(value, dict):
-            lines += _table(f"{name}.{key}", value)
+            lines += _format_table(f"{name}.{key}", value)
     return lines
 
 
@@ -78,7 +78,9 @@ def write_demand(path: Path, path_m: Array, period_s: float) -> None:
     path.write_text("\n".join(["time_s,X_mm,Y_mm", *rows]) + "\n", "utf-8")
 
 
-def cut(axes: Mapping[str, Axis], path_m: Array, offset_um: Mapping[str, Array] | None = None) -> dict[str, Motion]:
+def simulate_cut(
+    axes: Mapping[str, Axis], path_m: Array, offset_um: Mapping[str, Array] | None = None
+) -> dict[str, Motion]:
     """Cut the path (n, 2), with offsets (n,) in um per axis where there are some."""
     offsets = offset_um or {}
     return {
@@ -87,6 +89,6 @@ def cut(axes: Mapping[str, Axis], path_m: Array, offset_um: Mapping[str, Array] 
     }
 
 
-def table_m(axes: Mapping[str, Axis], moved: Mapping[str, Motion]) -> Array:
+def locate_table_m(axes: Mapping[str, Axis], moved: Mapping[str, Motion]) -> Array:
     """Return where the table is (n, d), m."""
-    return np.column_stack([metres(axis, moved[name].table) for name, axis in axes.items()])
+    return np.column_stack([convert_to_metres(axis, moved[name].table) for name, axis in axes.items()])

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from studies.zoo.nc import move, positions
+from studies.zoo.nc import make_move, make_set_points
 from studies.zoo.plant import STEP_S, Array, Drive, Plant
 
 Rng = np.random.Generator
@@ -51,11 +51,11 @@ class Rapids:
 
     def _back_and_forth(self, lengths: tuple[float, ...], shares: tuple[float, ...], period_s: float) -> Array:
         moves = [
-            move(sign * length, share * self.speed, self.acceleration, self.jerk, period_s)
+            make_move(sign * length, share * self.speed, self.acceleration, self.jerk, period_s)
             for length, share in zip(lengths, shares, strict=True)
             for sign in (1, -1)
         ]
-        return positions(moves, 0.3, period_s)
+        return make_set_points(moves, 0.3, period_s)
 
 
 @dataclass(frozen=True, slots=True)

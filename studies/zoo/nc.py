@@ -11,31 +11,31 @@ import numpy as np
 from studies.zoo.plant import Array
 
 
-def _boxed(rate: Array, seconds: float, period_s: float) -> Array:
+def _smooth_moving_average(rate: Array, seconds: float, period_s: float) -> Array:
     """Return a speed after a moving average, longer by its length; the distance stays."""
     n = round(seconds / period_s)
     return np.convolve(rate, np.ones(n) / n) if n > 1 else rate
 
 
-def move(distance: float, speed: float, acceleration: float, jerk: float, period_s: float) -> Array:
+def make_move(distance: float, speed: float, acceleration: float, jerk: float, period_s: float) -> Array:
     """Return the speeds (m/s) of a move over ``distance`` (m, signed); ``jerk`` 0 m/s3 is a trapezoid."""
     length = abs(distance)
     top = min(speed, math.sqrt(length * acceleration))
     cruise = max(1, round(length / top / period_s))
     rate = np.full(cruise, length / (cruise * period_s))
-    rate = _boxed(rate, top / acceleration, period_s)
-    rate = _boxed(rate, acceleration / jerk if jerk else 0.0, period_s)
+    rate = _smooth_moving_average(rate, top / acceleration, period_s)
+    rate = _smooth_moving_average(rate, acceleration / jerk if jerk else 0.0, period_s)
     return math.copysign(1.0, distance) * rate
 
 
-def positions(parts: Sequence[Array], rest_s: float, period_s: float) -> Array:
+def make_set_points(parts: Sequence[Array], rest_s: float, period_s: float) -> Array:
     """Return the set-points (m) of moves with a rest before, between and after them."""
     rest = np.zeros(round(rest_s / period_s))
     rates = np.concatenate([rest, *(part for one in parts for part in (one, rest))])
     return np.concatenate([[0.0], np.cumsum(rates) * period_s])
 
 
-def path(feed_m_s: float, period_s: float, smoothing_s: tuple[float, float] = (0.060, 0.030)) -> Array:
+def make_path(feed_m_s: float, period_s: float, smoothing_s: tuple[float, float] = (0.060, 0.030)) -> Array:
     """Return the set-points (n, 2) in m of a circle (radius 30 mm) and a square (40 mm), each axis smoothed."""
     circle = np.linspace(0.0, 2 * np.pi, 2001)
     corners = np.array([[0.0, 0.0], [0.04, 0.0], [0.04, 0.04], [0.0, 0.04], [0.0, 0.0]])
@@ -59,7 +59,7 @@ def path(feed_m_s: float, period_s: float, smoothing_s: tuple[float, float] = (0
     return np.column_stack(smooth)
 
 
-def distance_um(path_m: Array, points_m: Array, period_s: float, reach_s: float = 0.4) -> Array:
+def measure_distance_um(path_m: Array, points_m: Array, period_s: float, reach_s: float = 0.4) -> Array:
     """Return the distance (n,) in um of each point from the polyline of the path within ``reach_s`` of its time."""
     reach = round(reach_s / period_s)
     found = np.empty(len(points_m))

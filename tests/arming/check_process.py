@@ -14,7 +14,7 @@ import fdhil
 from fdhil.arming.background_check import FOLDER
 from fdhil.arming.code_digest import MAKER, code_files
 from fdhil.config import MachineConfig
-from fdhil.prediction.models import nominal_models
+from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.program import program_digest
 
 
@@ -23,7 +23,7 @@ def asked(program: Path, config: MachineConfig, folder: Path) -> bytes:
         "program": str(program),
         "program_digest": program_digest(program),
         "config": config.model_dump(mode="json"),
-        "models": {axis: model.as_dict() for axis, model in nominal_models(config).items()},
+        "models": {axis: model.as_dict() for axis, model in build_nominal_models(config).items()},
         "folder": str(folder / FOLDER),
         "key": "key",
     }

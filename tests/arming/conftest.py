@@ -35,4 +35,4 @@ def program(tmp_path: Path) -> Path:
 @pytest.fixture
 def planned(config: MachineConfig, program: Path) -> Correction:
     models = {axis: published().parameters for axis in "XY"}
-    return correction.plan(load_trajectory(program, config), models, config)
+    return correction.plan_correction(load_trajectory(program, config), models, config)

@@ -14,9 +14,9 @@ from fdhil.arming.first_block import FirstBlock
 from fdhil.arming.program_check import encoded
 from fdhil.arming.standstill import WATCHED_S, AtRest, Standstill
 from fdhil.config import MachineConfig
-from fdhil.correction import PlanLimits, check
-from fdhil.prediction import contour_error_um
-from fdhil.prediction.models import nominal_models
+from fdhil.correction import PlanLimits, check_offsets
+from fdhil.prediction import compute_contour_error_um
+from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.program import load_trajectory
 from fdhil.records import AxisSamples, Float, Parameters, freeze_array, freeze_integers
 from studies import real_plant
@@ -26,7 +26,7 @@ from tests.model.reference_drive import ReferenceDrive
 from tests.paths import compute_rms
 
 CONFIG = bench_config()
-MODELS = nominal_models(CONFIG)
+MODELS = build_nominal_models(CONFIG)
 CUT_ROWS = 1000
 LONG = "G21 G90 G94\nG1 Y55 F10000\nG1 X100\nG1 Y5\nG1 X0\nG4 P0.2\nM2\n"
 SHORT = "G21 G90 G94\nG1 X20 F4000\nG1 Y20\nG4 P0.2\nM2\n"
@@ -36,7 +36,7 @@ def checked(folder: Path, text: str, models: dict[str, Parameters], config: Mach
     program = folder / "part.ngc"
     program.write_text(text)
     reference = load_trajectory(program, config)
-    planned = correction.plan(reference, models, config, "inverse")
+    planned = correction.plan_correction(reference, models, config, "inverse")
     assert not planned.refused
     rows = np.frombuffer(encoded(reference.position_mm, planned.offset_um, config), "<i4").reshape(-1, 4).T.tolist()
     return program, Piece(0, dict(zip("XY", rows[:2], strict=True)), dict(zip("XY", rows[2:], strict=True)), True)
@@ -57,7 +57,7 @@ def cut(program: Path, piece: Piece, amperes: dict[str, float], config: MachineC
         drive.current_sum = MODELS[axis].R * amperes[axis]
         offset_mm = np.array(piece.offset[axis][:CUT_ROWS]) / config.axis[axis].scaling.increments_per_mm
         positions.append(drive.follow_demand((path + config.axis[axis].drive.sign * offset_mm).tolist()))
-    return contour_error_um(reference.path_mm, np.column_stack(positions), 0.001, 0)
+    return compute_contour_error_um(reference.path_mm, np.column_stack(positions), 0.001, 0)
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -81,8 +81,8 @@ def test_the_error_before_the_first_corner_is_gone(text: str, tmp_path: Path) ->
     for axis in "XY":
         assert len(anew.offset[axis]) == len(begin.offset[axis])
         assert anew.offset[axis][1700:] == begin.offset[axis][1700:] or text == SHORT
-        limits = PlanLimits.compute_effective(CONFIG.axis[axis], 0.001)
-        assert check(np.array(anew.offset[axis]), limits) == []
+        limits = PlanLimits.derive(CONFIG.axis[axis], 0.001)
+        assert check_offsets(np.array(anew.offset[axis]), limits) == []
 
 
 def test_rows_that_are_right_already_stay(tmp_path: Path) -> None:
@@ -127,8 +127,8 @@ def test_a_load_shifts_what_the_axes_hold(tmp_path: Path) -> None:
         for axis, path in reference.position_mm.items():
             ordered = path + np.array(piece.offset[axis]) / CONFIG.axis[axis].scaling.increments_per_mm
             start = np.array([amperes[axis], 0.0, 0.0, 0.0, 0.0, amperes[axis], plant.R * amperes[axis]])
-            positions.append(real_plant.run(plant, ordered * 1e-3, start=start).table_m * 1e3)
-        error.append(contour_error_um(reference.path_mm, np.column_stack(positions), 0.001))
+            positions.append(real_plant.simulate_axis(plant, ordered * 1e-3, start=start).table_m * 1e3)
+        error.append(compute_contour_error_um(reference.path_mm, np.column_stack(positions), 0.001))
     assert compute_rms(error[1]) < 0.2 * compute_rms(error[0])
     assert compute_rms(error[1]) < 0.3
 

@@ -15,8 +15,13 @@ from fdhil.arming import passes
 from fdhil.arming.passes import Pass
 from fdhil.arming.preparing import Armament, Refused
 from fdhil.config import MachineConfig
-from fdhil.prediction import contour_error_um
-from fdhil.prediction.gain import Gain, format_half_interval, joint_held_out_um, worst_skill_um
+from fdhil.prediction import compute_contour_error_um
+from fdhil.prediction.correction_gain import (
+    CorrectionGain,
+    combine_held_out_um,
+    find_worst_rms_um,
+    format_half_interval,
+)
 from fdhil.records import AxisSamples, Correction, Float, Notice, Skill, freeze_array, freeze_integers
 from tests.arming.mill import Mill
 from tests.arming.test_ahead import opened
@@ -68,7 +73,7 @@ def test_a_pass_is_measured_as_a_prediction_is_whatever_its_pieces(
         told = running.measured()
         assert told is not None
         path, is_at = (np.column_stack([of[a] for a in "XY"]) for of in (reference.position_mm, after.predicted_mm))
-        error = contour_error_um(path, is_at, reference.dt_s)
+        error = compute_contour_error_um(path, is_at, reference.dt_s)
         assert told["measured"]["max_um"] == pytest.approx(float(error.max()), rel=1e-6)
         if rows is not None:
             assert told["rows"] == rows
@@ -136,7 +141,7 @@ async def test_each_pass_is_told_beside_what_was_predicted(
 
 
 def test_a_gain_is_bounded_by_the_parameters_spread_and_by_the_skill(config: MachineConfig, program: Path) -> None:
-    def predicted(**changes: Any) -> Gain:
+    def predicted(**changes: Any) -> CorrectionGain:
         found = whole(program, config, **changes)
         assert isinstance(found, Armament)
         return found.predicted
@@ -164,12 +169,12 @@ def test_program_is_not_armed_when_the_last_moves_show_errors_that_make_a_positi
 
 
 def test_gain_includes_what_held_out_moves_show_and_is_unknown_where_an_axis_has_none() -> None:
-    assert joint_held_out_um({"X": 3.0, "Y": 4.0}, ("X", "Y")) == pytest.approx(5.0)
-    assert joint_held_out_um({"X": 3.0}, ("X", "Y")) is None
-    assert joint_held_out_um({"X": 3.0}, ()) is None
-    assert worst_skill_um({"X": (Skill("X", 1, 2.0, 9.0, 0.0, 9.0), Skill("X", 2, 3.0, 9.0, 0.0, 9.0)), "Y": ()}) == {
-        "X": 3.0
-    }
+    assert combine_held_out_um({"X": 3.0, "Y": 4.0}, ("X", "Y")) == pytest.approx(5.0)
+    assert combine_held_out_um({"X": 3.0}, ("X", "Y")) is None
+    assert combine_held_out_um({"X": 3.0}, ()) is None
+    assert find_worst_rms_um(
+        {"X": (Skill("X", 1, 2.0, 9.0, 0.0, 9.0), Skill("X", 2, 3.0, 9.0, 0.0, 9.0)), "Y": ()}
+    ) == {"X": 3.0}
 
 
 def test_a_spread_below_the_digits_is_not_zero() -> None:

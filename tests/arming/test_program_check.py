@@ -26,7 +26,7 @@ from fdhil.arming.preparing import ArmRequest, prepare, prepare_armament
 from fdhil.arming.program_check import KEPT, SCHEMA, answer_request, check, encoded, keep
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError, StoreError
-from fdhil.prediction.models import nominal_models, with_loops
+from fdhil.prediction.axis_models import apply_loops, build_nominal_models
 from fdhil.program import load_trajectory, program_digest
 from fdhil.records import Reason
 from tests.arming.check_process import answered, asked, says_instead
@@ -52,7 +52,7 @@ def written(folder: Path, text: str) -> Path:
 
 def checked(program: Path, config: MachineConfig) -> tuple[dict[str, Any], bytes, list[Any]]:
     body, told = io.BytesIO(), list[Any]()
-    header = check(program, program_digest(program), nominal_models(config), config, body, told.append)
+    header = check(program, program_digest(program), build_nominal_models(config), config, body, told.append)
     return header, body.getvalue(), told
 
 
@@ -60,7 +60,9 @@ def checked(program: Path, config: MachineConfig) -> tuple[dict[str, Any], bytes
 def test_the_rows_are_those_of_the_whole_plan(config: MachineConfig, tmp_path: Path) -> None:
     program = written(tmp_path, LONG)
     header, body, told = checked(program, config)
-    planned = correction.plan(load_trajectory(program, config), nominal_models(config), config, "inverse")
+    planned = correction.plan_correction(
+        load_trajectory(program, config), build_nominal_models(config), config, "inverse"
+    )
     assert body == encoded(planned.before.reference.position_mm, planned.offset_um, config)
     rows = np.frombuffer(body, "<i4").reshape(-1, 4)
     assert header["refused"] == []
@@ -93,7 +95,7 @@ def test_a_block_is_written_before_it_is_told(config: MachineConfig, tmp_path: P
             seen = end
 
     with file.open("wb") as body:
-        check(program, program_digest(program), nominal_models(config), config, body, look)
+        check(program, program_digest(program), build_nominal_models(config), config, body, look)
     assert seen > 15_000
 
 
@@ -179,7 +181,7 @@ async def _twice(config: MachineConfig, found: ArmRequest) -> list[CheckedProgra
 async def test_an_abandoned_check_says_so_and_leaves_nothing(config: MachineConfig, tmp_path: Path) -> None:
     program = written(tmp_path, HEAD + SQUARE * 2000 + "M2\n")
     check = BackgroundCheck(config)
-    running = asyncio.create_task(check.run(program, program_digest(program), nominal_models(config), whole))
+    running = asyncio.create_task(check.run(program, program_digest(program), build_nominal_models(config), whole))
     async with asyncio.timeout(500):
         while not (check.progress or {}).get("checked_s"):  # noqa: ASYNC110 - what another process says has no event
             await asyncio.sleep(0.05)
@@ -201,7 +203,7 @@ async def test_a_subroutine_beside_the_program_belongs_to_it(config: MachineConf
     beside = tmp_path / "square.ngc"
     beside.write_text(BESIDE)
     program = written(tmp_path, CALLS)
-    digest, models = program_digest(program), nominal_models(config)
+    digest, models = program_digest(program), build_nominal_models(config)
     folder, key = config.store.directory / FOLDER, BackgroundCheck(config)._key(digest, models, config)
     header = keep(folder, key, lambda body: check(program, digest, models, config, body, lambda _told: None))
     assert header["files"] == {"square.ngc": program_digest(beside)}
@@ -232,7 +234,7 @@ def test_what_changes_while_it_is_checked_is_refused(which: str, config: Machine
             file.write("(another)\n")
 
     with pytest.raises(ProgramError, match=f"{which} was modified while it was checked"):
-        check(program, program_digest(program), nominal_models(config), config, io.BytesIO(), change)
+        check(program, program_digest(program), build_nominal_models(config), config, io.BytesIO(), change)
 
 
 @pytest.mark.usefixtures("processes")
@@ -241,7 +243,7 @@ async def test_a_process_that_dies_within_a_line_is_told(
 ) -> None:
     program = written(tmp_path, LONG)
     says_instead(monkeypatch, tmp_path, 'read line\nprintf \'{"header": {"ref\'\nexit 9\n')
-    refused = await BackgroundCheck(config).run(program, program_digest(program), nominal_models(config), whole)
+    refused = await BackgroundCheck(config).run(program, program_digest(program), build_nominal_models(config), whole)
     assert isinstance(refused, tuple)
     assert (refused[0].code, "exit code 9" in refused[0].text) == ("InternalError", True)
 
@@ -252,7 +254,7 @@ async def test_a_process_that_cannot_be_started_is_told(
 ) -> None:
     program, check = written(tmp_path, LONG), BackgroundCheck(config)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "absent"))
-    refused = await check.run(program, program_digest(program), nominal_models(config), whole)
+    refused = await check.run(program, program_digest(program), build_nominal_models(config), whole)
     assert isinstance(refused, tuple)
     assert refused[0].text == "the check cannot be started (No such file or directory)"
     await check.attend()  # it is no fault of the daemon
@@ -267,7 +269,7 @@ async def test_a_broken_program_is_refused_with_its_line_by_a_process_that_ends(
     assert json.loads(answer.splitlines()[-1])["error"]["code"] == "ProgramError"
     (tmp_path / "answer").write_bytes(answer)
     says_instead(monkeypatch, tmp_path, f"read line\nexec cat '{tmp_path / 'answer'}'\n")
-    refused = await BackgroundCheck(config).run(program, program_digest(program), nominal_models(config), whole)
+    refused = await BackgroundCheck(config).run(program, program_digest(program), build_nominal_models(config), whole)
     assert isinstance(refused, tuple)
     assert refused[0].code == "ProgramError"
     assert "43" in refused[0].text
@@ -366,9 +368,9 @@ def test_a_store_that_refuses_is_told(tmp_path: Path) -> None:
 
 def test_rows_of_other_terms_or_loops_are_other_rows(config: MachineConfig, tmp_path: Path) -> None:
     program = written(tmp_path, HEAD + SQUARE + "G4 P0.3\nM2\n")
-    digest, six = program_digest(program), nominal_models(config)
+    digest, six = program_digest(program), build_nominal_models(config)
     rich = {axis: model.replace_values(stribeck=2.0, stribeck_speed=10.0) for axis, model in six.items()}
-    filtered = with_loops(config, {axis: {"speed_filter_s": 5e-4} for axis in config.axis}, "test")
+    filtered = apply_loops(config, {axis: {"speed_filter_s": 5e-4} for axis in config.axis}, "test")
     background, bodies = BackgroundCheck(config), dict[str, bytes]()
     for models, machine in ((six, config), (rich, config), (six, filtered)):
         key = background._key(digest, models, machine)

@@ -17,7 +17,7 @@ from fdhil.arming.program_check import check, encoded
 from fdhil.arming.whole_plan import plan_whole
 from fdhil.config import MachineConfig, parse_config
 from fdhil.errors import ProgramError
-from fdhil.prediction.models import nominal_models
+from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.program import program_digest
 from tests.arming.test_preparing import whole
 from tests.bench import bench_config, bench_document
@@ -34,7 +34,7 @@ def test_rows_are_in_the_drives_increments_and_sign() -> None:
     document = copy.deepcopy(bench_document())
     document["axis"]["Y"]["drive"] = {"sign": -1}
     config = parse_config(document)
-    planned = correction.plan(build_bench_trajectory(10), nominal_models(config), config, "mirror")
+    planned = correction.plan_correction(build_bench_trajectory(10), build_nominal_models(config), config, "mirror")
     position = planned.before.reference.position_mm
     rows = np.frombuffer(encoded(position, planned.offset_um, config), "<i4").reshape(-1, 4)
     per_mm = 65536 / 20
@@ -71,7 +71,7 @@ def test_a_program_beyond_32_bits_is_refused_whichever_way_it_is_checked(tmp_pat
         with pytest.raises(ProgramError, match=told):
             whole(program, config, method)
     with pytest.raises(ProgramError, match=told):
-        check(program, program_digest(program), nominal_models(config), config, io.BytesIO(), print)
+        check(program, program_digest(program), build_nominal_models(config), config, io.BytesIO(), print)
 
 
 @pytest.mark.parametrize("name", ["program.ngc", "program.csv"])
@@ -79,7 +79,7 @@ def test_rows_and_digest_are_of_one_content(name: str, config: MachineConfig, tm
     program, other = tmp_path / name, tmp_path / "other"
     texts = {".ngc": FAR.format(30), ".csv": "time_s,X_mm,Y_mm\n0.000,0,0\n0.001,0,0\n0.002,0,0\n"}
     program.write_text(texts[program.suffix])
-    request = ArmRequest(program, program_digest(program), nominal_models(config), config, "mirror")
+    request = ArmRequest(program, program_digest(program), build_nominal_models(config), config, "mirror")
     other.write_text(texts[program.suffix].replace("0", "0.0", 1))
     other.rename(program)
     with pytest.raises(ProgramError, match="was modified while it was checked"):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fdhil.cli.advise_view import show
-from fdhil.prediction.advise import Advice, Held
+from fdhil.prediction.feed_advice import FeedAdvice, FeedResult
 from tests.bench import bench_toml
 from tests.cli.test_predict import _bench as _bench
 from tests.cli.test_predict import invoke
@@ -82,9 +82,9 @@ def test_many_lines_become_few_ranges_and_a_program_that_keeps_the_tolerance(wav
     )
 
 
-def made(line: int, feed: float, error_um: float = 30.0) -> Advice:
-    held = Held(feed / 3000.0, feed / 3000.0, 1.0, feed / 3000.0)
-    return Advice(
+def made(line: int, feed: float, error_um: float = 30.0) -> FeedAdvice:
+    held = FeedResult(feed / 3000.0, feed / 3000.0, 1.0, feed / 3000.0)
+    return FeedAdvice(
         line, line / 10, (line + 1) / 10, error_um, "X 1.0", "corner", "X", ("X", "current", 0.5), 3000.0, held, None
     )
 

@@ -34,7 +34,7 @@ SETTINGS = Identification()
 def recordings(tmp_path: Path) -> list[Path]:
     paths = [tmp_path / f"{k}.csv" for k in range(2)]
     for k, path in enumerate(paths):
-        path.write_text(bench.as_csv(simulate_bench_shuttle(moves=2), 0.003, seed=k))
+        path.write_text(bench.format_as_csv(simulate_bench_shuttle(moves=2), 0.003, seed=k))
     return paths
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from fdhil.api import compilation_notice
-from fdhil.correction import kernels
+from fdhil.correction import offset_kernels
 
 
 def test_a_cold_cache_is_told_once_with_its_seconds(
@@ -27,14 +27,16 @@ def test_a_cold_cache_is_told_once_with_its_seconds(
 
 def test_what_numba_keeps_is_found_where_it_keeps_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The cache of a kernel of this process is the one that is examined."""
-    source = Path(kernels.__file__)
-    assert Path(kernels._differences.stats.cache_path) in list(compilation_notice._list_cache_folders(source))  # type: ignore[attr-defined]
+    source = Path(offset_kernels.__file__)
+    assert Path(offset_kernels._compute_differences.stats.cache_path) in list(
+        compilation_notice._list_cache_folders(source)
+    )  # type: ignore[attr-defined]
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     folder = tmp_path / f"{source.parent.name}_0"
     folder.mkdir()
     version = f"py{sys.version_info.major}{sys.version_info.minor}"
     made = folder / f"kernels._solve_plain-51.{version}.nbi"
     made.touch()
-    assert compilation_notice.is_compiled("fdhil.correction.kernels")
+    assert compilation_notice.is_compiled("fdhil.correction.offset_kernels")
     os.utime(made, (0, 0))  # older than the source: numba recompiles
-    assert not compilation_notice.is_compiled("fdhil.correction.kernels")
+    assert not compilation_notice.is_compiled("fdhil.correction.offset_kernels")

@@ -9,7 +9,7 @@ from fdhil.api.loop_comparison import list_equivalent_loops
 from fdhil.config.regulators import Regulators
 from fdhil.model import closed_loop
 from fdhil.records import LoopEstimate, Parameters, Verdict, freeze_array
-from studies.bench import shuttle
+from studies.bench import make_shuttle_demand
 from tests.bench import bench_config
 
 NAMES = ("position_gain_per_s", "speed_feedforward", "speed_kp", "position_ki_per_s2")
@@ -34,7 +34,7 @@ def test_no_cascade_is_the_same_without_real_gains_or_with_part_of_the_speed_fed
 @pytest.mark.usefixtures("long_computation")
 def test_exchanged_cascade_follows_a_rapid_alike() -> None:
     axis = bench_config().axis["X"]
-    model, demand_mm = Parameters(**axis.nominal.model_dump()), 1e3 * shuttle()
+    model, demand_mm = Parameters(**axis.nominal.model_dump()), 1e3 * make_shuttle_demand()
     g = axis.regulators
     names = ("position_gain_per_s", "speed_feedforward", "speed_kp", "speed_ki")
     cascade = found("p_pi_pi", names, (g.position_gain_per_s, 1.0, g.speed_kp, g.speed_ki))

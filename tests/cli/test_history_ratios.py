@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fdhil.config import Identification
-from fdhil.pipeline import analyse
+from fdhil.pipeline import analyse_window
 from fdhil.records import freeze_array
 from fdhil.store.history import History
 from fdhil.store.rows import Stamp
@@ -29,7 +29,7 @@ def deaf(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tmp_path = tmp_path_factory.mktemp("deaf")
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)
-    analysed = analyse(replace(find_noisy_windows(0.003)[0], axis="X", voltage_v=None), Identification())
+    analysed = analyse_window(replace(find_noisy_windows(0.003)[0], axis="X", voltage_v=None), Identification())
     assert analysed.estimate is not None
     deviations = np.sqrt(np.diag(analysed.estimate.covariance))
     rng = np.random.default_rng(4)
@@ -66,7 +66,7 @@ def test_what_the_data_sheet_gives_has_no_trend(tmp_path: Path, capsys: Any) -> 
     machine = config_of(tmp_path, ("X",))
     with History.open(machine.store.directory) as history:
         for day, window in enumerate(find_noisy_windows(0.003, moves=4)):
-            analysed = analyse(replace(window, voltage_v=None), Identification(), machine.axis["X"], 0.001)
+            analysed = analyse_window(replace(window, voltage_v=None), Identification(), machine.axis["X"], 0.001)
             assert analysed.verdict.accepted, analysed.verdict
             history.add_window(analysed, "", Stamp(START_S + 86_400.0 * day, "boot", window.start_tick))
     document = json.loads(fdhil("history", path, "--json", capsys=capsys)[1])

@@ -19,7 +19,7 @@ from fdhil.errors import ConfigError
 from fdhil.store import suffixes
 from fdhil.store.export import export_table, table_of
 from studies import bench
-from studies.slow_sensor import slow_windows
+from studies.slow_sensor import record_slow_windows
 from tests.bench import bench_toml
 from tests.identification.bench_recordings import simulate_bench_shuttle
 
@@ -27,7 +27,7 @@ from tests.identification.bench_recordings import simulate_bench_shuttle
 @pytest.fixture
 def shuttle(tmp_path: Path) -> Path:
     path = tmp_path / "shuttle.csv"
-    path.write_text(bench.as_csv(simulate_bench_shuttle(moves=2), 0.003))
+    path.write_text(bench.format_as_csv(simulate_bench_shuttle(moves=2), 0.003))
     return path
 
 
@@ -68,7 +68,7 @@ def test_json_holds_every_window_and_the_pool(shuttle: Path) -> None:
 
 def test_the_delay_of_a_slow_sensor_is_told_with_its_deviation(tmp_path: Path) -> None:
     path = tmp_path / "slow.csv"
-    export_table(table_of(slow_windows(0.005, delay_s=0.0012)[0]), path)
+    export_table(table_of(record_slow_windows(0.005, delay_s=0.0012)[0]), path)
     result = invoke(path, "--json")
     assert result.return_value == 0
     (window,) = told_document(result)["files"][0]["windows"]
@@ -100,7 +100,11 @@ def test_the_table_fits_a_terminal_of_80_columns(shuttle: Path, monkeypatch: pyt
 
 def test_refused_is_exit_1_with_null_values(tmp_path: Path) -> None:
     path = tmp_path / "still.csv"
-    path.write_text(bench.as_csv(bench.run(bench.Plant(), bench.shuttle(distance=0.02, speed=0.1)), 0.003))
+    path.write_text(
+        bench.format_as_csv(
+            bench.simulate_bench(bench.Plant(), bench.make_shuttle_demand(distance=0.02, speed=0.1)), 0.003
+        )
+    )
     result = invoke(path, "--json")
     assert result.return_value == 1
     (told,) = told_document(result)["files"]
@@ -200,7 +204,7 @@ def test_unknown_method_is_exit_2(shuttle: Path, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.usefixtures("processes")
 def test_every_file_format_gives_the_same_answer(tmp_path: Path) -> None:
-    table = table_of(slow_windows(0.005)[0])
+    table = table_of(record_slow_windows(0.005)[0])
     answers = []
     for name in tables.RECORDING_FORMATS:
         path = tmp_path / f"rapid{suffixes.suffix_of(suffixes.RECORDING_SUFFIXES, name)}"
@@ -236,7 +240,7 @@ demand_m = { name = "Demand", unit = "mm" }
 
 def _trace(tmp_path: Path, every: int = 1, sampling: str = "interval_mean") -> tuple[Path, Path]:
     """Write an oscilloscope trace with decimal commas, quotes and a 16-bit position counter, and its column map."""
-    lines = bench.as_csv(simulate_bench_shuttle(moves=2), 0.003).partition("time_s")[2].splitlines()[1::every]
+    lines = bench.format_as_csv(simulate_bench_shuttle(moves=2), 0.003).partition("time_s")[2].splitlines()[1::every]
     rows = ['"Time","Voltage","Current","Speed","Position","Demand"']
     for line in lines:
         time_s, voltage, current, speed, position_m, demand_m = map(float, line.split(","))

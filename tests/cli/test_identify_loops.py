@@ -19,9 +19,9 @@ pytestmark = pytest.mark.usefixtures("long_computation")
 @pytest.fixture
 def filtered(tmp_path: Path) -> Path:
     mechanics = real.Mechanics()
-    run = real.run(mechanics, build_shuttle_demand(2, 0.25, 0.5), real.Loops(speed_filter_s=0.001))
+    run = real.simulate_axis(mechanics, build_shuttle_demand(2, 0.25, 0.5), real.Loops(speed_filter_s=0.001))
     path = tmp_path / "filtered.csv"
-    path.write_text(real.as_csv(run, mechanics, real.Sensors(), 0.5))
+    path.write_text(real.format_as_csv(run, mechanics, real.Sensors(), 0.5))
     return path
 
 

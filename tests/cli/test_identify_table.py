@@ -18,28 +18,28 @@ from studies.real_plant import Mechanics, Sensors
 from tests.bench import bench_toml
 
 HERTZ = 60.0
-DEMAND_M = bench.shuttle(moves=2)
+DEMAND_M = bench.make_shuttle_demand(moves=2)
 SOFT = Mechanics(resonance_hz=HERTZ)
 
 
 @cache
 def signals() -> dict[str, bench.Array]:
     """Return the columns of two rapids of an axis with a compliant screw, including the table position."""
-    run = real_plant.run(SOFT, DEMAND_M, None, 1e-3)
-    told = real_plant.reported(run, SOFT, Sensors(noise=0.001, speed="difference"), 1)
+    run = real_plant.simulate_axis(SOFT, DEMAND_M, None, 1e-3)
+    told = real_plant.report_signals(run, SOFT, Sensors(noise=0.001, speed="difference"), 1)
     return {**told, "table_mm": np.round(1e3 * run.table_m, 4)}
 
 
 def written(folder: Path, table: bool) -> Path:
     columns = {name: values for name, values in signals().items() if table or name != "table_mm"}
     path = folder / "soft.csv"
-    path.write_text(bench.table_text(1e-3, columns))
+    path.write_text(bench.format_table(1e-3, columns))
     return path
 
 
 def printed(folder: Path, begin_s: float = 4321.0, lead: int = 400) -> Path:
     """Write the data of an ADXL345 at 3200 samples/s in the same run: y opposite to the axis, gravity on z."""
-    place = real_plant.run(SOFT, DEMAND_M, None, real_plant.STEP_S).table_m
+    place = real_plant.simulate_axis(SOFT, DEMAND_M, None, real_plant.STEP_S).table_m
     push = np.gradient(np.gradient(place, real_plant.STEP_S), real_plant.STEP_S)
     push = np.convolve(push, np.ones(10) / 10, "same")[::10]  # every 0.3125 ms
     push = np.concatenate([np.zeros(lead), push, np.zeros(200)])

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 import pytest
 
-from fdhil.prediction.models import load_model_file
+from fdhil.prediction.axis_models import load_model_file
 from studies import bench
 from tests.bench import bench_toml
 from tests.cli.test_identify import invoke, told_document
@@ -79,11 +79,15 @@ def test_a_model_file_is_written_that_predict_reads(deaf: Path, machine: Path, t
 
 def test_a_whole_model_needs_no_config_and_none_is_written_without_a_validated_pool(tmp_path: Path) -> None:
     recording, out = tmp_path / "shuttle.csv", tmp_path / "model.json"
-    recording.write_text(bench.as_csv(bench.run(bench.Plant(), bench.shuttle(distance=0.02, speed=0.1)), 0.003))
+    recording.write_text(
+        bench.format_as_csv(
+            bench.simulate_bench(bench.Plant(), bench.make_shuttle_demand(distance=0.02, speed=0.1)), 0.003
+        )
+    )
     refused = invoke(recording, "--write-model", out)
     assert refused.return_value == 1
     assert "is not written" in refused.stderr
     assert not out.exists()
-    recording.write_text(bench.as_csv(simulate_bench_shuttle(moves=2), 0.003))
+    recording.write_text(bench.format_as_csv(simulate_bench_shuttle(moves=2), 0.003))
     assert invoke(recording, "--write-model", out).return_value == 0
     assert load_model_file(out).parameters["X"].Jt == pytest.approx(0.075, rel=0.01)

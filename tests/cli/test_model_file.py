@@ -12,7 +12,7 @@ import pytest
 from fdhil.api.recording_analysis import FileResult
 from fdhil.cli.model_file import write_model
 from fdhil.identification.drive_loops.loop_identification import DIFFER
-from fdhil.prediction.models import load_model_file, with_loops
+from fdhil.prediction.axis_models import apply_loops, load_model_file
 from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Reason, Result, Verdict, freeze_array
 from tests.bench import bench_config
 from tests.store.made import BENCH
@@ -36,7 +36,7 @@ def test_another_structure_travels_with_its_gains(results: list[FileResult], tmp
     assert json.loads(path.read_text())["X"]["loops"] == {
         "structure": "pid", "position_gain_per_s": 84.0, "position_ki_per_s2": 1760.0, "speed_ki": 0.0,
     }  # fmt: skip
-    used = with_loops(CONFIG, load_model_file(path).loops, str(path)).axis["X"].regulators
+    used = apply_loops(CONFIG, load_model_file(path).loops, str(path)).axis["X"].regulators
     assert (used.structure, used.speed_kp) == ("pid", CONFIG.axis["X"].regulators.speed_kp)
 
 

@@ -13,8 +13,8 @@ from click.testing import CliRunner, Result
 
 from fdhil import config as configuration
 from fdhil.cli.main import cli
-from fdhil.prediction.contour import contour_error_um
-from fdhil.prediction.models import load_model_file
+from fdhil.prediction.axis_models import load_model_file
+from fdhil.prediction.contour_error import compute_contour_error_um
 from fdhil.program import write_demand_csv
 from fdhil.records import Float
 from fdhil.store.history import History
@@ -48,8 +48,8 @@ class Shop:
 def shop(tmp_path_factory: pytest.TempPathFactory, long_computation: None) -> Shop:
     folder = tmp_path_factory.mktemp("filtered")
     shop = Shop(folder, folder / "filtered.csv", folder / "bench.toml", folder / "model.json")
-    run = real.run(MECHANICS, build_shuttle_demand(2, 0.25, 0.5), LOOPS)
-    shop.recording.write_text(real.as_csv(run, MECHANICS, real.Sensors(), 0.5))
+    run = real.simulate_axis(MECHANICS, build_shuttle_demand(2, 0.25, 0.5), LOOPS)
+    shop.recording.write_text(real.format_as_csv(run, MECHANICS, real.Sensors(), 0.5))
     shop.config.write_text(bench_toml())
     result = invoke("identify", shop.recording, "--config", shop.config, "--write-model", shop.model)
     assert result.exit_code == 0, result.output
@@ -105,11 +105,13 @@ def assert_corrected(shop: Shop, *source: str | Path) -> None:
         rows = list(csv.DictReader(file))
     demand = np.column_stack([reference.position_mm[axis] for axis in "XY"])
     offset = np.column_stack([[float(row[f"{axis}_offset_um"]) / 1e3 for row in rows] for axis in "XY"])
-    before, after = (contour_error_um(demand, table_mm(order), reference.dt_s) for order in (demand, demand + offset))
+    before, after = (
+        compute_contour_error_um(demand, table_mm(order), reference.dt_s) for order in (demand, demand + offset)
+    )
     assert compute_rms(before) > 30.0
     assert compute_rms(after) < 0.5
     assert (after - before).max() < WORSE_UM
 
 
 def table_mm(order_mm: Float) -> Float:
-    return np.column_stack([real.run(MECHANICS, column / 1e3, LOOPS).table_m * 1e3 for column in order_mm.T])
+    return np.column_stack([real.simulate_axis(MECHANICS, column / 1e3, LOOPS).table_m * 1e3 for column in order_mm.T])

@@ -18,7 +18,7 @@ from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.records import freeze_array
 from fdhil.store.recordings import read_recording
 from fdhil.store.windows import encode_window
-from studies.slow_sensor import slow_windows
+from studies.slow_sensor import record_slow_windows
 from tests.daemon.machine_rig import BENCH, fdhil
 from tests.daemon.simulated_machine import config_of
 from tests.store.made import outcome, published, window
@@ -81,7 +81,7 @@ def test_an_export_is_a_recording_that_replays(rapid: Path, tmp_path: Path, caps
 
 def test_an_export_keeps_a_slow_sensors_samples_to_the_last_bit(tmp_path: Path, capsys: Any) -> None:
     stored, out = tmp_path / "w00000001-X.parquet", tmp_path / "out.csv"
-    made = slow_windows(0.005, delay_s=0.0012)[0]
+    made = record_slow_windows(0.005, delay_s=0.0012)[0]
     before = made.slow_voltage
     assert before is not None
     told = np.array(before.voltage_v)

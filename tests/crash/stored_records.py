@@ -21,7 +21,7 @@ from fdhil.commissioning.progress import Progress
 from fdhil.commissioning.record import CommissioningRecord, load_record, save_record
 from fdhil.commissioning.void import is_void, void_record
 from fdhil.config import MachineConfig
-from fdhil.correction.learning import Lesson
+from fdhil.correction.learned_offsets import LearnedOffset
 from fdhil.daemon import black_box
 from fdhil.daemon.outcome_store import WINDOWS_FOLDER, OutcomeStore
 from fdhil.errors import FdhilError, RecordingError, StoreError
@@ -170,7 +170,7 @@ class Audit(Plain):
 
 class LearnedOffsets(Plain):
     def keep(self, number: int) -> None:
-        lesson = Lesson({"X": np.full(50, float(number))}, float(number), 1.0, (float(number),))
+        lesson = LearnedOffset({"X": np.full(50, float(number))}, float(number), 1.0, (float(number),))
         with patch.object(lessons, "MOST_PROGRAMS", WINDOWS_KEPT):
             lessons.write_lesson(lessons.lesson_path(self.folder / "lessons", f"{number:032d}", "made"), lesson)
 

@@ -190,7 +190,7 @@ def test_internal_error_ends_the_daemon_and_is_reported(
     def fail(*_: Any) -> None:
         raise ZeroDivisionError("made up")
 
-    monkeypatch.setattr("fdhil.pipeline.AxisPipeline.feed", fail)
+    monkeypatch.setattr("fdhil.pipeline.AxisPipeline.process_record", fail)
     with pytest.raises(InternalError, match=r"ZeroDivisionError.*there was no guard, nothing was sent") as error:
         run_daemon_service(config, SimulatedMachine(rapids(config, count=1)).open)
     assert error.value.exit_code == 3

@@ -16,7 +16,7 @@ from fdhil import config as machine_config
 from fdhil.cli.demo.loop import read_trace, true_plants
 from fdhil.cli.demo.machines import machine_document
 from fdhil.commissioning.steps import commission
-from fdhil.prediction import contour_error_um, predict
+from fdhil.prediction import compute_contour_error_um, predict_path
 from fdhil.program import load_trajectory
 from fdhil.records import Parameters, compute_rms, compute_table_path
 from fdhil.store.history import History
@@ -64,7 +64,7 @@ def run(folder: Path, document: dict[str, Any], path: str, shuttle: str) -> Whol
         config, program = machine.config, machine.write_program(program_of(path), "path.ngc")
         with History.read(config.store.directory) as history:
             found = {axis: history.revisions(axis, limit=1)[0].set.parameters for axis in config.axis}
-        predicted = predict(load_trajectory(program, config), found, config)
+        predicted = predict_path(load_trajectory(program, config), found, config)
         measured_um = cut(machine, path)
         answer = machine.arm_program(program, method="inverse")
         assert answer["ok"], answer
@@ -83,7 +83,7 @@ def cut(machine: CompleteMachine, path: str) -> float:
     machine.play_program(program_of(path), "path.ngc")
     axes = tuple(machine.config.axis)
     reference, table = (compute_table_path(axes, rows) for rows in read_trace(trace, axes))
-    return compute_rms(contour_error_um(reference, table, 0.001))
+    return compute_rms(compute_contour_error_um(reference, table, 0.001))
 
 
 def machine(*axes: str) -> dict[str, Any]:

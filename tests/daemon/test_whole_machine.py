@@ -13,7 +13,7 @@ import pytest
 
 from fdhil.cli.demo.processes import Process
 from fdhil.errors import ConnectError
-from fdhil.prediction import contour_error_um
+from fdhil.prediction import compute_contour_error_um
 from fdhil.store.history import History
 from fdhil.store.windows import list_windows
 from tests.daemon.machine_rig import CORNER, REAL, SHUTTLE, MachineRig, fdhil, opened, patient
@@ -126,7 +126,7 @@ def _cut(shop: MachineRig, name: str, program: str = "corner.ngc", text: str = C
     rows = np.genfromtxt(trace, delimiter=",", names=True)
     reference = np.column_stack([rows[f"{axis}_reference_mm"] for axis in "XY"])
     table = np.column_stack([rows[f"{axis}_table_mm"] for axis in "XY"])
-    return float(np.sqrt(np.mean(contour_error_um(reference, table, 1e-3) ** 2)))
+    return float(np.sqrt(np.mean(compute_contour_error_um(reference, table, 1e-3) ** 2)))
 
 
 def _replays_bit_by_bit(shop: MachineRig, capsys: Capture) -> None:

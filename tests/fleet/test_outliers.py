@@ -13,8 +13,8 @@ from fdhil.fleet.outliers import BOUNDS, ParameterHistory, PeerGroup, assess_pee
 from fdhil.records import Float, freeze_array
 from studies import sisters
 from studies.pages import FOLDER
-from studies.sisters import SETS, single
-from studies.sisters import drawn as fleet
+from studies.sisters import SETS, make_single_axis
+from studies.sisters import draw_machines as fleet
 
 
 def assess_group(courses: list[ParameterHistory]) -> PeerGroup:
@@ -53,7 +53,9 @@ def test_outliers_do_not_mask_each_other(count: int) -> None:
 def test_three_kinds_of_screws_are_no_outliers() -> None:
     """Screws of three suppliers without a label, ten machines each, equal within a supplier; no axis is worn."""
     rng = np.random.default_rng(11)
-    kinds = [single(f"{kind}-{k}", 1 + 0.2 * kind + 0.002 * rng.normal()) for kind in range(3) for k in range(10)]
+    kinds = [
+        make_single_axis(f"{kind}-{k}", 1 + 0.2 * kind + 0.002 * rng.normal()) for kind in range(3) for k in range(10)
+    ]
     assert list_outliers(kinds) == []
 
 
@@ -134,14 +136,14 @@ def test_machine_with_many_sets_does_not_dominate() -> None:
 def test_false_alarm_rate_is_one_in_hundred_groups(kind: str) -> None:
     """The study counts more groups, and smaller ones."""
     for least, _ in BOUNDS[:6:2]:
-        alarms = np.count_nonzero(sisters.largest(kind, least, 200, seed=3) > 1)
+        alarms = np.count_nonzero(sisters.find_largest_score(kind, least, 200, seed=3) > 1)
         assert alarms <= 9, least  # 2 expected; more than 9 once in 20,000
 
 
 def test_nine_of_ten_outliers_are_found_at_study_threshold() -> None:
     figures = json.loads((FOLDER / "sisters.json").read_text("utf-8"))["figures"]
     told = figures["least_found"]["one"][figures["sizes"].index(12)]
-    assert sisters.share_found(12, 1, told, 60, seed=4) > 0.75  # by chance less than once in 10,000
+    assert sisters.compute_detected_share(12, 1, told, 60, seed=4) > 0.75  # by chance less than once in 10,000
 
 
 def test_uncertain_values_cause_no_outlier() -> None:
@@ -153,12 +155,12 @@ def test_uncertain_values_cause_no_outlier() -> None:
 def test_few_machines_are_not_assessed_and_equal_ones_agree() -> None:
     rng = np.random.default_rng(5)
     assert assess_peers(fleet(rng, count=4)) is None
-    assert assess_peers([*fleet(rng, count=4), single("m", np.nan, 1.0)]) is None
-    same = [single(str(k), 0.5) for k in range(6)]
+    assert assess_peers([*fleet(rng, count=4), make_single_axis("m", np.nan, 1.0)]) is None
+    same = [make_single_axis(str(k), 0.5) for k in range(6)]
     assert list_outliers(same) == []
-    same[0] = single("0", 0.6)
+    same[0] = make_single_axis("0", 0.6)
     assert list_outliers(same) == ["0"]
-    assert assess_peers([single(str(k), 0.0) for k in range(6)]) is None
+    assert assess_peers([make_single_axis(str(k), 0.0) for k in range(6)]) is None
 
 
 def build_machines(rng: np.random.Generator, in_common: float, count: int = 40) -> list[PeerGroup]:
@@ -167,7 +169,7 @@ def build_machines(rng: np.random.Generator, in_common: float, count: int = 40) 
     own[0] = (4.0, 4.0, 4.0)
     names = [f"mill-{k}" for k in range(count)]
     return [
-        assess_group([single(name, 1 + 0.05 * own[k, a], axis=axis) for k, name in enumerate(names)])
+        assess_group([make_single_axis(name, 1 + 0.05 * own[k, a], axis=axis) for k, name in enumerate(names)])
         for a, axis in enumerate("XYZ")
     ]
 

@@ -23,7 +23,7 @@ from fdhil.fleet import reanalysis, window_files
 from fdhil.fleet.parameter_sets import open_database
 from fdhil.fleet.window_reanalysis import AnalysisMethod, compute_code_digest
 from fdhil.fleet.worker_pools import WindowCrew, open_worker_pool
-from fdhil.pipeline import analyse
+from fdhil.pipeline import analyse_window
 from fdhil.records import Reason, WindowOutcome
 from tests.daemon.machine_rig import fdhil
 from tests.fleet.fleet_database import build_fleet, collect_messages, list_messages
@@ -47,7 +47,7 @@ def fleet_settings(database: Postgres, tmp_path: Path) -> Path:
         )
         for seed in range(EACH):
             window = find_noisy_windows(0.003, 100 * k + seed, moves=2)[seed % 2]
-            found = analyse(window, BEFORE)
+            found = analyse_window(window, BEFORE)
             assert found.verdict.accepted
             assert machine.store.store_outcomes([found if seed < EACH - 1 else run_refused(found)]) == []
         machine.close_store()

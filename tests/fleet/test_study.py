@@ -39,21 +39,21 @@ WRONG: Mapping[str, tuple[str, dict[str, int]]] = {
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("what", WRONG)
 def test_study_detects_lost_and_duplicated_records(what: str, database: Postgres, tmp_path: Path) -> None:
-    days = [fleet_day.machine(tmp_path / f"day-{k}", f"day-{k}", "nats://127.0.0.1:4222") for k in range(2)]
+    days = [fleet_day.make_machine(tmp_path / f"day-{k}", f"day-{k}", "nats://127.0.0.1:4222") for k in range(2)]
     for k, day in enumerate(days):
-        fleet_day.record(day, 30, seed=k)
-    machines = fleet_day.copied(days, tmp_path, 3, "nats://127.0.0.1:4222")
+        fleet_day.record_day(day, 30, seed=k)
+    machines = fleet_day.copy_machines(days, tmp_path, 3, "nats://127.0.0.1:4222")
     for config in machines:
         asyncio.run(collect_messages(build_fleet(database, tmp_path), list_messages_of_store(config)))
     change, expected = WRONG[what]
     database.execute_query(change)
-    found = fleet.checked(database, machines, days)
+    found = fleet.check_records(database, machines, days)
     assert {name: count for name, count in found.items() if count} == expected
 
 
 @pytest.mark.debian
 def test_killed_small_fleet_loses_no_record(tmp_path: Path) -> None:
-    found = fleet.killed(QUICK, tmp_path)
+    found = fleet.measure_with_kills(QUICK, tmp_path)
     assert sum(found["kills"].values()) >= 1
     wrong = {name: found[name] for name in ("lost", "doubled", "out_of_order", "refused", "miscounted")}
     assert not any(wrong.values()), wrong

@@ -63,7 +63,7 @@ def test_what_is_not_declared_is_a_finding() -> None:
 @pytest.mark.usefixtures("long_computation")
 def test_a_slip_of_one_character_changes_nothing_but_what_was_mistyped() -> None:
     text = slips.SAMPLE.read_text("utf-8")
-    counts, wrong = slips.judged(slips.sample(text, 500, seed=2), text)
+    counts, wrong = slips.count_outcomes(slips.sample_slips(text, 500, seed=2), text)
     assert wrong == []
     assert min(counts[outcome] for outcome in ("same", "refused", "value")) > 0
 
@@ -71,14 +71,14 @@ def test_a_slip_of_one_character_changes_nothing_but_what_was_mistyped() -> None
 def test_runs_add_up_and_the_goals_say_what_was_found() -> None:
     one = {"inputs": 600_000, "cpu_s": 1.0, "slowest_s": 0.5, "peak_mib": 9.0, "found": SLOW}
     two = {**one, "slowest_s": 0.1, "found": []}
-    parts = {name: fuzz.added(fuzz.added(None, one), two) for name in TARGETS}
+    parts = {name: fuzz.merge_figures(fuzz.merge_figures(None, one), two) for name in TARGETS}
     assert parts["web"] == {"inputs": 1_200_000, "cpu_s": 2.0, "slowest_s": 0.5, "peak_mib": 9.0, "found": []}
     letters = {"count": 3, "all": True, "outcomes": {"same": 2, "refused": 1}, "wrong": [], "met": True}
     figures: dict[str, Any] = {"targets": parts, "mended": {"web": ["a-b"]}, "slips": letters}
-    assert {goal: said["met"] for goal, said in fuzz.goals(figures).items()} == {"R12": True, "R17": True}
+    assert {goal: said["met"] for goal, said in fuzz.evaluate_goals(figures).items()} == {"R12": True, "R17": True}
     run = {"command": "c", "commit": "d", "date": "e", "versions": "v", "seeds": "1"}
     assert "None of them" in fuzz.page(run, figures)
-    figures["targets"] = parts | {"web": fuzz.added(two, one)}
+    figures["targets"] = parts | {"web": fuzz.merge_figures(two, one)}
     figures["slips"] = letters | {"met": False, "wrong": ["elsewhere: 'x'"], "outcomes": {"elsewhere": 3}}
-    assert {goal: said["met"] for goal, said in fuzz.goals(figures).items()} == {"R12": False, "R17": False}
+    assert {goal: said["met"] for goal, said in fuzz.evaluate_goals(figures).items()} == {"R12": False, "R17": False}
     assert "slow at x" in fuzz.page(run, figures)

@@ -231,7 +231,7 @@ class Bench:
         self.counter = self.counter % 240 + 1
         sampled = [frame for drive in self.drives for frame in drive.at_sync(self.tick)]
         self.held.append(tuple([drive.offset for drive in self.drives]))
-        axes, bus = self.listener.close_sync_cycle(bytes([self.counter]), self.tick * 1e-3, self.tick * 1e-3)
+        axes, bus = self.listener.receive_at_sync(bytes([self.counter]), self.tick * 1e-3, self.tick * 1e-3)
         inputs = StepInputs(
             True,
             axes,
@@ -244,7 +244,7 @@ class Bench:
             path=self.path,
             request=request,
         )
-        output = self.step(inputs)
+        output = self.decide_and_check(inputs)
         for cob_id, data in sampled:
             if cob_id not in drop:
                 self.receive_frames(cob_id, data)
@@ -252,7 +252,7 @@ class Bench:
             self.stream()
         return output
 
-    def step(self, inputs: StepInputs) -> StepOutput:
+    def decide_and_check(self, inputs: StepInputs) -> StepOutput:
         self.state, output = guard_step.step_guard(self.state, inputs, self.settings)
         self.outputs.append(output)
         if output.offsets is not None:
@@ -270,7 +270,7 @@ class Bench:
 
     def silence(self) -> StepOutput:
         axes, bus = self.listener.read_between_syncs(self.tick * 1e-3, True)
-        return self.step(StepInputs(False, axes, bus, main_alive=self.main_alive, path=self.path))
+        return self.decide_and_check(StepInputs(False, axes, bus, main_alive=self.main_alive, path=self.path))
 
     def settle(self, cycles: int = 130) -> None:
         for _ in range(cycles):

@@ -74,7 +74,7 @@ def settled_machine() -> tuple[Bench, StepInputs]:
         machine.receive_frames(0x701, b"\x05")
         machine.run_sync()
     machine.receive_frames(0x701, b"\x05")
-    seen, bus = machine.listener.close_sync_cycle(bytes([machine.counter + 1]), 0.151, 0.151)
+    seen, bus = machine.listener.receive_at_sync(bytes([machine.counter + 1]), 0.151, 0.151)
     return machine, StepInputs(True, seen, bus, path=machine.path)
 
 

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from fdhil import config as machine_config
 from fdhil.arming.guard_settings import settings_of
 from fdhil.config import CEILING_ACCELERATION_MM_S2, CEILING_OFFSET_UM, CEILING_SPEED_MM_S, VARIATION_MM, OffsetBounds
-from fdhil.correction import PlanLimits, check
-from fdhil.correction.gate import writing_off
-from fdhil.correction.limits import fit, to_increments
+from fdhil.correction import PlanLimits, check_offsets
+from fdhil.correction.correction_gate import check_writing_enabled
+from fdhil.correction.plan_limits import fit_within_limits, round_to_increments
 from fdhil.errors import ConfigError
 from fdhil.guard import offset_limits as guard_limits
 from fdhil.guard.correction_table import check_rows
@@ -84,21 +84,17 @@ def test_planner_and_guard_limits_agree_and_keep_the_ceilings(document: dict[str
         assert any(words in machine for words in ("too coarse", "from the largest offset to zero", "feed drives have"))
         return
     axis, period = machine.axis["X"], machine.machine.sync_period_s
-    if OffsetBounds.compute_effective(axis, period).is_too_coarse:
+    if OffsetBounds.derive(axis, period).is_too_coarse:
         with pytest.raises(ConfigError, match="too coarse"):
             settings_of(machine, "can0", Path(), "")
-        assert writing_off(["X"], machine)[0].code == "CoarseIncrements"
+        assert check_writing_enabled(["X"], machine)[0].code == "CoarseIncrements"
         return
-    assert OffsetBounds.compute_effective(axis, period).compute_time_to_safe_s(period) <= 0.120 + 1e-9
+    assert OffsetBounds.derive(axis, period).compute_time_to_safe_s(period) <= 0.120 + 1e-9
     whole = settings_of(machine, "can0", Path(), "").axes[0].limits
-    planned = PlanLimits.compute_effective(axis, period)
-    assert (
-        whole.offset,
-        whole.rate,
-        whole.acceleration,
-        whole.variation,
-        whole.window,
-    ) == OffsetBounds.compute_effective(axis, period).whole_increments
+    planned = PlanLimits.derive(axis, period)
+    assert (whole.offset, whole.rate, whole.acceleration, whole.variation, whole.window) == OffsetBounds.derive(
+        axis, period
+    ).whole_increments
     per_mm = axis.scaling.increments_per_mm
     assert whole.offset <= planned.offset + 1e-6 <= CEILING_OFFSET_UM * 1e-3 * per_mm + 1e-3
     assert whole.rate <= max(1.0, planned.rate) + 1e-6  # one increment is the least that can be sent
@@ -109,8 +105,8 @@ def test_planner_and_guard_limits_agree_and_keep_the_ceilings(document: dict[str
     random = np.random.default_rng(seed)
     wanted = planned.offset * random.uniform(0.1, 3) * np.sin(np.arange(400) * random.uniform(0.001, 1.5))
     wanted[200:] += planned.offset * random.choice([-1.0, 0.0, 1.0])
-    rows = to_increments(fit(wanted, planned))
-    assert check(rows, planned) == []
+    rows = round_to_increments(fit_within_limits(wanted, planned))
+    assert check_offsets(rows, planned) == []
     assert check_rows(whole, [0, *rows.tolist()], 0, rows.size + 1) is None  # from rest, as the planner has it
 
 

@@ -25,9 +25,9 @@ def test_latched_target_is_the_last_before_the_sync() -> None:
     monitor = listener()
     monitor.take_frame(0x201, target(5), 0.0)
     monitor.take_frame(0x201, target(6), 0.0)
-    axes, _ = monitor.close_sync_cycle(b"\x01", 0.0, 0.0)
+    axes, _ = monitor.receive_at_sync(b"\x01", 0.0, 0.0)
     assert axes[0].target == 6
-    axes, _ = monitor.close_sync_cycle(b"\x02", 0.001, 0.001)
+    axes, _ = monitor.receive_at_sync(b"\x02", 0.001, 0.001)
     assert axes[0].target is None
 
 
@@ -35,7 +35,7 @@ def test_ages_count_in_periods_of_each_pdo() -> None:
     monitor = listener()
     ages = []
     for k in range(1, 40):
-        axes, _ = monitor.close_sync_cycle(bytes([k]), k * 1e-3, k * 1e-3)
+        axes, _ = monitor.receive_at_sync(bytes([k]), k * 1e-3, k * 1e-3)
         ages.append(axes[0].feedback_age)
         if k < 20:
             monitor.take_frame(0x181, bytes(8), 0.0)
@@ -50,8 +50,8 @@ def test_ages_count_in_periods_of_each_pdo() -> None:
 def test_read_back_is_reported_once() -> None:
     monitor = listener()
     monitor.take_frame(0x381, struct.pack("<ii", 0, -77), 0.0)
-    assert monitor.close_sync_cycle(b"\x01", 0.0, 0.0)[0][0].read_back == -77
-    assert monitor.close_sync_cycle(b"\x02", 0.0, 0.0)[0][0].read_back is None
+    assert monitor.receive_at_sync(b"\x01", 0.0, 0.0)[0][0].read_back == -77
+    assert monitor.receive_at_sync(b"\x02", 0.0, 0.0)[0][0].read_back is None
 
 
 def test_early_frame_invalidates_the_read_back_next_to_it() -> None:
@@ -59,7 +59,7 @@ def test_early_frame_invalidates_the_read_back_next_to_it() -> None:
     monitor = listener()
     shown, ages = [], []
     for k in range(1, 60):
-        axes, _ = monitor.close_sync_cycle(bytes([k]), k * 1e-3, k * 1e-3)
+        axes, _ = monitor.receive_at_sync(bytes([k]), k * 1e-3, k * 1e-3)
         shown.append(axes[0].read_back)
         ages.append(axes[0].read_back_age)
         if k % 10 == 0:
@@ -82,9 +82,9 @@ def test_receive_filter_has_all_needed_ids() -> None:
 
 def test_sync_counter_restarts_after_a_silence() -> None:
     monitor = listener()
-    monitor.close_sync_cycle(b"\x05", 0.0, 0.0)
+    monitor.receive_at_sync(b"\x05", 0.0, 0.0)
     monitor.forget_sync()
-    _, bus = monitor.close_sync_cycle(b"\x99", 9.0, 9.0)
+    _, bus = monitor.receive_at_sync(b"\x99", 9.0, 9.0)
     assert not bus.sync_regular
     assert monitor.take_alarms() == ()
 
@@ -94,10 +94,10 @@ def test_short_pdo_is_dropped_and_long_one_is_counted() -> None:
     monitor.take_frame(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)
     for _ in range(3):
         monitor.take_frame(0x281, b"\0", 0.0)
-    axes, _ = monitor.close_sync_cycle(b"\x01", 0.0, 0.0)
+    axes, _ = monitor.receive_at_sync(b"\x01", 0.0, 0.0)
     assert (axes[0].statusword, axes[0].short_frames, axes[0].long_frames) == (0x1237, 3, 0)
     monitor.take_frame(0x281, struct.pack("<Hi", 0x0237, 0) + b"\0", 0.0)
-    axes, _ = monitor.close_sync_cycle(b"\x02", 0.0, 0.0)
+    axes, _ = monitor.receive_at_sync(b"\x02", 0.0, 0.0)
     assert (axes[0].statusword, axes[0].short_frames, axes[0].long_frames) == (0x0237, 0, 1)
 
 
@@ -152,14 +152,14 @@ def test_flood_of_events_is_one_alarm() -> None:
 def test_sync_counter_jump_raises_an_alarm(counters: list[int], codes: list[str]) -> None:
     monitor = listener()
     for counter in counters:
-        monitor.close_sync_cycle(bytes([counter]), 0.0, 0.0)
+        monitor.receive_at_sync(bytes([counter]), 0.0, 0.0)
     assert [alarm.code for alarm in monitor.take_alarms()] == codes
 
 
 def test_sync_without_counter_is_not_checked() -> None:
     monitor = listener()
     for data in (b"", b"\x05", b"", b"\x09", b"\x00\x01"):
-        monitor.close_sync_cycle(data, 0.0, 0.0)
+        monitor.receive_at_sync(data, 0.0, 0.0)
     assert monitor.take_alarms() == ()
 
 
@@ -167,10 +167,10 @@ def regular(intervals: list[tuple[float, float]], period_s: float = 0.001) -> li
     """Return whether each SYNC was regular, for (stamp, arrival) intervals in monotonic time."""
     monitor = listener(clock="monotonic", sync_period_s=period_s)
     stamp = arrival = 100.0
-    result = [monitor.close_sync_cycle(b"", stamp, arrival)[1].sync_regular]
+    result = [monitor.receive_at_sync(b"", stamp, arrival)[1].sync_regular]
     for by_stamp, by_arrival in intervals:
         stamp, arrival = stamp + by_stamp, arrival + by_arrival
-        result.append(monitor.close_sync_cycle(b"", stamp, arrival)[1].sync_regular)
+        result.append(monitor.receive_at_sync(b"", stamp, arrival)[1].sync_regular)
     return result
 
 
@@ -196,12 +196,12 @@ def test_two_senders_of_one_id_are_detected_after_three_cycles() -> None:
     for k in range(1, 5):
         monitor.take_frame(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)
         monitor.take_frame(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)  # a duplicate says nothing new
-        monitor.close_sync_cycle(bytes([k]), 0.0, 0.0)
+        monitor.receive_at_sync(bytes([k]), 0.0, 0.0)
     assert monitor.take_alarms() == ()
     for k in range(5, 8):
         monitor.take_frame(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)
         monitor.take_frame(0x281, struct.pack("<Hi", 0x1237, 1), 0.0)
-        monitor.close_sync_cycle(bytes([k]), 0.0, 0.0)
+        monitor.receive_at_sync(bytes([k]), 0.0, 0.0)
     assert [alarm.code for alarm in monitor.take_alarms()] == ["ForeignProducer"]
 
 
@@ -210,7 +210,7 @@ def test_any_traffic_is_accepted_without_error(frames: list[tuple[int, bytes]]) 
     monitor = listener()
     for cob_id, data in frames:
         monitor.take_frame(cob_id, data, 0.0)
-        monitor.close_sync_cycle(data[:1], 0.0, 0.0)
+        monitor.receive_at_sync(data[:1], 0.0, 0.0)
     axes, _ = monitor.read_between_syncs(0.0, True)
     assert len(axes) == len(monitor.settings.axes)
     assert {alarm.code for alarm in monitor.take_alarms()} <= INTERLOCK_CATALOGUE.keys()

@@ -114,8 +114,8 @@ class LateSync(Bench):
     late_s = 0.0
 
     def delay(self) -> None:
-        hear = self.listener.close_sync_cycle
-        self.listener.close_sync_cycle = lambda data, stamp_s, now_s: hear(  # type: ignore[method-assign]
+        hear = self.listener.receive_at_sync
+        self.listener.receive_at_sync = lambda data, stamp_s, now_s: hear(  # type: ignore[method-assign]
             data, stamp_s + self.late_s, now_s + self.late_s
         )
 

@@ -111,7 +111,7 @@ def test_internal_error_ramps_to_zero_and_exits_with_3(make: Make, where: str, m
         broken = (
             "fdhil.guard.guard_step.step_guard"
             if where == "core"
-            else "fdhil.guard.frame_monitor.FrameMonitor.close_sync_cycle"
+            else "fdhil.guard.frame_monitor.FrameMonitor.receive_at_sync"
         )
         monkeypatch.setattr(broken, fail)
 

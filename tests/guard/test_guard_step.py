@@ -123,11 +123,11 @@ def test_not_settled_refusal_has_the_number_of_good_cycles() -> None:
 
 
 def test_first_withdrawn_fact_is_the_cause(armed_machine: Bench) -> None:
-    axes, bus = armed_machine.listener.close_sync_cycle(
+    axes, bus = armed_machine.listener.receive_at_sync(
         bytes([armed_machine.counter + 1]), (armed_machine.tick + 1) * 1e-3, (armed_machine.tick + 1) * 1e-3
     )
     withdrawn = (Alarm("ModelStale"), Alarm("PoorSkill"))
-    armed_machine.step(StepInputs(True, axes, bus, withdrawn=withdrawn, path=armed_machine.path))
+    armed_machine.decide_and_check(StepInputs(True, axes, bus, withdrawn=withdrawn, path=armed_machine.path))
     assert (armed_machine.mode, armed_machine.state.cause) == (Mode.RAMP_DOWN, Alarm("ModelStale"))
 
 

@@ -27,13 +27,13 @@ def active() -> Bench:
 
 def inputs_of(machine: Bench, withdrawn: tuple[Alarm, ...] = ()) -> StepInputs:
     machine.counter = machine.counter % 240 + 1
-    seen, bus = machine.listener.close_sync_cycle(bytes([machine.counter]), 0.0, 0.0)
+    seen, bus = machine.listener.receive_at_sync(bytes([machine.counter]), 0.0, 0.0)
     return StepInputs(True, seen, bus, path=machine.path, withdrawn=withdrawn)
 
 
 def test_withdrawn_fact_ramps_down() -> None:
     machine = active()
-    machine.step(inputs_of(machine, (Alarm("ModelStale"),)))
+    machine.decide_and_check(inputs_of(machine, (Alarm("ModelStale"),)))
     assert machine.state.mode is Mode.RAMP_DOWN
     assert machine.alarms[-1].code == "ModelStale"
 
@@ -278,7 +278,7 @@ def test_event_driven_offset_waits_for_sync_while_sync_runs() -> None:
     machine.settle()
     assert machine.arm() == ()
     seen, bus = machine.listener.read_between_syncs(0.0, silent=False)
-    assert machine.step(StepInputs(False, seen, bus, path=machine.path)).offsets is None
+    assert machine.decide_and_check(StepInputs(False, seen, bus, path=machine.path)).offsets is None
 
 
 def test_following_error_reported_by_the_drive_is_used() -> None:

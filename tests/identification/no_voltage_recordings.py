@@ -82,17 +82,17 @@ def build_shuttle_demand(
 @lru_cache(maxsize=4)
 def simulate_screw_axis(moves: int = 4, mechanics: Mechanics = SCREW) -> real_plant.Run:
     """Simulate the ball-screw axis without noise."""
-    return real_plant.run(mechanics, build_shuttle_demand(moves), LOOPS)
+    return real_plant.simulate_axis(mechanics, build_shuttle_demand(moves), LOOPS)
 
 
 def format_screw_csv(moves: int = 4, seed: int = 0) -> str:
     """Return its recording as text, with the torque constant in a header."""
-    return real_plant.as_csv(simulate_screw_axis(moves), SCREW, SENSORS, RAPID_M_S, seed, voltage=False)
+    return real_plant.format_as_csv(simulate_screw_axis(moves), SCREW, SENSORS, RAPID_M_S, seed, voltage=False)
 
 
 def record_screw_axis(moves: int = 4, seed: int = 0, mechanics: Mechanics = SCREW, **sensors: Any) -> Recording:
     run, told = simulate_screw_axis(moves, mechanics), replace(SENSORS, **sensors)
-    read = real_plant.recording(run, mechanics, told, RAPID_M_S, seed, voltage=False)
+    read = real_plant.make_recording(run, mechanics, told, RAPID_M_S, seed, voltage=False)
     return replace(read, torque_constant_nm_per_a=mechanics.K)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.identification.demand_lead import align_demand_to_drive
-from fdhil.pipeline import analyse
+from fdhil.pipeline import analyse_window
 from fdhil.records import Window, freeze_array
 from studies.real_plant import Loops
 from tests.bench import bench_config
@@ -31,7 +31,7 @@ def test_whole_cycle_lead_is_removed_and_reported(cycles: int) -> None:
     on_time, found = align_demand_to_drive(ahead, AXIS, SYNC_S)
     assert found == cycles
     np.testing.assert_array_equal(on_time.demand_mm[cycles:-cycles], window.demand_mm[cycles:-cycles])
-    outcome = analyse(ahead, SETTINGS, AXIS, SYNC_S)
+    outcome = analyse_window(ahead, SETTINGS, AXIS, SYNC_S)
     assert outcome.verdict.accepted
     assert outcome.window is ahead
     assert any(f"{cycles} cycles ahead" in warning.text for warning in outcome.verdict.warnings)

@@ -128,7 +128,7 @@ def test_lost_samples_are_excluded(estimator_name: str) -> None:
 def test_switching_voltage_instants_have_valid_intervals(estimator_name: str) -> None:
     clean = simulate_bench_shuttle()
     sampled = replace(clean, voltage=clean.voltage_instant)
-    found = find_windows(parse_recording(bench.as_csv(sampled, 0.003, 1, voltage_sampling="instant")))
+    found = find_windows(parse_recording(bench.format_as_csv(sampled, 0.003, 1, voltage_sampling="instant")))
     estimate = _load_estimator(estimator_name)(found, SETTINGS)
     apart = np.abs(estimate.values - TRUTH) / np.sqrt(np.diag(estimate.covariance))
     assert (apart < 3.0).all()

@@ -7,7 +7,7 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.identification.identifiability import find_unphysical_values, withhold_unidentifiable
-from fdhil.pipeline import analyse
+from fdhil.pipeline import analyse_window
 from fdhil.records import PARAMETERS, Estimate, Result
 from studies import bench
 from tests.identification.bench_recordings import find_noisy_windows
@@ -55,5 +55,5 @@ def test_unphysical_value_is_reported() -> None:
 
 
 def test_a_drive_without_viscous_friction_is_accepted() -> None:
-    outcome = analyse(find_noisy_windows(0.003, plant=bench.Plant(ft=1e-5))[0], Identification())
+    outcome = analyse_window(find_noisy_windows(0.003, plant=bench.Plant(ft=1e-5))[0], Identification())
     assert outcome.verdict.accepted, outcome.verdict.reasons

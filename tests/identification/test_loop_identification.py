@@ -56,8 +56,8 @@ def build_shuttle_demand(moves: int, way: float, speed: float, rest_s: float = 0
 def simulate_rapids(loops: real.Loops, mechanics: real.Mechanics | None = None) -> list[Window]:
     """Return rapids of an independent plant, as a drive reports them."""
     mechanics = mechanics or real.Mechanics()
-    run = real.run(mechanics, build_shuttle_demand(4, 0.25, 0.5), loops)
-    return find_windows(real.recording(run, mechanics, real.Sensors(), 0.5))
+    run = real.simulate_axis(mechanics, build_shuttle_demand(4, 0.25, 0.5), loops)
+    return find_windows(real.make_recording(run, mechanics, real.Sensors(), 0.5))
 
 
 class RecordingDrive(ReferenceDrive):
@@ -169,7 +169,7 @@ def test_path_is_predicted_despite_unmodelled_effects() -> None:
     loops = replace(real.ORDINARY_LOOPS, speed_filter_s=0.001, speed_feedforward=0.95)
     own = apply_loops(build_bench_axis(), identify_loops_of(simulate_rapids(loops, mechanics), build_bench_axis()))
     demand = build_bench_demand(10)[:, 0]
-    truth = real.run(mechanics, demand / 1e3, loops).motor_m * 1e3
+    truth = real.simulate_axis(mechanics, demand / 1e3, loops).motor_m * 1e3
     off = [
         compute_rms(closed_loop.simulate_axis(NOMINAL, a, PERIOD, demand).position_mm - truth)
         for a in (build_bench_axis(), own)

@@ -46,10 +46,10 @@ def test_stages_are_found_in_a_quarter_millisecond_recording() -> None:
 
 
 def test_feed_moves_are_excluded_and_short_rapids_lack_a_cruise() -> None:
-    feed = bench.run(bench.Plant(), bench.shuttle(distance=0.05, speed=0.08))
-    assert find_windows(parse_recording(bench.as_csv(feed))) == []
-    short = bench.run(bench.Plant(), bench.shuttle(distance=0.05))
-    windows = find_windows(parse_recording(bench.as_csv(short)))
+    feed = bench.simulate_bench(bench.Plant(), bench.make_shuttle_demand(distance=0.05, speed=0.08))
+    assert find_windows(parse_recording(bench.format_as_csv(feed))) == []
+    short = bench.simulate_bench(bench.Plant(), bench.make_shuttle_demand(distance=0.05))
+    windows = find_windows(parse_recording(bench.format_as_csv(short)))
     assert len(windows) == 1
     assert windows[0].stages.cruise is None
 
@@ -64,7 +64,9 @@ def test_rapid_speed_is_taken_from_header_then_machine_then_file() -> None:
 
 
 def test_recording_cut_within_a_move_lacks_that_stage() -> None:
-    text = bench.as_csv(bench.run(bench.Plant(), bench.shuttle()), 0.001).splitlines(keepends=True)
+    text = bench.format_as_csv(bench.simulate_bench(bench.Plant(), bench.make_shuttle_demand()), 0.001).splitlines(
+        keepends=True
+    )
     head = next(k for k, line in enumerate(text) if line.startswith("time_s")) + 1
     late = find_windows(parse_recording("".join(text[:head] + text[head + 300 :])))
     assert late[0].stages.accelerate is None
@@ -73,7 +75,9 @@ def test_recording_cut_within_a_move_lacks_that_stage() -> None:
 
 
 def test_gaps_are_converted_to_window_samples() -> None:
-    text = bench.as_csv(bench.run(bench.Plant(), bench.shuttle()), 0.001).splitlines(keepends=True)
+    text = bench.format_as_csv(bench.simulate_bench(bench.Plant(), bench.make_shuttle_demand()), 0.001).splitlines(
+        keepends=True
+    )
     head = next(k for k, line in enumerate(text) if line.startswith("time_s")) + 1
     window = find_windows(parse_recording("".join(text[: head + 500] + text[head + 503 :])))[0]
     ((a, b),) = window.gaps
@@ -83,9 +87,9 @@ def test_gaps_are_converted_to_window_samples() -> None:
 
 
 def test_standstill_yields_no_windows() -> None:
-    still = bench.run(bench.Plant(), np.zeros(400))
-    assert find_windows(parse_recording(bench.as_csv(still))) == []
-    silent = replace(parse_recording(bench.as_csv(still, 0.0)), rapid_speed_rad_s=None)
+    still = bench.simulate_bench(bench.Plant(), np.zeros(400))
+    assert find_windows(parse_recording(bench.format_as_csv(still))) == []
+    silent = replace(parse_recording(bench.format_as_csv(still, 0.0)), rapid_speed_rad_s=None)
     assert find_windows(silent) == []
 
 

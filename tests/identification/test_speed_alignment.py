@@ -18,7 +18,7 @@ from fdhil.identification.speed_alignment import (
     estimate_speed_lag,
     shift_samples,
 )
-from fdhil.pipeline import analyse
+from fdhil.pipeline import analyse_window
 from fdhil.records import Float, Window, freeze_array
 from studies.real_plant import Mechanics, Sensors
 from tests.identification.realistic_rapids import simulate_rapids
@@ -72,7 +72,7 @@ def test_speed_from_position_differences_does_not_bias_parameters(estimator: Mod
 
 def test_the_lag_is_told_with_the_parameters_and_the_window_stays_as_recorded() -> None:
     (window,) = simulate_rapids(sensors=Sensors(speed="difference", encoder_bits=16))
-    outcome = analyse(window, SETTINGS)
+    outcome = analyse_window(window, SETTINGS)
     assert outcome.verdict.accepted, outcome.verdict.reasons
     assert outcome.window is window
     assert outcome.estimate is not None

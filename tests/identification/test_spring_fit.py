@@ -14,10 +14,10 @@ from fdhil.identification.prepared_motion import TermRegressor, prepare_window
 from fdhil.identification.rapid_windows import find_windows
 from fdhil.identification.spring_fit import RESONANCE, SHARE, fit_with_compliance
 from fdhil.identification.spring_torques import Spring, SpringTorques
-from fdhil.pipeline import analyse, pool
-from fdhil.pipeline.identified_loops import OwnLoops, softened
+from fdhil.pipeline import analyse_window, pool_windows
+from fdhil.pipeline.identified_loops import LoopTracker, search_resonance
 from fdhil.records import PARAMETERS, Window, WindowOutcome
-from studies.bench import shuttle
+from studies.bench import make_shuttle_demand
 from studies.real_plant import (
     ORDINARY_LOOPS,
     ORDINARY_MECHANICS,
@@ -26,10 +26,10 @@ from studies.real_plant import (
     SLOW_LOOPS,
     Mechanics,
     Sensors,
-    recording,
-    run,
+    make_recording,
+    simulate_axis,
 )
-from studies.reality import BASES, Machine, config_of, random_machines
+from studies.reality import BASES, Machine, draw_machines, make_config
 from tests.identification.realistic_rapids import simulate_rapids
 
 SETTINGS = Identification()
@@ -39,19 +39,19 @@ PERIOD_S = 1e-3
 def build_axis_with_resonance(mechanics: Mechanics, base: str, told_hz: float = 0.0) -> Axis:
     """Return the section of a base's axis, with a configured resonance."""
     loops = SLOW_LOOPS if base == "slow" else BASES[base][1]
-    return config_of(Machine("", base, mechanics, loops, Sensors(), loops, told_hz)).axis["X"]
+    return make_config(Machine("", base, mechanics, loops, Sensors(), loops, told_hz)).axis["X"]
 
 
 def simulate_slow_rapids(mechanics: Mechanics, seed: int = 1) -> list[Window]:
     """Return one rapid in each direction of the axis with dominant friction."""
     _, _, rapid_m_s, acceleration_m_s2, _ = BASES["slow"]
-    moved = run(mechanics, shuttle(0.4, rapid_m_s, acceleration_m_s2, 2), SLOW_LOOPS)
-    return find_windows(recording(moved, mechanics, Sensors(), rapid_m_s, seed))
+    moved = simulate_axis(mechanics, make_shuttle_demand(0.4, rapid_m_s, acceleration_m_s2, 2), SLOW_LOOPS)
+    return find_windows(make_recording(moved, mechanics, Sensors(), rapid_m_s, seed))
 
 
 def analyse_rapids(windows: list[Window], axis: Axis) -> list[WindowOutcome]:
     """Return the windows analysed through the axis pipeline."""
-    return [analyse(window, SETTINGS, axis, PERIOD_S) for window in windows]
+    return [analyse_window(window, SETTINGS, axis, PERIOD_S) for window in windows]
 
 
 def test_spring_without_table_inertia_adds_no_torque() -> None:
@@ -93,7 +93,7 @@ def test_configured_prior_counts_once_over_all_windows() -> None:
     for outcome in outcomes:
         assert outcome.estimate is not None
         assert outcome.estimate.get_std(SHARE) > 0.05
-    estimate, _ = pool(outcomes, SETTINGS)
+    estimate, _ = pool_windows(outcomes, SETTINGS)
     assert estimate is not None
     assert estimate.get_std(SHARE) > 0.7 * min(o.estimate.get_std(SHARE) for o in outcomes if o.estimate is not None)
 
@@ -121,7 +121,7 @@ def test_absent_configured_resonance_is_reported() -> None:
 def test_unconfigured_resonance_is_found_by_the_replay() -> None:
     axis = build_axis_with_resonance(SLOW, "slow")
     windows = simulate_slow_rapids(replace(SLOW, resonance_hz=80.0))
-    softer = softened(analyse_rapids(windows, axis), axis, PERIOD_S)
+    softer = search_resonance(analyse_rapids(windows, axis), axis, PERIOD_S)
     assert softer is not None
     again = analyse_rapids(windows, softer)
     for outcome in again:
@@ -135,12 +135,12 @@ def test_unconfigured_resonance_is_found_by_the_replay() -> None:
 @pytest.mark.usefixtures("long_computation")
 def test_running_machine_keeps_its_identified_resonance() -> None:
     windows = simulate_slow_rapids(replace(SLOW, resonance_hz=80.0))
-    loops = OwnLoops(build_axis_with_resonance(SLOW, "slow"), SETTINGS, PERIOD_S)
-    first, _ = loops.analyse(windows[0])
+    loops = LoopTracker(build_axis_with_resonance(SLOW, "slow"), SETTINGS, PERIOD_S)
+    first, _ = loops.analyse_rapid(windows[0])
     assert first.verdict.accepted
     assert loops.axis is not None
     assert loops.axis.resonance_hz is not None
-    second, _ = loops.analyse(windows[1])
+    second, _ = loops.analyse_rapid(windows[1])
     assert second.verdict.accepted
     assert second.estimate is not None
     assert RESONANCE in second.estimate.terms
@@ -152,7 +152,7 @@ def test_running_machine_keeps_its_identified_resonance() -> None:
 )
 def test_rigid_machine_yields_no_resonance(mechanics: Mechanics) -> None:
     axis = build_axis_with_resonance(SLOW, "slow")
-    assert softened(analyse_rapids(simulate_slow_rapids(mechanics), axis), axis, PERIOD_S) is None
+    assert search_resonance(analyse_rapids(simulate_slow_rapids(mechanics), axis), axis, PERIOD_S) is None
 
 
 def test_significant_resonance_is_added_without_regulators() -> None:
@@ -173,8 +173,8 @@ def test_holding_load_explains_the_start_of_a_move() -> None:
     """After a move the other way the drive still pulls that way, as far as friction and load hold it."""
     mechanics = replace(SLOW, load_nm=0.96, asymmetry=-0.09, static=0.08, static_speed_rad_s=17.0)
     _, _, rapid_m_s, acceleration_m_s2, _ = BASES["slow"]
-    moved = run(mechanics, shuttle(0.4, rapid_m_s, acceleration_m_s2, 3), SLOW_LOOPS)
-    last = find_windows(recording(moved, mechanics, Sensors(), rapid_m_s, 1))[-1]
+    moved = simulate_axis(mechanics, make_shuttle_demand(0.4, rapid_m_s, acceleration_m_s2, 3), SLOW_LOOPS)
+    last = find_windows(make_recording(moved, mechanics, Sensors(), rapid_m_s, 1))[-1]
     (outcome,) = analyse_rapids([last], build_axis_with_resonance(SLOW, "slow"))
     assert outcome.verdict.accepted, outcome.verdict.reasons
     assert outcome.verdict.unexplained_um is not None
@@ -183,11 +183,11 @@ def test_holding_load_explains_the_start_of_a_move() -> None:
 
 def test_stribeck_speed_stays_within_the_observed_speeds() -> None:
     """Below all observed speeds any amplitude would fit: this machine's fourth rapid once got 5e17 N.m."""
-    machine = random_machines(12, 1)[11]
+    machine = draw_machines(12, 1)[11]
     _, _, rapid_m_s, acceleration_m_s2, _ = BASES["slow"]
-    moved = run(machine.mechanics, shuttle(0.4, rapid_m_s, acceleration_m_s2, 4), machine.loops)
-    last = find_windows(recording(moved, machine.mechanics, machine.sensors, rapid_m_s, 65000))[-1]
-    (outcome,) = analyse_rapids([last], config_of(machine).axis["X"])
+    moved = simulate_axis(machine.mechanics, make_shuttle_demand(0.4, rapid_m_s, acceleration_m_s2, 4), machine.loops)
+    last = find_windows(make_recording(moved, machine.mechanics, machine.sensors, rapid_m_s, 65000))[-1]
+    (outcome,) = analyse_rapids([last], make_config(machine).axis["X"])
     assert outcome.verdict.accepted, outcome.verdict.reasons
     assert outcome.estimate is not None
     for name in {"stribeck"} & set(outcome.estimate.terms):

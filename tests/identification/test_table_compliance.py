@@ -20,10 +20,10 @@ from fdhil.identification.table_compliance import (
     estimate_compliance,
     merge_compliance,
 )
-from fdhil.pipeline import analyse
+from fdhil.pipeline import analyse_window
 from fdhil.records import Float, Parameters, Window, freeze_array
 from studies import real_plant
-from studies.bench import shuttle
+from studies.bench import make_shuttle_demand
 from studies.real_plant import Mechanics, Sensors
 from tests.bench import bench_config
 from tests.tiers import sampled
@@ -38,7 +38,7 @@ def compute_table_accelerations(mechanics: Mechanics, demand_m: Float, rows: int
     """Return the table's acceleration, averaged about each sample, from a run whose samples are steps of the
     simulation.
     """
-    fine = real_plant.run(mechanics, demand_m, None, real_plant.STEP_S).table_m
+    fine = real_plant.simulate_axis(mechanics, demand_m, None, real_plant.STEP_S).table_m
     every = round(DT_S / real_plant.STEP_S)
     steps = np.gradient(np.gradient(fine, real_plant.STEP_S), real_plant.STEP_S)
     return np.convolve(steps, np.ones(every) / every, "same")[::every][:rows]
@@ -47,8 +47,8 @@ def compute_table_accelerations(mechanics: Mechanics, demand_m: Float, rows: int
 @cache
 def simulate_table_rapid(hertz: float, seed: int = 1) -> Window:
     """Return a rapid of an axis with this resonance (0: rigid), with both table sensors and noise."""
-    mechanics, demand_m = Mechanics(resonance_hz=hertz), shuttle()
-    run = real_plant.run(mechanics, demand_m, None, DT_S)
+    mechanics, demand_m = Mechanics(resonance_hz=hertz), make_shuttle_demand()
+    run = real_plant.simulate_axis(mechanics, demand_m, None, DT_S)
     sensors = Sensors(noise=0.001, speed="difference")
     rng = np.random.default_rng(seed)
     table_mm = np.round(1e3 * run.table_m + 5e-5 * rng.standard_normal(run.table_m.size), 4)
@@ -58,7 +58,7 @@ def simulate_table_rapid(hertz: float, seed: int = 1) -> Window:
         + 0.05 * rng.standard_normal(table_mm.size)
     )
     recording = replace(
-        real_plant.recording(run, mechanics, sensors, 0.5, seed),
+        real_plant.make_recording(run, mechanics, sensors, 0.5, seed),
         table_mm=freeze_array(table_mm),
         table_m_s2=freeze_array(pushed),
     )
@@ -124,7 +124,7 @@ def test_sensor_unrelated_to_the_table_yields_no_compliance() -> None:
 
 
 def test_merged_compliance_keeps_the_shared_doubt() -> None:
-    outcome = analyse(replace(simulate_table_rapid(80.0), table_m_s2=None), Identification())
+    outcome = analyse_window(replace(simulate_table_rapid(80.0), table_m_s2=None), Identification())
     estimate = outcome.estimate
     assert estimate is not None
     assert set(TERMS) <= set(estimate.terms)
@@ -153,13 +153,13 @@ def test_different_configured_resonance_is_warned_of(configured: float | None, c
 @pytest.mark.usefixtures("real_time")
 def test_true_table_error_is_reported() -> None:
     window = replace(simulate_table_rapid(80.0), table_m_s2=None)
-    at_table = analyse(window, Identification()).at_table
+    at_table = analyse_window(window, Identification()).at_table
     assert at_table is not None
     assert window.table_mm is not None
     unseen_um = 1e3 * np.abs(window.table_mm - window.position_mm)
     assert at_table.unseen_max_um == pytest.approx(unseen_um.max(), abs=3.0)  # the zero is at standstill
     assert at_table.error_rms_um > at_table.unseen_rms_um > 5.0
-    assert analyse(replace(window, table_mm=None), Identification()).at_table is None
+    assert analyse_window(replace(window, table_mm=None), Identification()).at_table is None
 
 
 @pytest.mark.parametrize(("kind", "name"), sampled(product(KINDS, ["table_mm", "table_m_s2"]), every=3))
@@ -174,6 +174,8 @@ def test_arbitrary_sensor_signals_do_not_break_the_analysis(name: str, kind: str
         "steps": np.round(window.position_mm, 0),
     }[kind]
     told = replace(window, table_mm=freeze_array(values) if name == "table_mm" else None)
-    outcome = analyse(replace(told, table_m_s2=freeze_array(values) if name != "table_mm" else None), Identification())
+    outcome = analyse_window(
+        replace(told, table_m_s2=freeze_array(values) if name != "table_mm" else None), Identification()
+    )
     assert outcome.estimate is not None
     assert outcome.estimate.get_value("Jt") == pytest.approx(TRUE.Jt, rel=0.05)

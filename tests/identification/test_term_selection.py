@@ -20,7 +20,7 @@ from fdhil.identification.innovations import compute_filter_gains, compute_signa
 from fdhil.identification.likelihood_fit import compute_jacobian, estimate_typical_sizes
 from fdhil.identification.prepared_motion import TermRegressor, prepare_window
 from fdhil.identification.term_regressors import FIRST_TERM
-from fdhil.pipeline import analyse
+from fdhil.pipeline import analyse_window
 from fdhil.records import Estimate, Window
 from studies.real_plant import ORDINARY_LOOPS, ORDINARY_MECHANICS, ORDINARY_SENSORS, Loops, Mechanics, Sensors
 from tests.identification.realistic_rapids import simulate_rapids
@@ -51,7 +51,7 @@ def test_dead_time_of_a_commanded_voltage_is_identified_without_bias() -> None:
     assert estimate.get_value("dead_time") == pytest.approx(2.0, abs=4 * estimate.get_std("dead_time"))
     assert estimate.get_std("dead_time") < 0.1
     assert _count_deviations(estimate).max() < 4.0
-    assert analyse(window, SETTINGS).verdict.accepted
+    assert analyse_window(window, SETTINGS).verdict.accepted
 
 
 def test_terminal_voltage_excludes_dead_time_candidates() -> None:

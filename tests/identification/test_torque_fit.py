@@ -12,7 +12,7 @@ from fdhil.identification.rapid_windows import find_windows
 from fdhil.identification.torque_fit import build_torque_estimate, estimate_current_lag_s, fit_torque
 from fdhil.identification.torque_samples import extract_torque_samples
 from fdhil.records import RATIOS, Estimate, Result, Window, freeze_array
-from studies.real_plant import SLOW, SLOW_LOOPS, Mechanics, Run, Sensors, recording, run
+from studies.real_plant import SLOW, SLOW_LOOPS, Mechanics, Run, Sensors, make_recording, simulate_axis
 from tests.identification.no_voltage_recordings import SCREW, build_shuttle_demand, find_screw_windows
 
 SETTINGS = Identification()
@@ -67,7 +67,7 @@ def test_missing_torque_constant_yields_ratios() -> None:
 
 def test_intervals_cover_the_truth_without_voltage() -> None:
     """Over 24 windows of two plants the error in deviations has an RMS near 1."""
-    slow = run(SLOW, build_shuttle_demand(4, 0.2, 0.2, 2.0), SLOW_LOOPS)
+    slow = simulate_axis(SLOW, build_shuttle_demand(4, 0.2, 0.2, 2.0), SLOW_LOOPS)
     errors = []
     for mechanics, made in ((SLOW, slow), (replace(SCREW, static=0.0, screw_ripple=0.0), None)):
         for seed in range(3):
@@ -84,7 +84,7 @@ def test_intervals_cover_the_truth_without_voltage() -> None:
 
 
 def _simulate_windows(made: Run, mechanics: Mechanics, seed: int, rapid_m_s: float = 0.2) -> list[Window]:
-    read = recording(made, mechanics, Sensors(), rapid_m_s, seed, voltage=False)
+    read = make_recording(made, mechanics, Sensors(), rapid_m_s, seed, voltage=False)
     return find_windows(replace(read, torque_constant_nm_per_a=mechanics.K))
 
 
@@ -94,7 +94,7 @@ def test_long_samples_yield_the_same_parameters(dt_s: float) -> None:
     smooth = np.convolve(np.pad(build_shuttle_demand(2, 0.4, 0.5, 4.0), 50, "edge"), np.full(90, 1 / 90), "same")[
         50:-50
     ]
-    for window in _simulate_windows(run(Mechanics(), smooth, dt_s=dt_s), Mechanics(), 1, 0.5):
+    for window in _simulate_windows(simulate_axis(Mechanics(), smooth, dt_s=dt_s), Mechanics(), 1, 0.5):
         found = estimate_windows(window)
         for name, truth in Mechanics().truth().items():
             if name in TOLD:

@@ -12,10 +12,10 @@ from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.low_rate_voltage.within_sample import add_within_sample_doubt, compute_current_above_line_a
 from fdhil.identification.prepared_motion import prepare_window
 from fdhil.identification.rapid_windows import find_windows
-from fdhil.pipeline import analyse
+from fdhil.pipeline import analyse_window
 from fdhil.records import Estimate, Float, Parameters, Recording, Window, freeze_array
 from fdhil.sim.drive.plant_physics import PlantPhysics
-from studies.bench import shuttle
+from studies.bench import make_shuttle_demand
 from tests.bench import bench_config
 from tests.identification.realistic_rapids import simulate_rapids
 
@@ -29,7 +29,7 @@ VALUES = np.array(list(TRUTH.as_dict().values()))
 @lru_cache(maxsize=4)
 def _simulate_long_samples(row_s: float) -> tuple[Float, Float]:
     """Return demand (n,), mm, and samples (4, n) of V, A, rad/s, mm of the simulated drive with such set-points."""
-    demand = 1e3 * shuttle(moves=2)[:: round(row_s / 1e-3)]
+    demand = 1e3 * make_shuttle_demand(moves=2)[:: round(row_s / 1e-3)]
     physics = PlantPhysics(TRUTH, AXIS.regulators, row_s, INCREMENTS)
     counts = np.append(demand, [demand[-1]] * 2) * INCREMENTS / AXIS.screw_pitch_mm
     rows = np.empty((4, demand.size))
@@ -62,7 +62,7 @@ def _find_windows(row_s: float, noise: float = 0.001, seed: int = 1) -> list[Win
 
 
 def _identify_with_axis(window: Window, axis: Axis | None) -> Estimate:
-    outcome = analyse(window, SETTINGS, axis, window.dt_s)
+    outcome = analyse_window(window, SETTINGS, axis, window.dt_s)
     assert outcome.estimate is not None
     return outcome.estimate
 
@@ -79,7 +79,7 @@ def test_bias_without_known_loops_stays_within_the_interval(row_ms: int) -> None
 @pytest.mark.parametrize("row_ms", [4, 8, 10])
 def test_known_loops_give_the_parameters_of_short_samples(row_ms: int) -> None:
     for window in _find_windows(row_ms * 1e-3):
-        outcome = analyse(window, SETTINGS, AXIS, window.dt_s)
+        outcome = analyse_window(window, SETTINGS, AXIS, window.dt_s)
         assert outcome.verdict.accepted, outcome.verdict.reasons
         assert outcome.estimate is not None
         np.testing.assert_allclose(outcome.estimate.values[[0, 2, 3]], VALUES[[0, 2, 3]], rtol=0.01)

@@ -79,7 +79,7 @@ def take_voltage_from_sensors(bench: Bench) -> Bench:
 
 
 def digested(pipeline: AxisPipeline, records: Sequence[Any]) -> list[Outcome]:
-    return [o for record in records if not isinstance(record, Notice) for o in pipeline.feed(record)]
+    return [o for record in records if not isinstance(record, Notice) for o in pipeline.process_record(record)]
 
 
 def _virtual(document: dict[str, Any]) -> None:

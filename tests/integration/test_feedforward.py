@@ -16,9 +16,9 @@ from fdhil.arming.token import read_token
 from fdhil.cli.demo.processes import Process
 from fdhil.commissioning.record import save_record
 from fdhil.commissioning.steps import commission
-from fdhil.correction.flatness_feedforward import law
+from fdhil.correction.flatness_feedforward import derive_feedforward_law
 from fdhil.guard.interlocks import FEEDFORWARD_FACTS
-from fdhil.prediction.models import nominal_models
+from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.records import Float
 from tests.bench import bench_document
 from tests.integration.conftest import PATIENCE_S, Bench
@@ -66,8 +66,8 @@ def client(bench: Bench, short_settling_time: None, tmp_path: Path) -> Iterator[
 
 
 def switch_on(client: GuardClient, bench: Bench) -> None:
-    models = nominal_models(bench.config)
-    laws = {axis: law(models[axis], bench.config.axis[axis], 0.001) for axis in "XY"}
+    models = build_nominal_models(bench.config)
+    laws = {axis: derive_feedforward_law(models[axis], bench.config.axis[axis], 0.001) for axis in "XY"}
     run = bench.config.store.run_directory
     assert run is not None
     deadline = time.monotonic() + PATIENCE_S

@@ -9,7 +9,7 @@ import pytest
 from fdhil.guard import guard_step, interlock_checks, offset_limits
 from fdhil.guard.offset_limits import OffsetLimits
 from studies import kills
-from studies.fault_rows import RAMPED, Descent, descent
+from studies.fault_rows import RAMPED, Descent, assess_ramp_down
 from studies.live_guard import LiveGuard
 from tests.fault_matrix import ROWS
 from tests.tiers import sampled
@@ -20,7 +20,7 @@ LIMITS = OffsetLimits(offset=819, rate=65, acceleration=6, variation=9830, windo
 @pytest.mark.parametrize("row", sampled(RAMPED, every=3))
 def test_fault_at_any_time_ends_at_zero_in_time(row: str) -> None:
     assert RAMPED[row].code in ROWS[row].classes or not ROWS[row].classes or row == "F3"
-    found = kills.frame_part(row, 3, 7)
+    found = kills.run_frame_part(row, 3, 7)
     assert found.wrong == []
     assert len(found.descents[row]) == 3
 
@@ -28,7 +28,7 @@ def test_fault_at_any_time_ends_at_zero_in_time(row: str) -> None:
 @pytest.mark.usefixtures("processes")
 @pytest.mark.fault("F15")
 def test_killed_process_ends_at_zero() -> None:
-    found = kills.live_part("kills", 1, 3)
+    found = kills.run_live_part("kills", 1, 3)
     assert found.wrong == []
     assert found.frames > 100
 
@@ -40,7 +40,7 @@ def test_rig_arms_again_after_an_abandoned_correction(tmp_path: Path) -> None:
         live.start_guard()
         live.arm()
         live.give_up()
-        live.into_the_cut()
+        live.run_into_cut()
         assert any(live.offsets)
     finally:
         live.close()
@@ -53,23 +53,23 @@ def test_rig_arms_again_after_an_abandoned_correction(tmp_path: Path) -> None:
     [("kills", 3), ("restarts", 6), ("hangs", 1), ("faults", 8)],
 )
 def test_fault_at_any_time_ends_at_zero_on_socketcan(part: str, times: int) -> None:
-    found = kills.live_part(part, times, 1, "socketcan")
+    found = kills.run_live_part(part, times, 1, "socketcan")
     assert found.wrong == []
     assert found.counts["frames while hung"] == 0
 
 
 def test_ramp_down_is_checked_by_its_bounds() -> None:
     down = [(300, 0), *[(300 - 6 * k, 0) for k in range(51)]]
-    assert descent(down, 0, LIMITS, 2) == Descent(1, 51, within=False)
-    assert descent(down, 0, LIMITS, 20) == Descent(1, 51, within=True)
-    assert descent([(300, 0), (301, 0), (0, 0)], 0, LIMITS, 2) == Descent(2, 2, within=True)
-    assert descent([(0, 9)] * 60 + [(0, 10), (0, 0)], 0, LIMITS, 2) == Descent(61, 61, within=False)
-    assert descent(down[:-1], 0, LIMITS, 20) is None
+    assert assess_ramp_down(down, 0, LIMITS, 2) == Descent(1, 51, within=False)
+    assert assess_ramp_down(down, 0, LIMITS, 20) == Descent(1, 51, within=True)
+    assert assess_ramp_down([(300, 0), (301, 0), (0, 0)], 0, LIMITS, 2) == Descent(2, 2, within=True)
+    assert assess_ramp_down([(0, 9)] * 60 + [(0, 10), (0, 0)], 0, LIMITS, 2) == Descent(61, 61, within=False)
+    assert assess_ramp_down(down[:-1], 0, LIMITS, 20) is None
 
 
 def test_guard_that_misses_a_fault_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guard_step, interlock_checks.list_failing_interlocks.__name__, lambda _bus, _views: ())
-    assert kills.frame_part("E11", 1, 7).wrong
+    assert kills.run_frame_part("E11", 1, 7).wrong
 
 
 def test_guard_that_steps_to_zero_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,4 +81,4 @@ def test_guard_that_steps_to_zero_is_detected(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(
         guard_step, offset_limits.find_limit_violation.__name__, lambda _limits, _before, _rate, _offset: None
     )
-    assert any("a step" in each for each in kills.frame_part("F15", 20, 7).wrong)
+    assert any("a step" in each for each in kills.run_frame_part("F15", 20, 7).wrong)

@@ -13,7 +13,7 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.config import MachineConfig
-from fdhil.prediction import predict
+from fdhil.prediction import predict_path
 from fdhil.program import load_trajectory
 from fdhil.records import Float, Parameters
 from tests.bench import bench_document
@@ -60,7 +60,7 @@ def test_prediction_matches_the_simulator_within_half_a_micrometre(
         axis: Parameters(**(settings.nominal.model_dump() | PLANTS[plant][axis]))
         for axis, settings in config.axis.items()
     }
-    prediction = predict(load_trajectory(PROGRAMS / program, config), models, config)
+    prediction = predict_path(load_trajectory(PROGRAMS / program, config), models, config)
     both = np.column_stack([prediction.predicted_mm["X"], prediction.predicted_mm["Y"]])
     limited = any(prediction.limited_s.values())
     assert limited == (plant == "drifted" and program == "bench_20m.ngc" and feedforward == 1.0)

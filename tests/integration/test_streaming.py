@@ -19,9 +19,9 @@ from fdhil.arming.program_check import check
 from fdhil.arming.token import read_token
 from fdhil.config import MachineConfig
 from fdhil.correction import PlanLimits
-from fdhil.correction import check as check_limits
+from fdhil.correction import check_offsets as check_limits
 from fdhil.guard.interlocks import FACTS
-from fdhil.prediction.models import nominal_models
+from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.program import program_digest
 from fdhil.records import Float, Reason
 from tests.integration.conftest import PATIENCE_S, Bench
@@ -112,7 +112,7 @@ def test_streamed_rows_end_before_a_refused_position(bench: Bench, client: Guard
     assert stream.end == checked.rows
     assert client.status()["cause"]["code"] == "TableStarved"
     trace = np.genfromtxt(tmp_path / "trace.csv", delimiter=",", names=True)
-    limits = PlanLimits.compute_effective(bench.config.axis["X"], 0.001)
+    limits = PlanLimits.derive(bench.config.axis["X"], 0.001)
     for axis in "XY":
         sent = np.rint(trace[f"{axis}_offset_um"] / limits.um_per_increment)
         assert np.any(sent[: checked.rows - 1_000])
@@ -129,4 +129,4 @@ def grow(checked: CheckedProgram, demand: Path, rows: Path, config: MachineConfi
             checked.refused += (Reason(**result["refused"]),)
 
     with rows.open("r+b") as body:
-        check(demand, program_digest(demand), nominal_models(config), config, body, hear)
+        check(demand, program_digest(demand), build_nominal_models(config), config, body, hear)

@@ -21,8 +21,8 @@ from fdhil.drivers.cia402.bus_decoder import BusDecoder
 from fdhil.drivers.serial.text_lines import TextLine
 from fdhil.drivers.table.accelerometer import StreamedAccelerometer
 from fdhil.identification.rapid_windows import find_windows
-from fdhil.pipeline import analyse
-from fdhil.pipeline.recent_samples import RecentSamples
+from fdhil.pipeline import analyse_window
+from fdhil.pipeline.sample_buffer import SampleBuffer
 from fdhil.records import AxisSamples, Estimate, TableSamples, TickTimes, WindowOutcome
 from fdhil.sim.frame_types import Frame
 from tests.bench import bench_document
@@ -63,7 +63,7 @@ def recorded() -> dict[str, list[WindowOutcome]]:
     settings = machine.axis["Y"].accelerometer
     assert settings is not None
     sensor = StreamedAccelerometer("Y", settings, PERIOD_S)
-    recent = {axis: RecentSamples(axis, section, 10_000, PERIOD_S) for axis, section in machine.axis.items()}
+    recent = {axis: SampleBuffer(axis, section, 10_000, PERIOD_S) for axis, section in machine.axis.items()}
     hand = SteppedSimulator(machine)
     hand.switch_on()
     hand.play_rows(move_back_and_forth())
@@ -81,12 +81,14 @@ def recorded() -> dict[str, list[WindowOutcome]]:
             if isinstance(record, TickTimes):
                 ticks.add_arrivals(record)
             if isinstance(record, AxisSamples | TableSamples):
-                recent[record.axis].add(record)
+                recent[record.axis].append_block(record)
         frames, lines = [], []
     outcomes = {}
     for axis, section in machine.axis.items():
-        windows = find_windows(recent[axis].cut(begun, recent[axis].newest_tick or 0), section.rapid_speed_rad_s)
-        outcomes[axis] = [analyse(window, machine.identification, section, PERIOD_S) for window in windows]
+        windows = find_windows(
+            recent[axis].extract_recording(begun, recent[axis].newest_tick or 0), section.rapid_speed_rad_s
+        )
+        outcomes[axis] = [analyse_window(window, machine.identification, section, PERIOD_S) for window in windows]
     return outcomes
 
 

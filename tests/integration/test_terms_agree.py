@@ -10,7 +10,7 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.config import MachineConfig
-from fdhil.prediction import predict
+from fdhil.prediction import predict_path
 from fdhil.program import load_trajectory
 from fdhil.records import Float, Parameters
 from tests.bench import bench_document
@@ -51,7 +51,7 @@ def machine(case: str, *, told: bool) -> MachineConfig:
 
 def predicted(config: MachineConfig, terms: dict[str, float]) -> Float:
     models = {axis: Parameters(**s.nominal.model_dump()).replace_values(**terms) for axis, s in config.axis.items()}
-    answer = predict(load_trajectory(PROGRAM, config), models, config)
+    answer = predict_path(load_trajectory(PROGRAM, config), models, config)
     return np.column_stack([answer.predicted_mm["X"], answer.predicted_mm["Y"]])
 
 

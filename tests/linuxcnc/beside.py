@@ -14,7 +14,7 @@ import numpy as np
 
 from fdhil.arming.passes import FINISHED
 from fdhil.child_process import wrap_to_end_with_parent
-from fdhil.prediction import contour_error_um
+from fdhil.prediction import compute_contour_error_um
 from fdhil.records import Trajectory
 
 PATIENCE_S = 300.0
@@ -81,7 +81,7 @@ def contour_of_each_cut(trace: Path, part: Trajectory) -> list[float]:
         apart = np.abs(reference[first : first + len(rows)] - rows).max()
         if apart <= 1 / per_mm:
             there = slice(first, first + len(rows))
-            error = contour_error_um(reference[there], place[there], part.dt_s)
+            error = compute_contour_error_um(reference[there], place[there], part.dt_s)
             found.append(float(np.sqrt(np.mean(error**2))))
             first += len(rows)
         else:

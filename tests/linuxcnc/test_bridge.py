@@ -136,7 +136,7 @@ def hal_of(port: int) -> str:
 def windows_of(heard: Heard, config: MachineConfig) -> list[WindowOutcome]:
     pipeline = AxisPipeline("X", config)
     records = [r for r in heard.records if not isinstance(r, NcState | Notice)]
-    return [o for r in records for o in pipeline.feed(r) if isinstance(o, WindowOutcome)]
+    return [o for r in records for o in pipeline.process_record(r) if isinstance(o, WindowOutcome)]
 
 
 def first_motion(demand: Float) -> int:

@@ -21,7 +21,7 @@ from fdhil.bridges import hal_bus
 from fdhil.cli.demo.processes import Process
 from fdhil.config.axis_section import HAL_INCREMENTS
 from fdhil.daemon.daemon_socket import SOCKET_NAME
-from fdhil.prediction import contour_error_um
+from fdhil.prediction import compute_contour_error_um
 from fdhil.records import Float
 from tests.free_ports import find_free_port
 from tests.linuxcnc.beside import SHUTTLE, TRIES, fdhil, record, repeated, until
@@ -106,13 +106,13 @@ def test_the_second_cut_is_corrected_by_hal_pins_alone(shop: HalShop, plant: str
                 assert axis["parameters"][symbol]["value"] == pytest.approx(motors[name][symbol], rel=0.05), symbol
         for tried in range(1, TRIES + 1):
             demand, position, _ = shop.trace(lambda: record(shop.file, part, lambda: shop.nc.run(PART)))
-            before = rms(contour_error_um(demand, position, 0.001))
+            before = rms(compute_contour_error_um(demand, position, 0.001))
             fdhil("arm", shop.file, part)
             demand, position, offset = shop.trace(lambda: shop.nc.run(PART))
             until(lambda: len(shop.status()["passes"]) == tried)  # noqa: B023 - called at once
             if repeated(shop.status()):
                 break
-        after = rms(contour_error_um(demand, position, 0.001))
+        after = rms(compute_contour_error_um(demand, position, 0.001))
         assert shop.status()["counters"]["lost"] == 0
     first = int(np.flatnonzero(np.abs(offset).max(axis=1) > 0)[0])
     assert first == pytest.approx(LEAD_CYCLES, abs=5)

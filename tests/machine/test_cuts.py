@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.prediction import contour_error_um
+from fdhil.prediction import compute_contour_error_um
 from tests.machine.complete_machine import CompleteMachine
 from tests.machine.invariants import InvariantChecker
 
@@ -30,7 +30,7 @@ def cut_part(machine: CompleteMachine, program: str, name: str) -> float:
     machine.play_program(program, name)
     rows = np.genfromtxt(trace, delimiter=",", names=True)
     reference, table = (np.column_stack([rows[f"{axis}_{of}_mm"] for axis in "XY"]) for of in ("reference", "table"))
-    return float(np.sqrt(np.mean(contour_error_um(reference, table, 1e-3) ** 2)))
+    return float(np.sqrt(np.mean(compute_contour_error_um(reference, table, 1e-3) ** 2)))
 
 
 def read_pass(machine: CompleteMachine) -> dict[str, Any]:

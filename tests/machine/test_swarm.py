@@ -26,7 +26,7 @@ def test_seed_reproduces_complete_run(tmp_path: Path) -> None:
     for _ in range(2):
         folder = tmp_path / "life"
         folder.mkdir()
-        wrong, counted, machine = swarm.life_of(4, 12.0, folder)
+        wrong, counted, machine = swarm.run_machine_life(4, 12.0, folder)
         assert wrong == []
         lives.append((counted, machine.bus.digest.hexdigest(), machine.log.getvalue(), machine.journal))
         folder.rename(tmp_path / f"before-{len(lives)}")
@@ -34,7 +34,7 @@ def test_seed_reproduces_complete_run(tmp_path: Path) -> None:
 
 
 def test_failure_names_reproducing_command() -> None:
-    figures = swarm.nothing_run("code")
+    figures = swarm.make_empty_figures("code")
     swarm.add_life(figures, 17, 60.0, ["1.000 s: a step"], {"SYNC": 3, "frames": 9, "milliseconds": 70}, 2.0)
     page = swarm.page({**RUN, "seeds": "17 to 17"}, figures)
     assert "`make swarm N=1 SEED=17 SECONDS=60`: 1.000 s: a step" in page
@@ -44,10 +44,10 @@ def test_failure_names_reproducing_command() -> None:
 def test_run_adds_to_total_of_same_code(tmp_path: Path) -> None:
     path = tmp_path / "swarm.json"
     for seed in (1, 2):
-        figures = swarm.resumed(path, "code")
-        assert swarm.next_seed(figures) == seed
+        figures = swarm.load_figures(path, "code")
+        assert swarm.find_next_seed(figures) == seed
         swarm.add_life(figures, seed, 60.0, [], {"SYNC": 3, "frames": 9, "milliseconds": 70_000}, 2.0)
-        swarm.write(path, RUN, figures)
+        swarm.write_results(path, RUN, figures)
     figures = json.loads(path.read_text("utf-8"))["figures"]
     assert (figures["runs"], figures["machines"], figures["counted"]["SYNC"]) == ([[1, 2, 60.0]], 2, 6)
     assert swarm.is_counted(figures, 2, 60.0)
@@ -58,10 +58,10 @@ def test_run_adds_to_total_of_same_code(tmp_path: Path) -> None:
 
 def test_run_of_other_code_starts_new_total_and_lists_earlier_one(tmp_path: Path) -> None:
     path = tmp_path / "swarm.json"
-    figures = swarm.nothing_run("before")
+    figures = swarm.make_empty_figures("before")
     swarm.add_life(figures, 1, 60.0, ["2.0 s: wrong"], {"milliseconds": 70_000}, 2.0)
     path.write_text(json.dumps({"run": RUN, "figures": figures}), "utf-8")
-    again = swarm.resumed(path, "after")
+    again = swarm.load_figures(path, "after")
     assert (again["machines"], again["runs"], again["failures"]) == (0, [], [])
     assert again["earlier"] == [{"commit": "0123abcd", "machines": 1, "machine_s": 70.0, "failures": 1}]
 
@@ -70,7 +70,7 @@ def test_endless_run_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(swarm, "MOST_CPU_S", 0.02)
     handler = signal.signal(signal.SIGPROF, swarm._too_long)
     try:
-        _, wrong, _, _ = swarm.judged(1, 1.0)
+        _, wrong, _, _ = swarm.assess_life(1, 1.0)
     finally:
         signal.signal(signal.SIGPROF, handler)
     assert any("more than 0.02 s of processor time" in each for each in wrong), wrong

@@ -140,7 +140,7 @@ def draw_ordinary_machine(seed: int) -> tuple[real_plant.Mechanics, real_plant.L
     if seed == 0:
         return real_plant.ORDINARY_MECHANICS, real_plant.Loops(dead_time_v=2.0)
     base = real_plant.SLOW if seed % 2 else real_plant.Mechanics()
-    mechanics, loops_, _ = real_plant.drawn(np.random.default_rng(seed), base)
+    mechanics, loops_, _ = real_plant.draw_machine(np.random.default_rng(seed), base)
     return replace(mechanics, warming=0.0), replace(loops_, bus_sag=0.0)
 
 
@@ -152,7 +152,7 @@ def test_terms_match_study_plant(seed: int) -> None:
     gains = {name: getattr(real, name) for name in ("speed_kp", "speed_ki", "current_kp", "current_ki")}
     axis = build_bench_axis(speed_filter_s=0.0005, current_delay_cycles=2, **gains)
     demand, parameters = build_reversal(300, (0.060, 0.030)), name_terms(mechanics, real)
-    truth = real_plant.run(mechanics, demand * 1e-3, real)
+    truth = real_plant.simulate_axis(mechanics, demand * 1e-3, real)
     state = closed_loop.create_standstill_state(parameters, axis, float(demand[0]), truth.standstill_a)
     response = closed_loop.simulate_axis(parameters, axis, PERIOD, demand, state=state)
     assert np.abs(response.position_mm - truth.motor_m * 1e3).max() < 0.1e-3

@@ -11,10 +11,10 @@ import pytest
 from fdhil import config as configuration
 from fdhil import tables
 from fdhil.config import Axis
-from fdhil.correction import plan
+from fdhil.correction import plan_correction
 from fdhil.errors import ConfigError
 from fdhil.model import closed_loop
-from fdhil.prediction.models import nominal_models
+from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.records import Float, Parameters
 from tests.bench import bench_document
 from tests.model.reference_drive import EventReferenceDrive, ReferenceDrive
@@ -225,7 +225,7 @@ def test_inverse_works_for_every_structure(structure: str, option: str) -> None:
     The gain is smallest where a position integral works against an incomplete feed-forward.
     """
     config = build_bench_axis(structure, **OPTIONS[option])
-    correction = plan(build_bench_trajectory(10), nominal_models(config), config, "inverse")
+    correction = plan_correction(build_bench_trajectory(10), build_nominal_models(config), config, "inverse")
     assert correction.refused == ()
     gain = compute_rms(correction.before.contour_um) / compute_rms(correction.after.contour_um)
     assert gain > (3 if structure in ("double_pi", "linuxcnc_pid") and option == "all" else 10)
@@ -234,6 +234,6 @@ def test_inverse_works_for_every_structure(structure: str, option: str) -> None:
 def test_flatness_does_not_duplicate_torque_feedforward() -> None:
     """A drive with its own torque feed-forward gets no second one."""
     config = build_bench_axis("p_pi_pi", **OPTIONS["torque"])
-    correction = plan(build_bench_trajectory(10), nominal_models(config), config, "flatness")
+    correction = plan_correction(build_bench_trajectory(10), build_nominal_models(config), config, "flatness")
     assert correction.refused == ()
     assert compute_rms(correction.before.contour_um) > 5 * compute_rms(correction.after.contour_um)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from fdhil.config import MachineConfig
-from fdhil.prediction import predict
-from fdhil.prediction.models import nominal_models
+from fdhil.prediction import predict_path
+from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.program import Budget, interpret
 from fdhil.program import plan as plan_program
 from fdhil.records import Trajectory, Zone
@@ -27,16 +27,16 @@ def plan_test_program(text: str, config: MachineConfig) -> Trajectory:
     return plan_program(list(interpret(text.splitlines(), Budget.of(config.nc))), config)
 
 
-def zones_of(reference: Trajectory, config: MachineConfig = CONFIG) -> tuple[Zone, ...]:
-    return predict(reference, nominal_models(config), config).zones
+def find_program_zones(reference: Trajectory, config: MachineConfig = CONFIG) -> tuple[Zone, ...]:
+    return predict_path(reference, build_nominal_models(config), config).zones
 
 
-def nearest(zone: Zone, places: tuple[tuple[float, float], ...]) -> float:
+def find_nearest_zone(zone: Zone, places: tuple[tuple[float, float], ...]) -> float:
     at = np.array([float(word) for word in zone.where.split()[1::2]])[:2]
     return min(float(np.linalg.norm(at - place)) for place in places)
 
 
-def seconds(zones: tuple[Zone, ...], cause: str) -> float:
+def sum_duration_s(zones: tuple[Zone, ...], cause: str) -> float:
     return sum(zone.end_s - zone.start_s for zone in zones if zone.cause == cause)
 
 
@@ -50,32 +50,36 @@ def seconds(zones: tuple[Zone, ...], cause: str) -> float:
         (20, "G64 P5", 18.0),
     ],
 )
-def test_the_bench_has_four_corners_however_wide_the_nc_blends_them(feed: int, mode: str, widest_mm: float) -> None:
+def test_bench_path_has_four_corners_at_any_blending(feed: int, mode: str, widest_mm: float) -> None:
     """Blends of 2 to 200 ms: large errors are corners, each near its position; the half circle is not."""
     if mode == "fir":
-        zones = zones_of(build_bench_trajectory(feed))
+        zones = find_program_zones(build_bench_trajectory(feed))
     else:
-        zones = zones_of(plan_test_program(BENCH.format(mode=mode, feed=1000 * feed), LINUXCNC), LINUXCNC)
+        zones = find_program_zones(plan_test_program(BENCH.format(mode=mode, feed=1000 * feed), LINUXCNC), LINUXCNC)
     large = [zone for zone in zones if zone.max_um > 46.0 and zone.cause != "stop"]
     assert {zone.cause for zone in large} == {"corner"}
     for zone in large:
-        assert nearest(zone, CORNERS) < widest_mm
+        assert find_nearest_zone(zone, CORNERS) < widest_mm
     for corner in CORNERS:
-        assert any(nearest(zone, (corner,)) < widest_mm for zone in large)
-    bottom = [zone for zone in zones if nearest(zone, ((150, 5),)) < 10.0]
+        assert any(find_nearest_zone(zone, (corner,)) < widest_mm for zone in large)
+    bottom = [zone for zone in zones if find_nearest_zone(zone, ((150, 5),)) < 10.0]
     assert {zone.cause for zone in bottom} <= {"reversal", "circular lag"}
 
 
-def test_the_stick_at_the_bottom_is_a_reversal_until_the_lag_is_more() -> None:
+def test_reversal_stick_is_cause_until_lag_dominates() -> None:
     """At 10 m/min dry friction leaves 10 um there and the lag 5; at 20 the lag leaves 13."""
     for feed, cause in ((10, "reversal"), (20, "circular lag")):
-        bottom = [zone for zone in zones_of(build_bench_trajectory(feed)) if nearest(zone, ((150, 5),)) < 2.0]
+        bottom = [
+            zone
+            for zone in find_program_zones(build_bench_trajectory(feed))
+            if find_nearest_zone(zone, ((150, 5),)) < 2.0
+        ]
         assert {zone.cause for zone in bottom} == {cause}
 
 
 @pytest.mark.parametrize("feed", [10, 20])
-def test_a_rounded_path_errs_where_its_arcs_begin_and_end(feed: int) -> None:
-    zones = zones_of(build_trajectory(build_rounded_demand(feed)))
+def test_rounded_path_has_errors_at_arc_ends(feed: int) -> None:
+    zones = find_program_zones(build_trajectory(build_rounded_demand(feed)))
     assert {zone.cause for zone in sorted(zones, key=lambda z: -z.max_um)[:2]} == {"corner"}
     lag = [zone for zone in zones if zone.cause == "circular lag"]
     assert all(zone.max_um < 0.3 * max(z.max_um for z in zones) for zone in lag)
@@ -95,58 +99,60 @@ def test_a_rounded_path_errs_where_its_arcs_begin_and_end(feed: int) -> None:
         (20, 10000, "circular lag"),
     ],
 )
-def test_circles(nc: str, radius_mm: float, feed_mm_min: float, cause: str) -> None:
+def test_circle_zone_causes(nc: str, radius_mm: float, feed_mm_min: float, cause: str) -> None:
     config = NC[nc]
     program = f"G21 G90 G64\nG3 X0 Y0 I{radius_mm} P4 F{feed_mm_min}\nM2\n"
     reference = plan_test_program(program, config)
-    zones = zones_of(reference, config)
+    zones = find_program_zones(reference, config)
     assert "corner" not in {zone.cause for zone in zones}
     # once the loops have settled from the start, and before the stop
     inside = [zone for zone in zones if zone.end_s > 0.35 and zone.start_s < reference.time_s[-1] - 1.0]
     assert max(inside, key=lambda zone: zone.max_um if zone.cause not in ("start", "stop") else 0.0).cause == cause
     quadrants = ((0, 0), (radius_mm, radius_mm), (2 * radius_mm, 0), (radius_mm, -radius_mm))
     for zone in zones:
-        assert zone.cause != "reversal" or nearest(zone, quadrants) < 1.0
+        assert zone.cause != "reversal" or find_nearest_zone(zone, quadrants) < 1.0
 
 
-def test_a_circle_beyond_the_drives_is_saturation() -> None:
+def test_infeasible_circle_is_saturation() -> None:
     """20 m/min on 10 mm."""
-    zones = zones_of(plan_test_program("G21 G90 G64\nG3 X0 Y0 I10 P3 F20000\nM2\n", CONFIG))
+    zones = find_program_zones(plan_test_program("G21 G90 G64\nG3 X0 Y0 I10 P3 F20000\nM2\n", CONFIG))
     assert {zone.cause for zone in zones} == {"saturation"}
 
 
 @pytest.mark.parametrize("nc", NC)
-def test_chords_of_a_circle_are_a_circle(nc: str) -> None:
+def test_circle_of_chords_is_classified_as_circle(nc: str) -> None:
     """Each chord turns by 5 degrees within 18 ms, below the loops' time."""
     angle = np.linspace(0.0, 4 * np.pi, 145)[1:]
     chords = [f"G1 X{20 - 20 * np.cos(a):.4f} Y{20 * np.sin(a):.4f} F6000" for a in angle]
-    zones = zones_of(plan_test_program("\n".join(["G21 G90 G64 P0.01", *chords, "M2"]), NC[nc]), NC[nc])
+    zones = find_program_zones(plan_test_program("\n".join(["G21 G90 G64 P0.01", *chords, "M2"]), NC[nc]), NC[nc])
     inside = [zone for zone in zones if zone.start_s > 0.25 and zone.cause != "stop"]
     assert {zone.cause for zone in inside} == {"circular lag", "reversal"}
 
 
 @pytest.mark.parametrize("nc", NC)
 @pytest.mark.parametrize("radius_mm", [5, 20])
-def test_a_helix_is_a_circle(nc: str, radius_mm: float) -> None:
+def test_helix_is_classified_as_circle(nc: str, radius_mm: float) -> None:
     space = bench_config("XYZ")
     config = space.model_copy(update={"nc": NC[nc].nc})
-    zones = zones_of(plan_test_program(f"G21 G90 G64\nG3 X0 Y0 I{radius_mm} Z20 P3 F8000\nM2\n", config), config)
+    zones = find_program_zones(
+        plan_test_program(f"G21 G90 G64\nG3 X0 Y0 I{radius_mm} Z20 P3 F8000\nM2\n", config), config
+    )
     assert {zone.cause for zone in zones} <= {"start", "circular lag", "reversal", "stop"}
-    assert seconds(zones, "circular lag") > 0.5
+    assert sum_duration_s(zones, "circular lag") > 0.5
 
 
 @pytest.mark.parametrize(
     ("gain", "cause", "never"), [(20.0, "corner", "circular lag"), (100.0, "circular lag", "corner")]
 )
-def test_what_is_a_corner_goes_with_the_time_of_the_loops(gain: float, cause: str, never: str) -> None:
+def test_corner_detection_scales_with_loop_time(gain: float, cause: str, never: str) -> None:
     """The same arc of 90 degrees: slow loops have not settled at its end, fast ones always have."""
     axes = {
         name: axis.model_copy(update={"regulators": axis.regulators.model_copy(update={"position_gain_per_s": gain})})
         for name, axis in CONFIG.axis.items()
     }
     config = CONFIG.model_copy(update={"axis": axes})
-    models = {axis: replace(model, Cd=0.0) for axis, model in nominal_models(config).items()}
+    models = {axis: replace(model, Cd=0.0) for axis, model in build_nominal_models(config).items()}
     reference = plan_test_program("G21 G90 G64\nG1 X100 F6000\nG3 X120 Y20 J20\nG1 Y150\nM2\n", config)
-    zones = predict(reference, models, config, zones_above_um=0.5).zones
-    assert seconds(zones, cause) > 0.2
-    assert seconds(zones, never) == 0.0
+    zones = predict_path(reference, models, config, zones_above_um=0.5).zones
+    assert sum_duration_s(zones, cause) > 0.2
+    assert sum_duration_s(zones, never) == 0.0

@@ -17,9 +17,9 @@ from scipy.spatial import cKDTree
 
 from fdhil.config import MachineConfig, parse_config
 from fdhil.correction import mirror
-from fdhil.correction import plan as correct
-from fdhil.prediction import predict_corrected
-from fdhil.prediction.models import nominal_models
+from fdhil.correction import plan_correction as correct
+from fdhil.prediction import predict_corrected_path
+from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.program import Dwell, interpret, plan
 from fdhil.records import Float
 from tests.bench import bench_config, bench_document
@@ -182,10 +182,10 @@ def test_the_correction_stands_the_jerky_demand(theirs: Theirs) -> None:
     rows = theirs(text, math.inf)[:, :2]
     reference = build_trajectory(np.round(np.concatenate([rows, np.repeat(rows[-1:], 500, axis=0)]) * 3276.8) / 3276.8)
     config = bench_config()
-    models = nominal_models(config)
+    models = build_nominal_models(config)
     correction = correct(reference, models, config, "inverse")
     assert not correction.refused
-    mirrored = mirror.plan(reference, models, config, correction.before).offset_um
+    mirrored = mirror.plan_mirror_offsets(reference, models, config, correction.before).offset_um
     left = compute_rms(correction.after.contour_um)
     assert compute_rms(correction.before.contour_um) >= 14 * left
-    assert compute_rms(predict_corrected(reference, models, config, mirrored).contour_um) >= 2 * left
+    assert compute_rms(predict_corrected_path(reference, models, config, mirrored).contour_um) >= 2 * left

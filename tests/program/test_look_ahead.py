@@ -13,9 +13,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from fdhil.config import MachineConfig, parse_config
-from fdhil.correction import plan as correct
-from fdhil.correction import streaming
-from fdhil.prediction.models import nominal_models
+from fdhil.correction import block_streaming
+from fdhil.correction import plan_correction as correct
+from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.program import Arc, Dwell, Feed, Motion, Rapid, plan
 from fdhil.program.motions import BLEND, ORIGIN, Corner, Place, reached
 from fdhil.program.planner import stream
@@ -233,9 +233,9 @@ def test_a_jerky_demand_is_corrected_while_it_is_planned() -> None:
     """Steps of acceleration from a stream of blocks into the streamed correction: as good as the whole at once."""
     config = machine("trapezoidal")
     moves = [move for move in MOVES if not isinstance(move, Rapid)]
-    models = nominal_models(config)
+    models = build_nominal_models(config)
     pieces = (block.position_mm for block in stream(moves, config, 100))
-    blocks = list(streaming.stream(pieces, models, config))
+    blocks = list(block_streaming.stream_blocks(pieces, models, config))
     assert blocks[-1].final
     assert not any(block.refused for block in blocks)
     before = np.concatenate([block.before_um for block in blocks])

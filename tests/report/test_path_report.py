@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdhil.correction import plan
-from fdhil.prediction import predict
-from fdhil.prediction.models import nominal_models
+from fdhil.correction import plan_correction
+from fdhil.prediction import predict_path
+from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.records import Correction, freeze_array
 from fdhil.report import figures, path_maps, write_page
 from fdhil.report.path_report import (
@@ -28,12 +28,12 @@ from tests.bench import bench_config
 from tests.paths import build_bench_trajectory, build_trajectory, smooth_demand
 
 CONFIG = bench_config()
-MODELS = nominal_models(CONFIG)
+MODELS = build_nominal_models(CONFIG)
 
 
 @pytest.fixture(scope="module", name="correction")
 def _correction() -> Correction:
-    return plan(build_bench_trajectory(10), MODELS, CONFIG)
+    return plan_correction(build_bench_trajectory(10), MODELS, CONFIG)
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -67,7 +67,7 @@ def test_magnified_deviation_is_the_contour_error(correction: Correction) -> Non
 @pytest.mark.usefixtures("long_computation")
 def test_refused_correction_page_shows_the_reasons() -> None:
     """The page shows the uncorrected path and the advice."""
-    refused = plan(build_bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG)
+    refused = plan_correction(build_bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG)
     page = build_correction_page("part.ngc", "bench", refused)
     assert ("correction", "refused") in page.headline
     assert "lower the feed to" in page.sections[0].text
@@ -91,7 +91,7 @@ def test_planes_are_listed_for_three_axes_and_for_one() -> None:
     assert list_planes(solid) == [("X", "Y"), ("X", "Z")]
     alone = build_trajectory(np.asarray(flat.position_mm["Y"])[:, None], "Y")
     assert list_planes(alone) == []
-    page = build_prediction_page("up.ngc", "bench", predict(alone, MODELS, CONFIG))
+    page = build_prediction_page("up.ngc", "bench", predict_path(alone, MODELS, CONFIG))
     assert [caption for caption, _ in page.sections[0].figures] == ["Contour error over time"]
 
 
@@ -99,7 +99,7 @@ def test_single_axis_error_is_drawn_over_time() -> None:
     """At a reversal, the error of the axis is drawn over time."""
     there = np.linspace(0.0, 60.0, 360)
     path = smooth_demand(np.concatenate([there, there[::-1], np.zeros(300)])[:, None], (0.060, 0.030), 0.001)
-    page = build_prediction_page("up.ngc", "bench", predict(build_trajectory(path, "Y"), MODELS, CONFIG))
+    page = build_prediction_page("up.ngc", "bench", predict_path(build_trajectory(path, "Y"), MODELS, CONFIG))
     (caption, svg), *_ = page.sections[1].figures
     assert "reversal" in caption
     assert "Y ahead of the desired (um)" in svg
@@ -114,7 +114,7 @@ def test_long_path_is_drawn_by_points_with_limited_zones(tmp_path: Path) -> None
     once = np.column_stack([build_bench_trajectory(10).position_mm[axis] for axis in "XY"])
     both = np.concatenate([once, once[::-1]])
     path = np.concatenate([both + np.array([0.0, 0.5 * k]) for k in range(14)])
-    predicted = predict(build_trajectory(path), MODELS, CONFIG)
+    predicted = predict_path(build_trajectory(path), MODELS, CONFIG)
     assert len(predicted.zones) > 50
     page = build_prediction_page("long.ngc", "bench", predicted)
     along, places, zones = page.sections
@@ -151,6 +151,6 @@ def test_small_error_is_visible_next_to_a_large_one() -> None:
 
 def test_path_without_error_yields_a_page() -> None:
     still = build_trajectory(np.zeros((300, 2)))
-    page = build_prediction_page("nothing.ngc", "bench", predict(still, MODELS, CONFIG))
+    page = build_prediction_page("nothing.ngc", "bench", predict_path(still, MODELS, CONFIG))
     assert page.sections[1].text == page.sections[2].text == "No zone stands out."
     assert ("predicted, largest", "below 0.001 um") in page.headline

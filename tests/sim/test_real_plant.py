@@ -111,7 +111,7 @@ def test_real_plant_matches_independent_plant_with_same_effect(
     plant = replace(PLANT, ft=0.0) if "resonance_hz" in keys else PLANT
     start = np.zeros(7)
     demand = build_reversal()
-    other = real_plant.run(Mechanics(**mechanics, ft=plant.ft), demand / 1e3, Loops(**loops), start=start)
+    other = real_plant.simulate_axis(Mechanics(**mechanics, ft=plant.ft), demand / 1e3, Loops(**loops), start=start)
     got, without = (cut_path(build_axis(plant=plant, increments=FINE, **k), demand, FINE) for k in (keys, {}))
     away_um = 1e3 * np.abs(got[:, :2] - 1e3 * np.column_stack([other.motor_m, other.table_m]))
     meant_um = 1e3 * np.abs(got[:, :2] - without[:, :2]).max()

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdhil.correction.learning import Lesson
+from fdhil.correction.learned_offsets import LearnedOffset
 from fdhil.errors import StoreError
 from fdhil.store import lessons
 from fdhil.store.lessons import MOST_PROGRAMS, lesson_path, read_lesson, write_lesson
 
-LESSON = Lesson({"X": np.linspace(-3.0, 3.0, 50), "Y": np.zeros(50)}, 1.5, 0.35, (1.5, 0.6, 0.4))
+LESSON = LearnedOffset({"X": np.linspace(-3.0, 3.0, 50), "Y": np.zeros(50)}, 1.5, 0.35, (1.5, 0.6, 0.4))
 
 
 def test_a_lesson_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -35,13 +35,13 @@ def test_a_damaged_lesson_is_none(tmp_path: Path, keep: int) -> None:
 
 def test_a_lesson_that_is_not_finite_is_none(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
-    write_lesson(path, Lesson({"X": np.array([1.0, np.nan])}))
+    write_lesson(path, LearnedOffset({"X": np.array([1.0, np.nan])}))
     assert read_lesson(path) is None
 
 
 def test_the_oldest_lessons_go(tmp_path: Path) -> None:
     for number in range(MOST_PROGRAMS + 3):
-        write_lesson(tmp_path / f"{number}.npz", Lesson({"X": np.zeros(2)}))
+        write_lesson(tmp_path / f"{number}.npz", LearnedOffset({"X": np.zeros(2)}))
     assert len(list(tmp_path.glob("*.npz"))) == MOST_PROGRAMS
 
 
@@ -57,7 +57,7 @@ def test_a_lesson_that_goes_while_all_are_listed_is_left_out(tmp_path: Path, mon
         write_lesson(path, LESSON)
     read = lessons.read_lesson
 
-    def both_go(path: Path) -> Lesson | None:
+    def both_go(path: Path) -> LearnedOffset | None:
         found = read(path)
         for each in paths:
             each.unlink(missing_ok=True)

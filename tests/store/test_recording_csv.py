@@ -19,7 +19,7 @@ COLUMNS = ("voltage_V", "current_A", "speed_rad_per_s", "position_m", "demand_m"
 
 def _text(rows: int = 40, **headers: str) -> str:
     values = np.linspace(0.0, rows * 0.5, rows, endpoint=False)
-    return bench.table_text(0.001, dict.fromkeys(COLUMNS, values), **headers)
+    return bench.format_table(0.001, dict.fromkeys(COLUMNS, values), **headers)
 
 
 def _without(text: str, start: str) -> str:
@@ -44,7 +44,7 @@ def test_reads_units_and_headers(tmp_path: Path) -> None:
 def test_columns_may_come_in_any_order_with_more() -> None:
     columns: dict[str, bench.Array] = {name: np.linspace(0.0, 29.0, 30) for name in ("extra", *reversed(COLUMNS))}
     columns["current_A"] = np.linspace(0.0, 87.0, 30)
-    recording = parse_recording(bench.table_text(0.001, columns))
+    recording = parse_recording(bench.format_table(0.001, columns))
     assert recording.current_a[2] == 6.0
 
 
@@ -168,7 +168,9 @@ def test_a_file_larger_than_any_recording_is_refused_before_it_is_taken_apart(
 
 def _deaf(**headers: str) -> str:
     values = np.linspace(0.0, 20.0, 40, endpoint=False)
-    text = bench.table_text(0.001, dict.fromkeys((name for name in COLUMNS if name != "voltage_V"), values), **headers)
+    text = bench.format_table(
+        0.001, dict.fromkeys((name for name in COLUMNS if name != "voltage_V"), values), **headers
+    )
     return _without(text, "# voltage_sampling")
 
 
@@ -200,16 +202,16 @@ def test_a_wrong_header_of_the_signals_is_told(headers: dict[str, str], words: s
 def test_sensors_at_the_table_may_lack_rows_and_other_columns_may_not() -> None:
     columns: dict[str, bench.Array] = dict.fromkeys(COLUMNS, np.linspace(0.0, 29.0, 30))
     lacking = np.where(np.arange(30) == 5, np.nan, 1.0)
-    read = parse_recording(bench.table_text(0.001, columns | {"table_mm": lacking, "table_m_s2": -lacking}))
+    read = parse_recording(bench.format_table(0.001, columns | {"table_mm": lacking, "table_m_s2": -lacking}))
     assert read.table_mm is not None
     assert read.table_m_s2 is not None
     assert np.flatnonzero(np.isnan(read.table_mm)).tolist() == [5]
     assert read.table_m_s2[6] == -1.0
     assert parse_recording(_text()).table_mm is None
     with pytest.raises(RecordingError, match="line 13 has the non-finite value 'nan'"):
-        parse_recording(bench.table_text(0.001, columns | {"current_A": lacking}))
+        parse_recording(bench.format_table(0.001, columns | {"current_A": lacking}))
     with pytest.raises(RecordingError, match="line 13 has the non-finite value 'inf'"):
-        parse_recording(bench.table_text(0.001, columns | {"table_mm": np.where(np.isnan(lacking), np.inf, 1.0)}))
+        parse_recording(bench.format_table(0.001, columns | {"table_mm": np.where(np.isnan(lacking), np.inf, 1.0)}))
 
 
 def test_what_stands_twice_is_refused_and_empty_cells_of_a_spreadsheet_are_not() -> None:

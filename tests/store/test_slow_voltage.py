@@ -10,17 +10,17 @@ import pytest
 from fdhil.config import Identification
 from fdhil.daemon.outcome_json import build_outcome_document
 from fdhil.errors import RecordingError
-from fdhil.pipeline import analyse
+from fdhil.pipeline import analyse_window
 from fdhil.records import Window
 from fdhil.store.export import table_of
 from fdhil.store.recording_csv import encode, parse_recording
 from fdhil.store.windows import decode_window, encode_window
-from studies.slow_sensor import slow_windows
+from studies.slow_sensor import record_slow_windows
 from tests.polled_voltage import build_polled_windows
 
 
 def test_the_sensors_own_grid_is_kept_bit_by_bit() -> None:
-    window = slow_windows(0.005)[0]
+    window = record_slow_windows(0.005)[0]
     assert window.slow_voltage is not None
     back = decode_window(encode_window(window, "digest")).slow_voltage
     assert back is not None
@@ -33,14 +33,14 @@ def test_the_sensors_own_grid_is_kept_bit_by_bit() -> None:
 
 
 def test_a_changed_grid_is_damage() -> None:
-    content = encode_window(slow_windows(0.005)[0], "digest")
+    content = encode_window(record_slow_windows(0.005)[0], "digest")
     assert content.count(b'"period_s": 0.005') == 1
     with pytest.raises(RecordingError, match="digest"):
         decode_window(content.replace(b'"period_s": 0.005', b'"period_s": 0.006'))
 
 
 def test_what_current_and_speed_alone_tell_has_its_units_in_the_document() -> None:
-    outcome = analyse(replace(slow_windows(0.005)[0], slow_voltage=None), Identification())
+    outcome = analyse_window(replace(record_slow_windows(0.005)[0], slow_voltage=None), Identification())
     told = build_outcome_document(outcome)["parameters"]
     assert told["Jt/K"]["value"] == pytest.approx(0.075 / 0.8, rel=0.01)
     assert [told[name]["unit"] for name in ("Jt/K", "ft/K", "Cd/K")] == ["A.s2/rad", "A.s/rad", "A"]
@@ -54,7 +54,7 @@ def _lines(window: Window) -> list[str]:
 
 @pytest.mark.parametrize("period", ["5e-6", "1e-320"])
 def test_samples_closer_than_the_rows_are_refused(period: str) -> None:
-    lines = [line for line in _lines(slow_windows(0.005)[0]) if not line.startswith("# voltage_period_s")]
+    lines = [line for line in _lines(record_slow_windows(0.005)[0]) if not line.startswith("# voltage_period_s")]
     with pytest.raises(RecordingError, match="closer than its rows"):
         parse_recording("\n".join([f"# voltage_period_s: {period}", *lines]) + "\n")
 

@@ -12,9 +12,9 @@ import pytest
 from fdhil.config import Identification
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.rapid_windows import find_moving_range, find_windows
-from fdhil.pipeline import analyse
+from fdhil.pipeline import analyse_window
 from fdhil.records import Float, Reason, Window, freeze_array
-from fdhil.validation.rest import rest_faults
+from fdhil.validation.standstill_checks import check_sensor_offsets
 from fdhil.validation.window_fit import WindowFit
 from fdhil.validation.window_signals import WindowSignals
 from studies import faults
@@ -23,21 +23,21 @@ from tests.identification.bench_recordings import find_noisy_windows
 SETTINGS = Identification()
 
 
-def _at_rest(window: Window) -> Sequence[Reason]:
+def _list_standstill_faults(window: Window) -> Sequence[Reason]:
     fit = maximum_likelihood.fit_windows([window], SETTINGS)
     assert fit is not None
     return [
         reason
-        for reason in rest_faults(WindowFit(WindowSignals(window, SETTINGS), fit=fit))
+        for reason in check_sensor_offsets(WindowFit(WindowSignals(window, SETTINGS), fit=fit))
         if "at standstill the current" in reason.text
     ]
 
 
 @pytest.mark.parametrize("share", [-0.02, 0.02])
-def test_a_current_that_is_not_the_voltages_over_resistance_at_standstill_has_a_wrong_zero(share: float) -> None:
+def test_current_offset_at_standstill_is_refused(share: float) -> None:
     window = find_noisy_windows(0.003)[0]
     off = share * float(np.abs(window.current_a).max())
-    (reason,) = _at_rest(replace(window, current_a=freeze_array(window.current_a + off)))
+    (reason,) = _list_standstill_faults(replace(window, current_a=freeze_array(window.current_a + off)))
     assert reason.code == "CalibrationSuspect"
     told = re.search(r"reads (\S+) A", reason.text)
     assert told is not None
@@ -45,27 +45,27 @@ def test_a_current_that_is_not_the_voltages_over_resistance_at_standstill_has_a_
 
 
 @pytest.mark.parametrize("noise", [0.001, 0.003, 0.005])
-def test_right_zeros_are_believed(noise: float) -> None:
-    assert [_at_rest(window) for window in find_noisy_windows(noise, moves=2)] == [[], []]
+def test_correct_sensor_zeros_are_accepted(noise: float) -> None:
+    assert [_list_standstill_faults(window) for window in find_noisy_windows(noise, moves=2)] == [[], []]
 
 
 @pytest.mark.parametrize("rows_before_its_end", [5, 20, 60])
-def test_samples_lost_while_the_table_still_moves_are_missed(rows_before_its_end: int) -> None:
+def test_samples_lost_in_motion_are_refused(rows_before_its_end: int) -> None:
     window = find_noisy_windows(0.003)[0]
     end = find_moving_range(window)[1] - rows_before_its_end
-    assert "StaleData" in {r.code for r in analyse(_lost(window, end, 30), SETTINGS).verdict.reasons}
+    assert "StaleData" in {r.code for r in analyse_window(_drop_samples(window, end, 30), SETTINGS).verdict.reasons}
 
 
-def test_samples_lost_at_standstill_are_not() -> None:
-    outcome = analyse(_lost(find_noisy_windows(0.003)[0], 10, 20), SETTINGS)
+def test_samples_lost_at_standstill_are_tolerated() -> None:
+    outcome = analyse_window(_drop_samples(find_noisy_windows(0.003)[0], 10, 20), SETTINGS)
     assert "StaleData" not in {r.code for r in outcome.verdict.reasons}
 
 
-def _lost(window: Window, begin: int, rows: int) -> Window:
+def _drop_samples(window: Window, begin: int, rows: int) -> Window:
     end = min(begin + rows, window.n)
     assert window.voltage_v is not None
 
-    def spoilt(values: Float) -> Float:
+    def drop(values: Float) -> Float:
         values = values.copy()
         values[begin:end] = np.nan
         return freeze_array(values)
@@ -73,19 +73,17 @@ def _lost(window: Window, begin: int, rows: int) -> Window:
     return replace(
         window,
         gaps=((begin, end),),
-        voltage_v=spoilt(window.voltage_v),
-        current_a=spoilt(window.current_a),
-        speed_rad_s=spoilt(window.speed_rad_s),
-        position_mm=spoilt(window.position_mm),
+        voltage_v=drop(window.voltage_v),
+        current_a=drop(window.current_a),
+        speed_rad_s=drop(window.speed_rad_s),
+        position_mm=drop(window.position_mm),
     )
 
 
 @pytest.mark.parametrize(("seed", "told"), [(322, False), (2602, True)])
-def test_friction_that_rises_towards_rest_is_believed_where_it_tells_where_the_axis_rests(
-    seed: int, told: bool
-) -> None:
+def test_stribeck_friction_is_accepted_if_rest_position_is_known(seed: int, told: bool) -> None:
     sticking = faults.KINDS["Stribeck friction"].make(np.random.default_rng([1, 2, seed]))
     (window,) = find_windows(sticking.recording)
-    verdict = analyse(window, SETTINGS).verdict
+    verdict = analyse_window(window, SETTINGS).verdict
     assert verdict.accepted == told
     assert ["the axis may slip" in reason.text for reason in verdict.reasons] == ([] if told else [True])

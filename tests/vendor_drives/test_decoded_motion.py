@@ -78,9 +78,9 @@ def test_vendors_drive_is_identified(outfit: VendorDrive, tmp_path: Path) -> Non
     pipeline, moves = AxisPipeline("X", config), InferredMoves("X", config)
     outcomes = []
     for record in records:
-        outcomes += pipeline.feed(record)
+        outcomes += pipeline.process_record(record)
         for move in moves.detect_moves(record) if isinstance(record, AxisSamples) else ():
-            outcomes += pipeline.feed(move)
+            outcomes += pipeline.process_record(move)
     windows = [outcome for outcome in outcomes if isinstance(outcome, WindowOutcome)]
     assert [window.verdict.reasons for window in windows if not window.verdict.accepted] == []
     assert len(windows) == 2

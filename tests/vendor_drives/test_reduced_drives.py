@@ -10,7 +10,7 @@ import pytest
 from fdhil import correction
 from fdhil.arming.guard_settings import settings_of
 from fdhil.cia402 import pack_pdo
-from fdhil.prediction.contour import contour_error_um
+from fdhil.prediction.contour_error import compute_contour_error_um
 from fdhil.records import Float, Parameters, Trajectory, compute_rms, freeze_array
 from tests.sim.bench_simulator import PERIOD_S, SteppedSimulator, build_corner_rows, build_trajectory
 from tests.vendor_drives.vendor_machines import LED, OUTFITS, VendorDrive, build_vendor_config, start_drives
@@ -42,7 +42,7 @@ def play_demand(
     twin.machine.nc.play_demand("cut", demand)
     twin.run_until("finished")
     actual = np.array(table)[: len(path)]
-    return compute_rms(contour_error_um(path, actual, PERIOD_S))
+    return compute_rms(compute_contour_error_um(path, actual, PERIOD_S))
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -53,7 +53,7 @@ def test_corrected_cut_has_smaller_error(outfit: VendorDrive, tmp_path: Path) ->
     path = np.vstack([np.zeros((40, 2)), build_corner_rows(), np.tile(build_corner_rows()[-1:], (100, 1))])
     demand = build_trajectory(path)
     models = {axis: Parameters(**settings.nominal.model_dump()) for axis, settings in config.axis.items()}
-    planned = correction.plan(demand, models, config, "inverse")
+    planned = correction.plan_correction(demand, models, config, "inverse")
     before = play_demand(twin, demand, path)
     if outfit.on_line:
         after = play_demand(twin, demand, path, dict(planned.offset_um))

@@ -124,7 +124,7 @@ class GuardThread:
     def _decide(self, sync: bytes) -> None:
         self.tick += 1
         now_s = self.tick * PERIOD_S
-        axes, bus = self.listener.close_sync_cycle(sync, now_s, now_s)
+        axes, bus = self.listener.receive_at_sync(sync, now_s, now_s)
         inputs = StepInputs(True, axes, bus, alarms=self.listener.take_alarms(), path=self.path, request=self.request)
         self.request = None
         self.state, output = guard_step.step_guard(self.state, inputs, self.settings)
@@ -144,7 +144,7 @@ def build_shuttle_demand() -> Trajectory:
 def plan_correction(config: MachineConfig, demand: Trajectory) -> Float:
     """Return the offset (n,) um that the model in the file demands."""
     models = {axis: Parameters(**settings.nominal.model_dump()) for axis, settings in config.axis.items()}
-    found = correction.plan(demand, models, config, "inverse")
+    found = correction.plan_correction(demand, models, config, "inverse")
     assert not found.refused
     return found.offset_um["X"]
 

@@ -19,9 +19,9 @@ from numpy.testing import assert_allclose
 from fdhil import correction
 from fdhil.arming import passes
 from fdhil.config import MachineConfig
-from fdhil.correction.learning import Lesson
+from fdhil.correction.learned_offsets import LearnedOffset
 from fdhil.errors import ProgramError
-from fdhil.prediction.models import nominal_models
+from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.program import load_trajectory
 from fdhil.records import Notice
 from fdhil.store.history import History
@@ -113,7 +113,7 @@ def get(client: Client, judged: dict[str, Any], path: str, **query: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def planned(machine: MachineConfig) -> Any:
-    return correction.plan(load_trajectory(PROGRAM, machine), nominal_models(machine), machine)
+    return correction.plan_correction(load_trajectory(PROGRAM, machine), build_nominal_models(machine), machine)
 
 
 @pytest.mark.usefixtures("processes")
@@ -331,7 +331,7 @@ def test_a_name_is_shown_without_what_no_screen_shows() -> None:
 
 def test_what_passes_taught_is_told_of_this_machine_alone(client: Client, machine: MachineConfig) -> None:
     folder = machine.store.directory / "lessons"
-    lesson = Lesson({"X": np.zeros(3)}, without_um=9.0, curve_um=(9.0, 3.0, 1.0))
+    lesson = LearnedOffset({"X": np.zeros(3)}, without_um=9.0, curve_um=(9.0, 3.0, 1.0))
     write_lesson(lesson_path(folder, "ab" * 32, machine.digest), lesson)
     write_lesson(lesson_path(folder, "cd" * 32, "ef" * 32), lesson)
     told = client.get("/api/program/learning").json()

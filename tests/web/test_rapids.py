@@ -21,7 +21,7 @@ from fastapi import FastAPI
 from fdhil.config import MachineConfig
 from fdhil.daemon.kernel_warmup import simulate_nominal_rapid
 from fdhil.daemon.outcome_store import WINDOWS_FOLDER
-from fdhil.pipeline.overlay import Overlay, lay_over
+from fdhil.pipeline.model_overlay import ModelOverlay, overlay_model
 from fdhil.records import Window, freeze_array
 from fdhil.store.history import HISTORY_FILE_NAME, History
 from fdhil.store.windows import decode_window, read_window
@@ -322,7 +322,7 @@ def rapid(machine: MachineConfig) -> Window:
 
 
 def _told(window: Window, config: MachineConfig) -> dict[str, Signal]:
-    return {signal.name: signal for signal in signals_of(lay_over(window, config)).signals}
+    return {signal.name: signal for signal in signals_of(overlay_model(window, config)).signals}
 
 
 def test_without_a_voltage_the_closed_loop_is_laid_over(rapid: Window, machine: MachineConfig) -> None:
@@ -388,7 +388,7 @@ def test_a_long_recording_is_thinned_and_its_peaks_stay(rapid: Window, machine: 
         name: freeze_array(np.append(getattr(rapid, name), np.full(rows - rapid.n, getattr(rapid, name)[-1])))
         for name in ("demand_mm", "position_mm", "speed_rad_s", "current_a", "voltage_v")
     }
-    told = signals_of(Overlay(replace(rapid, **longer), lay_over(rapid, machine).outcome))
+    told = signals_of(ModelOverlay(replace(rapid, **longer), overlay_model(rapid, machine).outcome))
     assert told.every == 3
     assert len(told.time_s) == len(told.signals[0].measured) <= MOST_POINTS
     assert len(told.frequency_hz) == len(told.signals[0].measured_spectrum) <= MOST_POINTS

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from fdhil.config import Axis, MachineConfig
-from fdhil.correction.learning import Lesson
+from fdhil.correction.learned_offsets import LearnedOffset
 from fdhil.daemon import black_box
 from fdhil.daemon.kernel_warmup import simulate_nominal_rapid
 from fdhil.daemon.outcome_store import OutcomeStore
@@ -63,7 +63,7 @@ def fill(config: MachineConfig, rapids: int = 84, last: Stamp | None = None) -> 
             celsius = AMBIENT_C + 1.5 * float(np.sin(1.3 * k)) * (k < rapids - 4)
             for name, pipeline in pipelines.items():
                 window = rapid(name, config, k, rapids, celsius, int(rng.integers(1 << 30)))
-                assert store.store_outcomes(pipeline.feed(window)) == []
+                assert store.store_outcomes(pipeline.process_record(window)) == []
         clock["at"] = earlier(last, APART_S)
         store.store_outcomes([*NOTICES, black_box(config, clock["at"])])
 
@@ -134,5 +134,5 @@ def spoiled(window: Window, kind: int) -> Window:
 
 def teach(config: MachineConfig, program_digest: str, rows: int) -> None:
     offset = freeze_array(0.05 * np.sin(np.arange(rows) / 300.0))
-    lesson = Lesson(dict.fromkeys(config.axis, offset), 10.3, 0.7, (3.4, 1.6, 0.9))
+    lesson = LearnedOffset(dict.fromkeys(config.axis, offset), 10.3, 0.7, (3.4, 1.6, 0.9))
     write_lesson(lesson_path(config.store.directory / "lessons", program_digest, config.digest), lesson)

@@ -20,7 +20,7 @@ from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
 from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
 from fdhil.errors import DeviceTimeout, FdhilError, RecordingError
-from fdhil.prediction import contour_error_um, predict
+from fdhil.prediction import compute_contour_error_um, predict_path
 from fdhil.program import load_trajectory
 from fdhil.records import PARAMETERS, Parameters, ParameterSet, Window
 from fdhil.sim.drive.plant_physics import build_plant_parameters
@@ -145,7 +145,7 @@ def _measure(stage: Stage) -> Loop:
     stage.say("shuttling both axes at rapid speed")
     cold = _shuttle(stage, published)
     models = {axis: found[0].parameters for axis, found in published.items()}
-    predicted = predict(programs["10 m/min"], models, config)
+    predicted = predict_path(programs["10 m/min"], models, config)
     stage.say(f"predicted contour error of the path: {rms(predicted.contour_um):.1f} um RMS")
     cut(stage, "uncorrected", 20.0)
     cut(stage, "mirror", 20.0, "mirror")
@@ -218,7 +218,7 @@ def cut(stage: Stage, label: str, celsius: float, method: str | None = None) -> 
     program, trace = stage.programs["10 m/min"], stage.out / f"cut-{len(stage.cuts) + 1}.csv"
     finished = stage.twin.play(program, trace) if method is None else _corrected(stage, program, trace, method)
     reference, table = read_trace(trace, tuple(stage.config.axis))
-    contour = contour_error_um(reference, table, stage.config.machine.sync_period_s)
+    contour = compute_contour_error_um(reference, table, stage.config.machine.sync_period_s)
     late = sum(int(n) for n in finished["late_rpdo"].values())
     done = Cut(label, celsius, reference, table, contour, late)
     stage.cuts.append(done)

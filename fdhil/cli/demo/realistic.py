@@ -15,8 +15,8 @@ from fdhil.cli.demo.machines import REAL, machine_document
 from fdhil.cli.demo.report import Cut, Published
 from fdhil.config import MachineConfig
 from fdhil.errors import ConnectError, FdhilError
-from fdhil.prediction import predict
-from fdhil.prediction.models import models_for, validated_models
+from fdhil.prediction import predict_path
+from fdhil.prediction.axis_models import load_validated_models, select_models
 from fdhil.program import load_trajectory
 from fdhil.records import Parameters, Prediction
 from fdhil.store.history import History
@@ -119,9 +119,9 @@ def _predicted(stage: Stage) -> Prediction | None:
     if len(newest) < len(stage.config.axis):
         return None
     sets = {axis: revision.set for axis, revision in newest.items()}
-    models, config = validated_models(sets, stage.config, source)
+    models, config = load_validated_models(sets, stage.config, source)
     reference = load_trajectory(program, config)
-    return predict(reference, models_for(reference, models, config, source), config)
+    return predict_path(reference, select_models(reference, models, config, source), config)
 
 
 def _corrected(stage: Stage) -> str:

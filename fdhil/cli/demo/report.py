@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.correction import plan as plan_correction
-from fdhil.prediction import predict
+from fdhil.correction import plan_correction as plan_correction
+from fdhil.prediction import predict_path
 from fdhil.records import (
     INTERVAL_95,
     PARAMETERS,
@@ -212,7 +212,7 @@ def _path(loop: Loop) -> Section:
 
 def _predicted(loop: Loop) -> Section:
     models = _models(loop)
-    feeds = {feed: predict(loop.programs[feed], models, loop.config) for feed in ("10 m/min", "20 m/min")}
+    feeds = {feed: predict_path(loop.programs[feed], models, loop.config) for feed in ("10 m/min", "20 m/min")}
     slow = loop.programs["10 m/min"]
     pictures = []
     for place, number in (("A", 11), ("C", 12), ("E", 13)):
@@ -224,7 +224,7 @@ def _predicted(loop: Loop) -> Section:
         caption = f"Predicted path at {place} for two feeds, errors {MAGNIFIED} times as large (Figure {number})"
         pictures.append((caption, figures.draw_path_detail(curves, POINTS[place], 8.0)))
     for (label, change), number in zip(DRIFTS, (14, 15), strict=True):
-        drifted = predict(slow, models | {"X": _drift(models["X"], change)}, loop.config)
+        drifted = predict_path(slow, models | {"X": _drift(models["X"], change)}, loop.config)
         curves = [
             Curve("desired", _xy(slow.position_mm)),
             Curve("as identified", _xy(feeds["10 m/min"].predicted_mm)),

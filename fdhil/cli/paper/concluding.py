@@ -10,8 +10,8 @@ from fdhil.cli.paper import paths
 from fdhil.cli.paper.claims import Claim, Trial, make_claim
 from fdhil.cli.paper.scenarios import DEMANDED, machine
 from fdhil.correction import flatness_feedforward
-from fdhil.prediction import predict
-from fdhil.prediction.models import nominal_models
+from fdhil.prediction import predict_path
+from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.records import Prediction
 from fdhil.report import Table
 
@@ -39,8 +39,8 @@ def _stop() -> Claim:
     trials = []
     for name in DEMANDED:
         reference, config = paths.reference(name), machine(name)
-        models = nominal_models(config)
-        seconds = min(_seconds(partial(predict, reference, models, config)) for _ in range(3))
+        models = build_nominal_models(config)
+        seconds = min(_seconds(partial(predict_path, reference, models, config)) for _ in range(3))
         share = 100.0 * seconds / float(reference.time_s[-1])
         trials.append(Trial(name, "time to predict, of the time to cut", share, "%", least=100.0))
     return make_claim("conclusion-stop", trials)
@@ -56,10 +56,13 @@ def _on_line() -> Claim:
     trials = []
     for name in DEMANDED:
         config, reference = machine(name), paths.reference(name)
-        model, axis = nominal_models(config)["X"], config.axis["X"]
+        model, axis = build_nominal_models(config)["X"], config.axis["X"]
         known = np.asarray(reference.position_mm["X"])
         middle = known.size // 2
-        whole, part = (flatness_feedforward.offsets(p, model, axis, reference.dt_s) for p in (known, known[:middle]))
+        whole, part = (
+            flatness_feedforward.compute_feedforward_offsets(p, model, axis, reference.dt_s)
+            for p in (known, known[:middle])
+        )
         same = [np.flatnonzero(a[:middle] != b) for a, b in zip(whole, part, strict=True)]
         first = min((int(rows[0]) for rows in same if rows.size), default=middle)
         seconds = (middle - first) * reference.dt_s

@@ -11,7 +11,7 @@ from fdhil.cli.paper.scenarios import machine
 from fdhil.config import Identification
 from fdhil.identification.derivatives import ZERO_FORCING_1, differentiate_signal
 from fdhil.identification.estimators import least_squares
-from fdhil.prediction.models import nominal_models
+from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.records import PARAMETERS, Bool, Float, Recording, Window
 from fdhil.report import Table
 
@@ -44,7 +44,7 @@ class Estimating:
 
 def measure(runs: int) -> Estimating:
     """Run all methods over ``runs`` recordings per noise level."""
-    plant, simulator = bench.plant(), nominal_models(machine())["X"]
+    plant, simulator = bench.plant(), build_nominal_models(machine())["X"]
     recording = bench.rapid(plant)
     quick = bench.rapid(simulator, move=bench.QUICK)
     return Estimating(recording, methods.compare(plant, recording, runs), methods.compare(simulator, quick, runs))

@@ -15,11 +15,11 @@ from fdhil.config import Identification
 from fdhil.identification.estimators import least_squares, maximum_likelihood
 from fdhil.identification.likelihood_fit import fit_parameters_and_noise
 from fdhil.identification.prepared_motion import prepare_window
-from fdhil.pipeline.analysis import analyse
+from fdhil.pipeline.window_analysis import analyse_window
 from fdhil.records import UNITS, Estimate, Float, Window, WindowOutcome, compute_rms
 from fdhil.report import Table, figures
 from fdhil.report.parameter_format import DISPLAY_UNITS
-from fdhil.validation.backlash import dead_band
+from fdhil.validation.backlash import measure_dead_band
 
 TEMPERATURES_C = (20.0, 20.5, 21.0, 21.5, 22.0)
 SURE = 1.96  # standard deviations
@@ -69,7 +69,7 @@ def _outcome(noise: float, trouble: Trouble = Trouble()) -> WindowOutcome:  # no
     config = machine()
     recording = bench.rapid(bench.plant(), trouble=trouble, strokes=2)
     window = bench.noisy(recording, noise, 0)[-1]
-    return analyse(window, Identification(), config.axis["X"], config.machine.sync_period_s)
+    return analyse_window(window, Identification(), config.axis["X"], config.machine.sync_period_s)
 
 
 def _drifts() -> Mapping[str, Drift]:
@@ -150,7 +150,7 @@ def _whiteness() -> Claim:
 def _backlash() -> Claim:
     trials, rows = [], []
     for name, true in (("backlash-5", 5.0), ("backlash-20", 20.0), ("backlash-100", 100.0)):
-        band = dead_band(_outcome(0.001, Trouble(backlash_um=true)).window)
+        band = measure_dead_band(_outcome(0.001, Trouble(backlash_um=true)).window)
         found, std = (float("nan"), float("nan")) if band is None else (band.um, band.std_um)
         trials.append(Trial(name, "dead band found over the true one", found / true, "x", least=0.8, most=1.2))
         rows.append([f"{true:g}", f"{found:.1f}", f"{std:.1f}"])

@@ -14,10 +14,10 @@ from fdhil.cli.paper import bench
 from fdhil.cli.paper.drawings import Traced
 from fdhil.cli.paper.scenarios import PATHS, machine
 from fdhil.config import MachineConfig
-from fdhil.correction import flatness_feedforward, linear
-from fdhil.prediction import contour_error_um
-from fdhil.prediction.models import nominal_models
-from fdhil.prediction.predict import predict_corrected
+from fdhil.correction import flatness_feedforward, linear_loop
+from fdhil.prediction import compute_contour_error_um
+from fdhil.prediction.axis_models import build_nominal_models
+from fdhil.prediction.path_prediction import predict_corrected_path
 from fdhil.program import load_trajectory
 from fdhil.records import Bool, Float, Parameters, Prediction, Trajectory, compute_rms
 
@@ -58,7 +58,7 @@ def desired_mm(scenario: str, program: str = SLOW) -> Float:
 
 
 def _models(changes: tuple[tuple[str, float], ...], config: MachineConfig) -> dict[str, Parameters]:
-    models = nominal_models(config)
+    models = build_nominal_models(config)
     return models | {"X": models["X"].replace_values(**dict(changes))}
 
 
@@ -67,22 +67,24 @@ def predicted(scenario: str, program: str = SLOW, changes: tuple[tuple[str, floa
     """Predict a program without correction; ``changes`` replace nominal parameters of X."""
     config = machine(scenario)
     # no offsets; unlike predict() this skips the zones, which are not needed
-    return predict_corrected(reference(scenario, program), _models(changes, config), config, None)
+    return predict_corrected_path(reference(scenario, program), _models(changes, config), config, None)
 
 
 @cache
 def predict_paper_correction(scenario: str, method: str, program: str = SLOW) -> Prediction:
     """Predict a program with an unlimited correction by one of ``METHODS``."""
     before, config = predicted(scenario, program), machine(scenario)
-    models = nominal_models(config)
+    models = build_nominal_models(config)
     if method == "flatness":
         offsets = {
-            axis: flatness_feedforward.offsets(np.asarray(path), models[axis], config.axis[axis], before.reference.dt_s)
+            axis: flatness_feedforward.compute_feedforward_offsets(
+                np.asarray(path), models[axis], config.axis[axis], before.reference.dt_s
+            )
             for axis, path in before.reference.position_mm.items()
         }
         speed, torque = ({axis: pair[k] for axis, pair in offsets.items()} for k in (0, 1))
-        return predict_corrected(before.reference, models, config, None, speed, torque)
-    return predict_corrected(before.reference, models, config, offset_um(scenario, method, program))
+        return predict_corrected_path(before.reference, models, config, None, speed, torque)
+    return predict_corrected_path(before.reference, models, config, offset_um(scenario, method, program))
 
 
 def offset_um(scenario: str, method: str, program: str = SLOW) -> dict[str, Float]:
@@ -90,9 +92,11 @@ def offset_um(scenario: str, method: str, program: str = SLOW) -> dict[str, Floa
     before, config = predicted(scenario, program), machine(scenario)
     if method == "mirror":
         return {axis: -error for axis, error in before.error_um.items()}
-    models = nominal_models(config)
+    models = build_nominal_models(config)
     return {
-        axis: -linear.inverse(models[axis], config.axis[axis], before.reference.dt_s, error.size).apply(error)
+        axis: -linear_loop.invert_loop(
+            models[axis], config.axis[axis], before.reference.dt_s, error.size
+        ).compute_offset(error)
         for axis, error in before.error_um.items()
     }
 
@@ -101,7 +105,7 @@ def offset_um(scenario: str, method: str, program: str = SLOW) -> dict[str, Floa
 def measured_mm(scenario: str, program: str = SLOW) -> Float:
     """Return the table path (n, 2), mm, of the simulator's physics, independent of the model."""
     config, demand = machine(scenario), reference(scenario, program).position_mm
-    models, period_s = nominal_models(config), config.machine.sync_period_s
+    models, period_s = build_nominal_models(config), config.machine.sync_period_s
     tables = [bench.run(config.axis[axis], period_s, models[axis], np.asarray(demand[axis])).table_mm for axis in AXES]
     return np.column_stack(tables)
 
@@ -115,7 +119,7 @@ def contour_um(scenario: str, answer: Prediction, program: str = SLOW) -> Float:
     """Return the contour error (n,), um, relative to the scenario's reference path."""
     if not PATHS[scenario].programmed:
         return answer.contour_um
-    return contour_error_um(desired_mm(scenario, program), path_mm(answer), answer.reference.dt_s)
+    return compute_contour_error_um(desired_mm(scenario, program), path_mm(answer), answer.reference.dt_s)
 
 
 def traced(label: str, scenario: str, answer: Prediction, program: str = SLOW) -> Traced:

@@ -13,8 +13,8 @@ from fdhil.cli.paper.scenarios import CASCADES, DEMANDED, PATHS, machine
 from fdhil.config import Identification
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.model import closed_loop
-from fdhil.prediction import contour_error_um, predict
-from fdhil.prediction.models import nominal_models
+from fdhil.prediction import compute_contour_error_um, predict_path
+from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.records import Float, Parameters, Prediction, compute_rms
 from fdhil.report import Table, figures
 
@@ -82,7 +82,7 @@ def _feed_down() -> Claim:
 
 def identified() -> Parameters:
     """Identify the simulated drive from a fast and a slow rapid in both directions, noise of 0.1 %."""
-    true = nominal_models(machine())["X"]
+    true = build_nominal_models(machine())["X"]
     recordings = [bench.rapid(true, strokes=2, move=Move.measured(share)) for share in (1.0, SLOW_SHARE)]
     windows = [window for k, one in enumerate(recordings) for window in bench.noisy(one, 0.001, k)]
     return maximum_likelihood.estimate(windows, Identification()).build_parameters()
@@ -93,8 +93,8 @@ def _prediction() -> Claim:
     trials, pictures = [], []
     for name in CASCADES:
         config, reference = machine(name), paths.reference(name)
-        measured = contour_error_um(reference.path_mm, paths.measured_mm(name), reference.dt_s)
-        predicted = predict(reference, {"X": model, "Y": model}, config).contour_um
+        measured = compute_contour_error_um(reference.path_mm, paths.measured_mm(name), reference.dt_s)
+        predicted = predict_path(reference, {"X": model, "Y": model}, config).contour_um
         missed = 100.0 * compute_rms(predicted - measured) / compute_rms(measured)
         trials.append(Trial(name, "RMS between predicted and measured, of the measured", missed, "%", most=10.0))
         if name in DRAWN:
@@ -109,7 +109,7 @@ def _prediction() -> Claim:
 
 def _cutting() -> Claim:
     config = machine("full")
-    axis, true = config.axis["X"], nominal_models(config)["X"]
+    axis, true = config.axis["X"], build_nominal_models(config)["X"]
     demand = SLOW_MM_S * np.arange(0.0, 1.0, config.machine.sync_period_s)
     free = bench.run(axis, config.machine.sync_period_s, true, demand).table_mm
     trials = []
@@ -174,7 +174,7 @@ def _size() -> Claim:
 def apart_um(scenario: str, changes: Sequence[tuple[str, float]], program: str = SLOW) -> Float:
     """Return the distance (n,), um, between the paths with and without changed parameters of X."""
     one, other = paths.predicted(scenario, program), paths.predicted(scenario, program, tuple(changes))
-    return contour_error_um(paths.path_mm(one), paths.path_mm(other), one.reference.dt_s)
+    return compute_contour_error_um(paths.path_mm(one), paths.path_mm(other), one.reference.dt_s)
 
 
 def _at_e(scenario: str, values: Float) -> float:
@@ -219,7 +219,7 @@ def linear_response(scenario: str, answer: Prediction, offset_um: dict[str, Floa
     """Return the displacement (n,) of each axis, um, due to ``offset_um`` on the reference."""
     config = machine(scenario)
     moved = closed_loop.simulate_axes(
-        nominal_models(config), config.axis, answer.reference.dt_s, answer.reference.position_mm,
+        build_nominal_models(config), config.axis, answer.reference.dt_s, answer.reference.position_mm,
         {axis: 1e-3 * values for axis, values in offset_um.items()},
     )  # fmt: skip
     return {axis: 1e3 * (response.table_mm - answer.predicted_mm[axis]) for axis, response in moved.items()}

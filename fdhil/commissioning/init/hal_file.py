@@ -107,7 +107,7 @@ def _components(config: MachineConfig, splices: Sequence[Splice], hal: Hal) -> I
         pins = axis.drive.hal
         assert pins is not None  # offsets are inserted on HAL axes only
         unit, per_mm = pins.position_mm_per_unit, axis.scaling.increments_per_mm
-        offset, rate, acceleration, *_ = OffsetBounds.compute_effective(axis, period_s).whole_increments
+        offset, rate, acceleration, *_ = OffsetBounds.derive(axis, period_s).whole_increments
         yield from _comment(
             f"{splice.axis}: the limits of [axis.{splice.axis}.correction] and {MARGIN:g} times its rates"
         )

@@ -55,7 +55,7 @@ class LowRateInnovations:
 
 
 def locate_voltage_samples(motion: Motion, delay_s: float, ordered_for_s: float) -> SampleMarks:
-    """Return the marks of a voltage that is late by ``delay_s``, in the order of a delay of ``ordered_for_s``.
+    """Return the marks of a voltage that is late by ``measure_delay_s``, in the order of a delay of ``ordered_for_s``.
 
     While a delay is varied slightly, an innovation must stay that of the same sample: a mark that passed a sample would
     change the meaning of both.

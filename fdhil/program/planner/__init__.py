@@ -44,7 +44,7 @@ def plan(motions: Iterable[Motion], config: MachineConfig, max_rows: int = MAX_R
 def stream(
     motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float = math.inf
 ) -> Iterator[Trajectory]:
-    """Yield the same reference in blocks of ``block_rows`` (the last one shorter), in constant memory.
+    """Yield the same reference in blocks of ``count_block_rows`` (the last one shorter), in constant memory.
 
     A block is yielded as soon as its motions are known; its times continue those of the previous block.
     """

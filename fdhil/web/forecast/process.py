@@ -18,10 +18,15 @@ import numpy as np
 from fdhil import correction
 from fdhil.bounded_process import limit_process, receive_request, report_to_parent
 from fdhil.config import MachineConfig
-from fdhil.correction.result_documents import advised, correction_document, entry, sources
+from fdhil.correction.result_documents import (
+    advise_with_correction,
+    build_advice_document,
+    build_correction_document,
+    make_feed_sources,
+)
 from fdhil.errors import FdhilError, ProgramError
-from fdhil.prediction.feed_search import Source
-from fdhil.prediction.models import models_for, nominal_models, validated_models
+from fdhil.prediction.axis_models import build_nominal_models, load_validated_models, select_models
+from fdhil.prediction.feed_search import FeedScaledPath
 from fdhil.program import Budget, interpret, planner
 from fdhil.program.demand_csv import read_demand_csv
 from fdhil.records import Correction, Parameters, Trajectory
@@ -49,11 +54,11 @@ def forecast(program: Path, name: str, config: MachineConfig, folder: Path, repo
     reference = load(program, name, config)
     models, parameters, config = newest_models(reference, config)
     report_progress({"step": "correct", "rows": reference.time_s.size})
-    planned = correction.plan(reference, models, config)
+    planned = correction.plan_correction(reference, models, config)
     predicted = predict_gain_from_history(
         planned, models, config, any(state["revision"] for state in parameters.values())
     )
-    document = correction_document(name, planned, predicted, models) | {
+    document = build_correction_document(name, planned, predicted, models) | {
         "rows": reference.time_s.size,
         "sync_period_s": reference.dt_s,
         "axes": list(reference.table_axes),
@@ -78,16 +83,16 @@ def advice(
     motions = None if program.suffix == ".csv" else list(interpret(_lines(program), Budget.of(config.nc)))
     trials = itertools.count(1)
 
-    def telling(source: Source) -> Source:
+    def telling(source: FeedScaledPath) -> FeedScaledPath:
         def at(shares: Mapping[int, float]) -> Trajectory:
             report_progress({"step": "advise", "trial": next(trials)})
             return source.at(shares)
 
         return replace(source, at=at)
 
-    sure, hopeful = sources(motions, reference, models, config, tolerance_um)
-    found, most = advised(telling(sure), hopeful and telling(hopeful), models, config, tolerance_um)
-    return [entry(each, most) for each in found]
+    sure, hopeful = make_feed_sources(motions, reference, models, config, tolerance_um)
+    found, most = advise_with_correction(telling(sure), hopeful and telling(hopeful), models, config, tolerance_um)
+    return [build_advice_document(each, most) for each in found]
 
 
 def load(program: Path, name: str, config: MachineConfig) -> Trajectory:
@@ -117,13 +122,13 @@ def newest_models(
 
     The models are the history's newest, else the data sheet's values.
     """
-    given = nominal_models(config)
+    given = build_nominal_models(config)
     states: dict[str, dict[str, Any]] = {axis: {"revision": 0, "age_s": None} for axis in config.axis}
     newest, source = read_newest_sets(config.store.directory, config.axis), str(config.store.directory)
     for axis, revision in newest.items():
         states[axis] = {"revision": revision.set.revision, "age_s": round(revision.stamp.age_s(), 1)}
-    models, config = validated_models({axis: revision.set for axis, revision in newest.items()}, config, source)
-    return models_for(reference, given | models, config, source), states, config
+    models, config = load_validated_models({axis: revision.set for axis, revision in newest.items()}, config, source)
+    return select_models(reference, given | models, config, source), states, config
 
 
 def zones(planned: Correction) -> list[dict[str, Any]]:

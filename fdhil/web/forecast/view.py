@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fdhil.prediction.contour import WINDOW_S, nearest_points_mm
+from fdhil.prediction.contour_error import WINDOW_S, find_nearest_points_mm
 from fdhil.records import Bool, Float, Int
 from fdhil.web.forecast.kept import AFTER, BEFORE, Forecast
 
@@ -167,7 +167,7 @@ def _table(
     around = slice(max(0, rows.start - margin), rows.stop + margin)
     actual = forecast.actual_mm(case, rows)
     path = np.asarray(forecast.path_mm[around])
-    nearest = nearest_points_mm(path, actual, forecast.dt_s, rows.start - around.start)
+    nearest = find_nearest_points_mm(path, actual, forecast.dt_s, rows.start - around.start)
     drawn = (nearest + factor * (actual - nearest))[:, list(plane)]
     if plane[0] == plane[1]:
         drawn[:, 1] = 0.0

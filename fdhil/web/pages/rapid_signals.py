@@ -9,7 +9,7 @@ import numpy.typing as npt
 from pydantic import BaseModel
 
 from fdhil.identification.rapid_windows import find_moving_range, interpolate_gaps
-from fdhil.pipeline.overlay import Overlay
+from fdhil.pipeline.model_overlay import ModelOverlay
 from fdhil.records import Float, Reason, Window, compute_rms
 from fdhil.report.typography import typeset_text
 from fdhil.web.pages.rapid_list import Said
@@ -86,7 +86,7 @@ class _Course:
     model: str | None = None
 
 
-def signals_of(overlay: Overlay) -> RapidSignals:
+def signals_of(overlay: ModelOverlay) -> RapidSignals:
     """Return the signals of a rapid with its model."""
     window = overlay.window
     begin, end = find_moving_range(window)
@@ -122,7 +122,7 @@ def _said(reason: Reason) -> Said:
     return Said(code=reason.code, text=typeset_text(reason.text), advice=typeset_text(reason.advice))
 
 
-def _courses(overlay: Overlay) -> list[_Course]:
+def _courses(overlay: ModelOverlay) -> list[_Course]:
     """Return the rapid's signals in reading order: cause, response, error."""
     window = overlay.window
     speed, current, model = _modelled(overlay)
@@ -143,7 +143,7 @@ def _courses(overlay: Overlay) -> list[_Course]:
     return courses
 
 
-def _modelled(overlay: Overlay) -> tuple[Float | None, Float | None, str | None]:
+def _modelled(overlay: ModelOverlay) -> tuple[Float | None, Float | None, str | None]:
     """Return speed and current (n,) from the measured voltage, else from the closed loop."""
     window, driven, followed = overlay.window, overlay.driven, overlay.followed
     if driven is not None:

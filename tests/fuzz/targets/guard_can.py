@@ -81,7 +81,7 @@ def taste(data: bytes) -> None:
         if cob_id == ERROR:
             machine.listener.set_controller_state(payload.decode())
         elif cob_id == COB_SYNC:
-            machine.listener.close_sync_cycle(payload, machine.tick * 1e-3, machine.tick * 1e-3)
+            machine.listener.receive_at_sync(payload, machine.tick * 1e-3, machine.tick * 1e-3)
         else:
             machine.inject_frame(cob_id, payload)
     for _ in range(2):

@@ -15,12 +15,12 @@ from fdhil.arming.checked_program import CheckedProgram
 from fdhil.arming.program_check import HEADER
 from fdhil.commissioning.record import load_record, record_path, save_record
 from fdhil.config.user_file import hash_password, read_users, write_users
-from fdhil.correction.learning import Lesson
+from fdhil.correction.learned_offsets import LearnedOffset
 from fdhil.drivers.cia402.drive_profile_file import read_profile
 from fdhil.drivers.nc.nc_profile_file import read_nc_profile
 from fdhil.errors import FdhilError
 from fdhil.guard.guard_settings import encode_settings, load_settings
-from fdhil.prediction.models import load_model_file
+from fdhil.prediction.axis_models import load_model_file
 from fdhil.program.demand_csv import read_demand_csv
 from fdhil.store import audit
 from fdhil.store.column_map import read_column_map
@@ -80,7 +80,7 @@ def taste(data: bytes) -> None:
 def _written() -> Mapping[str, bytes]:
     from tests.commissioning.test_record import RECORD
 
-    write_lesson(FOLDER / "lesson.npz", Lesson({"X": np.arange(4.0)}, 3.0, 0.5, (3.0, 1.0)))
+    write_lesson(FOLDER / "lesson.npz", LearnedOffset({"X": np.arange(4.0)}, 3.0, 0.5, (3.0, 1.0)))
     write_users(FOLDER / "users.json", {"w": hash_password("canary-9b1f-password", "watch")})
     save_record(replace(RECORD, axis="X"), FOLDER)
     (FOLDER / audit.AUDIT_FILE_NAME).unlink(missing_ok=True)
