@@ -170,7 +170,7 @@ async def measure_collecting(bench: Bench, senders: Sequence[OutboxSender]) -> N
 def iterate_messages(sender: OutboxSender) -> Iterator[Message]:
     """Yield all that a machine has to tell, each record for itself."""
     with OutboxReader(sender._store) as reader:
-        for entry in reader.entries(0, 10_000_000):
+        for entry in reader.read_entries(0, 10_000_000):
             yield encode_entry(entry, sender.machine, reader.store, None)
 
 

@@ -27,9 +27,9 @@ from fdhil.fleet.window_reanalysis import AnalysisMethod, compute_code_digest
 from fdhil.fleet.worker_pools import open_worker_pool
 from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse_window
-from fdhil.store.history import described
+from fdhil.store.history_database import format_parameters
 from fdhil.store.recording_csv import parse_recording
-from fdhil.store.windows import encode_window
+from fdhil.store.window_file import encode_window
 from studies import bench
 from tests.fleet.servers import Postgres, run_postgres
 
@@ -94,7 +94,7 @@ async def gather_windows(fleet: Fleet, windows: int) -> int:
             record = {
                 "number": k,
                 "accepted": int(found.verdict.accepted),
-                "parameters": described(found),
+                "parameters": format_parameters(found),
                 "reasons": [],
             }
             at = BEGIN + timedelta(seconds=k)

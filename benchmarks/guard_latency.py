@@ -113,7 +113,7 @@ def measure_latencies(cycles: int) -> list[float]:
 def measure(hub: Hub, guard: GuardClient, cycles: int) -> list[float]:
     """Arm the guard and time its answers."""
     table = {name: [0] * ROWS for name in "XY"}
-    guard.load("XY", table, table, "p")
+    guard.load_table("XY", table, table, "p")
     for _ in range(200):
         hub.run_cycle(0)
         time.sleep(0.001)
@@ -137,7 +137,7 @@ def measure(hub: Hub, guard: GuardClient, cycles: int) -> list[float]:
     taken = []
     for k in range(cycles):
         if k % 50 == 0:
-            guard.alive()
+            guard.send_alive()
         taken.append(hub.run_cycle(2))
     return taken
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from playwright.sync_api import Browser, sync_playwright
 
-from tests.web import stage, tab
+from tests.web import browser_tab, web_rig
 
 RAPIDS = 168  # of each axis: twelve weeks
 TIMES = 3
@@ -36,11 +36,11 @@ TAKEN = """() => {
 def main() -> None:
     """Open each page so often with an empty cache, and as often again with a full one; print the medians."""
     times = int(sys.argv[1]) if len(sys.argv) > 1 else TIMES
-    with tempfile.TemporaryDirectory() as folder, stage.opened(Path(folder), RAPIDS) as machine:
-        token = machine.token("operator")
-        paths = machine.paths(token)
+    with tempfile.TemporaryDirectory() as folder, web_rig.open_rig(Path(folder), RAPIDS) as machine:
+        token = machine.log_in_for_token("operator")
+        paths = machine.list_paths(token)
         with sync_playwright() as playwright:
-            browser = tab.started(playwright)
+            browser = browser_tab.start_browser(playwright)
             print("page        first visit, ms   again, ms   largest, ms   requests   kB")
             for name, path in paths.items():
                 found = [_visits(browser, machine.url, path, token) for _ in range(times)]
@@ -50,14 +50,14 @@ def main() -> None:
 
 def _visits(browser: Browser, base: str, path: str, token: str) -> list[dict[str, Any]]:
     """Return what the first visit of a new browser took, and what the second did."""
-    with tab.opened(browser, base) as shown:
+    with browser_tab.open_tab(browser, base) as shown:
         shown.log_in(token)
-        shown.page.add_init_script(NOTE % (tab.READY, tab.LOADING))
+        shown.page.add_init_script(NOTE % (browser_tab.READY, browser_tab.LOADING))
         return [_visit(shown, path) for _ in range(2)]
 
 
-def _visit(shown: tab.Tab, path: str) -> dict[str, Any]:
-    shown.open(path)
+def _visit(shown: browser_tab.BrowserTab, path: str) -> dict[str, Any]:
+    shown.open_page(path)
     taken: dict[str, Any] = shown.page.evaluate(TAKEN)
     return {**taken, "ms": shown.page.evaluate("contentAfterMs")}
 

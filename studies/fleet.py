@@ -134,9 +134,9 @@ def check_records(
 def measure_record_sizes(day: MachineConfig, database: Postgres, total: int) -> dict[str, Any]:
     """Return what a record takes at each place."""
     with OutboxReader(day.store.directory) as reader:
-        entries = reader.entries(0, 100_000)
-        ((outbox,),) = reader._ask("SELECT sum(pgsize) FROM dbstat WHERE name = 'outbox'", ())
-        ((history,),) = reader._ask("SELECT sum(pgsize) FROM dbstat WHERE name <> 'outbox'", ())
+        entries = reader.read_entries(0, 100_000)
+        ((outbox,),) = reader._query("SELECT sum(pgsize) FROM dbstat WHERE name = 'outbox'", ())
+        ((history,),) = reader._query("SELECT sum(pgsize) FROM dbstat WHERE name <> 'outbox'", ())
         wire: dict[str, list[int]] = {}
         for entry in entries:
             wire.setdefault(entry.kind, []).append(len(encode_entry(entry, "mill-000", reader.store, None).payload))

@@ -13,11 +13,11 @@ from fdhil import config as machine_config
 from fdhil.config import MachineConfig
 from fdhil.records import Notice, Parameters, Skill
 from fdhil.store import HISTORY_FILE
-from fdhil.store.history import History
+from fdhil.store.history_database import History
+from fdhil.store.history_rows import TimeStamp
 from fdhil.store.outbox import Outbox
-from fdhil.store.rows import Stamp
 from tests.fleet.recording_machine import write_history
-from tests.store.made import BENCH, outcome, published, window
+from tests.store.sample_records import BENCH, make_outcome, make_published, make_window
 
 AXES = ("X", "Y", "Z")
 DAYS = 5  # that differ
@@ -36,18 +36,20 @@ def record_day(config: MachineConfig, records: int, first: int = 0, seed: int = 
     assert config.uplink is not None
     outbox = Outbox(config.uplink, config.uplink_directory)
     chance = random.Random(seed + first)
-    whole = {axis: window(60, axis=axis) for axis in AXES}
-    with History.open(config.store.directory, outbox.enter) as history:
+    whole = {axis: make_window(60, axis=axis) for axis in AXES}
+    with History.open(config.store.directory, outbox.add_entry) as history:
         history._db.execute("PRAGMA synchronous = OFF")  # how fast a disk is is not asked here
         for number in range(first, first + records):
             rapid, part = divmod(number, 3)
             axis = AXES[rapid % 3]
-            stamp = Stamp(MIDNIGHT_S + 86400 * rapid / (3 * A_DAY), "boot", rapid)
+            stamp = TimeStamp(MIDNIGHT_S + 86400 * rapid / (3 * A_DAY), "boot", rapid)
             if part == 0:
-                history.add_window(outcome(rapid % 20 != 0, whole[axis]), "", stamp)
+                history.add_window(make_outcome(rapid % 20 != 0, whole[axis]), "", stamp)
             elif part == 1:
                 changed = {name: value * chance.gauss(1, 0.01) for name, value in BENCH.as_dict().items()}
-                history.add_revision(published(rapid + 1, axis, Parameters.from_mapping(changed)), [rapid + 1], stamp)
+                history.add_revision(
+                    make_published(rapid + 1, axis, Parameters.from_mapping(changed)), [rapid + 1], stamp
+                )
             elif rapid % EACH_NOTICE:
                 history.add_skill(Skill(axis, rapid, *(abs(chance.gauss(2, 1)) for _ in range(4))), stamp)
             else:

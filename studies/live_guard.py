@@ -24,7 +24,7 @@ import numpy as np
 
 from fdhil import config as machine_config
 from fdhil.arming.guard_client import GuardClient
-from fdhil.arming.guard_settings import settings_of
+from fdhil.arming.guard_configuration import make_guard_settings
 from fdhil.config import MachineConfig
 from fdhil.guard.guard_settings import GuardSettings, encode_settings
 from fdhil.guard.transmit_socket import greet_hub, open_transmit_socket
@@ -129,21 +129,21 @@ def _become_daemon(folder: Path, demand: list[Column], offsets: list[Column], te
 def _serve(folder: Path, demand: list[Column], offsets: list[Column]) -> None:
     client = GuardClient(folder, timeout_s=PATIENCE_S)
     ways, corrections = (dict(zip(AXES, rows, strict=True)) for rows in (demand, offsets))
-    while not client.load(AXES, ways, corrections, DIGEST)["ok"]:
+    while not client.load_table(AXES, ways, corrections, DIGEST)["ok"]:
         time.sleep(0.01)
     while not client.arm(TOKEN, DIGEST, FACTS_GIVEN)["ok"]:
         time.sleep(0.01)
     os.write(3, b"armed")
     while True:
-        client.alive()
+        client.send_alive()
         if select.select([4], (), (), ALIVE_S)[0]:
             word = os.read(4, 64).decode()
             if not word:
                 return
             if word == "disarm":
-                client._send({"request": "disarm"})  # its answer comes with the next SYNC
+                client._send_message({"request": "disarm"})  # its answer comes with the next SYNC
             else:
-                client.alive({word: False})
+                client.send_alive({word: False})
             os.write(3, b"asked")
 
 
@@ -170,7 +170,7 @@ class LiveGuard:
         self._bus = attach_bus("can0", self.config.bus["can0"])
         place = {key: value for key, value in self._bus.settings.items() if key in ("port", "host")}
         self._place = self.config.bus["can0"].model_copy(update=place)
-        made = settings_of(self.config, "can0", folder, hashlib.sha256(TOKEN.encode()).hexdigest())
+        made = make_guard_settings(self.config, "can0", folder, hashlib.sha256(TOKEN.encode()).hexdigest())
         self.settings: GuardSettings = commissioned(made)
         (folder / "guard.json").write_text(encode_settings(self.settings))
         self._nodes = {axis.offset.cob_id: k for k, axis in enumerate(self.settings.axes)}

@@ -12,9 +12,9 @@ from typing import BinaryIO
 import pytest
 
 from fdhil.arming.checked_program import CheckedProgram
-from fdhil.arming.code_digest import code_digest
-from fdhil.arming.program_check import HEADER, SCHEMA, keep
-from fdhil.arming.token import TOKEN_NAME, ensure_token, read_token
+from fdhil.arming.code_digest import compute_code_digest
+from fdhil.arming.operator_token import TOKEN_NAME, ensure_token, read_token
+from fdhil.arming.program_check import HEADER, SCHEMA, store_checked
 from fdhil.config import Nc
 from fdhil.errors import ConfigError, FdhilError, ProgramError
 from fdhil.guard.guard_settings import encode_settings, load_settings
@@ -98,23 +98,23 @@ def test_program_check_with_flipped_bit_is_repeated(tmp_path: Path) -> None:
     rows = bytes(range(256)) * 16
     errors = {"before": {"rms_um": 1.0, "max_um": 2.0}, "after": {"rms_um": 0.1, "max_um": 0.2}}
     blocks = [[512, hashlib.sha256(rows).hexdigest()]]
-    header = {"schema": SCHEMA, "axes": ["X"], "code": code_digest(), "blocks": blocks, "files": {}, "rows": 512,
+    header = {"schema": SCHEMA, "axes": ["X"], "code": compute_code_digest(), "blocks": blocks, "files": {}, "rows": 512,
               "largest_um": 3.0, "refused": [], **errors}  # fmt: skip
 
     def write_check(body: BinaryIO) -> dict[str, object]:
         body.write(rows)
         return header
 
-    keep(tmp_path, "key", write_check)
-    found = CheckedProgram.find(tmp_path, "key", tmp_path)
+    store_checked(tmp_path, "key", write_check)
+    found = CheckedProgram.find_checked(tmp_path, "key", tmp_path)
     assert found is not None
-    assert (found.rows, found.errors) == (512, errors)
+    assert (found.row_count, found.errors) == (512, errors)
     for file, most in ((f"key{HEADER}", 400), ("key.rows", 40)):
         path = tmp_path / file
         whole = path.read_bytes()
         for flipped in flip_bits(whole, most, 4):
             path.write_bytes(flipped)
-            assert CheckedProgram.find(tmp_path, "key", tmp_path) is None
+            assert CheckedProgram.find_checked(tmp_path, "key", tmp_path) is None
         path.write_bytes(whole)
 
 

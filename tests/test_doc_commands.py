@@ -22,11 +22,11 @@ from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.fleet.rollout import ChangeFile
 from fdhil.fleet.signed_offer import ProposedChange
 from fdhil.store.column_map import ColumnMap
-from fdhil.store.windows import encode_window
+from fdhil.store.window_file import encode_window
 from studies import bench
 from tests.bench import bench_document
 from tests.daemon.machine_rig import fdhil
-from tests.store.made import published
+from tests.store.sample_records import make_published
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -156,7 +156,7 @@ def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     machine = config.load_config(tmp_path / "configs" / "sim.toml")
     store = OutcomeStore(machine)
     store.open()
-    store.store_outcomes([published(1), published(1, "Y")])
+    store.store_outcomes([make_published(1), make_published(1, "Y")])
     store.close()
     rapid = encode_window(simulate_nominal_rapid("X", machine.axis["X"], machine.machine.sync_period_s), machine.digest)
     (tmp_path / WINDOW).parent.mkdir(exist_ok=True)

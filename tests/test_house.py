@@ -22,7 +22,7 @@ def test_room_stays_within_its_budget_of_lines(room: str) -> None:
 def test_import_from_file_of_another_room_is_counted() -> None:
     tree = ast.parse(
         "from fdhil.config import MachineConfig, reading\n"
-        "from fdhil.store.history import History\n"
+        "from fdhil.store.history_database import History\n"
         "from fdhil.errors import FdhilError\n"
         "from fdhil.cli.console import show\n"
     )

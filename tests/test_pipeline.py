@@ -37,11 +37,11 @@ from fdhil.records import (
     freeze_array,
     freeze_integers,
 )
-from fdhil.store.windows import decode_window, encode_window
+from fdhil.store.window_file import decode_window, encode_window
 from studies.judging import GOOD
 from studies.slow_recordings import make_study_recording
 from tests.daemon.simulated_machine import config_of, rapids
-from tests.store.made import bits, same
+from tests.store.sample_records import is_bit_identical, view_bits
 
 
 @pytest.fixture
@@ -64,9 +64,9 @@ def list_numbers(outcomes: Sequence[Outcome]) -> list[object]:
         if isinstance(outcome, WindowOutcome):
             estimate = outcome.estimate
             assert estimate is not None
-            told += [bits(estimate.values), bits(estimate.covariance), repr(outcome.verdict)]
+            told += [view_bits(estimate.values), view_bits(estimate.covariance), repr(outcome.verdict)]
         elif isinstance(outcome, ParameterSet):
-            told += [repr(outcome.parameters), bits(outcome.covariance), outcome.revision, outcome.windows]
+            told += [repr(outcome.parameters), view_bits(outcome.covariance), outcome.revision, outcome.windows]
         else:
             told.append(repr(outcome))
     return told
@@ -119,7 +119,7 @@ def test_window_replayed_from_file_is_bit_identical(config: MachineConfig) -> No
     live = feed_records(AxisPipeline("X", config), rapids(config, count=1))
     (window,) = select_windows(live)
     stored = decode_window(encode_window(window, config.digest))
-    assert same(stored, window)
+    assert is_bit_identical(stored, window)
     assert list_numbers(AxisPipeline("X", config).process_record(stored)) == list_numbers(live)
 
 

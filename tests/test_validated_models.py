@@ -24,7 +24,7 @@ from studies import real_plant as real
 from tests.bench import bench_config
 from tests.identification.realistic_rapids import simulate_rapids
 from tests.paths import build_trajectory, smooth_demand
-from tests.store.made import published
+from tests.store.sample_records import make_published
 from tests.tiers import sampled
 
 CONFIG = bench_config("X")
@@ -87,7 +87,7 @@ def test_validated_model_is_used(plant: str, tmp_path: Path) -> None:
         return
     write_model([result], CONFIG.axis, path)
     written = load_model_file(path).parameters
-    newest = replace(published(1, "X", result.pooled.build_parameters()), covariance=result.pooled.covariance)
+    newest = replace(make_published(1, "X", result.pooled.build_parameters()), covariance=result.pooled.covariance)
     assert load_validated_models({"X": newest}, CONFIG, "store")[0] == written
     assert correction.plan_correction(MOVE, written, CONFIG).after.rms_um < 50.0
 

@@ -16,8 +16,8 @@ from fdhil.prediction import axis_models as model_files
 from fdhil.prediction.correction_gain import combine_held_out_um, find_largest_error_um, find_moving_axes
 from fdhil.program import load_trajectory
 from fdhil.records import Correction, Parameters, Prediction, Trajectory
-from fdhil.store.known_gain import recent_skills
-from fdhil.store.newest_sets import read_newest_sets
+from fdhil.store.history_gain import read_recent_skills
+from fdhil.store.newest_parameters import read_newest_parameters
 
 HISTORY = "history"
 Models = Mapping[str, Parameters] | str | Path | None
@@ -101,7 +101,7 @@ def find_held_out_max_um(reference: Trajectory, settings: MachineConfig, models:
     """Return the largest error (um) of the models in moves that they were not identified from; None where unknown."""
     found: Mapping[str, float] = {}
     if models == HISTORY:
-        found = find_largest_error_um(recent_skills(settings))
+        found = find_largest_error_um(read_recent_skills(settings))
     elif isinstance(models, str | Path):
         found = model_files.load_model_file(Path(models)).held_out_max_um
     return combine_held_out_um(found, find_moving_axes(reference))
@@ -119,7 +119,7 @@ def read_inputs(
     given: Mapping[str, Parameters] = known.models
     if models == HISTORY:
         source = str(settings.store.directory)
-        newest = read_newest_sets(settings.store.directory, settings.axis, warn)
+        newest = read_newest_parameters(settings.store.directory, settings.axis, warn)
         sets = {axis: found.set for axis, found in newest.items()}
         given, settings = model_files.load_validated_models(sets, settings, source)
     elif isinstance(models, str | Path):
@@ -138,7 +138,7 @@ def _refuse_refuted_loops(config: MachineConfig, axes: Iterable[str], source: st
     """Raise ConfigError where a model file lacks the loops of an axis whose rapids refuted the configured ones."""
     faults = []
     with contextlib.suppress(StoreError):
-        for axis, newest in read_newest_sets(config.store.directory, config.axis.keys() & axes).items():
+        for axis, newest in read_newest_parameters(config.store.directory, config.axis.keys() & axes).items():
             loops, same = newest.set.loops or {}, newest.set.config_digest == config.digest
             if same and (apart := model_files.describe_loop_differences(loops, config.axis[axis].regulators)):
                 text = f"LoopsDiffer: is missing, and the machine's rapids showed other loops than configured ({apart})"

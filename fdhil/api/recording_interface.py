@@ -13,12 +13,12 @@ import numpy.typing as npt
 from fdhil.errors import RecordingError
 from fdhil.records import Float, Window
 from fdhil.records import Recording as RecordedSignals
-from fdhil.store.column_map import check_map, mapped, read_column_map
-from fdhil.store.column_proposal import propose
+from fdhil.store.column_map import apply_column_map, check_map, read_column_map
+from fdhil.store.column_proposal import propose_for_table
 from fdhil.store.derived_columns import check_sizes, derive_columns
-from fdhil.store.recording_table import IMPORT_NOTES, RECORDING_FORMAT, VOLTAGE_COLUMN, RecordingTable, recording_of
-from fdhil.store.recordings import read_raw, read_recording, read_stored
-from fdhil.store.sample_times import even_times, usual_step
+from fdhil.store.recording_file import read_raw, read_recording, read_stored_window
+from fdhil.store.recording_table import IMPORT_NOTES, RECORDING_FORMAT, VOLTAGE_COLUMN, RecordingTable, make_recording
+from fdhil.store.sample_times import compute_usual_step, find_even_times
 
 PROPOSE = "?"
 SIGNALS: Mapping[str, str] = {  # short names of columns=
@@ -106,7 +106,7 @@ class Recording:
             "voltage_sampling": None if voltage is None else voltage_sampling,
         }
         headers = {"format": RECORDING_FORMAT, "axis": axis, **{k: str(v) for k, v in options.items() if v is not None}}
-        self._set_signals(recording_of(_build_table(headers, columns, name), name), name)
+        self._set_signals(make_recording(_build_table(headers, columns, name), name), name)
 
     def _set_signals(self, signals: RecordedSignals | Window, name: str) -> None:
         self.signals, self.name = signals, name
@@ -162,18 +162,22 @@ def read(path: str | Path, columns: str | Path | Mapping[str, Any] | None = None
     """
     path = Path(path)
     if columns is None:
-        stored = read_stored(path)
+        stored = read_stored_window(path)
         return Recording.of(stored if stored is not None else read_recording(path), str(path))
     if isinstance(columns, str | Path) and str(columns) != PROPOSE:
         return Recording.of(read_recording(path, read_column_map(Path(columns))), str(path))
     raw = read_raw(path)
     wanted = columns if isinstance(columns, Mapping) else {}
-    proposed = propose(raw, {SIGNALS.get(signal, signal): heading for signal, heading in wanted.items()}, str(path))
+    proposed = propose_for_table(
+        raw, {SIGNALS.get(signal, signal): heading for signal, heading in wanted.items()}, str(path)
+    )
     if isinstance(columns, str) and proposed.faults:
         raise RecordingError(f"{path}: {'; '.join(proposed.faults)}: give columns as a mapping")
     found = {each.signal: {"name": each.heading, "unit": each.unit} for each in proposed.columns}
     document = {"headers": {**proposed.headers, **headers}, "columns": found}
-    return Recording.of(recording_of(mapped(raw, check_map(document, str(path)), str(path)), str(path)), str(path))
+    return Recording.of(
+        make_recording(apply_column_map(raw, check_map(document, str(path)), str(path)), str(path)), str(path)
+    )
 
 
 def _convert_column(key: str, values: Array, name: str) -> Float:
@@ -204,8 +208,8 @@ def _build_table(headers: dict[str, str], columns: dict[str, Float], name: str) 
             f"{name}: time does not increase at index {row} ({time_s[row]:g} s): sort or cut the samples"
         )
     if time_s.size > 1:
-        columns["time_s"], note = even_times(time_s, None, name)
-        headers["sample_rate_hz"] = repr(1.0 / usual_step(columns["time_s"]))
+        columns["time_s"], note = find_even_times(time_s, None, name)
+        headers["sample_rate_hz"] = repr(1.0 / compute_usual_step(columns["time_s"]))
         if note:
             headers[IMPORT_NOTES] = note
     else:

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdhil.arming.code_digest import code_digest
-from fdhil.arming.program_check import HEADER, ROWS, SCHEMA, header_digest
+from fdhil.arming.code_digest import compute_code_digest
+from fdhil.arming.program_check import HEADER, ROWS, SCHEMA, compute_header_digest
 from fdhil.correction import correction_gate
 from fdhil.errors import ProgramError, StoreError
 from fdhil.program import program_digest
@@ -33,7 +33,7 @@ NO_ERROR: Mapping[str, float] = {"rms_um": 0.0, "max_um": 0.0}
 Rows = dict[str, list[int]]
 
 
-class Piece(NamedTuple):
+class TablePiece(NamedTuple):
     """Table rows from row ``first`` on: demand and offset per axis, in increments; ``final``: no more rows follow."""
 
     first: int
@@ -42,7 +42,7 @@ class Piece(NamedTuple):
     final: bool
 
 
-class Block(NamedTuple):
+class CheckedBlock(NamedTuple):
     """A block of checked rows, up to row ``end``; ``last``: the program ends with it."""
 
     end: int
@@ -64,7 +64,7 @@ class CheckedProgram:
         self.method = "inverse"
         self.half_um: float | None = None
         self.warnings: tuple[Reason, ...] = ()
-        self.blocks: list[Block] = []
+        self.blocks: list[CheckedBlock] = []
         self.errors: Mapping[str, Mapping[str, float]] = {"before": NO_ERROR, "after": NO_ERROR}
         self.header: Mapping[str, Any] | None = None
         self.refused: tuple[Reason, ...] = ()
@@ -72,43 +72,43 @@ class CheckedProgram:
         weakref.finalize(self, os.close, self._descriptor)
 
     @staticmethod
-    def find(folder: Path, key: str, program_folder: Path) -> CheckedProgram | None:
+    def find_checked(folder: Path, key: str, program_folder: Path) -> CheckedProgram | None:
         """Return the result stored under ``key``; None if there is none, other code made it, or rows are missing.
 
         The subroutines in ``program_folder`` must be those of the check.
         """
         try:
             header = json.loads((folder / (key + HEADER)).read_bytes())
-            if header.pop("digest") != header_digest(header):
+            if header.pop("digest") != compute_header_digest(header):
                 return None
             found = CheckedProgram(folder / (key + ROWS), header["axes"])
-            good = header["schema"] == SCHEMA and header["code"] == code_digest() and not header["refused"]
+            good = header["schema"] == SCHEMA and header["code"] == compute_code_digest() and not header["refused"]
             good = good and all(program_digest(program_folder / name) == sha for name, sha in header["files"].items())
-            blocks = [Block(end, sha256, end == header["rows"]) for end, sha256 in header["blocks"]]
+            blocks = [CheckedBlock(end, sha256, end == header["rows"]) for end, sha256 in header["blocks"]]
             for k, block in enumerate(blocks if good else []):
                 found.blocks.append(block)
-                found.content(k)
+                found.read_block(k)
             os.utime(folder / (key + HEADER))  # the oldest results are deleted
-            found.conclude(header)
+            found.set_header(header)
         except (OSError, StoreError, ValueError, LookupError, TypeError, AttributeError, RecursionError, ProgramError):
             return None
         return found if good and blocks and blocks[-1].last else None
 
-    def take(self, block: Block, errors: Mapping[str, Mapping[str, float]]) -> None:
+    def add_block(self, block: CheckedBlock, errors: Mapping[str, Mapping[str, float]]) -> None:
         """Add a block that passed; ``errors`` is the contour error so far, without and with the correction."""
         self.blocks.append(block)
         self.errors = errors
 
-    def conclude(self, header: Mapping[str, Any]) -> None:
+    def set_header(self, header: Mapping[str, Any]) -> None:
         self.errors = {which: header[which] for which in ("before", "after")}
         self.header = header
 
     @property
-    def rows(self) -> int:
+    def row_count(self) -> int:
         return self.blocks[-1].end if self.blocks else 0
 
     @property
-    def whole(self) -> bool:
+    def is_complete(self) -> bool:
         return self.header is not None and not self.refused
 
     @property
@@ -122,7 +122,7 @@ class CheckedProgram:
         """The largest offset; infinite while the check goes on."""
         return float(self.header["largest_um"]) if self.header is not None else math.inf
 
-    def content(self, k: int) -> bytes:
+    def read_block(self, k: int) -> bytes:
         """Return the rows of a block. Raises StoreError if they are not those that the check reported."""
         block, first = self.blocks[k], self.blocks[k - 1].end if k else 0
         size = 8 * len(self.axes)
@@ -146,51 +146,51 @@ class RowStream:
         self._next = 0
 
     @property
-    def ready(self) -> bool:
+    def has_block(self) -> bool:
         """Whether a block can be handed out; the last one only after the check has ended."""
         blocks = self.checked.blocks
-        return self._next < len(blocks) and (self.checked.whole or not blocks[self._next].last)
+        return self._next < len(blocks) and (self.checked.is_complete or not blocks[self._next].last)
 
     @property
-    def reach_s(self) -> float:
+    def checked_until_s(self) -> float:
         """The end of the rows that passed and may be handed out, in seconds of the program."""
-        blocks, whole = self.checked.blocks, self.checked.whole
+        blocks, whole = self.checked.blocks, self.checked.is_complete
         return max((block.end for block in blocks[-2:] if whole or not block.last), default=0) * self.period_s
 
     @property
-    def done(self) -> bool:
-        return self.checked.whole and self._next == len(self.checked.blocks)
+    def is_finished(self) -> bool:
+        return self.checked.is_complete and self._next == len(self.checked.blocks)
 
-    def take(self, seconds: float = 0.0) -> Piece:
+    def take_rows(self, seconds: float = 0.0) -> TablePiece:
         """Return the next block, or more blocks covering ``seconds``. Raises StoreError if the rows cannot be read."""
-        first, content = self.end, [self._block()]
-        while self.ready and (self.end - first) * self.period_s < seconds:
-            content.append(self._block())
+        first, content = self.end, [self._take_block()]
+        while self.has_block and (self.end - first) * self.period_s < seconds:
+            content.append(self._take_block())
         size = len(self.axes)
         rows = np.frombuffer(b"".join(content), "<i4").reshape(-1, 2 * size).T.tolist()
         demand, offset = (dict(zip(self.axes, part, strict=True)) for part in (rows[:size], rows[size:]))
-        return Piece(first, demand, offset, self.done)
+        return TablePiece(first, demand, offset, self.is_finished)
 
-    def _block(self) -> bytes:
-        content = self.checked.content(self._next)
+    def _take_block(self) -> bytes:
+        content = self.checked.read_block(self._next)
         self.end = self.checked.blocks[self._next].end
         self._next += 1
         return content
 
-    def lacks(self, status: Mapping[str, Any]) -> bool:
+    def has_too_few_rows(self, status: Mapping[str, Any]) -> bool:
         """Return whether the guard, by its status, holds less than the ring ahead of the machine."""
-        return not self.done and self.left_s(status) < RING_S
+        return not self.is_finished and self.compute_remaining_s(status) < RING_S
 
-    def left_s(self, status: Mapping[str, Any]) -> float:
+    def compute_remaining_s(self, status: Mapping[str, Any]) -> float:
         """Return the seconds of rows that the guard, by its status, holds ahead of the machine."""
         rows = status.get("rows")
         return (int(rows[1]) - int(status.get("row") or 0)) * self.period_s if rows else math.inf
 
-    def status(self) -> dict[str, Any]:
+    def report_progress(self) -> dict[str, Any]:
         """Return how far the check is, whether all passed, and what was refused."""
         checked = self.checked
         return {
-            "checked_s": round(checked.rows * self.period_s, 3),
-            "whole": checked.whole,
+            "checked_s": round(checked.row_count * self.period_s, 3),
+            "whole": checked.is_complete,
             "refused": [str(reason) for reason in checked.refused],
         }

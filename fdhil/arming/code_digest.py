@@ -19,16 +19,16 @@ _IMPORT = re.compile(r"^\s*from (fdhil[\w.]*) import (\([^)]*\)|.*)$", re.MULTIL
 _LISTED = re.compile(r'"(fdhil\.[\w.]+):\w+"')  # in a table of tables.py
 
 
-def code_digest() -> str:
+def compute_code_digest() -> str:
     """Return the digest of the code that makes the rows, as it is on disk now, and of its libraries' versions."""
     home = Path(fdhil.__file__).parent
     digest = hashlib.sha256(json.dumps([sys.version, *(library.__version__ for library in LIBRARIES)]).encode())
-    for name, content in sorted(code_files(home).items()):
+    for name, content in sorted(find_code_files(home).items()):
         digest.update(name.encode() + b"\0" + content)
     return digest.hexdigest()
 
 
-def code_files(home: Path) -> dict[str, bytes]:
+def find_code_files(home: Path) -> dict[str, bytes]:
     """Return the package files below ``home`` that the check imports, or that a table in tables.py lists."""
     found: dict[str, bytes] = {}
     waiting, seen = [MAKER], set[str]()
@@ -42,12 +42,12 @@ def code_files(home: Path) -> dict[str, bytes]:
             if file.is_file():
                 content = found[str(file.relative_to(home))] = file.read_bytes()
                 if module != "fdhil":  # which only offers the Python interface
-                    waiting += _imported(content.decode())
+                    waiting += _find_imports(content.decode())
         waiting.append(module.rpartition(".")[0] or "fdhil")  # a package is imported with its modules
     return found
 
 
-def _imported(text: str) -> Iterator[str]:
+def _find_imports(text: str) -> Iterator[str]:
     yield from _LISTED.findall(text)
     for module, names in _IMPORT.findall(text):
         yield module

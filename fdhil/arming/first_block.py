@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fdhil.arming.checked_program import Piece
-from fdhil.arming.program_check import reference_blocks
-from fdhil.arming.standstill import AtRest
+from fdhil.arming.checked_program import TablePiece
+from fdhil.arming.program_check import plan_reference_blocks
+from fdhil.arming.standstill_monitor import StandstillState
 from fdhil.config import Axis, MachineConfig
 from fdhil.correction.inverse import AxisInversePlanner, compute_common_delay_s, count_block_rows
 from fdhil.correction.plan_limits import check_offsets
@@ -31,7 +31,7 @@ CHANGED_SHARE = 0.05  # of the dry friction: smaller changes of the current are 
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
+class _AxisSolution:
     """The solution of one axis: its offsets (n,) in increments, and whether the limits allow them.
 
     ``old_mm`` and ``new_mm`` (n,) are the positions predicted with the offsets in force and with these.
@@ -48,7 +48,7 @@ class FirstBlock:
 
     def __init__(
         self,
-        begin: Piece,
+        begin: TablePiece,
         program: Path,
         models: Mapping[str, Parameters],
         config: MachineConfig,
@@ -60,7 +60,7 @@ class FirstBlock:
         """
         self.begin = self._checked = begin
         self._models, self._config, self._period_s = models, config, config.machine.sync_period_s
-        self._path = _first_rows(program, config, sha256)
+        self._path = _read_first_rows(program, config, sha256)
         rapid = {axis: config.axis[axis].rapid_speed_mm_s for axis in begin.offset}
         # the lag of rows that lag on purpose depends on the whole path
         self._fits = set(begin.offset) <= set(self._path) and compute_common_delay_s(rapid, models, config)[0] == 0.0
@@ -73,69 +73,73 @@ class FirstBlock:
         self._used_a = {axis: float(walk.carry.state[CURRENT]) for axis, walk in self._walks.items()}
         self._own: dict[str, Float] = {}
 
-    def renew(self, rest: Mapping[str, AtRest]) -> Piece | None:
+    def recompute(self, rest: Mapping[str, StandstillState]) -> TablePiece | None:
         """Return rows that begin where the axes stand; None if the rows in force are to stay.
 
         They stay if an axis does not stand at the program's start, if no current has changed, or if nothing is gained.
         """
         axes = tuple(self.begin.offset)
-        if not self._fits or not all(self._stands(axis, rest.get(axis)) for axis in axes):
+        if not self._fits or not all(self._is_at_start(axis, rest.get(axis)) for axis in axes):
             return None
-        if not any(self._differs(axis, rest[axis]) for axis in axes):
+        if not any(self._has_changed(axis, rest[axis]) for axis in axes):
             return None
         self._used_a = {axis: rest[axis].current_a for axis in axes}
-        found = closed_loop.run_per_axis(lambda axis: self._solved(axis, rest[axis]), axes)
-        if not all(one.allowed for one in found.values()) or not self._better(found):
+        found = closed_loop.run_per_axis(lambda axis: self._solve_axis(axis, rest[axis]), axes)
+        if not all(one.allowed for one in found.values()) or not self._is_improvement(found):
             return None
         signs = {axis: self._config.axis[axis].scaling.sign for axis in axes}
         offset = {axis: (signs[axis] * one.offset).astype(np.int64).tolist() for axis, one in found.items()}
         rows = len(next(iter(offset.values())))
-        return Piece(0, {axis: values[:rows] for axis, values in self.begin.demand.items()}, offset, self.begin.final)
+        return TablePiece(
+            0, {axis: values[:rows] for axis, values in self.begin.demand.items()}, offset, self.begin.final
+        )
 
-    def take(self, rows: Piece) -> None:
+    def apply_rows(self, rows: TablePiece) -> None:
         """Note that these rows are in force."""
         behind = {axis: values[len(rows.offset[axis]) :] for axis, values in self.begin.offset.items()}
         self.begin = self.begin._replace(offset={axis: rows.offset[axis] + behind[axis] for axis in rows.offset})
 
-    def expect(self, rest: Mapping[str, AtRest]) -> Piece | None:
+    def predict_rows(self, rest: Mapping[str, StandstillState]) -> TablePiece | None:
         """Return rows for a machine that will move to the start from where its axes ``rest``, like :meth:`renew`.
 
         An axis that has to move will stop with its regulators' integral at the edge of the dry friction's band, on the
         side of its last motion.
         """
-        return self.renew({axis: self._arrived(axis, there) for axis, there in rest.items() if axis in self._walks})
+        return self.recompute(
+            {axis: self._predict_standstill(axis, there) for axis, there in rest.items() if axis in self._walks}
+        )
 
-    def _arrived(self, axis: str, rest: AtRest) -> AtRest:
-        if self._stands(axis, rest):
+    def _predict_standstill(self, axis: str, rest: StandstillState) -> StandstillState:
+        if self._is_at_start(axis, rest):
             return rest
         start_mm = float(self._path[axis][0])
-        held, model = self._band(axis, start_mm), self._models[axis]
+        held, model = self._compute_friction_band(axis, start_mm), self._models[axis]
         torque_nm = held.high if start_mm > rest.demand_mm else held.low
-        return AtRest(start_mm, start_mm, torque_nm / model.K)
+        return StandstillState(start_mm, start_mm, torque_nm / model.K)
 
-    def _band(self, axis: str, position_mm: float) -> FrictionBand:
+    def _compute_friction_band(self, axis: str, position_mm: float) -> FrictionBand:
         return compute_friction_band(
             self._models[axis], position_mm * 2 * np.pi / self._config.axis[axis].screw_pitch_mm
         )
 
-    def _stands(self, axis: str, rest: AtRest | None) -> bool:
+    def _is_at_start(self, axis: str, rest: StandstillState | None) -> bool:
         room_mm = AT_START_INCREMENTS / self._config.axis[axis].scaling.increments_per_mm
         return rest is not None and abs(rest.demand_mm - self._path[axis][0]) <= room_mm
 
-    def _differs(self, axis: str, rest: AtRest) -> bool:
-        held, change_a = self._band(axis, rest.position_mm), rest.current_a - self._used_a[axis]
+    def _has_changed(self, axis: str, rest: StandstillState) -> bool:
+        held, change_a = self._compute_friction_band(axis, rest.position_mm), rest.current_a - self._used_a[axis]
         return abs(change_a) * self._models[axis].K > CHANGED_SHARE * 0.5 * (held.high - held.low)
 
-    def _solved(self, name: str, rest: AtRest) -> _Found:
+    def _solve_axis(self, name: str, rest: StandstillState) -> _AxisSolution:
         """Compute the offsets of one axis' first rows: the checked ones plus the change for another initial state."""
         walk, axis, path_mm = self._walks[name], self._config.axis[name], self._path[name]
-        loop, state = walk.loop, rest_state(rest, float(path_mm[0]), self._models[name], axis)
+        loop, state = walk.loop, make_initial_state(rest, float(path_mm[0]), self._models[name], axis)
         if name not in self._own:
-            self._own[name] = self._block(name, walk.carry.state)
+            self._own[name] = self._compute_offsets(name, walk.carry.state)
         own, ends = self._own[name], path_mm.size <= sum(count_block_rows(self._period_s))
         rows = own.size if ends else round(JOINED_S / self._period_s)
-        share = 1.0 if ends else _share(rows, self._period_s)
-        more = np.rint((self._block(name, state)[:rows] - own[:rows]) * share)
+        share = 1.0 if ends else _compute_blend(rows, self._period_s)
+        more = np.rint((self._compute_offsets(name, state)[:rows] - own[:rows]) * share)
         checked, begin = (
             axis.scaling.sign * np.array(piece.offset[name][: rows + 2], dtype=np.float64)  # a cycle looks two ahead
             for piece in (self._checked, self.begin)
@@ -148,9 +152,9 @@ class FirstBlock:
             loop.simulate_rows(path_mm[: new.size], own + offset - checked, state, 0, rows).table_mm
             for offset in (begin, new)
         )
-        return _Found(new[:rows], old_mm, new_mm, allowed)
+        return _AxisSolution(new[:rows], old_mm, new_mm, allowed)
 
-    def _block(self, name: str, state: State) -> Float:
+    def _compute_offsets(self, name: str, state: State) -> Float:
         walk, path_mm = self._walks[name], self._path[name]
         block, ahead = count_block_rows(self._period_s)
         ends = path_mm.size <= block + ahead
@@ -162,7 +166,7 @@ class FirstBlock:
             .offset[:rows]
         )
 
-    def _better(self, found: Mapping[str, _Found]) -> bool:
+    def _is_improvement(self, found: Mapping[str, _AxisSolution]) -> bool:
         around = compute_table_path((*found,), np.column_stack([self._path[axis] for axis in found]))
         old_um, new_um = (
             compute_rms(
@@ -175,11 +179,11 @@ class FirstBlock:
         return new_um < old_um
 
 
-def _first_rows(program: Path, config: MachineConfig, sha256: str | None) -> dict[str, Float]:
+def _read_first_rows(program: Path, config: MachineConfig, sha256: str | None) -> dict[str, Float]:
     block, ahead = count_block_rows(config.machine.sync_period_s)
     pieces: list[Mapping[str, Float]] = []
     rows = 0
-    for part in reference_blocks(program, config, sha256):
+    for part in plan_reference_blocks(program, config, sha256):
         pieces.append(part.position_mm)
         rows += part.time_s.size
         if rows > block + ahead:
@@ -187,7 +191,7 @@ def _first_rows(program: Path, config: MachineConfig, sha256: str | None) -> dic
     return {axis: np.concatenate([piece[axis] for piece in pieces])[: block + ahead + 1] for axis in pieces[0]}
 
 
-def rest_state(rest: AtRest, start_mm: float, parameters: Parameters, axis: Axis) -> State:
+def make_initial_state(rest: StandstillState, start_mm: float, parameters: Parameters, axis: Axis) -> State:
     """Return the state of an axis at a program's start, with the following error that it has at standstill."""
     off_mm = rest.position_mm - rest.demand_mm
     if abs(off_mm) * axis.scaling.increments_per_mm < 1.0:  # the drive itself sees none
@@ -195,7 +199,7 @@ def rest_state(rest: AtRest, start_mm: float, parameters: Parameters, axis: Axis
     return closed_loop.create_standstill_state(parameters, axis, start_mm + off_mm, rest.current_a, start_mm)
 
 
-def _share(rows: int, period_s: float) -> Float:
+def _compute_blend(rows: int, period_s: float) -> Float:
     """Return (rows,) the share of the recomputed rows: 1, then smoothly down to 0."""
     gone = np.clip((np.arange(rows) * period_s - ALONE_S) / (JOINED_S - ALONE_S), 0.0, 1.0)
     return np.asarray(1.0 - gone**3 * (10 - 15 * gone + 6 * gone**2))

@@ -47,10 +47,10 @@ class GuardClient:
             absent = f"no guard answers ({error.strerror or error}); start fdhil-guard with this machine's config"
             raise ConnectError.from_socket_error(str(path), error, absent) from None
 
-    def status(self) -> dict[str, Any]:
-        return self.ask({"request": "status"})
+    def read_status(self) -> dict[str, Any]:
+        return self.send_request({"request": "status"})
 
-    def load(
+    def load_table(
         self,
         axes: Sequence[str],
         demand: Mapping[str, correction_table.Column],
@@ -69,7 +69,9 @@ class GuardClient:
         body = correction_table.encode_table(axes, demand, offset, program_digest, first, final)
         descriptor = correction_table.seal_table(body)
         try:
-            return self.ask({"request": "table", "renew": renew}, self._timeout_s + len(body) / 2e5, descriptor)
+            return self.send_request(
+                {"request": "table", "renew": renew}, self._timeout_s + len(body) / 2e5, descriptor
+            )
         finally:
             os.close(descriptor)
 
@@ -81,9 +83,9 @@ class GuardClient:
         ``disarms``: the count in the status before preparation began; the guard refuses if it was disarmed since.
         """
         request = {"request": "arm", "token": token, "program_digest": program_digest, "facts": dict(facts)}
-        return self.ask(_as_of(disarms, request))
+        return self.send_request(_limit_to_disarms(disarms, request))
 
-    def feed_forward(
+    def enable_feedforward(
         self,
         token: str,
         laws: Mapping[str, Mapping[str, Any]],
@@ -93,50 +95,50 @@ class GuardClient:
         """Enable the on-line feed-forward; ``laws`` per axis as in ``feedforward.Law``, facts as its interlocks."""
         laws = {axis: dict(law) for axis, law in laws.items()}
         request = {"request": "feedforward", "token": token, "laws": laws, "facts": dict(facts)}
-        return self.ask(_as_of(disarms, request))
+        return self.send_request(_limit_to_disarms(disarms, request))
 
     def disarm(self) -> dict[str, Any]:
         """Ramp to zero; the answer comes at once, ``status`` shows when the state is OFF."""
-        return self.ask({"request": "disarm"})
+        return self.send_request({"request": "disarm"})
 
     def adopt(self, token: str) -> dict[str, Any]:
         """Take over the offsets that the drives hold and ramp them to zero (after FROZEN, or a residual offset)."""
-        return self.ask({"request": "adopt", "token": token})
+        return self.send_request({"request": "adopt", "token": token})
 
-    def touched(self, token: str) -> dict[str, int]:
+    def read_touch_counts(self, token: str) -> dict[str, int]:
         """Return how often each drive was written to so far; call it before comparing drives with their records."""
-        self.compared(token, {}, {})  # without SYNC the guard updates its counts only on a request
-        return dict(self.status().get("touched", {}))
+        self.report_comparison(token, {}, {})  # without SYNC the guard updates its counts only on a request
+        return dict(self.read_status().get("touched", {}))
 
-    def compared(self, token: str, axes: Mapping[str, str], touched: Mapping[str, int]) -> dict[str, Any]:
+    def report_comparison(self, token: str, axes: Mapping[str, str], touched: Mapping[str, int]) -> dict[str, Any]:
         """Report which drives were compared with their records; another fingerprint voids the record.
 
         ``touched`` are the counts before the comparison: a drive that was written to since is refused.
         """
-        return self.ask({"request": "compared", "token": token, "axes": dict(axes), "touched": dict(touched)})
+        return self.send_request({"request": "compared", "token": token, "axes": dict(axes), "touched": dict(touched)})
 
-    def alive(self, facts: Mapping[str, bool] | None = None) -> None:
+    def send_alive(self, facts: Mapping[str, bool] | None = None) -> None:
         """Report that the daemon is well, and the facts that still hold. Raises GuardLost if the guard is gone."""
         message: dict[str, Any] = {"request": "alive"}
         if facts is not None:
             message["facts"] = dict(facts)
-        self._send(message)
+        self._send_message(message)
 
-    def ask(
+    def send_request(
         self, request: Mapping[str, Any], timeout_s: float | None = None, descriptor: int | None = None
     ) -> dict[str, Any]:
         """Send one request, optionally with a file descriptor, and wait for the answer."""
         with self._asking:
             self._number += 1
             number = self._number
-            self._send({**request, "id": number}, descriptor)
+            self._send_message({**request, "id": number}, descriptor)
             deadline_s = self._clock.now_s() + (timeout_s or self._timeout_s)
             while True:
-                answer = self._line(deadline_s)
+                answer = self._receive_line(deadline_s)
                 if answer.pop("id", None) == number:
                     return answer
 
-    def _send(self, message: Mapping[str, Any], descriptor: int | None = None) -> None:
+    def _send_message(self, message: Mapping[str, Any], descriptor: int | None = None) -> None:
         line = encode_line(message)
         try:
             with self._sending:
@@ -144,24 +146,24 @@ class GuardClient:
                     line = line[socket.send_fds(self._socket, [line], [descriptor]) :]
                 self._socket.sendall(line)
         except OSError as error:
-            raise self._lost(error.strerror or str(error)) from None
+            raise self._make_lost_error(error.strerror or str(error)) from None
 
-    def _line(self, deadline_s: float) -> dict[str, Any]:
+    def _receive_line(self, deadline_s: float) -> dict[str, Any]:
         while b"\n" not in self._inbox:
             try:
                 if not self._clock.wait_readable(self._socket, max(0.0, deadline_s - self._clock.now_s())):
                     raise DeviceTimeout("guard", "did not answer; check its journal, then restart it")
                 chunk = self._socket.recv(1 << 16)
             except OSError as error:
-                raise self._lost(error.strerror or str(error)) from None
+                raise self._make_lost_error(error.strerror or str(error)) from None
             if not chunk:
-                raise self._lost("connection closed")
+                raise self._make_lost_error("connection closed")
             self._inbox += chunk
         line, self._inbox = self._inbox.split(b"\n", 1)
         return decode_line(line) or {}
 
     @staticmethod
-    def _lost(why: str) -> GuardLost:
+    def _make_lost_error(why: str) -> GuardLost:
         return GuardLost("guard", f"is gone ({why}); check its journal, then start it again")
 
     def close(self) -> None:
@@ -175,6 +177,6 @@ class GuardClient:
         self.close()
 
 
-def _as_of(disarms: int | None, request: dict[str, Any]) -> dict[str, Any]:
+def _limit_to_disarms(disarms: int | None, request: dict[str, Any]) -> dict[str, Any]:
     """Add the condition that there was no other disarm since."""
     return request if disarms is None else {**request, "disarms": disarms}

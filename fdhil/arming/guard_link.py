@@ -6,12 +6,20 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from fdhil.arming.answers import CHECK_ABANDONED
-from fdhil.arming.checked_program import Piece
+from fdhil.arming.arm_plan import ArmPlan, FeedforwardPlan
+from fdhil.arming.checked_program import TablePiece
 from fdhil.arming.guard_client import GuardClient
-from fdhil.arming.preparing import Armament, Feeding
-from fdhil.arming.standing import ABSENT, GONE, START_AND_ADOPT, Standing, landed, lost, standing
-from fdhil.arming.standing_mark import StandingMark
+from fdhil.arming.refusals import CHECK_ABANDONED
+from fdhil.arming.residual_offset import (
+    ABSENT,
+    GONE,
+    START_AND_ADOPT,
+    ResidualOffset,
+    make_lost_status,
+    read_residual_offset,
+    wait_until_idle,
+)
+from fdhil.arming.residual_offset_file import ResidualOffsetFile
 from fdhil.errors import ConnectError, DeviceError
 from fdhil.guard.guard_protocol import AT_REST, CHARGED_STATES
 from fdhil.records import Notice
@@ -36,15 +44,15 @@ class GuardLink:
         self._run_directory, self._clock = run_directory, clock
         self._lock = threading.Lock()
         self._client: GuardClient | None = None
-        self._mark = StandingMark(store_directory)
-        self._status: Mapping[str, Any] = self._mark.left or ABSENT
-        self._missed = self._mark.left is None
+        self._mark = ResidualOffsetFile(store_directory)
+        self._status: Mapping[str, Any] = self._mark.stored_status or ABSENT
+        self._missed = self._mark.stored_status is None
         self._status_s: float | None = None
         self._unreported: list[Notice] = []
         self._ended = False
 
     @property
-    def connected(self) -> bool:
+    def is_connected(self) -> bool:
         return self._client is not None
 
     @property
@@ -54,32 +62,32 @@ class GuardLink:
         return {**self._status, "heard_s_ago": age_s}
 
     @property
-    def standing(self) -> Standing:
+    def residual_offset(self) -> ResidualOffset:
         """What may still be applied in the drives, by the guard's last status."""
-        return standing(self._status)
+        return read_residual_offset(self._status)
 
     @property
     def state(self) -> str:
         return str(self._status["state"])
 
     @property
-    def disarms(self) -> int | None:
+    def disarm_count(self) -> int | None:
         """How often the guard had been disarmed by its last status; None if it does not report it."""
         return self._status.get("disarms")
 
     @property
-    def row(self) -> int:
+    def path_row(self) -> int:
         """The row of the path where the machine is, 0 before it has begun."""
         return int(self._status.get("row") or 0)
 
-    def look(self) -> Mapping[str, Any]:
+    def read_status(self) -> Mapping[str, Any]:
         """Connect if needed, read the status and return it (blocking); the next ``refresh`` reports the changes."""
-        with contextlib.suppress(DeviceError), self._asked():
+        with contextlib.suppress(DeviceError), self._use_connection():
             pass
         return self._status
 
-    def refresh(self) -> list[Notice]:
-        self.look()
+    def poll_changes(self) -> list[Notice]:
+        self.read_status()
         return self.take_changes()
 
     def take_changes(self) -> list[Notice]:
@@ -89,7 +97,7 @@ class GuardLink:
         return changes
 
     @contextlib.contextmanager
-    def _asked(self, arming: bool = False) -> Iterator[GuardClient]:
+    def _use_connection(self, arming: bool = False) -> Iterator[GuardClient]:
         """Yield the connection, and read the status afterwards; the next ``refresh`` reports the changes.
 
         A guard that does not answer is disconnected: what it may have armed it then ramps to zero.
@@ -102,82 +110,86 @@ class GuardLink:
                 if self._client is None:
                     self._client = GuardClient(self._run_directory, clock=self._clock)
                 if arming:
-                    self._mark.keep(standing(lost(before, arming)))
+                    self._mark.store(read_residual_offset(make_lost_status(before, arming)))
                 yield self._client
-                self._status, self._status_s = self._client.status(), self._clock.now_s()
-                self._keep()
-                self._unreported += _changes(before, self._status)
+                self._status, self._status_s = self._client.read_status(), self._clock.now_s()
+                self._store_residual_offset()
+                self._unreported += _report_changes(before, self._status)
             except DeviceError as error:
                 reached = self._client is not None
-                self._drop()
-                self._status = lost(before, arming and reached)
+                self._drop_connection()
+                self._status = make_lost_status(before, arming and reached)
                 if not self._missed or before["state"] not in GONE or self._status["state"] != before["state"]:
-                    self._unreported.append(_gone(before, self._status, error))
+                    self._unreported.append(_report_guard_loss(before, self._status, error))
                 self._missed = True
                 raise
 
-    def _keep(self) -> None:
-        residual = standing(self._status)
-        if residual.nothing:
+    def _store_residual_offset(self) -> None:
+        residual = read_residual_offset(self._status)
+        if residual.is_zero:
             self._mark.remove()
-        elif residual.known:
-            self._mark.keep(residual)
+        elif residual.is_applied:
+            self._mark.store(residual)
 
-    def _drop(self) -> None:
+    def _drop_connection(self) -> None:
         if self._client is not None:
             self._client.close()
         self._client = None
 
-    def say_alive(self, facts: Mapping[str, bool] | None) -> None:
+    def send_alive(self, facts: Mapping[str, bool] | None) -> None:
         """Report to the guard that the daemon is well (never blocks); ``refresh`` finds out if the guard is gone."""
         client = self._client
         if client is not None:
             try:
-                client.alive(facts)
+                client.send_alive(facts)
             except DeviceError:
                 self._status = {**self._status, "text": "the connection is lost"}
 
     def arm(
-        self, armament: Armament, token: str, given_up: Callable[[], bool], disarms: int | None
+        self, armament: ArmPlan, token: str, given_up: Callable[[], bool], disarms: int | None
     ) -> Mapping[str, Any]:
         """Load the table and arm (blocking), unless ``cancel_itself`` by then; return the guard's answer.
 
         A disarm that was answered in the meantime takes precedence; so does one that the guard counted after the first
         ``disarms``. Raises DeviceError if there is no guard.
         """
-        with self._asked(arming=True) as client:
+        with self._use_connection(arming=True) as client:
             if given_up():
                 return CHECK_ABANDONED
-            answer = self._load(client, armament, armament.begin)
+            answer = self._load_rows(client, armament, armament.first_piece)
             if not answer["ok"]:
                 return answer
             digest, facts = armament.stream.program_digest, armament.facts
-            return self._ask(client, lambda: client.arm(token, digest, facts, disarms), given_up)
+            return self._retry_until_settled(client, lambda: client.arm(token, digest, facts, disarms), given_up)
 
     @staticmethod
-    def _load(client: GuardClient, armament: Armament, piece: Piece, renew: bool = False) -> Mapping[str, Any]:
+    def _load_rows(client: GuardClient, armament: ArmPlan, piece: TablePiece, renew: bool = False) -> Mapping[str, Any]:
         digest = armament.stream.program_digest
-        return client.load(armament.stream.axes, piece.demand, piece.offset, digest, piece.first, piece.final, renew)
+        return client.load_table(
+            armament.stream.axes, piece.demand, piece.offset, digest, piece.first, piece.final, renew
+        )
 
-    def extend(self, armament: Armament, piece: Piece) -> Mapping[str, Any]:
+    def extend_stream(self, armament: ArmPlan, piece: TablePiece) -> Mapping[str, Any]:
         """Hand more rows of a running stream to the guard (blocking). Raises DeviceError if there is no guard."""
-        with self._asked() as client:
-            return self._load(client, armament, piece)
+        with self._use_connection() as client:
+            return self._load_rows(client, armament, piece)
 
-    def renew(self, armament: Armament, piece: Piece) -> Mapping[str, Any]:
+    def replace_first_rows(self, armament: ArmPlan, piece: TablePiece) -> Mapping[str, Any]:
         """Replace the first rows of a program that has not begun (blocking). DeviceError if there is no guard."""
-        with self._asked() as client:
-            return self._load(client, armament, piece, renew=True)
+        with self._use_connection() as client:
+            return self._load_rows(client, armament, piece, renew=True)
 
-    def feed_forward(
-        self, feeding: Feeding, token: str, given_up: Callable[[], bool], disarms: int | None
+    def enable_feedforward(
+        self, feeding: FeedforwardPlan, token: str, given_up: Callable[[], bool], disarms: int | None
     ) -> Mapping[str, Any]:
         """Enable the on-line feed-forward (blocking), like ``arm``. Raises DeviceError if there is no guard."""
-        with self._asked(arming=True) as client:
+        with self._use_connection(arming=True) as client:
             laws, facts = feeding.laws, feeding.facts
-            return self._ask(client, lambda: client.feed_forward(token, laws, facts, disarms), given_up)
+            return self._retry_until_settled(
+                client, lambda: client.enable_feedforward(token, laws, facts, disarms), given_up
+            )
 
-    def _ask(
+    def _retry_until_settled(
         self, client: GuardClient, arm: Callable[[], Mapping[str, Any]], given_up: Callable[[], bool]
     ) -> Mapping[str, Any]:
         """Repeat the request for a few seconds while the interlocks settle; any other refusal is final."""
@@ -185,7 +197,7 @@ class GuardLink:
         for _ in range(SETTLING_TRIES):
             if given_up():
                 return CHECK_ABANDONED
-            client.alive(None)  # planning took its time: the guard needs a recent sign of life
+            client.send_alive(None)  # planning took its time: the guard needs a recent sign of life
             answer = arm()
             if answer["ok"] or [reason["code"] for reason in answer.get("refused", [])] != ["NotSettled"]:
                 break
@@ -194,55 +206,55 @@ class GuardLink:
 
     def disarm(self) -> Mapping[str, Any]:
         """Request the ramp to zero and wait for its end (blocking). Raises DeviceError if there is no guard."""
-        with self._asked() as client:
+        with self._use_connection() as client:
             answer = client.disarm()
             if answer["ok"]:
-                landed(client.status, clock=self._clock)
+                wait_until_idle(client.read_status, clock=self._clock)
             return answer
 
     def close(self) -> None:
         """End the connection for good; the guard ramps to zero what still runs."""
         with self._lock:
             self._ended = True
-            self._drop()
+            self._drop_connection()
 
 
-def _gone(before: Mapping[str, Any], now: Mapping[str, Any], error: DeviceError) -> Notice:
-    residual = standing(now)
+def _report_guard_loss(before: Mapping[str, Any], now: Mapping[str, Any], error: DeviceError) -> Notice:
+    residual = read_residual_offset(now)
     was = "" if before["state"] in GONE else f"it was in state {before['state']}; "
     text = f"{error}; {was}{residual}"
-    if residual.nothing:
+    if residual.is_zero:
         return Notice("GuardLost", "minor", text)
     return Notice("GuardLost", "MAJOR", f"{text}; {START_AND_ADOPT}")
 
 
-def _severity(state: str, residual: Standing) -> Literal["info", "minor", "MAJOR"]:
+def _choose_severity(state: str, residual: ResidualOffset) -> Literal["info", "minor", "MAJOR"]:
     """A guard that is off and has not read its drives yet is no alarm; a known or frozen offset is one."""
-    if state not in AT_REST or residual.nothing:
+    if state not in AT_REST or residual.is_zero:
         return "info"
-    return "MAJOR" if state == "FROZEN" or residual.known else "minor"
+    return "MAJOR" if state == "FROZEN" or residual.is_applied else "minor"
 
 
-def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
-    return [*_voided(before, now), *_moved(before, now)]
+def _report_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
+    return [*_report_void_records(before, now), *_report_state_change(before, now)]
 
 
-def _voided(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
+def _report_void_records(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
     known = {item["axis"] for item in before.get("not_good", []) if item["code"] == RECORD_VOID}
     void = [item for item in now.get("not_good", []) if item["code"] == RECORD_VOID and item["axis"] not in known]
     return [Notice(RECORD_VOID, "MAJOR", f"{item['text']}; {item['advice']}", item["axis"]) for item in void]
 
 
-def _moved(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
+def _report_state_change(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
     cause = now.get("cause") or {}
     why = f": {cause.get('code', '')}: {cause['text']}" if cause.get("text") else ""
-    residual = standing(now)
-    severity = _severity(now["state"], residual)
+    residual = read_residual_offset(now)
+    severity = _choose_severity(now["state"], residual)
     left = f"; {residual}" if now["state"] in AT_REST else ""
     if before["state"] in GONE:
         return [Notice("GuardFound", severity, f"the guard is running, in state {now['state']}{why}{left}")]
     if before["state"] == now["state"]:
-        known = not left or standing(before).nothing == residual.nothing
+        known = not left or read_residual_offset(before).is_zero == residual.is_zero
         return [] if known else [Notice("GuardState", severity, f"{now['state']}{left}")]
     notice = Notice("GuardState", severity, f"{before['state']} -> {now['state']}{why}{left}", cause.get("axis", ""))
     tripped = (

@@ -19,15 +19,15 @@ class GuardPresence:
         self._path = run_directory / SOCKET_NAME
         self._asked_s = self._answered_s = -math.inf
 
-    def is_there(self) -> bool:
+    def is_present(self) -> bool:
         now_s = time.monotonic()
         if now_s - self._asked_s >= ASK_AGAIN_S:
             self._asked_s = now_s
-            if self._listens():
+            if self._is_listening():
                 self._answered_s = now_s
         return now_s - self._answered_s < RENEWED_S
 
-    def _listens(self) -> bool:
+    def _is_listening(self) -> bool:
         with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)) as asking:
             asking.setblocking(False)
             try:

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from fdhil.arming.code_digest import code_digest
+from fdhil.arming.code_digest import compute_code_digest
 from fdhil.bounded_process import limit_process, receive_request, report_to_parent
 from fdhil.config import MachineConfig
 from fdhil.correction import correction_gate
@@ -30,7 +30,7 @@ from fdhil.program import planner, program_digest
 from fdhil.program.demand_csv import read_demand_csv, require_digest
 from fdhil.program.loading import is_demand, open_program
 from fdhil.records import Float, Parameters, Reason, Trajectory
-from fdhil.store.atomic import keep_newest, make_folder, store_error, sync_folder, write_file
+from fdhil.store.atomic_file import keep_newest, make_folder, make_store_error, sync_folder, write_file
 
 SCHEMA = "fdhil-check-4"
 ROWS = ".rows"
@@ -48,38 +48,38 @@ Report = Callable[[Mapping[str, Any]], None]
 Opened = Callable[[], list[tuple[Path, str]]]  # which files were opened so far, with their digests
 
 
-def reference_blocks(program: Path, config: MachineConfig, sha256: str | None = None) -> Iterator[Trajectory]:
+def plan_reference_blocks(program: Path, config: MachineConfig, sha256: str | None = None) -> Iterator[Trajectory]:
     """Return the NC's demand in blocks. Raises ProgramError, RecordingError or ConfigError if it cannot be used.
 
     ``sha256`` is the program's digest: blocks of another content are a ProgramError.
     """
-    return _opened(program, config, sha256)[0]
+    return _open_reference(program, config, sha256)[0]
 
 
-def _opened(program: Path, config: MachineConfig, sha256: str | None) -> tuple[Iterator[Trajectory], Opened]:
+def _open_reference(program: Path, config: MachineConfig, sha256: str | None) -> tuple[Iterator[Trajectory], Opened]:
     if is_demand(program):
         return iter([read_demand_csv(program, config, sha256)]), list
     interpreter = open_program(program, config, sha256)
     return planner.stream(interpreter.run(), config, PIECE_ROWS), lambda: interpreter.files
 
 
-class _Files:
+class _FileDigests:
     """The digests of a program's files as they were read, subroutines in the same folder included."""
 
     def __init__(self, program: Path, digest: str) -> None:
         self._digests = {program: digest}
 
-    def take(self, files: Sequence[tuple[Path, str]]) -> None:
+    def add_files(self, files: Sequence[tuple[Path, str]]) -> None:
         for file, digest in files:
             require_digest(file, digest, self._digests.setdefault(file, digest))
 
-    def unchanged(self) -> dict[str, str]:
+    def require_unchanged(self) -> dict[str, str]:
         for file, digest in self._digests.items():
             require_digest(file, program_digest(file), digest)
         return {file.name: digest for file, digest in list(self._digests.items())[1:]}
 
 
-class _Path:
+class _PathBuffer:
     """Buffers the path until its blocks are planned; after them only the lines that a refusal may name."""
 
     def __init__(self, source: Iterator[Trajectory]) -> None:
@@ -87,13 +87,13 @@ class _Path:
         self._parts: deque[tuple[int, Trajectory]] = deque()
         self._end = 0
 
-    def pieces(self) -> Iterator[Mapping[str, Float]]:
+    def read_parts(self) -> Iterator[Mapping[str, Float]]:
         for part in self._source:
             self._parts.append((self._end, part))
             self._end += part.time_s.size
             yield part.position_mm
 
-    def positions(self, first: int, stop: int) -> dict[str, Float]:
+    def take_positions(self, first: int, stop: int) -> dict[str, Float]:
         while self._parts and self._parts[0][0] + self._parts[0][1].time_s.size <= first:
             self._parts.popleft()
         found: dict[str, list[Float]] = {axis: [] for axis in self._parts[0][1].axes}
@@ -102,7 +102,7 @@ class _Path:
                 found[axis].append(np.asarray(values[max(0, first - start) : max(0, stop - start)]))
         return {axis: np.concatenate(parts) for axis, parts in found.items()}
 
-    def line(self, row: int) -> int:
+    def find_line(self, row: int) -> int:
         for start, part in self._parts:
             if start <= row < start + part.time_s.size:
                 return int(part.line[row - start])
@@ -110,7 +110,7 @@ class _Path:
 
 
 @dataclass(slots=True)
-class _Findings:
+class _CheckSummary:
     rows: int = 0
     before_square: float = 0.0
     after_square: float = 0.0
@@ -120,7 +120,7 @@ class _Findings:
     refused: list[Reason] = field(default_factory=list)
     named: set[tuple[str, ...]] = field(default_factory=set)
 
-    def take(self, block: StreamBlock) -> None:
+    def add_block(self, block: StreamBlock) -> None:
         self.rows += block.before_um.size
         self.before_square += float(block.before_um @ block.before_um)
         self.after_square += float(block.after_um @ block.after_um)
@@ -128,11 +128,11 @@ class _Findings:
         self.after_max = max(self.after_max, float(block.after_um.max()))
         self.largest_um = max(self.largest_um, *(float(np.abs(o).max()) for o in block.offset_um.values()))
 
-    def refuse(self, block: StreamBlock, path: _Path, dt_s: float) -> list[Reason]:
+    def add_refusals(self, block: StreamBlock, path: _PathBuffer, dt_s: float) -> list[Reason]:
         """Add a block's refusals with line and time, once per line; return the new ones."""
         known = len(self.refused)
         for row, reason in sorted(zip(block.at, block.refused, strict=True), key=lambda pair: pair[0]):
-            line = path.line(row)
+            line = path.find_line(row)
             name = (reason.code, *reason.text.split()[:2], str(line or row))
             if name not in self.named:
                 self.named.add(name)
@@ -140,15 +140,15 @@ class _Findings:
                 self.refused.append(Reason(reason.code, f"{place}: {reason.text}", reason.advice))
         return self.refused[known:]
 
-    def errors(self) -> dict[str, dict[str, float]]:
+    def compute_errors(self) -> dict[str, dict[str, float]]:
         then, now = (math.sqrt(square / max(1, self.rows)) for square in (self.before_square, self.after_square))
         return {
             "before": {"rms_um": then, "max_um": self.before_max},
             "after": {"rms_um": now, "max_um": self.after_max},
         }
 
-    def header(self) -> dict[str, Any]:
-        errors = self.errors()
+    def make_header(self) -> dict[str, Any]:
+        errors = self.compute_errors()
         refused = self.refused or list(
             correction_gate.check_gain(errors["before"]["rms_um"], errors["after"]["rms_um"])
         )
@@ -156,7 +156,7 @@ class _Findings:
         return {"rows": self.rows, **errors, "largest_um": self.largest_um, "refused": reasons}
 
 
-def check(
+def check_program(
     program: Path, sha256: str, models: Mapping[str, Parameters], config: MachineConfig, body: BinaryIO, report: Report
 ) -> dict[str, Any]:
     """Run the whole program through correction and gate; write its rows to ``body``, return the header.
@@ -166,47 +166,53 @@ def check(
     written), each refusal ({"refused": ...}), and progress reports ({"progress": ...}). Raises ProgramError,
     RecordingError or ConfigError if the program cannot be used.
     """
-    source, opened = _opened(program, config, sha256)
-    path, findings, files = _Path(source), _Findings(), _Files(program, sha256)
-    code, blocks, pace = code_digest(), list[list[Any]](), _Pace(config.machine.sync_period_s)
-    for block in stream_blocks(path.pieces(), models, config, goes_on=True):
-        demand = path.positions(block.first_row, block.first_row + block.before_um.size)
-        files.take(opened())
-        findings.take(block)
-        for reason in findings.refuse(block, path, config.machine.sync_period_s):
+    source, opened = _open_reference(program, config, sha256)
+    path, findings, files = _PathBuffer(source), _CheckSummary(), _FileDigests(program, sha256)
+    code, blocks, pace = compute_code_digest(), list[list[Any]](), _ProgressReporter(config.machine.sync_period_s)
+    for block in stream_blocks(path.read_parts(), models, config, goes_on=True):
+        demand = path.take_positions(block.first_row, block.first_row + block.before_um.size)
+        files.add_files(opened())
+        findings.add_block(block)
+        for reason in findings.add_refusals(block, path, config.machine.sync_period_s):
             report({"refused": asdict(reason)})
         if len(findings.refused) >= MOST_REFUSED:
             break
         if not findings.refused:
-            rows = encoded(demand, block.offset_um, config)
+            rows = encode_rows(demand, block.offset_um, config)
             body.write(rows)
             body.flush()
             blocks.append([findings.rows, hashlib.sha256(rows).hexdigest()])
-            report({"block": blocks[-1], "last": block.final, "errors": findings.errors()})
-        pace.tell(report, findings, path)
-    of = {"schema": SCHEMA, "axes": list(config.axis), "code": code, "blocks": blocks, "files": files.unchanged()}
-    return of | findings.header()
+            report({"block": blocks[-1], "last": block.final, "errors": findings.compute_errors()})
+        pace.report_progress(report, findings, path)
+    of = {
+        "schema": SCHEMA,
+        "axes": list(config.axis),
+        "code": code,
+        "blocks": blocks,
+        "files": files.require_unchanged(),
+    }
+    return of | findings.make_header()
 
 
-class _Pace:
+class _ProgressReporter:
     def __init__(self, dt_s: float) -> None:
         self._dt_s, self._begun_s, self._reported_s = dt_s, time.monotonic(), -math.inf
 
-    def tell(self, report: Report, findings: _Findings, path: _Path) -> None:
+    def report_progress(self, report: Report, findings: _CheckSummary, path: _PathBuffer) -> None:
         now_s = time.monotonic()
         if now_s - self._reported_s < REPORT_S:
             return
         self._reported_s, checked_s = now_s, findings.rows * self._dt_s
         progress = {
             "checked_s": round(checked_s, 3),
-            "line": path.line(findings.rows - 1),
+            "line": path.find_line(findings.rows - 1),
             "times_real_time": round(checked_s / max(1e-3, now_s - self._begun_s), 1),
             "refused": len(findings.refused),
         }
         report({"progress": progress})
 
 
-def encoded(demand_mm: Mapping[str, Float], offset_um: Mapping[str, Float], config: MachineConfig) -> bytes:
+def encode_rows(demand_mm: Mapping[str, Float], offset_um: Mapping[str, Float], config: MachineConfig) -> bytes:
     """Return rows of demand and offset in increments, in the drives' own sign. Raises ProgramError beyond int32."""
     columns = []
     for values, per_mm in ((demand_mm, 1.0), (offset_um, 1e-3)):
@@ -219,20 +225,20 @@ def encoded(demand_mm: Mapping[str, Float], offset_um: Mapping[str, Float], conf
     return rows.astype("<i4").tobytes()
 
 
-def header_digest(header: Mapping[str, Any]) -> str:
+def compute_header_digest(header: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(header, sort_keys=True).encode()).hexdigest()
 
 
-def part_file(folder: Path, key: str) -> Path:
+def make_part_path(folder: Path, key: str) -> Path:
     return folder / f".{key}.part"
 
 
-def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) -> dict[str, Any]:
+def store_checked(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) -> dict[str, Any]:
     """Have the rows written, then store them and their header durably under ``key``; the oldest programs are removed.
 
     Raises StoreError if that fails. A refused program leaves nothing.
     """
-    part = part_file(folder, key)
+    part = make_part_path(folder, key)
     try:
         make_folder(folder)
         for leftover in folder.glob(".*.part"):  # left by a check that was ended
@@ -245,7 +251,7 @@ def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) 
         if header["refused"]:
             return header
         part.rename(folder / (key + ROWS))
-        write_file(folder / (key + HEADER), json.dumps(header | {"digest": header_digest(header)}).encode())
+        write_file(folder / (key + HEADER), json.dumps(header | {"digest": compute_header_digest(header)}).encode())
         others = [file for file in folder.glob("*" + HEADER) if file.stem != key]
         keep_newest(folder / (key + HEADER), others, KEPT)
         for rows in folder.glob("*" + ROWS):
@@ -253,7 +259,7 @@ def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) 
                 rows.unlink()
         sync_folder(folder)
     except OSError as error:
-        raise store_error(part, error) from None
+        raise make_store_error(part, error) from None
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
@@ -271,11 +277,11 @@ def answer_request(request: Mapping[str, Any], report: Report) -> None:
     config = MachineConfig.model_validate(request["config"])
     models = {axis: Parameters.from_mapping(values) for axis, values in request["models"].items()}
 
-    def run(body: BinaryIO) -> dict[str, Any]:
-        return check(Path(request["program"]), request["program_digest"], models, config, body, report)
+    def run_check(body: BinaryIO) -> dict[str, Any]:
+        return check_program(Path(request["program"]), request["program_digest"], models, config, body, report)
 
     try:
-        header = keep(Path(request["folder"]), request["key"], run)
+        header = store_checked(Path(request["folder"]), request["key"], run_check)
         report({"header": {name: value for name, value in header.items() if name != "blocks"}})  # which were reported
     except StoreError as error:
         report({"error": {"code": error.code, "text": str(error), "advice": "free disk space, then arm again"}})

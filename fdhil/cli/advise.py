@@ -90,7 +90,7 @@ def _held(advice: FeedAdvice, corrected: bool) -> bool:
 def _write(program: Path, advice: Sequence[FeedAdvice], config: MachineConfig, out: Path) -> None:
     from fdhil.program import Budget
     from fdhil.program.feed_words import with_feeds
-    from fdhil.store.output import open_output
+    from fdhil.store.output_file import open_output
 
     content = with_feeds(program, {a.line: a.plain.run for a in advice}, Budget.of(config.nc))
     with open_output(out) as file:

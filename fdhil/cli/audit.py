@@ -26,9 +26,9 @@ def audit(config: Path, last: int, as_json: bool) -> int:
     """
     machine = machine_config.load_config(config)
     from fdhil.daemon.service_log import escape_unprintable
-    from fdhil.store.audit import AUDIT_FILE_NAME, entries
+    from fdhil.store.audit_file import AUDIT_FILE_NAME, read_entries
 
-    found = list(entries(machine.store.directory))
+    found = list(read_entries(machine.store.directory))
     broken = [number for number, (_, wrong) in enumerate(found, start=1) if wrong]
     path = machine.store.directory / AUDIT_FILE_NAME
     if as_json:

@@ -67,8 +67,8 @@ def _try(machine: MachineConfig, entry: dict[str, str], what: str) -> None:
 
 
 def _append(machine: MachineConfig, entry: dict[str, str]) -> None:
-    from fdhil.store import audit
-    from fdhil.store.atomic import store_error
+    from fdhil.store import audit_file
+    from fdhil.store.atomic_file import make_store_error
 
     folder, uid = machine.store.directory, os.getuid()
     entry = {key: value[:MOST_CHARACTERS] for key, value in entry.items()}
@@ -76,8 +76,8 @@ def _append(machine: MachineConfig, entry: dict[str, str]) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise store_error(folder, error) from None
-    audit.append(folder, {"who": {"user": _name(uid), "uid": uid, "pid": os.getpid()}, **by, **entry})
+        raise make_store_error(folder, error) from None
+    audit_file.append_entry(folder, {"who": {"user": _name(uid), "uid": uid, "pid": os.getpid()}, **by, **entry})
 
 
 def _name(uid: int) -> str:

@@ -16,10 +16,10 @@ from fdhil.config import Identification, MachineConfig
 from fdhil.errors import FdhilError, RecordingError
 from fdhil.fleet.task_pool import TaskPool
 from fdhil.records import Reason, Recording, Verdict, Window, WindowOutcome
-from fdhil.store import suffixes
-from fdhil.store.accelerometer_csv import with_accelerometer
+from fdhil.store import file_suffixes
+from fdhil.store.accelerometer_csv import add_accelerometer
 from fdhil.store.column_map import ColumnMap
-from fdhil.store.recordings import read_recording, read_stored
+from fdhil.store.recording_file import read_recording, read_stored_window
 
 MANY_FILES = 16  # above this, further processes pay for their start
 MANY_WINDOWS = 48
@@ -93,12 +93,12 @@ def analyse_file(
 
 def read_recorded(path: Path, accelerometer: Path | None, columns: ColumnMap | None) -> Recording | Window:
     if next(os.walk(path), None) is not None:  # a folder without recordings; others are expanded before
-        known = ", ".join(suffixes.RECORDING_SUFFIXES)
+        known = ", ".join(file_suffixes.RECORDING_SUFFIXES)
         raise RecordingError(f"{path} has no recordings ({known}); give the folder that has them")
-    if accelerometer is None and columns is None and (stored := read_stored(path)) is not None:
+    if accelerometer is None and columns is None and (stored := read_stored_window(path)) is not None:
         return stored
     recording = read_recording(path, columns)
-    return recording if accelerometer is None else with_accelerometer(recording, accelerometer)
+    return recording if accelerometer is None else add_accelerometer(recording, accelerometer)
 
 
 def _outcomes(work: Callable[[Window], WindowOutcome], windows: Sequence[Window]) -> Iterator[WindowOutcome]:

@@ -173,11 +173,11 @@ def _guard(machine: MachineConfig) -> Iterator[ReportToGuard]:
     stays open meanwhile, because a restarted guard would not know the earlier counts.
     """
     from fdhil.arming.guard_client import GuardClient
-    from fdhil.arming.token import operator_token
+    from fdhil.arming.operator_token import get_operator_token
 
     def tell(seen: Mapping[str, str]) -> Sequence[Mapping[str, str]] | None:
         try:
-            return guard.compared(token, seen, touched).get("refused", []) if touched is not None else []
+            return guard.report_comparison(token, seen, touched).get("refused", []) if touched is not None else []
         except DeviceError as error:
             click.echo(f"the guard could not be informed; void records stay void: {error}", err=True)
             return None
@@ -186,9 +186,9 @@ def _guard(machine: MachineConfig) -> Iterator[ReportToGuard]:
     with ExitStack() as held:
         if (directory / SOCKET_NAME).exists():
             try:
-                token = operator_token(machine.run_directory)
+                token = get_operator_token(machine.run_directory)
                 guard = held.enter_context(GuardClient(directory))
-                touched = guard.touched(token)
+                touched = guard.read_touch_counts(token)
             except DeviceError as error:
                 click.echo(f"the guard could not be informed: {error}", err=True)
         yield tell

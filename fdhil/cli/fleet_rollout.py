@@ -58,7 +58,7 @@ def sign(change: Path, key_file: Path, by: str, machines: tuple[str, ...], out: 
     with with_extra():
         from fdhil.fleet.rollout import create_offer, read_change
         from fdhil.fleet.signed_offer import sign_offer as signed
-    from fdhil.store.output import open_output
+    from fdhil.store.output_file import open_output
 
     proposal, days = read_change(change)
     offer = create_offer(proposal, days, by, 1, machines)

@@ -114,12 +114,14 @@ def web(fleet: Path, host: str | None, port: int | None, as_json: bool) -> None:
         from fdhil.fleet import fleet_queries as _  # noqa: F401 - a missing library is reported before the start
     from fdhil.web import serving
 
-    serving.require()
+    serving.require_extra()
     from fdhil.web.fleet_app import make_fleet_app
 
     own = placed(settings.web, host, port)
     ask = partial(query_database, settings)
-    serving.serve(own, lambda: make_fleet_app(own, ask), lambda url: tell_ready("all machines", url, as_json))
+    serving.serve_application(
+        own, lambda: make_fleet_app(own, ask), lambda url: tell_ready("all machines", url, as_json)
+    )
 
 
 @click.command("web-user")

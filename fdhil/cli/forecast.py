@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from fdhil.config import MachineConfig
     from fdhil.prediction.error_forecast import ParameterStep, ZoneChange
     from fdhil.records import Float, Parameters, Prediction
-    from fdhil.store.rows import Comparison, Revision, Stamp
+    from fdhil.store.history_rows import Comparison, Revision, TimeStamp
 
 DAY_S = 86400.0
 FAR_DAYS = 36500.0
@@ -35,16 +35,16 @@ class Past:
     """Recent revisions of each axis, oldest first, and earlier predictions of a program, newest first."""
 
     revisions: Mapping[str, Sequence[Revision]]
-    comparisons: Sequence[tuple[Stamp, Comparison]]
+    comparisons: Sequence[tuple[TimeStamp, Comparison]]
 
     @staticmethod
     def read(config: MachineConfig, program_digest: str) -> Past:
         """Read the machine's history. Raises StoreError if there is none."""
-        from fdhil.store.history import History
+        from fdhil.store.history_database import History
 
-        with History.read(config.store.directory, partial(click.echo, err=True)) as history:
-            revisions = {axis: history.revisions(axis, RECENT) for axis in config.axis}
-            return Past(revisions, history.comparisons(program_digest, RECENT))
+        with History.open_read_only(config.store.directory, partial(click.echo, err=True)) as history:
+            revisions = {axis: history.read_revisions(axis, RECENT) for axis in config.axis}
+            return Past(revisions, history.read_comparisons(program_digest, RECENT))
 
 
 def comparison(
@@ -57,7 +57,7 @@ def comparison(
     zones: Sequence[Mapping[str, Any]],
 ) -> Comparison:
     """Return this prediction as a row of the store; ``zones`` are the JSON entries."""
-    from fdhil.store.rows import Comparison, UsedParameters
+    from fdhil.store.history_rows import Comparison, UsedParameters
 
     newest = {axis: found[-1].set.revision for axis, found in past.revisions.items() if found}
     return Comparison(
@@ -75,12 +75,12 @@ def remember(past: Past, now: Comparison, config: MachineConfig) -> None:
     if past.comparisons and _same(past.comparisons[0][1], now):
         return
     from fdhil.errors import StoreError
-    from fdhil.store.history import History
-    from fdhil.store.rows import Stamp
+    from fdhil.store.history_database import History
+    from fdhil.store.history_rows import TimeStamp
 
     try:
         with History.open(config.store.directory) as history:
-            history.add_comparison(now, Stamp.now())
+            history.add_comparison(now, TimeStamp.now())
     except StoreError as error:
         click.echo(f"this prediction was not stored for later comparison: {error}", err=True)
 

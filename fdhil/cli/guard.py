@@ -28,16 +28,16 @@ def guard(config: Path, check: bool) -> None:
     The guard sends no frame until the daemon arms a correction. It checks every interlock at each SYNC, and ramps the
     offsets to zero on any violation, when the daemon fails, and before it stops. Events are JSON lines on stdout.
     """
-    from fdhil.arming import guard_settings  # late: heavy imports, not needed for --help
-    from fdhil.arming.token import make_directory, operator_token
+    from fdhil.arming import guard_configuration  # late: heavy imports, not needed for --help
+    from fdhil.arming.operator_token import get_operator_token, make_run_directory
     from fdhil.commissioning.compare import compare_again
 
-    machine = guard_settings.with_given_key(machine_config.load_config(config))
-    name = guard_settings.corrected_bus(machine, str(config))
-    token_sha256 = hashlib.sha256(operator_token(machine.run_directory).encode()).hexdigest()
+    machine = guard_configuration.use_systemd_key(machine_config.load_config(config))
+    name = guard_configuration.find_corrected_bus(machine, str(config))
+    token_sha256 = hashlib.sha256(get_operator_token(machine.run_directory).encode()).hexdigest()
     run_directory = machine.guard_directory
-    make_directory(run_directory)
-    text = encode_settings(guard_settings.settings_of(machine, name, run_directory, token_sha256))
+    make_run_directory(run_directory)
+    text = encode_settings(guard_configuration.make_guard_settings(machine, name, run_directory, token_sha256))
     decode_settings(text, str(config))  # settings that the guard would refuse are refused before it starts
     file, bus = run_directory / SETTINGS_NAME, machine.bus[name]
     if check:
@@ -47,7 +47,9 @@ def guard(config: Path, check: bool) -> None:
     with open_transmit_socket(name, bus) as transmit, lock_bus(bus, transmit, run_directory) as lock:
         # if no NC runs the bus, the drives are compared with their commissioning records
         compare_again(machine, name, lambda text: click.echo(json.dumps({"event": "record_void", "text": text})))
-        _write(file, encode_settings(guard_settings.settings_of(machine, name, run_directory, token_sha256)))
+        _write(
+            file, encode_settings(guard_configuration.make_guard_settings(machine, name, run_directory, token_sha256))
+        )
         greet_hub(name, bus, transmit)
         os.set_inheritable(lock.fileno(), True)
         transmit.set_inheritable(True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from fdhil.errors import FdhilError
 from fdhil.report.history_charts import AxisHistory, build_time_chart
 from fdhil.report.typography import typeset_text
-from fdhil.store.output import open_output
+from fdhil.store.output_file import open_output
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

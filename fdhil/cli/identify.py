@@ -18,8 +18,8 @@ from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, FILE, OutputFile, Picture, Writing
 from fdhil.records import INTERVAL_95, get_unit
 from fdhil.report.parameter_format import INTERVAL_MEANING, format_cell, format_heading
-from fdhil.store import suffixes
-from fdhil.store.output import open_output
+from fdhil.store import file_suffixes
+from fdhil.store.output_file import open_output
 
 if TYPE_CHECKING:
     from fdhil.api.recording_analysis import FileResult
@@ -147,7 +147,7 @@ def _column_map(columns: Path | None, recordings: Sequence[Path], *, as_json: bo
         raise click.UsageError(f"{path} exists and is not overwritten; give it with --columns, or remove it")
     with open_output(path) as file:
         file.write(proposal.toml.encode())
-    for line in proposal.lines():
+    for line in proposal.format_lines():
         click.echo(line, err=True)
     click.echo(f"proposed column map: {path}", err=True)
     faults = proposal.faults
@@ -182,7 +182,7 @@ def _within(place: Path) -> Iterator[Path]:
     closed: list[Path] = []  # includes a path that is not a folder
     for folder, _, names in os.walk(place, onerror=lambda error: closed.append(Path(error.filename))):
         for file in (Path(folder, name) for name in names if not name.startswith(".")):
-            if file.suffix.lower() in suffixes.RECORDING_SUFFIXES and _may_be_read(file):
+            if file.suffix.lower() in file_suffixes.RECORDING_SUFFIXES and _may_be_read(file):
                 yield file
     yield from closed
 

@@ -18,7 +18,7 @@ from fdhil.identification.drive_loops.loop_identification import (
     is_better_than_configured,
 )
 from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Reason
-from fdhil.store.output import open_output
+from fdhil.store.output_file import open_output
 from fdhil.validation.table_error_budget import LOOPS_DIFFER
 
 

@@ -47,10 +47,10 @@ def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
     with with_extra():
         from fdhil.fleet.offer_review import load_current_machine, review_offer
     from fdhil.cli import offers_view
-    from fdhil.store.offers import lying
+    from fdhil.store.change_offers import list_offers
 
     machine = load_current_machine(config)
-    found = [review_offer(place, machine) for place in (*lying(machine.config.offers_directory), *files)]
+    found = [review_offer(place, machine) for place in (*list_offers(machine.config.offers_directory), *files)]
     offers_view.tell(found, machine.config, as_json)
     return 1 if any(each.wrong for each in found if each.place in files) else 0
 
@@ -114,11 +114,11 @@ def _text(option: str, text: str, most: int) -> str:
 
 
 def _place(machine: MachineConfig, offer: Path) -> Path:
-    from fdhil.store.offers import lying
+    from fdhil.store.change_offers import list_offers
 
     if offer.suffix == ".offer" or offer.name != str(offer):
         return offer
-    lie = lying(machine.offers_directory)
+    lie = list_offers(machine.offers_directory)
     of_name = {version: path for path, (name, version) in lie.items() if name == str(offer)}
     if not of_name:
         names = ", ".join(sorted({name for name, _ in lie.values()})) or "none"

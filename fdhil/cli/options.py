@@ -11,7 +11,7 @@ import click
 
 from fdhil.cli.failing import wants_json
 from fdhil.errors import ConfigError, ConfigFault
-from fdhil.store.output import check_output
+from fdhil.store.output_file import check_output
 
 DEFAULT_CONFIG = Path("machine.toml")
 

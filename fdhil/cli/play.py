@@ -93,7 +93,7 @@ def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, 
         for name in dict.fromkeys(axis.drive.bus for axis in machine.axis.values()):
             held.enter_context(lock_place(machine.bus[name], "set-points"))
         held.enter_context(before_other_work())
-        bench = held.enter_context(on_bench(plan, print_progress, GuardPresence(machine.guard_directory).is_there))
+        bench = held.enter_context(on_bench(plan, print_progress, GuardPresence(machine.guard_directory).is_present))
         bench.compare(records)
         here = bench.here()
         bench.require_start(here, go_to_start)
@@ -153,15 +153,15 @@ def _guard_told(
 ) -> Sequence[Mapping[str, str]]:
     """Report the compared drives to a running guard; return its refusals. Raises DeviceError."""
     from fdhil.arming.guard_client import GuardClient
-    from fdhil.arming.token import operator_token
+    from fdhil.arming.operator_token import get_operator_token
 
     directory = machine.guard_directory
     if not (directory / SOCKET_NAME).exists():
         return []
-    token = operator_token(machine.run_directory)
+    token = get_operator_token(machine.run_directory)
     with GuardClient(directory) as guard:
-        touched = guard.touched(token)
-        answer = guard.compared(token, {axis: records[axis].fingerprint for axis in as_compared()}, touched)
+        touched = guard.read_touch_counts(token)
+        answer = guard.report_comparison(token, {axis: records[axis].fingerprint for axis in as_compared()}, touched)
     time.sleep(MARKED_S)
     return list(answer.get("refused", []))
 

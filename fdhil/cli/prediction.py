@@ -181,7 +181,7 @@ def correct(options: Asked, method: str | None) -> int:
     from fdhil.api.machine_interface import find_held_out_max_um
     from fdhil.correction.result_documents import build_correction_document
     from fdhil.prediction.axis_models import load_model_file
-    from fdhil.store.known_gain import predict_gain_from_history
+    from fdhil.store.history_gain import predict_gain_from_history
 
     announce_compilation("predict", "correct")
     held_out_um = {} if options.model_path is None else load_model_file(options.model_path).held_out_um
@@ -271,7 +271,7 @@ def _correction_columns(planned: Correction) -> dict[str, tuple[Float, int]]:
 def _write(path: Path, columns: Mapping[str, tuple[Float, int]]) -> None:
     import numpy as np
 
-    from fdhil.store.output import open_output
+    from fdhil.store.output_file import open_output
 
     # adding 0 after rounding turns -0.0000 into 0.0000
     values = np.column_stack([np.round(values, decimals) + 0.0 for values, decimals in columns.values()])

@@ -51,7 +51,7 @@ def publish(protocol: str, config: Path, devices: Path | None, as_json: bool) ->
 
 def _write_devices(machine: MachineConfig, file: Path) -> None:
     from fdhil.shopfloor.mtconnect_adapter import build_agent_devices
-    from fdhil.store.output import open_output
+    from fdhil.store.output_file import open_output
 
     with open_output(file) as written:
         written.write(build_agent_devices(machine).encode())

@@ -52,7 +52,7 @@ def record(config: Path, out: Path, seconds: float | None, rest: float, with_gap
     written = recorded is not None and (with_gaps or recorded.is_complete)
     if recorded is not None and written:
         from fdhil.program import write_demand_csv
-        from fdhil.store.output import open_output
+        from fdhil.store.output_file import open_output
 
         with open_output(out) as file:
             write_demand_csv(recorded.reference, file)

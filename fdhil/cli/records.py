@@ -15,7 +15,7 @@ from fdhil.api.compilation_notice import announce_compilation
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, COLUMNS, CONFIG, FILE, OutputFile, Writing
 from fdhil.errors import RecordingError
-from fdhil.store import suffixes
+from fdhil.store import file_suffixes
 
 if TYPE_CHECKING:
     from fdhil.records import Outcome, Window
@@ -86,12 +86,12 @@ def read_windows(path: Path) -> list[Window]:
     """Return the windows of a window file (.parquet) or of a recording. Raises RecordingError for other files."""
     if path.suffix == ".parquet":
         from fdhil.store.recording_parquet import is_recording
-        from fdhil.store.windows import read_window
+        from fdhil.store.window_file import read_window
 
         if not is_recording(path):
             return [read_window(path)]
     from fdhil.identification.rapid_windows import find_windows
-    from fdhil.store.recordings import read_recording
+    from fdhil.store.recording_file import read_recording
 
     return find_windows(read_recording(path))
 
@@ -164,7 +164,7 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
 @click.option(
     "--format",
     "format_name",
-    type=click.Choice([*tables.RECORDING_FORMATS, *suffixes.BUS_LOGS.values()]),
+    type=click.Choice([*tables.RECORDING_FORMATS, *file_suffixes.BUS_LOGS.values()]),
     help="File format (default: by the suffix of --out, else csv).",
 )
 @COLUMNS

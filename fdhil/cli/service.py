@@ -52,7 +52,7 @@ def run(config: Path, method: str | None, as_json: bool) -> int:
     announce_compilation("identify", "predict", "correct")
     with service_log.write_lines_as_json(as_json):
         residual = daemon_service.run_daemon_service(machine, open_machine, method)
-    return 0 if residual.nothing else 3
+    return 0 if residual.is_zero else 3
 
 
 def _ask(
@@ -128,7 +128,7 @@ def arm(config: Path, program: Path | None, method: str | None, whole: bool, as_
         os.close(
             os.open(program, os.O_RDONLY | os.O_NONBLOCK)
         )  # a missing file is exit code 3, not a refusal by the daemon
-    from fdhil.arming.token import read_token
+    from fdhil.arming.operator_token import read_token
 
     request = {
         "request": "arm",
@@ -211,12 +211,12 @@ def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]
     """Disarm at the guard after the daemon failed with ``silent``. Raises ConnectError if the guard fails as well."""
     machine = machine_config.load_directories(config)
     from fdhil.arming.guard_client import GuardClient
-    from fdhil.arming.standing import landed, verdict
+    from fdhil.arming.residual_offset import answer_disarm, wait_until_idle
 
     try:
         with GuardClient(machine.guard_directory) as guard:
             answer = guard.disarm()
-            return {**(verdict(landed(guard.status)) if answer["ok"] else answer), "asked": "guard"}
+            return {**(answer_disarm(wait_until_idle(guard.read_status)) if answer["ok"] else answer), "asked": "guard"}
     except DeviceError as error:
         text = f"{silent}; the guard does not answer either ({error}); the applied offset is unknown"
         raise ConnectError("machine", text) from None
@@ -237,7 +237,7 @@ def adopt(config: Path, yes: bool, as_json: bool) -> None:
         raise click.UsageError("--json cannot prompt; give --yes as well")
     machine = machine_config.load_directories(config)
     from fdhil.arming.guard_client import GuardClient
-    from fdhil.arming.token import read_token
+    from fdhil.arming.operator_token import read_token
 
     def token() -> str:
         found = read_token(machine.run_directory)
@@ -260,23 +260,27 @@ def _written_after(config: Path, what: str, answer: Mapping[str, Any]) -> Iterat
 
 
 def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: bool) -> Mapping[str, Any]:
-    from fdhil.arming.standing import landed, standing, verdict
+    from fdhil.arming.residual_offset import answer_disarm, read_residual_offset, wait_until_idle
     from fdhil.guard.guard_protocol import AT_REST
 
-    status = guard.status()
-    residual, state = standing(status), status["state"]
+    status = guard.read_status()
+    residual, state = read_residual_offset(status), status["state"]
     if state not in AT_REST:
         text = f"the guard is {state}, a correction is active"
         return {"ok": False, "code": "NotOff", "text": text, "advice": "run fdhil disarm", "state": state}
-    if state == "OFF" and residual.nothing:
-        return verdict(status) | {"text": f"guard: OFF, {residual}; there is nothing to adopt"}
+    if state == "OFF" and residual.is_zero:
+        return answer_disarm(status) | {"text": f"guard: OFF, {residual}; there is nothing to adopt"}
     if not quiet:
         click.echo(f"the guard is {state}: {residual}", err=True)
     if not yes and not agreed("Is the feed held? Ramp the offset to zero now?"):
         raise DriveFault("adoption", f"not confirmed; nothing was sent; {residual}; {UNASKED}")
     try:
         answer = guard.adopt(token())
-        return verdict(landed(guard.status)) if answer["ok"] else {**answer, "may_stand_um": dict(residual.offset_um)}
+        return (
+            answer_disarm(wait_until_idle(guard.read_status))
+            if answer["ok"]
+            else {**answer, "may_stand_um": dict(residual.offset_um)}
+        )
     except DeviceError as error:
         raise ConnectError("adoption", f"{error}; {residual}") from None
 

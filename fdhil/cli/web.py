@@ -30,7 +30,7 @@ def web(config: Path, host: str | None, port: int | None, as_json: bool) -> None
     machine = machine.model_copy(update={"web": placed(machine.web, host, port)})
     from fdhil.web import serving  # late: --help imports nothing heavy
 
-    serving.run(machine, lambda url: tell_ready(machine.machine.name, url, as_json))
+    serving.serve_machine(machine, lambda url: tell_ready(machine.machine.name, url, as_json))
 
 
 def tell_ready(name: str, url: str, as_json: bool) -> None:

@@ -25,7 +25,7 @@ from fdhil.drivers.moves import load_event_source
 from fdhil.drivers.sensor_source import Sensor, create_sensors
 from fdhil.errors import DeviceError, ForeignMaster, StoreError
 from fdhil.identification.drive_loops.loop_identification import compare_with_configuration, is_better_than_configured
-from fdhil.store.history import History
+from fdhil.store.history_database import History
 
 RATE_TOLERANCE = 0.1
 PERIOD_TOLERANCE = 0.02
@@ -136,8 +136,8 @@ def _record(config: MachineConfig, axis: str, found: Survey) -> Iterator[Finding
 def compare_loops(config: MachineConfig, axis: str) -> Iterator[Finding]:
     """Compare the configured control loops with those identified last; nothing before the first identification."""
     try:
-        with History.read(config.store.directory) as history:
-            identified = history.loops(axis, 1)
+        with History.open_read_only(config.store.directory) as history:
+            identified = history.read_loops(axis, 1)
     except StoreError:  # there is no history yet, or the daemon reports its fault
         return
     for _, loops in identified:

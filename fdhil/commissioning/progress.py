@@ -15,7 +15,7 @@ from typing import Any
 
 from fdhil.commissioning.record import KEY_NAME, sealing_key
 from fdhil.errors import StoreError
-from fdhil.store.atomic import make_folder, write_file
+from fdhil.store.atomic_file import make_folder, write_file
 
 SCHEMA = "fdhil-commissioning-steps-1"
 MAX_BYTES = 256 * 1024

@@ -21,7 +21,7 @@ from fdhil.commissioning.void import confirm_record, is_void, void_mark
 from fdhil.config import Drive, MachineConfig
 from fdhil.drivers.cia402.drive_profile_file import load_profile
 from fdhil.errors import StoreError
-from fdhil.store.atomic import make_folder, store_error, sync_folder, write_file
+from fdhil.store.atomic_file import make_folder, make_store_error, sync_folder, write_file
 
 SCHEMA = "fdhil-commissioning-2"
 UNSEALED = "fdhil-commissioning-1"
@@ -155,7 +155,7 @@ def save_record(record: CommissioningRecord, directory: Path, key: Path | None =
     try:
         make_folder(directory)
     except OSError as error:
-        raise store_error(path, error) from None
+        raise make_store_error(path, error) from None
     seal = record.seal(sealing_key(key or directory / KEY_NAME))
     document = {"schema": SCHEMA, **asdict(record), "digest": record.digest, "seal": seal}
     write_file(path, json.dumps(document, indent=2).encode())

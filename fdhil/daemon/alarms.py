@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from fdhil.records import Notice
-from fdhil.store.notice_document import acknowledgement_document, date_of
-from fdhil.store.rows import Acknowledgement, Stamp, StoredNotice
+from fdhil.store.history_rows import Acknowledgement, StoredNotice, TimeStamp
+from fdhil.store.notice_document import format_date, make_acknowledgement_document
 
 _LASTING = """
     BusDown BusErrors BusOff BusSilent DiskFull DriveEmergency ErrorPassive FeedHold GantrySkew GuardLost
@@ -40,8 +40,8 @@ class Alarm:
     """The notices of one cause since it was last over and acknowledged; ``newest`` is the one that raised it last."""
 
     newest: StoredNotice
-    first: Stamp
-    until: Stamp | None = None
+    first: TimeStamp
+    until: TimeStamp | None = None
     count: int = 0
     raised: deque[StoredNotice] = field(default_factory=lambda: deque(maxlen=MOST_TOGETHER))
     waiting: set[int] = field(default_factory=set)
@@ -68,7 +68,7 @@ class AlarmTable:
 
     def __init__(self, notices: Iterable[StoredNotice] = ()) -> None:
         self._alarms: dict[Key, Alarm] = {}
-        self.ended: dict[int, Stamp] = {}
+        self.ended: dict[int, TimeStamp] = {}
         """End of each ended alarm, by the number of the notice that raised it last and of the one that ended it."""
         for stored in notices:
             self.take_notice(stored)
@@ -151,12 +151,12 @@ def build_alarm_document(alarm: Alarm) -> dict[str, Any]:
         "severity": notice.severity,
         "text": notice.text,
         "state": alarm.state,
-        "since": date_of(alarm.newest.stamp),
-        "until": None if alarm.until is None else date_of(alarm.until),
-        "first": date_of(alarm.first),
+        "since": format_date(alarm.newest.stamp),
+        "until": None if alarm.until is None else format_date(alarm.until),
+        "first": format_date(alarm.first),
         "count": alarm.count,
         "numbers": sorted(alarm.waiting, reverse=True),
-        "acknowledged": None if alarm.waiting else acknowledgement_document(alarm.given),
+        "acknowledged": None if alarm.waiting else make_acknowledgement_document(alarm.given),
     }
 
 

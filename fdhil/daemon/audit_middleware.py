@@ -10,13 +10,13 @@ from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fdhil.arming.answers import Answer, refusal
-from fdhil.arming.own_thread import in_own_thread
+from fdhil.arming.dedicated_thread import run_in_dedicated_thread
+from fdhil.arming.refusals import Answer, make_refusal
 from fdhil.daemon import service_log
 from fdhil.daemon.daemon_access import NEEDS, ClientProcess
 from fdhil.errors import StoreError
 from fdhil.guard.guard_access import Role
-from fdhil.store import audit
+from fdhil.store import audit_file
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 LOOKING = ("status", "live")
@@ -59,11 +59,11 @@ class AuditMiddleware:
             return await self._handle(request)
         if what not in DONE_FIRST and (trouble := await self._write_entry(what, request, peer, None)) is not None:
             return trouble
-        answer = refusal("Stopped", "the daemon ended before the answer", "start it, then repeat the request")
+        answer = make_refusal("Stopped", "the daemon ended before the answer", "start it, then repeat the request")
         try:
             answer = await self._handle(request)
         except Exception as error:
-            answer = refusal(type(error).__name__, str(error))
+            answer = make_refusal(type(error).__name__, str(error))
             raise
         finally:
             writing = self._begin_writing(self._write_entry(what, request, peer, answer))
@@ -95,7 +95,7 @@ class AuditMiddleware:
             held = self._held.pop(key, None)
             return await self._append_entry(_build_entry(what, request, peer, answer), held.lines if held else 0)
         text = f"{peer.user} sends {what} requests too often for the audit log"
-        busy = refusal("Busy", text, "try again in a second") if answer is None else None
+        busy = make_refusal("Busy", text, "try again in a second") if answer is None else None
         if key not in self._held:
             asyncio.get_running_loop().call_later(HELD_S if allowed else REFUSED_S, self._write_suppressed, key)
         count = self._held[key].lines if key in self._held else 0
@@ -126,11 +126,11 @@ class AuditMiddleware:
             service_log.write_line(f"{_describe_requester(entry)} requested {what}: {entry['result']}")
         try:
             async with self._disk:  # keeps the order of the requests
-                await in_own_thread(audit.append, self._folder, entry, self._clock)
+                await run_in_dedicated_thread(audit_file.append_entry, self._folder, entry, self._clock)
         except StoreError as error:
             text = f"{what} of {entry['who']['user']} could not be recorded in the audit log: {error}"
             service_log.write_line(text, "MAJOR")
-            return refusal(error.code, text, "nothing was done; repair the store, then try again")
+            return make_refusal(error.code, text, "nothing was done; repair the store, then try again")
         return None
 
 
@@ -158,10 +158,10 @@ def _truncate_value(value: Any) -> Any:
 def _refuse_access(what: str, peer: ClientProcess) -> Answer:
     if peer.role is Role.NOBODY:
         text = f"user {peer.user} has no access to the daemon"
-        return refusal("AuthRequired", text, "[access] of the configuration assigns the rights")
+        return make_refusal("AuthRequired", text, "[access] of the configuration assigns the rights")
     needs = NEEDS.get(what, Role.COMMISSION)
     whom = "the daemon's own user or root" if needs is Role.COMMISSION else "[access] operate"
-    return refusal(
+    return make_refusal(
         "AuthRequired",
         f"user {peer.user} may watch and disarm, but not request {_truncate_value(what)}",
         f"this needs {whom}",

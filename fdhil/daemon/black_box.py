@@ -13,7 +13,7 @@ from pathlib import Path
 
 from fdhil.errors import StoreError
 from fdhil.records import Notice
-from fdhil.store.atomic import make_folder, store_error, write_file
+from fdhil.store.atomic_file import make_folder, make_store_error, write_file
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 BLACK_BOX_FOLDER = "blackbox"
@@ -64,7 +64,7 @@ def write_black_box(
         for old in before[: max(0, len(before) + 1 - KEPT_FILES)]:
             old.path.unlink()
     except (OSError, StoreError) as error:
-        trouble = store_error(folder, error) if isinstance(error, OSError) else error
+        trouble = make_store_error(folder, error) if isinstance(error, OSError) else error
         return Notice(trouble.code, "minor", f"the frames around the trip could not be stored: {trouble}")
     lines = sum(log.count("\n") for log in logs.values())
     return Notice("BlackBox", "info", f"the last {lines} frames are in {file}")

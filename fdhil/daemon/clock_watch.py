@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fdhil.errors import StoreError
 from fdhil.records import Notice
-from fdhil.store.history import History
+from fdhil.store.history_database import History
 
 JUMP_S = 2.0  # between two checks; slewing a clock changes less
 BEHIND_S = 60.0
@@ -14,9 +14,9 @@ BEHIND_S = 60.0
 
 def find_newest_record_s(folder: Path) -> float | None:
     """Return the date of the history's newest record, s since 1970; None where there is none."""
-    with suppress(StoreError), History.read(folder) as history:
-        notices = [notice.stamp.wall_s for notice in history.notices(limit=1)]
-        return max([*notices, *(window.stamp.wall_s for window in history.windows(limit=1))], default=None)
+    with suppress(StoreError), History.open_read_only(folder) as history:
+        notices = [notice.stamp.wall_s for notice in history.read_notices(limit=1)]
+        return max([*notices, *(window.stamp.wall_s for window in history.read_windows(limit=1))], default=None)
     return None
 
 

@@ -11,10 +11,10 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from fdhil.arming.answers import Answer, refusal
-from fdhil.arming.desk import ArmingDesk
+from fdhil.arming.arming_service import ArmingService
 from fdhil.arming.guard_link import GUARD_TRIPPED, RECORD_VOIDING_CODES
-from fdhil.arming.standing import ADOPT_ADVICE, START_AND_ADOPT, Standing
+from fdhil.arming.refusals import Answer, make_refusal
+from fdhil.arming.residual_offset import ADOPT_ADVICE, START_AND_ADOPT, ResidualOffset
 from fdhil.cancellation import find_first_error
 from fdhil.commissioning.void import void_record
 from fdhil.config import MachineConfig, find_unlikely_values
@@ -68,7 +68,7 @@ class DaemonService:
         self._method = method
         self._run_directory = config.run_directory
         self._store = OutcomeStore(config, clock)
-        self._arming = ArmingDesk(config, self._store, self._run_directory, clock)
+        self._arming = ArmingService(config, self._store, self._run_directory, clock)
         self._watch = DaemonStatus(config, self._clock.now_s())
         self._live = LiveStream(config)
         self._gantry = GantryWatch(config)
@@ -84,8 +84,8 @@ class DaemonService:
         arming, access = self._arming, config.access
         self._control = ControlServer(
             self._audit.answer_request,
-            lambda: arming.checking,
-            arming.abandon,
+            lambda: arming.check_progress,
+            arming.abandon_preparation,
             access,
             self._live.serve_viewer,
             self._restore_access,
@@ -97,7 +97,7 @@ class DaemonService:
         self._resources: tuple[ResourceUse, ...] = ()
         self._frames_seen = -1
 
-    async def run(self) -> Standing:
+    async def run(self) -> ResidualOffset:
         """Serve until a signal requests a stop; return what may still be applied. BusLocked: another serves it."""
         loop = asyncio.get_running_loop()
         with lock_machine(self._run_directory, self._config.store.directory), service_log.date_lines_by(self._clock):
@@ -110,7 +110,7 @@ class DaemonService:
                 notify_systemd("STOPPING=1")
                 self.shutdown.start_deadline()
                 await self._ramp_to_zero()
-                stop, budgets, stands = self.shutdown, self._budgets, self._arming.guard.standing
+                stop, budgets, stands = self.shutdown, self._budgets, self._arming.guard.residual_offset
                 await stop.run_step(
                     "the audit log", self._audit.wait_until_written(), budgets.audit_s, "its last lines are lost"
                 )
@@ -119,22 +119,22 @@ class DaemonService:
                 for number in stopping:
                     loop.remove_signal_handler(number)
                 if (
-                    self._acquisition.opened.is_set() or not stands.nothing
+                    self._acquisition.opened.is_set() or not stands.is_zero
                 ):  # else it never ran, and only the error is reported
                     self._log_stopped(stands)
         return stands
 
-    def _log_stopped(self, stands: Standing) -> None:
-        if stands.nothing:
+    def _log_stopped(self, stands: ResidualOffset) -> None:
+        if stands.is_zero:
             service_log.write_line(f"stopped, {stands}")
         else:
             advice = START_AND_ADOPT if self._arming.guard.state == "lost" else ADOPT_ADVICE
             service_log.write_line(f"stopped, {stands}; {advice}", "MAJOR")
 
     @property
-    def residual_offset(self) -> Standing:
+    def residual_offset(self) -> ResidualOffset:
         """The offset that may still be applied, as far as the daemon knows."""
-        return self._arming.guard.standing
+        return self._arming.guard.residual_offset
 
     async def _run_tasks(self) -> None:
         clock = ClockWatch(await asyncio.to_thread(find_newest_record_s, self._config.store.directory))
@@ -148,8 +148,8 @@ class DaemonService:
             others = [tasks.create_task(self._run_pipeline(axis), name=f"axis {axis}") for axis in self._config.axis]
             others.append(tasks.create_task(self._store_notices(), name="notices"))
             others.append(tasks.create_task(self._void_records(), name="void"))
-            others.append(tasks.create_task(self._arming.attend(self._record_notices), name="guard"))
-            others.append(tasks.create_task(self._arming.stream(self._record_notices), name="stream"))
+            others.append(tasks.create_task(self._arming.supervise_guard(self._record_notices), name="guard"))
+            others.append(tasks.create_task(self._arming.stream_rows(self._record_notices), name="stream"))
             others.append(tasks.create_task(self._feed_watchdog(), name="watchdog"))
             others.append(tasks.create_task(self._monitor_bus(), name="listen"))
             others.append(tasks.create_task(self._monitor_resources(clock), name="resources"))
@@ -171,7 +171,7 @@ class DaemonService:
 
     async def _ramp_to_zero(self) -> None:
         effect = "the guard ramps to zero when this process has ended; see fdhil-guard's journal"
-        await self.shutdown.run_step("the ramp to zero", self._arming.stand_down(), self._budgets.zero_s, effect)
+        await self.shutdown.run_step("the ramp to zero", self._arming.shut_down(), self._budgets.zero_s, effect)
 
     async def _wait_for_analysis(self) -> None:
         axes = (queue.join() for queue in self._queues.values())
@@ -179,7 +179,7 @@ class DaemonService:
 
     def _prepare_pipelines(self) -> None:
         """Load each axis from the history, and compile the kernels."""
-        self._arming.begin(self._store.read_newest_revisions(), self._store.read_newest_skills())
+        self._arming.start_from_history(self._store.read_newest_revisions(), self._store.read_newest_skills())
         for axis in self._config.axis:
             history = self._store.read_axis_history(axis)
             self._pipelines[axis] = AxisPipeline(axis, self._config, self._method, history)
@@ -197,7 +197,7 @@ class DaemonService:
     def _take_record(self, record: Record | NcState | Notice) -> None:
         self._acquisition.reset_retry_delay()
         if isinstance(record, NcState):
-            self._arming.hear_nc(record)
+            self._arming.take_nc_state(record)
             self._record_notices(self._watch.nc.take_state(record, self._clock.now_s()))
             return
         self._watch.hearing.take_record(record, self._clock.now_s())
@@ -206,10 +206,10 @@ class DaemonService:
             return
         self._live.publish_record(record)
         if isinstance(record, Temperature):
-            self._arming.knowledge.note_temperature(record)
+            self._arming.knowledge.take_temperature(record)
         elif isinstance(record, AxisSamples):
             self._gantry.take_samples(record)
-            self._arming.hear(record)
+            self._arming.take_samples(record)
         for axis in self._config.axis if isinstance(record, TickTimes) else (record.axis,):
             if axis in self._queues:
                 self._queues[axis].put(record)
@@ -222,7 +222,7 @@ class DaemonService:
             self._busy_since_s[axis] = self._clock.now_s()
             outcomes, notices = await asyncio.to_thread(self._process_batch, axis, batch)
             del self._busy_since_s[axis]
-            self._arming.knowledge.note(outcomes)
+            self._arming.knowledge.take_outcomes(outcomes)
             self._log_outcomes([*outcomes, *notices])
             queue.mark_processed(len(batch))
 
@@ -350,7 +350,7 @@ class DaemonService:
             self._request_stop()
             return {"ok": True, "text": "stopping"}
         text = f"{request['request']!r} is an unknown request"
-        return refusal("BadRequest", text, "send status, live, arm, disarm, acknowledge or stop")
+        return make_refusal("BadRequest", text, "send status, live, arm, disarm, acknowledge or stop")
 
     async def _restore_access(self, trouble: str) -> None:
         self._record_notices([await restore_access(self._arming, trouble)])
@@ -377,9 +377,9 @@ class DaemonService:
             "dropped": dropped,
             "resources": {use.name: {"used": use.used, "allowed": use.allowed} for use in self._resources},
             "guard": dict(guard.status),
-            "may_stand": {"nothing": guard.standing.nothing, "text": str(guard.standing)},
+            "may_stand": {"nothing": guard.residual_offset.is_zero, "text": str(guard.residual_offset)},
             "armed": self._arming.armed,
-            "checking": self._arming.checking,
+            "checking": self._arming.check_progress,
             "passes": self._arming.passes,
             "store": store,
             "unacknowledged": self._store.notices.build_status(),
@@ -394,7 +394,7 @@ def _make_arm_notice(answer: Answer) -> Notice:
     return Notice("ArmRefused", "minor", f"{answer['code']}: {answer['text']}")
 
 
-def run_daemon_service(config: MachineConfig, open_source: OpenSource, method: str | None = None) -> Standing:
+def run_daemon_service(config: MachineConfig, open_source: OpenSource, method: str | None = None) -> ResidualOffset:
     """Run the daemon until it is stopped; return the offset that may still be applied.
 
     FdhilError when it cannot start or meets a fatal error.
@@ -415,7 +415,7 @@ def run_daemon_service(config: MachineConfig, open_source: OpenSource, method: s
         service.shutdown.cancel_deadline()
 
 
-async def _serve_until_stopped(service: DaemonService) -> Standing:
+async def _serve_until_stopped(service: DaemonService) -> ResidualOffset:
     stands = await service.run()
     service.shutdown.leave_overrun()
     return stands

@@ -17,8 +17,8 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from fdhil.arming.answers import CHECK_ABANDONED, Answer, refusal
-from fdhil.arming.token import make_directory
+from fdhil.arming.operator_token import make_run_directory
+from fdhil.arming.refusals import CHECK_ABANDONED, Answer, make_refusal
 from fdhil.cancellation import END_S, end_tasks
 from fdhil.config import Access
 from fdhil.daemon.daemon_access import ClientProcess, identify_peer, open_listener
@@ -112,7 +112,7 @@ class ControlServer:
             if name is not None and await asyncio.to_thread(_read_file_id, path) == name:
                 continue
             try:
-                await asyncio.to_thread(make_directory, path.parent)
+                await asyncio.to_thread(make_run_directory, path.parent)
                 return await asyncio.to_thread(open_listener, path, self._access)
             except (DeviceError, OSError) as error:
                 if not trouble:
@@ -173,7 +173,7 @@ class ControlServer:
         """Answer a request; during an arm request report progress and check that the client still waits."""
         request = decode_line(line)
         if request is None:
-            return refusal("BadRequest", "the request is not a JSON object", "send one JSON object per line")
+            return make_refusal("BadRequest", "the request is not a JSON object", "send one JSON object per line")
         if request.get("request") != "arm" or not peer.may_request("arm"):
             return await self._answer_request(request, peer)
         if _is_hung_up(writer):
@@ -198,16 +198,16 @@ class ControlServer:
 
     async def _answer_request(self, request: Mapping[str, Any], peer: ClientProcess) -> Answer:
         if not isinstance(request.get("request"), str):
-            return refusal(
+            return make_refusal(
                 "BadRequest", "the request has no text under the key 'request'", "status, arm, disarm or stop"
             )
         if len(self._busy) > MAX_CLIENTS and request["request"] not in ALWAYS_HEARD:
-            return refusal("Busy", f"{MAX_CLIENTS} other requests are pending", "wait for one of them to end")
+            return make_refusal("Busy", f"{MAX_CLIENTS} other requests are pending", "wait for one of them to end")
         try:
             return await self._handle(request, peer)
         except FdhilError as error:
             text, _, advice = str(error).partition("; ")
-            return refusal(type(error).__name__, text, advice) | {"exit_code": error.exit_code}
+            return make_refusal(type(error).__name__, text, advice) | {"exit_code": error.exit_code}
 
 
 def _read_file_id(path: Path) -> FileId | None:

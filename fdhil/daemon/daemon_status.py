@@ -10,7 +10,7 @@ from fdhil.daemon.bus_health import BusHealth, Trouble
 from fdhil.daemon.nc_watch import NcWatch
 from fdhil.daemon.outcome_json import build_loops_document
 from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, WindowOutcome
-from fdhil.store.set_document import parameters_status, terms_status
+from fdhil.store.parameter_document import report_parameters, report_terms
 
 SCHEMA = "fdhil-status-1"
 NOTICES = 20
@@ -125,8 +125,8 @@ class DaemonStatus:
             "windows_used": published and published.windows,
             "tick": published and published.tick,
             "temperature_c": published and published.temperature_c,
-            "parameters": parameters_status(published) if published else None,
-            "terms": terms_status(published) if published else None,
+            "parameters": report_parameters(published) if published else None,
+            "terms": report_terms(published) if published else None,
             "unexplained_um": published and published.unexplained_um,
             "warnings": [str(warning) for warning in published.warnings] if published else [],
             "last_window": _build_window_status(last) if last else None,

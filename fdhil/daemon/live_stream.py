@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.arming.answers import Answer, refusal
+from fdhil.arming.refusals import Answer, make_refusal
 from fdhil.config import MachineConfig
 from fdhil.json_lines import encode_line
 from fdhil.records import AxisSamples, Temperature, TickTimes, VoltageSamples
@@ -71,7 +71,7 @@ class LiveStream:
     def open_stream(self) -> Answer:
         """Return the answer that opens a stream, or a refusal."""
         if len(self._viewers) >= MAX_VIEWERS:
-            return refusal(
+            return make_refusal(
                 "Busy", f"{MAX_VIEWERS} other viewers are connected", "close one of them; `fdhil web` needs only one"
             )
         return {"ok": True, "live": "begin", **self._begin}

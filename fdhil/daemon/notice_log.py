@@ -5,14 +5,14 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fdhil.arming.answers import refusal
+from fdhil.arming.refusals import make_refusal
 from fdhil.daemon.alarms import AlarmTable, build_alarms_status
 from fdhil.daemon.service_log import escape_unprintable
 from fdhil.errors import FdhilError
 from fdhil.records import Notice
-from fdhil.store.history import RECENT_NOTICES
-from fdhil.store.notice_document import acknowledgement_document, notice_document
-from fdhil.store.rows import Acknowledgement, Stamp, StoredNotice
+from fdhil.store.history_database import RECENT_NOTICES
+from fdhil.store.history_rows import Acknowledgement, StoredNotice, TimeStamp
+from fdhil.store.notice_document import make_acknowledgement_document, make_notice_document
 
 NEWEST = RECENT_NOTICES
 TOLD_OPEN = 20  # open notices in the status
@@ -25,7 +25,7 @@ class NotAcknowledged(FdhilError):
 
     def __init__(self, code: str, text: str, advice: str) -> None:
         super().__init__(text)
-        self.answer = refusal(code, text, advice)
+        self.answer = make_refusal(code, text, advice)
 
 
 class NoticeLog:
@@ -45,7 +45,7 @@ class NoticeLog:
             asking = [notice for notice in notices if notice.notice.severity != "info"]
             self._by_number = {notice.number: notice.acknowledged or notice for notice in asking}
 
-    def add_stored(self, notice: Notice, number: int, stamp: Stamp) -> None:
+    def add_stored(self, notice: Notice, number: int, stamp: TimeStamp) -> None:
         """Add a stored notice."""
         with self._lock:
             self._last.append((notice, number))
@@ -87,7 +87,7 @@ class NoticeLog:
             number = next((number for stored, number in reversed(self._last) if stored is notice), None)
             entry = self._by_number.get(number) if number is not None else None
         given = entry if isinstance(entry, Acknowledgement) else None
-        return {"number": number, "acknowledged": acknowledgement_document(given)}
+        return {"number": number, "acknowledged": make_acknowledgement_document(given)}
 
     def build_status(self) -> dict[str, Any]:
         """Return how many notices are unacknowledged, how many of them MAJOR, and the newest, oldest first."""
@@ -97,7 +97,7 @@ class NoticeLog:
         return {
             "count": len(waiting),
             "MAJOR": major,
-            "newest": [notice_document(notice) for notice in waiting[-TOLD_OPEN:]],
+            "newest": [make_notice_document(notice) for notice in waiting[-TOLD_OPEN:]],
         }
 
     def build_alarms_status(self) -> dict[str, Any]:
@@ -119,7 +119,7 @@ def _is_number(value: object) -> bool:
 
 
 def parse_acknowledgement(
-    request: Mapping[str, Any], numbers: Sequence[int], stamp: Stamp | None = None
+    request: Mapping[str, Any], numbers: Sequence[int], stamp: TimeStamp | None = None
 ) -> Acknowledgement:
     """Parse an acknowledgement made now; NotAcknowledged where the request is invalid."""
     who, note = request.get("by"), request.get("note", "")
@@ -130,7 +130,7 @@ def parse_acknowledgement(
         text = "the note is not a text, or too long"
         raise NotAcknowledged("BadRequest", text, f"give a text of at most {MOST_NOTE} characters as 'note'")
     return Acknowledgement(
-        tuple(numbers), escape_unprintable(who.strip()), escape_unprintable(note.strip()), stamp or Stamp.now()
+        tuple(numbers), escape_unprintable(who.strip()), escape_unprintable(note.strip()), stamp or TimeStamp.now()
     )
 
 

@@ -3,7 +3,7 @@
 from fdhil.config import MachineConfig
 from fdhil.errors import StoreError
 from fdhil.records import Notice
-from fdhil.store.offers import waiting
+from fdhil.store.change_offers import list_undecided
 
 MOST = 20  # that are examined: the folder is another user's
 
@@ -19,7 +19,7 @@ class OfferWatch:
     def find_new_offers(self) -> list[Notice]:
         """Return a notice for each proposal that has arrived since the last call."""
         try:
-            found = waiting(self._folder, self._store) if self._folder is not None else []
+            found = list_undecided(self._folder, self._store) if self._folder is not None else []
         except StoreError as error:
             found = [str(error)]
         before, self._reported = self._reported, set(found[:MOST])

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, WindowOutcome, get_unit
-from fdhil.store.history import described, friction_of
-from fdhil.store.set_document import set_document
+from fdhil.store.history_database import format_friction, format_parameters
+from fdhil.store.parameter_document import make_set_document
 
 
 def build_outcome_document(outcome: Outcome) -> dict[str, Any]:
@@ -16,7 +16,7 @@ def build_outcome_document(outcome: Outcome) -> dict[str, Any]:
     if isinstance(outcome, WindowOutcome):
         return _build_window_document(outcome)
     if isinstance(outcome, ParameterSet):
-        return {"kind": "parameters", **set_document(outcome)}
+        return {"kind": "parameters", **make_set_document(outcome)}
     if isinstance(outcome, LoopEstimate):
         return build_loops_document(outcome)
     assert isinstance(outcome, Skill | Notice)
@@ -42,7 +42,7 @@ def build_loops_document(found: LoopEstimate) -> dict[str, Any]:
 
 def _build_window_document(outcome: WindowOutcome) -> dict[str, Any]:
     window, verdict = outcome.window, outcome.verdict
-    all_figures = {name: figures | {"unit": get_unit(name)} for name, figures in described(outcome).items()}
+    all_figures = {name: figures | {"unit": get_unit(name)} for name, figures in format_parameters(outcome).items()}
     terms = outcome.estimate.terms if outcome.estimate else ()
     return {
         "kind": "window",
@@ -59,7 +59,7 @@ def _build_window_document(outcome: WindowOutcome) -> dict[str, Any]:
         "warnings": [str(warning) for warning in verdict.warnings],
         "parameters": {name: figures for name, figures in all_figures.items() if name not in terms},
         "terms": {name: figures for name, figures in all_figures.items() if name in terms},
-        "friction_at_rapid": friction_of(outcome),
+        "friction_at_rapid": format_friction(outcome),
         "delay_s": _build_delay_document(outcome),
         "at_table": None if outcome.at_table is None else asdict(outcome.at_table),
         "nc": None if window.nc is None else asdict(window.nc),

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-from fdhil.arming.answers import Answer
+from fdhil.arming.refusals import Answer
 from fdhil.config import MachineConfig
 from fdhil.daemon import service_log
 from fdhil.daemon.notice_log import NEWEST, NotAcknowledged, NoticeLog, describe_numbers, parse_acknowledgement
@@ -29,12 +29,12 @@ from fdhil.records import (
     freeze_array,
 )
 from fdhil.store import WINDOWS_FOLDER as WINDOWS_FOLDER
-from fdhil.store.atomic import sync_folder
-from fdhil.store.history import HISTORY_FILE_NAME, History
-from fdhil.store.newest_sets import newest_loops, newest_sets
+from fdhil.store.atomic_file import sync_folder
+from fdhil.store.history_database import HISTORY_FILE_NAME, History
+from fdhil.store.history_rows import Revision, StoredWindow, TimeStamp
+from fdhil.store.newest_parameters import find_newest_loops, find_newest_parameters
 from fdhil.store.outbox import Outbox
-from fdhil.store.rows import Revision, Stamp, StoredWindow
-from fdhil.store.windows import RawScale, Scales, WindowStore
+from fdhil.store.window_file import RawScale, Scales, WindowStore
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 SKILLS = 3
@@ -68,7 +68,7 @@ def _read_figures(window: StoredWindow, key: str) -> Float:
 def _read_pool_members(windows: Sequence[StoredWindow]) -> tuple[PoolMember, ...]:
     members = []
     for place, window in enumerate(windows, start=1 - len(windows)):
-        if (pooled := window.told) is not None:
+        if (pooled := window.pool_entry) is not None:
             values, own, shared = (freeze_array(pooled[key]) for key in ("values", "own", "shared"))
             members.append(PoolMember(tuple(pooled["names"]), values, own, shared, place, window.direction))
     return tuple(members)
@@ -119,16 +119,16 @@ class OutcomeStore:
         new = self._history is None
         if self._history is None:
             outbox = self._outbox
-            adding = (outbox.enter, outbox.begin) if outbox else (None, None)
+            adding = (outbox.add_entry, outbox.add_earlier_rows) if outbox else (None, None)
             self._history = History.open(self._directory, *adding)
         folder = self._directory / WINDOWS_FOLDER
         self._windows = WindowStore(folder, self._config.store.keep_windows, self._config.digest)
         self.strays = tuple(map(service_log.escape_unprintable, self._windows.strays))
         if not new:
             return []
-        places = self._history.put_damaged_aside()
-        self.notices.load_history(self._history.notices(limit=NEWEST))
-        self._history.checkpoint()
+        places = self._history.quarantine_damaged_rows()
+        self.notices.load_history(self._history.read_notices(limit=NEWEST))
+        self._history.write_checkpoint()
         text = f"Damaged rows of the history were moved aside, older ones are used: {places}; check the disk."
         return [Notice("CorruptFile", "MAJOR", text)] if places else []
 
@@ -137,7 +137,7 @@ class OutcomeStore:
         if self._history is None or self._history.is_in_place():
             return []
         with suppress(OSError):
-            self._history.abandon()
+            self._history.discard_file()
         self._history = None
         for rows in self._accepted.values():
             rows.clear()  # row numbers of the old file
@@ -171,24 +171,24 @@ class OutcomeStore:
 
     def read_newest_revisions(self) -> dict[str, Revision]:
         """Return the newest revision of each axis in the history."""
-        return {} if self._history is None else newest_sets(self._history, self._config.axis)
+        return {} if self._history is None else find_newest_parameters(self._history, self._config.axis)
 
     def read_newest_skills(self) -> list[Skill]:
         """Return the newest skills of all axes, oldest first."""
         if self._history is None:
             return []
-        return [skill for axis in self._config.axis for skill in self._history.skills(axis, limit=SKILLS)]
+        return [skill for axis in self._config.axis for skill in self._history.read_skills(axis, limit=SKILLS)]
 
     def read_axis_history(self, axis: str) -> PipelineState:
         """Return what an earlier run left: first values, newest set, estimates of the newest accepted windows."""
         if self._history is None:
             return PipelineState()
-        newest = self._history.revisions(axis, limit=1)
+        newest = self._history.read_revisions(axis, limit=1)
         first = {
             direction: Parameters.from_mapping(dict(zip(PARAMETERS, _read_figures(window, "value"), strict=True)))
-            for direction, window in self._history.first_windows(axis).items()
+            for direction, window in self._history.read_first_windows(axis).items()
         }
-        windows = [window for window in self._history.windows(axis, limit=2 * HISTORY_WINDOWS) if window.accepted][
+        windows = [window for window in self._history.read_windows(axis, limit=2 * HISTORY_WINDOWS) if window.accepted][
             -HISTORY_WINDOWS:
         ]
         points = tuple(
@@ -198,12 +198,12 @@ class OutcomeStore:
             for window in windows[-4 * POOL_WINDOWS :]
         )
         published = newest[0].set if newest else None
-        loops = newest_loops(self._history, axis, self._config.digest)
+        loops = find_newest_loops(self._history, axis, self._config.digest)
         return PipelineState(first, published, points, _read_pool_members(windows), loops)
 
     def count_windows(self, axis: str) -> tuple[int, int]:
         """Return how many windows of an axis were ever accepted and refused."""
-        return (0, 0) if self._history is None else self._history.counts(axis)
+        return (0, 0) if self._history is None else self._history.count_windows(axis)
 
     def store_outcomes(self, outcomes: Sequence[Outcome]) -> list[Notice]:
         """Store outcomes durably in order; return a notice when that fails, and one when it works again."""
@@ -228,11 +228,11 @@ class OutcomeStore:
         assert self._history is not None
         for outcome in outcomes:
             self._store_outcome(outcome)
-        self._history.checkpoint()
+        self._history.write_checkpoint()
         return notices
 
     def _report_undeleted_file(self) -> list[Notice]:
-        left = self._windows.left if self._windows is not None else None
+        left = self._windows.removal_error if self._windows is not None else None
         if left is None or self._file_reported:
             return []
         self._file_reported = True
@@ -242,7 +242,7 @@ class OutcomeStore:
         """Store an acknowledgement of notices; StoreError when the disk refuses."""
         with self._lock:
             try:
-                given = parse_acknowledgement(request, self.notices.select_open(request), Stamp.now(self._clock))
+                given = parse_acknowledgement(request, self.notices.select_open(request), TimeStamp.now(self._clock))
             except NotAcknowledged as refused:
                 return refused.answer
             if self._history is None:
@@ -252,7 +252,7 @@ class OutcomeStore:
             if given.notices:
                 self._history.add_acknowledgement(given)
                 self._require_in_place(self._history)
-                self._history.checkpoint()
+                self._history.write_checkpoint()
                 self.notices.note_acknowledged(given)
         text = f"{describe_numbers(given.notices)} acknowledged by {given.who}; {self.notices.build_status()['count']} more are open"
         service_log.write_line(text)
@@ -268,11 +268,11 @@ class OutcomeStore:
     def _store_outcome(self, outcome: Outcome) -> None:
         assert self._history is not None
         assert self._windows is not None
-        stamp = Stamp.now(self._clock)
+        stamp = TimeStamp.now(self._clock)
         if isinstance(outcome, WindowOutcome):
             axis = outcome.window.axis
-            last = self._history.last_window_number()
-            file = self._windows.append(outcome.window, self._scales[axis], last)
+            last = self._history.find_last_window_number()
+            file = self._windows.append_window(outcome.window, self._scales[axis], last)
             number = self._history.add_window(outcome, file.path.name, stamp)
             if outcome.verdict.accepted:
                 self._accepted[axis].append((outcome.window.start_tick, number))

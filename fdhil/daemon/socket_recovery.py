@@ -2,14 +2,14 @@
 
 import asyncio
 
-from fdhil.arming.desk import ArmingDesk
+from fdhil.arming.arming_service import ArmingService
 from fdhil.errors import DeviceError
 from fdhil.records import Notice
 
 CODE = "SocketLost"
 
 
-async def restore_access(arming: ArmingDesk, trouble: str) -> Notice:
+async def restore_access(arming: ArmingService, trouble: str) -> Notice:
     """Write the token again after the socket; ramp to zero where ``trouble`` or an error prevents either."""
     try:
         await asyncio.to_thread(arming.restore_token)

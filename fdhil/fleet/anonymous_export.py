@@ -16,7 +16,7 @@ from typing import Any, LiteralString
 
 from fdhil.errors import StoreError
 from fdhil.fleet.parameter_sets import Db
-from fdhil.store.atomic import make_folder, store_error
+from fdhil.store.atomic_file import make_folder, make_store_error
 from fdhil.store.parquet_library import pa, pq
 
 KEY_BYTES = 32
@@ -73,7 +73,7 @@ def load_or_create_key(path: Path) -> bytes:
     except FileExistsError:
         pass
     except OSError as error:
-        raise store_error(path, error) from None
+        raise make_store_error(path, error) from None
     try:
         key = bytes.fromhex(path.read_text("ascii").strip())
         open_to_all = path.stat().st_mode & 0o077
@@ -104,7 +104,7 @@ def export_tables(
         counts["labels"] = _write_parquet(db, partial / "labels.parquet", columns, _LABELS, given, key)
         partial.rename(folder)
     except OSError as error:
-        raise store_error(folder, error) from None
+        raise make_store_error(folder, error) from None
     return {"folder": str(folder), "rows": counts, "labels": list(labels)}
 
 

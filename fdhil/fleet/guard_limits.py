@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
-from fdhil.arming.guard_settings import settings_of
+from fdhil.arming.guard_configuration import make_guard_settings
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError
 
@@ -16,7 +16,7 @@ def derive_guard_limits(machine: MachineConfig) -> Mapping[str, float]:
     """Return all limits of the corrected axes, by description; none where no guard could start with it."""
     found: dict[str, float] = {}
     try:
-        settings = settings_of(machine, next(iter(machine.bus)), Path(), "")
+        settings = make_guard_settings(machine, next(iter(machine.bus)), Path(), "")
     except ConfigError:
         return found
     for axis in settings.axes:

@@ -24,7 +24,7 @@ from fdhil.fleet.parameter_sets import (
 )
 from fdhil.records import PARAMETERS, get_unit
 from fdhil.report.drive_health import assess_axis_health
-from fdhil.store.rows import Stamp, StoredWindow
+from fdhil.store.history_rows import StoredWindow, TimeStamp
 
 NEWEST_SETS, APART = 180, "1 day"  # half a year
 TOGETHER = 500  # axes per query
@@ -109,5 +109,5 @@ def _convert_to_window(row: Row) -> StoredWindow:
         for name in PARAMETERS
         if row[name] is not None and math.isfinite(std := read_std(row, name))
     }
-    stamp = Stamp(row["at"].timestamp(), "", 0)
+    stamp = TimeStamp(row["at"].timestamp(), "", 0)
     return StoredWindow(row["sequence"], row["axis"], "", 0, 1, True, None, (), parameters, row["temperature_c"], stamp)

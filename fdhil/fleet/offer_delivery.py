@@ -20,8 +20,8 @@ from fdhil.errors import StoreError
 from fdhil.fleet.nats_transport import ERRORS, describe_cause
 from fdhil.fleet.record_message import Message, encode_answer
 from fdhil.fleet.signed_offer import LARGEST, Offer, OfferRefused, read_offer
-from fdhil.store.atomic import make_folder, store_error, write_file
-from fdhil.store.offers import Answer, file_name, lying, read_answers
+from fdhil.store.atomic_file import make_folder, make_store_error, write_file
+from fdhil.store.change_offers import OfferDecision, list_offers, make_file_name, read_decisions
 
 STREAM = "fdhil-offers"
 PREFIX = "fdhil.offers.v1"
@@ -147,9 +147,9 @@ class OfferFetcher:
     def count_reported_answers(self, count: int) -> None:
         self._reported += count
 
-    def _read_new_answers(self) -> list[Answer]:
+    def _read_new_answers(self) -> list[OfferDecision]:
         try:
-            answers = read_answers(self._config.store.directory)
+            answers = read_decisions(self._config.store.directory)
             self._reported = min(self._reported, len(answers))  # the file was started again
             return answers[self._reported :]
         except StoreError as error:
@@ -166,13 +166,13 @@ class OfferFetcher:
             except OfferRefused as error:
                 service_log.write_line(f"an offer was ignored: {error}", "minor")
                 continue
-            wanted[folder / file_name(offer.name, offer.version)] = document
+            wanted[folder / make_file_name(offer.name, offer.version)] = document
         try:
             make_folder(folder)
-            for obsolete in lying(folder).keys() - wanted.keys():
+            for obsolete in list_offers(folder).keys() - wanted.keys():
                 obsolete.unlink(missing_ok=True)
         except OSError as error:
-            raise store_error(folder, error) from None
+            raise make_store_error(folder, error) from None
         for path, document in wanted.items():
             if not _has_content(path, document):
                 write_file(path, document)

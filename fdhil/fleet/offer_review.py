@@ -24,8 +24,8 @@ from fdhil.config.toml_editing import NotEditable, edit_toml
 from fdhil.errors import ConfigError, OutputError, StoreError
 from fdhil.fleet.guard_limits import derive_guard_limits
 from fdhil.fleet.signed_offer import LARGEST, Offer, OfferRefused, read_offer
-from fdhil.store.atomic import write_file
-from fdhil.store.offers import Answer, add_answer, lying, newest_accepted, read_answers
+from fdhil.store.atomic_file import write_file
+from fdhil.store.change_offers import OfferDecision, add_decision, find_newest_accepted, list_offers, read_decisions
 
 CAUSES = {
     "DiskFull": "the disk is full; free some space",
@@ -55,7 +55,7 @@ class ReviewedOffer:
     document: str
     offer: Offer | None
     wrong: str
-    answers: Sequence[Answer] = ()
+    answers: Sequence[OfferDecision] = ()
     changes: Sequence[ValueChange] = ()
     text: str = ""
     config: MachineConfig | None = None
@@ -75,7 +75,7 @@ class CurrentMachine:
     file: Path
     raw: bytes
     config: MachineConfig
-    answers: Sequence[Answer]
+    answers: Sequence[OfferDecision]
     newest: Mapping[str, int]
     now_s: float
 
@@ -93,7 +93,7 @@ class CurrentMachine:
 def load_current_machine(file: Path, now_s: float | None = None) -> CurrentMachine:
     """Load the machine of a configuration; ConfigError, StoreError where its answers cannot be read."""
     config = machine_config.load_config(file)
-    raw, answers = file.read_bytes(), read_answers(config.store.directory)
+    raw, answers = file.read_bytes(), read_decisions(config.store.directory)
     return CurrentMachine(
         file, raw, config, answers, _find_newest_versions(config), time.time() if now_s is None else now_s
     )
@@ -101,7 +101,7 @@ def load_current_machine(file: Path, now_s: float | None = None) -> CurrentMachi
 
 def _find_newest_versions(config: MachineConfig) -> Mapping[str, int]:
     newest: dict[str, int] = {}
-    for place in lying(config.offers_directory):
+    for place in list_offers(config.offers_directory):
         with suppress(OfferRefused, OSError):
             offer = read_offer(_read_document(place), config.offers.trust)
             newest[offer.name] = max(offer.version, newest.get(offer.name, 0))
@@ -153,7 +153,7 @@ def _require_current_version(offer: Offer, machine: CurrentMachine) -> None:
         raise OfferRefused(f"it expired on {day}; ask the fleet server for a newer one")
     if offer.made_s > machine.now_s + AHEAD_S:
         raise OfferRefused("it is dated in the future of this PC's clock; set the clock")
-    accepted = newest_accepted(machine.answers, offer.name)
+    accepted = find_newest_accepted(machine.answers, offer.name)
     if offer.version < accepted:
         raise OfferRefused(f"version {accepted} was already accepted, and an older version cannot replace it")
     newest = machine.newest.get(offer.name, 0)
@@ -297,8 +297,10 @@ def _record_answer(
     offer = judged.offer
     assert offer is not None
     document = judged.document
-    noted = Answer(offer.name, offer.version, offer.stage, document, answer, by, reason, time.time(), config.digest)
-    add_answer(config.store.directory, noted)
+    noted = OfferDecision(
+        offer.name, offer.version, offer.stage, document, answer, by, reason, time.time(), config.digest
+    )
+    add_decision(config.store.directory, noted)
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from pydantic_core import from_json
 
 from fdhil.fleet import record_shapes
-from fdhil.store.outbox import Entry
+from fdhil.store.outbox import OutboxEntry
 
 SCHEMA = "fdhil-record-1"
 PREFIX = "fdhil.v1"
@@ -89,7 +89,7 @@ class UnreadableRecord:
     payload: bytes
 
 
-def encode_entry(entry: Entry, machine: str, store: str, window: bytes | None) -> Message:
+def encode_entry(entry: OutboxEntry, machine: str, store: str, window: bytes | None) -> Message:
     """Return the message of an outbox entry; an entry whose row was deleted is dated 1970."""
     record = {name: _encode_column(name, value) for name, value in entry.row.items() if name not in _NOT_SENT}
     if "id" in entry.row:

@@ -22,8 +22,8 @@ from fdhil.fleet.nats_transport import ERRORS, check_credentials, connect_to_ser
 from fdhil.fleet.offer_delivery import OfferFetcher
 from fdhil.fleet.record_message import Message, compute_digest, encode_entry, encode_machine, join_messages
 from fdhil.store import WINDOWS_FOLDER
-from fdhil.store.atomic import make_folder
-from fdhil.store.outbox import Entry, OutboxReader, Position, read_position, write_position
+from fdhil.store.atomic_file import make_folder
+from fdhil.store.outbox import OutboxEntry, OutboxPosition, OutboxReader, read_position, write_position
 
 BATCH = 500  # entries per read and per stored position
 MESSAGE_BYTES = 60 << 10  # of a joined message; a single larger record still fits the smallest stream
@@ -96,11 +96,11 @@ class OutboxSender:
                 raise ConnectionResetError("the connection has ended")
             await asyncio.sleep(POLL_S)
 
-    async def _read_next_entries(self, stream: JetStreamContext) -> tuple[Position, list[Entry]]:
+    async def _read_next_entries(self, stream: JetStreamContext) -> tuple[OutboxPosition, list[OutboxEntry]]:
         """Return the position and the entries after it; a new description of the machine is sent first."""
         with OutboxReader(self._store, self._checked) as reader:
-            position = reader.start(read_position(self._folder))
-            entries = reader.entries(position.entry, BATCH)
+            position = reader.resume_from(read_position(self._folder))
+            entries = reader.read_entries(position.entry, BATCH)
         about = compute_digest(self._about, reader.store)
         if position.about != about:
             await _publish_message(stream, encode_machine(self._about, self.machine, reader.store, time.time()))
@@ -109,7 +109,7 @@ class OutboxSender:
         return position, entries
 
     async def _send_entries(
-        self, stream: JetStreamContext, position: Position, entries: Sequence[Entry], most: int
+        self, stream: JetStreamContext, position: OutboxPosition, entries: Sequence[OutboxEntry], most: int
     ) -> None:
         """Send entries in order and store the position reached, also when one was refused."""
         messages = (self._build_message(entry, position.store, most) for entry in entries)
@@ -125,7 +125,7 @@ class OutboxSender:
                 position = replace(position, entry=last.number, message=last.message)
                 await asyncio.to_thread(write_position, self._folder, position)  # a disk may be slow
 
-    def _build_message(self, entry: Entry, store: str, most: int) -> Message:
+    def _build_message(self, entry: OutboxEntry, store: str, most: int) -> Message:
         window = _read_window(self._store / WINDOWS_FOLDER / Path(entry.row["file"]).name) if entry.with_file else None
         if window is not None and len(window) > most - HEAD_BYTES:
             window = None

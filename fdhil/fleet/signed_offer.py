@@ -26,7 +26,7 @@ from fdhil.config.remote_change_policy import explain_refusal
 from fdhil.config.section import Section
 from fdhil.config.uplink_section import Label, Labels
 from fdhil.errors import ConfigError, ConfigFault, FdhilError
-from fdhil.store.offers import OFFER_NAME_PATTERN
+from fdhil.store.change_offers import OFFER_NAME_PATTERN
 
 SCHEMA = "fdhil-offer-1"
 LARGEST = 512 * 1024  # bytes of an offer

@@ -5,7 +5,7 @@ import secrets
 from pathlib import Path
 
 from fdhil.errors import StoreError
-from fdhil.store.atomic import make_folder, store_error, write_file
+from fdhil.store.atomic_file import make_folder, make_store_error, write_file
 
 
 def build_window_path(folder: Path, name: str) -> Path:
@@ -21,11 +21,11 @@ def store_window(folder: Path, name: str, window: bytes) -> None:
     except FileNotFoundError:
         pass
     except OSError as error:
-        raise store_error(path, error) from None
+        raise make_store_error(path, error) from None
     try:
         make_folder(path.parent)
     except OSError as error:
-        raise store_error(path, error) from None
+        raise make_store_error(path, error) from None
     # a unique temporary name: no byte of another collector's partial file may get the final name. A file left by a
     # killed collector is removed as an unreferenced window
     write_file(path, window, part=build_window_path(folder, f"{name}-{secrets.token_hex(8)}"))

@@ -17,8 +17,8 @@ from fdhil.errors import FdhilError, RecordingError
 from fdhil.fleet.window_files import build_window_path
 from fdhil.pipeline import analyse_windows
 from fdhil.records import WindowOutcome
-from fdhil.store.history import described
-from fdhil.store.windows import MAX_FILE_BYTES, decode_window
+from fdhil.store.history_database import format_parameters
+from fdhil.store.window_file import MAX_FILE_BYTES, decode_window
 
 ROOMS = ("records", "model", "identification", "validation", "pipeline")  # the code that the results depend on
 LIBRARIES = ("numpy", "scipy", "numba", "pyarrow")
@@ -146,7 +146,7 @@ def _describe_outcome(outcome: WindowOutcome) -> dict[str, Any]:
         "warnings": [str(reason) for reason in verdict.warnings],
         "method": estimate and estimate.method,
         "result": estimate and estimate.result.value,
-        "parameters": described(outcome) if estimate else None,
+        "parameters": format_parameters(outcome) if estimate else None,
     }
 
 

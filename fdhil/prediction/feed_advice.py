@@ -28,7 +28,7 @@ ALONG_MM = 1e-9  # rows that move less have no direction
 class FeedResult:
     """The highest ``share`` of the feed that keeps a segment within the tolerance; None if no tried share does.
 
-    ``residual_um`` is its largest error at ``tried``: at ``share``, or at the lowest tried share. ``run`` is the share used
+    ``left_um`` is its largest error at ``tried``: at ``share``, or at the lowest tried share. ``run`` is the share used
     while the other segments were searched.
     """
 

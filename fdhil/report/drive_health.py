@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from fdhil.config import MachineConfig
     from fdhil.identification.trends import Crossing, Step
     from fdhil.records import Float
-    from fdhil.store.history import History
-    from fdhil.store.rows import StoredWindow
+    from fdhil.store.history_database import History
+    from fdhil.store.history_rows import StoredWindow
 
 NEWEST_WINDOWS = 2000
 DAY_S = 86_400.0
@@ -49,7 +49,7 @@ def assess_health(
             if ratios := [window for window in own if _has_ratios_only(window)]:
                 assessed[name] = assess_axis_health(ratios, {}, RATIOS)
             continue
-        first = history.first_revision(name)
+        first = history.read_first_revision(name)
         limits = {}
         if first is not None:
             shares = machine.maintenance.model_dump()

@@ -12,7 +12,7 @@ from fdhil.report.drive_health import NEWEST_WINDOWS, assess_health
 from fdhil.report.history_charts import AxisHistory
 
 if TYPE_CHECKING:
-    from fdhil.store.rows import Revision, StoredWindow
+    from fdhil.store.history_rows import Revision, StoredWindow
 
 NEWEST_NOTICES = 500
 PASS_CODE = "PassMeasured"
@@ -25,11 +25,11 @@ def read_history(
 
     ``tell`` receives a message about damaged rows that were left out.
     """
-    from fdhil.store.history import History
+    from fdhil.store.history_database import History
 
-    with History.read(machine.store.directory, tell) as stored:
-        windows = stored.windows(axis, limit=NEWEST_WINDOWS)
-        return [_describe_revision(revision) for revision in stored.revisions(axis)], assess_health(
+    with History.open_read_only(machine.store.directory, tell) as stored:
+        windows = stored.read_windows(axis, limit=NEWEST_WINDOWS)
+        return [_describe_revision(revision) for revision in stored.read_revisions(axis)], assess_health(
             windows, stored, machine
         )
 
@@ -41,13 +41,13 @@ def read_axes(
 
     Of the published sets of one axis the first and the ``newest`` are read.
     """
-    from fdhil.store.history import History
+    from fdhil.store.history_database import History
 
-    with History.read(machine.store.directory) as stored:
-        windows = stored.windows(axis, limit=NEWEST_WINDOWS)
-        revisions = stored.revisions(axis, newest)
+    with History.open_read_only(machine.store.directory) as stored:
+        windows = stored.read_windows(axis, limit=NEWEST_WINDOWS)
+        revisions = stored.read_revisions(axis, newest)
         if axis is not None and len(revisions) == newest > 1:
-            first = stored.first_revision(axis)
+            first = stored.read_first_revision(axis)
             revisions = [first, *revisions[1:]] if first is not None else revisions
         assessed = assess_health(windows, stored, machine)
     refused = _count_refusals(windows)
@@ -57,10 +57,10 @@ def read_axes(
 
 def read_refusals(machine: MachineConfig) -> dict[str, Refusals]:
     """Return the refusals among the newest windows, by axis. StoreError."""
-    from fdhil.store.history import History
+    from fdhil.store.history_database import History
 
-    with History.read(machine.store.directory) as stored:
-        return _count_refusals(stored.windows(limit=NEWEST_WINDOWS))
+    with History.open_read_only(machine.store.directory) as stored:
+        return _count_refusals(stored.read_windows(limit=NEWEST_WINDOWS))
 
 
 def _count_refusals(windows: Sequence[StoredWindow]) -> dict[str, Refusals]:
@@ -70,30 +70,30 @@ def _count_refusals(windows: Sequence[StoredWindow]) -> dict[str, Refusals]:
 
 def read_notices(machine: MachineConfig, axis: str | None = None) -> list[dict[str, Any]]:
     """Return the newest notices that require acknowledgement, and who acknowledged them, oldest first. StoreError."""
-    from fdhil.store.history import RECENT_NOTICES, History
-    from fdhil.store.notice_document import notice_document
+    from fdhil.store.history_database import RECENT_NOTICES, History
+    from fdhil.store.notice_document import make_notice_document
 
-    with History.read(machine.store.directory) as stored:
-        known = stored.notices(limit=RECENT_NOTICES)
+    with History.open_read_only(machine.store.directory) as stored:
+        known = stored.read_notices(limit=RECENT_NOTICES)
     asking = [n for n in known if n.notice.severity != "info" and axis in (None, n.notice.axis)]
-    return [notice_document(notice) for notice in asking[-NEWEST_NOTICES:]]
+    return [make_notice_document(notice) for notice in asking[-NEWEST_NOTICES:]]
 
 
 def read_passes(machine: MachineConfig) -> list[dict[str, Any]]:
     """Return the notices of passes that were cut with correction, oldest first. StoreError."""
-    from fdhil.store.history import RECENT_NOTICES, History
-    from fdhil.store.notice_document import notice_document
+    from fdhil.store.history_database import RECENT_NOTICES, History
+    from fdhil.store.notice_document import make_notice_document
 
-    with History.read(machine.store.directory) as stored:
-        known = stored.notices(limit=RECENT_NOTICES)
-    return [notice_document(notice) for notice in known if notice.notice.code == PASS_CODE]
+    with History.open_read_only(machine.store.directory) as stored:
+        known = stored.read_notices(limit=RECENT_NOTICES)
+    return [make_notice_document(notice) for notice in known if notice.notice.code == PASS_CODE]
 
 
 def _describe_revision(revision: Revision) -> dict[str, Any]:
-    from fdhil.store.set_document import set_document
+    from fdhil.store.parameter_document import make_set_document
 
     return {
-        **set_document(revision.set),
+        **make_set_document(revision.set),
         "time": datetime.fromtimestamp(revision.stamp.wall_s, UTC).isoformat(timespec="seconds"),
         "window_ids": list(revision.window_ids),
         "config_digest": revision.set.config_digest,

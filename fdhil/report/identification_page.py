@@ -49,7 +49,7 @@ def build_identification_page(found: IdentificationResult) -> Page:
 
 def save_picture(found: IdentificationResult, path: Path) -> None:
     """Save a picture of the first window in the format of the file's suffix."""
-    from fdhil.store.output import open_output
+    from fdhil.store.output_file import open_output
 
     figure = draw_identification(found)
     with open_output(path) as file:

@@ -24,13 +24,13 @@ LONGEST_S = 3600.0
 M_PER_MM = 1e-3
 
 
-def with_accelerometer(recording: Recording, path: Path) -> Recording:
+def add_accelerometer(recording: Recording, path: Path) -> Recording:
     """Return the recording with the table's acceleration from a file. RecordingError if they differ in their moves."""
-    time_s, axes = _read(path)
+    time_s, axes = _read_samples(path)
     wanted = np.gradient(interpolate_gaps(recording.speed_rad_s), recording.dt_s) * recording.pitch_mm / (2e3 * np.pi)
     grid = np.arange(0.0, time_s[-1] - time_s[0], recording.dt_s)
     measured = [np.interp(grid, time_s - time_s[0], values) for values in axes.T]
-    found = [_placed(wanted, values - np.median(values), recording.dt_s) for values in measured]
+    found = [_find_time_shift(wanted, values - np.median(values), recording.dt_s) for values in measured]
     best = int(np.argmax([abs(correlation) for correlation, _ in found]))
     correlation, begin_s = found[best]
     if abs(correlation) < LEAST_CORRELATION:
@@ -40,10 +40,10 @@ def with_accelerometer(recording: Recording, path: Path) -> Recording:
         )
     values = axes[:, best] if correlation > 0 else -axes[:, best]
     rows = freeze_array(np.arange(recording.speed_rad_s.size) * recording.dt_s)
-    return replace(recording, table_m_s2=freeze_array(_at(rows, time_s - time_s[0] + begin_s, values)))
+    return replace(recording, table_m_s2=freeze_array(_average_at_samples(rows, time_s - time_s[0] + begin_s, values)))
 
 
-def _read(path: Path) -> tuple[Float, Float]:
+def _read_samples(path: Path) -> tuple[Float, Float]:
     """Return times (n,) in s and accelerations (n, 3) in m/s2."""
     lines = read_csv_text(path).splitlines()
     rows = [line for line in lines if line.strip() and not line.startswith("#")]
@@ -64,7 +64,7 @@ def _read(path: Path) -> tuple[Float, Float]:
     return time_s, table[:, 1:] * M_PER_MM
 
 
-def _placed(wanted: Float, measured: Float, dt: float) -> tuple[float, float]:
+def _find_time_shift(wanted: Float, measured: Float, dt: float) -> tuple[float, float]:
     """Return the largest correlation, and the time (s) at which ``measured`` then begins on the clock of ``wanted``."""
     both = [filter_zero_phase(values - values.mean(), CORNER_HZ, dt) for values in (wanted, measured)]
     size = find_fft_size(wanted.size + measured.size)
@@ -78,7 +78,7 @@ def _placed(wanted: Float, measured: Float, dt: float) -> tuple[float, float]:
     return float(product[k] / power) if power else 0.0, float(shift * dt)
 
 
-def _at(rows_s: Float, time_s: Float, values: Float) -> Float:
+def _average_at_samples(rows_s: Float, time_s: Float, values: Float) -> Float:
     """Return the mean (n,) around each sample time, NaN beyond the file's ends and over lost samples."""
     step, row = float(np.median(np.diff(time_s))), rows_s[1] - rows_s[0]
     summed = np.concatenate([[0.0], np.cumsum(np.diff(time_s) * (values[1:] + values[:-1]) / 2)])

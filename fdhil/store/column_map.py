@@ -29,9 +29,9 @@ from fdhil.store.recording_table import (
     SAMPLING,
     VOLTAGE_COLUMN,
     RecordingTable,
-    unlike_lengths,
+    make_length_error,
 )
-from fdhil.store.sample_times import even_times, usual_step
+from fdhil.store.sample_times import compute_usual_step, find_even_times
 from fdhil.store.trace_text import TraceText
 
 SHOWN_NAMES = 12
@@ -75,11 +75,11 @@ class Column(Section):
     offset: Finite = 0.0
 
 
-def _as_tuple(value: Column | tuple[Column, ...]) -> tuple[Column, ...]:
+def _make_tuple(value: Column | tuple[Column, ...]) -> tuple[Column, ...]:
     return value if isinstance(value, tuple) else (value,)
 
 
-Columns = Annotated[Column | tuple[Column, ...], AfterValidator(_as_tuple)]
+Columns = Annotated[Column | tuple[Column, ...], AfterValidator(_make_tuple)]
 
 
 class ColumnMap(Section):
@@ -103,12 +103,12 @@ def check_map(document: Mapping[str, Any], source: str) -> ColumnMap:
         items = error.errors(include_url=False)
         faults = [ConfigFault(".".join(map(str, e["loc"])), e["msg"], "see the how-to on recordings") for e in items]
         raise ConfigError(source, faults) from None
-    if faults := [*_faults(column_map)]:
+    if faults := [*_find_faults(column_map)]:
         raise ConfigError(source, faults)
     return column_map
 
 
-def _faults(column_map: ColumnMap) -> list[ConfigFault]:
+def _find_faults(column_map: ColumnMap) -> list[ConfigFault]:
     needed = {"current_A": (TORQUE,), "speed_rad_per_s": (ANGLE, "position_m")}
     faults = [
         ConfigFault(f"columns.{signal}", "is missing", f"name its column, or that of {' or '.join(instead)}")
@@ -121,11 +121,11 @@ def _faults(column_map: ColumnMap) -> list[ConfigFault]:
             ConfigFault(
                 f"columns.{signal}.unit", f"{quote_cell(c.unit)} is not a unit of it", f"use one of {', '.join(units)}"
             )
-            for c in _as_tuple(columns)
+            for c in _make_tuple(columns)
             if c.unit not in units
         ]
     per_revolution = [
-        c.unit for c in _as_tuple(column_map.columns.get("speed_rad_per_s", ())) if c.unit in PER_REVOLUTION
+        c.unit for c in _make_tuple(column_map.columns.get("speed_rad_per_s", ())) if c.unit in PER_REVOLUTION
     ]
     wanted = ["axis", *([PITCH_KEY] if per_revolution or column_map.columns.keys() & {*PATH} else [])]
     wanted += [SAMPLING] if VOLTAGE_COLUMN in column_map.columns else []
@@ -135,7 +135,7 @@ def _faults(column_map: ColumnMap) -> list[ConfigFault]:
     ]
 
 
-def mapped(raw: RecordingTable, column_map: ColumnMap, source: str) -> RecordingTable:
+def apply_column_map(raw: RecordingTable, column_map: ColumnMap, source: str) -> RecordingTable:
     """Return the recording that a file contains by its map; rows that lack a value are left out, which makes a gap.
 
     Conversions of the numbers are listed in the header ``import_notes``. Raises RecordingError if a column is missing
@@ -144,28 +144,28 @@ def mapped(raw: RecordingTable, column_map: ColumnMap, source: str) -> Recording
     headers = {
         "format": RECORDING_FORMAT,
         **raw.headers,
-        **{key: _text(value) for key, value in column_map.headers.items()},
+        **{key: _format_header(value) for key, value in column_map.headers.items()},
     }
     pitch_m = math.nan
     if PITCH_KEY in headers:
-        pitch_m = _positive(headers[PITCH_KEY], PITCH_KEY, "a length above 0, in m", source)
+        pitch_m = _parse_positive(headers[PITCH_KEY], PITCH_KEY, "a length above 0, in m", source)
     rate_hz = None
     if "sample_rate_hz" in headers:
-        rate_hz = _positive(headers["sample_rate_hz"], "sample_rate_hz", "a number above 0", source)
-    column_map = _with_whole_names(raw, column_map, source)
-    raw = _sampled_together(raw, column_map, source)
-    columns, notes = _signals(raw, column_map, pitch_m, source)
+        rate_hz = _parse_positive(headers["sample_rate_hz"], "sample_rate_hz", "a number above 0", source)
+    column_map = _complete_names(raw, column_map, source)
+    raw = _select_sample_group(raw, column_map, source)
+    columns, notes = _convert_signals(raw, column_map, pitch_m, source)
     if "time_s" not in columns:
-        columns = {"time_s": _time(raw, rate_hz, len(next(iter(columns.values()))), source), **columns}
-    columns = _whole_rows(columns, source)
+        columns = {"time_s": _find_time(raw, rate_hz, len(next(iter(columns.values()))), source), **columns}
+    columns = _select_complete_rows(columns, source)
     if 0 < (lasts_s := np.ptp(columns["time_s"])) < SHORTEST_S:
         lasts = f"lasts only {lasts_s:.3g} s by its times, too short for a move"
         raise RecordingError(f"{source} {lasts}: correct the unit of time_s, or sample_rate_hz")
-    time_s, note = even_times(np.round(columns["time_s"] - columns["time_s"][0], 9), rate_hz, source)
+    time_s, note = find_even_times(np.round(columns["time_s"] - columns["time_s"][0], 9), rate_hz, source)
     columns["time_s"] = np.round(time_s, 9)
-    _check_rising(columns["time_s"], source)
+    _check_rising_time(columns["time_s"], source)
     if rate_hz is None:
-        headers["sample_rate_hz"] = f"{1 / usual_step(columns['time_s']):.9g}"
+        headers["sample_rate_hz"] = f"{1 / compute_usual_step(columns['time_s']):.9g}"
     if "speed_rad_per_s" not in columns and ANGLE not in columns:
         columns[ANGLE] = columns["position_m"] * (2 * math.pi / pitch_m)
     derive_columns(headers, columns)
@@ -175,7 +175,7 @@ def mapped(raw: RecordingTable, column_map: ColumnMap, source: str) -> Recording
     return RecordingTable(headers, columns)
 
 
-def _whole_rows(columns: Mapping[str, Float], source: str) -> dict[str, Float]:
+def _select_complete_rows(columns: Mapping[str, Float], source: str) -> dict[str, Float]:
     _check_lengths(columns, source)
     complete = np.isfinite(np.column_stack([columns[name] for name in columns if not name.startswith("table_")])).all(1)
     if np.count_nonzero(complete) < 2:
@@ -183,7 +183,7 @@ def _whole_rows(columns: Mapping[str, Float], source: str) -> dict[str, Float]:
     return {name: values[complete] for name, values in columns.items()}
 
 
-def whole_heading(raw: RecordingTable, name: str, source: str) -> str:
+def complete_heading(raw: RecordingTable, name: str, source: str) -> str:
     """Return the heading that contains ``name``, else ``name`` itself. RecordingError if several contain it."""
     names = list(dict.fromkeys(n for table in (raw, *raw.others) for n in (*table.columns, *table.doubts)))
     if name in names or name.startswith("#") or len(name) < LEAST_PART:
@@ -195,16 +195,16 @@ def whole_heading(raw: RecordingTable, name: str, source: str) -> str:
     return found[0] if found else name
 
 
-def _with_whole_names(raw: RecordingTable, column_map: ColumnMap, source: str) -> ColumnMap:
+def _complete_names(raw: RecordingTable, column_map: ColumnMap, source: str) -> ColumnMap:
     columns = {
-        signal: tuple(c.model_copy(update={"name": whole_heading(raw, c.name, source)}) for c in _as_tuple(of))
+        signal: tuple(c.model_copy(update={"name": complete_heading(raw, c.name, source)}) for c in _make_tuple(of))
         for signal, of in column_map.columns.items()
     }
     return column_map.model_copy(update={"columns": columns})
 
 
-def _sampled_together(raw: RecordingTable, column_map: ColumnMap, source: str) -> RecordingTable:
-    names = dict.fromkeys(column.name for columns in column_map.columns.values() for column in _as_tuple(columns))
+def _select_sample_group(raw: RecordingTable, column_map: ColumnMap, source: str) -> RecordingTable:
+    names = dict.fromkeys(column.name for columns in column_map.columns.values() for column in _make_tuple(columns))
     tables = [raw, *raw.others]
     having = [table for table in tables if all(name in table.columns or name in table.doubts for name in names)]
     if len(having) == 1:
@@ -212,7 +212,7 @@ def _sampled_together(raw: RecordingTable, column_map: ColumnMap, source: str) -
     for name in names:
         if not any(name in table.columns or name in table.doubts for table in tables):
             raise RecordingError(
-                f"{source} has no column {quote_cell(name)}; it has {_what_it_has(*tables)}: correct the column map"
+                f"{source} has no column {quote_cell(name)}; it has {_list_columns(*tables)}: correct the column map"
             )
     listed = ", ".join(map(quote_cell, names))
     if not having:
@@ -226,21 +226,21 @@ def _sampled_together(raw: RecordingTable, column_map: ColumnMap, source: str) -
     )
 
 
-def _signals(
+def _convert_signals(
     raw: RecordingTable, column_map: ColumnMap, pitch_m: float, source: str
 ) -> tuple[dict[str, Float], list[str]]:
     signals: dict[str, Float] = {}
     notes: dict[str, None] = {}  # in order, each once
-    _check_places(raw, column_map, source)
+    _check_distinct_columns(raw, column_map, source)
     for signal, of in column_map.columns.items():
         parts: dict[str, Float] = {}
-        for k, column in enumerate(_as_tuple(of)):
-            values = _column(raw, column.name, source)
+        for k, column in enumerate(_make_tuple(of)):
+            values = _get_column(raw, column.name, source)
             bits = None
             if signal in COUNTED:
                 values, bits = unwrap_counter(values)
             if signal in ("position_m", "demand_m") and bits is None:
-                values, is_turn = _over_turns(values, column, pitch_m / FACTORS[signal][column.unit], source)
+                values, is_turn = _unwrap_position(values, column, pitch_m / FACTORS[signal][column.unit], source)
                 if is_turn:
                     notes[f"{column.name} wraps at each turn of the screw and was unwrapped"] = None
             if bits is not None:
@@ -250,7 +250,7 @@ def _signals(
                 raise RecordingError(
                     f"{source}: {quote_cell(column.name)} is a time, not {signal}: correct the column map"
                 )
-            factor = 1.0 if is_clock else _factor(signal, column.unit, pitch_m)
+            factor = 1.0 if is_clock else _find_factor(signal, column.unit, pitch_m)
             _check_unit(raw, signal, column, source)
             parts[f"{column.name} ({k + 1})"] = (values * column.factor + column.offset) * factor
         _check_lengths(parts, source)
@@ -258,7 +258,7 @@ def _signals(
     return signals, [*notes]
 
 
-def _over_turns(values: Float, column: Column, pitch: float, source: str) -> tuple[Float, bool]:
+def _unwrap_position(values: Float, column: Column, pitch: float, source: str) -> tuple[Float, bool]:
     """Return a position within one turn unwrapped over all turns, and whether it was one; ``pitch`` in the map's unit.
 
     Raises RecordingError for a position that wraps at another length than the pitch.
@@ -275,10 +275,10 @@ def _over_turns(values: Float, column: Column, pitch: float, source: str) -> tup
     return values, is_turn
 
 
-def _check_places(raw: RecordingTable, column_map: ColumnMap, source: str) -> None:
+def _check_distinct_columns(raw: RecordingTable, column_map: ColumnMap, source: str) -> None:
     """Refuse two names of one column, as of a head that lists its signals one a line."""
     found: dict[int, str] = {}
-    for column in (column for columns in column_map.columns.values() for column in _as_tuple(columns)):
+    for column in (column for columns in column_map.columns.values() for column in _make_tuple(columns)):
         if column.name.startswith("#") or column.name not in raw.columns:
             continue
         other = found.setdefault(id(raw.columns[column.name]), column.name)
@@ -292,7 +292,7 @@ def _check_places(raw: RecordingTable, column_map: ColumnMap, source: str) -> No
 def _check_unit(raw: RecordingTable, signal: str, column: Column, source: str) -> None:
     """Refuse a unit that differs from the one above the column, unless the map itself scales it."""
     known = {**FACTORS[signal], **(PER_REVOLUTION if signal == "speed_rad_per_s" else {})}
-    units = [unit for unit in units_of_heading(raw, column.name) if unit in known]
+    units = [unit for unit in find_heading_units(raw, column.name) if unit in known]
     wrong = units and not any(math.isclose(known[unit], known[column.unit]) for unit in units)
     if wrong and "factor" not in column.model_fields_set and column.name not in raw.clocks:
         raise RecordingError(
@@ -301,25 +301,25 @@ def _check_unit(raw: RecordingTable, signal: str, column: Column, source: str) -
         )
 
 
-def units_of_heading(raw: RecordingTable, heading: str) -> list[str]:
+def find_heading_units(raw: RecordingTable, heading: str) -> list[str]:
     """Return the possible units of a column: the file's texts about it, and the ends of its heading."""
     names = [heading.strip(), *raw.texts.get(heading, ())]
     ends = (found[1] for name in names for form in _IN_NAME if (found := form.search(name.strip())))
-    return [_unit(text) for text in (*names, *ends)]
+    return [_normalise_unit(text) for text in (*names, *ends)]
 
 
-def _unit(text: str) -> str:
+def _normalise_unit(text: str) -> str:
     unit = text.strip("[]() ").translate(_MICRO)
     return SYNONYMS.get(unit, unit)
 
 
-def _time(raw: RecordingTable, rate_hz: float | None, rows: int, source: str) -> Float:
+def _find_time(raw: RecordingTable, rate_hz: float | None, rows: int, source: str) -> Float:
     is_doubtful = "time_s" in raw.doubts
     if ("time_s" in raw.columns and not is_doubtful) or (is_doubtful and rate_hz is None):
-        return _column(raw, "time_s", source)
+        return _get_column(raw, "time_s", source)
     if rate_hz is None:
         raise RecordingError(
-            f"{source} has no column 'time_s'; it has {_what_it_has(raw)}: name the column of "
+            f"{source} has no column 'time_s'; it has {_list_columns(raw)}: name the column of "
             "time_s in the column map, or give sample_rate_hz under [headers] if there is none"
         )
     if raw.interruption:
@@ -330,7 +330,7 @@ def _time(raw: RecordingTable, rate_hz: float | None, rows: int, source: str) ->
     return np.arange(rows) / rate_hz
 
 
-def _check_rising(time_s: Float, source: str) -> None:
+def _check_rising_time(time_s: Float, source: str) -> None:
     steps = np.diff(time_s)
     if (steps > 0).all():
         return
@@ -344,14 +344,14 @@ def _check_rising(time_s: Float, source: str) -> None:
 def _check_lengths(columns: Mapping[str, Float], source: str) -> None:
     sizes = {name: values.size for name, values in columns.items()}
     if len(set(sizes.values())) > 1:
-        raise unlike_lengths(sizes, source)
+        raise make_length_error(sizes, source)
 
 
-def _text(value: str | float) -> str:
+def _format_header(value: str | float) -> str:
     return value if isinstance(value, str) else repr(value)
 
 
-def _positive(text: str | None, key: str, what: str, source: str) -> float:
+def _parse_positive(text: str | None, key: str, what: str, source: str) -> float:
     try:
         value = float(text or "")
     except ValueError:
@@ -361,19 +361,19 @@ def _positive(text: str | None, key: str, what: str, source: str) -> float:
     return value
 
 
-def _factor(signal: str, unit: str, pitch_m: float) -> float:
+def _find_factor(signal: str, unit: str, pitch_m: float) -> float:
     if signal == "speed_rad_per_s" and unit in PER_REVOLUTION:
         return PER_REVOLUTION[unit] * 2 * math.pi / pitch_m
     return FACTORS[signal][unit]
 
 
-def _column(raw: RecordingTable, name: str, source: str) -> Float:
+def _get_column(raw: RecordingTable, name: str, source: str) -> Float:
     if name in raw.doubts:
         raise RecordingError(f"{source}: {quote_cell(name)} {raw.doubts[name]}")
     return raw.columns[name]
 
 
-def _what_it_has(*tables: RecordingTable) -> str:
+def _list_columns(*tables: RecordingTable) -> str:
     names_of_all = dict.fromkeys(name for table in tables for name in (*table.columns, *table.doubts))
     names = [quote_cell(name) for name in names_of_all if not name.startswith("#")]
     places = [name for name in names_of_all if name.startswith("#")]

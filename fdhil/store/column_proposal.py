@@ -21,9 +21,9 @@ import numpy as np
 from fdhil.csv_text import quote_cell
 from fdhil.errors import RecordingError
 from fdhil.records import Float
-from fdhil.store.column_map import FACTORS, units_of_heading, whole_heading
+from fdhil.store.column_map import FACTORS, complete_heading, find_heading_units
+from fdhil.store.recording_file import read_raw
 from fdhil.store.recording_table import PATH, RecordingTable
-from fdhil.store.recordings import read_raw
 
 HEADINGS: Mapping[str, str] = {  # in this order: a "position demand" is a demand, a "speed voltage" a speed
     "time_s": r"^t$|time|zeit|temps|^x-axis$|second|sekunde|timestamp",
@@ -41,7 +41,7 @@ RPM_FROM = 700.0  # a larger speed without a unit is assumed to be in rpm
 
 
 @dataclass(frozen=True)
-class Proposed:
+class ProposedColumn:
     """One signal's column: its heading, the unit of its numbers, and the reason."""
 
     signal: str
@@ -51,16 +51,16 @@ class Proposed:
 
 
 @dataclass(frozen=True)
-class Proposal:
+class ColumnProposal:
     """A proposed column map: its columns, headers, and the ``faults`` that prevent its use.
 
     ``aside`` are columns that need a pitch, which no file contains.
     """
 
-    columns: Sequence[Proposed]
+    columns: Sequence[ProposedColumn]
     headers: Mapping[str, str | float]
     faults: Sequence[str]
-    aside: Sequence[Proposed] = ()
+    aside: Sequence[ProposedColumn] = ()
 
     @property
     def toml(self) -> str:
@@ -74,38 +74,38 @@ class Proposal:
             lines.append(f"{mark}{each.signal} = {{ name = {name}, unit = {unit} }}  # {each.why}")
         return "\n".join(lines) + "\n"
 
-    def lines(self) -> Iterator[str]:
+    def format_lines(self) -> Iterator[str]:
         for each in (*self.columns, *self.aside):
             yield f"  {each.signal:16} {each.heading!r} in {each.unit}: {each.why}"
 
 
-def propose_columns(path: Path) -> Proposal:
+def propose_columns(path: Path) -> ColumnProposal:
     """Return the column map that a file suggests. Raises RecordingError if it cannot be read."""
-    return propose(read_raw(path))
+    return propose_for_table(read_raw(path))
 
 
-def propose(
+def propose_for_table(
     raw: RecordingTable, given: Mapping[str, str | Sequence[str]] = MappingProxyType({}), source: str = "recording"
-) -> Proposal:
+) -> ColumnProposal:
     """Return the column map that the columns of a file suggest.
 
     ``given`` maps signals to a heading, a part of one, or heading and unit; then no other signals are searched.
     """
     if given:
-        return _from_given(raw, given, source)
-    columns = _distinct(raw)
+        return _use_given_columns(raw, given, source)
+    columns = _select_distinct_columns(raw)
     by_name: dict[str, list[str]] = {}
     for heading in columns:
-        if (signal := _named(heading, raw)) is not None:
+        if (signal := _classify_heading(heading, raw)) is not None:
             by_name.setdefault(signal, []).append(heading)
     found = {s: (headings[0], "by its heading") for s, headings in by_name.items() if len(headings) == 1}
     headers: dict[str, str | float] = {"axis": "X"}
-    time = found.get("time_s") or _time(columns)
+    time = found.get("time_s") or _find_time_column(columns)
     if time is not None:
         found["time_s"] = time
-    _by_physics(columns, found, by_name)
+    _assign_by_physics(columns, found, by_name)
     if "voltage_V" in found:
-        headers["voltage_sampling"] = _sampling(columns, found)
+        headers["voltage_sampling"] = _determine_voltage_sampling(columns, found)
     faults = []
     if "time_s" not in found:
         faults.append("no column rises evenly like a time: give sample_rate_hz under [headers]")
@@ -115,31 +115,31 @@ def propose(
         faults.append("no speed recognised")
     if "current_A" in found:
         found.pop("torque_Nm", None)
-    proposed = [_with_unit(signal, *found[signal], columns, raw) for signal in FACTORS if signal in found]
+    proposed = [_add_unit(signal, *found[signal], columns, raw) for signal in FACTORS if signal in found]
     aside = [each for each in proposed if each.signal in PATH]
-    return Proposal([each for each in proposed if each not in aside], headers, faults, aside)
+    return ColumnProposal([each for each in proposed if each not in aside], headers, faults, aside)
 
 
-def _from_given(raw: RecordingTable, given: Mapping[str, str | Sequence[str]], source: str) -> Proposal:
+def _use_given_columns(raw: RecordingTable, given: Mapping[str, str | Sequence[str]], source: str) -> ColumnProposal:
     proposed, found = [], {}
     for signal, name_and_unit in given.items():
         if signal not in FACTORS:
             raise RecordingError(f"{source}: unknown signal {signal!r}; signals are {', '.join(FACTORS)}")
         part, *unit = (name_and_unit,) if isinstance(name_and_unit, str) else name_and_unit
-        heading = whole_heading(raw, part, source)
+        heading = complete_heading(raw, part, source)
         if heading not in raw.columns:
-            listed = ", ".join(map(quote_cell, _distinct(raw)))
+            listed = ", ".join(map(quote_cell, _select_distinct_columns(raw)))
             raise RecordingError(f"{source} has no column {quote_cell(part)}; it has {listed}: correct columns")
         found[signal] = (heading, "given")
-        known = unit[0] if unit else _unit(heading, raw, signal) or next(iter(FACTORS[signal]))  # SI
-        proposed.append(Proposed(signal, heading, known, "given"))
+        known = unit[0] if unit else _find_unit(heading, raw, signal) or next(iter(FACTORS[signal]))  # SI
+        proposed.append(ProposedColumn(signal, heading, known, "given"))
     headers: dict[str, str | float] = {"axis": "X"}
     if "voltage_V" in found:
-        headers["voltage_sampling"] = _sampling(raw.columns, found)
-    return Proposal(proposed, headers, [])
+        headers["voltage_sampling"] = _determine_voltage_sampling(raw.columns, found)
+    return ColumnProposal(proposed, headers, [])
 
 
-def _distinct(raw: RecordingTable) -> dict[str, Float]:
+def _select_distinct_columns(raw: RecordingTable) -> dict[str, Float]:
     found: dict[int, str] = {}
     for name, values in raw.columns.items():
         known = found.get(id(values))
@@ -150,22 +150,22 @@ def _distinct(raw: RecordingTable) -> dict[str, Float]:
     return {name: values for name, values in usable.items() if values.size == sizes[0][0]}
 
 
-def _named(heading: str, raw: RecordingTable) -> str | None:
+def _classify_heading(heading: str, raw: RecordingTable) -> str | None:
     text = heading.strip().lower()
-    if any("%" in unit for unit in units_of_heading(raw, heading)):
+    if any("%" in unit for unit in find_heading_units(raw, heading)):
         return None
     for signal, pattern in HEADINGS.items():
         if re.search(pattern, text):
-            return "angle_rad" if signal == "position_m" and _unit(heading, raw, "angle_rad") else signal
-    fitting = [signal for signal in HEADINGS if _unit(heading, raw, signal)]
+            return "angle_rad" if signal == "position_m" and _find_unit(heading, raw, "angle_rad") else signal
+    fitting = [signal for signal in HEADINGS if _find_unit(heading, raw, signal)]
     return fitting[0] if len(fitting) == 1 else None
 
 
-def _unit(heading: str, raw: RecordingTable, signal: str) -> str | None:
-    return next((u for u in units_of_heading(raw, heading) if u in FACTORS[signal]), None)
+def _find_unit(heading: str, raw: RecordingTable, signal: str) -> str | None:
+    return next((u for u in find_heading_units(raw, heading) if u in FACTORS[signal]), None)
 
 
-def _time(columns: Mapping[str, Float]) -> tuple[str, str] | None:
+def _find_time_column(columns: Mapping[str, Float]) -> tuple[str, str] | None:
     for heading, values in columns.items():
         steps = np.diff(values)
         if steps.size and np.isfinite(steps).all() and (steps > 0).all() and np.ptp(steps) < 0.1 * np.median(steps):
@@ -173,7 +173,7 @@ def _time(columns: Mapping[str, Float]) -> tuple[str, str] | None:
     return None
 
 
-def _by_physics(
+def _assign_by_physics(
     columns: Mapping[str, Float], found: dict[str, tuple[str, str]], by_name: Mapping[str, Sequence[str]]
 ) -> None:
     wanted = ("voltage_V", "current_A", "speed_rad_per_s")
@@ -185,38 +185,38 @@ def _by_physics(
     for triple in permutations(free, 3):
         fits = all(s not in found or found[s][0] == h for s, h in zip(wanted, triple, strict=True))
         fits = fits and all(s not in by_name or h in by_name[s] for s, h in zip(wanted, triple, strict=True))
-        fits = fits and not any(_is_of_another_unit(h, s) for s, h in zip(wanted, triple, strict=True))
+        fits = fits and not any(_has_other_unit(h, s) for s, h in zip(wanted, triple, strict=True))
         if fits:
-            choices.append((obeys(*(columns[h][:KEPT_ROWS] for h in triple)), triple))
+            choices.append((compute_explained_share(*(columns[h][:KEPT_ROWS] for h in triple)), triple))
     if choices and (best := max(choices))[0] > EXPLAINED:
         for signal, heading in zip(wanted, best[1], strict=True):
             found.setdefault(signal, (heading, f"fits the equations by {best[0]:.0%}"))
 
 
-def _is_of_another_unit(heading: str, signal: str) -> bool:
+def _has_other_unit(heading: str, signal: str) -> bool:
     found = re.search(r"[\[(]([^\[\]():,]*[^\[\]():,\d\s][^\[\]():,]*)[\])]$", heading.strip())
     return found is not None and found[1] not in FACTORS[signal]
 
 
-def obeys(voltage: Float, current: Float, speed: Float) -> float:
+def compute_explained_share(voltage: Float, current: Float, speed: Float) -> float:
     """Return the share of [1] and [2] that voltage, current and speed (n,) explain; 0 for negative parameters."""
     middle = [(v[1:] + v[:-1]) / 2 for v in (current, speed)]
-    electrical = _share(voltage[:-1], [middle[0], np.diff(current), middle[1]])
-    mechanical = _share(middle[0], [np.diff(speed), middle[1], np.sign(middle[1])])
+    electrical = _explain_variance(voltage[:-1], [middle[0], np.diff(current), middle[1]])
+    mechanical = _explain_variance(middle[0], [np.diff(speed), middle[1], np.sign(middle[1])])
     if electrical is None or mechanical is None or min(electrical[1][0], electrical[1][2], mechanical[1][0]) <= 0.0:
         return 0.0
     return electrical[0] * mechanical[0]
 
 
-def _sampling(columns: Mapping[str, Float], found: Mapping[str, tuple[str, str]]) -> str:
+def _determine_voltage_sampling(columns: Mapping[str, Float], found: Mapping[str, tuple[str, str]]) -> str:
     if not found.keys() >= {"current_A", "speed_rad_per_s"}:
         return "instant"
     u, i, w = (columns[found[s][0]][:KEPT_ROWS] for s in ("voltage_V", "current_A", "speed_rad_per_s"))
     instant = np.append((u[1:] + u[:-1]) / 2, u[-1])
-    return "interval_mean" if obeys(u, i, w) > obeys(instant, i, w) else "instant"
+    return "interval_mean" if compute_explained_share(u, i, w) > compute_explained_share(instant, i, w) else "instant"
 
 
-def _share(values: Float, regressors: Sequence[Float]) -> tuple[float, Float] | None:
+def _explain_variance(values: Float, regressors: Sequence[Float]) -> tuple[float, Float] | None:
     table = np.column_stack([*regressors, np.ones(values.size)])
     size = np.abs(table).max(axis=0)
     variance = float(np.var(values))
@@ -226,9 +226,9 @@ def _share(values: Float, regressors: Sequence[Float]) -> tuple[float, Float] | 
     return 1.0 - float(np.var(values - table / size @ weights)) / variance, weights
 
 
-def _with_unit(signal: str, heading: str, why: str, columns: Mapping[str, Float], raw: RecordingTable) -> Proposed:
-    if (unit := _unit(heading, raw, signal)) is not None:
-        return Proposed(signal, heading, unit, why)
+def _add_unit(signal: str, heading: str, why: str, columns: Mapping[str, Float], raw: RecordingTable) -> ProposedColumn:
+    if (unit := _find_unit(heading, raw, signal)) is not None:
+        return ProposedColumn(signal, heading, unit, why)
     values = columns[heading]
     unit = next(iter(FACTORS[signal]))
     if signal == "time_s" and float(np.median(np.diff(values))) >= 0.05:
@@ -237,4 +237,4 @@ def _with_unit(signal: str, heading: str, why: str, columns: Mapping[str, Float]
         unit = "rpm"
     elif signal in ("position_m", "demand_m") and float(np.ptp(values)) > math.tau:
         unit = "mm"
-    return Proposed(signal, heading, unit, f"{why}; unit guessed by size")
+    return ProposedColumn(signal, heading, unit, f"{why}; unit guessed by size")

@@ -16,22 +16,22 @@ def unwrap_counter(values: Float) -> tuple[Float, int | None]:
     jump within a step of the end of that range, and continue after the jump as before. Lost samples may be ``nan``.
     """
     known = np.flatnonzero(np.isfinite(values))
-    scale = _scale(values[known])
+    scale = _find_scale(values[known])
     if known.size < 3 or scale is None:
         return values, None
     counts = np.rint(values[known] * scale)
     for bits in BITS:
-        whole = _without_jumps(counts, 2.0**bits, 2.0)
+        whole = _remove_jumps(counts, 2.0**bits, 2.0)
         if whole is not None:
-            return _placed(values, known, whole / scale), bits
+            return _fill_finite(values, known, whole / scale), bits
     return values, None
 
 
 def unwrap_turns(values: Float, turn: float) -> tuple[Float, bool]:
     """Return the values (n,) of a position within one ``turn``, unwrapped, and whether there were such jumps."""
     known = np.flatnonzero(np.isfinite(values))
-    whole = _without_jumps(values[known], turn, 1e-3 * turn) if known.size > 2 else None
-    return (values, False) if whole is None else (_placed(values, known, whole), True)
+    whole = _remove_jumps(values[known], turn, 1e-3 * turn) if known.size > 2 else None
+    return (values, False) if whole is None else (_fill_finite(values, known, whole), True)
 
 
 def jump_of_reading(values: Float) -> float | None:
@@ -46,13 +46,13 @@ def jump_of_reading(values: Float) -> float | None:
     if reach == 0 or not is_jump.any() or np.count_nonzero(is_jump) > steps.size / 8:
         return None
     others = np.where(is_jump, 0.0, np.abs(steps))
-    near = _nearby(others)[is_jump]
+    near = _compute_nearby_maximum(others)[is_jump]
     goes_on = np.sign(steps[is_jump]) == -np.sign(np.median(steps[~is_jump & (steps != 0)]))
     is_moving = ((near > others.max() / 8) & (near < reach / 8)).all()
     return float(np.median(np.abs(steps[is_jump]))) if goes_on.all() and is_moving else None
 
 
-def _without_jumps(counts: Float, period: float, resolution: float) -> Float | None:
+def _remove_jumps(counts: Float, period: float, resolution: float) -> Float | None:
     jumps = np.abs(np.diff(counts))
     low = -period / 2 if counts.min() < 0 else 0.0
     if counts.min() < low or counts.max() >= low + period or jumps.max() <= period / 2:
@@ -60,18 +60,18 @@ def _without_jumps(counts: Float, period: float, resolution: float) -> Float | N
     whole: Float = np.unwrap(counts, period=period)
     steps = np.abs(np.diff(whole))
     is_wrap = jumps > period / 2
-    nearby = _nearby(np.where(is_wrap, 0.0, steps))
+    nearby = _compute_nearby_maximum(np.where(is_wrap, 0.0, steps))
     is_steady = (steps[is_wrap] <= 2 * nearby[is_wrap] + resolution).all() and steps.max() < period / 8
     return whole if is_steady else None
 
 
-def _placed(values: Float, known: Int, whole: Float) -> Float:
+def _fill_finite(values: Float, known: Int, whole: Float) -> Float:
     placed = values.copy()
     placed[known] = whole
     return placed
 
 
-def _scale(values: Float) -> float | None:
+def _find_scale(values: Float) -> float | None:
     if not (np.abs(values) < MOST_COUNTS).all():
         return None
     for decimals in range(MOST_DECIMALS + 1):
@@ -81,7 +81,7 @@ def _scale(values: Float) -> float | None:
     return None
 
 
-def _nearby(steps: Float, reach: int = 3) -> Float:
+def _compute_nearby_maximum(steps: Float, reach: int = 3) -> Float:
     padded = np.pad(steps, reach)
     greatest: Float = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(axis=1)
     return greatest

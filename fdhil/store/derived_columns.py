@@ -26,7 +26,7 @@ def derive_columns(headers: dict[str, str], columns: dict[str, Float]) -> None:
     """
     angle, torque = columns.get(ANGLE), columns.pop(TORQUE, None)
     if angle is not None and "speed_rad_per_s" not in columns:
-        columns["speed_rad_per_s"] = difference(angle, columns["time_s"])
+        columns["speed_rad_per_s"] = compute_rate(angle, columns["time_s"])
         headers["speed_source"] = "difference"
     if torque is None or "current_A" in columns:
         return
@@ -40,7 +40,7 @@ def derive_columns(headers: dict[str, str], columns: dict[str, Float]) -> None:
         headers[IMPORT_NOTES] = "; ".join(filter(None, [headers.get(IMPORT_NOTES, ""), note]))
 
 
-def difference(positions: Float, time_s: Float) -> Float:
+def compute_rate(positions: Float, time_s: Float) -> Float:
     """Return the mean rate (n,) of positions (n,) over the interval before each sample; 0 in the first."""
     return np.concatenate([[0.0], np.diff(positions) / np.diff(time_s)])
 

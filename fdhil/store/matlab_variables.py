@@ -16,7 +16,7 @@ NO_NUMBERS = "is not a vector of real numbers: save it as one, of type double"
 OBJECT = "is an object that only MATLAB can read (timeseries, table, Dataset): save it as a structure or an array"
 
 
-def matlab_table(variables: Mapping[str, Any], headers: Mapping[str, str], source: str) -> RecordingTable:
+def convert_variables(variables: Mapping[str, Any], headers: Mapping[str, str], source: str) -> RecordingTable:
     """Return the vectors within variables: scalar structures as mappings, cells and structure arrays as lists.
 
     A field can also be named by its last part alone, and a signal of a Simulink scope by its label, if they are unique.
@@ -25,7 +25,7 @@ def matlab_table(variables: Mapping[str, Any], headers: Mapping[str, str], sourc
     columns: dict[str, Float] = {}
     doubts: dict[str, str] = {}
     short: list[tuple[str, str]] = []
-    for name, alias, value in _leaves("", "", variables, 0):
+    for name, alias, value in _walk_variables("", "", variables, 0):
         if len(columns) + len(doubts) > MOST_COLUMNS:
             raise RecordingError(
                 f"{source} has more than {MOST_COLUMNS} variables, too many for a recording: save a part"
@@ -52,7 +52,7 @@ def matlab_table(variables: Mapping[str, Any], headers: Mapping[str, str], sourc
     return RecordingTable(headers, columns, frozenset(), doubts)
 
 
-def texts(headers: Any) -> dict[str, str]:
+def extract_headers(headers: Any) -> dict[str, str]:
     """Return the texts and numbers of a structure; nothing for any other value."""
     if not isinstance(headers, dict):
         return {}
@@ -60,7 +60,7 @@ def texts(headers: Any) -> dict[str, str]:
     return numbers | {key: value for key, value in headers.items() if isinstance(value, str)}
 
 
-def _leaves(name: str, alias: str, value: Any, depth: int) -> Iterator[tuple[str, str, Float | str]]:
+def _walk_variables(name: str, alias: str, value: Any, depth: int) -> Iterator[tuple[str, str, Float | str]]:
     """Yield name, short name, and the vector or the reason why there is none."""
     if depth > MOST_DEPTH:
         return
@@ -68,17 +68,17 @@ def _leaves(name: str, alias: str, value: Any, depth: int) -> Iterator[tuple[str
         label = value.get("label")  # of a signal of a scope
         for field, part in value.items():
             own = label if field == "values" and isinstance(label, str) and label else field
-            yield from _leaves(f"{name}.{field}" if name else field, own, part, depth + 1)
+            yield from _walk_variables(f"{name}.{field}" if name else field, own, part, depth + 1)
     elif isinstance(value, list):
         for k, part in enumerate(value[:MOST_COLUMNS], 1):
-            yield from _leaves(f"{name}({k})", "", part, depth + 1)
+            yield from _walk_variables(f"{name}({k})", "", part, depth + 1)
     elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
-        yield from _vectors(name, alias, value)
+        yield from _split_vectors(name, alias, value)
     elif not isinstance(value, (str, bytes, int, float, np.generic)):
         yield name, alias, NO_NUMBERS if isinstance(value, np.ndarray) else OBJECT
 
 
-def _vectors(name: str, alias: str, values: np.ndarray[Any, Any]) -> Iterator[tuple[str, str, Float | str]]:
+def _split_vectors(name: str, alias: str, values: np.ndarray[Any, Any]) -> Iterator[tuple[str, str, Float | str]]:
     values = values.squeeze() if values.ndim > 2 else values
     if values.size == max(values.shape, default=1):
         if values.size > 1:

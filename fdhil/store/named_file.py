@@ -22,7 +22,7 @@ def open_named(folder: Path, name: str) -> BufferedReader:
     replacing it by a link in between has no effect.
     """
     if not _NAME.fullmatch(name):
-        raise _bad(f"{name[:80]!a} is not a file name of fdhil")
+        raise _make_bad_name_error(f"{name[:80]!a} is not a file name of fdhil")
     try:
         held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
@@ -31,22 +31,22 @@ def open_named(folder: Path, name: str) -> BufferedReader:
         finally:
             os.close(held)
     except OSError as error:
-        raise _refused(name, error) from None
+        raise _make_open_error(name, error) from None
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         with suppress(OSError):
             os.close(descriptor)
-        raise _bad(f"{name} is not a regular file")
+        raise _make_bad_name_error(f"{name} is not a regular file")
     return os.fdopen(descriptor, "rb")
 
 
-def _bad(what: str) -> StoreError:
+def _make_bad_name_error(what: str) -> StoreError:
     return StoreError(f"{what}, and nothing was read; {_NEXT}", "BadName")
 
 
-def _refused(name: str, error: OSError) -> StoreError:
+def _make_open_error(name: str, error: OSError) -> StoreError:
     if error.errno in (errno.ENOENT, errno.ENOTDIR):
         text = f"{name} is not stored (any more): the newest recordings displace the oldest"
         return StoreError(f"{text}; raise keep_windows in [store] to keep more", "NotKept")
     if error.errno in (errno.ELOOP, errno.ENXIO):  # a link; a socket
-        return _bad(f"{name} is not a regular file")
+        return _make_bad_name_error(f"{name} is not a regular file")
     return StoreError(f"{name} cannot be read: {error.strerror}; check the permissions of the store")

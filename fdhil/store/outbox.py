@@ -18,8 +18,8 @@ from typing import Any
 
 from fdhil.config.uplink_section import Uplink
 from fdhil.errors import StoreError
-from fdhil.store import HISTORY_FILE, schema
-from fdhil.store.atomic import write_file
+from fdhil.store import HISTORY_FILE, history_schema
+from fdhil.store.atomic_file import write_file
 
 POSITION_FILE = "position.json"
 LARGEST_POSITION = 4096  # bytes of that file
@@ -51,7 +51,7 @@ _OF_NO_AXIS = {"acknowledgements": "''"}
 
 
 @dataclass(frozen=True, slots=True)
-class Position:
+class OutboxPosition:
     """How far the outbox of ``store`` is sent: the last entry and its message; ``about``: the machine's description."""
 
     store: str = ""
@@ -64,19 +64,19 @@ class Position:
         return self.store == store and self.entry > newest
 
 
-def read_position(folder: Path) -> Position:
+def read_position(folder: Path) -> OutboxPosition:
     """Return how far the outbox was sent; the beginning if unknown, so that everything is sent again."""
     try:
         with (folder / POSITION_FILE).open("rb") as file:
             document = json.loads(file.read(LARGEST_POSITION))
-        position = Position(**document)
+        position = OutboxPosition(**document)
     except (OSError, ValueError, TypeError, RecursionError):
-        return Position()
+        return OutboxPosition()
     kinds = all(isinstance(getattr(position, name), str) for name in ("store", "message", "about"))
-    return position if kinds and type(position.entry) is int and 0 <= position.entry < 1 << 63 else Position()
+    return position if kinds and type(position.entry) is int and 0 <= position.entry < 1 << 63 else OutboxPosition()
 
 
-def write_position(folder: Path, position: Position) -> None:
+def write_position(folder: Path, position: OutboxPosition) -> None:
     write_file(folder / POSITION_FILE, json.dumps(asdict(position)).encode())
 
 
@@ -88,7 +88,7 @@ class Outbox:
         self._folder = folder
         self._windows = Counter[str]()
 
-    def enter(self, db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
+    def add_entry(self, db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
         if table not in KINDS:
             return
         axis = row.get("axis") or ""
@@ -98,7 +98,7 @@ class Outbox:
         if number % PRUNE_EVERY == 0:
             self._prune(db, number)
 
-    def begin(self, db: sqlite3.Connection) -> None:
+    def add_earlier_rows(self, db: sqlite3.Connection) -> None:
         """Add entries once for the newest rows recorded before there was an [uplink]. Raises sqlite3.Error.
 
         An older copy of the history, of which more was sent than it has, gets an identity of its own.
@@ -132,7 +132,7 @@ class Outbox:
 
     def _prune(self, db: sqlite3.Connection, newest: int) -> None:
         """Delete sent entries and the oldest beyond the limit; the last sent entry stays as a reference."""
-        sent = _sent_before(db, read_position(self._folder))
+        sent = _find_last_sent(db, read_position(self._folder))
         (oldest,) = db.execute("SELECT min(id) FROM outbox").fetchone()
         until = min(max(sent, newest - self._settings.keep_unsent + 1), oldest + PRUNE_AT_MOST)
         db.execute("DELETE FROM outbox WHERE id < ?", (until,))
@@ -140,14 +140,14 @@ class Outbox:
             db.execute("UPDATE outbox_of SET dropped = dropped + ?", (dropped,))
 
 
-def _sent_before(db: sqlite3.Connection, position: Position) -> int:
+def _find_last_sent(db: sqlite3.Connection, position: OutboxPosition) -> int:
     query = "SELECT 1 FROM outbox, outbox_of WHERE id = ? AND message = ? AND store = ?"
     known = db.execute(query, (position.entry, position.message, position.store)).fetchone()
     return position.entry if known else 0
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class OutboxEntry:
     """An entry to be sent: ``row`` are the history's values, ``left_out`` says why there are none."""
 
     number: int
@@ -165,12 +165,12 @@ class OutboxReader:
     def __init__(self, directory: Path, checked: set[tuple[int, int]] | None = None) -> None:
         """Open the history of a store; ``checked`` as in :func:`schema.open_to_read`."""
         self._path = directory / HISTORY_FILE
-        self._db, version = schema.open_to_read(self._path, checked)
-        if version < schema.WITH_OUTBOX:
+        self._db, version = history_schema.open_to_read(self._path, checked)
+        if version < history_schema.WITH_OUTBOX:
             self._db.close()
             text = f"{self._path} has no outbox yet: start the daemon of this version, which upgrades it"
             raise StoreError(text, "SchemaVersion")
-        self.store, self.dropped = self._ask("SELECT store, dropped FROM outbox_of", ())[0]
+        self.store, self.dropped = self._query("SELECT store, dropped FROM outbox_of", ())[0]
         self._columns: dict[str, list[str]] = {}
 
     def __enter__(self) -> OutboxReader:
@@ -179,45 +179,45 @@ class OutboxReader:
     def __exit__(self, *_: object) -> None:
         self._db.close()
 
-    def _ask(self, query: str, values: tuple[object, ...]) -> list[tuple[Any, ...]]:
-        with schema.told(self._path):
+    def _query(self, query: str, values: tuple[object, ...]) -> list[tuple[Any, ...]]:
+        with history_schema.translate_errors(self._path):
             return self._db.execute(query, values).fetchall()
 
-    def start(self, position: Position) -> Position:
+    def resume_from(self, position: OutboxPosition) -> OutboxPosition:
         """Return where to resume: at ``position``, or at the beginning if it belongs to another file.
 
         Raises StoreError if the file is an older copy of what was sent.
         """
-        newest = self._ask("SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = 'outbox'", ())[0][0]
+        newest = self._query("SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = 'outbox'", ())[0][0]
         if position.is_beyond(newest, self.store):
             text = f"{self._path} is an older copy: {position.entry} records were sent, and it has {newest}"
             raise StoreError(f"{text}; restart the daemon, which gives it an identity of its own", "OlderCopy")
         query = "SELECT count(*) FROM outbox WHERE id = ? AND message = ?"
-        ((known,),) = self._ask(query, (position.entry, position.message))
+        ((known,),) = self._query(query, (position.entry, position.message))
         if position.store == self.store and known:
             return position
-        return Position(self.store, 0, "", position.about)
+        return OutboxPosition(self.store, 0, "", position.about)
 
-    def waiting(self, after: int) -> int:
-        return int(self._ask("SELECT count(*) FROM outbox WHERE id > ?", (after,))[0][0])
+    def count_waiting(self, after: int) -> int:
+        return int(self._query("SELECT count(*) FROM outbox WHERE id > ?", (after,))[0][0])
 
-    def entries(self, after: int, limit: int) -> list[Entry]:
+    def read_entries(self, after: int, limit: int) -> list[OutboxEntry]:
         """Return the next entries after one, in order."""
         query = "SELECT id, of, row, axis, message, with_file FROM outbox WHERE id > ? ORDER BY id LIMIT ?"
-        return [self._entry(*row) for row in self._ask(query, (after, limit))]
+        return [self._make_entry(*row) for row in self._query(query, (after, limit))]
 
-    def _entry(self, number: int, table: str, of: int, axis: str, message: str, with_file: int) -> Entry:
+    def _make_entry(self, number: int, table: str, of: int, axis: str, message: str, with_file: int) -> OutboxEntry:
         if table not in KINDS:
-            return Entry(number, "unknown", "", message, {}, "damaged", False)
-        values = self._ask(f"SELECT * FROM {table} WHERE id = ?", (of,))
-        row = dict(zip(self._names(table), values[0], strict=True)) if values else {}
+            return OutboxEntry(number, "unknown", "", message, {}, "damaged", False)
+        values = self._query(f"SELECT * FROM {table} WHERE id = ?", (of,))
+        row = dict(zip(self._read_column_names(table), values[0], strict=True)) if values else {}
         left_out = "" if row else "no longer kept"
-        if row and not schema.digest_of(table, row) == row["digest"] == message:
+        if row and not history_schema.compute_digest(table, row) == row["digest"] == message:
             row, left_out = {}, "damaged"
-        return Entry(number, KINDS[table], axis, message, row, left_out, bool(with_file and row))
+        return OutboxEntry(number, KINDS[table], axis, message, row, left_out, bool(with_file and row))
 
-    def _names(self, table: str) -> list[str]:
+    def _read_column_names(self, table: str) -> list[str]:
         if table not in self._columns:
-            rows = self._ask(f"SELECT name FROM pragma_table_info('{table}') ORDER BY cid", ())
+            rows = self._query(f"SELECT name FROM pragma_table_info('{table}') ORDER BY cid", ())
             self._columns[table] = [name for (name,) in rows]
         return self._columns[table]

@@ -28,40 +28,40 @@ import numpy as np
 from fdhil import errors
 from fdhil.bounded_process import limit_process
 from fdhil.errors import FdhilError, RecordingError
-from fdhil.store.recording_table import RecordingTable, unreadable
+from fdhil.store.recording_table import RecordingTable, make_unreadable_error
 
 LONGEST_S = 120.0  # by the clock; the largest accepted file needs a tenth of it
 MOST_BYTES = 4 << 30
 LONGEST_NAME = 200
 
 
-def most_processor_s(size: int) -> float:
+def limit_processor_s(size: int) -> float:
     """Return the processor time for a file of ``size`` bytes: ten times what a slow computer needs."""
     return min(0.8 + 2e-6 * size, LONGEST_S)
 
 
-def most_memory_bytes(size: int) -> int:
+def limit_memory_bytes(size: int) -> int:
     """Return the memory for a file of ``size`` bytes; compression reaches factors of 150."""
     return min((256 << 20) + 256 * size, MOST_BYTES)
 
 
-def read_apart(reader: str, kind: str, content: bytes, source: str) -> RecordingTable:
+def read_in_process(reader: str, kind: str, content: bytes, source: str) -> RecordingTable:
     """Return the result of ``read(content, source)`` of the module ``reader``, or raise its FdhilError.
 
     Raises RecordingError if its process did not survive the file, a ``kind`` by its name. The module's ``library``
     loads what it reads with.
     """
     with _ONE:
-        process, answer = _process(source), None
+        process, answer = _get_process(source), None
         try:
-            answer = process.answer(reader, content, source)
+            answer = process.read_file(reader, content, source)
         finally:
             if answer is None:  # interrupted: the next file must not get this one's answer
                 process.end()
     if isinstance(answer, FdhilError):
         raise answer
     if isinstance(answer, str):
-        raise unreadable(source, kind, EOFError(answer))
+        raise make_unreadable_error(source, kind, EOFError(answer))
     return answer
 
 
@@ -90,17 +90,17 @@ class ReadingProcess:
                     start_new_session=True,  # Ctrl-C is for the parent
                 )
             failing.callback(self.end)
-            self._told()  # ready
+            self._receive_exit_code()  # ready
             failing.pop_all()
 
-    def answer(self, reader: str, content: bytes, source: str) -> RecordingTable | FdhilError | str:
+    def read_file(self, reader: str, content: bytes, source: str) -> RecordingTable | FdhilError | str:
         """Return the table, the reader's refusal, or a text about the end of the fork."""
         try:
-            answer = self._answer(reader, content, source)
+            answer = self._exchange(reader, content, source)
         except (EOFError, OSError, ValueError):
             answer = None
         try:
-            self.ended = self._told()
+            self.ended = self._receive_exit_code()
         except (EOFError, OSError):  # it was ended itself
             self.ended = self.end()
         if answer is not None and not self.ended:
@@ -108,19 +108,19 @@ class ReadingProcess:
         if self.ended == -signal.SIGALRM:
             return f"it was not read within {LONGEST_S:g} s"
         if self.ended == -signal.SIGPROF:
-            return f"it was not read within {most_processor_s(len(content)):.2g} s of processor time"
+            return f"it was not read within {limit_processor_s(len(content)):.2g} s of processor time"
         return "its reader crashed"
 
-    def _answer(self, reader: str, content: bytes, source: str) -> RecordingTable | FdhilError:
+    def _exchange(self, reader: str, content: bytes, source: str) -> RecordingTable | FdhilError:
         here, there = Pipe()
         with here:
             with there:
                 socket.send_fds(self._asked, [reader.encode()], [there.fileno()])
             here.send_bytes(json.dumps([source, LONGEST_S]).encode())
             here.send_bytes(content)
-            return receive(here)
+            return receive_table(here)
 
-    def _told(self) -> int:
+    def _receive_exit_code(self) -> int:
         exit_code = self._asked.recv(LONGEST_NAME)
         if not exit_code:
             raise EOFError
@@ -138,10 +138,10 @@ _ONE = Lock()
 _PROCESSES: dict[int, ReadingProcess] = {}  # by process ID: a fork has none of its parent's
 
 
-def _process(source: str) -> ReadingProcess:
+def _get_process(source: str) -> ReadingProcess:
     process = _PROCESSES.get(os.getpid())
     if process is None or process.child.poll() is not None:
-        _end()
+        _end_process()
         try:
             process = _PROCESSES[os.getpid()] = ReadingProcess()
         except (EOFError, OSError) as error:
@@ -151,7 +151,7 @@ def _process(source: str) -> ReadingProcess:
 
 
 @atexit.register
-def _end() -> None:
+def _end_process() -> None:
     process = _PROCESSES.pop(os.getpid(), None)
     if process is not None:
         process.end()
@@ -173,17 +173,17 @@ def main() -> None:
             forked = os.fork()
             if forked == 0:
                 asked.close()
-                _read_and_end(reader, descriptors[0])
+                _read_and_exit(reader, descriptors[0])
             os.close(descriptors[0])
             asked.send(str(os.waitstatus_to_exitcode(os.waitpid(forked, 0)[1])).encode())
 
 
-def _read_and_end(reader: Any, descriptor: int) -> None:
+def _read_and_exit(reader: Any, descriptor: int) -> None:
     code = 1
     try:
         asked = Connection(descriptor)
         source, longest_s = json.loads(asked.recv_bytes())
-        answer(asked, reader, asked.recv_bytes(), source, longest_s)
+        send_table(asked, reader, asked.recv_bytes(), source, longest_s)
         code = 0
     except BaseException:  # noqa: BLE001 - this process exists for this file alone
         traceback.print_exc()
@@ -191,19 +191,19 @@ def _read_and_end(reader: Any, descriptor: int) -> None:
         os._exit(code)
 
 
-def answer(asked: Connection, reader: Any, content: bytes, source: str, longest_s: float) -> None:
+def send_table(asked: Connection, reader: Any, content: bytes, source: str, longest_s: float) -> None:
     """Read a file in this process within the limits for its size, and send the table or the refusal."""
     has = int(Path("/proc/self/statm").read_text("ascii").split()[0]) * resource.getpagesize()
     _, most = resource.getrlimit(resource.RLIMIT_AS)
     with contextlib.suppress(OSError, ValueError):  # a sandbox may forbid it
-        resource.setrlimit(resource.RLIMIT_AS, (has + most_memory_bytes(len(content)), most))
+        resource.setrlimit(resource.RLIMIT_AS, (has + limit_memory_bytes(len(content)), most))
     signal.setitimer(signal.ITIMER_REAL, longest_s)  # these signals end this process, also inside a library
-    signal.setitimer(signal.ITIMER_PROF, most_processor_s(len(content)))
-    for part in _parts(reader, content, source):
+    signal.setitimer(signal.ITIMER_PROF, limit_processor_s(len(content)))
+    for part in _encode_parts(reader, content, source):
         asked.send_bytes(part)
 
 
-def _parts(reader: Any, content: bytes, source: str) -> Iterator[bytes]:
+def _encode_parts(reader: Any, content: bytes, source: str) -> Iterator[bytes]:
     try:
         table: RecordingTable = reader.read(content, source)
     except FdhilError as error:
@@ -218,17 +218,17 @@ def _parts(reader: Any, content: bytes, source: str) -> Iterator[bytes]:
             yield np.asarray(values, dtype=np.float64).tobytes()
 
 
-def receive(asked: Connection) -> RecordingTable | FdhilError:
+def receive_table(asked: Connection) -> RecordingTable | FdhilError:
     """Return the table or the refusal. Raises EOFError, OSError or ValueError if there is none."""
     head = json.loads(asked.recv_bytes())
     if "error" in head:
         refusal: FdhilError = getattr(errors, head["error"])(head["text"])
         return refusal
-    first, *others = [_table(asked) for _ in range(head["tables"])]
+    first, *others = [_receive_columns(asked) for _ in range(head["tables"])]
     return replace(first, others=tuple(others))
 
 
-def _table(asked: Connection) -> RecordingTable:
+def _receive_columns(asked: Connection) -> RecordingTable:
     head = json.loads(asked.recv_bytes())
     columns = {name: np.frombuffer(asked.recv_bytes()).copy() for name in head["columns"]}
     return RecordingTable(head["headers"], columns, frozenset(head["clocks"]), head["doubts"], texts=head["texts"])

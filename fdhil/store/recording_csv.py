@@ -7,12 +7,12 @@ import numpy as np
 from fdhil.csv_text import check_lengths, decode_text, quote_cell
 from fdhil.errors import RecordingError
 from fdhil.records import Float, Recording
-from fdhil.store.recording_table import MIN_ROWS, TABLE, RecordingTable, check_headers, recording_of
+from fdhil.store.recording_table import MIN_ROWS, TABLE, RecordingTable, check_headers, make_recording
 
 
 def parse_recording(text: str, source: str = "recording") -> Recording:
     """Return the recording of a text; ``source`` names it in errors. RecordingError as :func:`recording_of`."""
-    return recording_of(parse_table(text, source), source)
+    return make_recording(parse_table(text, source), source)
 
 
 def decode(content: bytes, source: str) -> RecordingTable:
@@ -30,7 +30,7 @@ def parse_table(text: str, source: str) -> RecordingTable:
         raise RecordingError(f"{source} is truncated: it has headers but no columns; record it again")
     check_lengths(lines[k:], k + 1, source)
     names = [name.strip() for name in lines[k].split(",")]
-    headers = check_headers(_headers(lines[:k], len(names), source), dict.fromkeys(names), source)
+    headers = check_headers(_parse_headers(lines[:k], len(names), source), dict.fromkeys(names), source)
     for name in names:
         if name and names.count(name) > 1:
             places = " and ".join(f"#{j + 1}" for j, other in enumerate(names) if other == name)
@@ -39,11 +39,11 @@ def parse_table(text: str, source: str) -> RecordingTable:
         raise RecordingError(
             f"{source} is truncated: line {len(lines)} is incomplete, its last number may be cut off; copy it again"
         )
-    table = _numbers(lines, k + 1, names, source)
+    table = _parse_numbers(lines, k + 1, names, source)
     return RecordingTable(headers, {name: table[:, k] for k, name in reversed([*enumerate(names)])})
 
 
-def _headers(lines: list[str], width: int, source: str) -> dict[str, str]:
+def _parse_headers(lines: list[str], width: int, source: str) -> dict[str, str]:
     """Return the headers, without the empty cells that a spreadsheet appends."""
     empty = "," * (width - 1)
     if all(line.endswith(empty) for line in lines):
@@ -67,7 +67,7 @@ def encode(table: RecordingTable) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def _numbers(lines: list[str], first_row: int, names: list[str], source: str) -> Float:
+def _parse_numbers(lines: list[str], first_row: int, names: list[str], source: str) -> Float:
     """Return the rows (n, k): all finite except sensors at the table."""
     rows = [line for line in lines[first_row:] if line.strip()]
     if len(rows) < MIN_ROWS:
@@ -75,13 +75,13 @@ def _numbers(lines: list[str], first_row: int, names: list[str], source: str) ->
     try:
         table = np.loadtxt(rows, delimiter=",", comments=None, ndmin=2)
     except ValueError:
-        raise _bad_row(lines, first_row, names, source) from None
+        raise _find_bad_row(lines, first_row, names, source) from None
     if table.shape[1] != len(names) or not (np.isfinite(table) | (np.isnan(table) & np.isin(names, TABLE))).all():
-        raise _bad_row(lines, first_row, names, source)
+        raise _find_bad_row(lines, first_row, names, source)
     return table
 
 
-def _bad_row(lines: list[str], first_row: int, names: list[str], source: str) -> RecordingError:
+def _find_bad_row(lines: list[str], first_row: int, names: list[str], source: str) -> RecordingError:
     width = len(names)
     last = max(k for k, line in enumerate(lines) if line.strip())
     for k, line in enumerate(lines[first_row:], start=first_row):

@@ -8,9 +8,9 @@ import io
 import math
 from typing import Any
 
-from fdhil.store.matlab_variables import MOST_DEPTH, matlab_table, texts
-from fdhil.store.reading_process import read_apart
-from fdhil.store.recording_table import UNITS, UNREADABLE, RecordingTable, check_size, unreadable
+from fdhil.store.matlab_variables import MOST_DEPTH, convert_variables, extract_headers
+from fdhil.store.reading_process import read_in_process
+from fdhil.store.recording_table import UNITS, UNREADABLE, RecordingTable, check_size, make_unreadable_error
 
 KIND = "MATLAB file"
 MOST_VARIABLES = 1000
@@ -30,7 +30,7 @@ def encode(table: RecordingTable) -> bytes:
 
 def decode(content: bytes, source: str) -> RecordingTable:
     """Return the table of a file's bytes. Raises RecordingError if it is not a MATLAB file."""
-    return read_apart(__name__, KIND, content, source)
+    return read_in_process(__name__, KIND, content, source)
 
 
 def read(content: bytes, source: str) -> RecordingTable:
@@ -46,21 +46,21 @@ def read(content: bytes, source: str) -> RecordingTable:
         check_size(max((math.prod(shape) for _, shape in wanted), default=0), 1, source)
         names = [name for name, _ in wanted]
         read: dict[str, Any] = scipy_io.loadmat(io.BytesIO(content), variable_names=names, simplify_cells=False)
-        variables = {name: _plain(read[name]) for name in names if name in read}
+        variables = {name: _simplify_value(read[name]) for name in names if name in read}
         variables |= {str(name): None for name, _, kind in listed if kind in _OBJECTS}
     except (scipy_io.matlab.MatReadError, *UNREADABLE) as error:
-        raise unreadable(source, KIND, error) from None
-    return matlab_table(variables, texts(variables.pop("headers", None)), source)
+        raise make_unreadable_error(source, KIND, error) from None
+    return convert_variables(variables, extract_headers(variables.pop("headers", None)), source)
 
 
-def _plain(value: Any, depth: int = 0) -> Any:
+def _simplify_value(value: Any, depth: int = 0) -> Any:
     """Convert scipy's value: structures to mappings, structure arrays and cells to lists, texts to str."""
     kind = getattr(getattr(value, "dtype", None), "kind", "")
     if kind == "V" and value.dtype.names and depth < MOST_DEPTH:
-        parts = [{name: _plain(part[name], depth + 1) for name in value.dtype.names} for part in value.ravel()]
+        parts = [{name: _simplify_value(part[name], depth + 1) for name in value.dtype.names} for part in value.ravel()]
         return parts[0] if len(parts) == 1 else parts
     if kind == "O" and depth < MOST_DEPTH:
-        return [_plain(part, depth + 1) for part in value.ravel()]
+        return [_simplify_value(part, depth + 1) for part in value.ravel()]
     if kind in "US":
         return str(value.ravel()[0]) if value.size == 1 else ""
     return value

@@ -16,8 +16,16 @@ import numpy as np
 
 from fdhil.errors import FdhilError
 from fdhil.records import Float
-from fdhil.store.reading_process import read_apart
-from fdhil.store.recording_table import COLUMNS, PATH, UNITS, UNREADABLE, RecordingTable, check_size, unreadable
+from fdhil.store.reading_process import read_in_process
+from fdhil.store.recording_table import (
+    COLUMNS,
+    PATH,
+    UNITS,
+    UNREADABLE,
+    RecordingTable,
+    check_size,
+    make_unreadable_error,
+)
 
 KIND = "MDF 4 file"
 TIME = 1  # sync type of a master channel; others are angle, distance, index
@@ -47,35 +55,35 @@ def decode(content: bytes, source: str) -> RecordingTable:
 
     Raises RecordingError if it is not an MDF file.
     """
-    return read_apart(__name__, KIND, content, source)
+    return read_in_process(__name__, KIND, content, source)
 
 
 def read(content: bytes, source: str) -> RecordingTable:
     """Return the table, read in this process, which a damaged file may crash."""
     asammdf = library()
     if not content.startswith(b"MDF ") or content[64:68] != b"##HD":  # older versions and truncated files
-        raise unreadable(source, KIND, ValueError("its beginning is different"))
+        raise make_unreadable_error(source, KIND, ValueError("its beginning is different"))
     try:
         with asammdf.MDF(io.BytesIO(content)) as file:
             rows = [group.channel_group.cycles_nr for group in file.groups]
             check_size(max(rows, default=0), sum(len(group.channels) for group in file.groups), source)
-            headers = _headers(str(file.header.comment))
+            headers = _parse_headers(str(file.header.comment))
             units = {
                 c.name: (str(c.unit or ""),) for g in file.groups for c in g.channels if c.channel_type not in MASTER
             }
-            groups = _groups(file, rows)
+            groups = _read_groups(file, rows)
             tables = [RecordingTable(headers, c, frozenset(), doubts, texts=units) for c, doubts in groups]
     except UnboundLocalError:  # a bug of the library with files marked as unfinished
-        raise unreadable(source, KIND, ValueError("it is unfinished, or damaged")) from None
+        raise make_unreadable_error(source, KIND, ValueError("it is unfinished, or damaged")) from None
     except (asammdf.blocks.utils.MdfException, ExpatError, *UNREADABLE) as error:
-        raise unreadable(source, KIND, error) from None
+        raise make_unreadable_error(source, KIND, error) from None
     # first the group with fdhil's own columns, else the largest
     own = {*COLUMNS, *PATH}
     tables.sort(key=lambda table: (len(own & table.columns.keys()), table.columns["time_s"].size), reverse=True)
     return replace(tables[0], others=tuple(tables[1:])) if tables else RecordingTable({}, {})
 
 
-def _groups(file: Any, rows: list[int]) -> list[tuple[dict[str, Float], dict[str, str]]]:
+def _read_groups(file: Any, rows: list[int]) -> list[tuple[dict[str, Float], dict[str, str]]]:
     """Merge the channels of groups with equal times; return their columns with ``time_s``, and their doubts.
 
     Samples that the file marks as invalid are ``nan``.
@@ -106,7 +114,7 @@ def _groups(file: Any, rows: list[int]) -> list[tuple[dict[str, Float], dict[str
     return groups
 
 
-def _headers(comment: str) -> dict[str, str]:
+def _parse_headers(comment: str) -> dict[str, str]:
     found = _COMMENT.search(comment)
     try:
         headers = json.loads(html.unescape(found[1]) if found else comment)

@@ -87,31 +87,33 @@ class RecordingTable:
     texts: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
-def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
+def make_recording(table: RecordingTable, source: str = "recording") -> Recording:
     """Return the recording of a table. Raises RecordingError with the fault and its remedy."""
     check_headers(table.headers, table.columns, source)
-    table, pitches = _as_lengths(table, source)
+    table, pitches = _convert_angles(table, source)
     headers = dict(table.headers)
     names = [name for name in (*COLUMNS, *PATH, ANGLE, VOLTAGE_COLUMN, *TABLE) if name in table.columns]
-    values = _rows(table, names, source)
-    dt = 1.0 / _within(headers, "sample_rate_hz", RATE_HZ, source)
-    rows, gaps = _place(values[:, 0], dt, source)
-    columns = _spread(values, rows)
-    sampling = _sampling(headers, source) if SAMPLING in headers else "interval_mean"
+    values = _stack_columns(table, names, source)
+    dt = 1.0 / _parse_within(headers, "sample_rate_hz", RATE_HZ, source)
+    rows, gaps = _place_samples(values[:, 0], dt, source)
+    columns = _spread_samples(values, rows)
+    sampling = _parse_sampling(headers, source) if SAMPLING in headers else "interval_mean"
     _check_sources(headers, source)
-    pitch_m = _within(headers, PITCH_KEY, pitches, source) if PITCH_KEY in headers else STAND_IN_PITCH_M
-    rapid_m_s = _within(headers, "rapid_speed_m_per_s", RAPID_M_S, source) if "rapid_speed_m_per_s" in headers else None
-    paths = {name: _told(name, names, columns) for name in PATH}
+    pitch_m = _parse_within(headers, PITCH_KEY, pitches, source) if PITCH_KEY in headers else STAND_IN_PITCH_M
+    rapid_m_s = (
+        _parse_within(headers, "rapid_speed_m_per_s", RAPID_M_S, source) if "rapid_speed_m_per_s" in headers else None
+    )
+    paths = {name: _get_column(name, names, columns) for name in PATH}
     position_m, demand_m = paths["position_m"], paths["demand_m"]
     if position_m is None:
-        angle = _told(ANGLE, names, columns)
-        angle = _travel(columns[:, 2], dt, headers.get("speed_source")) if angle is None else angle
+        angle = _get_column(ANGLE, names, columns)
+        angle = _integrate_speed(columns[:, 2], dt, headers.get("speed_source")) if angle is None else angle
         position_m = angle * (pitch_m / (2 * math.pi))
     return Recording(
         axis=headers["axis"],
         dt_s=dt,
         time_s=freeze_array(values[0, 0] + dt * np.arange(columns.shape[0])),
-        voltage_v=_told(VOLTAGE_COLUMN, names, columns),
+        voltage_v=_get_column(VOLTAGE_COLUMN, names, columns),
         current_a=freeze_array(columns[:, 1]),
         speed_rad_s=freeze_array(columns[:, 2]),
         position_mm=freeze_array(position_m * 1e3),
@@ -119,17 +121,17 @@ def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
         voltage_sampling=sampling,
         pitch_mm=pitch_m * 1e3,
         rapid_speed_rad_s=None if rapid_m_s is None else rapid_m_s / pitch_m * 2 * math.pi,
-        temperature_c=_optional(headers, "temperature_C", source),
+        temperature_c=_parse_optional(headers, "temperature_C", source),
         gaps=gaps,
         headers=headers,
-        slow_voltage=_slow_voltage(headers, float(values[0, 0]), dt, source),
-        torque_constant_nm_per_a=_torque_constant(headers, source),
-        table_mm=_told("table_mm", names, columns),
-        table_m_s2=_told("table_m_s2", names, columns),
+        slow_voltage=_parse_slow_voltage(headers, float(values[0, 0]), dt, source),
+        torque_constant_nm_per_a=_parse_torque_constant(headers, source),
+        table_mm=_get_column("table_mm", names, columns),
+        table_m_s2=_get_column("table_m_s2", names, columns),
     )
 
 
-def _travel(speed_rad_s: Float, dt_s: float, source: str | None) -> Float:
+def _integrate_speed(speed_rad_s: Float, dt_s: float, source: str | None) -> Float:
     """Integrate a speed to an angle (n,), in place of a position that was not recorded; lost samples NaN.
 
     A speed that is a difference of positions is the mean over the interval before.
@@ -141,7 +143,7 @@ def _travel(speed_rad_s: Float, dt_s: float, source: str | None) -> Float:
     return np.where(known, angle, np.nan)
 
 
-def _as_lengths(table: RecordingTable, source: str) -> tuple[RecordingTable, tuple[float, float]]:
+def _convert_angles(table: RecordingTable, source: str) -> tuple[RecordingTable, tuple[float, float]]:
     """Convert the angles of a rotary axis to arc lengths; return the table and the allowed pitches."""
     headers, columns = dict(table.headers), dict(table.columns)
     if PITCH_OF_ROTARY not in headers:
@@ -150,9 +152,9 @@ def _as_lengths(table: RecordingTable, source: str) -> tuple[RecordingTable, tup
         raise RecordingError(
             f"{source} has no header radius_m: give the radius at which its angles count as path error"
         )
-    m_per_deg = math.radians(_within(headers, "radius_m", RADIUS_M, source))
-    headers["pitch_m_per_rev"] = repr(_within(headers, PITCH_OF_ROTARY, PITCH_DEG, source) * m_per_deg)
-    if (rapid := _optional(headers, "rapid_speed_deg_per_s", source)) is not None:
+    m_per_deg = math.radians(_parse_within(headers, "radius_m", RADIUS_M, source))
+    headers["pitch_m_per_rev"] = repr(_parse_within(headers, PITCH_OF_ROTARY, PITCH_DEG, source) * m_per_deg)
+    if (rapid := _parse_optional(headers, "rapid_speed_deg_per_s", source)) is not None:
         headers["rapid_speed_m_per_s"] = repr(rapid * m_per_deg)
     columns |= {name: columns.pop(angle) * m_per_deg for name, angle in ANGLES.items() if angle in columns}
     return replace(table, headers=headers, columns=columns), (0.0, math.inf)
@@ -164,11 +166,11 @@ def check_size(rows: int, columns: int, source: str) -> None:
         raise RecordingError(f"{source} declares {columns} columns of {rows} rows, too many for a recording: split it")
 
 
-def unlike_lengths(sizes: Mapping[str, int], source: str) -> RecordingError:
+def make_length_error(sizes: Mapping[str, int], source: str) -> RecordingError:
     return RecordingError(f"{source} has columns of different lengths, {sizes}: export them with one time step")
 
 
-def unreadable(source: str, kind: str, error: BaseException) -> RecordingError:
+def make_unreadable_error(source: str, kind: str, error: BaseException) -> RecordingError:
     """Return the error that says why a file is not of its kind."""
     first = (str(error).splitlines() or [type(error).__name__])[0][:200]
     return RecordingError(f"{source} is not a readable {kind}: {first}; export it again")
@@ -208,10 +210,10 @@ def check_headers(headers: Mapping[str, str], columns: Mapping[str, object], sou
     return dict(headers)
 
 
-def _rows(table: RecordingTable, names: list[str], source: str) -> Float:
+def _stack_columns(table: RecordingTable, names: list[str], source: str) -> Float:
     sizes = {name: table.columns[name].size for name in names}
     if len(set(sizes.values())) > 1:
-        raise unlike_lengths(sizes, source)
+        raise make_length_error(sizes, source)
     if sizes["time_s"] < MIN_ROWS and 1 < sizes["time_s"] < SLOW_HZ * np.ptp(table.columns["time_s"]):
         raise RecordingError(
             f"{source} has {sizes['time_s']} samples in {np.ptp(table.columns['time_s']):.3g} s, too few to "
@@ -228,11 +230,11 @@ def _rows(table: RecordingTable, names: list[str], source: str) -> Float:
     return np.column_stack([table.columns[name] for name in names])
 
 
-def _told(name: str, names: list[str], columns: Float) -> Float | None:
+def _get_column(name: str, names: list[str], columns: Float) -> Float | None:
     return freeze_array(columns[:, names.index(name)]) if name in names else None
 
 
-def _slow_voltage(headers: dict[str, str], start_s: float, dt_s: float, source: str) -> SlowVoltage | None:
+def _parse_slow_voltage(headers: dict[str, str], start_s: float, dt_s: float, source: str) -> SlowVoltage | None:
     """Return the samples of a voltage sensor that is slower than the rows, if the headers contain them.
 
     Sample j begins at ``voltage_begin_s`` + j ``voltage_period_s`` on the time axis of the rows, the first of which is
@@ -240,7 +242,10 @@ def _slow_voltage(headers: dict[str, str], start_s: float, dt_s: float, source: 
     """
     if "voltage_samples_V" not in headers:
         return None
-    period, begin = _positive(headers, "voltage_period_s", source), _optional(headers, "voltage_begin_s", source)
+    period, begin = (
+        _parse_positive(headers, "voltage_period_s", source),
+        _parse_optional(headers, "voltage_begin_s", source),
+    )
     if period < dt_s / 2:  # aligning finer samples with the rows would take hours
         raise RecordingError(
             f"{source} has voltage samples {period:g} s apart, closer than its rows: give voltage_period_s in seconds"
@@ -256,13 +261,17 @@ def _slow_voltage(headers: dict[str, str], start_s: float, dt_s: float, source: 
             f"{source} has voltage samples of a slower sensor without voltage_begin_s or without a finite value: "
             "export it again"
         )
-    error = _optional(headers, "voltage_error_s", source) or 0.0
+    error = _parse_optional(headers, "voltage_error_s", source) or 0.0
     return SlowVoltage(
-        begin - start_s, period, abs(error), freeze_array(samples), _late(headers, samples.size, period, source)
+        begin - start_s,
+        period,
+        abs(error),
+        freeze_array(samples),
+        _parse_late_times(headers, samples.size, period, source),
     )
 
 
-def _late(headers: dict[str, str], samples: int, period: float, source: str) -> Float | None:
+def _parse_late_times(headers: dict[str, str], samples: int, period: float, source: str) -> Float | None:
     """Return how much later than its grid time each sample of a slow sensor was taken."""
     if "voltage_late_s" not in headers:
         return None
@@ -275,7 +284,7 @@ def _late(headers: dict[str, str], samples: int, period: float, source: str) -> 
     return freeze_array(late)
 
 
-def _place(
+def _place_samples(
     time_s: Float, dt: float, source: str
 ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], tuple[tuple[int, int], ...]]:
     """Return the grid row (n,) of each sample and the half-open gaps between them."""
@@ -297,13 +306,13 @@ def _place(
     return rows, gaps
 
 
-def _spread(table: Float, rows: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Float:
+def _spread_samples(table: Float, rows: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Float:
     columns = np.full((int(rows[-1]) + 1, table.shape[1]), np.nan)
     columns[rows] = table
     return columns
 
 
-def _sampling(headers: dict[str, str], source: str) -> VoltageSampling:
+def _parse_sampling(headers: dict[str, str], source: str) -> VoltageSampling:
     value = headers["voltage_sampling"]
     if value == "interval_mean":
         return "interval_mean"
@@ -318,13 +327,13 @@ def _check_sources(headers: dict[str, str], source: str) -> None:
             raise RecordingError(f"{source} has {key} {quote_cell(headers[key])}: it must be {' or '.join(words)}")
 
 
-def _torque_constant(headers: dict[str, str], source: str) -> float | None:
+def _parse_torque_constant(headers: dict[str, str], source: str) -> float | None:
     key = "torque_constant_nm_per_a"
-    return _within(headers, key, CONSTANT_NM_A, source) if key in headers else None
+    return _parse_within(headers, key, CONSTANT_NM_A, source) if key in headers else None
 
 
-def _positive(headers: dict[str, str], key: str, source: str) -> float:
-    value = _optional(headers, key, source)
+def _parse_positive(headers: dict[str, str], key: str, source: str) -> float:
+    value = _parse_optional(headers, key, source)
     if value is None or not value > 0:
         raise RecordingError(
             f"{source} has header {key} = {quote_cell(str(headers.get(key)))}: it must be a number above 0"
@@ -332,8 +341,8 @@ def _positive(headers: dict[str, str], key: str, source: str) -> float:
     return value
 
 
-def _within(headers: dict[str, str], key: str, bounds: tuple[float, float], source: str) -> float:
-    value, (low, high) = _positive(headers, key, source), bounds
+def _parse_within(headers: dict[str, str], key: str, bounds: tuple[float, float], source: str) -> float:
+    value, (low, high) = _parse_positive(headers, key, source), bounds
     if low <= value <= high:
         return value
     length = key in ("pitch_m_per_rev", "rapid_speed_m_per_s")
@@ -342,7 +351,7 @@ def _within(headers: dict[str, str], key: str, bounds: tuple[float, float], sour
     raise RecordingError(text)
 
 
-def _optional(headers: dict[str, str], key: str, source: str) -> float | None:
+def _parse_optional(headers: dict[str, str], key: str, source: str) -> float | None:
     if key not in headers:
         return None
     try:

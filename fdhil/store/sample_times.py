@@ -13,17 +13,17 @@ MANY = 0.05  # of the steps: more deviate by jitter, fewer by pauses of the reco
 LEAST_SPANS = 20  # of the rounding: span that determines the period to a percent
 
 
-def even_times(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float, str]:
+def find_even_times(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float, str]:
     """Return the times (n,), or the even grid that they approximate, and what was done ("" if nothing).
 
     Raises RecordingError if steps may be rounded or jittered times as well as lost or uneven samples; ``rate_hz``
     decides.
     """
-    found_s, note = _unrounded(time_s, rate_hz, source)
-    return (found_s, note) if note else _without_jitter(found_s, rate_hz, source)
+    found_s, note = _undo_rounding(time_s, rate_hz, source)
+    return (found_s, note) if note else _remove_jitter(found_s, rate_hz, source)
 
 
-def _without_jitter(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float, str]:
+def _remove_jitter(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float, str]:
     """Return the grid of the rate if many steps are neither usual nor a multiple, as with time stamps."""
     steps = np.diff(time_s)
     usual = float(np.median(steps)) if rate_hz is None else 1 / rate_hz
@@ -49,9 +49,9 @@ def _without_jitter(time_s: Float, rate_hz: float | None, source: str) -> tuple[
     return time_s[0] + rows * usual, f"{shown}; a sample period of {usual:.6g} s is used"
 
 
-def _unrounded(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float, str]:
+def _undo_rounding(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float, str]:
     steps = np.diff(time_s)
-    rounding_s = _rounding(steps)
+    rounding_s = _find_rounding(steps)
     if steps.size < FEW or rounding_s is None or (steps < 0).any():
         return time_s, ""
     usual = float(np.median(steps)) if rate_hz is None else 1 / rate_hz
@@ -59,7 +59,7 @@ def _unrounded(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float
     is_loss = usual > 0 and _are_multiples(steps[off], usual)
     if not off.any() or (off.sum() < FEW and (is_loss or not steps[off].all())):
         return time_s, ""
-    grid = _grid(time_s, np.arange(time_s.size), rounding_s, rate_hz)
+    grid = _fit_grid(time_s, np.arange(time_s.size), rounding_s, rate_hz)
     is_short = rate_hz is None and time_s[-1] - time_s[0] < LEAST_SPANS * rounding_s
     if usual == 0 and (grid is None or is_short):
         raise RecordingError(
@@ -67,7 +67,7 @@ def _unrounded(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float
             "sample_rate_hz under [headers] of the column map"
         )
     if grid is None or is_short:
-        return (time_s, "") if is_loss else _with_gaps(time_s, steps, rounding_s, rate_hz)
+        return (time_s, "") if is_loss else _find_grid_with_gaps(time_s, steps, rounding_s, rate_hz)
     period_s = float(grid[-1] - grid[0]) / steps.size
     if is_loss and rate_hz is None:
         raise RecordingError(
@@ -75,10 +75,10 @@ def _unrounded(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float
             f"{period_s:.6g} s apart with times rounded to {rounding_s:g} s, or samples {usual:g} s apart of "
             "which some are lost; give sample_rate_hz under [headers] of the column map"
         )
-    return grid, _note(period_s, rounding_s)
+    return grid, _format_note(period_s, rounding_s)
 
 
-def usual_step(time_s: Float) -> float:
+def compute_usual_step(time_s: Float) -> float:
     """Return the mean of the steps that are as long as most, s; their median if none are."""
     steps = np.diff(time_s)
     usual = np.median(steps)
@@ -86,21 +86,21 @@ def usual_step(time_s: Float) -> float:
     return float(similar.mean() if similar.size else usual)
 
 
-def _with_gaps(time_s: Float, steps: Float, rounding_s: float, rate_hz: float | None) -> tuple[Float, str]:
+def _find_grid_with_gaps(time_s: Float, steps: Float, rounding_s: float, rate_hz: float | None) -> tuple[Float, str]:
     """Return the even grid with rows left out for lost samples; the times unchanged if they are on no grid."""
     near = steps[steps < 1.5 * np.median(steps)]
     if not near.size or rounding_s > near.mean() / 2:
         return time_s, ""
     rows = np.concatenate([[0], np.cumsum(np.maximum(np.rint(steps / near.mean()), 1))]).astype(np.int64)
-    grid = _grid(time_s, rows, rounding_s, rate_hz)
-    return (time_s, "") if grid is None else (grid, _note(float((grid[-1] - grid[0]) / rows[-1]), rounding_s))
+    grid = _fit_grid(time_s, rows, rounding_s, rate_hz)
+    return (time_s, "") if grid is None else (grid, _format_note(float((grid[-1] - grid[0]) / rows[-1]), rounding_s))
 
 
-def _note(period_s: float, rounding_s: float) -> str:
+def _format_note(period_s: float, rounding_s: float) -> str:
     return f"times are rounded to {rounding_s:.4g} s; a sample period of {period_s:.6g} s is used"
 
 
-def _rounding(steps: Float) -> float | None:
+def _find_rounding(steps: Float) -> float | None:
     """Return the least difference between distinct steps if all steps are multiples of it."""
     distinct = np.unique(np.round(steps, 9))
     least = float(np.diff(distinct).min()) if distinct.size > 1 else 0.0
@@ -115,7 +115,7 @@ def _are_multiples(steps: Float, usual: float) -> bool:
     return bool(((counts >= 2) & (np.abs(steps - counts * usual) <= STEP_TOLERANCE * steps)).all())
 
 
-def _grid(time_s: Float, rows: Int, rounding_s: float, rate_hz: float | None) -> Float | None:
+def _fit_grid(time_s: Float, rows: Int, rounding_s: float, rate_hz: float | None) -> Float | None:
     middle, about = rows - rows.mean(), time_s - time_s.mean()
     period_s = float(middle @ about / (middle @ middle)) if rate_hz is None else 1 / rate_hz
     if np.ptp(about - period_s * middle) > FIT * rounding_s:

@@ -47,27 +47,27 @@ class CellColumn:
     is_clock: bool = False
 
 
-def plain(cell: str) -> str:
+def strip_cell(cell: str) -> str:
     """Return a cell without surrounding quotes and blanks, with ASCII minus sign and blanks."""
     return cell.translate(_MINUS).strip().strip("\"'").strip()
 
 
 def is_void(cell: str) -> bool:
     """Return whether a cell means that there is no value."""
-    return plain(cell).lower() in VOID
+    return strip_cell(cell).lower() in VOID
 
 
 def is_number(cell: str) -> bool:
     """Return whether a cell is a number with either decimal mark, or a time of day."""
     if _QUICK.fullmatch(cell) is not None:
         return True
-    text = plain(cell)
-    return any(is_written_by(text, mark) for mark in DECIMALS) or _clock(text) is not None
+    text = strip_cell(cell)
+    return any(is_written_by(text, mark) for mark in DECIMALS) or _parse_clock(text) is not None
 
 
 def is_clock(cell: str) -> bool:
     """Return whether a cell is a time of day, with or without a date."""
-    return _clock(plain(cell)) is not None
+    return _parse_clock(strip_cell(cell)) is not None
 
 
 def is_written_by(text: str, decimal: str) -> bool:
@@ -78,16 +78,16 @@ def is_written_by(text: str, decimal: str) -> bool:
 def parse_column(cells: Sequence[str], decimal: str) -> CellColumn:
     """Return the cells as numbers with the decimal mark ``decimal``, or as times of day."""
     try:  # the usual format, ten times as fast
-        return CellColumn(_quick(cells, decimal))
+        return CellColumn(_parse_simple_numbers(cells, decimal))
     except ValueError:
         pass
-    texts = [plain(cell) for cell in cells]
+    texts = [strip_cell(cell) for cell in cells]
     first = next((text for text in texts if text.lower() not in VOID), "")
-    if _clock(first) is not None:
-        return _clock_column(texts)
+    if _parse_clock(first) is not None:
+        return _parse_clock_column(texts)
     values, bad = np.full(len(texts), np.nan), None
     for k, text in enumerate(texts):
-        value = _number(text, decimal)
+        value = _parse_number(text, decimal)
         if value is not None:
             values[k] = value
         elif bad is None and text.lower() not in VOID:
@@ -95,7 +95,7 @@ def parse_column(cells: Sequence[str], decimal: str) -> CellColumn:
     return CellColumn(values, bad)
 
 
-def _quick(cells: Sequence[str], decimal: str) -> Float:
+def _parse_simple_numbers(cells: Sequence[str], decimal: str) -> Float:
     other = "," if decimal == "." else "."
     if any(other in cell or "_" in cell for cell in cells):
         raise ValueError
@@ -103,7 +103,7 @@ def _quick(cells: Sequence[str], decimal: str) -> Float:
     return np.where(np.isinf(values), np.nan, values)
 
 
-def _number(text: str, decimal: str) -> float | None:
+def _parse_number(text: str, decimal: str) -> float | None:
     found = _NUMBERS[decimal].fullmatch(text)
     if found is None:
         return None
@@ -113,7 +113,7 @@ def _number(text: str, decimal: str) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _clock(text: str) -> tuple[str, float] | None:
+def _parse_clock(text: str) -> tuple[str, float] | None:
     found = _CLOCK.fullmatch(text) or _STOPWATCH.fullmatch(text)
     if found is None:
         return None
@@ -125,11 +125,11 @@ def _clock(text: str) -> tuple[str, float] | None:
     return f"{part.get('date') or ''}{part.get('zone') or ''}", 3600.0 * hour + 60.0 * int(part["m"]) + seconds
 
 
-def _clock_column(texts: Sequence[str]) -> CellColumn:
+def _parse_clock_column(texts: Sequence[str]) -> CellColumn:
     """Return seconds; midnight is a drop of half a day or more, and only there may the date change."""
     values, before, dated = np.full(len(texts), np.nan), math.nan, ""
     for k, text in enumerate(texts):
-        read = _clock(text)
+        read = _parse_clock(text)
         if read is None:
             if text.lower() in VOID:
                 continue
@@ -139,10 +139,10 @@ def _clock_column(texts: Sequence[str]) -> CellColumn:
         if not math.isnan(before) and (date != dated) and not midnight:
             return CellColumn(values, k, True)
         values[k], before, dated = seconds, seconds, date
-    return CellColumn(past_midnight(values), None, True)
+    return CellColumn(unwrap_midnight(values), None, True)
 
 
-def past_midnight(seconds: Float) -> Float:
+def unwrap_midnight(seconds: Float) -> Float:
     """Return times of day that continue past midnight: a drop of half a day or more is a new day."""
     known = np.flatnonzero(np.isfinite(seconds))
     passed = np.cumsum(np.diff(seconds[known]) < -HALF_DAY_S)

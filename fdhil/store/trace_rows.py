@@ -8,7 +8,7 @@ from itertools import pairwise
 
 from fdhil.csv_text import quote_cell
 from fdhil.errors import RecordingError
-from fdhil.store.trace_cells import is_clock, is_number, is_void, plain
+from fdhil.store.trace_cells import is_clock, is_number, is_void, strip_cell
 
 HEAD_LINES = 400  # searched for the first row of numbers
 SAME_WIDTH = 3  # successive rows of numbers that mark their beginning
@@ -19,7 +19,7 @@ COMMENT_MARKS = "#%/ "
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class TraceRow:
     """The cells of one record, and the number of the line on which it ends (1 is the first)."""
 
     line: int
@@ -27,7 +27,7 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class RowLayout:
     """The number of cells of a row, and its columns (from 0) that are numbers, or empty, in most rows."""
 
     width: int
@@ -38,103 +38,103 @@ class Layout:
     def filled(self) -> int:
         return self.numbers[-1] + 1
 
-    def is_row(self, row: Row) -> bool:
+    def is_row(self, row: TraceRow) -> bool:
         """Return whether a record is a row of numbers by its length and its first number."""
-        return len(row.cells) == self.width and self._begins(row)
+        return len(row.cells) == self.width and self._has_first_number(row)
 
-    def is_short(self, row: Row) -> bool:
+    def is_short(self, row: TraceRow) -> bool:
         """Return whether a record is a row of numbers whose last cells are missing."""
-        if len(row.cells) >= self.width or not self._begins(row) or is_clock(row.cells[self.numbers[0]]):
+        if len(row.cells) >= self.width or not self._has_first_number(row) or is_clock(row.cells[self.numbers[0]]):
             return False
-        return len(self._found(row)) > 1 and self._is_clean(row)
+        return len(self._find_numbers(row)) > 1 and self._is_clean(row)
 
-    def has_numbers(self, row: Row) -> bool:
+    def has_numbers(self, row: TraceRow) -> bool:
         """Return whether a record has the length of a row and two numbers or more, after a text."""
-        return len(row.cells) == self.width and len(self._found(row)) > 1
+        return len(row.cells) == self.width and len(self._find_numbers(row)) > 1
 
-    def begins_rows(self, rows: Sequence[Row]) -> bool:
+    def is_start_of_rows(self, rows: Sequence[TraceRow]) -> bool:
         """Return whether these records are all rows of two numbers or more, without texts."""
-        return all(self.is_row(row) and len(self._found(row)) > 1 and self._is_clean(row) for row in rows)
+        return all(self.is_row(row) and len(self._find_numbers(row)) > 1 and self._is_clean(row) for row in rows)
 
-    def is_doubtful(self, row: Row) -> bool:
+    def is_doubtful(self, row: TraceRow) -> bool:
         """Return whether a record is a row of two numbers or more, whatever its other cells are."""
-        return self.is_row(row) and len(self._found(row)) > 1
+        return self.is_row(row) and len(self._find_numbers(row)) > 1
 
-    def has_label(self, row: Row) -> bool:
+    def has_label(self, row: TraceRow) -> bool:
         """Return whether a row of numbers has a text where the others are empty."""
         return any(not is_void(row.cells[j]) for j in self.empty)
 
-    def _begins(self, row: Row) -> bool:
+    def _has_first_number(self, row: TraceRow) -> bool:
         first = row.cells[self.numbers[0]] if len(row.cells) > self.numbers[0] else "text"
-        return is_number(first) or (is_void(first) and bool(self._found(row)))
+        return is_number(first) or (is_void(first) and bool(self._find_numbers(row)))
 
-    def _found(self, row: Row) -> list[str]:
-        return [cell for cell in self._cells(row) if is_number(cell)]
+    def _find_numbers(self, row: TraceRow) -> list[str]:
+        return [cell for cell in self._list_number_cells(row) if is_number(cell)]
 
-    def _is_clean(self, row: Row) -> bool:
-        return all(is_number(cell) or is_void(cell) for cell in self._cells(row))
+    def _is_clean(self, row: TraceRow) -> bool:
+        return all(is_number(cell) or is_void(cell) for cell in self._list_number_cells(row))
 
-    def _cells(self, row: Row) -> list[str]:
+    def _list_number_cells(self, row: TraceRow) -> list[str]:
         return [row.cells[j] for j in self.numbers if j < len(row.cells)]
 
 
 @dataclass(frozen=True, slots=True)
-class Body:
+class TraceBody:
     """The rows of numbers of a text, the records before them, and the first interruption ("" without one)."""
 
-    head: Sequence[Row]
-    rows: Sequence[Row]
-    layout: Layout
+    head: Sequence[TraceRow]
+    rows: Sequence[TraceRow]
+    layout: RowLayout
     interruption: str
 
 
-def find_body(rows: Sequence[Row], source: str, is_complete: bool) -> Body | None:
+def find_body(rows: Sequence[TraceRow], source: str, is_complete: bool) -> TraceBody | None:
     """Return the rows of numbers; None without any. An incomplete last row is left out.
 
     Empty lines, comments, repeated names and rows without a value may stand between rows. Raises RecordingError for
     anything else, and for a row with more or fewer cells than the others.
     """
     rows = [row for row in rows if len(row.cells) > 1 or any(cell.strip() for cell in row.cells)]
-    layout = _layout(rows)
-    first = None if layout is None else _first_row(rows, layout)
+    layout = _find_layout(rows)
+    first = None if layout is None else _find_first_row(rows, layout)
     if layout is None or first is None:
         return None
     if not is_complete and _is_cut_off(rows, layout):
         rows = rows[:-1]
-    last_full = _last(rows, layout.is_row)
-    end = 1 + max(last_full, _last(rows, layout.is_short))
+    last_full = _find_last(rows, layout.is_row)
+    end = 1 + max(last_full, _find_last(rows, layout.is_short))
     if (left := sum(map(layout.has_numbers, rows[end:]))) > MOST_FOOTER_ROWS:
-        raise _no_row(rows[end], source, f"and {left} rows of numbers follow")
-    head = {_words(row) for row in rows[:first]}
-    spare = _spare(rows[:first], layout)
-    body: list[Row] = []
+        raise _make_no_row_error(rows[end], source, f"and {left} rows of numbers follow")
+    head = {_normalise_row(row) for row in rows[:first]}
+    spare = _find_spare_columns(rows[:first], layout)
+    body: list[TraceRow] = []
     for k in range(first, end):
-        row, cells = rows[k], _as_wide(rows[k], layout, k < last_full, source)
+        row, cells = rows[k], _fit_width(rows[k], layout, k < last_full, source)
         is_wide = len(row.cells) > layout.width
         if cells is not None and any(is_number(cells[j]) or (is_wide and not is_void(cells[j])) for j in spare):
-            raise _uneven(row, layout, source)
+            raise _make_uneven_error(row, layout, source)
         if cells is not None:
-            body.append(row if cells is row.cells else Row(row.line, cells))
+            body.append(row if cells is row.cells else TraceRow(row.line, cells))
             continue
-        words = _words(row)
+        words = _normalise_row(row)
         if words and words not in head and not row.cells[0].strip().startswith(COMMENTS):
-            raise _no_row(row, source)
-    return Body(rows[:first], body, layout, _interruption(body))
+            raise _make_no_row_error(row, source)
+    return TraceBody(rows[:first], body, layout, _find_interruption(body))
 
 
-def _interruption(body: Sequence[Row]) -> str:
+def _find_interruption(body: Sequence[TraceRow]) -> str:
     steps = [below.line - above.line for above, below in pairwise(body)]
     k = next((k for k, step in enumerate(steps) if step != min(steps)), None)
     return "" if k is None else f"line {body[k].line + 1} interrupts the rows"
 
 
-def _spare(head: Sequence[Row], layout: Layout) -> list[int]:
+def _find_spare_columns(head: Sequence[TraceRow], layout: RowLayout) -> list[int]:
     """Return the empty columns after the last number without a name: a number there was moved out of its column."""
     after = [j for j in layout.empty if j >= layout.filled]
-    return [j for j in after if not any(len(row.cells) > j and plain(row.cells[j]) for row in head)]
+    return [j for j in after if not any(len(row.cells) > j and strip_cell(row.cells[j]) for row in head)]
 
 
-def _is_cut_off(rows: Sequence[Row], layout: Layout) -> bool:
+def _is_cut_off(rows: Sequence[TraceRow], layout: RowLayout) -> bool:
     """Return whether the last row lacks cells, or its last cell has fewer digits than those of all other rows."""
     if len(rows[-1].cells) < layout.width:
         return True
@@ -143,11 +143,11 @@ def _is_cut_off(rows: Sequence[Row], layout: Layout) -> bool:
     return len(set(endings[:-1])) == 1 and endings[-1] < endings[0]
 
 
-def _last(rows: Sequence[Row], is_one: Callable[[Row], bool]) -> int:
+def _find_last(rows: Sequence[TraceRow], is_one: Callable[[TraceRow], bool]) -> int:
     return next((k for k in range(len(rows) - 1, -1, -1) if is_one(rows[k])), -1)
 
 
-def _as_wide(row: Row, layout: Layout, is_before_full: bool, source: str) -> list[str] | None:
+def _fit_width(row: TraceRow, layout: RowLayout, is_before_full: bool, source: str) -> list[str] | None:
     """Return as many cells as the other rows have; None for a record that is not a row.
 
     Raises RecordingError if cells are missing before full rows, or if there are more than in the other rows.
@@ -156,26 +156,26 @@ def _as_wide(row: Row, layout: Layout, is_before_full: bool, source: str) -> lis
     if layout.is_row(row) or (not missing and not any(cell.strip() for cell in row.cells)):
         return row.cells
     is_short, cut = layout.is_short(row), row.cells[: layout.width]
-    is_wide = missing < 0 and layout.is_row(Row(row.line, cut))
+    is_wide = missing < 0 and layout.is_row(TraceRow(row.line, cut))
     if (is_short and is_before_full) or (is_wide and any(cell.strip() for cell in row.cells[layout.width :])):
-        raise _uneven(row, layout, source)
+        raise _make_uneven_error(row, layout, source)
     if is_short:
         return row.cells + [""] * missing
     return cut if is_wide else None
 
 
-def _words(row: Row) -> str:
-    return " ".join(map(plain, row.cells)).lstrip(COMMENT_MARKS)
+def _normalise_row(row: TraceRow) -> str:
+    return " ".join(map(strip_cell, row.cells)).lstrip(COMMENT_MARKS)
 
 
-def _no_row(row: Row, source: str, more: str = "") -> RecordingError:
+def _make_no_row_error(row: TraceRow, source: str, more: str = "") -> RecordingError:
     text = quote_cell(" ".join(row.cells))
     return RecordingError(
         f"{source} line {row.line} is not a row of numbers: {text}{more and f', {more}'}; export it again"
     )
 
 
-def _uneven(row: Row, layout: Layout, source: str) -> RecordingError:
+def _make_uneven_error(row: TraceRow, layout: RowLayout, source: str) -> RecordingError:
     filled = len(row.cells) if len(row.cells) != layout.width else sum(not is_void(cell) for cell in row.cells)
     most = layout.width if len(row.cells) != layout.width else layout.filled
     return RecordingError(
@@ -184,7 +184,7 @@ def _uneven(row: Row, layout: Layout, source: str) -> RecordingError:
     )
 
 
-def _layout(rows: Sequence[Row]) -> Layout | None:
+def _find_layout(rows: Sequence[TraceRow]) -> RowLayout | None:
     rows = rows[:: max(1, len(rows) // SAMPLE_ROWS)]
     sample = [[is_number(cell) for cell in row.cells] for row in rows]
     numeric = [flags for flags in sample if sum(flags) > 1]
@@ -196,23 +196,23 @@ def _layout(rows: Sequence[Row]) -> Layout | None:
     full = [row for row in rows if len(row.cells) == width]
     void = [sum(is_void(row.cells[j]) for row in full) for j in range(width)]
     empty = tuple(j for j, count in enumerate(void) if j not in numbers and 2 * count > len(full))
-    return Layout(width, numbers, empty) if numbers else None
+    return RowLayout(width, numbers, empty) if numbers else None
 
 
-def _first_row(rows: Sequence[Row], layout: Layout) -> int | None:
+def _find_first_row(rows: Sequence[TraceRow], layout: RowLayout) -> int | None:
     """Return where the rows of numbers begin: several in succession.
 
     Labels may stand next to the first of them; a head with numbers next to labels continues with other lines.
     """
     for k in range(min(len(rows) - SAME_WIDTH + 1, HEAD_LINES)):
-        if layout.begins_rows(rows[k : k + SAME_WIDTH]):
+        if layout.is_start_of_rows(rows[k : k + SAME_WIDTH]):
             after = next((row for row in rows[k:] if not layout.is_row(row) or not layout.has_label(row)), None)
             if after is not None and layout.is_row(after):
-                return _with_doubtful(rows, k, layout)
+                return _include_doubtful_rows(rows, k, layout)
     return None
 
 
-def _with_doubtful(rows: Sequence[Row], first: int, layout: Layout) -> int:
+def _include_doubtful_rows(rows: Sequence[TraceRow], first: int, layout: RowLayout) -> int:
     while first and layout.is_doubtful(rows[first - 1]):
         first -= 1
     return first

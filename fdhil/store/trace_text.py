@@ -19,9 +19,9 @@ from fdhil.csv_text import check_lengths, decode_text, quote_cell
 from fdhil.errors import RecordingError
 from fdhil.records import Float
 from fdhil.store.recording_table import RecordingTable, check_size
-from fdhil.store.trace_cells import DECIMALS, is_number, is_void, is_written_by, parse_column, plain
-from fdhil.store.trace_head import Head, read_head
-from fdhil.store.trace_rows import SAMPLE_ROWS, Body, Row, find_body
+from fdhil.store.trace_cells import DECIMALS, is_number, is_void, is_written_by, parse_column, strip_cell
+from fdhil.store.trace_head import TraceHead, read_head
+from fdhil.store.trace_rows import SAMPLE_ROWS, TraceBody, TraceRow, find_body
 
 SEPARATORS = "\t;,| "  # a blank means a run of blanks
 MOST_LINES_IN_ROW = 8
@@ -55,22 +55,22 @@ def parse_trace(content: bytes, settings: TraceText, source: str) -> RecordingTa
 
     A lost value is ``nan``. Raises RecordingError if there are no rows of numbers, or if they are ambiguous.
     """
-    lines = _text(content, settings, source).replace("\r\r\n", "\n").splitlines(keepends=True)
+    lines = _decode_text(content, settings, source).replace("\r\r\n", "\n").splitlines(keepends=True)
     check_lengths(lines, 1, source)
-    lines = _without_outer_quotes(lines)
+    lines = _remove_outer_quotes(lines)
     separator = settings.separator
     if lines and (stated := _EXCEL.fullmatch(lines[0])):
         separator, lines[0] = separator or stated[1], "\n"
-    separator = separator or _separator(lines)
-    body = find_body(_records(lines, separator, source), source, lines[-1:] == [] or lines[-1][-1] in "\r\n")
+    separator = separator or _find_separator(lines)
+    body = find_body(_read_rows(lines, separator, source), source, lines[-1:] == [] or lines[-1][-1] in "\r\n")
     if body is None:
-        raise _no_rows(lines, separator, source)
+        raise _make_no_rows_error(lines, separator, source)
     check_size(len(body.rows), body.layout.width, source)
-    decimal = settings.decimal or _decimal(body, separator, source)
-    return _table(body, read_head(_head_lines(lines, body, separator), body.layout), decimal)
+    decimal = settings.decimal or _find_decimal_mark(body, separator, source)
+    return _make_table(body, read_head(_split_head_lines(lines, body, separator), body.layout), decimal)
 
 
-def _text(content: bytes, settings: TraceText, source: str) -> str:
+def _decode_text(content: bytes, settings: TraceText, source: str) -> str:
     if kind := next((kind for mark, kind in BINARY.items() if content.startswith(mark)), None):
         raise RecordingError(f"{source} is not a text but {kind}")
     if settings.encoding is not None:
@@ -94,7 +94,7 @@ def _text(content: bytes, settings: TraceText, source: str) -> str:
     return decode_text(content, source)
 
 
-def _without_outer_quotes(lines: list[str]) -> list[str]:
+def _remove_outer_quotes(lines: list[str]) -> list[str]:
     """Undo a spreadsheet's quoting of whole rows as single cells."""
     quoted = [_WHOLE_LINE.fullmatch(line) for line in lines]
     if 2 * sum(match is not None for match in quoted) <= len(lines):
@@ -104,22 +104,24 @@ def _without_outer_quotes(lines: list[str]) -> list[str]:
     return [match[1].replace('""', '"') + "\n" if match else line for match, line in zip(quoted, lines, strict=True)]
 
 
-def _separator(lines: Sequence[str]) -> str:
+def _find_separator(lines: Sequence[str]) -> str:
     some = [line for line in lines if any(map(str.isdigit, line))]
     sample = some[:: max(1, len(some) // SAMPLE_ROWS)]
 
-    def score(separator: str) -> int:
+    def score_separator(separator: str) -> int:
         total = 0
         for line in sample:
-            cells = [cell for _, row in _split([line], separator) for cell in row if not is_void(cell)]
+            cells = [cell for _, row in _split_cells([line], separator) for cell in row if not is_void(cell)]
             numbers = sum(map(is_number, cells))
             total += 2 * numbers - len(cells) if numbers > 1 else 0
         return total
 
-    return max(SEPARATORS, key=score)  # the first of equally good ones
+    return max(SEPARATORS, key=score_separator)  # the first of equally good ones
 
 
-def _split(lines: Iterable[str], separator: str, quoting: int = csv.QUOTE_MINIMAL) -> Iterator[tuple[int, list[str]]]:
+def _split_cells(
+    lines: Iterable[str], separator: str, quoting: int = csv.QUOTE_MINIMAL
+) -> Iterator[tuple[int, list[str]]]:
     is_blank = separator == " "
     if is_blank:
         lines = (re.sub(r"[ \t]+", " ", line.strip()) for line in lines)
@@ -128,12 +130,12 @@ def _split(lines: Iterable[str], separator: str, quoting: int = csv.QUOTE_MINIMA
         yield reader.line_num, cells
 
 
-def _records(lines: Sequence[str], separator: str, source: str) -> list[Row]:
+def _read_rows(lines: Sequence[str], separator: str, source: str) -> list[TraceRow]:
     try:
-        rows = [Row(*record) for record in _split(lines, separator)]
+        rows = [TraceRow(*record) for record in _split_cells(lines, separator)]
         ends = [0, *(row.line for row in rows)]
         if any(below - above > MOST_LINES_IN_ROW for above, below in pairwise(ends)):  # a quote without an end
-            rows = [Row(*record) for record in _split(lines, separator, csv.QUOTE_NONE)]
+            rows = [TraceRow(*record) for record in _split_cells(lines, separator, csv.QUOTE_NONE)]
     except (csv.Error, TypeError, ValueError) as error:  # a separator that is a quote or an end of line
         raise RecordingError(
             f"{source} cannot be split with separator {separator!r} ({error}): correct it in the column map"
@@ -141,7 +143,7 @@ def _records(lines: Sequence[str], separator: str, source: str) -> list[Row]:
     return rows
 
 
-def _no_rows(lines: Sequence[str], separator: str, source: str) -> RecordingError:
+def _make_no_rows_error(lines: Sequence[str], separator: str, source: str) -> RecordingError:
     last = next((line.strip() for line in reversed(lines) if any(map(str.isdigit, line))), "")
     return RecordingError(
         f"{source} has no rows of numbers (separator {separator!r}; the last line with a digit is "
@@ -149,13 +151,13 @@ def _no_rows(lines: Sequence[str], separator: str, source: str) -> RecordingErro
     )
 
 
-def _decimal(body: Body, separator: str, source: str) -> str:
+def _find_decimal_mark(body: TraceBody, separator: str, source: str) -> str:
     """Return the decimal mark, by the first number that only one of them can have written."""
     marked = ""
     padded = ""
     for row in body.rows:
         for j in body.layout.numbers:
-            cell = plain(row.cells[j])
+            cell = strip_cell(row.cells[j])
             marks = [mark for mark in DECIMALS if is_written_by(cell, mark)]
             if len(marks) == 1:
                 return marks[0]
@@ -176,21 +178,21 @@ def _decimal(body: Body, separator: str, source: str) -> str:
     return "."
 
 
-def _head_lines(lines: Sequence[str], body: Body, separator: str) -> list[list[Row]]:
+def _split_head_lines(lines: Sequence[str], body: TraceBody, separator: str) -> list[list[TraceRow]]:
     """Return the lines above the rows in the possible ways to split them."""
-    head: list[list[Row]] = []
+    head: list[list[TraceRow]] = []
     for row in body.head:
         cells = row.cells
         if cells and (mark := _COMMENT.match(cells[0])):
             cells = cells[1:] if mark[0] == cells[0] and separator == " " else [cells[0][mark.end() :], *cells[1:]]
-        ways = [Row(row.line, cells), row]
+        ways = [TraceRow(row.line, cells), row]
         if separator == " ":
-            ways.append(Row(row.line, _WIDE_BLANKS.split(_COMMENT.sub("", lines[row.line - 1], count=1).strip())))
+            ways.append(TraceRow(row.line, _WIDE_BLANKS.split(_COMMENT.sub("", lines[row.line - 1], count=1).strip())))
         head.append(ways)
     return head
 
 
-def _table(body: Body, head: Head, decimal: str) -> RecordingTable:
+def _make_table(body: TraceBody, head: TraceHead, decimal: str) -> RecordingTable:
     named: dict[int, list[str]] = {j: [f"#{j + 1}"] for j in range(body.layout.width)}
     for name, j in head.columns.items():
         named[j].append(name)
@@ -211,12 +213,12 @@ def _table(body: Body, head: Head, decimal: str) -> RecordingTable:
     for name, (line, places) in head.twice.items():
         columns_of_name = " and ".join(f"#{j + 1}" for j in places)
         unclear[name] = f"names {columns_of_name} (line {line}): use one of these as its name"
-        doubts |= _uneven_times(name, [f"#{j + 1}" for j in places if j < body.layout.width], columns)
+        doubts |= _find_uneven_times(name, [f"#{j + 1}" for j in places if j < body.layout.width], columns)
     doubts |= {name: why for name, why in unclear.items() if name not in columns}
     return RecordingTable({}, columns, frozenset(clocks), doubts, body.interruption, texts=texts)
 
 
-def _uneven_times(name: str, places: Sequence[str], columns: Mapping[str, Float]) -> dict[str, str]:
+def _find_uneven_times(name: str, places: Sequence[str], columns: Mapping[str, Float]) -> dict[str, str]:
     """Return the doubt about columns of one name that are differing times: each channel has times of its own."""
     every = [columns[place][np.isfinite(columns[place])] for place in places]
     is_time = all(

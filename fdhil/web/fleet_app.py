@@ -13,9 +13,9 @@ from fastapi import APIRouter, Depends, FastAPI, Query, Request
 
 from fdhil.config.web_section import Web
 from fdhil.records import PARAMETERS
-from fdhil.web.answers import Refused
-from fdhil.web.app import application
-from fdhil.web.pages import session
+from fdhil.web.application import make_application
+from fdhil.web.fault_responses import RequestRefused
+from fdhil.web.pages import session_page
 
 router = APIRouter(prefix="/api/fleet")
 KEPT_S = 30.0  # lifetime of an answer: a hundred browsers load the database like one
@@ -27,7 +27,7 @@ Machine = Annotated[str, Query(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 Axis = Annotated[str, Query(pattern=r"^[A-Z]2?$")]
 
 
-class Answers:
+class AnswerCache:
     """Runs one query at a time, and caches the newest answers for a while."""
 
     def __init__(self, ask: Ask, now_s: Callable[[], float] = time.monotonic) -> None:
@@ -47,19 +47,19 @@ class Answers:
         return answer
 
 
-async def _answers(request: Request) -> Answers:
+async def _get_answers(request: Request) -> AnswerCache:
     answers = request.app.state.answers
-    assert isinstance(answers, Answers)
+    assert isinstance(answers, AnswerCache)
     return answers
 
 
-CacheDependency = Annotated[Answers, Depends(_answers)]
+CacheDependency = Annotated[AnswerCache, Depends(_get_answers)]
 
 
 def make_fleet_app(web: Web, ask: Ask) -> FastAPI:
     """Return the application; ``ask(question, **given)`` answers. Raises ConfigError for a faulty users file."""
-    app = application(web, (session.router, router), ("fleet",), ("fleet",), "fdhil fleet status FLEET")
-    app.state.answers = Answers(ask)
+    app = make_application(web, (session_page.router, router), ("fleet",), ("fleet",), "fdhil fleet status FLEET")
+    app.state.answers = AnswerCache(ask)
     return app
 
 
@@ -97,7 +97,7 @@ def axis(cache: CacheDependency, machine: Machine, axis: Axis) -> dict[str, Any]
     """Return the trend of each parameter of an axis, with its newest sets."""
     courses = [cache("trend", machine=machine, axis=axis, parameter=name) for name in PARAMETERS]
     if not courses[0]["sets"]:
-        raise Refused(
+        raise RequestRefused(
             404,
             "NoSuchAxis",
             f"no parameters of axis {axis} of {machine} were collected",

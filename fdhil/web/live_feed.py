@@ -20,7 +20,7 @@ from fdhil.cancellation import run_attempt
 from fdhil.daemon.live_stream import LIVE_SIGNALS, decode_base64
 from fdhil.errors import ConnectError, DeviceError
 from fdhil.json_lines import decode_line
-from fdhil.web.live_ring import Ring
+from fdhil.web.live_ring import SampleRing
 
 KEPT_S = 300.0
 SILENT_S = 5.0
@@ -34,7 +34,7 @@ NONSENSE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError)
 
 
 @dataclass(eq=False, slots=True)
-class Viewer:
+class LiveViewer:
     """A watching browser: its user or address, when it last drew, and whether another one took its place."""
 
     owner: str
@@ -48,16 +48,16 @@ class LiveFeed:
     def __init__(self, path: Path, axes: Mapping[str, Any], period_s: float) -> None:
         self._path = path
         self.period_s = period_s
-        self.rings = {axis: Ring(round(KEPT_S / period_s)) for axis in axes}
-        self.trouble = "waiting for the daemon"
+        self.rings = {axis: SampleRing(round(KEPT_S / period_s)) for axis in axes}
+        self.fault_text = "waiting for the daemon"
         self.skipped_lines = 0
         self._bases: dict[str, int] = {}
         self._line: tuple[float, float] | None = None
-        self.viewers: list[Viewer] = []
+        self.viewers: list[LiveViewer] = []
         self._wanted = asyncio.Event()
 
     @asynccontextmanager
-    async def watched(self, viewer: Viewer) -> AsyncIterator[None]:
+    async def register_viewer(self, viewer: LiveViewer) -> AsyncIterator[None]:
         """Keep the daemon's stream open while the block is open, and a minute longer."""
         self.viewers.append(viewer)
         self._wanted.set()
@@ -89,54 +89,56 @@ class LiveFeed:
         while True:
             await self._wanted.wait()
             try:
-                await run_attempt("daemon", self._read())
+                await run_attempt("daemon", self._read_stream())
                 self._wanted.clear()
-                self.trouble = "waiting for the daemon"
+                self.fault_text = "waiting for the daemon"
             except (OSError, TimeoutError, DeviceError, *NONSENSE) as error:
-                self.trouble = _cause(error)
+                self.fault_text = _describe_error(error)
                 await asyncio.sleep(RETRY_S)
                 if not self.viewers:
                     self._wanted.clear()
 
-    async def _read(self) -> None:
+    async def _read_stream(self) -> None:
         reader, writer = await asyncio.open_unix_connection(str(self._path), limit=LONGEST_LINE)
         try:
             writer.write(b'{"request": "live"}\n')
-            answer = await _line_of(reader)
+            answer = await _read_line(reader)
             if answer.get("ok") is not True:
                 raise ConnectError("daemon", f"{answer.get('text')}; {answer.get('advice')}")
             self._bases.clear()
-            self.trouble = ""
+            self.fault_text = ""
             seen_s = time.monotonic()
             while time.monotonic() - seen_s < LINGER_S:
                 if self.viewers:
                     seen_s = time.monotonic()
-                self.take(await _line_of(reader))
+                self.take_line(await _read_line(reader))
         finally:
             writer.close()
 
-    def take(self, line: Mapping[str, Any]) -> None:
+    def take_line(self, line: Mapping[str, Any]) -> None:
         """Take one line of the daemon; one of ``NONSENSE`` for an invalid one."""
         take: Callable[[Mapping[str, Any]], None] | None = {
-            "samples": self._samples,
-            "voltage": self._voltage,
-            "times": self._times,
-            "temperature": lambda line_of_axis: self.rings[line_of_axis["axis"]].warm(float(line_of_axis["celsius"])),
-            "skipped": self._skip,
+            "samples": self._take_samples,
+            "voltage": self._take_voltage,
+            "times": self._take_times,
+            "temperature": lambda line_of_axis: self.rings[line_of_axis["axis"]].set_temperature(
+                float(line_of_axis["celsius"])
+            ),
+            "skipped": self._count_skipped,
         }.get(line.get("live", ""))
         if take is not None and line.get("axis", next(iter(self.rings))) in self.rings:
             take(line)
 
-    def _samples(self, line: Mapping[str, Any]) -> None:
+    def _take_samples(self, line: Mapping[str, Any]) -> None:
         values = decode_base64(line["values"], "<f4").reshape(len(LIVE_SIGNALS), -1)
         after = decode_base64(line["ticks"], "<i4") if "ticks" in line else np.arange(values.shape[1])
         axis, first = line["axis"], int(line["tick"])
         base = self._bases.get(axis)
         if base is None or first + base < self.rings[axis].end:
-            base = self._bases[axis] = self._base(axis, first)
-        self.rings[axis].put(after.astype(np.int64) + first + base, values)
+            base = self._bases[axis] = self._find_tick_base(axis, first)
+        self.rings[axis].put_samples(after.astype(np.int64) + first + base, values)
 
-    def _base(self, axis: str, first: int) -> int:
+    def _find_tick_base(self, axis: str, first: int) -> int:
         """Return the offset from an axis' ticks to this process' count: another axis' offset if both agree."""
         end = self.rings[axis].end
         for other, base in self._bases.items():
@@ -145,12 +147,12 @@ class LiveFeed:
                 return base
         return max(end, int(time.monotonic() / self.period_s)) - first
 
-    def _times(self, line: Mapping[str, Any]) -> None:
+    def _take_times(self, line: Mapping[str, Any]) -> None:
         (first, last), (first_ns, last_ns) = line["tick"], line["t_ns"]
         slope = (last - first) / (last_ns - first_ns) if last_ns > first_ns else 1e-9 / self.period_s
         self._line = (first - slope * first_ns, slope)
 
-    def _voltage(self, line: Mapping[str, Any]) -> None:
+    def _take_voltage(self, line: Mapping[str, Any]) -> None:
         base = self._bases.get(line["axis"])
         if self._line is None or base is None:
             return
@@ -158,11 +160,11 @@ class LiveFeed:
         ticks = np.floor(begin + slope * decode_base64(line["t_ns"], "<i8")).astype(np.int64) + base
         self.rings[line["axis"]].put_voltage(ticks, decode_base64(line["values"], "<f4"))
 
-    def _skip(self, line: Mapping[str, Any]) -> None:
+    def _count_skipped(self, line: Mapping[str, Any]) -> None:
         self.skipped_lines += int(line["lines"])
 
 
-async def _line_of(reader: asyncio.StreamReader) -> dict[str, Any]:
+async def _read_line(reader: asyncio.StreamReader) -> dict[str, Any]:
     async with asyncio.timeout(SILENT_S):
         line = await reader.readline()
     if not line:
@@ -173,7 +175,7 @@ async def _line_of(reader: asyncio.StreamReader) -> dict[str, Any]:
     return document
 
 
-def _cause(error: Exception) -> str:
+def _describe_error(error: Exception) -> str:
     if isinstance(error, DeviceError):
         return str(error)
     if isinstance(error, TimeoutError):

@@ -27,7 +27,7 @@ VOLTAGE, TEMPERATURE = DRAWN.index("voltage_v"), DRAWN.index("temperature_c")
 
 
 @dataclass(frozen=True, slots=True)
-class Envelope:
+class SignalEnvelope:
     """The minimum and maximum of every signal in each column, (signals, columns), NaN without samples.
 
     Column j covers ``per_column`` ticks from ``first_tick`` + j ``per_column`` on.
@@ -39,7 +39,7 @@ class Envelope:
     high: Rows
 
 
-class Ring:
+class SampleRing:
     """The newest ``capacity`` samples of one axis: those of the ticks from ``begin`` to before ``end``."""
 
     def __init__(self, capacity: int) -> None:
@@ -54,7 +54,7 @@ class Ring:
         """The oldest tick that is kept; ``end`` while there is none."""
         return max(self._first, self.end - self.capacity)
 
-    def put(self, ticks: NDArray[np.int64], values: NDArray[Any]) -> None:
+    def put_samples(self, ticks: NDArray[np.int64], values: NDArray[Any]) -> None:
         """Add samples: rising ``ticks`` (n,), after all before them, and the daemon's signals (7, n)."""
         if self._values is None:
             self._values = np.full((len(DRAWN), self.capacity), np.nan, np.float32)
@@ -74,11 +74,11 @@ class Ring:
             held = (ticks >= self.begin) & (ticks < self.end)
             self._values[VOLTAGE, ticks[held] % self.capacity] = values[held]
 
-    def warm(self, celsius: float) -> None:
+    def set_temperature(self, celsius: float) -> None:
         """Set the temperature of the samples from here on."""
         self._celsius = celsius
 
-    def rows(self, first: int, end: int) -> Rows:
+    def read_samples(self, first: int, end: int) -> Rows:
         """Return the samples (signals, n) of the ticks from ``first`` to before ``end``, NaN for missing ones."""
         values = np.full((len(DRAWN), end - first), np.nan, np.float32)
         held = np.arange(max(first, self.begin), min(end, self.end))
@@ -86,9 +86,9 @@ class Ring:
             values[:, held[0] - first : held[-1] + 1 - first] = self._values[:, held % self.capacity]
         return values
 
-    def envelope(self, first: int, end: int, per_column: int) -> Envelope:
+    def compute_envelope(self, first: int, end: int, per_column: int) -> SignalEnvelope:
         """Return the complete columns between two ticks; the first begins at a multiple of their width."""
         start = -(-first // per_column) * per_column
         columns = max(0, (end - start) // per_column)
-        rows = self.rows(start, start + columns * per_column).reshape(len(DRAWN), columns, per_column)
-        return Envelope(start, per_column, np.fmin.reduce(rows, axis=2), np.fmax.reduce(rows, axis=2))
+        rows = self.read_samples(start, start + columns * per_column).reshape(len(DRAWN), columns, per_column)
+        return SignalEnvelope(start, per_column, np.fmin.reduce(rows, axis=2), np.fmax.reduce(rows, axis=2))

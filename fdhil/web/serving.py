@@ -31,7 +31,7 @@ END_S = 8.0  # below the TimeoutStopSec of the unit
 GIVE_BACK_S = 60.0
 
 
-def require() -> None:
+def require_extra() -> None:
     """Raise FdhilError if the web extra is not installed."""
     if any(find_spec(name) is None for name in NEEDED):
         raise FdhilError("fdhil web needs the extra 'web': pip install 'fdhil[web]'")
@@ -44,7 +44,7 @@ def check_reach(web: Web) -> None:
     faults = []
     where = f"other computers can reach {web.host}"
     if web.tls_certificate_file is None and (web.acting or not web.unprotected):
-        faults.append(ConfigFault("web.tls_certificate_file", f"is missing, and {where}", _tls_advice(web)))
+        faults.append(ConfigFault("web.tls_certificate_file", f"is missing, and {where}", _advise_tls(web)))
     if web.users_file is None and not web.unprotected:
         advice = "add users with fdhil web-user, or set web.unprotected = true to let every computer read"
         faults.append(ConfigFault("web.users_file", f"is missing, and {where}", advice))
@@ -52,42 +52,42 @@ def check_reach(web: Web) -> None:
         raise ConfigError("web.host", faults)
 
 
-def _tls_advice(web: Web) -> str:
+def _advise_tls(web: Web) -> str:
     files = "set certificate and key"
     if web.acting:
         return f"{files}: operators send passwords"
     return f"{files}, or set web.unprotected = true to serve without TLS"
 
 
-def run(config: MachineConfig, ready: Callable[[str], None]) -> None:
+def serve_machine(config: MachineConfig, ready: Callable[[str], None]) -> None:
     """Serve the pages of a machine until SIGTERM or SIGINT; ``ready`` receives the address. FdhilError as below."""
-    require()
-    from fdhil.web.app import make_app
+    require_extra()
+    from fdhil.web.application import make_app
 
-    serve(config.web, lambda: make_app(config), ready)
+    serve_application(config.web, lambda: make_app(config), ready)
 
 
-def serve(web: Web, make: Callable[[], FastAPI], ready: Callable[[str], None]) -> None:
+def serve_application(web: Web, make: Callable[[], FastAPI], ready: Callable[[str], None]) -> None:
     """Serve an application until SIGTERM or SIGINT. Raises FdhilError if it cannot start."""
-    require()
+    require_extra()
     check_reach(web)
-    certificate = _tls(web)
+    certificate = _load_certificate(web)
     malloc_tuning.limit_heap_growth()
-    with _listening(web) as listener:
+    with _open_listener(web) as listener:
         shutdown = Shutdown(END_S, os._exit)
         try:
-            asyncio.run(_serve(web, make, listener, certificate, ready, shutdown))
+            asyncio.run(_run_server(web, make, listener, certificate, ready, shutdown))
         finally:
             shutdown.cancel_deadline()
 
 
-def url_of(web: Web, listener: socket.socket) -> str:
+def make_url(web: Web, listener: socket.socket) -> str:
     port = listener.getsockname()[1]
     host = "localhost" if web.host in ("0.0.0.0", "::") else f"[{web.host}]" if ":" in web.host else web.host
     return f"{'https' if web.tls_certificate_file else 'http'}://{host}:{port}"
 
 
-def _tls(web: Web) -> ssl.SSLContext | None:
+def _load_certificate(web: Web) -> ssl.SSLContext | None:
     if web.tls_certificate_file is None or web.tls_key_file is None:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -102,7 +102,7 @@ def _tls(web: Web) -> ssl.SSLContext | None:
 
 
 @contextlib.contextmanager
-def _listening(web: Web) -> Iterator[socket.socket]:
+def _open_listener(web: Web) -> Iterator[socket.socket]:
     try:
         family, _, _, _, address = socket.getaddrinfo(web.host, web.port, type=socket.SOCK_STREAM)[0]
         if is_loopback(web.host) and not is_loopback(str(address[0])):
@@ -115,7 +115,7 @@ def _listening(web: Web) -> Iterator[socket.socket]:
         yield listener
 
 
-async def _serve(
+async def _run_server(
     web: Web,
     make: Callable[[], FastAPI],
     listener: socket.socket,
@@ -123,14 +123,14 @@ async def _serve(
     ready: Callable[[str], None],
     shutdown: Shutdown,
 ) -> None:
-    server = server_of(make(), certificate, lambda: ready(url_of(web, listener)))
+    server = make_server(make(), certificate, lambda: ready(make_url(web, listener)))
 
-    def stop() -> None:
+    def stop_server() -> None:
         shutdown.start_deadline()
         server.should_exit = True
 
     for number in (signal.SIGTERM, signal.SIGINT):
-        asyncio.get_running_loop().add_signal_handler(number, stop)
+        asyncio.get_running_loop().add_signal_handler(number, stop_server)
     giving_back = asyncio.create_task(_give_back(), name="free memory")
     try:
         await server.serve([listener])
@@ -145,7 +145,7 @@ async def _give_back() -> None:
         await asyncio.to_thread(malloc_tuning.trim_heap)
 
 
-def server_of(app: FastAPI, certificate: ssl.SSLContext | None, ready: Callable[[], None]) -> uvicorn.Server:
+def make_server(app: FastAPI, certificate: ssl.SSLContext | None, ready: Callable[[], None]) -> uvicorn.Server:
     """Return the server of an application; it calls ``ready`` once it listens."""
     import uvicorn  # late: this module must import without the extra
 

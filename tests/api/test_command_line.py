@@ -137,7 +137,7 @@ def test_identification_runs_without_optional_libraries() -> None:
 
 def test_missing_parquet_library_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    for name in ("fdhil.store.parquet_library", "fdhil.store.recording_parquet", "fdhil.store.windows"):
+    for name in ("fdhil.store.parquet_library", "fdhil.store.recording_parquet", "fdhil.store.window_file"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     with pytest.raises(FdhilError, match=r"pip install 'fdhil\[machine\]'"):
         fdhil.read("rapid.parquet")

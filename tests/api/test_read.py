@@ -10,7 +10,7 @@ from scipy.io import savemat
 
 import fdhil
 from fdhil.errors import RecordingError
-from fdhil.store.column_proposal import propose, propose_columns
+from fdhil.store.column_proposal import propose_columns, propose_for_table
 from fdhil.store.recording_table import RecordingTable
 from tests.api.independent_motor import TRUTH
 from tests.api.motor_recordings import record_motor
@@ -73,7 +73,7 @@ def test_position_needs_a_pitch_and_states_are_not_signals(tmp_path: Path) -> No
 def test_column_of_another_length_is_not_proposed() -> None:
     m = record_motor("steps of voltage")
     columns = {"t": m.time, "u": m.voltage, "i": m.current[1:], "w": m.speed}
-    proposal = propose(RecordingTable({}, columns))
+    proposal = propose_for_table(RecordingTable({}, columns))
     assert [p.signal for p in proposal.columns] == ["time_s", "voltage_V", "speed_rad_per_s"]
     assert proposal.faults == ["no current recognised"]
 

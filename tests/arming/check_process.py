@@ -12,13 +12,13 @@ import pytest
 
 import fdhil
 from fdhil.arming.background_check import FOLDER
-from fdhil.arming.code_digest import MAKER, code_files
+from fdhil.arming.code_digest import MAKER, find_code_files
 from fdhil.config import MachineConfig
 from fdhil.prediction.axis_models import build_nominal_models
 from fdhil.program import program_digest
 
 
-def asked(program: Path, config: MachineConfig, folder: Path) -> bytes:
+def make_request(program: Path, config: MachineConfig, folder: Path) -> bytes:
     request = {
         "program": str(program),
         "program_digest": program_digest(program),
@@ -30,7 +30,7 @@ def asked(program: Path, config: MachineConfig, folder: Path) -> bytes:
     return json.dumps(request).encode() + b"\n"
 
 
-def answered(request: bytes, errors: Path) -> bytes:
+def run_check_process(request: bytes, errors: Path) -> bytes:
     command = [sys.executable, "-X", "importtime", "-m", MAKER]
     with errors.open("wb") as stderr, subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=stderr) as process:
         assert process.stdin is not None
@@ -41,20 +41,20 @@ def answered(request: bytes, errors: Path) -> bytes:
         assert process.wait() == 0
     said = errors.read_text().splitlines()
     assert [line for line in said if not line.startswith("import time:")] == []
-    _covered_by_the_digest({line.rsplit("|", 1)[1].strip() for line in said})
+    _assert_covered_by_digest({line.rsplit("|", 1)[1].strip() for line in said})
     return answer
 
 
-def _covered_by_the_digest(imported: set[str]) -> None:
+def _assert_covered_by_digest(imported: set[str]) -> None:
     """The digest covers the imports as written; every module that is really imported must be among them."""
-    files = code_files(Path(fdhil.__file__).parent)
+    files = find_code_files(Path(fdhil.__file__).parent)
     covered = {name.removesuffix(".py").removesuffix("/__init__").replace("/", ".") for name in files}
     modules = {name.removeprefix("fdhil.") for name in imported if name.startswith("fdhil.")}
     assert modules - covered == set()
     assert len(modules) > 50
 
 
-def says_instead(monkeypatch: pytest.MonkeyPatch, folder: Path, script: str) -> None:
+def replace_output(monkeypatch: pytest.MonkeyPatch, folder: Path, script: str) -> None:
     python = folder / "python"
     python.write_text(f"#!/bin/sh\n{script}")
     python.chmod(0o700)

@@ -11,16 +11,16 @@ from fdhil import correction
 from fdhil.config import MachineConfig
 from fdhil.program import load_trajectory
 from fdhil.records import Correction
-from tests.arming.mill import Mill
-from tests.arming.test_preparing import GENTLE
-from tests.store.made import published
+from tests.arming.machine_peer import MachinePeer
+from tests.arming.test_arm_plan import GENTLE
+from tests.store.sample_records import make_published
 
 
 @pytest.fixture
-def mill(config: MachineConfig) -> Iterator[Mill]:
+def machine_peer(config: MachineConfig) -> Iterator[MachinePeer]:
     assert config.store.run_directory is not None
     config.store.run_directory.mkdir(parents=True)
-    made = Mill(config.store.run_directory)
+    made = MachinePeer(config.store.run_directory)
     yield made
     made.close()
 
@@ -34,5 +34,5 @@ def program(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def planned(config: MachineConfig, program: Path) -> Correction:
-    models = {axis: published().parameters for axis in "XY"}
+    models = {axis: make_published().parameters for axis in "XY"}
     return correction.plan_correction(load_trajectory(program, config), models, config)

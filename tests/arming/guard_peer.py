@@ -16,7 +16,7 @@ FINE: Mapping[str, Any] = {"state": "ACTIVE", "cause": None, "ok": True, "may_st
 Says = Callable[[str], Mapping[str, Any] | None]
 
 
-class Guard:
+class GuardPeer:
     """Answers requests by ``says``; None: no answer. ``descriptor`` came with the current request."""
 
     def __init__(self, folder: Path) -> None:
@@ -29,42 +29,42 @@ class Guard:
         self._listener.listen()
         self._threads: list[threading.Thread] = []
         self._peers: list[socket.socket] = []
-        self._begin(self._accept)
+        self._open_socket(self._accept_client)
 
-    def _begin(self, what: Callable[..., None], *values: Any) -> None:
+    def _open_socket(self, what: Callable[..., None], *values: Any) -> None:
         self._threads.append(threading.Thread(target=what, args=values, daemon=True))
         self._threads[-1].start()
 
-    def _accept(self) -> None:
+    def _accept_client(self) -> None:
         while True:
             try:
                 peer, _ = self._listener.accept()
             except OSError:
                 return
             self._peers.append(peer)
-            self._begin(self._serve, peer)
+            self._open_socket(self._serve_client, peer)
 
-    def _serve(self, peer: socket.socket) -> None:
+    def _serve_client(self, peer: socket.socket) -> None:
         with contextlib.suppress(ConnectionError), peer:
             inbox = b""
-            while chunk := self._receive(peer):
+            while chunk := self._receive_line(peer):
                 *lines, inbox = (inbox + chunk).split(b"\n")
                 for line in lines:
-                    self._take(peer, json.loads(line))
-                self._let_go()
+                    self._take_request(peer, json.loads(line))
+                self._drop_client()
 
-    def _receive(self, peer: socket.socket) -> bytes:
+    def _receive_line(self, peer: socket.socket) -> bytes:
         chunk, descriptors, _, _ = socket.recv_fds(peer, 1 << 16, 1)
         if descriptors:
             self.descriptor = descriptors[0]
         return chunk
 
-    def _let_go(self) -> None:
+    def _drop_client(self) -> None:
         if self.descriptor is not None:
             os.close(self.descriptor)
             self.descriptor = None
 
-    def _take(self, peer: socket.socket, request: Mapping[str, Any]) -> None:
+    def _take_request(self, peer: socket.socket, request: Mapping[str, Any]) -> None:
         self.heard.append(request["request"])
         self.requests.append(request)
         answer = self.says(request["request"]) if "id" in request else None

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from fdhil import correction
-from fdhil.arming.checked_program import Piece
+from fdhil.arming.checked_program import TablePiece
 from fdhil.arming.first_block import FirstBlock
-from fdhil.arming.program_check import encoded
-from fdhil.arming.standstill import WATCHED_S, AtRest, Standstill
+from fdhil.arming.program_check import encode_rows
+from fdhil.arming.standstill_monitor import WATCHED_S, StandstillMonitor, StandstillState
 from fdhil.config import MachineConfig
 from fdhil.correction import PlanLimits, check_offsets
 from fdhil.prediction import compute_contour_error_um
@@ -32,21 +32,23 @@ LONG = "G21 G90 G94\nG1 Y55 F10000\nG1 X100\nG1 Y5\nG1 X0\nG4 P0.2\nM2\n"
 SHORT = "G21 G90 G94\nG1 X20 F4000\nG1 Y20\nG4 P0.2\nM2\n"
 
 
-def checked(folder: Path, text: str, models: dict[str, Parameters], config: MachineConfig) -> tuple[Path, Piece]:
+def make_checked(
+    folder: Path, text: str, models: dict[str, Parameters], config: MachineConfig
+) -> tuple[Path, TablePiece]:
     program = folder / "part.ngc"
     program.write_text(text)
     reference = load_trajectory(program, config)
     planned = correction.plan_correction(reference, models, config, "inverse")
     assert not planned.refused
-    rows = np.frombuffer(encoded(reference.position_mm, planned.offset_um, config), "<i4").reshape(-1, 4).T.tolist()
-    return program, Piece(0, dict(zip("XY", rows[:2], strict=True)), dict(zip("XY", rows[2:], strict=True)), True)
+    rows = np.frombuffer(encode_rows(reference.position_mm, planned.offset_um, config), "<i4").reshape(-1, 4).T.tolist()
+    return program, TablePiece(0, dict(zip("XY", rows[:2], strict=True)), dict(zip("XY", rows[2:], strict=True)), True)
 
 
-def resting(amperes: dict[str, float]) -> dict[str, AtRest]:
-    return {axis: AtRest(0.0, 0.0, current) for axis, current in amperes.items()}
+def make_standstill(amperes: dict[str, float]) -> dict[str, StandstillState]:
+    return {axis: StandstillState(0.0, 0.0, current) for axis, current in amperes.items()}
 
 
-def cut(program: Path, piece: Piece, amperes: dict[str, float], config: MachineConfig) -> Float:
+def simulate_cut(program: Path, piece: TablePiece, amperes: dict[str, float], config: MachineConfig) -> Float:
     """Return the contour error (n,) of independent drives that begin with a current, on the first rows."""
     reference = load_trajectory(program, config)
     positions = []
@@ -62,17 +64,17 @@ def cut(program: Path, piece: Piece, amperes: dict[str, float], config: MachineC
 
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("text", [LONG, SHORT])
-def test_the_error_before_the_first_corner_is_gone(text: str, tmp_path: Path) -> None:
+def test_error_before_first_corner_is_removed(text: str, tmp_path: Path) -> None:
     amperes = {"X": 4.0, "Y": -3.0}
-    program, begin = checked(tmp_path, text, MODELS, CONFIG)
+    program, begin = make_checked(tmp_path, text, MODELS, CONFIG)
     first = FirstBlock(begin, program, MODELS, CONFIG)
-    rows = first.renew(resting(amperes))
+    rows = first.recompute(make_standstill(amperes))
     assert rows is not None
     assert first.begin is begin
-    first.take(rows)
+    first.apply_rows(rows)
     anew = first.begin
-    before, after = (cut(program, piece, amperes, CONFIG) for piece in (begin, anew))
-    without = cut(program, begin, {"X": 0.0, "Y": 0.0}, CONFIG)
+    before, after = (simulate_cut(program, piece, amperes, CONFIG) for piece in (begin, anew))
+    without = simulate_cut(program, begin, {"X": 0.0, "Y": 0.0}, CONFIG)
     assert compute_rms(after[:600]) < 0.2 * compute_rms(before[:600])
     assert compute_rms(after) < 1.1 * compute_rms(without)
     assert anew.demand == begin.demand
@@ -85,41 +87,41 @@ def test_the_error_before_the_first_corner_is_gone(text: str, tmp_path: Path) ->
         assert check_offsets(np.array(anew.offset[axis]), limits) == []
 
 
-def test_rows_that_are_right_already_stay(tmp_path: Path) -> None:
-    program, begin = checked(tmp_path, SHORT, MODELS, CONFIG)
+def test_correct_rows_are_kept(tmp_path: Path) -> None:
+    program, begin = make_checked(tmp_path, SHORT, MODELS, CONFIG)
     first = FirstBlock(begin, program, MODELS, CONFIG)
-    assert first.renew(resting({"X": 0.1, "Y": -0.1})) is None
-    rows = first.renew(resting({"X": 0.0, "Y": 4.0}))
+    assert first.recompute(make_standstill({"X": 0.1, "Y": -0.1})) is None
+    rows = first.recompute(make_standstill({"X": 0.0, "Y": 4.0}))
     assert rows is not None
-    first.take(rows)
-    assert first.renew(resting({"X": 0.0, "Y": 4.1})) is None
-    assert first.renew(resting({"X": 0.0, "Y": 0.0})) is not None  # it has moved since
+    first.apply_rows(rows)
+    assert first.recompute(make_standstill({"X": 0.0, "Y": 4.1})) is None
+    assert first.recompute(make_standstill({"X": 0.0, "Y": 0.0})) is not None  # it has moved since
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_what_the_way_to_the_start_leaves_is_expected(tmp_path: Path) -> None:
-    program, begin = checked(tmp_path, LONG, MODELS, CONFIG)
+def test_current_after_move_to_start_is_predicted(tmp_path: Path) -> None:
+    program, begin = make_checked(tmp_path, LONG, MODELS, CONFIG)
     first = FirstBlock(begin, program, MODELS, CONFIG)
-    rows = first.expect({"X": AtRest(250.0, 250.0, 3.0), "Y": AtRest(0.0, 0.0, 5.0)})
+    rows = first.predict_rows({"X": StandstillState(250.0, 250.0, 3.0), "Y": StandstillState(0.0, 0.0, 5.0)})
     assert rows is not None
-    first.take(rows)
+    first.apply_rows(rows)
     amperes = {"X": -6.0, "Y": 5.0}
-    before, after = (cut(program, piece, amperes, CONFIG) for piece in (begin, first.begin))
+    before, after = (simulate_cut(program, piece, amperes, CONFIG) for piece in (begin, first.begin))
     assert compute_rms(after[:600]) < 0.3 * compute_rms(before[:600])
-    assert first.renew(resting(amperes)) is None  # as it was expected
+    assert first.recompute(make_standstill(amperes)) is None  # as it was expected
 
 
-def test_a_load_shifts_what_the_axes_hold(tmp_path: Path) -> None:
+def test_load_shifts_holding_current(tmp_path: Path) -> None:
     """The plant is independent of the model: each axis stands at an edge of a friction band shifted by its load."""
     plant = replace(Mechanics(), load_nm=4.0, static=0.2)
     model = Parameters.from_mapping({**plant.truth(), "load": 4.0, "stribeck": 1.0, "stribeck_speed": 10.0})
     models = {"X": model, "Y": model}
-    program, begin = checked(tmp_path, LONG, models, CONFIG)
+    program, begin = make_checked(tmp_path, LONG, models, CONFIG)
     first = FirstBlock(begin, program, models, CONFIG)
     amperes = {"X": (4.0 - 5.8) / 0.8, "Y": (4.0 + 5.8) / 0.8}
-    rows = first.expect({"X": AtRest(9.0, 9.0, 0.0), "Y": AtRest(-9.0, -9.0, 0.0)})
+    rows = first.predict_rows({"X": StandstillState(9.0, 9.0, 0.0), "Y": StandstillState(-9.0, -9.0, 0.0)})
     assert rows is not None
-    first.take(rows)
+    first.apply_rows(rows)
     reference = load_trajectory(program, CONFIG)
     error = []
     for piece in (begin, first.begin):
@@ -133,41 +135,43 @@ def test_a_load_shifts_what_the_axes_hold(tmp_path: Path) -> None:
     assert compute_rms(error[1]) < 0.3
 
 
-@pytest.mark.parametrize("rest", [{}, {"X": AtRest(0, 0, 3)}, {"X": AtRest(0, 0, 3), "Y": AtRest(5, 5, 3)}])
-def test_an_axis_that_does_not_stand_at_the_start_leaves_the_rows(rest: dict[str, AtRest], tmp_path: Path) -> None:
-    program, begin = checked(tmp_path, SHORT, MODELS, CONFIG)
+@pytest.mark.parametrize(
+    "rest", [{}, {"X": StandstillState(0, 0, 3)}, {"X": StandstillState(0, 0, 3), "Y": StandstillState(5, 5, 3)}]
+)
+def test_rows_are_kept_for_axis_away_from_start(rest: dict[str, StandstillState], tmp_path: Path) -> None:
+    program, begin = make_checked(tmp_path, SHORT, MODELS, CONFIG)
     first = FirstBlock(begin, program, MODELS, CONFIG)
-    assert first.renew(rest) is None
+    assert first.recompute(rest) is None
     assert first.begin is begin
 
 
-def heard(first: int, current: Float, position: float = 1.0) -> AxisSamples:
+def make_samples(first: int, current: Float, position: float = 1.0) -> AxisSamples:
     n = current.size
     still = freeze_array(np.full(n, position))
     zero, ticks = freeze_array(np.zeros(n)), freeze_integers(np.arange(first, first + n))
     return AxisSamples("X", ticks, still, still, zero, freeze_array(current), None, zero, freeze_integers(np.zeros(n)))
 
 
-def test_the_current_is_that_of_the_last_samples() -> None:
-    standstill = Standstill(CONFIG)
+def test_holding_current_is_of_the_last_samples() -> None:
+    standstill = StandstillMonitor(CONFIG)
     rows = round(WATCHED_S / 0.001)
-    standstill.take(heard(0, np.full(rows // 2, 1.0)))
-    assert standstill.now() == {}
-    standstill.take(heard(rows // 2, np.full(rows, 2.0)))
-    assert standstill.now()["X"] == pytest.approx(AtRest(1.0, 1.0, 2.0))
+    standstill.take_samples(make_samples(0, np.full(rows // 2, 1.0)))
+    assert standstill.find_standing_axes() == {}
+    standstill.take_samples(make_samples(rows // 2, np.full(rows, 2.0)))
+    assert standstill.find_standing_axes()["X"] == pytest.approx(StandstillState(1.0, 1.0, 2.0))
 
 
-def test_an_axis_that_moves_or_was_not_heard_is_not_at_rest() -> None:
+def test_moving_or_unsampled_axis_is_not_at_standstill() -> None:
     rows = round(WATCHED_S / 0.001)
-    good = heard(0, np.full(2 * rows, 2.0))
+    good = make_samples(0, np.full(2 * rows, 2.0))
     moved = replace(good, position_mm=freeze_array(np.linspace(0, 1, 2 * rows)))
     holed = replace(good, tick=freeze_integers(np.where(good.tick > rows, good.tick + 1, good.tick)))
     offset = replace(good, offset_mm=freeze_array(np.full(2 * rows, 0.001)))
     for samples in (moved, holed, offset):
-        standstill = Standstill(CONFIG)
-        standstill.take(samples)
-        assert standstill.now() == {}
-    standstill = Standstill(CONFIG)
-    standstill.take(good)
-    standstill.take(heard(0, np.full(10, 2.0)))
-    assert standstill.now() == {}
+        standstill = StandstillMonitor(CONFIG)
+        standstill.take_samples(samples)
+        assert standstill.find_standing_axes() == {}
+    standstill = StandstillMonitor(CONFIG)
+    standstill.take_samples(good)
+    standstill.take_samples(make_samples(0, np.full(10, 2.0)))
+    assert standstill.find_standing_axes() == {}

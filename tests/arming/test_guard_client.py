@@ -24,7 +24,7 @@ from tests.guard.simulated_bus import settings
 
 
 @pytest.fixture
-def far(tmp_path: Path) -> Iterator[Callable[[bytes | None], GuardClient]]:
+def scripted_guard(tmp_path: Path) -> Iterator[Callable[[bytes | None], GuardClient]]:
     server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     server.bind(str(tmp_path / "guard.sock"))
     server.listen()
@@ -54,36 +54,36 @@ def far(tmp_path: Path) -> Iterator[Callable[[bytes | None], GuardClient]]:
 Far = Callable[[bytes | None], GuardClient]
 
 
-def test_no_guard_there_is_one_sentence(tmp_path: Path) -> None:
+def test_missing_guard_is_reported_in_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(ConnectError, match="start fdhil-guard"):
         GuardClient(tmp_path)
 
 
-def test_answers_of_others_are_passed_over(far: Far) -> None:
-    client = far(b'[]\n{"id": 99, "ok": false}\n{"id": 1, "ok": true, "state": "OFF"}\n')
-    assert client.status() == {"ok": True, "state": "OFF"}
+def test_answers_to_other_requests_are_skipped(scripted_guard: Far) -> None:
+    client = scripted_guard(b'[]\n{"id": 99, "ok": false}\n{"id": 1, "ok": true, "state": "OFF"}\n')
+    assert client.read_status() == {"ok": True, "state": "OFF"}
 
 
-def test_a_guard_that_gives_no_answer_is_told(far: Far) -> None:
-    with pytest.raises(DeviceTimeout, match="did not answer"), far(b"") as client:
+def test_silent_guard_is_reported(scripted_guard: Far) -> None:
+    with pytest.raises(DeviceTimeout, match="did not answer"), scripted_guard(b"") as client:
         client.disarm()
 
 
-def test_a_guard_that_went_is_lost(far: Far) -> None:
-    client = far(None)
+def test_closed_connection_is_guard_lost(scripted_guard: Far) -> None:
+    client = scripted_guard(None)
     with pytest.raises(GuardLost, match="is gone"):
         client.adopt("token")
     with pytest.raises(GuardLost, match="is gone"):
-        say_alive_for_ever(client)
+        send_alive_forever(client)
 
 
-def say_alive_for_ever(client: GuardClient) -> None:
+def send_alive_forever(client: GuardClient) -> None:
     while True:
-        client.alive({"model_fresh": True})
+        client.send_alive({"model_fresh": True})
 
 
-def test_a_connection_that_breaks_is_lost(far: Far, monkeypatch: pytest.MonkeyPatch) -> None:
-    client = far(b"")
+def test_broken_connection_is_guard_lost(scripted_guard: Far, monkeypatch: pytest.MonkeyPatch) -> None:
+    client = scripted_guard(b"")
     client._timeout_s = 20.0
     client._socket.shutdown(socket.SHUT_RD)
     with pytest.raises(GuardLost):
@@ -103,39 +103,39 @@ def test_a_connection_that_breaks_is_lost(far: Far, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(client, "_socket", Broken())
     ready = os.open(os.devnull, os.O_RDONLY)
     with pytest.raises(GuardLost, match="reset"):
-        client.feed_forward("token", {"X": {}}, {})
+        client.enable_feedforward("token", {"X": {}}, {})
     os.close(ready)
 
 
-def test_a_table_goes_with_its_descriptor(far: Far) -> None:
-    client = far(b'{"id": 1, "ok": true}\n{"id": 2, "ok": true}\n')
-    assert client.compared("token", {"X": "fingerprint"}, {"X": 0})["ok"]
+def test_table_is_sent_with_its_descriptor(scripted_guard: Far) -> None:
+    client = scripted_guard(b'{"id": 1, "ok": true}\n{"id": 2, "ok": true}\n')
+    assert client.report_comparison("token", {"X": "fingerprint"}, {"X": 0})["ok"]
     before = len(list(Path("/proc/self/fd").iterdir()))
-    assert client.load("X", {"X": [1, 2]}, {"X": [0, 0]}, "digest") == {"ok": True}
+    assert client.load_table("X", {"X": [1, 2]}, {"X": [0, 0]}, "digest") == {"ok": True}
     assert len(list(Path("/proc/self/fd").iterdir())) == before
-    client.alive()
+    client.send_alive()
 
 
 @pytest.mark.parametrize(
     "line", [b"", b"NaN", b'{"a": Infinity}', b"[" * 20_000, b"\xff", b"[]", b'{"a": ' + b"9" * 5000 + b"}"]
 )
-def test_what_is_no_request_is_none(line: bytes) -> None:
+def test_invalid_request_is_refused(line: bytes) -> None:
     assert parse_line(line) is None
 
 
 @pytest.mark.parametrize(
     "mark", ["NaN", "[]", "1.5", "1e999", "-9007199254740993", "true", "null", '"' + "x" * 201 + '"']
 )
-def test_a_mark_that_cannot_be_given_back_is_left_out(mark: str) -> None:
+def test_mark_that_cannot_be_restored_is_ignored(mark: str) -> None:
     assert "id" not in (parse_line(f'{{"id": {mark}}}'.encode()) or {})
 
 
-def start(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+def start_guard(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     monkeypatch.setattr(sys, "argv", ["fdhil.guard", *arguments])
     return entry.main()
 
 
-def test_it_starts_on_its_descriptor_and_stops_at_a_signal(
+def test_guard_starts_on_descriptor_and_stops_at_signal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, handlers: None
 ) -> None:
     file = tmp_path / "guard.json"
@@ -151,16 +151,16 @@ def test_it_starts_on_its_descriptor_and_stops_at_a_signal(
     monkeypatch.setattr(stop_signals, "catch_signals", catch_and_raise)
     with socket.create_server(("127.0.0.1", 0)) as server:
         near = socket.create_connection(server.getsockname())
-        assert start(monkeypatch, "--settings", str(file), "--descriptor", str(near.detach())) == 3
+        assert start_guard(monkeypatch, "--settings", str(file), "--descriptor", str(near.detach())) == 3
 
 
-def test_without_settings_or_descriptor_it_says_what_is_wrong(
+def test_missing_settings_or_descriptor_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], handlers: None
 ) -> None:
     file = tmp_path / "guard.json"
-    assert start(monkeypatch, "--settings", str(file), "--descriptor", "0") == 2
+    assert start_guard(monkeypatch, "--settings", str(file), "--descriptor", "0") == 2
     file.write_text(encode_settings(settings(run_directory=str(tmp_path))))
-    assert start(monkeypatch, "--settings", str(file), "--descriptor", str(1 << 20)) == 3
+    assert start_guard(monkeypatch, "--settings", str(file), "--descriptor", str(1 << 20)) == 3
     told = capsys.readouterr().err.splitlines()
     assert "run fdhil-guard" in told[0]
     assert "start the guard with fdhil-guard" in told[1]
@@ -168,9 +168,7 @@ def test_without_settings_or_descriptor_it_says_what_is_wrong(
         runpy.run_path(str(entry.__file__), run_name="__main__")
 
 
-def test_a_machine_whose_numbers_are_unknown_leaves_two_signals_alone(
-    monkeypatch: pytest.MonkeyPatch, handlers: None
-) -> None:
+def test_unknown_system_call_numbers_skip_two_signals(monkeypatch: pytest.MonkeyPatch, handlers: None) -> None:
     monkeypatch.setattr(stop_signals, "SIGACTION", {})
     wake = stop_signals.catch_signals()
     signal.raise_signal(signal.SIGQUIT)

@@ -12,15 +12,15 @@ from typing import Any
 
 import pytest
 
-from fdhil.arming.checked_program import Piece
-from fdhil.arming.desk import ALIVE_S, ArmingDesk
+from fdhil.arming.arming_service import ALIVE_S, ArmingService
+from fdhil.arming.checked_program import TablePiece
 from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.guard_link import GUARD_TRIPPED, GuardLink
-from fdhil.arming.token import read_token
+from fdhil.arming.operator_token import read_token
 from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.errors import DeviceError
-from tests.arming.guard_peer import FINE, Guard
+from tests.arming.guard_peer import FINE, GuardPeer
 from tests.daemon.simulated_machine import config_of
 
 STARVED = {"state": "RAMP_DOWN", "cause": {"code": "TableStarved", "text": "no rows", "axis": ""}, "ok": True}
@@ -39,60 +39,60 @@ def folder(config: MachineConfig) -> Path:
 
 
 @pytest.fixture
-def guard(folder: Path) -> Iterator[Guard]:
-    made = Guard(folder)
+def guard(folder: Path) -> Iterator[GuardPeer]:
+    made = GuardPeer(folder)
     yield made
     made.close()
 
 
-class Long:
+class LongProgram:
     stream = SimpleNamespace(axes=("X",), program_digest="digest")
 
 
-def test_a_link_that_was_ended_makes_no_new_connection(guard: Guard, folder: Path) -> None:
+def test_closed_link_does_not_reconnect(guard: GuardPeer, folder: Path) -> None:
     """A status request in progress at shutdown would otherwise leave an open connection."""
     link = GuardLink(folder, folder)
-    link.refresh()
+    link.poll_changes()
     link.close()
-    assert link.refresh() == []
-    assert not link.connected
+    assert link.poll_changes() == []
+    assert not link.is_connected
     with pytest.raises(DeviceError, match="is disconnected: the daemon is shutting down"):
         link.disarm()
 
 
-def test_a_trip_that_another_request_saw_is_told_all_the_same(guard: Guard, folder: Path) -> None:
-    link, long = GuardLink(folder, folder), Long()
-    assert [notice.code for notice in link.refresh()] == ["GuardFound"]
+def test_trip_seen_by_other_request_is_reported(guard: GuardPeer, folder: Path) -> None:
+    link, long = GuardLink(folder, folder), LongProgram()
+    assert [notice.code for notice in link.poll_changes()] == ["GuardFound"]
     guard.says = lambda _kind: STARVED
-    piece = Piece(0, {"X": [0]}, {"X": [0]}, False)
-    assert link.extend(long, piece)["ok"]  # type: ignore[arg-type]
+    piece = TablePiece(0, {"X": [0]}, {"X": [0]}, False)
+    assert link.extend_stream(long, piece)["ok"]  # type: ignore[arg-type]
     assert link.state == "RAMP_DOWN"
-    assert [notice.code for notice in link.refresh()] == ["GuardState", GUARD_TRIPPED]
-    assert link.refresh() == []
+    assert [notice.code for notice in link.poll_changes()] == ["GuardState", GUARD_TRIPPED]
+    assert link.poll_changes() == []
     link.close()
 
 
-def test_a_guard_that_does_not_answer_is_let_go(guard: Guard, folder: Path) -> None:
+def test_silent_guard_is_disconnected(guard: GuardPeer, folder: Path) -> None:
     link = GuardLink(folder, folder)
-    link.refresh()
+    link.poll_changes()
     assert link._client is not None
     link._client._timeout_s = 0.2
     guard.says = lambda kind: None if kind == "disarm" else FINE
     with pytest.raises(DeviceError):
         link.disarm()
-    assert not link.connected
-    assert [notice.code for notice in link.refresh()] == ["GuardLost", "GuardFound"]
+    assert not link.is_connected
+    assert [notice.code for notice in link.poll_changes()] == ["GuardLost", "GuardFound"]
     link.close()
 
 
 @pytest.mark.usefixtures("real_time")
-async def test_a_slow_guard_still_hears_that_the_daemon_lives(
-    config: MachineConfig, guard: Guard, folder: Path, monkeypatch: pytest.MonkeyPatch
+async def test_slow_guard_still_receives_alive(
+    config: MachineConfig, guard: GuardPeer, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fdhil.arming.guard_link.GuardClient", partial(GuardClient, timeout_s=100.0))
     guard.says = lambda _kind: None
-    desk = ArmingDesk(config, OutcomeStore(config), folder)
-    attending = asyncio.create_task(desk.attend(lambda _told: None))
+    desk = ArmingService(config, OutcomeStore(config), folder)
+    attending = asyncio.create_task(desk.supervise_guard(lambda _told: None))
     async with asyncio.timeout(60.0):
         while guard.heard.count("alive") < 20:  # noqa: ASYNC110 - it is another thread that hears
             await asyncio.sleep(ALIVE_S)
@@ -103,8 +103,8 @@ async def test_a_slow_guard_still_hears_that_the_daemon_lives(
 
 
 @pytest.mark.parametrize("how", ["disarm", "abandon", "hang up"])
-async def test_what_is_given_up_while_it_is_planned_is_not_armed(
-    how: str, config: MachineConfig, guard: Guard, folder: Path, monkeypatch: pytest.MonkeyPatch
+async def test_abandoned_program_is_not_armed(
+    how: str, config: MachineConfig, guard: GuardPeer, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     planning, planned = threading.Event(), threading.Event()
 
@@ -113,18 +113,19 @@ async def test_what_is_given_up_while_it_is_planned_is_not_armed(
         assert planned.wait(60.0)
 
         demand = {"X": [0], "Y": [0]}
-        begin = Piece(0, demand, demand, True)
+        begin = TablePiece(0, demand, demand, True)
         return SimpleNamespace(facts={}, begin=begin, rows=1, summary=lambda: {"method": "inverse"})
 
     monkeypatch.setattr(
-        "fdhil.arming.desk.prepare", lambda *_: SimpleNamespace(ahead=False, program_digest="", models={})
+        "fdhil.arming.arming_service.prepare_request",
+        lambda *_: SimpleNamespace(ahead=False, program_digest="", models={}),
     )
-    monkeypatch.setattr("fdhil.arming.desk.plan_whole", lambda *_: None)
-    monkeypatch.setattr("fdhil.arming.desk.taught", lambda *_: (None, None))
-    monkeypatch.setattr("fdhil.arming.desk.prepare_armament", slow)
+    monkeypatch.setattr("fdhil.arming.arming_service.plan_whole_program", lambda *_: None)
+    monkeypatch.setattr("fdhil.arming.arming_service.apply_learned_offsets", lambda *_: (None, None))
+    monkeypatch.setattr("fdhil.arming.arming_service.prepare_program", slow)
     guard.says = lambda _kind: {**FINE, "state": "OFF"}
-    desk = ArmingDesk(config, OutcomeStore(config), folder)
-    desk.begin({}, [])
+    desk = ArmingService(config, OutcomeStore(config), folder)
+    desk.start_from_history({}, [])
     request = {"request": "arm", "program": "a.ngc", "token": read_token(folder)}
     hung_up = threading.Event()
     arming = asyncio.create_task(desk.arm(request, hung_up.is_set))
@@ -132,7 +133,7 @@ async def test_what_is_given_up_while_it_is_planned_is_not_armed(
     if how == "disarm":
         await desk.disarm()
     elif how == "abandon":
-        desk.abandon()
+        desk.abandon_preparation()
     else:
         hung_up.set()
     planned.set()
@@ -144,10 +145,10 @@ async def test_what_is_given_up_while_it_is_planned_is_not_armed(
 
 
 @pytest.mark.fault("E18")
-async def test_a_disarm_waits_for_no_disk(config: MachineConfig, guard: Guard, folder: Path) -> None:
+async def test_disarm_does_not_wait_for_disk(config: MachineConfig, guard: GuardPeer, folder: Path) -> None:
     """Every thread of asyncio's pool waits for the disk, as with pending axes, history, notices and requests."""
     guard.says = lambda _kind: {**FINE, "state": "OFF"}
-    desk, answers = ArmingDesk(config, OutcomeStore(config), folder), threading.Event()
+    desk, answers = ArmingService(config, OutcomeStore(config), folder), threading.Event()
     waiting = [asyncio.create_task(asyncio.to_thread(answers.wait, 60.0)) for _ in range(40)]
     try:
         await asyncio.sleep(0)
@@ -166,31 +167,31 @@ async def test_a_disarm_waits_for_no_disk(config: MachineConfig, guard: Guard, f
         ({"program": "\ud800.ngc"}, "BadRequest"),
     ],
 )
-async def test_a_text_that_no_file_and_no_token_can_be_is_answered(
+async def test_invalid_program_or_token_text_is_refused(
     asked: Mapping[str, str], code: str, config: MachineConfig, folder: Path
 ) -> None:
-    desk = ArmingDesk(config, OutcomeStore(config), folder)
-    desk.begin({}, [])
+    desk = ArmingService(config, OutcomeStore(config), folder)
+    desk.start_from_history({}, [])
     request = {"request": "arm", "program": "a.ngc", "token": read_token(folder), **asked}
     assert (await desk.arm(request))["code"] == code
 
 
-async def test_a_disarm_that_is_answered_before_the_guard_is_asked_to_arm_is_the_last_word(
-    config: MachineConfig, guard: Guard, folder: Path, monkeypatch: pytest.MonkeyPatch
+async def test_disarm_during_preparation_prevents_arming(
+    config: MachineConfig, guard: GuardPeer, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     feeding = SimpleNamespace(laws={}, facts={}, summary=dict, progress=dict)
-    monkeypatch.setattr("fdhil.arming.desk.prepare_feeding", lambda *_: feeding)
+    monkeypatch.setattr("fdhil.arming.arming_service.prepare_feedforward", lambda *_: feeding)
     guard.says = lambda _kind: {**FINE, "state": "OFF"}
-    desk = ArmingDesk(config, OutcomeStore(config), folder)
-    desk.begin({}, [])
-    asked, disarmed, feed_forward = threading.Event(), threading.Event(), desk.guard.feed_forward
+    desk = ArmingService(config, OutcomeStore(config), folder)
+    desk.start_from_history({}, [])
+    asked, disarmed, feed_forward = threading.Event(), threading.Event(), desk.guard.enable_feedforward
 
     def its_turn_comes_late(*given: Any) -> Any:
         asked.set()
         assert disarmed.wait(60.0)
         return feed_forward(*given)
 
-    monkeypatch.setattr(desk.guard, "feed_forward", its_turn_comes_late)
+    monkeypatch.setattr(desk.guard, "enable_feedforward", its_turn_comes_late)
     arming = asyncio.create_task(desk.arm({"request": "arm", "method": "flatness", "token": read_token(folder)}))
     assert await asyncio.to_thread(asked.wait, 60.0)
     assert (await desk.disarm())["ok"]
@@ -200,20 +201,20 @@ async def test_a_disarm_that_is_answered_before_the_guard_is_asked_to_arm_is_the
     desk.guard.close()
 
 
-async def test_the_guard_is_told_as_of_which_disarm_it_is_asked(
-    config: MachineConfig, guard: Guard, folder: Path, monkeypatch: pytest.MonkeyPatch
+async def test_arm_request_carries_disarm_count(
+    config: MachineConfig, guard: GuardPeer, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    desk = ArmingDesk(config, OutcomeStore(config), folder)
-    desk.begin({}, [])
+    desk = ArmingService(config, OutcomeStore(config), folder)
+    desk.start_from_history({}, [])
     disarms, of_its_time = 4, SimpleNamespace(laws={}, facts={}, summary=dict, progress=dict)
 
     def planned(*_: object) -> Any:
         nonlocal disarms
         disarms += 1
-        desk.guard.look()
+        desk.guard.read_status()
         return of_its_time
 
-    monkeypatch.setattr("fdhil.arming.desk.prepare_feeding", planned)
+    monkeypatch.setattr("fdhil.arming.arming_service.prepare_feedforward", planned)
     guard.says = lambda _kind: {**FINE, "state": "OFF", "disarms": disarms}
     await desk.arm({"request": "arm", "method": "flatness", "token": read_token(folder)})
     asked = next(request for request in guard.requests if request["request"] == "feedforward")

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from fdhil.arming.guard_presence import GuardPresence
-from tests.arming.guard_peer import Guard
+from tests.arming.guard_peer import GuardPeer
 
 
 @pytest.fixture
@@ -18,30 +18,30 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now_s
 
 
-def test_guard_is_there_while_it_listens_and_a_moment_longer(tmp_path: Path, clock: list[float]) -> None:
-    presence, guard = GuardPresence(tmp_path), Guard(tmp_path)
-    assert presence.is_there()
+def test_guard_is_present_while_listening_and_briefly_after(tmp_path: Path, clock: list[float]) -> None:
+    presence, guard = GuardPresence(tmp_path), GuardPeer(tmp_path)
+    assert presence.is_present()
     (tmp_path / "guard.sock").unlink()  # cleaned away: it makes it again
     clock[0] += 2.0
-    assert presence.is_there()
+    assert presence.is_present()
     guard.close()
     clock[0] += 2.0
-    assert not presence.is_there()
+    assert not presence.is_present()
 
 
-def test_socket_that_a_killed_guard_left_is_no_guard(tmp_path: Path, clock: list[float]) -> None:
+def test_socket_of_killed_guard_is_not_present(tmp_path: Path, clock: list[float]) -> None:
     presence = GuardPresence(tmp_path)
-    assert not presence.is_there()
-    Guard(tmp_path).close()
+    assert not presence.is_present()
+    GuardPeer(tmp_path).close()
     clock[0] += 2.0
     assert (tmp_path / "guard.sock").exists()
-    assert not presence.is_there()
+    assert not presence.is_present()
 
 
-def test_guard_that_starts_is_noticed(tmp_path: Path, clock: list[float]) -> None:
+def test_started_guard_is_detected(tmp_path: Path, clock: list[float]) -> None:
     presence = GuardPresence(tmp_path)
-    assert not presence.is_there()
-    guard = Guard(tmp_path)
+    assert not presence.is_present()
+    guard = GuardPeer(tmp_path)
     clock[0] += 2.0
-    assert presence.is_there()
+    assert presence.is_present()
     guard.close()

@@ -19,18 +19,18 @@ import pytest
 
 import fdhil
 from fdhil import correction
+from fdhil.arming.arm_plan import ArmRequest, prepare_program, prepare_request
 from fdhil.arming.background_check import FOLDER, BackgroundCheck
-from fdhil.arming.checked_program import CheckedProgram, Piece, RowStream
-from fdhil.arming.code_digest import code_digest
-from fdhil.arming.preparing import ArmRequest, prepare, prepare_armament
-from fdhil.arming.program_check import KEPT, SCHEMA, answer_request, check, encoded, keep
+from fdhil.arming.checked_program import CheckedProgram, RowStream, TablePiece
+from fdhil.arming.code_digest import compute_code_digest
+from fdhil.arming.program_check import KEPT, SCHEMA, answer_request, check_program, encode_rows, store_checked
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError, StoreError
 from fdhil.prediction.axis_models import apply_loops, build_nominal_models
 from fdhil.program import load_trajectory, program_digest
 from fdhil.records import Reason
-from tests.arming.check_process import answered, asked, says_instead
-from tests.arming.test_preparing import known, save_records
+from tests.arming.check_process import make_request, replace_output, run_check_process
+from tests.arming.test_arm_plan import make_model_states, save_records
 from tests.daemon.simulated_machine import config_of
 
 SQUARE = "G1 X40 F6000\nG1 Y30\nG1 X0\nG1 Y0\n"
@@ -44,26 +44,26 @@ def config(tmp_path: Path) -> MachineConfig:
     return config_of(tmp_path, ("X", "Y"))
 
 
-def written(folder: Path, text: str) -> Path:
+def write_program(folder: Path, text: str) -> Path:
     path = folder / "program.ngc"
     path.write_text(text)
     return path
 
 
-def checked(program: Path, config: MachineConfig) -> tuple[dict[str, Any], bytes, list[Any]]:
+def run_check(program: Path, config: MachineConfig) -> tuple[dict[str, Any], bytes, list[Any]]:
     body, told = io.BytesIO(), list[Any]()
-    header = check(program, program_digest(program), build_nominal_models(config), config, body, told.append)
+    header = check_program(program, program_digest(program), build_nominal_models(config), config, body, told.append)
     return header, body.getvalue(), told
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_the_rows_are_those_of_the_whole_plan(config: MachineConfig, tmp_path: Path) -> None:
-    program = written(tmp_path, LONG)
-    header, body, told = checked(program, config)
+def test_checked_rows_equal_whole_plan(config: MachineConfig, tmp_path: Path) -> None:
+    program = write_program(tmp_path, LONG)
+    header, body, told = run_check(program, config)
     planned = correction.plan_correction(
         load_trajectory(program, config), build_nominal_models(config), config, "inverse"
     )
-    assert body == encoded(planned.before.reference.position_mm, planned.offset_um, config)
+    assert body == encode_rows(planned.before.reference.position_mm, planned.offset_um, config)
     rows = np.frombuffer(body, "<i4").reshape(-1, 4)
     assert header["refused"] == []
     assert header["rows"] == len(rows)
@@ -82,8 +82,8 @@ def test_the_rows_are_those_of_the_whole_plan(config: MachineConfig, tmp_path: P
     assert first == header["rows"]
 
 
-def test_a_block_is_written_before_it_is_told(config: MachineConfig, tmp_path: Path) -> None:
-    file, program, seen = tmp_path / "rows", written(tmp_path, LONG), 0
+def test_block_is_written_before_it_is_reported(config: MachineConfig, tmp_path: Path) -> None:
+    file, program, seen = tmp_path / "rows", write_program(tmp_path, LONG), 0
 
     def look(told: Mapping[str, Any]) -> None:
         nonlocal seen
@@ -95,11 +95,11 @@ def test_a_block_is_written_before_it_is_told(config: MachineConfig, tmp_path: P
             seen = end
 
     with file.open("wb") as body:
-        check(program, program_digest(program), build_nominal_models(config), config, body, look)
+        check_program(program, program_digest(program), build_nominal_models(config), config, body, look)
     assert seen > 15_000
 
 
-def hard_program() -> str:
+def write_hard_program() -> str:
     lines = LONG.splitlines()
     for number in HARD_LINES:
         lines[number - 1] = lines[number - 1].split(" F")[0] + " F30000"
@@ -108,9 +108,9 @@ def hard_program() -> str:
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_every_place_is_named_with_line_axis_figure_and_advice(config: MachineConfig, tmp_path: Path) -> None:
+def test_every_refusal_names_line_axis_figure_and_advice(config: MachineConfig, tmp_path: Path) -> None:
     sharp = config.model_copy(update={"nc": config.nc.model_copy(update={"smoothing_s": (0.02, 0.01)})})
-    header, body, at_once = checked(written(tmp_path, hard_program()), sharp)
+    header, body, at_once = run_check(write_program(tmp_path, write_hard_program()), sharp)
     assert [one["refused"] for one in at_once if "refused" in one] == header["refused"]
     assert len(body) == 16 * header["blocks"][-1][0] < 16 * header["rows"]  # no row from the first place on
     demand = [told for told in header["refused"] if told["code"] == "DemandTooHigh"]
@@ -121,56 +121,56 @@ def test_every_place_is_named_with_line_axis_figure_and_advice(config: MachineCo
     assert all(" ms: no offset can help" in one["text"] and one["advice"] for one in demand)
 
 
-def test_a_program_without_an_error_gains_nothing(config: MachineConfig, tmp_path: Path) -> None:
-    header, _, _ = checked(written(tmp_path, "G4 P12\nM2\n"), config)
+def test_program_without_error_is_refused(config: MachineConfig, tmp_path: Path) -> None:
+    header, _, _ = run_check(write_program(tmp_path, "G4 P12\nM2\n"), config)
     assert [told["code"] for told in header["refused"]] == ["NoGain"]
 
 
 @pytest.mark.usefixtures("processes")
-def test_a_checked_program_is_armed_with_its_first_rows_and_goes_on(config: MachineConfig, tmp_path: Path) -> None:
-    program = written(tmp_path, LONG)
+def test_checked_program_is_armed_and_streamed(config: MachineConfig, tmp_path: Path) -> None:
+    program = write_program(tmp_path, LONG)
     save_records(config)
-    found = prepare(program, None, config, known(config))
+    found = prepare_request(program, None, config, make_model_states(config))
     assert isinstance(found, ArmRequest)
     assert found.ahead
-    first, again = asyncio.run(_twice(config, found))
+    first, again = asyncio.run(_check_twice(config, found))
     assert isinstance(first, CheckedProgram)
     assert isinstance(again, CheckedProgram)
-    armament = prepare_armament(found, first, config, known(config))
+    armament = prepare_program(found, first, config, make_model_states(config))
     assert all(armament.facts.values()), armament.facts
     assert armament.stream.program_digest == program_digest(program)
-    stream, pieces = armament.stream, [armament.begin]
+    stream, pieces = armament.stream, [armament.first_piece]
     assert len(pieces[0].demand["X"]) == 10_000
-    assert first.whole
-    assert stream.lacks({"rows": [0, 10_000], "row": 1})
-    assert not stream.lacks({"rows": [0, 10_000], "row": 0})
-    while stream.ready:
-        pieces.append(stream.take())
+    assert first.is_complete
+    assert stream.has_too_few_rows({"rows": [0, 10_000], "row": 1})
+    assert not stream.has_too_few_rows({"rows": [0, 10_000], "row": 0})
+    while stream.has_block:
+        pieces.append(stream.take_rows())
     assert [piece.final for piece in pieces] == [False] * (len(pieces) - 1) + [True]
     assert [piece.first for piece in pieces[1:]] == [block.end for block in first.blocks[4:-1]]
     (file,) = (config.store.directory / FOLDER).glob("*.rows")
     body = np.frombuffer(file.read_bytes(), "<i4").reshape(-1, 4)
     assert np.array_equal(np.concatenate([piece.offset["Y"] for piece in pieces]), body[:, 3])
-    assert not stream.lacks({"rows": [0, 10_000], "row": 9_999})
+    assert not stream.has_too_few_rows({"rows": [0, 10_000], "row": 9_999})
 
 
-def whole(_checked: CheckedProgram) -> bool:
+def read_all_rows(_checked: CheckedProgram) -> bool:
     return False
 
 
-async def _twice(config: MachineConfig, found: ArmRequest) -> list[CheckedProgram | tuple[Reason, ...]]:
+async def _check_twice(config: MachineConfig, found: ArmRequest) -> list[CheckedProgram | tuple[Reason, ...]]:
     check, heard = BackgroundCheck(config), list[Mapping[str, Any]]()
 
-    async def listen() -> None:
+    async def count_messages() -> None:
         while True:
             if check.progress is not None:
                 heard.append(check.progress)
             await asyncio.sleep(0.01)
 
-    listening = asyncio.create_task(listen())
-    first = await check.run(found.program, found.program_digest, found.models, whole)
+    listening = asyncio.create_task(count_messages())
+    first = await check.check_until(found.program, found.program_digest, found.models, read_all_rows)
     before = len(heard)
-    again = await check.run(found.program, found.program_digest, found.models, whole)
+    again = await check.check_until(found.program, found.program_digest, found.models, read_all_rows)
     listening.cancel()
     assert heard[-1]["program"] == str(found.program)
     assert len(heard) == before
@@ -178,10 +178,12 @@ async def _twice(config: MachineConfig, found: ArmRequest) -> list[CheckedProgra
 
 
 @pytest.mark.usefixtures("processes")
-async def test_an_abandoned_check_says_so_and_leaves_nothing(config: MachineConfig, tmp_path: Path) -> None:
-    program = written(tmp_path, HEAD + SQUARE * 2000 + "M2\n")
+async def test_abandoned_check_is_reported_and_leaves_no_files(config: MachineConfig, tmp_path: Path) -> None:
+    program = write_program(tmp_path, HEAD + SQUARE * 2000 + "M2\n")
     check = BackgroundCheck(config)
-    running = asyncio.create_task(check.run(program, program_digest(program), build_nominal_models(config), whole))
+    running = asyncio.create_task(
+        check.check_until(program, program_digest(program), build_nominal_models(config), read_all_rows)
+    )
     async with asyncio.timeout(500):
         while not (check.progress or {}).get("checked_s"):  # noqa: ASYNC110 - what another process says has no event
             await asyncio.sleep(0.05)
@@ -199,95 +201,101 @@ BESIDE = "O<square> SUB\n" + SQUARE + "O<square> ENDSUB\n"
 
 
 @pytest.mark.usefixtures("processes")
-async def test_a_subroutine_beside_the_program_belongs_to_it(config: MachineConfig, tmp_path: Path) -> None:
+async def test_subroutine_in_program_folder_is_part_of_check(config: MachineConfig, tmp_path: Path) -> None:
     beside = tmp_path / "square.ngc"
     beside.write_text(BESIDE)
-    program = written(tmp_path, CALLS)
+    program = write_program(tmp_path, CALLS)
     digest, models = program_digest(program), build_nominal_models(config)
-    folder, key = config.store.directory / FOLDER, BackgroundCheck(config)._key(digest, models, config)
-    header = keep(folder, key, lambda body: check(program, digest, models, config, body, lambda _told: None))
+    folder, key = config.store.directory / FOLDER, BackgroundCheck(config)._make_key(digest, models, config)
+    header = store_checked(
+        folder, key, lambda body: check_program(program, digest, models, config, body, lambda _told: None)
+    )
     assert header["files"] == {"square.ngc": program_digest(beside)}
-    first = await BackgroundCheck(config).run(program, digest, models, whole)
+    first = await BackgroundCheck(config).check_until(program, digest, models, read_all_rows)
     assert isinstance(first, CheckedProgram)
     assert [list(block[:2]) for block in first.blocks] == header["blocks"]  # it is known
     (file,) = folder.glob("*.rows")
-    assert CheckedProgram.find(file.parent, file.stem, tmp_path) is not None
+    assert CheckedProgram.find_checked(file.parent, file.stem, tmp_path) is not None
     beside.write_text(BESIDE.replace("X40", "X41"))
-    assert CheckedProgram.find(file.parent, file.stem, tmp_path) is None
-    again = await BackgroundCheck(config).run(program, digest, models, whole)
+    assert CheckedProgram.find_checked(file.parent, file.stem, tmp_path) is None
+    again = await BackgroundCheck(config).check_until(program, digest, models, read_all_rows)
     assert isinstance(again, CheckedProgram)
     assert again.blocks != first.blocks
     assert again.header is not None
     assert again.header["files"] == {"square.ngc": program_digest(beside)}
     beside.unlink()
-    assert CheckedProgram.find(file.parent, file.stem, tmp_path) is None
+    assert CheckedProgram.find_checked(file.parent, file.stem, tmp_path) is None
 
 
 @pytest.mark.parametrize("which", ["program.ngc", "square.ngc"])
-def test_what_changes_while_it_is_checked_is_refused(which: str, config: MachineConfig, tmp_path: Path) -> None:
+def test_file_changed_during_check_is_refused(which: str, config: MachineConfig, tmp_path: Path) -> None:
     """Its rows would otherwise be stored under the digest of the old content."""
     (tmp_path / "square.ngc").write_text(BESIDE)
-    program = written(tmp_path, CALLS)
+    program = write_program(tmp_path, CALLS)
 
     def change(_told: Mapping[str, Any]) -> None:
         with (tmp_path / which).open("a") as file:
             file.write("(another)\n")
 
     with pytest.raises(ProgramError, match=f"{which} was modified while it was checked"):
-        check(program, program_digest(program), build_nominal_models(config), config, io.BytesIO(), change)
+        check_program(program, program_digest(program), build_nominal_models(config), config, io.BytesIO(), change)
 
 
 @pytest.mark.usefixtures("processes")
-async def test_a_process_that_dies_within_a_line_is_told(
+async def test_process_death_within_a_line_is_reported(
     config: MachineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    program = written(tmp_path, LONG)
-    says_instead(monkeypatch, tmp_path, 'read line\nprintf \'{"header": {"ref\'\nexit 9\n')
-    refused = await BackgroundCheck(config).run(program, program_digest(program), build_nominal_models(config), whole)
+    program = write_program(tmp_path, LONG)
+    replace_output(monkeypatch, tmp_path, 'read line\nprintf \'{"header": {"ref\'\nexit 9\n')
+    refused = await BackgroundCheck(config).check_until(
+        program, program_digest(program), build_nominal_models(config), read_all_rows
+    )
     assert isinstance(refused, tuple)
     assert (refused[0].code, "exit code 9" in refused[0].text) == ("InternalError", True)
 
 
 @pytest.mark.usefixtures("processes")
-async def test_a_process_that_cannot_be_started_is_told(
+async def test_process_that_cannot_start_is_reported(
     config: MachineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    program, check = written(tmp_path, LONG), BackgroundCheck(config)
+    program, check = write_program(tmp_path, LONG), BackgroundCheck(config)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "absent"))
-    refused = await check.run(program, program_digest(program), build_nominal_models(config), whole)
+    refused = await check.check_until(program, program_digest(program), build_nominal_models(config), read_all_rows)
     assert isinstance(refused, tuple)
     assert refused[0].text == "the check cannot be started (No such file or directory)"
-    await check.attend()  # it is no fault of the daemon
+    await check.raise_failure()  # it is no fault of the daemon
 
 
 @pytest.mark.usefixtures("processes")
-async def test_a_broken_program_is_refused_with_its_line_by_a_process_that_ends(
+async def test_faulty_program_is_refused_with_its_line(
     config: MachineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    program = written(tmp_path, HEAD + SQUARE * 10 + "G1 X[1/0]\nM2\n")
-    answer = answered(asked(program, config, tmp_path), tmp_path / "stderr")
+    program = write_program(tmp_path, HEAD + SQUARE * 10 + "G1 X[1/0]\nM2\n")
+    answer = run_check_process(make_request(program, config, tmp_path), tmp_path / "stderr")
     assert json.loads(answer.splitlines()[-1])["error"]["code"] == "ProgramError"
     (tmp_path / "answer").write_bytes(answer)
-    says_instead(monkeypatch, tmp_path, f"read line\nexec cat '{tmp_path / 'answer'}'\n")
-    refused = await BackgroundCheck(config).run(program, program_digest(program), build_nominal_models(config), whole)
+    replace_output(monkeypatch, tmp_path, f"read line\nexec cat '{tmp_path / 'answer'}'\n")
+    refused = await BackgroundCheck(config).check_until(
+        program, program_digest(program), build_nominal_models(config), read_all_rows
+    )
     assert isinstance(refused, tuple)
     assert refused[0].code == "ProgramError"
     assert "43" in refused[0].text
 
 
 @pytest.mark.usefixtures("processes")
-def test_the_process_ends_with_the_daemon(config: MachineConfig, tmp_path: Path) -> None:
-    program = written(tmp_path, HEAD + SQUARE * 5000 + "M2\n")
+def test_check_process_ends_with_daemon(config: MachineConfig, tmp_path: Path) -> None:
+    program = write_program(tmp_path, HEAD + SQUARE * 5000 + "M2\n")
     command = [sys.executable, "-m", "fdhil.arming.program_check"]
-    done = subprocess.run(command, input=asked(program, config, tmp_path), capture_output=True, check=False)
+    done = subprocess.run(command, input=make_request(program, config, tmp_path), capture_output=True, check=False)
     assert (done.returncode, done.stderr) == (1, b"")
     assert b"header" not in done.stdout
 
 
-def made(folder: Path, key: str) -> Path:
-    code = code_digest()
+def make_checked(folder: Path, key: str) -> Path:
+    code = compute_code_digest()
 
-    def rows(body: Any) -> dict[str, Any]:
+    def write_rows(body: Any) -> dict[str, Any]:
         content = np.arange(32, dtype="<i4").tobytes()
         body.write(content)
         blocks = [[end, hashlib.sha256(content[16 * (end - 4) : 16 * end]).hexdigest()] for end in (4, 8)]
@@ -295,88 +303,88 @@ def made(folder: Path, key: str) -> Path:
         of = {"schema": SCHEMA, "code": code, "files": {}, "axes": ["X", "Y"], "rows": 8, "blocks": blocks}
         return {**of, **errors, "refused": [], "largest_um": 1.0}
 
-    keep(folder, key, rows)
+    store_checked(folder, key, write_rows)
     return folder / f"{key}.rows"
 
 
-def test_what_was_checked_is_only_believed_whole(tmp_path: Path) -> None:
-    file = made(tmp_path, "a")
-    found = CheckedProgram.find(tmp_path, "a", tmp_path)
+def test_damaged_check_result_is_not_used(tmp_path: Path) -> None:
+    file = make_checked(tmp_path, "a")
+    found = CheckedProgram.find_checked(tmp_path, "a", tmp_path)
     assert found is not None
-    assert (found.whole, found.rows, found.gain_um) == (True, 8, 1.5)
-    assert CheckedProgram.find(tmp_path, "b", tmp_path) is None
+    assert (found.is_complete, found.row_count, found.gain_um) == (True, 8, 1.5)
+    assert CheckedProgram.find_checked(tmp_path, "b", tmp_path) is None
     stream = RowStream(found, "digest", 0.001)
     content = bytearray(file.read_bytes())
     content[70] ^= 1
     file.write_bytes(content)
-    assert CheckedProgram.find(tmp_path, "a", tmp_path) is None
-    assert stream.take() == Piece(
+    assert CheckedProgram.find_checked(tmp_path, "a", tmp_path) is None
+    assert stream.take_rows() == TablePiece(
         0, {"X": [0, 4, 8, 12], "Y": [1, 5, 9, 13]}, {"X": [2, 6, 10, 14], "Y": [3, 7, 11, 15]}, False
     )
     with pytest.raises(StoreError, match="damaged"):
-        stream.take()
+        stream.take_rows()
     file.write_bytes(content[:40])
     with pytest.raises(StoreError, match="damaged"):
-        RowStream(found, "digest", 0.001).take()
-    assert CheckedProgram.find(tmp_path, "a", tmp_path) is None
+        RowStream(found, "digest", 0.001).take_rows()
+    assert CheckedProgram.find_checked(tmp_path, "a", tmp_path) is None
     file.unlink()
-    assert CheckedProgram.find(tmp_path, "a", tmp_path) is None
+    assert CheckedProgram.find_checked(tmp_path, "a", tmp_path) is None
 
 
-def test_what_is_armed_outlives_its_file(tmp_path: Path) -> None:
-    file = made(tmp_path, "a")
-    found = CheckedProgram.find(tmp_path, "a", tmp_path)
+def test_armed_rows_survive_removal_of_file(tmp_path: Path) -> None:
+    file = make_checked(tmp_path, "a")
+    found = CheckedProgram.find_checked(tmp_path, "a", tmp_path)
     assert found is not None
     file.unlink()
-    assert RowStream(found, "digest", 0.001).take(1.0).final
+    assert RowStream(found, "digest", 0.001).take_rows(1.0).final
 
 
-def test_what_other_code_made_is_checked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made(tmp_path, "a")
+def test_result_of_other_code_is_checked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_checked(tmp_path, "a")
     home = tmp_path / "fdhil"
     shutil.copytree(Path(fdhil.__file__).parent, home, ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(fdhil, "__file__", str(home / "__init__.py"))
-    assert CheckedProgram.find(tmp_path, "a", tmp_path) is not None
+    assert CheckedProgram.find_checked(tmp_path, "a", tmp_path) is not None
     (home / "guard" / "core.py").write_text("")  # makes no row
-    assert CheckedProgram.find(tmp_path, "a", tmp_path) is not None
+    assert CheckedProgram.find_checked(tmp_path, "a", tmp_path) is not None
     with (home / "program" / "planner" / "smoothing.py").open("a") as file:
         file.write("# otherwise\n")
-    assert CheckedProgram.find(tmp_path, "a", tmp_path) is None
+    assert CheckedProgram.find_checked(tmp_path, "a", tmp_path) is None
 
 
-def test_a_refused_program_is_not_kept_and_old_ones_go(tmp_path: Path) -> None:
+def test_refused_program_is_not_stored_and_old_ones_are_removed(tmp_path: Path) -> None:
     (tmp_path / ".left.part").write_bytes(b"half")
     refused: dict[str, Any] = {"refused": [{"code": "NoGain", "text": "", "advice": ""}]}
-    assert keep(tmp_path, "no", lambda body: refused if body.write(b"rows") else {}) == refused
+    assert store_checked(tmp_path, "no", lambda body: refused if body.write(b"rows") else {}) == refused
     assert list(tmp_path.iterdir()) == []
     for number in range(KEPT + 2):
-        file = made(tmp_path, f"k{number}")
+        file = make_checked(tmp_path, f"k{number}")
         for path in (file, file.with_suffix(".json")):
             os.utime(path, (number, number))
-    made(tmp_path, "newest")
+    make_checked(tmp_path, "newest")
     names = {path.stem for path in tmp_path.glob("*.json")}
     assert names == {"newest", *(f"k{n}" for n in range(3, KEPT + 2))}
     assert {path.stem for path in tmp_path.glob("*.rows")} == names
     assert all(json.loads(path.read_bytes())["rows"] == 8 for path in tmp_path.glob("*.json"))
 
 
-def test_a_store_that_refuses_is_told(tmp_path: Path) -> None:
+def test_store_error_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(StoreError):
-        made(tmp_path / "file" / "folder", "a")
+        make_checked(tmp_path / "file" / "folder", "a")
 
 
-def test_rows_of_other_terms_or_loops_are_other_rows(config: MachineConfig, tmp_path: Path) -> None:
-    program = written(tmp_path, HEAD + SQUARE + "G4 P0.3\nM2\n")
+def test_other_terms_or_loops_need_another_check(config: MachineConfig, tmp_path: Path) -> None:
+    program = write_program(tmp_path, HEAD + SQUARE + "G4 P0.3\nM2\n")
     digest, six = program_digest(program), build_nominal_models(config)
     rich = {axis: model.replace_values(stribeck=2.0, stribeck_speed=10.0) for axis, model in six.items()}
     filtered = apply_loops(config, {axis: {"speed_filter_s": 5e-4} for axis in config.axis}, "test")
     background, bodies = BackgroundCheck(config), dict[str, bytes]()
     for models, machine in ((six, config), (rich, config), (six, filtered)):
-        key = background._key(digest, models, machine)
-        request = json.dumps(background._request(program, digest, models, key, machine))
+        key = background._make_key(digest, models, machine)
+        request = json.dumps(background._make_request(program, digest, models, key, machine))
         answer_request(json.loads(request), lambda _told: None)
-        found = CheckedProgram.find(config.store.directory / FOLDER, key, tmp_path)
+        found = CheckedProgram.find_checked(config.store.directory / FOLDER, key, tmp_path)
         assert found is not None
-        bodies[key] = b"".join(found.content(k) for k in range(len(found.blocks)))
+        bodies[key] = b"".join(found.read_block(k) for k in range(len(found.blocks)))
     assert len(set(bodies.values())) == len(bodies) == 3

@@ -18,11 +18,11 @@ from fdhil.commissioning.record import axis_digest, save_record
 from fdhil.commissioning.void import void_record
 from fdhil.config import MachineConfig
 from fdhil.records import Notice
-from fdhil.store.history import History
+from fdhil.store.history_database import History
 from tests.commissioning.test_record import RECORD
 from tests.daemon.machine_rig import BENCH, fdhil
 from tests.daemon.simulated_machine import config_of
-from tests.store.made import STAMP, outcome, published, window
+from tests.store.sample_records import STAMP, make_outcome, make_published, make_window
 
 CIRCLE = ("--radius-mm", "10", "--feed", "3000")
 
@@ -37,8 +37,8 @@ def _proven(tmp_path: Path) -> MachineConfig:
     machine = machine_of(tmp_path)
     with History.open(machine.store.directory) as history:
         for axis in ("X", "Y"):
-            number = history.add_window(outcome(of=window(axis=axis)), "", STAMP)
-            history.add_revision(published(axis=axis), [number], STAMP)
+            number = history.add_window(make_outcome(of=make_window(axis=axis)), "", STAMP)
+            history.add_revision(make_published(axis=axis), [number], STAMP)
             made = replace(RECORD, axis=axis, config_digest=axis_digest(machine, axis))
             save_record(made, machine.store.directory)
     return machine

@@ -21,7 +21,7 @@ from fdhil.errors import FdhilError
 from fdhil.fleet import window_files
 from fdhil.fleet.window_reanalysis import reanalyse_batch
 from fdhil.identification.rapid_windows import find_moving_range
-from fdhil.store.windows import read_window
+from fdhil.store.window_file import read_window
 from studies import bench
 from tests.daemon.machine_rig import fdhil
 from tests.fleet import stored_rapids

@@ -17,8 +17,8 @@ from fdhil import config as machine_config
 from fdhil.cli.main import cli, run_safely
 from fdhil.commissioning.record import load_record
 from fdhil.errors import DriveFault
-from fdhil.store import audit
-from fdhil.store.history import History
+from fdhil.store import audit_file
+from fdhil.store.history_database import History
 from tests.bench import bench_toml
 from tests.commissioning.foreign_nc import A_FEW, FOREIGN, NMT, OFFSET, SDO, SYNC, ForeignNc, LateOperator, is_offset
 from tests.drivers.peer import DrivePeer
@@ -167,8 +167,8 @@ def test_an_axis_is_tried_where_the_operator_agrees_and_known_to_the_history(
     assert out.splitlines()[-1].startswith("next: fdhil run")
     assert "\raxis X at " in err
     assert "of 7" not in out
-    with History.read(bench.store) as history:
-        (newest,) = history.revisions("X", limit=1)
+    with History.open_read_only(bench.store) as history:
+        (newest,) = history.read_revisions("X", limit=1)
     for name, true in TRUE.items():
         assert newest.set.parameters.as_dict()[name] == pytest.approx(true, rel=0.01), name
 
@@ -246,7 +246,7 @@ WRONG: dict[str, tuple[Callable[[Bench], None], str, bool]] = {
 
 
 def in_the_audit(bench: Bench) -> list[tuple[str, str, str | None]]:
-    found = [entry for entry, wrong in audit.entries(bench.store) if wrong is None]
+    found = [entry for entry, wrong in audit_file.read_entries(bench.store) if wrong is None]
     return [(entry.get("asked") or entry["answered"], entry["axis"], entry.get("result")) for entry in found]
 
 
@@ -273,7 +273,7 @@ def test_what_is_done_to_a_drive_is_in_the_audit_before_it_is_done(
 @pytest.mark.fault("F5")
 @pytest.mark.parametrize("options", [(), ("--set-pdos",)])
 def test_what_cannot_be_written_down_is_not_done(options: tuple[str, ...], bench: Bench) -> None:
-    (bench.store / audit.AUDIT_FILE_NAME).mkdir(parents=True)
+    (bench.store / audit_file.AUDIT_FILE_NAME).mkdir(parents=True)
     code, _, err = bench.commission("--yes", *options)
     assert (code, "could not be written" in err) == (3, True)
     assert bench.peer.heard == []

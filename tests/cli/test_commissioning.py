@@ -27,7 +27,7 @@ from fdhil.commissioning.void import is_void, void_record
 from fdhil.config import load_config
 from fdhil.sim.drive.drive_objects import compute_serial_number
 from fdhil.sim.wire.tcp_hub import TcpHub
-from tests.arming.guard_peer import Guard
+from tests.arming.guard_peer import GuardPeer
 from tests.sim.hub_thread import HubThread
 from tests.sim.simulator_process import SimulatorProcess, write_config
 
@@ -242,7 +242,7 @@ def test_where_the_guard_took_nothing_of_a_comparison_void_records_stay_so(
     path = write_config(tmp_path, bus='interface = "virtual"')
     config = load_config(path)
     config.guard_directory.mkdir(parents=True, exist_ok=True)
-    guard = Guard(config.guard_directory)
+    guard = GuardPeer(config.guard_directory)
     guard.says = lambda _kind: {"ok": True, "state": "OFF", "touched": {"X": 0, "Y": 0}}
 
     def compare(*_: object) -> list[tuple[str, Finding]]:
@@ -268,7 +268,7 @@ def test_what_is_seen_while_drives_are_compared_speaks_against_them(
     config = load_config(path)
     store = config.store.directory
     config.guard_directory.mkdir(parents=True, exist_ok=True)
-    guard, said = Guard(config.guard_directory), {"ok": True, "state": "OFF", "touched": {"X": 3, "Y": 0}}
+    guard, said = GuardPeer(config.guard_directory), {"ok": True, "state": "OFF", "touched": {"X": 3, "Y": 0}}
     void = {"code": "RecordVoid", "axis": "Y", "text": "axis Y: it has booted", "advice": "run fdhil check"}
 
     def compare(*_: object) -> list[tuple[str, Finding]]:

@@ -12,8 +12,8 @@ import pytest
 
 from fdhil.program import write_demand_csv
 from fdhil.records import Skill
-from fdhil.store.history import History
-from fdhil.store.rows import Stamp
+from fdhil.store.history_database import History
+from fdhil.store.history_rows import TimeStamp
 from tests.cli.test_predict import _bench as _bench
 from tests.cli.test_predict import invoke, remember
 from tests.paths import build_bench_trajectory, build_trajectory, smooth_demand
@@ -74,7 +74,7 @@ def test_with_a_history_a_gain_has_its_uncertainty_and_a_spread_below_the_digits
     remember(bench, [{}], known_to=1e-6)
     with History.open(bench / "fdhil-data") as history:
         for axis in "XY":
-            history.add_skill(Skill(axis, 1, 0.4, 1.0, 0.0, 30.0), Stamp(0.0, "boot", 0))
+            history.add_skill(Skill(axis, 1, 0.4, 1.0, 0.0, 30.0), TimeStamp(0.0, "boot", 0))
     arguments = ["correct", bench / "demand.csv", "--config", bench / "bench.toml", "--from-history"]
     text = invoke(*arguments).stdout
     assert re.search(

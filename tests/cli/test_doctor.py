@@ -21,8 +21,8 @@ from fdhil import config as machine_config
 from fdhil.cli.demo.toml import to_toml
 from fdhil.cli.doctor import doctor
 from fdhil.records import Notice
-from fdhil.store.history import HISTORY_FILE_NAME, History
-from fdhil.store.rows import Stamp
+from fdhil.store.history_database import HISTORY_FILE_NAME, History
+from fdhil.store.history_rows import TimeStamp
 from tests.bench import bench_document
 from tests.drivers.peer import DrivePeer
 from tests.short_waits import shorten_waits
@@ -110,7 +110,7 @@ def clock_never_set(pc: Pc, patch: pytest.MonkeyPatch) -> None:
 
 def clock_set_back(pc: Pc, patch: pytest.MonkeyPatch) -> None:
     with History.open(pc.store) as history:
-        now = Stamp.now()
+        now = TimeStamp.now()
         history.add_notice(Notice("SyncLost", "info", "SYNC is back."), replace(now, wall_s=now.wall_s + 86400))
 
 

@@ -11,7 +11,7 @@ import pytest
 from fdhil import config as machine_config
 from fdhil.cli.doctor.offers import examine_offers
 from fdhil.config import MachineConfig
-from fdhil.store.offers import ANSWERS_FILE, Answer, add_answer, file_name
+from fdhil.store.change_offers import ANSWERS_FILE, OfferDecision, add_decision, make_file_name
 from tests.fleet.offer_signing import OfferSigner, create_machine
 
 
@@ -20,7 +20,7 @@ def machine(tmp_path: Path) -> MachineConfig:
     works = OfferSigner(tmp_path)
     config = machine_config.load_config(create_machine(works, tmp_path / "mill"))
     config.offers_directory.mkdir(parents=True)
-    (config.offers_directory / file_name("friction", 3)).write_bytes(works.sign_document())
+    (config.offers_directory / make_file_name("friction", 3)).write_bytes(works.sign_document())
     return config
 
 
@@ -32,8 +32,8 @@ def told(machine: MachineConfig) -> list[tuple[str, bool]]:
 
 def test_an_offer_is_told_until_it_is_answered(machine: MachineConfig) -> None:
     assert told(machine) == [("OfferWaits", False)]
-    answer = Answer("friction", 3, 1, "0" * 64, "rejected", "Anna", "not now", time.time(), "")
-    add_answer(machine.store.directory, answer)
+    answer = OfferDecision("friction", 3, 1, "0" * 64, "rejected", "Anna", "not now", time.time(), "")
+    add_decision(machine.store.directory, answer)
     assert told(machine) == []
 
 
@@ -46,7 +46,7 @@ def test_answers_that_cannot_be_read(machine: MachineConfig) -> None:
 @pytest.mark.parametrize("what", ["the folder", "an offer"])
 def test_what_this_user_may_not_read(what: str, machine: MachineConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = machine.offers_directory
-    shut = folder if what == "the folder" else folder / file_name("friction", 3)
+    shut = folder if what == "the folder" else folder / make_file_name("friction", 3)
     monkeypatch.setattr(os, "access", lambda path, _: path != shut)  # root can read everything
     assert ("OffersUnread", True) in told(machine)
 

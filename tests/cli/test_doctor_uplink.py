@@ -13,7 +13,7 @@ import pytest
 
 from fdhil.cli.doctor.uplink import examine_uplink
 from fdhil.store import HISTORY_FILE
-from fdhil.store.outbox import POSITION_FILE, OutboxReader, Position, write_position
+from fdhil.store.outbox import POSITION_FILE, OutboxPosition, OutboxReader, write_position
 from tests.fleet.recording_machine import RecordingMachine, write_history
 from tests.reserved_port import reserve_port
 
@@ -44,8 +44,8 @@ def recorded(folder: Path, **uplink: str) -> RecordingMachine:
     machine.record_windows(1)
     machine.config.uplink_directory.mkdir()
     with OutboxReader(machine.config.store.directory) as reader:
-        last = reader.entries(0, 100)[-1]
-        write_position(machine.config.uplink_directory, Position(reader.store, last.number, last.message))
+        last = reader.read_entries(0, 100)[-1]
+        write_position(machine.config.uplink_directory, OutboxPosition(reader.store, last.number, last.message))
     machine.close_store()
     return machine
 

@@ -24,7 +24,7 @@ from fdhil.cli.main import cli, run_safely
 from fdhil.commissioning.record import axis_digest, save_record
 from fdhil.guard.guard_settings import load_settings
 from fdhil.guard.offset_limits import OffsetLimits
-from tests.arming.test_guard_settings import RECORD
+from tests.arming.test_guard_configuration import RECORD
 from tests.guard.drive_peer import Peer, hold_demand, write_config
 from tests.reserved_port import reserve_port
 

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from fdhil.records import PARAMETERS, Notice, freeze_array
-from fdhil.store.history import History
-from fdhil.store.rows import Acknowledgement, Stamp
+from fdhil.store.history_database import History
+from fdhil.store.history_rows import Acknowledgement, TimeStamp
 from tests.daemon.machine_rig import BENCH, fdhil
 from tests.daemon.simulated_machine import config_of
-from tests.store.made import outcome, published, window
+from tests.store.sample_records import make_outcome, make_published, make_window
 
 START_S = 1_800_000_000.0
 DAYS = 60
@@ -39,17 +39,17 @@ def worn(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for k in range(2 * DAYS):
             day = k / 2
             celsius = 22 + 2 * np.sin(k) + 0.01 * day
-            made = outcome(of=window(temperature_c=float(celsius)))
+            made = make_outcome(of=make_window(temperature_c=float(celsius)))
             assert made.estimate is not None
             values = made.estimate.values + STDS * rng.standard_normal(6)
             values[4] += WEAR_PER_DAY * day
             values[5] += PER_KELVIN * (celsius - 22)
             values[3] *= 1.13 if day >= STEP_DAY else 1.0
             estimate = replace(made.estimate, values=freeze_array(values), covariance=freeze_array(np.diag(STDS**2)))
-            stamp = Stamp(START_S + 86_400 * day, "boot", k)
+            stamp = TimeStamp(START_S + 86_400 * day, "boot", k)
             number = history.add_window(replace(made, estimate=estimate), "", stamp)
-            parameters = replace(published(1).parameters, **dict(zip(PARAMETERS, values.tolist(), strict=True)))
-            history.add_revision(replace(published(k + 1), parameters=parameters), [number], stamp)
+            parameters = replace(make_published(1).parameters, **dict(zip(PARAMETERS, values.tolist(), strict=True)))
+            history.add_revision(replace(make_published(k + 1), parameters=parameters), [number], stamp)
     return path
 
 
@@ -131,9 +131,9 @@ def test_rapids_that_were_not_believed_are_in_the_report(tmp_path: Path, capsys:
     path.write_text(BENCH)
     with History.open(config_of(tmp_path, ("X", "Y")).store.directory) as history:
         for k in range(3):
-            stamp = Stamp(START_S + 86_400 * k, "boot", k)
-            history.add_window(outcome(accepted=False, of=window(axis="Y")), "", stamp)
-            history.add_window(outcome(of=window(axis="X")), "", stamp)
+            stamp = TimeStamp(START_S + 86_400 * k, "boot", k)
+            history.add_window(make_outcome(accepted=False, of=make_window(axis="Y")), "", stamp)
+            history.add_window(make_outcome(of=make_window(axis="X")), "", stamp)
     assert fdhil("report", path, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
     page = (tmp_path / "report.html").read_text()
     assert "None of 3 rapids was accepted, most often (3 ×) because of MissingStage(cruise): no plateau." in page
@@ -148,13 +148,13 @@ def test_a_long_store_is_a_small_page(tmp_path: Path, capsys: Any) -> None:
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)
     rng = np.random.default_rng(1)
-    made = outcome(of=window())
+    made = make_outcome(of=make_window())
     assert made.estimate is not None
     with History.open(config_of(tmp_path, ("X", "Y")).store.directory) as history:
         for k in range(240):
             values = made.estimate.values * (1 + 0.01 * rng.standard_normal(6))
             estimate = replace(made.estimate, values=freeze_array(values))
-            history.add_window(replace(made, estimate=estimate), "", Stamp(START_S + 7_200 * k, "boot", k))
+            history.add_window(replace(made, estimate=estimate), "", TimeStamp(START_S + 7_200 * k, "boot", k))
     assert fdhil("report", path, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
     page = (tmp_path / "report.html").read_text()
     assert len(page) < 600_000
@@ -193,9 +193,9 @@ def test_history_and_report_tell_what_waits_and_who_acknowledged(tmp_path: Path,
     path.write_text(BENCH)
     with History.open(config_of(tmp_path).store.directory) as history:
         for k, text in enumerate(("the bus was gone", "the bus was gone again")):
-            history.add_notice(Notice("BusDown", "MAJOR", text), Stamp(START_S + k, "boot", k))
-        history.add_notice(Notice("BusDown", "info", "the bus is back"), Stamp(START_S + 9, "boot", 9))
-        history.add_acknowledgement(Acknowledgement((1,), "anna", "plug", Stamp(START_S + 60, "boot", 60)))
+            history.add_notice(Notice("BusDown", "MAJOR", text), TimeStamp(START_S + k, "boot", k))
+        history.add_notice(Notice("BusDown", "info", "the bus is back"), TimeStamp(START_S + 9, "boot", 9))
+        history.add_acknowledgement(Acknowledgement((1,), "anna", "plug", TimeStamp(START_S + 60, "boot", 60)))
     out = fdhil("history", path, capsys=capsys)[1]
     assert "pending notices (see fdhil acknowledge): 1" in out
     assert "acknowledged by anna" in out

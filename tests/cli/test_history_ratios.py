@@ -13,8 +13,8 @@ import pytest
 from fdhil.config import Identification
 from fdhil.pipeline import analyse_window
 from fdhil.records import freeze_array
-from fdhil.store.history import History
-from fdhil.store.rows import Stamp
+from fdhil.store.history_database import History
+from fdhil.store.history_rows import TimeStamp
 from tests.daemon.machine_rig import BENCH, fdhil
 from tests.daemon.simulated_machine import config_of
 from tests.identification.bench_recordings import find_noisy_windows
@@ -39,7 +39,9 @@ def deaf(tmp_path_factory: pytest.TempPathFactory) -> Path:
             values[6] *= 1.13 if day >= LOADED_ON_DAY else 1.0
             values[8] *= 1.0 + WEAR_PER_DAY * day
             estimate = replace(analysed.estimate, values=freeze_array(values))
-            history.add_window(replace(analysed, estimate=estimate), "", Stamp(START_S + 86_400.0 * day, "boot", day))
+            history.add_window(
+                replace(analysed, estimate=estimate), "", TimeStamp(START_S + 86_400.0 * day, "boot", day)
+            )
     return path
 
 
@@ -68,7 +70,7 @@ def test_what_the_data_sheet_gives_has_no_trend(tmp_path: Path, capsys: Any) -> 
         for day, window in enumerate(find_noisy_windows(0.003, moves=4)):
             analysed = analyse_window(replace(window, voltage_v=None), Identification(), machine.axis["X"], 0.001)
             assert analysed.verdict.accepted, analysed.verdict
-            history.add_window(analysed, "", Stamp(START_S + 86_400.0 * day, "boot", window.start_tick))
+            history.add_window(analysed, "", TimeStamp(START_S + 86_400.0 * day, "boot", window.start_tick))
     document = json.loads(fdhil("history", path, "--json", capsys=capsys)[1])
     assert {"Jt", "ft", "Cd"} <= set(document["trends"]["X"])
     assert not {"R", "L", "K"} & set(document["trends"]["X"])

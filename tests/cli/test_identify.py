@@ -16,8 +16,8 @@ from fdhil import tables
 from fdhil.cli.identify import identify
 from fdhil.cli.main import cli, run_safely
 from fdhil.errors import ConfigError
-from fdhil.store import suffixes
-from fdhil.store.export import export_table, table_of
+from fdhil.store import file_suffixes
+from fdhil.store.window_export import convert_window, export_table
 from studies import bench
 from studies.slow_sensor import record_slow_windows
 from tests.bench import bench_toml
@@ -68,7 +68,7 @@ def test_json_holds_every_window_and_the_pool(shuttle: Path) -> None:
 
 def test_the_delay_of_a_slow_sensor_is_told_with_its_deviation(tmp_path: Path) -> None:
     path = tmp_path / "slow.csv"
-    export_table(table_of(record_slow_windows(0.005, delay_s=0.0012)[0]), path)
+    export_table(convert_window(record_slow_windows(0.005, delay_s=0.0012)[0]), path)
     result = invoke(path, "--json")
     assert result.return_value == 0
     (window,) = told_document(result)["files"][0]["windows"]
@@ -204,10 +204,10 @@ def test_unknown_method_is_exit_2(shuttle: Path, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.usefixtures("processes")
 def test_every_file_format_gives_the_same_answer(tmp_path: Path) -> None:
-    table = table_of(record_slow_windows(0.005)[0])
+    table = convert_window(record_slow_windows(0.005)[0])
     answers = []
     for name in tables.RECORDING_FORMATS:
-        path = tmp_path / f"rapid{suffixes.suffix_of(suffixes.RECORDING_SUFFIXES, name)}"
+        path = tmp_path / f"rapid{file_suffixes.find_suffix(file_suffixes.RECORDING_SUFFIXES, name)}"
         export_table(table, path, name)
         answers.append(told_document(invoke("--json", path))["files"][0]["pooled"])
     assert answers[0]["validated"]

@@ -15,7 +15,7 @@ from fdhil.identification.drive_loops.loop_identification import DIFFER
 from fdhil.prediction.axis_models import apply_loops, load_model_file
 from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Reason, Result, Verdict, freeze_array
 from tests.bench import bench_config
-from tests.store.made import BENCH
+from tests.store.sample_records import BENCH
 
 CONFIG = bench_config("X")
 POOLED = Estimate(

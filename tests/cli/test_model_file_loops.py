@@ -17,14 +17,14 @@ from fdhil.prediction.axis_models import load_model_file
 from fdhil.prediction.contour_error import compute_contour_error_um
 from fdhil.program import write_demand_csv
 from fdhil.records import Float
-from fdhil.store.history import History
-from fdhil.store.rows import Stamp
+from fdhil.store.history_database import History
+from fdhil.store.history_rows import TimeStamp
 from studies import real_plant as real
 from tests.bench import bench_toml
 from tests.cli.test_predict import invoke as run
 from tests.identification.test_loop_identification import build_shuttle_demand
 from tests.paths import build_bench_trajectory, compute_rms
-from tests.store.made import published
+from tests.store.sample_records import make_published
 
 MECHANICS, LOOPS = real.Mechanics(), real.Loops(speed_filter_s=0.002)
 WORSE_UM = 1.0
@@ -72,10 +72,10 @@ def test_correction_with_the_model_file_makes_no_place_of_the_real_path_worse(sh
 def test_correction_from_the_history_uses_the_loops_of_the_published_sets(shop: Shop) -> None:
     config = configuration.load_config(shop.config)
     model = load_model_file(shop.model)
-    found = replace(published(1, "X", model.parameters["X"]), config_digest=config.digest, loops=model.loops["X"])
+    found = replace(make_published(1, "X", model.parameters["X"]), config_digest=config.digest, loops=model.loops["X"])
     with History.open(config.store.directory) as history:
         for axis in "XY":
-            history.add_revision(replace(found, axis=axis), [], Stamp.now())
+            history.add_revision(replace(found, axis=axis), [], TimeStamp.now())
     assert_corrected(shop, "--from-history")
     older = {axis: {k: v for k, v in json.loads(shop.model.read_text())["X"].items() if k != "loops"} for axis in "XY"}
     path = shop.folder / "older.json"

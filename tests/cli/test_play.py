@@ -18,7 +18,7 @@ import can
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.store import audit
+from fdhil.store import audit_file
 from tests.integration.conftest import sign_off
 from tests.sim.simulator_process import SimulatorProcess, write_config
 
@@ -105,7 +105,9 @@ class Shop:
         return process
 
     def last_in_the_audit(self) -> tuple[str, str | None]:
-        *_, (entry, _) = audit.entries(machine_config.load_config(self.folder / "machine.toml").store.directory)
+        *_, (entry, _) = audit_file.read_entries(
+            machine_config.load_config(self.folder / "machine.toml").store.directory
+        )
         return entry.get("asked") or entry["answered"], entry.get("result")
 
     def wait(self, condition: Callable[[], bool]) -> None:

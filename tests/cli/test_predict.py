@@ -15,8 +15,8 @@ from fdhil.cli.main import cli, run_safely
 from fdhil.errors import StoreError
 from fdhil.program import write_demand_csv
 from fdhil.records import Parameters, ParameterSet, freeze_array
-from fdhil.store.history import History
-from fdhil.store.rows import Stamp
+from fdhil.store.history_database import History
+from fdhil.store.history_rows import TimeStamp
 from tests.bench import bench_toml
 from tests.paths import build_bench_trajectory
 
@@ -91,7 +91,7 @@ def test_history_gives_parameters_and_their_uncertainty(bench: Path) -> None:
             published = ParameterSet(
                 axis, 1, Parameters.from_mapping(values), freeze_array(covariance), 3, 0, None, "digest"
             )
-            history.add_revision(published, [], Stamp(0.0, "boot", 0))
+            history.add_revision(published, [], TimeStamp(0.0, "boot", 0))
     out = bench / "out.csv"
     arguments = ["--config", bench / "bench.toml", "--from-history", "--json", "--out", out]
     result = invoke("predict", bench / "demand.csv", *arguments)
@@ -118,7 +118,7 @@ def publish(
         known = ParameterSet(
             axis, number, Parameters.from_mapping(nominal | changed), freeze_array(covariance), 3, 0, None, "digest"
         )
-        history.add_revision(known, [], Stamp(86400.0 * (number if days is None else days), "boot", 0))
+        history.add_revision(known, [], TimeStamp(86400.0 * (number if days is None else days), "boot", 0))
 
 
 def test_history_tells_what_a_fixture_costs(bench: Path) -> None:

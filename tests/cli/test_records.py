@@ -16,12 +16,12 @@ from fdhil.cli.records import read_windows
 from fdhil.daemon.kernel_warmup import simulate_nominal_rapid
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.records import freeze_array
-from fdhil.store.recordings import read_recording
-from fdhil.store.windows import encode_window
+from fdhil.store.recording_file import read_recording
+from fdhil.store.window_file import encode_window
 from studies.slow_sensor import record_slow_windows
 from tests.daemon.machine_rig import BENCH, fdhil
 from tests.daemon.simulated_machine import config_of
-from tests.store.made import outcome, published, window
+from tests.store.sample_records import make_outcome, make_published, make_window
 
 
 @pytest.fixture
@@ -30,7 +30,16 @@ def machine(tmp_path: Path) -> Path:
     path.write_text(BENCH)
     store = OutcomeStore(config_of(tmp_path, ("X", "Y")))
     store.open()
-    store.store_outcomes([outcome(), published(1), outcome(accepted=False), outcome(), published(2), published(1, "Y")])
+    store.store_outcomes(
+        [
+            make_outcome(),
+            make_published(1),
+            make_outcome(accepted=False),
+            make_outcome(),
+            make_published(2),
+            make_published(1, "Y"),
+        ]
+    )
     store.close()
     return path
 
@@ -59,7 +68,7 @@ def test_replay_tells_outcomes_to_full_precision_and_the_verdict(rapid: Path, ca
 
 def test_replay_of_what_is_not_validated_exits_1(tmp_path: Path, capsys: Any) -> None:
     bad = tmp_path / "bad.parquet"
-    bad.write_bytes(encode_window(window(), ""))
+    bad.write_bytes(encode_window(make_window(), ""))
     code, out, _ = fdhil("replay", bad, capsys=capsys)
     assert code == 1
     assert "refused" in out
@@ -124,7 +133,7 @@ def test_a_recording_that_cannot_be_read_is_one_sentence_and_3(
 
 def test_a_recording_of_another_axis_than_the_configs_is_told(machine: Path, tmp_path: Path, capsys: Any) -> None:
     path = tmp_path / "z.parquet"
-    path.write_bytes(encode_window(window(axis="Z"), ""))
+    path.write_bytes(encode_window(make_window(axis="Z"), ""))
     code, _, err = fdhil("replay", "--config", machine, path, capsys=capsys)
     assert code == 3
     assert "is of axis Z" in err
@@ -136,7 +145,7 @@ def test_history_as_json_has_intervals_and_every_bit(machine: Path, capsys: Any)
     assert (code, document["schema"]) == (0, "fdhil-history-1")
     assert [(row["axis"], row["revision"]) for row in document["revisions"]] == [("X", 1), ("X", 2), ("Y", 1)]
     told = document["revisions"][0]["parameters"]["R"]
-    assert told["value"] == published(1).parameters.R
+    assert told["value"] == make_published(1).parameters.R
     assert document["revisions"][1]["window_ids"] == [1, 3]
     code, out, _ = fdhil("history", machine, "--json", "--axis", "Y", capsys=capsys)
     assert [row["axis"] for row in json.loads(out)["revisions"]] == ["Y"]
@@ -160,11 +169,11 @@ def test_history_says_how_the_parameters_follow_the_temperature(tmp_path: Path, 
     store = OutcomeStore(config_of(tmp_path, ("X", "Y")))
     store.open()
     for k in range(6):
-        warm = outcome(of=window(temperature_c=20.0 + k))
+        warm = make_outcome(of=make_window(temperature_c=20.0 + k))
         assert warm.estimate is not None
         values = warm.estimate.values * np.where(np.array(warm.estimate.names) == "ft", 1 - 0.1 * k, 1.0)
         store.store_outcomes(
-            [replace(warm, estimate=replace(warm.estimate, values=freeze_array(values))), published(k + 1)]
+            [replace(warm, estimate=replace(warm.estimate, values=freeze_array(values))), make_published(k + 1)]
         )
     store.close()
     _, out, _ = fdhil("history", path, "--json", capsys=capsys)

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.arming.token import ensure_token
+from fdhil.arming.operator_token import ensure_token
 from fdhil.cli.status_view import believed, sparkline
 from fdhil.config import load_config
 from fdhil.daemon import service_log
@@ -27,7 +27,7 @@ from fdhil.report.parameter_format import compute_half_width, format_cell
 from tests.daemon.machine_rig import BENCH, fdhil
 from tests.daemon.simulated_machine import config_of
 from tests.reserved_port import reserve_port
-from tests.store.made import outcome, published
+from tests.store.sample_records import make_outcome, make_published
 from tests.unprivileged_command import UNPRIVILEGED
 
 
@@ -66,7 +66,7 @@ def answering(machine: Path, answer: Mapping[str, Any], *told: Mapping[str, Any]
 
 def status_of(tmp_path: Path) -> dict[str, Any]:
     watch = DaemonStatus(config_of(tmp_path, ("X", "Y")), 0.0)
-    for told in (outcome(), published(), Notice("LoadChanged", "MAJOR", "[red]Jt rose[/red]", "X")):
+    for told in (make_outcome(), make_published(), Notice("LoadChanged", "MAJOR", "[red]Jt rose[/red]", "X")):
         watch.take_outcome(told, 1.0)
     store = {"directory": "d", "fault": "DiskFull", "strays": []}
     return {"ok": True, "state": "OFF(SHADOW)", **watch.build_status(2.0), "counters": {"frames": 7}, "store": store}

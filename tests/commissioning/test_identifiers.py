@@ -11,7 +11,7 @@ import can
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.arming.guard_settings import settings_of
+from fdhil.arming.guard_configuration import make_guard_settings
 from fdhil.commissioning.compare import compare_again
 from fdhil.commissioning.identifiers import POINT, find_clash
 from fdhil.commissioning.master import Master
@@ -68,7 +68,7 @@ def config_of(folder: Path, offset_rpdo: int, axes: str = "X", **second: Any) ->
 
 
 def test_guard_of_a_dcf_sends_what_the_file_says(tmp_path: Path) -> None:
-    [axis] = settings_of(config_of(tmp_path, 0x305), "can0", tmp_path, "").axes
+    [axis] = make_guard_settings(config_of(tmp_path, 0x305), "can0", tmp_path, "").axes
     assert (axis.offset.cob_id, axis.target.cob_id) == (0x305, 0x205)
     assert [pdo.cob_id for pdo in axis.tpdos] == [0x185, 0x285, 0x385, 0x485]
 
@@ -93,7 +93,7 @@ def test_guard_is_refused_that_would_send_what_is_in_use(offset_rpdo: int, whose
     with pytest.raises(
         ConfigError, match=f"COB-ID {offset_rpdo:03X}, with which the guard sends offsets, also belongs to {whose}"
     ):
-        settings_of(config, "can0", tmp_path, "")
+        make_guard_settings(config, "can0", tmp_path, "")
 
 
 def test_identifier_of_a_node_that_is_heard_is_in_use(tmp_path: Path) -> None:

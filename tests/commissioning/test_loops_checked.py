@@ -11,8 +11,8 @@ from fdhil.cli.loops_view import loops_line
 from fdhil.commissioning.config_check import compare_loops
 from fdhil.daemon.outcome_json import build_loops_document
 from fdhil.records import LoopEstimate, Reason, Verdict, freeze_array
-from fdhil.store.history import History
-from fdhil.store.rows import Stamp
+from fdhil.store.history_database import History
+from fdhil.store.history_rows import TimeStamp
 from tests.bench import bench_document
 
 DIFFER = Reason(
@@ -32,7 +32,7 @@ def test_what_the_rapids_showed_is_compared_with_the_configuration(tmp_path: Pat
     assert not list(compare_loops(config, "X"))  # before the first identification
     for found, same in ((loops(), True), (loops(DIFFER), False)):
         history = History.open(tmp_path)
-        history.add_loops(found, Stamp(0.0, "boot-1", 1))
+        history.add_loops(found, TimeStamp(0.0, "boot-1", 1))
         history.close()
         (finding,) = compare_loops(config, "X")
         assert finding.ok is same

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.arming.guard_settings import settings_of
+from fdhil.arming.guard_configuration import make_guard_settings
 from fdhil.commissioning.bus_listener import Traffic
 from fdhil.commissioning.compare import compare_again
 from fdhil.commissioning.config_check import check_machine, compare_heard
@@ -179,11 +179,11 @@ def test_record_is_void_where_a_second_writer_was_set_up_since(tmp_path: Path, m
         save_record(record, settings.store.directory)
         compare_again(settings, "can0", told.append)
         assert told == []
-        assert settings_of(settings, "can0", tmp_path, "").axes[0].record_void is False
+        assert make_guard_settings(settings, "can0", tmp_path, "").axes[0].record_void is False
         give_rpdo(drive, 20, 0x3F0, [POSITION_OFFSET])
         compare_again(settings, "can0", told.append)
     assert told[0].startswith("RecordVoid: axis X: its RPDO20 (COB-ID 3F0) writes 60B0, as fdhil does")
-    [axis] = settings_of(settings, "can0", tmp_path, "").axes
+    [axis] = make_guard_settings(settings, "can0", tmp_path, "").axes
     assert axis.record_void is True
     assert axis.void_reason.startswith("its RPDO20 (COB-ID 3F0) writes 60B0")
 
@@ -191,17 +191,20 @@ def test_record_is_void_where_a_second_writer_was_set_up_since(tmp_path: Path, m
 def test_guard_is_told_the_cob_ids_of_the_record(tmp_path: Path) -> None:
     settings = corrected(tmp_path)
     save_record(RECORD, settings.store.directory)
-    assert settings_of(settings, "can0", tmp_path, "").axes[0].writers == (0x401, 0x501)  # by default, not valid
+    assert make_guard_settings(settings, "can0", tmp_path, "").axes[0].writers == (
+        0x401,
+        0x501,
+    )  # by default, not valid
     kept = {"1403": 0x501, "1404": 0x8000_0333, "1405": 0xA001_2345, "1406": 0x8000_0000}
     save_record(replace(RECORD, options=kept), settings.store.directory)
-    assert settings_of(settings, "can0", tmp_path, "").axes[0].writers == (0x333, 0x401)
+    assert make_guard_settings(settings, "can0", tmp_path, "").axes[0].writers == (0x333, 0x401)
 
 
 def test_bit_30_of_a_cob_id_says_nothing_of_an_rpdo(tmp_path: Path) -> None:
     settings = corrected(tmp_path)
     kept = {"1403": 0x4000_0501, "1404": 0xC000_0333}
     save_record(replace(RECORD, options=kept), settings.store.directory)
-    assert settings_of(settings, "can0", tmp_path, "").axes[0].writers == (0x333, 0x401)
+    assert make_guard_settings(settings, "can0", tmp_path, "").axes[0].writers == (0x333, 0x401)
 
 
 def test_rpdo_of_a_high_number_is_kept_like_any_other(tmp_path: Path) -> None:
@@ -209,7 +212,7 @@ def test_rpdo_of_a_high_number_is_kept_like_any_other(tmp_path: Path) -> None:
     record = replace(plain, options={**plain.options, "1500": 0x401, "15FF": 0x8000_0333})
     assert record.fingerprint == plain.fingerprint
     save_record(record, settings.store.directory)
-    assert settings_of(settings, "can0", tmp_path, "").axes[0].writers == (0x333, 0x501)
+    assert make_guard_settings(settings, "can0", tmp_path, "").axes[0].writers == (0x333, 0x501)
 
 
 def test_drive_of_another_bus_makes_no_identifier_harmless(tmp_path: Path) -> None:
@@ -221,7 +224,7 @@ def test_drive_of_another_bus_makes_no_identifier_harmless(tmp_path: Path) -> No
     document["axis"]["Y"]["table"] = {"cob_id": 0x501}
     del document["axis"]["Y"]["correction"]
     settings = parse_config(document, folder=tmp_path)
-    assert settings_of(settings, "can0", tmp_path, "").axes[0].writers == (0x401, 0x501)
+    assert make_guard_settings(settings, "can0", tmp_path, "").axes[0].writers == (0x401, 0x501)
 
 
 def test_rpdo_of_29_bits_is_none_of_the_profiles(peer: tuple[DrivePeer, MachineConfig]) -> None:

@@ -22,7 +22,7 @@ import pytest
 from fdhil.commissioning.play import Bench, Played, Signals
 from fdhil.commissioning.void import is_void, void_record
 from fdhil.config import MachineConfig, load_config
-from tests.arming.guard_peer import Guard
+from tests.arming.guard_peer import GuardPeer
 from tests.bench import axis_toml, bench_toml
 from tests.commissioning.foreign_nc import (
     A_FEW,
@@ -156,7 +156,7 @@ def test_a_drive_that_boots_while_it_plays_is_not_vouched_for(floor: Floor) -> N
             bus.send(can.Message(arbitration_id=0x701, data=b"\x00", is_extended_id=False))
 
     floor.config.guard_directory.mkdir(parents=True, exist_ok=True)
-    guard = Guard(floor.config.guard_directory)
+    guard = GuardPeer(floor.config.guard_directory)
     guard.says = lambda _kind: {"ok": True, "state": "OFF", "touched": {"X": 4, "Y": 5}}
     thread = floor.while_it_plays(boot)
     code, _, err = floor.play(STROKE, "--yes")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fdhil import config as configuration
-from fdhil.arming.guard_settings import limits_of
+from fdhil.arming.guard_configuration import compute_offset_limits
 from fdhil.correction import PlanLimits, check_offsets, mirror, plan_correction
 from fdhil.correction.inverse import BLOCK_S
 from fdhil.correction.linear_loop import invert_loop, measure_delay_s
@@ -52,7 +52,9 @@ def assert_within_limits(correction: Correction) -> None:
         assert np.allclose(increments, np.rint(increments), atol=1e-6)
         whole = np.rint(increments).astype(np.int64)
         assert check_offsets(whole, limits) == []
-        assert check_rows(limits_of(CONFIG.axis[axis], 0.001), whole.tolist(), 0, whole.size) is None  # as the guard
+        assert (
+            check_rows(compute_offset_limits(CONFIG.axis[axis], 0.001), whole.tolist(), 0, whole.size) is None
+        )  # as the guard
 
 
 @pytest.mark.parametrize(("feed", "smoothing"), [(10, (0.060, 0.030)), (20, (0.060, 0.030)), (10, (0.030, 0.015))])

@@ -13,7 +13,7 @@ from fdhil.daemon.daemon_service import DaemonService, InternalError
 from fdhil.daemon.outcome_store import WINDOWS_FOLDER, OutcomeStore
 from fdhil.errors import FdhilError
 from fdhil.records import Notice, Outcome, ParameterSet, WindowOutcome
-from fdhil.store.history import HISTORY_FILE_NAME, History
+from fdhil.store.history_database import HISTORY_FILE_NAME, History
 from tests.crash.stored_records import check_readable, configured
 from tests.daemon.simulated_machine import SimulatedMachine, rapids
 
@@ -34,8 +34,8 @@ class Daemon:
     def found(self) -> set[int]:
         if not (self.folder / HISTORY_FILE_NAME).exists():
             return set()
-        with History.read(self.folder) as history:
-            windows, sets = history.windows("X"), history.revisions("X")
+        with History.open_read_only(self.folder) as history:
+            windows, sets = history.read_windows("X"), history.read_revisions("X")
         whole = []
         for row in windows[-RAPIDS:]:
             if (window := check_readable(self.folder / WINDOWS_FOLDER / row.file)) is not None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from fdhil.store.history import History
+from fdhil.store.history_database import History
 from tests.crash.call_faults import (
     CommandChannel,
     Work,

@@ -16,7 +16,7 @@ from unittest.mock import patch
 import numpy as np
 
 from fdhil.arming import checked_program, program_check
-from fdhil.arming.code_digest import code_digest
+from fdhil.arming.code_digest import compute_code_digest
 from fdhil.commissioning.progress import Progress
 from fdhil.commissioning.record import CommissioningRecord, load_record, save_record
 from fdhil.commissioning.void import is_void, void_record
@@ -26,18 +26,18 @@ from fdhil.daemon import black_box
 from fdhil.daemon.outcome_store import WINDOWS_FOLDER, OutcomeStore
 from fdhil.errors import FdhilError, RecordingError, StoreError
 from fdhil.records import Notice, Outcome, Window
-from fdhil.store import audit, lessons
-from fdhil.store.history import History
-from fdhil.store.windows import list_windows, read_window
+from fdhil.store import audit_file, learned_offset_files
+from fdhil.store.history_database import History
+from fdhil.store.window_file import list_windows, read_window
 from tests.daemon.simulated_machine import config_of
-from tests.store.made import outcome, published, same, window
+from tests.store.sample_records import is_bit_identical, make_outcome, make_published, make_window
 
 SAMPLES = 150
 WINDOWS_KEPT = 2
 STEPS = 40
 FIRST_TICK = 1000
 MUCH_LATER = 10**6  # a number that comes after any other
-CODE = code_digest()
+CODE = compute_code_digest()
 _LINE = re.compile(r"\(\d+\.\d{6}\) can0 \d+#\w*$")
 
 
@@ -92,19 +92,19 @@ class DaemonKeeper:
 
 class Rapids(DaemonKeeper):
     def outcomes(self, number: int) -> list[Outcome]:
-        return [outcome(of=window(SAMPLES, seed=number, start_tick=FIRST_TICK + number))]
+        return [make_outcome(of=make_window(SAMPLES, seed=number, start_tick=FIRST_TICK + number))]
 
     def found(self) -> set[int]:
-        with History.read(self.folder) as history:
-            rows = history.windows("X")
+        with History.open_read_only(self.folder) as history:
+            rows = history.read_windows("X")
         files = list_windows(self.folder / WINDOWS_FOLDER).windows
         names, refused = {file.path.name for file in files}, set[int]()
         for row in rows:
             number = row.start_tick - FIRST_TICK
             if row.file in names:
-                kept = window(SAMPLES, seed=number, start_tick=row.start_tick)
+                kept = make_window(SAMPLES, seed=number, start_tick=row.start_tick)
                 found = check_readable(self.folder / WINDOWS_FOLDER / row.file)
-                assert found is None or same(found, kept), f"rapid {number} is another"
+                assert found is None or is_bit_identical(found, kept), f"rapid {number} is another"
                 if found is None:
                     refused.add(number)
             else:
@@ -115,17 +115,17 @@ class Rapids(DaemonKeeper):
 
 class Sets(DaemonKeeper):
     def outcomes(self, number: int) -> list[Outcome]:
-        return [published(number)]
+        return [make_published(number)]
 
     def keep(self, number: int) -> None:
         self.store.fault = None
         super().keep(number)
 
     def found(self) -> set[int]:
-        with History.read(self.folder) as history:
-            sets = [row.set for row in history.revisions("X")]
+        with History.open_read_only(self.folder) as history:
+            sets = [row.set for row in history.read_revisions("X")]
         for result in sets:
-            kept = published(result.revision)
+            kept = make_published(result.revision)
             equal = result.parameters == kept.parameters and result.covariance.tobytes() == kept.covariance.tobytes()
             assert equal, f"revision {result.revision} is another"
         return in_order(result.revision for result in sets)
@@ -142,8 +142,8 @@ class Notices(DaemonKeeper):
         self.store.store_acknowledgement({"by": f"person {number}", "notices": [waits[-1]["number"]]})
 
     def found(self) -> set[int]:
-        with History.read(self.folder) as history:
-            rows = [row for row in history.notices() if row.notice.code == "Tested" and row.acknowledged]
+        with History.open_read_only(self.folder) as history:
+            rows = [row for row in history.read_notices() if row.notice.code == "Tested" and row.acknowledged]
         for row in rows:
             assert row.notice.text == f"notice {row.notice.tick}", f"notice {row.notice.tick} is another"
         return in_order(row.notice.tick for row in rows)
@@ -161,21 +161,26 @@ class Plain:
 class Audit(Plain):
     def keep(self, number: int) -> None:
         self.folder.mkdir(exist_ok=True)
-        audit.append(self.folder, {"asked": "arm", "number": number})
+        audit_file.append_entry(self.folder, {"asked": "arm", "number": number})
 
     def found(self) -> set[int]:
-        good = [entry for entry, wrong in audit.entries(self.folder) if wrong is None]
+        good = [entry for entry, wrong in audit_file.read_entries(self.folder) if wrong is None]
         return in_order(entry["number"] for entry in good)
 
 
 class LearnedOffsets(Plain):
     def keep(self, number: int) -> None:
         lesson = LearnedOffset({"X": np.full(50, float(number))}, float(number), 1.0, (float(number),))
-        with patch.object(lessons, "MOST_PROGRAMS", WINDOWS_KEPT):
-            lessons.write_lesson(lessons.lesson_path(self.folder / "lessons", f"{number:032d}", "made"), lesson)
+        with patch.object(learned_offset_files, "MOST_PROGRAMS", WINDOWS_KEPT):
+            learned_offset_files.write_learned(
+                learned_offset_files.make_learned_path(self.folder / "lessons", f"{number:032d}", "made"), lesson
+            )
 
     def found(self) -> set[int]:
-        there = {int(program): lesson for _, program, lesson in lessons.kept_lessons(self.folder / "lessons", "made")}
+        there = {
+            int(program): lesson
+            for _, program, lesson in learned_offset_files.list_learned(self.folder / "lessons", "made")
+        }
         for number, lesson in there.items():
             whole = np.array_equal(lesson.offset_um["X"], np.full(50, number)) and lesson.curve_um == (float(number),)
             assert whole, f"lesson {number} is another"
@@ -232,17 +237,19 @@ class Voids(Plain):
 class Programs(Plain):
     def keep(self, number: int) -> None:
         with patch.object(program_check, "KEPT", WINDOWS_KEPT):
-            program_check.keep(self.folder / "programs", str(number), lambda body: _checked(body, number))
+            program_check.store_checked(self.folder / "programs", str(number), lambda body: _checked(body, number))
 
     def found(self) -> set[int]:
         folder = self.folder / "programs"
         there = {}
         for number in sorted(int(file.stem) for file in folder.glob(f"*{program_check.HEADER}")):
-            with patch.object(checked_program, "code_digest", lambda: CODE):  # all of the package is read for it
-                found = checked_program.CheckedProgram.find(folder, str(number), folder)
+            with patch.object(
+                checked_program, "compute_code_digest", lambda: CODE
+            ):  # all of the package is read for it
+                found = checked_program.CheckedProgram.find_checked(folder, str(number), folder)
             if found is not None:
                 there[number] = found
-                assert found.content(0) == _rows(number), f"program {number} is another"
+                assert found.read_block(0) == _rows(number), f"program {number} is another"
         gone = range(1, max(there, default=0)) if len(there) >= WINDOWS_KEPT else range(0)
         return {*there, *gone}
 

@@ -14,7 +14,7 @@ import pytest
 from fdhil.commissioning.progress import Progress
 from fdhil.daemon import black_box
 from fdhil.errors import StoreError
-from fdhil.store import atomic
+from fdhil.store import atomic_file
 from fdhil.system_clock import Clock
 from tests.crash import call_faults, clocks, disks
 from tests.crash.loops import KINDS, Kind, tried
@@ -117,7 +117,7 @@ def test_newest_file_is_kept_with_any_clock(tmp_path: Path) -> None:
         others = list(tmp_path.iterdir())
         file.touch()
         os.utime(file, (1000.0 - number, 1000.0 - number))
-        atomic.keep_newest(file, others, most=3)
+        atomic_file.keep_newest(file, others, most=3)
     assert {file.name for file in tmp_path.iterdir()} == {"3", "4", "5"}
 
 

@@ -23,7 +23,7 @@ from fdhil.daemon.audit_middleware import TOLD, AuditMiddleware
 from fdhil.daemon.daemon_access import NEEDS, ClientProcess, get_role
 from fdhil.daemon.daemon_socket import ControlServer
 from fdhil.guard.guard_access import Role
-from fdhil.store import audit
+from fdhil.store import audit_file
 from tests.daemon.simulated_machine import SimulatedMachine, config_of
 from tests.daemon.test_daemon_service import serving
 from tests.listening_ports import list_tcp_ports
@@ -76,7 +76,9 @@ async def test_request_without_the_role_is_refused_and_audited(role: Role, tmp_p
         assert answer["ok"] == peer.may_request(what) == (what in desk.done)
         assert answer["ok"] or answer["code"] == "AuthRequired"
         await audited.wait_until_written()
-    reported = [(entry.get("asked") or entry["answered"], entry.get("result")) for entry, _ in audit.entries(tmp_path)]
+    reported = [
+        (entry.get("asked") or entry["answered"], entry.get("result")) for entry, _ in audit_file.read_entries(tmp_path)
+    ]
     refused = [what for what, result in reported if result == "AuthRequired"]
     assert refused == [what for what in (*NEEDS, "stop") if not peer.may_request(what)]
     assert {what for what, result in reported if result == "done"} == set(desk.done) - {"status", "live"}
@@ -89,7 +91,7 @@ async def test_request_is_audited_before_execution_and_its_answer_logged(
     at_that_time: list[dict[str, Any]] = []
 
     async def handle(request: Mapping[str, Any]) -> dict[str, Any]:
-        at_that_time.extend(entry for entry, _ in audit.entries(tmp_path))
+        at_that_time.extend(entry for entry, _ in audit_file.read_entries(tmp_path))
         return {"ok": False, "code": "ModelStale", "text": "too old"}
 
     peer = ClientProcess("fdhil-web", 990, 99, Role.OPERATE)
@@ -99,7 +101,7 @@ async def test_request_is_audited_before_execution_and_its_answer_logged(
     assert [(entry["asked"], entry["by"], entry["who"]["user"]) for entry in at_that_time] == [
         ("arm", "anna", "fdhil-web")
     ]
-    last = list(audit.entries(tmp_path))[-1][0]
+    last = list(audit_file.read_entries(tmp_path))[-1][0]
     assert (last["answered"], last["result"], last["program"]) == ("arm", "ModelStale", "/p/part.ngc")
     assert "fdhil-web (process 99) for anna requested arm: ModelStale" in capsys.readouterr().err
 
@@ -129,7 +131,7 @@ async def test_flood_of_requests_does_not_fill_the_disk(tmp_path: Path) -> None:
         assert (await audited.answer_request({"request": "disarm"}, owner))["ok"]
     await audited.wait_until_written()
     assert desk.done == ["disarm"] * 300
-    assert len(list(audit.entries(tmp_path))) < 100
+    assert len(list(audit_file.read_entries(tmp_path))) < 100
 
 
 async def test_suppressed_disarm_is_audited_a_moment_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,7 +140,7 @@ async def test_suppressed_disarm_is_audited_a_moment_later(tmp_path: Path, monke
     audited = AuditMiddleware(desk.handle, tmp_path)
 
     def told() -> int:
-        return sum(1 + entry.get("not_written", 0) for entry, _ in audit.entries(tmp_path))
+        return sum(1 + entry.get("not_written", 0) for entry, _ in audit_file.read_entries(tmp_path))
 
     for _ in range(60):
         await audited.answer_request({"request": "disarm"}, watcher)
@@ -149,7 +151,7 @@ async def test_suppressed_disarm_is_audited_a_moment_later(tmp_path: Path, monke
         await audited.answer_request({"request": "disarm"}, watcher)
     await audited.wait_until_written()
     assert (told(), len(desk.done)) == (65, 65)
-    assert len(list(audit.entries(tmp_path))) < 30
+    assert len(list(audit_file.read_entries(tmp_path))) < 30
 
 
 @pytest.mark.fault("F12", "G1")
@@ -165,11 +167,11 @@ async def test_refused_user_gets_one_short_audit_line_a_minute(tmp_path: Path) -
         for what in (*NEEDS, "stop", "anything"):
             for _ in range(10):
                 assert (await audited.answer_request({**long, "request": what}, stranger))["code"] == "AuthRequired"
-    result = [entry.get("not_written", 0) for entry, _ in audit.entries(tmp_path)]
+    result = [entry.get("not_written", 0) for entry, _ in audit_file.read_entries(tmp_path)]
     assert result == [0, 69, 69]
     await audited.wait_until_written()
-    assert sum(1 + entry.get("not_written", 0) for entry, _ in audit.entries(tmp_path)) == 210
-    assert (tmp_path / audit.AUDIT_FILE_NAME).stat().st_size < 4000
+    assert sum(1 + entry.get("not_written", 0) for entry, _ in audit_file.read_entries(tmp_path)) == 210
+    assert (tmp_path / audit_file.AUDIT_FILE_NAME).stat().st_size < 4000
 
 
 async def test_failed_request_is_audited(tmp_path: Path) -> None:
@@ -181,7 +183,9 @@ async def test_failed_request_is_audited(tmp_path: Path) -> None:
         with pytest.raises(ZeroDivisionError):
             await audited.answer_request({"request": what}, owner)
     await audited.wait_until_written()
-    result = [(entry["answered"], entry["result"]) for entry, _ in audit.entries(tmp_path) if "answered" in entry]
+    result = [
+        (entry["answered"], entry["result"]) for entry, _ in audit_file.read_entries(tmp_path) if "answered" in entry
+    ]
     assert result == [("arm", "ZeroDivisionError"), ("disarm", "ZeroDivisionError")]
 
 
@@ -193,7 +197,7 @@ async def test_long_unknown_request_names_fill_neither_disk_nor_memory(tmp_path:
     )
     for k in range(100):
         assert (await audited.answer_request({"request": f"{k}" + "x" * 60_000}, watcher))["code"] == "AuthRequired"
-    kept = list(audit.entries(tmp_path))
+    kept = list(audit_file.read_entries(tmp_path))
     assert 1 <= len(kept) < 50
     assert [fault for _, fault in kept if fault] == []
     assert max(len(entry["answered"]) for entry, _ in kept) <= 500
@@ -242,7 +246,7 @@ async def test_other_user_is_identified_by_the_kernel(role: Role, open_folder: P
         command = [sys.executable, "-c", ASK, str(open_folder / "s"), str(STRANGER)]
         asked = await asyncio.to_thread(subprocess.run, command, capture_output=True, timeout=60, check=True)
     assert [answer["ok"] for answer in json.loads(asked.stdout)] == [True, True, role is Role.OPERATE, False]
-    who = {entry["who"]["user"] for entry, _ in audit.entries(open_folder)}
+    who = {entry["who"]["user"] for entry, _ in audit_file.read_entries(open_folder)}
     assert who == {"nobody"}
 
 
@@ -252,20 +256,20 @@ def test_audit_command_shows_entries_and_tampering(tmp_path: Path) -> None:
     folder = machine_config.load_config(config).store.directory
     folder.mkdir()
     for program in ("a.ngc", "b.ngc"):
-        audit.append(
+        audit_file.append_entry(
             folder, {"who": {"user": "fdhil-web", "uid": 1, "pid": 2}, "asked": "arm", "by": "anna", "program": program}
         )
     shown = CliRunner().invoke(cli, ["audit", str(config)], standalone_mode=False)
     assert shown.return_value == 0
     assert "fdhil-web for anna  arm a.ngc (requested)" in shown.output
     assert "2 entries, all intact" in shown.output
-    path = folder / audit.AUDIT_FILE_NAME
+    path = folder / audit_file.AUDIT_FILE_NAME
     path.write_text(path.read_text().replace("a.ngc", "c.ngc"))
     shown = CliRunner().invoke(cli, ["audit", str(config), "--json"], standalone_mode=False)
     assert shown.return_value == 1
     assert json.loads(shown.output)["broken"] == [1]
     for nonsense in ({}, {"who": "root"}, {"who": {}, "result": 5}):  # sealed, but by no command of fdhil
-        audit.append(folder, nonsense)
+        audit_file.append_entry(folder, nonsense)
     assert CliRunner().invoke(cli, ["audit", str(config)], standalone_mode=False).output.count("NOT INTACT") == 3
 
 

@@ -13,11 +13,11 @@ from fdhil.daemon import notice_log
 from fdhil.daemon.daemon_socket import ask_daemon
 from fdhil.daemon.notice_log import NotAcknowledged, NoticeLog, parse_acknowledgement
 from fdhil.records import Notice
-from fdhil.store.history import History
-from fdhil.store.rows import StoredNotice
+from fdhil.store.history_database import History
+from fdhil.store.history_rows import StoredNotice
 from tests.daemon.simulated_machine import SimulatedMachine, config_of
 from tests.daemon.test_daemon_service import _skip_kernel_warmup, serving, status_when  # noqa: F401 (a fixture)
-from tests.store.made import STAMP
+from tests.store.sample_records import STAMP
 
 DOWN = Notice("BusDown", "MAJOR", "Bus can0: gone; nothing is received until it is reconnected, which is retried.")
 BACK = Notice("BusDown", "info", "Bus can0 is back.")
@@ -51,8 +51,8 @@ async def test_notice_stays_open_until_acknowledged_also_across_a_restart(
         assert [n["code"] for n in status["unacknowledged"]["newest"]] == ["MaintenanceDue"]
         answer = await _acknowledged(path, up_to=status["unacknowledged"]["newest"][-1]["number"], by="ben")
         assert answer["ok"]
-    with History.read(config.store.directory) as history:
-        known = {n.notice.text: n.acknowledged for n in history.notices() if n.notice.severity != "info"}
+    with History.open_read_only(config.store.directory) as history:
+        known = {n.notice.text: n.acknowledged for n in history.read_notices() if n.notice.severity != "info"}
     assert {text: given.who for text, given in known.items() if given} == {DOWN.text: "anna", DUE.text: "ben"}
     assert [given.note for given in known.values() if given] == ["plug was out", ""]
 

@@ -10,8 +10,8 @@ import pytest
 from fdhil.daemon import service_log
 from fdhil.daemon.alarms import AlarmTable, build_alarm_document
 from fdhil.records import Notice
-from fdhil.store.history import History
-from fdhil.store.rows import Acknowledgement, Stamp, StoredNotice
+from fdhil.store.history_database import History
+from fdhil.store.history_rows import Acknowledgement, StoredNotice, TimeStamp
 from tests.daemon.simulated_machine import SimulatedMachine, config_of
 from tests.daemon.test_daemon_service import _skip_kernel_warmup, serving, status_when  # noqa: F401 (a fixture)
 
@@ -20,8 +20,8 @@ BACK = Notice("HeartbeatLost", "info", "Drive X sends its heartbeat again.", "X"
 TRIP = Notice("GuardTripped", "MAJOR", "EchoMismatch: axis X", "X")
 
 
-def at(second: int) -> Stamp:
-    return Stamp(1.7e9 + second, "boot", second)
+def at(second: int) -> TimeStamp:
+    return TimeStamp(1.7e9 + second, "boot", second)
 
 
 def table(*notices: Notice) -> AlarmTable:
@@ -124,5 +124,5 @@ async def test_suppressed_end_of_an_alarm_is_stored_after_the_flood(
         status = await status_when(path, lambda s: s["alarms"]["first"] and not s["alarms"]["active"])
         assert status["alarms"]["first"][0]["count"] < 40
         await status_when(path, lambda s: s["notices"][-1]["text"] == BACK.text)
-    with History.read(config.store.directory) as history:
-        assert history.notices()[-1].notice.severity == "info"
+    with History.open_read_only(config.store.directory) as history:
+        assert history.read_notices()[-1].notice.severity == "info"

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.arming.guard_link import GUARD_TRIPPED, _changes
+from fdhil.arming.guard_link import GUARD_TRIPPED, _report_changes
 from fdhil.daemon import black_box
 from fdhil.drivers.can.frame_history import FrameHistory, format_candump
 from fdhil.drivers.can.frame_ring import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, pack_frames
@@ -21,7 +21,7 @@ def status(state: str, code: str = "") -> dict[str, Any]:
 @pytest.mark.parametrize("before", ["ARMED", "RAMPING", "ACTIVE", "HOLD", "FEEDFORWARD"])
 @pytest.mark.parametrize("after", ["RAMP_DOWN", "OFF", "FROZEN"])
 def test_alarm_that_ends_a_correction_is_a_trip(before: str, after: str) -> None:
-    shown_status = _changes(status(before), status(after, "EchoMismatch"))
+    shown_status = _report_changes(status(before), status(after, "EchoMismatch"))
     assert [notice.code for notice in shown_status] == ["GuardState", GUARD_TRIPPED]
     assert (shown_status[1].severity, shown_status[1].axis, shown_status[1].text) == ("MAJOR", "X", "EchoMismatch: why")
 
@@ -39,17 +39,17 @@ def test_alarm_that_ends_a_correction_is_a_trip(before: str, after: str) -> None
     ],
 )
 def test_ordered_end_or_continuing_correction_is_not_a_trip(before: dict[str, Any], after: dict[str, Any]) -> None:
-    assert [notice.code for notice in _changes(before, after) if notice.code == GUARD_TRIPPED] == []
+    assert [notice.code for notice in _report_changes(before, after) if notice.code == GUARD_TRIPPED] == []
 
 
 def test_record_voided_by_the_guard_is_reported_once() -> None:
     void = {"code": "RecordVoid", "axis": "X", "text": "the drive has rebooted", "advice": "compare it"}
     now = {"state": "OFF", "not_good": [void]}
-    assert [(n.code, n.axis, n.text) for n in _changes({"state": "OFF", "not_good": []}, now)] == [
+    assert [(n.code, n.axis, n.text) for n in _report_changes({"state": "OFF", "not_good": []}, now)] == [
         ("RecordVoid", "X", "the drive has rebooted; compare it")
     ]
-    assert _changes(now, now) == []
-    assert [notice.code for notice in _changes({"state": "absent"}, now)] == ["RecordVoid", "GuardFound"]
+    assert _report_changes(now, now) == []
+    assert [notice.code for notice in _report_changes({"state": "absent"}, now)] == ["RecordVoid", "GuardFound"]
 
 
 def test_frame_history_keeps_ten_seconds() -> None:

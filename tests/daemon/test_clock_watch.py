@@ -9,8 +9,8 @@ import pytest
 
 from fdhil.daemon.clock_watch import ClockWatch, find_newest_record_s
 from fdhil.records import Notice
-from fdhil.store.history import History
-from fdhil.store.rows import Stamp
+from fdhil.store.history_database import History
+from fdhil.store.history_rows import TimeStamp
 from tests.daemon.simulated_machine import SimulatedMachine, config_of
 from tests.daemon.test_daemon_service import serving, status_when
 
@@ -38,7 +38,7 @@ async def test_clock_behind_the_history_is_reported_at_start(tmp_path: Path) -> 
     config = config_of(tmp_path)
     assert find_newest_record_s(config.store.directory) is None
     with History.open(config.store.directory) as history:
-        history.add_notice(Notice("Armed", "info", "in two hours"), Stamp(time.time() + 7200.0, "boot", 1))
+        history.add_notice(Notice("Armed", "info", "in two hours"), TimeStamp(time.time() + 7200.0, "boot", 1))
     async with serving(config, SimulatedMachine()) as path:
         status = await status_when(path, lambda shown_status: shown_status["unacknowledged"]["newest"])
     shown_status = {notice["code"]: notice["text"] for notice in status["unacknowledged"]["newest"]}

@@ -25,8 +25,8 @@ from fdhil.daemon.daemon_socket import ask_daemon
 from fdhil.daemon.machine_lock import BusLocked
 from fdhil.errors import ConnectError, DeviceError
 from fdhil.records import Notice
-from fdhil.store.history import History
-from fdhil.store.windows import list_windows
+from fdhil.store.history_database import History
+from fdhil.store.window_file import list_windows
 from tests.bench import bench_document
 from tests.daemon.machine_rig import fdhil
 from tests.daemon.simulated_machine import NOMINAL, SimulatedMachine, config_of, rapids
@@ -80,10 +80,10 @@ async def test_rapids_become_parameters_with_intervals_in_status_and_history(tmp
         result = axis["parameters"][name]
         assert result["low"] < result["value"] < result["high"]
         assert result["value"] == pytest.approx(true, rel=0.1), name
-    with History.read(config.store.directory) as history:
-        assert [r.set.revision for r in history.revisions("X")] == [1, 2]
-        assert history.revisions("X")[1].window_ids == (1, 2)
-        assert [w.accepted for w in history.windows("X")] == [True, True]
+    with History.open_read_only(config.store.directory) as history:
+        assert [r.set.revision for r in history.read_revisions("X")] == [1, 2]
+        assert history.read_revisions("X")[1].window_ids == (1, 2)
+        assert [w.accepted for w in history.read_windows("X")] == [True, True]
     listing = list_windows(config.store.directory / "windows")
     assert [file.number for file in listing.windows] == [1, 2]
     assert not path.exists()
@@ -159,8 +159,8 @@ async def test_flood_of_notices_becomes_a_few_lines_and_a_count(
     async with serving(config, machine) as path:
         await status_when(path, lambda s: s["counters"]["frames"] == 2000)
     assert 10 < capsys.readouterr().err.count("DriveEmergency") < 40
-    with History.read(config.store.directory) as history:
-        assert len(history.notices()) < 40
+    with History.open_read_only(config.store.directory) as history:
+        assert len(history.read_notices()) < 40
 
 
 async def test_invalid_requests_are_answered_and_affect_no_other_client(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.arming.token import ensure_token, make_directory, operator_token, read_token
+from fdhil.arming.operator_token import ensure_token, get_operator_token, make_run_directory, read_token
 from fdhil.config import Access
 from fdhil.daemon import service_log
 from fdhil.daemon.daemon_access import ClientProcess
@@ -28,7 +28,7 @@ from fdhil.daemon.systemd_notify import notify_systemd
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProgramError
 from fdhil.guard.guard_access import Role
 from fdhil.records import Notice, Skill
-from tests.store.made import outcome, published
+from tests.store.sample_records import make_outcome, make_published
 
 
 @pytest.fixture
@@ -240,11 +240,11 @@ def test_notify_without_a_service_manager_does_nothing(tmp_path: Path, monkeypat
 
 
 def test_every_outcome_is_one_line() -> None:
-    assert format_outcome(outcome())[0] == "X: G0 + at 12.35 s (600 samples) accepted, fit 97.25 %"
-    refused, severity = format_outcome(outcome(accepted=False))
+    assert format_outcome(make_outcome())[0] == "X: G0 + at 12.35 s (600 samples) accepted, fit 97.25 %"
+    refused, severity = format_outcome(make_outcome(accepted=False))
     assert refused.endswith("refused, fit 97.25 %: MissingStage(cruise): no plateau")
     assert severity == "info"
-    assert "revision 1 from 3 windows: R 0.5 ohm, L 0.005 H" in format_outcome(published())[0]
+    assert "revision 1 from 3 windows: R 0.5 ohm, L 0.005 H" in format_outcome(make_published())[0]
     assert "predicted within 0.25 um RMS" in format_outcome(Skill("X", 5, 0.25, 1.0, 0.0, 24.0))[0]
     assert format_outcome(Notice("LoadChanged", "MAJOR", "Jt rose", "X")) == ("X: LoadChanged: Jt rose", "MAJOR")
 
@@ -357,9 +357,9 @@ def test_concurrent_token_creation_gives_both_the_same_token(tmp_path: Path, mon
 
 
 def test_guard_refuses_a_world_writable_folder(tmp_path: Path) -> None:
-    operator_token(tmp_path / "run")
+    get_operator_token(tmp_path / "run")
     (tmp_path / "run").chmod(0o777)
-    for use in (operator_token, make_directory):
+    for use in (get_operator_token, make_run_directory):
         with pytest.raises(DeviceError, match=r"any user may put a socket .* chmod 0700"):
             use(tmp_path / "run")
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from fdhil.pipeline import Record
 from fdhil.records import MoveEvent, MoveKind, NcMove, NcState, Notice
-from fdhil.store.history import History
-from fdhil.store.windows import list_windows, read_window
+from fdhil.store.history_database import History
+from fdhil.store.window_file import list_windows, read_window
 from tests.daemon.simulated_machine import SimulatedMachine, config_of, rapids
 from tests.daemon.test_daemon_service import serving, status_when
 
@@ -37,8 +37,8 @@ async def test_nc_report_of_a_rapid_is_stored_with_its_window(tmp_path: Path) ->
     texts = {notice["code"]: notice["text"] for notice in status["notices"]}
     assert texts["BusSilent"] == "nothing is heard (the NC is at line 14 of part.ngc)"
     assert "rapid override is 70 %" in texts["OverrideChanged"]
-    with History.read(config.store.directory) as history:
-        first, second = history.windows("X")
+    with History.open_read_only(config.store.directory) as history:
+        first, second = history.read_windows("X")
     assert [window.nc and window.nc["line"] for window in (first, second)] == [12, 14]
     assert second.reasons[0] == "EpisodeAborted: the NC reports an override of 70 % in line 14"
     stored = [read_window(file.path).nc for file in list_windows(config.store.directory / "windows").windows]

@@ -21,12 +21,12 @@ from fdhil.daemon.outcome_store import OutcomeStore, get_raw_scales
 from fdhil.errors import StoreError
 from fdhil.identification.window_pool import build_pool_member
 from fdhil.records import LoopEstimate, Notice, Outcome, Verdict, freeze_array
-from fdhil.store.history import HISTORY_FILE_NAME, History
-from fdhil.store.rows import Comparison, Stamp
-from fdhil.store.set_document import set_document
-from fdhil.store.windows import encode_window, list_windows
+from fdhil.store.history_database import HISTORY_FILE_NAME, History
+from fdhil.store.history_rows import Comparison, TimeStamp
+from fdhil.store.parameter_document import make_set_document
+from fdhil.store.window_file import encode_window, list_windows
 from tests.daemon.simulated_machine import config_of
-from tests.store.made import BENCH, outcome, published, window
+from tests.store.sample_records import BENCH, make_outcome, make_published, make_window
 
 
 def opened(folder: Path) -> tuple[OutcomeStore, list[Notice]]:
@@ -37,10 +37,10 @@ def opened(folder: Path) -> tuple[OutcomeStore, list[Notice]]:
 def test_outcomes_are_stored_in_order_and_loaded_again(tmp_path: Path) -> None:
     store, output = opened(tmp_path)
     notices: list[Outcome] = [
-        outcome(),
-        outcome(accepted=False),
-        outcome(),
-        published(1),
+        make_outcome(),
+        make_outcome(accepted=False),
+        make_outcome(),
+        make_published(1),
         Notice("A", "info", "b", "X"),
     ]
     assert output == []
@@ -51,7 +51,7 @@ def test_outcomes_are_stored_in_order_and_loaded_again(tmp_path: Path) -> None:
     assert again.count_windows("X") == (2, 1)
     assert known.first is not None
     assert known.newest is not None
-    assert known.newest.parameters == published(1).parameters
+    assert known.newest.parameters == make_published(1).parameters
     assert [point.tick for point in known.points] == [12_345, 12_345]
     assert again.read_newest_revisions()["X"].window_ids == (1, 3)
     again.close()
@@ -61,7 +61,7 @@ def test_window_of_a_drive_is_stored_as_integers(tmp_path: Path) -> None:
     scales = get_raw_scales(config_of(tmp_path), "X")
     raw = np.random.default_rng(1).integers(-(2**30), 2**30, 600).astype(float)
     columns: dict[str, Any] = {name: candidates[0].decode(raw) for name, candidates in scales.items()}
-    content = encode_window(window(**columns), "", scales)
+    content = encode_window(make_window(**columns), "", scales)
     assert b"factor" in content
     assert content.count(b'"factor"') == len(scales)
 
@@ -77,13 +77,13 @@ def test_disk_error_is_reported_once_and_recovers(
         raise OSError(number, os.strerror(number))
 
     with monkeypatch.context() as patch:
-        patch.setattr("fdhil.store.atomic.os.write", refuse)
-        output = store.store_outcomes([outcome()])
+        patch.setattr("fdhil.store.atomic_file.os.write", refuse)
+        output = store.store_outcomes([make_outcome()])
         assert [notice.code for notice in output] == [code]
         assert "continues in shadow" in output[0].text
         assert store.fault == code
-        assert store.store_outcomes([outcome()]) == []
-    assert [notice.code for notice in store.store_outcomes([outcome()])] == ["StoreRecovered"]
+        assert store.store_outcomes([make_outcome()]) == []
+    assert [notice.code for notice in store.store_outcomes([make_outcome()])] == ["StoreRecovered"]
     assert store.fault != code
     assert len(list_windows(tmp_path / "fdhil-data" / "windows").windows) == 1
     store.close()
@@ -98,7 +98,7 @@ def test_damaged_history_is_moved_aside_and_a_new_one_started(tmp_path: Path) ->
         store, output = opened(tmp_path)
         assert [notice.code for notice in output] == ["CorruptFile"]
         assert store.fault is None
-        assert store.store_outcomes([published(k)]) == []
+        assert store.store_outcomes([make_published(k)]) == []
         store.close()
         assert (directory / f"{HISTORY_FILE_NAME}.corrupt-{k}").read_bytes().startswith(b"garbage")
 
@@ -113,7 +113,7 @@ def test_newer_schema_is_not_touched_in_shadow(tmp_path: Path) -> None:
     store, output = opened(tmp_path)
     assert [notice.code for notice in output] == ["SchemaVersion"]
     assert store.fault == "SchemaVersion"
-    assert store.store_outcomes([outcome()]) == []
+    assert store.store_outcomes([make_outcome()]) == []
     assert store.read_axis_history("X").newest is None
     store.close()
 
@@ -122,7 +122,7 @@ def test_store_that_cannot_be_created_is_reported(tmp_path: Path) -> None:
     (tmp_path / "fdhil-data").write_text("in the way")
     store, output = opened(tmp_path)
     assert [notice.severity for notice in output] == ["MAJOR"]
-    assert store.store_outcomes([outcome()]) == []
+    assert store.store_outcomes([make_outcome()]) == []
 
 
 @pytest.mark.fault("F18")
@@ -140,7 +140,9 @@ def test_pool_data_of_windows_are_loaded_again(tmp_path: Path) -> None:
     store, _ = opened(tmp_path)
     ways = (1, -1, 1)
     assert (
-        store.store_outcomes([outcome(of=window(direction=way, start_tick=1000 * k)) for k, way in enumerate(ways)])
+        store.store_outcomes(
+            [make_outcome(of=make_window(direction=way, start_tick=1000 * k)) for k, way in enumerate(ways)]
+        )
         == []
     )
     store.close()
@@ -150,7 +152,7 @@ def test_pool_data_of_windows_are_loaded_again(tmp_path: Path) -> None:
     assert set(known.first) == {1, -1}
     assert [result.direction for result in known.members] == list(ways)
     assert [result.place for result in known.members] == [-2, -1, 0]
-    made = outcome(of=window())
+    made = make_outcome(of=make_window())
     assert made.estimate is not None
     fresh = build_pool_member(made.window, made.estimate)
     for name in ("values", "own", "shared"):
@@ -163,9 +165,9 @@ def test_loops_are_loaded_again_with_the_same_configuration(tmp_path: Path) -> N
     )
     store, _ = opened(tmp_path)
     digest = config_of(tmp_path).digest
-    assert store.store_outcomes([found, published(1)]) == []
+    assert store.store_outcomes([found, make_published(1)]) == []
     assert store.read_axis_history("X").loops is None
-    assert store.store_outcomes([replace(published(2), config_digest=digest)]) == []
+    assert store.store_outcomes([replace(make_published(2), config_digest=digest)]) == []
     loops = store.read_axis_history("X").loops
     store.close()
     assert loops is not None
@@ -174,14 +176,14 @@ def test_loops_are_loaded_again_with_the_same_configuration(tmp_path: Path) -> N
 
 def test_load_is_part_of_the_json_document() -> None:
     loaded = BENCH.replace_values(load=2.5)
-    document = set_document(
-        replace(published(), parameters=loaded, covariance=freeze_array(np.eye(7)), unexplained_um=0.5)
+    document = make_set_document(
+        replace(make_published(), parameters=loaded, covariance=freeze_array(np.eye(7)), unexplained_um=0.5)
     )
     assert document["terms"]["load"]["value"] == 2.5
     assert document["terms"]["load"]["unit"] == "N.m"
     assert document["terms"]["load"]["high"] == pytest.approx(2.5 + 1.96, abs=0.01)
     assert (document["unexplained_um"], document["warnings"]) == (0.5, [])
-    result = build_outcome_document(outcome())
+    result = build_outcome_document(make_outcome())
     assert (result["terms"], result["warnings"], result["unexplained_um"]) == ({}, [], None)
     assert result["friction_at_rapid"]["value"] == pytest.approx(5.0 + 0.05 * 157.08, abs=0.01)
 
@@ -219,7 +221,7 @@ def test_undeletable_old_window_is_reported_once(tmp_path: Path, monkeypatch: py
             raise OSError(errno.EPERM, os.strerror(errno.EPERM))
 
     monkeypatch.setattr(Path, "unlink", refuse)
-    notices = [notice for _ in range(6) for notice in store.store_outcomes([outcome()])]
+    notices = [notice for _ in range(6) for notice in store.store_outcomes([make_outcome()])]
     assert [(notice.code, notice.severity) for notice in notices] == [("StrayFiles", "minor")]
     assert "w00000001-X.parquet cannot be removed" in notices[0].text
     assert (store.count_windows("X"), store.fault) == ((6, 0), None)
@@ -273,7 +275,7 @@ def test_replaced_history_is_reported_and_the_new_file_used(
 ) -> None:
     history, backup = tmp_path / "fdhil-data" / HISTORY_FILE_NAME, tmp_path / "backup"
     store, _ = opened(tmp_path)
-    assert store.store_outcomes([outcome(), Notice("A", "MAJOR", "seen")]) == []
+    assert store.store_outcomes([make_outcome(), Notice("A", "MAJOR", "seen")]) == []
     with closing(sqlite3.connect(history)) as db, closing(sqlite3.connect(backup)) as copy:
         db.backup(copy)
     for k in range(20):
@@ -282,17 +284,17 @@ def test_replaced_history_is_reported_and_the_new_file_used(
     if read:
         reader.execute("SELECT count(*) FROM notices").fetchone()
     change(history, backup)
-    whole = outcome()
+    whole = make_outcome()
     notices = [
         notice.code for k in range(8) for notice in store.store_outcomes([whole, Notice("C", "MAJOR", f"after {k}")])
     ]
     assert (notices, store.fault) == (["StoreReplaced"], None)
     last = store.notices.build_status()["newest"][-1]["number"]
     assert store.store_acknowledgement({"notices": [last], "by": "anna"})["ok"]
-    with History.read(tmp_path / "fdhil-data") as found:
-        assert len(found.windows()) in (8, 9)
-        assert [n.notice.text for n in found.notices()][-8:] == [f"after {k}" for k in range(8)]
-        assert found.notices()[-1].acknowledged is not None
+    with History.open_read_only(tmp_path / "fdhil-data") as found:
+        assert len(found.read_windows()) in (8, 9)
+        assert [n.notice.text for n in found.read_notices()][-8:] == [f"after {k}" for k in range(8)]
+        assert found.read_notices()[-1].acknowledged is not None
     reader.close()
     store.close()
     with closing(sqlite3.connect(history)) as db:
@@ -301,9 +303,9 @@ def test_replaced_history_is_reported_and_the_new_file_used(
 
 def test_removed_windows_folder_is_created_again(tmp_path: Path) -> None:
     store, _ = opened(tmp_path)
-    assert store.store_outcomes([outcome()]) == []
+    assert store.store_outcomes([make_outcome()]) == []
     shutil.rmtree(tmp_path / "fdhil-data" / "windows")
-    notices = [notice.code for _ in range(3) for notice in store.store_outcomes([outcome()])]
+    notices = [notice.code for _ in range(3) for notice in store.store_outcomes([make_outcome()])]
     assert (notices, store.fault) == (["StoreFault", "StoreRecovered"], None)
     assert len(list_windows(tmp_path / "fdhil-data" / "windows").windows) == 2
     store.close()
@@ -322,8 +324,8 @@ def test_acknowledgement_applies_only_to_the_current_history(tmp_path: Path) -> 
 
 def test_foreign_write_to_the_history_is_not_a_replacement(tmp_path: Path) -> None:
     store, _ = opened(tmp_path)
-    assert store.store_outcomes([outcome()]) == []
+    assert store.store_outcomes([make_outcome()]) == []
     with History.open(tmp_path / "fdhil-data") as other:
-        other.add_comparison(Comparison("p", "name", "", {}, 1.0, ()), Stamp.now())
-    assert [store.store_outcomes([outcome()]) for _ in range(3)] == [[]] * 3
+        other.add_comparison(Comparison("p", "name", "", {}, 1.0, ()), TimeStamp.now())
+    assert [store.store_outcomes([make_outcome()]) for _ in range(3)] == [[]] * 3
     store.close()

@@ -19,7 +19,7 @@ from fdhil.commissioning.steps import commission
 from fdhil.prediction import compute_contour_error_um, predict_path
 from fdhil.program import load_trajectory
 from fdhil.records import Parameters, compute_rms, compute_table_path
-from fdhil.store.history import History
+from fdhil.store.history_database import History
 from tests.bench import rotary_axis
 from tests.drivers.peer import DrivePeer
 from tests.machine.complete_machine import CompleteMachine
@@ -62,8 +62,8 @@ def on_a_bus(channel: str) -> dict[str, Any]:
 def run(folder: Path, document: dict[str, Any], path: str, shuttle: str) -> Whole:
     with shuttled(folder, document, shuttle) as machine:
         config, program = machine.config, machine.write_program(program_of(path), "path.ngc")
-        with History.read(config.store.directory) as history:
-            found = {axis: history.revisions(axis, limit=1)[0].set.parameters for axis in config.axis}
+        with History.open_read_only(config.store.directory) as history:
+            found = {axis: history.read_revisions(axis, limit=1)[0].set.parameters for axis in config.axis}
         predicted = predict_path(load_trajectory(program, config), found, config)
         measured_um = cut(machine, path)
         answer = machine.arm_program(program, method="inverse")

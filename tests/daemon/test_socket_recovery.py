@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from fdhil.arming.desk import ArmingDesk
-from fdhil.arming.token import TOKEN_NAME, read_token
+from fdhil.arming.arming_service import ArmingService
+from fdhil.arming.operator_token import TOKEN_NAME, read_token
 from fdhil.config import Access
 from fdhil.daemon import daemon_socket
 from fdhil.daemon.daemon_access import ClientProcess
@@ -76,8 +76,8 @@ async def test_removed_token_is_written_again(tmp_path: Path) -> None:
     config = config_of(tmp_path)
     run = config.run_directory
     run.mkdir(parents=True)
-    desk = ArmingDesk(config, OutcomeStore(config), run)
-    desk.begin({}, [])
+    desk = ArmingService(config, OutcomeStore(config), run)
+    desk.start_from_history({}, [])
     before = read_token(run)
     (run / TOKEN_NAME).unlink()
     notice = await restore_access(desk, "")
@@ -88,7 +88,7 @@ async def test_daemon_disarms_when_its_socket_cannot_be_recovered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = config_of(tmp_path)
-    desk = ArmingDesk(config, OutcomeStore(config), config.run_directory)
+    desk = ArmingService(config, OutcomeStore(config), config.run_directory)
     disarmed = []
 
     async def disarm() -> Mapping[str, Any]:

@@ -14,8 +14,8 @@ import pytest
 from fdhil.cli.demo.processes import Process
 from fdhil.errors import ConnectError
 from fdhil.prediction import compute_contour_error_um
-from fdhil.store.history import History
-from fdhil.store.windows import list_windows
+from fdhil.store.history_database import History
+from fdhil.store.window_file import list_windows
 from tests.daemon.machine_rig import CORNER, REAL, SHUTTLE, MachineRig, fdhil, opened, patient
 
 Capture = pytest.CaptureFixture[str]
@@ -136,8 +136,8 @@ def _replays_bit_by_bit(shop: MachineRig, capsys: Capture) -> None:
     code, out, err = fdhil("replay", "--config", shop.path, "--json", *files, capsys=capsys)
     assert code == 0, err
     document = json.loads(out)
-    with History.read(shop.config.store.directory) as history:
-        stored, revisions, skills = history.windows("X"), history.revisions("X"), history.skills("X")
+    with History.open_read_only(shop.config.store.directory) as history:
+        stored, revisions, skills = history.read_windows("X"), history.read_revisions("X"), history.read_skills("X")
     for file, window, revision, skill in zip(document["files"], stored, revisions, skills, strict=True):
         of = {outcome["kind"]: outcome for outcome in file["outcomes"]}
         unitless = {

@@ -23,10 +23,10 @@ from fdhil.drivers.can.frame_ring import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
 from fdhil.drivers.can.log_conversion import ConvertedLog, convert_log
 from fdhil.drivers.can.logged_frame import BUS_ERROR, FD_LENGTHS, LoggedFrame, LogHeader
 from fdhil.errors import RecordingError
-from fdhil.store import suffixes
+from fdhil.store import file_suffixes
 from tests.daemon.machine_rig import fdhil
 
-FORMATS = tuple(suffixes.BUS_LOGS.values())
+FORMATS = tuple(file_suffixes.BUS_LOGS.values())
 CANDUMP = """\
 (1714557600.249713) can0 080#
 (1714557600.249813) can0 181#0100000002000000
@@ -51,7 +51,7 @@ NOW_NS = 1_714_557_600 * 10**9
 
 
 def get_suffix(name: str) -> str:
-    return suffixes.suffix_of(suffixes.BUS_LOGS, name)
+    return file_suffixes.find_suffix(file_suffixes.BUS_LOGS, name)
 
 
 def convert_file(text: str, target: str, folder: Path, source: str = "candump") -> tuple[Path, ConvertedLog]:

@@ -41,11 +41,12 @@ def list_messages_of_store(config: MachineConfig, with_windows: bool = False) ->
     with OutboxReader(config.store.directory) as reader:
         windows = {
             entry.number: (config.store.directory / WINDOWS_FOLDER / entry.row["file"]).read_bytes()
-            for entry in reader.entries(0, 10_000 if with_windows else 0)
+            for entry in reader.read_entries(0, 10_000 if with_windows else 0)
             if entry.with_file
         }
         entries = [
-            encode_entry(entry, name, reader.store, windows.get(entry.number)) for entry in reader.entries(0, 10_000)
+            encode_entry(entry, name, reader.store, windows.get(entry.number))
+            for entry in reader.read_entries(0, 10_000)
         ]
         return [encode_machine(_describe_machine(config, settings), name, reader.store, 1_800_000_000.0), *entries]
 

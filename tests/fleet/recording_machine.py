@@ -12,7 +12,7 @@ from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.records import Notice, Outcome, Parameters, Skill
 from tests.bench import bench_document
-from tests.store.made import BENCH, outcome, published, window
+from tests.store.sample_records import BENCH, make_outcome, make_published, make_window
 
 AXES = ("X", "Y")
 
@@ -51,9 +51,9 @@ class RecordingMachine:
         for _ in range(count):
             self._tick += 1000
             for axis in axes:
-                whole = window(axis=axis, start_tick=self._tick, seed=self._tick)
-                outcomes.append(outcome(accepted=self._tick % 3000 != 0, of=whole))
-                outcomes.append(published(self._tick // 1000, axis, changed))
+                whole = make_window(axis=axis, start_tick=self._tick, seed=self._tick)
+                outcomes.append(make_outcome(accepted=self._tick % 3000 != 0, of=whole))
+                outcomes.append(make_published(self._tick // 1000, axis, changed))
                 outcomes.append(Skill(axis, self._tick, 1.5, 4.0, 2.0, 1.6))
             outcomes.append(Notice("Drift", "minor", "Friction rises; look at the lubrication.", axes[0], self._tick))
         assert self.store.store_outcomes(outcomes) == []

@@ -9,7 +9,7 @@ from pathlib import Path
 from fdhil.config import Identification
 from fdhil.fleet import window_files
 from fdhil.fleet.window_reanalysis import AnalysisMethod, ReanalysedWindow, WindowReference, compute_code_digest
-from fdhil.store.windows import encode_window
+from fdhil.store.window_file import encode_window
 from tests.identification.bench_recordings import find_noisy_windows
 
 

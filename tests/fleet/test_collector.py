@@ -21,8 +21,8 @@ from fdhil.errors import StoreError
 from fdhil.fleet import window_files
 from fdhil.fleet.collector import Collector, ReceivedRecord, _fetch_messages, _receive_batch, _return_pending_batch
 from fdhil.fleet.record_message import Message, UnreadableRecord, encode_entry
-from fdhil.store import atomic
-from fdhil.store.outbox import Entry
+from fdhil.store import atomic_file
+from fdhil.store.outbox import OutboxEntry
 
 DIGEST, STORE = "a" * 64, "5" * 32
 
@@ -60,7 +60,7 @@ class FakeReader:
 
 def create_messages(log: list[str], window: bytes | None = None) -> FakeMessage:
     row = {"id": 1, "wall_s": 1_800_000_000.0, "accepted": 1}
-    message: Message = encode_entry(Entry(1, "window", "X", DIGEST, row, "", False), "mill-1", STORE, window)
+    message: Message = encode_entry(OutboxEntry(1, "window", "X", DIGEST, row, "", False), "mill-1", STORE, window)
     return FakeMessage(message.subject, message.payload, log)
 
 
@@ -147,7 +147,7 @@ def test_killed_collector_does_not_corrupt_window_of_another(tmp_path: Path, mon
         fsync(descriptor)
         if stat.S_ISREG(os.fstat(descriptor).st_mode):
             with monkeypatch.context() as inner:
-                inner.setattr(atomic, "write_all", kill_writer)
+                inner.setattr(atomic_file, "write_all", kill_writer)
                 with pytest.raises(KeyboardInterrupt):
                     window_files.store_window(tmp_path, name, window)
 

@@ -18,8 +18,8 @@ from fdhil.cli.doctor.uplink import _outbox
 from fdhil.errors import ConfigError, StoreError
 from fdhil.records import Notice
 from fdhil.store import outbox
-from fdhil.store.history import HISTORY_FILE_NAME, History
-from fdhil.store.outbox import OutboxReader, Position, read_position, write_position
+from fdhil.store.history_database import HISTORY_FILE_NAME, History
+from fdhil.store.outbox import OutboxPosition, OutboxReader, read_position, write_position
 from tests.bench import bench_document
 from tests.fleet.recording_machine import RecordingMachine, write_history
 
@@ -45,7 +45,7 @@ def change_database(machine: RecordingMachine, statement: str) -> None:
 def test_all_records_enter_outbox_in_order(machine: RecordingMachine) -> None:
     count = machine.record_windows(2)
     with read_outbox(machine) as reader:
-        entries = reader.entries(0, 1000)
+        entries = reader.read_entries(0, 1000)
     assert [entry.number for entry in entries] == list(range(1, count + 1))
     of_x = [entry.kind for entry in entries if entry.axis == "X"]
     assert of_x == ["window", "parameters", "skill", "notice"] * 2
@@ -57,7 +57,7 @@ def test_acknowledgement_enters_outbox(machine: RecordingMachine) -> None:
     machine.record_windows(1)
     machine.store.store_acknowledgement({"up_to": 1, "by": "Anna"})
     with read_outbox(machine) as reader:
-        assert reader.entries(0, 1000)[-1].kind == "acknowledgement"
+        assert reader.read_entries(0, 1000)[-1].kind == "acknowledgement"
 
 
 def test_outbox_is_empty_without_uplink(tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_outbox_is_empty_without_uplink(tmp_path: Path) -> None:
     machine.record_windows(1)
     machine.close_store()
     with read_outbox(machine) as reader:
-        assert reader.waiting(0) == 0
+        assert reader.count_waiting(0) == 0
 
 
 def test_record_and_outbox_entry_are_written_together(machine: RecordingMachine) -> None:
@@ -76,10 +76,10 @@ def test_record_and_outbox_entry_are_written_together(machine: RecordingMachine)
     change_database(machine, f"CREATE TRIGGER refuses {when} BEGIN SELECT RAISE(FAIL, 'no'); END")
     with pytest.raises(AssertionError):
         machine.record_windows(1)  # its notice is refused
-    with read_outbox(machine) as reader, History.read(machine.config.store.directory) as history:
-        assert len(history.notices()) == 1
-        assert [entry.kind for entry in reader.entries(0, 1000)].count("notice") == 1
-        assert len(history.windows()) == 4
+    with read_outbox(machine) as reader, History.open_read_only(machine.config.store.directory) as history:
+        assert len(history.read_notices()) == 1
+        assert [entry.kind for entry in reader.read_entries(0, 1000)].count("notice") == 1
+        assert len(history.read_windows()) == 4
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_windows_are_sent_by_policy(policy: dict[str, Any], sent: int, tmp_path:
     machine = RecordingMachine(write_history(tmp_path, **policy))
     machine.record_windows(6)  # every third is refused
     with read_outbox(machine) as reader:
-        assert sum(entry.with_file for entry in reader.entries(0, 1000)) == sent
+        assert sum(entry.with_file for entry in reader.read_entries(0, 1000)) == sent
     machine.close_store()
 
 
@@ -107,8 +107,8 @@ def test_restored_history_copy_gets_new_identity(running: bool, machine: Recordi
     shutil.copy(history, history.with_name("backup"))
     machine.record_windows(2)
     with read_outbox(machine) as reader:
-        *_, last = reader.entries(0, 1000)
-        sent = Position(reader.store, last.number, last.message)
+        *_, last = reader.read_entries(0, 1000)
+        sent = OutboxPosition(reader.store, last.number, last.message)
     write_position(find_folder(machine), sent)
     if running:
         history.with_name("backup").replace(history)
@@ -117,27 +117,27 @@ def test_restored_history_copy_gets_new_identity(running: bool, machine: Recordi
         machine.close_store()
         history.with_name("backup").replace(history)
         with read_outbox(machine) as reader, pytest.raises(StoreError, match="is an older copy"):
-            reader.start(sent)
+            reader.resume_from(sent)
         assert [trouble.code for trouble in _outbox(machine.config)] == ["UplinkOutbox"]
         assert machine.store.open() == []
     machine.store.store_outcomes([Notice("A", "minor", "after")])
     with read_outbox(machine) as reader:
         assert reader.store != sent.store
-        assert reader.start(sent) == Position(reader.store)
-        assert [(entry.number, entry.row["text"]) for entry in reader.entries(0, 1000)] == [(1, "after")]
+        assert reader.resume_from(sent) == OutboxPosition(reader.store)
+        assert [(entry.number, entry.row["text"]) for entry in reader.read_entries(0, 1000)] == [(1, "after")]
 
 
 @pytest.mark.usefixtures("frequent_windows")
 def test_sent_entries_are_removed_except_the_last(machine: RecordingMachine) -> None:
     machine.record_windows(3)
     with read_outbox(machine) as reader:
-        last = reader.entries(0, 1000)[14]
-        sent = Position(reader.store, last.number, last.message)
+        last = reader.read_entries(0, 1000)[14]
+        sent = OutboxPosition(reader.store, last.number, last.message)
     write_position(find_folder(machine), sent)
     machine.record_windows(3)
     with read_outbox(machine) as reader:
-        assert reader.entries(0, 1)[0].number == last.number
-        assert reader.start(read_position(find_folder(machine))) == sent
+        assert reader.read_entries(0, 1)[0].number == last.number
+        assert reader.resume_from(read_position(find_folder(machine))) == sent
         assert reader.dropped == 0
 
 
@@ -152,7 +152,7 @@ def test_full_outbox_drops_and_counts_oldest_entries(tmp_path: Path) -> None:
     machine = RecordingMachine(write_history(tmp_path), keep_unsent=20)
     count = sum(machine.record_windows(1) for _ in range(9))
     with read_outbox(machine) as reader:
-        kept = reader.entries(0, 5000)
+        kept = reader.read_entries(0, 5000)
         assert 20 <= len(kept) < 30
         assert kept[-1].number == count
         assert reader.dropped == count - len(kept)
@@ -169,18 +169,18 @@ def test_damaged_position_restarts_from_beginning(content: str, machine: Recordi
     machine.record_windows(1)
     (find_folder(machine) / outbox.POSITION_FILE).write_text(content)
     with read_outbox(machine) as reader:
-        assert reader.start(read_position(find_folder(machine))).entry == 0
+        assert reader.resume_from(read_position(find_folder(machine))).entry == 0
     machine.record_windows(2)  # which lets go what was sent
 
 
 def test_position_of_another_history_restarts_from_beginning(machine: RecordingMachine) -> None:
     machine.record_windows(1)
     with read_outbox(machine) as reader:
-        third = reader.entries(0, 10)[2]
-        good = Position(reader.store, third.number, third.message)
-        assert reader.start(good) == good
+        third = reader.read_entries(0, 10)[2]
+        good = OutboxPosition(reader.store, third.number, third.message)
+        assert reader.resume_from(good) == good
         for other in (replace(good, store="0" * 32), replace(good, message="0" * 64)):
-            assert reader.start(other) == Position(reader.store)
+            assert reader.resume_from(other) == OutboxPosition(reader.store)
 
 
 def test_damaged_or_deleted_row_is_reported_as_such(machine: RecordingMachine) -> None:
@@ -189,7 +189,7 @@ def test_damaged_or_deleted_row_is_reported_as_such(machine: RecordingMachine) -
     change_database(machine, "DELETE FROM notices")
     change_database(machine, "UPDATE outbox SET row = 2 WHERE of = 'skills' AND axis = 'X'")
     with read_outbox(machine) as reader:
-        told = {(entry.axis, entry.kind): entry.left_out for entry in reader.entries(0, 10)}
+        told = {(entry.axis, entry.kind): entry.left_out for entry in reader.read_entries(0, 10)}
     assert told == {
         ("X", "window"): "",
         ("X", "parameters"): "damaged",
@@ -242,7 +242,7 @@ def test_earlier_records_are_sent_once_in_order(older_history: Path) -> None:
     for _ in range(2):
         machine = RecordingMachine(older_history)
         with read_outbox(machine) as reader:
-            entries = reader.entries(0, 1000)
+            entries = reader.read_entries(0, 1000)
         assert [entry.number for entry in entries] == list(range(1, 30))
         assert {entry.left_out for entry in entries} == {""}
         for kind in ("window", "parameters", "skill", "notice"):
@@ -255,7 +255,7 @@ def test_earlier_records_are_sent_once_in_order(older_history: Path) -> None:
     machine = RecordingMachine(older_history)
     machine.record_windows(1)
     with read_outbox(machine) as reader:
-        assert len(reader.entries(0, 1000)) == 29 + 7
+        assert len(reader.read_entries(0, 1000)) == 29 + 7
     machine.close_store()
 
 
@@ -264,7 +264,7 @@ def test_clock_set_back_does_not_change_order(older_history: Path) -> None:
     assert config.uplink is not None
     with closing(sqlite3.connect(config.store.directory / HISTORY_FILE_NAME)) as db:
         db.execute("UPDATE revisions SET wall_s = 1000 - id")
-        outbox.Outbox(config.uplink, config.uplink_directory).begin(db)
+        outbox.Outbox(config.uplink, config.uplink_directory).add_earlier_rows(db)
         rows = db.execute("SELECT row FROM outbox WHERE of = 'revisions' ORDER BY id").fetchall()
     assert rows == sorted(rows)
     assert len(rows) == 8
@@ -273,7 +273,7 @@ def test_clock_set_back_does_not_change_order(older_history: Path) -> None:
 def test_newest_of_too_many_earlier_records_are_sent(older_history: Path) -> None:
     machine = RecordingMachine(older_history, keep_unsent=5)
     with read_outbox(machine) as reader:
-        kinds = [entry.kind for entry in reader.entries(0, 1000)]
+        kinds = [entry.kind for entry in reader.read_entries(0, 1000)]
     assert len(kinds) == 5
     assert kinds[-1] == "acknowledgement"
     machine.close_store()

@@ -21,7 +21,7 @@ from fdhil.fleet.record_message import (
     encode_machine,
     join_messages,
 )
-from fdhil.store.outbox import Entry
+from fdhil.store.outbox import OutboxEntry
 
 STORE, DIGEST = "5" * 32, "a" * 64
 ROW = {
@@ -37,9 +37,9 @@ ROW = {
 }
 
 
-def create_entry(**changes: Any) -> Entry:
+def create_entry(**changes: Any) -> OutboxEntry:
     given: dict[str, Any] = {"row": ROW, "left_out": "", "with_file": False}
-    return Entry(number=7, kind="parameters", axis="X", message=DIGEST, **(given | changes))
+    return OutboxEntry(number=7, kind="parameters", axis="X", message=DIGEST, **(given | changes))
 
 
 def decode_single(message: Message) -> Record:

@@ -13,8 +13,8 @@ from fdhil import config as machine_config
 from fdhil.commissioning.record import axis_digest, save_record
 from fdhil.config import MachineConfig
 from fdhil.daemon.offer_watch import OfferWatch
-from fdhil.store import audit
-from fdhil.store.offers import ANSWERS_FILE
+from fdhil.store import audit_file
+from fdhil.store.change_offers import ANSWERS_FILE
 from tests.commissioning.test_record import RECORD
 from tests.daemon.machine_rig import fdhil
 from tests.fleet.offer_signing import NOW, OfferSigner, create_machine
@@ -85,7 +85,7 @@ def test_acceptance_is_in_audit_log(offer_signer: OfferSigner, config_file: Path
         == 0
     )
     told = [{key: entry.get(key) for key in ("by", "asked", "answered", "offer", "result")} for entry, _ in
-            audit.entries(store)]  # fmt: skip
+            audit_file.read_entries(store)]  # fmt: skip
     assert told == [
         {"by": "Bert", "asked": "accept an offer", "answered": None, "offer": "friction", "result": None},
         {"by": "Bert", "asked": None, "answered": "accept an offer", "offer": "friction", "result": "done"},
@@ -100,7 +100,7 @@ def test_acceptance_is_in_audit_log(offer_signer: OfferSigner, config_file: Path
 
 def test_offer_is_not_accepted_when_audit_log_fails(offer_signer: OfferSigner, config_file: Path, capsys: Any) -> None:
     store = place_offer(offer_signer, config_file).store.directory
-    (store / audit.AUDIT_FILE_NAME).mkdir(parents=True)
+    (store / audit_file.AUDIT_FILE_NAME).mkdir(parents=True)
     before = config_file.read_bytes()
     assert fdhil("offers", "accept", config_file, "friction", "--by", "Bert", capsys=capsys)[0] == 3
     assert config_file.read_bytes() == before

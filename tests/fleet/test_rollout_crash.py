@@ -14,8 +14,8 @@ from fdhil import config as machine_config
 from fdhil.cli.main import cli, run_safely
 from fdhil.config.toml_editing import edit_toml
 from fdhil.errors import ConfigError, FdhilError, StoreError
-from fdhil.store.atomic import write_file
-from fdhil.store.offers import read_answers
+from fdhil.store.atomic_file import write_file
+from fdhil.store.change_offers import read_decisions
 from tests.crash import call_faults, disks
 from tests.crash.loops import KINDS, Kind, tried
 from tests.crash.stored_records import Plain
@@ -78,7 +78,7 @@ class AcceptanceScenario(Plain):
             assert kept.read_text() in texts, f"{kept.name} is half"
         assert self.file.read_text() in texts, "the configuration is half"
         now = STATES[texts.index(self.file.read_text())]
-        accepted = {each.version for each in read_answers(self.folder / "fdhil-data")}
+        accepted = {each.version for each in read_decisions(self.folder / "fdhil-data")}
         assert now >= max(accepted, default=0), f"version {now} is in force"
         return accepted
 

@@ -21,7 +21,7 @@ from fdhil.fleet.nats_transport import connect_to_server, prepare_record_stream
 from fdhil.fleet.offer_delivery import OfferFetcher
 from fdhil.fleet.signed_offer import Offer
 from fdhil.records import Notice
-from fdhil.store.offers import lying
+from fdhil.store.change_offers import list_offers
 from tests.daemon.machine_rig import fdhil
 from tests.fleet import servers
 from tests.fleet.fleet_database import collect_messages, list_messages
@@ -31,7 +31,7 @@ from tests.fleet.servers import NatsServer, Postgres, wait_until
 from tests.fleet.test_server_permissions import SECRET, expect_login
 from tests.fleet.test_uplink_to_database import build_fleet_settings, run_process
 from tests.shopfloor.mosquitto import certify
-from tests.store.made import published
+from tests.store.sample_records import make_published
 
 pytestmark = pytest.mark.debian
 CHANGE = """
@@ -79,7 +79,7 @@ class FleetRig:
                 break
 
     def list_offers(self, name: str) -> list[str]:
-        return [path.name for path in lying(self.config(name).offers_directory)]
+        return [path.name for path in list_offers(self.config(name).offers_directory)]
 
     def open_stage(self, code: int, *options: object) -> Any:
         """Show the roll-out, or open a stage with the options."""
@@ -132,7 +132,7 @@ def test_change_is_rolled_out_stage_by_stage(collected: FleetRig) -> None:
     digest = shop.config("mill-1").digest
     noticed = Notice("MaintenanceDue", "minor", "Friction rises; look at the lubrication.", "X", 1000)
     lies = Notice("OfferWaits", "minor", "a configuration change is proposed: friction version 4")
-    assert machine.store.store_outcomes([replace(published(), config_digest=digest), noticed, lies]) == []
+    assert machine.store.store_outcomes([replace(make_published(), config_digest=digest), noticed, lies]) == []
     machine.close_store()
     shop.uplink("mill-1")
     wait_until(
@@ -210,7 +210,7 @@ async def fetch_offers(
     assert config.uplink is not None
     async with connect_to_server(config.uplink, f"fdhil-{config.plant_name}", "uplink") as client:
         await (letterbox or OfferFetcher(config)).fetch_offers(client.jetstream(timeout=timeout_s), "5" * 32)
-    return sorted(path.name for path in lying(config.offers_directory))
+    return sorted(path.name for path in list_offers(config.offers_directory))
 
 
 async def test_machine_fetches_only_its_own_offers(server: NatsServer, tmp_path: Path) -> None:

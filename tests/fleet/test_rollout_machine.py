@@ -24,15 +24,15 @@ from fdhil.fleet.offer_review import (
     review_offer,
 )
 from fdhil.fleet.signed_offer import Offer, OfferRefused
-from fdhil.store.atomic import write_file
-from fdhil.store.offers import (
+from fdhil.store.atomic_file import write_file
+from fdhil.store.change_offers import (
     ANSWERS_FILE,
     LARGEST_ANSWERS,
-    Answer,
-    add_answer,
-    file_name,
-    newest_accepted,
-    read_answers,
+    OfferDecision,
+    add_decision,
+    find_newest_accepted,
+    make_file_name,
+    read_decisions,
 )
 from tests.fleet.offer_signing import NOW, TOLD, OfferSigner, create_machine
 
@@ -99,7 +99,7 @@ def test_unsuitable_offer_changes_nothing(
     with pytest.raises(OfferRefused, match="is not accepted"):
         accept_offer(offer_signer.write_document(**changes), config_file, "Bert", may_loosen=True)
     assert config_file.read_bytes() == before
-    assert read_answers(load_current_machine(config_file).config.store.directory) == []
+    assert read_decisions(load_current_machine(config_file).config.store.directory) == []
 
 
 def test_machine_without_uplink_has_own_name_and_no_labels(offer_signer: OfferSigner, config_file: Path) -> None:
@@ -121,11 +121,11 @@ def test_accepted_values_are_written_and_old_file_is_kept(offer_signer: OfferSig
     }
     config = machine_config.load_config(config_file)
     assert config.axis["X"].nominal.ft == 0.061
-    (answer,) = read_answers(config.store.directory)
+    (answer,) = read_decisions(config.store.directory)
     assert (answer.answer, answer.by, answer.version, answer.config_digest) == ("accepted", "Bert", 3, config.digest)
     once_more = accept_offer(offer_signer.write_document(), config_file, "Bert", may_loosen=False)
     assert once_more.changes == []
-    assert len(read_answers(config.store.directory)) == 1
+    assert len(read_decisions(config.store.directory)) == 1
     assert not list(config_file.parent.glob(".*"))
 
 
@@ -145,12 +145,12 @@ def test_older_version_is_refused_after_newer_one(offer_signer: OfferSigner, con
     assert review(offer_signer, config_file, version=4, values={"axis.X.nominal.ft": 0.05}).wrong == ""
     lie = load_current_machine(config_file).config.offers_directory
     lie.mkdir(parents=True)
-    (lie / file_name("friction", 5)).write_bytes(offer_signer.sign_document(version=5))
-    (lie / file_name("friction", 6)).write_bytes(b"no offer, whatever its name says")
-    os.mkfifo(lie / file_name("friction", 7))
+    (lie / make_file_name("friction", 5)).write_bytes(offer_signer.sign_document(version=5))
+    (lie / make_file_name("friction", 6)).write_bytes(b"no offer, whatever its name says")
+    os.mkfifo(lie / make_file_name("friction", 7))
     assert "version 5 of the fleet server replaces it" in review(offer_signer, config_file, version=4).wrong
     assert (
-        review_offer(lie / file_name("friction", 7), load_current_machine(config_file)).wrong
+        review_offer(lie / make_file_name("friction", 7), load_current_machine(config_file)).wrong
         == "it is not a regular file; export it again"
     )
     assert review_offer(lie, load_current_machine(config_file)).wrong == "it is not a regular file; export it again"
@@ -211,11 +211,11 @@ def test_rejected_offer_changes_nothing_and_can_be_accepted_later(offer_signer: 
     reject_offer(offer_signer.write_document(expires_s=NOW - 1), config_file, "Bert", "the screw was changed last week")
     assert config_file.read_bytes() == before
     store = load_current_machine(config_file).config.store.directory
-    (answer,) = read_answers(store)
+    (answer,) = read_decisions(store)
     assert (answer.answer, answer.reason) == ("rejected", "the screw was changed last week")
-    assert newest_accepted([answer], "friction") == 0
+    assert find_newest_accepted([answer], "friction") == 0
     accept_offer(offer_signer.write_document(), config_file, "Bert", may_loosen=False)
-    assert [each.answer for each in read_answers(store)] == ["rejected", "accepted"]
+    assert [each.answer for each in read_decisions(store)] == ["rejected", "accepted"]
 
 
 def test_offer_in_force_cannot_be_rejected(offer_signer: OfferSigner, config_file: Path) -> None:
@@ -231,7 +231,7 @@ def test_offer_in_force_cannot_be_rejected(offer_signer: OfferSigner, config_fil
     config_file.write_bytes(build_backup_path(config_file, done.offer).read_bytes())
     assert config_file.read_bytes() == before
     reject_offer(offer_signer.write_document(), config_file, "Anna", "it was worse")
-    answers = read_answers(load_current_machine(config_file).config.store.directory)
+    answers = read_decisions(load_current_machine(config_file).config.store.directory)
     assert [each.answer for each in answers] == ["accepted", "rejected"]
 
 
@@ -260,24 +260,24 @@ def test_offer_is_not_accepted_when_answers_are_unreadable(
 
 
 def test_answers_of_wrong_types_are_damage(tmp_path: Path) -> None:
-    right = Answer("a", 1, 1, "d", "accepted", "b", "", 1.5, "c")
+    right = OfferDecision("a", 1, 1, "d", "accepted", "b", "", 1.5, "c")
     for wrong in (replace(right, version="1"), replace(right, at_s=1), replace(right, answer="maybe")):  # type: ignore[arg-type]
         write_file(tmp_path / ANSWERS_FILE, b"")
         (tmp_path / ANSWERS_FILE).unlink()
-        add_answer(tmp_path, right)
+        add_decision(tmp_path, right)
         told = json.loads((tmp_path / ANSWERS_FILE).read_text())
-        told["answers"].append({name: getattr(wrong, name) for name in Answer.__slots__})
+        told["answers"].append({name: getattr(wrong, name) for name in OfferDecision.__slots__})
         (tmp_path / ANSWERS_FILE).write_text(json.dumps(told))
         with pytest.raises(StoreError):
-            read_answers(tmp_path)
+            read_decisions(tmp_path)
 
 
 def test_answer_on_full_disk_is_refused_and_earlier_ones_kept(tmp_path: Path) -> None:
-    first = Answer("a", 1, 1, "d", "accepted", "b", "", 1.5, "c")
-    add_answer(tmp_path, first)
+    first = OfferDecision("a", 1, 1, "d", "accepted", "b", "", 1.5, "c")
+    add_decision(tmp_path, first)
     with pytest.raises(StoreError, match="no room for another decision"):
-        add_answer(tmp_path, replace(first, reason="x" * LARGEST_ANSWERS))
-    assert read_answers(tmp_path) == [first]
+        add_decision(tmp_path, replace(first, reason="x" * LARGEST_ANSWERS))
+    assert read_decisions(tmp_path) == [first]
 
 
 def test_full_disk_leaves_configuration_unchanged(
@@ -294,7 +294,7 @@ def test_full_disk_leaves_configuration_unchanged(
     with pytest.raises(OutputError, match="the disk is full; free some space; the configuration is unchanged"):
         accept_offer(offer_signer.write_document(), config_file, "Bert", may_loosen=False)
     assert config_file.read_bytes() == before
-    assert read_answers(load_current_machine(config_file).config.store.directory) == []
+    assert read_decisions(load_current_machine(config_file).config.store.directory) == []
     monkeypatch.undo()
     accept_offer(offer_signer.write_document(), config_file, "Bert", may_loosen=False)
 

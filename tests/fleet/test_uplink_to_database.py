@@ -12,11 +12,11 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from fdhil.store.windows import read_window
+from fdhil.store.window_file import read_window
 from studies.fleet_cut import Network
 from tests.fleet.recording_machine import RecordingMachine, write_history
 from tests.fleet.servers import PATIENCE_S, NatsServer, Postgres, run_nats, wait_until
-from tests.store.made import same, window
+from tests.store.sample_records import is_bit_identical, make_window
 
 pytestmark = pytest.mark.debian
 
@@ -100,7 +100,7 @@ def test_records_reach_database_once_and_in_order(tmp_path: Path, database: Post
     assert database.execute_query("SELECT machine, records, missing FROM fleet.machines") == [("mill_1", expected, 0)]
     ((name,),) = database.execute_query("SELECT window_name FROM fleet.windows WHERE axis = 'Y' AND number = 2")
     stored = read_window(tmp_path / "objects" / name[:2] / f"{name}.parquet")
-    assert same(stored, window(axis="Y", start_tick=1000, seed=1000))
+    assert is_bit_identical(stored, make_window(axis="Y", start_tick=1000, seed=1000))
 
 
 def test_kill_at_any_point_loses_and_duplicates_nothing(tmp_path: Path, database: Postgres) -> None:

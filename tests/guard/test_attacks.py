@@ -109,7 +109,7 @@ def test_running_correction_misses_no_sync_under_garbage_floods_and_signals(rig:
     rig.settle()
     client = rig.client
     assert client is not None
-    missed = client.status()["missed_cycles"]
+    missed = client.read_status()["missed_cycles"]
     before_kb, before, armed_at = memory_kb(rig), open_descriptors(rig), rig.peer.tick
     wrong = descriptors(tmp_path)
     lines = list(garbage())
@@ -159,8 +159,10 @@ def test_running_correction_misses_no_sync_under_garbage_floods_and_signals(rig:
     assert [o for _, o in moving] == [(OFFSET[0][rows[t[0]]], OFFSET[1][rows[t[0]]]) for t, _ in moving]
     check_limits(rig)
     assert memory_kb(rig) - before_kb < 16_000
-    assert client.status()["may_stand_um"] == {"X": 0.0, "Y": 0.0}
-    rig.peer.wait(lambda: client.status()["ok"] and open_descriptors(rig) <= before + MAX_CLIENTS, "closed descriptors")
+    assert client.read_status()["may_stand_um"] == {"X": 0.0, "Y": 0.0}
+    rig.peer.wait(
+        lambda: client.read_status()["ok"] and open_descriptors(rig) <= before + MAX_CLIENTS, "closed descriptors"
+    )
 
 
 @pytest.mark.fault("F13")
@@ -216,7 +218,7 @@ def wait_for_ready(rig: Rig) -> bool:
 def test_second_request_waits_for_the_first_answer(rig: Rig) -> None:
     guard = rig.connect()
     rig.peer.stand()
-    rig.peer.wait(lambda: guard.status()["tick"] == rig.peer.tick, "the last SYNC")
+    rig.peer.wait(lambda: guard.read_status()["tick"] == rig.peer.tick, "the last SYNC")
     idle = [connection(rig) for _ in range(2 * MAX_CLIENTS)]
     with connection(rig) as client:
         client.send(b'{"request": "arm", "id": 1}\n{"request": "arm", "id": 2}\n')

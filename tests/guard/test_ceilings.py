@@ -14,7 +14,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fdhil import config as machine_config
-from fdhil.arming.guard_settings import settings_of
+from fdhil.arming.guard_configuration import make_guard_settings
 from fdhil.config import CEILING_ACCELERATION_MM_S2, CEILING_OFFSET_UM, CEILING_SPEED_MM_S, VARIATION_MM, OffsetBounds
 from fdhil.correction import PlanLimits, check_offsets
 from fdhil.correction.correction_gate import check_writing_enabled
@@ -86,11 +86,11 @@ def test_planner_and_guard_limits_agree_and_keep_the_ceilings(document: dict[str
     axis, period = machine.axis["X"], machine.machine.sync_period_s
     if OffsetBounds.derive(axis, period).is_too_coarse:
         with pytest.raises(ConfigError, match="too coarse"):
-            settings_of(machine, "can0", Path(), "")
+            make_guard_settings(machine, "can0", Path(), "")
         assert check_writing_enabled(["X"], machine)[0].code == "CoarseIncrements"
         return
     assert OffsetBounds.derive(axis, period).compute_time_to_safe_s(period) <= 0.120 + 1e-9
-    whole = settings_of(machine, "can0", Path(), "").axes[0].limits
+    whole = make_guard_settings(machine, "can0", Path(), "").axes[0].limits
     planned = PlanLimits.derive(axis, period)
     assert (whole.offset, whole.rate, whole.acceleration, whole.variation, whole.window) == OffsetBounds.derive(
         axis, period

@@ -18,7 +18,7 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.arming.guard_client import GuardClient, GuardLost
-from fdhil.arming.guard_settings import settings_of
+from fdhil.arming.guard_configuration import make_guard_settings
 from fdhil.cli.failing import run_safely
 from fdhil.cli.main import cli
 from fdhil.guard.guard_settings import encode_settings
@@ -45,7 +45,7 @@ class Rig:
         self.program = program
         self.settings = folder / "guard.json"
         token = hashlib.sha256(TOKEN.encode()).hexdigest()
-        self.settings.write_text(encode_settings(commissioned(settings_of(self.config, "can0", folder, token))))
+        self.settings.write_text(encode_settings(commissioned(make_guard_settings(self.config, "can0", folder, token))))
         self.journal = (folder / "journal").open("a")
         self.process = self.start()
         self.client: GuardClient | None = None
@@ -85,7 +85,7 @@ class Rig:
         while not self._ended.wait(0.05):
             if self.alive.is_set():
                 try:
-                    self.client.alive()
+                    self.client.send_alive()
                 except GuardLost:
                     return
 
@@ -93,9 +93,9 @@ class Rig:
         client = self.client or self.connect()
         demand = dict(zip("XY", DEMAND, strict=True))
         offset = {axis: [round(amplitude * v) for v in column] for axis, column in zip("XY", OFFSET, strict=True)}
-        answer = client.load("XY", demand, offset, DIGEST)
+        answer = client.load_table("XY", demand, offset, DIGEST)
         assert answer["ok"], answer
-        self.peer.wait(lambda: client.status()["good_for"] > 100, "good interlocks")
+        self.peer.wait(lambda: client.read_status()["good_for"] > 100, "good interlocks")
         answer = client.arm(TOKEN, DIGEST, FACTS_GIVEN)
         assert answer["ok"], answer
         self.peer.wait(lambda: len(self.peer.offsets_sent()) > 30, "zeros")
@@ -104,13 +104,13 @@ class Rig:
         client = self.client
         assert client is not None
         self.peer.stand()
-        self.peer.wait(lambda: client.status()["tick"] == self.peer.tick, "the last SYNC")
+        self.peer.wait(lambda: client.read_status()["tick"] == self.peer.tick, "the last SYNC")
         self.peer.read_out()
         self.peer.syncing = True
 
     def state(self) -> str:
         assert self.client is not None
-        return str(self.client.status()["state"])
+        return str(self.client.read_status()["state"])
 
     def into_the_cut(self) -> None:
         self.arm()
@@ -119,7 +119,7 @@ class Rig:
     def into_the_cut_blindly(self) -> None:
         client = self.connect()
         columns = [dict(zip("XY", rows, strict=True)) for rows in (DEMAND, OFFSET)]
-        assert client.load("XY", columns[0], columns[1], DIGEST)["ok"]
+        assert client.load_table("XY", columns[0], columns[1], DIGEST)["ok"]
         self.peer.wait(lambda: client.arm(TOKEN, DIGEST, FACTS_GIVEN)["ok"], "arming")
         self.peer.wait(lambda: len(self.peer.offsets_sent()) > 30, "zeros")
         self.play_into_the_cut()
@@ -166,7 +166,7 @@ def check_limits(rig: Rig) -> None:
 
 def test_guard_process_is_mute_until_armed_then_aligned_then_off(rig: Rig) -> None:
     client = rig.connect()
-    rig.peer.wait(lambda: client.status()["good_for"] > 200, "SYNC")
+    rig.peer.wait(lambda: client.read_status()["good_for"] > 200, "SYNC")
     assert rig.peer.sent == []
     assert list_tcp_ports(rig.process.pid) == set()
     rig.arm()
@@ -179,7 +179,7 @@ def test_guard_process_is_mute_until_armed_then_aligned_then_off(rig: Rig) -> No
     assert len(moving) > 600
     assert [o for _, o in moving] == [(OFFSET[0][rows[t[0]]], OFFSET[1][rows[t[0]]]) for t, _ in moving]
     check_limits(rig)
-    assert client.status()["cause"]["code"] == "Finished", "\n".join(map(str, rig.events()))
+    assert client.read_status()["cause"]["code"] == "Finished", "\n".join(map(str, rig.events()))
     rig.peer.expected = False
     rig.peer.read_out()
     count = len(rig.peer.sent)
@@ -240,7 +240,7 @@ def test_lost_sync_freezes_and_adopt_ramps_to_zero(rig: Rig, capsys: pytest.Capt
     held = rig.peer.offsets_sent()[-1][1]
     time.sleep(0.1)
     assert len(rig.peer.sent) == count
-    assert rig.client.status()["cause"]["code"] == "SyncLost"
+    assert rig.client.read_status()["cause"]["code"] == "SyncLost"
     assert rig.adopt() == 1
     assert "refused: SyncLost" in capsys.readouterr().err
     (rig.run_directory / short_timeouts.BUS).unlink()
@@ -270,7 +270,7 @@ def test_stopped_process_sends_nothing(rig: Rig) -> None:
     rig.process.send_signal(signal.SIGCONT)
     rig.peer.wait(lambda: rig.state() == "OFF", "off")
     assert rig.client is not None
-    assert rig.client.status()["cause"]["code"] in ("LoopOverrun", "MainLost")
+    assert rig.client.read_status()["cause"]["code"] in ("LoopOverrun", "MainLost")
     check_limits(rig)
 
 
@@ -311,11 +311,11 @@ def test_forged_foreign_or_missing_frames_cause_no_step(rig: Rig, cob_id: int) -
     drive.received_offset = -819
     peer.wait(lambda: rig.state() == "OFF", "off")
     peer.expected = False  # the guard is silent, whatever the drives hold
-    assert client.status()["cause"]["code"] == "OffsetHijack"
+    assert client.read_status()["cause"]["code"] == "OffsetHijack"
     held = [offsets[0] for _, _, offsets in peer.latched]
     steps = [abs(b - a) for a, b in itertools.pairwise(held)]
     # the foreign one, and one back where a frame of ours was on its way already
-    assert sum(step > LIMITS.hard_rate for step in steps) <= 2 + client.status()["missed_cycles"]
+    assert sum(step > LIMITS.hard_rate for step in steps) <= 2 + client.read_status()["missed_cycles"]
     peer.playing, peer.row = False, 0
     tick = peer.tick
     peer.wait(lambda: peer.tick > tick + 1, "SYNC")

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.arming.guard_settings import settings_of
+from fdhil.arming.guard_configuration import make_guard_settings
 from fdhil.guard.guard_protocol import Mode
 from fdhil.guard.guard_settings import GuardSettings, decode_settings, encode_settings
 from fdhil.guard.guard_state import AxisInput, BusView, GuardState, StepInputs, make_initial_state
@@ -50,7 +50,7 @@ def mutate(made: Bench, position: int, speed: int) -> None:
 
 def test_speed_step_follows_from_the_config(tmp_path: Path) -> None:
     """200 A make 160 N.m on 0.075 kg.m2: 22 increments per cycle squared; twice that is plausible."""
-    made = settings_of(bench_config("X"), "can0", tmp_path, "")
+    made = make_guard_settings(bench_config("X"), "can0", tmp_path, "")
     assert made.axes[0].speed_count == pytest.approx(1e-3)
     assert made.axes[0].speed_step == pytest.approx(2 * 200 * 0.8 / 0.075 * 65536 / (2 * math.pi) * 1e-6)
     assert decode_settings(encode_settings(made)) == made

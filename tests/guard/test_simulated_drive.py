@@ -17,7 +17,7 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.arming.guard_client import GuardClient
-from fdhil.arming.guard_settings import settings_of
+from fdhil.arming.guard_configuration import make_guard_settings
 from fdhil.guard.guard_settings import encode_settings
 from tests.guard.drive_peer import open_bus, write_config
 from tests.guard.simulated_bus import FACTS_GIVEN, commissioned
@@ -82,14 +82,14 @@ def play(twin: SimulatedDriveRig, guard: GuardClient, folder: Path) -> dict[str,
     rows = demand_mm()
     columns = [[round(row[k] * 3276.8) for row in rows] for k in (0, 1)]
     bump = offset_increments()
-    loaded = guard.load("XY", dict(zip("XY", columns, strict=True)), {"X": bump, "Y": [-v for v in bump]}, "p")
+    loaded = guard.load_table("XY", dict(zip("XY", columns, strict=True)), {"X": bump, "Y": [-v for v in bump]}, "p")
     assert loaded["ok"], loaded
-    while guard.status()["good_for"] <= 100:
+    while guard.read_status()["good_for"] <= 100:
         time.sleep(0.01)
     armed = guard.arm(TOKEN, "p", FACTS_GIVEN)
     assert armed["ok"], armed
-    tick = guard.status()["tick"]
-    while guard.status()["tick"] < tick + 50:  # what it is behind SYNC is over
+    tick = guard.read_status()["tick"]
+    while guard.read_status()["tick"] < tick + 50:  # what it is behind SYNC is over
         time.sleep(0.01)
     file = folder / "demand.csv"
     lines = [f"{k * 1e-3:.3f},{x:.9f},{y:.9f}" for k, (x, y) in enumerate(rows)]
@@ -104,7 +104,7 @@ def test_each_row_is_applied_at_its_own_cycle(tmp_path: Path) -> None:
     config = machine_config.load_config(twin.config)
     bus = config.bus["can0"].model_copy(update={"port": twin.port})
     settings = tmp_path / "guard.json"
-    made = settings_of(config, "can0", tmp_path, hashlib.sha256(TOKEN.encode()).hexdigest())
+    made = make_guard_settings(config, "can0", tmp_path, hashlib.sha256(TOKEN.encode()).hexdigest())
     settings.write_text(encode_settings(commissioned(made)))
     with open_bus("can0", bus) as far:
         command = [sys.executable, "-m", "fdhil.guard", "--settings", str(settings), "--descriptor", str(far.fileno())]
@@ -116,13 +116,13 @@ def test_each_row_is_applied_at_its_own_cycle(tmp_path: Path) -> None:
 
         def keep_alive() -> None:
             while not ended.wait(0.05):
-                client.alive()
+                client.send_alive()
 
         keeper = threading.Thread(target=keep_alive)
         keeper.start()
         try:
             finished = play(twin, client, tmp_path)
-            while (status := client.status())["state"] != "OFF":
+            while (status := client.read_status())["state"] != "OFF":
                 time.sleep(0.01)
         finally:
             ended.set()

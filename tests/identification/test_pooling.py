@@ -16,11 +16,11 @@ from fdhil.identification.between_window_variance import (
 from fdhil.identification.ripple_parts import combine_ripples, split_ripples
 from fdhil.identification.window_pool import build_pool_member, estimate_friction_at, pool_estimates
 from fdhil.records import INTERVAL_95, PARAMETERS, Estimate, Float, Parameters, freeze_array
-from tests.store.made import outcome, window
+from tests.store.sample_records import make_outcome, make_window
 
 BENCH = Parameters(0.5, 0.005, 0.8, 0.075, 0.05, 5.0)
 RAPID = 157.0  # rad/s
-FIRST = outcome(of=window()).estimate
+FIRST = make_outcome(of=make_window()).estimate
 assert FIRST is not None
 
 
@@ -146,7 +146,7 @@ def test_ripple_parts_combine_to_the_original() -> None:
 
 
 def test_given_and_missing_parameters_stay_so_in_the_pool() -> None:
-    made = outcome(of=window())
+    made = make_outcome(of=make_window())
     assert made.estimate is not None
     values, covariance = made.estimate.values.copy(), made.estimate.covariance.copy()
     values[:2] = covariance[:2, :] = covariance[:, :2] = np.nan

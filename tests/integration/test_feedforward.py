@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fdhil.arming.guard_client import GuardClient
-from fdhil.arming.token import read_token
+from fdhil.arming.operator_token import read_token
 from fdhil.cli.demo.processes import Process
 from fdhil.commissioning.record import save_record
 from fdhil.commissioning.steps import commission
@@ -72,8 +72,8 @@ def switch_on(client: GuardClient, bench: Bench) -> None:
     assert run is not None
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
-        client.alive()
-        answer = client.feed_forward(read_token(run), laws, dict.fromkeys(FEEDFORWARD_FACTS, True))
+        client.send_alive()
+        answer = client.enable_feedforward(read_token(run), laws, dict.fromkeys(FEEDFORWARD_FACTS, True))
         if answer["ok"]:
             return
         time.sleep(0.1)
@@ -84,7 +84,7 @@ def largest_errors_um(bench: Bench, client: GuardClient, demand: Path, trace: Pa
     bench.command(json.dumps({"command": "trace", "file": str(trace)}))
     bench.command(json.dumps({"command": "play", "file": str(demand)}))
     while bench.events.empty() or not any(e["event"] == "finished" for e in list(bench.events.queue)):
-        client.alive()
+        client.send_alive()
         time.sleep(0.05)
     bench.event("finished")
     data = np.genfromtxt(trace, delimiter=",", names=True)[:rows]
@@ -106,9 +106,9 @@ def test_feedforward_reduces_the_largest_following_error(bench: Bench, client: G
         assert before[axis] / after[axis] >= smaller, (before, after)
     client.disarm()
     deadline = time.monotonic() + PATIENCE_S
-    while client.status()["feedforward"]["state"] != "OFF" and time.monotonic() < deadline:
+    while client.read_status()["feedforward"]["state"] != "OFF" and time.monotonic() < deadline:
         time.sleep(0.02)
-    status = client.status()["feedforward"]
+    status = client.read_status()["feedforward"]
     assert status["state"] == "OFF"
     assert status["cause"]["code"] == "Disarmed"
     assert status["applied"] == {"X": [0, 0], "Y": [0, 0]}

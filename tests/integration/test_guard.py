@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from fdhil.arming.guard_client import GuardClient
-from fdhil.arming.token import read_token
+from fdhil.arming.operator_token import read_token
 from fdhil.cli.demo.processes import Process
 from fdhil.guard.interlocks import FACTS
 from tests.integration.conftest import PATIENCE_S, Bench, sign_off
@@ -65,7 +65,7 @@ def toml(document: dict[str, Any], path: str = "") -> str:
 def arm(client: GuardClient, token: str) -> dict[str, Any]:
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
-        client.alive()
+        client.send_alive()
         answer = dict(client.arm(token, DIGEST, dict.fromkeys(FACTS, True)))
         if answer["ok"]:
             return answer
@@ -74,9 +74,9 @@ def arm(client: GuardClient, token: str) -> dict[str, Any]:
 
 
 def missed_until_it_is_waited_for(client: GuardClient) -> int:
-    first = client.status()["tick"]
-    while (status := client.status())["tick"] < first + 50:
-        client.alive()
+    first = client.read_status()["tick"]
+    while (status := client.read_status())["tick"] < first + 50:
+        client.send_alive()
         time.sleep(0.02)
     return int(status["missed_cycles"])
 
@@ -94,9 +94,9 @@ def every_offset_is_applied_in_its_own_cycle(bench: Bench, client: GuardClient, 
     increments = np.round(way * 65536 / 20).astype(int).tolist()
     bench.command('{"command": "nc", "on": true}')
     bench.event("nc")
-    loaded = client.load(("X", "Y"), {"X": increments, "Y": increments}, {"X": bump, "Y": bump}, DIGEST)
+    loaded = client.load_table(("X", "Y"), {"X": increments, "Y": increments}, {"X": bump, "Y": bump}, DIGEST)
     assert loaded["ok"], loaded
-    assert client.status()["state"] == "OFF"
+    assert client.read_status()["state"] == "OFF"
     run = bench.config.store.run_directory
     assert run is not None
     assert arm(client, read_token(run))["state"] == "ARMED"
@@ -105,11 +105,11 @@ def every_offset_is_applied_in_its_own_cycle(bench: Bench, client: GuardClient, 
     bench.command(json.dumps({"command": "trace", "file": str(trace)}))
     bench.command(json.dumps({"command": "play", "file": str(demand)}))
     while bench.events.empty() or not any(e["event"] == "finished" for e in list(bench.events.queue)):
-        client.alive()
+        client.send_alive()
         time.sleep(0.05)
     late = bench.event("finished")["late_rpdo"]
     # a host that halts the guard for a cycle is counted; whatever is not counted must be right
-    missed = client.status()["missed_cycles"] - missed
+    missed = client.read_status()["missed_cycles"] - missed
     assert missed <= len(way) // 100
     assert max(late.values()) <= missed
     applied = np.genfromtxt(trace, delimiter=",", names=True)["X_offset_um"][: way.size] * 65536 / 20e3

@@ -15,7 +15,7 @@ import pytest
 from click.testing import CliRunner
 
 from fdhil.arming.guard_client import GuardClient
-from fdhil.arming.token import read_token
+from fdhil.arming.operator_token import read_token
 from fdhil.cli.demo.processes import Process
 from fdhil.cli.main import cli
 from fdhil.commissioning.void import is_void, void_record
@@ -150,7 +150,7 @@ def test_remapped_read_back_moves_nothing(rig: TrustRig, tmp_path: Path) -> None
         bus.set_filters([{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in (0x301, 0x302, 0x764)])
         with rig.guard() as client:
             deadline = time.monotonic() + PATIENCE_S
-            while (status := client.status())["state"] != "FROZEN":
+            while (status := client.read_status())["state"] != "FROZEN":
                 assert time.monotonic() < deadline, status
                 time.sleep(0.05)
             assert status["cause"]["code"] == "OffsetDoubtful"

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.arming.token import read_token
+from fdhil.arming.operator_token import read_token
 from tests.bench import bench_document
 from tests.integration.conftest import Bench
 from tests.integration.test_guard import DIGEST, arm, guarded, missed_until_it_is_waited_for
@@ -69,7 +69,7 @@ def test_correction_works_with_the_played_program(bench: Bench, tmp_path: Path) 
                     break
             else:
                 pytest.fail("".join(result))
-            loaded = guard.load(("X", "Y"), {"X": increments, "Y": increments}, {"X": bump, "Y": bump}, DIGEST)
+            loaded = guard.load_table(("X", "Y"), {"X": increments, "Y": increments}, {"X": bump, "Y": bump}, DIGEST)
             assert loaded["ok"], loaded
             run = bench.config.store.run_directory
             assert run is not None
@@ -82,15 +82,15 @@ def test_correction_works_with_the_played_program(bench: Bench, tmp_path: Path) 
                 bus.set_filters([{"can_id": 0x301, "can_mask": 0x7FF, "extended": False}])
                 offsets = []
                 while play.poll() is None:
-                    guard.alive()
+                    guard.send_alive()
                     time.sleep(0.02)
                     while (frame := bus.recv(0)) is not None:
                         if frame.arbitration_id == 0x301:
                             offsets.append(struct.unpack("<i", frame.data)[0])
             output, err = play.communicate()
         assert play.returncode == 0, output + err
-        assert max(offsets) == 100, guard.status()
+        assert max(offsets) == 100, guard.read_status()
         assert offsets[-1] == 0
-        assert guard.status()["state"] == "OFF"
+        assert guard.read_status()["state"] == "OFF"
         # what play wrote to the drives and gave back does not void their records
-        assert not any(axis["record_void"] for axis in guard.status().get("axes", {}).values())
+        assert not any(axis["record_void"] for axis in guard.read_status().get("axes", {}).values())

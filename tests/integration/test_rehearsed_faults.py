@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fdhil.arming.guard_client import GuardClient
-from fdhil.arming.token import read_token
+from fdhil.arming.operator_token import read_token
 from tests.integration.conftest import PATIENCE_S, Bench
 from tests.integration.test_guard import DIGEST, arm, client, sections, transport
 
@@ -36,7 +36,7 @@ def test_bus_fault_ends_at_zero_with_its_class(case: str, bench: Bench, client: 
     bump = np.round(200 * np.sin(np.linspace(0, np.pi, WAY.size)) ** 2).astype(int).tolist()
     bench.command('{"command": "nc", "on": true}')
     bench.event("nc")
-    assert client.load(("X", "Y"), {"X": increments, "Y": increments}, {"X": bump, "Y": bump}, DIGEST)["ok"]
+    assert client.load_table(("X", "Y"), {"X": increments, "Y": increments}, {"X": bump, "Y": bump}, DIGEST)["ok"]
     run = bench.config.store.run_directory
     assert run is not None
     arm(client, read_token(run))
@@ -45,9 +45,9 @@ def test_bus_fault_ends_at_zero_with_its_class(case: str, bench: Bench, client: 
     bench.command(json.dumps({"command": "fault", "at_row": 450, "duration_s": 0.05, **fault}))
     bench.command(json.dumps({"command": "play", "file": str(demand)}))
     deadline = time.monotonic() + PATIENCE_S
-    while (status := client.status())["state"] not in ("OFF", "FROZEN"):
+    while (status := client.read_status())["state"] not in ("OFF", "FROZEN"):
         assert time.monotonic() < deadline, status
-        client.alive()
+        client.send_alive()
         time.sleep(0.02)
     assert status["cause"]["code"] == code
     bench.event("finished")

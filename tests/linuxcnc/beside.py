@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.arming.passes import FINISHED
+from fdhil.arming.pass_monitor import FINISHED
 from fdhil.child_process import wrap_to_end_with_parent
 from fdhil.prediction import compute_contour_error_um
 from fdhil.records import Trajectory

@@ -19,8 +19,8 @@ from typing import Any, Self
 
 from fdhil import config as machine_config
 from fdhil.arming.guard_client import GuardClient
-from fdhil.arming.guard_settings import corrected_bus, settings_of
-from fdhil.arming.token import make_directory, operator_token
+from fdhil.arming.guard_configuration import find_corrected_bus, make_guard_settings
+from fdhil.arming.operator_token import get_operator_token, make_run_directory
 from fdhil.commissioning.record import CommissioningRecord, axis_digest, load_record, save_record
 from fdhil.commissioning.void import confirm_record, void_mark
 from fdhil.config import MachineConfig
@@ -99,7 +99,7 @@ class CompleteMachine:
         self._serving: asyncio.Task[Any] | None = None
         self._hung_until_s = 0.0
         self._guard_due_s = self._sync_s = self._wall_s = self.clock.now_s()
-        make_directory(self.config.run_directory)
+        make_run_directory(self.config.run_directory)
         self._commission_axes()
         self._put_frame(self.plant.power_on())
 
@@ -171,16 +171,16 @@ class CompleteMachine:
         marks = {axis: void_mark(directory, axis) for axis in self.config.axis}
         records = {axis: load_record(directory, axis) for axis in self.config.axis}
         with GuardClient(self.config.guard_directory, clock=self.clock) as client:
-            touched = client.touched(self.read_token)
+            touched = client.read_touch_counts(self.read_token)
             seen = {axis: record.fingerprint for axis, record in records.items() if record is not None}
-            answer = client.compared(self.read_token, seen, touched)
+            answer = client.report_comparison(self.read_token, seen, touched)
         for axis in set(seen) - {each["axis"] for each in answer.get("refused", [])}:
             confirm_record(directory, axis, marks[axis])
 
     @property
     def read_token(self) -> str:
         """The operator's token."""
-        return operator_token(self.config.run_directory)
+        return get_operator_token(self.config.run_directory)
 
     def inject_fault(self, kind: str, **fields: Any) -> None:
         """Start a named fault of the simulated machine, as the operator's panel does."""
@@ -285,9 +285,9 @@ class CompleteMachine:
 
     def _start_guard(self) -> None:
         assert self.guard is None
-        run, name = self.config.guard_directory, corrected_bus(self.config, "machine")
-        digest = hashlib.sha256(operator_token(self.config.run_directory).encode()).hexdigest()
-        settings = settings_of(self.config, name, run, digest)
+        run, name = self.config.guard_directory, find_corrected_bus(self.config, "machine")
+        digest = hashlib.sha256(get_operator_token(self.config.run_directory).encode()).hexdigest()
+        settings = make_guard_settings(self.config, name, run, digest)
         can = GuardSocket(self.bus, settings.sent_ids, FrameMonitor(settings).list_received_ids())
         self._journal_near, journal_far = os.pipe()
         os.set_blocking(self._journal_near, False)

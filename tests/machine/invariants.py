@@ -11,7 +11,7 @@ from typing import Any
 
 from fdhil.guard.guard_protocol import AT_REST
 from fdhil.guard.offset_adoption import list_applied_offsets
-from fdhil.store.audit import entries
+from fdhil.store.audit_file import read_entries
 from tests.guard.frame_checks import Wire
 from tests.machine.complete_machine import CompleteMachine
 
@@ -145,7 +145,7 @@ class InvariantChecker:
             self.list_violations(f"doubled windows: {doubled}")
         if sound != "ok":
             self.list_violations(f"the history is damaged: {sound}")
-        for entry, trouble in entries(self._machine.config.store.directory):
+        for entry, trouble in read_entries(self._machine.config.store.directory):
             self.counted["audit lines"] += 1
             if trouble is not None:
                 self.list_violations(f"the audit: {trouble}: {entry}")

@@ -22,7 +22,7 @@ from fdhil.prediction.axis_models import (
 from fdhil.records import Float, ParameterSet
 from tests.bench import bench_config
 from tests.paths import build_trajectory
-from tests.store.made import BENCH, published
+from tests.store.sample_records import BENCH, make_published
 
 GOOD: dict[str, Any] = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.0, "Cd": 5}
 
@@ -161,7 +161,7 @@ FILTERED: Mapping[str, float | str] = {"speed_filter_s": 0.002, "speed_kp": 23.4
 
 
 def make_published_set(loops: Mapping[str, float | str] | None, digest: str = CONFIG.digest) -> dict[str, ParameterSet]:
-    return {"X": replace(published(), config_digest=digest, loops=loops)}
+    return {"X": replace(make_published(), config_digest=digest, loops=loops)}
 
 
 def test_published_set_is_used_with_its_loops() -> None:
@@ -187,7 +187,7 @@ def test_loops_of_earlier_configuration_are_refused_unless_equal() -> None:
 
 def make_friction_set(dry_nm: float, stribeck_nm: float, covariance: Float) -> dict[str, ParameterSet]:
     parameters = BENCH.replace_values(Cd=dry_nm, stribeck=stribeck_nm, stribeck_speed=8.0)
-    return {"X": replace(published(parameters=parameters), covariance=covariance)}
+    return {"X": replace(make_published(parameters=parameters), covariance=covariance)}
 
 
 def test_slightly_unphysical_set_is_bounded() -> None:

@@ -9,7 +9,7 @@ from fdhil.daemon.daemon_status import DaemonStatus
 from fdhil.records import Notice
 from fdhil.shopfloor.status_poller import StatusPoller, StatusUpdate
 from tests.daemon.simulated_machine import config_of
-from tests.store.made import outcome, published
+from tests.store.sample_records import make_outcome, make_published
 
 NOW = 1_700_000_000_000
 
@@ -39,7 +39,7 @@ class Daemon:
 
 
 def identified() -> tuple[Any, ...]:
-    return outcome(), published()
+    return make_outcome(), make_published()
 
 
 def load_changed(text: str = "Jt rose") -> Notice:

@@ -11,7 +11,7 @@ import pytest
 
 from fdhil.errors import ConfigError, RecordingError
 from fdhil.store.column_map import read_column_map
-from fdhil.store.recordings import read_recording
+from fdhil.store.recording_file import read_recording
 
 N, PITCH_M = 400, 0.01
 TIME = np.arange(N) * 1e-3
@@ -21,37 +21,37 @@ CURRENT = 0.1 * SPEED + 1.25
 HEADERS = '[headers]\naxis = "X"\npitch_m_per_rev = 0.01\nrapid_speed_m_per_s = 0.15\ntorque_constant_nm_per_a = 0.3\n'
 
 
-def _comma(value: float) -> str:
+def _make_comma_trace(value: float) -> str:
     return f"{value:.9g}".replace(".", ",")
 
 
-def _twincat(columns: dict[str, np.ndarray]) -> bytes:
+def _make_twincat_trace(columns: dict[str, np.ndarray]) -> bytes:
     lines = ["Name\tScope Project", "File\tC:\\scope.csv", "Starttime of export\t128783093223690000", ""]
     lines.append("\t".join(f"Name\t{name}" for name in columns))
     lines.append("\t".join("SampleTime[ms]\t1" for _ in columns))
     lines.append("\t".join(f"SymbolName\tMAIN.{name}" for name in columns))
     lines.append("")
     for k in range(N):
-        lines.append("\t".join(f"{k}\t{_comma(v[k])}" for v in columns.values()))
+        lines.append("\t".join(f"{k}\t{_make_comma_trace(v[k])}" for v in columns.values()))
     return "\r\n".join([*lines, "EOF", ""]).encode()
 
 
-def _semicolon(columns: dict[str, np.ndarray]) -> bytes:
+def _make_semicolon_trace(columns: dict[str, np.ndarray]) -> bytes:
     lines = [";".join(["Time", *columns]), ";".join(["ms", *("[]" for _ in columns)])]
     lines += [";".join([f"{k}", *(f"{v[k]:.9g}" for v in columns.values())]) for k in range(N)]
     return "\r\n".join([*lines, ""]).encode("utf-16")
 
 
-def _quoted(columns: dict[str, np.ndarray]) -> bytes:
+def _make_quoted_trace(columns: dict[str, np.ndarray]) -> bytes:
     lines = ["Oszilloskop, Kanäle Achse X", ",".join(['"Zeit"', *(f'"{name}"' for name in columns)])]
     lines += [",".join([f"{k * 1e-3:.6f}", *(f"{v[k]:.9g}" for v in columns.values())]) for k in range(N)]
     return ("\n".join(lines) + "\n").encode("cp1252")
 
 
 CASES: dict[str, tuple[Callable[[dict[str, np.ndarray]], bytes], str]] = {
-    "twincat": (_twincat, 'time_s = { name = "#1", unit = "ms" }'),
-    "semicolon": (_semicolon, 'time_s = { name = "Time", unit = "ms" }'),
-    "quoted": (_quoted, 'time_s = { name = "Zeit", unit = "s" }'),
+    "twincat": (_make_twincat_trace, 'time_s = { name = "#1", unit = "ms" }'),
+    "semicolon": (_make_semicolon_trace, 'time_s = { name = "Time", unit = "ms" }'),
+    "quoted": (_make_quoted_trace, 'time_s = { name = "Zeit", unit = "s" }'),
 }
 MAP = """
 [columns]
@@ -63,7 +63,7 @@ demand_m = [{ name = "Ist", unit = "mm" }, { name = "Schlepp", unit = "um" }]
 """
 
 
-def _columns() -> dict[str, np.ndarray]:
+def _make_columns() -> dict[str, np.ndarray]:
     return {
         "Strom": CURRENT * 1e3,
         "Drehzahl": SPEED * 60 / (2 * math.pi),
@@ -73,10 +73,10 @@ def _columns() -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_makers_text_file_becomes_a_recording(case: str, tmp_path: Path) -> None:
+def test_vendor_text_file_becomes_a_recording(case: str, tmp_path: Path) -> None:
     write, time = CASES[case]
     trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
-    trace.write_bytes(write(_columns()))
+    trace.write_bytes(write(_make_columns()))
     told.write_text(HEADERS + MAP % time)
     read = read_recording(trace, read_column_map(told))
     assert (read.axis, read.dt_s, read.voltage_v, read.torque_constant_nm_per_a) == ("X", 0.001, None, 0.3)
@@ -85,9 +85,9 @@ def test_a_makers_text_file_becomes_a_recording(case: str, tmp_path: Path) -> No
     np.testing.assert_allclose(read.demand_mm - read.position_mm, SPEED * 2e-3, atol=1e-6)
 
 
-def test_without_a_speed_it_is_the_difference_of_positions(tmp_path: Path) -> None:
+def test_missing_speed_is_difference_of_positions(tmp_path: Path) -> None:
     trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
-    trace.write_bytes(_semicolon(_columns()))
+    trace.write_bytes(_make_semicolon_trace(_make_columns()))
     told.write_text(
         HEADERS + MAP.replace('speed_rad_per_s = { name = "Drehzahl", unit = "rpm" }\n', "") % CASES["semicolon"][1]
     )
@@ -96,9 +96,9 @@ def test_without_a_speed_it_is_the_difference_of_positions(tmp_path: Path) -> No
     np.testing.assert_allclose(read.speed_rad_s[1:], SPEED[1:], rtol=1e-5, atol=1e-4)
 
 
-def test_a_speed_of_the_table_needs_the_pitch_alone(tmp_path: Path) -> None:
+def test_table_speed_needs_only_the_pitch(tmp_path: Path) -> None:
     trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
-    trace.write_bytes(_semicolon(_columns() | {"Drehzahl": SPEED * PITCH_M / (2 * math.pi) * 60e3}))
+    trace.write_bytes(_make_semicolon_trace(_make_columns() | {"Drehzahl": SPEED * PITCH_M / (2 * math.pi) * 60e3}))
     told.write_text(HEADERS + MAP.replace('"rpm"', '"mm/min"') % CASES["semicolon"][1])
     np.testing.assert_allclose(read_recording(trace, read_column_map(told)).speed_rad_s, SPEED, rtol=1e-7, atol=1e-9)
 
@@ -113,7 +113,7 @@ def test_a_speed_of_the_table_needs_the_pitch_alone(tmp_path: Path) -> None:
         ('current_A = { name = "Strom", unit = "mA" }\n', "", "columns.current_A"),
     ],
 )
-def test_a_wrong_map_is_told_by_its_key(old: str, new: str, words: str, tmp_path: Path) -> None:
+def test_invalid_map_is_refused_with_its_key(old: str, new: str, words: str, tmp_path: Path) -> None:
     told = tmp_path / "map.toml"
     told.write_text((HEADERS + MAP % CASES["twincat"][1]).replace(old, new))
     with pytest.raises(ConfigError, match=words):
@@ -131,7 +131,7 @@ def test_a_wrong_map_is_told_by_its_key(old: str, new: str, words: str, tmp_path
         ),
     ],
 )
-def test_a_trace_that_is_not_what_the_map_says_is_one_sentence(content: bytes, words: str, tmp_path: Path) -> None:
+def test_trace_that_contradicts_the_map_is_refused_in_one_sentence(content: bytes, words: str, tmp_path: Path) -> None:
     trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
     trace.write_bytes(content)
     told.write_text(HEADERS + MAP % CASES["quoted"][1])
@@ -154,11 +154,13 @@ def test_a_trace_that_is_not_what_the_map_says_is_one_sentence(content: bytes, w
         ("V;V;V;V;V", "Strom", "", "", ""),
     ],
 )
-def test_a_unit_that_the_file_contradicts_is_refused(
+def test_unit_that_contradicts_the_file_is_refused(
     units: str, name: str, old: str, new: str, words: str, tmp_path: Path
 ) -> None:
     trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
-    text = _semicolon(_columns()).decode("utf-16").replace("ms;[];[];[];[]", units).replace("Strom", name)
+    text = (
+        _make_semicolon_trace(_make_columns()).decode("utf-16").replace("ms;[];[];[];[]", units).replace("Strom", name)
+    )
     trace.write_bytes(text.encode())
     told.write_text((HEADERS + MAP % CASES["semicolon"][1]).replace(old, new))
     if not words:
@@ -178,7 +180,7 @@ def test_a_unit_that_the_file_contradicts_is_refused(
 )
 def test_times_that_do_not_rise_are_refused(time_ms: Callable[[int], int], words: str, tmp_path: Path) -> None:
     trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
-    head, rows = _semicolon(_columns()).decode("utf-16").split("[]\r\n", 1)
+    head, rows = _make_semicolon_trace(_make_columns()).decode("utf-16").split("[]\r\n", 1)
     cells = [row.partition(";")[2] for row in rows.splitlines()]
     trace.write_text("\n".join([f"{head}[]", *(f"{time_ms(k)};{row}" for k, row in enumerate(cells)), ""]))
     told.write_text(HEADERS + MAP % CASES["semicolon"][1])

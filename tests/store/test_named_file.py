@@ -29,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return inside
 
 
-def test_a_file_of_the_folder_is_opened(folder: Path) -> None:
+def test_file_of_the_folder_is_opened(folder: Path) -> None:
     with open_named(folder, "w00000001-X.parquet") as file:
         assert file.read() == b"a rapid"
 
@@ -42,7 +42,7 @@ def test_a_file_of_the_folder_is_opened(folder: Path) -> None:
         "a" * 65, "ä.parquet", "%2e%2e", "~", ".w1.parquet.part", "link", "dangling", "deeper", "pipe", "socket",
     ],
 )  # fmt: skip
-def test_what_is_no_name_or_no_regular_file_is_not_opened(folder: Path, name: str) -> None:
+def test_invalid_name_or_special_file_is_refused(folder: Path, name: str) -> None:
     with pytest.raises(StoreError) as refused:
         open_named(folder, name)
     assert refused.value.code == "BadName"
@@ -53,11 +53,11 @@ def test_what_is_no_name_or_no_regular_file_is_not_opened(folder: Path, name: st
 @pytest.mark.fault("G4")
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=200)
 @given(name=st.text(max_size=80) | st.text(alphabet="./\\%2eE0wX-\0", max_size=12))
-def test_no_name_reaches_another_file(folder: Path, name: str) -> None:
-    assert _content_or_code(folder, name) in {b"a rapid", "BadName", "NotKept"}
+def test_no_name_reaches_a_file_outside(folder: Path, name: str) -> None:
+    assert _read_or_code(folder, name) in {b"a rapid", "BadName", "NotKept"}
 
 
-def _content_or_code(folder: Path, name: str) -> bytes | str:
+def _read_or_code(folder: Path, name: str) -> bytes | str:
     try:
         with open_named(folder, name) as file:
             return file.read()
@@ -66,14 +66,14 @@ def _content_or_code(folder: Path, name: str) -> bytes | str:
 
 
 @pytest.mark.fault("G4")
-def test_the_folder_itself_may_be_missing_or_a_file(folder: Path) -> None:
+def test_missing_folder_or_file_in_its_place_is_reported(folder: Path) -> None:
     for place in (folder / "nowhere", folder / "w00000001-X.parquet"):
         with pytest.raises(StoreError) as refused:
             open_named(place, "w00000001-X.parquet")
         assert refused.value.code == "NotKept"
 
 
-def test_a_file_that_the_oldest_went_with_says_so(folder: Path) -> None:
+def test_displaced_file_is_reported(folder: Path) -> None:
     with pytest.raises(StoreError, match="keep_windows") as refused:
         open_named(folder, "w00000002-X.parquet")
     assert refused.value.code == "NotKept"

@@ -12,35 +12,35 @@ import pytest
 
 from fdhil.errors import FdhilError, RecordingError
 from fdhil.store import reading_process
-from fdhil.store.export import export_table, table_of
-from fdhil.store.reading_process import read_apart
-from fdhil.store.recordings import read_recording, read_table
+from fdhil.store.reading_process import read_in_process
+from fdhil.store.recording_file import read_recording, read_table
+from fdhil.store.window_export import convert_window, export_table
 from tests.fuzz.tasting import FOUND
 from tests.store import failing_reader
-from tests.store.made import window
+from tests.store.sample_records import make_window
 
 pytestmark = pytest.mark.usefixtures("processes")
 
 
 @pytest.fixture(autouse=True)
-def _none_before_and_after() -> Iterator[None]:
-    reading_process._end()
+def _fresh_process() -> Iterator[None]:
+    reading_process._end_process()
     yield
-    reading_process._end()
+    reading_process._end_process()
 
 
-def _asked(content: bytes, source: str) -> str:
-    table = read_apart(failing_reader.__name__, "such file", content, source)
+def _read_file(content: bytes, source: str) -> str:
+    table = read_in_process(failing_reader.__name__, "such file", content, source)
     assert table.columns["time_s"].tolist() == [0.0, 1.0, 2.0]
     return table.headers["of"]
 
 
 @pytest.mark.fault("G8")
 @pytest.mark.parametrize("name", ["mat", "h5"])
-def test_a_file_that_ends_its_reader_is_refused_and_the_next_one_read(name: str, tmp_path: Path) -> None:
+def test_file_that_crashes_reader_is_refused_and_next_is_read(name: str, tmp_path: Path) -> None:
     bad, good = tmp_path / "bad.mat", tmp_path / f"good.{name}"
     bad.write_bytes((FOUND / "recording_mat" / "vector-of-unknown-type").read_bytes())
-    export_table(table_of(window()), good, {"h5": "hdf5"}.get(name, name))
+    export_table(convert_window(make_window()), good, {"h5": "hdf5"}.get(name, name))
     with pytest.raises(RecordingError, match=r"bad\.mat is not a readable MATLAB file.*crashed; export it again"):
         read_recording(bad)
     assert read_recording(good).axis == "X"
@@ -58,44 +58,44 @@ def test_a_file_that_ends_its_reader_is_refused_and_the_next_one_read(name: str,
         ("hang", "within 0.8 s of processor time"),
     ],
 )
-def test_a_reader_that_goes_astray_is_ended(does: str, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runaway_reader_is_killed(does: str, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         if does == "sleep":
             patch.setattr(reading_process, "LONGEST_S", 0.3)
         with pytest.raises(RecordingError, match=f"^r is not a readable such file.*{told}.*; export it again$"):
-            _asked(does.encode(), "r")
-    assert _asked(b"", "the next") == "the next"
+            _read_file(does.encode(), "r")
+    assert _read_file(b"", "the next") == "the next"
 
 
-def test_what_one_file_broke_is_whole_for_the_next_one() -> None:
-    assert _asked(b"break", "one") == "one"
-    assert _asked(b"", "the next") == "the next"
+def test_damage_by_one_file_does_not_affect_the_next() -> None:
+    assert _read_file(b"break", "one") == "one"
+    assert _read_file(b"", "the next") == "the next"
 
 
-def test_an_interrupted_reading_leaves_no_answer_to_the_next_file() -> None:
+def test_interrupted_reading_leaves_no_stale_answer() -> None:
     with pytest.raises(KeyboardInterrupt):
-        _asked(b"interrupt", "r")
-    assert _asked(b"", "the next") == "the next"
+        _read_file(b"interrupt", "r")
+    assert _read_file(b"", "the next") == "the next"
 
 
-def test_an_idle_reader_that_was_ended_is_begun_anew() -> None:
-    assert _asked(b"", "first") == "first"
+def test_killed_idle_reader_is_restarted() -> None:
+    assert _read_file(b"", "first") == "first"
     (process,) = reading_process._PROCESSES.values()
     process.child.kill()
     process.child.wait()
-    assert _asked(b"", "second") == "second"
+    assert _read_file(b"", "second") == "second"
 
 
-def test_a_script_is_not_run_again_and_a_forked_process_has_a_reader_of_its_own(tmp_path: Path) -> None:
+def test_script_is_not_rerun_and_fork_has_own_reader(tmp_path: Path) -> None:
     for n in (120, 150):
-        export_table(table_of(window(n=n, raw=False)), tmp_path / f"{n}.mat", "mat")
+        export_table(convert_window(make_window(n=n, raw=False)), tmp_path / f"{n}.mat", "mat")
     script = tmp_path / "script.py"
     script.write_text(
         textwrap.dedent(
             """\
             import os
             from pathlib import Path
-            from fdhil.store.recordings import read_table
+            from fdhil.store.recording_file import read_table
 
             print("begun", flush=True)
             assert read_table(Path("120.mat")).columns["time_s"].size == 117
@@ -114,23 +114,23 @@ def test_a_script_is_not_run_again_and_a_forked_process_has_a_reader_of_its_own(
     assert done.stdout.split() == ["begun", "done", "done"]
 
 
-def test_no_module_beside_the_file_is_taken_for_a_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    export_table(table_of(window()), tmp_path / "r.mat", "mat")
+def test_module_next_to_the_file_is_not_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    export_table(convert_window(make_window()), tmp_path / "r.mat", "mat")
     (tmp_path / "numpy.py").write_text("raise SystemExit(1)")
     monkeypatch.chdir(tmp_path)
     assert read_recording(Path("r.mat")).axis == "X"
 
 
-def test_a_missing_extra_is_told_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_extra_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "asammdf.py").write_text("raise ImportError")
-    export_table(table_of(window()), tmp_path / "r.mf4", "mdf4")
+    export_table(convert_window(make_window()), tmp_path / "r.mf4", "mdf4")
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(FdhilError, match="pip install 'fdhil"):
         read_table(tmp_path / "r.mf4")
 
 
 @pytest.mark.parametrize("program", ["/nowhere", "/bin/true"])
-def test_a_reader_that_cannot_be_started_is_no_fault_of_the_file(program: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reader_that_cannot_start_is_not_blamed_on_the_file(program: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", program)
     with pytest.raises(RecordingError, match=r"^r was not read: .*cannot be started.*; free memory"):
-        _asked(b"", "r")
+        _read_file(b"", "r")

@@ -11,10 +11,18 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from fdhil.errors import RecordingError
-from fdhil.store.column_map import ColumnMap, mapped
+from fdhil.store.column_map import ColumnMap, apply_column_map
 from fdhil.store.recording_table import RecordingTable
 from fdhil.store.trace_text import parse_trace
-from tests.store.dialects import SIGNALS, Dialect, column_map, rows_kept, signals, write, written_values
+from tests.store.trace_dialects import (
+    SIGNALS,
+    Dialect,
+    compute_written_values,
+    count_kept_rows,
+    make_column_map,
+    make_signals,
+    write_trace,
+)
 
 HABITS: dict[str, list[Any]] = {
     "separator": ["\t", ";", ",", "|", " ", "  ", ", ", "; "],
@@ -59,13 +67,13 @@ READ = [
 ]
 
 
-def _read(dialect: Dialect) -> RecordingTable:
-    told = ColumnMap.model_validate(column_map(dialect))
-    return mapped(parse_trace(write(dialect, signals()), told.text, "trace"), told, "trace")
+def _read_trace(dialect: Dialect) -> RecordingTable:
+    told = ColumnMap.model_validate(make_column_map(dialect))
+    return apply_column_map(parse_trace(write_trace(dialect, make_signals()), told.text, "trace"), told, "trace")
 
 
 def _assert_equal(read: RecordingTable, dialect: Dialect) -> None:
-    written, kept = written_values(dialect, signals()), rows_kept(dialect)
+    written, kept = compute_written_values(dialect, make_signals()), count_kept_rows(dialect)
     of = ("voltage_V", "current_A", "speed_rad_per_s", "position_m", "demand_m")
     for signal, name in zip(of, SIGNALS, strict=True):
         np.testing.assert_allclose(read.columns[signal], written[name][kept], rtol=1e-12, atol=1e-12, err_msg=signal)
@@ -73,8 +81,8 @@ def _assert_equal(read: RecordingTable, dialect: Dialect) -> None:
 
 
 @pytest.mark.parametrize("dialect", READ, ids=repr)
-def test_a_common_dialect_is_read(dialect: Dialect) -> None:
-    _assert_equal(_read(dialect), dialect)
+def test_common_dialect_is_read(dialect: Dialect) -> None:
+    _assert_equal(_read_trace(dialect), dialect)
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -83,12 +91,12 @@ def test_a_common_dialect_is_read(dialect: Dialect) -> None:
 @example({"separator": " ", "thousands": " "})
 @example({"separator": ",", "names": "comma"})
 @settings(max_examples=150)
-def test_a_trace_in_any_dialect_is_read_equal_or_refused(habits: dict[str, Any]) -> None:
+def test_any_dialect_is_read_equal_or_refused(habits: dict[str, Any]) -> None:
     dialect = Dialect(**habits)
     assume(dialect.thousands != dialect.decimal)
     assume(dialect.encoding != "cp1252" or dialect.minus == "-")
     try:
-        read = _read(dialect)
+        read = _read_trace(dialect)
     except RecordingError:
         return
     _assert_equal(read, dialect)

@@ -18,11 +18,11 @@ I = np.round(2 * np.cos(np.arange(N) / 5), 4)  # noqa: E741 - the current
 Row = Callable[[int], str]
 
 
-def _comma(text: str) -> str:
+def _make_comma_trace(text: str) -> str:
     return text.replace(".", ",")
 
 
-def _labels(k: int) -> str:
+def _make_labels(k: int) -> str:
     labels = ["Record Length,40,Points", "Sample Interval,0.001,s", "Trigger Point,100,Samples", ",,", "Offset,0,s"]
     return labels[k] if k < len(labels) else ",,"
 
@@ -43,7 +43,7 @@ HEADS: dict[str, tuple[str, Row, tuple[str, str, str]]] = {
         lambda k: f"{TIME[k]:.6e},{U[k]},{I[k]}",
         ("TIME", "CH1", "CH2"),
     ),
-    "Tektronix TDS": ("", lambda k: f"{_labels(k)},{TIME[k]:.6f},{U[k]},{I[k]},", ("#4", "#5", "#6")),
+    "Tektronix TDS": ("", lambda k: f"{_make_labels(k)},{TIME[k]:.6f},{U[k]},{I[k]},", ("#4", "#5", "#6")),
     "Keysight": (
         "x-axis,1,2\nsecond,Volt,Ampere\n",
         lambda k: f"{TIME[k]:+.8E},{U[k]:+.5E},{I[k]:+.5E}",
@@ -56,7 +56,7 @@ HEADS: dict[str, tuple[str, Row, tuple[str, str, str]]] = {
     ),
     "PicoScope": (
         "Zeit;Kanal A;Kanal B\n(s);(V);(A)\n\n",
-        lambda k: _comma(f"{TIME[k]:.8f};{U[k]:.8f};{I[k]:.8f}"),
+        lambda k: _make_comma_trace(f"{TIME[k]:.8f};{U[k]:.8f};{I[k]:.8f}"),
         ("Zeit", "Kanal A", "Kanal B"),
     ),
     "Rohde & Schwarz": (
@@ -66,7 +66,7 @@ HEADS: dict[str, tuple[str, Row, tuple[str, str, str]]] = {
     ),
     "LabVIEW": (
         LABVIEW,
-        lambda k: _comma(f"{TIME[k]:.6f}\t{U[k]:.6f}\t{I[k]:.6f}"),
+        lambda k: _make_comma_trace(f"{TIME[k]:.6f}\t{U[k]:.6f}\t{I[k]:.6f}"),
         ("X_Value", "Spannung", "Strom"),
     ),
     "Yokogawa": (YOKOGAWA, lambda k: f",{U[k]:.5E},{I[k]:.5E},{TIME[k]}", ("#4", "#2", "#3")),
@@ -74,7 +74,7 @@ HEADS: dict[str, tuple[str, Row, tuple[str, str, str]]] = {
     "pandas": (",t,u,i\n", lambda k: f"{k},{TIME[k]:.4f},{U[k]},{I[k]}", ("t", "u", "i")),
     "catman": (
         "HBM_CATMAN\t\t\r\nMessrate\t1000 Hz\t\r\nZeit  1 - Standard\tSpannung\tStrom\r\ns\tV\tA\r\n",
-        lambda k: _comma(f"{TIME[k]:.6f}\t{U[k]:.5f}\t{I[k]:.5f}"),
+        lambda k: _make_comma_trace(f"{TIME[k]:.6f}\t{U[k]:.5f}\t{I[k]:.5f}"),
         ("Zeit 1 - Standard", "Spannung", "Strom"),
     ),
     "two lines in a name": (
@@ -89,7 +89,7 @@ HEADS: dict[str, tuple[str, Row, tuple[str, str, str]]] = {
     ),
     "rows as one quoted cell each": (
         "Time;U;I\n",
-        lambda k: _comma(f'"{TIME[k]:.4f};{U[k]};{I[k]}"'),
+        lambda k: _make_comma_trace(f'"{TIME[k]:.4f};{U[k]};{I[k]}"'),
         ("Time", "U", "I"),
     ),
     "a table of Markdown": (
@@ -105,14 +105,14 @@ HEADS: dict[str, tuple[str, Row, tuple[str, str, str]]] = {
 }
 
 
-def _parsed(head: str, row: Row) -> RecordingTable:
+def _parse(head: str, row: Row) -> RecordingTable:
     return parse_trace((head + "".join(f"{row(k)}\n" for k in range(N))).encode(), TraceText(), "trace")
 
 
 @pytest.mark.parametrize("instrument", HEADS)
-def test_the_names_of_an_instrument_stand_for_its_columns(instrument: str) -> None:
+def test_instrument_headings_name_the_columns(instrument: str) -> None:
     head, row, names = HEADS[instrument]
-    read = _parsed(head, row)
+    read = _parse(head, row)
     for name, values in zip(names, (TIME, U, I), strict=True):
         assert name not in read.doubts
         np.testing.assert_allclose(read.columns[name], values, atol=1e-4)
@@ -126,15 +126,15 @@ def test_the_names_of_an_instrument_stand_for_its_columns(instrument: str) -> No
         ("Time, s;Voltage\n", "Voltage", "is one of the 2 cells of line 1, the rows have 5"),
     ],
 )
-def test_a_name_without_one_column_is_doubted(head: str, name: str, words: str) -> None:
-    read = _parsed(head, lambda k: f"{k};{U[k]};{I[k]};{U[k]};{I[k]}")
+def test_name_without_unique_column_is_doubtful(head: str, name: str, words: str) -> None:
+    read = _parse(head, lambda k: f"{k};{U[k]};{I[k]};{U[k]};{I[k]}")
     assert words in read.doubts[name]
 
 
 @pytest.mark.parametrize(
     ("row", "words"),
     [
-        (lambda k: f"{k},{_comma(f'{U[k]:.2f}')},{_comma(f'{I[k]:.2f}')}", "decimal commas"),
+        (lambda k: f"{k},{_make_comma_trace(f'{U[k]:.2f}')},{_make_comma_trace(f'{I[k]:.2f}')}", "decimal commas"),
         (lambda k: f"{k};{k + 1}.125;{k + 2}.250", "may be decimal or separate thousands"),
         (lambda k: f"{k};{U[k]};{I[k]}" if k != 9 else "9;1.5", "2 cells in line 10, the other rows have 3"),
         (lambda k: f"{k};{U[k]};{I[k]}" if k != 9 else "9;1;5;2", "4 cells in line 10, the other rows have 3"),
@@ -149,13 +149,13 @@ def test_a_name_without_one_column_is_doubted(head: str, name: str, words: str) 
         (lambda k: f"{k} ms;{U[k]} V;{I[k]} A", "no rows of numbers"),
     ],
 )
-def test_rows_that_can_be_read_in_two_ways_are_refused(row: Row, words: str) -> None:
+def test_ambiguous_rows_are_refused(row: Row, words: str) -> None:
     with pytest.raises(RecordingError, match=words):
-        _parsed("", row)
+        _parse("", row)
 
 
-def test_a_text_among_numbers_is_doubted_where_its_column_is_used() -> None:
-    read = _parsed("Time;U;I\n", lambda k: f"{k};{U[k] if k != 9 else '12.x'};{I[k]}")
+def test_text_among_numbers_makes_its_column_doubtful() -> None:
+    read = _parse("Time;U;I\n", lambda k: f"{k};{U[k] if k != 9 else '12.x'};{I[k]}")
     assert "has '12.x' in line 11" in read.doubts["U"] == read.doubts["#2"]
     assert "I" not in read.doubts
 
@@ -167,34 +167,34 @@ def test_a_text_among_numbers_is_doubted_where_its_column_is_used() -> None:
         (lambda k: f"{k};{U[k]};{k};{I[k]}", "names #1 and #3"),
     ],
 )
-def test_times_beside_each_channel_must_agree(row: Row, words: str) -> None:
-    read = _parsed("Name;U;Name;I\n", row)
+def test_times_of_each_channel_must_agree(row: Row, words: str) -> None:
+    read = _parse("Name;U;Name;I\n", row)
     assert words in read.doubts.get("#1", read.doubts["Name"])
     assert ("#1" in read.doubts) == ("separate" in words)
 
 
-def test_a_text_in_the_first_row_is_no_head() -> None:
-    read = _parsed("Time;U;I\n", lambda k: f"{k};{U[k] if k > 1 else 'start'};{I[k]}")
+def test_text_in_first_row_is_not_a_head() -> None:
+    read = _parse("Time;U;I\n", lambda k: f"{k};{U[k] if k > 1 else 'start'};{I[k]}")
     assert read.columns["I"].size == N
     assert "has 'start' in line 2" in read.doubts["U"]
 
 
-def test_a_name_may_begin_as_a_comment_does() -> None:
-    read = _parsed("% duty;# Time;U\n", lambda k: f"{I[k]};{TIME[k]:.3f};{U[k]}")
+def test_name_may_begin_like_a_comment() -> None:
+    read = _parse("% duty;# Time;U\n", lambda k: f"{I[k]};{TIME[k]:.3f};{U[k]}")
     assert {"% duty", "duty", "# Time", "U"} <= read.columns.keys()
 
 
 @pytest.mark.parametrize(("cut", "kept"), [(0, N), (1, N - 1), (3, N - 1), (9, N - 1)])
-def test_a_row_that_was_not_written_to_its_end_is_left_out(cut: int, kept: int) -> None:
+def test_incomplete_last_row_is_left_out(cut: int, kept: int) -> None:
     text = "Time;U;I\n" + "\n".join(f"{TIME[k]:.4f};{U[k]:.4f};{I[k]:.4f}" for k in range(N))
     read = parse_trace(text[: len(text) - cut].encode(), TraceText(), "trace")
     assert read.columns["I"].size == kept
     np.testing.assert_allclose(read.columns["I"], I[:kept])
 
 
-def test_an_empty_line_after_each_row_is_no_interruption() -> None:
-    assert _parsed("Time;U;I\n\n", lambda k: f"{k};{U[k]};{I[k]}\n").interruption == ""
-    assert "line 11" in _parsed("", lambda k: f"{k};{U[k]};{I[k]}" + ("\n" if k == 9 else "")).interruption
+def test_empty_line_after_each_row_is_not_an_interruption() -> None:
+    assert _parse("Time;U;I\n\n", lambda k: f"{k};{U[k]};{I[k]}\n").interruption == ""
+    assert "line 11" in _parse("", lambda k: f"{k};{U[k]};{I[k]}" + ("\n" if k == 9 else "")).interruption
 
 
 @pytest.mark.parametrize(
@@ -206,6 +206,6 @@ def test_an_empty_line_after_each_row_is_no_interruption() -> None:
         (b"PAR1", "a Parquet file: name it .parquet"),
     ],
 )
-def test_a_file_that_is_no_text_is_named(begins: bytes, words: str) -> None:
+def test_binary_file_is_refused_with_its_kind(begins: bytes, words: str) -> None:
     with pytest.raises(RecordingError, match=f"is not a text but .*{words}"):
         parse_trace(begins + bytes(range(256)), TraceText(), "trace")

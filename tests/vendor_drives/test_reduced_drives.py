@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fdhil import correction
-from fdhil.arming.guard_settings import settings_of
+from fdhil.arming.guard_configuration import make_guard_settings
 from fdhil.cia402 import pack_pdo
 from fdhil.prediction.contour_error import compute_contour_error_um
 from fdhil.records import Float, Parameters, Trajectory, compute_rms, freeze_array
@@ -25,7 +25,7 @@ def play_demand(
     table: list[list[float]] = []
     senders = []
     if offset_um:
-        settings = settings_of(twin.machine.config, "can0", Path(), "")
+        settings = make_guard_settings(twin.machine.config, "can0", Path(), "")
         senders = [(axis.offset, offset_um[axis.name] * 1e-3 * axis.increments_per_mm) for axis in settings.axes]
 
     def each_cycle() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil import correction
-from fdhil.arming.guard_settings import settings_of
+from fdhil.arming.guard_configuration import make_guard_settings
 from fdhil.cia402 import pack_pdo
 from fdhil.cli.demo.toml import to_toml
 from fdhil.commissioning.config_check import check_machine
@@ -104,7 +104,7 @@ class GuardThread:
     """The machine with the guard's core in this process: one decision after each SYNC, as in the guard's process."""
 
     def __init__(self, twin: SteppedSimulator, config: MachineConfig, folder: Path, path: CorrectedPath) -> None:
-        self.settings = settings_of(config, "can0", folder, "")
+        self.settings = make_guard_settings(config, "can0", folder, "")
         self.listener, self.state = FrameMonitor(self.settings), make_initial_state(self.settings)
         self.twin, self.path, self.outputs = twin, path, list[StepOutput]()
         self.request: GuardRequest | None = None

@@ -8,38 +8,38 @@ from typing import TYPE_CHECKING
 import pytest
 
 RAPIDS = 24  # of each axis: a fortnight
-pytest.register_assert_rewrite("tests.web.tab")
+pytest.register_assert_rewrite("tests.web.browser_tab")
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-    from tests.web.stage import Stage
-    from tests.web.tab import Tab
+    from tests.web.browser_tab import BrowserTab
+    from tests.web.web_rig import WebRig
 
 
 @pytest.fixture(scope="package")
-def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
-    from tests.web.stage import opened
+def web_rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebRig]:
+    from tests.web.web_rig import open_rig
 
-    with opened(tmp_path_factory.mktemp("stage"), RAPIDS) as stage:
+    with open_rig(tmp_path_factory.mktemp("stage"), RAPIDS) as stage:
         yield stage
 
 
 @pytest.fixture(scope="module")
-def chromium() -> Iterator[Browser]:
+def chromium_browser() -> Iterator[Browser]:
     from playwright.sync_api import sync_playwright
 
-    from tests.web.tab import started
+    from tests.web.browser_tab import start_browser
 
     with sync_playwright() as playwright:
-        browser = started(playwright)
+        browser = start_browser(playwright)
         yield browser
         browser.close()
 
 
 @pytest.fixture
-def tab(stage: Stage, chromium: Browser) -> Iterator[Tab]:
-    from tests.web.tab import opened
+def browser_tab(web_rig: WebRig, chromium_browser: Browser) -> Iterator[BrowserTab]:
+    from tests.web.browser_tab import open_tab
 
-    with opened(chromium, stage.url) as tab:
+    with open_tab(chromium_browser, web_rig.url) as tab:
         yield tab

@@ -16,10 +16,10 @@ from schemathesis import Case
 from schemathesis.checks import CHECKS, load_all_checks
 from schemathesis.python import asgi
 
-from fdhil.store.history import History
-from fdhil.web.app import make_app
-from tests.store.made import STAMP, outcome, published
-from tests.web.clients import OWN, app_of, machine_of, token_for
+from fdhil.store.history_database import History
+from fdhil.web.application import make_app
+from tests.store.sample_records import STAMP, make_outcome, make_published
+from tests.web.http_clients import OWN, log_in_for_token, make_test_app, write_machine
 
 load_all_checks()
 EXAMPLES = 6
@@ -29,21 +29,21 @@ CONFORMANCE: Any = CHECKS.get_by_names(
 )
 
 
-def _described() -> Any:
+def _describe_routes() -> Any:
     with tempfile.TemporaryDirectory() as folder:
-        return schemathesis.openapi.from_dict(app_of(Path(folder)).openapi())
+        return schemathesis.openapi.from_dict(make_test_app(Path(folder)).openapi())
 
 
-SCHEMA = _described()
+SCHEMA = _describe_routes()
 OPERATIONS = {found.ok().label: found.ok() for found in SCHEMA.get_all_operations()}
 
 
 @pytest.fixture(scope="module")
 def app(tmp_path_factory: pytest.TempPathFactory) -> FastAPI:
-    config = machine_of(tmp_path_factory.mktemp("machine"), acting=True)
+    config = write_machine(tmp_path_factory.mktemp("machine"), acting=True)
     with History.open(config.store.directory) as history:
-        history.add_window(outcome(), "", STAMP)
-        history.add_revision(published(1), (1,), STAMP)
+        history.add_window(make_outcome(), "", STAMP)
+        history.add_revision(make_published(1), (1,), STAMP)
     return make_app(config)
 
 
@@ -52,20 +52,20 @@ def session(app: FastAPI) -> Iterator[Any]:
     """A client whose threads run before the first test, and after the last."""
     application: Any = app
     with asgi.get_client(application) as client:
-        client.get("http://localhost/api/machine/programs", headers=own(app, "operator"))
+        client.get("http://localhost/api/machine/programs", headers=make_own_request(app, "operator"))
         yield client
 
 
 @pytest.fixture(scope="module")
 def replaying(app: FastAPI, session: Any) -> None:
-    session.get("http://localhost/api/rapids/X/1/signals", headers=own(app, "operator"))
+    session.get("http://localhost/api/rapids/X/1/signals", headers=make_own_request(app, "operator"))
 
 
-def own(app: FastAPI, name: str) -> dict[str, str]:
-    return {**OWN, **({"Authorization": f"Bearer {token_for(app, name)}"} if name else {})}
+def make_own_request(app: FastAPI, name: str) -> dict[str, str]:
+    return {**OWN, **({"Authorization": f"Bearer {log_in_for_token(app, name)}"} if name else {})}
 
 
-def test_every_kind_of_page_is_described() -> None:
+def test_every_route_is_described() -> None:
     assert {"GET /api/machine", "POST /api/machine/arm", "POST /api/session", "GET /api/machine/plan"} <= set(
         OPERATIONS
     )
@@ -73,9 +73,9 @@ def test_every_kind_of_page_is_described() -> None:
 
 @pytest.mark.usefixtures("processes", "replaying")
 @pytest.mark.parametrize("label", OPERATIONS)
-def test_whatever_is_sent_is_answered_as_described(label: str, app: FastAPI, session: Any) -> None:
+def test_any_request_is_answered_as_described(label: str, app: FastAPI, session: Any) -> None:
     name = "" if label.startswith("POST /api/session") else "operator"  # a login that is guessed costs its scrypt
-    headers = own(app, name)
+    headers = make_own_request(app, name)
 
     @settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck))
     @given(data=st.data())
@@ -87,7 +87,7 @@ def test_whatever_is_sent_is_answered_as_described(label: str, app: FastAPI, ses
         case.validate_response(answer, checks=CONFORMANCE)
 
     sent()
-    _end_forecasts(session, own(app, "operator"))
+    _end_forecasts(session, make_own_request(app, "operator"))
 
 
 def _end_forecasts(session: Any, headers: dict[str, str]) -> None:
@@ -96,7 +96,7 @@ def _end_forecasts(session: Any, headers: dict[str, str]) -> None:
 
 
 @pytest.mark.parametrize("label", [label for label in OPERATIONS if "/api/session" not in label])
-def test_a_stranger_is_told_nothing_whatever_he_sends(label: str, session: Any) -> None:
+def test_client_without_login_learns_nothing(label: str, session: Any) -> None:
     @settings(max_examples=2, deadline=None, suppress_health_check=list(HealthCheck))
     @given(data=st.data())
     def sent(data: st.DataObject) -> None:

@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 
 from fdhil.records import Parameters
-from fdhil.store.history import History
-from fdhil.web.app import make_app
-from fdhil.web.pages.machine_lights import axis_light, change_light, steps
+from fdhil.store.history_database import History
+from fdhil.web.application import make_app
+from fdhil.web.pages.machine_state import classify_axis, classify_change, suggest_steps
 from tests.daemon.simulated_machine import SimulatedMachine, rapids
 from tests.daemon.test_daemon_service import serving, status_when
-from tests.store.made import BENCH, STAMP, published
-from tests.web.clients import OWN, client_of, daemon_that, machine_of
+from tests.store.sample_records import BENCH, STAMP, make_published
+from tests.web.http_clients import OWN, make_client, serve_daemon, write_machine
 
 CALM: dict[str, Any] = {
     "samples_s_ago": 0.1, "drive_state": "Operation enabled", "parameters": {}, "last_window": None, "warnings": [],
@@ -34,11 +34,11 @@ def _quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.daemon.daemon_service.compile_kernels", lambda config, method: None)
 
 
-async def test_a_real_daemon_is_shown_with_its_axes_and_what_to_do_next(tmp_path: Path) -> None:
-    config = machine_of(tmp_path)
+async def test_running_daemon_is_shown_with_axes_and_next_steps(tmp_path: Path) -> None:
+    config = write_machine(tmp_path)
     async with (
         serving(config, SimulatedMachine(rapids(config, count=1))) as path,
-        client_of(make_app(config), "watcher") as client,
+        make_client(make_app(config), "watcher") as client,
     ):
         await status_when(path, lambda s: s["axes"]["X"]["accepted"] == 1)
         told = (await client.get("/api/machine")).json()
@@ -54,12 +54,12 @@ async def test_a_real_daemon_is_shown_with_its_axes_and_what_to_do_next(tmp_path
     assert (config.run_directory / "token").read_text() not in text
 
 
-async def test_a_silent_daemon_is_told_and_what_is_stored_is_shown_all_the_same(tmp_path: Path) -> None:
-    config = machine_of(tmp_path, users=False)
+async def test_silent_daemon_is_reported_and_stored_data_shown(tmp_path: Path) -> None:
+    config = write_machine(tmp_path, users=False)
     with History.open(config.store.directory) as history:
-        history.add_revision(published(1), (), STAMP)
-        history.add_revision(published(2, parameters=Parameters(0.5, 0.005, 0.8, 0.5, 0.05, 5.0)), (), STAMP)
-    async with client_of(make_app(config)) as client:
+        history.add_revision(make_published(1), (), STAMP)
+        history.add_revision(make_published(2, parameters=Parameters(0.5, 0.005, 0.8, 0.5, 0.05, 5.0)), (), STAMP)
+    async with make_client(make_app(config)) as client:
         answer = await client.get("/api/machine")
         stored = (await client.get("/api/machine/parameters")).json()
     told = answer.json()
@@ -71,28 +71,28 @@ async def test_a_silent_daemon_is_told_and_what_is_stored_is_shown_all_the_same(
     assert (moved["first"], moved["light"]) == (BENCH.Jt, "bad")
 
 
-async def test_without_a_store_there_is_nothing_to_show_and_it_says_why(tmp_path: Path) -> None:
-    async with client_of(make_app(machine_of(tmp_path, users=False))) as client:
+async def test_missing_store_is_reported(tmp_path: Path) -> None:
+    async with make_client(make_app(write_machine(tmp_path, users=False))) as client:
         told = (await client.get("/api/machine/parameters")).json()
     assert told["axes"] == {}
     assert told["fault"]["code"] == "NoHistory"
     assert told["fault"]["advice"] == "run the daemon first"
 
 
-async def test_many_browsers_ask_the_daemon_no_more_than_one_does(tmp_path: Path) -> None:
-    config = machine_of(tmp_path, users=False)
-    async with daemon_that(config, lambda _: STATUS) as asked, client_of(make_app(config)) as client:
+async def test_many_browsers_cause_one_status_request(tmp_path: Path) -> None:
+    config = write_machine(tmp_path, users=False)
+    async with serve_daemon(config, lambda _: STATUS) as asked, make_client(make_app(config)) as client:
         for _ in range(20):
             assert (await client.get("/api/machine")).json()["machine"] == "bench"
     assert len(asked) < 20
 
 
-async def test_half_a_character_and_a_number_that_is_none_end_no_answer(tmp_path: Path) -> None:
-    config = machine_of(tmp_path)
+async def test_surrogates_and_nan_do_not_break_responses(tmp_path: Path) -> None:
+    config = write_machine(tmp_path)
     told = {**STATUS, "text": "b\udcf6hlen.ngc", "ratio": math.nan}
     async with (
-        daemon_that(config, lambda request: {**told, "ok": request["request"] == "status", "code": "NoTable"}),
-        client_of(make_app(config), "operator", **OWN) as client,
+        serve_daemon(config, lambda request: {**told, "ok": request["request"] == "status", "code": "NoTable"}),
+        make_client(make_app(config), "operator", **OWN) as client,
     ):
         answer = await client.get("/api/machine")
         refused = await client.post("/api/machine/disarm")
@@ -115,24 +115,22 @@ async def test_half_a_character_and_a_number_that_is_none_end_no_answer(tmp_path
         ({"warnings": ["W: w"]}, [], "warn", "W: w"),
     ],
 )
-def test_an_axis_has_a_colour_and_the_words_for_it(
-    changes: dict[str, Any], troubles: list[str], light: str, words: str
-) -> None:
-    found = axis_light(CALM | changes, troubles)
+def test_axis_state_has_colour_and_text(changes: dict[str, Any], troubles: list[str], light: str, words: str) -> None:
+    found = classify_axis(CALM | changes, troubles)
     assert found.light == light
     assert words in found.text
 
 
-def test_a_parameter_is_beyond_its_limit_only_surely() -> None:
-    assert change_light(1.0, 0.01, 1.0, 0.3) == (0.0, "good")
-    assert change_light(1.2, 0.01, 1.0, 0.3)[1] == "warn"
-    assert change_light(1.31, 0.1, 1.0, 0.3)[1] == "warn"
-    assert change_light(0.6, 0.05, 1.0, 0.3)[1] == "bad"
-    assert change_light(1.0, None, 1.0, 0.3) == (None, "none")
-    assert change_light(1.0, 0.1, None, 0.3) == (None, "none")
+def test_parameter_is_beyond_limit_only_with_certainty() -> None:
+    assert classify_change(1.0, 0.01, 1.0, 0.3) == (0.0, "good")
+    assert classify_change(1.2, 0.01, 1.0, 0.3)[1] == "warn"
+    assert classify_change(1.31, 0.1, 1.0, 0.3)[1] == "warn"
+    assert classify_change(0.6, 0.05, 1.0, 0.3)[1] == "bad"
+    assert classify_change(1.0, None, 1.0, 0.3) == (None, "none")
+    assert classify_change(1.0, 0.1, None, 0.3) == (None, "none")
 
 
-def _lost() -> Iterator[tuple[dict[str, Any], str, bool]]:
+def _make_lost_status() -> Iterator[tuple[dict[str, Any], str, bool]]:
     stands = {"may_stand": {"nothing": False, "text": "3 um on X may still be applied"}}
     yield {"state": "lost", **stands}, "start fdhil-guard, then run fdhil adopt", True
     yield {"state": "FROZEN", **stands}, "then run fdhil adopt", True
@@ -149,13 +147,13 @@ def _lost() -> Iterator[tuple[dict[str, Any], str, bool]]:
     yield {}, "fdhil arm CONFIG PROGRAM", False
 
 
-@pytest.mark.parametrize(("changes", "advice", "urgent"), list(_lost()))
-def test_what_to_do_next_is_always_said(changes: dict[str, Any], advice: str, urgent: bool) -> None:
-    first, *_ = steps(STATUS | changes, acting=False)
+@pytest.mark.parametrize(("changes", "advice", "urgent"), list(_make_lost_status()))
+def test_next_step_is_always_suggested(changes: dict[str, Any], advice: str, urgent: bool) -> None:
+    first, *_ = suggest_steps(STATUS | changes, acting=False)
     assert advice in first.advice
     assert first.urgent is urgent
 
 
-def test_what_was_ordered_is_no_fault_to_mend() -> None:
+def test_ordered_stop_is_not_a_fault() -> None:
     ordered = {"guard": {"cause": {"code": "Disarmed", "text": "disarmed", "advice": "arm again"}}}
-    assert [step.text for step in steps(STATUS | ordered, acting=True)] == ["Everything is in order."]
+    assert [step.text for step in suggest_steps(STATUS | ordered, acting=True)] == ["Everything is in order."]

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.web.stage import Stage
-from tests.web.tab import Tab, opened
+from tests.web.browser_tab import BrowserTab, open_tab
+from tests.web.web_rig import WebRig
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -18,45 +18,45 @@ pytestmark = [pytest.mark.debian, pytest.mark.timeout(900)]
 
 
 @contextmanager
-def open_events_tab(name: str, stage: Stage, chromium: Browser) -> Iterator[Tab]:
-    with opened(chromium, stage.url) as tab:
-        tab.log_in(stage.token(name))
+def open_events_tab(name: str, stage: WebRig, chromium: Browser) -> Iterator[BrowserTab]:
+    with open_tab(chromium, stage.url) as tab:
+        tab.log_in(stage.log_in_for_token(name))
         yield tab
 
 
-def waiting(stage: Stage) -> set[int]:
-    kinds = stage.ask("/api/events", None, stage.token("watcher"))["waiting"]
+def count_waiting(stage: WebRig) -> set[int]:
+    kinds = stage.send_request("/api/events", None, stage.log_in_for_token("watcher"))["waiting"]
     return {number for kind in kinds for number in kind["numbers"]}
 
 
-def test_a_notice_is_acknowledged_with_the_keyboard_alone_and_stays_so(stage: Stage, chromium: Browser) -> None:
-    stage.status_when(lambda status: status["unacknowledged"]["count"])
-    with open_events_tab("operator", stage, chromium) as tab:
-        tab.open("/events")
+def test_notice_is_acknowledged_by_keyboard_and_stays_so(web_rig: WebRig, chromium_browser: Browser) -> None:
+    web_rig.wait_for_status(lambda status: status["unacknowledged"]["count"])
+    with open_events_tab("operator", web_rig, chromium_browser) as tab:
+        tab.open_page("/events")
         button = tab.page.get_by_role("button", name="Acknowledge notice").first
         number = int("".join(filter(str.isdecimal, str(button.get_attribute("aria-label")).partition(":")[0])))
-        assert number in waiting(stage)
+        assert number in count_waiting(web_rig)
         button.focus()
         tab.page.keyboard.press("Enter")
         tab.page.keyboard.type("seen by keyboard")
-        assert tab.violations() == []
+        assert tab.find_violations() == []
         tab.page.keyboard.press("Enter")
         tab.page.get_by_text("seen by keyboard").first.wait_for()
-        assert number not in waiting(stage)
+        assert number not in count_waiting(web_rig)
         tab.page.reload()
         tab.page.get_by_text("seen by keyboard").first.wait_for()
 
 
-def test_who_may_only_look_is_told_how_to_acknowledge_and_has_no_button(stage: Stage, chromium: Browser) -> None:
-    with open_events_tab("watcher", stage, chromium) as tab:
-        tab.open("/events")
+def test_watcher_has_no_acknowledge_button(web_rig: WebRig, chromium_browser: Browser) -> None:
+    with open_events_tab("watcher", web_rig, chromium_browser) as tab:
+        tab.open_page("/events")
         tab.page.get_by_text("To acknowledge in the browser").wait_for()
         assert tab.page.get_by_role("button", name="Acknowledge").count() == 0
 
 
-def test_the_list_is_filtered_by_its_address(stage: Stage, chromium: Browser) -> None:
-    with open_events_tab("watcher", stage, chromium) as tab:
-        tab.open("/events?code=LoadChanged")
+def test_event_list_is_filtered_by_address(web_rig: WebRig, chromium_browser: Browser) -> None:
+    with open_events_tab("watcher", web_rig, chromium_browser) as tab:
+        tab.open_page("/events?code=LoadChanged")
         classes = tab.page.locator("article .class code").all_text_contents()
         assert classes
         assert set(classes) == {"LoadChanged"}
@@ -64,21 +64,21 @@ def test_the_list_is_filtered_by_its_address(stage: Stage, chromium: Browser) ->
         tab.page.wait_for_url("**/events")
 
 
-def test_a_black_box_is_shown_and_given_as_a_file(stage: Stage, chromium: Browser) -> None:
-    with open_events_tab("watcher", stage, chromium) as tab:
-        tab.open("/events")
+def test_black_box_is_shown_and_downloaded(web_rig: WebRig, chromium_browser: Browser) -> None:
+    with open_events_tab("watcher", web_rig, chromium_browser) as tab:
+        tab.open_page("/events")
         tab.page.get_by_role("button", name="Show the drives' signals").first.click()
         tab.page.locator("#black-box").wait_for()
-        assert tab.violations() == []
+        assert tab.find_violations() == []
         with tab.page.expect_download() as saved:
             tab.page.get_by_role("button", name="Download 2").first.click()
         assert saved.value.suggested_filename.endswith(".log")
         assert " can0 080#" in saved.value.path().read_text("ascii")
 
 
-def test_a_course_is_read_without_its_picture(stage: Stage, chromium: Browser) -> None:
-    with open_events_tab("watcher", stage, chromium) as tab:
-        tab.open("/history/X")
+def test_trend_is_readable_as_table(web_rig: WebRig, chromium_browser: Browser) -> None:
+    with open_events_tab("watcher", web_rig, chromium_browser) as tab:
+        tab.open_page("/history/X")
         tab.page.get_by_role("group", name="R over time").wait_for()
         summary = tab.page.locator("summary").first
         summary.focus()

@@ -13,7 +13,7 @@ from fdhil.cli.demo.processes import Process
 from tests.fleet.fleet_database import build_fleet, spread_over_days, store_records
 from tests.fleet.recording_machine import RecordingMachine, write_history
 from tests.fleet.servers import run_postgres
-from tests.web.tab import WIDE, opened
+from tests.web.browser_tab import WIDE, open_tab
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, ViewportSize
@@ -45,29 +45,29 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("path", ["/fleet", "/fleet/mill-2/X"])
-def test_the_page_is_for_everyone(path: str, url: str, chromium: Browser) -> None:
-    with opened(chromium, url) as tab:
+def test_fleet_page_is_accessible(path: str, url: str, chromium_browser: Browser) -> None:
+    with open_tab(chromium_browser, url) as tab:
         tab.page.emulate_media(reduced_motion="reduce")
-        tab.open(path)
+        tab.open_page(path)
         assert tab.page.locator("h1").count() == 1
-        assert (tab.wider(), tab.violations()) == ([], [])
-        wide = tab.labels()
+        assert (tab.find_overflow(), tab.find_violations()) == ([], [])
+        wide = tab.list_labels()
         tab.page.emulate_media(color_scheme="dark")
-        assert tab.violations("color-contrast") == []
+        assert tab.find_violations("color-contrast") == []
         tab.page.set_viewport_size(AT_400_PERCENT)
-        assert wide - tab.labels() == set()
-        assert tab.wider() == []
+        assert wide - tab.list_labels() == set()
+        assert tab.find_overflow() == []
 
 
-def test_what_is_due_and_who_differs_from_its_peers_leads_to_its_axis(url: str, chromium: Browser) -> None:
-    with opened(chromium, url) as tab:
-        tab.open("/")
-        tab.says("section:has(h2:text-is('Due')) tr", "mill-2, axis X")
-        tab.says("section:has(h2:text-is('Different from their peers')) tr", "+8")
+def test_due_and_outlying_axes_link_to_their_axis(url: str, chromium_browser: Browser) -> None:
+    with open_tab(chromium_browser, url) as tab:
+        tab.open_page("/")
+        tab.wait_for_text("section:has(h2:text-is('Due')) tr", "mill-2, axis X")
+        tab.wait_for_text("section:has(h2:text-is('Different from their peers')) tr", "+8")
         tab.page.get_by_label("Peers have the same").select_option("lubricant")
-        tab.says("section:has(h2:text-is('Different from their peers')) tr", "mill-4, axis X")
+        tab.wait_for_text("section:has(h2:text-is('Different from their peers')) tr", "mill-4, axis X")
         tab.page.locator("section:has(h2:text-is('Due')) a", has_text="mill-2, axis X").first.click()
-        tab.says("h1", "mill-2, axis X")
+        tab.wait_for_text("h1", "mill-2, axis X")
         tab.page.locator(".chart .plot canvas").nth(5).wait_for()
         assert tab.page.locator(".chart").count() == 6
         assert [url for url in tab.asked if "/api/machine" in url] == []

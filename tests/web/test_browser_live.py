@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.web.stage import Stage
-from tests.web.tab import NARROW, Tab, opened
+from tests.web.browser_tab import NARROW, BrowserTab, open_tab
+from tests.web.web_rig import WebRig
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -20,15 +20,15 @@ CURRENT = "figure.chart:has(figcaption:has-text('Current'))"
 
 
 @pytest.fixture
-def phone(stage: Stage, chromium: Browser) -> Iterator[Tab]:
-    with opened(chromium, stage.url, NARROW) as tab:
-        tab.log_in(stage.token("watcher"))
+def phone(web_rig: WebRig, chromium_browser: Browser) -> Iterator[BrowserTab]:
+    with open_tab(chromium_browser, web_rig.url, NARROW) as tab:
+        tab.log_in(web_rig.log_in_for_token("watcher"))
         yield tab
 
 
-def test_it_is_frozen_enlarged_and_read_off_by_the_keyboard(phone: Tab) -> None:
-    phone.open("/live?axis=X&seconds=2")
-    phone.says(STATE, phone.word("live.running").partition("{")[0])
+def test_live_page_is_frozen_zoomed_and_read_by_keyboard(phone: BrowserTab) -> None:
+    phone.open_page("/live?axis=X&seconds=2")
+    phone.wait_for_text(STATE, phone.get_text("live.running").partition("{")[0])
     assert phone.page.locator("tbody tr").count() == 1  # the axis of the link alone
     chart = phone.page.locator(f"{CURRENT} .plot")
     reading = phone.page.locator(f"{CURRENT} output")
@@ -37,7 +37,7 @@ def test_it_is_frozen_enlarged_and_read_off_by_the_keyboard(phone: Tab) -> None:
     place_s = float((reading.text_content() or "").partition(" s")[0])
     for _ in range(5):
         phone.page.keyboard.press("+")
-    phone.says(STATE, phone.word("live.frozen.single").partition(",")[0])
+    phone.wait_for_text(STATE, phone.get_text("live.frozen.single").partition(",")[0])
     stayed_s = float((reading.text_content() or "").partition(" s")[0])
     assert stayed_s == pytest.approx(place_s, abs=0.004)
     phone.page.keyboard.press("ArrowLeft")
@@ -47,22 +47,22 @@ def test_it_is_frozen_enlarged_and_read_off_by_the_keyboard(phone: Tab) -> None:
     second = reading.text_content() or ""
     places = [float(told.partition(" s")[0]) for told in (first, second)]
     assert places[0] - places[1] == pytest.approx(0.002, abs=2e-5)  # one sample, at the stage's SYNC
-    phone.says("caption", phone.word("live.values.at").partition("{")[0])
+    phone.wait_for_text("caption", phone.get_text("live.values.at").partition("{")[0])
     phone.page.keyboard.press("Home")
-    phone.says(STATE, phone.word("live.frozen"))
-    phone.page.get_by_role("button", name=phone.word("live.go")).press("Enter")
-    phone.says(STATE, phone.word("live.running").partition("{")[0])
+    phone.wait_for_text(STATE, phone.get_text("live.frozen"))
+    phone.page.get_by_role("button", name=phone.get_text("live.go")).press("Enter")
+    phone.wait_for_text(STATE, phone.get_text("live.running").partition("{")[0])
 
 
-def test_what_is_chosen_is_in_the_address(phone: Tab) -> None:
-    phone.open("/live")
-    phone.says(STATE, phone.word("live.running").partition("{")[0])
-    phone.page.get_by_label(phone.word("live.seconds")).select_option("5")
+def test_selection_is_kept_in_the_address(phone: BrowserTab) -> None:
+    phone.open_page("/live")
+    phone.wait_for_text(STATE, phone.get_text("live.running").partition("{")[0])
+    phone.page.get_by_label(phone.get_text("live.seconds")).select_option("5")
     phone.page.get_by_label("Y", exact=True).uncheck()
-    phone.says(STATE, phone.word("live.running").partition("{")[0])
+    phone.wait_for_text(STATE, phone.get_text("live.running").partition("{")[0])
     phone.page.wait_for_url("**/live?axis=X&seconds=5")
     phone.page.reload()
-    phone.ready()
-    phone.says(STATE, phone.word("live.running").partition("{")[0])
+    phone.wait_until_ready()
+    phone.wait_for_text(STATE, phone.get_text("live.running").partition("{")[0])
     assert not phone.page.get_by_label("Y", exact=True).is_checked()
-    assert phone.page.get_by_label(phone.word("live.seconds")).input_value() == "5"
+    assert phone.page.get_by_label(phone.get_text("live.seconds")).input_value() == "5"

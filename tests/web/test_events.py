@@ -13,13 +13,13 @@ from fdhil.config import MachineConfig
 from fdhil.daemon import black_box
 from fdhil.drivers.can.frame_history import format_candump
 from fdhil.records import Notice
-from fdhil.store.history import History
-from fdhil.store.rows import Acknowledgement, Stamp
-from fdhil.web.app import make_app
+from fdhil.store.history_database import History
+from fdhil.store.history_rows import Acknowledgement, TimeStamp
+from fdhil.web.application import make_app
 from tests.daemon.simulated_machine import SimulatedMachine
 from tests.daemon.test_daemon_service import _skip_kernel_warmup, serving, status_when  # noqa: F401 (a fixture)
 from tests.drivers.frame_builder import FrameBuilder
-from tests.web.clients import OWN, client_of, machine_of
+from tests.web.http_clients import OWN, make_client, write_machine
 
 DAY_S = 86_400.0
 TRIP = (
@@ -37,27 +37,29 @@ NOTICES = (
 
 @pytest.fixture
 def machine(tmp_path: Path) -> MachineConfig:
-    config = machine_of(tmp_path, acting=True)
+    config = write_machine(tmp_path, acting=True)
     with History.open(config.store.directory) as history:
-        numbers = [history.add_notice(notice, Stamp(1.7e9 + k * DAY_S, "boot", k)) for k, notice in enumerate(NOTICES)]
-        history.add_acknowledgement(Acknowledgement((numbers[-1],), "anna", "swept", Stamp.now()))
+        numbers = [
+            history.add_notice(notice, TimeStamp(1.7e9 + k * DAY_S, "boot", k)) for k, notice in enumerate(NOTICES)
+        ]
+        history.add_acknowledgement(Acknowledgement((numbers[-1],), "anna", "swept", TimeStamp.now()))
     return config
 
 
 @pytest.fixture
 async def client(machine: MachineConfig) -> AsyncIterator[httpx.AsyncClient]:
-    async with client_of(make_app(machine), "operator", **OWN) as client:
+    async with make_client(make_app(machine), "operator", **OWN) as client:
         yield client
 
 
-async def _get(client: httpx.AsyncClient, **wanted: Any) -> Any:
+async def _get_document(client: httpx.AsyncClient, **wanted: Any) -> Any:
     answer = await client.get("/api/events", params=wanted)
     assert answer.status_code == 200, answer.text
     return answer.json()
 
 
-async def test_what_waits_is_in_front_by_kind_with_cause_effect_and_next_action(client: httpx.AsyncClient) -> None:
-    told = await _get(client)
+async def test_unacknowledged_alarms_come_first_with_explanation(client: httpx.AsyncClient) -> None:
+    told = await _get_document(client)
     due, tripped = told["waiting"]  # what is active is in front
     assert (due["state"], due["until"], tripped["state"], tripped["count"]) == ("active", None, "gone", 2)
     assert (tripped["newest"]["code"], tripped["numbers"], due["newest"]["code"]) == (
@@ -71,31 +73,33 @@ async def test_what_waits_is_in_front_by_kind_with_cause_effect_and_next_action(
     assert [(event["code"], event["acknowledged"]["who"]) for event in told["others"]] == [("StrayFiles", "anna")]
 
 
-async def test_end_of_an_alarm_is_its_until_and_no_notice_of_its_own(
-    client: httpx.AsyncClient, machine: MachineConfig
-) -> None:
+async def test_end_of_alarm_is_shown_as_until(client: httpx.AsyncClient, machine: MachineConfig) -> None:
     with History.open(machine.store.directory) as history:
-        history.add_notice(Notice("MaintenanceDue", "info", "ft is back at 0.05 N.m.s", "Y"), Stamp(1.8e9, "boot", 9))
-        history.add_acknowledgement(Acknowledgement((3,), "anna", "", Stamp.now()))
-    told = await _get(client)
+        history.add_notice(
+            Notice("MaintenanceDue", "info", "ft is back at 0.05 N.m.s", "Y"), TimeStamp(1.8e9, "boot", 9)
+        )
+        history.add_acknowledgement(Acknowledgement((3,), "anna", "", TimeStamp.now()))
+    told = await _get_document(client)
     assert [kind["newest"]["code"] for kind in told["waiting"]] == ["GuardTripped"]
     due = next(event for event in told["others"] if event["code"] == "MaintenanceDue")
     assert (due["severity"], due["until"]) == ("minor", "2027-01-15T08:00:00+00:00")
     assert [event["code"] for event in told["others"]].count("MaintenanceDue") == 1
 
 
-async def test_the_list_is_filtered_and_paged(client: httpx.AsyncClient, machine: MachineConfig) -> None:
-    assert [kind["newest"]["axis"] for kind in (await _get(client, axis="Y"))["waiting"]] == ["Y"]
-    assert [kind["newest"]["code"] for kind in (await _get(client, code="GuardTripped"))["waiting"]] == ["GuardTripped"]
-    informed = await _get(client, severity="info")
+async def test_event_list_is_filtered_and_paged(client: httpx.AsyncClient, machine: MachineConfig) -> None:
+    assert [kind["newest"]["axis"] for kind in (await _get_document(client, axis="Y"))["waiting"]] == ["Y"]
+    assert [kind["newest"]["code"] for kind in (await _get_document(client, code="GuardTripped"))["waiting"]] == [
+        "GuardTripped"
+    ]
+    informed = await _get_document(client, severity="info")
     assert ([event["code"] for event in informed["others"]], informed["waiting"]) == (["Armed"], [])
     with History.open(machine.store.directory) as history:
         for k in range(5):
-            history.add_notice(Notice("Armed", "info", f"armed {k}"), Stamp.now())
+            history.add_notice(Notice("Armed", "info", f"armed {k}"), TimeStamp.now())
     seen: list[str] = []
     before: int | None = None
     while True:
-        page = await _get(client, severity="info", limit=4, **({"before": before} if before else {}))
+        page = await _get_document(client, severity="info", limit=4, **({"before": before} if before else {}))
         seen += [event["text"] for event in page["others"]]
         before = page["older_before"]
         if before is None:
@@ -103,9 +107,7 @@ async def test_the_list_is_filtered_and_paged(client: httpx.AsyncClient, machine
     assert seen == [f"armed {k}" for k in range(4, -1, -1)] + ["armed part.ngc"]
 
 
-async def test_an_acknowledgement_goes_through_the_daemon_and_is_shown_everywhere(
-    client: httpx.AsyncClient, machine: MachineConfig
-) -> None:
+async def test_acknowledgement_is_stored_by_daemon_and_shown(client: httpx.AsyncClient, machine: MachineConfig) -> None:
     async with serving(machine, SimulatedMachine()) as path:
         wanted = {"notices": [4, 2], "note": "the mapping was wrong"}
         answer = await client.post("/api/events/acknowledge", json=wanted)
@@ -115,7 +117,7 @@ async def test_an_acknowledgement_goes_through_the_daemon_and_is_shown_everywher
         assert [notice["code"] for notice in status["unacknowledged"]["newest"]] == ["MaintenanceDue"]
         unknown = await client.post("/api/events/acknowledge", json={"notices": [99]})
         assert (unknown.status_code, unknown.json()["code"]) == (409, "NoSuchNotice")
-    told = await _get(client)
+    told = await _get_document(client)
     assert [kind["newest"]["code"] for kind in told["waiting"]] == ["MaintenanceDue"]
     given = next(event for event in told["others"] if event["number"] == 4)["acknowledged"]
     assert (given["who"], given["note"]) == ("operator", "the mapping was wrong")
@@ -123,15 +125,13 @@ async def test_an_acknowledgement_goes_through_the_daemon_and_is_shown_everywher
     assert course["acknowledged"]["who"] == "operator"
 
 
-async def test_without_a_daemon_it_is_said_and_nothing_is_acknowledged(client: httpx.AsyncClient) -> None:
+async def test_acknowledging_without_daemon_is_reported(client: httpx.AsyncClient) -> None:
     answer = await client.post("/api/events/acknowledge", json={"notices": [4]})
     assert (answer.status_code, answer.json()["code"]) == (503, "ConnectError")
-    assert (await _get(client))["waiting_count"] == 3
+    assert (await _get_document(client))["waiting_count"] == 3
 
 
-async def test_a_black_box_is_listed_drawn_and_given_as_it_is(
-    client: httpx.AsyncClient, machine: MachineConfig
-) -> None:
+async def test_black_box_is_listed_drawn_and_downloaded(client: httpx.AsyncClient, machine: MachineConfig) -> None:
     log = format_candump("can0", FrameBuilder(n=900).build_frames())
     black_box.write_black_box(machine.store.directory, "EchoMismatch", lambda: {"can0": log})
     (machine.store.directory / black_box.BLACK_BOX_FOLDER / "notes.log").write_text("no black box")
@@ -155,9 +155,7 @@ async def test_a_black_box_is_listed_drawn_and_given_as_it_is(
 
 @pytest.mark.parametrize("name", ["..%2f..%2fhistory.sqlite", "%2e%2e", "a%00b", "x" * 65, "linked.log", "pipe%0a.log"])
 @pytest.mark.fault("G4")
-async def test_a_name_from_outside_opens_nothing_else(
-    name: str, client: httpx.AsyncClient, machine: MachineConfig
-) -> None:
+async def test_foreign_name_opens_no_other_file(name: str, client: httpx.AsyncClient, machine: MachineConfig) -> None:
     folder = machine.store.directory / black_box.BLACK_BOX_FOLDER
     folder.mkdir()
     (folder / "linked.log").symlink_to(machine.store.directory / "history.sqlite")
@@ -167,7 +165,7 @@ async def test_a_name_from_outside_opens_nothing_else(
         assert b"SQLite" not in answer.content
 
 
-async def test_a_black_box_that_is_none_is_said(client: httpx.AsyncClient, machine: MachineConfig) -> None:
+async def test_invalid_black_box_is_reported(client: httpx.AsyncClient, machine: MachineConfig) -> None:
     folder = machine.store.directory / black_box.BLACK_BOX_FOLDER
     folder.mkdir()
     (folder / "20261123T010203.000004Z-Made.log").write_text("nothing that candump wrote")

@@ -21,7 +21,7 @@ from tests.bench import bench_axis
 from tests.daemon.machine_rig import fdhil
 from tests.daemon.simulated_machine import config_of
 from tests.web.certificate import write_certificate
-from tests.web.clients import OWN
+from tests.web.http_clients import OWN
 
 Capture = pytest.CaptureFixture[str]
 TLS = {"tls_certificate_file": Path("c"), "tls_key_file": Path("k")}
@@ -29,14 +29,14 @@ USERS = {"users_file": Path("u")}
 CANARY = "canary-5e7a"
 
 
-def test_by_default_nothing_but_this_computer_is_reached() -> None:
+def test_default_serves_only_this_computer() -> None:
     web = Web()
     assert (web.host, web.on_loopback, web.acting, web.unprotected) == ("127.0.0.1", True, False, False)
     serving.check_reach(web)
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.7", "mill.example", "127.0.0.1.example"])
-def test_beyond_this_computer_it_takes_tls_and_users_or_a_word(host: str) -> None:
+def test_remote_access_requires_tls_and_users_or_unprotected(host: str) -> None:
     assert not is_loopback(host)
     for given, missing in (({}, 2), (TLS, 1), (USERS, 1)):
         with pytest.raises(ConfigError) as told:
@@ -49,42 +49,44 @@ def test_beyond_this_computer_it_takes_tls_and_users_or_a_word(host: str) -> Non
         serving.check_reach(Web(host=host, unprotected=True, acting=True, users_file=Path("u")))
 
 
-def test_what_belongs_together_is_refused_alone(tmp_path: Path) -> None:
+def test_incomplete_settings_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="must be given together"):
         config_of(tmp_path, web={"tls_key_file": "k"})
     with pytest.raises(ConfigError, match="acting needs a users_file"):
         config_of(tmp_path, web={"acting": True})
 
 
-def test_who_may_look_changes_nothing_that_was_learnt_of_the_machine(tmp_path: Path) -> None:
+def test_users_do_not_change_config_digest(tmp_path: Path) -> None:
     changed = config_of(tmp_path, web={"port": 0, "users_file": "u", "acting": True})
     assert changed.digest == config_of(tmp_path).digest
     assert changed.web.users_file == tmp_path / "u"
 
 
-def test_a_missing_extra_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_extra_is_reported_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.web.serving.find_spec", lambda name: None)
     with pytest.raises(FdhilError, match=r"needs the extra 'web': pip install 'fdhil\[web\]'"):
-        serving.require()
+        serving.require_extra()
 
 
-def written(folder: Path, **web: Any) -> Path:
+def write_config(folder: Path, **web: Any) -> Path:
     path = folder / "machine.toml"
     path.write_text(to_toml({"machine": {"name": "bench"}, "axis": {"X": bench_axis()}, "web": web}))
     return path
 
 
-def given(password: str, *arguments: str | Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> tuple[int, str]:
+def run_with_password(
+    password: str, *arguments: str | Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> tuple[int, str]:
     monkeypatch.setattr("sys.stdin", io.StringIO(password + "\n"))
     code, out, err = fdhil(*arguments, capsys=capsys)
     return code, out + err
 
 
-def test_users_come_and_go(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, users = written(tmp_path, users_file="u.json"), tmp_path / "u.json"
+def test_users_are_added_and_removed(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, users = write_config(tmp_path, users_file="u.json"), tmp_path / "u.json"
 
     def run(password: str, *more: str) -> tuple[int, str]:
-        return given(password, "web-user", path, *more, capsys=capsys, monkeypatch=monkeypatch)
+        return run_with_password(password, "web-user", path, *more, capsys=capsys, monkeypatch=monkeypatch)
 
     code, said = run(f"{CANARY} long enough", "op", "--role", "operate")
     assert (code, CANARY in said) == (0, False)
@@ -98,12 +100,14 @@ def test_users_come_and_go(tmp_path: Path, capsys: Capture, monkeypatch: pytest.
     code, said = run("", "op", "--remove")
     assert (code, "there is no user op" in said) == (2, True)
     assert list(read_users(users)) == ["ann"]
-    code, said = given("x", "web-user", written(tmp_path), "op", capsys=capsys, monkeypatch=monkeypatch)
+    code, said = run_with_password(
+        "x", "web-user", write_config(tmp_path), "op", capsys=capsys, monkeypatch=monkeypatch
+    )
     assert (code, "add users_file" in said) == (2, True)
 
 
-def test_what_cannot_be_listened_at_is_told(tmp_path: Path, capsys: Capture) -> None:
-    path = written(tmp_path)
+def test_unavailable_address_is_reported(tmp_path: Path, capsys: Capture) -> None:
+    path = write_config(tmp_path)
     for arguments, code, words in (
         (("--host", "0.0.0.0"), 2, "web.users_file"),
         (("--host", "127.0.0.1", "--port", "99999"), 2, "99999"),
@@ -115,15 +119,15 @@ def test_what_cannot_be_listened_at_is_told(tmp_path: Path, capsys: Capture) -> 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.fault("G10")
 @pytest.mark.goal("R16")
-def test_served_by_tls_it_tells_no_secret_and_ends_in_order(
+def test_tls_server_reveals_no_secret_and_ends_orderly(
     tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_certificate(tmp_path / "web.crt", tmp_path / "web.key")
     files = {"users_file": "u.json", "tls_certificate_file": "web.crt", "tls_key_file": "web.key"}
-    path = written(tmp_path, port=0, acting=True, **files)
+    path = write_config(tmp_path, port=0, acting=True, **files)
     password = f"{CANARY} of the operator"
     for name, role in (("op", "operate"), ("ann", "watch")):
-        given(password, "web-user", path, name, "--role", role, capsys=capsys, monkeypatch=monkeypatch)
+        run_with_password(password, "web-user", path, name, "--role", role, capsys=capsys, monkeypatch=monkeypatch)
     run_directory = tmp_path / "fdhil-data" / "run"
     run_directory.mkdir(parents=True)
     (run_directory / "token").write_text(f"{CANARY}-token")
@@ -155,8 +159,8 @@ def test_served_by_tls_it_tells_no_secret_and_ends_in_order(
     assert "Traceback" not in log.read_text()
 
 
-def test_a_certificate_that_is_none_is_told(tmp_path: Path, capsys: Capture) -> None:
+def test_invalid_certificate_is_reported(tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "c").write_text("no certificate")
-    path = written(tmp_path, tls_certificate_file="c", tls_key_file="c")
+    path = write_config(tmp_path, tls_certificate_file="c", tls_key_file="c")
     code, _, err = fdhil("web", path, capsys=capsys)
     assert (code, "web.tls_certificate_file" in err or "cannot be used" in err) == (2, True)

@@ -24,8 +24,8 @@ from fdhil.prediction import compute_contour_error_um, predict_path
 from fdhil.program import load_trajectory
 from fdhil.records import PARAMETERS, Parameters, ParameterSet, Window
 from fdhil.sim.drive.plant_physics import build_plant_parameters
-from fdhil.store.history import History
-from fdhil.store.windows import read_window
+from fdhil.store.history_database import History
+from fdhil.store.window_file import read_window
 
 Say = Callable[[str], None]
 
@@ -174,10 +174,10 @@ def _shuttle(stage: Stage, published: dict[str, list[Published]]) -> dict[str, t
     # the last accepted window of each axis with its fit
     play_shuttle(stage)
     newest: dict[str, tuple[Window, float | None]] = {}
-    with History.read(stage.config.store.directory) as history:
+    with History.open_read_only(stage.config.store.directory) as history:
         for axis in stage.config.axis:
-            published[axis].append(published_of(history.revisions(axis, limit=1)[0].set))
-            stored = [row for row in history.windows(axis) if row.accepted][-1]
+            published[axis].append(published_of(history.read_revisions(axis, limit=1)[0].set))
+            stored = [row for row in history.read_windows(axis) if row.accepted][-1]
             window = read_window(stage.config.store.directory / "windows" / stored.file)
             newest[axis] = (window, stored.fit_percent)
     return newest

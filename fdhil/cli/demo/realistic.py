@@ -19,8 +19,8 @@ from fdhil.prediction import predict_path
 from fdhil.prediction.axis_models import load_validated_models, select_models
 from fdhil.program import load_trajectory
 from fdhil.records import Parameters, Prediction
-from fdhil.store.history import History
-from fdhil.store.newest_sets import read_newest_sets
+from fdhil.store.history_database import History
+from fdhil.store.newest_parameters import read_newest_parameters
 
 AMBIENT_C = 20.0
 
@@ -104,8 +104,8 @@ def run_realistic(out: Path, realtime: bool, say: Say) -> Realistic:
 
 
 def _verdict(stage: Stage, axis: str) -> AxisVerdict:
-    with History.read(stage.config.store.directory) as history:
-        sets, windows = history.revisions(axis, limit=1), history.windows(axis)
+    with History.open_read_only(stage.config.store.directory) as history:
+        sets, windows = history.read_revisions(axis, limit=1), history.read_windows(axis)
     reasons = Counter(reason.partition(":")[0] for window in windows for reason in window.reasons)
     accepted = sum(window.accepted for window in windows)
     stage.say(f"{axis}: {accepted} of {len(windows)} rapids accepted, {'a' if sets else 'no'} model published")
@@ -115,7 +115,7 @@ def _verdict(stage: Stage, axis: str) -> AxisVerdict:
 def _predicted(stage: Stage) -> Prediction | None:
     # None unless every axis has a published model
     source, program = str(stage.config.store.directory), stage.programs["10 m/min"]
-    newest = read_newest_sets(stage.config.store.directory, stage.config.axis)
+    newest = read_newest_parameters(stage.config.store.directory, stage.config.axis)
     if len(newest) < len(stage.config.axis):
         return None
     sets = {axis: revision.set for axis, revision in newest.items()}

@@ -88,7 +88,7 @@ def examine_guard(config: MachineConfig) -> Iterator[Trouble]:
         return
     try:
         with GuardClient(config.guard_directory) as guard:
-            state = str(guard.status().get("state"))
+            state = str(guard.read_status().get("state"))
     except DeviceError as error:
         means = "nothing can be armed, and applied offsets remain in the drives"
         yield Trouble.create_from_error("GuardSilent", "guard", error, means)

@@ -15,7 +15,7 @@ from fdhil.commissioning.cycle import Lateness
 from fdhil.commissioning.realtime import CYCLE_PRIORITY, prioritise
 from fdhil.config import MachineConfig
 from fdhil.guard.turn_lateness import BINS_US, MOST_LATE
-from fdhil.store.atomic import make_folder, write_file
+from fdhil.store.atomic_file import make_folder, write_file
 
 FILE_NAME = "latency.json"
 MEND = "reduce the load of this PC, use a real-time kernel (PREEMPT_RT), and start the guard with its systemd unit"

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from fdhil.cli.doctor.trouble import Trouble
 from fdhil.config import MachineConfig
 from fdhil.errors import StoreError
-from fdhil.store.offers import lying, waiting
+from fdhil.store.change_offers import list_offers, list_undecided
 
 PLACE = "offers"
 MEANS = "proposed changes cannot be shown or accepted; the machine keeps its configuration"
@@ -21,12 +21,12 @@ def examine_offers(config: MachineConfig) -> Iterator[Trouble]:
         mend = "give this user read permission, or correct [offers] directory"
         yield Trouble("OffersUnread", PLACE, f"{folder} cannot be read", MEANS, mend)
         return
-    for path in lying(folder):
+    for path in list_offers(folder):
         if not os.access(path, os.R_OK):
             mend = "give this user read permission"
             yield Trouble("OffersUnread", PLACE, f"{path} cannot be read", MEANS, mend)
     try:
-        offers = waiting(folder, config.store.directory)
+        offers = list_undecided(folder, config.store.directory)
     except StoreError as error:
         yield Trouble.create_from_error("OffersUnread", PLACE, error, MEANS)
         return

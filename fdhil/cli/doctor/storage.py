@@ -5,14 +5,14 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from fdhil.arming.token import TOKEN_NAME, check_rights, read_token
+from fdhil.arming.operator_token import TOKEN_NAME, check_run_directory, read_token
 from fdhil.cli.doctor.trouble import Trouble
 from fdhil.commissioning.record import load_record
 from fdhil.commissioning.void import is_void
 from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError, StoreError
 from fdhil.guard.guard_protocol import SOCKET_NAME
-from fdhil.store.history import History
+from fdhil.store.history_database import History
 
 LEAST_FREE_BYTES = 256 << 20
 WINDOW_BYTES = 100_000  # approximate size of one recorded rapid
@@ -49,7 +49,7 @@ def may_write(folder: Path) -> bool:
 
 def _history(folder: Path) -> Iterator[Trouble]:
     try:
-        with History.read(folder):
+        with History.open_read_only(folder):
             pass
     except StoreError as error:
         if error.code != "NoHistory":
@@ -77,7 +77,7 @@ def _run_directory(folder: Path) -> Iterator[Trouble]:
         mend = "choose a shorter [store] run_directory, such as /run/fdhil"
         yield Trouble("SocketPathLong", "sockets", what, "neither daemon nor guard can be contacted", mend)
     try:
-        check_rights(folder)
+        check_run_directory(folder)
     except DeviceError as error:
         yield Trouble.create_from_error("RunDirectoryOpen", "sockets", error, "commands may reach a foreign program")
     except OSError:

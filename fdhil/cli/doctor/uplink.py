@@ -14,7 +14,7 @@ from fdhil.config import MachineConfig
 from fdhil.config.credentials import create_tls_context, read_password, read_secret
 from fdhil.config.uplink_section import Uplink
 from fdhil.errors import ConnectError, StoreError
-from fdhil.store.outbox import POSITION_FILE, OutboxReader, Position, read_position
+from fdhil.store.outbox import POSITION_FILE, OutboxPosition, OutboxReader, read_position
 
 PLACE = "uplink"
 LONGEST_WAIT_S = 3600.0  # usual at most
@@ -44,7 +44,7 @@ def _folder(config: MachineConfig) -> Iterator[Trouble]:
     if not base.is_dir() or (not may_write(base) and base.stat().st_uid == os.getuid()):
         mend = "give the user of fdhil uplink write permission, or correct [uplink] directory"
         yield Trouble("UplinkFolder", PLACE, f"{base} is not writable", "nothing is sent", mend)
-    elif (folder / POSITION_FILE).exists() and read_position(folder) == Position():
+    elif (folder / POSITION_FILE).exists() and read_position(folder) == OutboxPosition():
         what = f"{folder / POSITION_FILE} cannot be read, or is damaged"
         means = "the whole outbox is sent again; the server recognises duplicates; nothing is deleted meanwhile"
         yield Trouble("UplinkPosition", PLACE, what, means, "restart fdhil uplink, which rewrites it", False)
@@ -53,8 +53,8 @@ def _folder(config: MachineConfig) -> Iterator[Trouble]:
 def _outbox(config: MachineConfig) -> Iterator[Trouble]:
     try:
         with OutboxReader(config.store.directory) as reader:
-            position = reader.start(read_position(config.uplink_directory))
-            waiting, first = reader.waiting(position.entry), reader.entries(position.entry, 1)
+            position = reader.resume_from(read_position(config.uplink_directory))
+            waiting, first = reader.count_waiting(position.entry), reader.read_entries(position.entry, 1)
             dropped = reader.dropped
     except StoreError as error:
         if error.code in ("SchemaVersion", "OlderCopy"):  # a damaged one is reported for the store

@@ -66,21 +66,21 @@ def summarise_black_boxes(store: Path) -> list[BlackBox]:
     ]
 
 
-def opened(store: Path, name: str) -> BinaryIO:
+def open_black_box(store: Path, name: str) -> BinaryIO:
     """Open a black box by a name from outside. Raises StoreError if it is none."""
     return open_named(store / BLACK_BOX_FOLDER, name)
 
 
-def envelope(store: Path, name: str, config: MachineConfig) -> Envelope:
+def make_envelope(store: Path, name: str, config: MachineConfig) -> Envelope:
     """Return the drives' signals in a black box. Raises StoreError, RecordingError."""
-    with opened(store, name) as file:
+    with open_black_box(store, name) as file:
         found = decode_candump(file.read(LARGEST_LOG + 1), config)
     last = max((int(samples.tick[-1]) for samples in found.values()), default=0)
     period_s = config.machine.sync_period_s
-    return Envelope(name=name, axes=[_axis(samples, last, period_s) for samples in found.values()])
+    return Envelope(name=name, axes=[_make_axis_envelope(samples, last, period_s) for samples in found.values()])
 
 
-def _axis(samples: AxisSamples, last_tick: int, period_s: float) -> AxisEnvelope:
+def _make_axis_envelope(samples: AxisSamples, last_tick: int, period_s: float) -> AxisEnvelope:
     signals = {
         ("following_error", "um"): (samples.demand_mm + samples.offset_mm - samples.position_mm) * 1e3,
         ("offset", "um"): samples.offset_mm * 1e3,
@@ -100,13 +100,18 @@ def _axis(samples: AxisSamples, last_tick: int, period_s: float) -> AxisEnvelope
         samples=samples.tick.size,
         lost_frames=samples.lost,
         signals=[
-            Signal(name=name, unit=unit, low=_least(values, starts, 1.0), high=_least(values, starts, -1.0))
+            Signal(
+                name=name,
+                unit=unit,
+                low=_compute_extremes(values, starts, 1.0),
+                high=_compute_extremes(values, starts, -1.0),
+            )
             for (name, unit), values in signals.items()
         ],
     )
 
 
-def _least(values: Float, starts: Any, sign: float) -> list[float | None]:
+def _compute_extremes(values: Float, starts: Any, sign: float) -> list[float | None]:
     """Return the minimum (``sign`` 1) or the maximum (-1) of each column."""
     least: Float = np.fmin.reduceat(sign * values, starts)
     return round_digits(sign * least)

@@ -7,8 +7,8 @@ from pydantic import BaseModel
 
 from fdhil.daemon.alarms import MOST_TOGETHER, Alarm, AlarmTable
 from fdhil.daemon.notice_texts import get_effect_and_action
-from fdhil.store.notice_document import date_of, notice_document
-from fdhil.store.rows import Stamp, StoredNotice
+from fdhil.store.history_rows import StoredNotice, TimeStamp
+from fdhil.store.notice_document import format_date, make_notice_document
 
 MOST_PAGE = 200
 MOST_EARLIER = 50
@@ -79,58 +79,60 @@ class Events(BaseModel):
     codes: list[str]
 
 
-def event(stored: StoredNotice, until: Stamp | None = None) -> Event:
+def make_event(stored: StoredNotice, until: TimeStamp | None = None) -> Event:
     """Return a notice with its explanation, and when its cause ended."""
     effect, action = get_effect_and_action(stored.notice)
     text = stored.notice.text
     cause = text.partition(f"; {effect}")[0] if effect else text  # the guard's own text contains all three
-    ended = None if until is None else date_of(until)
-    return Event(**notice_document(stored), cause=cause, effect=effect, action=action, until=ended)
+    ended = None if until is None else format_date(until)
+    return Event(**make_notice_document(stored), cause=cause, effect=effect, action=action, until=ended)
 
 
-def page(notices: Sequence[StoredNotice], *, limit: int, before: int | None = None, **only: Any) -> Events:
+def make_event_page(notices: Sequence[StoredNotice], *, limit: int, before: int | None = None, **only: Any) -> Events:
     """Return the notices that match ``only`` (axis, code, severity; None: any); ``notices`` are oldest first.
 
     Without a severity those of severity info are left out.
     """
     table = AlarmTable(notices)
-    shown = [alarm for alarm in table.list_shown() if _is(alarm.newest, **only)]
+    shown = [alarm for alarm in table.list_shown() if _is_selected(alarm.newest, **only)]
     active = {alarm.newest.number for alarm in shown if alarm.until is None}
-    waiting = [stored for stored in notices if stored.is_open and _is(stored, **only)]
+    waiting = [stored for stored in notices if stored.is_open and _is_selected(stored, **only)]
     others = [
-        stored for stored in notices if not stored.is_open and stored.number not in active and _is(stored, **only)
+        stored
+        for stored in notices
+        if not stored.is_open and stored.number not in active and _is_selected(stored, **only)
     ]
     older = [stored for stored in others if before is None or stored.number < before]
     newest = older[-limit:][::-1]
     return Events(
-        waiting=[_together(alarm) for alarm in shown],
+        waiting=[_make_waiting_alarm(alarm) for alarm in shown],
         active_count=len(active),
         waiting_count=len(waiting),
         waiting_major=sum(stored.notice.severity == "MAJOR" for stored in waiting),
         newest_waiting=waiting[-1].number if waiting else None,
-        others=[event(stored, table.ended.get(stored.number)) for stored in newest],
+        others=[make_event(stored, table.ended.get(stored.number)) for stored in newest],
         older_before=newest[-1].number if len(older) > limit else None,
         codes=sorted({stored.notice.code for stored in notices}),
     )
 
 
-def _together(alarm: Alarm) -> Waiting:
-    documents = [notice_document(stored) for stored in list(alarm.raised)[::-1]]
+def _make_waiting_alarm(alarm: Alarm) -> Waiting:
+    documents = [make_notice_document(stored) for stored in list(alarm.raised)[::-1]]
     earlier = [
         {key: document[key] for key in ("number", "time", "text")} for document in documents[1 : MOST_EARLIER + 1]
     ]
     return Waiting(
-        newest=event(alarm.newest),
+        newest=make_event(alarm.newest),
         state=alarm.state,
-        until=None if alarm.until is None else date_of(alarm.until),
+        until=None if alarm.until is None else format_date(alarm.until),
         count=alarm.count,
         numbers=sorted(alarm.waiting, reverse=True)[:MOST_TOGETHER],
-        first_time=date_of(alarm.first),
+        first_time=format_date(alarm.first),
         earlier=[Earlier(**document) for document in earlier],
     )
 
 
-def _is(stored: StoredNotice, axis: str | None, code: str | None, severity: Severity | None) -> bool:
+def _is_selected(stored: StoredNotice, axis: str | None, code: str | None, severity: Severity | None) -> bool:
     notice = stored.notice
     wanted = notice.severity == severity if severity else notice.severity != "info"
     return wanted and axis in (None, notice.axis) and code in (None, notice.code)

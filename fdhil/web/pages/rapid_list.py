@@ -9,9 +9,9 @@ from pydantic import BaseModel
 from fdhil.records import INTERVAL_95, get_unit
 from fdhil.report.parameter_format import DISPLAY_UNITS, format_cell
 from fdhil.report.typography import typeset_text
-from fdhil.store.history import History
-from fdhil.store.rows import StoredWindow
-from fdhil.web.answers import Refused
+from fdhil.store.history_database import History
+from fdhil.store.history_rows import StoredWindow
+from fdhil.web.fault_responses import RequestRefused
 
 SEARCHED = 5_000
 """Rows of the history searched by one request: with many more a rare reason would take seconds."""
@@ -112,7 +112,7 @@ class RapidTold(BaseModel):
 Verdict = Literal["accepted", "refused"]
 
 
-def page_of(
+def read_rapid_page(
     history: History,
     is_stored: Kept,
     axis: str | None = None,
@@ -122,7 +122,7 @@ def page_of(
     limit: int = 50,
 ) -> Rapids:
     """Return the newest matching rapids below the number ``before``."""
-    before = newest_id(history) + 1 if before is None else before
+    before = find_newest_id(history) + 1 if before is None else before
     first = max(1, before - SEARCHED)
     wanted = {"axis = :axis": axis, "instr(reasons, :code)": None if code is None else f'"{code}:'}
     conditions = [condition for condition, value in wanted.items() if value is not None]
@@ -130,22 +130,26 @@ def page_of(
         conditions.append(f"accepted = {int(verdict == 'accepted')}")
     where = " AND ".join(["id < :before", "id >= :first", *conditions])
     values = {"before": before, "first": first, "axis": axis, "code": wanted["instr(reasons, :code)"]}
-    found = history.chosen_windows(f"{where} ORDER BY id DESC", values, limit)
+    found = history.select_windows(f"{where} ORDER BY id DESC", values, limit)
     oldest = found[-1].number if len(found) == limit else first
-    return Rapids(rapids=[rapid_of(window, is_stored) for window in found], older_before=oldest if oldest > 1 else None)
+    return Rapids(
+        rapids=[make_rapid(window, is_stored) for window in found], older_before=oldest if oldest > 1 else None
+    )
 
 
-def newest_id(history: History) -> int:
+def find_newest_id(history: History) -> int:
     """Return the number of the newest rapid, 0 without one."""
-    return int(history.figures("SELECT coalesce(max(id), 0) FROM windows", {})[0][0])
+    return int(history.query_counts("SELECT coalesce(max(id), 0) FROM windows", {})[0][0])
 
 
-def counts_of(history: History, axes: Iterable[str], axis: str | None = None) -> Counts:
+def count_rapids(history: History, axes: Iterable[str], axis: str | None = None) -> Counts:
     """Count the newest rapids by verdict and by reason."""
-    values = {"first": newest_id(history) - SEARCHED, "axis": axis}
+    values = {"first": find_newest_id(history) - SEARCHED, "axis": axis}
     where = "windows.id > :first" + (" AND axis = :axis" if axis else "")
-    verdicts = dict(history.figures(f"SELECT accepted, count(*) FROM windows WHERE {where} GROUP BY accepted", values))
-    by_reason = history.figures(
+    verdicts = dict(
+        history.query_counts(f"SELECT accepted, count(*) FROM windows WHERE {where} GROUP BY accepted", values)
+    )
+    by_reason = history.query_counts(
         "SELECT substr(value, 1, instr(value || ':', ':') - 1) AS code, count(DISTINCT windows.id) AS rapids"
         " FROM windows, json_each(CASE WHEN json_valid(reasons) THEN reasons ELSE '[]' END)"
         f" WHERE {where} AND accepted = 0 GROUP BY code ORDER BY rapids DESC, code",
@@ -156,7 +160,7 @@ def counts_of(history: History, axes: Iterable[str], axis: str | None = None) ->
     return Counts(axes=[*axes], searched=accepted + refused, accepted=accepted, refused=refused, by_reason=reasons)
 
 
-def rapid_of(window: StoredWindow, is_stored: Kept) -> Rapid:
+def make_rapid(window: StoredWindow, is_stored: Kept) -> Rapid:
     """Return a stored window for the browser."""
     return Rapid(
         id=window.number,
@@ -167,37 +171,37 @@ def rapid_of(window: StoredWindow, is_stored: Kept) -> Rapid:
         fit_percent=window.fit_percent,
         unexplained_um=window.unexplained_um,
         temperature_celsius=window.temperature_c,
-        reasons=[_said(reason) for reason in window.reasons],
-        warnings=[_said(warning) for warning in window.warnings],
+        reasons=[_split_reason(reason) for reason in window.reasons],
+        warnings=[_split_reason(warning) for warning in window.warnings],
         nc=None if window.nc is None else NcSaid(**window.nc),
         file=window.file,
         kept=is_stored(window.file),
     )
 
 
-def _said(reason: str) -> Said:
+def _split_reason(reason: str) -> Said:
     code, _, text = reason.partition(":")
     return Said(code=code, text=typeset_text(text.strip()))
 
 
-def told_of(history: History, window: StoredWindow, is_stored: Kept) -> RapidTold:
+def read_rapid_details(history: History, window: StoredWindow, is_stored: Kept) -> RapidTold:
     """Return the stored data of one rapid."""
     values = {"axis": window.axis, "id": window.number, "direction": window.direction}
 
-    def nearest(condition: str, order: str) -> int | None:
+    def find_nearest(condition: str, order: str) -> int | None:
         query = f"SELECT id FROM windows WHERE axis = :axis AND {condition} ORDER BY id {order} LIMIT 1"
-        return next((int(row[0]) for row in history.figures(query, values)), None)
+        return next((int(row[0]) for row in history.query_counts(query, values)), None)
 
     return RapidTold(
-        rapid=rapid_of(window, is_stored),
-        parameters=[figure_of(name, values_of) for name, values_of in (window.parameters or {}).items()],
-        older_id=nearest("id < :id", "DESC"),
-        newer_id=nearest("id > :id", "ASC"),
-        alike_id=nearest("id < :id AND direction = :direction AND accepted = 1", "DESC"),
+        rapid=make_rapid(window, is_stored),
+        parameters=[make_figure(name, values_of) for name, values_of in (window.parameters or {}).items()],
+        older_id=find_nearest("id < :id", "DESC"),
+        newer_id=find_nearest("id > :id", "ASC"),
+        alike_id=find_nearest("id < :id AND direction = :direction AND accepted = 1", "DESC"),
     )
 
 
-def figure_of(name: str, figures: dict[str, Any]) -> Figure:
+def make_figure(name: str, figures: dict[str, Any]) -> Figure:
     """Return one parameter of a window with its interval."""
     value, std = figures.get("value"), figures.get("std")
     half = None if std is None else INTERVAL_95 * std
@@ -216,10 +220,10 @@ def figure_of(name: str, figures: dict[str, Any]) -> Figure:
     )
 
 
-def the_window(history: History, axis: str, number: int) -> StoredWindow:
+def read_window(history: History, axis: str, number: int) -> StoredWindow:
     """Return the window of an axis with this number; Refused if there is none, or it is damaged."""
-    found = history.chosen_windows("id = :id AND axis = :axis", {"id": number, "axis": axis}, 1)
+    found = history.select_windows("id = :id AND axis = :axis", {"id": number, "axis": axis}, 1)
     if not found:
         text = f"the history has no rapid {number} of axis {axis}"
-        raise Refused(404, "NoSuchRapid", text, "use one from the list of rapids")
+        raise RequestRefused(404, "NoSuchRapid", text, "use one from the list of rapids")
     return found[0]

@@ -76,7 +76,7 @@ class RapidSignals(BaseModel):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Course:
+class _SignalCurve:
     """A signal (n,) with its name and unit, and the curve (n,) of a model."""
 
     name: str
@@ -86,7 +86,7 @@ class _Course:
     model: str | None = None
 
 
-def signals_of(overlay: ModelOverlay) -> RapidSignals:
+def make_rapid_signals(overlay: ModelOverlay) -> RapidSignals:
     """Return the signals of a rapid with its model."""
     window = overlay.window
     begin, end = find_moving_range(window)
@@ -98,52 +98,52 @@ def signals_of(overlay: ModelOverlay) -> RapidSignals:
         time_s=round_digits(np.arange(0, window.n, every) * window.dt_s, 9),
         move_begin_s=begin * window.dt_s,
         move_end_s=end * window.dt_s,
-        stages=_stages(window),
+        stages=_list_stages(window),
         direction=window.direction,
         turns_hz=float(np.nanmax(np.abs(window.speed_rad_s), initial=0.0)) / (2.0 * math.pi),
-        frequency_hz=round_digits(frequency[:: _step(frequency.size)], 9),
-        signals=[_signal(course, slice(begin, end), every) for course in _courses(overlay)],
+        frequency_hz=round_digits(frequency[:: _choose_step(frequency.size)], 9),
+        signals=[_make_signal(course, slice(begin, end), every) for course in _list_curves(overlay)],
         replayed=Replayed(
             accepted=verdict.accepted,
             fit_percent=verdict.fit_percent,
             unexplained_um=verdict.unexplained_um,
-            reasons=[_said(reason) for reason in verdict.reasons],
-            warnings=[_said(warning) for warning in verdict.warnings],
+            reasons=[_make_reason(reason) for reason in verdict.reasons],
+            warnings=[_make_reason(warning) for warning in verdict.warnings],
         ),
     )
 
 
-def _stages(window: Window) -> list[Stage]:
+def _list_stages(window: Window) -> list[Stage]:
     spans = ((name, getattr(window.stages, name)) for name in ("accelerate", "cruise", "brake"))
     return [Stage(name=n, begin_s=s[0] * window.dt_s, end_s=s[1] * window.dt_s) for n, s in spans if s is not None]
 
 
-def _said(reason: Reason) -> Said:
+def _make_reason(reason: Reason) -> Said:
     return Said(code=reason.code, text=typeset_text(reason.text), advice=typeset_text(reason.advice))
 
 
-def _courses(overlay: ModelOverlay) -> list[_Course]:
+def _list_curves(overlay: ModelOverlay) -> list[_SignalCurve]:
     """Return the rapid's signals in reading order: cause, response, error."""
     window = overlay.window
-    speed, current, model = _modelled(overlay)
+    speed, current, model = _select_model(overlay)
     courses = [
-        *_voltage(window),
-        _Course("current_a", "A", window.current_a, current, model),
-        _Course("speed_rad_s", "rad/s", window.speed_rad_s, speed, model),
+        *_make_voltage_curve(window),
+        _SignalCurve("current_a", "A", window.current_a, current, model),
+        _SignalCurve("speed_rad_s", "rad/s", window.speed_rad_s, speed, model),
     ]
     followed = overlay.followed
     predicted = None if followed is None else 1e3 * (followed.predicted_mm - window.demand_mm)
     error = 1e3 * (window.position_mm - window.demand_mm)
     if np.isfinite(error).any():
-        courses.append(_Course("following_error_um", "um", error, predicted, None if followed is None else "loop"))
+        courses.append(_SignalCurve("following_error_um", "um", error, predicted, None if followed is None else "loop"))
     if window.offset_mm is not None:
-        courses.append(_Course("offset_um", "um", 1e3 * window.offset_mm))
+        courses.append(_SignalCurve("offset_um", "um", 1e3 * window.offset_mm))
     if window.table_mm is not None:
-        courses.append(_Course("table_error_um", "um", 1e3 * (window.table_mm - window.demand_mm)))
+        courses.append(_SignalCurve("table_error_um", "um", 1e3 * (window.table_mm - window.demand_mm)))
     return courses
 
 
-def _modelled(overlay: ModelOverlay) -> tuple[Float | None, Float | None, str | None]:
+def _select_model(overlay: ModelOverlay) -> tuple[Float | None, Float | None, str | None]:
     """Return speed and current (n,) from the measured voltage, else from the closed loop."""
     window, driven, followed = overlay.window, overlay.driven, overlay.followed
     if driven is not None:
@@ -158,20 +158,20 @@ def _modelled(overlay: ModelOverlay) -> tuple[Float | None, Float | None, str | 
     return None, None, None
 
 
-def _voltage(window: Window) -> list[_Course]:
+def _make_voltage_curve(window: Window) -> list[_SignalCurve]:
     """Return the voltage at the window's rows; a slow sensor's value covers its whole period."""
     if window.voltage_v is not None:
-        return [_Course("voltage_v", "V", window.voltage_v)]
+        return [_SignalCurve("voltage_v", "V", window.voltage_v)]
     slow = window.slow_voltage
     if slow is None:
         return []
     sample = np.floor((np.arange(window.n) * window.dt_s - slow.begin_s) / slow.period_s).astype(np.int64)
     inside = (sample >= 0) & (sample < slow.voltage_v.size)
     held = np.where(inside, slow.voltage_v[np.clip(sample, 0, slow.voltage_v.size - 1)], math.nan)
-    return [_Course("voltage_v", "V", held)]
+    return [_SignalCurve("voltage_v", "V", held)]
 
 
-def _signal(course: _Course, moving: slice, every: int) -> Signal:
+def _make_signal(course: _SignalCurve, moving: slice, every: int) -> Signal:
     measured, modelled = course.measured, course.modelled
     residual = None if modelled is None else measured - modelled
     left = np.zeros(0) if residual is None else residual[moving][np.isfinite(residual[moving])]
@@ -184,12 +184,12 @@ def _signal(course: _Course, moving: slice, every: int) -> Signal:
         modelled=None if modelled is None else round_digits(modelled[::every]),
         residual=None if residual is None else round_digits(residual[::every]),
         residual_rms=compute_rms(left) if left.size else None,
-        measured_spectrum=round_digits(spectrum(measured)),
-        residual_spectrum=None if residual is None else round_digits(spectrum(residual)),
+        measured_spectrum=round_digits(compute_spectrum(measured)),
+        residual_spectrum=None if residual is None else round_digits(compute_spectrum(residual)),
     )
 
 
-def spectrum(values: Float) -> Float:
+def compute_spectrum(values: Float) -> Float:
     """Return the amplitudes (m,) of a signal (n,) less its mean: a sine of amplitude 1 makes a peak of 1.
 
     Uses Hann's window (Harris 1978); lost samples are interpolated. Of adjacent frequencies the largest is kept.
@@ -199,13 +199,13 @@ def spectrum(values: Float) -> Float:
     known = interpolate_gaps(np.where(np.isfinite(values), values, math.nan))
     taper = np.hanning(values.size + 1)[:-1]
     amplitude = 2.0 * np.abs(np.fft.rfft((known - known.mean()) * taper)) / max(float(taper.sum()), 1e-300)
-    step = _step(amplitude.size)
+    step = _choose_step(amplitude.size)
     padded = np.append(amplitude, np.zeros(-amplitude.size % step))
     peaks: Float = padded.reshape(-1, step).max(axis=1)
     return peaks
 
 
-def _step(size: int) -> int:
+def _choose_step(size: int) -> int:
     return max(1, -(-size // MOST_POINTS))
 
 

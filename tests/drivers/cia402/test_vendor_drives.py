@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fdhil import tables
-from fdhil.arming.guard_settings import settings_of
+from fdhil.arming.guard_configuration import make_guard_settings
 from fdhil.cia402 import pack_pdo
 from fdhil.config import MachineConfig, parse_config
 from fdhil.drivers.can.frame_ring import pack_frames
@@ -86,7 +86,7 @@ def test_second_axis_of_a_device_uses_the_next_node_id() -> None:
     assert profile.can_take_offset
     document = bench_document("X")
     document["axis"]["X"]["drive"] = {"logical_axis": 2, "node_id": 1}
-    settings = settings_of(parse_config(document), "can0", Path(), "")
+    settings = make_guard_settings(parse_config(document), "can0", Path(), "")
     axis = settings.axes[0]
     assert (axis.node_id, axis.target.cob_id, axis.offset.cob_id) == (1, 0x202, 0x302)
     assert axis.offset.layout == ((0x60B0, 0, 32, True),)

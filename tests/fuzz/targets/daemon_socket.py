@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from fdhil.arming.answers import Answer
+from fdhil.arming.refusals import Answer
 from fdhil.config import Access
 from fdhil.daemon import service_log
 from fdhil.daemon.daemon_access import ClientProcess

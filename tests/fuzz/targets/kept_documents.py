@@ -22,10 +22,10 @@ from fdhil.errors import FdhilError
 from fdhil.guard.guard_settings import encode_settings, load_settings
 from fdhil.prediction.axis_models import load_model_file
 from fdhil.program.demand_csv import read_demand_csv
-from fdhil.store import audit
+from fdhil.store import audit_file
 from fdhil.store.column_map import read_column_map
-from fdhil.store.lessons import read_lesson, write_lesson
-from fdhil.store.windows import read_window
+from fdhil.store.learned_offset_files import read_learned, write_learned
+from fdhil.store.window_file import read_window
 from tests.bench import bench_config
 from tests.fuzz.tasting import Target
 from tests.guard.simulated_bus import settings
@@ -44,15 +44,15 @@ def _record(path: Path) -> None:
 
 
 def _audit(path: Path) -> None:
-    for body, wrong in audit.entries(path.parent):
+    for body, wrong in audit_file.read_entries(path.parent):
         json.dumps(body)
         assert wrong is None or "audit" in wrong
-    audit.append(path.parent, {"asked": "arm"})
+    audit_file.append_entry(path.parent, {"asked": "arm"})
 
 
 # name of the file -> its reader
 READERS: Mapping[str, Callable[[Path], object]] = {
-    "lesson.npz": read_lesson,
+    "lesson.npz": read_learned,
     "guard.json": load_settings,
     "model.json": load_model_file,
     record_path(Path(), "X").name: _record,
@@ -61,8 +61,8 @@ READERS: Mapping[str, Callable[[Path], object]] = {
     "columns.toml": read_column_map,
     "drive.toml": _profile,
     "nc.toml": lambda path: read_nc_profile(str(path), "mtconnect"),
-    f"key{HEADER}": lambda path: CheckedProgram.find(path.parent, "key", path.parent),
-    audit.AUDIT_FILE_NAME: _audit,
+    f"key{HEADER}": lambda path: CheckedProgram.find_checked(path.parent, "key", path.parent),
+    audit_file.AUDIT_FILE_NAME: _audit,
     "window.parquet": read_window,
 }
 
@@ -80,11 +80,11 @@ def taste(data: bytes) -> None:
 def _written() -> Mapping[str, bytes]:
     from tests.commissioning.test_record import RECORD
 
-    write_lesson(FOLDER / "lesson.npz", LearnedOffset({"X": np.arange(4.0)}, 3.0, 0.5, (3.0, 1.0)))
+    write_learned(FOLDER / "lesson.npz", LearnedOffset({"X": np.arange(4.0)}, 3.0, 0.5, (3.0, 1.0)))
     write_users(FOLDER / "users.json", {"w": hash_password("canary-9b1f-password", "watch")})
     save_record(replace(RECORD, axis="X"), FOLDER)
-    (FOLDER / audit.AUDIT_FILE_NAME).unlink(missing_ok=True)
-    audit.append(FOLDER, {"asked": "arm"})
+    (FOLDER / audit_file.AUDIT_FILE_NAME).unlink(missing_ok=True)
+    audit_file.append_entry(FOLDER, {"asked": "arm"})
     written = {path.name: path.read_bytes() for path in FOLDER.iterdir()}
     return written | {
         "guard.json": encode_settings(settings("X")).encode(),

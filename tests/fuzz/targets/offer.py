@@ -11,7 +11,7 @@ from fdhil.config.toml_editing import NotEditable, edit_toml
 from fdhil.errors import FdhilError
 from fdhil.fleet.offer_delivery import split_documents
 from fdhil.fleet.signed_offer import Offer, _parse_offer, create_key, encode_canonical, read_offer, sign_offer
-from fdhil.store.offers import ANSWERS_FILE, Answer, add_answer, read_answers
+from fdhil.store.change_offers import ANSWERS_FILE, OfferDecision, add_decision, read_decisions
 from tests.bench import bench_toml
 from tests.fuzz.tasting import Target
 
@@ -38,7 +38,7 @@ def _of_text(data: bytes) -> None:
 
 def _of_answers(data: bytes) -> None:
     (FOLDER / ANSWERS_FILE).write_bytes(data)
-    read_answers(FOLDER)
+    read_decisions(FOLDER)
 
 
 READERS = (_parse_offer, _of_message, _of_text, _of_answers)
@@ -52,7 +52,7 @@ def taste(data: bytes) -> None:
 
 def target() -> Target:
     offer = Offer.model_validate(TOLD)
-    add_answer(FOLDER, Answer("friction", 3, 1, "d", "accepted", "Bert", "", 1.5, "c"))
+    add_decision(FOLDER, OfferDecision("friction", 3, 1, "d", "accepted", "Bert", "", 1.5, "c"))
     seeds = [
         encode_canonical(offer),
         sign_offer(offer, FOLDER / "key"),

@@ -19,10 +19,10 @@ from typing import Any
 from fdhil import tables
 from fdhil.errors import FdhilError, RecordingError
 from fdhil.store import reading_process
-from fdhil.store.export import table_of
-from fdhil.store.recording_table import RecordingTable, recording_of
+from fdhil.store.recording_table import RecordingTable, make_recording
+from fdhil.store.window_export import convert_window
 from tests.fuzz.tasting import Target
-from tests.store.made import window
+from tests.store.sample_records import make_window
 
 WORDS = [b"fdhil-recording-1", b"sample_rate_hz", b"time_s", b"nan", b"inf", b"1e999", b"voltage_samples_V", b"\0" * 8]
 RAISED = 1
@@ -52,7 +52,7 @@ class _Reader:
         self.begin()
         try:
             self._asked.send_bytes(data)
-            return reading_process.receive(self._asked)
+            return reading_process.receive_table(self._asked)
         except (EOFError, OSError, ValueError):
             self._fork.join()
             self._asked.close()
@@ -74,7 +74,7 @@ def _read_all(module: Any, asked: Connection, others: Connection) -> None:
         except EOFError:
             return
         try:
-            reading_process.answer(asked, module, content, "r", reading_process.LONGEST_S)
+            reading_process.send_table(asked, module, content, "r", reading_process.LONGEST_S)
         except BaseException:  # noqa: BLE001 - whatever is not declared is what is looked for
             traceback.print_exc(file=told)
             told.flush()
@@ -83,7 +83,7 @@ def _read_all(module: Any, asked: Connection, others: Connection) -> None:
 
 def target_of(name: str, longest: int, words: list[bytes]) -> Target:
     form = tables.load_entry(tables.RECORDING_FORMATS, name)
-    whole = table_of(window(n=120))
+    whole = convert_window(make_window(n=120))
     few = RecordingTable(whole.headers, {key: values[:20] for key, values in whole.columns.items()})
     reader = _Reader(form) if hasattr(form, "library") else None
 
@@ -94,7 +94,7 @@ def target_of(name: str, longest: int, words: list[bytes]) -> Target:
             table = form.decode(data, "r") if reader is None else reader.read(data)
             if isinstance(table, FdhilError):
                 raise table
-            recording_of(table, "r")
+            make_recording(table, "r")
         except RecordingError as error:
             assert len(str(error)) < 2000
 

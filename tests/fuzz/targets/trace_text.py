@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from fdhil.errors import RecordingError
-from fdhil.store.column_map import ColumnMap, mapped
-from fdhil.store.recording_table import recording_of
+from fdhil.store.column_map import ColumnMap, apply_column_map
+from fdhil.store.recording_table import make_recording
 from fdhil.store.trace_text import parse_trace
 from tests.fuzz.tasting import Target
-from tests.store.dialects import Dialect, column_map, signals, write
+from tests.store.trace_dialects import Dialect, make_column_map, make_signals, write_trace
 
 WORDS = [
     b"sep=;", b'"', b'""', b"1.009,38", b"1,5E-03", b"\xe2\x88\x92", b"13:59:59.7", b"2025-03-05T10:22:03", b"NaN",
@@ -25,14 +25,14 @@ DIALECTS = [
 def taste(data: bytes) -> None:
     """Read the bytes by a map with all columns in the file, or only the names."""
     for dialect in (DIALECTS[0], DIALECTS[3]):
-        told = ColumnMap.model_validate(column_map(dialect))
+        told = ColumnMap.model_validate(make_column_map(dialect))
         try:
-            recording_of(mapped(parse_trace(data, told.text, "r"), told, "r"), "r")
+            make_recording(apply_column_map(parse_trace(data, told.text, "r"), told, "r"), "r")
         except RecordingError as error:
             assert len(str(error)) < 2000
 
 
 def target() -> Target:
-    few = {name: values[:12] for name, values in signals().items()}
-    seeds = [write(dialect, few) for dialect in DIALECTS]
+    few = {name: values[:12] for name, values in make_signals().items()}
+    seeds = [write_trace(dialect, few) for dialect in DIALECTS]
     return Target("trace_text", seeds, taste, WORDS, 2500)

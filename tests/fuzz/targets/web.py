@@ -15,9 +15,9 @@ from urllib.parse import unquote_to_bytes
 
 import anyio.to_thread
 
-from fdhil.web import access
+from fdhil.web import login
 from tests.fuzz.tasting import Target
-from tests.web.clients import app_of, token_for
+from tests.web.http_clients import log_in_for_token, make_test_app
 
 _FOLDER = tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None)
 _LOOP = asyncio.new_event_loop()
@@ -31,8 +31,8 @@ async def _at_once(function: Any, *given: Any, **_how: Any) -> Any:
     return function(*given)
 
 
-APP = app_of(Path(_FOLDER.name))
-TOKENS = ("", token_for(APP, "watcher"), token_for(APP, "operator"))
+APP = make_test_app(Path(_FOLDER.name))
+TOKENS = ("", log_in_for_token(APP, "watcher"), log_in_for_token(APP, "operator"))
 DECLARED = {200, 204, 206, 304, 400, 401, 403, 404, 405, 408, 409, 413, 416, 421, 422, 429, 503, 504}
 ROUTES = sorted({path for route in APP.routes if "json" not in (path := getattr(route, "path", ""))} - {""})
 
@@ -89,7 +89,7 @@ def taste(data: bytes) -> None:
     """Send the request in the bytes, as the user selected by the first of them."""
     if data:
         # by design a password takes a tenth of a second; a thread per request takes most of the rest
-        with patch.object(access, "verify_password", _no_match), patch.object(anyio.to_thread, "run_sync", _at_once):
+        with patch.object(login, "verify_password", _no_match), patch.object(anyio.to_thread, "run_sync", _at_once):
             _LOOP.run_until_complete(_asked(data))
 
 
