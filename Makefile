@@ -44,7 +44,7 @@ $(VENV)/.ok: pyproject.toml requirements.lock
 $(VENV)/.kernels: $(VENV)/.ok $(KERNELS)
 	@echo "compiling the kernels (once, about a minute)"
 	@find fdhil studies -name '*.nb[ic]' -delete # a kernel that was compiled into another one is not looked at again
-	@$(BIN)/python -m fdhil.cli.kernels
+	@$(BIN)/python -m fdhil.cli.kernel_compilation
 	@$(BIN)/python -m studies.kernels
 	@touch $@
 

@@ -18,8 +18,8 @@ from typing import Any
 from websockets.asyncio.client import connect
 
 from benchmarks.whole_machine import cpu_s
-from fdhil.cli.demo.processes import Process, Twin
-from fdhil.cli.demo.toml import to_toml
+from fdhil.cli.demo.processes import ChildProcess, SimulatorProcess
+from fdhil.cli.demo.toml_writer import format_toml
 from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
 from fdhil.errors import FdhilError
 from studies.pages import ROOT
@@ -104,28 +104,28 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
         document = machine()
-        (out / "twin.toml").write_text(to_toml(document), "utf-8")
+        (out / "twin.toml").write_text(format_toml(document), "utf-8")
         rounds = round((seconds + WITHOUT_S + 60) / ROUND_S)
         (out / "shuttle.ngc").write_text("G21 G90\n" + ROUND * rounds + "M2\n", "utf-8")
-        with Twin(out / "twin.toml", out / "twin.log") as twin:
+        with SimulatorProcess(out / "twin.toml", out / "twin.log") as twin:
             for name, place in twin.ready["buses"].items():
                 document["bus"][name]["port"] = place["port"]
-            (out / "machine.toml").write_text(to_toml(document), "utf-8")
-            with Process("daemon", ["fdhil", "run", str(out / "machine.toml")], out / "daemon.log") as daemon:
+            (out / "machine.toml").write_text(format_toml(document), "utf-8")
+            with ChildProcess("daemon", ["fdhil", "run", str(out / "machine.toml")], out / "daemon.log") as daemon:
                 while status(out) is None:
-                    daemon.check()
+                    daemon.check_running()
                     time.sleep(0.1)
-                twin.command("nc", on=True)
-                twin.event("nc", 60.0)
-                twin.command("play", file=str(out / "shuttle.ngc"))
-                twin.event("playing", 120.0)
+                twin.send_command("nc", on=True)
+                twin.await_event("nc", 60.0)
+                twin.send_command("play", file=str(out / "shuttle.ngc"))
+                twin.await_event("playing", 120.0)
                 command = ["fdhil", "web", str(out / "machine.toml"), "--port", "0", "--json"]
-                with Process("web", command, out / "web.log") as web:
-                    url = web.event("ready")["url"]
+                with ChildProcess("web", command, out / "web.log") as web:
+                    url = web.await_event("ready")["url"]
                     measure(out, (twin, daemon, web), url, seconds)
 
 
-def measure(out: Path, processes: tuple[Process, Process, Process], url: str, seconds: float) -> None:
+def measure(out: Path, processes: tuple[ChildProcess, ChildProcess, ChildProcess], url: str, seconds: float) -> None:
     """Measure without a viewer, then with one, and print both."""
     _, daemon, web = processes
     time.sleep(5.0)
@@ -154,13 +154,13 @@ def measure(out: Path, processes: tuple[Process, Process, Process], url: str, se
     print(f"skipped {viewer.skipped_ticks}, coarser {viewer.coarser}, lost by the web process {viewer.skipped_lines}")
 
 
-def part(out: Path, processes: tuple[Process, ...], seconds: float) -> dict[str, Any]:
+def part(out: Path, processes: tuple[ChildProcess, ...], seconds: float) -> dict[str, Any]:
     """Let it run for so long; return what was counted meanwhile."""
     start, cpu, first = time.monotonic(), [cpu_s(process.pid) for process in processes], status(out)
     while time.monotonic() - start < seconds:
         time.sleep(min(1.0, seconds))
         for process in processes:
-            process.check()
+            process.check_running()
     took, last = time.monotonic() - start, status(out)
     assert first is not None
     assert last is not None

@@ -13,8 +13,8 @@ import tomllib
 from pathlib import Path
 
 from fdhil.cli.demo import loop
-from fdhil.cli.demo.processes import Process, Twin
-from fdhil.cli.demo.toml import to_toml
+from fdhil.cli.demo.processes import ChildProcess, SimulatorProcess
+from fdhil.cli.demo.toml_writer import format_toml
 from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
 from fdhil.errors import FdhilError
 
@@ -34,13 +34,13 @@ def main() -> None:
         out = Path(folder)
         document = tomllib.loads(Path(loop.__file__).with_name("machine.toml").read_text("utf-8"))
         document["sim"]["pace"] = "realtime"
-        (out / "twin.toml").write_text(to_toml(document), "utf-8")
+        (out / "twin.toml").write_text(format_toml(document), "utf-8")
         (out / "shuttle.ngc").write_text(PROGRAM, "utf-8")
-        with Twin(out / "twin.toml", out / "twin.log") as twin:
+        with SimulatorProcess(out / "twin.toml", out / "twin.log") as twin:
             place = twin.ready["buses"]["can0"]
             document["bus"] = {"can0": {"interface": "socketcand", "port": place["port"]}}
-            (out / "machine.toml").write_text(to_toml(document), "utf-8")
-            with Process("daemon", ["fdhil", "run", str(out / "machine.toml")], out / "daemon.log") as daemon:
+            (out / "machine.toml").write_text(format_toml(document), "utf-8")
+            with ChildProcess("daemon", ["fdhil", "run", str(out / "machine.toml")], out / "daemon.log") as daemon:
                 _measure(twin, daemon, out, seconds)
 
 
@@ -51,14 +51,14 @@ def _status(out: Path) -> dict[str, object] | None:
         return None
 
 
-def _measure(twin: Twin, daemon: Process, out: Path, seconds: float) -> None:
+def _measure(twin: SimulatorProcess, daemon: ChildProcess, out: Path, seconds: float) -> None:
     while _status(out) is None:
-        daemon.check()
+        daemon.check_running()
         time.sleep(0.1)
-    twin.command("nc", on=True)
-    twin.event("nc", 30.0)
-    twin.command("play", file=str(out / "shuttle.ngc"))
-    twin.event("playing", 30.0)
+    twin.send_command("nc", on=True)
+    twin.await_event("nc", 30.0)
+    twin.send_command("play", file=str(out / "shuttle.ngc"))
+    twin.await_event("playing", 30.0)
     before, start = _status(out), time.monotonic()
     cpu = {process.name: cpu_s(process.pid) for process in (twin, daemon)}
     time.sleep(seconds)

@@ -17,7 +17,7 @@ from typing import Any
 import click
 
 from fdhil import errors
-from fdhil.cli.main import cli, leaves
+from fdhil.cli.main import cli, iterate_commands
 from fdhil.config.config_template import format_toml, get_default, list_tables, write_template
 from fdhil.daemon.alarms import CONDITIONS
 from fdhil.daemon.notice_texts import WORDS
@@ -97,7 +97,7 @@ def command_reference() -> str:
     """Return every command's help as Markdown."""
     lines = ["# Commands", "", "Generated from the command line's own help.", ""]
     top = click.Context(cli, info_name="fdhil", help_option_names=["-h", "--help"])
-    for name, command in leaves(cli):
+    for name, command in iterate_commands(cli):
         help_text = command.get_help(click.Context(command, info_name=name, parent=top))
         lines += [f"## fdhil {name}", "", "```text", help_text, "```", ""]
     return "\n".join(lines)

@@ -73,10 +73,10 @@ class FeedDriveBench:
         changes: Mapping[str, Any] | None = None,
         patience_s: float = DEFAULT_PATIENCE_S,
     ) -> None:
-        from fdhil.cli.demo.machines import merge
+        from fdhil.cli.demo.machines import merge_tables
 
         document = _build_bench_document(axes, bus) | {"sim": {"pace": pace, "modbus": modbus}}
-        merge(document, changes or {})
+        merge_tables(document, changes or {})
         self.folder = folder
         self._document, self._patience_s = document, patience_s
         self._events: queue.Queue[dict[str, Any]] = queue.Queue()
@@ -138,14 +138,14 @@ class FeedDriveBench:
 
     def write_config(self, path: Path | None = None) -> Path:
         """Write the configuration with which fdhil's own commands join this machine; return its path."""
-        from fdhil.cli.demo.toml import to_toml
+        from fdhil.cli.demo.toml_writer import format_toml
 
         document = copy.deepcopy(self._document)
         document["bus"]["can0"] |= self.bus_arguments
         for axis, place in self.ready["modbus"].items():
             document["axis"][axis].setdefault("voltage", {}).update(place)
         path = path or self.folder / "machine.toml"
-        path.write_text(to_toml(document), "utf-8")
+        path.write_text(format_toml(document), "utf-8")
         return path
 
     # -- state and commands
@@ -196,9 +196,9 @@ class FeedDriveBench:
 
 
 def _build_bench_document(axes: str, bus: str) -> dict[str, Any]:
-    from fdhil.cli.demo.machines import machine_document
+    from fdhil.cli.demo.machines import load_machine_document
 
-    document = machine_document()
+    document = load_machine_document()
     first = next(iter(document["axis"].values()))
     kept = {"machine": document["machine"], "axis": {name: copy.deepcopy(first) for name in axes}}
     places: Mapping[str, dict[str, Any]] = {

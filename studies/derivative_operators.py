@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fdhil.cli.paper import operators
+from fdhil.cli.paper import derivative_operators
 from fdhil.identification.derivatives import DerivativeStencil
 
 
@@ -16,6 +16,6 @@ def _savitzky_golay(half: int) -> DerivativeStencil:
 
 
 OPERATORS: Mapping[str, DerivativeStencil] = {
-    **operators.OPERATORS,
+    **derivative_operators.OPERATORS,
     **{operator.name: operator for operator in (_savitzky_golay(3), _savitzky_golay(7))},
 }

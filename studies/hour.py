@@ -24,9 +24,9 @@ from typing import Any
 from fdhil import config as machine_config
 from fdhil.bridges import linuxcnc as bridge
 from fdhil.child_process import interrupt_on_stop_signals, wrap_to_end_with_parent
-from fdhil.cli.demo.machines import machine_document
-from fdhil.cli.demo.processes import Process
-from fdhil.cli.demo.toml import to_toml
+from fdhil.cli.demo.machines import load_machine_document
+from fdhil.cli.demo.processes import ChildProcess
+from fdhil.cli.demo.toml_writer import format_toml
 from fdhil.daemon.daemon_socket import SOCKET_NAME
 from fdhil.program import load_trajectory
 from tests.free_ports import find_free_port
@@ -99,15 +99,15 @@ class Retrofit:
 
 def write_simulator_config(folder: Path) -> Path:
     """Write the simulator's own configuration: the real drives, hidden from fdhil."""
-    document = machine_document()
+    document = load_machine_document()
     document["sim"]["pace"] = "lockstep"
-    (folder / "twin.toml").write_text(to_toml(document))
+    (folder / "twin.toml").write_text(format_toml(document))
     return folder / "twin.toml"
 
 
 def write_answers(folder: Path, twin: SimulatorProcess, port: int) -> dict[str, str]:
     """Write the answers from the data sheets; return each with its source."""
-    sheet = machine_document()["axis"]
+    sheet = load_machine_document()["axis"]
     told: dict[str, Any] = {
         "bus": {name: dict(bus) for name, bus in twin.ready["buses"].items()},
         "g0": {"source": "linuxcnc"},
@@ -128,7 +128,7 @@ def write_answers(folder: Path, twin: SimulatorProcess, port: int) -> dict[str, 
                 source, target = source[name], target.setdefault(name, {})
             target[key] = source[key]
             known[f"axis.{axis}.{path}"] = where
-    (folder / "answers.toml").write_text(to_toml(told))
+    (folder / "answers.toml").write_text(format_toml(told))
     return known
 
 
@@ -177,7 +177,7 @@ def run_with_linuxcnc(hour: Retrofit, twin: SimulatorProcess, port: int, stack: 
     """Daemon, guard and LinuxCNC run; cut."""
     with hour.step("fdhil run, fdhil-guard"):
         for name, command in (("guard", ["fdhil.cli.guard"]), ("daemon", ["fdhil", "run"])):
-            stack.enter_context(Process(name, [*command, str(hour.file)], hour.folder / f"{name}.log"))
+            stack.enter_context(ChildProcess(name, [*command, str(hour.file)], hour.folder / f"{name}.log"))
         run_directory = machine_config.load_config(hour.file).store.run_directory
         assert run_directory is not None
         until((run_directory / SOCKET_NAME).exists)

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from fdhil import config as machine_config
-from fdhil.cli.demo.machines import machine_document
-from fdhil.cli.demo.processes import Process, Twin
-from fdhil.cli.demo.toml import to_toml
+from fdhil.cli.demo.machines import load_machine_document
+from fdhil.cli.demo.processes import ChildProcess, SimulatorProcess
+from fdhil.cli.demo.toml_writer import format_toml
 from fdhil.commissioning.record import save_record
 from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
@@ -36,7 +36,7 @@ STORE_MB = 512
 
 def make_config(folder: Path, period_s: float, lockstep: bool) -> dict[str, Any]:
     """Return the configuration: the demonstration's two axes, with a store of its own and all ports chosen."""
-    document = machine_document()
+    document = load_machine_document()
     document["machine"]["sync_period_s"] = period_s
     document["sim"]["pace"] = "lockstep" if lockstep else "realtime"
     document["guard"]["clock"] = "sync" if lockstep else "monotonic"
@@ -64,8 +64,8 @@ class MachineRig:
     document: dict[str, Any]
     filled: Path | None = None
     config: MachineConfig = field(init=False)
-    twin: Twin = field(init=False)
-    processes: dict[str, Process] = field(default_factory=dict)
+    twin: SimulatorProcess = field(init=False)
+    processes: dict[str, ChildProcess] = field(default_factory=dict)
     url: str = ""
     restarts: dict[str, int] = field(default_factory=dict)
     mounted: bool = False
@@ -115,9 +115,9 @@ class MachineRig:
 
     def start_simulator(self) -> None:
         """Switch the machine on; it has the ports that it had before."""
-        self.file.write_text(to_toml(self.document), "utf-8")
+        self.file.write_text(format_toml(self.document), "utf-8")
         self.config = machine_config.load_config(self.file)
-        self.twin = Twin(self.file, self.logs / "machine.log")
+        self.twin = SimulatorProcess(self.file, self.logs / "machine.log")
 
     def start(self, name: str) -> None:
         """Start one of fdhil's processes and wait until it answers."""
@@ -128,9 +128,9 @@ class MachineRig:
             "pages": ["fdhil", "web", config, "--port", "0", "--json"],
             "publisher": ["fdhil", "publish", "prometheus", config],
         }[name]
-        self.processes[name] = process = Process(name, command, self.logs / f"{name}.log")
+        self.processes[name] = process = ChildProcess(name, command, self.logs / f"{name}.log")
         if name == "pages":
-            self.url = process.event("ready")["url"]
+            self.url = process.await_event("ready")["url"]
         elif name == "daemon":
             self.wait(lambda: self.query_status() is not None, "the daemon answers", process)
         elif name == "publisher":
@@ -144,7 +144,7 @@ class MachineRig:
         """Restart processes that have ended, as systemd would, and count them."""
         for name, process in list(self.processes.items()):
             try:
-                process.check()
+                process.check_running()
             except ConnectError:
                 process.stop()
                 self.restarts[name] = self.restarts.get(name, 0) + 1
@@ -220,11 +220,11 @@ class MachineRig:
         """Return a part of the daemon's status, empty while there is none."""
         return (self.query_status() or {}).get(key) or {}
 
-    def wait(self, done: Callable[[], bool], what: str, process: Process | None = None) -> None:
+    def wait(self, done: Callable[[], bool], what: str, process: ChildProcess | None = None) -> None:
         """Wait for a condition; FdhilError after ten minutes, or if a process has ended."""
         until_s = time.monotonic() + PATIENCE_S
         while not done():
-            (process or self.twin).check()
+            (process or self.twin).check_running()
             if time.monotonic() > until_s:
                 raise FdhilError(f"waited in vain: {what}; see {self.logs}")
             time.sleep(LOOK_S)
@@ -232,7 +232,7 @@ class MachineRig:
     def switch_nc(self, on: bool) -> None:
         """Switch the NC on or off, trying again while a drive is not ready for it."""
         for _ in range(TRIES):
-            self.twin.command("nc", on=on)
+            self.twin.send_command("nc", on=on)
             if (told := self.read_event("nc")) and told["on"] is on:
                 return
             time.sleep(LOOK_S)
@@ -240,26 +240,26 @@ class MachineRig:
 
     def start_fault(self, name: str, **keys: Any) -> None:
         """Start a fault of the simulated machine."""
-        self.twin.command("fault", fault=name, **keys)
+        self.twin.send_command("fault", fault=name, **keys)
 
     def read_event(self, kind: str) -> dict[str, Any] | None:
         """Return the machine's next event of a kind, None where it cannot; its other complaints are of the faults."""
         while True:
             try:
-                return self.twin.event(kind)
+                return self.twin.await_event(kind)
             except ConnectError as error:
-                self.twin.check()
+                self.twin.check_running()
                 if CANNOT in str(error):
                     return None
 
     def play_program(self, program: Path, meanwhile: Callable[[], None] = lambda: None) -> bool:
         """Let the NC play a program; return whether no fault stopped it. An NC that has lost a drive is switched on."""
-        self.twin.command("play", file=str(program))
+        self.twin.send_command("play", file=str(program))
         meanwhile()
         finished = self.read_event("finished")
         if finished is None:
             self.switch_nc(on=True)
-            self.twin.command("play", file=str(program))
+            self.twin.send_command("play", file=str(program))
             finished = self.read_event("finished")
         return finished is not None and not finished["stopped"]
 
@@ -270,8 +270,8 @@ def _listens(port: int) -> bool:
     return False
 
 
-def _ended(process: Process) -> bool:
+def _ended(process: ChildProcess) -> bool:
     with suppress(ConnectError):
-        process.check()
+        process.check_running()
         return False
     return True

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from fdhil import config
-from fdhil.cli.demo.toml import to_toml
+from fdhil.cli.demo.toml_writer import format_toml
 
 AXIS: Mapping[str, Any] = {
     "screw_pitch_mm": 20.0,
@@ -50,7 +50,7 @@ def bench_document(axes: str = "XY") -> dict[str, Any]:
 
 def axis_toml(name: str = "X", corrected: bool = True, **changes: Any) -> str:
     """Return the lines of [axis.NAME] and the tables in it."""
-    return to_toml(bench_axis(corrected, **changes), f"axis.{name}")
+    return format_toml(bench_axis(corrected, **changes), f"axis.{name}")
 
 
 def bench_toml(axes: str = "XY", corrected: bool = True, **changes: Any) -> str:

@@ -12,7 +12,7 @@ SHORT_WAITS: dict[str, float] = {
     "commissioning.config_check.LISTEN_S": 0.05,
     "commissioning.survey.LISTEN_S": 0.05,
     "commissioning.transmit.LOOK_S": 0.01,
-    "cli.consent.LOOK_S": 0.01,
+    "cli.operator_prompt.LOOK_S": 0.01,
     "drivers.can.bus_listener.POLL_S": 0.01,
     "drivers.can.sdo_channel.QUIET_S": 0.05,
     "commissioning.steps.SETTLE_CYCLES": 120,

@@ -15,7 +15,7 @@ import pytest
 
 from fdhil import config
 from fdhil.cli.guard import guard
-from fdhil.cli.main import cli, leaves
+from fdhil.cli.main import cli, iterate_commands
 from fdhil.config.fleet_config import Fleet
 from fdhil.daemon.kernel_warmup import simulate_nominal_rapid
 from fdhil.daemon.outcome_store import OutcomeStore
@@ -34,31 +34,31 @@ PAGES = [
     for path in sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md")])
     if path.parent.name not in ("studies", "reference")
 ]
-LEAVES = dict(leaves(cli))
+LEAVES = dict(iterate_commands(cli))
 NEEDS_A_MACHINE = {"sim", "run", "status", "demo", "web", "web-user", "publish"}
 WINDOW = "configs/fdhil-data/windows/w00000001-X.parquet"
 
 
-def blocks(page: Path, language: str) -> Iterator[str]:
+def find_blocks(page: Path, language: str) -> Iterator[str]:
     for found, body in re.findall(r"^```(\w+)\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL):
         if found == language:
             yield body
 
 
-def lines(page: Path) -> list[str]:
+def list_commands(page: Path) -> list[str]:
     """Return the commands of the page's shell blocks, fenced or indented, in order, without comments."""
     text = page.read_text("utf-8")
     indented = re.findall(r"^    (.*)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE)
-    shown = "\n".join([*blocks(page, "sh"), *blocks(page, "bash"), *indented])
+    shown = "\n".join([*find_blocks(page, "sh"), *find_blocks(page, "bash"), *indented])
     return [line.partition("  #")[0].strip() for line in shown.splitlines() if re.match(r"fdhil(-guard)? ", line)]
 
 
-def mentions(page: Path) -> list[str]:
+def list_mentions(page: Path) -> list[str]:
     found = re.findall(r"`(fdhil(?:-guard)? [^`]*)`", " ".join(page.read_text("utf-8").split()))
     return [line for line in found if not line.startswith("fdhil --")]
 
 
-def chosen(line: str) -> tuple[click.Command, list[str]]:
+def find_command(line: str) -> tuple[click.Command, list[str]]:
     program, *words = shlex.split(line)
     if program == "fdhil-guard":
         return guard, words
@@ -68,10 +68,10 @@ def chosen(line: str) -> tuple[click.Command, list[str]]:
     raise click.UsageError(f"there is no command {words[0]}")
 
 
-def faults(line: str, whole: bool) -> str:
+def find_faults(line: str, whole: bool) -> str:
     """Return the fault of a command line: options and, if ``whole``, the number of arguments."""
     try:
-        command, words = chosen(line)
+        command, words = find_command(line)
         context = click.Context(command)
         values, rest, _ = command.make_parser(context).parse_args(list(words))
     except click.UsageError as error:
@@ -91,17 +91,17 @@ def faults(line: str, whole: bool) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_command_of_a_document_is_one_that_fdhil_has(page: Path) -> None:
-    assert [wrong for line in lines(page) if (wrong := faults(line, whole=True))] == []
-    assert [wrong for line in mentions(page) if (wrong := faults(line, whole=False))] == []
+def test_every_documented_command_exists(page: Path) -> None:
+    assert [wrong for line in list_commands(page) if (wrong := find_faults(line, whole=True))] == []
+    assert [wrong for line in list_mentions(page) if (wrong := find_faults(line, whole=False))] == []
 
 
-def test_a_command_that_fdhil_does_not_have_is_seen() -> None:
-    assert faults("fdhil predict part.ngc --config machine.toml", whole=True) == ""
-    assert "foretell" in faults("fdhil foretell part.ngc", whole=True)
-    assert "--colour" in faults("fdhil predict part.ngc --colour red", whole=False)
-    assert "rain" in faults("fdhil correct part.ngc --method rain", whole=False)
-    assert "missing" in faults("fdhil predict --config machine.toml", whole=True)
+def test_unknown_documented_command_is_detected() -> None:
+    assert find_faults("fdhil predict part.ngc --config machine.toml", whole=True) == ""
+    assert "foretell" in find_faults("fdhil foretell part.ngc", whole=True)
+    assert "--colour" in find_faults("fdhil predict part.ngc --colour red", whole=False)
+    assert "rain" in find_faults("fdhil correct part.ngc --method rain", whole=False)
+    assert "missing" in find_faults("fdhil predict --config machine.toml", whole=True)
 
 
 @pytest.mark.parametrize("name", LEAVES)
@@ -109,7 +109,7 @@ def test_help_ends_with_valid_example_and_exit_codes(name: str) -> None:
     text = LEAVES[name].get_help(click.Context(LEAVES[name], info_name=name))
     example = re.findall(r"Example:\n\s+(.*)", text)
     assert example[0].startswith(f"fdhil {name}")
-    assert faults(example[0], whole=True) == ""
+    assert find_faults(example[0], whole=True) == ""
     assert "Exit codes:\n    0  " in text
 
 
@@ -125,7 +125,7 @@ RUN = {
 GENERATED = ("benchmarks.md", "index.md")
 
 
-def untried(page: Path) -> Iterator[str]:
+def find_untried_blocks(page: Path) -> Iterator[str]:
     """Yield the first line of each block without a test and without a reason."""
     for before, language, body in re.findall(r"([^\n]*)\n```(\w*)\n(.*?)^```", page.read_text("utf-8"), re.M | re.S):
         commands = language in ("sh", "bash") and re.search(r"^fdhil(-guard)? ", body, re.MULTILINE)
@@ -135,22 +135,22 @@ def untried(page: Path) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_block_of_a_document_is_tried_or_says_why_not(page: Path) -> None:
+def test_every_code_block_is_tried_or_marked(page: Path) -> None:
     if page.name not in GENERATED:
-        assert list(untried(page)) == []
+        assert list(find_untried_blocks(page)) == []
 
 
-def test_block_that_is_not_tried_is_found(tmp_path: Path) -> None:
+def test_untried_block_is_detected(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text(
         "text\n```text\nnot tried\n```\n<!-- not run: a drawing -->\n```text\nmarked\n```\n```toml\na = 1\n```\n"
     )
-    assert list(untried(page)) == ["not tried"]
+    assert list(find_untried_blocks(page)) == ["not tried"]
     assert all((ROOT / test).is_file() and name in (ROOT / test).read_text("utf-8") for (name, _), test in RUN.items())
 
 
 @pytest.fixture
-def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def configs_copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of configs/ with a store of one rapid and one parameter set, as after ``fdhil run``."""
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
     machine = config.load_config(tmp_path / "configs" / "sim.toml")
@@ -167,9 +167,9 @@ def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("page", ["README.md", "docs/tutorial/first-identification.md"])
-def test_the_first_commands_run_as_they_stand(page: str, house: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_first_commands_run_unchanged(page: str, configs_copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ran = 0
-    for line in lines(ROOT / page):
+    for line in list_commands(ROOT / page):
         line = line.replace("*.parquet", Path(WINDOW).name).replace("FILE.parquet", Path(WINDOW).name)
         name = shlex.split(line)[1]
         if line.startswith("fdhil ") and name not in NEEDS_A_MACHINE and "machine.toml" not in line:
@@ -177,16 +177,16 @@ def test_the_first_commands_run_as_they_stand(page: str, house: Path, capsys: py
             assert code == 0, f"{line}: {out}{err}"
             ran += 1
     assert ran >= 6
-    assert [path.name for path in house.glob("*.csv")] != []
+    assert [path.name for path in configs_copy.glob("*.csv")] != []
 
 
-def spoilt(text: str, change: Callable[[list[list[str]]], list[list[str]]]) -> str:
+def change_rows(text: str, change: Callable[[list[list[str]]], list[list[str]]]) -> str:
     head, _, body = text.partition("time_s")
     names, *rows = [line.split(",") for line in f"time_s{body}".splitlines()]
     return head + "\n".join(",".join(row) for row in [names, *change(rows)]) + "\n"
 
 
-def scaled(column: int) -> Callable[[list[list[str]]], list[list[str]]]:
+def scale_column(column: int) -> Callable[[list[list[str]]], list[list[str]]]:
     return lambda rows: [[*row[:column], f"{1.2 * float(row[column]):.6f}", *row[column + 1 :]] for row in rows]
 
 
@@ -196,32 +196,32 @@ def scaled(column: int) -> Callable[[list[list[str]]], list[list[str]]]:
         (lambda rows: rows[:350] + rows[390:], "StaleData"),
         (lambda rows: [[*row[:2], rows[300][2], *row[3:]] if 300 <= k < 360 else row for k, row in enumerate(rows)],
          "StuckValue"),
-        (scaled(3), "CalibrationSuspect"),
-        (scaled(2), ""),
+        (scale_column(3), "CalibrationSuspect"),
+        (scale_column(2), ""),
     ],
     ids=["rows deleted", "value repeated", "speed x 1.2", "current x 1.2"],
 )  # fmt: skip
-def test_the_tutorial_says_what_becomes_of_a_spoilt_rapid(
+def test_tutorial_names_refusal_of_corrupted_rapid(
     change: Callable[[list[list[str]]], list[list[str]]], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Without a data sheet a constant gain error looks like another drive; every other damage is refused by code."""
     text = bench.format_as_csv(bench.simulate_bench(bench.Plant(), bench.make_shuttle_demand()), 0.001)
     assert text.partition("time_s")[2].startswith(",voltage_V,current_A,speed_rad_per_s,")
-    (tmp_path / "rapid.csv").write_text(spoilt(text, change))
+    (tmp_path / "rapid.csv").write_text(change_rows(text, change))
     code, out, _ = fdhil("identify", tmp_path / "rapid.csv", capsys=capsys)
     assert (code, told in out) == (1 if told else 0, True), out
     assert not told or told in (ROOT / "docs/tutorial/first-identification.md").read_text("utf-8")
 
 
-def merged(document: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+def merge_documents(document: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     for key, value in changes.items():
-        document[key] = merged(document.get(key, {}), value) if isinstance(value, dict) else value
+        document[key] = merge_documents(document.get(key, {}), value) if isinstance(value, dict) else value
     return document
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_piece_of_a_configuration_can_be_put_into_one(page: Path) -> None:
-    for text in blocks(page, "toml"):
+def test_every_configuration_fragment_is_valid(page: Path) -> None:
+    for text in find_blocks(page, "toml"):
         piece = tomllib.loads(text)
         if "columns" in piece:
             ColumnMap.model_validate(piece)
@@ -231,6 +231,6 @@ def test_every_piece_of_a_configuration_can_be_put_into_one(page: Path) -> None:
         elif "set" in piece:
             ProposedChange.model_validate(ChangeFile.model_validate(piece).proposed_fields)
         elif not {"fault", "tpdos", "base"} & set(piece):
-            assert config.parse_config(merged(bench_document(), piece)).axis
-    for text in blocks(page, "python"):
+            assert config.parse_config(merge_documents(bench_document(), piece)).axis
+    for text in find_blocks(page, "python"):
         compile(text, str(page), "exec")

@@ -19,7 +19,7 @@ TEMPLATE = ROOT / "configs" / "machine-template.toml"
 PAGES = sorted(path for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 
 
-def test_the_code_overview_names_what_exists() -> None:
+def test_code_overview_names_existing_files() -> None:
     page = (ROOT / "docs" / "explanation" / "code-overview.md").read_text("utf-8")
     named = set(re.findall(r"`((?:fdhil|studies)/[\w/.]*)`", page))
     assert len(named) > 40
@@ -27,14 +27,14 @@ def test_the_code_overview_names_what_exists() -> None:
 
 
 @pytest.mark.usefixtures("processes")
-def test_the_generated_files_are_current() -> None:
+def test_generated_files_are_current() -> None:
     """In a separate process, because click caches the help option."""
     command = [sys.executable, str(ROOT / "docs" / "generate.py"), "--check"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def uncommented(text: str, *chosen: str) -> str:
+def uncomment_lines(text: str, *chosen: str) -> str:
     """Return the template with the chosen settings and sections uncommented."""
     lines, section = [], ""
     for line in text.splitlines():
@@ -44,13 +44,13 @@ def uncommented(text: str, *chosen: str) -> str:
     return "\n".join(lines)
 
 
-def loaded(tmp_path: Path, text: str) -> config.MachineConfig:
+def load_template(tmp_path: Path, text: str) -> config.MachineConfig:
     path = tmp_path / "machine.toml"
     path.write_text(text, "utf-8")
     return config.load_config(path)
 
 
-def test_the_template_as_it_stands_sends_nothing() -> None:
+def test_unchanged_template_sends_nothing() -> None:
     machine = config.load_config(TEMPLATE)
     assert list(machine.axis) == ["X"]
     assert machine.axis["X"].correction is None
@@ -58,31 +58,31 @@ def test_the_template_as_it_stands_sends_nothing() -> None:
     assert machine.axis["X"].temperature is None
 
 
-def test_each_optional_block_of_the_template_may_be_uncommented(tmp_path: Path) -> None:
+def test_each_optional_template_block_can_be_uncommented(tmp_path: Path) -> None:
     text = TEMPLATE.read_text("utf-8")
     blocks = re.findall(r"^#(\[.*\])$", text, re.MULTILINE)
     assert {"[axis.X.correction]", "[axis.X.feedforward]", "[axis.X.temperature]", "[sim]"} <= set(blocks)
     for block in blocks:
-        assert loaded(tmp_path, uncommented(text, block)).digest, block
-    machine = loaded(tmp_path, uncommented(text, "[axis.X.feedforward]"))
+        assert load_template(tmp_path, uncomment_lines(text, block)).digest, block
+    machine = load_template(tmp_path, uncomment_lines(text, "[axis.X.feedforward]"))
     assert machine.axis["X"].feedforward == config.FeedforwardLimits()
 
 
-def test_each_section_of_the_template_may_be_uncommented_and_shows_its_defaults(tmp_path: Path) -> None:
+def test_each_template_section_can_be_uncommented_and_shows_defaults(tmp_path: Path) -> None:
     text = TEMPLATE.read_text("utf-8")
     sections = re.findall(r"^#?(\[.*\])$", text, re.MULTILINE)
-    everything, as_it_stands = loaded(tmp_path, uncommented(text, *sections)), config.load_config(TEMPLATE)
+    everything, as_it_stands = load_template(tmp_path, uncomment_lines(text, *sections)), config.load_config(TEMPLATE)
     assert everything.nc == as_it_stands.nc
     examples = {"run_directory": None, "daemon_user": None}  # keys without a default
     assert everything.guard.model_copy(update=examples) == as_it_stands.guard
     for section in sections:
-        assert loaded(tmp_path, uncommented(text, section)).digest, section
+        assert load_template(tmp_path, uncomment_lines(text, section)).digest, section
 
 
 @pytest.mark.parametrize(
     "model", [config.Thermometer, config.FeedforwardLimits, config.CanBus, config.SimAxis, config.Reality]
 )
-def test_comments_stand_right_above_what_they_explain(model: type[config.Section]) -> None:
+def test_comments_are_directly_above_their_keys(model: type[config.Section]) -> None:
     text = TEMPLATE.read_text("utf-8")
     header, _, words = (model.__doc__ or "").partition(": ")
     name = header.replace("NAME", "can0")
@@ -92,7 +92,7 @@ def test_comments_stand_right_above_what_they_explain(model: type[config.Section
     assert [key for key in keys if key not in block] == []
 
 
-def test_every_error_of_the_reference_is_told_to_the_end_of_its_sentence() -> None:
+def test_error_reference_has_complete_sentences() -> None:
     rows = re.findall(
         r"^\| `\w+` \| \d \| (.*) \|$", (ROOT / "docs/reference/errors.md").read_text("utf-8"), re.MULTILINE
     )
@@ -106,7 +106,7 @@ def test_every_shipped_config_is_valid(path: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_link_between_documents_leads_somewhere(page: Path) -> None:
+def test_every_document_link_resolves(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text("utf-8")):
         assert (page.parent / target).exists(), f"{page}: {target}"
 
@@ -114,13 +114,13 @@ def test_every_link_between_documents_leads_somewhere(page: Path) -> None:
 @pytest.mark.parametrize(
     "table", [name for name, value in vars(tables).items() if isinstance(value, dict) and name.isupper()]
 )
-def test_being_listed_is_being_tested(table: str) -> None:
+def test_every_registered_entry_is_tested(table: str) -> None:
     """The suite of each table runs over all its entries."""
     runs_over_all = re.compile(rf"(parametrize\(.*|params=list\(|for name in )tables\.{table}\b")
     assert any(runs_over_all.search(path.read_text("utf-8")) for path in (ROOT / "tests").glob("**/test_*.py"))
 
 
-def test_the_papers_that_a_stranger_looks_for_are_there() -> None:
+def test_license_security_and_contributing_files_exist() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
     shipped = project["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
     assert [name for name in shipped if not (ROOT / name[1:]).exists()] == []
@@ -131,7 +131,7 @@ def test_the_papers_that_a_stranger_looks_for_are_there() -> None:
     assert "\ncff-version: 1.2.0\n" in f"\n{citation}"
 
 
-def test_the_index_of_decisions_lists_every_page_once_in_order() -> None:
+def test_decision_index_lists_every_page_once_in_order() -> None:
     folder = ROOT / "docs" / "decisions"
     listed = re.findall(r"^(\d+)\. \[(.*)\]\((.*)\)$", (folder / "README.md").read_text("utf-8"), re.MULTILINE)
     assert [target for _, _, target in listed] == sorted(path.name for path in folder.glob("0*.md"))
@@ -141,7 +141,7 @@ def test_the_index_of_decisions_lists_every_page_once_in_order() -> None:
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_the_source_archive_holds_what_is_needed_and_nothing_else(tmp_path: Path) -> None:
+def test_source_archive_has_exactly_the_needed_files(tmp_path: Path) -> None:
     archive = next(iter(SdistBuilder(str(ROOT)).build(directory=str(tmp_path))))
     with tarfile.open(archive) as opened:
         names = {name.partition("/")[2] for name in opened.getnames()}
@@ -156,7 +156,7 @@ def test_the_source_archive_holds_what_is_needed_and_nothing_else(tmp_path: Path
     assert [name for name in names if re.search(r"__pycache__|\.venv|fdhil-data|\.parquet$|^out/|^\.git/", name)] == []
 
 
-def test_every_reason_to_refuse_a_window_is_explained() -> None:
+def test_every_window_refusal_is_explained() -> None:
     paths = [*ROOT.glob("fdhil/validation/*.py"), ROOT / "fdhil" / "pipeline" / "validated_pool.py"]
     sources = "".join(path.read_text("utf-8") for path in paths)
     codes = set(re.findall(r'"([A-Z][a-z]+[A-Z][A-Za-z]+)"', sources))

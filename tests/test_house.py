@@ -24,7 +24,7 @@ def test_import_from_file_of_another_room_is_counted() -> None:
         "from fdhil.config import MachineConfig, reading\n"
         "from fdhil.store.history_database import History\n"
         "from fdhil.errors import FdhilError\n"
-        "from fdhil.cli.console import show\n"
+        "from fdhil.cli.printable_console import show\n"
     )
     assert list(find_doors(tree, "cli")) == [("config", False), ("config", True), ("store", True)]
 

@@ -25,12 +25,12 @@ CLASS = re.compile(r"[A-Z][a-z]+[A-Za-z]*(\(\w+\))?")
 
 
 @cache
-def calls() -> tuple[tuple[str, str, int, bool], ...]:
+def list_calls() -> tuple[tuple[str, str, int, bool], ...]:
     """Return code, location and number of words of each call, and whether the last word is a text."""
-    return tuple(_calls())
+    return tuple(_find_calls())
 
 
-def _calls() -> Iterator[tuple[str, str, int, bool]]:
+def _find_calls() -> Iterator[tuple[str, str, int, bool]]:
     for path in sorted(PRODUCT.rglob("*.py")):
         tree = ast.parse(path.read_text("utf-8"))
         named = {
@@ -41,21 +41,26 @@ def _calls() -> Iterator[tuple[str, str, int, bool]]:
             if isinstance(target, ast.Name)
         }
         for node in ast.walk(tree):
-            if isinstance(node, ast.Call) and _name(node) in CALLS:
+            if isinstance(node, ast.Call) and _name_call(node) in CALLS:
                 words = [word for word in node.args if not isinstance(word, ast.Constant) or word.value is not False]
-                first = words[1 if _name(node) == "Refused" else 0] if len(words) > 1 else None
+                first = words[1 if _name_call(node) == "Refused" else 0] if len(words) > 1 else None
                 code = first.value if isinstance(first, ast.Constant) else named.get(getattr(first, "id", ""))
                 if isinstance(code, str) and CLASS.fullmatch(code):
                     last = words[-1]
                     says = not (isinstance(last, ast.Constant) and not last.value)
-                    yield code.partition("(")[0], f"{path.name}:{node.lineno}", len(words) - CALLS[_name(node)], says
+                    yield (
+                        code.partition("(")[0],
+                        f"{path.name}:{node.lineno}",
+                        len(words) - CALLS[_name_call(node)],
+                        says,
+                    )
 
 
-def _name(call: ast.Call) -> str:
+def _name_call(call: ast.Call) -> str:
     return call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
 
 
-def documented() -> set[str]:
+def list_documented_codes() -> set[str]:
     """Return the codes in the first cell of table rows whose other cells are not empty."""
     found: set[str] = set()
     for page in PAGES:
@@ -67,19 +72,19 @@ def documented() -> set[str]:
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_each_refusal_tells_class_cause_and_next_action() -> None:
-    short = [f"{place} {code}" for code, place, left, says in calls() if left < 0 or not says]
+def test_each_refusal_has_code_cause_and_action() -> None:
+    short = [f"{place} {code}" for code, place, left, says in list_calls() if left < 0 or not says]
     assert short == []
 
 
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.goal("R19")
-def test_every_class_is_in_the_documents_with_effect_and_next_action(
+def test_every_code_is_documented_with_effect_and_action(
     record_property: Callable[[str, object], None],
 ) -> None:
-    told = {code for code, *_ in calls()} | INTERLOCK_CATALOGUE.keys() | WORDS.keys()
+    told = {code for code, *_ in list_calls()} | INTERLOCK_CATALOGUE.keys() | WORDS.keys()
     told |= {name for row in ROWS.values() if row.id not in TOLD_OTHERWISE for name in row.classes}
-    assert sorted(told - documented()) == []
+    assert sorted(told - list_documented_codes()) == []
     assert all(map(all, WORDS.values()))
     assert all(
         cause and action and REACTION_EFFECTS[reaction] for reaction, cause, action in INTERLOCK_CATALOGUE.values()
@@ -88,6 +93,6 @@ def test_every_class_is_in_the_documents_with_effect_and_next_action(
 
 
 @pytest.mark.goal("R19")
-def test_no_class_is_documented_that_there_is_not() -> None:
+def test_every_documented_code_exists() -> None:
     product = "\n".join(path.read_text("utf-8") for path in PRODUCT.rglob("*.py"))
-    assert [name for name in sorted(documented()) if name not in product] == []
+    assert [name for name in sorted(list_documented_codes()) if name not in product] == []

@@ -17,7 +17,7 @@ import numpy as np
 
 from fdhil import correction
 from fdhil.cli.doctor.latency import read_latency
-from fdhil.cli.prediction import inputs
+from fdhil.cli.prediction_commands import load_inputs
 from fdhil.commissioning.progress import Progress
 from fdhil.commissioning.record import CommissioningRecord, holds, load_record
 from fdhil.commissioning.void import is_void
@@ -35,7 +35,7 @@ NEWEST_PASSES = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class AcceptanceOptions:
     """Options of ``fdhil acceptance``."""
 
     by: str
@@ -72,7 +72,7 @@ class Findings:
     """
 
     machine: MachineConfig
-    asked: Asked
+    options: AcceptanceOptions
     made_utc: str
     proofs: Mapping[str, AxisProof]
     histories: Sequence[AxisHistory]
@@ -86,9 +86,9 @@ class Findings:
     open_points: Sequence[str]
 
 
-def find(machine: MachineConfig, config: Path, options: Asked) -> Findings:
+def gather_findings(machine: MachineConfig, config: Path, options: AcceptanceOptions) -> Findings:
     """Gather the content. Raises ConfigError, StoreError, ProgramError, RecordingError."""
-    proofs = {axis: _proof(machine, axis) for axis in machine.axis}
+    proofs = {axis: _gather_axis_proof(machine, axis) for axis in machine.axis}
     passes: Sequence[Mapping[str, Any]] = []
     notices: Sequence[Mapping[str, Any]] = []
     try:
@@ -103,15 +103,15 @@ def find(machine: MachineConfig, config: Path, options: Asked) -> Findings:
     identified = known >= set(machine.axis)
     linear = [axis for axis in ("X", "Y", "Z") if axis in machine.axis]
     plane = (linear[0], linear[1]) if len(linear) > 1 else None
-    circles = _circles(config, options, plane, identified) if plane else {}
-    path = _planned(options.program, config, identified) if options.program else None
+    circles = _evaluate_circles(config, options, plane, identified) if plane else {}
+    path = _plan_correction(options.program, config, identified) if options.program else None
     points = [f"{axis}: {proof.against}" for axis, proof in proofs.items() if proof.against]
     points += [
         f"{axis}: no published parameters, nominal ones are used; run the daemon while the axis makes rapids"
         for axis in machine.axis
         if axis not in known
     ]
-    points += _beyond(options, circles, path)
+    points += _find_exceeded_limits(options, circles, path)
     if major := sum(notice["severity"] == "MAJOR" for notice in notices):
         points.append(f"{major} MAJOR notices are pending; see fdhil status, then fdhil acknowledge")
     made = datetime.now(UTC).isoformat(timespec="seconds")
@@ -119,7 +119,7 @@ def find(machine: MachineConfig, config: Path, options: Asked) -> Findings:
     return Findings(*known_by, passes, notices, read_latency(machine), points)
 
 
-def _proof(machine: MachineConfig, axis: str) -> AxisProof:
+def _gather_axis_proof(machine: MachineConfig, axis: str) -> AxisProof:
     directory, key = machine.store.directory, machine.store.directory / "commissioning.key"
     try:
         record = load_record(directory, axis, key, may_lack_key=True)
@@ -135,34 +135,36 @@ def _proof(machine: MachineConfig, axis: str) -> AxisProof:
     return AxisProof(record, Progress(directory, axis).done(), against)
 
 
-def _planned(program: Path, config: Path, from_history: bool) -> Correction:
-    reference, models, machine = inputs(program, config, None, from_history)
+def _plan_correction(program: Path, config: Path, from_history: bool) -> Correction:
+    reference, models, machine = load_inputs(program, config, None, from_history)
     return correction.plan_correction(reference, models, machine)
 
 
-def _circles(config: Path, options: Asked, plane: tuple[str, str], from_history: bool) -> dict[str, CircleDeviations]:
+def _evaluate_circles(
+    config: Path, options: AcceptanceOptions, plane: tuple[str, str], from_history: bool
+) -> dict[str, CircleDeviations]:
     with tempfile.TemporaryDirectory(prefix="fdhil-circle-") as folder:
         program = Path(folder) / "circle.ngc"
         program.write_text(write_circle_program(plane, options.radius_mm, options.feed_mm_min), "ascii")
-        planned = _planned(program, config, from_history)
+        planned = _plan_correction(program, config, from_history)
     cases = {"predicted, uncorrected": planned.before}
     if not planned.refused:
         cases["predicted, corrected"] = planned.after
     found = {
-        label: evaluate_circle(_table_mm(predicted, plane), options.radius_mm, (0.0, 0.0))
+        label: evaluate_circle(_extract_table_mm(predicted, plane), options.radius_mm, (0.0, 0.0))
         for label, predicted in cases.items()
     }
     if options.measured_circle is not None:
-        found["measured"] = evaluate_circle(read_path(options.measured_circle, plane), options.radius_mm)
+        found["measured"] = evaluate_circle(read_measured_path(options.measured_circle, plane), options.radius_mm)
     return found
 
 
-def _table_mm(predicted: Prediction, plane: tuple[str, str]) -> Float:
+def _extract_table_mm(predicted: Prediction, plane: tuple[str, str]) -> Float:
     reference = predicted.reference
     return reference.compute_table_mm(predicted.predicted_mm)[:, [reference.table_axes.index(axis) for axis in plane]]
 
 
-def read_path(path: Path, plane: tuple[str, str]) -> Float:
+def read_measured_path(path: Path, plane: tuple[str, str]) -> Float:
     """Return a measured path (n, 2), mm. Raises RecordingError if the file has none."""
     names = [f"{axis}_mm" for axis in plane]
     try:
@@ -180,7 +182,9 @@ def read_path(path: Path, plane: tuple[str, str]) -> Float:
     return np.array(rows)
 
 
-def _beyond(options: Asked, circles: Mapping[str, CircleDeviations], path: Correction | None) -> list[str]:
+def _find_exceeded_limits(
+    options: AcceptanceOptions, circles: Mapping[str, CircleDeviations], path: Correction | None
+) -> list[str]:
     # a limit without a result to compare is open as well
     points = []
     if options.circle_um is not None:
@@ -196,9 +200,9 @@ def _beyond(options: Asked, circles: Mapping[str, CircleDeviations], path: Corre
     return points
 
 
-def document_of(found: Findings) -> dict[str, Any]:
+def build_acceptance_document(found: Findings) -> dict[str, Any]:
     """Return the content as JSON; ``sha256`` covers all other entries, with sorted keys and without spaces."""
-    machine, options = found.machine, found.asked
+    machine, options = found.machine, found.options
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "made_utc": found.made_utc,
@@ -211,15 +215,15 @@ def document_of(found: Findings) -> dict[str, Any]:
             "config_digest": machine.digest,
             "sync_period_s": machine.machine.sync_period_s,
         },
-        "axes": {axis: _axis_document(found, axis) for axis in machine.axis},
+        "axes": {axis: _describe_axis(found, axis) for axis in machine.axis},
         "circle": {
             "plane": "".join(found.plane or ()),
             "radius_mm": options.radius_mm,
             "feed_mm_min": options.feed_mm_min,
             "limit_um": options.circle_um,
-            "found": {label: _circle_document(circle) for label, circle in found.circles.items()},
+            "found": {label: _describe_circle(circle) for label, circle in found.circles.items()},
         },
-        "program": _program_document(found),
+        "program": _describe_program(found),
         "passes": list(found.passes),
         "notices": list(found.notices),
         "latency": found.latency,
@@ -231,7 +235,7 @@ def document_of(found: Findings) -> dict[str, Any]:
     return document | {"sha256": hashlib.sha256(text.encode()).hexdigest()}
 
 
-def _axis_document(found: Findings, axis: str) -> dict[str, Any]:
+def _describe_axis(found: Findings, axis: str) -> dict[str, Any]:
     proof = found.proofs[axis]
     rows = next((history.rows for history in found.histories if history.axis == axis), ())
     newest = rows[-1]["parameters"] if rows else None
@@ -246,7 +250,7 @@ def _axis_document(found: Findings, axis: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _circle_document(circle: CircleDeviations) -> dict[str, Any]:
+def _describe_circle(circle: CircleDeviations) -> dict[str, Any]:
     counter, clockwise = circle.deviations_um
     largest, least = circle.radial_um
     return {
@@ -259,15 +263,15 @@ def _circle_document(circle: CircleDeviations) -> dict[str, Any]:
     }
 
 
-def _program_document(found: Findings) -> dict[str, Any] | None:
-    if found.path is None or found.asked.program is None:
+def _describe_program(found: Findings) -> dict[str, Any] | None:
+    if found.path is None or found.options.program is None:
         return None
     path = found.path
     cases = {"uncorrected": path.before} | ({} if path.refused else {"corrected": path.after})
     return {
-        "name": found.asked.program.name,
-        "sha256": program_digest(found.asked.program),
-        "limit_um": found.asked.contour_um,
+        "name": found.options.program.name,
+        "sha256": program_digest(found.options.program),
+        "limit_um": found.options.contour_um,
         "method": path.method,
         "refused": [str(reason) for reason in path.refused],
         **{label: {"rms_um": p.rms_um, "max_um": float(p.contour_um.max())} for label, p in cases.items()},

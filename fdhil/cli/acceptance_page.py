@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fdhil.cli.acceptance_findings import NO_LIMIT, AxisProof, Findings
-from fdhil.cli.doctor.latency import latency_text
+from fdhil.cli.doctor.latency import format_latency
 from fdhil.report import Page, Section, Table
 from fdhil.report.circular_plot import draw_polar
 from fdhil.report.condition_summary import LATEST_HEAD, build_latest_rows
@@ -23,16 +23,16 @@ SIGNATURES = ("tested by", "received by")
 LINE = "_" * 28
 
 
-def page_of(found: Findings, document: Mapping[str, Any]) -> Page:
+def build_acceptance_page(found: Findings, document: Mapping[str, Any]) -> Page:
     """Return the page; ``document`` is the JSON content with its hash."""
     state = "accepted" if not found.open_points else f"{len(found.open_points)} points open"
-    sections = [_verdict(found), _proven(found), _parameters(found)]
+    sections = [_build_machine_section(found), _build_proof_section(found), _build_parameter_section(found)]
     if found.plane is not None:
-        sections.append(_circular(found))
-    sections.append(_running(found))
-    if found.path is not None and found.asked.program is not None:
-        page = build_correction_page(found.asked.program.name, "", found.path)
-        sections += [Section(f"Program {found.asked.program.name}: {s.title}", s.text, s.tables, s.figures)
+        sections.append(_build_circular_section(found))
+    sections.append(_build_operation_section(found))
+    if found.path is not None and found.options.program is not None:
+        page = build_correction_page(found.options.program.name, "", found.path)
+        sections += [Section(f"Program {found.options.program.name}: {s.title}", s.text, s.tables, s.figures)
                      for s in page.sections]  # fmt: skip
     commissioned = sum(not proof.against for proof in found.proofs.values())
     tiles = [("verdict", state), ("drives commissioned", f"{commissioned} of {len(found.proofs)}")]
@@ -41,17 +41,17 @@ def page_of(found: Findings, document: Mapping[str, Any]) -> Page:
         f"Acceptance of {found.machine.machine.name}",
         "Commissioning, parameters and accuracy of its drives. Nothing was sent for this report.",
         tiles,
-        [*sections, _signatures(found, document)],
+        [*sections, _build_signature_section(found, document)],
     )
 
 
-def _verdict(found: Findings) -> Section:
+def _build_machine_section(found: Findings) -> Section:
     machine = found.machine
     records = [proof.record for proof in found.proofs.values() if proof.record is not None]
     rows = [
-        ["customer", found.asked.customer or "-"],
-        ["site", found.asked.site or "-"],
-        ["operator", found.asked.by or "-"],
+        ["customer", found.options.customer or "-"],
+        ["site", found.options.site or "-"],
+        ["operator", found.options.by or "-"],
         ["machine", machine.machine.name],
         ["serial numbers of the drives", ", ".join(f"{each.axis} {each.serial}" for each in records) or "-"],
         ["configuration, digest", machine.digest],
@@ -66,14 +66,14 @@ def _verdict(found: Findings) -> Section:
     points = [[str(number), point] for number, point in enumerate(found.open_points, 1)]
     tables = [Table(("", "open point"), points)] if points else []
     text = "No open points: every drive is commissioned and identified"
-    text = "" if points else f"{text}, and all limits are kept." if found.asked.limits else f"{text}."
-    if not found.asked.limits:
+    text = "" if points else f"{text}, and all limits are kept." if found.options.limits else f"{text}."
+    if not found.options.limits:
         text = f"{text} {NO_LIMIT.capitalize()}.".lstrip()
     return Section("The machine", text, [*tables, Table(("", "value"), rows)])
 
 
-def _proven(found: Findings) -> Section:
-    columns = [_proof_column(proof) for proof in found.proofs.values()]
+def _build_proof_section(found: Findings) -> Section:
+    columns = [_format_proof_column(proof) for proof in found.proofs.values()]
     rows = [[what, *cells] for what, *cells in zip(PROOF_ROWS, *columns, strict=True)]
     steps = [[axis, name, time.replace("T", " ")[:16]] for axis, proof in found.proofs.items()
              for name, time in proof.steps.items()]  # fmt: skip
@@ -84,7 +84,7 @@ def _proven(found: Findings) -> Section:
     return Section("Commissioning", "", tables)
 
 
-def _proof_column(proof: AxisProof) -> list[str]:
+def _format_proof_column(proof: AxisProof) -> list[str]:
     record = proof.record
     if record is None:
         return [*["-"] * (len(PROOF_ROWS) - 1), proof.against]
@@ -96,7 +96,7 @@ def _proof_column(proof: AxisProof) -> list[str]:
     ]  # fmt: skip
 
 
-def _parameters(found: Findings) -> Section:
+def _build_parameter_section(found: Findings) -> Section:
     shares = found.machine.maintenance.model_dump()
     tables = [Table(LATEST_HEAD, build_latest_rows(history, shares), f"Axis {history.axis}")
               for history in found.histories if history.rows]  # fmt: skip
@@ -108,8 +108,8 @@ def _parameters(found: Findings) -> Section:
     return Section("Parameters", text, tables)
 
 
-def _circular(found: Findings) -> Section:
-    options = found.asked
+def _build_circular_section(found: Findings) -> Section:
+    options = found.options
     columns = [
         [f"{um:.2f}" for um in (*circle.deviations_um, circle.both_um, circle.hysteresis_um, *circle.radial_um)]
         for circle in found.circles.values()
@@ -131,7 +131,7 @@ def _circular(found: Findings) -> Section:
     )
 
 
-def _running(found: Findings) -> Section:
+def _build_operation_section(found: Findings) -> Section:
     head = ("time", "severity", "what")
     passes, notices = (
         [[format_minute(n["time"]), n["severity"], n["text"]] for n in entries]
@@ -141,14 +141,14 @@ def _running(found: Findings) -> Section:
               ((passes, "Passes with the correction"), (notices, "Open notices")) if rows]  # fmt: skip
     late = "The latency of this PC was not measured: run fdhil doctor --latency 600."
     if found.latency is not None:
-        late = f"This PC, measured {format_minute(found.latency['time'])}: {latency_text(found.latency)}."
+        late = f"This PC, measured {format_minute(found.latency['time'])}: {format_latency(found.latency)}."
     none = [what for what, rows in (("No pass with the correction.", passes), ("No open notices.", notices))
             if not rows]  # fmt: skip
     return Section("In operation", " ".join([*none, late]), tables)
 
 
-def _signatures(found: Findings, document: Mapping[str, Any]) -> Section:
-    names = (found.asked.by or LINE, LINE)
+def _build_signature_section(found: Findings, document: Mapping[str, Any]) -> Section:
+    names = (found.options.by or LINE, LINE)
     rows = [[who, name, LINE, LINE] for who, name in zip(SIGNATURES, names, strict=True)]
     text = f"SHA-256 of the content, as printed by fdhil acceptance --json: {document['sha256']}"
     return Section("Signatures", text, [Table(("", "name", "date, place", "signature"), rows)])

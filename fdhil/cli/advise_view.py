@@ -22,7 +22,7 @@ SPREADS = (1.1, 1.5, 2.0, 4.0)  # highest to lowest feed within one range
 Range = list["FeedAdvice"]
 
 
-def show(
+def show_advice(
     advice: Sequence[FeedAdvice],
     most: Mapping[float, FeedAdvice] | None,
     tolerance_um: float,
@@ -33,11 +33,11 @@ def show(
     if not advice:
         click.echo(f"the whole path stays within {tolerance_um:g} um as programmed")
         return
-    found = ranges(advice, feeds)
+    found = group_into_ranges(advice, feeds)
     if len(found) > MANY:
         slowest = min(cut(a.plain.run * a.feed_mm_min) for a in advice)
         click.echo(f"{len(advice)} lines in {len(found)} ranges, down to F{slowest:g}; the {MANY} worst of them:")
-    worst = sorted(found, key=lambda one: -_worst(one).error_um)[:MANY]
+    worst = sorted(found, key=lambda one: -_find_worst(one).error_um)[:MANY]
     for one in sorted(worst, key=lambda one: one[0].start_s):
         _show_range(one, most)
     if len(found) > len(worst):
@@ -48,23 +48,23 @@ def show(
         click.echo("the correction was not evaluated: an axis lacks the section [axis.X.correction]")
 
 
-def ranges(advice: Sequence[FeedAdvice], feeds: Callable[[int], bool]) -> list[Range]:
+def group_into_ranges(advice: Sequence[FeedAdvice], feeds: Callable[[int], bool]) -> list[Range]:
     """Group consecutive lines of similar feeds, widening the feed spread until at most ``MANY`` ranges remain."""
     found: list[Range] = []
     for spread in SPREADS:
-        found = list(_runs(advice, feeds, spread))
+        found = list(_split_by_feed(advice, feeds, spread))
         if len(found) <= MANY:
             break
     return found
 
 
-def _runs(advice: Sequence[FeedAdvice], feeds: Callable[[int], bool], spread: float) -> Iterator[Range]:
+def _split_by_feed(advice: Sequence[FeedAdvice], feeds: Callable[[int], bool], spread: float) -> Iterator[Range]:
     run: Range = []
     low = high = 0.0
     for a in advice:
         feed = a.plain.run * a.feed_mm_min
         wide = max(high, feed) > spread * min(low, feed)
-        if run and (wide or not (_alike(run[-1], a) and _follows(run[-1], a, feeds))):
+        if run and (wide or not (_is_similar(run[-1], a) and _is_adjacent(run[-1], a, feeds))):
             yield run
             run = []
         low, high = (min(low, feed), max(high, feed)) if run else (feed, feed)
@@ -72,22 +72,22 @@ def _runs(advice: Sequence[FeedAdvice], feeds: Callable[[int], bool], spread: fl
     yield run
 
 
-def _follows(before: FeedAdvice, after: FeedAdvice, feeds: Callable[[int], bool]) -> bool:
+def _is_adjacent(before: FeedAdvice, after: FeedAdvice, feeds: Callable[[int], bool]) -> bool:
     """Return whether no feed line lies between two lines; zones of a demand are never grouped."""
     return 0 < before.line < after.line and not any(map(feeds, range(before.line + 1, after.line)))
 
 
-def _alike(one: FeedAdvice, other: FeedAdvice) -> bool:
+def _is_similar(one: FeedAdvice, other: FeedAdvice) -> bool:
     """Return whether two lines have the same programmed feed, and both or neither keep the tolerance at a lower one."""
     return one.feed_mm_min == other.feed_mm_min and (one.plain.share is None) == (other.plain.share is None)
 
 
-def _worst(one: Range) -> FeedAdvice:
+def _find_worst(one: Range) -> FeedAdvice:
     return max(one, key=lambda a: a.error_um)
 
 
 def _show_range(one: Range, most: Mapping[float, FeedAdvice] | None) -> None:
-    worst, first, last = _worst(one), one[0], one[-1]
+    worst, first, last = _find_worst(one), one[0], one[-1]
     at = f"at line {worst.line}, {worst.where}" if last is not first else f"at {worst.where}"
     name = f"lines {first.line}-{last.line}" if last is not first else f"line {first.line}"
     if not first.line:
@@ -95,7 +95,7 @@ def _show_range(one: Range, most: Mapping[float, FeedAdvice] | None) -> None:
     fast = worst.corrected if worst.corrected and worst.corrected.share is not None else None
     better = "" if fast is None else f", with the correction F{cut(fast.run * worst.feed_mm_min):g}"
     click.echo(
-        f"{name}: F{_span([a.feed_mm_min for a in one])} -> F{_span([cut(a.plain.run * a.feed_mm_min) for a in one])}"
+        f"{name}: F{_format_feed_span([a.feed_mm_min for a in one])} -> F{_format_feed_span([cut(a.plain.run * a.feed_mm_min) for a in one])}"
         f"{better}, worst {worst.error_um:.1f} um {at} ({worst.cause}, most of it axis {worst.axis})"
     )
     axis, what, share = max((a.load for a in one), key=lambda load: load[2])
@@ -106,16 +106,16 @@ def _show_range(one: Range, most: Mapping[float, FeedAdvice] | None) -> None:
         ("without correction", worst.plain, other.plain),
         ("with the correction", worst.corrected, other.corrected),
     ):
-        if held is not None and (held.share is None or _hopes(held, hopeful)):
-            click.echo(f"  {kind}: {_told(held, hopeful, worst.feed_mm_min)}")
+        if held is not None and (held.share is None or _is_clearly_higher(held, hopeful)):
+            click.echo(f"  {kind}: {_format_limit(held, hopeful, worst.feed_mm_min)}")
 
 
-def _span(feeds: Sequence[float]) -> str:
+def _format_feed_span(feeds: Sequence[float]) -> str:
     low, high = min(feeds), max(feeds)
     return f"{high:g}" if cut(low) == cut(high) else f"{low:g}..{high:g}"
 
 
-def _told(held: FeedResult, most: FeedResult | None, feed_mm_min: float) -> str:
+def _format_limit(held: FeedResult, most: FeedResult | None, feed_mm_min: float) -> str:
     if held.share is None:
         left = f": an error of {held.residual_um:.1f} um remains" if math.isfinite(held.residual_um) else ""
         with_it = (
@@ -124,10 +124,10 @@ def _told(held: FeedResult, most: FeedResult | None, feed_mm_min: float) -> str:
             else ""
         )
         return f"no feed down to {cut(held.tried * feed_mm_min):g} mm/min keeps the tolerance{left}{with_it}"
-    hopeful = most.share * feed_mm_min if most and most.share and _hopes(held, most) else None
+    hopeful = most.share * feed_mm_min if most and most.share and _is_clearly_higher(held, most) else None
     more = "" if hopeful is None else f", perhaps {cut(hopeful):g}"
     return f"at most {cut(held.share * feed_mm_min):g} mm/min{more}"
 
 
-def _hopes(held: FeedResult, most: FeedResult | None) -> bool:
+def _is_clearly_higher(held: FeedResult, most: FeedResult | None) -> bool:
     return bool(most and most.share and held.share and most.share > 1.02 * held.share)

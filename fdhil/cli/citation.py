@@ -8,7 +8,7 @@ PAPER = "Trajectory shortcoming prediction from physical parameter estimation"
 TITLE = "fdhil: identify feed drives during rapid moves, predict the path error and correct it"
 
 
-def cite(context: click.Context, _: click.Parameter, is_wanted: bool) -> None:
+def print_citation(context: click.Context, _: click.Parameter, is_wanted: bool) -> None:
     """Print both BibTeX entries and exit."""
     if not is_wanted or context.resilient_parsing:
         return

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fdhil.cli.commission_guide import Asked, Guide, confirm, room_of
-from fdhil.cli.commission_steps import NOTHING, trial_moves
-from fdhil.cli.consent import agreed, answered
+from fdhil.cli.commission_reporter import CommissionOptions, StepReporter, parse_room, require_confirmation
+from fdhil.cli.commission_step_texts import NOTHING, describe_trial_motions
+from fdhil.cli.operator_prompt import ask_text, ask_yes_no
 from fdhil.errors import DriveFault
 
 if TYPE_CHECKING:
@@ -22,8 +22,12 @@ if TYPE_CHECKING:
     from fdhil.records import Notice, Outcome
 
 
-def try_commissioned(
-    machine: MachineConfig, record: CommissioningRecord, options: Asked, progress: Progress, guide: Guide
+def run_trial(
+    machine: MachineConfig,
+    record: CommissioningRecord,
+    options: CommissionOptions,
+    progress: Progress,
+    guide: StepReporter,
 ) -> dict[str, Any] | None:
     """Run the trial of a commissioned axis; None without a room. Raises DriveFault if it is refused."""
     from fdhil.api.compilation_notice import announce_compilation
@@ -31,11 +35,11 @@ def try_commissioned(
 
     axis, room = record.axis, options.room
     if room is None:
-        options.say(f"axis {axis}: no trial, because no --room was given; units, signs and model are unproven")
+        options.show_text(f"axis {axis}: no trial, because no --room was given; units, signs and model are unproven")
         return None
-    guide.moves = trial_moves(machine, axis, room)
+    guide.moves = describe_trial_motions(machine, axis, room)
 
-    def report(step: str) -> None:
+    def report_step(step: str) -> None:
         if step == "return":
             ask_to_move(f"back by {guide.moves[step]} to the start of the trial")
             return
@@ -46,20 +50,25 @@ def try_commissioned(
     def ask_to_move(way: str) -> None:
         if not options.yes:
             advice = "the axis was not moved and its record stays valid; start again when it may move"
-            confirm(axis, f"Axis {axis} will move {way}. Is its path free? Start?", advice)
+            require_confirmation(axis, f"Axis {axis} will move {way}. Is its path free? Start?", advice)
 
-    def result(step: str, found: Found) -> None:
-        guide.result(step, found)
+    def report_result(step: str, found: Found) -> None:
+        guide.report_result(step, found)
         if found.get("return"):
             guide.moves["return"] = found["return"]
 
-    def saw(question: str) -> bool | None:
-        return None if options.yes else agreed(question)
+    def confirm_observation(question: str) -> bool | None:
+        return None if options.yes else ask_yes_no(question)
 
     settings = machine.axis[axis]
-    operator = Operator(report, saw, result, lambda mm: guide.show_position(settings.format_in_unit(mm, form=".3f")))
+    operator = Operator(
+        report_step,
+        confirm_observation,
+        report_result,
+        lambda mm: guide.show_position(settings.format_in_unit(mm, form=".3f")),
+    )
     announce_compilation("identify")
-    with _history(machine, axis) as (known, keep):
+    with _open_history(machine, axis) as (known, keep):
         tried = try_axis(machine, record, room, operator, progress, known)
         keep(tried.outcomes)
     return dict(tried.found)
@@ -71,7 +80,7 @@ def ask_room(axis: str, unit: str) -> Room | None:
         f"How far may axis {axis} move from here, for a jog and for rapids, in {unit}? Back and forward, as: -20 200; "
         "Enter: not at all"
     )
-    said = answered(question)
+    said = ask_text(question)
     words = said.split()
     if not words:
         return None
@@ -79,11 +88,11 @@ def ask_room(axis: str, unit: str) -> Room | None:
         back, forward = map(float, words)
     except ValueError:
         raise DriveFault(f"drive {axis}", f"{said!r} is not two numbers; the axis was not moved, start again") from None
-    return room_of((back, forward))
+    return parse_room((back, forward))
 
 
 @contextmanager
-def _history(
+def _open_history(
     machine: MachineConfig, axis: str
 ) -> Iterator[tuple[PipelineState | None, Callable[[Sequence[Outcome]], None]]]:
     """Yield the history of the axis and a function that stores outcomes.
@@ -102,13 +111,13 @@ def _history(
             return
         store = OutcomeStore(machine)
         open_.callback(store.close)
-        _tell(store.open())
+        _print_notices(store.open())
         yield (
             PipelineState(newest=store.read_axis_history(axis).newest),
-            lambda outcomes: _tell(store.store_outcomes(outcomes)),
+            lambda outcomes: _print_notices(store.store_outcomes(outcomes)),
         )
 
 
-def _tell(notices: Sequence[Notice]) -> None:
+def _print_notices(notices: Sequence[Notice]) -> None:
     for notice in notices:
         click.echo(f"{notice.code}: {notice.text}", err=True)

@@ -6,7 +6,7 @@ from typing import Any
 MOST_SHOWN = 20
 
 
-def changes(answer: Mapping[str, Any]) -> Iterator[str]:
+def describe_changes(answer: Mapping[str, Any]) -> Iterator[str]:
     """Yield the change of each parameter, then the changed verdicts, then the unreadable windows."""
     unknown = f", {answer['without_config']} of them without a configuration" if answer["without_config"] else ""
     yield f"revision {answer['revision']}: {answer['windows']} windows analysed again{unknown}"

@@ -10,8 +10,8 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.bus_lock import lock_bus
+from fdhil.cli.cli_errors import prepare_streams, run_safely
 from fdhil.cli.epilogs import read_epilog
-from fdhil.cli.failing import prepare_streams, run_safely
 from fdhil.cli.options import CONFIG
 from fdhil.errors import DeviceError
 from fdhil.guard.guard_protocol import SETTINGS_NAME
@@ -41,13 +41,13 @@ def guard(config: Path, check: bool) -> None:
     decode_settings(text, str(config))  # settings that the guard would refuse are refused before it starts
     file, bus = run_directory / SETTINGS_NAME, machine.bus[name]
     if check:
-        _write(file, text)
+        _write_settings(file, text)
         click.echo(f"{file}: settings of the guard for {name}")
         return
     with open_transmit_socket(name, bus) as transmit, lock_bus(bus, transmit, run_directory) as lock:
         # if no NC runs the bus, the drives are compared with their commissioning records
         compare_again(machine, name, lambda text: click.echo(json.dumps({"event": "record_void", "text": text})))
-        _write(
+        _write_settings(
             file, encode_settings(guard_configuration.make_guard_settings(machine, name, run_directory, token_sha256))
         )
         greet_hub(name, bus, transmit)
@@ -58,7 +58,7 @@ def guard(config: Path, check: bool) -> None:
         os.execv(sys.executable, [sys.executable, *arguments])
 
 
-def _write(file: Path, text: str) -> None:
+def _write_settings(file: Path, text: str) -> None:
     temporary = file.with_suffix(".new")
     try:
         temporary.unlink(missing_ok=True)

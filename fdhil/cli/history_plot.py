@@ -18,7 +18,7 @@ WIDTH, HEIGHT = 6.0, 2.1  # of a panel, inches
 HEAD, FOOT = 0.8, 0.45
 
 
-def figure_of(histories: Sequence[AxisHistory]) -> Figure:
+def build_figure(histories: Sequence[AxisHistory]) -> Figure:
     """Return a figure with one column per axis and one row per parameter."""
     from matplotlib import style
     from matplotlib.figure import Figure
@@ -50,6 +50,6 @@ def write_plot(histories: Sequence[AxisHistory], path: Path) -> None:
     shown = [history for history in histories if history.list_parameters()]
     if not shown:
         raise FdhilError("nothing to plot: no parameters are published yet; run the daemon while the axes make rapids")
-    figure = figure_of(shown)
+    figure = build_figure(shown)
     with open_output(path) as file:
         figure.savefig(file, format=path.suffix.lower().removeprefix("."), dpi=120)

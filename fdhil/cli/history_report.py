@@ -38,25 +38,25 @@ def write_report(
     notices: Sequence[Mapping[str, Any]] = (),
 ) -> None:
     """Write the report of all recorded axes and their notices. Raises FdhilError without the extra ``report``."""
-    sections = [_verdict(machine, histories, refused)]
-    sections += [_axis_section(history, refused.get(history.axis, Refusals())) for history in histories]
-    sections += [_notices(notices)] if notices else []
+    sections = [_build_verdict_section(machine, histories, refused)]
+    sections += [_build_axis_section(history, refused.get(history.axis, Refusals())) for history in histories]
+    sections += [_build_notice_section(notices)] if notices else []
     page = Page(
         f"{machine.machine.name}: condition of the drives",
-        f"Identified from rapid moves; {_span(histories)}. {INTERVAL_MEANING.capitalize()}.",
-        [_tile(history, refused.get(history.axis, Refusals())) for history in histories],
+        f"Identified from rapid moves; {_describe_time_span(histories)}. {INTERVAL_MEANING.capitalize()}.",
+        [_build_tile(history, refused.get(history.axis, Refusals())) for history in histories],
         sections,
     )
     write_page_or_pdf(page, path, pdf)
 
 
-def _span(histories: Sequence[AxisHistory]) -> str:
+def _describe_time_span(histories: Sequence[AxisHistory]) -> str:
     times = [window["time"] for history in histories for window in (history.health or {}).get("windows", ())]
     times += [row["time"] for history in histories for row in history.rows]
     return f"from {min(times)[:10]} to {max(times)[:10]}" if times else "nothing identified yet"
 
 
-def _tile(history: AxisHistory, refused: Refusals) -> tuple[str, str]:
+def _build_tile(history: AxisHistory, refused: Refusals) -> tuple[str, str]:
     limits = (history.health or {}).get("limits", {})
     if any(limit["reached"] for limit in limits.values()):
         return f"axis {history.axis}", "limit reached"
@@ -70,7 +70,9 @@ def _tile(history: AxisHistory, refused: Refusals) -> tuple[str, str]:
     )
 
 
-def _verdict(machine: MachineConfig, histories: Sequence[AxisHistory], refused: Mapping[str, Refusals]) -> Section:
+def _build_verdict_section(
+    machine: MachineConfig, histories: Sequence[AxisHistory], refused: Mapping[str, Refusals]
+) -> Section:
     shares = machine.maintenance.model_dump()
     rows = [[history.axis, text] for history in histories
             for text in describe_condition(history, refused.get(history.axis, Refusals()))]  # fmt: skip
@@ -82,7 +84,7 @@ def _verdict(machine: MachineConfig, histories: Sequence[AxisHistory], refused: 
     return Section("Condition", "", [Table(("axis", "condition"), rows), *latest])
 
 
-def _axis_section(history: AxisHistory, refused: Refusals) -> Section:
+def _build_axis_section(history: AxisHistory, refused: Refusals) -> Section:
     many = (
         max((len(history.list_estimates(name)) for name in history.list_parameters()), default=0)
         > MOST_SINGLE_ESTIMATES
@@ -91,11 +93,15 @@ def _axis_section(history: AxisHistory, refused: Refusals) -> Section:
         f"With more than {MOST_SINGLE_ESTIMATES} rapids the plots show the median of each day, and a band from the {DAY_PERCENTILES[0]:.0f}th to "
         f"the {DAY_PERCENTILES[1]:.0f}th percentile."
     )  # fmt: skip
-    tables = [*_health_tables(history.health), *_refused_tables(refused), *_revision_tables(history.rows)]
-    return Section(f"Axis {history.axis}", shown, tables, _pictures(history))
+    tables = [
+        *_build_health_tables(history.health),
+        *_build_refusal_tables(refused),
+        *_build_revision_tables(history.rows),
+    ]
+    return Section(f"Axis {history.axis}", shown, tables, _draw_trends(history))
 
 
-def _pictures(history: AxisHistory) -> list[tuple[str, str]]:
+def _draw_trends(history: AxisHistory) -> list[tuple[str, str]]:
     pictures = []
     for name in history.list_parameters():
         what = f"{name.partition('_')[0]}, {PARAMETER_MEANINGS[name]}"
@@ -108,7 +114,7 @@ def _pictures(history: AxisHistory) -> list[tuple[str, str]]:
     return pictures
 
 
-def _health_tables(health: Mapping[str, Any] | None) -> list[Table]:
+def _build_health_tables(health: Mapping[str, Any] | None) -> list[Table]:
     if health is None:
         return []
     slopes = Table(
@@ -118,13 +124,13 @@ def _health_tables(health: Mapping[str, Any] | None) -> list[Table]:
     )
     changes = Table(
         head=["time", "window", "parameters that changed", "likely cause"],
-        rows=[[_minute(c["time"]), str(c["window"]), describe_change(c), c["cause"]] for c in health["changes"]],
+        rows=[[_format_minute(c["time"]), str(c["window"]), describe_change(c), c["cause"]] for c in health["changes"]],
         caption="Changes",
     )
     return [table for table in (slopes, changes) if table.rows]
 
 
-def _refused_tables(refused: Refusals) -> list[Table]:
+def _build_refusal_tables(refused: Refusals) -> list[Table]:
     if not refused.refused:
         return []
     rows = [[code, str(count), text, time] for code, count, text, time in refused.reasons]
@@ -132,7 +138,7 @@ def _refused_tables(refused: Refusals) -> list[Table]:
     return [Table(("reason", "count", "text of the latest", "time of the latest"), rows, caption)]
 
 
-def _revision_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
+def _build_revision_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
     if not rows:
         return []
     names = list(dict.fromkeys(name for row in rows for name in row["parameters"]))
@@ -142,7 +148,7 @@ def _revision_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
     cells = [
         [
             str(row["revision"]),
-            _minute(row["time"]),
+            _format_minute(row["time"]),
             "" if row["temperature_c"] is None else f"{row['temperature_c']:.2f}",
             str(row["windows_used"]),
             *(format_cell(name, its["value"], compute_half_width(its), " ") for name, its in row["parameters"].items()),
@@ -154,22 +160,28 @@ def _revision_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
     return [Table(head, cells, caption, folded=f"{len(rows)} published parameter sets")]
 
 
-def _notices(notices: Sequence[Mapping[str, Any]]) -> Section:
+def _build_notice_section(notices: Sequence[Mapping[str, Any]]) -> Section:
     waiting = sum(notice["acknowledged"] is None for notice in notices)
     shown = sorted(notices, key=lambda notice: (notice["acknowledged"] is not None, -notice["number"]))[:MOST_NOTICES]
     rows = [
-        [_minute(n["time"]), n["severity"], n["axis"] or "-", f"{n['code']}: {n['text']}", _answered(n["acknowledged"])]
+        [
+            _format_minute(n["time"]),
+            n["severity"],
+            n["axis"] or "-",
+            f"{n['code']}: {n['text']}",
+            _format_acknowledgement(n["acknowledged"]),
+        ]
         for n in shown
     ]
     caption = f"{waiting} pending; {len(shown)} of {len(notices)} are shown"
     return Section("Notices", "", [Table(("time (UTC)", "severity", "axis", "notice", "acknowledged"), rows, caption)])
 
 
-def _answered(given: Mapping[str, Any] | None) -> str:
+def _format_acknowledgement(given: Mapping[str, Any] | None) -> str:
     if given is None:
         return "pending"
-    return f"{given['who']}, {_minute(given['time'])}" + (f": {given['note']}" if given["note"] else "")
+    return f"{given['who']}, {_format_minute(given['time'])}" + (f": {given['note']}" if given["note"] else "")
 
 
-def _minute(time: str) -> str:
+def _format_minute(time: str) -> str:
     return time[:16].replace("T", " ")

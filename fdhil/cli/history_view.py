@@ -6,7 +6,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from fdhil.cli.status_view import narrow_table, open_console
+from fdhil.cli.status_view import make_narrow_table, open_console
 from fdhil.report.drive_health import build_slope_rows, describe_change
 from fdhil.report.parameter_format import format_minute
 
@@ -18,7 +18,7 @@ def show_health(told: Mapping[str, Mapping[str, Any]], console: Console | None =
     out = console or open_console()
     for axis, its in told.items():
         if rows := build_slope_rows(its):
-            table = narrow_table(f"axis {axis}: slopes")
+            table = make_narrow_table(f"axis {axis}: slopes")
             for text in ("parameter", "per kelvin of\nthe slide-way", "per day", "maintenance limit"):
                 table.add_column(text)
             for row in rows:
@@ -38,15 +38,15 @@ def show_notices(notices: Sequence[Mapping[str, Any]], console: Console | None =
     if waiting:
         out.print(f"pending notices (see fdhil acknowledge): {len(waiting)}", highlight=False)
     for notice in waiting[-SHOWN_OPEN:]:
-        out.print(escape(_line(notice)), highlight=False)
+        out.print(escape(_format_notice(notice)), highlight=False)
     for notice in done[-SHOWN_DONE:]:
         given = notice["acknowledged"]
         note = f": {given['note']}" if given["note"] else ""
-        text = f"{_line(notice)}\n    acknowledged by {given['who']} on {format_minute(given['time'])}{note}"
+        text = f"{_format_notice(notice)}\n    acknowledged by {given['who']} on {format_minute(given['time'])}{note}"
         out.print(escape(text), highlight=False)
 
 
-def _line(notice: Mapping[str, Any]) -> str:
+def _format_notice(notice: Mapping[str, Any]) -> str:
     where = f"{notice['axis']}: " if notice["axis"] else ""
     number = "" if notice["number"] is None else f"{notice['number']:>5}  "
     return f"{number}{format_minute(notice['time'])}  {notice['severity']:5}  {where}{notice['code']}: {notice['text']}"

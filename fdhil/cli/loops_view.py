@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from fdhil.config import Axis
 
 
-def loops_line(status: Mapping[str, Any]) -> str:
+def format_loop_status(status: Mapping[str, Any]) -> str:
     """Return the loops of an axis' status as text; empty if they match the configuration."""
     if status["validated"] and not status["warnings"]:
         return ""

@@ -8,8 +8,8 @@ from importlib import import_module
 
 import click
 
-from fdhil.cli.citation import cite
-from fdhil.cli.failing import SuggestingGroup, prepare_streams, run_safely
+from fdhil.cli.citation import print_citation
+from fdhil.cli.cli_errors import SuggestingGroup, prepare_streams, run_safely
 
 __all__ = ["COMMANDS", "cli", "main", "run_safely"]
 
@@ -18,49 +18,52 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "Try": {
         "demo": ("fdhil.cli.demo:demo", "Run the whole loop on a simulated machine and write a report."),
         "paper": ("fdhil.cli.paper:paper", "Test the claims of the reference paper on simulated machines."),
-        "sim": ("fdhil.cli.sim:sim", "Simulate a machine with drives, sensors and NC."),
+        "sim": ("fdhil.cli.sim_command:sim", "Simulate a machine with drives, sensors and NC."),
     },
     "Set up": {
-        "init": ("fdhil.cli.init:init", "Create a configuration from NC files, drives and questions."),
-        "scan": ("fdhil.cli.commissioning:scan", "List the nodes on the CAN bus."),
-        "check": ("fdhil.cli.commissioning:check", "Compare the drives on the bus with the configuration."),
-        "commission": ("fdhil.cli.commission:commission", "Commission the drives, step by step."),
+        "init": ("fdhil.cli.init_command:init", "Create a configuration from NC files, drives and questions."),
+        "scan": ("fdhil.cli.bus_commands:scan", "List the nodes on the CAN bus."),
+        "check": ("fdhil.cli.bus_commands:check", "Compare the drives on the bus with the configuration."),
+        "commission": ("fdhil.cli.commission_command:commission", "Commission the drives, step by step."),
         "doctor": ("fdhil.cli.doctor:doctor", "Diagnose the PC, bus, drives, sensors, store and clock."),
-        "eds": ("fdhil.cli.eds:eds", "Assess a drive from its EDS or DCF file."),
+        "eds": ("fdhil.cli.eds_command:eds", "Assess a drive from its EDS or DCF file."),
     },
     "Run": {
-        "run": ("fdhil.cli.service:run", "Run the daemon: identify, predict, and correct once armed."),
-        "status": ("fdhil.cli.service:status", "Show the daemon's status."),
-        "arm": ("fdhil.cli.service:arm", "Arm the correction of one program."),
-        "disarm": ("fdhil.cli.service:disarm", "Ramp the correction to zero and disarm."),
-        "adopt": ("fdhil.cli.service:adopt", "Ramp an offset that is still applied to zero."),
-        "acknowledge": ("fdhil.cli.service:acknowledge", "Acknowledge pending notices."),
-        "web": ("fdhil.cli.web:web", "Serve the machine pages for a browser."),
-        "web-user": ("fdhil.cli.web:web_user", "Manage web users and their roles."),
-        "publish": ("fdhil.cli.publish:publish", "Publish status over OPC UA, MQTT, MTConnect or Prometheus."),
+        "run": ("fdhil.cli.daemon_commands:run", "Run the daemon: identify, predict, and correct once armed."),
+        "status": ("fdhil.cli.daemon_commands:status", "Show the daemon's status."),
+        "arm": ("fdhil.cli.daemon_commands:arm", "Arm the correction of one program."),
+        "disarm": ("fdhil.cli.daemon_commands:disarm", "Ramp the correction to zero and disarm."),
+        "adopt": ("fdhil.cli.daemon_commands:adopt", "Ramp an offset that is still applied to zero."),
+        "acknowledge": ("fdhil.cli.daemon_commands:acknowledge", "Acknowledge pending notices."),
+        "web": ("fdhil.cli.web_commands:web", "Serve the machine pages for a browser."),
+        "web-user": ("fdhil.cli.web_commands:web_user", "Manage web users and their roles."),
+        "publish": ("fdhil.cli.publish_command:publish", "Publish status over OPC UA, MQTT, MTConnect or Prometheus."),
     },
     "Programs": {
-        "predict": ("fdhil.cli.prediction:predict", "Predict the path error of a program before the cut."),
-        "correct": ("fdhil.cli.prediction:correct", "Plan the correction of a program."),
-        "advise": ("fdhil.cli.advise:advise", "Compute the highest feed per line that keeps a tolerance."),
-        "interpret": ("fdhil.cli.program:interpret", "List the motions of an NC program."),
-        "record": ("fdhil.cli.record:record", "Record the demand of an air cut from the bus."),
-        "play": ("fdhil.cli.play:play", "Stream a program to the drives of a bench without NC."),
+        "predict": ("fdhil.cli.prediction_commands:predict", "Predict the path error of a program before the cut."),
+        "correct": ("fdhil.cli.prediction_commands:correct", "Plan the correction of a program."),
+        "advise": ("fdhil.cli.advise_command:advise", "Compute the highest feed per line that keeps a tolerance."),
+        "interpret": ("fdhil.cli.interpret_command:interpret", "List the motions of an NC program."),
+        "record": ("fdhil.cli.record_command:record", "Record the demand of an air cut from the bus."),
+        "play": ("fdhil.cli.play_command:play", "Stream a program to the drives of a bench without NC."),
     },
     "Look back": {
-        "identify": ("fdhil.cli.identify:identify", "Identify a drive from recordings."),
-        "history": ("fdhil.cli.records:history", "Show parameters, trends and notices over time."),
-        "report": ("fdhil.cli.records:report", "Write an HTML report of the history."),
-        "replay": ("fdhil.cli.records:replay", "Repeat the analysis of recorded windows, bit for bit."),
-        "compare": ("fdhil.cli.compare:compare", "Compare passes, models or recordings before and after a change."),
-        "audit": ("fdhil.cli.audit:audit", "Show and verify the audit log."),
-        "acceptance": ("fdhil.cli.acceptance:acceptance", "Write the acceptance report of a machine."),
-        "export": ("fdhil.cli.records:export", "Convert a recording or bus log to another format."),
+        "identify": ("fdhil.cli.identify_command:identify", "Identify a drive from recordings."),
+        "history": ("fdhil.cli.history_commands:history", "Show parameters, trends and notices over time."),
+        "report": ("fdhil.cli.history_commands:report", "Write an HTML report of the history."),
+        "replay": ("fdhil.cli.history_commands:replay", "Repeat the analysis of recorded windows, bit for bit."),
+        "compare": (
+            "fdhil.cli.compare_command:compare",
+            "Compare passes, models or recordings before and after a change.",
+        ),
+        "audit": ("fdhil.cli.audit_command:audit", "Show and verify the audit log."),
+        "acceptance": ("fdhil.cli.acceptance_command:acceptance", "Write the acceptance report of a machine."),
+        "export": ("fdhil.cli.history_commands:export", "Convert a recording or bus log to another format."),
     },
     "Plant": {
-        "uplink": ("fdhil.cli.fleet:uplink", "Send this machine's records to the fleet server."),
-        "fleet": ("fdhil.cli.fleet:fleet", "Collect and compare the histories of many machines."),
-        "offers": ("fdhil.cli.offers:offers", "List, accept or reject proposed configuration changes."),
+        "uplink": ("fdhil.cli.fleet_commands:uplink", "Send this machine's records to the fleet server."),
+        "fleet": ("fdhil.cli.fleet_commands:fleet", "Collect and compare the histories of many machines."),
+        "offers": ("fdhil.cli.offers_commands:offers", "List, accept or reject proposed configuration changes."),
     },
 }
 COMMANDS = {name: entry for commands in GROUPS.values() for name, entry in commands.items()}
@@ -109,13 +112,13 @@ class LazyGroup(SuggestingGroup):
                 formatter.write_dl([(name.ljust(NAME_WIDTH), text) for name, (_, text) in commands.items()])
 
 
-def leaves(group: click.Group, before: str = "") -> Iterator[tuple[str, click.Command]]:
+def iterate_commands(group: click.Group, before: str = "") -> Iterator[tuple[str, click.Command]]:
     """Yield each command with its full name, as "fleet collect"; imports all of them."""
     context = click.Context(group)
     for name in group.list_commands(context):
         command = group.get_command(context, name)
         if isinstance(command, click.Group):
-            yield from leaves(command, f"{before}{name} ")
+            yield from iterate_commands(command, f"{before}{name} ")
         elif command is not None:
             yield f"{before}{name}", command
 
@@ -127,7 +130,7 @@ def leaves(group: click.Group, before: str = "") -> Iterator[tuple[str, click.Co
     is_flag=True,
     is_eager=True,
     expose_value=False,
-    callback=cite,
+    callback=print_citation,
     help="Show the BibTeX entries of fdhil and its reference paper, then exit.",
 )
 def cli() -> None:

@@ -33,8 +33,10 @@ def write_model(results: Sequence[FileResult], axes: Mapping[str, Axis], path: P
     if not valid:
         click.echo(f"fdhil: {path} is not written, because no recording gives a validated model", err=True)
         return
-    loops = {r.axis: found for r in results if r.axis and (found := _loops(r.loops, axes.get(r.axis))) is not None}
-    refuting = {r.axis: reason for r in results if r.axis and (reason := _refuting(r, axes)) is not None}
+    loops = {
+        r.axis: found for r in results if r.axis and (found := _select_loops(r.loops, axes.get(r.axis))) is not None
+    }
+    refuting = {r.axis: reason for r in results if r.axis and (reason := _find_refuting_reason(r, axes)) is not None}
     if wrong := sorted(refuting.keys() & valid.keys() - loops.keys()):
         text = f"axis {wrong[0]}: {refuting[wrong[0]]}; {refuting[wrong[0]].advice}"
         click.echo(f"fdhil: {path} is not written, its loops would be wrong: {text}", err=True)
@@ -44,14 +46,14 @@ def write_model(results: Sequence[FileResult], axes: Mapping[str, Axis], path: P
         click.echo(f"{text} regulators, which these recordings did not confirm; give --config or --loops", err=True)
     shown = {r.axis: {"held_out": asdict(r.held_out)} for r in results if r.axis and r.held_out is not None}
     document = {
-        name: _model(name, pooled, axes.get(name)) | loops.get(name, {}) | shown.get(name, {})
+        name: _build_model(name, pooled, axes.get(name)) | loops.get(name, {}) | shown.get(name, {})
         for name, pooled in valid.items()
     }
     with open_output(path) as file:
         file.write((json.dumps(document, indent=2, allow_nan=False) + "\n").encode())
 
 
-def _model(name: str, estimate: Estimate, axis: Axis | None) -> dict[str, Any]:
+def _build_model(name: str, estimate: Estimate, axis: Axis | None) -> dict[str, Any]:
     values = {key: estimate.get_value(key) for key in PARAMETERS}
     unknown = [key for key, value in values.items() if not math.isfinite(value)]
     if unknown and axis is None:
@@ -63,7 +65,7 @@ def _model(name: str, estimate: Estimate, axis: Axis | None) -> dict[str, Any]:
     return {**values, "terms": terms} if terms else values
 
 
-def _refuting(result: FileResult, axes: Mapping[str, Axis]) -> Reason | None:
+def _find_refuting_reason(result: FileResult, axes: Mapping[str, Axis]) -> Reason | None:
     """Return the reason why the loops used with a model cannot be the drive's, or None."""
     reasons = [reason for reason in result.verdict.reasons if reason.code == LOOPS_DIFFER]
     if result.loops is not None and result.axis not in axes:
@@ -71,7 +73,7 @@ def _refuting(result: FileResult, axes: Mapping[str, Axis]) -> Reason | None:
     return reasons[0] if reasons else None
 
 
-def _loops(found: LoopEstimate | None, axis: Axis | None) -> dict[str, Any] | None:
+def _select_loops(found: LoopEstimate | None, axis: Axis | None) -> dict[str, Any] | None:
     """Return the loops that explain the rapids better than the configured ones, or None."""
     if found is None or not found.verdict.accepted:
         return None

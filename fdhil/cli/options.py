@@ -9,14 +9,14 @@ from typing import Any
 
 import click
 
-from fdhil.cli.failing import wants_json
+from fdhil.cli.cli_errors import is_json_requested
 from fdhil.errors import ConfigError, ConfigFault
 from fdhil.store.output_file import check_output
 
 DEFAULT_CONFIG = Path("machine.toml")
 
 
-def _check_default(_ctx: click.Context, _param: click.Parameter, value: Path) -> Path:
+def _require_default_config(_ctx: click.Context, _param: click.Parameter, value: Path) -> Path:
     if value == DEFAULT_CONFIG and not value.exists():
         fault = ConfigFault("file", "is not in this folder", "name the configuration, or create one with fdhil init")
         raise ConfigError(str(value), [fault])
@@ -26,9 +26,9 @@ def _check_default(_ctx: click.Context, _param: click.Parameter, value: Path) ->
 # readability is checked when reading: an unreadable file is exit code 3, not a wrong call
 FILE = click.Path(path_type=Path, readable=False)
 FOLDER = click.Path(path_type=Path, readable=False, file_okay=False)
-CONFIG = click.argument("config", type=FILE, default=DEFAULT_CONFIG, callback=_check_default)
+CONFIG = click.argument("config", type=FILE, default=DEFAULT_CONFIG, callback=_require_default_config)
 CONFIG_OPTION = click.option("--config", "config_path", type=FILE, default=DEFAULT_CONFIG, show_default=True,
-                             callback=_check_default, help="Machine configuration (TOML).")  # fmt: skip
+                             callback=_require_default_config, help="Machine configuration (TOML).")  # fmt: skip
 FLEET = click.argument("fleet", type=FILE)
 PROGRAM = click.argument("program", type=FILE, metavar="PROGRAM|DEMAND.csv")
 MODEL = click.option("--model", "model_path", type=FILE, help="Model file (JSON) with the parameters of each axis.")
@@ -42,7 +42,7 @@ COLUMNS = click.option(
 )
 
 
-class Positive(click.FloatRange):
+class PositiveFloat(click.FloatRange):
     """A finite number above 0, or within a positive range; rejects nan and infinity, which a FloatRange accepts."""
 
     def __init__(self, least: float | None = None, most: float | None = None) -> None:
@@ -72,7 +72,7 @@ class OutputFile(click.Path):
         return path
 
 
-class Picture(OutputFile):
+class PictureFile(OutputFile):
     """An image file to write; ``-`` derives its name from the recording."""
 
     def __init__(self) -> None:
@@ -83,7 +83,7 @@ class Picture(OutputFile):
         return Path(value) if str(value) == "-" else super().convert(value, param, ctx)
 
 
-class ConfigFirst(click.Command):
+class ConfigFirstCommand(click.Command):
     """A command whose CONFIG is optional although other arguments follow it."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -96,28 +96,28 @@ class ConfigFirst(click.Command):
         return super().parse_args(ctx, args)
 
 
-class Writing(click.Command):
+class WritingCommand(click.Command):
     """A command with output files: refuses to overwrite its inputs or to write a file twice, and reports each file."""
 
     def invoke(self, ctx: click.Context) -> Any:
         """Compare outputs with inputs, run the command, then report the files that were written."""
-        given = [(p, path) for p in self.params for path in _paths(ctx.params.get(str(p.name)))]
+        given = [(p, path) for p in self.params for path in _list_paths(ctx.params.get(str(p.name)))]
         for k, (option, path) in enumerate(given):
             for other, there in given[:k] + given[k + 1 :]:
-                if isinstance(option.type, OutputFile) and _same_file(path, there):
+                if isinstance(option.type, OutputFile) and _is_same_file(path, there):
                     text = f"{path} is also named by {other.human_readable_name}; choose another name"
                     raise click.BadParameter(text, ctx, option)
         outputs = [path for option, path in given if isinstance(option.type, OutputFile)]
-        before = [_identity(path) for path in outputs]
+        before = [_read_file_identity(path) for path in outputs]
         try:
             return super().invoke(ctx)
         finally:  # a command that answers no writes its file as well
             for path, old in zip(outputs, before, strict=True):
-                if _identity(path) != old and (not wants_json() or sys.stderr.isatty()):
+                if _read_file_identity(path) != old and (not is_json_requested() or sys.stderr.isatty()):
                     click.echo(f"wrote {path}", err=True)
 
 
-def _identity(path: Path) -> tuple[int, int] | None:
+def _read_file_identity(path: Path) -> tuple[int, int] | None:
     """Return inode and modification time of a regular file, which change when it is written; None if there is none."""
     try:
         found = path.stat()
@@ -126,7 +126,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return (found.st_ino, found.st_mtime_ns) if stat.S_ISREG(found.st_mode) else None
 
 
-def _same_file(path: Path, there: Path) -> bool:
+def _is_same_file(path: Path, there: Path) -> bool:
     """Return whether two names denote one regular file, existing or not yet written."""
     try:
         return path.samefile(there) and path.is_file()
@@ -134,6 +134,6 @@ def _same_file(path: Path, there: Path) -> bool:
         return os.path.realpath(path) == os.path.realpath(there)
 
 
-def _paths(value: Any) -> list[Path]:
+def _list_paths(value: Any) -> list[Path]:
     values = value if isinstance(value, tuple) else (value,)
     return [path for path in values if isinstance(path, Path)]

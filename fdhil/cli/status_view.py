@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from fdhil.cli.console import PrintableConsole
-from fdhil.cli.loops_view import loops_line
+from fdhil.cli.loops_view import format_loop_status
+from fdhil.cli.printable_console import PrintableConsole
 from fdhil.records import PARAMETERS
 from fdhil.report.parameter_format import INTERVAL_MEANING, compute_half_width, format_cell, format_heading
 
@@ -42,20 +42,22 @@ def open_console() -> Console:
     return PrintableConsole(width=shutil.get_terminal_size((80, 24)).columns)
 
 
-def show(status: Mapping[str, Any], console: Console | None = None) -> None:
+def show_status(status: Mapping[str, Any], console: Console | None = None) -> None:
     """Print the status document."""
     out = console or open_console()
     guard = status.get("guard") or {}
-    out.print(f"[bold]{escape(status['machine'])}[/bold]: {_heard(status)}, up {_ago(status['uptime_s'])}")
+    out.print(
+        f"[bold]{escape(status['machine'])}[/bold]: {_describe_source(status)}, up {_format_age(status['uptime_s'])}"
+    )
     if difference := status.get("config_difference"):
         out.print(f"[red]{escape(difference)}[/red]")
-    out.print(counted(status.get("counters", {})))
+    out.print(format_counters(status.get("counters", {})))
     if nc := status.get("nc"):
-        out.print(escape(nc_line(nc)))
+        out.print(escape(format_nc_state(nc)))
     loads = "".join(f", {bus} loaded {load:.0f} %" for bus, load in status["bus_load_percent"].items())
-    out.print(escape(f"correction: {status['state']}, guard {_guard(guard)}{loads}"))
+    out.print(escape(f"correction: {status['state']}, guard {_describe_guard(guard)}{loads}"))
     if lateness := guard.get("lateness"):
-        out.print(lateness_line(lateness["recent"]))
+        out.print(format_lateness(lateness["recent"]))
     residual = status.get("may_stand", {"nothing": True})
     if guard.get("state") == "lost":
         out.print(f"[red]{escape(guard['text'])}[/red]")
@@ -78,78 +80,80 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
     for trouble in status.get("troubles", []):
         where = f"{trouble['axis']}: " if trouble["axis"] else ""
         out.print(f"[red]{escape(where + trouble['code'])}[/red]: {escape(trouble['text'])}")
-    for alarm in _other_alarms(status):
+    for alarm in _select_other_alarms(status):
         where = f"{alarm['axis']}: " if alarm["axis"] else ""
         often = f", {alarm['count']} times since {alarm['first']}" if alarm["count"] > 1 else ""
         out.print(
             f"[red]{escape(where + alarm['code'])}[/red] active since {alarm['since']}{often}: {escape(alarm['text'])}"
         )
-    out.print(_axes_table(status["axes"]))
+    out.print(_build_axes_table(status["axes"]))
     for axis, found in status["axes"].items():
-        if unused := _unused(found):
+        if unused := _describe_unused_moves(found):
             out.print(escape(f"{axis}: {unused}"))
-        if text := believed(found):
+        if text := describe_model(found):
             out.print(escape(f"{axis}: {text}"))
-        if (loops := found.get("loops")) and (line := loops_line(loops)):
+        if (loops := found.get("loops")) and (line := format_loop_status(loops)):
             out.print(escape(f"{axis}: {line}"))
     if (waiting := status.get("unacknowledged") or {}).get("count"):
         out.print(f"pending notices: {waiting['count']}, of them MAJOR {waiting['MAJOR']}")
     for notice in status["notices"][-5:]:
-        out.print(escape(_notice_line(notice)))
+        out.print(escape(_format_notice(notice)))
 
 
-def _other_alarms(status: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+def _select_other_alarms(status: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     # alarms that are also troubles are shown as troubles
     shown = {(trouble["code"], trouble["axis"]) for trouble in status.get("troubles", [])}
     alarms = (status.get("alarms") or {}).get("first", [])
     return [one for one in alarms if one["state"] == "active" and (one["code"], one["axis"]) not in shown]
 
 
-def _notice_line(notice: Mapping[str, Any]) -> str:
+def _format_notice(notice: Mapping[str, Any]) -> str:
     axis = f"{notice['axis']}: " if notice["axis"] else ""
     given = notice.get("acknowledged")
     seen = f" (acknowledged by {given['who']})" if given else ""
     number = f"  {notice['number']:>4}" if notice.get("number") is not None else "      "
-    line = f"{_ago(notice['age_s']):>9} ago{number}  {notice['severity']:5}  {axis}{notice['code']}: {notice['text']}"
+    line = f"{_format_age(notice['age_s']):>9} ago{number}  {notice['severity']:5}  {axis}{notice['code']}: {notice['text']}"
     return line + seen
 
 
-def _heard(status: Mapping[str, Any]) -> str:
+def _describe_source(status: Mapping[str, Any]) -> str:
     source, sync = status["source"], status["sync"]
     state = source["state"]
     if state != "listening":
-        state = f"[red]{state}[/red] for {_ago(source['heard_s_ago'] if state == 'silent' else source['since_s'])}"
-    quiet = [f"{bus} silent for {_ago(age_s)}" for bus, age_s in source["buses"].items() if age_s > LIVE_S]
+        state = (
+            f"[red]{state}[/red] for {_format_age(source['heard_s_ago'] if state == 'silent' else source['since_s'])}"
+        )
+    quiet = [f"{bus} silent for {_format_age(age_s)}" for bus, age_s in source["buses"].items() if age_s > LIVE_S]
     if state == "listening" and quiet:
         state = f"{state}, [red]{escape(', '.join(quiet))}[/red]"
     if sync["rate_hz"] is not None:
         return f"{state}, SYNC {sync['rate_hz']:.1f} Hz of {sync['expected_hz']:.0f}"
     last_s = sync["heard_s_ago"]
-    return f"{state}, " + ("no SYNC yet" if last_s is None else f"no SYNC for {_ago(last_s)}")
+    return f"{state}, " + ("no SYNC yet" if last_s is None else f"no SYNC for {_format_age(last_s)}")
 
 
-def _guard(guard: Mapping[str, Any]) -> str:
+def _describe_guard(guard: Mapping[str, Any]) -> str:
     # an old answer may be outdated
     state, heard_s = str(guard.get("state", "absent")), guard.get("heard_s_ago")
     if state == "absent" or heard_s is None:
         return state
     if state == "lost":
-        return f"lost, last seen {_ago(heard_s)} ago in state {guard.get('last_state')}"
-    return state if heard_s <= GUARD_LIVE_S else f"{state} at its last answer, {_ago(heard_s)} ago"
+        return f"lost, last seen {_format_age(heard_s)} ago in state {guard.get('last_state')}"
+    return state if heard_s <= GUARD_LIVE_S else f"{state} at its last answer, {_format_age(heard_s)} ago"
 
 
-def lateness_line(recent: Mapping[str, Any]) -> str:
+def format_lateness(recent: Mapping[str, Any]) -> str:
     """Return the lateness of this PC in the last minute or two, measured by the guard, as text."""
     worst = f"the slowest after {recent['worst_us'] / 1e3:.2f} ms"
     if not recent["late"]:
-        return f"this PC: none of the last {grouped(recent['turns'])} offsets late, {worst}"
-    return f"[red]this PC: {grouped(recent['late'])} of the last {grouped(recent['turns'])} offsets late[/red], {worst}"
+        return f"this PC: none of the last {group_digits(recent['turns'])} offsets late, {worst}"
+    return f"[red]this PC: {group_digits(recent['late'])} of the last {group_digits(recent['turns'])} offsets late[/red], {worst}"
 
 
-def nc_line(nc: Mapping[str, Any]) -> str:
+def format_nc_state(nc: Mapping[str, Any]) -> str:
     """Return the state reported by the NC as text."""
     if nc["motion"] == "unknown":
-        return f"NC: no data for {_ago(nc['heard_s_ago'])}, its moves are unknown"
+        return f"NC: no data for {_format_age(nc['heard_s_ago'])}, its moves are unknown"
     program = (nc["program"] or "").rpartition("/")[2]
     line = "" if nc["line"] is None else f" line {nc['line']}" + (f" of {program}" if program else "")
     parts = [f"{nc['motion']}{line}"]
@@ -162,31 +166,33 @@ def nc_line(nc: Mapping[str, Any]) -> str:
     return "NC: " + ", ".join(parts)
 
 
-def _ago(seconds: float) -> str:
+def _format_age(seconds: float) -> str:
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
-def grouped(count: int) -> str:
+def group_digits(count: int) -> str:
     """Return a count with its digits in groups of three."""
     return f"{count:,}".replace(",", " ")
 
 
-def counted(counters: Mapping[str, Any]) -> str:
+def format_counters(counters: Mapping[str, Any]) -> str:
     """Return the frame counters as text: received, lost, and all others that are not 0."""
     if not counters:
         return "frames: none"
-    text = f"frames received {grouped(counters.get('frames', 0))}, lost {grouped(counters.get('lost', 0))}"
+    text = f"frames received {group_digits(counters.get('frames', 0))}, lost {group_digits(counters.get('lost', 0))}"
     parts = []
     for name, count in counters.items():
         where, _, what = name.rpartition(".")
         if count and what in COUNTED:
-            parts.append(f"{where}: {COUNTED[what]} {grouped(count)}" if where else f"{COUNTED[what]} {grouped(count)}")
+            parts.append(
+                f"{where}: {COUNTED[what]} {group_digits(count)}" if where else f"{COUNTED[what]} {group_digits(count)}"
+            )
     return escape(f"{text} ({'; '.join(parts)})" if parts else text)
 
 
-def _unused(axis: Mapping[str, Any]) -> str:
+def _describe_unused_moves(axis: Mapping[str, Any]) -> str:
     moves = axis.get("moves") or {}
     reasons = [f"{count} refused: {code}" for code, count in axis.get("refused_by", {}).items()]
     if moves.get("too_slow"):
@@ -198,7 +204,7 @@ def _unused(axis: Mapping[str, Any]) -> str:
     return f"{moves.get('seen', 0)} moves detected; not used: {', '.join(reasons)}" if reasons else ""
 
 
-def believed(axis: Mapping[str, Any]) -> str:
+def describe_model(axis: Mapping[str, Any]) -> str:
     """Return additional terms, unexplained error at the table, and warnings of an axis as text."""
     terms = ", ".join(
         f"{name} {format_cell(name, term['value'], compute_half_width(term), ' ')} {term['unit']}"
@@ -210,8 +216,8 @@ def believed(axis: Mapping[str, Any]) -> str:
     return "; ".join(part for part in parts if part)
 
 
-def _axes_table(axes: Mapping[str, Any]) -> Table:
-    table = narrow_table()
+def _build_axes_table(axes: Mapping[str, Any]) -> Table:
+    table = make_narrow_table()
     for text in ("axis", "windows\nok/not", "rev", *map(format_heading, PARAMETERS)):
         table.add_column(text, no_wrap=True)
     for name, axis in axes.items():
@@ -225,7 +231,7 @@ def _axes_table(axes: Mapping[str, Any]) -> Table:
     return table
 
 
-def narrow_table(title: str | None = None) -> Table:
+def make_narrow_table(title: str | None = None) -> Table:
     """Return a table whose parameter columns fit 80 columns, with a caption that explains ±."""
     table = Table(
         title=title, title_justify="left", caption=INTERVAL_MEANING, caption_justify="left", box=box.SIMPLE_HEAD
@@ -234,7 +240,7 @@ def narrow_table(title: str | None = None) -> Table:
     return table
 
 
-def sparkline(values: Sequence[float]) -> str:
+def draw_sparkline(values: Sequence[float]) -> str:
     """Return values as a row of bars, scaled from the lowest to the highest."""
     low, high = min(values), max(values)
     span = high - low or 1.0
@@ -248,7 +254,7 @@ def show_history(rows: Sequence[Mapping[str, Any]], console: Console | None = No
         of_axis = [row for row in rows if row["axis"] == axis]
         names = list(of_axis[0]["parameters"])
         first, last = (of_axis[k]["time"][:10] for k in (0, -1))
-        table = narrow_table(f"axis {axis}: {len(of_axis)} revisions, {first} to {last}")
+        table = make_narrow_table(f"axis {axis}: {len(of_axis)} revisions, {first} to {last}")
         for text in ("rev", "time\nUTC", "degC", "win", *map(format_heading, names)):
             table.add_column(text, no_wrap=True)
         for row in of_axis[-newest:]:
@@ -259,7 +265,7 @@ def show_history(rows: Sequence[Mapping[str, Any]], console: Console | None = No
             ]
             time = row["time"][5:16].replace("T", "\n")
             table.add_row(str(row["revision"]), time, degrees, str(row["windows_used"]), *cells)
-        courses = [sparkline([row["parameters"][name]["value"] for row in of_axis[-COURSE:]]) for name in names]
+        courses = [draw_sparkline([row["parameters"][name]["value"] for row in of_axis[-COURSE:]]) for name in names]
         table.add_section()
         table.add_row("", "trend", "", "", *courses)
         out.print(table)

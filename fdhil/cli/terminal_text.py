@@ -9,7 +9,7 @@ _LAYOUT = "\n\t"
 _REPLACEMENT = "\N{REPLACEMENT CHARACTER}"
 
 
-def without_controls(text: str) -> str:
+def replace_controls(text: str) -> str:
     """Return text with each control or direction character, except newline and tab, replaced by a mark.
 
     >>> without_controls("axis \\x1b[2J X\\n") == "axis \\N{REPLACEMENT CHARACTER}[2J X\\n"

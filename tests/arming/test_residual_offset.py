@@ -374,7 +374,7 @@ def test_hanging_disk_delays_adoption_only_briefly(
         append(folder, entry)
 
     monkeypatch.setattr(audit_file, "append_entry", slow)
-    monkeypatch.setattr("fdhil.cli.audited.DISK_S", 0.05)
+    monkeypatch.setattr("fdhil.cli.audit_hook.DISK_S", 0.05)
     now = [FROZEN, OFF]
     guard.says = lambda kind: {"ok": True} if kind == "adopt" else now.pop(0) if len(now) > 1 else now[0]
     code, out, err = fdhil("adopt", machine, "--yes", capsys=capsys)
@@ -419,7 +419,7 @@ def test_guard_with_own_run_directory_is_found(machine: Path, capsys: Any) -> No
 def test_disarm_with_hanging_daemon_asks_the_guard(
     machine: Path, folder: Path, guard: GuardPeer, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
-    monkeypatch.setattr("fdhil.cli.service.DISARM_S", 0.05)
+    monkeypatch.setattr("fdhil.cli.daemon_commands.DISARM_S", 0.05)
     with socket.socket(socket.AF_UNIX) as hung:
         hung.bind(str(folder / "daemon.sock"))
         hung.listen()

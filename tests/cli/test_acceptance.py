@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.cli.doctor.latency import keep_latency, measure_latency
+from fdhil.cli.doctor.latency import measure_latency, store_latency
 from fdhil.commissioning.record import axis_digest, save_record
 from fdhil.commissioning.void import void_record
 from fdhil.config import MachineConfig
@@ -27,14 +27,14 @@ from tests.store.sample_records import STAMP, make_outcome, make_published, make
 CIRCLE = ("--radius-mm", "10", "--feed", "3000")
 
 
-def machine_of(folder: Path) -> MachineConfig:
+def write_machine(folder: Path) -> MachineConfig:
     (folder / "machine.toml").write_text(BENCH)
     return config_of(folder, ("X", "Y"))
 
 
 @pytest.fixture(name="proven")
 def _proven(tmp_path: Path) -> MachineConfig:
-    machine = machine_of(tmp_path)
+    machine = write_machine(tmp_path)
     with History.open(machine.store.directory) as history:
         for axis in ("X", "Y"):
             number = history.add_window(make_outcome(of=make_window(axis=axis)), "", STAMP)
@@ -44,7 +44,7 @@ def _proven(tmp_path: Path) -> MachineConfig:
     return machine
 
 
-def test_a_machine_that_is_proven_is_accepted(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
+def test_commissioned_machine_is_accepted(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
     page = tmp_path / "acceptance.html"
     options = ("--out", page, "--by", "A. Fitter", "--circle-um", "12", *CIRCLE, "--json")
     code, out, _ = fdhil("acceptance", tmp_path / "machine.toml", *options, capsys=capsys)
@@ -62,7 +62,7 @@ def test_a_machine_that_is_proven_is_accepted(proven: MachineConfig, tmp_path: P
     assert f"{before['hysteresis_um']:.2f}" in shown
 
 
-def test_what_is_open_is_named(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
+def test_report_names_each_open_point(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
     """Each open point has an action, and the exit code is 1."""
     void_record(proven.store.directory, "X", "booted")
     save_record(replace(RECORD, axis="Y", config_digest="other"), proven.store.directory)
@@ -79,8 +79,8 @@ def test_what_is_open_is_named(proven: MachineConfig, tmp_path: Path, capsys: An
     assert "4 points are open" in out
 
 
-def test_a_machine_of_which_nothing_is_known_has_a_report_too(tmp_path: Path, capsys: Any) -> None:
-    machine_of(tmp_path)
+def test_report_is_written_for_machine_without_records(tmp_path: Path, capsys: Any) -> None:
+    write_machine(tmp_path)
     code, out, _ = fdhil("acceptance", tmp_path / "machine.toml", "--out", tmp_path / "a.html", *CIRCLE, capsys=capsys)
     assert code == 1
     for axis in ("X", "Y"):
@@ -89,7 +89,7 @@ def test_a_machine_of_which_nothing_is_known_has_a_report_too(tmp_path: Path, ca
     assert "use the nominal parameters" in (tmp_path / "a.html").read_text("utf-8")
 
 
-def test_a_measured_circle_stands_beside_the_predicted_ones(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
+def test_measured_circle_is_reported_with_predicted_ones(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
     """The circle is 5 um too large in one direction and 3 um too small in the other; the measured value decides."""
     angle = np.linspace(0.0, 2.5 * np.pi, 4000)
     ways = [
@@ -109,14 +109,12 @@ def test_a_measured_circle_stands_beside_the_predicted_ones(proven: MachineConfi
     assert "a CSV with the columns X_mm, Y_mm" in err
 
 
-def test_report_has_a_header_passes_open_notices_and_lateness(
-    proven: MachineConfig, tmp_path: Path, capsys: Any
-) -> None:
+def test_report_has_header_passes_open_notices_and_latency(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
     with History.open(proven.store.directory) as history:
         history.add_notice(Notice("PassMeasured", "info", "pass 1 of p.ngc: contour error measured 0.70 um RMS"), STAMP)
         history.add_notice(Notice("GuardTripped", "MAJOR", "LimitActive: an internal limit is active", "X"), STAMP)
     measured = measure_latency(proven, 0.02)
-    keep_latency(proven, measured)
+    store_latency(proven, measured)
     page = tmp_path / "a.html"
     options = ("--out", page, "--customer", "Muster AG", "--site", "Hall 3", "--by", "A. Fitter", *CIRCLE)
     code, out, err = fdhil("acceptance", tmp_path / "machine.toml", *options, capsys=capsys)

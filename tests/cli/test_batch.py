@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.cli import batch
+from fdhil.cli import batch_analysis
 from fdhil.cli.main import cli, run_safely
 from fdhil.config import Identification
 from fdhil.errors import FdhilError
@@ -38,22 +38,24 @@ def recordings(tmp_path: Path) -> list[Path]:
     return paths
 
 
-def test_each_window_and_each_pool_is_a_step_of_its_file(recordings: list[Path]) -> None:
+def test_progress_counts_each_window_and_pool_of_a_file(recordings: list[Path]) -> None:
     shares: list[float] = []
-    results = list(batch.analyse_files(recordings, SETTINGS, None, shares.append))
+    results = list(batch_analysis.analyse_files(recordings, SETTINGS, None, shares.append))
     assert [result.file for result in results] == [str(path) for path in recordings]
     assert shares == pytest.approx([1 / 3] * 6)
 
 
 @pytest.mark.usefixtures("real_time")
 @pytest.mark.parametrize("limit", ["MANY_FILES", "MANY_WINDOWS"])
-def test_other_processes_give_the_same(recordings: list[Path], limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parallel_analysis_gives_identical_results(
+    recordings: list[Path], limit: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     recordings = recordings if limit == "MANY_FILES" else recordings[:1]
-    alone = list(batch.analyse_files(recordings, SETTINGS))
-    monkeypatch.setattr(batch, limit, 1)
+    alone = list(batch_analysis.analyse_files(recordings, SETTINGS))
+    monkeypatch.setattr(batch_analysis, limit, 1)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     shares: list[float] = []
-    together = list(batch.analyse_files(recordings, SETTINGS, None, shares.append))
+    together = list(batch_analysis.analyse_files(recordings, SETTINGS, None, shares.append))
     assert sum(shares) == pytest.approx(len(recordings))
     for one, other in zip(alone, together, strict=True):
         assert one.file == other.file
@@ -63,19 +65,19 @@ def test_other_processes_give_the_same(recordings: list[Path], limit: str, monke
 
 
 @pytest.mark.usefixtures("real_time")
-def test_a_process_that_dies_is_a_sentence(recordings: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch, "MANY_FILES", 1)
+def test_killed_worker_is_reported_in_one_sentence(recordings: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch_analysis, "MANY_FILES", 1)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    monkeypatch.setattr(batch, "_analyse_some", dying)
+    monkeypatch.setattr(batch_analysis, "_analyse_chunk", kill_worker)
     with pytest.raises(FdhilError, match="was killed"):
-        list(batch.analyse_files(recordings, SETTINGS))
+        list(batch_analysis.analyse_files(recordings, SETTINGS))
 
 
-def dying(numbered: Any, **how: Any) -> None:
+def kill_worker(numbered: Any, **how: Any) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_a_folder_is_all_its_recordings_and_a_stored_window_the_bits_that_a_fleet_finds(
+def test_folder_is_expanded_and_stored_window_keeps_its_bits(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "objects"
@@ -100,7 +102,7 @@ def test_a_folder_is_all_its_recordings_and_a_stored_window_the_bits_that_a_flee
     assert "has no recordings" in fdhil("identify", tmp_path / "empty", capsys=capsys)[2]
 
 
-def test_a_terminal_sees_how_far_the_work_is(recordings: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_terminal_shows_progress(recordings: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
     master, slave = pty.openpty()
     with os.fdopen(slave, "w") as terminal, pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["fdhil", "identify", "--json", *map(str, recordings)])
@@ -128,7 +130,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.usefixtures("processes")
-def test_processes_that_analyse_end_with_the_command_when_it_is_killed(tmp_path: Path) -> None:
+def test_worker_processes_end_when_command_is_killed(tmp_path: Path) -> None:
     (tmp_path / "analysing.py").write_text(ANALYSING)
     with subprocess.Popen([sys.executable, tmp_path / "analysing.py"], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None

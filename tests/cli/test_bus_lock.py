@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fdhil.cli import bus_lock
-from fdhil.cli.bus_lock import endpoint, lock_bus
+from fdhil.cli.bus_lock import lock_bus, resolve_bus_endpoint
 from fdhil.config import CanBus
 from fdhil.errors import ConnectError, DeviceError
 
@@ -34,7 +34,7 @@ def has_ipv6() -> bool:
 
 
 @pytest.mark.parametrize("host", ["localhost", "127.0.0.1", "127.0.0.2", "0.0.0.0", "::ffff:127.0.0.1", "::1"])
-def test_every_name_of_this_computer_is_one_place(host: str) -> None:
+def test_all_names_of_this_computer_are_one_endpoint(host: str) -> None:
     with lock_bus(CanBus(port=47)):
         with pytest.raises(DeviceError, match="BusLocked"):
             lock_bus(CanBus(host=host, port=47))
@@ -44,25 +44,25 @@ def test_every_name_of_this_computer_is_one_place(host: str) -> None:
     lock_bus(CanBus(host=host, port=47)).close()
 
 
-def test_the_open_socket_says_where_it_leads() -> None:
+def test_open_socket_determines_endpoint() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         with socket.create_connection(("localhost", port)) as transmit:
-            found = endpoint(CanBus(host="a name that is looked up no more", port=port), transmit)
-    assert found == endpoint(CanBus(host="127.0.0.1", port=port))
+            found = resolve_bus_endpoint(CanBus(host="a name that is looked up no more", port=port), transmit)
+    assert found == resolve_bus_endpoint(CanBus(host="127.0.0.1", port=port))
 
 
-def test_an_interface_is_known_by_its_number() -> None:
+def test_interface_is_identified_by_index() -> None:
     lo = socket.if_nametoindex("lo")
-    assert endpoint(CanBus(interface="socketcan", channel="lo")).startswith(f"interface {lo} of")
+    assert resolve_bus_endpoint(CanBus(interface="socketcan", channel="lo")).startswith(f"interface {lo} of")
     with pytest.raises(ConnectError, match="nothing was sent"):
-        endpoint(CanBus(interface="socketcan", channel="none9"))
+        resolve_bus_endpoint(CanBus(interface="socketcan", channel="none9"))
     with pytest.raises(ConnectError, match="cannot be found"):
-        endpoint(CanBus(host="no.such.host.invalid", port=1))
-    assert str(os.getpid()) in endpoint(CanBus(interface="virtual"))
+        resolve_bus_endpoint(CanBus(host="no.such.host.invalid", port=1))
+    assert str(os.getpid()) in resolve_bus_endpoint(CanBus(interface="virtual"))
 
 
-def test_an_adapter_that_is_plugged_in_again_has_its_owner_still(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_replugged_adapter_stays_locked(monkeypatch: pytest.MonkeyPatch) -> None:
     bus = CanBus(interface="socketcan", channel="can0")
     monkeypatch.setattr("socket.if_nametoindex", lambda _name: 7)
     with lock_bus(bus):
@@ -72,7 +72,7 @@ def test_an_adapter_that_is_plugged_in_again_has_its_owner_still(monkeypatch: py
         lock_bus(CanBus(interface="socketcan", channel="can1")).close()
 
 
-def test_a_run_directory_has_one_guard_too(tmp_path: Path) -> None:
+def test_run_directory_is_locked_for_one_guard(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "run")
     with (
         lock_bus(CanBus(port=47), run_directory=tmp_path / "run"),
@@ -81,7 +81,7 @@ def test_a_run_directory_has_one_guard_too(tmp_path: Path) -> None:
         lock_bus(CanBus(port=48), run_directory=tmp_path / "link")
 
 
-def test_a_directory_that_others_may_write_is_not_used(
+def test_directory_writable_by_others_is_not_used(
     directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     home = tmp_path / "home"
@@ -95,7 +95,7 @@ def test_a_directory_that_others_may_write_is_not_used(
         lock_bus(CanBus(port=47))
 
 
-def test_what_lies_in_the_place_of_the_file_is_not_followed(directory: Path, tmp_path: Path) -> None:
+def test_lock_file_that_is_a_symlink_is_not_followed(directory: Path, tmp_path: Path) -> None:
     (directory / "bus.lock").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(DeviceError, match="nothing was sent"):
         lock_bus(CanBus(port=47))
@@ -104,7 +104,7 @@ def test_what_lies_in_the_place_of_the_file_is_not_followed(directory: Path, tmp
 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.skipif(os.getuid() != 0, reason="needs root, to be somebody else")
-def test_somebody_else_can_neither_lock_nor_block(directory: Path) -> None:
+def test_other_user_can_neither_lock_nor_block(directory: Path) -> None:
     """The lock file is inaccessible; its former name may be used by anyone."""
     lock_bus(CanBus(port=47)).close()
     squatter = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -120,7 +120,7 @@ def test_somebody_else_can_neither_lock_nor_block(directory: Path) -> None:
 
 
 @pytest.mark.usefixtures("processes")
-def test_it_survives_an_exec(directory: Path) -> None:
+def test_lock_survives_exec(directory: Path) -> None:
     """The guard replaces its program by exec; the lock lasts until the process ends."""
     lock = lock_bus(CanBus(port=47))
     os.set_inheritable(lock.fileno(), True)

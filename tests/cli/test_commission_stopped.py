@@ -36,7 +36,7 @@ PATIENCE_S = 300.0
 
 
 @pytest.fixture(scope="module")
-def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[SimulatorProcess, Path]]:
+def simulator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[SimulatorProcess, Path]]:
     folder = tmp_path_factory.mktemp("twin")
     with SimulatorProcess(write_config(folder, axes="X")) as running:
         joined = folder / "joined"
@@ -47,7 +47,9 @@ def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[SimulatorPr
 
 
 @contextmanager
-def rapid(twin: tuple[SimulatorProcess, Path]) -> Iterator[tuple[subprocess.Popen[str], Callable[[], can.Message]]]:
+def start_rapid(
+    twin: tuple[SimulatorProcess, Path],
+) -> Iterator[tuple[subprocess.Popen[str], Callable[[], can.Message]]]:
     running, file = twin
     command = [sys.executable, "-c", QUICK, "commission", str(file), "--yes", "--room", "-2", "150"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -62,7 +64,7 @@ def rapid(twin: tuple[SimulatorProcess, Path]) -> Iterator[tuple[subprocess.Pope
 
         begun = None
         while True:
-            target = target_of(heard())
+            target = decode_target(heard())
             begun = target if begun is None else begun
             if target is not None and begun is not None and abs(target - begun) > 40.0 * PER_MM:
                 break
@@ -70,18 +72,18 @@ def rapid(twin: tuple[SimulatorProcess, Path]) -> Iterator[tuple[subprocess.Pope
         yield process, heard
 
 
-def target_of(frame: can.Message) -> int | None:
+def decode_target(frame: can.Message) -> int | None:
     return struct.unpack("<Hi", frame.data)[1] if frame.arbitration_id == 0x201 else None
 
 
-def test_a_stopped_trial_brakes_and_switches_off(twin: tuple[SimulatorProcess, Path]) -> None:
-    with rapid(twin) as (process, heard):
+def test_interrupted_trial_brakes_and_switches_drive_off(simulator: tuple[SimulatorProcess, Path]) -> None:
+    with start_rapid(simulator) as (process, heard):
         process.send_signal(signal.SIGTERM)
         targets: list[int] = []
         words = [0x0F]
         while True:
             frame = heard()
-            if (target := target_of(frame)) is not None:
+            if (target := decode_target(frame)) is not None:
                 targets.append(target)
                 words.append(struct.unpack_from("<H", frame.data)[0])
                 if len(targets) == 60:  # a second signal does not interrupt the braking

@@ -14,7 +14,7 @@ from tests.daemon.machine_rig import fdhil
 ROWS = 500
 
 
-def trace(path: Path, away_um: float, along_um: float = 0.0, end: str = "_table_mm") -> Path:
+def write_trace(path: Path, away_um: float, along_um: float = 0.0, end: str = "_table_mm") -> Path:
     """Write a straight pass in X at 10 mm/s whose table deviates in Y and lags in X."""
     rows = [f"time_s,X_reference_mm,X{end},Y_reference_mm,Y{end}"]
     rows += [
@@ -24,8 +24,11 @@ def trace(path: Path, away_um: float, along_um: float = 0.0, end: str = "_table_
     return path
 
 
-def test_passes_are_compared_by_the_distance_from_the_path(tmp_path: Path, capsys: Any) -> None:
-    before, after = trace(tmp_path / "before.csv", 20.0), trace(tmp_path / "after.csv", 2.0, end="_predicted_mm")
+def test_passes_are_compared_by_contour_error(tmp_path: Path, capsys: Any) -> None:
+    before, after = (
+        write_trace(tmp_path / "before.csv", 20.0),
+        write_trace(tmp_path / "after.csv", 2.0, end="_predicted_mm"),
+    )
     code, out, _ = fdhil("compare", before, after, "--json", capsys=capsys)
     document = json.loads(out)
     assert (code, document["schema"], document["kind"]) == (0, "fdhil-compare-1", "pass")
@@ -35,14 +38,14 @@ def test_passes_are_compared_by_the_distance_from_the_path(tmp_path: Path, capsy
     assert "contour error smaller by a factor of 10" in out
 
 
-def test_lag_along_the_path_is_no_contour_error(tmp_path: Path, capsys: Any) -> None:
-    before, after = trace(tmp_path / "before.csv", 3.0), trace(tmp_path / "after.csv", 3.0, along_um=50.0)
+def test_lag_along_path_is_not_a_contour_error(tmp_path: Path, capsys: Any) -> None:
+    before, after = write_trace(tmp_path / "before.csv", 3.0), write_trace(tmp_path / "after.csv", 3.0, along_um=50.0)
     document = json.loads(fdhil("compare", before, after, "--json", capsys=capsys)[1])
     assert document["after"]["axes"]["X"]["rms_um"] == pytest.approx(50.0)
     assert document["after"]["contour"]["rms_um"] < math.hypot(3.0, 5.0)  # only the start of the path
 
 
-def test_models_are_compared_by_their_parameters(tmp_path: Path, capsys: Any) -> None:
+def test_models_are_compared_by_parameters(tmp_path: Path, capsys: Any) -> None:
     model = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
     before, after = tmp_path / "before.json", tmp_path / "after.json"
     before.write_text(json.dumps({"X": model, "Y": model}))
@@ -64,10 +67,10 @@ def test_models_are_compared_by_their_parameters(tmp_path: Path, capsys: Any) ->
         (None, 3, "cannot be read"),
     ],
 )
-def test_wrong_file_is_answered_by_a_sentence(
+def test_wrong_file_is_refused_in_one_sentence(
     text: str | None, code: int, message: str, tmp_path: Path, capsys: Any
 ) -> None:
-    good, other = trace(tmp_path / "good.csv", 1.0), tmp_path / "other.csv"
+    good, other = write_trace(tmp_path / "good.csv", 1.0), tmp_path / "other.csv"
     if text is not None:
         other.write_text(text)
     found, _, err = fdhil("compare", good, other, capsys=capsys)

@@ -13,8 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 from fdhil import config
-from fdhil.cli.console import PrintableConsole
-from fdhil.cli.terminal_text import without_controls
+from fdhil.cli.printable_console import PrintableConsole
+from fdhil.cli.terminal_text import replace_controls
 from fdhil.errors import ConfigError
 from tests.bench import bench_toml
 from tests.daemon.machine_rig import fdhil
@@ -22,7 +22,7 @@ from tests.daemon.machine_rig import fdhil
 HOSTILE = ("\x1b[2J\x1b]0;owned\x07", "\x9b31m", "a\rb", "\b\b", "\x00", "\u202eexe")
 
 
-def written(*renderables: object, colours: bool = False) -> str:
+def print_to_console(*renderables: object, colours: bool = False) -> str:
     file = io.StringIO()
     console = PrintableConsole(file=file, force_terminal=colours, width=60)
     for each in renderables:
@@ -31,26 +31,26 @@ def written(*renderables: object, colours: bool = False) -> str:
 
 
 @pytest.mark.parametrize("hostile", HOSTILE)
-def test_no_control_character_gets_through_rich(hostile: str) -> None:
+def test_console_replaces_control_characters(hostile: str) -> None:
     table = Table(hostile, title=hostile)
     table.add_row(escape(hostile))
     table.add_row(Text(hostile))
-    shown = written(escape(hostile), Text(hostile), table)
-    assert without_controls(shown) == shown
+    shown = print_to_console(escape(hostile), Text(hostile), table)
+    assert replace_controls(shown) == shown
     assert "\N{REPLACEMENT CHARACTER}" in shown or hostile in ("a\rb", "\b\b")  # removed by rich itself
 
 
-def test_colours_of_the_console_itself_stay() -> None:
-    assert "\x1b[1m" in written("[bold]X[/bold] \x1b[31m", colours=True)
-    assert "\x1b[31m" not in written("[bold]X[/bold] \x1b[31m", colours=True)
+def test_console_keeps_its_own_colours() -> None:
+    assert "\x1b[1m" in print_to_console("[bold]X[/bold] \x1b[31m", colours=True)
+    assert "\x1b[31m" not in print_to_console("[bold]X[/bold] \x1b[31m", colours=True)
 
 
 @given(st.text())
-def test_text_keeps_its_length_and_all_that_is_harmless(text: str) -> None:
-    shown = without_controls(text)
+def test_replaced_text_keeps_length_and_printable_characters(text: str) -> None:
+    shown = replace_controls(text)
     assert len(shown) == len(text)
     assert all(a == b or b == "\N{REPLACEMENT CHARACTER}" for a, b in zip(text, shown, strict=True))
-    assert without_controls("Fräse 5 µm\n\tX") == "Fräse 5 µm\n\tX"
+    assert replace_controls("Fräse 5 µm\n\tX") == "Fräse 5 µm\n\tX"
 
 
 @pytest.mark.parametrize("name", ["Mill\x1b[2J", "Mill\nX", "Mill\x7f", "Mill\u2028"])
@@ -59,7 +59,9 @@ def test_machine_name_with_control_characters_is_refused(name: str) -> None:
         config.parse_config({"machine": {"name": name}})
 
 
-def test_error_about_a_hostile_file_name_is_harmless(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_error_with_control_characters_in_file_name_is_printable(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     hostile = tmp_path / "a\x1b[2J.toml"
     hostile.write_text(bench_toml("X").replace('name = "bench"', 'name = ""'))
     code, out, err = fdhil("status", hostile, capsys=capsys)

@@ -15,11 +15,11 @@ from fdhil.records import Skill
 from fdhil.store.history_database import History
 from fdhil.store.history_rows import TimeStamp
 from tests.cli.test_predict import _bench as _bench
-from tests.cli.test_predict import invoke, remember
+from tests.cli.test_predict import run_cli, store_parameters
 from tests.paths import build_bench_trajectory, build_trajectory, smooth_demand
 
 
-def one_corner(folder: Path) -> Path:
+def write_one_corner(folder: Path) -> Path:
     """A demand with one corner and a rest, for a small page."""
     ramp = np.linspace(0.0, 30.0, 180)
     corner = np.column_stack(
@@ -30,10 +30,10 @@ def one_corner(folder: Path) -> Path:
     return path
 
 
-def test_writes_json_and_csv(bench: Path) -> None:
+def test_correct_writes_json_and_csv(bench: Path) -> None:
     out = bench / "out.csv"
     arguments = ["--config", bench / "bench.toml", "--method", "mirror", "--json", "--out", out]
-    result = invoke("correct", bench / "demand.csv", *arguments)
+    result = run_cli("correct", bench / "demand.csv", *arguments)
     assert result.exit_code == 0
     document = json.loads(result.stdout)
     assert document["refused"] == []
@@ -47,10 +47,10 @@ def test_writes_json_and_csv(bench: Path) -> None:
     assert {"Y_offset_um", "X_corrected_error_um", "Y_corrected_error_um", "contour_error_um"} <= set(rows[0])
 
 
-def test_a_refusal_writes_zeros_and_exits_1(bench: Path) -> None:
+def test_refused_correction_writes_zeros_and_exits_1(bench: Path) -> None:
     write_demand_csv(build_bench_trajectory(20, (0.030, 0.015)), bench / "fast.csv")
     out = bench / "out.csv"
-    result = invoke("correct", bench / "fast.csv", "--config", bench / "bench.toml", "--json", "--out", out)
+    result = run_cli("correct", bench / "fast.csv", "--config", bench / "bench.toml", "--json", "--out", out)
     assert result.exit_code == 1
     refused = json.loads(result.stdout)["refused"]
     assert {entry["code"] for entry in refused} == {"DemandTooHigh"}
@@ -59,9 +59,9 @@ def test_a_refusal_writes_zeros_and_exits_1(bench: Path) -> None:
         assert all(float(row["X_offset_um"]) == float(row["Y_offset_um"]) == 0.0 for row in csv.DictReader(file))
 
 
-def test_text_for_people(bench: Path) -> None:
+def test_correct_prints_text(bench: Path) -> None:
     """A gain without an independent check is not called better."""
-    result = invoke("correct", bench / "demand.csv", "--config", bench / "bench.toml", "--method", "mirror")
+    result = run_cli("correct", bench / "demand.csv", "--config", bench / "bench.toml", "--method", "mirror")
     assert result.exit_code == 0
     assert "predicted with the mirror correction: " in result.stdout
     assert "by the model alone; its accuracy on this machine is unknown" in result.stdout
@@ -69,32 +69,32 @@ def test_text_for_people(bench: Path) -> None:
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_with_a_history_a_gain_has_its_uncertainty_and_a_spread_below_the_digits_is_not_zero(bench: Path) -> None:
+def test_gain_from_history_has_nonzero_uncertainty(bench: Path) -> None:
     """With parameters known to 1e-6 the gain is limited by the prediction error of held-out moves."""
-    remember(bench, [{}], known_to=1e-6)
+    store_parameters(bench, [{}], known_to=1e-6)
     with History.open(bench / "fdhil-data") as history:
         for axis in "XY":
             history.add_skill(Skill(axis, 1, 0.4, 1.0, 0.0, 30.0), TimeStamp(0.0, "boot", 0))
     arguments = ["correct", bench / "demand.csv", "--config", bench / "bench.toml", "--from-history"]
-    text = invoke(*arguments).stdout
+    text = run_cli(*arguments).stdout
     assert re.search(
         r"predicted with the inverse correction: at most \d\.\d\d um RMS \(95 %\), \d\.\d\d by the model; .*"
         r" at least \d+\.\d times better",
         text,
     )
-    document = json.loads(invoke(*arguments, "--json").stdout)
+    document = json.loads(run_cli(*arguments, "--json").stdout)
     assert document["after"]["uncertainty_um"] == pytest.approx(0.4 * 2**0.5, rel=1e-3)
     assert 1 < document["gain_at_least"] < document["gain"]
     page = bench / "correct.html"
-    assert invoke("correct", one_corner(bench), *arguments[2:], "--report", page).exit_code == 0
+    assert run_cli("correct", write_one_corner(bench), *arguments[2:], "--report", page).exit_code == 0
     assert "predicted smaller by at least" in page.read_text("utf-8")
-    text = invoke("predict", *arguments[1:]).stdout
+    text = run_cli("predict", *arguments[1:]).stdout
     assert "± <0.1 um" in text
     assert "± 0.0" not in text
 
 
-def test_an_unknown_method_is_refused(bench: Path) -> None:
-    result = invoke("correct", bench / "demand.csv", "--config", bench / "bench.toml", "--method", "magic")
+def test_unknown_method_is_refused(bench: Path) -> None:
+    result = run_cli("correct", bench / "demand.csv", "--config", bench / "bench.toml", "--method", "magic")
     assert result.exit_code == 2
     assert "mirror" in result.stderr
 
@@ -102,7 +102,7 @@ def test_an_unknown_method_is_refused(bench: Path) -> None:
 def test_flatness_writes_speed_and_torque(bench: Path) -> None:
     out = bench / "out.csv"
     arguments = ["--config", bench / "bench.toml", "--method", "flatness", "--json", "--out", out]
-    result = invoke("correct", bench / "demand.csv", *arguments)
+    result = run_cli("correct", bench / "demand.csv", *arguments)
     assert result.exit_code == 0
     assert json.loads(result.stdout)["gain"] > 50
     with out.open() as file:
@@ -112,8 +112,8 @@ def test_flatness_writes_speed_and_torque(bench: Path) -> None:
     assert "X_speed_offset_rad_per_s" in rows[0]
 
 
-def test_the_default_method_is_the_best_one(bench: Path) -> None:
-    result = invoke("correct", bench / "demand.csv", "--config", bench / "bench.toml", "--json")
+def test_default_method_is_the_best(bench: Path) -> None:
+    result = run_cli("correct", bench / "demand.csv", "--config", bench / "bench.toml", "--json")
     document = json.loads(result.stdout)
     assert document["method"] == "inverse"
     assert document["gain"] > 60
@@ -121,14 +121,14 @@ def test_the_default_method_is_the_best_one(bench: Path) -> None:
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_a_report_shows_before_and_after(bench: Path) -> None:
+def test_report_shows_errors_before_and_after_correction(bench: Path) -> None:
     for command, shown in (("predict", "predicted, RMS"), ("correct", "not known here")):
         page = bench / f"{command}.html"
-        arguments = [command, one_corner(bench), "--config", bench / "bench.toml", "--report", page]
-        assert invoke(*arguments).exit_code == 0
+        arguments = [command, write_one_corner(bench), "--config", bench / "bench.toml", "--report", page]
+        assert run_cli(*arguments).exit_code == 0
         assert shown in page.read_text("utf-8")
         assert "with the nominal parameters of the configuration" in page.read_text("utf-8")
     missing = bench / "demand.csv" / "page.html"
-    refused = invoke("predict", bench / "demand.csv", "--config", bench / "bench.toml", "--report", missing)
+    refused = run_cli("predict", bench / "demand.csv", "--config", bench / "bench.toml", "--report", missing)
     assert refused.exit_code == 3
     assert "cannot be written" in refused.stderr

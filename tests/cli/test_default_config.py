@@ -9,15 +9,15 @@ from typing import Any
 import click
 import pytest
 
-from fdhil.cli.main import cli, leaves
-from fdhil.cli.options import ConfigFirst
+from fdhil.cli.main import cli, iterate_commands
+from fdhil.cli.options import ConfigFirstCommand
 from tests.bench import bench_toml
 from tests.daemon.machine_rig import fdhil
 
 DEMAND = "time_s,X_mm,Y_mm\n" + "".join(f"{k / 1000:.3f},{min(k, 400) / 100:.5f},0\n" for k in range(800))
 
 
-def config_of(command: click.Command) -> click.Argument | None:
+def write_config(command: click.Command) -> click.Argument | None:
     return next((p for p in command.params if p.name == "config" and isinstance(p, click.Argument)), None)
 
 
@@ -29,22 +29,20 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("name", [name for name, command in leaves(cli) if config_of(command) is not None])
+@pytest.mark.parametrize("name", [name for name, command in iterate_commands(cli) if write_config(command) is not None])
 def test_config_defaults_to_machine_toml(name: str) -> None:
-    command = dict(leaves(cli))[name]
-    config, arguments = config_of(command), [p for p in command.params if isinstance(p, click.Argument)]
+    command = dict(iterate_commands(cli))[name]
+    config, arguments = write_config(command), [p for p in command.params if isinstance(p, click.Argument)]
     assert config is not None
     assert config.default == Path("machine.toml")
-    assert config is arguments[-1] or isinstance(command, ConfigFirst)
+    assert config is arguments[-1] or isinstance(command, ConfigFirstCommand)
 
 
 @pytest.mark.parametrize(
     "arguments",
     [("arm", "part.csv"), ("acknowledge", "3", "4"), ("acknowledge", "--all"), ("arm", "--method", "flatness")],
 )
-def test_argument_after_config_is_understood_without_config(
-    arguments: tuple[str, ...], folder: Path, capsys: Any
-) -> None:
+def test_argument_is_recognised_when_config_is_omitted(arguments: tuple[str, ...], folder: Path, capsys: Any) -> None:
     code, _, err = fdhil(*arguments, capsys=capsys)
     assert (code, "daemon" in err) == (3, True), err  # parsed; only the daemon is missing
     (folder / "machine.toml").unlink()
@@ -53,7 +51,7 @@ def test_argument_after_config_is_understood_without_config(
     assert "machine.toml cannot be used: file: is not in this folder (name the configuration, or create one" in err
 
 
-def test_predict_takes_machine_toml_and_reports_what_it_wrote(folder: Path, capsys: Any) -> None:
+def test_predict_uses_machine_toml_and_reports_written_files(folder: Path, capsys: Any) -> None:
     code, out, err = fdhil("predict", "part.csv", "--out", "p.csv", capsys=capsys)
     assert (code, err) == (0, "wrote p.csv\n")
     assert "um" in out
@@ -67,7 +65,7 @@ def test_predict_takes_machine_toml_and_reports_what_it_wrote(folder: Path, caps
 @pytest.mark.parametrize(
     ("typed", "meant"), [(["xstatus"], "status"), (["fleet", "colect"], "collect"), (["status", "--wach"], "--watch")]
 )
-def test_unknown_word_is_answered_by_the_nearest_one(typed: list[str], meant: str, capsys: Any) -> None:
+def test_unknown_command_suggests_nearest_one(typed: list[str], meant: str, capsys: Any) -> None:
     code, _, err = fdhil(*typed, capsys=capsys)
     assert code == 2
     assert f"Did you mean '{meant}'" in err
@@ -84,7 +82,7 @@ def test_unknown_word_is_answered_by_the_nearest_one(typed: list[str], meant: st
         ("history", "--plot", "h.svg"),
     ],
 )
-def test_missing_library_is_named_before_anything_is_started(
+def test_missing_library_is_reported_before_start(
     arguments: tuple[str, ...], folder: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = set(folder.iterdir())

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.cli.demo import _realistic, realistic, realistic_page
-from fdhil.cli.demo.machines import REAL, machine_document
-from fdhil.cli.demo.realistic import AxisVerdict, Realistic, running_realistic
-from fdhil.cli.demo.report import Cut, Published
+from fdhil.cli.demo import _describe_realistic, realistic_machine, realistic_page
+from fdhil.cli.demo.demo_page import CutPass, Published
+from fdhil.cli.demo.machines import REAL, load_machine_document
+from fdhil.cli.demo.realistic_machine import AxisOutcome, RealisticResult, run_realistic_in_process
 from fdhil.config import Reality
 from fdhil.errors import ConnectError, DeviceTimeout, FdhilError
 from fdhil.records import PARAMETERS, Parameters
@@ -29,21 +29,21 @@ TRUE = Parameters(0.5, 0.005, 0.8, 0.075, 0.05, 5.0)
 WAY = np.column_stack([np.linspace(0, 10, 50), np.zeros(50)])
 
 
-def machine() -> machine_config.MachineConfig:
-    return machine_config.parse_config(machine_document(REAL))
+def load_machine() -> machine_config.MachineConfig:
+    return machine_config.parse_config(load_machine_document(REAL))
 
 
-def passes(*labels: str) -> list[Cut]:
-    return [Cut(label, 20.0, WAY, WAY, np.full(50, 8.0 / 4.0**n), 0) for n, label in enumerate(labels)]
+def make_passes(*labels: str) -> list[CutPass]:
+    return [CutPass(label, 20.0, WAY, WAY, np.full(50, 8.0 / 4.0**n), 0) for n, label in enumerate(labels)]
 
 
-def published() -> Published:
+def make_published_set() -> Published:
     names = (*PARAMETERS, "load")
     return Published(TRUE.replace_values(Jt=0.0751, load=2.5), dict.fromkeys(names, 1e-3), 20.0)
 
 
-def test_the_shipped_configuration_is_the_demonstrations_machine() -> None:
-    shipped, shown = machine_config.load_config(SHIPPED), machine()
+def test_shipped_configuration_equals_demo_machine() -> None:
+    shipped, shown = machine_config.load_config(SHIPPED), load_machine()
     assert {axis: twin.reality for axis, twin in shipped.sim.axis.items()} == {
         axis: twin.reality for axis, twin in shown.sim.axis.items()
     }
@@ -52,62 +52,62 @@ def test_the_shipped_configuration_is_the_demonstrations_machine() -> None:
     assert Reality() not in [twin.reality for twin in shown.sim.axis.values()]
 
 
-def test_a_refusal_is_told_with_its_reasons(tmp_path: Path) -> None:
-    refused = Realistic(
-        machine(),
+def test_refusal_is_reported_with_reasons(tmp_path: Path) -> None:
+    refused = RealisticResult(
+        load_machine(),
         dict.fromkeys("XY", TRUE),
-        dict.fromkeys("XY", AxisVerdict(None, 0, 4, {"Implausible": 4})),
+        dict.fromkeys("XY", AxisOutcome(None, 0, 4, {"Implausible": 4})),
         None,
-        passes("uncorrected"),
+        make_passes("uncorrected"),
         "the daemon refuses the request arm: ModelNotValidated",
     )
-    section = realistic_page.section(refused)
+    section = realistic_page.build_section(refused)
     assert "ModelNotValidated" in section.text
-    assert realistic_page.headline(refused)[1] == "refused"
-    assert realistic_page.verdict_rows(refused)[0] == ["X", "0 of 4", "none published", "4 x Implausible"]
-    assert realistic_page.parameter_rows(refused) == []
-    assert ["load_nm", "", "2.5"] in realistic_page.effect_rows(refused)
-    write_page(Page("title", "subtitle", [realistic_page.headline(refused)], [section]), tmp_path / "report.html")
+    assert realistic_page.build_headline(refused)[1] == "refused"
+    assert realistic_page.list_verdict_rows(refused)[0] == ["X", "0 of 4", "none published", "4 x Implausible"]
+    assert realistic_page.list_parameter_rows(refused) == []
+    assert ["load_nm", "", "2.5"] in realistic_page.list_effect_rows(refused)
+    write_page(Page("title", "subtitle", [realistic_page.build_headline(refused)], [section]), tmp_path / "report.html")
     assert "0 of 4" in (tmp_path / "report.html").read_text("utf-8")
-    told = _realistic(refused)
+    told = _describe_realistic(refused)
     assert told["axes"]["X"]["parameters"] is None
     assert told["refused"]
 
 
-def test_what_was_believed_stands_beside_the_truth() -> None:
-    verdict = AxisVerdict(published(), 4, 4, {})
-    believed = Realistic(machine(), {"X": TRUE}, {"X": verdict}, None, passes("uncorrected", "inverse"), "")
-    assert realistic_page.headline(believed) == ("on a realistic machine reduced by", "4.0 x")
-    rows = realistic_page.parameter_rows(believed)
+def test_report_shows_identified_next_to_true_parameters() -> None:
+    verdict = AxisOutcome(make_published_set(), 4, 4, {})
+    believed = RealisticResult(
+        load_machine(), {"X": TRUE}, {"X": verdict}, None, make_passes("uncorrected", "inverse"), ""
+    )
+    assert realistic_page.build_headline(believed) == ("on a realistic machine reduced by", "4.0 x")
+    rows = realistic_page.list_parameter_rows(believed)
     assert [row[1] for row in rows] == [*PARAMETERS, "load"]
     assert rows[-1][3] == "2.500 ±0.002 N.m"
-    assert realistic_page.verdict_rows(believed)[0] == ["X", "4 of 4", "six parameters and load", ""]
-    told = _realistic(believed)
+    assert realistic_page.list_verdict_rows(believed)[0] == ["X", "4 of 4", "six parameters and load", ""]
+    told = _describe_realistic(believed)
     assert told["axes"]["X"]["terms"] == {"load": 2.5}
     assert [cut["label"] for cut in told["cuts"]] == ["uncorrected", "inverse"]
 
 
-def silent(text: str) -> None:
+def ignore_progress(text: str) -> None:
     """Print nothing."""
 
 
 @pytest.mark.usefixtures("processes")
-def test_result_of_the_realistic_machine_is_that_of_its_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = Realistic(machine(), {"X": TRUE}, {}, None, passes("uncorrected"), "refused")
-    monkeypatch.setattr(realistic, "run_realistic", lambda *_: found)
-    with running_realistic(tmp_path, False, silent) as result:
+def test_realistic_result_is_returned_from_its_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = RealisticResult(load_machine(), {"X": TRUE}, {}, None, make_passes("uncorrected"), "refused")
+    monkeypatch.setattr(realistic_machine, "run_realistic", lambda *_: found)
+    with run_realistic_in_process(tmp_path, False, ignore_progress) as result:
         told = result()
     assert (told.config, told.truth, told.refused) == (found.config, found.truth, found.refused)
     np.testing.assert_array_equal(told.cuts[0].contour_um, found.cuts[0].contour_um)
 
 
-def time_out(*_: object) -> Realistic:
+def time_out(*_: object) -> RealisticResult:
     raise DeviceTimeout("simulated machine", "no event")
 
 
-def end_early(*_: object) -> Realistic:
+def end_early(*_: object) -> RealisticResult:
     os._exit(1)
 
 
@@ -116,19 +116,21 @@ def end_early(*_: object) -> Realistic:
     ("run", "kind", "text"),
     [(time_out, DeviceTimeout, "simulated machine: no event"), (end_early, ConnectError, "its process ended early")],
 )
-def test_failure_of_the_realistic_machine_is_that_of_the_demonstration(
-    run: Callable[..., Realistic], kind: type[FdhilError], text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_failure_of_realistic_process_fails_the_demo(
+    run: Callable[..., RealisticResult],
+    kind: type[FdhilError],
+    text: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(realistic, "run_realistic", run)
-    with running_realistic(tmp_path, False, silent) as result, pytest.raises(kind, match=text):
+    monkeypatch.setattr(realistic_machine, "run_realistic", run)
+    with run_realistic_in_process(tmp_path, False, ignore_progress) as result, pytest.raises(kind, match=text):
         result()
 
 
 @pytest.mark.usefixtures("processes")
-def test_realistic_machine_stops_in_order_when_the_demonstration_ends_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def run(out: Path, *_: object) -> Realistic:
+def test_realistic_process_stops_in_order_when_demo_ends_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(out: Path, *_: object) -> RealisticResult:
         try:
             (out / "runs").touch()
             signal.pause()
@@ -136,8 +138,8 @@ def test_realistic_machine_stops_in_order_when_the_demonstration_ends_first(
             (out / "stopped").touch()
         raise AssertionError
 
-    monkeypatch.setattr(realistic, "run_realistic", run)
-    with running_realistic(tmp_path, False, silent):
+    monkeypatch.setattr(realistic_machine, "run_realistic", run)
+    with run_realistic_in_process(tmp_path, False, ignore_progress):
         while not (tmp_path / "runs").exists():
             time.sleep(0.01)
     assert (tmp_path / "stopped").exists()
@@ -159,7 +161,7 @@ with stopping_in_order(), loop.running(Path(sys.argv[1]), False, lambda text: No
 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_machine_guard_and_daemon_end_with_the_demonstration(number: signal.Signals, tmp_path: Path) -> None:
+def test_all_processes_end_with_the_demo(number: signal.Signals, tmp_path: Path) -> None:
     command = [sys.executable, "-c", RUNNING, str(tmp_path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as demo:
         assert demo.stdout is not None

@@ -18,7 +18,7 @@ import pytest
 from click.testing import CliRunner
 
 from fdhil import config as machine_config
-from fdhil.cli.demo.toml import to_toml
+from fdhil.cli.demo.toml_writer import format_toml
 from fdhil.cli.doctor import doctor
 from fdhil.records import Notice
 from fdhil.store.history_database import HISTORY_FILE_NAME, History
@@ -30,14 +30,14 @@ from tests.unprivileged_command import UNPRIVILEGED
 
 
 @pytest.fixture(autouse=True)
-def quick(virtual_threads: object, monkeypatch: pytest.MonkeyPatch) -> None:
+def short_timeouts(virtual_threads: object, monkeypatch: pytest.MonkeyPatch) -> None:
     """Use shorter waits, and a PC without other load."""
     shorten_waits(monkeypatch, {"drivers.can.sdo_channel.RESPONSE_TIMEOUT_S": 0.2})
     monkeypatch.setattr("os.getloadavg", lambda: (0.1, 0.1, 0.1))
     monkeypatch.setattr("fdhil.cli.doctor.computer.GOVERNOR", Path("/none"))
 
 
-class Pc:
+class PcSetup:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.store = folder / "store"
@@ -56,16 +56,16 @@ class Pc:
     def run_directory(self) -> Path:
         return self.store / "run"
 
-    def write(self) -> Path:
+    def write_config(self) -> Path:
         path = self.folder / "machine.toml"
-        path.write_text(to_toml({**self.document, "bus": {"can0": self.bus}}), "utf-8")
+        path.write_text(format_toml({**self.document, "bus": {"can0": self.bus}}), "utf-8")
         return path
 
-    def peer(self) -> DrivePeer:
-        return DrivePeer(machine_config.load_config(self.write()))
+    def start_peer(self) -> DrivePeer:
+        return DrivePeer(machine_config.load_config(self.write_config()))
 
-    def examined(self, *options: str) -> tuple[int, list[dict[str, Any]]]:
-        result = CliRunner().invoke(doctor, [str(self.write()), "--json", *options], standalone_mode=False)
+    def run_doctor(self, *options: str) -> tuple[int, list[dict[str, Any]]]:
+        result = CliRunner().invoke(doctor, [str(self.write_config()), "--json", *options], standalone_mode=False)
         assert result.exception is None, result.exception
         document = json.loads(result.stdout)
         assert document["schema"] == "fdhil-doctor-1"
@@ -73,66 +73,68 @@ class Pc:
 
 
 @pytest.fixture
-def pc(tmp_path: Path) -> Pc:
-    made = Pc(tmp_path)
+def pc_setup(tmp_path: Path) -> PcSetup:
+    made = PcSetup(tmp_path)
     made.run_directory.mkdir(parents=True, mode=0o700)
     return made
 
 
-def store_is_a_file(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def replace_store_by_file(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     (pc.folder / "occupied").write_text("x")
     pc.document["store"]["directory"] = str(pc.folder / "occupied" / "store")
 
 
-def store_may_not_be_written(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def make_store_read_only(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     # root can write everywhere
-    patch.setattr("fdhil.cli.doctor.storage.may_write", lambda _: False)
+    patch.setattr("fdhil.cli.doctor.storage.can_write", lambda _: False)
 
 
-def little_room(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def fill_disk(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     patch.setattr("fdhil.cli.doctor.storage.LEAST_FREE_BYTES", 1 << 60)
 
 
-def damaged_history(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def damage_history(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     (pc.store / HISTORY_FILE_NAME).write_bytes(b"no database" * 1000)
 
 
-def newer_history(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def write_newer_history(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     History.open(pc.store).close()
     with sqlite3.connect(pc.store / HISTORY_FILE_NAME) as db:
         db.execute("PRAGMA user_version = 99")
     db.close()
 
 
-def clock_never_set(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def reset_clock(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     patch.setattr("time.time", lambda: 0.0)
 
 
-def clock_set_back(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def set_clock_back(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     with History.open(pc.store) as history:
         now = TimeStamp.now()
         history.add_notice(Notice("SyncLost", "info", "SYNC is back."), replace(now, wall_s=now.wall_s + 86400))
 
 
-def no_port(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def remove_port(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     pc.bus = {"interface": "socketcand", "port": 0}
 
 
-def hub_is_away(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def stop_hub(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         pc.bus = {"interface": "socketcand", "port": free.getsockname()[1]}
 
 
-def kernel_without_can(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def disable_can_kernel(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     pc.bus = {"interface": "socketcan", "channel": "can9"}
-    patch.setattr("fdhil.cli.doctor.computer._opens_can", lambda: False)
+    patch.setattr("fdhil.cli.doctor.computer._can_open_socket", lambda: False)
 
 
-def adapter(pc: Pc, patch: pytest.MonkeyPatch, flags: str | None, details: dict[str, Any] | None = None) -> None:
+def fake_can_interface(
+    pc: PcSetup, patch: pytest.MonkeyPatch, flags: str | None, details: dict[str, Any] | None = None
+) -> None:
     """Fake a CAN interface of the kernel and ``ip``; ``flags`` None: no interface."""
     pc.bus = {"interface": "socketcan", "channel": "can9", "bitrate": 500_000}
-    patch.setattr("fdhil.cli.doctor.computer._opens_can", lambda: True)
+    patch.setattr("fdhil.cli.doctor.computer._can_open_socket", lambda: True)
     patch.setattr("fdhil.cli.doctor.computer.INTERFACES", pc.folder)
     if flags is not None:
         (pc.folder / "can9").mkdir()
@@ -143,148 +145,159 @@ def adapter(pc: Pc, patch: pytest.MonkeyPatch, flags: str | None, details: dict[
     patch.setattr("shutil.which", lambda name: str(tool))
 
 
-def no_adapter(pc: Pc, patch: pytest.MonkeyPatch) -> None:
-    adapter(pc, patch, None)
+def remove_adapter(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
+    fake_can_interface(pc, patch, None)
 
 
-def interface_down(pc: Pc, patch: pytest.MonkeyPatch) -> None:
-    adapter(pc, patch, "0x80\n")
+def set_interface_down(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
+    fake_can_interface(pc, patch, "0x80\n")
 
 
-def bus_off(pc: Pc, patch: pytest.MonkeyPatch) -> None:
-    adapter(pc, patch, "0x81\n", {"state": "BUS-OFF", "bittiming": {"bitrate": 500_000}, "restart_ms": 100})
+def set_bus_off(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
+    fake_can_interface(pc, patch, "0x81\n", {"state": "BUS-OFF", "bittiming": {"bitrate": 500_000}, "restart_ms": 100})
 
 
-def error_passive(pc: Pc, patch: pytest.MonkeyPatch) -> None:
-    adapter(pc, patch, "0x81\n", {"state": "ERROR-PASSIVE"})
+def set_error_passive(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
+    fake_can_interface(pc, patch, "0x81\n", {"state": "ERROR-PASSIVE"})
 
 
-def other_bit_rate(pc: Pc, patch: pytest.MonkeyPatch) -> None:
-    adapter(pc, patch, "0x81\n", {"state": "ERROR-ACTIVE", "bittiming": {"bitrate": 250_000}})
+def change_bit_rate(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
+    fake_can_interface(pc, patch, "0x81\n", {"state": "ERROR-ACTIVE", "bittiming": {"bitrate": 250_000}})
 
 
-def drive_is_away(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def remove_drive(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     pc.axis["drive"] = {"node_id": 9}
 
 
-def other_rated_current(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def change_rated_current(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     pc.axis["drive"] = {"rated_current_a": 10.0}
 
 
-def other_scale(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def change_scale(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     pc.axis["drive"] = {"increments_per_rev": 4096}
 
 
-def sensor_is_away(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def remove_sensor(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     pc.axis["voltage"] = {"source": "modbus", "host": "127.0.0.1", "port": 9, "timeout_s": 0.2}
 
 
-def socket_path_too_long(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def lengthen_socket_path(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     pc.document["store"]["run_directory"] = str(pc.folder / ("x" * 120))
 
 
-def anybody_may_write(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def open_run_directory(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     pc.run_directory.chmod(stat.S_IMODE(0o777))
 
 
-def token_can_be_read(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def open_token(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     (pc.run_directory / "token").write_text("secret")
     (pc.run_directory / "token").chmod(0o644)
 
 
-def corrected(pc: Pc) -> None:
+def configure_correction(pc: PcSetup) -> None:
     pc.axis["correction"] = {"max_offset_um": 50.0}
 
 
-def damaged_record(pc: Pc, patch: pytest.MonkeyPatch) -> None:
-    corrected(pc)
+def damage_record(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
+    configure_correction(pc)
     (pc.store / "commissioning-X.json").write_text("{}")
 
 
-def guard_is_silent(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+def start_silent_guard(pc: PcSetup, patch: pytest.MonkeyPatch) -> None:
     with socket.socket(socket.AF_UNIX) as left:
         left.bind(str(pc.run_directory / "guard.sock"))
 
 
-PLANTED: dict[Callable[[Pc, pytest.MonkeyPatch], None], str] = {
-    store_is_a_file: "StoreNoFolder",
-    store_may_not_be_written: "StoreReadOnly",
-    little_room: "DiskFull",
-    damaged_history: "CorruptFile",
-    newer_history: "SchemaVersion",
-    clock_never_set: "ClockNotSet",
-    clock_set_back: "ClockBehind",
-    no_port: "NoPort",
-    hub_is_away: "HubAway",
-    kernel_without_can: "NoKernelCan",
-    no_adapter: "InterfaceMissing",
-    interface_down: "InterfaceDown",
-    bus_off: "BusOff",
-    error_passive: "BusPassive",
-    other_bit_rate: "BitrateDiffers",
-    drive_is_away: "DriveDiffers",
-    other_rated_current: "RatedCurrentDiffers",
-    other_scale: "ScaleDiffers",
-    sensor_is_away: "VoltageDiffers",
-    socket_path_too_long: "SocketPathLong",
-    anybody_may_write: "RunDirectoryOpen",
-    token_can_be_read: "TokenOpen",
-    damaged_record: "RecordBad",
-    guard_is_silent: "GuardSilent",
+PLANTED: dict[Callable[[PcSetup, pytest.MonkeyPatch], None], str] = {
+    replace_store_by_file: "StoreNoFolder",
+    make_store_read_only: "StoreReadOnly",
+    fill_disk: "DiskFull",
+    damage_history: "CorruptFile",
+    write_newer_history: "SchemaVersion",
+    reset_clock: "ClockNotSet",
+    set_clock_back: "ClockBehind",
+    remove_port: "NoPort",
+    stop_hub: "HubAway",
+    disable_can_kernel: "NoKernelCan",
+    remove_adapter: "InterfaceMissing",
+    set_interface_down: "InterfaceDown",
+    set_bus_off: "BusOff",
+    set_error_passive: "BusPassive",
+    change_bit_rate: "BitrateDiffers",
+    remove_drive: "DriveDiffers",
+    change_rated_current: "RatedCurrentDiffers",
+    change_scale: "ScaleDiffers",
+    remove_sensor: "VoltageDiffers",
+    lengthen_socket_path: "SocketPathLong",
+    open_run_directory: "RunDirectoryOpen",
+    open_token: "TokenOpen",
+    damage_record: "RecordBad",
+    start_silent_guard: "GuardSilent",
 }
 
 
-def test_nothing_is_wrong_with_a_machine_as_it_must_be(pc: Pc) -> None:
-    with pc.peer():
-        assert pc.examined() == (0, [])
+def test_correct_machine_has_no_problems(pc_setup: PcSetup) -> None:
+    with pc_setup.start_peer():
+        assert pc_setup.run_doctor() == (0, [])
 
 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("plant", PLANTED, ids=lambda plant: plant.__name__)
-def test_a_planted_trouble_is_named_first(plant: Callable[..., None], pc: Pc, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pc.peer():
-        plant(pc, monkeypatch)
-        code, troubles = pc.examined()
+def test_planted_problem_is_listed_first(
+    plant: Callable[..., None], pc_setup: PcSetup, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pc_setup.start_peer():
+        plant(pc_setup, monkeypatch)
+        code, troubles = pc_setup.run_doctor()
     assert troubles[0]["code"] == PLANTED[plant], troubles
     assert code == 1
     assert all(troubles[0][part] for part in ("place", "what", "means", "mend"))
 
 
-def test_what_could_be_better_comes_last_and_is_no_failure(pc: Pc, monkeypatch: pytest.MonkeyPatch) -> None:
-    corrected(pc)
+def test_minor_problems_come_last_and_exit_0(pc_setup: PcSetup, monkeypatch: pytest.MonkeyPatch) -> None:
+    configure_correction(pc_setup)
     monkeypatch.setattr("os.getloadavg", lambda: (99.0, 99.0, 99.0))
-    code, troubles = pc.examined("--offline")
+    code, troubles = pc_setup.run_doctor("--offline")
     assert (code, [t["code"] for t in troubles]) == (0, ["BusyHost", "NotCommissioned"])
 
 
 @pytest.mark.usefixtures("processes")
-def test_a_store_that_may_not_be_entered_is_told_and_the_rest_examined(pc: Pc) -> None:
-    pc.document["store"]["run_directory"] = str(pc.folder / "run")
-    History.open(pc.store).close()
-    command = [*UNPRIVILEGED, sys.executable, "-m", "fdhil", "doctor", str(pc.write()), "--json", "--offline"]
-    pc.store.chmod(0)
+def test_unreadable_store_is_reported_and_rest_is_examined(pc_setup: PcSetup) -> None:
+    pc_setup.document["store"]["run_directory"] = str(pc_setup.folder / "run")
+    History.open(pc_setup.store).close()
+    command = [
+        *UNPRIVILEGED,
+        sys.executable,
+        "-m",
+        "fdhil",
+        "doctor",
+        str(pc_setup.write_config()),
+        "--json",
+        "--offline",
+    ]
+    pc_setup.store.chmod(0)
     try:
         done = subprocess.run(command, capture_output=True, text=True)
     finally:
-        pc.store.chmod(0o700)
+        pc_setup.store.chmod(0o700)
     assert (done.returncode, done.stderr) == (1, "")
     troubles = json.loads(done.stdout)["troubles"]
     assert {"StoreReadOnly", "NotSeen"} <= {trouble["code"] for trouble in troubles}
-    assert any(str(pc.store) in trouble["what"] and "sudo" in trouble["mend"] for trouble in troubles)
+    assert any(str(pc_setup.store) in trouble["what"] and "sudo" in trouble["mend"] for trouble in troubles)
 
 
-def test_offline_leaves_the_hub_in_peace(pc: Pc) -> None:
+def test_offline_does_not_contact_hub(pc_setup: PcSetup) -> None:
     with socket.create_server(("127.0.0.1", 0)) as hub:
-        pc.bus = {"interface": "socketcand", "port": hub.getsockname()[1]}
-        pc.examined("--offline")
+        pc_setup.bus = {"interface": "socketcand", "port": hub.getsockname()[1]}
+        pc_setup.run_doctor("--offline")
         hub.setblocking(False)
         with pytest.raises(BlockingIOError):
             hub.accept()
 
 
-def test_it_reads_well(pc: Pc) -> None:
-    pc.document["store"]["run_directory"] = str(pc.folder / ("x" * 120))
-    result = CliRunner().invoke(doctor, [str(pc.write()), "--offline"], standalone_mode=False)
+def test_doctor_prints_readable_text(pc_setup: PcSetup) -> None:
+    pc_setup.document["store"]["run_directory"] = str(pc_setup.folder / ("x" * 120))
+    result = CliRunner().invoke(doctor, [str(pc_setup.write_config()), "--offline"], standalone_mode=False)
     assert "1. sockets: " in result.stdout
     assert "   fix:   choose a shorter [store] run_directory" in result.stdout
     assert "1 to fix, 0 to improve" in result.stdout

@@ -8,17 +8,17 @@ from typing import Any
 
 import pytest
 
-from fdhil.cli.doctor.latency import examine_latency, histogram_lines, latency_text, measure_latency, read_latency
+from fdhil.cli.doctor.latency import examine_latency, format_histogram, format_latency, measure_latency, read_latency
 from fdhil.config import MachineConfig
 from tests.daemon.machine_rig import BENCH, fdhil
 from tests.daemon.simulated_machine import config_of
 
 
-class Pc:
+class SleepyPc:
     def __init__(self, *late_s: float) -> None:
         self._late_s, self._count, self._now_s = late_s, 0, 100.0
 
-    def now_s(self) -> float:
+    def read_clock(self) -> float:
         return self._now_s
 
     def sleep(self, seconds: float) -> None:
@@ -32,13 +32,13 @@ def machine(tmp_path: Path) -> MachineConfig:
     return config_of(tmp_path, ("X", "Y"))
 
 
-def measured(machine: MachineConfig, *late_s: float, seconds: float = 1.0) -> dict[str, Any]:
-    pc = Pc(*late_s)
-    return measure_latency(machine, seconds, pc.now_s, pc.sleep)
+def measure_on_sleepy_pc(machine: MachineConfig, *late_s: float, seconds: float = 1.0) -> dict[str, Any]:
+    pc = SleepyPc(*late_s)
+    return measure_latency(machine, seconds, pc.read_clock, pc.sleep)
 
 
-def test_wake_ups_are_counted_by_how_late_they_are(machine: MachineConfig) -> None:
-    found = measured(machine, *[30e-6] * 9, 150e-6)
+def test_wake_ups_are_counted_by_latency(machine: MachineConfig) -> None:
+    found = measure_on_sleepy_pc(machine, *[30e-6] * 9, 150e-6)
     assert (found["turns"], found["late"]) == (pytest.approx(1000, abs=2), 0)
     assert {top: count for top, count in found["histogram_us"] if count} == {
         50: pytest.approx(900, abs=2),
@@ -46,19 +46,19 @@ def test_wake_ups_are_counted_by_how_late_they_are(machine: MachineConfig) -> No
     }
     assert found["worst_us"] == pytest.approx(150, abs=2)
     assert list(examine_latency(found)) == []
-    assert "up to 50 us" in next(histogram_lines(found["histogram_us"]))
+    assert "up to 50 us" in next(format_histogram(found["histogram_us"]))
 
 
-def test_late_pc_is_a_trouble_with_its_remedy(machine: MachineConfig) -> None:
-    found = measured(machine, *[30e-6] * 99, 9e-3)
+def test_slow_pc_is_reported_with_remedy(machine: MachineConfig) -> None:
+    found = measure_on_sleepy_pc(machine, *[30e-6] * 99, 9e-3)
     (trouble,) = examine_latency(found)
     assert (trouble.code, trouble.grave) == ("PcLate", True)
     assert "worst 9000 us" in trouble.what
     assert found["late"] == pytest.approx(found["turns"] / 100, abs=1)
-    assert latency_text(found) in trouble.what
+    assert format_latency(found) in trouble.what
 
 
-def test_doctor_measures_keeps_and_reports_it(machine: MachineConfig, tmp_path: Path, capsys: Any) -> None:
+def test_doctor_measures_stores_and_reports_latency(machine: MachineConfig, tmp_path: Path, capsys: Any) -> None:
     _, out, err = fdhil("doctor", tmp_path / "machine.toml", "--offline", "--latency", "1", capsys=capsys)
     assert "wake-ups every 1 ms: median latency" in out
     kept = read_latency(machine)

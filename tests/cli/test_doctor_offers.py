@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.cli.doctor.offers import examine_offers
+from fdhil.cli.doctor.offers_check import examine_offers
 from fdhil.config import MachineConfig
 from fdhil.store.change_offers import ANSWERS_FILE, OfferDecision, add_decision, make_file_name
 from tests.fleet.offer_signing import OfferSigner, create_machine
@@ -24,37 +24,41 @@ def machine(tmp_path: Path) -> MachineConfig:
     return config
 
 
-def told(machine: MachineConfig) -> list[tuple[str, bool]]:
+def list_trouble_codes(machine: MachineConfig) -> list[tuple[str, bool]]:
     found = list(examine_offers(machine))
     assert all(each.what and each.means and each.mend for each in found)
     return [(each.code, each.grave) for each in found]
 
 
-def test_an_offer_is_told_until_it_is_answered(machine: MachineConfig) -> None:
-    assert told(machine) == [("OfferWaits", False)]
+def test_offer_is_reported_until_answered(machine: MachineConfig) -> None:
+    assert list_trouble_codes(machine) == [("OfferWaits", False)]
     answer = OfferDecision("friction", 3, 1, "0" * 64, "rejected", "Anna", "not now", time.time(), "")
     add_decision(machine.store.directory, answer)
-    assert told(machine) == []
+    assert list_trouble_codes(machine) == []
 
 
-def test_answers_that_cannot_be_read(machine: MachineConfig) -> None:
+def test_unreadable_answers_are_reported(machine: MachineConfig) -> None:
     machine.store.directory.mkdir(parents=True, exist_ok=True)
     (machine.store.directory / ANSWERS_FILE).write_text("{")
-    assert told(machine) == [("OffersUnread", True)]
+    assert list_trouble_codes(machine) == [("OffersUnread", True)]
 
 
 @pytest.mark.parametrize("what", ["the folder", "an offer"])
-def test_what_this_user_may_not_read(what: str, machine: MachineConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_offers_without_read_permission_are_reported(
+    what: str, machine: MachineConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = machine.offers_directory
     shut = folder if what == "the folder" else folder / make_file_name("friction", 3)
     monkeypatch.setattr(os, "access", lambda path, _: path != shut)  # root can read everything
-    assert ("OffersUnread", True) in told(machine)
+    assert ("OffersUnread", True) in list_trouble_codes(machine)
 
 
-def test_where_no_works_is_trusted_nothing_is_looked_at(machine: MachineConfig) -> None:
+def test_offers_are_ignored_without_trusted_key(machine: MachineConfig) -> None:
     alone = machine.model_copy(update={"offers": machine.offers.model_copy(update={"trust": ()})})
-    assert told(alone) == []
+    assert list_trouble_codes(alone) == []
 
 
-def test_no_offer_is_no_trouble(tmp_path: Path) -> None:
-    assert told(machine_config.load_config(create_machine(OfferSigner(tmp_path), tmp_path / "mill"))) == []
+def test_no_offers_are_no_problem(tmp_path: Path) -> None:
+    assert (
+        list_trouble_codes(machine_config.load_config(create_machine(OfferSigner(tmp_path), tmp_path / "mill"))) == []
+    )

@@ -15,29 +15,29 @@ from tests.bench import bench_config
 NAMES = ("position_gain_per_s", "speed_feedforward", "speed_kp", "position_ki_per_s2")
 
 
-def found(structure: str, names: tuple[str, ...], values: tuple[float, ...]) -> LoopEstimate:
+def make_loops(structure: str, names: tuple[str, ...], values: tuple[float, ...]) -> LoopEstimate:
     covariance = freeze_array(np.zeros((len(names), len(names))))
     return LoopEstimate("X", structure, names, freeze_array(values), covariance, Verdict(True, None, ()), None)
 
 
-def test_pid_is_reported_as_the_two_cascades_of_its_sum_and_product() -> None:
-    same = list_equivalent_loops(found("pid", NAMES, (84.0, 1.0, 20.0, 1760.0)))
+def test_pid_is_reported_with_two_equivalent_cascades() -> None:
+    same = list_equivalent_loops(make_loops("pid", NAMES, (84.0, 1.0, 20.0, 1760.0)))
     assert [each["position_gain_per_s"] for each in same] == pytest.approx([40.0, 44.0])
     assert [each["speed_ki"] for each in same] == pytest.approx([880.0, 800.0])
 
 
-def test_no_cascade_is_the_same_without_real_gains_or_with_part_of_the_speed_fed_forward() -> None:
-    assert list_equivalent_loops(found("pid", NAMES, (40.0, 1.0, 20.0, 1760.0))) == []
-    assert list_equivalent_loops(found("pid", NAMES, (84.0, 0.5, 20.0, 1760.0))) == []
+def test_no_equivalent_cascade_for_complex_gains_or_partial_feedforward() -> None:
+    assert list_equivalent_loops(make_loops("pid", NAMES, (40.0, 1.0, 20.0, 1760.0))) == []
+    assert list_equivalent_loops(make_loops("pid", NAMES, (84.0, 0.5, 20.0, 1760.0))) == []
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_exchanged_cascade_follows_a_rapid_alike() -> None:
+def test_equivalent_cascade_follows_rapid_identically() -> None:
     axis = bench_config().axis["X"]
     model, demand_mm = Parameters(**axis.nominal.model_dump()), 1e3 * make_shuttle_demand()
     g = axis.regulators
     names = ("position_gain_per_s", "speed_feedforward", "speed_kp", "speed_ki")
-    cascade = found("p_pi_pi", names, (g.position_gain_per_s, 1.0, g.speed_kp, g.speed_ki))
+    cascade = make_loops("p_pi_pi", names, (g.position_gain_per_s, 1.0, g.speed_kp, g.speed_ki))
     pid, exchanged = list_equivalent_loops(cascade)
     assert (pid["structure"], exchanged["structure"]) == ("pid", "p_pi_pi")
     other = axis.model_copy(update={"regulators": Regulators.model_validate(g.model_dump() | dict(exchanged))})

@@ -29,7 +29,7 @@ from tests.guard.drive_peer import Peer, hold_demand, write_config
 from tests.reserved_port import reserve_port
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+def run_guard(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     monkeypatch.setattr(sys, "argv", ["fdhil-guard", *arguments])
     return run_safely(guard)
 
@@ -40,17 +40,17 @@ def peer() -> Iterator[Peer]:
         yield made
 
 
-def test_help(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(monkeypatch, "--help") == 0
+def test_guard_help_exits_0(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_guard(monkeypatch, "--help") == 0
     text = capsys.readouterr().out
     assert "sends no frame until the daemon arms" in " ".join(text.split())
 
 
-def test_check_writes_the_settings_and_a_token(
+def test_check_writes_settings_and_token(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = write_config(tmp_path, 1)
-    assert run(monkeypatch, str(config), "--check") == 0
+    assert run_guard(monkeypatch, str(config), "--check") == 0
     assert "guard.json" in capsys.readouterr().out
     directory = tmp_path / "fdhil-data" / "run"
     settings = load_settings(directory / "guard.json")
@@ -65,25 +65,25 @@ def test_check_writes_the_settings_and_a_token(
     assert settings.axes[0].window == 32768
 
 
-def test_without_a_correction_section_writing_is_off(
+def test_guard_refuses_machine_without_correction_section(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = write_config(tmp_path, 1, corrected=False)
-    assert run(monkeypatch, str(config)) == 2
+    assert run_guard(monkeypatch, str(config)) == 2
     assert "writing is off" in capsys.readouterr().err
 
 
-def test_no_hub_is_one_sentence(
+def test_missing_hub_is_reported_in_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with reserve_port() as port:
-        assert run(monkeypatch, str(write_config(tmp_path, port))) == 3
+        assert run_guard(monkeypatch, str(write_config(tmp_path, port))) == 3
     told = capsys.readouterr().err
     assert "start the hub first" in told
     assert len(told.splitlines()) == 1
 
 
-def test_no_drive_is_commissioned_while_a_guard_owns_the_bus(
+def test_commissioning_is_refused_while_guard_owns_bus(
     tmp_path: Path, peer: Peer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The running guard read the records at its start and would not use a new one."""
@@ -94,12 +94,12 @@ def test_no_drive_is_commissioned_while_a_guard_owns_the_bus(
     assert "BusLocked" in capsys.readouterr().err
 
 
-def never(*_: object) -> None:
+def fail_if_called(*_: object) -> None:
     raise AssertionError("a second guard")
 
 
 @pytest.mark.usefixtures("processes")
-def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(
+def test_guard_process_owns_bus_and_stops_cleanly(
     tmp_path: Path, peer: Peer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A second guard on another name of the same hub exits with 3 and sends nothing."""
@@ -111,9 +111,9 @@ def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         ready = json.loads(process.stdout.readline())
-        monkeypatch.setattr(os, "execv", never)
+        monkeypatch.setattr(os, "execv", fail_if_called)
         try:
-            seconds = [(run(monkeypatch, str(again)), capsys.readouterr().err) for again in (config, other)]
+            seconds = [(run_guard(monkeypatch, str(again)), capsys.readouterr().err) for again in (config, other)]
         finally:
             process.send_signal(signal.SIGTERM)
         told = [json.loads(line) for line in process.stdout]
@@ -127,7 +127,7 @@ def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(
 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
-def test_a_guard_whose_output_is_closed_says_nothing_on_the_bus(closed: str, tmp_path: Path, peer: Peer) -> None:
+def test_guard_with_closed_stdout_sends_nothing_on_bus(closed: str, tmp_path: Path, peer: Peer) -> None:
     """Otherwise the bus would get the descriptor of stdout, and log lines would be sent on it."""
     config = write_config(tmp_path, peer.port)
     command = f"exec {sys.executable} -m fdhil.cli.guard {config} {closed}"
@@ -146,7 +146,7 @@ def test_a_guard_whose_output_is_closed_says_nothing_on_the_bus(closed: str, tmp
 
 
 @pytest.mark.usefixtures("processes")
-def test_the_process_alone_refuses_what_it_cannot_use(tmp_path: Path) -> None:
+def test_guard_process_refuses_invalid_settings(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "fdhil.guard", "--settings", str(tmp_path / "none.json"), "--descriptor", "0"]
     refused = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
     assert refused.returncode == 2
@@ -154,7 +154,7 @@ def test_the_process_alone_refuses_what_it_cannot_use(tmp_path: Path) -> None:
     assert len(refused.stderr.splitlines()) == 1
 
 
-def test_a_guard_under_a_user_of_its_own(
+def test_guard_runs_under_separate_user(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The guard has its own directory, gets the token from systemd, and accepts the daemon's user."""
@@ -170,7 +170,7 @@ def test_a_guard_under_a_user_of_its_own(
     key.chmod(0o400)
     machine = machine_config.load_config(config)
     save_record(replace(RECORD, config_digest=axis_digest(machine, "X")), machine.store.directory, key)
-    assert run(monkeypatch, str(config), "--check") == 0
+    assert run_guard(monkeypatch, str(config), "--check") == 0
     settings = load_settings(tmp_path / "own" / "guard.json")
     assert settings.token_sha256 == hashlib.sha256(b"the operator's").hexdigest()
     assert settings.daemon_uid == pwd.getpwnam("daemon").pw_uid
@@ -179,5 +179,5 @@ def test_a_guard_under_a_user_of_its_own(
     assert settings.axes[0].record, "its key came from systemd too"
     assert not (tmp_path / "fdhil-data" / "run").exists()
     config.write_text(config.read_text().replace('"daemon"', '"nobody of that name"'))
-    assert run(monkeypatch, str(config), "--check") == 2
+    assert run_guard(monkeypatch, str(config), "--check") == 2
     assert "the user 'nobody of that name' does not exist" in capsys.readouterr().err

@@ -29,7 +29,7 @@ PER_KELVIN = -0.25  # of Cd, N.m
 
 
 @pytest.fixture(scope="module")
-def worn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def worn_history(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A machine with wearing ft, temperature-dependent Cd, and a table load added on day 40."""
     tmp_path = tmp_path_factory.mktemp("worn")
     path = tmp_path / "machine.toml"
@@ -53,12 +53,12 @@ def worn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def _days(date: str) -> float:
+def _count_days(date: str) -> float:
     return (datetime.fromisoformat(date) - datetime.fromtimestamp(START_S, UTC)).total_seconds() / 86_400
 
 
-def test_slopes_hold_wear_and_warming_apart(worn: Path, capsys: Any) -> None:
-    document = json.loads(fdhil("history", worn, "--json", capsys=capsys)[1])
+def test_slopes_separate_wear_and_temperature(worn_history: Path, capsys: Any) -> None:
+    document = json.loads(fdhil("history", worn_history, "--json", capsys=capsys)[1])
     wear, warming = document["trends"]["X"]["ft"], document["slopes"]["X"]["Cd"]
     assert wear["low"] <= WEAR_PER_DAY <= wear["high"]
     assert wear["per_day"] == pytest.approx(WEAR_PER_DAY, rel=0.05)
@@ -69,49 +69,49 @@ def test_slopes_hold_wear_and_warming_apart(worn: Path, capsys: Any) -> None:
     assert steady["low"] <= 0 <= steady["high"]
 
 
-def test_a_changed_load_is_found_and_named(worn: Path, capsys: Any) -> None:
-    document = json.loads(fdhil("history", worn, "--json", capsys=capsys)[1])
+def test_load_change_is_detected_and_named(worn_history: Path, capsys: Any) -> None:
+    document = json.loads(fdhil("history", worn_history, "--json", capsys=capsys)[1])
     (change,) = document["changes"]["X"]
-    assert _days(change["time"]) == pytest.approx(STEP_DAY, abs=0.6)
+    assert _count_days(change["time"]) == pytest.approx(STEP_DAY, abs=0.6)
     assert change["cause"] == "a changed load"
     told = change["parameters"]["Jt"]
     assert (told["before"], told["after"]) == (pytest.approx(0.075, rel=2e-3), pytest.approx(0.08475, rel=2e-3))
     # the trend of Jt restarts at the step, which is not wear
-    assert _days(document["trends"]["X"]["Jt"]["since"]) == pytest.approx(STEP_DAY, abs=0.6)
+    assert _count_days(document["trends"]["X"]["Jt"]["since"]) == pytest.approx(STEP_DAY, abs=0.6)
     assert document["trends"]["X"]["Jt"]["low"] <= 0 <= document["trends"]["X"]["Jt"]["high"]
 
 
-def test_the_date_of_a_limit_comes_with_its_interval(worn: Path, capsys: Any) -> None:
-    document = json.loads(fdhil("history", worn, "--json", capsys=capsys)[1])
+def test_limit_date_has_interval(worn_history: Path, capsys: Any) -> None:
+    document = json.loads(fdhil("history", worn_history, "--json", capsys=capsys)[1])
     (limit,) = [limit for name, limit in document["limits"]["X"].items() if name == "ft"]
     first = document["revisions"][0]["parameters"]["ft"]["value"]
     assert limit["limit"] == pytest.approx(2 * first)  # default limit
     due = (2 * first - 0.05) / WEAR_PER_DAY
-    assert _days(limit["earliest"]) <= due <= _days(limit["latest"])
-    assert _days(limit["date"]) == pytest.approx(due, rel=0.05)
+    assert _count_days(limit["earliest"]) <= due <= _count_days(limit["latest"])
+    assert _count_days(limit["date"]) == pytest.approx(due, rel=0.05)
     assert not limit["reached"]
-    _, out, _ = fdhil("history", worn, capsys=capsys)
+    _, out, _ = fdhil("history", worn_history, capsys=capsys)
     assert f"on {limit['date'][:10]}" in out
     assert f"({limit['earliest'][:10]} to {limit['latest'][:10]})" in out
     assert "a changed load" in out
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_the_plot_and_the_report_show_it(worn: Path, tmp_path: Path, capsys: Any) -> None:
+def test_plot_and_report_show_trends(worn_history: Path, tmp_path: Path, capsys: Any) -> None:
     plot = tmp_path / "plot.png"
-    assert fdhil("history", worn, "--plot", plot, capsys=capsys)[::2] == (0, f"wrote {plot}\n")
+    assert fdhil("history", worn_history, "--plot", plot, capsys=capsys)[::2] == (0, f"wrote {plot}\n")
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "plot.png").stat().st_size > 50_000
-    assert fdhil("report", worn, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
+    assert fdhil("report", worn_history, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
     page = (tmp_path / "report.html").read_text()
     for words in ("Slopes since the last change", "a changed load", "maintenance limit"):
         assert words in page
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_the_report_begins_with_how_the_drives_are(worn: Path, tmp_path: Path, capsys: Any) -> None:
-    document = json.loads(fdhil("history", worn, "--json", capsys=capsys)[1])
-    assert fdhil("report", worn, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
+def test_report_starts_with_condition_of_drives(worn_history: Path, tmp_path: Path, capsys: Any) -> None:
+    document = json.loads(fdhil("history", worn_history, "--json", capsys=capsys)[1])
+    assert fdhil("report", worn_history, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
     page = (tmp_path / "report.html").read_text()
     verdict, _, axis = page.partition("<h2>Axis X</h2>")
     limit = document["limits"]["X"]["ft"]
@@ -126,7 +126,7 @@ def test_the_report_begins_with_how_the_drives_are(worn: Path, tmp_path: Path, c
     assert [label for label, _ in told["marks"]] == ["a changed load"]
 
 
-def test_rapids_that_were_not_believed_are_in_the_report(tmp_path: Path, capsys: Any) -> None:
+def test_refused_rapids_are_in_report(tmp_path: Path, capsys: Any) -> None:
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)
     with History.open(config_of(tmp_path, ("X", "Y")).store.directory) as history:
@@ -143,7 +143,7 @@ def test_rapids_that_were_not_believed_are_in_the_report(tmp_path: Path, capsys:
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_a_long_store_is_a_small_page(tmp_path: Path, capsys: Any) -> None:
+def test_long_history_gives_small_page(tmp_path: Path, capsys: Any) -> None:
     """With many rapids the plot shows the daily median and a percentile band."""
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)
@@ -167,19 +167,19 @@ def test_a_long_store_is_a_small_page(tmp_path: Path, capsys: Any) -> None:
     )
 
 
-def test_an_axis_that_there_is_not_is_refused(worn: Path, capsys: Any) -> None:
+def test_unknown_axis_is_refused(worn_history: Path, capsys: Any) -> None:
     """An unknown axis is a wrong option, not an empty history."""
-    code, _, told = fdhil("history", worn, "--axis", "Q", capsys=capsys)
+    code, _, told = fdhil("history", worn_history, "--axis", "Q", capsys=capsys)
     assert code == 2
     assert "has no axis Q" in told
 
 
-def test_every_table_fits_80_columns_and_says_what_its_intervals_are(worn: Path, capsys: Any) -> None:
-    out = fdhil("history", worn, capsys=capsys)[1]
+def test_tables_fit_80_columns_and_explain_intervals(worn_history: Path, capsys: Any) -> None:
+    out = fdhil("history", worn_history, capsys=capsys)[1]
     assert max(map(len, out.splitlines())) <= 80
     assert "…" not in out
     assert out.count("half the width of the 95 % interval") == 2
-    document = json.loads(fdhil("history", worn, "--json", capsys=capsys)[1])
+    document = json.loads(fdhil("history", worn_history, "--json", capsys=capsys)[1])
     told = document["revisions"][-1]["parameters"]["Jt"]
     (newest,) = (line for line in out.splitlines() if line.startswith("120 "))
     assert f"{1e3 * told['value']:.0f}" in newest.split()
@@ -188,7 +188,7 @@ def test_every_table_fits_80_columns_and_says_what_its_intervals_are(worn: Path,
     assert half == pytest.approx(1.96 * told["std"], rel=1e-3)
 
 
-def test_history_and_report_tell_what_waits_and_who_acknowledged(tmp_path: Path, capsys: Any) -> None:
+def test_history_and_report_show_pending_and_acknowledged_notices(tmp_path: Path, capsys: Any) -> None:
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)
     with History.open(config_of(tmp_path).store.directory) as history:

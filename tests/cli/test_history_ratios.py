@@ -24,7 +24,7 @@ WEAR_PER_DAY = 0.01  # of Cd/K
 
 
 @pytest.fixture(scope="module")
-def deaf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def history_without_voltage(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A machine without voltage sensor, with wearing friction and a table load added on day 12."""
     tmp_path = tmp_path_factory.mktemp("deaf")
     path = tmp_path / "machine.toml"
@@ -45,8 +45,8 @@ def deaf(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_ratios_tell_wear_and_a_changed_load(deaf: Path, capsys: Any) -> None:
-    document = json.loads(fdhil("history", deaf, "--json", capsys=capsys)[1])
+def test_ratios_show_wear_and_load_change(history_without_voltage: Path, capsys: Any) -> None:
+    document = json.loads(fdhil("history", history_without_voltage, "--json", capsys=capsys)[1])
     wear = document["trends"]["X"]["Cd/K"]
     assert wear["low"] > 0
     (change,) = document["changes"]["X"]
@@ -54,15 +54,15 @@ def test_ratios_tell_wear_and_a_changed_load(deaf: Path, capsys: Any) -> None:
     assert list(change["parameters"]) == ["Jt/K"]
 
 
-def test_ratios_are_shown_where_nothing_else_is_published(deaf: Path, capsys: Any, tmp_path: Path) -> None:
+def test_ratios_are_shown_without_published_sets(history_without_voltage: Path, capsys: Any, tmp_path: Path) -> None:
     plot = tmp_path / "ratios.png"
-    shown = fdhil("history", deaf, "--plot", plot, capsys=capsys)[1]
+    shown = fdhil("history", history_without_voltage, "--plot", plot, capsys=capsys)[1]
     assert "Cd/K A" in shown
     assert "a changed load" in shown
     assert plot.stat().st_size > 10_000
 
 
-def test_what_the_data_sheet_gives_has_no_trend(tmp_path: Path, capsys: Any) -> None:
+def test_data_sheet_values_have_no_trend(tmp_path: Path, capsys: Any) -> None:
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)
     machine = config_of(tmp_path, ("X",))

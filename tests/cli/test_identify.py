@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from fdhil import tables
-from fdhil.cli.identify import identify
+from fdhil.cli.identify_command import identify
 from fdhil.cli.main import cli, run_safely
 from fdhil.errors import ConfigError
 from fdhil.store import file_suffixes
@@ -31,19 +31,19 @@ def shuttle(tmp_path: Path) -> Path:
     return path
 
 
-def invoke(*arguments: object) -> Result:
+def run_cli(*arguments: object) -> Result:
     return CliRunner().invoke(cli, ["identify", *map(str, arguments)], standalone_mode=False)
 
 
-def told_document(result: Result) -> dict[str, Any]:
+def load_json_document(result: Result) -> dict[str, Any]:
     document: dict[str, Any] = json.loads(result.stdout)
     return document
 
 
-def test_json_holds_every_window_and_the_pool(shuttle: Path) -> None:
-    result = invoke(shuttle, "--json")
+def test_json_has_every_window_and_the_pool(shuttle: Path) -> None:
+    result = run_cli(shuttle, "--json")
     assert result.return_value == 0
-    document = told_document(result)
+    document = load_json_document(result)
     assert document["schema"] == "fdhil-identify-1"
     (told,) = document["files"]
     assert (told["file"], told["axis"]) == (str(shuttle), "X")
@@ -66,78 +66,78 @@ def test_json_holds_every_window_and_the_pool(shuttle: Path) -> None:
     assert pooled["parameters"]["L"]["unit"] == "H"
 
 
-def test_the_delay_of_a_slow_sensor_is_told_with_its_deviation(tmp_path: Path) -> None:
+def test_delay_of_slow_sensor_is_reported_with_deviation(tmp_path: Path) -> None:
     path = tmp_path / "slow.csv"
     export_table(convert_window(record_slow_windows(0.005, delay_s=0.0012)[0]), path)
-    result = invoke(path, "--json")
+    result = run_cli(path, "--json")
     assert result.return_value == 0
-    (window,) = told_document(result)["files"][0]["windows"]
+    (window,) = load_json_document(result)["files"][0]["windows"]
     assert set(window["delay_s"]) == {"value", "std", "unit"}
     assert window["delay_s"]["unit"] == "s"
     assert abs(window["delay_s"]["value"] - 0.0012) < 4 * window["delay_s"]["std"] < 2e-4
-    assert "voltage is delayed by 1.2" in invoke(path).stdout
+    assert "voltage is delayed by 1.2" in run_cli(path).stdout
 
 
 @pytest.mark.parametrize("method", ["least_squares", "maximum_likelihood"])
-def test_method_is_obeyed(shuttle: Path, method: str) -> None:
-    assert invoke(shuttle, "--json", "--method", method).return_value == 0
+def test_method_option_selects_estimator(shuttle: Path, method: str) -> None:
+    assert run_cli(shuttle, "--json", "--method", method).return_value == 0
 
 
-def test_people_get_a_table(shuttle: Path) -> None:
-    result = invoke(shuttle)
+def test_identify_prints_table(shuttle: Path) -> None:
+    result = run_cli(shuttle)
     assert result.return_value == 0
     assert "all 2" in result.stdout
     assert "g.m2" in result.stdout
 
 
-def test_the_table_fits_a_terminal_of_80_columns(shuttle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_table_fits_80_columns(shuttle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    lines = invoke(shuttle).stdout.splitlines()
+    lines = run_cli(shuttle).stdout.splitlines()
     assert max(map(len, lines[1:])) <= 80
     assert any(line.split()[-1:] == ["valid"] for line in lines)
     assert not any("\N{HORIZONTAL ELLIPSIS}" in line for line in lines)
 
 
-def test_refused_is_exit_1_with_null_values(tmp_path: Path) -> None:
+def test_refused_recording_exits_1_with_null_values(tmp_path: Path) -> None:
     path = tmp_path / "still.csv"
     path.write_text(
         bench.format_as_csv(
             bench.simulate_bench(bench.Plant(), bench.make_shuttle_demand(distance=0.02, speed=0.1)), 0.003
         )
     )
-    result = invoke(path, "--json")
+    result = run_cli(path, "--json")
     assert result.return_value == 1
-    (told,) = told_document(result)["files"]
+    (told,) = load_json_document(result)["files"]
     assert told["windows"] == []
     assert told["pooled"]["windows_used"] == 0
     assert told["pooled"]["reasons"][0].startswith("NoWindow")
     assert told["pooled"]["parameters"]["R"]["value"] is None
     assert "reason" in told["pooled"]["parameters"]["R"]
-    assert "NoWindow" in invoke(path).stdout
+    assert "NoWindow" in run_cli(path).stdout
 
 
-def test_config_gives_the_rapid_speed(shuttle: Path, tmp_path: Path) -> None:
+def test_rapid_speed_comes_from_config(shuttle: Path, tmp_path: Path) -> None:
     text = "".join(x for x in shuttle.read_text().splitlines(keepends=True) if "rapid_speed" not in x)
     shuttle.write_text(text)
     config = tmp_path / "machine.toml"
     fast = tmp_path / "fast.toml"
-    config.write_text(_config(500.0))
-    fast.write_text(_config(2000.0))
-    assert len(told_document(invoke(shuttle, "--json", "--config", config))["files"][0]["windows"]) == 2
-    assert told_document(invoke(shuttle, "--json", "--config", fast))["files"][0]["windows"] == []
+    config.write_text(_write_config(500.0))
+    fast.write_text(_write_config(2000.0))
+    assert len(load_json_document(run_cli(shuttle, "--json", "--config", config))["files"][0]["windows"]) == 2
+    assert load_json_document(run_cli(shuttle, "--json", "--config", fast))["files"][0]["windows"] == []
 
 
-def _config(rapid: float) -> str:
+def _write_config(rapid: float) -> str:
     return bench_toml("X", rapid_speed_mm_s=rapid)
 
 
-def test_one_bad_recording_does_not_end_a_batch(shuttle: Path, tmp_path: Path) -> None:
+def test_unreadable_recording_does_not_stop_batch(shuttle: Path, tmp_path: Path) -> None:
     """The error of the bad recording is in the document, in the table and on stderr."""
     bad, absent = tmp_path / "bad.csv", tmp_path / "absent.csv"
     bad.write_bytes(b"time_s,voltage_V\n1,two\n")
-    result = invoke(bad, shuttle, absent, "--json")
+    result = run_cli(bad, shuttle, absent, "--json")
     assert result.return_value == 3
-    first, good, last = told_document(result)["files"]
+    first, good, last = load_json_document(result)["files"]
     assert good["pooled"]["validated"] is True
     assert "error" not in good
     for told, path in ((first, bad), (last, absent)):
@@ -148,7 +148,7 @@ def test_one_bad_recording_does_not_end_a_batch(shuttle: Path, tmp_path: Path) -
         assert told["pooled"]["parameters"]["R"]["value"] is None
         assert told["pooled"]["reasons"] == [f"RecordingError: {told['error']['text']}"]
         assert told["error"]["class"] == "RecordingError"
-    shown = invoke(bad, shuttle, absent)
+    shown = run_cli(bad, shuttle, absent)
     assert shown.return_value == 3
     assert "all 2" in shown.stdout
     assert " ".join(shown.stdout.split()).count("not identified") == 2
@@ -157,11 +157,11 @@ def test_one_bad_recording_does_not_end_a_batch(shuttle: Path, tmp_path: Path) -
 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("place", ["empty", "closed", "a" * 300])
-def test_a_bad_place_does_not_end_a_batch(place: str, shuttle: Path, tmp_path: Path) -> None:
+def test_unreadable_folder_does_not_stop_batch(place: str, shuttle: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "closed").mkdir()
     (tmp_path / "closed" / "in").mkdir(mode=0)
-    result = identified_without_rights(tmp_path / place, shuttle)
+    result = identify_without_permissions(tmp_path / place, shuttle)
     assert result.returncode == 3, result.stderr
     bad, good = json.loads(result.stdout)["files"]
     assert good["pooled"]["validated"] is True
@@ -169,25 +169,25 @@ def test_a_bad_place_does_not_end_a_batch(place: str, shuttle: Path, tmp_path: P
     assert why.get(place, "cannot be read (File name too long)") in bad["error"]["text"]
 
 
-def identified_without_rights(*recordings: Path) -> subprocess.CompletedProcess[str]:
+def identify_without_permissions(*recordings: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "fdhil", "identify", "--json", *map(str, recordings)]
     if os.geteuid() == 0:
         command = ["setpriv", "--bounding-set=-dac_override,-dac_read_search", *command]
     return subprocess.run(command, capture_output=True, text=True, timeout=100)
 
 
-def test_an_axis_that_the_config_lacks_is_told(shuttle: Path, tmp_path: Path) -> None:
+def test_axis_missing_in_config_is_reported(shuttle: Path, tmp_path: Path) -> None:
     """Without the axis in the configuration no comparison with nominal values is possible."""
     shuttle.write_text(shuttle.read_text().replace("# axis: X", "# axis: Q", 1))
-    (tmp_path / "machine.toml").write_text(_config(500.0))
-    (told,) = told_document(invoke(shuttle, "--json", "--config", tmp_path / "machine.toml"))["files"]
+    (tmp_path / "machine.toml").write_text(_write_config(500.0))
+    (told,) = load_json_document(run_cli(shuttle, "--json", "--config", tmp_path / "machine.toml"))["files"]
     assert told["pooled"]["validated"] is True
     assert [text for text in told["pooled"]["warnings"] if "NoSuchAxis: axis Q is not in the configuration" in text]
-    (told,) = told_document(invoke(shuttle, "--json"))["files"]
+    (told,) = load_json_document(run_cli(shuttle, "--json"))["files"]
     assert "NoSuchAxis" not in str(told)
 
 
-def test_unreadable_recording_is_exit_3_in_one_sentence(
+def test_unreadable_recording_exits_3_with_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("sys.argv", ["fdhil-identify", str(tmp_path / "absent.csv")])
@@ -197,27 +197,27 @@ def test_unreadable_recording_is_exit_3_in_one_sentence(
     assert "cannot be read" in error
 
 
-def test_unknown_method_is_exit_2(shuttle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_method_exits_2(shuttle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["fdhil-identify", str(shuttle), "--method", "guess"])
     assert run_safely(identify) == 2
 
 
 @pytest.mark.usefixtures("processes")
-def test_every_file_format_gives_the_same_answer(tmp_path: Path) -> None:
+def test_every_file_format_gives_identical_result(tmp_path: Path) -> None:
     table = convert_window(record_slow_windows(0.005)[0])
     answers = []
     for name in tables.RECORDING_FORMATS:
         path = tmp_path / f"rapid{file_suffixes.find_suffix(file_suffixes.RECORDING_SUFFIXES, name)}"
         export_table(table, path, name)
-        answers.append(told_document(invoke("--json", path))["files"][0]["pooled"])
+        answers.append(load_json_document(run_cli("--json", path))["files"][0]["pooled"])
     assert answers[0]["validated"]
     assert answers == [answers[0]] * len(answers)
 
 
-def test_a_wrong_column_map_is_told_as_configuration(shuttle: Path, tmp_path: Path) -> None:
+def test_wrong_column_map_is_reported_as_configuration_error(shuttle: Path, tmp_path: Path) -> None:
     wrong = tmp_path / "map.toml"
     wrong.write_text("[columns]\n")
-    refused = invoke(shuttle, "--columns", wrong).exception
+    refused = run_cli(shuttle, "--columns", wrong).exception
     assert isinstance(refused, ConfigError)
     assert "headers.axis" in str(refused)
 
@@ -238,7 +238,7 @@ demand_m = { name = "Demand", unit = "mm" }
 """
 
 
-def _trace(tmp_path: Path, every: int = 1, sampling: str = "interval_mean") -> tuple[Path, Path]:
+def _write_trace(tmp_path: Path, every: int = 1, sampling: str = "interval_mean") -> tuple[Path, Path]:
     """Write an oscilloscope trace with decimal commas, quotes and a 16-bit position counter, and its column map."""
     lines = bench.format_as_csv(simulate_bench_shuttle(moves=2), 0.003).partition("time_s")[2].splitlines()[1::every]
     rows = ['"Time","Voltage","Current","Speed","Position","Demand"']
@@ -259,29 +259,29 @@ def _trace(tmp_path: Path, every: int = 1, sampling: str = "interval_mean") -> t
     return tmp_path / "trace.csv", tmp_path / "map.toml"
 
 
-def test_a_scopes_trace_is_identified_and_says_how_it_was_read(tmp_path: Path) -> None:
-    trace, columns = _trace(tmp_path)
-    result = invoke(trace, "--columns", columns, "--json")
-    pooled = told_document(result)["files"][0]["pooled"]
+def test_oscilloscope_trace_is_identified_with_column_map(tmp_path: Path) -> None:
+    trace, columns = _write_trace(tmp_path)
+    result = run_cli(trace, "--columns", columns, "--json")
+    pooled = load_json_document(result)["files"][0]["pooled"]
     assert pooled["validated"], pooled
     assert pooled["parameters"]["K"]["value"] == pytest.approx(0.8, rel=0.01)
     assert "ReadOtherwise: Position wraps like a counter of 16 bits and was unwrapped" in pooled["warnings"]
 
 
-def test_a_rapid_recorded_too_slowly_is_refused_by_its_rate(tmp_path: Path) -> None:
-    trace, columns = _trace(tmp_path, every=50, sampling="instant")
-    pooled = told_document(invoke(trace, "--columns", columns, "--json"))["files"][0]["pooled"]
+def test_recording_with_low_sample_rate_is_refused(tmp_path: Path) -> None:
+    trace, columns = _write_trace(tmp_path, every=50, sampling="instant")
+    pooled = load_json_document(run_cli(trace, "--columns", columns, "--json"))["files"][0]["pooled"]
     assert not pooled["validated"]
     assert pooled["reasons"][0] == "LowExcitation: 20 Hz is too slow to resolve a drive's acceleration"
 
 
 @pytest.mark.usefixtures("processes")
-def test_columns_of_unlike_lengths_are_json_as_well(tmp_path: Path) -> None:
+def test_columns_of_different_lengths_give_json_error(tmp_path: Path) -> None:
     from scipy import io
 
-    columns = _trace(tmp_path)[1]
+    columns = _write_trace(tmp_path)[1]
     names = ("Time", "Voltage", "Current", "Speed", "Position", "Demand")
     io.savemat(tmp_path / "short.mat", {name: list(range(50 + (name == "Current"))) for name in names})
-    result = invoke(tmp_path / "short.mat", "--columns", columns, "--json")
+    result = run_cli(tmp_path / "short.mat", "--columns", columns, "--json")
     assert result.return_value == 3
-    assert "unlike lengths" in told_document(result)["files"][0]["error"]["text"]
+    assert "unlike lengths" in load_json_document(result)["files"][0]["error"]["text"]

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("long_computation")
 
 
 @pytest.fixture
-def filtered(tmp_path: Path) -> Path:
+def filtered_recording(tmp_path: Path) -> Path:
     mechanics = real.Mechanics()
     run = real.simulate_axis(mechanics, build_shuttle_demand(2, 0.25, 0.5), real.Loops(speed_filter_s=0.001))
     path = tmp_path / "filtered.csv"
@@ -25,10 +25,10 @@ def filtered(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_filter_that_is_not_configured_is_told_and_used(filtered: Path, tmp_path: Path) -> None:
+def test_unconfigured_filter_is_reported_and_used(filtered_recording: Path, tmp_path: Path) -> None:
     config = tmp_path / "machine.toml"
     config.write_text(bench_toml())
-    result = CliRunner().invoke(cli, ["identify", str(filtered), "--config", str(config), "--json"])
+    result = CliRunner().invoke(cli, ["identify", str(filtered_recording), "--config", str(config), "--json"])
     (told,) = json.loads(result.stdout)["files"]
     assert told["pooled"]["validated"]
     loops = told["loops"]  # identified without --loops, because the configured ones do not explain the rapids
@@ -40,8 +40,8 @@ def test_a_filter_that_is_not_configured_is_told_and_used(filtered: Path, tmp_pa
     assert loops["warnings"][0].startswith("LoopsDiffer: ")
 
 
-def test_people_read_a_table_of_the_loops(filtered: Path) -> None:
-    result = CliRunner().invoke(cli, ["identify", str(filtered), "--loops"])
+def test_loops_are_printed_as_table(filtered_recording: Path) -> None:
+    result = CliRunner().invoke(cli, ["identify", str(filtered_recording), "--loops"])
     assert result.exit_code == 0
     assert "loops: p_pi_pi" in result.stdout
     assert "speed_filter_s" in result.stdout

@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from fdhil.cli.main import cli
-from fdhil.cli.status_view import believed
+from fdhil.cli.status_view import describe_model
 from studies import bench, real_plant
 from studies.real_plant import Mechanics, Sensors
 from tests.bench import bench_toml
@@ -23,21 +23,21 @@ SOFT = Mechanics(resonance_hz=HERTZ)
 
 
 @cache
-def signals() -> dict[str, bench.Array]:
+def make_signals() -> dict[str, bench.Array]:
     """Return the columns of two rapids of an axis with a compliant screw, including the table position."""
     run = real_plant.simulate_axis(SOFT, DEMAND_M, None, 1e-3)
     told = real_plant.report_signals(run, SOFT, Sensors(noise=0.001, speed="difference"), 1)
     return {**told, "table_mm": np.round(1e3 * run.table_m, 4)}
 
 
-def written(folder: Path, table: bool) -> Path:
-    columns = {name: values for name, values in signals().items() if table or name != "table_mm"}
+def write_recording(folder: Path, table: bool) -> Path:
+    columns = {name: values for name, values in make_signals().items() if table or name != "table_mm"}
     path = folder / "soft.csv"
     path.write_text(bench.format_table(1e-3, columns))
     return path
 
 
-def printed(folder: Path, begin_s: float = 4321.0, lead: int = 400) -> Path:
+def print_status(folder: Path, begin_s: float = 4321.0, lead: int = 400) -> Path:
     """Write the data of an ADXL345 at 3200 samples/s in the same run: y opposite to the axis, gravity on z."""
     place = real_plant.simulate_axis(SOFT, DEMAND_M, None, real_plant.STEP_S).table_m
     push = np.gradient(np.gradient(place, real_plant.STEP_S), real_plant.STEP_S)
@@ -55,21 +55,21 @@ def printed(folder: Path, begin_s: float = 4321.0, lead: int = 400) -> Path:
     return path
 
 
-def invoke(*arguments: object) -> Result:
+def run_cli(*arguments: object) -> Result:
     return CliRunner().invoke(cli, ["identify", *map(str, arguments)], standalone_mode=False)
 
 
-def told(result: Result) -> dict[str, Any]:
+def load_json_document(result: Result) -> dict[str, Any]:
     (file,) = json.loads(result.stdout)["files"]
     return dict(file)
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_an_encoder_at_the_table_tells_resonance_and_true_error(tmp_path: Path) -> None:
+def test_table_encoder_gives_resonance_and_true_error(tmp_path: Path) -> None:
     config = tmp_path / "machine.toml"
     config.write_text(bench_toml("X", resonance_hz=45.0))
-    path = written(tmp_path, table=True)
-    file = told(invoke(path, "--config", config, "--json"))
+    path = write_recording(tmp_path, table=True)
+    file = load_json_document(run_cli(path, "--config", config, "--json"))
     for window in file["windows"]:
         found = window["terms"]["resonance"]
         assert found["unit"] == "Hz"
@@ -80,16 +80,16 @@ def test_an_encoder_at_the_table_tells_resonance_and_true_error(tmp_path: Path) 
         assert window["at_table"]["unseen_rms_um"] > 5.0
         assert window["at_table"]["left_rms_um"] < window["at_table"]["unseen_rms_um"] / 2
     assert file["pooled"]["terms"]["resonance"]["value"] == pytest.approx(HERTZ, rel=0.08)
-    shown = " ".join(invoke(path, "--config", config).stdout.split())
+    shown = " ".join(run_cli(path, "--config", config).stdout.split())
     assert "resonance" in shown
     assert "unseen by the drive's encoder" in shown
     assert "not at 45 Hz as configured" in shown
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_a_printers_accelerometer_file_is_laid_beside_the_recording(tmp_path: Path) -> None:
-    path = written(tmp_path, table=False)
-    file = told(invoke(path, "--accelerometer", printed(tmp_path), "--json"))
+def test_accelerometer_file_is_aligned_with_recording(tmp_path: Path) -> None:
+    path = write_recording(tmp_path, table=False)
+    file = load_json_document(run_cli(path, "--accelerometer", print_status(tmp_path), "--json"))
     found = [window["terms"]["resonance"] for window in file["windows"] if "resonance" in window["terms"]]
     assert found
     for one in found:
@@ -97,7 +97,7 @@ def test_a_printers_accelerometer_file_is_laid_beside_the_recording(tmp_path: Pa
     assert all("at_table" not in window for window in file["windows"])
 
 
-def test_status_says_what_the_table_did_and_how_it_swings() -> None:
+def test_status_shows_table_error_and_resonance() -> None:
     figures = {"value": 60.0, "std": 1.0, "low": 58.0, "high": 62.0, "unit": "Hz"}
     seen = {
         "error_rms_um": 46.2,
@@ -106,21 +106,22 @@ def test_status_says_what_the_table_did_and_how_it_swings() -> None:
         "unseen_max_um": 46.0,
         "left_rms_um": 5.0,
     }
-    text = believed({"terms": {"resonance": figures}, "last_window": {"at_table": seen}, "warnings": []})
+    text = describe_model({"terms": {"resonance": figures}, "last_window": {"at_table": seen}, "warnings": []})
     assert "resonance 60" in text
     assert "table error of 46.20 um RMS in the last rapid" in text
-    assert "table" not in believed({"terms": {}, "last_window": {"at_table": None}})
+    assert "table" not in describe_model({"terms": {}, "last_window": {"at_table": None}})
 
 
-def test_a_file_of_another_run_or_kind_is_refused(tmp_path: Path) -> None:
-    path, other = written(tmp_path, table=False), tmp_path / "other.csv"
+def test_foreign_accelerometer_file_is_refused(tmp_path: Path) -> None:
+    path, other = write_recording(tmp_path, table=False), tmp_path / "other.csv"
     rows = np.random.default_rng(1).standard_normal((4000, 3))
     other.write_text("".join(f"{k * 1e-3:.4f},{a:.3f},{b:.3f},{c:.3f}\n" for k, (a, b, c) in enumerate(rows)))
-    file = told(invoke(path, "--accelerometer", other, "--json"))
+    file = load_json_document(run_cli(path, "--accelerometer", other, "--json"))
     assert "does not match the moves of the recording" in file["error"]["text"]
     other.write_text("time,x\n1,2\n")
     assert (
-        "is not an accelerometer recording" in told(invoke(path, "--accelerometer", other, "--json"))["error"]["text"]
+        "is not an accelerometer recording"
+        in load_json_document(run_cli(path, "--accelerometer", other, "--json"))["error"]["text"]
     )
     result = CliRunner().invoke(cli, ["identify", str(path), str(path), "--accelerometer", str(other)])
     assert "applies to one recording" in str(result.output) + str(result.exception)

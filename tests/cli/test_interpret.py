@@ -12,17 +12,17 @@ from fdhil.cli.main import cli, run_safely
 from tests.bench import bench_toml
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+def run_cli(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     monkeypatch.setattr("sys.argv", ["fdhil", *arguments])
     return run_safely(cli)
 
 
-def test_json_lists_all_kinds_of_motion(
+def test_json_lists_all_motion_kinds(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     program = tmp_path / "p.ngc"
     program.write_text("G0 X1\nG1 Y2 F60\n\nG3 X1 Y4 J1\nG4 P1.5\nM2\n")
-    assert call(monkeypatch, "interpret", str(program), "--json") == 0
+    assert run_cli(monkeypatch, "interpret", str(program), "--json") == 0
     assert json.loads(capsys.readouterr().out) == {
         "schema": "fdhil-interpret-1",
         "motions": [
@@ -35,25 +35,25 @@ def test_json_lists_all_kinds_of_motion(
     }  # fmt: skip
 
 
-def test_an_error_is_one_sentence_and_nothing_on_stdout(
+def test_error_is_one_sentence_with_empty_stdout(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     program = tmp_path / "p.ngc"
     program.write_text("G0 X1\nG1 X2\n")
-    assert call(monkeypatch, "interpret", str(program)) == 3
+    assert run_cli(monkeypatch, "interpret", str(program)) == 3
     shown = capsys.readouterr()
     assert shown.out == ""
     assert shown.err.count("\n") == 1
     assert "line 2" in shown.err
-    assert call(monkeypatch, "interpret", str(tmp_path / "none.ngc")) == 3
+    assert run_cli(monkeypatch, "interpret", str(tmp_path / "none.ngc")) == 3
 
 
-def test_the_table_has_a_row_per_motion(
+def test_table_has_one_row_per_motion(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     program = tmp_path / "p.ngc"
     program.write_text("G0 X1\nX2\n")
-    assert call(monkeypatch, "interpret", str(program)) == 0
+    assert run_cli(monkeypatch, "interpret", str(program)) == 0
     assert len(capsys.readouterr().out.splitlines()) == 2
 
 
@@ -61,19 +61,19 @@ PROBED = "(finds the edge of the part, then works from it)\nG21 G90 G64\nG0 X0 Y
 PROBED += "G10 L20 P0 X0\nG0 X5\nG1 X[#1] F1000\nM2\n"
 
 
-def document_of(
+def load_document(
     text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *more: str
 ) -> dict[str, Any]:
     program = tmp_path / "p.ngc"
     program.write_text(text)
-    call(monkeypatch, "interpret", str(program), "--json", *more)
+    run_cli(monkeypatch, "interpret", str(program), "--json", *more)
     return dict(json.loads(capsys.readouterr().out))
 
 
-def test_a_probe_is_listed_and_what_follows_it_is_said_to_be_unknown(
+def test_probe_is_listed_and_following_position_is_unknown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    document = document_of(PROBED, tmp_path, capsys, monkeypatch)
+    document = load_document(PROBED, tmp_path, capsys, monkeypatch)
     assert document["motions"][1] == {"line": 4, "kind": "probe", "end": [20.0, 0.0, 0.0], "feed": 300.0}
     assert document["motions"][2] == {"line": 7, "kind": "rapid", "end": [25.0, 0.0, 0.0]}
     (note,) = document["notes"]
@@ -81,11 +81,11 @@ def test_a_probe_is_listed_and_what_follows_it_is_said_to_be_unknown(
     assert note["text"].startswith("line 4: the touch point of the probe is unknown")
 
 
-def test_rotary_words_are_listed_in_degrees_and_millimetres(
+def test_rotary_motion_is_listed_in_degrees_and_millimetres(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = "G0 X20 A45\nF100 G1 A90\nG20\nG2 I0.1 B5 U1\nG21 G0 X0\nG91 A10\nM2\n"
-    motions = document_of(text, tmp_path, capsys, monkeypatch)["motions"]
+    motions = load_document(text, tmp_path, capsys, monkeypatch)["motions"]
     assert [motion.get("rotary") for motion in motions] == [
         {"A": 45.0},
         {"A": 90.0},
@@ -111,7 +111,7 @@ def test_rotary_words_are_listed_in_degrees_and_millimetres(
         ),
     ],
 )
-def test_a_number_that_another_nc_reads_otherwise_is_questioned(
+def test_ambiguous_number_gives_note(
     text: str,
     code: str,
     told: str,
@@ -119,13 +119,13 @@ def test_a_number_that_another_nc_reads_otherwise_is_questioned(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    (note,) = document_of(text, tmp_path, capsys, monkeypatch)["notes"]
+    (note,) = load_document(text, tmp_path, capsys, monkeypatch)["notes"]
     assert note["code"] == code
     assert note["text"].startswith(told)
     assert "[nc]" in note["advice"]
     machine = tmp_path / "machine.toml"
     machine.write_text(bench_toml() + '[nc]\ndwell_unit = "ms_without_point"\nintegers = "thousandths"\n')
-    document = document_of(text, tmp_path, capsys, monkeypatch, "--config", str(machine))
+    document = load_document(text, tmp_path, capsys, monkeypatch, "--config", str(machine))
     assert "notes" not in document
     assert document["motions"][1]["end"] == [10.0, 0.0, 0.0]
 
@@ -141,9 +141,9 @@ def test_a_number_that_another_nc_reads_otherwise_is_questioned(
         ("G0 X1\nG0 X9000000\n", "line 2, 'X': axis X at 9000000 mm: the set-point"),
     ],
 )
-def test_what_the_machine_cannot_be_ordered_is_refused(
+def test_motion_beyond_machine_is_refused(
     text: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "machine.toml").write_text(bench_toml())
-    document = document_of(text, tmp_path, capsys, monkeypatch, "--config", str(tmp_path / "machine.toml"))
+    document = load_document(text, tmp_path, capsys, monkeypatch, "--config", str(tmp_path / "machine.toml"))
     assert document["error"]["text"].startswith(told)

@@ -16,12 +16,12 @@ from fdhil.cli.main import COMMANDS, cli, main, run_safely
 from fdhil.errors import ConfigError, ConfigFault, ConnectError
 
 
-def fdhil(*arguments: str) -> subprocess.CompletedProcess[str]:
+def run_fdhil(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-m", "fdhil", *arguments], capture_output=True, text=True)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_is_there_and_explains_itself(name: str) -> None:
+def test_every_command_exists_with_help(name: str) -> None:
     module, _, attribute = COMMANDS[name][0].partition(":")
     command = getattr(import_module(module), attribute)
     assert isinstance(command, click.Command)
@@ -42,14 +42,14 @@ def test_help_imports_no_numerics() -> None:
 
 
 @pytest.mark.usefixtures("processes")
-def test_an_unknown_command_and_option_are_usage_errors() -> None:
-    assert fdhil("identfy").returncode == 2
-    done = fdhil("predict", "--no-such-option")
+def test_unknown_command_and_option_exit_2() -> None:
+    assert run_fdhil("identfy").returncode == 2
+    done = run_fdhil("predict", "--no-such-option")
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
 
 
-def test_errors_are_sentences_with_their_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_are_one_sentence_with_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
     @click.command()
     def broken() -> None:
         raise ConnectError("can0", "is not there; bring it up with `ip link set can0 up`")
@@ -70,12 +70,12 @@ def test_errors_are_sentences_with_their_exit_code(capsys: pytest.CaptureFixture
     assert "nc: is no table" in said
 
 
-def test_the_list_is_in_the_order_of_the_workflow() -> None:
+def test_commands_are_listed_in_workflow_order() -> None:
     listed = cli.list_commands(click.Context(cli))
     assert listed[:8] == ["demo", "paper", "sim", "init", "scan", "check", "commission", "doctor"]
 
 
-def test_the_entry_point_shows_no_advice_of_libraries(
+def test_entry_point_hides_library_warnings(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Warnings of libraries are for developers; child processes hide them as well."""
@@ -93,7 +93,7 @@ def test_the_entry_point_shows_no_advice_of_libraries(
     assert "fdhil" in capsys.readouterr().out
 
 
-def test_ctrl_c_is_told_to_programs_too(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_is_reported_as_json(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     @click.command()
     @click.option("--json", "as_json", is_flag=True)
     def stopped(as_json: bool) -> None:

@@ -30,7 +30,7 @@ PID = LoopEstimate(
 
 
 @pytest.mark.parametrize("results", [[replace(VALID, loops=PID)], [replace(REFUTED, loops=PID), VALID]])
-def test_another_structure_travels_with_its_gains(results: list[FileResult], tmp_path: Path) -> None:
+def test_identified_structure_is_written_with_its_gains(results: list[FileResult], tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     write_model(results, CONFIG.axis, path)
     assert json.loads(path.read_text())["X"]["loops"] == {
@@ -40,15 +40,13 @@ def test_another_structure_travels_with_its_gains(results: list[FileResult], tmp
     assert (used.structure, used.speed_kp) == ("pid", CONFIG.axis["X"].regulators.speed_kp)
 
 
-def test_loops_as_configured_are_not_written(tmp_path: Path) -> None:
+def test_configured_loops_are_not_written(tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     write_model([replace(VALID, loops=replace(PID, verdict=Verdict(True, None)))], CONFIG.axis, path)
     assert "loops" not in json.loads(path.read_text())["X"]
 
 
-def test_model_is_not_written_where_rapids_refute_loops_that_none_replace(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_model_is_not_written_when_loops_are_refuted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "model.json"
     write_model([REFUTED, VALID], CONFIG.axis, path)
     assert not path.exists()

@@ -38,7 +38,7 @@ main()
 """
 
 
-class Relay:
+class TcpRelay:
     """A connection between fdhil and the hub that can be closed."""
 
     def __init__(self, port: int) -> None:
@@ -46,10 +46,10 @@ class Relay:
         self._listening = socket.create_server(("127.0.0.1", 0))
         self.port = self._listening.getsockname()[1]
         self._ends: list[socket.socket] = []
-        self._thread = threading.Thread(target=self._carry, daemon=True)
+        self._thread = threading.Thread(target=self._forward, daemon=True)
         self._thread.start()
 
-    def _carry(self) -> None:
+    def _forward(self) -> None:
         near, _ = self._listening.accept()
         far = socket.create_connection(("127.0.0.1", self._hub))
         self._ends = [near, far]
@@ -64,7 +64,7 @@ class Relay:
         except OSError:
             return
 
-    def cut(self) -> None:
+    def close_connections(self) -> None:
         for end in self._ends:
             end.shutdown(socket.SHUT_RDWR)
         self._thread.join()
@@ -73,20 +73,20 @@ class Relay:
 
 
 @dataclass
-class Shop:
+class BenchSetup:
     twin: SimulatorProcess
     folder: Path
     bus: can.BusABC
 
-    def config(self, port: int) -> Path:
+    def write_config(self, port: int) -> Path:
         path = write_config(self.folder, bus=f'interface = "socketcand"\nport = {port}')
         path.write_text(path.read_text() + SETPOINTS + '[guard]\nclock = "sync"\n[play]\nheartbeat_s = 1.0\n')
         return path
 
-    def playing(self, port: int) -> subprocess.Popen[str]:
+    def start_play(self, port: int) -> subprocess.Popen[str]:
         program = self.folder / "part.ngc"
         program.write_text(STROKE)
-        arguments = ["play", program, "--config", self.config(port), "--yes", "--go-to-start"]
+        arguments = ["play", program, "--config", self.write_config(port), "--yes", "--go-to-start"]
         process = subprocess.Popen(
             [sys.executable, "-c", QUICK, *map(str, arguments)],
             stdout=subprocess.PIPE,
@@ -95,16 +95,16 @@ class Shop:
         )
         targets: list[float] = []
 
-        def moves() -> bool:
+        def is_moving() -> bool:
             while (frame := self.bus.recv(0)) is not None:
                 if frame.arbitration_id == 0x201:
                     targets.append(struct.unpack("<Hi", frame.data)[1] / PER_MM)
             return process.poll() is not None or (bool(targets) and max(targets) - min(targets) > 5.0)
 
-        self.wait(moves)
+        self.wait(is_moving)
         return process
 
-    def last_in_the_audit(self) -> tuple[str, str | None]:
+    def read_last_audit_entry(self) -> tuple[str, str | None]:
         *_, (entry, _) = audit_file.read_entries(
             machine_config.load_config(self.folder / "machine.toml").store.directory
         )
@@ -116,67 +116,67 @@ class Shop:
             assert time.monotonic() < deadline
             time.sleep(0.005)
 
-    def stopped_by_themselves(self) -> bool:
+    def assert_drives_stopped(self) -> bool:
         """Both drives report the lost heartbeat, enter the fault state and stop."""
         lost: set[int] = set()
 
-        def told() -> bool:
+        def is_reported() -> bool:
             while (frame := self.bus.recv(0)) is not None:
                 if frame.arbitration_id in (0x081, 0x082) and frame.data[:2] == HEARTBEAT_LOST.to_bytes(2, "little"):
                     lost.add(frame.arbitration_id)
             return len(lost) == 2
 
-        self.wait(told)
-        places = [self.read(0x6064)]
+        self.wait(is_reported)
+        places = [self.read_object(0x6064)]
 
-        def stands() -> bool:
+        def is_standing() -> bool:
             time.sleep(0.2)
-            places.append(self.read(0x6064))
-            return self.read(0x6041) & 0x4F == 0x08 and places[-1] == places[-2]
+            places.append(self.read_object(0x6064))
+            return self.read_object(0x6041) & 0x4F == 0x08 and places[-1] == places[-2]
 
-        self.wait(stands)
+        self.wait(is_standing)
         return places[-1] < 300 * PER_MM
 
-    def read(self, index: int) -> int:
+    def read_object(self, index: int) -> int:
         request = bytes([0x40]) + struct.pack("<HB", index, 0) + bytes(4)
         self.bus.send(can.Message(arbitration_id=0x601, data=request, is_extended_id=False))
         answers: list[bytes] = []
 
-        def answered() -> bool:
+        def has_answered() -> bool:
             while (frame := self.bus.recv(0)) is not None:
                 if frame.arbitration_id == 0x581 and frame.data[1:3] == request[1:3]:
                     answers.append(bytes(frame.data))
             return bool(answers)
 
-        self.wait(answered)
+        self.wait(has_answered)
         return int.from_bytes(answers[-1][4:], "little", signed=True)
 
 
 @pytest.fixture(scope="module")
-def shop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shop]:
+def bench_setup(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BenchSetup]:
     folder = tmp_path_factory.mktemp("play")
     with SimulatorProcess(write_config(folder)) as twin, twin.join_bus() as bus:
-        made = Shop(twin, folder, bus)
-        sign_off(machine_config.load_config(made.config(twin.bus_settings["port"])))
+        made = BenchSetup(twin, folder, bus)
+        sign_off(machine_config.load_config(made.write_config(twin.bus_settings["port"])))
         yield made
 
 
-def test_a_killed_process_leaves_drives_that_stop(shop: Shop) -> None:
-    process = shop.playing(shop.twin.bus_settings["port"])
+def test_drives_stop_when_play_is_killed(bench_setup: BenchSetup) -> None:
+    process = bench_setup.start_play(bench_setup.twin.bus_settings["port"])
     process.send_signal(signal.SIGKILL)
     said = process.communicate()
     assert process.returncode == -signal.SIGKILL, said
-    assert shop.last_in_the_audit() == ("play", None)  # without a result
-    assert shop.stopped_by_themselves()
+    assert bench_setup.read_last_audit_entry() == ("play", None)  # without a result
+    assert bench_setup.assert_drives_stopped()
 
 
-def test_a_lost_bus_leaves_drives_that_stop_and_is_told(shop: Shop) -> None:
-    cable = Relay(shop.twin.bus_settings["port"])
-    process = shop.playing(cable.port)
-    cable.cut()
+def test_drives_stop_and_error_is_reported_when_bus_is_lost(bench_setup: BenchSetup) -> None:
+    cable = TcpRelay(bench_setup.twin.bus_settings["port"])
+    process = bench_setup.start_play(cable.port)
+    cable.close_connections()
     _, err = process.communicate()
     assert process.returncode == 3
     assert "drives stop by themselves" in err
-    assert shop.last_in_the_audit()[1] not in (None, "done")
+    assert bench_setup.read_last_audit_entry()[1] not in (None, "done")
     assert "Traceback" not in err
-    assert shop.stopped_by_themselves()
+    assert bench_setup.assert_drives_stopped()

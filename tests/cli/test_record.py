@@ -24,7 +24,7 @@ NC = '[nc]\nprofile = "jerk_limited"\n'
 
 
 @pytest.fixture(scope="module")
-def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[SimulatorProcess, Path]]:
+def simulator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[SimulatorProcess, Path]]:
     folder = tmp_path_factory.mktemp("twin")
     path = write_config(folder, sim="modbus = false")
     path.write_text(path.read_text() + NC)
@@ -49,12 +49,14 @@ class Recording:
         return self.process.returncode, json.loads(stdout)
 
 
-def increments(reference: Trajectory) -> Float:
+def convert_to_increments(reference: Trajectory) -> Float:
     return np.round(np.column_stack(list(reference.position_mm.values())) * (65536 / 20))
 
 
-def test_a_recorded_program_is_its_demand_to_the_increment(twin: tuple[SimulatorProcess, Path], tmp_path: Path) -> None:
-    process, config = twin
+def test_recorded_demand_equals_program_to_the_increment(
+    simulator: tuple[SimulatorProcess, Path], tmp_path: Path
+) -> None:
+    process, config = simulator
     program, out = tmp_path / "program.ngc", tmp_path / "demand.csv"
     program.write_text(PROGRAM)
     recording = Recording(config, out, "--rest", "0.6")
@@ -62,16 +64,19 @@ def test_a_recorded_program_is_its_demand_to_the_increment(twin: tuple[Simulator
     code, document = recording.end()
     assert (code, document["complete"], document["gaps"]) == (0, True, []), document
     machine = configuration.load_config(config)
-    ordered, heard = increments(load_trajectory(program, machine)), increments(load_trajectory(out, machine))
+    ordered, heard = (
+        convert_to_increments(load_trajectory(program, machine)),
+        convert_to_increments(load_trajectory(out, machine)),
+    )
     first = int(np.flatnonzero(np.abs(np.diff(ordered, axis=0)).max(axis=1))[0])  # the first increment that moves
     rows = min(len(heard), len(ordered) - first)
     assert rows > len(ordered) - 60
     np.testing.assert_array_equal(heard[:rows], ordered[first : first + rows])
 
 
-def test_without_a_motion_there_is_nothing_to_write(twin: tuple[SimulatorProcess, Path], tmp_path: Path) -> None:
+def test_recording_without_motion_writes_nothing(simulator: tuple[SimulatorProcess, Path], tmp_path: Path) -> None:
     out = tmp_path / "demand.csv"
-    recording = Recording(twin[1], out)
+    recording = Recording(simulator[1], out)
     recording.process.send_signal(signal.SIGINT)
     code, document = recording.end()
     assert (code, document["rows"], document["file"]) == (1, 0, None)
@@ -79,8 +84,8 @@ def test_without_a_motion_there_is_nothing_to_write(twin: tuple[SimulatorProcess
     assert not out.exists()
 
 
-def test_a_demand_with_a_hole_is_not_written(twin: tuple[SimulatorProcess, Path], tmp_path: Path) -> None:
-    process, config = twin
+def test_demand_with_gap_is_not_written(simulator: tuple[SimulatorProcess, Path], tmp_path: Path) -> None:
+    process, config = simulator
     program, out = tmp_path / "program.ngc", tmp_path / "demand.csv"
     program.write_text("G1 X12 Y12 F6000\nM2\n")
     recording = Recording(config, out, "--rest", "0.3")

@@ -64,33 +64,33 @@ class Terminal:
         self._reader.join()
 
 
-class Desk:
+class Workstation:
     def __init__(self, folder: Path) -> None:
         self._ports = {"29536": str(find_free_port()), "port = 5020": "port = 0", "port = 5021": "port = 0"}
         shutil.copytree(ROOT / "configs", folder / "configs", symlinks=True)
         shipped = folder / "configs/sim.toml"
-        shipped.write_text(self._with_free_ports(shipped.read_text("utf-8")), "utf-8")
+        shipped.write_text(self._assign_free_ports(shipped.read_text("utf-8")), "utf-8")
         self.folder = folder / "hour"
         self.folder.mkdir()
         self.open: dict[str, Terminal] = {}
 
-    def _with_free_ports(self, text: str) -> str:
+    def _assign_free_ports(self, text: str) -> str:
         for usual, free in self._ports.items():
             text = text.replace(usual, free)
         return text
 
-    def do(self, language: str, block: str) -> str:
+    def execute_line(self, language: str, block: str) -> str:
         match language:
             case "toml":
-                (self.folder / "answers.toml").write_text(self._with_free_ports(block), "utf-8")
+                (self.folder / "answers.toml").write_text(self._assign_free_ports(block), "utf-8")
                 return ""
             case "sh":
-                return [self._command(line) for line in block.splitlines()][-1]
+                return [self._prepare_command(line) for line in block.splitlines()][-1]
             case "text":
-                return [self._panel(line) for line in block.splitlines()][-1]
+                return [self._type_panel_command(line) for line in block.splitlines()][-1]
         raise AssertionError(f"the page has a block of {language}")
 
-    def _command(self, line: str) -> str:
+    def _prepare_command(self, line: str) -> str:
         if line.startswith(TYPED_BY_THE_TEST):
             return ""
         name, *arguments = shlex.split(line)
@@ -101,14 +101,14 @@ class Desk:
                 self.open[server] = Terminal(words, self.folder)
                 self.open[server].wait_for(ready)
                 return ""
-        return self._run(words)
+        return self._run_command(words)
 
-    def _run(self, words: list[str]) -> str:
+    def _run_command(self, words: list[str]) -> str:
         done = subprocess.run(words, cwd=self.folder, input="y\n" * 20, capture_output=True, text=True, check=False)
         assert done.returncode == 0, f"{words}: {done.stdout}{done.stderr}"
         return done.stdout
 
-    def _panel(self, line: str) -> str:
+    def _type_panel_command(self, line: str) -> str:
         self.open["fdhil sim"].type(line)
         if "shuttle" in line:
             self.open["fdhil run"].wait_for("accepted", RAPIDS)
@@ -123,17 +123,17 @@ class Desk:
 
 
 @pytest.fixture
-def desk(tmp_path: Path, processes: None) -> Iterator[Desk]:
+def workstation(tmp_path: Path, processes: None) -> Iterator[Workstation]:
     del processes
-    made = Desk(tmp_path)
+    made = Workstation(tmp_path)
     yield made
     made.close()
 
 
-def test_tutorial_ends_with_a_corrected_cut(desk: Desk) -> None:
+def test_tutorial_ends_with_corrected_pass(workstation: Workstation) -> None:
     blocks = re.findall(r"^```(\w+)\n(.*?)^```", PAGE.read_text("utf-8"), re.MULTILINE | re.DOTALL)
-    printed = {block: desk.do(language, block) for language, block in blocks}
+    printed = {block: workstation.execute_line(language, block) for language, block in blocks}
     (compared,) = (text for block, text in printed.items() if block.startswith("fdhil compare"))
     (factor,) = re.findall(r"smaller by a factor of ([\d.]+)", compared)
     assert float(factor) > 10.0
-    assert (desk.folder / "report.html").stat().st_size > 10_000
+    assert (workstation.folder / "report.html").stat().st_size > 10_000

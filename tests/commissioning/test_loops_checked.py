@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from fdhil import config as configuration
-from fdhil.cli.loops_view import loops_line
+from fdhil.cli.loops_view import format_loop_status
 from fdhil.commissioning.config_check import compare_loops
 from fdhil.daemon.outcome_json import build_loops_document
 from fdhil.records import LoopEstimate, Reason, Verdict, freeze_array
@@ -41,5 +41,7 @@ def test_what_the_rapids_showed_is_compared_with_the_configuration(tmp_path: Pat
 
 
 def test_the_status_tells_of_loops_that_are_not_as_configured() -> None:
-    assert loops_line(build_loops_document(loops())) == ""
-    assert "LoopsDiffer: the configured regulators leave 34 um" in loops_line(build_loops_document(loops(DIFFER)))
+    assert format_loop_status(build_loops_document(loops())) == ""
+    assert "LoopsDiffer: the configured regulators leave 34 um" in format_loop_status(
+        build_loops_document(loops(DIFFER))
+    )

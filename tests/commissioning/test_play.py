@@ -260,7 +260,7 @@ def test_axes_that_are_held_at_the_start_are_switched_off_where_an_nc_comes(
         nc.on |= asked == 20
         return False
 
-    monkeypatch.setattr("fdhil.cli.play._entered", wait_for_enter)
+    monkeypatch.setattr("fdhil.cli.play_command._is_enter_pressed", wait_for_enter)
     with ForeignNc(floor.config.bus["can0"].channel, FOREIGN["SYNC"], lambda _: False) as nc:
         code, document, _ = floor.play(STROKE, "--yes", "--hold")
         assert nc.count(SYNC) <= A_FEW

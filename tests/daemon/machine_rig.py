@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.cli.demo.processes import Process, Twin
+from fdhil.cli.demo.processes import ChildProcess, SimulatorProcess
 from fdhil.cli.main import cli, run_safely
 from fdhil.commissioning.record import save_record
 from fdhil.commissioning.steps import commission
@@ -58,7 +58,7 @@ def patient() -> Iterator[None]:
 @dataclass
 class MachineRig:
     folder: Path
-    twin: Twin
+    twin: SimulatorProcess
     path: Path
     config: MachineConfig
 
@@ -72,22 +72,22 @@ class MachineRig:
             for axis in self.config.axis:
                 save_record(commission(self.config, axis), self.config.store.directory)
 
-    def daemon(self) -> Process:
-        daemon = Process("daemon", ["fdhil", "run", str(self.path)], self.folder / "daemon.log")
+    def daemon(self) -> ChildProcess:
+        daemon = ChildProcess("daemon", ["fdhil", "run", str(self.path)], self.folder / "daemon.log")
         self.wait(lambda: self.status() is not None, daemon)
         self.wait_for_status(lambda s: s["source"]["state"] == "listening")
         return daemon
 
-    def guard(self) -> Process:
-        guard = Process("guard", ["fdhil.cli.guard", str(self.path)], self.folder / "guard.log")
+    def guard(self) -> ChildProcess:
+        guard = ChildProcess("guard", ["fdhil.cli.guard", str(self.path)], self.folder / "guard.log")
         self.wait((self.run_directory / "guard.sock").exists, guard)
         return guard
 
-    def wait(self, done: Any, process: Process | None = None) -> None:
+    def wait(self, done: Any, process: ChildProcess | None = None) -> None:
         while not done():
-            self.twin.check()
+            self.twin.check_running()
             if process is not None:
-                process.check()
+                process.check_running()
             time.sleep(0.05)
 
     def status(self) -> dict[str, Any] | None:
@@ -112,19 +112,19 @@ class MachineRig:
         self.wait_for_status(lambda s: s["state"] == "OFF" and s["armed"] is None)
 
     def nc(self, on: bool) -> None:
-        self.twin.command("nc", on=on)
-        self.twin.event("nc")
+        self.twin.send_command("nc", on=on)
+        self.twin.await_event("nc")
 
     def play(self, name: str, program: str, **options: Any) -> dict[str, Any]:
         path = self.folder / name
         path.write_text(program)
-        return self.twin.play(path, **options)
+        return self.twin.play_program(path, **options)
 
 
 @contextmanager
 def opened(folder: Path, bench: str = BENCH) -> Iterator[MachineRig]:
     (folder / "twin.toml").write_text(f'{bench}[bus.can0]\ninterface = "socketcand"\n')
-    with Twin(folder / "twin.toml", folder / "twin.log") as twin:
+    with SimulatorProcess(folder / "twin.toml", folder / "twin.log") as twin:
         bus = twin.ready["buses"]["can0"]
         machine = folder / "machine.toml"
         place = f'channel = "{bus["channel"]}"\nhost = "{bus["host"]}"\nport = {bus["port"]}\n'

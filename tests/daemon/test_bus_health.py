@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.cli.status_view import counted, open_console, show
+from fdhil.cli.status_view import format_counters, open_console, show_status
 from fdhil.config import MachineConfig
 from fdhil.daemon.bus_health import FEW_SYNCS, BusHealth
 from fdhil.daemon.daemon_status import DaemonStatus
@@ -90,7 +90,7 @@ def _skip_kernel_warmup(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def shown(status: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> str:
     capsys.readouterr()
-    show(status, open_console())
+    show_status(status, open_console())
     return " ".join(capsys.readouterr().out.split())
 
 
@@ -292,6 +292,6 @@ async def test_daemon_reports_unusable_moves(tmp_path: Path, capsys: pytest.Capt
 
 def test_counters_are_reported_in_words() -> None:
     counters = {"frames": 41230, "lost": 2, "can0.frames": 41230, "can0.pdo_lost": 2, "can0.sync_missed": 0}
-    assert counted(counters) == "frames received 41 230, lost 2 (can0: PDO lost 2)"
-    assert counted({"frames": 7}) == "frames received 7, lost 0"
-    assert counted({}) == "frames: none"
+    assert format_counters(counters) == "frames received 41 230, lost 2 (can0: PDO lost 2)"
+    assert format_counters({"frames": 7}) == "frames received 7, lost 0"
+    assert format_counters({}) == "frames: none"

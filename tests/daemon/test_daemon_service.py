@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.cli.demo.toml import to_toml
+from fdhil.cli.demo.toml_writer import format_toml
 from fdhil.cli.doctor.devices import examine_daemon
 from fdhil.commissioning.void import void_path
 from fdhil.config import MachineConfig, load_config
@@ -93,11 +93,11 @@ async def test_edited_configuration_is_reported_with_the_limits_in_force(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "machine.toml"
-    file.write_text(to_toml(bench_document()))
+    file.write_text(format_toml(bench_document()))
     async with serving(load_config(file), SimulatedMachine()):
         document = bench_document()
         document["axis"]["X"]["correction"]["max_offset_um"] = 5.0
-        file.write_text(to_toml(document))
+        file.write_text(format_toml(document))
         (tmp_path / "p.ngc").write_text("G0 X1")
         asked = [("status",), ("status", "--json"), ("arm", tmp_path / "p.ngc"), ("arm", tmp_path / "p.ngc", "--json")]
         answers = [await asyncio.to_thread(fdhil, command, file, *more, capsys=capsys) for command, *more in asked]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.cli.demo.processes import Twin
+from fdhil.cli.demo.processes import SimulatorProcess
 from tests.daemon.machine_rig import AXIS, HEAD, MachineRig, fdhil
 
 pytestmark = pytest.mark.usefixtures("processes")
@@ -35,7 +35,7 @@ time_constant_s = 1e9
 def rig(tmp_path: Path) -> Iterator[MachineRig]:
     bench = HEAD + AXIS + TWIN
     (tmp_path / "twin.toml").write_text(f'{bench}[bus.can0]\ninterface = "socketcand"\n')
-    with Twin(tmp_path / "twin.toml", tmp_path / "twin.log") as twin:
+    with SimulatorProcess(tmp_path / "twin.toml", tmp_path / "twin.log") as twin:
         bus, sensor = twin.ready["buses"]["can0"], twin.ready["modbus"]["X"]
         expected = "\n".join(f"{key} = {json.dumps(value)}" for key, value in {**sensor, "period_s": 0.05}.items())
         place = "\n".join(f"{key} = {json.dumps(bus[key])}" for key in ("channel", "host", "port"))
@@ -48,11 +48,11 @@ def test_drift_tracks_warming_and_load_change(rig: MachineRig, capsys: pytest.Ca
     with rig.daemon() as daemon:
         rig.nc(on=True)
         for celsius in CELSIUS:
-            rig.twin.command("temperature", celsius=float(celsius))
+            rig.twin.send_command("temperature", celsius=float(celsius))
             rig.wait_for_status(partial(_is_read, float(celsius)))
             _shuttle(rig)
         assert not [n for n in _notices(rig) if n["code"] in {"LoadChanged", "ParameterJump", "MaintenanceDue"}]
-        rig.twin.command("set", axis="X", parameters={"Jt": 0.085 * 1.13})
+        rig.twin.send_command("set", axis="X", parameters={"Jt": 0.085 * 1.13})
         _shuttle(rig)
         loaded = [notice for notice in _notices(rig) if notice["code"] == "LoadChanged"]
         assert [notice["severity"] for notice in loaded] == ["MAJOR", "minor"]

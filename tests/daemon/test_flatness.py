@@ -77,7 +77,7 @@ def fed_forward(shop: MachineRig, capsys: Capture) -> dict[str, float]:
 def fades_out_on_an_emergency(shop: MachineRig, capsys: Capture) -> None:
     switch_on(shop, capsys)
     shop.wait_for_status(lambda s: s["state"] == "FEEDFORWARD")
-    shop.twin.command("fault", fault="frame", can_id=0x081, data="1043080000000000")
+    shop.twin.send_command("fault", fault="frame", can_id=0x081, data="1043080000000000")
     status = shop.wait_for_status(lambda s: s["state"] == "OFF" and s["armed"] is None)
     assert feed_of(status)["cause"]["code"] == "DriveEmergency"
     boxes = shop.config.store.directory / "blackbox"
@@ -97,7 +97,7 @@ def largest_errors_um(shop: MachineRig, name: str) -> dict[str, float]:
     path = build_bench_demand(10, hold_s=0.2)
     lines = [f"{k * 0.001:.3f},{x:.9f},{y:.9f}" for k, (x, y) in enumerate(path)]
     demand.write_text("time_s,X_mm,Y_mm\n" + "\n".join(lines) + "\n", "utf-8")
-    shop.twin.play(demand, trace=trace)
+    shop.twin.play_program(demand, trace=trace)
     data = np.genfromtxt(trace, delimiter=",", names=True)[: len(path)]
     errors = {axis: data[f"{axis}_table_mm"] - data[f"{axis}_reference_mm"] for axis in "XY"}
     return {axis: 1e3 * float(np.abs(error).max()) for axis, error in errors.items()}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from fdhil.cli.status_view import nc_line
+from fdhil.cli.status_view import format_nc_state
 from fdhil.daemon.nc_watch import NcWatch
 from fdhil.records import MoveKind, NcState, Notice
 
@@ -49,11 +49,11 @@ def test_status_shows_the_nc_state() -> None:
     assert status is not None
     assert (status["heard_s_ago"], status["motion"], status["tool"]) == (0.25, "rapid", 3)
     line = "NC: rapid line 12 of part.ngc, feed override 100 %, rapid override 50 %, feed hold"
-    assert nc_line(status) == line
+    assert format_nc_state(status) == line
     watch.take_state(NcState(0, 0, MoveKind.UNKNOWN), 2.0)
     status = watch.build_status(5.0)
     assert status is not None
-    assert nc_line(status) == "NC: no data for 3 s, its moves are unknown"
+    assert format_nc_state(status) == "NC: no data for 3 s, its moves are unknown"
 
 
 def test_non_unicode_program_name_is_escaped() -> None:

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.cli.demo.loop import read_trace, true_plants
-from fdhil.cli.demo.machines import machine_document
+from fdhil.cli.demo.loop import compute_true_parameters, read_trace
+from fdhil.cli.demo.machines import load_machine_document
 from fdhil.commissioning.steps import commission
 from fdhil.prediction import compute_contour_error_um, predict_path
 from fdhil.program import load_trajectory
@@ -74,7 +74,7 @@ def run(folder: Path, document: dict[str, Any], path: str, shuttle: str) -> Whol
         assert status["guard"]["cause"]["code"] == "Finished"
         assert machine.wrong == []
         notices = tuple(notice["text"] for notice in status["notices"])
-        return Whole(found, true_plants(config), predicted.rms_um, measured_um, corrected_um, notices)
+        return Whole(found, compute_true_parameters(config), predicted.rms_um, measured_um, corrected_um, notices)
 
 
 def cut(machine: CompleteMachine, path: str) -> float:
@@ -87,7 +87,7 @@ def cut(machine: CompleteMachine, path: str) -> float:
 
 
 def machine(*axes: str) -> dict[str, Any]:
-    document = machine_document()
+    document = load_machine_document()
     for table in (document["axis"], document["sim"]["axis"]):
         for axis in [*table]:
             if axis not in axes:

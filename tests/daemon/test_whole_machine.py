@@ -11,7 +11,7 @@ import can
 import numpy as np
 import pytest
 
-from fdhil.cli.demo.processes import Process
+from fdhil.cli.demo.processes import ChildProcess
 from fdhil.errors import ConnectError
 from fdhil.prediction import compute_contour_error_um
 from fdhil.store.history_database import History
@@ -83,9 +83,9 @@ def _has_identified_the_drives(status: dict[str, object]) -> None:
 
 
 def _refuses_a_second_daemon(shop: MachineRig) -> None:
-    second = Process("second daemon", ["fdhil", "run", str(shop.path)], shop.folder / "second.log")
+    second = ChildProcess("second daemon", ["fdhil", "run", str(shop.path)], shop.folder / "second.log")
     with pytest.raises(ConnectError, match="BusLocked"):
-        second.event("ready")
+        second.await_event("ready")
     assert second.stop() == 3
 
 

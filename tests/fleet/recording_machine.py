@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fdhil import config as machine_config
-from fdhil.cli.demo.toml import to_toml
+from fdhil.cli.demo.toml_writer import format_toml
 from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.records import Notice, Outcome, Parameters, Skill
@@ -24,7 +24,7 @@ def write_history(folder: Path, name: str = "mill-1", **uplink: Any) -> Path:
     document["machine"]["name"] = name
     document["uplink"] = {"labels": {"type": "V-800"}} | uplink
     file = folder / "machine.toml"
-    file.write_text(to_toml(document))
+    file.write_text(format_toml(document))
     return file
 
 

@@ -11,7 +11,7 @@ pytestmark = pytest.mark.usefixtures("processes")
 
 
 @pytest.mark.parametrize(
-    "module", ["fdhil.daemon.daemon_service", "fdhil.guard.guard_process", "fdhil.cli.main", "fdhil.cli.fleet"]
+    "module", ["fdhil.daemon.daemon_service", "fdhil.guard.guard_process", "fdhil.cli.main", "fdhil.cli.fleet_commands"]
 )
 def test_daemon_and_guard_run_without_fleet_extra(module: str) -> None:
     code = f"import sys, {module}; print([name for name in ('nats', 'psycopg', 'distributed') if name in sys.modules])"

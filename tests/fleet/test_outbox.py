@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.cli.demo.toml import to_toml
-from fdhil.cli.doctor.uplink import _outbox
+from fdhil.cli.demo.toml_writer import format_toml
+from fdhil.cli.doctor.uplink_check import _examine_outbox
 from fdhil.errors import ConfigError, StoreError
 from fdhil.records import Notice
 from fdhil.store import outbox
@@ -62,7 +62,7 @@ def test_acknowledgement_enters_outbox(machine: RecordingMachine) -> None:
 
 def test_outbox_is_empty_without_uplink(tmp_path: Path) -> None:
     file = tmp_path / "machine.toml"
-    file.write_text(to_toml(bench_document()))
+    file.write_text(format_toml(bench_document()))
     machine = RecordingMachine(file)
     machine.record_windows(1)
     machine.close_store()
@@ -118,7 +118,7 @@ def test_restored_history_copy_gets_new_identity(running: bool, machine: Recordi
         history.with_name("backup").replace(history)
         with read_outbox(machine) as reader, pytest.raises(StoreError, match="is an older copy"):
             reader.resume_from(sent)
-        assert [trouble.code for trouble in _outbox(machine.config)] == ["UplinkOutbox"]
+        assert [trouble.code for trouble in _examine_outbox(machine.config)] == ["UplinkOutbox"]
         assert machine.store.open() == []
     machine.store.store_outcomes([Notice("A", "minor", "after")])
     with read_outbox(machine) as reader:

@@ -12,7 +12,7 @@ import can
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.cli.demo.processes import Process
+from fdhil.cli.demo.processes import ChildProcess
 from fdhil.commissioning.scan import BusScanner
 from fdhil.drivers.bus_source import BusSource
 from fdhil.records import AxisSamples, Notice
@@ -186,7 +186,7 @@ def test_daemon_waits_for_a_silent_foreign_drive(hub: TcpHub, machine: Path, tmp
     log = tmp_path / "daemon.log"
     with start_slave("slave.js", hub, DRIVE) as peer, join_clients(hub) as (master,):
         peer.event("ready")
-        with Process("daemon", ["fdhil", "run", str(machine)], log) as daemon:
+        with ChildProcess("daemon", ["fdhil", "run", str(machine)], log) as daemon:
             _wait_until(daemon, lambda: "BusSilent: No frame is received on bus can0" in log.read_text())
             master.send(can.Message(arbitration_id=0, data=[1, NODE], is_extended_id=False))
 
@@ -199,7 +199,7 @@ def test_daemon_waits_for_a_silent_foreign_drive(hub: TcpHub, machine: Path, tmp
     assert "ready: bench, axes X; listening, sending nothing" in log.read_text()
 
 
-def _wait_until(process: Process, done: Callable[[], bool]) -> None:
+def _wait_until(process: ChildProcess, done: Callable[[], bool]) -> None:
     while not done():
-        process.check()
+        process.check_running()
         time.sleep(0.05)

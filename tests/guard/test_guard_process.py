@@ -19,7 +19,7 @@ import pytest
 from fdhil import config as machine_config
 from fdhil.arming.guard_client import GuardClient, GuardLost
 from fdhil.arming.guard_configuration import make_guard_settings
-from fdhil.cli.failing import run_safely
+from fdhil.cli.cli_errors import run_safely
 from fdhil.cli.main import cli
 from fdhil.guard.guard_settings import encode_settings
 from tests.guard import short_timeouts

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fdhil.api.recording_analysis import FileResult
-from fdhil.cli.batch import analyse_file
+from fdhil.cli.batch_analysis import analyse_file
 from fdhil.config import Identification
 from fdhil.config.config_loader import load_config
 from fdhil.identification.current_means import simulate_reading_lag

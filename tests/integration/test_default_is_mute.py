@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.cli.demo.processes import Process
+from fdhil.cli.demo.processes import ChildProcess
 from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
 from fdhil.errors import DeviceError
 from tests.guard.drive_peer import Peer, hold_demand, write_config
@@ -38,7 +38,7 @@ def test_default_daemon_sends_no_frame_and_opens_no_port(
         except DeviceError:
             return False
 
-    daemon = Process("daemon", ["fdhil", "run", str(config)], tmp_path / "daemon.log")
+    daemon = ChildProcess("daemon", ["fdhil", "run", str(config)], tmp_path / "daemon.log")
     try:
         peer.wait(listening, "the daemon")
         first = peer.tick

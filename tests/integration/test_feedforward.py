@@ -13,7 +13,7 @@ import pytest
 
 from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.operator_token import read_token
-from fdhil.cli.demo.processes import Process
+from fdhil.cli.demo.processes import ChildProcess
 from fdhil.commissioning.record import save_record
 from fdhil.commissioning.steps import commission
 from fdhil.correction.flatness_feedforward import derive_feedforward_law
@@ -58,8 +58,8 @@ def client(bench: Bench, short_settling_time: None, tmp_path: Path) -> Iterator[
     path.write_text(toml(json.loads(bench.config.model_dump_json(exclude_none=True))), "utf-8")
     run = bench.config.store.run_directory
     assert run is not None
-    with Process("guard", ["fdhil.cli.guard", str(path)], tmp_path / "guard.log") as guard:
-        guard.event("ready", PATIENCE_S)
+    with ChildProcess("guard", ["fdhil.cli.guard", str(path)], tmp_path / "guard.log") as guard:
+        guard.await_event("ready", PATIENCE_S)
         with GuardClient(run) as guard_client:
             yield guard_client
         assert guard.stop() == 0

@@ -14,7 +14,7 @@ import pytest
 
 from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.operator_token import read_token
-from fdhil.cli.demo.processes import Process
+from fdhil.cli.demo.processes import ChildProcess
 from fdhil.guard.interlocks import FACTS
 from tests.integration.conftest import PATIENCE_S, Bench, sign_off
 
@@ -47,8 +47,8 @@ def guarded(bench: Bench, tmp_path: Path) -> Iterator[GuardClient]:
     run = bench.config.store.run_directory
     assert run is not None
     sign_off(bench.config)
-    with Process("guard", ["fdhil.cli.guard", str(path)], tmp_path / "guard.log") as guard:
-        guard.event("ready", PATIENCE_S)
+    with ChildProcess("guard", ["fdhil.cli.guard", str(path)], tmp_path / "guard.log") as guard:
+        guard.await_event("ready", PATIENCE_S)
         with closing(GuardClient(run)) as guard_client:
             yield guard_client
         assert guard.stop() == 0

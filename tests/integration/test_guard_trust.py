@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.operator_token import read_token
-from fdhil.cli.demo.processes import Process
+from fdhil.cli.demo.processes import ChildProcess
 from fdhil.cli.main import cli
 from fdhil.commissioning.void import is_void, void_record
 from fdhil.guard.interlocks import FACTS
@@ -50,8 +50,8 @@ class TrustRig:
 
     @contextmanager
     def guard(self) -> Iterator[GuardClient]:
-        with Process("guard", [short_timeouts.__name__, str(self.config)], self.folder / "guard.log") as process:
-            process.event("ready", PATIENCE_S)
+        with ChildProcess("guard", [short_timeouts.__name__, str(self.config)], self.folder / "guard.log") as process:
+            process.await_event("ready", PATIENCE_S)
             with GuardClient(self.run) as client:
                 yield client
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from fdhil import config as machine_config
 from fdhil.bridges import hal_bus
-from fdhil.cli.demo.toml import to_toml
+from fdhil.cli.demo.toml_writer import format_toml
 from fdhil.commissioning.init.hal_file import correction_hal, splices_of
 from fdhil.commissioning.init.linuxcnc_text import Hal, Ini, parse_hal
 from fdhil.config.axis_section import HAL_INCREMENTS
@@ -103,7 +103,7 @@ class HalMachine(LinuxCnc):
     """LinuxCNC with the plant, fdhil's offsets inserted, and both bridges."""
 
     def __init__(self, file: Path, text: dict[str, Any], motors: Mapping[str, Mapping[str, float]]) -> None:
-        file.write_text(to_toml(text))
+        file.write_text(format_toml(text))
         axes = "".join(motors)
         base = machine_hal(axes, motors)
         config, hal = machine_config.load_config(file), plant_hal(base)

@@ -18,7 +18,7 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.bridges import hal_bus
-from fdhil.cli.demo.processes import Process
+from fdhil.cli.demo.processes import ChildProcess
 from fdhil.config.axis_section import HAL_INCREMENTS
 from fdhil.daemon.daemon_socket import SOCKET_NAME
 from fdhil.prediction import compute_contour_error_um
@@ -92,7 +92,7 @@ def test_the_second_cut_is_corrected_by_hal_pins_alone(shop: HalShop, plant: str
     part = tmp_path / "part.csv"
     with ExitStack() as stack:
         for name, command in (("guard", ["fdhil.cli.guard"]), ("daemon", ["fdhil", "run"])):
-            started = stack.enter_context(Process(name, [*command, str(shop.file)], tmp_path / f"{name}.log"))
+            started = stack.enter_context(ChildProcess(name, [*command, str(shop.file)], tmp_path / f"{name}.log"))
             if name == "guard":
                 shop.nc.prioritise(started.pid)
         run_directory = machine_config.load_config(shop.file).store.run_directory

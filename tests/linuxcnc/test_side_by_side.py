@@ -12,9 +12,9 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.bridges import linuxcnc as bridge
-from fdhil.cli.demo.machines import machine_document
-from fdhil.cli.demo.processes import Process
-from fdhil.cli.demo.toml import to_toml
+from fdhil.cli.demo.machines import load_machine_document
+from fdhil.cli.demo.processes import ChildProcess
+from fdhil.cli.demo.toml_writer import format_toml
 from fdhil.daemon.daemon_socket import SOCKET_NAME
 from fdhil.program import load_trajectory
 from tests.free_ports import find_free_port
@@ -43,24 +43,24 @@ class Shop:
 
 @pytest.fixture
 def shop(tmp_path: Path) -> Iterator[Shop]:
-    document = machine_document()
+    document = load_machine_document()
     document["sim"]["pace"] = "lockstep"
     document["nc"] = {"profile": "linuxcnc"}
     document["g0"] = {"source": "linuxcnc"}
     document["nc_source"] = {"linuxcnc": {"port": find_free_port()}}
     for axis in document["axis"].values():
         axis["max_acceleration_mm_s2"] = 2000.0
-    (tmp_path / "twin.toml").write_text(to_toml(document))
+    (tmp_path / "twin.toml").write_text(format_toml(document))
     file = tmp_path / "machine.toml"
     with ExitStack() as stack:
         twin = stack.enter_context(
             SimulatorProcess(tmp_path / "twin.toml", "--demand", "-", "--trace", tmp_path / "trace.csv")
         )
         document["bus"] = twin.ready["buses"]
-        file.write_text(to_toml(document))
+        file.write_text(format_toml(document))
         fdhil("commission", file, "--yes")
         for name, command in (("guard", ["fdhil.cli.guard"]), ("daemon", ["fdhil", "run"])):
-            stack.enter_context(Process(name, [*command, str(file)], tmp_path / f"{name}.log"))
+            stack.enter_context(ChildProcess(name, [*command, str(file)], tmp_path / f"{name}.log"))
         run_directory = machine_config.load_config(file).store.run_directory
         assert run_directory is not None
         until((run_directory / SOCKET_NAME).exists)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from pymodbus.client import ModbusSerialClient
 
-from fdhil.cli.sim import _ready_lines
+from fdhil.cli.sim_command import _format_ready_event
 from fdhil.config import parse_config
 from fdhil.errors import ConnectError
 from fdhil.sim.simulator_service import SimulatorService
@@ -42,7 +42,7 @@ def test_units_on_one_line_are_served_and_described(tmp_path: Path) -> None:
         ready = events.get(timeout=120)
         where = str(tmp_path / "line")
         assert ready["modbus"] == {"X": {"device": where, "unit": 1}, "Y": {"device": where, "unit": 2}}
-        assert f"  voltage sensor Y: serial line {where}" in _ready_lines(ready)
+        assert f"  voltage sensor Y: serial line {where}" in _format_ready_event(ready)
         with ModbusSerialClient(where, baudrate=115200, timeout=60, retries=0) as master:
             both = [master.read_input_registers(0, count=1, device_id=unit).registers for unit in (1, 2)]
             assert all(abs(value - (value >> 15 << 16)) < 1000 for (value,) in both)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from fdhil import config
-from fdhil.cli.sim import Positions, _lines, _tell_json
+from fdhil.cli.sim_command import PositionLine, _format_event, _print_json_event
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError
 from fdhil.records import Trajectory
@@ -139,7 +139,7 @@ def test_eds_without_run_directory_is_temporary(tmp_path: Path) -> None:
 
 
 def test_events_are_json_lines(capsys: pytest.CaptureFixture[str]) -> None:
-    _tell_json({"event": "error", "text": "two\nlines"})
+    _print_json_event({"event": "error", "text": "two\nlines"})
     assert capsys.readouterr().out == '{"event": "error", "text": "two\\nlines"}\n'
 
 
@@ -157,17 +157,17 @@ def test_events_are_json_lines(capsys: pytest.CaptureFixture[str]) -> None:
     ],
 )
 def test_events_are_readable_sentences_on_terminal(event: dict[str, Any], text: str) -> None:
-    assert _lines(event) == [text]
+    assert _format_event(event) == [text]
 
 
 def test_positions_are_shown_during_motion_and_once_at_end() -> None:
     at_mm = {"X": 0.0, "Y": -3.0}
-    shown = Positions(lambda: dict(at_mm))
-    assert shown.line() is None
+    shown = PositionLine(lambda: dict(at_mm))
+    assert shown.format_line() is None
     at_mm["X"] = 12.5
-    assert shown.line() == "X 12.500 mm  Y -3.000 mm"
-    assert shown.line() == "X 12.500 mm  Y -3.000 mm"
-    assert shown.line() is None
+    assert shown.format_line() == "X 12.500 mm  Y -3.000 mm"
+    assert shown.format_line() == "X 12.500 mm  Y -3.000 mm"
+    assert shown.format_line() is None
 
 
 def test_drive_time_follows_sync_in_lockstep_and_the_clock_once_sync_is_missing() -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdhil.cli.batch import analyse_file
+from fdhil.cli.batch_analysis import analyse_file
 from fdhil.config import Identification
 from fdhil.identification.rapid_windows import find_windows
 from fdhil.pipeline import analyse_window, pool_windows

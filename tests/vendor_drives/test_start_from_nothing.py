@@ -14,7 +14,7 @@ from fdhil import config as machine_config
 from fdhil import correction
 from fdhil.arming.guard_configuration import make_guard_settings
 from fdhil.cia402 import pack_pdo
-from fdhil.cli.demo.toml import to_toml
+from fdhil.cli.demo.toml_writer import format_toml
 from fdhil.commissioning.config_check import check_machine
 from fdhil.commissioning.record import save_record
 from fdhil.commissioning.steps import commission
@@ -79,7 +79,7 @@ def create_config(outfit: VendorDrive, machine: MachineConfig, folder: Path, cap
     """Run init, check which keys it reports as missing, and run it again with them."""
     file, answers = folder / "machine.toml", answer_interview(outfit, machine)
     given = folder / "answers.toml"
-    given.write_text(to_toml(answers))
+    given.write_text(format_toml(answers))
     code, out, err = fdhil("init", file, "--answers", given, "--json", capsys=capsys)
     assert code == 2, out + err
     missing = [fault["path"] for fault in json.loads(out)["error"]["faults"]]
@@ -88,7 +88,7 @@ def create_config(outfit: VendorDrive, machine: MachineConfig, folder: Path, cap
         key = path.removeprefix("axis.X.")
         table, _, name = key.partition(".")
         answers["axis"]["X"].setdefault(table, {})[name] = KNOWN[key]
-    given.write_text(to_toml(answers))
+    given.write_text(format_toml(answers))
     code, out, err = fdhil("init", file, "--answers", given, capsys=capsys)
     assert code == 0, out + err
     return machine_config.load_config(file)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from fdhil.cli.demo.processes import Process
+from fdhil.cli.demo.processes import ChildProcess
 from tests.fleet.fleet_database import build_fleet, spread_over_days, store_records
 from tests.fleet.recording_machine import RecordingMachine, write_history
 from tests.fleet.servers import run_postgres
@@ -39,8 +39,8 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
             asyncio.run(store_records(build_fleet(database, folder), spread_over_days(machine, begin)))
         file = folder / "fleet.toml"
         file.write_text(f'[database]\nconnection = "{database.connection}"\n')
-        web = Process("web", ["fdhil", "fleet", "web", "--port", "0", "--json", str(file)], folder / "web.log")
-        yield str(web.event("ready")["url"]).rstrip("/")
+        web = ChildProcess("web", ["fdhil", "fleet", "web", "--port", "0", "--json", str(file)], folder / "web.log")
+        yield str(web.await_event("ready")["url"]).rstrip("/")
         assert web.stop() == 0
 
 

@@ -11,8 +11,8 @@ from typing import Any
 import httpx
 import pytest
 
-from fdhil.cli.demo.processes import Process
-from fdhil.cli.demo.toml import to_toml
+from fdhil.cli.demo.processes import ChildProcess
+from fdhil.cli.demo.toml_writer import format_toml
 from fdhil.config.user_file import read_users, verify_password
 from fdhil.config.web_section import Web, is_loopback
 from fdhil.errors import ConfigError, FdhilError
@@ -70,7 +70,7 @@ def test_missing_extra_is_reported_in_one_sentence(monkeypatch: pytest.MonkeyPat
 
 def write_config(folder: Path, **web: Any) -> Path:
     path = folder / "machine.toml"
-    path.write_text(to_toml({"machine": {"name": "bench"}, "axis": {"X": bench_axis()}, "web": web}))
+    path.write_text(format_toml({"machine": {"name": "bench"}, "axis": {"X": bench_axis()}, "web": web}))
     return path
 
 
@@ -134,8 +134,8 @@ def test_tls_server_reveals_no_secret_and_ends_orderly(
     (run_directory / "token").chmod(0o600)
     log = tmp_path / "web.log"
     trusting = ssl.create_default_context(cafile=str(tmp_path / "web.crt"))
-    with Process("web", ["fdhil", "web", str(path), "--json"], log) as web:
-        url = web.event("ready")["url"]
+    with ChildProcess("web", ["fdhil", "web", str(path), "--json"], log) as web:
+        url = web.await_event("ready")["url"]
         assert url.startswith("https://127.0.0.1:")
         with httpx.Client(base_url=url, verify=trusting, headers=OWN, timeout=60.0) as client:
             said = [client.get(page) for page in ("/", "/api/session", "/api/machine", "/static/app.js")]

@@ -19,8 +19,8 @@ from urllib.request import Request, urlopen
 
 from fdhil import config as machine_config
 from fdhil.arming.operator_token import read_token
-from fdhil.cli.demo.processes import Process, Twin
-from fdhil.cli.demo.toml import to_toml
+from fdhil.cli.demo.processes import ChildProcess, SimulatorProcess
+from fdhil.cli.demo.toml_writer import format_toml
 from fdhil.commissioning.record import save_record
 from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
@@ -48,8 +48,8 @@ class WebRig:
     folder: Path
     config_path: Path
     config: MachineConfig
-    twin: Twin
-    processes: dict[str, Process | SilentProcess] = field(default_factory=dict)
+    twin: SimulatorProcess
+    processes: dict[str, ChildProcess | SilentProcess] = field(default_factory=dict)
     url: str = ""
 
     @property
@@ -69,9 +69,9 @@ class WebRig:
         self.wait_for_status(lambda told: told["source"]["state"] == "listening")
 
     def start_web(self) -> None:
-        web = Process("web", ["fdhil", "web", "--json", str(self.config_path)], self.folder / "web.log")
+        web = ChildProcess("web", ["fdhil", "web", "--json", str(self.config_path)], self.folder / "web.log")
         self.processes["web"] = web
-        self.url = str(web.event("ready")["url"]).rstrip("/")
+        self.url = str(web.await_event("ready")["url"]).rstrip("/")
 
     def send_request(self, path: str, body: bytes | None = None, token: str = "") -> Any:
         headers = {"Content-Type": "application/json", "X-Fdhil": "1", "Authorization": f"Bearer {token}"}
@@ -145,11 +145,11 @@ class WebRig:
         assert answer["ok"], answer
 
     def send_nc_command(self, on: bool) -> None:
-        self.twin.command("nc", on=on)
-        self.twin.event("nc")
+        self.twin.send_command("nc", on=on)
+        self.twin.await_event("nc")
 
     def play_program(self, program: Path) -> None:
-        self.twin.play(program)
+        self.twin.play_program(program)
 
 
 def read_document() -> dict[str, Any]:
@@ -167,10 +167,10 @@ def read_document() -> dict[str, Any]:
 @contextmanager
 def open_rig(folder: Path, rapids: int = 84, acting: bool = True) -> Iterator[WebRig]:
     asked = read_document()
-    (folder / "twin.toml").write_text(to_toml(asked), "utf-8")
-    with Twin(folder / "twin.toml", folder / "twin.log") as twin:
+    (folder / "twin.toml").write_text(format_toml(asked), "utf-8")
+    with SimulatorProcess(folder / "twin.toml", folder / "twin.log") as twin:
         path = folder / "machine.toml"
-        path.write_text(to_toml(_join_settings(asked, twin, acting)), "utf-8")
+        path.write_text(format_toml(_join_settings(asked, twin, acting)), "utf-8")
         stage = WebRig(folder, path, machine_config.load_config(path), twin)
         try:
             _prepare_machine(stage, rapids)
@@ -184,7 +184,7 @@ def open_rig(folder: Path, rapids: int = 84, acting: bool = True) -> Iterator[We
                 process.stop()
 
 
-def _join_settings(asked: dict[str, Any], twin: Twin, acting: bool) -> dict[str, Any]:
+def _join_settings(asked: dict[str, Any], twin: SimulatorProcess, acting: bool) -> dict[str, Any]:
     bus = {key: value for key, value in twin.ready["buses"]["can0"].items() if value is not None}
     sensors = {axis: {"temperature": {**place, "period_s": 0.5}} for axis, place in twin.ready["modbus"].items()}
     axes = {name: {**axis, **sensors.get(name, {})} for name, axis in asked["axis"].items()}

@@ -13,8 +13,8 @@ from fdhil.child_process import interrupt_on_stop_signals
 from fdhil.cli.options import AS_JSON, FOLDER
 
 if TYPE_CHECKING:
-    from fdhil.cli.demo.realistic import Realistic
-    from fdhil.cli.demo.report import Loop, Published
+    from fdhil.cli.demo.demo_page import DemoResult, Published
+    from fdhil.cli.demo.realistic_machine import RealisticResult
     from fdhil.records import Parameters
 
 
@@ -32,32 +32,34 @@ def demo(out: Path, realtime: bool, pdf: bool, as_json: bool) -> None:
     repeats. In parallel it does the same on a machine with realistic imperfections. Needs the extra 'report'.
     """
     from fdhil.cli.demo import realistic_page
+    from fdhil.cli.demo.demo_page import build_demo_page
     from fdhil.cli.demo.loop import run_loop
-    from fdhil.cli.demo.realistic import running_realistic
-    from fdhil.cli.demo.report import page
+    from fdhil.cli.demo.realistic_machine import run_realistic_in_process
     from fdhil.report import find_browser, require_libraries, write_page_or_pdf
 
     require_libraries()  # before the computation
 
-    def say(text: str) -> None:
+    def show_progress(text: str) -> None:
         if not as_json or sys.stderr.isatty():
             click.echo(text, err=as_json)
 
     if pdf:
         find_browser()
-    with interrupt_on_stop_signals(), running_realistic(out / "realistic", realtime, say) as result:
-        loop = run_loop(out, realtime, say)
+    with interrupt_on_stop_signals(), run_realistic_in_process(out / "realistic", realtime, show_progress) as result:
+        loop = run_loop(out, realtime, show_progress)
         realistic = result()
         report = out / "report.html"
-        laid_out = page(loop, [realistic_page.headline(realistic)], [realistic_page.section(realistic)])
+        laid_out = build_demo_page(
+            loop, [realistic_page.build_headline(realistic)], [realistic_page.build_section(realistic)]
+        )
         write_page_or_pdf(laid_out, report, report.with_suffix(".pdf") if pdf else None)
     if as_json:
-        click.echo(json.dumps({**_document(loop, report), "realistic": _realistic(realistic)}))
+        click.echo(json.dumps({**_build_demo_document(loop, report), "realistic": _describe_realistic(realistic)}))
     else:
-        _tables(loop, realistic, report)
+        _print_tables(loop, realistic, report)
 
 
-def _parameters(found: Published, truth: Parameters) -> dict[str, Any]:
+def _describe_parameters(found: Published, truth: Parameters) -> dict[str, Any]:
     from fdhil.records import PARAMETERS, UNITS
 
     return {
@@ -71,13 +73,13 @@ def _parameters(found: Published, truth: Parameters) -> dict[str, Any]:
     }
 
 
-def _realistic(realistic: Realistic) -> dict[str, Any]:
+def _describe_realistic(realistic: RealisticResult) -> dict[str, Any]:
     axes = {
         axis: {
             "rapids": found.rapids,
-            "believed": found.believed,
+            "believed": found.accepted,
             "reasons": dict(found.reasons),
-            "parameters": found.published and _parameters(found.published, realistic.truth[axis]),
+            "parameters": found.published and _describe_parameters(found.published, realistic.truth[axis]),
             "terms": found.published and dict(found.published.parameters.terms),
         }
         for axis, found in realistic.verdicts.items()
@@ -86,16 +88,16 @@ def _realistic(realistic: Realistic) -> dict[str, Any]:
     return {"axes": axes, "cuts": cuts, "refused": realistic.refused or None}
 
 
-def _document(loop: Loop, report: Path) -> dict[str, Any]:
-    from fdhil.cli.demo.report import rms
+def _build_demo_document(loop: DemoResult, report: Path) -> dict[str, Any]:
+    from fdhil.cli.demo.demo_page import compute_rms
 
-    identified = {axis: _parameters(sets[0], loop.truth[axis]) for axis, sets in loop.published.items()}
+    identified = {axis: _describe_parameters(sets[0], loop.truth[axis]) for axis, sets in loop.published.items()}
     before, mirror, after, *rest = loop.cuts
     contour = loop.predicted.contour_um
     return {
         "schema": "fdhil-demo-1",
         "identified": identified,
-        "predicted": {"rms_um": rms(contour), "max_um": float(contour.max())},
+        "predicted": {"rms_um": compute_rms(contour), "max_um": float(contour.max())},
         "before": {"rms_um": before.rms_um, "max_um": before.max_um},
         "mirror": {"rms_um": mirror.rms_um, "max_um": mirror.max_um, "late_offsets": mirror.late_offsets},
         "after": {"rms_um": after.rms_um, "max_um": after.max_um, "late_offsets": after.late_offsets},
@@ -105,19 +107,19 @@ def _document(loop: Loop, report: Path) -> dict[str, Any]:
     }
 
 
-def _tables(loop: Loop, realistic: Realistic, report: Path) -> None:
+def _print_tables(loop: DemoResult, realistic: RealisticResult, report: Path) -> None:
     from rich.table import Table
 
-    from fdhil.cli.console import PrintableConsole
     from fdhil.cli.demo import realistic_page
-    from fdhil.cli.demo.report import CUT_HEAD, PARAMETER_HEAD, cut_rows, parameter_rows
+    from fdhil.cli.demo.demo_page import CUT_HEAD, PARAMETER_HEAD, list_cut_rows, list_parameter_rows
+    from fdhil.cli.printable_console import PrintableConsole
 
     console = PrintableConsole()
     for title, head, rows in (
-        ("Identified from the rapids", PARAMETER_HEAD, parameter_rows(loop)),
-        ("Contour error, measured at the simulated table", CUT_HEAD, cut_rows(loop)),
-        ("Results of the realistic machine", realistic_page.VERDICT_HEAD, realistic_page.verdict_rows(realistic)),
-        ("Contour error of the realistic machine", CUT_HEAD, realistic_page.cut_rows(realistic)),
+        ("Identified from the rapids", PARAMETER_HEAD, list_parameter_rows(loop)),
+        ("Contour error, measured at the simulated table", CUT_HEAD, list_cut_rows(loop)),
+        ("Results of the realistic machine", realistic_page.VERDICT_HEAD, realistic_page.list_verdict_rows(realistic)),
+        ("Contour error of the realistic machine", CUT_HEAD, realistic_page.list_cut_rows(realistic)),
     ):
         table = Table(title=title, title_justify="left")
         for k, name in enumerate(head):

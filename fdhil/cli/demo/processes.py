@@ -17,7 +17,7 @@ from fdhil.errors import ConnectError, DeviceTimeout
 PATIENCE_S = 900.0  # only for hanging processes, on a busy host; an ended process is detected at once
 
 
-class Process:
+class ChildProcess:
     """A command of fdhil as a child process; stderr goes to a log file, stdout is read line by line.
 
     Raises ConnectError if it ends before it is ready, DeviceTimeout if an awaited event does not arrive.
@@ -39,7 +39,7 @@ class Process:
                 start_new_session=True,  # Ctrl-C must reach only this process, which stops the others in order
             )
         self._lines: queue.Queue[str | None] = queue.Queue()
-        self._reader = threading.Thread(target=self._read, name=f"{name} events", daemon=True)
+        self._reader = threading.Thread(target=self._read_lines, name=f"{name} events", daemon=True)
         self._reader.start()
 
     @property
@@ -47,13 +47,13 @@ class Process:
         """Process identifier."""
         return self._child.pid
 
-    def _read(self) -> None:
+    def _read_lines(self) -> None:
         assert self._child.stdout is not None
         for line in self._child.stdout:
             self._lines.put(line)
         self._lines.put(None)
 
-    def event(self, kind: str, timeout_s: float = PATIENCE_S) -> dict[str, Any]:
+    def await_event(self, kind: str, timeout_s: float = PATIENCE_S) -> dict[str, Any]:
         """Return the next event of this kind and discard all events before it."""
         deadline = time.monotonic() + timeout_s
         while True:
@@ -64,26 +64,28 @@ class Process:
                     self.name, f"did not report {kind!r} within {timeout_s:.0f} s; see {self._log}"
                 ) from None
             if line is None:
-                raise ConnectError(self.name, f"ended before it reported {kind!r}: {self._last_words()}")
+                raise ConnectError(self.name, f"ended before it reported {kind!r}: {self._read_last_log_line()}")
             event = json.loads(line)
             if event.get("event") == "error":
                 raise ConnectError(self.name, str(event.get("text")))
             if event.get("event") == kind:
                 return dict(event)
 
-    def command(self, command: str, **fields: Any) -> None:
+    def send_command(self, command: str, **fields: Any) -> None:
         """Send one command to the operator's panel."""
         assert self._child.stdin is not None
         try:
             self._child.stdin.write(json.dumps({"command": command, **fields}) + "\n")
             self._child.stdin.flush()
         except BrokenPipeError:
-            raise ConnectError(self.name, f"has ended: {self._last_words()}") from None
+            raise ConnectError(self.name, f"has ended: {self._read_last_log_line()}") from None
 
-    def check(self) -> None:
+    def check_running(self) -> None:
         """Raise ConnectError if the process has ended."""
         if self._child.poll() is not None:
-            raise ConnectError(self.name, f"ended with exit code {self._child.returncode}: {self._last_words()}")
+            raise ConnectError(
+                self.name, f"ended with exit code {self._child.returncode}: {self._read_last_log_line()}"
+            )
 
     def stop(self, timeout_s: float = 60.0) -> int:
         """Terminate the process, kill it after ``timeout_s``, and return its exit code."""
@@ -100,7 +102,7 @@ class Process:
                 stream.close()
         return self._child.returncode
 
-    def _last_words(self) -> str:
+    def _read_last_log_line(self) -> str:
         lines = self._log.read_text("utf-8", "replace").strip().splitlines()
         return lines[-1] if lines else "without a message"
 
@@ -111,21 +113,21 @@ class Process:
         self.stop()
 
 
-class Twin(Process):
+class SimulatorProcess(ChildProcess):
     """The simulator with its operator's panel; ``ready`` is its first event."""
 
     def __init__(self, config: Path, log: Path) -> None:
         # if this process is killed, it runs on until guard and daemon have left the bus
         super().__init__("simulated machine", ["fdhil", "sim", str(config), "--json"], log, signal.SIGUSR1)
         try:
-            self.ready: Mapping[str, Any] = self.event("ready")
+            self.ready: Mapping[str, Any] = self.await_event("ready")
         except BaseException:
             self.stop()
             raise
 
-    def play(self, program: Path, trace: Path | None = None, timeout_s: float = PATIENCE_S) -> dict[str, Any]:
+    def play_program(self, program: Path, trace: Path | None = None, timeout_s: float = PATIENCE_S) -> dict[str, Any]:
         """Let the NC play a program or demand; return its ``finished`` event (late offset frames, trace file)."""
         if trace is not None:
-            self.command("trace", file=str(trace))
-        self.command("play", file=str(program))
-        return self.event("finished", timeout_s)
+            self.send_command("trace", file=str(trace))
+        self.send_command("play", file=str(program))
+        return self.await_event("finished", timeout_s)

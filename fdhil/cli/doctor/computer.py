@@ -35,17 +35,17 @@ def examine_buses(config: MachineConfig, offline: bool) -> dict[str, list[Troubl
     ``offline`` does not connect to a hub of CAN frames.
     """
     used = dict.fromkeys(axis.drive.bus for axis in config.axis.values())
-    return {name: list(_bus(f"bus {name}", config.bus[name], offline)) for name in used}
+    return {name: list(_examine_bus(f"bus {name}", config.bus[name], offline)) for name in used}
 
 
-def _bus(place: str, bus: CanBus, offline: bool) -> Iterator[Trouble]:
+def _examine_bus(place: str, bus: CanBus, offline: bool) -> Iterator[Trouble]:
     if bus.interface == "socketcand":
-        yield from _hub(place, bus, offline)
+        yield from _examine_hub(place, bus, offline)
     elif bus.interface == "socketcan":
-        yield from _interface(place, bus)
+        yield from _examine_interface(place, bus)
 
 
-def _hub(place: str, bus: CanBus, offline: bool) -> Iterator[Trouble]:
+def _examine_hub(place: str, bus: CanBus, offline: bool) -> Iterator[Trouble]:
     means = "no drive can be received"
     if bus.port == 0:
         what = "the configuration has no port for the CAN hub"
@@ -61,24 +61,24 @@ def _hub(place: str, bus: CanBus, offline: bool) -> Iterator[Trouble]:
         yield Trouble("HubAway", place, what, means, f"start the hub (socketcand or `fdhil sim`) or correct [{place}]")
 
 
-def _interface(place: str, bus: CanBus) -> Iterator[Trouble]:
+def _examine_interface(place: str, bus: CanBus) -> Iterator[Trouble]:
     means, there = "no drive can be received", INTERFACES / bus.channel
-    if not hasattr(socket, "AF_CAN") or not _opens_can():
+    if not hasattr(socket, "AF_CAN") or not _can_open_socket():
         mend = "load the kernel modules can, can_raw and that of the adapter, or use a kernel that has them"
         yield Trouble("NoKernelCan", place, NO_CAN_ADDRESS, means, mend)
     elif not there.exists():
         what = f"there is no CAN interface {bus.channel}"
-        mend = f"plug the adapter in, load its driver, then: {_bring_up(bus)}"
+        mend = f"plug the adapter in, load its driver, then: {_format_bring_up_command(bus)}"
         yield Trouble("InterfaceMissing", place, what, means, mend)
     elif not int((there / "flags").read_text(), 16) & UP:
         what = f"the CAN interface {bus.channel} is down"
-        yield Trouble("InterfaceDown", place, what, means, _bring_up(bus))
+        yield Trouble("InterfaceDown", place, what, means, _format_bring_up_command(bus))
     else:
-        yield from _controller(place, bus, link_details(bus.channel))
-        yield from _receive_buffer(place)
+        yield from _examine_controller(place, bus, read_link_details(bus.channel))
+        yield from _examine_receive_buffer(place)
 
 
-def _opens_can() -> bool:
+def _can_open_socket() -> bool:
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError:
@@ -86,11 +86,11 @@ def _opens_can() -> bool:
     return True
 
 
-def _bring_up(bus: CanBus) -> str:
+def _format_bring_up_command(bus: CanBus) -> str:
     return f"sudo ip link set {bus.channel} up type can bitrate {bus.bitrate} restart-ms 100"
 
 
-def link_details(channel: str) -> Mapping[str, Any]:
+def read_link_details(channel: str) -> Mapping[str, Any]:
     """Return state, bit timing and restart setting of a CAN controller from ``ip``; empty if unavailable."""
     tool = shutil.which("ip")
     if tool is None:
@@ -103,24 +103,26 @@ def link_details(channel: str) -> Mapping[str, Any]:
     return {}
 
 
-def _controller(place: str, bus: CanBus, details: Mapping[str, Any]) -> Iterator[Trouble]:
+def _examine_controller(place: str, bus: CanBus, details: Mapping[str, Any]) -> Iterator[Trouble]:
     # a virtual interface has no controller, and no details
     bitrate = details.get("bittiming", {}).get("bitrate")
     if bitrate and bitrate != bus.bitrate:
         what = f"{bus.channel} runs at {bitrate} bit/s, the configuration has {bus.bitrate}"
-        mend = f"correct [{place}] bitrate, or: sudo ip link set {bus.channel} down, then {_bring_up(bus)}"
+        mend = (
+            f"correct [{place}] bitrate, or: sudo ip link set {bus.channel} down, then {_format_bring_up_command(bus)}"
+        )
         yield Trouble("BitrateDiffers", place, what, "nodes with different bit rates corrupt each other's frames", mend)
     if (state := str(details.get("state"))) in BAD_STATES:
         what, means = BAD_STATES[state]
-        mend = f"check plugs, wiring, the two terminating resistors and the bit rate, then: {_bring_up(bus)}"
+        mend = f"check plugs, wiring, the two terminating resistors and the bit rate, then: {_format_bring_up_command(bus)}"
         yield Trouble("BusOff" if state == "BUS-OFF" else "BusPassive", place, f"{bus.channel} {what}", means, mend)
     if details.get("restart_ms") == 0:
         what = f"{bus.channel} does not restart automatically after a bus-off"
         means = "one disturbance stops all reception until it is restarted manually"
-        yield Trouble("NoRestart", place, what, means, _bring_up(bus), grave=False)
+        yield Trouble("NoRestart", place, what, means, _format_bring_up_command(bus), grave=False)
 
 
-def _receive_buffer(place: str) -> Iterator[Trouble]:
+def _examine_receive_buffer(place: str) -> Iterator[Trouble]:
     with suppress(OSError, ValueError):
         largest = int(LARGEST_RECEIVE_BUFFER.read_text())
         if largest < ENOUGH_BUFFER_BYTES:

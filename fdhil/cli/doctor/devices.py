@@ -40,10 +40,10 @@ def examine_devices(
     except DeviceError as error:
         yield Trouble.create_from_error(type(error).__name__, error.device, error, "no drive can be received")
         return
-    yield from troubles_of([each for each in found if each[0] not in recorded or each[1].point != RECORD_POINT])
+    yield from list_troubles([each for each in found if each[0] not in recorded or each[1].point != RECORD_POINT])
 
 
-def troubles_of(found: Sequence[Place]) -> list[Trouble]:
+def list_troubles(found: Sequence[Place]) -> list[Trouble]:
     """Return the differences in the order in which to fix them; an absent drive hides its other differences."""
     differ = [(place, finding) for place, finding in found if finding.ok is False]
     rank = {point: k for k, point in enumerate(ORDER)}

@@ -64,7 +64,7 @@ def measure_latency(
     }
 
 
-def keep_latency(config: MachineConfig, found: Mapping[str, Any]) -> Path:
+def store_latency(config: MachineConfig, found: Mapping[str, Any]) -> Path:
     """Write a measurement to the store, for the acceptance report. Raises StoreError."""
     path = config.store.directory / FILE_NAME
     make_folder(path.parent)
@@ -81,7 +81,7 @@ def read_latency(config: MachineConfig) -> dict[str, Any] | None:
         return None
 
 
-def latency_text(found: Mapping[str, Any]) -> str:
+def format_latency(found: Mapping[str, Any]) -> str:
     """Return a measurement as text."""
     return (
         f"{found['turns']} wake-ups every {found['period_us'] / 1e3:g} ms: median latency {found['p50_us']:.0f} us, "
@@ -90,7 +90,7 @@ def latency_text(found: Mapping[str, Any]) -> str:
     )
 
 
-def histogram_lines(histogram_us: list[list[int | None]]) -> Iterator[str]:
+def format_histogram(histogram_us: list[list[int | None]]) -> Iterator[str]:
     """Yield one line per non-empty class."""
     most = max(count or 0 for _, count in histogram_us) or 1
     for top, count in histogram_us:
@@ -102,6 +102,6 @@ def histogram_lines(histogram_us: list[list[int | None]]) -> Iterator[str]:
 def examine_latency(found: Mapping[str, Any]) -> Iterator[Trouble]:
     """Yield a problem if the share of late wake-ups exceeds the limit above which the guard refuses arming."""
     if found["late"] > MOST_LATE * found["turns"]:
-        what = f"this PC is too slow: {latency_text(found)}"
+        what = f"this PC is too slow: {format_latency(found)}"
         means = f"offsets are sent late; above {MOST_LATE:.1%} late offsets the guard refuses arming"
         yield Trouble("PcLate", "processors", what, means, MEND)

@@ -30,7 +30,7 @@ def examine_store(config: MachineConfig) -> Iterator[Trouble]:
         what, mend = f"{base} is a file; [store] needs a folder", "move it away or correct [store] directory"
         yield Trouble("StoreNoFolder", "store", what, means, mend)
         return
-    if not may_write(base):
+    if not can_write(base):
         mend = (
             f"give this user ({os.environ.get('USER') or os.getuid()}) write permission, or correct [store] directory"
         )
@@ -39,15 +39,15 @@ def examine_store(config: MachineConfig) -> Iterator[Trouble]:
     if free < LEAST_FREE_BYTES:
         what = f"{free / 1e6:.0f} MB are free on the disk of {base}, enough for {free // WINDOW_BYTES} rapids"
         yield Trouble("DiskFull", "store", what, means, "free space, or lower keep_windows in [store]")
-    yield from _history(folder)
+    yield from _examine_history(folder)
 
 
-def may_write(folder: Path) -> bool:
+def can_write(folder: Path) -> bool:
     """Return whether this user can create files in a folder."""
     return os.access(folder, os.W_OK | os.X_OK)
 
 
-def _history(folder: Path) -> Iterator[Trouble]:
+def _examine_history(folder: Path) -> Iterator[Trouble]:
     try:
         with History.open_read_only(folder):
             pass
@@ -59,7 +59,7 @@ def _history(folder: Path) -> Iterator[Trouble]:
 def examine_secrets(config: MachineConfig) -> Iterator[Trouble]:
     """Examine sockets, token and records: presence and permissions."""
     for folder in dict.fromkeys((config.run_directory, config.guard_directory)):
-        yield from _run_directory(folder)
+        yield from _examine_run_directory(folder)
     if (config.run_directory / TOKEN_NAME).is_symlink() or (config.run_directory / TOKEN_NAME).exists():
         try:
             read_token(config.run_directory)
@@ -67,10 +67,10 @@ def examine_secrets(config: MachineConfig) -> Iterator[Trouble]:
             yield Trouble.create_from_error("TokenOpen", "token", error, "nothing can be armed")
     for name, axis in config.axis.items():
         if axis.correction is not None:
-            yield from _record(config, name)
+            yield from _examine_record(config, name)
 
 
-def _run_directory(folder: Path) -> Iterator[Trouble]:
+def _examine_run_directory(folder: Path) -> Iterator[Trouble]:
     path = str((folder / SOCKET_NAME).absolute())
     if len(os.fsencode(path)) > LONGEST_SOCKET_PATH:
         what = f"{path} is too long for a socket ({len(path)} characters, at most {LONGEST_SOCKET_PATH})"
@@ -84,7 +84,7 @@ def _run_directory(folder: Path) -> Iterator[Trouble]:
         pass  # unreadable; programs that use it report the reason
 
 
-def _record(config: MachineConfig, axis: str) -> Iterator[Trouble]:
+def _examine_record(config: MachineConfig, axis: str) -> Iterator[Trouble]:
     place, means = f"axis {axis}", "nothing can be armed there"
     directory = config.store.directory
     try:

@@ -36,62 +36,70 @@ def paper(out: Path, runs: int, pdf: bool, as_json: bool) -> None:
     """
     from importlib.metadata import version
 
-    from fdhil.cli.paper.page import document, page, write_pictures
+    from fdhil.cli.paper.claims_page import build_claims_document, build_claims_page, write_pictures
     from fdhil.report import find_browser, require_libraries, write_page_or_pdf
     from fdhil.store.output_file import open_output
 
     require_libraries()
     if pdf:
         find_browser()  # before the computation
-    _make(out)
+    _create_folders(out)
     with interrupt_on_stop_signals():
-        claims = gather(runs, lambda text: click.echo(text, err=True) if sys.stderr.isatty() or not as_json else None)
+        claims = gather_claims(
+            runs, lambda text: click.echo(text, err=True) if sys.stderr.isatty() or not as_json else None
+        )
         files = write_pictures(claims, out)
-        result = document(claims, runs, version("fdhil"), files)
-        write_page_or_pdf(page(claims), out / "paper.html", out / "paper.pdf" if pdf else None)
+        result = build_claims_document(claims, runs, version("fdhil"), files)
+        write_page_or_pdf(build_claims_page(claims), out / "paper.html", out / "paper.pdf" if pdf else None)
     with open_output(out / "paper.json") as file:
         file.write(json.dumps(result, indent=1, ensure_ascii=False).encode())
     if as_json:
         click.echo(json.dumps(result))
     else:
-        _table(claims, out / "paper.html")
+        _print_summary(claims, out / "paper.html")
 
 
-def gather(runs: int, say: Callable[[str], object]) -> list[Claim]:
+def gather_claims(runs: int, say: Callable[[str], object]) -> list[Claim]:
     """Evaluate all claims in the order of the paper; ``say`` receives the progress."""
-    from fdhil.cli.paper import concluding, correcting, estimating, measuring, predicting
+    from fdhil.cli.paper import (
+        conclusion_claims,
+        correction_claims,
+        estimation_claims,
+        measurement_claims,
+        prediction_claims,
+    )
 
     say(f"identifying one rapid {runs} times by every method")
-    found = estimating.claims(runs)
+    found = estimation_claims.evaluate_claims(runs)
     say("measuring the machine, cold and warm")
-    found += measuring.claims()
+    found += measurement_claims.evaluate_claims()
     say("simulating the path in every scenario")
-    structure, *predicted = predicting.claims()
+    structure, *predicted = prediction_claims.evaluate_claims()
     say("simulating the corrected path")
-    corrected = correcting.claims()
-    return [structure, *found, *predicted, *corrected, *concluding.claims([*predicted, *corrected])]
+    corrected = correction_claims.evaluate_claims()
+    return [structure, *found, *predicted, *corrected, *conclusion_claims.evaluate_claims([*predicted, *corrected])]
 
 
-def _make(out: Path) -> None:
+def _create_folders(out: Path) -> None:
     try:
         (out / "pictures").mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"the folder {out} cannot be created: {error.strerror}; choose another --out") from None
 
 
-def _table(claims: list[Claim], report: Path) -> None:
+def _print_summary(claims: list[Claim], report: Path) -> None:
     from rich.table import Table
 
-    from fdhil.cli.console import PrintableConsole
-    from fdhil.cli.paper.page import SUMMARY_HEAD, counts, summary_rows
+    from fdhil.cli.paper.claims_page import SUMMARY_HEAD, count_verdicts, list_summary_rows
+    from fdhil.cli.printable_console import PrintableConsole
 
     console = PrintableConsole()
     table = Table(title="The paper, claim by claim", title_justify="left")
     for name in SUMMARY_HEAD:
         table.add_column(name)
-    for row in summary_rows(claims):
+    for row in list_summary_rows(claims):
         table.add_row(*row)
     console.print(table)
-    summary = ", ".join(f"{number} {verdict}" for verdict, number in counts(claims).items())
+    summary = ", ".join(f"{number} {verdict}" for verdict, number in count_verdicts(claims).items())
     console.print(f"{summary}.")
     console.print(f"wrote {report}", soft_wrap=True)

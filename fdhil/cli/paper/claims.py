@@ -83,14 +83,14 @@ class Claim:
         """The distinct scenarios of the trials."""
         return tuple(dict.fromkeys(trial.scenario for trial in self.trials))
 
-    def shown_by(self, scenario: str) -> bool:
+    def is_shown_by(self, scenario: str) -> bool:
         """Return whether all trials of a scenario hold."""
         return all(trial.holds for trial in self.trials if trial.scenario == scenario)
 
     @property
     def verdict(self) -> Verdict:
         """The verdict by the rule of this module."""
-        shown = [self.shown_by(scenario) for scenario in self.scenarios]
+        shown = [self.is_shown_by(scenario) for scenario in self.scenarios]
         if all(shown) and shown:
             return Verdict.HOLDS
         return Verdict.CONDITION if any(shown) else Verdict.NOT
@@ -100,7 +100,7 @@ class Claim:
         """Where the claim holds and where it does not; empty unless it holds with a condition."""
         if self.verdict is not Verdict.CONDITION:
             return ""
-        where = [scenario for scenario in self.scenarios if self.shown_by(scenario)]
+        where = [scenario for scenario in self.scenarios if self.is_shown_by(scenario)]
         rest = [scenario for scenario in self.scenarios if scenario not in where]
         return f"in {', '.join(where)}; not in {', '.join(rest)}"
 

@@ -27,7 +27,7 @@ class Scenario:
     programmed: bool = False
 
 
-def _loop(feedforward: float, smoothing_s: Sequence[float], **regulators: Any) -> dict[str, Any]:
+def _make_changes(feedforward: float, smoothing_s: Sequence[float], **regulators: Any) -> dict[str, Any]:
     gains = {f"axis.{axis}.regulators.speed_feedforward": feedforward for axis in "XY"}
     rapids = {f"axis.{axis}.rapid_speed_mm_s": FAST_MM_S for axis in "XY"}
     others = {f"axis.{axis}.regulators.{key}": value for axis in "XY" for key, value in regulators.items()}
@@ -39,23 +39,29 @@ _DOUBLE_PI = {"structure": "double_pi", "position_ki_per_s2": 1250.0}
 
 
 PATHS: Mapping[str, Scenario] = {
-    "full": Scenario("speed feed-forward 1, smoothing NC", _loop(1.0, SMOOTHED_S)),
-    "half": Scenario("speed feed-forward 0.5, smoothing NC", _loop(0.5, SMOOTHED_S)),
-    "lag": Scenario("no feed-forward, smoothing NC", _loop(0.0, SMOOTHED_S)),
+    "full": Scenario("speed feed-forward 1, smoothing NC", _make_changes(1.0, SMOOTHED_S)),
+    "half": Scenario("speed feed-forward 0.5, smoothing NC", _make_changes(0.5, SMOOTHED_S)),
+    "lag": Scenario("no feed-forward, smoothing NC", _make_changes(0.0, SMOOTHED_S)),
     "full-programmed": Scenario(
-        "speed feed-forward 1, smoothing NC, against the programmed path", _loop(1.0, SMOOTHED_S), programmed=True
+        "speed feed-forward 1, smoothing NC, against the programmed path",
+        _make_changes(1.0, SMOOTHED_S),
+        programmed=True,
     ),
     "half-programmed": Scenario(
-        "speed feed-forward 0.5, smoothing NC, against the programmed path", _loop(0.5, SMOOTHED_S), programmed=True
+        "speed feed-forward 0.5, smoothing NC, against the programmed path",
+        _make_changes(0.5, SMOOTHED_S),
+        programmed=True,
     ),
     "lag-programmed": Scenario(
-        "no feed-forward, smoothing NC, against the programmed path", _loop(0.0, SMOOTHED_S), programmed=True
+        "no feed-forward, smoothing NC, against the programmed path", _make_changes(0.0, SMOOTHED_S), programmed=True
     ),
-    "sharp-full": Scenario("speed feed-forward 1, sharp corners", _loop(1.0, ())),
-    "sharp-half": Scenario("speed feed-forward 0.5, sharp corners", _loop(0.5, ())),
-    "sharp-lag": Scenario("no feed-forward, sharp corners", _loop(0.0, ())),
-    "double-pi": Scenario("double PI, no feed-forward, smoothing NC", _loop(0.0, SMOOTHED_S, **_DOUBLE_PI)),
-    "sharp-double-pi": Scenario("double PI, speed feed-forward 0.5, sharp corners", _loop(0.5, (), **_DOUBLE_PI)),
+    "sharp-full": Scenario("speed feed-forward 1, sharp corners", _make_changes(1.0, ())),
+    "sharp-half": Scenario("speed feed-forward 0.5, sharp corners", _make_changes(0.5, ())),
+    "sharp-lag": Scenario("no feed-forward, sharp corners", _make_changes(0.0, ())),
+    "double-pi": Scenario("double PI, no feed-forward, smoothing NC", _make_changes(0.0, SMOOTHED_S, **_DOUBLE_PI)),
+    "sharp-double-pi": Scenario(
+        "double PI, speed feed-forward 0.5, sharp corners", _make_changes(0.5, (), **_DOUBLE_PI)
+    ),
 }
 """Control loops and NCs that execute the path."""
 
@@ -71,7 +77,7 @@ def _read_text(name: str) -> str:
 
 
 @lru_cache(maxsize=32)
-def machine(name: str = "") -> MachineConfig:
+def load_machine(name: str = "") -> MachineConfig:
     """Return the configuration of a scenario; without a name, that of ``configs/paper.toml``."""
     document = tomllib.loads(_read_text("paper.toml"))
     for key, value in (PATHS[name].changes if name else {}).items():
