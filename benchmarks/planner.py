@@ -17,11 +17,17 @@ from benchmarks.inverse import measure_gains
 from fdhil import config as configuration
 from fdhil.program import Arc, Feed, Motion, interpret, plan
 from fdhil.program.motions import Corner
-from fdhil.program.planner import stream
+from fdhil.program.planner import stream_trajectory
 from fdhil.records import Float
 from tests.bench import bench_config, bench_document
-from tests.linuxcnc.machine import DemandRecorder
-from tests.program.test_linuxcnc_demand import ACCELERATION_MM_S2, EXACT_SHARE, apart_mm, ours, program
+from tests.linuxcnc.linuxcnc_process import DemandRecorder
+from tests.program.test_linuxcnc_demand import (
+    ACCELERATION_MM_S2,
+    EXACT_SHARE,
+    build_program,
+    measure_distance_mm,
+    plan_demand,
+)
 
 BENCH = "G21 G90 G17 {mode}\nF{feed:g}\nG1 Y55\nX100\nG3 X200 I50\nG1 X250\nY0\nM2\n"
 BESIDE = ("contour", "zigzag", "helix", "wave")
@@ -54,7 +60,7 @@ def measure_speeds() -> None:
     """Motions and seconds of path per second."""
     for profile, moves in PROFILES.items():
         begun, rows = time.process_time(), 0
-        for block in stream(make_chords(moves), make_machine(profile), 1000):
+        for block in stream_trajectory(make_chords(moves), make_machine(profile), 1000):
             rows += block.time_s.size
         took = time.process_time() - begun
         print(f"{profile}: {moves / took:.0f} motions/s, {rows * 0.001 / took:.0f} x real time on one core")
@@ -65,13 +71,13 @@ def compare_with_linuxcnc(nc: DemandRecorder) -> None:
     print("path, mode, feed: rows of LinuxCNC; difference of time, largest distance at the same millisecond")
     for path in BESIDE:
         for mode, feed in product(("G61", "G64 P0.05", "G64 P0.2 Q0.02"), (6000.0, 20000.0)):
-            text = program(path, mode, feed)
-            b = nc.record(text)
+            text = build_program(path, mode, feed)
+            b = nc.record_demand(text)
             told = []
             for profile in ("linuxcnc", "trapezoidal"):
                 share = EXACT_SHARE if mode == "G61" and profile == "trapezoidal" else 1.0
-                a = ours(text, ACCELERATION_MM_S2 * share, profile)
-                told.append(f"{profile} {100 * (len(a) / len(b) - 1):+.2f} %, {apart_mm(a, b):.3f} mm")
+                a = plan_demand(text, ACCELERATION_MM_S2 * share, profile)
+                told.append(f"{profile} {100 * (len(a) / len(b) - 1):+.2f} %, {measure_distance_mm(a, b):.3f} mm")
             print(f"{path}, {mode}, {feed / 1000:g} m/min: {len(b)}; {'; '.join(told)}")
 
 
@@ -84,7 +90,7 @@ def make_jerky_demands(nc: DemandRecorder | None) -> Iterator[tuple[str, Float]]
             name = f"{mode}, {feed / 1000:g} m/min"
             yield f"trapezoidal, {name}", np.column_stack(list(reference.position_mm.values()))
             if nc is not None:
-                rows = nc.record(text)[:, :2]
+                rows = nc.record_demand(text)[:, :2]
                 yield f"LinuxCNC, {name}", np.concatenate([rows, np.repeat(rows[-1:], 500, axis=0)])
 
 

@@ -16,7 +16,7 @@ from typing import Any
 from studies import slips
 from studies.pages import ROOT, join_words, run_study, wrap_paragraph, write_head, write_table
 from tests.fuzz import TARGETS
-from tests.fuzz.tasting import LONGEST_S, MOST_BYTES, found_inputs
+from tests.fuzz.input_assessment import LONGEST_S, MOST_BYTES, list_found_inputs
 
 GOAL = 1_000_000
 PORTION = 20_000
@@ -89,7 +89,7 @@ def merge_figures(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -> F
 
 def load_fixed_inputs() -> dict[str, list[str]]:
     """Return the inputs that once hurt, by the names of their files."""
-    found = {name: [path.name for path in found_inputs(name)] for name in TARGETS}
+    found = {name: [path.name for path in list_found_inputs(name)] for name in TARGETS}
     return {name: names for name, names in found.items() if names}
 
 

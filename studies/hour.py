@@ -30,8 +30,16 @@ from fdhil.cli.demo.toml_writer import format_toml
 from fdhil.daemon.daemon_socket import SOCKET_NAME
 from fdhil.program import load_trajectory
 from tests.free_ports import find_free_port
-from tests.linuxcnc.beside import PART, SHUTTLE, TRIES, contour_of_each_cut, record, repeated, until
-from tests.linuxcnc.machine import LinuxCnc, write_machine
+from tests.linuxcnc.cli_session import (
+    PART,
+    SHUTTLE,
+    TRIES,
+    compute_contour_errors,
+    is_pass_repeated,
+    record_demand,
+    wait_for_state,
+)
+from tests.linuxcnc.linuxcnc_process import LinuxCnc, write_machine
 from tests.sim.simulator_process import SimulatorProcess
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -158,17 +166,17 @@ def run_first_cut(hour: Retrofit, nc: LinuxCnc) -> None:
     part = hour.folder / "part.csv"
     with hour.step("rapids of each axis, until fdhil believes what it has identified"):
         nc.run(SHUTTLE)
-        until(lambda: all(axis["accepted"] >= 4 for axis in hour.query_status()["axes"].values()))
+        wait_for_state(lambda: all(axis["accepted"] >= 4 for axis in hour.query_status()["axes"].values()))
     for tried in range(1, TRIES + 1):
         with hour.step("air cut, recorded by fdhil record", rest="longer than the program's longest dwell"):
-            record(hour.file, part, lambda: nc.run(PART))
+            record_demand(hour.file, part, lambda: nc.run(PART))
         with hour.step("fdhil correct, fdhil arm"):
             hour.run_command("correct", part, "--config", hour.file, "--from-history")
             hour.run_command("arm", hour.file, part)
         with hour.step("the corrected cut"):
             nc.run(PART)
-            until(lambda: len(hour.query_status()["passes"]) == tried)  # noqa: B023 - called at once
-        if repeated(hour.query_status()):
+            wait_for_state(lambda: len(hour.query_status()["passes"]) == tried)  # noqa: B023 - called at once
+        if is_pass_repeated(hour.query_status()):
             return
         print("  LinuxCNC has ordered something else than before, the guard has ramped to zero: once more")
 
@@ -180,11 +188,11 @@ def run_with_linuxcnc(hour: Retrofit, twin: SimulatorProcess, port: int, stack: 
             stack.enter_context(ChildProcess(name, [*command, str(hour.file)], hour.folder / f"{name}.log"))
         run_directory = machine_config.load_config(hour.file).store.run_directory
         assert run_directory is not None
-        until((run_directory / SOCKET_NAME).exists)
+        wait_for_state((run_directory / SOCKET_NAME).exists)
     loads = f"loadusr -Wn {bridge.NAME} /usr/bin/python3 {bridge.__file__} --port {port} --channel 1\n"
     with hour.step("LinuxCNC on and homed", loadusr="the line that `python -m fdhil.bridges` prints, in the HAL file"):
         nc = stack.enter_context(LinuxCnc(SPEED_MM_S, ACCELERATION_MM_S2, loads, "XY"))
-        stack.enter_context(nc.driving(twin))
+        stack.enter_context(nc.drive_simulator(twin))
     run_first_cut(hour, nc)
 
 
@@ -227,7 +235,7 @@ def main() -> None:
                 run_with_linuxcnc(hour, twin, port, stack)
             twin.wait_for_event("finished")
         config = machine_config.load_config(hour.file)
-        before_um, *_, after_um = contour_of_each_cut(trace, load_trajectory(hour.folder / "part.csv", config))
+        before_um, *_, after_um = compute_contour_errors(trace, load_trajectory(hour.folder / "part.csv", config))
         print_report(hour, before_um, after_um)
     sys.exit(after_um >= before_um)
 

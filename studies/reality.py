@@ -28,7 +28,7 @@ from fdhil.pipeline import analyse_window, pool_windows
 from fdhil.pipeline.identified_loops import adopt_loops, reanalyse_with_loops
 from fdhil.prediction.contour_error import compute_contour_error_um
 from fdhil.prediction.path_prediction import compute_table_deflection_mm
-from fdhil.program.loading import load_trajectory
+from fdhil.program.program_loading import load_trajectory
 from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Parameters, Trajectory, WindowOutcome, compute_rms
 from studies import pages
 from studies.bench import Array, make_shuttle_demand

@@ -19,8 +19,8 @@ from fdhil import config as machine_config
 from fdhil.cli.demo.machines import load_machine_document
 from fdhil.cli.demo.processes import ChildProcess, SimulatorProcess
 from fdhil.cli.demo.toml_writer import format_toml
-from fdhil.commissioning.record import save_record
-from fdhil.commissioning.steps import commission
+from fdhil.commissioning.commissioning_record import save_record
+from fdhil.commissioning.commissioning_steps import commission_axis
 from fdhil.config import MachineConfig
 from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
 from fdhil.errors import ConnectError, FdhilError
@@ -102,7 +102,7 @@ class MachineRig:
             shutil.copytree(self.filled, self.store)
         self.start_simulator()
         for axis in self.config.axis:
-            save_record(commission(self.config, axis), self.store, self.config.store.commissioning_key)
+            save_record(commission_axis(self.config, axis), self.store, self.config.store.commissioning_key)
         for name in ("guard", "daemon", "pages", "publisher"):
             self.start(name)
         self.switch_nc(on=True)

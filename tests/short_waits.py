@@ -10,13 +10,13 @@ import pytest
 SHORT_WAITS: dict[str, float] = {
     "commissioning.scan.LISTEN_S": 0.05,
     "commissioning.config_check.LISTEN_S": 0.05,
-    "commissioning.survey.LISTEN_S": 0.05,
+    "commissioning.drive_survey.LISTEN_S": 0.05,
     "commissioning.transmit.LOOK_S": 0.01,
     "cli.operator_prompt.LOOK_S": 0.01,
     "drivers.can.bus_listener.POLL_S": 0.01,
     "drivers.can.sdo_channel.QUIET_S": 0.05,
-    "commissioning.steps.SETTLE_CYCLES": 120,
-    "commissioning.steps.AVERAGE_CYCLES": 60,
+    "commissioning.commissioning_steps.SETTLE_CYCLES": 120,
+    "commissioning.commissioning_steps.AVERAGE_CYCLES": 60,
 }
 
 

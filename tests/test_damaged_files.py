@@ -128,7 +128,7 @@ def test_program_check_with_flipped_bit_is_repeated(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_huge_number_in_program_is_a_program_error(line: str) -> None:
     try:
-        list(interpret([line, "M2"], Budget.of(Nc())))
+        list(interpret([line, "M2"], Budget.create_from_config(Nc())))
     except ProgramError as error:
         told = str(error)
     else:

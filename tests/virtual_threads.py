@@ -34,7 +34,7 @@ _start, _join, _wait = threading.Thread.start, threading.Thread.join, threading.
 _select, _wait_readable = selectors.DefaultSelector.select, Clock.wait_readable
 
 
-class _Turn:
+class _WaitingThread:
     """A thread that waits until ``ready``, or until ``until_s``; ``go`` is released when it may run."""
 
     def __init__(self, ready: Callable[[], bool], until_s: float = math.inf) -> None:
@@ -43,7 +43,7 @@ class _Turn:
         self.go.acquire()
 
 
-class _Mark(threading.local):
+class _ThreadMark(threading.local):
     takes_turns = False
 
 
@@ -56,29 +56,29 @@ class VirtualThreads:
     def __init__(self, seed: int | None = None) -> None:
         self._chance = None if seed is None else random.Random(seed)
         self.now_s = FIRST_S
-        self._waiting: list[_Turn] = []
+        self._waiting: list[_WaitingThread] = []
         self._ended: list[threading.Thread] = []
         self._released = False
-        self._thread = _Mark()
+        self._thread = _ThreadMark()
         self._thread.takes_turns = True
 
     def wait(self, ready: Callable[[], bool], seconds: float | None) -> bool:
         """Let others run until ``ready``, at most for the given time; return whether it is."""
-        turn = _Turn(ready, math.inf if seconds is None else self.now_s + seconds + ROUNDING_S)
+        turn = _WaitingThread(ready, math.inf if seconds is None else self.now_s + seconds + ROUNDING_S)
         self._waiting.append(turn)
-        self._hand_on(turn)
+        self._run_next_thread(turn)
         return ready()
 
-    def _hand_on(self, own: _Turn | None = None) -> None:
+    def _run_next_thread(self, own: _WaitingThread | None = None) -> None:
         if self._released:
             return
-        following = self._next()
+        following = self._select_next()
         if following is not own:
             following.go.release()
             if own is not None:
-                self._await(own)
+                self._await_turn(own)
 
-    def _next(self) -> _Turn:
+    def _select_next(self) -> _WaitingThread:
         while True:
             may_run = (turn for turn in self._waiting if turn.until_s <= self.now_s or turn.ready())
             first = next(may_run, None)
@@ -92,7 +92,7 @@ class VirtualThreads:
             else:
                 _sleep(OUTSIDE_S)
 
-    def _await(self, turn: _Turn) -> None:
+    def _await_turn(self, turn: _WaitingThread) -> None:
         try:
             turn.go.acquire()
         except BaseException:  # a signal's handler has raised it
@@ -136,17 +136,17 @@ class VirtualThreads:
         if not self._thread.takes_turns:
             _start(thread)
             return
-        turn, run = _Turn(lambda: True), thread.run
+        turn, run = _WaitingThread(lambda: True), thread.run
 
         def run_in_turn() -> None:
-            self._await(turn)
+            self._await_turn(turn)
             self._thread.takes_turns = True
             try:
                 run()
             finally:
                 self._thread.takes_turns = False
                 self._ended.append(thread)
-                self._hand_on()
+                self._run_next_thread()
 
         thread.run = run_in_turn  # type: ignore[method-assign]
         self._thread.takes_turns = False  # the new thread reports its start before it waits for its turn
@@ -181,10 +181,10 @@ class VirtualThreads:
         poll.register(connection, select.POLLIN)
         return self.wait(lambda: bool(poll.poll(0)), seconds)
 
-    def when_readable(self, call: Callable[..., Any]) -> Callable[..., Any]:
+    def wrap_when_readable(self, call: Callable[..., Any]) -> Callable[..., Any]:
         """Return a socket call that lets others run until there is data to read."""
 
-        def waiting(connection: socket.socket, *given: Any) -> Any:
+        def wait_then_call(connection: socket.socket, *given: Any) -> Any:
             blocks = connection.gettimeout() != 0 and connection.fileno() >= 0
             if (
                 self._thread.takes_turns
@@ -194,9 +194,9 @@ class VirtualThreads:
                 raise TimeoutError("timed out")
             return call(connection, *given)
 
-        return waiting
+        return wait_then_call
 
-    def install(self, patch: pytest.MonkeyPatch) -> None:
+    def install_patches(self, patch: pytest.MonkeyPatch) -> None:
         """Replace the waiting functions of threads, and the clocks; a thread pool waits by a queue made of these."""
         # python-can measures its waiting time by the wall clock
         for module, name in ((time, "monotonic"), (threading, "_time"), (queue, "time"), (can.bus, "time")):
@@ -206,7 +206,7 @@ class VirtualThreads:
         patch.setattr(time, "time_ns", lambda: round(self.wall_s() * 1e9))
         patch.setattr(time, "sleep", self.sleep)
         for name in ("accept", "recv", "recvmsg"):
-            patch.setattr(socket.socket, name, self.when_readable(getattr(socket.socket, name)))
+            patch.setattr(socket.socket, name, self.wrap_when_readable(getattr(socket.socket, name)))
         patch.setattr(Clock, "wait_readable", lambda *given: self.wait_readable(*given))
         patch.setattr(queue, "SimpleQueue", queue._PySimpleQueue)  # type: ignore[attr-defined]
         patch.setattr(threading.Condition, "wait", lambda *given: self.wait_condition(*given))
@@ -214,7 +214,7 @@ class VirtualThreads:
         patch.setattr(threading.Thread, "join", lambda *given, **named: self.join(*given, **named))
         patch.setattr(selectors.DefaultSelector, "select", lambda *given: self.select(*given))
 
-    def release(self) -> None:
+    def release_all(self) -> None:
         """Let every thread run freely."""
         self._thread.takes_turns, self._released = False, True
         while self._waiting:
@@ -226,6 +226,6 @@ def virtual_threads(request: pytest.FixtureRequest) -> Iterator[VirtualThreads]:
     """Run the test and its threads one at a time on virtual time; its parameter is a seed."""
     threads = VirtualThreads(getattr(request, "param", None))
     with pytest.MonkeyPatch.context() as patch:
-        threads.install(patch)
+        threads.install_patches(patch)
         yield threads
-    threads.release()
+    threads.release_all()

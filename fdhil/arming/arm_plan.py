@@ -14,9 +14,9 @@ from fdhil.arming.first_block import FirstBlock
 from fdhil.arming.model_tracker import SKILL_MOVES, AxisModelState
 from fdhil.arming.program_check import plan_reference_blocks
 from fdhil.arming.standstill_monitor import StandstillState
-from fdhil.commissioning.feedforward import feedforward_object
-from fdhil.commissioning.offset_writers import INVALID_COB_ID, identifier_of
-from fdhil.commissioning.record import CommissioningRecord, holds, load_record
+from fdhil.commissioning.commissioning_record import CommissioningRecord, is_record_valid, load_record
+from fdhil.commissioning.feedforward_setup import format_rpdo_key
+from fdhil.commissioning.offset_writers import INVALID_COB_ID, extract_cob_id
 from fdhil.config import MachineConfig
 from fdhil.correction import correction_gate, flatness_feedforward
 from fdhil.drivers.cia402.drive_profile_file import load_profile
@@ -30,7 +30,7 @@ from fdhil.prediction.correction_gain import (
     find_largest_error_um,
     find_worst_rms_um,
 )
-from fdhil.program import program_digest
+from fdhil.program import compute_program_digest
 from fdhil.records import Parameters, Reason, Skill
 
 MODEL_AGE_S = 8 * 3600.0  # a shift: older parameters describe another state of the machine
@@ -131,7 +131,7 @@ def prepare_request(
     if isinstance(found, Refusal):
         return found
     models = {axis: add_resonance(model, config.axis[axis]) for axis, model in found[0].items()}
-    digest = program_digest(program)
+    digest = compute_program_digest(program)
     ahead = method in (None, "inverse") and _is_longer_than_ring(program, config, digest)
     if ahead and (
         off := correction_gate.check_writing_enabled(list(config.axis), config)
@@ -256,7 +256,7 @@ def prepare_feedforward(config: MachineConfig, known: Mapping[str, AxisModelStat
     }
     records = _read_records(axes, config)
     facts = collect_feedforward_facts(axes, config, known) | {
-        "commissioned": all(holds(record, config, axis) for axis, record in records.items()),
+        "commissioned": all(is_record_valid(record, config, axis) for axis, record in records.items()),
         "feedforward_commissioned": all(
             _has_feedforward_rpdo(record, config, name) for name, record in records.items()
         ),
@@ -278,8 +278,8 @@ def _has_feedforward_rpdo(record: CommissioningRecord | None, config: MachineCon
     found = profile.find_rpdo(profile.speed_offset)
     if record is None or found is None:
         return False
-    cob_id = record.options.get(feedforward_object(found[0].number), INVALID_COB_ID)
-    return not cob_id & INVALID_COB_ID and identifier_of(cob_id) == found[0].cob_base + config.get_node_id(axis)
+    cob_id = record.options.get(format_rpdo_key(found[0].number), INVALID_COB_ID)
+    return not cob_id & INVALID_COB_ID and extract_cob_id(cob_id) == found[0].cob_base + config.get_node_id(axis)
 
 
 def collect_model_facts(
@@ -315,7 +315,7 @@ def _is_predicted_well(skills: Sequence[Skill], gain_um: float) -> bool:
 def _collect_commissioning_facts(axes: Sequence[str], largest_um: float, config: MachineConfig) -> dict[str, bool]:
     records = _read_records(axes, config)
     return {
-        "commissioned": all(holds(record, config, axis) for axis, record in records.items()),
+        "commissioned": all(is_record_valid(record, config, axis) for axis, record in records.items()),
         # the plans assume that the drive's feed-forward includes the offset; others would get worse
         "offset_in_feedforward_known": all(r is not None and r.offset_in_feedforward is True for r in records.values()),
         "watchdog_proven": largest_um <= UNGUARDED_UM or _is_watchdog_proven(records),

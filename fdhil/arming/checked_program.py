@@ -22,7 +22,7 @@ from fdhil.arming.code_digest import compute_code_digest
 from fdhil.arming.program_check import HEADER, ROWS, SCHEMA, compute_header_digest
 from fdhil.correction import correction_gate
 from fdhil.errors import ProgramError, StoreError
-from fdhil.program import program_digest
+from fdhil.program import compute_program_digest
 from fdhil.records import Reason
 
 RING_S = 10.0  # of rows held by the guard ahead of the machine; below 1 s it ramps down
@@ -83,7 +83,9 @@ class CheckedProgram:
                 return None
             found = CheckedProgram(folder / (key + ROWS), header["axes"])
             good = header["schema"] == SCHEMA and header["code"] == compute_code_digest() and not header["refused"]
-            good = good and all(program_digest(program_folder / name) == sha for name, sha in header["files"].items())
+            good = good and all(
+                compute_program_digest(program_folder / name) == sha for name, sha in header["files"].items()
+            )
             blocks = [CheckedBlock(end, sha256, end == header["rows"]) for end, sha256 in header["blocks"]]
             for k, block in enumerate(blocks if good else []):
                 found.blocks.append(block)

@@ -9,10 +9,10 @@ from typing import Any
 
 from fdhil.arming.operator_token import find_credential
 from fdhil.cia402 import COB_RPDO, get_first_axis_index
-from fdhil.commissioning.identifiers import require_own_identifiers, sent_pdos
-from fdhil.commissioning.offset_writers import INVALID_COB_ID, identifier_of
-from fdhil.commissioning.record import KEY_NAME, CommissioningRecord, load_record, of_config
-from fdhil.commissioning.void import is_void, void_reason
+from fdhil.commissioning.cob_id_conflicts import list_guard_rpdos, require_unique_guard_ids
+from fdhil.commissioning.commissioning_record import KEY_NAME, CommissioningRecord, is_record_of_config, load_record
+from fdhil.commissioning.offset_writers import INVALID_COB_ID, extract_cob_id
+from fdhil.commissioning.void_mark import is_record_void, read_void_reason
 from fdhil.config import Axis, MachineConfig, OffsetBounds, find_share_fault
 from fdhil.drivers.cia402.drive_profile import DriveProfile, PdoSpec
 from fdhil.drivers.cia402.drive_profile_file import load_profile, require_offset
@@ -67,7 +67,7 @@ def make_guard_settings(machine: MachineConfig, bus: str, run_directory: Path, t
         watching=tuple(_find_user_ids((*machine.access.watch, *machine.access.operate))),
         lead=machine.bus[bus].offset_lead_cycles,
     )
-    require_own_identifiers(machine, bus)
+    require_unique_guard_ids(machine, bus)
     return settings
 
 
@@ -139,8 +139,8 @@ def _find_offset_writers(
     exist, or was invalid, at commissioning was set up by another master since.
     """
     node, recorded = machine.get_node_id(name), () if record is None else record.rpdos
-    harmless = {identifier_of(cob_id) for cob_id in recorded if not cob_id & INVALID_COB_ID}
-    suspect = {identifier_of(cob_id) for cob_id in recorded if cob_id & INVALID_COB_ID}
+    harmless = {extract_cob_id(cob_id) for cob_id in recorded if not cob_id & INVALID_COB_ID}
+    suspect = {extract_cob_id(cob_id) for cob_id in recorded if cob_id & INVALID_COB_ID}
     suspect |= {base + node for base in COB_RPDO} | {spec.cob_base + node for spec in profile.rpdos}
     same_bus = {n: axis for n, axis in machine.axis.items() if axis.drive.bus == machine.axis[name].drive.bus}
     known = {
@@ -151,15 +151,15 @@ def _find_offset_writers(
         if spec.valid
     }
     known |= {axis.table.cob_id or 0 for axis in same_bus.values() if axis.table is not None}
-    sent = {spec.cob_base + node for spec in sent_pdos(machine, name, profile)}
+    sent = {spec.cob_base + node for spec in list_guard_rpdos(machine, name, profile)}
     return tuple(sorted(cob_id for cob_id in suspect - known - harmless - sent if 0 < cob_id <= 0x7FF))
 
 
 def _read_fingerprint(machine: MachineConfig, name: str, record: CommissioningRecord | None) -> dict[str, Any]:
-    if record is None or not of_config(record, machine, name):
+    if record is None or not is_record_of_config(record, machine, name):
         return {}
-    void = is_void(machine.store.directory, name)
-    reason = void_reason(machine.store.directory, name) if void else ""
+    void = is_record_void(machine.store.directory, name)
+    reason = read_void_reason(machine.store.directory, name) if void else ""
     return {"record": record.fingerprint, "record_void": void, "void_reason": reason}
 
 

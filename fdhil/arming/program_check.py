@@ -26,9 +26,9 @@ from fdhil.config import MachineConfig
 from fdhil.correction import correction_gate
 from fdhil.correction.block_streaming import StreamBlock, stream_blocks
 from fdhil.errors import FdhilError, ProgramError, StoreError
-from fdhil.program import planner, program_digest
+from fdhil.program import compute_program_digest, planner
 from fdhil.program.demand_csv import read_demand_csv, require_digest
-from fdhil.program.loading import is_demand, open_program
+from fdhil.program.program_loading import is_demand, open_program
 from fdhil.records import Float, Parameters, Reason, Trajectory
 from fdhil.store.atomic_file import keep_newest, make_folder, make_store_error, sync_folder, write_file
 
@@ -60,7 +60,7 @@ def _open_reference(program: Path, config: MachineConfig, sha256: str | None) ->
     if is_demand(program):
         return iter([read_demand_csv(program, config, sha256)]), list
     interpreter = open_program(program, config, sha256)
-    return planner.stream(interpreter.run(), config, PIECE_ROWS), lambda: interpreter.files
+    return planner.stream_trajectory(interpreter.run(), config, PIECE_ROWS), lambda: interpreter.files
 
 
 class _FileDigests:
@@ -75,7 +75,7 @@ class _FileDigests:
 
     def require_unchanged(self) -> dict[str, str]:
         for file, digest in self._digests.items():
-            require_digest(file, program_digest(file), digest)
+            require_digest(file, compute_program_digest(file), digest)
         return {file.name: digest for file, digest in list(self._digests.items())[1:]}
 
 

@@ -18,13 +18,13 @@ import numpy as np
 from fdhil import correction
 from fdhil.cli.doctor.latency import read_latency
 from fdhil.cli.prediction_commands import load_inputs
-from fdhil.commissioning.progress import Progress
-from fdhil.commissioning.record import CommissioningRecord, holds, load_record
-from fdhil.commissioning.void import is_void
+from fdhil.commissioning.commissioning_record import CommissioningRecord, is_record_valid, load_record
+from fdhil.commissioning.step_progress import StepProgress
+from fdhil.commissioning.void_mark import is_record_void
 from fdhil.config import MachineConfig
 from fdhil.errors import RecordingError, StoreError
 from fdhil.prediction.circle_evaluation import CircleDeviations, evaluate_circle, write_circle_program
-from fdhil.program import program_digest
+from fdhil.program import compute_program_digest
 from fdhil.records import PARAMETERS, UNITS, Correction, Float, Prediction
 from fdhil.report.history_charts import AxisHistory
 from fdhil.report.history_reader import PASS_CODE, group_by_axis, read_history, read_notices, read_passes
@@ -128,11 +128,11 @@ def _gather_axis_proof(machine: MachineConfig, axis: str) -> AxisProof:
     if record is None:
         return AxisProof(None, {}, "not commissioned; run fdhil commission")
     against = ""
-    if is_void(directory, axis):
+    if is_record_void(directory, axis):
         against = "its record is void; run fdhil check with the NC off"
-    elif not holds(record, machine, axis):
+    elif not is_record_valid(record, machine, axis):
         against = "its record was made with another configuration; commission it again"
-    return AxisProof(record, Progress(directory, axis).done(), against)
+    return AxisProof(record, StepProgress(directory, axis).list_step_times(), against)
 
 
 def _plan_correction(program: Path, config: Path, from_history: bool) -> Correction:
@@ -270,7 +270,7 @@ def _describe_program(found: Findings) -> dict[str, Any] | None:
     cases = {"uncorrected": path.before} | ({} if path.refused else {"corrected": path.after})
     return {
         "name": found.options.program.name,
-        "sha256": program_digest(found.options.program),
+        "sha256": compute_program_digest(found.options.program),
         "limit_um": found.options.contour_um,
         "method": path.method,
         "refused": [str(reason) for reason in path.refused],

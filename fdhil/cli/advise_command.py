@@ -98,10 +98,10 @@ def _can_keep_tolerance(advice: FeedAdvice, corrected: bool) -> bool:
 
 def _write_program(program: Path, advice: Sequence[FeedAdvice], config: MachineConfig, out: Path) -> None:
     from fdhil.program import Budget
-    from fdhil.program.feed_words import with_feeds
+    from fdhil.program.feed_words import replace_feeds
     from fdhil.store.output_file import open_output
 
-    content = with_feeds(program, {a.line: a.plain.run for a in advice}, Budget.of(config.nc))
+    content = replace_feeds(program, {a.line: a.plain.run for a in advice}, Budget.create_from_config(config.nc))
     with open_output(out) as file:
         file.write(content)
 
@@ -116,7 +116,9 @@ def _create_feed_sources(
     from fdhil.correction.result_documents import make_feed_sources
     from fdhil.program import Budget, interpret
 
-    motions = None if program.suffix.lower() == ".csv" else list(interpret(program, Budget.of(config.nc)))
+    motions = (
+        None if program.suffix.lower() == ".csv" else list(interpret(program, Budget.create_from_config(config.nc)))
+    )
     return make_feed_sources(motions, reference, models, config, tolerance_um)
 
 

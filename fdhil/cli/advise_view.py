@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fdhil.program.feed_words import cut
+from fdhil.program.feed_words import cut_to_digits
 
 if TYPE_CHECKING:
     from fdhil.prediction.feed_advice import FeedAdvice, FeedResult
@@ -35,7 +35,7 @@ def show_advice(
         return
     found = group_into_ranges(advice, feeds)
     if len(found) > MANY:
-        slowest = min(cut(a.plain.run * a.feed_mm_min) for a in advice)
+        slowest = min(cut_to_digits(a.plain.run * a.feed_mm_min) for a in advice)
         click.echo(f"{len(advice)} lines in {len(found)} ranges, down to F{slowest:g}; the {MANY} worst of them:")
     worst = sorted(found, key=lambda one: -_find_worst(one).error_um)[:MANY]
     for one in sorted(worst, key=lambda one: one[0].start_s):
@@ -93,9 +93,9 @@ def _show_range(one: Range, most: Mapping[float, FeedAdvice] | None) -> None:
     if not first.line:
         name = f"{first.start_s:.2f} s .. {first.end_s:.2f} s"
     fast = worst.corrected if worst.corrected and worst.corrected.share is not None else None
-    better = "" if fast is None else f", with the correction F{cut(fast.run * worst.feed_mm_min):g}"
+    better = "" if fast is None else f", with the correction F{cut_to_digits(fast.run * worst.feed_mm_min):g}"
     click.echo(
-        f"{name}: F{_format_feed_span([a.feed_mm_min for a in one])} -> F{_format_feed_span([cut(a.plain.run * a.feed_mm_min) for a in one])}"
+        f"{name}: F{_format_feed_span([a.feed_mm_min for a in one])} -> F{_format_feed_span([cut_to_digits(a.plain.run * a.feed_mm_min) for a in one])}"
         f"{better}, worst {worst.error_um:.1f} um {at} ({worst.cause}, most of it axis {worst.axis})"
     )
     axis, what, share = max((a.load for a in one), key=lambda load: load[2])
@@ -112,21 +112,21 @@ def _show_range(one: Range, most: Mapping[float, FeedAdvice] | None) -> None:
 
 def _format_feed_span(feeds: Sequence[float]) -> str:
     low, high = min(feeds), max(feeds)
-    return f"{high:g}" if cut(low) == cut(high) else f"{low:g}..{high:g}"
+    return f"{high:g}" if cut_to_digits(low) == cut_to_digits(high) else f"{low:g}..{high:g}"
 
 
 def _format_limit(held: FeedResult, most: FeedResult | None, feed_mm_min: float) -> str:
     if held.share is None:
         left = f": an error of {held.residual_um:.1f} um remains" if math.isfinite(held.residual_um) else ""
         with_it = (
-            f"; the other lines keep the tolerance with this one at {cut(held.run * feed_mm_min):g}"
+            f"; the other lines keep the tolerance with this one at {cut_to_digits(held.run * feed_mm_min):g}"
             if held.run > held.tried
             else ""
         )
-        return f"no feed down to {cut(held.tried * feed_mm_min):g} mm/min keeps the tolerance{left}{with_it}"
+        return f"no feed down to {cut_to_digits(held.tried * feed_mm_min):g} mm/min keeps the tolerance{left}{with_it}"
     hopeful = most.share * feed_mm_min if most and most.share and _is_clearly_higher(held, most) else None
-    more = "" if hopeful is None else f", perhaps {cut(hopeful):g}"
-    return f"at most {cut(held.share * feed_mm_min):g} mm/min{more}"
+    more = "" if hopeful is None else f", perhaps {cut_to_digits(hopeful):g}"
+    return f"at most {cut_to_digits(held.share * feed_mm_min):g} mm/min{more}"
 
 
 def _is_clearly_higher(held: FeedResult, most: FeedResult | None) -> bool:

@@ -20,8 +20,8 @@ from fdhil.guard.guard_protocol import SOCKET_NAME
 
 if TYPE_CHECKING:
     from fdhil.commissioning.config_check import Place
-    from fdhil.commissioning.scan import BusScan, Description, Node
-    from fdhil.commissioning.void import Mark
+    from fdhil.commissioning.scan import BusScan, DeviceDescription, ScannedNode
+    from fdhil.commissioning.void_mark import Mark
     from fdhil.config import MachineConfig
 
 ReportToGuard = Callable[[Mapping[str, str]], Sequence[Mapping[str, str]] | None]
@@ -58,7 +58,7 @@ def scan(config: Path, places: tuple[Path, ...], as_json: bool) -> None:
         _show_scans(scans)
 
 
-def _read_eds_files(places: Sequence[Path], folder: Path) -> list[Description]:
+def _read_eds_files(places: Sequence[Path], folder: Path) -> list[DeviceDescription]:
     # a named file must be readable; an unreadable one in the default folder is only reported
     from fdhil.commissioning.scan import read_descriptions
 
@@ -91,7 +91,7 @@ def _show_scans(scans: Sequence[BusScan]) -> None:
                 out.print(Text(f"node {node.node_id} reports {emergency}"), soft_wrap=True)
 
 
-def _format_node_row(node: Node, unanswered: str) -> list[str]:
+def _format_node_row(node: ScannedNode, unanswered: str) -> list[str]:
     """Return the cells of a node, most with two lines, so that a row fits 80 columns."""
     period = node.heartbeat_s or (node.answers.heartbeat_s if node.answers else None)
     beat = f"{period * 1e3:.0f} ms" if period else "none"
@@ -118,9 +118,9 @@ def check(config: Path, as_json: bool) -> int:
     """
     machine = machine_config.load_config(config)
     from fdhil.commissioning.config_check import check_machine
-    from fdhil.commissioning.void import void_mark
+    from fdhil.commissioning.void_mark import read_void_mark
 
-    marks = {axis: void_mark(machine.store.directory, axis) for axis in machine.axis}
+    marks = {axis: read_void_mark(machine.store.directory, axis) for axis in machine.axis}
     with _connect_guard(machine) as tell:
         found = check_machine(machine, print_progress)
         _record_comparison(machine, found, tell, marks)
@@ -139,8 +139,8 @@ def _record_comparison(
 
     A doubt that arose after the comparison remains: in the guard, and in a mark that differs from ``marks``.
     """
-    from fdhil.commissioning.compare import RECORD_POINT
-    from fdhil.commissioning.void import confirm_record, is_void, void_record
+    from fdhil.commissioning.record_comparison import RECORD_POINT
+    from fdhil.commissioning.void_mark import clear_void_mark, is_record_void, mark_record_void
 
     directory, seen = machine.store.directory, {}
     for place, finding in found:
@@ -148,7 +148,7 @@ def _record_comparison(
             axis = place.removeprefix("axis ")
             seen[axis] = finding.found if finding.ok else ""
             if not finding.ok:
-                void_record(directory, axis, finding.cause)
+                mark_record_void(directory, axis, finding.cause)
     answer = tell(seen) if seen else []
     if answer is None:
         return
@@ -159,8 +159,8 @@ def _record_comparison(
     if not all(each["axis"] for each in refused):  # the guard accepted none of it
         return
     for axis in {axis for axis, digest in seen.items() if digest} - {each["axis"] for each in refused}:
-        confirm_record(directory, axis, marks[axis])
-        if is_void(directory, axis):
+        clear_void_mark(directory, axis, marks[axis])
+        if is_record_void(directory, axis):
             text = "its drive changed again after the comparison, so its record stays void"
             click.echo(f"RecordVoid: axis {axis}: {text}; run fdhil check again", err=True)
 

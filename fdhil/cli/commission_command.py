@@ -38,7 +38,7 @@ from fdhil.errors import ConfigError, ConfigFault, DriveFault
 if TYPE_CHECKING:
     from types import FrameType
 
-    from fdhil.commissioning.progress import Progress
+    from fdhil.commissioning.step_progress import StepProgress
     from fdhil.config import MachineConfig
 
 SCHEMA = "fdhil-commission-1"
@@ -125,7 +125,7 @@ def _interrupt_on_signals() -> Iterator[None]:
 
     Only the first signal counts: a second one must not interrupt the braking.
     """
-    from fdhil.commissioning.moving import handling
+    from fdhil.commissioning.axis_motion import handle_signals
 
     stopping = False
 
@@ -135,14 +135,14 @@ def _interrupt_on_signals() -> Iterator[None]:
             stopping = True
             raise KeyboardInterrupt
 
-    with handling(interrupt_once):
+    with handle_signals(interrupt_once):
         yield
 
 
-def _open_progress(machine: MachineConfig, axis: str) -> Progress:
-    from fdhil.commissioning.progress import Progress
+def _open_progress(machine: MachineConfig, axis: str) -> StepProgress:
+    from fdhil.commissioning.step_progress import StepProgress
 
-    return Progress(machine.store.directory, axis, machine.store.commissioning_key)
+    return StepProgress(machine.store.directory, axis, machine.store.commissioning_key)
 
 
 def _print_plan(machine: MachineConfig, axes: list[str], options: CommissionOptions) -> int:
@@ -178,16 +178,16 @@ def _print_plan(machine: MachineConfig, axes: list[str], options: CommissionOpti
 
 def _commission_axis(machine: MachineConfig, axis: str, options: CommissionOptions) -> dict[str, Any]:
     from fdhil.cli.bus_lock import lock_bus
-    from fdhil.commissioning import steps
-    from fdhil.commissioning.hal_proof import commission_hal
-    from fdhil.commissioning.record import save_record
+    from fdhil.commissioning import commissioning_steps
+    from fdhil.commissioning.commissioning_record import save_record
+    from fdhil.commissioning.hal_commissioning import commission_hal
 
     hal = machine.axis[axis].drive.source == "hal"
     progress = _open_progress(machine, axis)
-    if progress.doubt:
-        click.echo(progress.doubt, err=True)
+    if progress.rejection:
+        click.echo(progress.rejection, err=True)
     if options.again:
-        progress.forget()
+        progress.forget_steps()
     if options.room is None and not options.yes and can_run_trial(machine, axis):
         options = replace(options, room=ask_room(axis, machine.axis[axis].unit))
     if options.room is not None and not hal:
@@ -204,7 +204,7 @@ def _commission_axis(machine: MachineConfig, axis: str, options: CommissionOptio
         if hal:
             record = commission_hal(machine, axis, report)
         else:
-            record = steps.commission(machine, axis, report, progress, guide.report_result)
+            record = commissioning_steps.commission_axis(machine, axis, report, progress, guide.report_result)
         path = save_record(record, machine.store.directory, machine.store.commissioning_key)
         ended["text"] = f"record {record.digest[:16]}"
         options.show_text(
@@ -250,14 +250,14 @@ def _set_pdos(machine: MachineConfig, axis: str, options: CommissionOptions) -> 
 
 
 def _confirm_first_motion(machine: MachineConfig, axis: str) -> None:
-    from fdhil.commissioning.steps import largest_move_um
+    from fdhil.commissioning.commissioning_steps import compute_largest_move_um
 
     hal = machine.axis[axis].drive.source == "hal"
     question = f"Axis {axis} will move by 10 um, or by 50 um if friction holds it. Is it free to move? Start?"
     if not hal:
         question = (
             f"The set-up of axis {axis} matches. The drive will be switched on and the axis will move by 10 um, then "
-            f"up to {largest_move_um(machine, axis):.0f} um back and forward. Is it free to move? Start?"
+            f"up to {compute_largest_move_um(machine, axis):.0f} um back and forward. Is it free to move? Start?"
         )
     if axis[0] + "2" in machine.axis:
         question = f"{axis} is one of two drives of a gantry axis: its beam will be skewed by as much. {question}"

@@ -15,8 +15,8 @@ from fdhil.cli.operator_prompt import ask_yes_no
 from fdhil.errors import DriveFault
 
 if TYPE_CHECKING:
-    from fdhil.commissioning.progress import Found, Progress, Step
-    from fdhil.commissioning.strokes import Room
+    from fdhil.commissioning.step_progress import CompletedStep, Found, StepProgress
+    from fdhil.commissioning.stroke_planning import TravelRoom
 
 POSITION_S = 0.2  # period of the position display while an axis moves
 
@@ -25,7 +25,7 @@ POSITION_S = 0.2  # period of the position display while an axis moves
 class CommissionOptions:
     """Options of ``fdhil commission``; ``quiet``: only the JSON document goes to stdout."""
 
-    room: Room | None
+    room: TravelRoom | None
     yes: bool
     again: bool
     quiet: bool
@@ -49,20 +49,20 @@ class StepReporter:
         axis: str,
         options: CommissionOptions,
         steps: Mapping[str, str],
-        progress: Progress,
+        progress: StepProgress,
         first: int,
         total: int,
     ) -> None:
         self._axis, self._asked, self._steps, self._first, self._total = axis, options, steps, first, total
         self.moves: dict[str, str] = {}
         self._shown_s: float | None = None
-        progress.on_kept = self.report_kept_step
+        progress.on_reused = self.report_kept_step
 
     def __call__(self, step: str) -> None:
         """Announce the next step."""
         self._show_line(f"{self._format_heading(step)}: {describe_step(self._steps[step], self.moves[step])}")
 
-    def report_kept_step(self, name: str, step: Step) -> None:
+    def report_kept_step(self, name: str, step: CompletedStep) -> None:
         """Report that a completed step is skipped, with its result."""
         from fdhil.report.parameter_format import format_minute
 
@@ -97,16 +97,16 @@ def describe_step(does: str, moves: str) -> str:
     return does if moves == NOTHING else f"{does} Moves {moves}."
 
 
-def parse_room(given: tuple[float, float] | None) -> Room | None:
+def parse_room(given: tuple[float, float] | None) -> TravelRoom | None:
     """Return the allowed travel, back and forward, mm or degrees. Raises click.BadParameter if it is invalid."""
-    from fdhil.commissioning.strokes import Room
+    from fdhil.commissioning.stroke_planning import TravelRoom
 
     if given is None:
         return None
     back, forward = given
     if not (-1e4 <= back <= 0.0 <= forward <= 1e4):
         raise click.BadParameter("--room needs the travel back (0 or less) and forward (0 or more) in mm or degrees")
-    return Room(back, forward)
+    return TravelRoom(back, forward)
 
 
 def require_confirmation(axis: str, question: str, advice: str) -> None:

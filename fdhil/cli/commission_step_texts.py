@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fdhil.commissioning.progress import Progress
-    from fdhil.commissioning.strokes import Room
+    from fdhil.commissioning.step_progress import StepProgress
+    from fdhil.commissioning.stroke_planning import TravelRoom
     from fdhil.config import MachineConfig
 
 STEPS: Mapping[str, str] = {
@@ -87,9 +87,9 @@ def describe_motions(machine: MachineConfig, axis: str) -> dict[str, str]:
     if machine.axis[axis].drive.source == "hal":
         moved = "10 um toward plus, or 50 um if friction holds it"
         return {"listen": NOTHING, "move": moved, "watchdog test": "back to where it was"}
-    from fdhil.commissioning.steps import SIGN_TEST_UM, TRIAL_RAMPS, largest_move_um
+    from fdhil.commissioning.commissioning_steps import SIGN_TEST_UM, TRIAL_RAMPS, compute_largest_move_um
 
-    largest = largest_move_um(machine, axis)
+    largest = compute_largest_move_um(machine, axis)
     return dict.fromkeys(STEPS, NOTHING) | {
         "enable": "nothing, except to hold the position",
         "sign test": f"{SIGN_TEST_UM:g} um toward plus and back, by the offset",
@@ -98,10 +98,10 @@ def describe_motions(machine: MachineConfig, axis: str) -> dict[str, str]:
     }
 
 
-def describe_trial_motions(machine: MachineConfig, axis: str, room: Room | None) -> dict[str, str]:
+def describe_trial_motions(machine: MachineConfig, axis: str, room: TravelRoom | None) -> dict[str, str]:
     """Return the motion of each step of the ``TRIAL``. Raises DriveFault if the room is too small."""
-    from fdhil.commissioning.strokes import plan_jog, plan_rapid, require_single_drive
-    from fdhil.commissioning.trial import TRIAL_RAPIDS
+    from fdhil.commissioning.axis_trial import TRIAL_RAPIDS
+    from fdhil.commissioning.stroke_planning import plan_jog, plan_rapid, require_single_drive
 
     require_single_drive(machine, axis)
     settings = machine.axis[axis]
@@ -120,13 +120,13 @@ def describe_trial_motions(machine: MachineConfig, axis: str, room: Room | None)
 
 
 def list_planned_steps(
-    machine: MachineConfig, axis: str, room: Room | None, asks: bool, progress: Progress
+    machine: MachineConfig, axis: str, room: TravelRoom | None, asks: bool, progress: StepProgress
 ) -> list[dict[str, Any]]:
     """Return all steps of an axis with effect, motion and, if completed, time. Sends nothing.
 
     Without a ``room`` the trial is included if ``asks``, because the operator will be asked for it.
     """
-    done = progress.done()
+    done = progress.list_step_times()
     hal = machine.axis[axis].drive.source == "hal"
     steps = [(HAL_STEPS if hal else STEPS, describe_motions(machine, axis))]
     if not hal and (room is not None or (asks and can_run_trial(machine, axis))):

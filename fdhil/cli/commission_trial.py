@@ -14,9 +14,9 @@ from fdhil.cli.operator_prompt import ask_text, ask_yes_no
 from fdhil.errors import DriveFault
 
 if TYPE_CHECKING:
-    from fdhil.commissioning.progress import Found, Progress
-    from fdhil.commissioning.record import CommissioningRecord
-    from fdhil.commissioning.strokes import Room
+    from fdhil.commissioning.commissioning_record import CommissioningRecord
+    from fdhil.commissioning.step_progress import Found, StepProgress
+    from fdhil.commissioning.stroke_planning import TravelRoom
     from fdhil.config import MachineConfig
     from fdhil.pipeline import PipelineState
     from fdhil.records import Notice, Outcome
@@ -26,12 +26,12 @@ def run_trial(
     machine: MachineConfig,
     record: CommissioningRecord,
     options: CommissionOptions,
-    progress: Progress,
+    progress: StepProgress,
     guide: StepReporter,
 ) -> dict[str, Any] | None:
     """Run the trial of a commissioned axis; None without a room. Raises DriveFault if it is refused."""
     from fdhil.api.compilation_notice import announce_compilation
-    from fdhil.commissioning.trial import Operator, try_axis
+    from fdhil.commissioning.axis_trial import OperatorCallbacks, try_axis
 
     axis, room = record.axis, options.room
     if room is None:
@@ -61,7 +61,7 @@ def run_trial(
         return None if options.yes else ask_yes_no(question)
 
     settings = machine.axis[axis]
-    operator = Operator(
+    operator = OperatorCallbacks(
         report_step,
         confirm_observation,
         report_result,
@@ -74,7 +74,7 @@ def run_trial(
     return dict(tried.found)
 
 
-def ask_room(axis: str, unit: str) -> Room | None:
+def ask_room(axis: str, unit: str) -> TravelRoom | None:
     """Ask for the allowed travel of the axis; None if no motion is allowed."""
     question = (
         f"How far may axis {axis} move from here, for a jog and for rapids, in {unit}? Back and forward, as: -20 200; "

@@ -30,7 +30,7 @@ def guard(config: Path, check: bool) -> None:
     """
     from fdhil.arming import guard_configuration  # late: heavy imports, not needed for --help
     from fdhil.arming.operator_token import get_operator_token, make_run_directory
-    from fdhil.commissioning.compare import compare_again
+    from fdhil.commissioning.record_comparison import verify_commissioned_drives
 
     machine = guard_configuration.use_systemd_key(machine_config.load_config(config))
     name = guard_configuration.find_corrected_bus(machine, str(config))
@@ -46,7 +46,9 @@ def guard(config: Path, check: bool) -> None:
         return
     with open_transmit_socket(name, bus) as transmit, lock_bus(bus, transmit, run_directory) as lock:
         # if no NC runs the bus, the drives are compared with their commissioning records
-        compare_again(machine, name, lambda text: click.echo(json.dumps({"event": "record_void", "text": text})))
+        verify_commissioned_drives(
+            machine, name, lambda text: click.echo(json.dumps({"event": "record_void", "text": text}))
+        )
         _write_settings(
             file, encode_settings(guard_configuration.make_guard_settings(machine, name, run_directory, token_sha256))
         )

@@ -16,11 +16,11 @@ from fdhil.cli.options import AS_JSON, DEFAULT_CONFIG, FILE, OutputFile, Writing
 from fdhil.errors import ConfigError, ConfigFault, OutputError
 
 if TYPE_CHECKING:
-    from fdhil.commissioning.init.draft import Asked, Draft
-    from fdhil.commissioning.init.drives import FoundBus
-    from fdhil.commissioning.init.linuxcnc import Machine
-    from fdhil.commissioning.init.making import Look
-    from fdhil.commissioning.init.told import Told
+    from fdhil.commissioning.init.config_assembly import Look
+    from fdhil.commissioning.init.config_draft import ConfigDraft, OperatorQuestion
+    from fdhil.commissioning.init.drive_discovery import FoundBus
+    from fdhil.commissioning.init.linuxcnc_import import LinuxcncMachine
+    from fdhil.commissioning.init.sourced_value import SourcedValue
 
 SCHEMA = "fdhil-init-1"
 INTERFACES = Path("/sys/class/net")
@@ -74,18 +74,18 @@ def init(
             text = "exists, and fdhil init never overwrites a file; name another file, or move it away"
             raise OutputError(f"{each} {text}")
     given = machine_config.read_toml(answers, "a file of answers") if answers is not None else {}
-    from fdhil.commissioning.init.linuxcnc import read_linuxcnc  # late: --help imports nothing heavy
-    from fdhil.commissioning.init.making import conclude, make
+    from fdhil.commissioning.init.config_assembly import finish_draft, make_draft
+    from fdhil.commissioning.init.linuxcnc_import import read_linuxcnc  # late: --help imports nothing heavy
 
     nc = read_linuxcnc(ini) if ini is not None else None
     ask = _ask_operator if answers is None and not as_json else None
     if nc is not None and hal:
-        draft = make(file, given, nc, ask, pins=[] if offline else read_running_pins())
+        draft = make_draft(file, given, nc, ask, pins=[] if offline else read_running_pins())
     else:
-        draft = make(
+        draft = make_draft(
             file, given, nc, ask, None if offline else _make_bus_scanner(places, file.parent), _find_can_interface()
         )
-    text = conclude(draft, file)
+    text = finish_draft(draft, file)
     made = {file: text} | ({hal_file: _build_hal_file(text, file, nc, draft)} if nc is not None and hal else {})
     for place, content in made.items() if not dry_run else ():
         with place.open("x", encoding="utf-8") as out:  # never overwrites a file created meanwhile
@@ -108,8 +108,8 @@ def read_running_pins() -> list[str]:
     return [words[4] for line in listing.stdout.splitlines() if len(words := line.split()) > 4]
 
 
-def _build_hal_file(text: str, file: Path, nc: Machine, draft: Draft) -> str:
-    from fdhil.commissioning.init.hal_file import correction_hal, splices_of
+def _build_hal_file(text: str, file: Path, nc: LinuxcncMachine, draft: ConfigDraft) -> str:
+    from fdhil.commissioning.init.hal_file import find_insertions, format_correction_hal
 
     machine = machine_config.parse_config(machine_config.parse_toml(text.encode(), str(file)), str(file), file.parent)
     corrected = [axis for axis, settings in machine.axis.items() if settings.correction is not None]
@@ -117,12 +117,12 @@ def _build_hal_file(text: str, file: Path, nc: Machine, draft: Draft) -> str:
         f"{file.with_suffix('.hal').name} loads the bridge: add it as the last HALFILE in [HAL] of the INI; "
         f"LinuxCNC's user must be able to read {file.name}"
     )
-    splices = splices_of(nc.hal, nc.joints, corrected)
-    return correction_hal(machine, str(file.resolve()), nc.joint_count, splices, nc.hal)
+    splices = find_insertions(nc.hal, nc.joints, corrected)
+    return format_correction_hal(machine, str(file.resolve()), nc.joint_count, splices, nc.hal)
 
 
 def _make_bus_scanner(places: Sequence[Path], folder: Path) -> Look:
-    from fdhil.commissioning.init.drives import find_drives
+    from fdhil.commissioning.init.drive_discovery import find_drives
     from fdhil.commissioning.scan import read_descriptions
 
     descriptions, faults = read_descriptions(places or [folder])
@@ -139,15 +139,15 @@ def _make_bus_scanner(places: Sequence[Path], folder: Path) -> Look:
     return scan_bus
 
 
-def _find_can_interface() -> Told | None:
-    from fdhil.commissioning.init.told import Told
+def _find_can_interface() -> SourcedValue | None:
+    from fdhil.commissioning.init.sourced_value import SourcedValue
 
     found = [place.parent.name for place in sorted(INTERFACES.glob("*/type")) if place.read_text().strip() == CAN_TYPE]
     source = "this PC's CAN interface" if len(found) == 1 else f"guessed: the first of {', '.join(found)}"
-    return Told(found[0], source, len(found) > 1) if found else None
+    return SourcedValue(found[0], source, len(found) > 1) if found else None
 
 
-def _ask_operator(asked: Asked) -> Any:
+def _ask_operator(asked: OperatorQuestion) -> Any:
     """Prompt until the answer is a valid value; return None if the proposal is accepted."""
     click.echo(f"\n{asked.path}: {asked.meaning}" if asked.meaning else f"\n{asked.path}", err=True)
     click.echo(f"  where: {asked.where}", err=True)
@@ -170,7 +170,7 @@ def _ask_operator(asked: Asked) -> Any:
             click.echo(f"  {error.faults[0].what}; try again", err=True)
 
 
-def _build_init_document(draft: Draft, file: Path, text: str, dry_run: bool) -> dict[str, Any]:
+def _build_init_document(draft: ConfigDraft, file: Path, text: str, dry_run: bool) -> dict[str, Any]:
     values = [
         {"path": path, "value": setting.value, "source": setting.source, "guessed": setting.guessed}
         for path, setting in draft.values.items()
@@ -185,7 +185,7 @@ def _build_init_document(draft: Draft, file: Path, text: str, dry_run: bool) -> 
     }
 
 
-def _list_guesses(draft: Draft) -> list[str]:
+def _list_guesses(draft: ConfigDraft) -> list[str]:
     # equal guesses of several axes become one line
     places: dict[tuple[str, str, str], list[str]] = {}
     for path, setting in draft.values.items():
@@ -198,7 +198,7 @@ def _list_guesses(draft: Draft) -> list[str]:
     ]
 
 
-def _print_summary(draft: Draft, file: Path, dry_run: bool, quiet: bool) -> None:
+def _print_summary(draft: ConfigDraft, file: Path, dry_run: bool, quiet: bool) -> None:
     # with --dry-run stdout has the file
     if quiet:
         return
@@ -207,7 +207,7 @@ def _print_summary(draft: Draft, file: Path, dry_run: bool, quiet: bool) -> None
         click.echo(line, err=dry_run)
 
     done = "would be written" if dry_run else "written"
-    print_line(f"{file} {done}: {len(draft.values)} values, {draft.guessed} of them guessed")
+    print_line(f"{file} {done}: {len(draft.values)} values, {draft.guessed_count} of them guessed")
     for line in _list_guesses(draft):
         print_line(f"  check {line}")
     for note in draft.notes:

@@ -32,32 +32,34 @@ def interpret(program: Path, config_path: Path | None, as_document: bool, max_bl
     from fdhil.config import Nc, load_config
     from fdhil.program.budget import Budget
     from fdhil.program.interpreter import Interpreter
-    from fdhil.program.motions import as_json
-    from fdhil.program.planner.limits import checked
+    from fdhil.program.motions import serialise_motion
+    from fdhil.program.planner.axis_limits import check_motions
     from fdhil.program.program_notes import ProgramNotes
 
     config = None if config_path is None else load_config(config_path)
     budget = replace(
-        Budget.of(Nc() if config is None else config.nc), max_blocks=max_blocks, max_repeated_blocks=max_repeated
+        Budget.create_from_config(Nc() if config is None else config.nc),
+        max_blocks=max_blocks,
+        max_repeated_blocks=max_repeated,
     )
     notes = ProgramNotes(budget.dialect)
-    motions = notes.watch(Interpreter(program, budget, block_delete=False).run())
+    motions = notes.watch_motions(Interpreter(program, budget, block_delete=False).run())
     if config is not None:
-        motions = checked(motions, config)
+        motions = check_motions(motions, config)
     with tempfile.SpooledTemporaryFile(_SPOOL_CHARACTERS, mode="w+", encoding="utf-8") as spool:
         if as_document:
             spool.write('{"schema": "fdhil-interpret-1", "motions": [')
             separator = "\n"
             for motion in motions:
-                spool.write(separator + json.dumps(as_json(motion)))
+                spool.write(separator + json.dumps(serialise_motion(motion)))
                 separator = ",\n"
-            found = [asdict(note) for note in notes.found]
+            found = [asdict(note) for note in notes.notes]
             spool.write("\n]" + (f', "notes": {json.dumps(found)}' if found else "") + "}\n")
         else:
-            for row in map(as_json, motions):
+            for row in map(serialise_motion, motions):
                 values = "  ".join(f"{key} {value}" for key, value in row.items() if key not in ("line", "kind"))
                 spool.write(f"{row['line']:>7}  {row['kind']:<6}  {values}\n")
         spool.seek(0)
         shutil.copyfileobj(spool, sys.stdout)
-    for note in () if as_document else notes.found:
+    for note in () if as_document else notes.notes:
         click.echo(f"note, {note}; {note.advice}", err=True)

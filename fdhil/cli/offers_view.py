@@ -63,10 +63,12 @@ def summarise_changes(done: ReviewedOffer) -> str:
 
 def describe_voided_items(old: MachineConfig, new: MachineConfig) -> Iterator[str]:
     """Yield what a change of the configuration invalidates, as text."""
-    from fdhil.commissioning.record import axis_digest, record_path
+    from fdhil.commissioning.commissioning_record import build_record_path, compute_axis_digest
 
     for axis in new.axis:
-        if record_path(new.store.directory, axis).exists() and axis_digest(old, axis) != axis_digest(new, axis):
+        if build_record_path(new.store.directory, axis).exists() and compute_axis_digest(
+            old, axis
+        ) != compute_axis_digest(new, axis):
             yield f"the commissioning record of axis {axis} becomes invalid: commission it before the next correction"
     if old.digest != new.digest:
         yield "the restart ends an active correction; arming is refused until the axes are identified again"

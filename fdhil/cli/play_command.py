@@ -24,9 +24,9 @@ from fdhil.errors import DeviceError, DriveFault
 from fdhil.guard.guard_protocol import SOCKET_NAME
 
 if TYPE_CHECKING:
-    from fdhil.commissioning.play import Bench, Plan, Played
-    from fdhil.commissioning.record import CommissioningRecord
-    from fdhil.commissioning.set_points import SetPoints
+    from fdhil.commissioning.commissioning_record import CommissioningRecord
+    from fdhil.commissioning.demand_playback import Bench, PlaybackPlan, PlaybackResult
+    from fdhil.commissioning.set_points import SetPointGenerator
     from fdhil.config import MachineConfig
 
 NOBODY = "standard input has ended, so Enter cannot be pressed; nothing was played; run it without --hold"
@@ -63,11 +63,11 @@ def play(
     meanwhile.
     """
     machine = machine_config.load_config(config_path)
-    from fdhil.commissioning.play import plan_play
+    from fdhil.commissioning.demand_playback import plan_playback
     from fdhil.program import load_trajectory
 
     try:
-        plan = plan_play(machine, load_trajectory(program, machine), str(config_path))
+        plan = plan_playback(machine, load_trajectory(program, machine), str(config_path))
         if not as_json or dry_run:
             click.echo(_describe_plan(plan, program), err=as_json)
         if dry_run:
@@ -82,31 +82,37 @@ def play(
     return int(played.stopped is not None)
 
 
-def _run_play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, hold: bool, yes: bool) -> Played:
+def _run_play(
+    machine: MachineConfig, plan: PlaybackPlan, program: Path, go_to_start: bool, hold: bool, yes: bool
+) -> PlaybackResult:
     from fdhil.arming.guard_presence import GuardPresence
     from fdhil.cli.bus_lock import lock_bus_part
-    from fdhil.commissioning.play import on_bench, valid_records
-    from fdhil.commissioning.realtime import before_other_work
+    from fdhil.commissioning.demand_playback import load_valid_records, open_bench
+    from fdhil.commissioning.realtime_scheduling import lock_realtime_resources
 
-    records = valid_records(machine)
+    records = load_valid_records(machine)
     with ExitStack() as held, _raise_on_signals():
         for name in dict.fromkeys(axis.drive.bus for axis in machine.axis.values()):
             held.enter_context(lock_bus_part(machine.bus[name], "set-points"))
-        held.enter_context(before_other_work())
-        bench = held.enter_context(on_bench(plan, print_progress, GuardPresence(machine.guard_directory).is_present))
-        bench.compare(records)
-        here = bench.here()
+        held.enter_context(lock_realtime_resources())
+        bench = held.enter_context(open_bench(plan, print_progress, GuardPresence(machine.guard_directory).is_present))
+        bench.compare_drives(records)
+        here = bench.read_positions()
         bench.require_start(here, go_to_start)
         if not yes:
             _confirm_motion(bench, program, here)
         ended = held.enter_context(audit_action(machine, "play", program=str(program)))
-        with bench.led(lambda: _confirm_records(machine, records, bench.as_compared)):
+        with bench.hold_drives_enabled(lambda: _confirm_records(machine, records, bench.find_axes_without_reboot)):
             stopped = bench.go_to_start(_brake_on_signals, go_to_start)
             if stopped is not None:
                 raise DriveFault("the move to the start", f"{stopped}; nothing was played")
             if hold:
                 click.echo("holding at the start: press Enter to begin", err=True)
-            played = bench.play(_brake_on_signals, _is_enter_pressed) if hold else bench.play(_brake_on_signals)
+            played = (
+                bench.play_demand(_brake_on_signals, _is_enter_pressed)
+                if hold
+                else bench.play_demand(_brake_on_signals)
+            )
         ended["text"] = played.stopped or f"{played.rows} set-points, to the end"
         return played
 
@@ -125,15 +131,15 @@ def _is_enter_pressed() -> bool:
 def _confirm_records(
     machine: MachineConfig, records: Mapping[str, CommissioningRecord], as_compared: Callable[[], set[str]]
 ) -> None:
-    """Confirm the commissioning records of the drives that are still ``as_compared``; the write to 0x1016 was ours.
+    """Confirm the commissioning records of the drives that are still ``find_axes_without_reboot``; the write to 0x1016 was ours.
 
     The doubts of the guard and of the store are read before each comparison, so later doubts remain.
     """
-    from fdhil.commissioning.void import confirm_record, void_mark
+    from fdhil.commissioning.void_mark import clear_void_mark, read_void_mark
 
     try:
         refused = _report_to_guard(machine, records, as_compared)
-        marks = {axis: void_mark(machine.store.directory, axis) for axis in records}
+        marks = {axis: read_void_mark(machine.store.directory, axis) for axis in records}
         holding = as_compared()
     except DeviceError as error:
         click.echo(f"the guard could not be informed of the comparison of the drives: {error}", err=True)
@@ -145,7 +151,7 @@ def _confirm_records(
         click.echo(f"{each['code']}: {each['text']}; {each['advice']}", err=True)
     if all(each["axis"] for each in refused):  # otherwise the guard accepted none of it
         for axis in holding - {each["axis"] for each in refused}:
-            confirm_record(machine.store.directory, axis, marks[axis])
+            clear_void_mark(machine.store.directory, axis, marks[axis])
 
 
 def _report_to_guard(
@@ -169,22 +175,22 @@ def _report_to_guard(
 @contextmanager
 def _raise_on_signals() -> Iterator[None]:
     # while the axes stand, SIGTERM and a closed terminal act like Ctrl-C
-    from fdhil.commissioning.moving import handling
+    from fdhil.commissioning.axis_motion import handle_signals
 
-    with handling(signal.default_int_handler):
+    with handle_signals(signal.default_int_handler):
         yield
 
 
 @contextmanager
-def _brake_on_signals(path: SetPoints) -> Iterator[None]:
+def _brake_on_signals(path: SetPointGenerator) -> Iterator[None]:
     # while the axes move, every signal brakes them
-    from fdhil.commissioning.moving import handling
+    from fdhil.commissioning.axis_motion import handle_signals
 
-    with handling(lambda number, _frame: path.stop(SIGNALS[number])):
+    with handle_signals(lambda number, _frame: path.brake_to_rest(SIGNALS[number])):
         yield
 
 
-def _describe_plan(plan: Plan, program: Path) -> str:
+def _describe_plan(plan: PlaybackPlan, program: Path) -> str:
     trajectory = plan.trajectory
     lines = [
         f"{program.name}: {trajectory.time_s.size} set-points, {trajectory.time_s[-1] - trajectory.time_s[0]:.3f} s"
@@ -199,7 +205,7 @@ def _describe_plan(plan: Plan, program: Path) -> str:
 
 
 def _confirm_motion(bench: Bench, program: Path, here: list[int]) -> None:
-    ways = zip(bench.plan.axes, bench.away_mm(here), strict=True)
+    ways = zip(bench.plan.axes, bench.compute_distance_to_start_mm(here), strict=True)
     shown = {axis: bench.plan.config.axis[axis] for axis in bench.plan.axes}
     start = ", ".join(f"{axis} {shown[axis].format_in_unit(way, form='+.3f')}" for axis, way in ways if way)
     first = f"First the axes move slowly to the start ({start}). " if start else ""
@@ -216,13 +222,13 @@ def _print_document(as_json: bool, more: Mapping[str, Any]) -> None:
         click.echo(json.dumps({"schema": "fdhil-play-1", **more}))
 
 
-def _print_result(played: Played, plan: Plan, as_json: bool) -> None:
+def _print_result(played: PlaybackResult, plan: PlaybackPlan, as_json: bool) -> None:
     late = played.lateness
     sync = {
         "period_s": plan.trajectory.dt_s,
         "cycles": late.cycles,
-        "late_p50_us": late.quantile_us(0.5),
-        "late_p99_us": late.quantile_us(0.99),
+        "late_p50_us": late.compute_quantile_us(0.5),
+        "late_p99_us": late.compute_quantile_us(0.99),
         "late_max_us": round(late.most_us, 1),
         "skipped": late.skipped,
         "scheduling": played.scheduling,

@@ -157,9 +157,9 @@ def _add_history(
     """
     from fdhil import prediction
     from fdhil.cli import history_forecast
-    from fdhil.program import program_digest
+    from fdhil.program import compute_program_digest
 
-    digest = program_digest(program)
+    digest = compute_program_digest(program)
     past = history_forecast.ProgramHistory.read(config, digest)
     reference, zones = predicted.reference, document["zones"]
     std_um = prediction.compute_contour_std_um(reference, models, _collect_covariances(reference, past), config)

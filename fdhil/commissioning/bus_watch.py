@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from fdhil import cia402
-from fdhil.commissioning.bus_listener import shows_master
+from fdhil.commissioning.traffic_listener import classify_master_frame
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.frame_ring import FrameRing
 from fdhil.drivers.cia402.drive_profile import DriveProfile
@@ -23,7 +23,7 @@ class BusWatch:
     """Tracks another master on one bus.
 
     ``sign`` is the first frame of another master, None without one; it is never cleared. ``sent_by_other`` are the
-    COB-IDs it sent, ``led_by_other`` the axes whose set-points it sends or whose node it stopped by NMT; ``stopped``
+    COB-IDs it sent, ``is_led_by_other`` the axes whose set-points it sends or whose node it stopped by NMT; ``stopped``
     are those it has not started since. ``written`` are the objects that fdhil wrote, by node-ID and index. One thread
     adds received frames, any thread may send.
     """
@@ -45,7 +45,9 @@ class BusWatch:
         self._offsets: set[int] = set()
 
     @classmethod
-    def of(cls, name: str, config: MachineConfig, guard_runs: Callable[[], bool] = lambda: False) -> BusWatch:
+    def create_from_config(
+        cls, name: str, config: MachineConfig, guard_runs: Callable[[], bool] = lambda: False
+    ) -> BusWatch:
         """Return the watch of a bus with the drives of a configuration; a running guard may send their offsets."""
         watch = cls(name, guard_runs)
         for axis, settings in config.axis.items():
@@ -63,15 +65,15 @@ class BusWatch:
     def _add_drive(self, axis: str, profile: DriveProfile, node_id: int) -> None:
         self._node_of[axis] = node_id
         self._own |= {spec.cob_base + node_id for spec in profile.tpdos}
-        offsets = set(offset_ids(profile, node_id))
+        offsets = set(find_offset_cob_ids(profile, node_id))
         self._offsets |= offsets
         self._axis_of |= dict.fromkeys({spec.cob_base + node_id for spec in profile.rpdos} - offsets, axis)
 
-    def take(self, can_id: int, data: bytes) -> None:
+    def inspect_received(self, can_id: int, data: bytes) -> None:
         """Inspect a received frame; ``can_id`` includes its flags."""
         if can_id in self._harmless and can_id not in self._sent:
             return
-        sign = self._sign_of(can_id)
+        sign = self._classify_frame(can_id)
         if sign is None:
             if can_id <= 0x7FF and can_id not in self._offsets:
                 self._harmless.add(can_id)
@@ -81,11 +83,11 @@ class BusWatch:
         if can_id in self._axis_of:
             self.led_by_other |= {self._axis_of[can_id]}
         elif can_id == cia402.COB_NMT and len(data) > 1:
-            self._take_nmt(data[0], data[1])
+            self._track_nmt_command(data[0], data[1])
         if self.sign is None:
             self._first_id, self.sign = can_id, sign
 
-    def _take_nmt(self, command: int, node_id: int) -> None:
+    def _track_nmt_command(self, command: int, node_id: int) -> None:
         axes = {axis for axis, node in self._node_of.items() if node_id in (0, node)}
         if command == cia402.NmtCommand.START:
             self.stopped -= axes
@@ -93,24 +95,24 @@ class BusWatch:
             self.stopped |= axes
             self.led_by_other |= axes
 
-    def _sign_of(self, can_id: int) -> str | None:
+    def _classify_frame(self, can_id: int) -> str | None:
         if can_id in self._own:
             return None
         if can_id in self._offsets:
             return None if self._guard_runs() else "offsets"
         if can_id in self._axis_of:
             return "set-points"
-        return shows_master(can_id) or ("with identifiers of fdhil" if can_id in self._sent else None)
+        return classify_master_frame(can_id) or ("with identifiers of fdhil" if can_id in self._sent else None)
 
-    def sync_came(self) -> bool:
+    def has_new_sync(self) -> bool:
         """Return whether another master has sent SYNC since the last call."""
         before, self._syncs_before = self._syncs_before, self._syncs
         return self._syncs_before > before
 
-    def admit(self, can_id: int, data: bytes) -> None:
+    def require_send_allowed(self, can_id: int, data: bytes) -> None:
         """Register a frame that is about to be sent; ForeignMaster if another master forbids it."""
         if not self.may_send(can_id):
-            raise self.refusal("nothing more was sent")
+            raise self.build_refusal("nothing more was sent")
         self._sent.add(can_id)
         if can_id & ~0x7F == cia402.COB_SDO_REQUEST and data[0] >> 5 == _DOWNLOAD:
             self.written.add((can_id & 0x7F, int.from_bytes(data[1:3], "little")))
@@ -122,7 +124,7 @@ class BusWatch:
         axis = self._axis_of.get(can_id)
         return axis not in self.led_by_other if axis else can_id in self._offsets - self.sent_by_other
 
-    def refusal(self, outcome: str) -> ForeignMaster:
+    def build_refusal(self, outcome: str) -> ForeignMaster:
         """Return the exception to raise; ``outcome`` describes how the drives were left."""
         sends = "SYNC or set-points" if self.sign in ("SYNC", "set-points") else self.sign
         text = f"an NC is sending {sends}; switch it off while fdhil acts on the bus, then start again"
@@ -131,7 +133,7 @@ class BusWatch:
         )
 
 
-def offset_ids(profile: DriveProfile, node_id: int) -> Iterator[int]:
+def find_offset_cob_ids(profile: DriveProfile, node_id: int) -> Iterator[int]:
     """Yield the COB-IDs of the RPDOs that carry offsets (sent by a guard) but no target."""
     offsets = {profile.offset, profile.speed_offset, profile.torque_offset}
     for spec in profile.rpdos:
@@ -149,5 +151,5 @@ class WatchedRing(FrameRing):
 
     def append_frame(self, t_ns: int, can_id: int, data: bytes) -> None:
         """Store one frame (writer's side only)."""
-        self._watch.take(can_id, data)
+        self._watch.inspect_received(can_id, data)
         super().append_frame(t_ns, can_id, data)

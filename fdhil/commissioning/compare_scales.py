@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 from fdhil.cia402 import Object
-from fdhil.commissioning.finding import Finding, lacks, read_optional
+from fdhil.commissioning.finding import Finding, read_optional, report_missing_object
 from fdhil.commissioning.master import Master
 from fdhil.drivers.cia402.drive_profile import decode_speed_unit
 
@@ -13,13 +13,13 @@ Read = Callable[[int, int], int | None]
 """Reads an unsigned object by index and sub-index; None if the drive does not report it."""
 
 
-def compare_scale(master: Master) -> Iterator[Finding]:
+def compare_increments(master: Master) -> Iterator[Finding]:
     """Compare the position increments per motor revolution (0x6091 and 0x6092, else 0x608F) with the configuration."""
     expected = master.config.axis[master.axis].drive.increments_per_rev
     wanted = f"{expected} per revolution"
-    reported = increments_told(partial(read_optional, master))
+    reported = read_increments_per_rev(partial(read_optional, master))
     if reported is None:
-        yield lacks("scale", wanted, "0x6092", "0x608F")
+        yield report_missing_object("scale", wanted, "0x6092", "0x608F")
         return
     per_rev, source = reported
     found = f"{per_rev:g} per revolution"
@@ -30,16 +30,16 @@ def compare_scale(master: Master) -> Iterator[Finding]:
     yield Finding("scale", wanted, found, same, cause, "correct the drive's factors or drive.increments_per_rev")
 
 
-def increments_told(read: Read) -> tuple[float, str] | None:
+def read_increments_per_rev(read: Read) -> tuple[float, str] | None:
     """Return a drive's position increments per motor revolution and the objects they come from; None if unavailable."""
-    feed, gear = _ratio(read, Object.FEED_CONSTANT), _ratio(read, Object.GEAR_RATIO)
+    feed, gear = _read_ratio(read, Object.FEED_CONSTANT), _read_ratio(read, Object.GEAR_RATIO)
     if feed is not None:
         return feed / (gear or 1.0), "0x6092 and 0x6091"
-    encoder = _ratio(read, Object.POSITION_ENCODER_RESOLUTION)
+    encoder = _read_ratio(read, Object.POSITION_ENCODER_RESOLUTION)
     return None if encoder is None else (encoder, "0x608F")
 
 
-def _ratio(read: Read, index: int) -> float | None:
+def _read_ratio(read: Read, index: int) -> float | None:
     upper, lower = read(index, 1), read(index, 2)
     return None if upper is None or not lower else upper / lower
 
@@ -56,7 +56,7 @@ def compare_rating(master: Master) -> Iterator[Finding]:
     expected = drive.rated_current_a if place == Object.RATED_CURRENT else drive.rated_torque_nm
     reported, wanted = read_optional(master, place), f"{expected:g} {symbol}"
     if reported is None:
-        yield lacks(what, wanted, f"0x{place:04X}")
+        yield report_missing_object(what, wanted, f"0x{place:04X}")
         return
     found = f"{reported / 1e3:g} {symbol}"
     same = abs(reported / 1e3 - expected) <= 0.01 * expected
@@ -94,7 +94,7 @@ def compare_dc_link(master: Master) -> Iterator[Finding]:
 
 def compare_scales(master: Master) -> Iterator[Finding]:
     """Yield the findings of all scales."""
-    yield from compare_scale(master)
+    yield from compare_increments(master)
     yield from compare_rating(master)
     yield from compare_speed_unit(master)
     yield from compare_dc_link(master)

@@ -8,15 +8,15 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from fdhil.commissioning.bus_listener import LISTEN_S, BusListener, Traffic
-from fdhil.commissioning.compare import RECORD_POINT, compare_record
+from fdhil.commissioning.cob_id_conflicts import compare_cob_ids
+from fdhil.commissioning.commissioning_record import CommissioningRecord, load_record
+from fdhil.commissioning.drive_survey import DriveSurvey, survey_drive
 from fdhil.commissioning.finding import Finding, read_optional
-from fdhil.commissioning.identifiers import compare_identifiers
 from fdhil.commissioning.master import Master
-from fdhil.commissioning.offset_writers import compare_heard_writers
-from fdhil.commissioning.record import CommissioningRecord, load_record
-from fdhil.commissioning.survey import Survey, survey
-from fdhil.commissioning.timing import judge_sync
+from fdhil.commissioning.offset_writers import compare_traffic_writers
+from fdhil.commissioning.record_comparison import RECORD_POINT, compare_record
+from fdhil.commissioning.sync_timing import assess_sync_jitter
+from fdhil.commissioning.traffic_listener import LISTEN_S, BusListener, BusTraffic
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus_listener import ListeningBus
 from fdhil.drivers.cia402.drive_profile import DriveProfile, PdoSpec
@@ -46,23 +46,23 @@ def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _te
     for bus in dict.fromkeys(axis.drive.bus for axis in config.axis.values()):
         say(f"listening on bus {bus}")
         with BusListener(ListeningBus(bus, config.bus[bus])) as listener:
-            listener.listen(LISTEN_S)
+            listener.listen_for(LISTEN_S)
             listener.require_readable()
             traffic = listener.traffic
         found += [(f"bus {bus}", finding) for finding in compare_bus(traffic, config)]
         for axis in (name for name, settings in config.axis.items() if settings.drive.bus == bus):
             say(f"comparing axis {axis}")
             compared = (
-                compare_asked(config, axis, traffic.ids)
+                compare_by_sdo(config, axis, traffic.cob_ids)
                 if traffic.master is None
-                else compare_heard(traffic, config, axis)
+                else compare_by_traffic(traffic, config, axis)
             )
             found += [(f"axis {axis}", finding) for finding in (*compared, *compare_loops(config, axis))]
             found += [(f"axis {axis}", finding) for finding in asyncio.run(compare_sensors(config, axis))]
     return found
 
 
-def compare_bus(traffic: Traffic, config: MachineConfig) -> Iterator[Finding]:
+def compare_bus(traffic: BusTraffic, config: MachineConfig) -> Iterator[Finding]:
     """Report who runs the bus and at which SYNC period."""
     wanted = config.machine.sync_period_s
     expected, period_s = f"{wanted * 1e3:g} ms", traffic.sync_period_s
@@ -80,49 +80,51 @@ def compare_bus(traffic: Traffic, config: MachineConfig) -> Iterator[Finding]:
         cause = f"the SYNC period is {found}, but the configuration has {expected}"
         yield Finding("SYNC", expected, found, same, cause, "correct machine.sync_period_s or the NC's cycle")
     if period_s is not None:
-        yield judge_sync((np.diff(traffic.sync_ns) * 1e-9).tolist(), period_s, config.guard.clock == "sync")
+        yield assess_sync_jitter((np.diff(traffic.sync_ns) * 1e-9).tolist(), period_s, config.guard.clock == "sync")
 
 
-def compare_asked(config: MachineConfig, axis: str, received: Sequence[int] = ()) -> list[Finding]:
+def compare_by_sdo(config: MachineConfig, axis: str, received: Sequence[int] = ()) -> list[Finding]:
     """Compare a drive by SDO, while no NC runs the bus; ``received`` are COB-IDs already received there."""
     node = f"node-ID {config.get_node_id(axis)}"
     with Master(config, axis) as master:
-        master.heard.ids.update(received)
+        master.feedback.ids.update(received)
         try:
-            found = survey(master)
+            found = survey_drive(master)
             seen = f"{node}, serial number {found.identity.serial}"
             if not found.is_drive:
                 return [
                     Finding("drive", node, seen),
                     *found.findings,
-                    *_not_compared(SDO_POINTS, "it is not a drive", FIND),
+                    *_list_uncompared_points(SDO_POINTS, "it is not a drive", FIND),
                 ]
             return [
                 Finding("drive", node, seen),
                 *found.findings,
-                _heartbeat(found.options.get("1017")),
-                *_rapid(config, master.profile, lambda: read_optional(master, *master.profile.digital_inputs)),
-                *_voltage_object(config, axis, master.profile, master),
-                *_record(config, axis, found),
+                _check_heartbeat(found.options.get("1017")),
+                *_check_rapid_signal(
+                    config, master.profile, lambda: read_optional(master, *master.profile.digital_inputs)
+                ),
+                *_check_voltage_object(config, axis, master.profile, master),
+                *_compare_signed_off_record(config, axis, found),
             ]
         except ForeignMaster:
             raise
         except DeviceError as error:
-            return [_unreachable("drive", node, error)]
+            return [_report_unreachable("drive", node, error)]
 
 
-def _not_compared(points: Sequence[str], cause: str, advice: str) -> list[Finding]:
+def _list_uncompared_points(points: Sequence[str], cause: str, advice: str) -> list[Finding]:
     return [Finding(point, "as configured", "not read", None, cause, advice) for point in points]
 
 
-def _record_of(config: MachineConfig, axis: str) -> CommissioningRecord | None:
+def _load_record_if_readable(config: MachineConfig, axis: str) -> CommissioningRecord | None:
     try:
         return load_record(config.store.directory, axis, config.store.commissioning_key, may_lack_key=True)
     except StoreError:
         return None
 
 
-def _record(config: MachineConfig, axis: str, found: Survey) -> Iterator[Finding]:
+def _compare_signed_off_record(config: MachineConfig, axis: str, found: DriveSurvey) -> Iterator[Finding]:
     try:
         record = load_record(config.store.directory, axis, config.store.commissioning_key, may_lack_key=True)
     except StoreError as error:
@@ -151,18 +153,20 @@ def compare_loops(config: MachineConfig, axis: str) -> Iterator[Finding]:
         yield Finding("loops", f"{settings.regulators.structure} as configured", shown, same, cause, advice)
 
 
-def _unreachable(point: str, expected: str, error: DeviceError) -> Finding:
+def _report_unreachable(point: str, expected: str, error: DeviceError) -> Finding:
     cause, _, advice = str(error).removeprefix(f"{error.device}: ").partition("; ")
     return Finding(point, expected, "no answer", False, cause, advice or "check its supply and its wiring")
 
 
-def _heartbeat(period_ms: int | None) -> Finding:
+def _check_heartbeat(period_ms: int | None) -> Finding:
     cause = "it sends no heartbeat (0x1017), so only its PDOs show that it is alive"
     shown = f"{period_ms} ms" if period_ms else "none"
     return Finding("heartbeat", "any", shown, bool(period_ms), cause, "set 0x1017 to 100 with the drive's tool")
 
 
-def _rapid(config: MachineConfig, profile: DriveProfile, read: Callable[[], int | None]) -> Iterator[Finding]:
+def _check_rapid_signal(
+    config: MachineConfig, profile: DriveProfile, read: Callable[[], int | None]
+) -> Iterator[Finding]:
     if not load_event_source(config.g0.source).needs_input:
         yield Finding("rapid signal", config.g0.source, f"{config.g0.source} needs no input")
         return
@@ -181,7 +185,7 @@ def _rapid(config: MachineConfig, profile: DriveProfile, read: Callable[[], int 
     yield Finding("rapid signal", expected, f"{'on' if value >> bit & 1 else 'off'} now")
 
 
-def _voltage_object(config: MachineConfig, axis: str, profile: DriveProfile, master: Master) -> Iterator[Finding]:
+def _check_voltage_object(config: MachineConfig, axis: str, profile: DriveProfile, master: Master) -> Iterator[Finding]:
     if config.axis[axis].voltage.is_separate:
         return
     if profile.voltage is None or not profile.voltage_objects:
@@ -200,32 +204,32 @@ def _voltage_object(config: MachineConfig, axis: str, profile: DriveProfile, mas
     yield Finding("voltage", "from the drive", shown, raw is not None, cause, "choose another profile or sensor")
 
 
-def compare_heard(traffic: Traffic, config: MachineConfig, axis: str) -> Iterator[Finding]:
+def compare_by_traffic(traffic: BusTraffic, config: MachineConfig, axis: str) -> Iterator[Finding]:
     """Compare one drive as far as the traffic of a running NC shows it; nothing is sent."""
     profile, node_id = load_profile(config.axis[axis].drive), config.get_node_id(axis)
-    nmt = traffic.nmt(node_id)
+    nmt = traffic.decode_nmt_state(node_id)
     cause = f"no frame of node-ID {node_id} was received"
-    shown = f"{cause}" if node_id not in traffic.nodes else f"node-ID {node_id}, {nmt or 'no heartbeat'}"
+    shown = f"{cause}" if node_id not in traffic.sending_nodes else f"node-ID {node_id}, {nmt or 'no heartbeat'}"
     advice = "check the drive's supply and drive.node_id"
-    yield Finding("drive", f"node-ID {node_id}", shown, node_id in traffic.nodes, cause, advice)
-    period_s = traffic.heartbeat_s(node_id)
-    yield _heartbeat(None if period_s is None else round(period_s * 1e3))
+    yield Finding("drive", f"node-ID {node_id}", shown, node_id in traffic.sending_nodes, cause, advice)
+    period_s = traffic.measure_heartbeat_s(node_id)
+    yield _check_heartbeat(None if period_s is None else round(period_s * 1e3))
     for spec in profile.tpdos:
-        yield _heard_pdo(traffic, spec, node_id)
+        yield _compare_pdo_traffic(traffic, spec, node_id)
     target = profile.find_rpdo(profile.target)
     if target is not None:
-        yield _heard_pdo(traffic, target[0], node_id)
+        yield _compare_pdo_traffic(traffic, target[0], node_id)
     table = config.axis[axis].table
     if table is not None and table.cob_id is not None:
-        yield _heard_table(traffic, table.cob_id)
-    yield compare_identifiers(config, axis, traffic.ids)
+        yield _compare_table_encoder_traffic(traffic, table.cob_id)
+    yield compare_cob_ids(config, axis, traffic.cob_ids)
     if profile.find_tpdo(profile.offset) is not None:
-        yield compare_heard_writers(config, axis, _record_of(config, axis), traffic)
-    yield from _rapid(config, profile, lambda: _heard_value(traffic, profile, node_id))
-    yield from _not_compared(("device", *SDO_POINTS), "only the NC may use SDO while it runs", NC_OFF)
+        yield compare_traffic_writers(config, axis, _load_record_if_readable(config, axis), traffic)
+    yield from _check_rapid_signal(config, profile, lambda: _extract_digital_inputs(traffic, profile, node_id))
+    yield from _list_uncompared_points(("device", *SDO_POINTS), "only the NC may use SDO while it runs", NC_OFF)
 
 
-def _heard_pdo(traffic: Traffic, spec: PdoSpec, node_id: int) -> Finding:
+def _compare_pdo_traffic(traffic: BusTraffic, spec: PdoSpec, node_id: int) -> Finding:
     """Compare a PDO's rate and length with the profile; without SYNC none is due."""
     cob_id, syncs = spec.cob_base + node_id, len(traffic.sync_ns)
     count, length = traffic.count.get(cob_id, 0), traffic.length.get(cob_id, 0)
@@ -243,7 +247,7 @@ def _heard_pdo(traffic: Traffic, spec: PdoSpec, node_id: int) -> Finding:
     return Finding(spec.name, expected, shown, ok, cause, advice)
 
 
-def _heard_table(traffic: Traffic, cob_id: int) -> Finding:
+def _compare_table_encoder_traffic(traffic: BusTraffic, cob_id: int) -> Finding:
     count, syncs = traffic.count.get(cob_id, 0), len(traffic.sync_ns)
     cause = f"the table encoder's TPDO {cob_id:03X} was received {count} times in {syncs} SYNC"
     advice = "start its node, make that TPDO synchronous (type 1), or correct cob_id of the table"
@@ -251,7 +255,7 @@ def _heard_table(traffic: Traffic, cob_id: int) -> Finding:
     return Finding("table encoder", f"{cob_id:03X} every SYNC", f"{count} in {syncs} SYNC", ok, cause, advice)
 
 
-def _heard_value(traffic: Traffic, profile: DriveProfile, node_id: int) -> int | None:
+def _extract_digital_inputs(traffic: BusTraffic, profile: DriveProfile, node_id: int) -> int | None:
     mapped = profile.find_tpdo(profile.digital_inputs)
     if mapped is None:
         return None
@@ -262,14 +266,14 @@ def _heard_value(traffic: Traffic, profile: DriveProfile, node_id: int) -> int |
 
 async def compare_sensors(config: MachineConfig, axis: str) -> list[Finding]:
     """Connect to and read the sensors of one axis; reading alone does not disturb a running daemon."""
-    return [await _sensor(point, sensor) for point, sensor in create_sensors(axis, config).items()]
+    return [await _probe_sensor(point, sensor) for point, sensor in create_sensors(axis, config).items()]
 
 
-async def _sensor(point: str, sensor: Sensor) -> Finding:
+async def _probe_sensor(point: str, sensor: Sensor) -> Finding:
     try:
         await sensor.link.connect()
         return Finding(point, sensor.link.place, await sensor.format_reading())
     except DeviceError as error:
-        return _unreachable(point, sensor.link.place, error)
+        return _report_unreachable(point, sensor.link.place, error)
     finally:
         sensor.link.close()

@@ -12,12 +12,12 @@ _KINDS = {
 }
 
 
-def is_drive(device_type: int | None) -> bool:
+def is_cia402_drive(device_type: int | None) -> bool:
     """Return whether the device profile is CiA 402."""
     return device_type is not None and device_type & 0xFFFF == DRIVES
 
 
-def describe(device_type: int | None) -> str:
+def describe_device_type(device_type: int | None) -> str:
     """Return the device profile in words.
 
     >>> describe(0x00030191)

@@ -41,7 +41,7 @@ def has_object(master: Master, index: int) -> bool:
     return True
 
 
-def lacks(point: str, expected: str, *objects: str, needed: bool = False) -> Finding:
+def report_missing_object(point: str, expected: str, *objects: str, needed: bool = False) -> Finding:
     """Return the finding for an item that cannot be compared because the drive has no such object."""
     shown = " and ".join(objects)
     advice = "see its manual for what it does instead"

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from fdhil.cia402 import COB_SDO_RESPONSE, Object, unpack_pdo
-from fdhil.commissioning.bus_listener import Traffic
+from fdhil.commissioning.commissioning_record import CommissioningRecord
 from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.master import Master
-from fdhil.commissioning.record import CommissioningRecord
+from fdhil.commissioning.traffic_listener import BusTraffic
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.sdo_channel import NO_OBJECT, NO_SUB_INDEX
 from fdhil.drivers.cia402.device_description import read_device
@@ -47,12 +47,12 @@ class OtherRpdo:
         return f"{Object.RPDO_PARAMETER + self.number - 1:04X}"
 
     @property
-    def valid(self) -> bool:
+    def is_valid(self) -> bool:
         """Whether the drive accepts its frames."""
         return not self.cob_id & INVALID_COB_ID
 
 
-def identifier_of(cob_id: int) -> int:
+def extract_cob_id(cob_id: int) -> int:
     """Return the identifier in a drive's COB-ID word; bit 29 is kept to distinguish 29-bit identifiers.
 
     Bit 30 has no meaning for an RPDO (CiA 301, 7.5.2.35); drives may set it or not.
@@ -74,35 +74,35 @@ def read_other_rpdos(master: Master) -> tuple[OtherRpdo, ...]:
         missing, allowed = 0, MOST_MISSING if block == 0 else MOST_MISSING_BEHIND
         for number in range(block + 1, block + LOGICAL_AXIS_PDOS + 1):
             if number not in own:
-                found[number] = _read(master, number)
+                found[number] = _read_rpdo(master, number)
             exists = number in own or found[number] is not None
             missing, allowed = 0 if exists else missing + 1, MOST_MISSING if exists else allowed
             if missing >= allowed:
                 break
-    for number in _of_eds(master) - own - found.keys():
-        found[number] = _read(master, number)
+    for number in _list_eds_rpdos(master) - own - found.keys():
+        found[number] = _read_rpdo(master, number)
     return tuple(rpdo for _, rpdo in sorted(found.items()) if rpdo is not None)
 
 
-def _of_eds(master: Master) -> set[int]:
+def _list_eds_rpdos(master: Master) -> set[int]:
     """The drive may have more RPDOs, or fewer."""
     eds = master.config.axis[master.axis].drive.eds
     return set() if eds is None else {place.number for place in read_device(eds).rpdos}
 
 
-def _read(master: Master, number: int) -> OtherRpdo | None:
-    cob_id = _number(master, Object.RPDO_PARAMETER + number - 1, 1)
+def _read_rpdo(master: Master, number: int) -> OtherRpdo | None:
+    cob_id = _read_existing_int(master, Object.RPDO_PARAMETER + number - 1, 1)
     if cob_id is None:
         return None
     mapping = Object.RPDO_MAPPING + number - 1
-    count = _number(master, mapping, 0) or 0
+    count = _read_existing_int(master, mapping, 0) or 0
     if count in MULTIPLEXED:
         return OtherRpdo(number, cob_id, None)
-    words = (_number(master, mapping, sub) or 0 for sub in range(1, min(count, MOST_MAPPED) + 1))
+    words = (_read_existing_int(master, mapping, sub) or 0 for sub in range(1, min(count, MOST_MAPPED) + 1))
     return OtherRpdo(number, cob_id, tuple(words))
 
 
-def _number(master: Master, index: int, sub: int) -> int | None:
+def _read_existing_int(master: Master, index: int, sub: int) -> int | None:
     """Return None only if the object does not exist; raise SdoAbort on any other refusal."""
     try:
         return master.sdo.read_int(index, sub)
@@ -112,7 +112,7 @@ def _number(master: Master, index: int, sub: int) -> int | None:
         raise
 
 
-def offsets_of(master: Master, rpdo: OtherRpdo) -> tuple[int, ...]:
+def find_written_offsets(master: Master, rpdo: OtherRpdo) -> tuple[int, ...]:
     """Return which of the axis' offset objects an RPDO writes."""
     profile = master.profile
     keys = (profile.offset, profile.speed_offset, profile.torque_offset)
@@ -122,44 +122,44 @@ def offsets_of(master: Master, rpdo: OtherRpdo) -> tuple[int, ...]:
     return tuple(index for index, _ in keys if index in written)
 
 
-def record_options(master: Master, rpdos: tuple[OtherRpdo, ...]) -> dict[str, int]:
+def collect_record_options(master: Master, rpdos: tuple[OtherRpdo, ...]) -> dict[str, int]:
     """Return the COB-IDs to be stored in a commissioning record, since a running guard reads no drive by SDO.
 
     All valid ones, so that their frames count as harmless; of the others those with an offset.
     """
-    return {rpdo.key: rpdo.cob_id for rpdo in rpdos if rpdo.valid or offsets_of(master, rpdo)}
+    return {rpdo.key: rpdo.cob_id for rpdo in rpdos if rpdo.is_valid or find_written_offsets(master, rpdo)}
 
 
-def compare_writers(master: Master, rpdos: tuple[OtherRpdo, ...]) -> Finding:
+def compare_offset_writers(master: Master, rpdos: tuple[OtherRpdo, ...]) -> Finding:
     """Verify that only fdhil can write the offsets, and that its frames write nothing else."""
     expected = "only the profile's RPDOs"
-    wrong = next(_wrong(master, rpdos), None)
+    wrong = next(_find_conflicting_rpdos(master, rpdos), None)
     if wrong is None:
         return Finding(POINT, expected, expected)
     rpdo, why = wrong
-    where = f"RPDO{rpdo.number} (COB-ID {identifier_of(rpdo.cob_id) & ~EXTENDED:03X})"
+    where = f"RPDO{rpdo.number} (COB-ID {extract_cob_id(rpdo.cob_id) & ~EXTENDED:03X})"
     parameter, mapping = Object.RPDO_PARAMETER + rpdo.number - 1, Object.RPDO_MAPPING + rpdo.number - 1
     advice = f"set bit 31 of 0x{parameter:04X}:01, or change 0x{mapping:04X}, with the NC's or the drive's own tool"
     return Finding(POINT, expected, where, False, f"its {where} {why}", advice)
 
 
-def _wrong(master: Master, rpdos: tuple[OtherRpdo, ...]) -> Iterator[tuple[OtherRpdo, str]]:
+def _find_conflicting_rpdos(master: Master, rpdos: tuple[OtherRpdo, ...]) -> Iterator[tuple[OtherRpdo, str]]:
     ours = {spec.cob_base + master.node_id for spec in master.profile.rpdos}
     for rpdo in rpdos:
-        written = " and ".join(f"{index:04X}" for index in offsets_of(master, rpdo))
-        if not rpdo.valid:
+        written = " and ".join(f"{index:04X}" for index in find_written_offsets(master, rpdo))
+        if not rpdo.is_valid:
             continue
         if rpdo.mapped is None:
             yield rpdo, f"is multiplexed and can write {written}: another master can step the table"
         elif written:
             yield rpdo, f"writes {written}, as fdhil does: another master that sends it steps the table"
-        elif identifier_of(rpdo.cob_id) in ours and rpdo.mapped:
+        elif extract_cob_id(rpdo.cob_id) in ours and rpdo.mapped:
             listed = ", ".join(f"{word:08X}" for word in rpdo.mapped)
             yield rpdo, f"has the COB-ID of an RPDO of the profile and maps {listed}: our frames would write that"
 
 
-def compare_heard_writers(
-    config: MachineConfig, name: str, record: CommissioningRecord | None, traffic: Traffic
+def compare_traffic_writers(
+    config: MachineConfig, name: str, record: CommissioningRecord | None, traffic: BusTraffic
 ) -> Finding:
     """Compare an axis' offset with the frames that are not PDOs of a configured drive.
 
@@ -167,15 +167,15 @@ def compare_heard_writers(
     """
     profile, axis = load_profile(config.axis[name].drive), config.axis[name]
     kept = () if record is None else record.rpdos
-    known = {identifier_of(cob_id) for cob_id in kept if not cob_id & INVALID_COB_ID}
+    known = {extract_cob_id(cob_id) for cob_id in kept if not cob_id & INVALID_COB_ID}
     for each, other in config.axis.items():
         if other.drive.bus == axis.drive.bus:
             found = load_profile(other.drive)
             known |= {spec.cob_base + config.get_node_id(each) for spec in (*found.rpdos, *found.tpdos)}
-    held, bits = _shown_offset(profile, config.get_node_id(name), traffic)
+    held, bits = _read_shown_offset(profile, config.get_node_id(name), traffic)
     expected = "written by fdhil only"
-    for cob_id in sorted({*traffic.ids} - known) if abs(held) >= LEAST_HELD else ():
-        if _carries(traffic, cob_id, held, bits):
+    for cob_id in sorted({*traffic.cob_ids} - known) if abs(held) >= LEAST_HELD else ():
+        if _is_value_in_frame(traffic, cob_id, held, bits):
             um = abs(held) / axis.scaling.increments_per_mm * 1e3
             cause = f"it holds an offset of {um:.1f} um, which the frame {cob_id:03X} of another master carries"
             advice = "find the NC function that writes it, switch it off, and run fdhil check with the NC off"
@@ -183,7 +183,7 @@ def compare_heard_writers(
     return Finding(POINT, expected, expected)
 
 
-def _shown_offset(profile: DriveProfile, node_id: int, traffic: Traffic) -> tuple[int, int]:
+def _read_shown_offset(profile: DriveProfile, node_id: int, traffic: BusTraffic) -> tuple[int, int]:
     found = profile.find_tpdo(profile.offset)
     data = None if found is None else traffic.data.get(found[0].cob_base + node_id)
     if found is None or data is None:
@@ -191,14 +191,14 @@ def _shown_offset(profile: DriveProfile, node_id: int, traffic: Traffic) -> tupl
     return unpack_pdo(found[0].entries, data.to_bytes(8, "little"))[found[0].entries.index(found[1])], found[1].bits
 
 
-def _carries(traffic: Traffic, cob_id: int, held: int, bits: int) -> bool:
+def _is_value_in_frame(traffic: BusTraffic, cob_id: int, held: int, bits: int) -> bool:
     if not 0x180 <= cob_id < COB_SDO_RESPONSE:
         return False
     frame = traffic.data[cob_id].to_bytes(8, "little")[: traffic.length[cob_id]]
     return (held & (1 << bits) - 1).to_bytes(bits // 8, "little") in frame
 
 
-def unreadable(abort: SdoAbort) -> Finding:
+def report_unreadable_rpdo(abort: SdoAbort) -> Finding:
     """Return the finding for an RPDO that exists but cannot be read."""
     cause = f"not all of its RPDOs can be read ({abort}): one may write its offset"
     return Finding(POINT, "only the profile's RPDOs", "unknown", None, cause, "look up its RPDOs in its manual")

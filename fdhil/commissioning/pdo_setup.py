@@ -7,9 +7,16 @@ then it is made valid again. On failure the old PDOs are restored.
 from dataclasses import dataclass
 
 from fdhil.cia402 import NmtCommand, Object, PowerState, decode_power_state
+from fdhil.commissioning.drive_survey import (
+    INVALID_COB_ID,
+    PdoParameters,
+    compare_pdo,
+    listen_for_master,
+    read_mapping,
+    read_pdos,
+)
 from fdhil.commissioning.finding import read_optional
 from fdhil.commissioning.master import Master
-from fdhil.commissioning.survey import INVALID_COB_ID, PdoFound, compare_pdo, listen, read_mapping, read_pdos
 from fdhil.drivers.cia402.drive_profile import PdoSpec
 from fdhil.errors import DeviceError, DriveFault, ProtocolError, SdoAbort
 
@@ -21,35 +28,35 @@ TOO_LONG = 0x06040042
 
 
 @dataclass(frozen=True, slots=True)
-class SetUp:
+class PdoSetup:
     """The PDOs that were written (none: all were right), and whether the drive has stored them permanently."""
 
     written: tuple[str, ...]
     saved: bool | None
 
 
-def set_up_pdos(master: Master) -> SetUp:
+def set_up_pdos(master: Master) -> PdoSetup:
     """Write all PDOs that differ from the profile and store them; on DriveFault all PDOs are unchanged.
 
     ``saved`` None: nothing was written, False: the drive has no 0x1010 or refuses it.
     """
-    listen(master)
+    listen_for_master(master)
     _require_disabled(master)
     pdos = read_pdos(master)
     wrong = [(spec, found) for spec, found in pdos if compare_pdo(spec, found, master.node_id).ok is False]
     if not wrong:
-        return SetUp((), None)
-    master.nmt(NmtCommand.ENTER_PRE_OPERATIONAL)
-    begun: list[tuple[PdoSpec, PdoFound]] = []
+        return PdoSetup((), None)
+    master.send_nmt(NmtCommand.ENTER_PRE_OPERATIONAL)
+    begun: list[tuple[PdoSpec, PdoParameters]] = []
     try:
         for spec, found in wrong:
             begun.append((spec, found))
-            _write_spec(master, spec, found)
-        _require_same(master)
+            _write_pdo_spec(master, spec, found)
+        _verify_written_pdos(master)
     except BaseException as error:  # Ctrl-C, too: a partial mapping is worse than the old one
-        _give_back(master, begun, error)
+        _restore_pdos(master, begun, error)
         raise
-    return SetUp(tuple(spec.name for spec, _ in wrong), _save(master))
+    return PdoSetup(tuple(spec.name for spec, _ in wrong), _save_to_drive(master))
 
 
 def _require_disabled(master: Master) -> None:
@@ -58,11 +65,11 @@ def _require_disabled(master: Master) -> None:
         raise DriveFault(master.device, "it is in Operation enabled, so nothing was written; switch it off first")
 
 
-def _write_spec(master: Master, spec: PdoSpec, found: PdoFound) -> None:
+def _write_pdo_spec(master: Master, spec: PdoSpec, found: PdoParameters) -> None:
     cob_id = spec.cob_base + master.node_id | found.cob_id & NO_REMOTE_REQUEST
     wanted = cob_id if spec.valid else cob_id | INVALID_COB_ID
     try:
-        _write(master, found, wanted, spec.every_sync, tuple(entry.mapping for entry in spec.entries))
+        _write_pdo(master, found, wanted, spec.every_sync, tuple(entry.mapping for entry in spec.entries))
     except SdoAbort as abort:
         why = {
             UNMAPPABLE: "one of these objects cannot be mapped into it",
@@ -73,7 +80,7 @@ def _write_spec(master: Master, spec: PdoSpec, found: PdoFound) -> None:
         raise DriveFault(master.device, f"it refuses {spec.name} with {listed}: {why}; {advice}") from None
 
 
-def _write(master: Master, found: PdoFound, cob_id: int, kind: int, words: tuple[int, ...]) -> None:
+def _write_pdo(master: Master, found: PdoParameters, cob_id: int, kind: int, words: tuple[int, ...]) -> None:
     """Write one PDO; a correct mapping is not written, since it may be read-only."""
     write = master.sdo.write_int
     write(found.parameter, 1, found.cob_id | INVALID_COB_ID, 4)
@@ -86,7 +93,7 @@ def _write(master: Master, found: PdoFound, cob_id: int, kind: int, words: tuple
     write(found.parameter, 1, cob_id, 4)
 
 
-def _require_same(master: Master) -> None:
+def _verify_written_pdos(master: Master) -> None:
     for spec, found in read_pdos(master):
         finding = compare_pdo(spec, found, master.node_id)
         if finding.ok is False:
@@ -95,17 +102,17 @@ def _require_same(master: Master) -> None:
             )
 
 
-def _give_back(master: Master, begun: list[tuple[PdoSpec, PdoFound]], error: BaseException) -> None:
+def _restore_pdos(master: Master, begun: list[tuple[PdoSpec, PdoParameters]], error: BaseException) -> None:
     for spec, found in reversed(begun):
         try:
-            _write(master, found, found.cob_id, found.kind, found.mapped)
+            _write_pdo(master, found, found.cob_id, found.kind, found.mapped)
         except DeviceError as left:
             cause = str(error).removeprefix(f"{master.device}: ") or "it was interrupted"
             text = f"{cause}; {spec.name} could not be restored ({left}); power the drive off and on again"
             raise ProtocolError(master.device, text) from error
 
 
-def _save(master: Master) -> bool:
+def _save_to_drive(master: Master) -> bool:
     try:
         master.sdo.write_int(STORE, 1, SAVE, 4)
     except SdoAbort:

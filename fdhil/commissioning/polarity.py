@@ -21,7 +21,7 @@ RESTING = 0.2  # of the top speed: slower samples show offsets and rounding
 CODE = "SignOrScale"
 
 
-def judge_jog(jog: Recording, distance_mm: float, axis: Axis) -> Iterator[Finding]:
+def assess_jog(jog: Recording, distance_mm: float, axis: Axis) -> Iterator[Finding]:
     """Compare the recording of a jog over ``distance_mm`` and back with an axis whose units are correct."""
     commanded = abs(distance_mm)
     way = float(np.nanmax(np.abs(jog.position_mm - jog.position_mm[np.isfinite(jog.position_mm)][0])))
@@ -30,13 +30,13 @@ def judge_jog(jog: Recording, distance_mm: float, axis: Axis) -> Iterator[Findin
     same = abs(way - commanded) <= TRAVEL_TOLERANCE * commanded
     advice = "its set-point and position have different scales; correct its factors (0x6091, 0x6092)"
     yield Finding("travel", wanted, went, same, cause, advice)
-    yield _speed(jog)
-    yield from _table(jog)
-    power = signed_power(jog)
-    yield _sign("current", "current times speed", power["current x speed"], "drive.sign or the current's sign")
+    yield _check_speed_unit(jog)
+    yield from _check_table_travel(jog)
+    power = compute_signal_correlations(jog)
+    yield _check_sign("current", "current times speed", power["current x speed"], "drive.sign or the current's sign")
     voltage = [power[name] for name in ("voltage x current", "voltage x speed") if name in power]
     if voltage:
-        yield _sign("voltage", "voltage times current, and times speed", min(voltage), VOLTAGE_ADVICE)
+        yield _check_sign("voltage", "voltage times current, and times speed", min(voltage), VOLTAGE_ADVICE)
     else:
         cause = "no voltage was recorded"
         yield Finding("voltage sign", "positive", "unknown", None, cause, "R and L stay as in the data sheet")
@@ -45,17 +45,17 @@ def judge_jog(jog: Recording, distance_mm: float, axis: Axis) -> Iterator[Findin
 VOLTAGE_ADVICE = "the sensor's leads, its word order and [axis.*.voltage] scale"
 
 
-def signed_power(rows: Recording) -> dict[str, float]:
+def compute_signal_correlations(rows: Recording) -> dict[str, float]:
     """Return the correlation (-1 to 1) of each pair of current, speed and voltage over the samples in motion."""
-    speed, current, voltage = rows.speed_rad_s, rows.current_a, voltage_of(rows)
+    speed, current, voltage = rows.speed_rad_s, rows.current_a, interpolate_voltage(rows)
     signals = {"current x speed": (current, speed)}
     if voltage is not None:
         signals |= {"voltage x current": (voltage, current), "voltage x speed": (voltage, speed)}
     moving = np.abs(np.nan_to_num(speed)) > RESTING * np.nanmax(np.abs(speed))
-    return {name: _correlation(a[moving], b[moving]) for name, (a, b) in signals.items()}
+    return {name: _compute_correlation(a[moving], b[moving]) for name, (a, b) in signals.items()}
 
 
-def voltage_of(rows: Recording) -> Float | None:
+def interpolate_voltage(rows: Recording) -> Float | None:
     """Return the voltage at each sample (n,), interpolated linearly from a slower sensor; None without one."""
     slow = rows.slow_voltage
     if slow is None:
@@ -66,13 +66,13 @@ def voltage_of(rows: Recording) -> Float | None:
     return np.interp(at, middle[known], slow.voltage_v[known]) if known.any() else None
 
 
-def _correlation(a: Float, b: Float) -> float:
+def _compute_correlation(a: Float, b: Float) -> float:
     known = np.isfinite(a) & np.isfinite(b)
     size = math.sqrt(float(np.square(a[known]).sum()) * float(np.square(b[known]).sum()))
     return float(a[known] @ b[known]) / size if size > 0.0 else 0.0
 
 
-def _sign(what: str, product: str, correlation: float, where: str) -> Finding:
+def _check_sign(what: str, product: str, correlation: float, where: str) -> Finding:
     shown = f"{correlation:+.2f}"
     if abs(correlation) < LEAST_CORRELATION:
         cause = f"{CODE}: {product} cancel out over a move back and forth ({shown}): the sign of its {what} is unknown"
@@ -81,7 +81,7 @@ def _sign(what: str, product: str, correlation: float, where: str) -> Finding:
     return Finding(f"{what} sign", "positive", shown, correlation > 0.0, cause, f"check {where}")
 
 
-def _speed(jog: Recording) -> Finding:
+def _check_speed_unit(jog: Recording) -> Finding:
     rate = np.gradient(jog.position_mm, jog.dt_s) * 2 * math.pi / jog.pitch_mm
     known = np.isfinite(rate) & np.isfinite(jog.speed_rad_s)
     power = float(np.square(rate[known]).sum())
@@ -91,7 +91,7 @@ def _speed(jog: Recording) -> Finding:
     return Finding("speed unit", "1", f"{ratio:.3f}", same, cause, "set drive.speed_unit, or its speed's unit (0x60A9)")
 
 
-def _table(jog: Recording) -> Iterator[Finding]:
+def _check_table_travel(jog: Recording) -> Iterator[Finding]:
     if jog.table_mm is None:
         return
     known = np.isfinite(jog.table_mm) & np.isfinite(jog.position_mm)
@@ -104,9 +104,9 @@ def _table(jog: Recording) -> Iterator[Finding]:
     yield Finding("table", "1", f"{ratio:.3f}", abs(ratio - 1.0) <= TABLE_TOLERANCE, cause, advice)
 
 
-def judge_acceleration(rows: Recording) -> Finding:
+def assess_acceleration_power(rows: Recording) -> Finding:
     """Check the power balance: during acceleration of a rapid the integral of u i is positive, as R is."""
-    voltage = voltage_of(rows)
+    voltage = interpolate_voltage(rows)
     expected = "power in while accelerating"
     if voltage is None:
         return Finding("power balance", expected, "no voltage", None, "no voltage was recorded", "nothing")

@@ -1,6 +1,6 @@
 """Generate the set-points of a machine, one row per SYNC, and keep every row inside its bounds. Pure.
 
-All set-points come from :meth:`SetPoints.step` alone. A row is sent only if the axes can still be braked inside their
+All set-points come from :meth:`SetPointGenerator.step` alone. A row is sent only if the axes can still be braked inside their
 travel from there: a stop is always possible, and always the same. It continues straight ahead from the last two rows
 sent, each axis' speed falling to zero in the same n cycles, n = ceil(max |v|/a).
 """
@@ -23,7 +23,7 @@ Row = Sequence[float]
 
 
 @dataclass(frozen=True, slots=True)
-class Bounds:
+class AxisBounds:
     """Limits of one axis' set-points, in drive increments and SYNC cycles.
 
     ``low`` and ``high`` bound the travel, ``speed`` is in increments per cycle, ``acceleration`` in increments per
@@ -39,7 +39,7 @@ class Bounds:
     delay_cycles: int = 2
 
     @classmethod
-    def of(
+    def create_for_axis(
         cls,
         name: str,
         axis: Axis,
@@ -47,7 +47,7 @@ class Bounds:
         travel_mm: tuple[float, float],
         speed_mm_s: float | None = None,
         acceleration_mm_s2: float | None = None,
-    ) -> Bounds:
+    ) -> AxisBounds:
         """Return the bounds of an axis: the configuration's, or lower ones; half its following-error window."""
         scaling, own = axis.scaling, axis.setpoints
         low, high = sorted(scaling.sign * mm * scaling.increments_per_mm for mm in travel_mm)
@@ -65,7 +65,7 @@ class Bounds:
         )
 
 
-class SetPoints:
+class SetPointGenerator:
     """The set-points of some axes, at rest at ``start`` until :meth:`play`.
 
     ``stopped`` says why a motion ended before its last row, None otherwise; nothing is played afterwards. ``cycles``
@@ -73,7 +73,7 @@ class SetPoints:
     called by another.
     """
 
-    def __init__(self, bounds: Sequence[Bounds], start: Sequence[int]) -> None:
+    def __init__(self, bounds: Sequence[AxisBounds], start: Sequence[int]) -> None:
         self.bounds = tuple(bounds)
         self.stopped: str | None = None
         self.cycles = self.played = 0
@@ -86,7 +86,7 @@ class SetPoints:
         ]
 
     @property
-    def resting(self) -> bool:
+    def is_resting(self) -> bool:
         """Whether nothing is played and the axes are at standstill."""
         return self._rows is None and self._last == self._before
 
@@ -95,71 +95,73 @@ class SetPoints:
         """The last row sent."""
         return self._last
 
-    def play(self, rows: Iterable[Row]) -> None:
+    def play_rows(self, rows: Iterable[Row]) -> None:
         """Send these rows, in increments, one per cycle; they begin at the rest position. Ignored once stopped."""
         if self.stopped is None:
             self._rows = iter(rows)
 
-    def stop(self, why: str) -> None:
+    def brake_to_rest(self, why: str) -> None:
         """Brake to rest from the next cycle on; the first reason is kept."""
         if self.stopped is None:
             self.stopped = why
 
-    def hold(self, why: str) -> None:
+    def hold_last_row(self, why: str) -> None:
         """Stay at the last row sent, since the drives have long stopped there."""
-        self.stop(why)
+        self.brake_to_rest(why)
         self._rows, self._brake, self._before = None, iter(()), self._last
 
-    def step(self, positions: Sequence[int | None] = ()) -> tuple[int, ...]:
+    def advance_cycle(self, positions: Sequence[int | None] = ()) -> tuple[int, ...]:
         """Return the set-points of this cycle in whole increments; ``positions`` are the drives' newest."""
-        self._watch(positions)
-        row = self._next()
+        self._check_following_error(positions)
+        row = self._select_next_row()
         self._before, self._last = self._last, row
         self.cycles += 1
         for sent, value in zip(self._sent, row, strict=True):
             sent.append(value)
         return tuple(map(round, row))
 
-    def _next(self) -> tuple[float, ...]:
+    def _select_next_row(self) -> tuple[float, ...]:
         if self.stopped is None and self._rows is not None:
             row = next(self._rows, None)
-            fault = self._fault(row) if row is not None else self._ended()
+            fault = self._find_row_fault(row) if row is not None else self._check_end_speed()
             if fault is None:
                 self.played += row is not None
                 return self._last if row is None else tuple(map(float, row))
-            self.stop(fault)
+            self.brake_to_rest(fault)
         if self.stopped is not None:
             self._rows = None  # another thread may have called play meanwhile
-            self._brake = self._braking() if self._brake is None else self._brake
+            self._brake = self._generate_braking_rows() if self._brake is None else self._brake
         braked = None if self._brake is None else next(self._brake, None)
         return self._last if braked is None else braked
 
-    def _ended(self) -> str | None:
+    def _check_end_speed(self) -> str | None:
         """At the end of the rows the axes must be at standstill, or nearly."""
         self._rows = None
-        still = all(abs(v) <= of.acceleration + ROUNDING for v, of in zip(self._speed(), self.bounds, strict=True))
+        still = all(
+            abs(v) <= of.acceleration + ROUNDING for v, of in zip(self._compute_speed(), self.bounds, strict=True)
+        )
         return None if still else "the set-points ended in motion"
 
-    def _speed(self) -> tuple[float, ...]:
+    def _compute_speed(self) -> tuple[float, ...]:
         return tuple(now - then for now, then in zip(self._last, self._before, strict=True))
 
-    def _cycles_to_stop(self, speed: Sequence[float]) -> int:
+    def _count_cycles_to_stop(self, speed: Sequence[float]) -> int:
         return max(math.ceil(abs(v) / of.acceleration - 1e-9) for v, of in zip(speed, self.bounds, strict=True))
 
-    def _braking(self) -> Iterator[tuple[float, ...]]:
-        start, speed = self._last, self._speed()
-        n = self._cycles_to_stop(speed)
+    def _generate_braking_rows(self) -> Iterator[tuple[float, ...]]:
+        start, speed = self._last, self._compute_speed()
+        n = self._count_cycles_to_stop(speed)
         for k in range(1, n + 1):
             way = k - k * (k + 1) / (2 * n)
             yield tuple(at + v * way for at, v in zip(start, speed, strict=True))
 
-    def _fault(self, row: Row) -> str | None:
+    def _find_row_fault(self, row: Row) -> str | None:
         """Return why this row must not be sent, None if it may; NaN fails every comparison."""
         if len(row) != len(self.bounds) or not all(map(math.isfinite, row)):
             return "a set-point is not a number"
         speed = [now - then for now, then in zip(row, self._last, strict=True)]
-        way = max(self._cycles_to_stop(speed) - 1, 0) / 2
-        for at, v, before, of in zip(row, speed, self._speed(), self.bounds, strict=True):
+        way = max(self._count_cycles_to_stop(speed) - 1, 0) / 2
+        for at, v, before, of in zip(row, speed, self._compute_speed(), self.bounds, strict=True):
             if not abs(v) <= of.speed + ROUNDING:
                 return f"axis {of.axis}: a set-point exceeds the axis' speed"
             if not abs(v - before) <= of.acceleration + ROUNDING:
@@ -168,15 +170,15 @@ class SetPoints:
                 return f"axis {of.axis}: it could not be braked inside its travel"
         return None
 
-    def _watch(self, positions: Sequence[int | None]) -> None:
+    def _check_following_error(self, positions: Sequence[int | None]) -> None:
         for position, sent, of in zip(positions, self._sent, self.bounds, strict=False):
             if position is not None:
                 away = max(min(sent) - position, position - max(sent))
                 if not away <= of.following_error:
-                    self.stop(f"axis {of.axis}: it does not follow its set-points")
+                    self.brake_to_rest(f"axis {of.axis}: it does not follow its set-points")
 
 
-def straight(start: Row, goal: Row, speed: Row, acceleration: Row, rounding_cycles: int = 1) -> Float:
+def plan_straight_move(start: Row, goal: Row, speed: Row, acceleration: Row, rounding_cycles: int = 1) -> Float:
     """Return rows (n, axes) straight from ``start`` to ``goal``, at rest at both ends, in the units of the arguments.
 
     A trapezoid of speed in which the slowest axis has its ``speed`` and ``acceleration`` (per cycle and per cycle

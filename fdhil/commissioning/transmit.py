@@ -104,5 +104,5 @@ class TransmitBus(ListeningBus):
         """Send one frame; DeviceError if the bus does not accept it, ForeignMaster if another master runs it."""
         time.sleep(max(0.0, self._free_from_s - time.monotonic()))
         with self._send_lock:
-            self.watch.admit(can_id, data)
+            self.watch.require_send_allowed(can_id, data)
             self._sender.send(can_id, data)

@@ -16,7 +16,7 @@ from fdhil.arming.guard_link import GUARD_TRIPPED, RECORD_VOIDING_CODES
 from fdhil.arming.refusals import Answer, make_refusal
 from fdhil.arming.residual_offset import ADOPT_ADVICE, START_AND_ADOPT, ResidualOffset
 from fdhil.cancellation import find_first_error
-from fdhil.commissioning.void import void_record
+from fdhil.commissioning.void_mark import mark_record_void
 from fdhil.config import MachineConfig, find_unlikely_values
 from fdhil.daemon import alarms, black_box, malloc_tuning, service_log
 from fdhil.daemon.acquisition import Acquisition, OpenSource
@@ -268,7 +268,7 @@ class DaemonService:
         while True:
             axis = await self._void_axes.get()
             try:
-                await asyncio.to_thread(void_record, self._config.store.directory, axis, self._void_by.pop(axis))
+                await asyncio.to_thread(mark_record_void, self._config.store.directory, axis, self._void_by.pop(axis))
             except StoreError as error:
                 service_log.write_line(str(error), "MAJOR")
             self._void_axes.task_done()

@@ -62,7 +62,7 @@ class AxisSettings:
     unit; 0: not checked. ``travel`` are the drive's software limits (0x607D), None: it has none.
     ``compute_heartbeat_timeout_s`` 0: the drive has no heartbeat, only its PDOs show that it is Operational. ``writers`` are
     foreign COB-IDs whose frames may change an offset of the drive. ``record`` is the fingerprint of the commissioned
-    drive, empty: not commissioned; ``record_void``: an event since then voids it, ``void_reason`` names the event.
+    drive, empty: not commissioned; ``record_void``: an event since then voids it, ``read_void_reason`` names the event.
     """
 
     name: str

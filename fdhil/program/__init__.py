@@ -3,22 +3,22 @@
 from fdhil.program.budget import Budget
 from fdhil.program.demand_csv import write_demand_csv
 from fdhil.program.interpreter import interpret
-from fdhil.program.loading import load_trajectory, program_digest
-from fdhil.program.motions import Arc, Dwell, Feed, Motion, Probe, Rapid, Turned
+from fdhil.program.motions import Arc, AxisMove, Dwell, Feed, Motion, Probe, Rapid
 from fdhil.program.planner import plan
+from fdhil.program.program_loading import compute_program_digest, load_trajectory
 
 __all__ = [
     "Arc",
+    "AxisMove",
     "Budget",
     "Dwell",
     "Feed",
     "Motion",
     "Probe",
     "Rapid",
-    "Turned",
+    "compute_program_digest",
     "interpret",
     "load_trajectory",
     "plan",
-    "program_digest",
     "write_demand_csv",
 ]

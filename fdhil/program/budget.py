@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fdhil.config import Nc
-from fdhil.program.dialect import LINUXCNC, Dialect
+from fdhil.program.nc_dialect import LINUXCNC, Dialect
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +32,11 @@ class Budget:
     dialect: Dialect = LINUXCNC
 
     @classmethod
-    def of(cls, nc: Nc) -> Budget:
+    def create_from_config(cls, nc: Nc) -> Budget:
         """Return the budget and dialect of a machine's configuration."""
-        return cls(nc.max_blocks, nc.max_repeated_blocks, max_call_depth=nc.max_call_depth, dialect=Dialect.of(nc))
+        return cls(
+            nc.max_blocks,
+            nc.max_repeated_blocks,
+            max_call_depth=nc.max_call_depth,
+            dialect=Dialect.create_from_config(nc),
+        )

@@ -18,8 +18,8 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.csv_text import check_lengths, decode_text, quote_cell, read_content
 from fdhil.errors import ConfigError, ConfigFault, ProgramError, RecordingError
-from fdhil.program.limit_notes import limit_notes
-from fdhil.program.reach import first_beyond
+from fdhil.program.limit_notes import find_limit_violations
+from fdhil.program.position_range_check import find_first_out_of_range
 from fdhil.records import Float, Trajectory, freeze_array, freeze_integers
 
 _STEP_TOLERANCE = 1e-3  # of the SYNC period, for the period itself
@@ -62,7 +62,7 @@ def read_demand_csv(path: Path, config: MachineConfig, sha256: str | None = None
     if not text.endswith("\n"):
         cut = f"line {len(lines)} has no end of line, so its last number may be truncated"
         raise RecordingError(f"{path} is truncated: {cut}; copy it again")
-    table = _numbers(path, lines, names)
+    table = _parse_numbers(path, lines, names)
     columns = {name: table[:, k] for k, name in enumerate(names)}
     _check_times(path, lines, columns["time_s"], config.machine.sync_period_s)
     moved = {}
@@ -83,8 +83,8 @@ def read_demand_csv(path: Path, config: MachineConfig, sha256: str | None = None
     rapid = still.astype(np.bool_)
     rapid.setflags(write=False)
     position_mm = {axis: freeze_array(moved.get(axis, still)) for axis in config.axis}
-    if (beyond := first_beyond(position_mm, config)) is not None:
-        raise RecordingError(f"{path} line {_line_of(lines, beyond.row)}: {beyond.text}")
+    if (beyond := find_first_out_of_range(position_mm, config)) is not None:
+        raise RecordingError(f"{path} line {_find_line_number(lines, beyond.row)}: {beyond.text}")
     time_s = freeze_array(columns["time_s"])
     demand = Trajectory(
         config.machine.sync_period_s,
@@ -94,23 +94,23 @@ def read_demand_csv(path: Path, config: MachineConfig, sha256: str | None = None
         freeze_integers(still),
         mm_per_degree=config.mm_per_degree,
     )
-    return replace(demand, notes=limit_notes(demand, config))
+    return replace(demand, notes=find_limit_violations(demand, config))
 
 
-def _numbers(path: Path, lines: Sequence[str], names: Sequence[str]) -> Float:
+def _parse_numbers(path: Path, lines: Sequence[str], names: Sequence[str]) -> Float:
     rows = [line for line in lines[1:] if line.strip()]
     if not rows:
         raise RecordingError(f"{path}: there is no row of data; record or export it again")
     try:
         table = np.loadtxt(rows, delimiter=",", ndmin=2, comments=None)
     except ValueError:
-        raise _bad_row(path, lines, names) from None
+        raise _find_bad_row(path, lines, names) from None
     if table.shape[1] != len(names) or not np.isfinite(table).all():
-        raise _bad_row(path, lines, names)
+        raise _find_bad_row(path, lines, names)
     return np.asarray(table, dtype=np.float64)
 
 
-def _bad_row(path: Path, lines: Sequence[str], names: Sequence[str]) -> RecordingError:
+def _find_bad_row(path: Path, lines: Sequence[str], names: Sequence[str]) -> RecordingError:
     for number, line in enumerate(lines[1:], 2):
         cells = line.split(",")
         if line.strip() and len(cells) != len(names):
@@ -138,12 +138,12 @@ def _check_times(path: Path, lines: Sequence[str], time_s: Float, sync_period_s:
         raise ConfigError(str(path), [fault])
     off = np.flatnonzero(np.abs(steps - sync_period_s) > _JITTER_TOLERANCE * sync_period_s + 2 * _ROUNDING_S)
     if off.size:
-        number = _line_of(lines, int(off[0]) + 1)
+        number = _find_line_number(lines, int(off[0]) + 1)
         text = f"{path} line {number} is {steps[off[0]]:g} s after the row before it; rows must be one SYNC apart"
         raise RecordingError(text)
 
 
-def _line_of(lines: Sequence[str], row: int) -> int:
+def _find_line_number(lines: Sequence[str], row: int) -> int:
     return [number for number, line in enumerate(lines, 1) if line.strip()][row + 1]
 
 

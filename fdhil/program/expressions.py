@@ -29,147 +29,149 @@ _STEPS = {
 _EQUAL = 1e-4  # tolerance of EQ and NE, and of whole numbers
 
 
-class Context(Protocol):
+class EvaluationContext(Protocol):
     """Evaluation context of values: the parameters (KeyError for a missing one) and the executed line."""
 
     line: int
 
-    def number(self, index: int) -> float: ...
+    def get_numbered(self, index: int) -> float: ...
 
-    def named(self, name: str) -> float: ...
+    def get_named(self, name: str) -> float: ...
 
 
-def now(value: Value) -> float:
+def evaluate_value(value: Value) -> float:
     """Evaluate a value."""
     return value() if callable(value) else value
 
 
-class Reader:
+class ExpressionReader:
     """Parses values from ``text`` (lower case, no blanks and comments) at ``at``; ProgramError for invalid text."""
 
     __slots__ = ("_context", "_depth", "_max_depth", "at", "text", "word_at")
 
-    def __init__(self, text: str, context: Context, max_depth: int) -> None:
+    def __init__(self, text: str, context: EvaluationContext, max_depth: int) -> None:
         self.text = text
         self.at = self.word_at = 0
         self._context = context
         self._max_depth = max_depth
         self._depth = 0
 
-    def fault(self, message: str, word: str | None = None) -> ProgramError:
+    def build_error(self, message: str, word: str | None = None) -> ProgramError:
         """Return the error for the word being parsed (from ``word_at`` on), or for another one."""
         if word is None and not self.text[self.at : self.at + 1].isascii():
-            return self._stranger()
-        return _fault(self._context, word or self.text[self.word_at : self.word_at + 12], message)
+            return self._build_foreign_character_error()
+        return _build_error(self._context, word or self.text[self.word_at : self.word_at + 12], message)
 
-    def _stranger(self) -> ProgramError:
+    def _build_foreign_character_error(self) -> ProgramError:
         end = self.at + 1
         while end < min(len(self.text), self.at + 4) and not self.text[end].isascii():
             end += 1
-        ways = (as_written(self.text[self.at : stop]) for stop in range(end, self.at, -1))
+        ways = (decode_as_written(self.text[self.at : stop]) for stop in range(end, self.at, -1))
         character = next((way for way in ways if len(way) == 1), self.text[self.at])
         name = f"U+{ord(character):04X}, {unicodedata.name(character, 'unnamed').lower()}"
         word = self.text[self.word_at : self.at].upper() + character
         return ProgramError(self._context.line, word, f"ends in a character that no NC accepts ({name}); type it again")
 
-    def done(self) -> bool:
+    def is_done(self) -> bool:
         """Return whether all of the text is parsed."""
         return self.at >= len(self.text)
 
-    def take(self, mark: str) -> bool:
+    def take_mark(self, mark: str) -> bool:
         """Step over ``mark`` if it is next."""
         if self.text.startswith(mark, self.at):
             self.at += len(mark)
             return True
         return False
 
-    def value(self) -> Value:
+    def read_value(self) -> Value:
         """Parse one value: a number, ``#`` parameter, ``[expression]`` or function, each with or without a sign."""
         match = _NUMBER.match(self.text, self.at)
         if match is not None:
             self.at = match.end()
-            return _finite(self._context, float(match.group()), match.group()[:12])
+            return _require_finite(self._context, float(match.group()), match.group()[:12])
         self._depth += 1
         if self._depth > self._max_depth:
-            raise self.fault(f"nests deeper than {self._max_depth} levels; write it in several steps")
+            raise self.build_error(f"nests deeper than {self._max_depth} levels; write it in several steps")
         try:
-            return self._composed()
+            return self._read_composed_value()
         finally:
             self._depth -= 1
 
-    def _composed(self) -> Value:
-        if self.take("-"):
-            value = self.value()
-            return _lazily(lambda a: -a, value)
-        if self.take("+"):
-            return self.value()
-        if self.take("["):
-            return self.bracketed()
-        if self.take("#"):
-            return self._parameter()
+    def _read_composed_value(self) -> Value:
+        if self.take_mark("-"):
+            value = self.read_value()
+            return _apply_lazily(lambda a: -a, value)
+        if self.take_mark("+"):
+            return self.read_value()
+        if self.take_mark("["):
+            return self.read_bracketed()
+        if self.take_mark("#"):
+            return self._read_parameter()
         match = _FUNCTION.match(self.text, self.at)
         if match is None:
-            raise self.fault("is not a value; a number, a parameter (#), a function or a bracket is expected here")
+            raise self.build_error(
+                "is not a value; a number, a parameter (#), a function or a bracket is expected here"
+            )
         self.at = match.end()
-        return self._function(match.group())
+        return self._read_function(match.group())
 
-    def bracketed(self) -> Value:
+    def read_bracketed(self) -> Value:
         """Parse up to the bracket that closes the one just read, and return the expression's value."""
-        values = [self.value()]
+        values = [self.read_value()]
         operators: list[str] = []
-        while not self.take("]"):
+        while not self.take_mark("]"):
             match = _OPERATOR.match(self.text, self.at)
             if match is None:
-                what = "the bracket is not closed" if self.done() else "is not an operator"
-                word = "[" if self.done() else self.text[self.at : self.at + 12]
-                raise self.fault(f"{what}; write [value operator value ...]", word)
+                what = "the bracket is not closed" if self.is_done() else "is not an operator"
+                word = "[" if self.is_done() else self.text[self.at : self.at + 12]
+                raise self.build_error(f"{what}; write [value operator value ...]", word)
             operator = match.group()
             while operators and _STEPS[operators[-1]] >= _STEPS[operator]:
-                self._reduce(values, operators)
+                self._reduce_operators(values, operators)
             self.at = match.end()
             operators.append(operator)
-            values.append(self.value())
+            values.append(self.read_value())
         while operators:
-            self._reduce(values, operators)
+            self._reduce_operators(values, operators)
         return values[0]
 
-    def _reduce(self, values: list[Value], operators: list[str]) -> None:
+    def _reduce_operators(self, values: list[Value], operators: list[str]) -> None:
         right, left, operator = values.pop(), values.pop(), operators.pop()
-        values.append(_binary(self._context, operator, left, right))
+        values.append(_build_binary_value(self._context, operator, left, right))
 
-    def _parameter(self) -> Value:
+    def _read_parameter(self) -> Value:
         if self.text.startswith("<", self.at):
-            return _named(self._context, self.name())
-        return _numbered(self._context, self.value())
+            return _build_named_reader(self._context, self.read_name())
+        return _build_numbered_reader(self._context, self.read_value())
 
-    def name(self) -> str:
+    def read_name(self) -> str:
         """Parse ``<name>``."""
         end = self.text.find(">", self.at)
-        if not self.take("<") or end < 0:
-            raise self.fault("is a name without its closing '>'")
+        if not self.take_mark("<") or end < 0:
+            raise self.build_error("is a name without its closing '>'")
         name = self.text[self.at : end]
         self.at = end + 1
         return name
 
-    def _function(self, name: str) -> Value:
+    def _read_function(self, name: str) -> Value:
         if name == "exists":
-            return self._exists()
-        if not self.take("["):
-            raise self.fault("the function's argument must be in brackets", name)
-        argument = self.bracketed()
+            return self._read_exists()
+        if not self.take_mark("["):
+            raise self.build_error("the function's argument must be in brackets", name)
+        argument = self.read_bracketed()
         if name == "atan":
-            if not (self.take("/") and self.take("[")):
-                raise self.fault("ATAN needs two arguments: ATAN[y]/[x]", name)
-            other = self.bracketed()
-            return lambda: math.degrees(math.atan2(now(argument), now(other)))
-        return _applied(self._context, name, argument)
+            if not (self.take_mark("/") and self.take_mark("[")):
+                raise self.build_error("ATAN needs two arguments: ATAN[y]/[x]", name)
+            other = self.read_bracketed()
+            return lambda: math.degrees(math.atan2(evaluate_value(argument), evaluate_value(other)))
+        return _build_function_value(self._context, name, argument)
 
-    def _exists(self) -> Value:
-        if self.take("[") and self.take("#") and self.text.startswith("<", self.at):
-            name = self.name()
-            if self.take("]"):
-                return lambda: _is_there(self._context, name)
-        raise self.fault("EXISTS needs the name of a parameter: EXISTS[#<name>]", "exists")
+    def _read_exists(self) -> Value:
+        if self.take_mark("[") and self.take_mark("#") and self.text.startswith("<", self.at):
+            name = self.read_name()
+            if self.take_mark("]"):
+                return lambda: _is_parameter_set(self._context, name)
+        raise self.build_error("EXISTS needs the name of a parameter: EXISTS[#<name>]", "exists")
 
 
 def is_whole(value: float) -> bool:
@@ -177,18 +179,18 @@ def is_whole(value: float) -> bool:
     return abs(value - round(value)) <= _EQUAL
 
 
-def whole(context: Context, value: float, what: str) -> int:
+def require_whole(context: EvaluationContext, value: float, what: str) -> int:
     """Return a value as a whole number; ProgramError for any other value."""
     if not is_whole(value):
-        raise _fault(context, f"{what}{value:g}", "is not a whole number, which is required here")
+        raise _build_error(context, f"{what}{value:g}", "is not a whole number, which is required here")
     return round(value)
 
 
-def _fault(context: Context, word: str, message: str) -> ProgramError:
-    return ProgramError(context.line, word.upper() if word.isascii() else as_written(word), message)
+def _build_error(context: EvaluationContext, word: str, message: str) -> ProgramError:
+    return ProgramError(context.line, word.upper() if word.isascii() else decode_as_written(word), message)
 
 
-def as_written(text: str) -> str:
+def decode_as_written(text: str) -> str:
     """Decode characters that represent the bytes of a file: UTF-8 if valid, else Latin-1."""
     try:
         return text.encode("latin-1").decode("utf-8")
@@ -196,84 +198,84 @@ def as_written(text: str) -> str:
         return text
 
 
-def _finite(context: Context, value: float, word: str) -> float:
+def _require_finite(context: EvaluationContext, value: float, word: str) -> float:
     if value - value != 0.0:
-        raise _fault(context, word, "is too large a number; use one that a machine can reach")
+        raise _build_error(context, word, "is too large a number; use one that a machine can reach")
     return value
 
 
-def _lazily(function: Callable[[float], float], value: Value) -> Value:
+def _apply_lazily(function: Callable[[float], float], value: Value) -> Value:
     return (lambda: function(value())) if callable(value) else function(value)
 
 
-def _is_there(context: Context, name: str) -> float:
+def _is_parameter_set(context: EvaluationContext, name: str) -> float:
     try:
-        context.named(name)
+        context.get_named(name)
     except KeyError:
         return 0.0
     return 1.0
 
 
-def _named(context: Context, name: str) -> Value:
-    def read() -> float:
+def _build_named_reader(context: EvaluationContext, name: str) -> Value:
+    def read_named() -> float:
         try:
-            return context.named(name)
+            return context.get_named(name)
         except KeyError:
-            raise _fault(context, f"#<{name}>", "is a parameter without a value; set it first") from None
+            raise _build_error(context, f"#<{name}>", "is a parameter without a value; set it first") from None
 
-    return read
+    return read_named
 
 
-def _numbered(context: Context, index: Value) -> Value:
+def _build_numbered_reader(context: EvaluationContext, index: Value) -> Value:
     if not callable(index):
-        number = whole(context, index, "#")
-        _number(context, number)
-        return partial(context.number, number)
-    return lambda: _number(context, whole(context, index(), "#"))
+        number = require_whole(context, index, "#")
+        _read_numbered(context, number)
+        return partial(context.get_numbered, number)
+    return lambda: _read_numbered(context, require_whole(context, index(), "#"))
 
 
-def _number(context: Context, number: int) -> float:
+def _read_numbered(context: EvaluationContext, number: int) -> float:
     try:
-        return context.number(number)
+        return context.get_numbered(number)
     except KeyError:
-        raise _fault(context, f"#{number}", "is not a parameter; parameters are numbered 1 to 5601") from None
+        raise _build_error(context, f"#{number}", "is not a parameter; parameters are numbered 1 to 5601") from None
 
 
-def _applied(context: Context, name: str, argument: Value) -> Value:
+def _build_function_value(context: EvaluationContext, name: str, argument: Value) -> Value:
     function = _UNARY[name]
 
-    def apply(value: float) -> float:
+    def apply_function(value: float) -> float:
         try:
-            return _finite(context, function(value), name)
+            return _require_finite(context, function(value), name)
         except (ValueError, OverflowError):
-            raise _fault(context, name, f"has no real value for {value:g}") from None
+            raise _build_error(context, name, f"has no real value for {value:g}") from None
 
-    return _lazily(apply, argument)
+    return _apply_lazily(apply_function, argument)
 
 
-def _binary(context: Context, operator: str, left: Value, right: Value) -> Value:
+def _build_binary_value(context: EvaluationContext, operator: str, left: Value, right: Value) -> Value:
     function = _BINARY[operator]
 
-    def combine() -> float:
+    def combine_operands() -> float:
         a = left() if callable(left) else left
         b = right() if callable(right) else right
         try:
             value = function(a, b)
-            return value if value - value == 0.0 else _finite(context, value, operator)
+            return value if value - value == 0.0 else _require_finite(context, value, operator)
         except ZeroDivisionError:
-            raise _fault(context, operator, "divides by zero; guard it with IF") from None
+            raise _build_error(context, operator, "divides by zero; guard it with IF") from None
         except (ValueError, OverflowError, TypeError):
-            raise _fault(context, operator, f"has no real value for {a:g} and {b:g}") from None
+            raise _build_error(context, operator, f"has no real value for {a:g} and {b:g}") from None
 
-    return combine if callable(left) or callable(right) else combine()
+    return combine_operands if callable(left) or callable(right) else combine_operands()
 
 
-def _modulo(left: float, right: float) -> float:
+def _compute_modulo(left: float, right: float) -> float:
     result = math.fmod(left, right) if right else left % right
     return result + abs(right) if result < 0.0 else result
 
 
-def _round(value: float) -> float:
+def _round_half_away(value: float) -> float:
     return math.copysign(math.floor(abs(value) + 0.5), value)  # halves go away from zero
 
 
@@ -286,7 +288,7 @@ _UNARY: Mapping[str, Callable[[float], float]] = {
     "fix": math.floor,
     "fup": math.ceil,
     "ln": math.log,
-    "round": _round,
+    "round": _round_half_away,
     "sin": lambda x: math.sin(math.radians(x)),
     "sqrt": math.sqrt,
     "tan": lambda x: math.tan(math.radians(x)),
@@ -295,7 +297,7 @@ _BINARY: Mapping[str, Callable[[float, float], float]] = {
     "**": math.pow,
     "*": operators.mul,
     "/": operators.truediv,
-    "mod": _modulo,
+    "mod": _compute_modulo,
     "+": operators.add,
     "-": operators.sub,
     "eq": lambda a, b: float(abs(a - b) < _EQUAL),

@@ -14,19 +14,29 @@ from functools import partial
 from pathlib import Path
 
 from fdhil.errors import GcodeBudget, ProgramError
-from fdhil.program import arcs, canned, lathe, modes, offsets, probing, roughing, splines, targets
+from fdhil.program import (
+    arcs,
+    block_modes,
+    canned_cycles,
+    coordinate_systems,
+    lathe,
+    probing,
+    roughing,
+    splines,
+    targets,
+)
 from fdhil.program.budget import Budget
-from fdhil.program.checks import CYCLES, check_machine_words, check_readers, one_reader_of_axes
-from fdhil.program.commands import Command
-from fdhil.program.expressions import now
-from fdhil.program.flow import Flow
-from fdhil.program.machine import Machine
-from fdhil.program.modal import INDEX, Modal
+from fdhil.program.expressions import evaluate_value
+from fdhil.program.modal_state import INDEX, ModalState
+from fdhil.program.motion_builder import MotionBuilder
 from fdhil.program.motions import Feed, Motion, Rapid
-from fdhil.program.parameters import Variables
-from fdhil.program.source import Source
-from fdhil.program.state import KeptModes, names_of, numbers_of
-from fdhil.program.words import Block, Line, clean, read, without_number
+from fdhil.program.o_words import OWordCommand
+from fdhil.program.parameters import ProgramVariables
+from fdhil.program.program_flow import ProgramFlow
+from fdhil.program.program_source import ProgramSource
+from fdhil.program.readable_state import SavedModes, build_named_readings, build_numbered_readings
+from fdhil.program.word_checks import CYCLES, check_machine_words, check_word_usage, require_single_axis_code
+from fdhil.program.words import Block, ParsedLine, clean_line, parse_line, remove_line_number
 
 _VALUE = r"([+-]?(?:\d++\.?\d*+|\.\d++))[ \t]*+"
 _SIMPLE = re.compile(
@@ -57,23 +67,23 @@ class Interpreter:
     def __init__(self, source: Path | Iterable[str], budget: Budget, block_delete: bool) -> None:
         self._budget = budget
         self._block_delete = block_delete
-        self._plain = budget.dialect.plain
-        self._machine = Machine(budget)
+        self._plain = budget.dialect.is_plain
+        self._machine = MotionBuilder(budget)
         modal = self._machine.modal
         modal.wrapped = frozenset(INDEX[axis.lower()] for axis in budget.dialect.wrapped_axes)
-        first = Source(source, budget.max_line_chars)
-        names = names_of(
+        first = ProgramSource(source, budget.max_line_chars)
+        names = build_named_readings(
             modal, lambda: self._flow.source.line, lambda: self._flow.depth, lambda: self._variables.returned
         )
-        self._variables = Variables(budget.max_parameters, numbers_of(modal), names)
-        self._variables.store(5220, 1.0)
-        self._kept = KeptModes(modal, self._variables)
-        self._flow = Flow(first, self._variables, budget, self._kept.returned, self._state)
-        self._series = canned.Series()
-        self._spline = splines.Series()
-        self._nurbs = splines.Nurbs()
-        self._orders = self._other_orders()
-        self._known: dict[str, Command | Line] = {}
+        self._variables = ProgramVariables(budget.max_parameters, build_numbered_readings(modal), names)
+        self._variables.store_number(5220, 1.0)
+        self._kept = SavedModes(modal, self._variables)
+        self._flow = ProgramFlow(first, self._variables, budget, self._kept.end_call, self._copy_state)
+        self._series = canned_cycles.CycleSeries()
+        self._spline = splines.SplineSeries()
+        self._nurbs = splines.NurbsCurve()
+        self._orders = self._build_motion_orders()
+        self._known: dict[str, OWordCommand | ParsedLine] = {}
         self._blocks = self._again = 0
         self._empty_so_far = True
         self._percent = self._tool = self._ended = False
@@ -93,12 +103,12 @@ class Interpreter:
         machine = self._machine
         try:
             while not self._ended:
-                found = self._next_line()
+                found = self._read_next_line()
                 if found is None:
                     self._check_end()
                     break
                 raw, line = found
-                motion = self._simple(raw, line) or self._line(raw, line)
+                motion = self._execute_simple_block(raw, line) or self._execute_line(raw, line)
                 if motion is not None:
                     yield motion
                 elif machine.out:
@@ -111,22 +121,22 @@ class Interpreter:
         finally:
             self._flow.close()
 
-    def _next_line(self) -> tuple[str, int] | None:
+    def _read_next_line(self) -> tuple[str, int] | None:
         """Return the next line to execute and its number, None after the last one; skipped lines are counted too."""
         flow = self._flow
         while True:
-            raw = flow.source.next(flow.repeating)
+            raw = flow.source.read_next_line(flow.repeating)
             if raw is None:
-                flow.at_end()
+                flow.check_at_end()
                 return None
             line = flow.source.line
-            self._count(raw, line)
-            if not flow.skipping:
+            self._count_block(raw, line)
+            if not flow.is_skipping:
                 return raw, line
             self._variables.line = line
-            flow.skip_over(raw, line)
+            flow.skip_line(raw, line)
 
-    def _count(self, raw: str, line: int) -> None:
+    def _count_block(self, raw: str, line: int) -> None:
         self._blocks += 1
         if self._blocks > self._budget.max_blocks:
             what = f"more than {self._budget.max_blocks} blocks were executed; if that is intended,"
@@ -139,17 +149,17 @@ class Interpreter:
                 what += " If not, raise max_repeated_blocks ([nc], or --max-repeated-blocks)"
                 raise GcodeBudget(line, raw.strip()[:24], what)
 
-    def _state(self) -> object:
+    def _copy_state(self) -> object:
         """Return a copy of everything that the program has changed so far, except its position."""
         kept = (self._machine, self._series, self._spline, self._nurbs, self._pending_tool, self._tool)
-        return self._variables.state(), self._kept.state(), deepcopy(kept)
+        return self._variables.copy_state(), self._kept.copy_state(), deepcopy(kept)
 
-    def _simple(self, raw: str, line: int) -> Motion | None:
+    def _execute_simple_block(self, raw: str, line: int) -> Motion | None:
         match = _SIMPLE.fullmatch(raw) if self._plain else None
         if match is None:
             return None
         g, x, y, z, f = match.groups()
-        return self._straight(
+        return self._execute_straight_move(
             line,
             10 * int(g) if g else None,
             float(x) if x else None,
@@ -158,13 +168,13 @@ class Interpreter:
             float(f) if f else None,
         )
 
-    def _straight(
+    def _execute_straight_move(
         self, line: int, code: int | None, x: float | None, y: float | None, z: float | None, f: float | None
     ) -> Motion | None:
         """Execute a block of G0 or G1 (times ten), X, Y, Z and F; return None, without effect, if it is not simple."""
         modal = self._machine.modal
         motion = modal.motion if code is None else code
-        if motion not in (0, 10) or not modal.plain or self._nurbs.points or (x is None and y is None and z is None):
+        if motion not in (0, 10) or not modal.is_plain or self._nurbs.points or (x is None and y is None and z is None):
             return None
         feed = modal.feed_mm_min if f is None else f * modal.scale
         if not 0.0 <= feed < math.inf or (motion == 10 and feed == 0.0):
@@ -174,7 +184,7 @@ class Interpreter:
             if word is not None:
                 value = word * modal.scale
                 position[index] = value if modal.absolute else position[index] + value
-        end = modal.machine(position)
+        end = modal.convert_to_machine(position)
         limit = self._budget.max_coordinate_mm
         if not (abs(end[0]) <= limit and abs(end[1]) <= limit and abs(end[2]) <= limit):
             return None
@@ -189,66 +199,66 @@ class Interpreter:
         corner = modal.corner
         return Rapid(line, end, corner) if motion == 0 else Feed(line, end, feed, corner)
 
-    def _line(self, raw: str, line: int) -> Motion | None:
-        known = self._fetch(raw, line)
+    def _execute_line(self, raw: str, line: int) -> Motion | None:
+        known = self._fetch_line(raw, line)
         if known is None:
             return None
         if known.straight is not None and self._plain:
-            x, y, z, f = (None if value is None else now(value) for value in known.straight)
-            motion = self._straight(line, known.code, x, y, z, f)
+            x, y, z, f = (None if value is None else evaluate_value(value) for value in known.straight)
+            motion = self._execute_straight_move(line, known.code, x, y, z, f)
             if motion is not None:
                 return motion
         if known.words or known.fixed is not None:
-            block = self._block(known)
+            block = self._evaluate_block(known)
             if "call" in block.m:
-                check_readers(block, None)
-                self._ended = not self._flow.call_or_end(block, without_number(clean(raw, line).lstrip("/")))
+                check_word_usage(block, None)
+                self._ended = not self._flow.call_or_end(block, remove_line_number(clean_line(raw, line).lstrip("/")))
                 return None
-            self._execute(block)
-            self._settle(block.settings, line)
+            self._execute_block(block)
+            self._store_settings(block.settings, line)
         else:
-            self._settle(known.values(self._variables), line)
+            self._store_settings(known.evaluate_settings(self._variables), line)
         return None
 
-    def _block(self, known: Line) -> Block:
+    def _evaluate_block(self, known: ParsedLine) -> Block:
         """Return the block of a line at present, with its numbers as the dialect reads them."""
-        return self._budget.dialect.read(known.block(self._variables), self._machine.modal)
+        return self._budget.dialect.scale_block(known.evaluate_block(self._variables), self._machine.modal)
 
-    def _fetch(self, raw: str, line: int) -> Line | None:
+    def _fetch_line(self, raw: str, line: int) -> ParsedLine | None:
         """Return a parsed line, None if it has no words; an O-word is executed."""
         self._variables.line = line
         known = self._known.get(raw)
         if known is None:
-            known = self._read(raw, line)
+            known = self._parse_line(raw, line)
             if known is None:
                 return None
             if self._flow.repeats:
                 if len(self._known) >= self._budget.max_kept_lines:
                     self._known.clear()
                 self._known[raw] = known
-        if isinstance(known, Command):
-            self._flow.execute(known, line)
+        if isinstance(known, OWordCommand):
+            self._flow.execute_command(known, line)
             return None
         return known
 
-    def _settle(self, settings: list[tuple[int | str, float]], line: int) -> None:
+    def _store_settings(self, settings: list[tuple[int | str, float]], line: int) -> None:
         for key, value in settings:
-            self._variables.set(key, value, line)
+            self._variables.set_parameter(key, value, line)
 
-    def _read(self, raw: str, line: int) -> Command | Line | None:
+    def _parse_line(self, raw: str, line: int) -> OWordCommand | ParsedLine | None:
         if raw.strip() == "%":
-            self._at_percent(line)
+            self._process_percent(line)
             return None
-        text = clean(raw, line)
+        text = clean_line(raw, line)
         self._empty_so_far = self._empty_so_far and not raw.strip()
         if text.startswith("/"):
             text = "" if self._block_delete else text[1:]
         if not text:
             return None
-        text = without_number(text)
+        text = remove_line_number(text)
         if text.startswith("o"):
-            return self._flow.read(text)
-        return read(text, self._variables, self._budget.max_nesting)
+            return self._flow.read_command(text)
+        return parse_line(text, self._variables, self._budget.max_nesting)
 
     def _check_end(self) -> None:
         line = max(1, self._flow.source.line)
@@ -257,7 +267,7 @@ class Interpreter:
         if self._empty_so_far:
             raise ProgramError(line, "", "the program is empty; use one with at least one block")
 
-    def _at_percent(self, line: int) -> None:
+    def _process_percent(self, line: int) -> None:
         if self._empty_so_far:
             self._percent, self._empty_so_far = True, False
         elif self._percent or self._flow.depth:
@@ -265,31 +275,31 @@ class Interpreter:
         else:
             raise ProgramError(line, "%", "must enclose the program; add it before the first block")
 
-    def _execute(self, block: Block) -> None:
+    def _execute_block(self, block: Block) -> None:
         machine, modal = self._machine, self._machine.modal
         if machine.compensation is not None:
-            modes.check_compensated(modal, block)
+            block_modes.check_compensated(modal, block)
             if "stop" in block.m or "tool" in block.m:
-                machine.settle()
-        check_readers(block, _motion_of(modal, block))
+                machine.settle_compensation()
+        check_word_usage(block, _determine_motion(modal, block))
         if not block.m and block.g.keys() <= _MOTION_ALONE and block.words.keys().isdisjoint(_MACHINE_WORDS):
-            modes.set_feed(modal, block)
-            self._motion(block, False)
+            block_modes.set_feed(modal, block)
+            self._execute_motion(block, False)
             return
-        one_reader_of_axes(block)
+        require_single_axis_code(block)
         check_machine_words(block)
-        modes.set_feed(modal, block)
-        modes.set_spindle(modal, block)
-        modes.set_switches(modal, block)
+        block_modes.set_feed(modal, block)
+        block_modes.set_spindle(modal, block)
+        block_modes.set_switches(modal, block)
         self._change_tool(block)
-        if "modal state" in block.m and not self._kept.do(block.m["modal state"], self._flow.depth):
-            raise block.fault("M72", "has no modes to restore; save them by M70 first")
+        if "modal state" in block.m and not self._kept.execute_code(block.m["modal state"], self._flow.depth):
+            raise block.build_error("M72", "has no modes to restore; save them by M70 first")
         if block.g.get("one-shot") == 40:
-            modes.dwell(machine, block)
-        modes.set_units(modal, block)
-        self._coordinates(block)
-        modes.set_distance(modal, block)
-        self._motion(block, self._set(block))
+            block_modes.order_dwell(machine, block)
+        block_modes.set_units(modal, block)
+        self._set_coordinates(block)
+        block_modes.set_distance(modal, block)
+        self._execute_motion(block, self._execute_one_shot(block))
         self._ended = self._ended or block.m.get("stop") in _STOPS
 
     def _change_tool(self, block: Block) -> None:
@@ -299,40 +309,42 @@ class Interpreter:
         elif block.m.get("tool") == 61:
             self._tool = block.words.get("q", 0.0) != 0.0
 
-    def _coordinates(self, block: Block) -> None:
+    def _set_coordinates(self, block: Block) -> None:
         modal, g = self._machine.modal, block.g
         if "cutter compensation" in g:
-            modes.compensate(self._machine, block, self._tool)
+            block_modes.switch_compensation(self._machine, block, self._tool)
         if "tool length" in g:
-            offsets.set_tool_length(modal, block)
+            coordinate_systems.set_tool_length(modal, block)
         if "co-ordinate system" in g:
-            offsets.select_system(modal, self._variables, offsets.SYSTEMS[g["co-ordinate system"]])
+            coordinate_systems.select_system(
+                modal, self._variables, coordinate_systems.SYSTEMS[g["co-ordinate system"]]
+            )
 
-    def _set(self, block: Block) -> bool:
+    def _execute_one_shot(self, block: Block) -> bool:
         """Execute a one-shot code; return True if it uses the axis words."""
         modal, variables = self._machine.modal, self._variables
         code = block.g.get("one-shot", 40)
         if code in (281, 301):
-            offsets.store_home(modal, variables, code)
+            coordinate_systems.store_home(modal, variables, code)
         elif code in (921, 922, 923):
-            offsets.drop_g92(modal, variables, code)
+            coordinate_systems.drop_g92(modal, variables, code)
         elif code == 100:
-            offsets.set_data(modal, variables, block)
+            coordinate_systems.set_system_data(modal, variables, block)
         elif code in (920, 520):
-            offsets.set_g92(modal, variables, block)
+            coordinate_systems.set_g92(modal, variables, block)
         elif code in (280, 300):
-            offsets.go_home(self._machine, variables, block)
+            coordinate_systems.go_home(self._machine, variables, block)
         return code in (100, 920, 520, 280, 300) or block.g.get("tool length") == 431
 
-    def _motion(self, block: Block, axes_used: bool) -> None:
+    def _execute_motion(self, block: Block, axes_used: bool) -> None:
         machine, modal = self._machine, self._machine.modal
-        axis = targets.axis_letter(block)
+        axis = targets.find_axis_letter(block)
         before = modal.motion
         if "motion" in block.g:
             modal.motion = block.g["motion"]
         elif "machine co-ordinates" in block.g and modal.motion not in (0, 10):
-            raise block.fault("G53", "needs G0 or G1")
-        elif axes_used or _motion_of(modal, block) is None:
+            raise block.build_error("G53", "needs G0 or G1")
+        elif axes_used or _determine_motion(modal, block) is None:
             return
         code = modal.motion
         if code not in CYCLES:
@@ -342,55 +354,55 @@ class Interpreter:
         if code not in (splines.NURBS_BEGIN, splines.NURBS_END):
             self._nurbs.points.clear()
         if code in roughing.CODES:
-            self._work_contour(block, before)
+            self._execute_contour_cycle(block, before)
         elif code in CYCLES:
-            canned.cycle(machine, block, self._series, before != code)
+            canned_cycles.order_canned_cycle(machine, block, self._series, before != code)
         elif code in self._orders:
             self._orders[code](block)
         elif axis is not None and not axes_used:
-            raise block.fault(axis, "has no motion code; use G0, G1, G2 or G3")
+            raise block.build_error(axis, "has no motion code; use G0, G1, G2 or G3")
 
-    def _other_orders(self) -> Mapping[int, Callable[[Block], None]]:
+    def _build_motion_orders(self) -> Mapping[int, Callable[[Block], None]]:
         machine, modal = self._machine, self._machine.modal
         return {
-            0: lambda block: machine.rapid_to(block, targets.target(modal, block)),
-            10: lambda block: machine.feed_to(block, targets.target(modal, block)),
-            **dict.fromkeys(arcs.CODES, partial(arcs.arc, machine)),
-            **dict.fromkeys(probing.CODES, partial(probing.probe, machine, self._variables)),
-            330: partial(lathe.synchronised, machine),
-            331: partial(lathe.synchronised, machine),
-            760: partial(lathe.threading, machine),
-            **dict.fromkeys(splines.BEZIER_CODES, partial(splines.spline, machine, self._spline)),
-            splines.NURBS_BEGIN: partial(self._nurbs.gather, machine),
+            0: lambda block: machine.move_rapid_to(block, targets.compute_target(modal, block)),
+            10: lambda block: machine.feed_to(block, targets.compute_target(modal, block)),
+            **dict.fromkeys(arcs.CODES, partial(arcs.order_arc, machine)),
+            **dict.fromkeys(probing.CODES, partial(probing.order_probe_move, machine, self._variables)),
+            330: partial(lathe.order_synchronised_feed, machine),
+            331: partial(lathe.order_synchronised_feed, machine),
+            760: partial(lathe.order_threading_cycle, machine),
+            **dict.fromkeys(splines.BEZIER_CODES, partial(splines.order_spline, machine, self._spline)),
+            splines.NURBS_BEGIN: partial(self._nurbs.gather_point, machine),
             splines.NURBS_END: partial(self._nurbs.order_motions, machine),
         }
 
-    def _work_contour(self, block: Block, before: int) -> None:
+    def _execute_contour_cycle(self, block: Block, before: int) -> None:
         """G70 to G72.2: read the contour of subroutine Q without executing its blocks, and machine it."""
         modal, flow = self._machine.modal, self._flow
-        start = roughing.start_of(self._machine, block)
+        start = roughing.move_to_start(self._machine, block)
         here = list(modal.position)
         flow.call_contour(block, str(round(block.words["q"])))
-        contour = roughing.Drawn(modal, before, start)
+        contour = roughing.DrawnContour(modal, before, start)
         depth = flow.depth
         while flow.depth >= depth:
-            found = self._next_line()
+            found = self._read_next_line()
             if found is None:
                 break
             raw, line = found
-            known = self._fetch(raw, line)
+            known = self._fetch_line(raw, line)
             if known is not None:
-                drawn = self._block(known)
-                contour.add(drawn)
-                self._settle(drawn.settings, line)
+                drawn = self._evaluate_block(known)
+                contour.add_block(drawn)
+                self._store_settings(drawn.settings, line)
         modal.position = here
-        roughing.work(self._machine, block, contour, start)
+        roughing.order_contour_cycle(self._machine, block, contour, start)
         modal.motion = contour.motion
 
 
-def _motion_of(modal: Modal, block: Block) -> int | None:
+def _determine_motion(modal: ModalState, block: Block) -> int | None:
     """Return the motion code of the block, or the active one if the block has words for it."""
     if "motion" in block.g:
         return block.g["motion"]
     arc = modal.motion in arcs.CODES and any(letter in block.words for letter in "ijkr")
-    return modal.motion if arc or targets.axis_letter(block) is not None else None
+    return modal.motion if arc or targets.find_axis_letter(block) is not None else None

@@ -6,38 +6,38 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from fdhil.program.machine import Machine
-from fdhil.program.modal import Modal
-from fdhil.program.targets import axis_words, target
+from fdhil.program.modal_state import ModalState
+from fdhil.program.motion_builder import MotionBuilder
+from fdhil.program.targets import collect_axis_words, compute_target
 from fdhil.program.words import Block
 
 _MAX_PASSES = 10_000
 
 
-def synchronised(machine: Machine, block: Block) -> None:
+def order_synchronised_feed(machine: MotionBuilder, block: Block) -> None:
     """G33 feeds K per revolution to its target; G33.1 feeds there and back to its start."""
     modal = machine.modal
     code = modal.code
-    if not axis_words(block):
-        raise block.fault(code, "needs axis words")
+    if not collect_axis_words(block):
+        raise block.build_error(code, "needs axis words")
     if "k" not in block.words:
-        raise block.fault(code, "needs K, the distance per revolution")
+        raise block.build_error(code, "needs K, the distance per revolution")
     start = list(modal.position)
-    feed = _synchronous_feed(modal, block, abs(block.words["k"]) * modal.scale)
-    machine.line_to(block, target(modal, block), feed)
+    feed = _compute_synchronous_feed(modal, block, abs(block.words["k"]) * modal.scale)
+    machine.move_line_to(block, compute_target(modal, block), feed)
     if modal.motion == 331:
-        machine.line_to(block, start, feed * abs(block.words.get("i", 1.0)))
+        machine.move_line_to(block, start, feed * abs(block.words.get("i", 1.0)))
 
 
-def _synchronous_feed(modal: Modal, block: Block, pitch_mm: float) -> float:
+def _compute_synchronous_feed(modal: ModalState, block: Block, pitch_mm: float) -> float:
     if modal.spindle_turns == 0:
         code = modal.code
-        raise block.fault(code, "needs a turning spindle; use S and M3 or M4 first")
+        raise block.build_error(code, "needs a turning spindle; use S and M3 or M4 first")
     return pitch_mm * modal.spindle_rpm
 
 
 @dataclass(frozen=True, slots=True)
-class Thread:
+class ThreadGeometry:
     """A thread in mm.
 
     ``offset`` from the drive line to its crest (negative outside), total ``depth``, depth ``first`` of the first pass,
@@ -60,7 +60,7 @@ class Thread:
         """Feed along a taper that keeps the pitch along Z."""
         return self.feed * math.hypot(self.depth, self.taper) / self.taper if self.taper else self.feed
 
-    def depths(self) -> Iterator[float]:
+    def list_depths(self) -> Iterator[float]:
         """Yield the depth of each pass, the full one ``springs`` times more."""
         number, depth, crest = 1, self.first, abs(self.offset)
         while (
@@ -73,18 +73,20 @@ class Thread:
             yield self.depth
 
 
-def threading(machine: Machine, block: Block) -> None:
+def order_threading_cycle(machine: MotionBuilder, block: Block) -> None:
     """G76: passes of growing depth from the drive line (X at the start) along Z, and a rapid to the end."""
     modal = machine.modal
-    thread = _thread(modal, block)
-    end = target(modal, block)
+    thread = _read_thread(modal, block)
+    end = compute_target(modal, block)
     start = list(modal.position)
-    for depth in thread.depths():
-        _cut(machine, block, thread, start, end[2], depth)
-    machine.rapid_to(block, end)
+    for depth in thread.list_depths():
+        _order_pass(machine, block, thread, start, end[2], depth)
+    machine.move_rapid_to(block, end)
 
 
-def _cut(machine: Machine, block: Block, thread: Thread, start: list[float], end_z: float, depth: float) -> None:
+def _order_pass(
+    machine: MotionBuilder, block: Block, thread: ThreadGeometry, start: list[float], end_z: float, depth: float
+) -> None:
     outward = 1.0 if thread.offset > 0.0 else -1.0
     along = 1.0 if end_z > start[2] else -1.0
     clear = start[0] - outward * (thread.depth - depth)
@@ -92,27 +94,27 @@ def _cut(machine: Machine, block: Block, thread: Thread, start: list[float], end
     first_z = start[2] + along * depth * thread.slide
     last_z = end_z - along * (thread.depth - depth) * thread.slide
 
-    def at(x: float, z: float) -> list[float]:
+    def build_position(x: float, z: float) -> list[float]:
         return [x, start[1], z, *start[3:]]
 
-    machine.rapid_to(block, at(clear, first_z))
+    machine.move_rapid_to(block, build_position(clear, first_z))
     if thread.at_entry:
-        machine.line_to(block, at(crest, first_z), thread.taper_feed)
-        machine.line_to(block, at(root, first_z + along * thread.taper), thread.taper_feed)
+        machine.move_line_to(block, build_position(crest, first_z), thread.taper_feed)
+        machine.move_line_to(block, build_position(root, first_z + along * thread.taper), thread.taper_feed)
     else:
-        machine.rapid_to(block, at(root, first_z))
+        machine.move_rapid_to(block, build_position(root, first_z))
     if thread.at_exit:
-        machine.line_to(block, at(root, last_z - along * thread.taper), thread.feed)
-        machine.line_to(block, at(crest, last_z), thread.taper_feed)
+        machine.move_line_to(block, build_position(root, last_z - along * thread.taper), thread.feed)
+        machine.move_line_to(block, build_position(crest, last_z), thread.taper_feed)
     else:
-        machine.line_to(block, at(root, last_z), thread.feed)
-    machine.rapid_to(block, at(clear, last_z))
+        machine.move_line_to(block, build_position(root, last_z), thread.feed)
+    machine.move_rapid_to(block, build_position(clear, last_z))
 
 
-def _thread(modal: Modal, block: Block) -> Thread:
+def _read_thread(modal: ModalState, block: Block) -> ThreadGeometry:
     words = block.words
-    if not axis_words(block):
-        raise block.fault("G76", "needs Z, the thread's end")
+    if not collect_axis_words(block):
+        raise block.build_error("G76", "needs Z, the thread's end")
     for letter, meaning in (
         ("p", "the pitch"),
         ("i", "the thread's offset"),
@@ -120,16 +122,16 @@ def _thread(modal: Modal, block: Block) -> Thread:
         ("k", "the depth"),
     ):
         if letter not in words:
-            raise block.fault("G76", f"needs {letter.upper()}, {meaning}")
+            raise block.build_error("G76", f"needs {letter.upper()}, {meaning}")
     if words["i"] == 0.0 or words["p"] <= 0.0 or not 0.0 < words["j"] < words["k"]:
-        raise block.fault("G76", "needs P and J greater than 0, K greater than J, and I other than 0")
+        raise block.build_error("G76", "needs P and J greater than 0, K greater than J, and I other than 0")
     ends = round(words.get("l", 0.0))
     degression, springs, angle = words.get("r", 1.0), words.get("h", 0.0), words.get("q", 0.0)
     if ends < 0 or springs != round(springs) or springs > _MAX_PASSES or not abs(angle) < 89.0:
-        raise block.fault("G76", "needs H whole, L not negative, and Q below 89 degrees")
+        raise block.build_error("G76", "needs H whole, L not negative, and Q below 89 degrees")
     half = modal.scale * (0.5 if modal.diameter else 1.0)
-    return Thread(
-        feed=_synchronous_feed(modal, block, words["p"] * modal.scale),
+    return ThreadGeometry(
+        feed=_compute_synchronous_feed(modal, block, words["p"] * modal.scale),
         offset=words["i"] * half,
         first=words["j"] * half,
         depth=words["k"] * half,

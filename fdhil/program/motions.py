@@ -34,7 +34,7 @@ class Corner:
 BLEND = Corner()
 
 
-class Turned(NamedTuple):
+class AxisMove(NamedTuple):
     """The order for one axis of A B C (degrees) U V W (mm) in machine co-ordinates."""
 
     axis: str
@@ -52,7 +52,7 @@ class Rapid:
     line: int
     end: Point
     corner: Corner = BLEND
-    rotary: tuple[Turned, ...] = ()
+    rotary: tuple[AxisMove, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class Feed:
     end: Point
     feed: float
     corner: Corner = BLEND
-    rotary: tuple[Turned, ...] = ()
+    rotary: tuple[AxisMove, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ class Arc:
     plane: str
     feed: float
     corner: Corner = BLEND
-    rotary: tuple[Turned, ...] = ()
+    rotary: tuple[AxisMove, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,7 @@ class Dwell:
 Motion = Rapid | Feed | Arc | Dwell
 
 
-def reached(motion: Rapid | Feed | Arc, start: Place) -> Place:
+def compute_end(motion: Rapid | Feed | Arc, start: Place) -> Place:
     """Return where a motion from ``start`` ends, of all axes."""
     end = [*motion.end, *start[3:]]
     for turned in motion.rotary:
@@ -109,7 +109,7 @@ def reached(motion: Rapid | Feed | Arc, start: Place) -> Place:
     return tuple(end)
 
 
-class Swept(NamedTuple):
+class SweptArc(NamedTuple):
     """An arc's geometry in mm and rad: its ``centre``, the ``radii`` at its ends, start angle and swept angle.
 
     Points in a plane are complex: first + j second axis.
@@ -123,28 +123,28 @@ class Swept(NamedTuple):
     length_mm: float
 
     @staticmethod
-    def of(motion: Arc, start: Sequence[float]) -> Swept:
+    def create_from_arc(motion: Arc, start: Sequence[float]) -> SweptArc:
         """Return the geometry of an arc from ``start``."""
         axes = PLANE_AXES[motion.plane]
         centre = complex(motion.centre[axes[0]] or 0.0, motion.centre[axes[1]] or 0.0)
-        return swept(start, motion.end, centre, motion.turns, axes)
+        return sweep_arc(start, motion.end, centre, motion.turns, axes)
 
 
-def swept(
+def sweep_arc(
     start: Sequence[float], end: Sequence[float], centre: complex, turns: int, axes: tuple[int, int, int]
-) -> Swept:
+) -> SweptArc:
     """Return the arc from start to end about a centre in the plane of ``axes`` (first, second, normal)."""
     first, second, normal = axes
     begin = complex(start[first], start[second]) - centre
     finish = complex(end[first], end[second]) - centre
     radii = abs(begin), abs(finish)
-    angle = _swept_rad(begin, finish, turns)
+    angle = _compute_swept_rad(begin, finish, turns)
     rise = end[normal] - start[normal]
     length = math.hypot((radii[0] + radii[1]) / 2.0 * angle, rise)
-    return Swept(centre, radii, cmath.phase(begin), angle, rise, length)
+    return SweptArc(centre, radii, cmath.phase(begin), angle, rise, length)
 
 
-def _swept_rad(begin: complex, finish: complex, turns: int) -> float:
+def _compute_swept_rad(begin: complex, finish: complex, turns: int) -> float:
     """Return the signed angle (rad) from one radius to the other: coincident ones give a full circle."""
     circle = 2.0 * math.pi
     angle = math.remainder(cmath.phase(finish) - cmath.phase(begin), circle)
@@ -157,25 +157,25 @@ def _swept_rad(begin: complex, finish: complex, turns: int) -> float:
     return angle + (turns - (1 if turns > 0 else -1)) * circle
 
 
-def as_json(motion: Motion) -> dict[str, Any]:
+def serialise_motion(motion: Motion) -> dict[str, Any]:
     """Return one motion as the object that ``interpret --json`` lists: mm, mm/min and s with 6 decimals."""
     if isinstance(motion, Dwell):
         return {"line": motion.line, "kind": "dwell", "seconds": round(motion.seconds, 6)}
     shown: dict[str, Any] = {
         "line": motion.line,
         "kind": type(motion).__name__.lower(),
-        "end": [_shown(value) for value in motion.end],
+        "end": [_round_coordinate(value) for value in motion.end],
     }
     if isinstance(motion, Arc):
-        shown["centre"] = [None if value is None else _shown(value) for value in motion.centre]
+        shown["centre"] = [None if value is None else _round_coordinate(value) for value in motion.centre]
         shown["turns"] = motion.turns
         shown["plane"] = motion.plane
     if not isinstance(motion, Rapid):
-        shown["feed"] = _shown(motion.feed)
+        shown["feed"] = _round_coordinate(motion.feed)
     if motion.rotary:
-        shown["rotary"] = {turned.axis: _shown(turned.end) for turned in motion.rotary}
+        shown["rotary"] = {turned.axis: _round_coordinate(turned.end) for turned in motion.rotary}
     return shown
 
 
-def _shown(value: float) -> float:
+def _round_coordinate(value: float) -> float:
     return round(value, 6) + 0.0  # + 0.0 makes the negative zero positive

@@ -12,7 +12,7 @@ _LOCAL = range(1, LOCAL_NUMBERS + 1)
 _READ_ONLY = frozenset({*range(5400, 5410), *range(5420, 5429)})
 
 
-class Variables:
+class ProgramVariables:
     """The parameters #1 to #5602 and #<name>; #1 to #30 and names without leading underscore are local to the call.
 
     ``line`` is the executed line, ``returned`` the value of the last subroutine; ``state_numbers`` and ``state_names``
@@ -35,7 +35,7 @@ class Variables:
         self._state_numbers = state_numbers
         self._state_names = state_names
 
-    def number(self, index: int) -> float:
+    def get_numbered(self, index: int) -> float:
         """Return #index; 0 if it was never set."""
         if index in self._state_numbers:
             return self._state_numbers[index]()
@@ -43,13 +43,13 @@ class Variables:
             raise KeyError(index)
         return self._numbers.get(index, 0.0)
 
-    def named(self, name: str) -> float:
+    def get_named(self, name: str) -> float:
         """Return #<name>."""
         if name in self._state_names:
             return float(self._state_names[name]())
         return (self._globals if name.startswith("_") else self._locals)[name]
 
-    def set(self, key: int | str, value: float, line: int) -> None:
+    def set_parameter(self, key: int | str, value: float, line: int) -> None:
         """Set #key; ProgramError for a read-only one, one out of range, or too many."""
         if isinstance(key, int):
             if key in self._state_numbers or key in _READ_ONLY or not 1 <= key <= LAST_NUMBER:
@@ -63,15 +63,15 @@ class Variables:
             raise GcodeBudget(line, f"#<{key}>", f"exceeds the {self._max} parameters allowed")
         names[key] = value
 
-    def store(self, index: int, value: float) -> None:
+    def store_number(self, index: int, value: float) -> None:
         """Set a numbered parameter on behalf of the machine (offsets, homes)."""
         self._numbers[index] = value
 
-    def state(self) -> object:
+    def copy_state(self) -> object:
         """Return a copy of all parameters of the program and of the current call."""
         return dict(self._numbers), dict(self._globals), dict(self._locals), self.returned
 
-    def enter(self, arguments: list[float] | None) -> None:
+    def enter_call(self, arguments: list[float] | None) -> None:
         """Begin a call: its own local names and #1 to #30, the arguments first; None (M98) keeps the numbers."""
         saved = None
         if arguments is not None:
@@ -80,7 +80,7 @@ class Variables:
         self._stack.append((saved, self._locals))
         self._locals = {}
 
-    def leave(self) -> None:
+    def leave_call(self) -> None:
         """End a call and restore the caller's local parameters."""
         saved, self._locals = self._stack.pop()
         if saved is not None:

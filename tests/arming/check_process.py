@@ -15,13 +15,13 @@ from fdhil.arming.background_check import FOLDER
 from fdhil.arming.code_digest import MAKER, find_code_files
 from fdhil.config import MachineConfig
 from fdhil.prediction.axis_models import build_nominal_models
-from fdhil.program import program_digest
+from fdhil.program import compute_program_digest
 
 
 def make_request(program: Path, config: MachineConfig, folder: Path) -> bytes:
     request = {
         "program": str(program),
-        "program_digest": program_digest(program),
+        "program_digest": compute_program_digest(program),
         "config": config.model_dump(mode="json"),
         "models": {axis: model.as_dict() for axis, model in build_nominal_models(config).items()},
         "folder": str(folder / FOLDER),

@@ -28,13 +28,13 @@ from fdhil.arming.arming_service import ArmingService
 from fdhil.arming.model_tracker import AxisModelState, ModelTracker
 from fdhil.arming.operator_token import read_token
 from fdhil.arming.whole_plan import plan_whole_program
-from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
-from fdhil.commissioning.void import void_record
+from fdhil.commissioning.commissioning_record import CommissioningRecord, compute_axis_digest, save_record
+from fdhil.commissioning.void_mark import mark_record_void
 from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.errors import ConfigError, ProgramError
 from fdhil.identification.drive_loops.loop_identification import DIFFER
-from fdhil.program import loading, program_digest
+from fdhil.program import compute_program_digest, program_loading
 from fdhil.records import LoopEstimate, Notice, Reason, Skill, Verdict
 from fdhil.store.history_rows import Revision, TimeStamp
 from tests.daemon.simulated_machine import config_of
@@ -69,7 +69,7 @@ def make_record(config: MachineConfig, **changes: Any) -> CommissioningRecord:
         product_code=2,
         revision=3,
         serial=4,
-        config_digest=axis_digest(config, "X"),
+        config_digest=compute_axis_digest(config, "X"),
         mapping_fingerprint="f",
         options={"6007": 1},
         following_error_window_um=10_000.0,
@@ -84,7 +84,7 @@ def make_record(config: MachineConfig, **changes: Any) -> CommissioningRecord:
 
 def save_records(config: MachineConfig, **changes: Any) -> None:
     save_record(make_record(config, **changes), config.store.directory)
-    other = make_record(config, axis="Y", config_digest=axis_digest(config, "Y"))
+    other = make_record(config, axis="Y", config_digest=compute_axis_digest(config, "Y"))
     save_record(other, config.store.directory)
 
 
@@ -107,7 +107,7 @@ def test_all_facts_hold_for_a_good_machine(config: MachineConfig, program: Path)
     assert all(armament.facts.values()), armament.facts
     told = armament.summarise()
     assert told["after"]["rms_um"] < 0.2 * told["before"]["rms_um"]
-    assert told["program_digest"] == program_digest(program)
+    assert told["program_digest"] == compute_program_digest(program)
     assert told["rows"] == len(armament.first_piece.offset["X"])
     assert armament.first_piece.final
 
@@ -135,7 +135,7 @@ def test_fact_that_does_not_hold_is_withheld(changes: dict[str, Any], withheld: 
 @pytest.mark.fault("A23")
 def test_void_record_withholds_commissioned(config: MachineConfig, program: Path) -> None:
     save_records(config)
-    void_record(config.store.directory, "X", "booted")
+    mark_record_void(config.store.directory, "X", "booted")
     armament = make_whole_plan(program, config)
     assert isinstance(armament, ArmPlan)
     assert [name for name, good in armament.facts.items() if not good] == ["commissioned"]
@@ -218,7 +218,7 @@ async def test_wrong_token_is_refused_and_missing_guard_reported(config: Machine
         answer = await desk.arm(request | {"token": token})
         assert (answer["ok"], answer["code"]) == (False, "AuthRequired")
     token = read_token(config.store.run_directory)
-    meant = {"token": token, "program_digest": program_digest(program)}
+    meant = {"token": token, "program_digest": compute_program_digest(program)}
     assert (await desk.arm(request | meant))["code"] == "GuardAbsent"
     program.write_bytes(program.read_bytes() + b"\n")
     assert (await desk.arm(request | meant))["code"] == "ProgramMismatch"
@@ -251,12 +251,12 @@ def test_sparse_file_is_refused_by_its_size(name: str, config: MachineConfig, tm
 
 
 def test_program_that_grows_while_it_is_read_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loading, "MAX_BYTES", 10)
+    monkeypatch.setattr(program_loading, "MAX_BYTES", 10)
     monkeypatch.setattr(os, "fstat", lambda _file: SimpleNamespace(st_mode=stat.S_IFREG, st_size=4))
     program = tmp_path / "program.ngc"
     program.write_bytes(b"G1 X10 F1000\n")
     with pytest.raises(ProgramError, match="is larger than"):
-        program_digest(program)
+        compute_program_digest(program)
 
 
 def test_changed_load_holds_until_new_parameters(config: MachineConfig, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from fdhil.arming.arm_plan import MODEL_AGE_S, FeedforwardPlan, Refusal, collect_feedforward_facts, prepare_feedforward
-from fdhil.commissioning.record import axis_digest, save_record
+from fdhil.commissioning.commissioning_record import compute_axis_digest, save_record
 from fdhil.config import FeedforwardLimits, MachineConfig
 from fdhil.guard.interlocks import FEEDFORWARD_FACTS
 from fdhil.guard.request_parsing import parse_law
@@ -26,7 +26,7 @@ def config(tmp_path: Path) -> MachineConfig:
 def save_records(config: MachineConfig, **changes: Any) -> None:
     for axis in "XY":
         options = {"6007": 1, "1402": 0x400 + config.get_node_id(axis)}
-        values: dict[str, Any] = {"axis": axis, "config_digest": axis_digest(config, axis), "options": options}
+        values: dict[str, Any] = {"axis": axis, "config_digest": compute_axis_digest(config, axis), "options": options}
         save_record(make_record(config, **(values | (changes if axis == "X" else {}))), config.store.directory)
 
 

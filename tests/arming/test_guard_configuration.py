@@ -9,8 +9,8 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.arming.guard_configuration import compute_heartbeat_timeout_s, compute_offset_limits, make_guard_settings
-from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
-from fdhil.commissioning.void import void_record
+from fdhil.commissioning.commissioning_record import CommissioningRecord, compute_axis_digest, save_record
+from fdhil.commissioning.void_mark import mark_record_void
 from fdhil.config import CorrectionLimits, Drive, TableEncoder
 from fdhil.drivers.cia402.drive_profile import DriveProfile
 from fdhil.drivers.cia402.drive_profile_file import load_profile
@@ -60,7 +60,7 @@ def test_software_limits_are_those_of_commissioning(tmp_path: Path) -> None:
 
 def test_settings_contain_record_and_its_validity(tmp_path: Path) -> None:
     config = machine_config.load_config(write_config(tmp_path, 1))
-    store, signed = config.store.directory, replace(RECORD, config_digest=axis_digest(config, "X"))
+    store, signed = config.store.directory, replace(RECORD, config_digest=compute_axis_digest(config, "X"))
 
     def known() -> list[tuple[str, bool]]:
         return [(axis.record, axis.record_void) for axis in make_guard_settings(config, "can0", tmp_path, "").axes]
@@ -71,7 +71,7 @@ def test_settings_contain_record_and_its_validity(tmp_path: Path) -> None:
     assert known() == [("", False), ("", False)]
     save_record(signed, store)
     assert known() == [(signed.fingerprint, False), ("", False)]
-    void_record(store, "X", "booted")
+    mark_record_void(store, "X", "booted")
     assert known() == [(signed.fingerprint, True), ("", False)]
     made = make_guard_settings(config, "can0", tmp_path, "")
     assert decode_settings(encode_settings(made)) == made
@@ -103,6 +103,6 @@ def test_guard_identifiers_are_not_used_by_others(tmp_path: Path, monkeypatch: p
     elsewhere = drives["Y"].drive.model_copy(update={"node_id": 2})
     drives["Y"] = drives["Y"].model_copy(update={"drive": elsewhere})
     monkeypatch.setattr("fdhil.arming.guard_configuration.load_profile", other)
-    monkeypatch.setattr("fdhil.commissioning.identifiers.load_profile", other)
+    monkeypatch.setattr("fdhil.commissioning.cob_id_conflicts.load_profile", other)
     with pytest.raises(ConfigError, match=r"axis.Y.drive.profile: COB-ID"):
         make_guard_settings(config.model_copy(update={"axis": drives}), "can0", tmp_path, "")

@@ -27,7 +27,7 @@ from fdhil.arming.program_check import KEPT, SCHEMA, answer_request, check_progr
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError, StoreError
 from fdhil.prediction.axis_models import apply_loops, build_nominal_models
-from fdhil.program import load_trajectory, program_digest
+from fdhil.program import compute_program_digest, load_trajectory
 from fdhil.records import Reason
 from tests.arming.check_process import make_request, replace_output, run_check_process
 from tests.arming.test_arm_plan import make_model_states, save_records
@@ -52,7 +52,9 @@ def write_program(folder: Path, text: str) -> Path:
 
 def run_check(program: Path, config: MachineConfig) -> tuple[dict[str, Any], bytes, list[Any]]:
     body, told = io.BytesIO(), list[Any]()
-    header = check_program(program, program_digest(program), build_nominal_models(config), config, body, told.append)
+    header = check_program(
+        program, compute_program_digest(program), build_nominal_models(config), config, body, told.append
+    )
     return header, body.getvalue(), told
 
 
@@ -95,7 +97,7 @@ def test_block_is_written_before_it_is_reported(config: MachineConfig, tmp_path:
             seen = end
 
     with file.open("wb") as body:
-        check_program(program, program_digest(program), build_nominal_models(config), config, body, look)
+        check_program(program, compute_program_digest(program), build_nominal_models(config), config, body, look)
     assert seen > 15_000
 
 
@@ -138,7 +140,7 @@ def test_checked_program_is_armed_and_streamed(config: MachineConfig, tmp_path: 
     assert isinstance(again, CheckedProgram)
     armament = prepare_program(found, first, config, make_model_states(config))
     assert all(armament.facts.values()), armament.facts
-    assert armament.stream.program_digest == program_digest(program)
+    assert armament.stream.program_digest == compute_program_digest(program)
     stream, pieces = armament.stream, [armament.first_piece]
     assert len(pieces[0].demand["X"]) == 10_000
     assert first.is_complete
@@ -182,7 +184,7 @@ async def test_abandoned_check_is_reported_and_leaves_no_files(config: MachineCo
     program = write_program(tmp_path, HEAD + SQUARE * 2000 + "M2\n")
     check = BackgroundCheck(config)
     running = asyncio.create_task(
-        check.check_until(program, program_digest(program), build_nominal_models(config), read_all_rows)
+        check.check_until(program, compute_program_digest(program), build_nominal_models(config), read_all_rows)
     )
     async with asyncio.timeout(500):
         while not (check.progress or {}).get("checked_s"):  # noqa: ASYNC110 - what another process says has no event
@@ -205,12 +207,12 @@ async def test_subroutine_in_program_folder_is_part_of_check(config: MachineConf
     beside = tmp_path / "square.ngc"
     beside.write_text(BESIDE)
     program = write_program(tmp_path, CALLS)
-    digest, models = program_digest(program), build_nominal_models(config)
+    digest, models = compute_program_digest(program), build_nominal_models(config)
     folder, key = config.store.directory / FOLDER, BackgroundCheck(config)._make_key(digest, models, config)
     header = store_checked(
         folder, key, lambda body: check_program(program, digest, models, config, body, lambda _told: None)
     )
-    assert header["files"] == {"square.ngc": program_digest(beside)}
+    assert header["files"] == {"square.ngc": compute_program_digest(beside)}
     first = await BackgroundCheck(config).check_until(program, digest, models, read_all_rows)
     assert isinstance(first, CheckedProgram)
     assert [list(block[:2]) for block in first.blocks] == header["blocks"]  # it is known
@@ -222,7 +224,7 @@ async def test_subroutine_in_program_folder_is_part_of_check(config: MachineConf
     assert isinstance(again, CheckedProgram)
     assert again.blocks != first.blocks
     assert again.header is not None
-    assert again.header["files"] == {"square.ngc": program_digest(beside)}
+    assert again.header["files"] == {"square.ngc": compute_program_digest(beside)}
     beside.unlink()
     assert CheckedProgram.find_checked(file.parent, file.stem, tmp_path) is None
 
@@ -238,7 +240,9 @@ def test_file_changed_during_check_is_refused(which: str, config: MachineConfig,
             file.write("(another)\n")
 
     with pytest.raises(ProgramError, match=f"{which} was modified while it was checked"):
-        check_program(program, program_digest(program), build_nominal_models(config), config, io.BytesIO(), change)
+        check_program(
+            program, compute_program_digest(program), build_nominal_models(config), config, io.BytesIO(), change
+        )
 
 
 @pytest.mark.usefixtures("processes")
@@ -248,7 +252,7 @@ async def test_process_death_within_a_line_is_reported(
     program = write_program(tmp_path, LONG)
     replace_output(monkeypatch, tmp_path, 'read line\nprintf \'{"header": {"ref\'\nexit 9\n')
     refused = await BackgroundCheck(config).check_until(
-        program, program_digest(program), build_nominal_models(config), read_all_rows
+        program, compute_program_digest(program), build_nominal_models(config), read_all_rows
     )
     assert isinstance(refused, tuple)
     assert (refused[0].code, "exit code 9" in refused[0].text) == ("InternalError", True)
@@ -260,7 +264,9 @@ async def test_process_that_cannot_start_is_reported(
 ) -> None:
     program, check = write_program(tmp_path, LONG), BackgroundCheck(config)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "absent"))
-    refused = await check.check_until(program, program_digest(program), build_nominal_models(config), read_all_rows)
+    refused = await check.check_until(
+        program, compute_program_digest(program), build_nominal_models(config), read_all_rows
+    )
     assert isinstance(refused, tuple)
     assert refused[0].text == "the check cannot be started (No such file or directory)"
     await check.raise_failure()  # it is no fault of the daemon
@@ -276,7 +282,7 @@ async def test_faulty_program_is_refused_with_its_line(
     (tmp_path / "answer").write_bytes(answer)
     replace_output(monkeypatch, tmp_path, f"read line\nexec cat '{tmp_path / 'answer'}'\n")
     refused = await BackgroundCheck(config).check_until(
-        program, program_digest(program), build_nominal_models(config), read_all_rows
+        program, compute_program_digest(program), build_nominal_models(config), read_all_rows
     )
     assert isinstance(refused, tuple)
     assert refused[0].code == "ProgramError"
@@ -376,7 +382,7 @@ def test_store_error_is_reported(tmp_path: Path) -> None:
 
 def test_other_terms_or_loops_need_another_check(config: MachineConfig, tmp_path: Path) -> None:
     program = write_program(tmp_path, HEAD + SQUARE + "G4 P0.3\nM2\n")
-    digest, six = program_digest(program), build_nominal_models(config)
+    digest, six = compute_program_digest(program), build_nominal_models(config)
     rich = {axis: model.replace_values(stribeck=2.0, stribeck_speed=10.0) for axis, model in six.items()}
     filtered = apply_loops(config, {axis: {"speed_filter_s": 5e-4} for axis in config.axis}, "test")
     background, bodies = BackgroundCheck(config), dict[str, bytes]()

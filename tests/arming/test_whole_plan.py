@@ -18,7 +18,7 @@ from fdhil.arming.whole_plan import plan_whole_program
 from fdhil.config import MachineConfig, parse_config
 from fdhil.errors import ProgramError
 from fdhil.prediction.axis_models import build_nominal_models
-from fdhil.program import program_digest
+from fdhil.program import compute_program_digest
 from tests.arming.test_arm_plan import make_whole_plan
 from tests.bench import bench_config, bench_document
 from tests.daemon.simulated_machine import config_of
@@ -71,7 +71,9 @@ def test_program_beyond_32_bits_is_refused_by_both_checks(tmp_path: Path) -> Non
         with pytest.raises(ProgramError, match=told):
             make_whole_plan(program, config, method)
     with pytest.raises(ProgramError, match=told):
-        check_program(program, program_digest(program), build_nominal_models(config), config, io.BytesIO(), print)
+        check_program(
+            program, compute_program_digest(program), build_nominal_models(config), config, io.BytesIO(), print
+        )
 
 
 @pytest.mark.parametrize("name", ["program.ngc", "program.csv"])
@@ -79,7 +81,7 @@ def test_rows_and_digest_belong_to_the_same_content(name: str, config: MachineCo
     program, other = tmp_path / name, tmp_path / "other"
     texts = {".ngc": FAR.format(30), ".csv": "time_s,X_mm,Y_mm\n0.000,0,0\n0.001,0,0\n0.002,0,0\n"}
     program.write_text(texts[program.suffix])
-    request = ArmRequest(program, program_digest(program), build_nominal_models(config), config, "mirror")
+    request = ArmRequest(program, compute_program_digest(program), build_nominal_models(config), config, "mirror")
     other.write_text(texts[program.suffix].replace("0", "0.0", 1))
     other.rename(program)
     with pytest.raises(ProgramError, match="was modified while it was checked"):

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from fdhil.cli.doctor.latency import measure_latency, store_latency
-from fdhil.commissioning.record import axis_digest, save_record
-from fdhil.commissioning.void import void_record
+from fdhil.commissioning.commissioning_record import compute_axis_digest, save_record
+from fdhil.commissioning.void_mark import mark_record_void
 from fdhil.config import MachineConfig
 from fdhil.records import Notice
 from fdhil.store.history_database import History
@@ -39,7 +39,7 @@ def _proven(tmp_path: Path) -> MachineConfig:
         for axis in ("X", "Y"):
             number = history.add_window(make_outcome(of=make_window(axis=axis)), "", STAMP)
             history.add_revision(make_published(axis=axis), [number], STAMP)
-            made = replace(RECORD, axis=axis, config_digest=axis_digest(machine, axis))
+            made = replace(RECORD, axis=axis, config_digest=compute_axis_digest(machine, axis))
             save_record(made, machine.store.directory)
     return machine
 
@@ -64,7 +64,7 @@ def test_commissioned_machine_is_accepted(proven: MachineConfig, tmp_path: Path,
 
 def test_report_names_each_open_point(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
     """Each open point has an action, and the exit code is 1."""
-    void_record(proven.store.directory, "X", "booted")
+    mark_record_void(proven.store.directory, "X", "booted")
     save_record(replace(RECORD, axis="Y", config_digest="other"), proven.store.directory)
     options = ("--out", tmp_path / "a.html", "--circle-um", "0.001", "--contour-um", "5", *CIRCLE)
     code, out, _ = fdhil("acceptance", tmp_path / "machine.toml", *options, capsys=capsys)

@@ -19,11 +19,11 @@ import can
 import pytest
 
 from fdhil.cli.main import cli, run_safely
-from fdhil.commissioning.bus_listener import LISTEN_S
-from fdhil.commissioning.compare import RECORD_POINT
+from fdhil.commissioning.commissioning_record import load_record
 from fdhil.commissioning.finding import Finding
-from fdhil.commissioning.record import load_record
-from fdhil.commissioning.void import is_void, void_record
+from fdhil.commissioning.record_comparison import RECORD_POINT
+from fdhil.commissioning.traffic_listener import LISTEN_S
+from fdhil.commissioning.void_mark import is_record_void, mark_record_void
 from fdhil.config import load_config
 from fdhil.sim.drive.drive_objects import compute_serial_number
 from fdhil.sim.wire.tcp_hub import TcpHub
@@ -36,9 +36,9 @@ WAITS: tuple[tuple[str, str, float], ...] = (
     ("commissioning.scan", "LISTEN_S", 0.3),
     ("commissioning.scan", "ANSWER_S", 1.0),
     ("commissioning.config_check", "LISTEN_S", 0.3),
-    ("commissioning.survey", "LISTEN_S", 0.3),
-    ("commissioning.steps", "SETTLE_CYCLES", 120),
-    ("commissioning.steps", "AVERAGE_CYCLES", 400),
+    ("commissioning.drive_survey", "LISTEN_S", 0.3),
+    ("commissioning.commissioning_steps", "SETTLE_CYCLES", 120),
+    ("commissioning.commissioning_steps", "AVERAGE_CYCLES", 400),
     ("commissioning.watchdog", "STARVE_TIMEOUT_S", 15.0),  # simulated drives are slower on a slow host
     ("drivers.can.sdo_channel", "RESPONSE_TIMEOUT_S", 5.0),
     ("drivers.can.sdo_channel", "DEADLINE_S", 20.0),
@@ -256,11 +256,11 @@ def test_void_records_stay_void_when_guard_refuses_comparison(
         return [("axis X", Finding(RECORD_POINT, "f", "f"))]
 
     monkeypatch.setattr("fdhil.commissioning.config_check.check_machine", compare)
-    void_record(config.store.directory, "X", "booted")
+    mark_record_void(config.store.directory, "X", "booted")
     code, _, err = run_fdhil("check", path, "--json")
     assert code == 0
     assert ("NotOff: a correction is on; run fdhil check again" if answer else "void records stay void") in err
-    assert is_void(config.store.directory, "X")
+    assert is_record_void(config.store.directory, "X")
     guard.close()
 
 
@@ -276,25 +276,25 @@ def test_doubt_during_comparison_keeps_record_void(
     void = {"code": "RecordVoid", "axis": "Y", "text": "axis Y: it has booted", "advice": "run fdhil check"}
 
     def compare(*_: object) -> list[tuple[str, Finding]]:
-        void_record(store, "X", "booted again")
+        mark_record_void(store, "X", "booted again")
         guard.says = lambda kind: {"ok": False, "refused": [void]} if kind == "compared" else said
         return [(f"axis {axis}", Finding(RECORD_POINT, "f", "f")) for axis in "XY"]
 
     monkeypatch.setattr("fdhil.commissioning.config_check.check_machine", compare)
     guard.says = lambda _kind: said
     for axis in "XY":
-        void_record(store, axis, "booted")
+        mark_record_void(store, axis, "booted")
     code, _, err = run_fdhil("check", path, "--json")
     assert code == 0
     assert guard.requests[-1]["touched"] == {"X": 3, "Y": 0}
-    assert [is_void(store, axis) for axis in "XY"] == [True, True]
+    assert [is_record_void(store, axis) for axis in "XY"] == [True, True]
     assert "RecordVoid: axis X: its drive changed again after the comparison" in err
     assert "RecordVoid: axis Y: it has booted; run fdhil check again" in err
     guard.close()
     (config.guard_directory / "guard.sock").unlink()
     monkeypatch.setattr("fdhil.commissioning.config_check.check_machine", lambda *_: compare()[1:])
     assert run_fdhil("check", path, "--json")[0] == 0
-    assert [is_void(store, axis) for axis in "XY"] == [True, False]
+    assert [is_record_void(store, axis) for axis in "XY"] == [True, False]
 
 
 @pytest.mark.usefixtures("real_time")

@@ -15,12 +15,22 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.cli.main import cli, run_safely
-from fdhil.commissioning.record import load_record
+from fdhil.commissioning.commissioning_record import load_record
 from fdhil.errors import DriveFault
 from fdhil.store import audit_file
 from fdhil.store.history_database import History
 from tests.bench import bench_toml
-from tests.commissioning.foreign_nc import A_FEW, FOREIGN, NMT, OFFSET, SDO, SYNC, ForeignNc, LateOperator, is_offset
+from tests.commissioning.foreign_nc import (
+    A_FEW,
+    FOREIGN,
+    NMT,
+    OFFSET,
+    SDO,
+    SYNC,
+    ForeignNc,
+    LateOperator,
+    is_offset_frame,
+)
 from tests.drivers.peer import DrivePeer
 from tests.eds import write_eds
 from tests.short_waits import shorten_waits
@@ -29,11 +39,11 @@ from tests.tiers import sampled
 WAITS = {
     "commissioning.watchdog.STARVE_TIMEOUT_S": 1.0,
     "drivers.can.sdo_channel.RESPONSE_TIMEOUT_S": 0.2,
-    "commissioning.strokes.JOG_MM": 1.0,
-    "commissioning.trial.TIMING_CYCLES": 100,
-    "commissioning.trial.TRIAL_RAPIDS": 4,
-    "commissioning.trial.REST_S": 0.6,
-    "commissioning.trial.LAST_REST_S": 0.4,
+    "commissioning.stroke_planning.JOG_MM": 1.0,
+    "commissioning.axis_trial.TIMING_CYCLES": 100,
+    "commissioning.axis_trial.TRIAL_RAPIDS": 4,
+    "commissioning.axis_trial.REST_S": 0.6,
+    "commissioning.axis_trial.LAST_REST_S": 0.4,
 }
 TRUE = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075}
 
@@ -115,7 +125,7 @@ def test_interrupted_commissioning_continues_with_unfinished_step(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as stopped:
-        stopped.setattr("fdhil.commissioning.steps.watchdog_test", stop)
+        stopped.setattr("fdhil.commissioning.commissioning_steps.run_watchdog_test", stop)
         code, out, err = drive_bench.run_commission("--yes")
         assert (code, err.strip()) == (130, "fdhil: stopped by the operator")
         assert out.endswith("next: run the same command again; it continues with the unfinished step\n")
@@ -261,7 +271,7 @@ def test_action_is_in_audit_log_before_drive_is_accessed(
         before.extend(read_audit_entries(drive_bench))
         raise DriveFault("drive X", "it is not as it must be")
 
-    monkeypatch.setattr("fdhil.commissioning.steps.commission", commission)
+    monkeypatch.setattr("fdhil.commissioning.commissioning_steps.commission_axis", commission)
     monkeypatch.setattr("fdhil.commissioning.pdo_setup.set_up_pdos", commission)
     assert drive_bench.run_commission("--yes")[0] == 1
     assert before == [("commission", "X", None)]
@@ -308,11 +318,11 @@ def test_wrong_setup_is_refused(what: str, drive_bench: DriveBench) -> None:
 @pytest.mark.parametrize("what", sampled(FOREIGN, every=3))
 def test_nc_started_during_sign_test_leaves_no_record(what: str, drive_bench: DriveBench) -> None:
     config = machine_config.load_config(drive_bench.file)
-    with ForeignNc(config.bus["can0"].channel, FOREIGN[what], is_offset) as nc:
+    with ForeignNc(config.bus["can0"].channel, FOREIGN[what], is_offset_frame) as nc:
         code, out, err = drive_bench.run_commission("--yes", "--json")
         assert nc.on
-        assert max(nc.count(OFFSET), nc.count(SYNC)) <= A_FEW
-        assert nc.count(NMT) == 0
+        assert max(nc.count_frames(OFFSET), nc.count_frames(SYNC)) <= A_FEW
+        assert nc.count_frames(NMT) == 0
     assert code == 3, err
     error = json.loads(out)["error"]
     assert error["class"] == "ForeignMaster"
@@ -338,8 +348,8 @@ def test_nc_started_during_prompt_prevents_motion(question: int, sync: int, driv
     with ForeignNc(config.bus["can0"].channel, FOREIGN["SYNC"], lambda _: False) as nc:
         code, _, err = drive_bench.run_commission(said=LateOperator(nc, "-2 130\ny\ny\ny\n", question))
         assert nc.on
-        assert nc.count(SYNC) <= sync
-        assert nc.count(NMT) == nc.count(SDO) == 0
+        assert nc.count_frames(SYNC) <= sync
+        assert nc.count_frames(NMT) == nc.count_frames(SDO) == 0
         assert sync or nc.sent == []
     assert code == 3, err
     assert (load_record(drive_bench.store, "X") is None) is (question <= 2)

@@ -21,7 +21,7 @@ from fdhil import config as machine_config
 from fdhil.cli.bus_lock import lock_bus
 from fdhil.cli.guard import guard
 from fdhil.cli.main import cli, run_safely
-from fdhil.commissioning.record import axis_digest, save_record
+from fdhil.commissioning.commissioning_record import compute_axis_digest, save_record
 from fdhil.guard.guard_settings import load_settings
 from fdhil.guard.offset_limits import OffsetLimits
 from tests.arming.test_guard_configuration import RECORD
@@ -169,7 +169,7 @@ def test_guard_runs_under_separate_user(
     key.write_text("5e" * 32)
     key.chmod(0o400)
     machine = machine_config.load_config(config)
-    save_record(replace(RECORD, config_digest=axis_digest(machine, "X")), machine.store.directory, key)
+    save_record(replace(RECORD, config_digest=compute_axis_digest(machine, "X")), machine.store.directory, key)
     assert run_guard(monkeypatch, str(config), "--check") == 0
     settings = load_settings(tmp_path / "own" / "guard.json")
     assert settings.token_sha256 == hashlib.sha256(b"the operator's").hexdigest()

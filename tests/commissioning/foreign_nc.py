@@ -43,9 +43,9 @@ class ForeignNc:
     def __post_init__(self) -> None:
         self._bus = can.Bus(interface="virtual", channel=self.channel)
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread = threading.Thread(target=self._run_thread, daemon=True)
 
-    def _run(self) -> None:
+    def _run_thread(self) -> None:
         due = 0.0
         while not self._stopping.is_set():
             message = self._bus.recv(0.001)
@@ -68,19 +68,19 @@ class ForeignNc:
         self._thread.join()
         self._bus.shutdown()
 
-    def count(self, can_id: int) -> int:
+    def count_frames(self, can_id: int) -> int:
         return [sent for sent, _ in self.sent].count(can_id)
 
 
-def offset_of(frame: Frame) -> int:
+def decode_offset(frame: Frame) -> int:
     return int.from_bytes(frame[1][:4], "little", signed=True) if frame[0] == OFFSET else 0
 
 
-def is_offset(frame: Frame) -> bool:
-    return offset_of(frame) > 5
+def is_offset_frame(frame: Frame) -> bool:
+    return decode_offset(frame) > 5
 
 
-def moves(frame: Frame) -> bool:
+def is_moving_frame(frame: Frame) -> bool:
     return frame[0] == TARGET and int.from_bytes(frame[1][2:6], "little", signed=True) > 3000
 
 

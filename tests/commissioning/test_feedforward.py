@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from fdhil.commissioning.steps import commission
+from fdhil.commissioning.commissioning_steps import commission_axis
 from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError, DriveFault
 from tests.drivers.frame_builder import build_machine_config
@@ -17,7 +17,7 @@ Frames = list[tuple[int, bytes]]
 NOT_VALID = 0x80000401
 
 
-class Spoilt(DrivePeer):
+class FaultyDrive(DrivePeer):
     """A drive whose received frames ``spoil`` changes, answers (a list of frames) or drops (None)."""
 
     spoil: Callable[[int, bytes], bytes | Frames | None] = staticmethod(lambda _id, data: data)
@@ -28,67 +28,67 @@ class Spoilt(DrivePeer):
             return super().handle_frame(can_id, changed)
         return changed or []
 
-    def rpdo(self) -> int:
+    def feedforward_cob_id(self) -> int:
         """COB-ID of the RPDO with both offsets."""
         return self.drive.dictionary.get_number(0x1402, 1)
 
-    def held(self) -> tuple[int, int]:
+    def active_offsets(self) -> tuple[int, int]:
         """Active speed and torque offset."""
         return self.drive.dictionary.get_number(0x60B1), self.drive.dictionary.get_number(0x60B2)
 
 
-pytestmark = pytest.mark.usefixtures("quick_commissioning")
+pytestmark = pytest.mark.usefixtures("fast_commissioning")
 
 
 @pytest.fixture
-def peer() -> Iterator[tuple[Spoilt, MachineConfig]]:
+def peer() -> Iterator[tuple[FaultyDrive, MachineConfig]]:
     bus: dict[str, object] = {"interface": "virtual", "channel": uuid.uuid4().hex}
     settings = build_machine_config(bus=bus, feedforward={})
-    with Spoilt(settings) as running:
+    with FaultyDrive(settings) as running:
         yield running, settings
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_a_drive_that_takes_both_is_signed_off_with_its_cob_id(peer: tuple[Spoilt, MachineConfig]) -> None:
+def test_drive_that_applies_both_offsets_is_signed_off_with_cob_id(peer: tuple[FaultyDrive, MachineConfig]) -> None:
     drive, settings = peer
     seen: list[tuple[int, int]] = []
 
-    def watch(can_id: int, data: bytes) -> bytes:
+    def record_frames(can_id: int, data: bytes) -> bytes:
         if can_id == 0x401:
             seen.append((int.from_bytes(data[:4], "little", signed=True), int.from_bytes(data[4:], "little")))
         return data
 
-    drive.spoil = watch
-    record = commission(settings, "X")
-    assert record.options["1402"] == drive.rpdo() == 0x401
+    drive.spoil = record_frames
+    record = commission_axis(settings, "X")
+    assert record.options["1402"] == drive.feedforward_cob_id() == 0x401
     assert set(seen) == {(0x0102, 3), (0, 0)}
     assert seen[-1] == (0, 0)
-    assert drive.held() == (0, 0)
+    assert drive.active_offsets() == (0, 0)
 
 
-def swapped(can_id: int, data: bytes) -> bytes:
+def swap_offsets(can_id: int, data: bytes) -> bytes:
     return data[2:] + data[:2] if can_id == 0x401 else data
 
 
-def no_torque(can_id: int, data: bytes) -> bytes:
+def drop_torque_offset(can_id: int, data: bytes) -> bytes:
     return data[:4] + bytes(2) if can_id == 0x401 else data
 
 
-def lost(can_id: int, data: bytes) -> bytes | None:
+def drop_frame(can_id: int, data: bytes) -> bytes | None:
     return None if can_id == 0x401 else data
 
 
-def keeps_it(can_id: int, data: bytes) -> bytes | None:
+def keep_offset(can_id: int, data: bytes) -> bytes | None:
     return None if can_id == 0x401 and not any(data) else data
 
 
-def aborts(can_id: int, data: bytes) -> bytes | Frames:
+def abort_download(can_id: int, data: bytes) -> bytes | Frames:
     if can_id == 0x601 and data[0] >> 5 == 1 and data[1:3] == b"\x02\x14":
         return [(0x581, b"\x80" + data[1:4] + (0x06010000).to_bytes(4, "little"))]
     return data
 
 
-def ignores(can_id: int, data: bytes) -> bytes | Frames:
+def ignore_download(can_id: int, data: bytes) -> bytes | Frames:
     """Confirm a download to 0x1402 without executing it."""
     if can_id == 0x601 and data[0] >> 5 == 1 and data[1:3] == b"\x02\x14":
         return [(0x581, b"\x60" + data[1:4] + bytes(4))]
@@ -98,56 +98,56 @@ def ignores(can_id: int, data: bytes) -> bytes | Frames:
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (swapped, "was sent (258, 3) as speed and torque offset and holds"),
-        (no_torque, "holds (258, 0)"),
-        (lost, "holds (0, 0)"),
-        (keeps_it, "was sent (0, 0) as speed and torque offset and holds (258, 3)"),
-        (aborts, "it refuses the RPDO of 60B1 and 60B2"),
-        (ignores, "the RPDO of 60B1 and 60B2 stays at 80000401"),
+        (swap_offsets, "was sent (258, 3) as speed and torque offset and holds"),
+        (drop_torque_offset, "holds (258, 0)"),
+        (drop_frame, "holds (0, 0)"),
+        (keep_offset, "was sent (0, 0) as speed and torque offset and holds (258, 3)"),
+        (abort_download, "it refuses the RPDO of 60B1 and 60B2"),
+        (ignore_download, "the RPDO of 60B1 and 60B2 stays at 80000401"),
     ],
 )
-def test_a_drive_that_takes_them_otherwise_is_refused_by_name_and_left_as_it_was(
-    spoil: Callable[[int, bytes], bytes | Frames | None], says: str, peer: tuple[Spoilt, MachineConfig]
+def test_drive_with_faulty_offsets_is_refused_and_restored(
+    spoil: Callable[[int, bytes], bytes | Frames | None], says: str, peer: tuple[FaultyDrive, MachineConfig]
 ) -> None:
     drive, settings = peer
     drive.spoil = spoil
     with pytest.raises(DriveFault, match="FeedforwardOff: ") as caught:
-        commission(settings, "X")
+        commission_axis(settings, "X")
     assert says in str(caught.value)
     assert "remove [axis.X.feedforward]" in str(caught.value)
-    assert drive.rpdo() == NOT_VALID
-    assert drive.held() == (0, 0)
+    assert drive.feedforward_cob_id() == NOT_VALID
+    assert drive.active_offsets() == (0, 0)
     assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
 
 
 @pytest.mark.parametrize("entries", [[(0x60B2, 0, 16), (0x60B1, 0, 32)], [(0x60B1, 0, 32)], []])
-def test_another_mapping_is_refused_before_anything_is_written(
-    entries: list[tuple[int, int, int]], peer: tuple[Spoilt, MachineConfig]
+def test_different_mapping_is_refused_before_writing(
+    entries: list[tuple[int, int, int]], peer: tuple[FaultyDrive, MachineConfig]
 ) -> None:
     drive, settings = peer
     drive.drive.overwrite_mapping(0x1602, entries)
     with pytest.raises(DriveFault, match=r"FeedforwardOff: its RPDO3 maps .* instead of 60B1 and 60B2"):
-        commission(settings, "X")
-    assert drive.rpdo() == NOT_VALID
+        commission_axis(settings, "X")
+    assert drive.feedforward_cob_id() == NOT_VALID
     assert not {0x000, 0x080, 0x401} & set(drive.heard)
 
 
-def test_what_fails_later_makes_the_rpdo_invalid_again(peer: tuple[Spoilt, MachineConfig]) -> None:
+def test_later_failure_makes_rpdo_invalid_again(peer: tuple[FaultyDrive, MachineConfig]) -> None:
     drive, settings = peer
     drive.drive.faults.ignore_offset = True
     with pytest.raises(DeviceError, match="0x60B0 holds 0"):
-        commission(settings, "X")
-    assert drive.rpdo() == NOT_VALID
+        commission_axis(settings, "X")
+    assert drive.feedforward_cob_id() == NOT_VALID
 
 
-def test_ctrl_c_makes_the_rpdo_invalid_again(peer: tuple[Spoilt, MachineConfig]) -> None:
+def test_ctrl_c_makes_rpdo_invalid_again(peer: tuple[FaultyDrive, MachineConfig]) -> None:
     drive, settings = peer
 
-    def interrupted(step: str) -> None:
+    def raise_interrupt(step: str) -> None:
         if step == "sign test":
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        commission(settings, "X", interrupted)
-    assert drive.rpdo() == NOT_VALID
-    assert drive.held() == (0, 0)
+        commission_axis(settings, "X", raise_interrupt)
+    assert drive.feedforward_cob_id() == NOT_VALID
+    assert drive.active_offsets() == (0, 0)

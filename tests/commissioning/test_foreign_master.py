@@ -14,13 +14,13 @@ from typing import Any
 import can
 import pytest
 
-from fdhil.commissioning import config_check, pdo_setup, steps
-from fdhil.commissioning.compare import compare_again
+from fdhil.commissioning import commissioning_steps, config_check, pdo_setup
+from fdhil.commissioning.axis_motion import move_axes
+from fdhil.commissioning.axis_trial import enable_heartbeat_watch
 from fdhil.commissioning.master import Master
-from fdhil.commissioning.moving import move
-from fdhil.commissioning.set_points import Bounds, straight
-from fdhil.commissioning.trial import guarded
-from fdhil.commissioning.watchdog import watchdog_test
+from fdhil.commissioning.record_comparison import verify_commissioned_drives
+from fdhil.commissioning.set_points import AxisBounds, plan_straight_move
+from fdhil.commissioning.watchdog import run_watchdog_test
 from fdhil.config import MachineConfig
 from fdhil.errors import ForeignMaster
 from tests.commissioning.foreign_nc import (
@@ -36,9 +36,9 @@ from tests.commissioning.foreign_nc import (
     TO_BRAKE,
     ForeignNc,
     Frame,
-    is_offset,
-    moves,
-    offset_of,
+    decode_offset,
+    is_moving_frame,
+    is_offset_frame,
 )
 from tests.drivers.frame_builder import build_machine_config
 from tests.drivers.peer import DrivePeer
@@ -46,7 +46,7 @@ from tests.integration.conftest import sign_off
 from tests.tiers import sampled
 from tests.virtual_threads import VirtualThreads
 
-pytestmark = pytest.mark.usefixtures("quick_commissioning")
+pytestmark = pytest.mark.usefixtures("fast_commissioning")
 
 
 @dataclass(frozen=True)
@@ -54,28 +54,28 @@ class Rig:
     peer: DrivePeer
     config: MachineConfig
 
-    def nc(self, what: str, when: Callable[[Frame], bool], *, often: bool = True) -> ForeignNc:
+    def start_nc(self, what: str, when: Callable[[Frame], bool], *, often: bool = True) -> ForeignNc:
         return ForeignNc(self.config.bus["can0"].channel, FOREIGN[what], when, often)
 
-    def require_left_alone(self, nc: ForeignNc, what: str, braking: int = 0) -> None:
+    def require_drive_released(self, nc: ForeignNc, what: str, braking: int = 0) -> None:
         """fdhil may send only a few SYNC after the other master, and the drive must be stopped or left to it."""
         assert nc.on
-        assert nc.count(OFFSET) <= A_FEW + braking
-        assert nc.count(SYNC) <= A_FEW + braking
-        assert nc.count(TARGET) <= A_FEW + braking
-        assert nc.count(NMT) == 0
-        assert nc.count(SDO) <= 1  # it was in flight
-        assert nc.count(HEARTBEAT) <= 2
+        assert nc.count_frames(OFFSET) <= A_FEW + braking
+        assert nc.count_frames(SYNC) <= A_FEW + braking
+        assert nc.count_frames(TARGET) <= A_FEW + braking
+        assert nc.count_frames(NMT) == 0
+        assert nc.count_frames(SDO) <= 1  # it was in flight
+        assert nc.count_frames(HEARTBEAT) <= 2
         if what in LEFT_TO_IT:
-            assert nc.count(LEFT_TO_IT[what]) <= 1
+            assert nc.count_frames(LEFT_TO_IT[what]) <= 1
         if what != "offset":
-            assert [offset_of(frame) for frame in nc.sent if frame[0] == OFFSET][-1:] in ([], [0])
-            assert self.holds(lambda: self.peer.drive.dictionary.get_number(0x60B0) == 0)
+            assert [decode_offset(frame) for frame in nc.sent if frame[0] == OFFSET][-1:] in ([], [0])
+            assert self.has_settled(lambda: self.peer.drive.dictionary.get_number(0x60B0) == 0)
         if what != "target":
             off = ("SWITCH_ON_DISABLED", "FAULT", "FAULT_REACTION_ACTIVE")
-            assert self.holds(lambda: self.peer.drive.power.state.name in off)
+            assert self.has_settled(lambda: self.peer.drive.power.state.name in off)
 
-    def holds(self, condition: Callable[[], bool]) -> bool:
+    def has_settled(self, condition: Callable[[], bool]) -> bool:
         """Whether the condition holds after the simulated drive has processed its frames."""
         time.sleep(0.01)
         return condition()
@@ -91,62 +91,66 @@ def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
         yield Rig(peer, config)
 
 
-def sign_test(master: Master) -> None:
-    steps.sign_test(master)
+def start_sign_test(master: Master) -> None:
+    commissioning_steps.run_sign_test(master)
 
 
-def feedforward_test(master: Master) -> None:
-    steps.feedforward_test(master)
+def start_feedforward_test(master: Master) -> None:
+    commissioning_steps.run_feedforward_test(master)
 
 
-def proved_watchdog(master: Master) -> None:
-    watchdog_test(master, steps.enable)
+def start_watchdog_test(master: Master) -> None:
+    run_watchdog_test(master, commissioning_steps.enable_drive)
 
 
-def rapid(master: Master) -> None:
-    bounds = Bounds.of("X", master.config.axis["X"], master.period_s, (-50.0, 50.0), 100.0)
+def start_rapid(master: Master) -> None:
+    bounds = AxisBounds.create_for_axis("X", master.config.axis["X"], master.period_s, (-50.0, 50.0), 100.0)
     assert master.target is not None
-    with guarded(master):
+    with enable_heartbeat_watch(master):
         goal = master.target + 65536
-        move([master], [bounds], straight((master.target,), (goal,), (bounds.speed,), (bounds.acceleration,), 20))
+        move_axes(
+            [master],
+            [bounds],
+            plan_straight_move((master.target,), (goal,), (bounds.speed,), (bounds.acceleration,), 20),
+        )
 
 
-def held_while_asked(master: Master) -> None:
+def hold_during_question(master: Master) -> None:
     master.loop._landed.wait(60)
-    steps.ramp(master, 33, 1)
+    commissioning_steps.ramp_offset(master, 33, 1)
 
 
-def is_heartbeat(frame: Frame) -> bool:
+def is_heartbeat_frame(frame: Frame) -> bool:
     return frame[0] == HEARTBEAT
 
 
-def is_held(frame: Frame) -> bool:
+def is_hold_frame(frame: Frame) -> bool:
     return frame[0] == TARGET and frame[1][:2] == b"\x0f\x00"
 
 
 STEPS: dict[str, tuple[Callable[[Master], None], Callable[[Frame], bool], int]] = {
-    "sign test": (sign_test, is_offset, 0),
-    "feed-forward test": (feedforward_test, is_offset, 0),
-    "watchdog test": (proved_watchdog, is_heartbeat, 0),
-    "question": (held_while_asked, is_held, 0),
-    "rapid": (rapid, moves, TO_BRAKE),
+    "sign test": (start_sign_test, is_offset_frame, 0),
+    "feed-forward test": (start_feedforward_test, is_offset_frame, 0),
+    "watchdog test": (start_watchdog_test, is_heartbeat_frame, 0),
+    "question": (hold_during_question, is_hold_frame, 0),
+    "rapid": (start_rapid, is_moving_frame, TO_BRAKE),
 }
 
 
-def led_through(config: MachineConfig, step: Callable[[Master], None]) -> None:
-    with Master(config, "X") as master, steps.rolled_back(master):
-        steps.prepare(master)
-        steps.enable(master)
+def run_step(config: MachineConfig, step: Callable[[Master], None]) -> None:
+    with Master(config, "X") as master, commissioning_steps.roll_back_afterwards(master):
+        commissioning_steps.prepare_drive(master)
+        commissioning_steps.enable_drive(master)
         step(master)
 
 
 @pytest.mark.parametrize(("step", "what"), sampled(product(STEPS, FOREIGN), every=5))
-def test_another_master_ends_a_step_within_a_few_sync(step: str, what: str, rig: Rig) -> None:
+def test_step_ends_within_few_syncs_of_another_master(step: str, what: str, rig: Rig) -> None:
     done, when, braking = STEPS[step]
-    with rig.nc(what, when) as nc:
+    with rig.start_nc(what, when) as nc:
         with pytest.raises(ForeignMaster, match=r"an NC is sending .*; switch it off") as told:
-            led_through(rig.config, done)
-        rig.require_left_alone(nc, what, braking)
+            run_step(rig.config, done)
+        rig.require_drive_released(nc, what, braking)
     left = {
         "target": "axis X was left to that master, its offset set to zero",
         "offset": "X was stopped and its drive switched off, and may hold an offset of that master: power it off",
@@ -158,58 +162,56 @@ def test_another_master_ends_a_step_within_a_few_sync(step: str, what: str, rig:
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("virtual_threads", [1, 2, 3], indirect=True)
 @pytest.mark.parametrize("step", STEPS)
-def test_another_master_is_noticed_in_whatever_order_threads_run(
-    step: str, virtual_threads: VirtualThreads, rig: Rig
-) -> None:
-    test_another_master_ends_a_step_within_a_few_sync(step, "offset", rig)
+def test_another_master_is_detected_in_every_thread_order(step: str, virtual_threads: VirtualThreads, rig: Rig) -> None:
+    test_step_ends_within_few_syncs_of_another_master(step, "offset", rig)
 
 
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("what", FOREIGN)
-def test_a_single_frame_of_another_master_is_enough(what: str, rig: Rig) -> None:
-    with rig.nc(what, is_offset, often=False) as nc:
+def test_single_frame_of_another_master_is_detected(what: str, rig: Rig) -> None:
+    with rig.start_nc(what, is_offset_frame, often=False) as nc:
         with pytest.raises(ForeignMaster):
-            steps.commission(rig.config, "X")
-        rig.require_left_alone(nc, what)
+            commissioning_steps.commission_axis(rig.config, "X")
+        rig.require_drive_released(nc, what)
 
 
-def set_pdos(config: MachineConfig) -> None:
+def start_pdo_setup(config: MachineConfig) -> None:
     with Master(config, "X") as master:
         pdo_setup.set_up_pdos(master)
 
 
 @pytest.mark.parametrize("what", FOREIGN)
-@pytest.mark.parametrize("ask", [config_check.check_machine, set_pdos])
-def test_a_drive_is_asked_no_more_once_another_master_is_heard(
+@pytest.mark.parametrize("ask", [config_check.check_machine, start_pdo_setup])
+def test_sdo_requests_end_when_another_master_is_detected(
     ask: Callable[[MachineConfig], object], what: str, rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(config_check, "LISTEN_S", 0.1)
-    with rig.nc(what, lambda frame: frame[0] == SDO) as nc:
+    with rig.start_nc(what, lambda frame: frame[0] == SDO) as nc:
         with pytest.raises(ForeignMaster, match="nothing more was sent"):
             ask(rig.config)
         assert nc.sent == []
 
 
-def test_a_record_holds_where_an_nc_comes_while_a_guard_starts(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fdhil.commissioning.compare.LISTEN_S", 0.1)
+def test_record_stays_valid_when_nc_starts_during_guard_start(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fdhil.commissioning.record_comparison.LISTEN_S", 0.1)
     sign_off(rig.config)
     said: list[str] = []
-    with rig.nc("SYNC", lambda frame: frame[0] == SDO) as nc:
-        compare_again(rig.config, "can0", said.append)
+    with rig.start_nc("SYNC", lambda frame: frame[0] == SDO) as nc:
+        verify_commissioned_drives(rig.config, "can0", said.append)
         assert nc.sent == []
     assert said == []
 
 
-def test_a_heartbeat_like_ours_ends_the_watchdog_test(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_watchdog_test_ends_on_foreign_heartbeat_with_own_id(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """From another fdhil on another computer: the drive would not detect that this one's has stopped."""
     monkeypatch.setitem(FOREIGN, "heartbeat", (HEARTBEAT, b"\x05"))
-    with rig.nc("heartbeat", is_heartbeat) as nc:
+    with rig.start_nc("heartbeat", is_heartbeat_frame) as nc:
         with pytest.raises(ForeignMaster, match=r"an NC is sending with identifiers of fdhil; .* COB-ID 764"):
-            led_through(rig.config, proved_watchdog)
-        rig.require_left_alone(nc, "heartbeat")
+            run_step(rig.config, start_watchdog_test)
+        rig.require_drive_released(nc, "heartbeat")
 
 
-def test_a_drive_that_an_nc_stops_and_starts_is_left_without_an_offset(rig: Rig) -> None:
+def test_drive_restarted_by_nc_has_zero_offset(rig: Rig) -> None:
     """An NC first stops the nodes, sets them up and starts them; meanwhile drives ignore all frames."""
     channel = rig.config.bus["can0"].channel
 
@@ -222,35 +224,33 @@ def test_a_drive_that_an_nc_stops_and_starts_is_left_without_an_offset(rig: Rig)
                 nc.send(can.Message(arbitration_id=SYNC, is_extended_id=False))
 
     def hold(master: Master) -> None:
-        steps.ramp(master, 33, 1)
+        commissioning_steps.ramp_offset(master, 33, 1)
         master.wait_cycles(20)
         thread.start()
         master.wait_cycles(10_000)
 
     zeroed, thread = threading.Event(), threading.Thread(target=stop_and_start)
     with pytest.raises(ForeignMaster, match=r"NMT commands; .* axis X was left to that master, its offset set to zero"):
-        led_through(rig.config, hold)
-    assert rig.holds(lambda: rig.peer.drive.dictionary.get_number(0x60B0) == 0)
+        run_step(rig.config, hold)
+    assert rig.has_settled(lambda: rig.peer.drive.dictionary.get_number(0x60B0) == 0)
     zeroed.set()
     thread.join()
     assert rig.peer.heard.count(NMT) == 3  # our start, then the NC's own two
 
 
-def test_a_drive_that_an_nc_stops_for_good_may_hold_an_offset_and_that_is_reported(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("fdhil.commissioning.landing.START_CYCLES", 50)
+def test_drive_stopped_by_nc_is_reported_with_possible_offset(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fdhil.commissioning.foreign_master_stop.START_CYCLES", 50)
     monkeypatch.setitem(FOREIGN, "stop", (NMT, b"\x02\x00"))
-    with rig.nc("stop", is_offset, often=False) as nc:
+    with rig.start_nc("stop", is_offset_frame, often=False) as nc:
         with pytest.raises(ForeignMaster, match="which stopped its node, and may hold an offset: power it off and on"):
-            led_through(rig.config, sign_test)
-        assert nc.count(TARGET) == 0
-        assert nc.count(SYNC) <= A_FEW
+            run_step(rig.config, start_sign_test)
+        assert nc.count_frames(TARGET) == 0
+        assert nc.count_frames(SYNC) <= A_FEW
 
 
-def test_no_frame_leaves_before_the_bus_was_listened_to(rig: Rig) -> None:
+def test_no_frame_is_sent_before_bus_was_listened_to(rig: Rig) -> None:
     """A connection opened next to an NC has not received anything yet."""
-    with rig.nc("SYNC", lambda _frame: True) as nc:
+    with rig.start_nc("SYNC", lambda _frame: True) as nc:
         nc.on = True
         with Master(rig.config, "X") as master, pytest.raises(ForeignMaster):
             master.sdo.read_bytes(0x1000)

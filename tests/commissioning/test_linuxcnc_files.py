@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.commissioning.init.linuxcnc import Machine, machine_of, read_linuxcnc
-from fdhil.commissioning.init.linuxcnc_text import Hal, parse_hal, parse_ini
+from fdhil.commissioning.init.linuxcnc_import import LinuxcncMachine, build_machine, read_linuxcnc
+from fdhil.commissioning.init.linuxcnc_text import HalNetlist, parse_hal, parse_ini
 from fdhil.errors import ConfigError
 
 SAMPLES = Path("/usr/share/doc/linuxcnc/examples/sample-configs")
@@ -59,21 +59,21 @@ net x-fb cia402.0.pos-fb => joint.0.motor-pos-fb
 """
 
 
-def machine(folder: Path, ini: str = INI, **files: str) -> Machine:
+def read_machine(folder: Path, ini: str = INI, **files: str) -> LinuxcncMachine:
     (folder / "mill.ini").write_text(ini)
     for name, text in ({"drives": HAL_TEXT} | files).items():
         (folder / f"{name}.hal").write_text(text)
     return read_linuxcnc(folder / "mill.ini")
 
 
-def told(found: Machine) -> dict[str, object]:
-    return {path: each.value for path, each in found.told.items()}
+def list_values(found: LinuxcncMachine) -> dict[str, object]:
+    return {path: each.value for path, each in found.values.items()}
 
 
-def test_a_machine_is_read(tmp_path: Path) -> None:
-    found = machine(tmp_path)
+def test_machine_is_read_from_ini_and_hal(tmp_path: Path) -> None:
+    found = read_machine(tmp_path)
     assert found.axes == ("X", "Y", "Z")
-    assert told(found) == {
+    assert list_values(found) == {
         "machine.name": "Mill No 3",
         "machine.sync_period_s": 0.002,
         "nc.profile": "linuxcnc",
@@ -90,7 +90,7 @@ def test_a_machine_is_read(tmp_path: Path) -> None:
         "X": (1000.0, "LinuxCNC: cia402.0.pos-scale"),
         "Y": (-819.2, "LinuxCNC: [JOINT_1] SCALE"),
     }
-    assert found.told["axis.X.rapid_speed_mm_s"].source == "LinuxCNC: [TRAJ] MAX_LINEAR_VELOCITY"
+    assert found.values["axis.X.rapid_speed_mm_s"].source == "LinuxCNC: [TRAJ] MAX_LINEAR_VELOCITY"
     assert found.notes == []
 
 
@@ -112,40 +112,40 @@ MAX_LIMIT = 720
 )
 
 
-def test_a_rotary_axis_is_read_in_degrees_and_the_second_joint_of_a_gantry_as_a_second_drive(tmp_path: Path) -> None:
-    found = machine(tmp_path, ROTARY_AND_GANTRY.replace("[JOINT_2]", "[JOINT_2]\nSCALE = 819.2"))
+def test_rotary_axis_is_read_in_degrees_and_gantry_joint_as_second_drive(tmp_path: Path) -> None:
+    found = read_machine(tmp_path, ROTARY_AND_GANTRY.replace("[JOINT_2]", "[JOINT_2]\nSCALE = 819.2"))
     assert found.axes == ("X", "Y", "Y2", "A")
     of_table = {
-        path.removeprefix("axis.A."): value for path, value in told(found).items() if path.startswith("axis.A.")
+        path.removeprefix("axis.A."): value for path, value in list_values(found).items() if path.startswith("axis.A.")
     }
     assert of_table == {
         "unit": "deg", "rapid_speed_deg_s": 90.0, "max_acceleration_deg_s2": 600.0,
         "drive.following_error_window_deg": 2.0,
     }  # fmt: skip
-    assert not any(path.startswith("axis.Y2.") for path in told(found))
+    assert not any(path.startswith("axis.Y2.") for path in list_values(found))
     assert {axis: scale.increments_per_unit for axis, scale in found.scales.items()} == {
         "X": 1000.0, "Y": -819.2, "Y2": 819.2, "A": 8192.0
     }  # fmt: skip
     assert found.notes == ["LinuxCNC allows A -720 to 720 deg: do not exceed that with `fdhil commission --room`"]
 
 
-def test_wrapped_rotary_axis_is_told(tmp_path: Path) -> None:
+def test_wrapped_rotary_axis_is_recognised(tmp_path: Path) -> None:
     ini = ROTARY_AND_GANTRY.replace("[AXIS_A]", "[AXIS_A]\nWRAPPED_ROTARY = 1")
-    assert told(machine(tmp_path, ini))["nc.wrapped_axes"] == ["A"]
+    assert list_values(read_machine(tmp_path, ini))["nc.wrapped_axes"] == ["A"]
 
 
-def test_radians_become_degrees_and_other_angles_are_refused(tmp_path: Path) -> None:
+def test_radians_are_converted_and_unknown_angular_units_refused(tmp_path: Path) -> None:
     ini = ROTARY_AND_GANTRY.replace("ANGULAR_UNITS = degree", "ANGULAR_UNITS = radian")
-    assert told(machine(tmp_path, ini))["axis.A.rapid_speed_deg_s"] == pytest.approx(math.degrees(90.0))
+    assert list_values(read_machine(tmp_path, ini))["axis.A.rapid_speed_deg_s"] == pytest.approx(math.degrees(90.0))
     with pytest.raises(ConfigError, match=r"TRAJ\.ANGULAR_UNITS.*is 'turns'.*one of degree"):
-        machine(tmp_path, ini.replace("= radian", "= turns"))
+        read_machine(tmp_path, ini.replace("= radian", "= turns"))
 
 
-def test_inches_become_millimetres(tmp_path: Path) -> None:
-    found = machine(tmp_path, INI.replace("LINEAR_UNITS = mm", "LINEAR_UNITS = inch"))
-    assert told(found)["axis.Y.rapid_speed_mm_s"] == pytest.approx(7620.0)
+def test_inches_are_converted_to_millimetres(tmp_path: Path) -> None:
+    found = read_machine(tmp_path, INI.replace("LINEAR_UNITS = mm", "LINEAR_UNITS = inch"))
+    assert list_values(found)["axis.Y.rapid_speed_mm_s"] == pytest.approx(7620.0)
     assert found.scales["Y"].increments_per_unit == pytest.approx(-819.2 / 25.4)
-    assert told(machine(tmp_path, INI.replace("= mm", "= 1.0")))["axis.Y.rapid_speed_mm_s"] == 300.0
+    assert list_values(read_machine(tmp_path, INI.replace("= mm", "= 1.0")))["axis.Y.rapid_speed_mm_s"] == 300.0
 
 
 @pytest.mark.parametrize(
@@ -173,8 +173,8 @@ def test_inches_become_millimetres(tmp_path: Path) -> None:
         ("HALFILE = drives.hal", "HALFILE = lost.hal", "HALFILE lost.hal was not read (No such file or directory)"),
     ],
 )
-def test_what_matters_beside_fdhil_is_noted(old: str, new: str, words: str, tmp_path: Path) -> None:
-    (note,) = machine(tmp_path, INI.replace(old, new)).notes
+def test_settings_that_affect_fdhil_are_noted(old: str, new: str, words: str, tmp_path: Path) -> None:
+    (note,) = read_machine(tmp_path, INI.replace(old, new)).notes
     assert words in note
 
 
@@ -220,28 +220,30 @@ MAX_VELOCITY=100
         ("MAX_VELOCITY=50", "[AXIS_W]", "", (None, 1.0, 1.0, 100.0, 2000.0)),
     ],
 )
-def test_the_limits_are_those_that_linuxcnc_keeps(
+def test_limits_are_those_that_linuxcnc_keeps(
     traj: str, x: str, y: str, limits: tuple[float | None, ...], tmp_path: Path
 ) -> None:
-    found = told(machine(tmp_path, CASE.format(traj=traj, x=x, y=y)))
+    found = list_values(read_machine(tmp_path, CASE.format(traj=traj, x=x, y=y)))
     keys = ["nc.max_path_speed_mm_s"]
     keys += [f"axis.{axis}.{key}" for axis in "XY" for key in ("rapid_speed_mm_s", "max_acceleration_mm_s2")]
     assert [found.get(key) for key in keys] == pytest.approx(list(limits))
 
 
 def test_trivkins_without_coordinates_numbers_its_joints_by_the_alphabet_of_axes(tmp_path: Path) -> None:
-    found = machine(tmp_path, INI.replace("COORDINATES = X Y Z", "COORDINATES = Z X").replace("SCALE = -819.2", ""))
+    found = read_machine(
+        tmp_path, INI.replace("COORDINATES = X Y Z", "COORDINATES = Z X").replace("SCALE = -819.2", "")
+    )
     assert found.axes == ("X", "Z")
-    assert "axis.Y.rapid_speed_mm_s" not in told(found)
-    assert told(found)["axis.Z.rapid_speed_mm_s"] == 100.0
+    assert "axis.Y.rapid_speed_mm_s" not in list_values(found)
+    assert list_values(found)["axis.Z.rapid_speed_mm_s"] == 100.0
 
 
-def test_the_s_curve_planner_is_planned_with_its_jerk(tmp_path: Path) -> None:
+def test_s_curve_planner_is_imported_with_its_jerk(tmp_path: Path) -> None:
     curved = INI.replace("COORDINATES", "PLANNER_TYPE = 1\nMAX_LINEAR_JERK = 9000\nCOORDINATES")
-    found = told(machine(tmp_path, curved))
+    found = list_values(read_machine(tmp_path, curved))
     assert found["nc.profile"] == "jerk_limited"
     assert [found[f"axis.{axis}.max_jerk_mm_s3"] for axis in "XYZ"] == [9000.0] * 3
-    weak = told(machine(tmp_path, curved.replace("9000", "0.9")))
+    weak = list_values(read_machine(tmp_path, curved.replace("9000", "0.9")))
     assert weak["nc.profile"] == "linuxcnc"
     assert "axis.X.max_jerk_mm_s3" not in weak
 
@@ -262,21 +264,21 @@ ADDER += "net x-sum sum2.x.out => x-pid.command\n"
         ("loadrt pid names=x-pid,y-pid\n" + ADDER, "y-pid"),
     ],
 )
-def test_a_position_loop_is_found_under_any_name_and_behind_a_chain(hal: str, loop: str, tmp_path: Path) -> None:
-    (note,) = machine(tmp_path, drives=HAL_TEXT + hal).notes
+def test_position_loop_is_found_under_any_name_and_through_components(hal: str, loop: str, tmp_path: Path) -> None:
+    (note,) = read_machine(tmp_path, drives=HAL_TEXT + hal).notes
     assert note.startswith(f"axis Y: HAL's {loop} closes the position loop")
 
 
-def test_a_loop_that_the_command_does_not_reach_is_no_position_loop(tmp_path: Path) -> None:
+def test_loop_without_position_command_is_not_a_position_loop(tmp_path: Path) -> None:
     """A spindle's loop, and one that gets only the position."""
     hal = "loadrt pid names=spindle,other\nnet s motion.spindle-speed-out => spindle.command\n"
     hal += "net y joint.1.motor-pos-cmd => sum2.y.in0\nnet fb sum2.y.out => other.feedback\n"
-    assert machine(tmp_path, drives=HAL_TEXT + hal).notes == []
+    assert read_machine(tmp_path, drives=HAL_TEXT + hal).notes == []
 
 
-def test_a_position_loop_in_hal_is_noted_with_its_gains(tmp_path: Path) -> None:
+def test_hal_position_loop_is_noted_with_gains(tmp_path: Path) -> None:
     loop = "net y joint.1.motor-pos-cmd => pid.y.command\nsetp pid.y.Pgain 40\nsetp pid.y.FF1 1\n"
-    (note,) = machine(tmp_path, drives=HAL_TEXT + loop).notes
+    (note,) = read_machine(tmp_path, drives=HAL_TEXT + loop).notes
     assert "HAL's pid.y closes the position loop (Pgain 40, FF1 1)" in note
     assert "remove this loop" in note
 
@@ -291,38 +293,38 @@ def test_a_position_loop_in_hal_is_noted_with_its_gains(tmp_path: Path) -> None:
         ("#INCLUDE mill.ini", "include each other endlessly"),
     ],
 )
-def test_files_that_tell_no_machine_are_refused(text: str, words: str, tmp_path: Path) -> None:
+def test_files_without_machine_are_refused(text: str, words: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=words):
-        machine(tmp_path, text)
+        read_machine(tmp_path, text)
 
 
-def test_hal_joins_pins_through_every_way_of_writing() -> None:
+def test_hal_links_are_parsed_in_every_notation() -> None:
     ini = parse_ini("[J]\nS = 5\nS = 6\n", lambda _name: "")
-    hal = Hal()
+    hal = HalNetlist()
     more = "linksp sig here.in\n"
     text = "net sig a.out => b.in # c.in\nlinkps d.out => sig\nsetp b.scale [J](S)\nx.scale = [J]T\nsource more.hal\n"
     parse_hal(text, ini, {"more.hal": more}.__getitem__, hal)
-    assert hal.joined("a.out") == ["b.in", "d.out", "here.in"]
+    assert hal.find_linked_pins("a.out") == ["b.in", "d.out", "here.in"]
     assert hal.given == {"b.scale": "5", "x.scale": "[J]T"}
 
 
 @given(st.lists(st.tuples(st.integers(0, len(INI)), st.text(max_size=12)), max_size=6), st.integers(1, 9))
 @settings(max_examples=150, deadline=None)
-def test_spoilt_files_are_read_or_refused(spoilt: list[tuple[int, str]], step: int) -> None:
+def test_corrupted_files_are_read_or_refused(spoilt: list[tuple[int, str]], step: int) -> None:
     text = INI
     for place, put in spoilt:
         text = text[:place] + put + text[place + step :]
-    hal = Hal()
+    hal = HalNetlist()
     ini = parse_ini(text, lambda _name: "")
     parse_hal(text + HAL_TEXT, ini, lambda _name: "", hal)
     with contextlib.suppress(ConfigError):
-        found = machine_of(ini, hal, Path("mill.ini"))
+        found = build_machine(ini, hal, Path("mill.ini"))
         assert found.axes
         assert all(math.isfinite(scale.increments_per_unit) for scale in found.scales.values())
 
 
 @pytest.mark.debian
-def test_all_sample_machines_of_the_package_are_read_or_refused_by_name() -> None:
+def test_sample_machines_are_read_or_refused_by_name() -> None:
     read, refused = 0, list[str]()
     for path in sorted(SAMPLES.rglob("*.ini")):
         try:

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
+from fdhil.commissioning.drive_survey import read_pdos, survey_drive
 from fdhil.commissioning.master import Master
-from fdhil.commissioning.pdo_setup import SetUp, set_up_pdos
-from fdhil.commissioning.survey import read_pdos, survey
+from fdhil.commissioning.pdo_setup import PdoSetup, set_up_pdos
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.sdo_channel import SdoChannel
 from fdhil.errors import DriveFault
@@ -21,10 +21,10 @@ from tests.drivers.peer import DrivePeer
 from tests.tiers import sampled
 from tests.vendor_drives.vendor_machines import OUTFITS, VendorDrive, build_vendor_config
 
-pytestmark = pytest.mark.usefixtures("quick_commissioning")
+pytestmark = pytest.mark.usefixtures("fast_commissioning")
 
 
-def config(**sections: Any) -> MachineConfig:
+def build_config(**sections: Any) -> MachineConfig:
     return build_machine_config(
         bus={"interface": "virtual", "channel": uuid.uuid4().hex}, guard={"clock": "sync"}, **sections
     )
@@ -32,7 +32,7 @@ def config(**sections: Any) -> MachineConfig:
 
 @pytest.fixture
 def peer() -> Iterator[tuple[DrivePeer, MachineConfig]]:
-    settings = config()
+    settings = build_config()
     with DrivePeer(settings) as running:
         yield running, settings
 
@@ -49,18 +49,18 @@ SPOILT: Mapping[str, tuple[Callable[[DrivePeer], object], str]] = {
 
 
 @pytest.mark.parametrize("what", SPOILT)
-def test_what_differs_is_written(what: str, peer: tuple[DrivePeer, MachineConfig]) -> None:
+def test_differing_pdos_are_written(what: str, peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     spoil, name = SPOILT[what]
     spoil(drive)
     with Master(settings, "X") as master:
         assert set_up_pdos(master).written == (name,)
-        points = {finding.point: finding.ok for finding in survey(master).findings}
+        points = {finding.point: finding.ok for finding in survey_drive(master).findings}
     assert points[name] is True
     assert not {0x080, 0x201, 0x301} & set(drive.heard)  # no SYNC, no set-point: nothing can move
 
 
-def test_type_of_a_fixed_mapping_is_set(peer: tuple[DrivePeer, MachineConfig]) -> None:
+def test_transmission_type_of_fixed_mapping_is_set(peer: tuple[DrivePeer, MachineConfig]) -> None:
     """The drive refuses every write to its mappings, as in its EDS, but accepts transmission types."""
     drive, settings = peer
     entries = drive.drive.dictionary.entries
@@ -70,7 +70,7 @@ def test_type_of_a_fixed_mapping_is_set(peer: tuple[DrivePeer, MachineConfig]) -
     drive.drive.overwrite_object(0x1800, 2, 255)
     with Master(settings, "X") as master:
         assert set_up_pdos(master).written == ("TPDO1",)
-        assert set_up_pdos(master) == SetUp((), None)
+        assert set_up_pdos(master) == PdoSetup((), None)
         drive.drive.overwrite_object(0x1A00, 1, 0x60620020)
         drive.drive.overwrite_object(0x1800, 2, 255)
         with pytest.raises(DriveFault, match="it refuses TPDO1 with 6064:00, 606C:00"):
@@ -79,25 +79,25 @@ def test_type_of_a_fixed_mapping_is_set(peer: tuple[DrivePeer, MachineConfig]) -
 
 
 @pytest.mark.parametrize("outfit", sampled(OUTFITS, every=3), ids=lambda outfit: outfit.name)
-def test_a_drive_of_every_make_is_set_up_as_it_comes(outfit: VendorDrive, tmp_path: Path) -> None:
+def test_drive_of_every_vendor_is_set_up_from_defaults(outfit: VendorDrive, tmp_path: Path) -> None:
     settings = build_vendor_config(
         outfit, tmp_path, bus={"can0": {"interface": "virtual", "channel": uuid.uuid4().hex}}
     )
     with DrivePeer(settings), Master(settings, "X") as master:
         done = set_up_pdos(master)
         assert done.written
-        assert set_up_pdos(master) == SetUp((), None)
+        assert set_up_pdos(master) == PdoSetup((), None)
 
 
-def test_a_drive_that_is_right_is_left_alone(peer: tuple[DrivePeer, MachineConfig]) -> None:
+def test_correct_drive_is_not_written(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     with Master(settings, "X") as master:
-        assert set_up_pdos(master) == SetUp((), None)
+        assert set_up_pdos(master) == PdoSetup((), None)
     assert set(drive.heard) == {0x601}
 
 
 @pytest.mark.fault("A25")
-def test_a_drive_that_refuses_an_object_keeps_all_its_pdos(tmp_path: Path) -> None:
+def test_pdos_are_restored_when_drive_refuses_object(tmp_path: Path) -> None:
     own = tmp_path / "own.toml"
     own.write_text(
         'base = "fdhil_twin"\n'
@@ -105,7 +105,7 @@ def test_a_drive_that_refuses_an_object_keeps_all_its_pdos(tmp_path: Path) -> No
         '[[tpdos]]\nname = "TPDO2"\ncob_base = 0x280\n'
         "entries = [[0x6041, 0, 16, false], [0x6078, 0, 16, true], [0x605A, 0, 16, true]]\n"
     )
-    settings = config(drive={"profile": str(own)})
+    settings = build_config(drive={"profile": str(own)})
     with DrivePeer(settings), Master(settings, "X") as master:
         before = [found for _, found in read_pdos(master)]
         with pytest.raises(DriveFault, match="it refuses TPDO2 with 6041:00, 6078:00, 605A:00"):
@@ -113,7 +113,7 @@ def test_a_drive_that_refuses_an_object_keeps_all_its_pdos(tmp_path: Path) -> No
         assert [found for _, found in read_pdos(master)] == before
 
 
-def test_an_enabled_drive_is_not_touched(peer: tuple[DrivePeer, MachineConfig]) -> None:
+def test_enabled_drive_is_not_written(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     drive.drive.overwrite_object(0x1800, 2, 255)
     drive.drive.overwrite_object(0x6041, 0, 0x1237)
@@ -122,15 +122,15 @@ def test_an_enabled_drive_is_not_touched(peer: tuple[DrivePeer, MachineConfig]) 
     assert drive.drive.dictionary.get_number(0x1800, 2) == 255
 
 
-def test_the_objects_of_a_second_axis_are_asked_0x800_higher(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_objects_of_second_axis_are_offset_by_0x800(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
 
-    def upload(_link: SdoChannel, index: int, _sub: int) -> bytes:
+    def record_upload(_link: SdoChannel, index: int, _sub: int) -> bytes:
         asked.append(index)
         return bytes(2)
 
-    monkeypatch.setattr(SdoChannel, "_upload_object", upload)
-    with Master(config(drive={"logical_axis": 2, "node_id": 1}), "X") as master:
+    monkeypatch.setattr(SdoChannel, "_upload_object", record_upload)
+    with Master(build_config(drive={"logical_axis": 2, "node_id": 1}), "X") as master:
         for index in (0x6041, 0x68B0, 0x1018):
             master.sdo.read_int(index)
     assert asked == [0x6841, 0x68B0, 0x1018]

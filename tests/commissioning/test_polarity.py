@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fdhil.commissioning.polarity import judge_acceleration, judge_jog
-from fdhil.commissioning.set_points import straight
+from fdhil.commissioning.polarity import assess_acceleration_power, assess_jog
+from fdhil.commissioning.set_points import plan_straight_move
 from fdhil.records import Recording, SlowVoltage, freeze_array
 from tests.bench import bench_config
 
@@ -19,9 +19,9 @@ AXIS = bench_config("X").axis["X"]
 R, K, J, FRICTION = 0.5, 0.8, 0.075, 5.0
 
 
-def jogged(weight_nm: float = 0.0, top_mm_s: float = 5.0, way_mm: float = JOG) -> Recording:
+def record_jog(weight_nm: float = 0.0, top_mm_s: float = 5.0, way_mm: float = JOG) -> Recording:
     """Samples of a jog back and forth; ``weight_nm`` acts on the axis all the time."""
-    part = straight((0.0,), (way_mm,), (top_mm_s * DT,), (50.0 * top_mm_s / 5.0 * DT**2,), 20)[:, 0]
+    part = plan_straight_move((0.0,), (way_mm,), (top_mm_s * DT,), (50.0 * top_mm_s / 5.0 * DT**2,), 20)[:, 0]
     rest = np.zeros(300)
     position = np.concatenate([rest, part, rest + way_mm, way_mm - part, rest])
     speed = np.gradient(position, DT) * 2 * math.pi / PITCH
@@ -35,14 +35,14 @@ def jogged(weight_nm: float = 0.0, top_mm_s: float = 5.0, way_mm: float = JOG) -
     )  # fmt: skip
 
 
-def causes(jog: Recording) -> str:
-    return "; ".join(finding.cause for finding in judge_jog(jog, JOG, AXIS) if finding.ok is False)
+def list_causes(jog: Recording) -> str:
+    return "; ".join(finding.cause for finding in assess_jog(jog, JOG, AXIS) if finding.ok is False)
 
 
 @pytest.mark.parametrize("weight_nm", [0.0, 20.0, -20.0])
-def test_a_right_axis_passes_also_one_that_carries_a_weight(weight_nm: float) -> None:
-    jog = jogged(weight_nm)
-    assert [f.point for f in judge_jog(jog, JOG, AXIS) if f.ok] == [
+def test_correct_axis_passes_with_and_without_weight(weight_nm: float) -> None:
+    jog = record_jog(weight_nm)
+    assert [f.point for f in assess_jog(jog, JOG, AXIS) if f.ok] == [
         "travel",
         "speed unit",
         "current sign",
@@ -51,7 +51,7 @@ def test_a_right_axis_passes_also_one_that_carries_a_weight(weight_nm: float) ->
     lossy = replace(
         jog, current_a=freeze_array(np.where(np.arange(jog.current_a.size) % 50 == 3, np.nan, jog.current_a))
     )
-    assert causes(lossy) == ""
+    assert list_causes(lossy) == ""
 
 
 WRONG: dict[str, tuple[Callable[[Recording], Recording], str]] = {
@@ -75,48 +75,48 @@ WRONG: dict[str, tuple[Callable[[Recording], Recording], str]] = {
 
 @pytest.mark.parametrize("what", WRONG)
 @pytest.mark.fault("B10")
-def test_what_is_wrong_is_named(what: str) -> None:
+def test_wrong_unit_or_sign_is_named(what: str) -> None:
     spoil, says = WRONG[what]
-    assert says in causes(spoil(jogged()))
+    assert says in list_causes(spoil(record_jog()))
 
 
 @pytest.mark.fault("B10")
-def test_words_that_are_swapped_are_told() -> None:
+def test_swapped_words_are_detected() -> None:
     """A float with swapped words is noise of any size."""
-    jog = jogged()
+    jog = record_jog()
     noise = freeze_array(np.random.default_rng(2).normal(size=jog.speed_rad_s.size) * 1e3)
-    assert "SignOrScale: voltage times current" in causes(replace(jog, voltage_v=noise))
+    assert "SignOrScale: voltage times current" in list_causes(replace(jog, voltage_v=noise))
 
 
-def test_a_slower_sensor_is_judged_too() -> None:
-    jog = jogged()
+def test_slower_voltage_sensor_is_assessed() -> None:
+    jog = record_jog()
     assert jog.voltage_v is not None
     means = jog.voltage_v[: jog.voltage_v.size // 50 * 50].reshape(-1, 50).mean(axis=1)
     slow = replace(jog, voltage_v=None, slow_voltage=SlowVoltage(0.0, 0.05, 0.0, freeze_array(means)))
-    assert causes(slow) == ""
+    assert list_causes(slow) == ""
     turned = replace(slow, slow_voltage=SlowVoltage(0.0, 0.05, 0.0, freeze_array(-means)))
-    assert "voltage times current, and times speed is negative" in causes(turned)
+    assert "voltage times current, and times speed is negative" in list_causes(turned)
 
 
-def test_without_a_voltage_nothing_is_said_of_it() -> None:
-    (voltage,) = [f for f in judge_jog(replace(jogged(), voltage_v=None), JOG, AXIS) if f.point == "voltage sign"]
+def test_missing_voltage_is_not_assessed() -> None:
+    (voltage,) = [f for f in assess_jog(replace(record_jog(), voltage_v=None), JOG, AXIS) if f.point == "voltage sign"]
     assert (voltage.ok, voltage.cause) == (None, "no voltage was recorded")
 
 
-def test_a_motor_takes_power_while_it_accelerates() -> None:
-    rapid = jogged(top_mm_s=400.0, way_mm=150.0)
-    assert judge_acceleration(rapid).ok is True
+def test_motor_that_delivers_power_while_accelerating_is_refused() -> None:
+    rapid = record_jog(top_mm_s=400.0, way_mm=150.0)
+    assert assess_acceleration_power(rapid).ok is True
     assert rapid.voltage_v is not None
-    wrong = judge_acceleration(replace(rapid, voltage_v=freeze_array(-rapid.voltage_v)))
+    wrong = assess_acceleration_power(replace(rapid, voltage_v=freeze_array(-rapid.voltage_v)))
     assert (wrong.ok, "J while it accelerated, which is impossible for a motor" in wrong.cause) == (False, True)
 
 
-def test_a_table_that_goes_another_way_is_told() -> None:
-    jog = jogged()
+def test_table_moving_differently_is_detected() -> None:
+    jog = record_jog()
     seen = replace(
         jog, table_mm=freeze_array(np.where(np.arange(jog.position_mm.size) % 3 == 0, jog.position_mm + 7.0, np.nan))
     )
-    assert [f.point for f in judge_jog(seen, JOG, AXIS) if f.ok][2] == "table"
+    assert [f.point for f in assess_jog(seen, JOG, AXIS) if f.ok][2] == "table"
     turned = replace(jog, table_mm=-jog.position_mm)
-    assert "its table moves -1 times the distance of its motor" in causes(turned)
-    assert causes(replace(jog, table_mm=jog.position_mm * np.nan)) == ""
+    assert "its table moves -1 times the distance of its motor" in list_causes(turned)
+    assert list_causes(replace(jog, table_mm=jog.position_mm * np.nan)) == ""

@@ -8,99 +8,102 @@ from pathlib import Path
 
 import pytest
 
-from fdhil.commissioning.progress import Progress, Step, steps_path
-from fdhil.commissioning.record import KEY_NAME
+from fdhil.commissioning.commissioning_record import KEY_NAME
+from fdhil.commissioning.step_progress import CompletedStep, StepProgress, build_steps_path
 from fdhil.errors import StoreError
 
 FOUND = {"moved_um": 10.07, "jog": "5 mm"}
 
 
-def begun(folder: Path) -> Progress:
-    progress = Progress(folder, "X")
-    progress.keep("sign test", "this drive", FOUND)
+def write_progress(folder: Path) -> StepProgress:
+    progress = StepProgress(folder, "X")
+    progress.save_step("sign test", "this drive", FOUND)
     return progress
 
 
-def test_a_step_is_kept_for_the_same_drive_alone(tmp_path: Path) -> None:
-    begun(tmp_path)
-    told: list[tuple[str, Step]] = []
-    again = Progress(tmp_path, "X")
-    again.on_kept = lambda name, step: told.append((name, step))
-    assert again.kept("sign test", "another drive") is None
-    assert again.kept("watchdog test", "this drive") is None
+def test_step_is_reused_for_same_drive_only(tmp_path: Path) -> None:
+    write_progress(tmp_path)
+    told: list[tuple[str, CompletedStep]] = []
+    again = StepProgress(tmp_path, "X")
+    again.on_reused = lambda name, step: told.append((name, step))
+    assert again.reuse_step("sign test", "another drive") is None
+    assert again.reuse_step("watchdog test", "this drive") is None
     assert told == []
-    assert again.kept("sign test", "this drive") == FOUND
+    assert again.reuse_step("sign test", "this drive") == FOUND
     assert [name for name, _ in told] == ["sign test"]
-    assert again.done().keys() == {"sign test"}
-    assert Progress(tmp_path, "Y").done() == {}
+    assert again.list_step_times().keys() == {"sign test"}
+    assert StepProgress(tmp_path, "Y").list_step_times() == {}
 
 
-def test_what_could_not_be_told_is_asked_again(tmp_path: Path) -> None:
-    progress = begun(tmp_path)
-    progress.keep("feed-forward test", "this drive", {"in_feedforward": None})
-    assert progress.done().keys() == {"sign test"}
+def test_undetermined_step_is_repeated(tmp_path: Path) -> None:
+    progress = write_progress(tmp_path)
+    progress.save_step("feed-forward test", "this drive", {"in_feedforward": None})
+    assert progress.list_step_times().keys() == {"sign test"}
 
 
-def test_all_is_forgotten_on_demand(tmp_path: Path) -> None:
-    begun(tmp_path).forget()
-    assert not steps_path(tmp_path, "X").exists()
-    assert Progress(tmp_path, "X").done() == {}
+def test_forget_deletes_all_steps(tmp_path: Path) -> None:
+    write_progress(tmp_path).forget_steps()
+    assert not build_steps_path(tmp_path, "X").exists()
+    assert StepProgress(tmp_path, "X").list_step_times() == {}
 
 
-def changed(path: Path) -> None:
+def change_content(path: Path) -> None:
     path.write_text(path.read_text().replace("10.07", "10.08"))
 
 
-def of_another_axis(path: Path) -> None:
+def use_file_of_another_axis(path: Path) -> None:
     path.write_text(path.read_text().replace('"axis": "X"', '"axis": "Y"'))
 
 
-def half(path: Path) -> None:
+def truncate_file(path: Path) -> None:
     path.write_text(path.read_text()[:40])
 
 
-def a_list(path: Path) -> None:
+def write_list(path: Path) -> None:
     path.write_text("[1, 2]")
 
 
-def other_fields(path: Path) -> None:
+def write_other_fields(path: Path) -> None:
     document = json.loads(path.read_text())
     document["steps"]["sign test"]["more"] = 1
     path.write_text(json.dumps(document))
 
 
-def not_text(path: Path) -> None:
+def write_binary(path: Path) -> None:
     path.write_bytes(b"\xff\xfe\x00" * 9)
 
 
-def without_a_key(path: Path) -> None:
+def remove_key(path: Path) -> None:
     path.with_name(KEY_NAME).unlink()
 
 
-@pytest.mark.parametrize("spoil", [changed, of_another_axis, half, a_list, other_fields, not_text, without_a_key])
-def test_a_file_that_is_not_ours_is_not_believed(spoil: Callable[[Path], None], tmp_path: Path) -> None:
-    begun(tmp_path)
-    spoil(steps_path(tmp_path, "X"))
-    progress = Progress(tmp_path, "X")
-    assert progress.done() == {}
-    assert progress.doubt.startswith("commissioning-X.steps.json was rejected (")
-    assert progress.doubt.endswith("every step is repeated")
-    progress.keep("sign test", "this drive", FOUND)
-    assert Progress(tmp_path, "X").kept("sign test", "this drive") == FOUND
+@pytest.mark.parametrize(
+    "spoil",
+    [change_content, use_file_of_another_axis, truncate_file, write_list, write_other_fields, write_binary, remove_key],
+)
+def test_foreign_or_damaged_file_is_rejected(spoil: Callable[[Path], None], tmp_path: Path) -> None:
+    write_progress(tmp_path)
+    spoil(build_steps_path(tmp_path, "X"))
+    progress = StepProgress(tmp_path, "X")
+    assert progress.list_step_times() == {}
+    assert progress.rejection.startswith("commissioning-X.steps.json was rejected (")
+    assert progress.rejection.endswith("every step is repeated")
+    progress.save_step("sign test", "this drive", FOUND)
+    assert StepProgress(tmp_path, "X").reuse_step("sign test", "this drive") == FOUND
 
 
-def test_a_store_that_takes_nothing_is_told(tmp_path: Path) -> None:
+def test_unwritable_store_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    progress = Progress(tmp_path / "file" / "store", "X")
+    progress = StepProgress(tmp_path / "file" / "store", "X")
     with pytest.raises(StoreError, match=r"cannot be written .* check the rights"):
-        progress.keep("sign test", "this drive", FOUND)
+        progress.save_step("sign test", "this drive", FOUND)
 
 
-def test_a_step_for_which_there_is_no_room_is_refused_and_those_before_it_stay(tmp_path: Path) -> None:
-    progress, room = Progress(tmp_path, "X"), {"told": "x" * 21_000}
+def test_step_beyond_size_limit_is_refused_and_previous_ones_stay(tmp_path: Path) -> None:
+    progress, room = StepProgress(tmp_path, "X"), {"told": "x" * 21_000}
     for number in range(12):
-        progress.keep(f"step {number}", "this drive", room)
+        progress.save_step(f"step {number}", "this drive", room)
     with pytest.raises(StoreError, match="no room for another step"):
-        progress.keep("one too many", "this drive", room)
-    again = Progress(tmp_path, "X")
-    assert (again.doubt, len(again.done()), len(progress.done())) == ("", 12, 12)
+        progress.save_step("one too many", "this drive", room)
+    again = StepProgress(tmp_path, "X")
+    assert (again.rejection, len(again.list_step_times()), len(progress.list_step_times())) == ("", 12, 12)

@@ -14,12 +14,12 @@ from typing import Any
 
 import pytest
 
-from fdhil.commissioning.record import (
+from fdhil.commissioning.commissioning_record import (
     KEY_NAME,
     SCHEMA,
     CommissioningRecord,
+    build_record_path,
     load_record,
-    record_path,
     save_record,
 )
 from fdhil.errors import StoreError
@@ -29,7 +29,7 @@ RECORD = CommissioningRecord(
 )
 
 
-def test_a_record_comes_back_as_it_was(tmp_path: Path) -> None:
+def test_saved_record_is_loaded_unchanged(tmp_path: Path) -> None:
     save_record(RECORD, tmp_path / "store")
     save_record(replace(RECORD, axis="Y"), tmp_path / "store")
     assert load_record(tmp_path / "store", "X") == RECORD
@@ -39,7 +39,7 @@ def test_a_record_comes_back_as_it_was(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("key", ["offset_in_feedforward", "watchdog", "options", "serial", "digest", "schema", "axis"])
-def test_a_changed_record_is_refused(key: str, tmp_path: Path) -> None:
+def test_modified_record_is_refused(key: str, tmp_path: Path) -> None:
     path = save_record(RECORD, tmp_path)
     document = json.loads(path.read_text())
     document[key] = {"6007": 0} if key == "options" else "other" if key != "serial" else 5
@@ -49,18 +49,18 @@ def test_a_changed_record_is_refused(key: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seal", ["of no key", "of another key", "none", "no text", "not ASCII"])
-def test_a_record_made_without_the_key_is_refused(seal: str, tmp_path: Path) -> None:
+def test_record_sealed_without_key_is_refused(seal: str, tmp_path: Path) -> None:
     """Anyone can recompute the digest; the seal needs the key."""
     path = save_record(RECORD, tmp_path)
     forged = replace(RECORD, watchdog="proven", options={"6007": 0})
-    seals: dict[str, Any] = {"of no key": forged.seal(b""), "of another key": forged.seal(b"k" * 64), "none": None,
+    seals: dict[str, Any] = {"of no key": forged.compute_seal(b""), "of another key": forged.compute_seal(b"k" * 64), "none": None,
                              "no text": 5, "not ASCII": "\ud800é"}  # fmt: skip
     path.write_text(json.dumps({"schema": SCHEMA, **asdict(forged), "digest": forged.digest, "seal": seals[seal]}))
     with pytest.raises(StoreError, match="not sealed with this machine's key; commission the axis again"):
         load_record(tmp_path, "X")
 
 
-def test_a_record_of_the_time_before_the_key_asks_for_commissioning(tmp_path: Path) -> None:
+def test_unsealed_record_requires_new_commissioning(tmp_path: Path) -> None:
     path = save_record(RECORD, tmp_path)
     document = json.loads(path.read_text()) | {"schema": "fdhil-commissioning-1"}
     del document["seal"]
@@ -69,12 +69,12 @@ def test_a_record_of_the_time_before_the_key_asks_for_commissioning(tmp_path: Pa
         load_record(tmp_path, "X")
 
 
-def _link(key: Path) -> None:
+def _create_link(key: Path) -> None:
     key.rename(key.with_suffix(".old"))
     key.symlink_to(key.with_suffix(".old"))
 
 
-def _fifo(key: Path) -> None:
+def _create_fifo(key: Path) -> None:
     key.unlink()
     os.mkfifo(key, 0o600)
 
@@ -85,14 +85,12 @@ def _fifo(key: Path) -> None:
         (lambda key: key.chmod(0o644), "can be read by others"),
         (lambda key: key.unlink(), "cannot be read"),
         (lambda key: key.write_text("short"), "is damaged"),
-        (_fifo, "can be read by others"),
-        (_link, "cannot be read"),
+        (_create_fifo, "can be read by others"),
+        (_create_link, "cannot be read"),
     ],
     ids=["readable", "missing", "short", "fifo", "link"],
 )
-def test_a_key_that_keeps_no_secret_vouches_for_nothing(
-    spoil: Callable[[Path], object], words: str, tmp_path: Path
-) -> None:
+def test_readable_or_damaged_key_is_refused(spoil: Callable[[Path], object], words: str, tmp_path: Path) -> None:
     save_record(RECORD, tmp_path)
     spoil(tmp_path / KEY_NAME)
     with pytest.raises(StoreError, match=words) as error:
@@ -100,32 +98,30 @@ def test_a_key_that_keeps_no_secret_vouches_for_nothing(
     assert "commission every axis again" in str(error.value)
 
 
-def test_who_may_not_read_the_key_believes_the_digest_alone_if_it_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_caller_without_key_accepts_digest_only_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_record(RECORD, tmp_path)
 
     really_open = os.open
 
-    def refuse(path: Any, *given: Any) -> int:
+    def refuse_key(path: Any, *given: Any) -> int:
         if Path(path).name != KEY_NAME:
             return really_open(path, *given)
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr(os, "open", refuse)
+    monkeypatch.setattr(os, "open", refuse_key)
     with pytest.raises(StoreError, match="may not be read by this user"):
         load_record(tmp_path, "X")
     assert load_record(tmp_path, "X", may_lack_key=True) == RECORD
 
 
 @pytest.mark.timeout(60)
-def test_a_pipe_in_the_place_of_a_record_is_none_and_is_not_waited_for(tmp_path: Path) -> None:
-    os.mkfifo(record_path(tmp_path, "X"))
+def test_pipe_instead_of_record_is_refused_without_waiting(tmp_path: Path) -> None:
+    os.mkfifo(build_record_path(tmp_path, "X"))
     with pytest.raises(StoreError, match="is not a commissioning record"):
         load_record(tmp_path, "X")
 
 
-def test_the_key_may_lie_elsewhere(tmp_path: Path) -> None:
+def test_key_may_be_in_another_folder(tmp_path: Path) -> None:
     key = tmp_path / "elsewhere.key"
     save_record(RECORD, tmp_path / "store", key)
     assert load_record(tmp_path / "store", "X", key) == RECORD
@@ -140,13 +136,13 @@ def test_the_key_may_lie_elsewhere(tmp_path: Path) -> None:
      '{"schema": "' + "x" * 70_000 + '"}'],
     ids=lambda text: text[:12],
 )  # fmt: skip
-def test_what_is_no_record_is_refused(text: str, tmp_path: Path) -> None:
-    record_path(tmp_path, "X").write_text(text)
+def test_invalid_record_file_is_refused(text: str, tmp_path: Path) -> None:
+    build_record_path(tmp_path, "X").write_text(text)
     with pytest.raises(StoreError, match="is not a commissioning record; commission the axis again"):
         load_record(tmp_path, "X")
 
 
-def test_no_flipped_bit_of_a_record_changes_what_is_read(tmp_path: Path) -> None:
+def test_flipped_bit_never_changes_loaded_record(tmp_path: Path) -> None:
     path = save_record(RECORD, tmp_path)
     whole, rng, refused = path.read_bytes(), random.Random(4), list[str]()
     for byte in range(len(whole)):

@@ -14,13 +14,20 @@ from pathlib import Path
 import can
 import pytest
 
-from fdhil.commissioning.bus_listener import Traffic
-from fdhil.commissioning.config_check import check_machine, compare_heard
+from fdhil.commissioning.commissioning_steps import check_axis
+from fdhil.commissioning.config_check import check_machine, compare_by_traffic
+from fdhil.commissioning.drive_survey import DeviceIdentity, compare_identity
 from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.master import Master
-from fdhil.commissioning.scan import BusScanner, Description, EdsMatch, printable, read_descriptions, scan_bus
-from fdhil.commissioning.steps import check_axis
-from fdhil.commissioning.survey import Identity, compare_identity
+from fdhil.commissioning.scan import (
+    BusScanner,
+    DeviceDescription,
+    EdsMatch,
+    read_descriptions,
+    replace_unprintable,
+    scan_bus,
+)
+from fdhil.commissioning.traffic_listener import BusTraffic
 from fdhil.config import Drive, MachineConfig
 from fdhil.drivers.can.frame_ring import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, pack_frames
 from fdhil.drivers.cia402.drive_profile_file import load_profile
@@ -31,11 +38,11 @@ from tests.drivers.peer import DrivePeer
 from tests.short_waits import shorten_waits
 from tests.virtual_threads import VirtualThreads
 
-WHO = Identity(1, 2, 3, 4)
+WHO = DeviceIdentity(1, 2, 3, 4)
 
 
 @pytest.fixture(autouse=True)
-def quick(virtual_threads: object, monkeypatch: pytest.MonkeyPatch) -> None:
+def fast_scan(virtual_threads: object, monkeypatch: pytest.MonkeyPatch) -> None:
     shorten_waits(monkeypatch)
 
 
@@ -46,9 +53,9 @@ def peer() -> Iterator[tuple[DrivePeer, MachineConfig]]:
         yield running, settings
 
 
-def traffic(*rows: Row) -> Traffic:
-    heard = Traffic()
-    heard.take(pack_frames(rows))
+def build_traffic(*rows: Row) -> BusTraffic:
+    heard = BusTraffic()
+    heard.add_frames(pack_frames(rows))
     return heard
 
 
@@ -72,42 +79,48 @@ def traffic(*rows: Row) -> Traffic:
         (0x200 | ERROR_FLAG, bytes(8), None),
     ],
 )
-def test_a_master_is_recognised_by_what_it_sends(can_id: int, data: bytes, master: str | None) -> None:
-    assert traffic((0, can_id, data)).master == master
+def test_master_is_recognised_by_its_frames(can_id: int, data: bytes, master: str | None) -> None:
+    assert build_traffic((0, can_id, data)).master == master
 
 
-def test_nodes_states_and_heartbeats_are_heard() -> None:
+def test_nodes_states_and_heartbeats_are_listed() -> None:
     beats = [(int(k * 5e8), 0x703, bytes([0x7F])) for k in range(4)]
-    heard = traffic(*beats, (0, 0x182, bytes(8)), (0, 0x085, b"\x11\x86" + bytes(6)), (0, 0x707, b"\x33"))
-    assert heard.nodes == {2, 3, 5, 7}
-    assert (heard.nmt(3), heard.nmt(2), heard.nmt(7)) == ("pre-operational", None, "unknown (33)")
-    assert heard.heartbeat_s(3) == pytest.approx(0.5)
-    assert heard.heartbeat_s(7) is None
+    heard = build_traffic(*beats, (0, 0x182, bytes(8)), (0, 0x085, b"\x11\x86" + bytes(6)), (0, 0x707, b"\x33"))
+    assert heard.sending_nodes == {2, 3, 5, 7}
+    assert (heard.decode_nmt_state(3), heard.decode_nmt_state(2), heard.decode_nmt_state(7)) == (
+        "pre-operational",
+        None,
+        "unknown (33)",
+    )
+    assert heard.measure_heartbeat_s(3) == pytest.approx(0.5)
+    assert heard.measure_heartbeat_s(7) is None
     assert heard.emergencies == {5: {0x8611}}
 
 
-def test_a_sync_that_was_late_once_does_not_change_the_period() -> None:
+def test_single_late_sync_does_not_change_period() -> None:
     stamps = [k * 1_000_000 + (9_000_000 if k == 20 else 0) for k in range(21)]
-    assert traffic(*((t, 0x80, b"") for t in stamps)).sync_period_s == pytest.approx(1e-3)
-    assert traffic(*((t, 0x703, b"\x7f") for t in stamps)).heartbeat_s(3) == pytest.approx(1e-3)
+    assert build_traffic(*((t, 0x80, b"") for t in stamps)).sync_period_s == pytest.approx(1e-3)
+    assert build_traffic(*((t, 0x703, b"\x7f") for t in stamps)).measure_heartbeat_s(3) == pytest.approx(1e-3)
 
 
-def test_a_node_that_comes_while_it_is_looked_who_is_there_disturbs_nobody(
+def test_node_appearing_during_listing_causes_no_error(
     virtual_threads: VirtualThreads, request: pytest.FixtureRequest
 ) -> None:
-    virtual_threads.release()
+    virtual_threads.release_all()
     request.addfinalizer(partial(sys.setswitchinterval, sys.getswitchinterval()))
     sys.setswitchinterval(1e-6)  # threads switch as often as possible
     ids = range(0x181, 0x1FF)
     for _ in range(30):
-        heard = Traffic()
-        coming = threading.Thread(target=heard.take, args=(pack_frames([(0, can_id, bytes(8)) for can_id in ids]),))
+        heard = BusTraffic()
+        coming = threading.Thread(
+            target=heard.add_frames, args=(pack_frames([(0, can_id, bytes(8)) for can_id in ids]),)
+        )
         coming.start()
         while coming.is_alive():
-            assert len(heard.nodes) <= len(ids)
+            assert len(heard.sending_nodes) <= len(ids)
         coming.join()
-        assert len(heard.nodes) == len(ids)
-    assert traffic((0, 0x80, b"")).sync_period_s is None
+        assert len(heard.sending_nodes) == len(ids)
+    assert build_traffic((0, 0x80, b"")).sync_period_s is None
 
 
 @pytest.mark.parametrize(
@@ -126,39 +139,39 @@ def test_a_node_that_comes_while_it_is_looked_who_is_there_disturbs_nobody(
         ((9, None, None), None),
     ],
 )
-def test_an_eds_fits_by_vendor_product_and_revision(found: tuple[int | None, ...], fit: str | None) -> None:
-    assert Description(Path("drive.eds"), *found).fits(WHO) == fit
+def test_eds_matches_by_vendor_product_and_revision(found: tuple[int | None, ...], fit: str | None) -> None:
+    assert DeviceDescription(Path("drive.eds"), *found).match_identity(WHO) == fit
 
 
-def test_a_node_that_does_not_say_who_it_is_fits_no_eds() -> None:
-    assert Description(Path("drive.eds"), 0, None, None).fits(Identity(0, 0, 0, 0)) is None
+def test_node_without_identity_matches_no_eds() -> None:
+    assert DeviceDescription(Path("drive.eds"), 0, None, None).match_identity(DeviceIdentity(0, 0, 0, 0)) is None
 
 
-def test_eds_files_are_read_and_others_are_left(tmp_path: Path) -> None:
+def test_eds_files_are_read_and_others_ignored(tmp_path: Path) -> None:
     text = "[DeviceInfo]\nVendorNumber=0x1\nProductNumber=2\nRevisionNumber=3\n[1000]\nParameterName=Type\nDataType=7\n"
     (tmp_path / "good.eds").write_text(text)
     (tmp_path / "bad.dcf").write_text("nothing")
     (tmp_path / "readme.txt").write_text("nothing")
     found, faults = read_descriptions([tmp_path])
-    assert [(d.path.name, d.fits(WHO)) for d in found] == [("good.eds", "exact")]
+    assert [(d.path.name, d.match_identity(WHO)) for d in found] == [("good.eds", "exact")]
     text = f"{tmp_path}/bad.dcf: line 1: it has no object; this is not an EDS file"
     assert [str(fault) for fault in faults] == [text]
 
 
 @pytest.mark.parametrize("text", [b"\x1b]0;owned\x07", b"a\rb\nc", b"\xff\xfe", b"x" * 500])
 @pytest.mark.fault("G12")
-def test_a_drives_text_cannot_steer_a_terminal(text: bytes) -> None:
-    assert printable(text).isprintable()
-    assert len(printable(text)) <= 80
+def test_drive_text_cannot_control_terminal(text: bytes) -> None:
+    assert replace_unprintable(text).isprintable()
+    assert len(replace_unprintable(text)) <= 80
 
 
-def test_a_node_that_lacks_objects_is_listed_all_the_same(
+def test_node_without_optional_objects_is_listed(
     peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, settings = peer
-    exact = Description(Path("b.eds"), 0x46444849, 0x402, 0x10000)
-    other = Description(Path("a.eds"), 0x46444849, 0x402, 7)
-    vendors = Description(Path("0.eds"), 0x46444849, 0xFFFFFFFF, 7)
+    exact = DeviceDescription(Path("b.eds"), 0x46444849, 0x402, 0x10000)
+    other = DeviceDescription(Path("a.eds"), 0x46444849, 0x402, 7)
+    vendors = DeviceDescription(Path("0.eds"), 0x46444849, 0xFFFFFFFF, 7)
     found = scan_bus("can0", settings, [vendors, other, exact])
     assert [(node.node_id, node.axis) for node in found.nodes] == [(1, "X")]
     answers = found.nodes[0].answers
@@ -166,12 +179,12 @@ def test_a_node_that_lacks_objects_is_listed_all_the_same(
     assert answers.eds == EdsMatch("b.eds", "exact")
     assert answers.is_drive
     with BusScanner("can0", settings.bus["can0"]) as bus:
-        assert bus.read(1, 0x5FFF) is None
+        assert bus.read_object(1, 0x5FFF) is None
         monkeypatch.setattr("fdhil.drivers.can.sdo_channel.RESPONSE_TIMEOUT_S", 0.01)  # receives nothing
-        assert bus.read(9, 0x1000) is None
+        assert bus.read_object(9, 0x1000) is None
 
 
-def test_nothing_is_asked_once_a_master_is_heard(peer: tuple[DrivePeer, MachineConfig]) -> None:
+def test_nothing_is_sent_when_master_is_detected(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     with (
         can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc,
@@ -179,17 +192,17 @@ def test_nothing_is_asked_once_a_master_is_heard(peer: tuple[DrivePeer, MachineC
     ):
         nc.send(can.Message(arbitration_id=0x80, is_extended_id=False))
         while bus.traffic.master is None:
-            bus.listen(0.1)
+            bus.listen_for(0.1)
         with pytest.raises(ForeignMaster, match=r"an NC is sending SYNC .* nothing more was sent"):
-            bus.answering()
+            bus.find_answering_nodes()
         with pytest.raises(ForeignMaster, match="start again"):
-            bus.read(1, 0x1000)
+            bus.read_object(1, 0x1000)
     while not drive.heard:
         time.sleep(0.01)
     assert drive.heard == [0x80]
 
 
-def test_a_silent_bus_is_told() -> None:
+def test_silent_bus_is_reported() -> None:
     settings = build_machine_config(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
     with pytest.raises(ConnectError, match="no node sent a frame and none answered"):
         scan_bus("can0", settings, [])
@@ -205,9 +218,7 @@ DIFFERENT: dict[str, tuple[Callable[[DrivePeer], None], str]] = {
 
 
 @pytest.mark.parametrize("point", DIFFERENT)
-def test_a_drive_that_is_not_set_up_differs_in_that_point_alone(
-    point: str, peer: tuple[DrivePeer, MachineConfig]
-) -> None:
+def test_missing_setup_is_the_only_difference(point: str, peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     spoil, shown = DIFFERENT[point]
     spoil(drive)
@@ -218,7 +229,7 @@ def test_a_drive_that_is_not_set_up_differs_in_that_point_alone(
     assert not {0x000, 0x080, 0x201, 0x301} & set(drive.heard)
 
 
-def lacking(drive: DrivePeer, *indices: int) -> None:
+def remove_objects(drive: DrivePeer, *indices: int) -> None:
     for index in indices:
         for key in [key for key in drive.drive.dictionary.entries if key >> 8 == index]:
             del drive.drive.dictionary.entries[key]
@@ -234,9 +245,9 @@ LACKING = {
 
 
 @pytest.mark.parametrize("point", LACKING)
-def test_what_the_drive_does_not_have_is_not_compared(point: str, peer: tuple[DrivePeer, MachineConfig]) -> None:
+def test_missing_objects_are_not_compared(point: str, peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
-    lacking(drive, *LACKING[point])
+    remove_objects(drive, *LACKING[point])
     (finding,) = [finding for _, finding in check_machine(settings) if not finding.ok]
     shown = " and ".join(f"0x{index:04X}" for index in LACKING[point])
     assert (finding.point, finding.ok, finding.found) == (point, None, f"no {shown}")
@@ -244,43 +255,41 @@ def test_what_the_drive_does_not_have_is_not_compared(point: str, peer: tuple[Dr
 
 
 @pytest.mark.parametrize("code", [AbortCode.NO_DATA, AbortCode.DEVICE_STATE, AbortCode.READ_WRITE_ONLY])
-def test_an_object_that_the_drive_refuses_to_tell_ends_no_check(
-    code: AbortCode, peer: tuple[DrivePeer, MachineConfig]
-) -> None:
+def test_refused_object_does_not_end_check(code: AbortCode, peer: tuple[DrivePeer, MachineConfig]) -> None:
     """Some drives have objects without a value, and one refusal must not hide everything else."""
     drive, settings = peer
 
-    def refuse() -> int:
+    def refuse_read() -> int:
         raise TransferAbort(code)
 
     for key in (0x100000, 0x101804, 0x600700, 0x607D01):
         if key in drive.drive.dictionary.entries:
-            drive.drive.dictionary.read_hooks[key] = refuse
-    lacking(drive, 0x67FF)
+            drive.drive.dictionary.read_hooks[key] = refuse_read
+    remove_objects(drive, 0x67FF)
     found = {finding.point: finding for _, finding in check_machine(settings)}
     assert {point for point, finding in found.items() if not finding.ok} == {"device", "communication lost"}
     assert found["device"].ok is found["communication lost"].ok is None
     assert (found["TPDO1"].ok, found["following error"].ok) == (True, True)
 
 
-def test_a_drive_that_does_not_say_who_it_is_is_not_compared_with_a_makers_profile() -> None:
+def test_drive_without_identity_is_not_compared_with_vendor_profile() -> None:
     profile = replace(load_profile(Drive()), vendor_id=0xFB)
-    told = {vendor: compare_identity(profile, Identity(vendor, 2, 3, 4)).ok for vendor in (0xFB, 0xFC, 0)}
+    told = {vendor: compare_identity(profile, DeviceIdentity(vendor, 2, 3, 4)).ok for vendor in (0xFB, 0xFC, 0)}
     assert told == {0xFB: True, 0xFC: False, 0: None}
 
 
-def test_a_drive_that_coasts_is_told_though_the_other_object_is_missing(peer: tuple[DrivePeer, MachineConfig]) -> None:
+def test_coasting_drive_is_reported_although_other_object_is_missing(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
-    lacking(drive, 0x605A)
+    remove_objects(drive, 0x605A)
     drive.drive.overwrite_object(0x605E, 0, 0)
     (finding,) = [finding for _, finding in check_machine(settings) if not finding.ok]
     assert (finding.ok, finding.found) == (False, "0x605A = missing, 0x605E = 0")
 
 
-def test_a_drive_without_a_following_error_window_is_not_commissioned(peer: tuple[DrivePeer, MachineConfig]) -> None:
+def test_drive_without_following_error_window_is_not_commissioned(peer: tuple[DrivePeer, MachineConfig]) -> None:
     """Nothing would stop it when it leaves its path, and offsets could not be compared with the window."""
     drive, settings = peer
-    lacking(drive, 0x6065)
+    remove_objects(drive, 0x6065)
     with (
         Master(settings, "X") as master,
         pytest.raises(DriveFault, match=r"it has no 0x6065 that can be read; see its manual"),
@@ -288,9 +297,9 @@ def test_a_drive_without_a_following_error_window_is_not_commissioned(peer: tupl
         check_axis(master)
 
 
-def test_a_device_that_is_no_drive_is_told_as_such(peer: tuple[DrivePeer, MachineConfig]) -> None:
+def test_device_that_is_not_a_drive_is_reported(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
-    lacking(drive, 0x67FF)
+    remove_objects(drive, 0x67FF)
     drive.drive.overwrite_object(0x1000, 0, 0x00030191)
     found = {finding.point: finding for place, finding in check_machine(settings) if place == "axis X"}
     assert {point for point, finding in found.items() if finding.ok is False} == {"device"}
@@ -303,11 +312,11 @@ def test_a_device_that_is_no_drive_is_told_as_such(peer: tuple[DrivePeer, Machin
 @pytest.mark.parametrize(
     ("device_type", "first", "ok"), [(0x192, None, True), (0xFFFF0191, 0x20192, True), (0, 0, None)]
 )
-def test_a_drive_says_so_itself_or_as_the_first_of_several_devices(
+def test_drive_is_recognised_by_own_or_first_device_type(
     device_type: int, first: int | None, ok: bool | None, peer: tuple[DrivePeer, MachineConfig]
 ) -> None:
     drive, settings = peer
-    lacking(drive, 0x67FF)
+    remove_objects(drive, 0x67FF)
     if first is not None:
         own = drive.drive.dictionary.entries[0x100000]
         drive.drive.dictionary.entries[0x67FF00] = replace(own, index=0x67FF)
@@ -317,18 +326,18 @@ def test_a_drive_says_so_itself_or_as_the_first_of_several_devices(
     assert finding.ok is ok
 
 
-def test_a_bus_of_another_bit_rate_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_sent_on_bus_with_other_bit_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     for where in ("scan", "config_check"):
         monkeypatch.setattr(f"fdhil.commissioning.{where}.LISTEN_S", 2.0)
     settings = build_machine_config(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as loud:
         stop = threading.Event()
 
-        def disturb() -> None:
+        def send_error_frames() -> None:
             while not stop.wait(0.01):
                 loud.send(can.Message(arbitration_id=0x4, data=bytes(8), is_error_frame=True))
 
-        thread = threading.Thread(target=disturb)
+        thread = threading.Thread(target=send_error_frames)
         thread.start()
         try:
             for ask in (lambda: scan_bus("can0", settings, []), lambda: check_machine(settings)):
@@ -343,12 +352,14 @@ def test_a_bus_of_another_bit_rate_is_not_asked(monkeypatch: pytest.MonkeyPatch)
         assert loud.recv(0) is None
 
 
-def heard(config: MachineConfig, wire: FrameBuilder, *more: Row) -> dict[str, Finding]:
-    return {finding.point: finding for finding in compare_heard(traffic(*wire.build_rows(), *more), config, "X")}
+def listen_to_nc(config: MachineConfig, wire: FrameBuilder, *more: Row) -> dict[str, Finding]:
+    return {
+        finding.point: finding for finding in compare_by_traffic(build_traffic(*wire.build_rows(), *more), config, "X")
+    }
 
 
-def test_what_an_ncs_traffic_shows_is_compared() -> None:
-    found = heard(build_machine_config(), FrameBuilder(400), *((int(k * 1e8), 0x701, b"\x05") for k in range(4)))
+def test_traffic_of_nc_is_compared() -> None:
+    found = listen_to_nc(build_machine_config(), FrameBuilder(400), *((int(k * 1e8), 0x701, b"\x05") for k in range(4)))
     assert {point for point, finding in found.items() if finding.ok} == {
         "drive", "heartbeat", "identifiers", "offset writers",
         "TPDO1", "TPDO2", "TPDO3", "TPDO4", "RPDO1", "rapid signal",
@@ -356,13 +367,13 @@ def test_what_an_ncs_traffic_shows_is_compared() -> None:
     assert not [point for point, finding in found.items() if finding.ok is False]
 
 
-def test_a_drive_on_another_node_id_is_told() -> None:
-    found = heard(build_machine_config(), FrameBuilder(400, node_id=5))
+def test_drive_on_other_node_id_is_reported() -> None:
+    found = listen_to_nc(build_machine_config(), FrameBuilder(400, node_id=5))
     assert found["drive"].ok is False
     assert found["TPDO1"].cause == "TPDO1 (181) was received 0 times in 400 SYNC, 400 are due"
 
 
 @pytest.mark.parametrize(("bit", "state"), [(16, "on now"), (3, "off now")])
-def test_the_rapid_signal_is_shown(bit: int, state: str) -> None:
+def test_rapid_signal_is_reported(bit: int, state: str) -> None:
     config = build_machine_config(g0={"source": "digital_input", "input_bit": bit})
-    assert heard(config, FrameBuilder(400))["rapid signal"].found == state
+    assert listen_to_nc(config, FrameBuilder(400))["rapid signal"].found == state

@@ -17,9 +17,9 @@ import numpy as np
 
 from fdhil.arming import checked_program, program_check
 from fdhil.arming.code_digest import compute_code_digest
-from fdhil.commissioning.progress import Progress
-from fdhil.commissioning.record import CommissioningRecord, load_record, save_record
-from fdhil.commissioning.void import is_void, void_record
+from fdhil.commissioning.commissioning_record import CommissioningRecord, load_record, save_record
+from fdhil.commissioning.step_progress import StepProgress
+from fdhil.commissioning.void_mark import is_record_void, mark_record_void
 from fdhil.config import MachineConfig
 from fdhil.correction.learned_offsets import LearnedOffset
 from fdhil.daemon import black_box
@@ -190,15 +190,15 @@ class LearnedOffsets(Plain):
 
 class Steps(Plain):
     def keep(self, number: int) -> None:
-        Progress(self.folder, "X").keep(f"step {number % STEPS}", "this drive", {"number": number})
+        StepProgress(self.folder, "X").save_step(f"step {number % STEPS}", "this drive", {"number": number})
 
     def found(self) -> set[int]:
-        progress = Progress(self.folder, "X")
-        if progress.doubt:
-            self.said.append(progress.doubt)
+        progress = StepProgress(self.folder, "X")
+        if progress.rejection:
+            self.said.append(progress.rejection)
         numbers = set[int]()
-        for name in progress.done():
-            number = int((progress.found(name, "this drive") or {})["number"])
+        for name in progress.list_step_times():
+            number = int((progress.find_result(name, "this drive") or {})["number"])
             assert name == f"step {number % STEPS}", "a step is another"
             numbers.add(number)
         return numbers | set(range(1, max(numbers, default=STEPS) - STEPS + 1))
@@ -227,11 +227,11 @@ def _record(number: int) -> CommissioningRecord:
 
 class Voids(Plain):
     def keep(self, number: int) -> None:
-        void_record(self.folder, str(number), "the drive has rebooted")
+        mark_record_void(self.folder, str(number), "the drive has rebooted")
 
     def found(self) -> set[int]:
         numbers = {int(path.stem.partition("-")[2]) for path in self.folder.glob("commissioning-*.void")}
-        return {number for number in numbers if is_void(self.folder, str(number))}
+        return {number for number in numbers if is_record_void(self.folder, str(number))}
 
 
 class Programs(Plain):

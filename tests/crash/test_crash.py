@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.commissioning.progress import Progress
+from fdhil.commissioning.step_progress import StepProgress
 from fdhil.daemon import black_box
 from fdhil.errors import StoreError
 from fdhil.store import atomic_file
@@ -79,7 +79,7 @@ def test_read_only_disk_refuses_and_loses_nothing(name: str, tmp_path: Path) -> 
 
 
 def test_unreadable_steps_are_not_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    Progress(tmp_path, "X").keep("sign test", "this drive", {"um": 10.0})
+    StepProgress(tmp_path, "X").save_step("sign test", "this drive", {"um": 10.0})
 
     def refuses(*_: Any, **__: Any) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
@@ -87,8 +87,8 @@ def test_unreadable_steps_are_not_overwritten(tmp_path: Path, monkeypatch: pytes
     with monkeypatch.context() as patched:
         patched.setattr(Path, "open", refuses)
         with pytest.raises(StoreError, match=r"cannot be read .* check the disk, or move it away"):
-            Progress(tmp_path, "X")
-    assert Progress(tmp_path, "X").done().keys() == {"sign test"}
+            StepProgress(tmp_path, "X")
+    assert StepProgress(tmp_path, "X").list_step_times().keys() == {"sign test"}
 
 
 @pytest.mark.fault("F9")

@@ -14,8 +14,8 @@ import pytest
 from fdhil import config as machine_config
 from fdhil.cli.demo.processes import ChildProcess, SimulatorProcess
 from fdhil.cli.main import cli, run_safely
-from fdhil.commissioning.record import save_record
-from fdhil.commissioning.steps import commission
+from fdhil.commissioning.commissioning_record import save_record
+from fdhil.commissioning.commissioning_steps import commission_axis
 from fdhil.config import MachineConfig
 from fdhil.daemon.daemon_socket import ask_daemon
 from fdhil.errors import ConnectError
@@ -40,9 +40,9 @@ BENCH = HEAD + AXIS + AXIS.replace(".X", ".Y")
 WAITS = {
     "drivers.can.sdo_channel.RESPONSE_TIMEOUT_S": 20.0,
     "drivers.can.sdo_channel.DEADLINE_S": 20.0,
-    "commissioning.survey.LISTEN_S": 0.3,
-    "commissioning.steps.SETTLE_CYCLES": 100,
-    "commissioning.steps.AVERAGE_CYCLES": 60,
+    "commissioning.drive_survey.LISTEN_S": 0.3,
+    "commissioning.commissioning_steps.SETTLE_CYCLES": 100,
+    "commissioning.commissioning_steps.AVERAGE_CYCLES": 60,
 }
 
 
@@ -70,7 +70,7 @@ class MachineRig:
     def commission(self) -> None:
         with patient():
             for axis in self.config.axis:
-                save_record(commission(self.config, axis), self.config.store.directory)
+                save_record(commission_axis(self.config, axis), self.config.store.directory)
 
     def daemon(self) -> ChildProcess:
         daemon = ChildProcess("daemon", ["fdhil", "run", str(self.path)], self.folder / "daemon.log")

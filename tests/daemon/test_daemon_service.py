@@ -17,7 +17,7 @@ import pytest
 
 from fdhil.cli.demo.toml_writer import format_toml
 from fdhil.cli.doctor.devices import examine_daemon
-from fdhil.commissioning.void import void_path
+from fdhil.commissioning.void_mark import build_mark_path
 from fdhil.config import MachineConfig, load_config
 from fdhil.daemon.bus_health import BusHealth
 from fdhil.daemon.daemon_service import DaemonService, InternalError, run_daemon_service
@@ -219,9 +219,9 @@ async def test_systemd_receives_ready_watchdog_and_stopping(tmp_path: Path, monk
 async def test_boot_up_of_a_drive_voids_its_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config, booted = config_of(tmp_path), Notice("NodeRebooted", "MAJOR", "Drive X booted.", "X")
     async with serving(config, SimulatedMachine([Notice("SyncLost", "MAJOR", "SYNC stopped"), booted])):
-        await _exists(void_path(config.store.directory, "X"))
-    assert "booted" in void_path(config.store.directory, "X").read_text()
-    void_path(config.store.directory, "X").unlink()
+        await _exists(build_mark_path(config.store.directory, "X"))
+    assert "booted" in build_mark_path(config.store.directory, "X").read_text()
+    build_mark_path(config.store.directory, "X").unlink()
     (tmp_path / "file").write_text("")
     blocked = config.model_copy(update={"store": config.store.model_copy(update={"directory": tmp_path / "file"})})
     async with serving(blocked, SimulatedMachine([booted])) as path:
@@ -242,8 +242,8 @@ async def test_suppressed_boot_up_notice_still_voids_the_record(tmp_path: Path) 
     voiding = asyncio.create_task(service._void_records())
     await service._void_axes.join()
     voiding.cancel()
-    assert "boot 299" in void_path(config.store.directory, "X").read_text()
-    assert "Drive Y booted" in void_path(config.store.directory, "Y").read_text()
+    assert "boot 299" in build_mark_path(config.store.directory, "X").read_text()
+    assert "Drive Y booted" in build_mark_path(config.store.directory, "Y").read_text()
 
 
 def test_watchdog_starves_on_a_hanging_source_but_not_on_a_silent_bus(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import pytest
 from fdhil import config as machine_config
 from fdhil.cli.demo.loop import compute_true_parameters, read_trace
 from fdhil.cli.demo.machines import load_machine_document
-from fdhil.commissioning.steps import commission
+from fdhil.commissioning.commissioning_steps import commission_axis
 from fdhil.prediction import compute_contour_error_um, predict_path
 from fdhil.program import load_trajectory
 from fdhil.records import Parameters, compute_rms, compute_table_path
@@ -157,7 +157,7 @@ def test_each_drive_is_commissioned(document: dict[str, Any], monkeypatch: pytes
         for axis in config.axis:
             peers.enter_context(DrivePeer(config, axis))
         for axis in config.axis:
-            record = commission(config, axis)
+            record = commission_axis(config, axis)
             assert record.readback_ok
             assert record.offset_in_feedforward
             assert record.watchdog == "proven"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.commissioning.steps import commission
+from fdhil.commissioning.commissioning_steps import commission_axis
 from fdhil.config import MachineConfig
 from fdhil.drivers import MachineSource, Record, open_machine
 from fdhil.errors import ConnectError, DriveFault, ProtocolError
@@ -110,11 +110,11 @@ def has_moved(records: list[Record]) -> bool:
 
 @pytest.mark.usefixtures("processes")
 def test_simulated_drive_is_commissioned(simulator_process: SimulatorProcess, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.3)
-    monkeypatch.setattr("fdhil.commissioning.steps.SETTLE_CYCLES", 150)
-    monkeypatch.setattr("fdhil.commissioning.steps.AVERAGE_CYCLES", 80)
+    monkeypatch.setattr("fdhil.commissioning.drive_survey.LISTEN_S", 0.3)
+    monkeypatch.setattr("fdhil.commissioning.commissioning_steps.SETTLE_CYCLES", 150)
+    monkeypatch.setattr("fdhil.commissioning.commissioning_steps.AVERAGE_CYCLES", 80)
     with patient():
-        record = commission(simulator_process.build_config(), "X")
+        record = commission_axis(simulator_process.build_config(), "X")
     assert record.offset_in_feedforward is True
     assert record.watchdog == "proven"
     assert record.sign_test_um == pytest.approx(10, abs=3)
@@ -122,13 +122,13 @@ def test_simulated_drive_is_commissioned(simulator_process: SimulatorProcess, mo
 
 @pytest.mark.usefixtures("real_time")
 def test_wrong_window_setting_is_refused(simulator_process: SimulatorProcess, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.3)
+    monkeypatch.setattr("fdhil.commissioning.drive_survey.LISTEN_S", 0.3)
     settings = simulator_process.build_config()
     wrong = settings.axis["X"].model_copy(
         update={"drive": settings.axis["X"].drive.model_copy(update={"increments_per_rev": 4096})}
     )
     with patient(), pytest.raises(DriveFault, match="65536 position increments per motor revolution"):
-        commission(settings.model_copy(update={"axis": {"X": wrong}}), "X")
+        commission_axis(settings.model_copy(update={"axis": {"X": wrong}}), "X")
 
 
 @pytest.mark.usefixtures("real_time")
@@ -164,10 +164,10 @@ async def test_rapid_is_recorded_completely(simulator_process: SimulatorProcess)
 async def test_active_nc_prevents_commissioning(
     simulator_process: SimulatorProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 60.0)  # it ends with the first SYNC
+    monkeypatch.setattr("fdhil.commissioning.drive_survey.LISTEN_S", 60.0)  # it ends with the first SYNC
     simulator_process.send_command(command="nc", on=True)
     with pytest.raises(ProtocolError, match="an NC is sending"):
-        await asyncio.to_thread(commission, simulator_process.build_config(), "X")
+        await asyncio.to_thread(commission_axis, simulator_process.build_config(), "X")
 
 
 async def test_voltage_sensor_is_read_and_its_loss_reported(simulator_process: SimulatorProcess) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.commissioning.record import axis_digest, save_record
+from fdhil.commissioning.commissioning_record import compute_axis_digest, save_record
 from fdhil.config import MachineConfig
 from fdhil.daemon.offer_watch import OfferWatch
 from fdhil.store import audit_file
@@ -143,7 +143,7 @@ def test_invalidated_records_are_listed(offer_signer: OfferSigner, config_file: 
         offer_signer, config_file, values={"axis.X.correction.max_offset_um": 5.0, "axis.Y.nominal.ft": 0.06}
     )
     for axis in "XY":
-        save_record(replace(RECORD, axis=axis, config_digest=axis_digest(config, axis)), config.store.directory)
+        save_record(replace(RECORD, axis=axis, config_digest=compute_axis_digest(config, axis)), config.store.directory)
     said = fdhil("offers", "list", config_file, capsys=capsys)[1]
     assert "the commissioning record of axis X becomes invalid" in said
     assert "record of axis Y" not in said

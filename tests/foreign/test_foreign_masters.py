@@ -89,7 +89,7 @@ def test_no_request_is_sent_next_to_a_foreign_master(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 60.0)  # it ends with the master's first frame
+    monkeypatch.setattr("fdhil.commissioning.drive_survey.LISTEN_S", 60.0)  # it ends with the master's first frame
     process, path = simulator_process
     with start_master(make, process) as nc, process.join_bus() as bus:
         nc.event("enabled")

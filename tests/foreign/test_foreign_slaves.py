@@ -55,16 +55,16 @@ def short_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorter waits than on a real machine where nothing is sent, longer ones where something is."""
     monkeypatch.setattr("fdhil.commissioning.scan.LISTEN_S", 0.4)
     monkeypatch.setattr("fdhil.commissioning.config_check.LISTEN_S", 0.4)
-    monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.4)
+    monkeypatch.setattr("fdhil.commissioning.drive_survey.LISTEN_S", 0.4)
     # the slave is a process of its own, on a computer that is busy
     monkeypatch.setattr("fdhil.commissioning.scan.ANSWER_S", 2.0)
-    monkeypatch.setattr(BusScanner, "answering", wait_for_answer)
+    monkeypatch.setattr(BusScanner, "find_answering_nodes", wait_for_answer)
     monkeypatch.setattr("fdhil.drivers.can.sdo_channel.RESPONSE_TIMEOUT_S", 60.0)
     monkeypatch.setattr("fdhil.drivers.can.sdo_channel.DEADLINE_S", 60.0)
 
 
 def wait_for_answer(
-    scanner: BusScanner, answering: Callable[[BusScanner], set[int]] = BusScanner.answering
+    scanner: BusScanner, answering: Callable[[BusScanner], set[int]] = BusScanner.find_answering_nodes
 ) -> set[int]:
     """Scan all nodes until the drive has answered; it is certainly on the bus."""
     while not (found := answering(scanner)):

@@ -26,7 +26,7 @@ COMPILED = ("njit", "@compiled", "@inlined")
 UNSEEN = ["fdhil.store.reading_process"]
 
 
-def kernels() -> list[str]:
+def list_kernel_modules() -> list[str]:
     """Return the modules with compiled functions, which cannot be instrumented."""
     files = (ROOT / "fdhil").rglob("*.py")
     found = [path for path in files if any(word in path.read_text("utf-8") for word in COMPILED)]
@@ -53,33 +53,37 @@ def _fuzz(options: argparse.Namespace, corpus: Path, folder: Path) -> None:
     except ImportError:
         sys.exit("atheris is not installed; there is one for Linux and Python below 3.14: make setup with that")
 
-    with atheris.instrument_imports(include=["fdhil"], exclude=[*kernels(), *UNSEEN], enable_loader_override=False):
-        from tests.fuzz import tasting
-        from tests.fuzz.targets import target_of
+    with atheris.instrument_imports(
+        include=["fdhil"], exclude=[*list_kernel_modules(), *UNSEEN], enable_loader_override=False
+    ):
+        from tests.fuzz import input_assessment
+        from tests.fuzz.targets import load_target
 
-        target = target_of(options.name)
+        target = load_target(options.name)
         for seed in target.seeds:  # imports that would otherwise happen late
-            tasting.judged(target, seed)
+            input_assessment.assess_input(target, seed)
     gc.collect()
     gc.freeze()  # imported objects are not scanned again and again
     corpus.mkdir(parents=True, exist_ok=True)
     for seed in target.seeds:
         (corpus / hashlib.sha256(seed).hexdigest()[:16]).write_bytes(seed)
     words = folder / "words"
-    words.write_text("".join(f'"{_escaped(word)}"\n' for word in target.words))
-    search = _Search(options, target, tasting)
+    words.write_text("".join(f'"{_escape_input(word)}"\n' for word in target.words))
+    search = _FuzzSearch(options, target, input_assessment)
     kept = options.found / options.name  # an input that ends the process itself
     kept.mkdir(parents=True, exist_ok=True)
     flags = [f"-seed={options.seed}", f"-max_len={target.longest}", f"-dict={words}", "-verbosity=0", "-timeout=600"]
-    atheris.Setup([sys.argv[0], *flags, "-rss_limit_mb=8192", f"-artifact_prefix={kept}/", str(corpus)], search.taste)
+    atheris.Setup(
+        [sys.argv[0], *flags, "-rss_limit_mb=8192", f"-artifact_prefix={kept}/", str(corpus)], search.try_input
+    )
     atheris.Fuzz()
 
 
-def _escaped(word: bytes) -> str:
+def _escape_input(word: bytes) -> str:
     return "".join(f"\\x{byte:02x}" for byte in word)
 
 
-class _Search:
+class _FuzzSearch:
     """Counts inputs, stores failing ones, and ends the process after enough inputs."""
 
     def __init__(self, options: argparse.Namespace, target: Any, tasting: Any) -> None:
@@ -88,17 +92,17 @@ class _Search:
         self._found: dict[tuple[str, str], int] = {}
         self._begin_s, self._begin_cpu_s = time.monotonic(), tasting.processor_s(target)
 
-    def taste(self, data: bytes) -> None:
+    def try_input(self, data: bytes) -> None:
         begin_s = self._tasting.processor_s(self._target)
         finding = self._tasting.judged(self._target, data)
         self._slowest_s = max(self._slowest_s, self._tasting.processor_s(self._target) - begin_s)
         self._count += 1
         if finding is not None:
-            self._keep(finding, data)
+            self._store_finding(finding, data)
         if self._count >= self._options.inputs or time.monotonic() - self._begin_s > self._options.seconds:
-            self._end()
+            self._end_process()
 
-    def _keep(self, finding: Any, data: bytes) -> None:
+    def _store_finding(self, finding: Any, data: bytes) -> None:
         place = (finding.kind, finding.place)
         self._found[place] = self._found.get(place, 0) + 1
         if self._found[place] == 1:
@@ -111,21 +115,21 @@ class _Search:
                 file=sys.stderr,
             )
 
-    def _end(self) -> None:
+    def _end_process(self) -> None:
         figures = {
             "target": self._target.name,
             "inputs": self._count,
             "cpu_s": self._tasting.processor_s(self._target) - self._begin_cpu_s,
             "slowest_s": self._slowest_s,
             "peak_mib": max(self._tasting.peaks_bytes(self._target)) / (1 << 20),
-            "found": _told(self._found),
+            "found": _format_summary(self._found),
         }
         print(json.dumps(figures), flush=True)
         sys.stderr.flush()
         os._exit(bool(self._found))  # the fuzzer's own end would repeat the report
 
 
-def _told(found: dict[tuple[str, str], int]) -> Sequence[dict[str, Any]]:
+def _format_summary(found: dict[tuple[str, str], int]) -> Sequence[dict[str, Any]]:
     return [{"kind": kind, "place": place, "inputs": count} for (kind, place), count in found.items()]
 
 

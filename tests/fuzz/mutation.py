@@ -5,22 +5,22 @@ from __future__ import annotations
 import random
 from collections.abc import Iterator, Sequence
 
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 
 _ODD = (b"\0", b"\xff", b"\x7f", b"\x80", b"-1", b"nan", b"1e999", b"9" * 40, b"\n", b"[" * 40, b"\xed\xa0\x80")
 
 
-def mutants(target: Target, count: int, seed: int) -> Iterator[bytes]:
+def generate_mutants(target: Target, count: int, seed: int) -> Iterator[bytes]:
     """Yield mutated copies of the target's valid examples."""
     rng = random.Random(f"{target.name} {seed}")
     for _ in range(count):
         data = bytearray(rng.choice(target.seeds))
         for _ in range(rng.choice((1, 1, 2, 4, 8))):
-            _change(data, target, rng)
+            _mutate_input(data, target, rng)
         yield bytes(data[: target.longest])
 
 
-def _change(data: bytearray, target: Target, rng: random.Random) -> None:
+def _mutate_input(data: bytearray, target: Target, rng: random.Random) -> None:
     at, size = rng.randrange(len(data) + 1), rng.randrange(1, 17)
     words: Sequence[bytes] = (*_ODD, *target.words)
     match rng.randrange(6):

@@ -14,9 +14,9 @@ import can
 import pytest
 
 from fdhil import config as machine_config
+from fdhil.commissioning.commissioning_record import CommissioningRecord, compute_axis_digest, save_record
+from fdhil.commissioning.drive_survey import survey_drive
 from fdhil.commissioning.master import Master
-from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
-from fdhil.commissioning.survey import survey
 from fdhil.config import MachineConfig
 from fdhil.pipeline import AxisPipeline
 from fdhil.program import load_trajectory
@@ -54,11 +54,11 @@ class Bench:
 def sign_off(config: MachineConfig) -> None:
     for axis in config.axis:
         with Master(config, axis) as master:
-            found = survey(master)
+            found = survey_drive(master)
         record = CommissioningRecord(
             axis=axis,
             **asdict(found.identity),
-            config_digest=axis_digest(config, axis),
+            config_digest=compute_axis_digest(config, axis),
             mapping_fingerprint=found.fingerprint,
             options=found.options,
             following_error_window_um=found.window_um,
@@ -108,11 +108,13 @@ def transport(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def short_settling_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.3)
+    monkeypatch.setattr("fdhil.commissioning.drive_survey.LISTEN_S", 0.3)
     monkeypatch.setattr("fdhil.commissioning.transmit.LOOK_S", 0.05)
-    monkeypatch.setattr("fdhil.commissioning.steps.SETTLE_CYCLES", 150)
-    monkeypatch.setattr("fdhil.commissioning.steps.AVERAGE_CYCLES", 80)
-    monkeypatch.setattr("fdhil.commissioning.steps.MOST_RAMPS", 1000)  # a slow host sees few of them begin
+    monkeypatch.setattr("fdhil.commissioning.commissioning_steps.SETTLE_CYCLES", 150)
+    monkeypatch.setattr("fdhil.commissioning.commissioning_steps.AVERAGE_CYCLES", 80)
+    monkeypatch.setattr(
+        "fdhil.commissioning.commissioning_steps.MOST_RAMPS", 1000
+    )  # a slow host sees few of them begin
     monkeypatch.setattr("fdhil.commissioning.watchdog.STARVE_TIMEOUT_S", 15.0)  # a slow host's drives live slower
 
 

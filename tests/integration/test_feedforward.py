@@ -14,8 +14,8 @@ import pytest
 from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.operator_token import read_token
 from fdhil.cli.demo.processes import ChildProcess
-from fdhil.commissioning.record import save_record
-from fdhil.commissioning.steps import commission
+from fdhil.commissioning.commissioning_record import save_record
+from fdhil.commissioning.commissioning_steps import commission_axis
 from fdhil.correction.flatness_feedforward import derive_feedforward_law
 from fdhil.guard.interlocks import FEEDFORWARD_FACTS
 from fdhil.prediction.axis_models import build_nominal_models
@@ -51,7 +51,7 @@ def sections() -> dict[str, Any]:
 @pytest.fixture
 def client(bench: Bench, short_settling_time: None, tmp_path: Path) -> Iterator[GuardClient]:
     for axis in "XY":
-        record = commission(bench.config, axis)
+        record = commission_axis(bench.config, axis)
         save_record(record, bench.config.store.directory)
         assert record.options["1402"] == 0x400 + bench.config.get_node_id(axis)
     path = tmp_path / "machine.toml"

@@ -18,7 +18,7 @@ from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.operator_token import read_token
 from fdhil.cli.demo.processes import ChildProcess
 from fdhil.cli.main import cli
-from fdhil.commissioning.void import is_void, void_record
+from fdhil.commissioning.void_mark import is_record_void, mark_record_void
 from fdhil.guard.interlocks import FACTS
 from tests.guard import short_timeouts
 from tests.integration.conftest import PATIENCE_S, Bench, sign_off
@@ -109,10 +109,10 @@ def test_record_is_valid_until_an_event_voids_it(rig: TrustRig) -> None:
         rig.until(client, VOID)
         rig.nc(on=False)
         assert rig.check() == 1
-        assert is_void(rig.store, "X")
+        assert is_record_void(rig.store, "X")
         rig.write(bus, WINDOW, 32768)
         assert rig.check() == 0
-        assert not is_void(rig.store, "X")
+        assert not is_record_void(rig.store, "X")
         rig.nc(on=True)
         rig.until(client, set())
         rig.fault(axis="X", fault="reboot")
@@ -125,14 +125,14 @@ def test_record_is_valid_until_an_event_voids_it(rig: TrustRig) -> None:
     with rig.bench.join() as bus:
         rig.write(bus, 0x6007, 0, 0x2B)
     with rig.guard() as client:  # it is compared before the guard starts, which has not heard of it
-        assert is_void(rig.store, "X")
+        assert is_record_void(rig.store, "X")
         rig.nc(on=True)
         rig.until(client, VOID)
 
 
 def test_void_record_survives_a_guard_restart_next_to_a_running_nc(rig: TrustRig) -> None:
     rig.nc(on=True)
-    void_record(rig.store, "X", "booted")
+    mark_record_void(rig.store, "X", "booted")
     with rig.guard() as client:
         rig.until(client, VOID)
 

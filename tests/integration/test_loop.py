@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.commissioning.steps import commission
+from fdhil.commissioning.commissioning_steps import commission_axis
 from fdhil.drivers import open_machine
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import AxisSamples, MoveEvent, MoveKind, ParameterSet, WindowOutcome
@@ -104,7 +104,7 @@ def demand_and_position_are_aligned(blocks: list[AxisSamples]) -> None:
 
 @pytest.mark.usefixtures("short_settling_time")
 def test_axis_is_commissioned(bench: Bench, transport: str) -> None:
-    record = commission(bench.config, "X")
+    record = commission_axis(bench.config, "X")
     assert record.watchdog == "proven"
     # a virtual machine with one processor may be too slow to see the ramp begin: then it must not be told either way
     assert record.offset_in_feedforward in ((True, None) if transport == "socketcan" else (True,))

@@ -22,7 +22,7 @@ from fdhil.correction import PlanLimits
 from fdhil.correction import check_offsets as check_limits
 from fdhil.guard.interlocks import FACTS
 from fdhil.prediction.axis_models import build_nominal_models
-from fdhil.program import program_digest
+from fdhil.program import compute_program_digest
 from fdhil.records import Float, Reason
 from tests.integration.conftest import PATIENCE_S, Bench
 from tests.integration.test_guard import DIGEST, client, sections
@@ -129,4 +129,4 @@ def grow(checked: CheckedProgram, demand: Path, rows: Path, config: MachineConfi
             checked.refused += (Reason(**result["refused"]),)
 
     with rows.open("r+b") as body:
-        check_program(demand, program_digest(demand), build_nominal_models(config), config, body, hear)
+        check_program(demand, compute_program_digest(demand), build_nominal_models(config), config, body, hear)

@@ -17,8 +17,8 @@ import numpy as np
 from fdhil import config as machine_config
 from fdhil.bridges import hal_bus
 from fdhil.cli.demo.toml_writer import format_toml
-from fdhil.commissioning.init.hal_file import correction_hal, splices_of
-from fdhil.commissioning.init.linuxcnc_text import Hal, Ini, parse_hal
+from fdhil.commissioning.init.hal_file import find_insertions, format_correction_hal
+from fdhil.commissioning.init.linuxcnc_text import HalNetlist, Ini, parse_hal
 from fdhil.config.axis_section import HAL_INCREMENTS
 from fdhil.records import Float
 from tests.linuxcnc.hal_plant import (
@@ -28,21 +28,21 @@ from tests.linuxcnc.hal_plant import (
     PITCH_MM,
     POSITION_GAIN,
     SPEED_KP,
-    machine_hal,
+    write_machine_hal,
 )
-from tests.linuxcnc.machine import LinuxCnc
+from tests.linuxcnc.linuxcnc_process import LinuxCnc
 
 RTAPI = "/usr/bin/rtapi_app"
 LEAD_CYCLES = 150  # the test computer is busy
 
 
-def plant_hal(text: str) -> Hal:
-    hal = Hal()
+def write_plant_hal(text: str) -> HalNetlist:
+    hal = HalNetlist()
     parse_hal(text, Ini({}), lambda _name: "", hal)
     return hal
 
 
-def hal_pins(axis: str, joint: int, hal: Hal) -> dict[str, Any]:
+def build_hal_pins(axis: str, joint: int, hal: HalNetlist) -> dict[str, Any]:
     def source(name: str) -> str:
         return next(pin for pin in hal.nets[f"{axis.lower()}-{name}"] if pin.endswith(".out"))
 
@@ -57,7 +57,7 @@ def hal_pins(axis: str, joint: int, hal: Hal) -> dict[str, Any]:
     }
 
 
-def document(folder: Path, bus_port: int, nc_port: int, axes: str = "XY", **correction: float) -> dict[str, Any]:
+def build_document(folder: Path, bus_port: int, nc_port: int, axes: str = "XY", **correction: float) -> dict[str, Any]:
     regulators = {
         "structure": "linuxcnc_pid",
         "pid_output": "current",
@@ -73,7 +73,7 @@ def document(folder: Path, bus_port: int, nc_port: int, axes: str = "XY", **corr
         "current_ki": CURRENT_KI,
         "voltage_limit_v": 300.0,
     }
-    hal = plant_hal(machine_hal(axes, dict.fromkeys(axes, MOTOR)))
+    hal = write_plant_hal(write_machine_hal(axes, dict.fromkeys(axes, MOTOR)))
     limits = {"max_offset_um": 250.0, "max_speed_mm_s": 20.0, "max_acceleration_mm_s2": 1000.0}
     axis = {
         "screw_pitch_mm": PITCH_MM,
@@ -93,7 +93,7 @@ def document(folder: Path, bus_port: int, nc_port: int, axes: str = "XY", **corr
         },
         "store": {"directory": str(folder / "store")},
         "axis": {
-            letter: {**axis, "drive": {"source": "hal", "bus": "hal", "hal": hal_pins(letter, joint, hal)}}
+            letter: {**axis, "drive": {"source": "hal", "bus": "hal", "hal": build_hal_pins(letter, joint, hal)}}
             for joint, letter in enumerate(axes)
         },
     }
@@ -105,14 +105,14 @@ class HalMachine(LinuxCnc):
     def __init__(self, file: Path, text: dict[str, Any], motors: Mapping[str, Mapping[str, float]]) -> None:
         file.write_text(format_toml(text))
         axes = "".join(motors)
-        base = machine_hal(axes, motors)
-        config, hal = machine_config.load_config(file), plant_hal(base)
-        splices = splices_of(hal, {letter: joint for joint, letter in enumerate(axes)}, axes)
-        text_of_hal = correction_hal(config, "{folder}/machine.toml", len(axes), splices, hal)
+        base = write_machine_hal(axes, motors)
+        config, hal = machine_config.load_config(file), write_plant_hal(base)
+        splices = find_insertions(hal, {letter: joint for joint, letter in enumerate(axes)}, axes)
+        text_of_hal = format_correction_hal(config, "{folder}/machine.toml", len(axes), splices, hal)
         beside = {"fdhil.hal": text_of_hal, "machine.toml": file.read_text()}
         super().__init__(axes=axes, base=base, hal="source fdhil.hal\n", beside=beside)
 
-    def pids_of(self, program: str) -> list[int]:
+    def find_pids(self, program: str) -> list[int]:
         found = []
         for place in Path("/proc").glob("[0-9]*/cmdline"):
             with suppress(OSError):
@@ -124,7 +124,7 @@ class HalMachine(LinuxCnc):
     def prioritise(self, *others: int) -> None:
         """Give LinuxCNC, the bridge and others real-time priority, as on a machine, if permitted."""
         programs = (RTAPI, "milltask", hal_bus.__file__)
-        for pid in (*others, *(pid for program in programs for pid in self.pids_of(program))):
+        for pid in (*others, *(pid for program in programs for pid in self.find_pids(program))):
             for task in Path(f"/proc/{pid}/task").glob("*"):
                 with suppress(OSError):
                     os.sched_setscheduler(int(task.name), os.SCHED_FIFO, os.sched_param(10))
@@ -137,7 +137,7 @@ class HalTrace:
         self._nodes = nodes
         self._wire = socket.create_connection(("127.0.0.1", port))
         self._came: list[bytes] = []
-        self._reading = threading.Thread(target=self._read, name="trace")
+        self._reading = threading.Thread(target=self._read_thread, name="trace")
 
     def __enter__(self) -> Self:
         for text in (b"< open hal >", b"< rawmode >"):
@@ -150,12 +150,12 @@ class HalTrace:
         self._reading.join()
         self._wire.close()
 
-    def _read(self) -> None:
+    def _read_thread(self) -> None:
         with suppress(ConnectionError):  # the bridge drops unread data
             while came := self._wire.recv(1 << 20):
                 self._came.append(came)
 
-    def rows_mm(self) -> tuple[Float, Float, Float]:
+    def read_rows_mm(self) -> tuple[Float, Float, Float]:
         """Return demand, position and applied offset (n, axes) in mm of each complete servo cycle."""
         per_mm = HAL_INCREMENTS / PITCH_MM
         now: dict[int, bytes] = {}
@@ -166,14 +166,14 @@ class HalTrace:
                 continue
             cob_id = int(words[2], 16)
             if cob_id == hal_bus.RPDO1 + 1 and len(now) == 3 * self._nodes:
-                rows.append(self._row(now))
+                rows.append(self._convert_row(now))
                 now = {}
             if cob_id & 0x780 in (hal_bus.RPDO1, hal_bus.TPDO1, hal_bus.TPDO3):
                 now[cob_id] = bytes.fromhex(words[4].decode())
         table = np.array(rows, float) / per_mm
         return table[:, 0], table[:, 1], table[:, 2]
 
-    def _row(self, now: Mapping[int, bytes]) -> list[list[int]]:
+    def _convert_row(self, now: Mapping[int, bytes]) -> list[list[int]]:
         kinds = ((hal_bus.RPDO1, "<Hi", 1), (hal_bus.TPDO1, "<ii", 0), (hal_bus.TPDO3, "<ii", 1))
         nodes = range(1, self._nodes + 1)
         return [[struct.unpack(form, now[base + node])[at] for node in nodes] for base, form, at in kinds]

@@ -28,7 +28,7 @@ NOISE = {"current": 0.2, "speed": 0.03, "voltage": 0.5}
 NAMES = ("current", "integral", "speed", "position", "voltage")
 
 
-def step_of(motor: Mapping[str, float]) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+def compute_step(motor: Mapping[str, float]) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     """Return (5, 6) the next states of current, loop integral, speed, position and mean voltage.
 
     Columns: current, integral, speed, position, current demand and friction torque.
@@ -48,7 +48,7 @@ def step_of(motor: Mapping[str, float]) -> np.ndarray[tuple[int, int], np.dtype[
     return np.asarray(step)
 
 
-class Sums:
+class SumAllocator:
     """Allocates instances of sum2, and writes what they add."""
 
     def __init__(self, first: int = 0) -> None:
@@ -56,7 +56,7 @@ class Sums:
         self.functions: list[str] = []
         self._count = first
 
-    def add(self, terms: Sequence[tuple[str, float]], out: str) -> None:
+    def add_sum(self, terms: Sequence[tuple[str, float]], out: str) -> None:
         """Let signal ``out`` be the sum of signals times gains, computed in the order of the thread."""
         first, *rest = terms
         rest = rest or [(first[0], 0.0)]
@@ -70,9 +70,9 @@ class Sums:
             first = (target, 1.0)
 
 
-def machine_hal(axes: str, motors: Mapping[str, Mapping[str, float]]) -> str:
+def write_machine_hal(axes: str, motors: Mapping[str, Mapping[str, float]]) -> str:
     """Return the HAL file of a machine with these axes, each a motor with a current-controlled drive."""
-    sums = Sums()
+    sums = SumAllocator()
     lines = [
         f"loadrt trivkins coordinates={axes.lower()}",
         f"loadrt motmod servo_period_nsec=1000000 num_joints={len(axes)}",
@@ -82,20 +82,20 @@ def machine_hal(axes: str, motors: Mapping[str, Mapping[str, float]]) -> str:
     ]
     wires: list[str] = []
     for joint, axis in enumerate(axes):
-        wires += _axis(joint, axis.lower(), motors[axis], sums)
+        wires += _write_axis(joint, axis.lower(), motors[axis], sums)
     for axis in axes:
         for name in NAMES:
-            sums.add([(f"{axis.lower()}-{name}-next", 1.0)], f"{axis.lower()}-{name}")
+            sums.add_sum([(f"{axis.lower()}-{name}-next", 1.0)], f"{axis.lower()}-{name}")
     latched = sums.functions[-len(axes) * len(NAMES) :]
     stepped = sums.functions[: -len(axes) * len(NAMES)]
-    noise = Sums(first=len(sums.functions))
+    noise = SumAllocator(first=len(sums.functions))
     shown = [f"{axis.lower()}-{name}" for axis in axes for name in NOISE]
     for number, signal in enumerate(shown):
         peak = NOISE[signal.partition("-")[2]]
-        _noisy(number, signal, shown[(number + 1) % len(shown)], peak, noise)
+        _add_noise(number, signal, shown[(number + 1) % len(shown)], peak, noise)
     sums.lines += noise.lines
     order = [*latched, "motion-command-handler", "motion-controller", *(f"pid.{x.lower()}.do-pid-calcs" for x in axes)]
-    order += [*_with_limits(stepped, axes), *noise.functions]
+    order += [*_add_friction(stepped, axes), *noise.functions]
     order += [f"mult2.{number}" for number in range(len(axes) * len(NOISE))]
     lines += [f"loadrt sum2 count={len(sums.functions) + len(noise.functions)}", *sums.lines, *wires]
     lines += [f"addf {function} servo-thread" for function in order]
@@ -107,16 +107,16 @@ def machine_hal(axes: str, motors: Mapping[str, Mapping[str, float]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _noisy(number: int, signal: str, other: str, peak: float, sums: Sums) -> None:
+def _add_noise(number: int, signal: str, other: str, peak: float, sums: SumAllocator) -> None:
     """Add sensor noise to a signal: of the chaotic map x' = 1 - a x^2, of two signals in turn."""
     own = f"{signal}-map"
-    sums.add([(f"{own}-square", -1.95 - 0.007 * number)], own)
+    sums.add_sum([(f"{own}-square", -1.95 - 0.007 * number)], own)
     sums.lines += [f"setp {sums.functions[-1]}.offset 1"]
     sums.lines += [f"net {own} => mult2.{number}.in0 mult2.{number}.in1", f"net {own}-square mult2.{number}.out"]
-    sums.add([(signal, 1.0), (own, peak), (f"{other}-map", -peak)], f"{signal}-shown")
+    sums.add_sum([(signal, 1.0), (own, peak), (f"{other}-map", -peak)], f"{signal}-shown")
 
 
-def _with_limits(stepped: Sequence[str], axes: str) -> Iterator[str]:
+def _add_friction(stepped: Sequence[str], axes: str) -> Iterator[str]:
     """Put each axis' friction after the three sums that it consists of."""
     each = len(stepped) // len(axes)
     for number in range(len(axes)):
@@ -124,12 +124,12 @@ def _with_limits(stepped: Sequence[str], axes: str) -> Iterator[str]:
         yield from (*own[:3], f"limit1.{number}", *own[3:])
 
 
-def _axis(joint: int, x: str, motor: Mapping[str, float], sums: Sums) -> Iterator[str]:
-    step = step_of(motor)
+def _write_axis(joint: int, x: str, motor: Mapping[str, float], sums: SumAllocator) -> Iterator[str]:
+    step = compute_step(motor)
     states = [f"{x}-{name}" for name in NAMES]
     inputs = [states[CURRENT], states[INTEGRAL], states[SPEED], states[PLACE], f"{x}-output"]
     free = -step[SPEED] / step[SPEED, 5]
-    sums.add([(inputs[k], float(free[k])) for k in (0, 1, 2, 4)], f"{x}-stopping")
+    sums.add_sum([(inputs[k], float(free[k])) for k in (0, 1, 2, 4)], f"{x}-stopping")
     yield f"net {x}-stopping => limit1.{joint}.in"
     yield f"net {x}-friction limit1.{joint}.out"
     yield f"setp limit1.{joint}.min {-motor.get('Cd_back', motor['Cd'])}"
@@ -137,10 +137,10 @@ def _axis(joint: int, x: str, motor: Mapping[str, float], sums: Sums) -> Iterato
     for state, name in enumerate(NAMES):
         if state == SPEED:
             slope = float(step[SPEED, 5])
-            sums.add([(f"{x}-friction", slope), (f"{x}-stopping", -slope)], f"{x}-{name}-next")
+            sums.add_sum([(f"{x}-friction", slope), (f"{x}-stopping", -slope)], f"{x}-{name}-next")
             continue
         terms = [(signal, float(step[state, k])) for k, signal in enumerate([*inputs, f"{x}-friction"])]
-        sums.add([(s, g) for s, g in terms if g != 0.0], f"{x}-{name}-next")
+        sums.add_sum([(s, g) for s, g in terms if g != 0.0], f"{x}-{name}-next")
     yield f"net {x}-command joint.{joint}.motor-pos-cmd => pid.{x}.command"
     yield f"net {x}-position => joint.{joint}.motor-pos-fb pid.{x}.feedback"
     yield f"net {x}-enable joint.{joint}.amp-enable-out => pid.{x}.enable"

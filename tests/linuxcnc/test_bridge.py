@@ -20,7 +20,7 @@ from fdhil.drivers import Record, open_machine
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import AxisSamples, Float, Int, MoveEvent, MoveKind, NcState, Notice, WindowOutcome
 from tests.free_ports import find_free_port
-from tests.linuxcnc.machine import LinuxCnc
+from tests.linuxcnc.linuxcnc_process import LinuxCnc
 from tests.sim.simulator_process import SimulatorProcess, write_config
 
 pytestmark = pytest.mark.debian
@@ -57,23 +57,23 @@ addf sampler.2 servo-thread
 
 
 @dataclass
-class Heard:
+class SourceRecorder:
     """Records received from the machine's source."""
 
     records: list[Record] = field(default_factory=list)
     came: asyncio.Event = field(default_factory=asyncio.Event)
 
-    def take(self, record: Record) -> None:
+    def add_record(self, record: Record) -> None:
         self.records.append(record)
         self.came.set()
 
-    def of(self, axis: str, newest: int | None = None) -> tuple[Int, Float]:
+    def select_axis(self, axis: str, newest: int | None = None) -> tuple[Int, Float]:
         """Return ticks and demand (n,) of an axis, from the bus; only of the ``newest`` blocks."""
         mine = (r for r in reversed(self.records) if isinstance(r, AxisSamples) and r.axis == axis)
         blocks = list(islice(mine, newest))[::-1]
         return np.concatenate([b.tick for b in blocks]), np.concatenate([b.demand_mm for b in blocks])
 
-    def events(self, axis: str) -> list[MoveEvent]:
+    def list_events(self, axis: str) -> list[MoveEvent]:
         return [r for r in self.records if isinstance(r, MoveEvent) and r.axis == axis]
 
     @property
@@ -81,46 +81,48 @@ class Heard:
         """The NC's last state."""
         return next(r for r in reversed(self.records) if isinstance(r, NcState))
 
-    def place(self, axis: str) -> float:
+    def get_position_mm(self, axis: str) -> float:
         """The axis' position as reported by the NC, mm."""
         return (self.state.demand_mm or {})[axis]
 
-    async def until(self, holds: Callable[[], bool]) -> None:
+    async def wait_until(self, holds: Callable[[], bool]) -> None:
         async with asyncio.timeout(PATIENCE_S):
             while not holds():
                 self.came.clear()
                 await self.came.wait()
 
-    async def rest(self, strokes: int) -> None:
+    async def wait_for_rest(self, strokes: int) -> None:
         """Wait until the bus has caught up: so many strokes of X are completed, and it rests at the NC's position."""
 
-        def stands() -> bool:
+        def is_at_standstill() -> bool:
             if self.state.motion is not MoveKind.REST:
                 return False
-            if np.count_nonzero(np.diff(self.of("X")[1] > STROKE_MM / 2)) < strokes:
+            if np.count_nonzero(np.diff(self.select_axis("X")[1] > STROKE_MM / 2)) < strokes:
                 return False
-            return self.stands(1500)
+            return self.is_at_standstill(1500)
 
-        await self.until(stands)
+        await self.wait_until(is_at_standstill)
 
-    def stands(self, ticks: int) -> bool:
+    def is_at_standstill(self, ticks: int) -> bool:
         """Return whether the bus has rested long enough at the NC's position."""
-        demand = {axis: self.of(axis, 100)[1][-ticks:] for axis in "XY"}
-        return all(np.ptp(demand[axis]) == 0 and abs(demand[axis][-1] - self.place(axis)) < 0.001 for axis in "XY")
+        demand = {axis: self.select_axis(axis, 100)[1][-ticks:] for axis in "XY"}
+        return all(
+            np.ptp(demand[axis]) == 0 and abs(demand[axis][-1] - self.get_position_mm(axis)) < 0.001 for axis in "XY"
+        )
 
 
 @asynccontextmanager
-async def listening(config: MachineConfig) -> AsyncIterator[Heard]:
-    heard = Heard()
+async def listen_to_machine(config: MachineConfig) -> AsyncIterator[SourceRecorder]:
+    heard = SourceRecorder()
     async with open_machine(config) as source:
-        running = asyncio.create_task(source.run(heard.take))
-        await heard.until(lambda: any(isinstance(r, NcState) for r in heard.records))
+        running = asyncio.create_task(source.run(heard.add_record))
+        await heard.wait_until(lambda: any(isinstance(r, NcState) for r in heard.records))
         yield heard
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
 
 
-def beside(path: Path, twin: SimulatorProcess, port: int) -> MachineConfig:
+def build_config(path: Path, twin: SimulatorProcess, port: int) -> MachineConfig:
     """The simulator's machine in fdhil's configuration, with LinuxCNC's bridge as its source of rapids."""
     bus = twin.ready["buses"]["can0"]
     text = path.read_text().replace("[bus.can0]\n", f"[bus.can0]\nport = {bus['port']}\n")
@@ -129,26 +131,26 @@ def beside(path: Path, twin: SimulatorProcess, port: int) -> MachineConfig:
     return machine_config.load_config(listener)
 
 
-def hal_of(port: int) -> str:
+def find_hal(port: int) -> str:
     return f"{TRUTH}loadusr -Wn {bridge.NAME} /usr/bin/python3 {bridge.__file__} --port {port} --channel 1\n"
 
 
-def windows_of(heard: Heard, config: MachineConfig) -> list[WindowOutcome]:
+def cut_windows(heard: SourceRecorder, config: MachineConfig) -> list[WindowOutcome]:
     pipeline = AxisPipeline("X", config)
     records = [r for r in heard.records if not isinstance(r, NcState | Notice)]
     return [o for r in records for o in pipeline.process_record(r) if isinstance(o, WindowOutcome)]
 
 
-def first_motion(demand: Float) -> int:
+def find_first_motion(demand: Float) -> int:
     return int(np.flatnonzero(np.abs(np.diff(demand)) > 1e-3)[0])
 
 
 @contextmanager
-def sampled(nc: LinuxCnc, path: Path) -> Iterator[None]:
+def record_samples(nc: LinuxCnc, path: Path) -> Iterator[None]:
     """Write the sampler's data to a file, one row per servo cycle."""
     with (nc.folder / "log").open("ab") as log, path.open("wb") as rows:
         command = ("stdbuf", "-oL", "halsampler", "-c", "2")
-        sampler = nc._as_nobody(*command, environment=os.environ, log=log, out=rows.fileno())
+        sampler = nc._start_unprivileged(*command, environment=os.environ, log=log, out=rows.fileno())
         try:
             yield
         finally:
@@ -156,29 +158,29 @@ def sampled(nc: LinuxCnc, path: Path) -> Iterator[None]:
             sampler.wait()
 
 
-async def test_linuxcncs_own_sequence_is_recovered(tmp_path: Path) -> None:
+async def test_bridge_recovers_linuxcnc_sequence(tmp_path: Path) -> None:
     port, path = find_free_port(), write_config(tmp_path, 'pace = "lockstep"\nmodbus = false')
-    with SimulatorProcess(path, "--demand", "-") as twin, LinuxCnc(hal=hal_of(port)) as nc:
-        config = beside(path, twin, port)
-        with sampled(nc, tmp_path / "truth"):
-            async with listening(config) as heard:
-                with nc.driving(twin):
+    with SimulatorProcess(path, "--demand", "-") as twin, LinuxCnc(hal=find_hal(port)) as nc:
+        config = build_config(path, twin, port)
+        with record_samples(nc, tmp_path / "truth"):
+            async with listen_to_machine(config) as heard:
+                with nc.drive_simulator(twin):
                     await asyncio.to_thread(nc.run, PART)
-                    await heard.rest(4)
+                    await heard.wait_for_rest(4)
     truth = np.loadtxt(tmp_path / "truth")
     for axis, column in (("X", 0), ("Y", 1)):
-        check_sequence(heard, axis, truth[:, column], truth[:, 3].astype(int).tolist())
-    rapids = [w for w in windows_of(heard, config) if w.window.nc is not None]
+        require_same_sequence(heard, axis, truth[:, column], truth[:, 3].astype(int).tolist())
+    rapids = [w for w in cut_windows(heard, config) if w.window.nc is not None]
     assert [w.window.nc and w.window.nc.line for w in rapids] == [2, 5, 7, 8]
 
 
-def check_sequence(heard: Heard, axis: str, demand: Float, types: Sequence[int]) -> None:
+def require_same_sequence(heard: SourceRecorder, axis: str, demand: Float, types: Sequence[int]) -> None:
     """Compare with the sampler's data row by row; both begin with the first motion."""
-    ticks, bus = heard.of(axis)
-    offset = int(ticks[first_motion(bus)]) - first_motion(demand)
+    ticks, bus = heard.select_axis(axis)
+    offset = int(ticks[find_first_motion(bus)]) - find_first_motion(demand)
     n = min(demand.size, int(ticks[-1]) - offset)
     told = np.full(n, MoveKind.REST, object)
-    for event in heard.events(axis):
+    for event in heard.list_events(axis):
         told[max(0, event.tick - offset + 1) :] = event.kind
     true = np.array([KINDS[k] for k in types[:n]], object)
     moves = np.abs(np.diff(demand[:n], prepend=demand[0])) > 2e-3
@@ -188,29 +190,31 @@ def check_sequence(heard: Heard, axis: str, demand: Float, types: Sequence[int])
     assert set(told[moves]) == {MoveKind.RAPID, MoveKind.FEED, MoveKind.ARC}
 
 
-async def test_overrides_and_holds_are_told_and_their_rapids_refused(tmp_path: Path) -> None:
+async def test_overrides_and_holds_are_reported_and_their_rapids_refused(tmp_path: Path) -> None:
     port, path = find_free_port(), write_config(tmp_path, 'pace = "lockstep"\nmodbus = false')
-    with SimulatorProcess(path, "--demand", "-") as twin, LinuxCnc(hal=hal_of(port)) as nc:
-        config = beside(path, twin, port)
-        async with listening(config) as heard:
-            with nc.driving(twin):
+    with SimulatorProcess(path, "--demand", "-") as twin, LinuxCnc(hal=find_hal(port)) as nc:
+        config = build_config(path, twin, port)
+        async with listen_to_machine(config) as heard:
+            with nc.drive_simulator(twin):
                 for value in (0.8, 1.0):
-                    await asyncio.to_thread(nc.order, "override", value=value)
-                    await heard.until(lambda value=value: heard.state.feed_override == value)  # type: ignore[misc]
+                    await asyncio.to_thread(nc.send_order, "override", value=value)
+                    await heard.wait_until(lambda value=value: heard.state.feed_override == value)  # type: ignore[misc]
                 for run, value in enumerate((1.0, 0.9, 1.0), 1):
                     if value != heard.state.rapid_override:
-                        await asyncio.to_thread(nc.order, "rapid_override", value=value)
-                    await heard.until(lambda value=value: heard.state.rapid_override == value)  # type: ignore[misc]
+                        await asyncio.to_thread(nc.send_order, "rapid_override", value=value)
+                    await heard.wait_until(lambda value=value: heard.state.rapid_override == value)  # type: ignore[misc]
                     await asyncio.to_thread(nc.run, RAPIDS)
-                    await heard.rest(2 * run)
+                    await heard.wait_for_rest(2 * run)
                 await asyncio.to_thread(nc.start, RAPIDS)
-                await heard.until(lambda: heard.state.motion is MoveKind.RAPID and heard.place("X") > 20.0)
-                await asyncio.to_thread(nc.order, "pause")
-                await heard.until(lambda: heard.state.motion is MoveKind.HOLD and heard.stands(300))
-                await asyncio.to_thread(nc.order, "resume")
-                await asyncio.to_thread(nc.order, "rest")
-                await heard.rest(8)
-    outcomes = windows_of(heard, config)
+                await heard.wait_until(
+                    lambda: heard.state.motion is MoveKind.RAPID and heard.get_position_mm("X") > 20.0
+                )
+                await asyncio.to_thread(nc.send_order, "pause")
+                await heard.wait_until(lambda: heard.state.motion is MoveKind.HOLD and heard.is_at_standstill(300))
+                await asyncio.to_thread(nc.send_order, "resume")
+                await asyncio.to_thread(nc.send_order, "rest")
+                await heard.wait_for_rest(8)
+    outcomes = cut_windows(heard, config)
     texts = [str(o.verdict.reasons[0]) for o in outcomes if not o.verdict.accepted]
     accepted = [o.window.nc for o in outcomes if o.verdict.accepted]
     assert {nc and (nc.override, nc.held) for nc in accepted} == {((1.0, 1.0), False)}, texts

@@ -24,8 +24,8 @@ from fdhil.daemon.daemon_socket import SOCKET_NAME
 from fdhil.prediction import compute_contour_error_um
 from fdhil.records import Float
 from tests.free_ports import find_free_port
-from tests.linuxcnc.beside import SHUTTLE, TRIES, fdhil, record, repeated, until
-from tests.linuxcnc.hal_machine import LEAD_CYCLES, HalMachine, HalTrace, document
+from tests.linuxcnc.cli_session import SHUTTLE, TRIES, is_pass_repeated, record_demand, run_fdhil, wait_for_state
+from tests.linuxcnc.hal_machine import LEAD_CYCLES, HalMachine, HalTrace, build_document
 from tests.linuxcnc.hal_plant import MOTOR, OTHERS, PITCH_MM
 
 pytestmark = pytest.mark.debian
@@ -49,20 +49,20 @@ PER_MM = HAL_INCREMENTS / PITCH_MM
 
 
 @dataclass
-class HalShop:
+class HalRig:
     file: Path
     nc: HalMachine
     port: int
 
-    def status(self) -> dict[str, Any]:
-        return fdhil("status", self.file)
+    def read_status(self) -> dict[str, Any]:
+        return run_fdhil("status", self.file)
 
-    def trace(self, cut: Callable[[], None]) -> tuple[Float, Float, Float]:
+    def read_trace(self, cut: Callable[[], None]) -> tuple[Float, Float, Float]:
         """Return demand, position and applied offset (n, 2) in mm, from the first motion of ``cut`` on."""
         with HalTrace(self.port, 2) as trace:
             cut()
             time.sleep(0.5)  # the trace records LinuxCNC in real time
-        demand, position, offset = trace.rows_mm()
+        demand, position, offset = trace.read_rows_mm()
         moving = np.flatnonzero(np.abs(np.diff(demand, axis=0)).max(axis=1) > 0)
         rows = slice(moving[0], moving[-1] + 300)
         return demand[rows], position[rows], offset[rows]
@@ -74,52 +74,54 @@ def plant() -> str:
 
 
 @pytest.fixture
-def shop(tmp_path: Path, plant: str) -> Iterator[HalShop]:
+def hal_rig(tmp_path: Path, plant: str) -> Iterator[HalRig]:
     port, nc_port = find_free_port(), find_free_port()
-    with HalMachine(tmp_path / "machine.toml", document(tmp_path, port, nc_port), PLANTS[plant][0]) as nc:
+    with HalMachine(tmp_path / "machine.toml", build_document(tmp_path, port, nc_port), PLANTS[plant][0]) as nc:
         nc.prioritise()
-        yield HalShop(tmp_path / "machine.toml", nc, port)
+        yield HalRig(tmp_path / "machine.toml", nc, port)
 
 
-def rms(values: Float) -> float:
+def compute_rms(values: Float) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
 @pytest.mark.parametrize("plant", PLANTS)
-def test_the_second_cut_is_corrected_by_hal_pins_alone(shop: HalShop, plant: str, tmp_path: Path) -> None:
+def test_second_cut_is_corrected_through_hal_pins(hal_rig: HalRig, plant: str, tmp_path: Path) -> None:
     motors, least_gain = PLANTS[plant]
-    fdhil("commission", shop.file, "--yes")
+    run_fdhil("commission", hal_rig.file, "--yes")
     part = tmp_path / "part.csv"
     with ExitStack() as stack:
         for name, command in (("guard", ["fdhil.cli.guard"]), ("daemon", ["fdhil", "run"])):
-            started = stack.enter_context(ChildProcess(name, [*command, str(shop.file)], tmp_path / f"{name}.log"))
+            started = stack.enter_context(ChildProcess(name, [*command, str(hal_rig.file)], tmp_path / f"{name}.log"))
             if name == "guard":
-                shop.nc.prioritise(started.pid)
-        run_directory = machine_config.load_config(shop.file).store.run_directory
+                hal_rig.nc.prioritise(started.pid)
+        run_directory = machine_config.load_config(hal_rig.file).store.run_directory
         assert run_directory is not None
-        until((run_directory / SOCKET_NAME).exists)
+        wait_for_state((run_directory / SOCKET_NAME).exists)
         for _ in range(2):
-            shop.nc.run(SHUTTLE)
-        until(lambda: all(axis["accepted"] >= 4 for axis in shop.status()["axes"].values()))
-        for name, axis in shop.status()["axes"].items():
+            hal_rig.nc.run(SHUTTLE)
+        wait_for_state(lambda: all(axis["accepted"] >= 4 for axis in hal_rig.read_status()["axes"].values()))
+        for name, axis in hal_rig.read_status()["axes"].items():
             for symbol in ("R", "L", "K", "Jt"):
                 assert axis["parameters"][symbol]["value"] == pytest.approx(motors[name][symbol], rel=0.05), symbol
         for tried in range(1, TRIES + 1):
-            demand, position, _ = shop.trace(lambda: record(shop.file, part, lambda: shop.nc.run(PART)))
-            before = rms(compute_contour_error_um(demand, position, 0.001))
-            fdhil("arm", shop.file, part)
-            demand, position, offset = shop.trace(lambda: shop.nc.run(PART))
-            until(lambda: len(shop.status()["passes"]) == tried)  # noqa: B023 - called at once
-            if repeated(shop.status()):
+            demand, position, _ = hal_rig.read_trace(
+                lambda: record_demand(hal_rig.file, part, lambda: hal_rig.nc.run(PART))
+            )
+            before = compute_rms(compute_contour_error_um(demand, position, 0.001))
+            run_fdhil("arm", hal_rig.file, part)
+            demand, position, offset = hal_rig.read_trace(lambda: hal_rig.nc.run(PART))
+            wait_for_state(lambda: len(hal_rig.read_status()["passes"]) == tried)  # noqa: B023 - called at once
+            if is_pass_repeated(hal_rig.read_status()):
                 break
-        after = rms(compute_contour_error_um(demand, position, 0.001))
-        assert shop.status()["counters"]["lost"] == 0
+        after = compute_rms(compute_contour_error_um(demand, position, 0.001))
+        assert hal_rig.read_status()["counters"]["lost"] == 0
     first = int(np.flatnonzero(np.abs(offset).max(axis=1) > 0)[0])
     assert first == pytest.approx(LEAD_CYCLES, abs=5)
     assert after < before / least_gain, (before, after)
 
 
-class Nonsense:
+class InvalidClient:
     """A client of the bridge that sends arbitrary offsets."""
 
     def __init__(self, port: int) -> None:
@@ -127,7 +129,7 @@ class Nonsense:
         self.wire.sendall(b"< open hal >< rawmode >")
         self.rest = b""
 
-    def run(self, cycles: int, offset_mm: Callable[[int], float | None]) -> list[float]:
+    def send_offsets(self, cycles: int, offset_mm: Callable[[int], float | None]) -> list[float]:
         """Answer so many SYNCs with the offset of X and Y; return the offset applied to X in each cycle, mm."""
         applied: list[float] = []
         while len(applied) < cycles:
@@ -150,16 +152,16 @@ class Nonsense:
 
 
 @pytest.fixture
-def nonsense(shop: HalShop) -> Iterator[Nonsense]:
-    client = Nonsense(shop.port)
+def invalid_client(hal_rig: HalRig) -> Iterator[InvalidClient]:
+    client = InvalidClient(hal_rig.port)
     yield client
     client.close()
 
 
-def test_limit3_holds_whatever_is_sent(shop: HalShop, nonsense: Nonsense) -> None:
-    nonsense.run(300, lambda _cycle: 0.0)
-    applied = np.array(nonsense.run(1500, lambda cycle: 40.0 * (-1) ** (cycle // 90)))
-    limits = document(shop.file.parent, 0, 0)["axis"]["X"]["correction"]
+def test_limit3_bounds_every_offset(hal_rig: HalRig, invalid_client: InvalidClient) -> None:
+    invalid_client.send_offsets(300, lambda _cycle: 0.0)
+    applied = np.array(invalid_client.send_offsets(1500, lambda cycle: 40.0 * (-1) ** (cycle // 90)))
+    limits = build_document(hal_rig.file.parent, 0, 0)["axis"]["X"]["correction"]
     rounding = 2 / PER_MM
     assert np.abs(applied).max() == pytest.approx(limits["max_offset_um"] * 1e-3, abs=rounding)
     speed, acceleration = np.diff(applied) / 1e-3, np.diff(applied, 2) / 1e-6
@@ -169,24 +171,24 @@ def test_limit3_holds_whatever_is_sent(shop: HalShop, nonsense: Nonsense) -> Non
 
 @pytest.mark.fault("E8")
 @pytest.mark.parametrize("fault", ["silence", "end", "abort and estop"])
-def test_hal_brings_the_offset_to_zero(shop: HalShop, nonsense: Nonsense, fault: str) -> None:
-    nonsense.run(300, lambda _cycle: 0.0)
-    held = nonsense.run(700, lambda _cycle: 0.05)
+def test_hal_ramps_offset_to_zero(hal_rig: HalRig, invalid_client: InvalidClient, fault: str) -> None:
+    invalid_client.send_offsets(300, lambda _cycle: 0.0)
+    held = invalid_client.send_offsets(700, lambda _cycle: 0.05)
     assert held[-1] == pytest.approx(0.05, abs=1e-4)
     if fault == "abort and estop":  # offsets are still sent
-        shop.nc.order("estop")
-        left = nonsense.run(1500, lambda _cycle: 0.05)
+        hal_rig.nc.send_order("estop")
+        left = invalid_client.send_offsets(1500, lambda _cycle: 0.05)
     elif fault == "end":
-        nonsense.close()
-        other = Nonsense(shop.port)
-        left = other.run(1500, lambda _cycle: None)
+        invalid_client.close()
+        other = InvalidClient(hal_rig.port)
+        left = other.send_offsets(1500, lambda _cycle: None)
         other.close()
     else:
-        left = nonsense.run(1500, lambda _cycle: None)
+        left = invalid_client.send_offsets(1500, lambda _cycle: None)
     assert set(left[-200:]) == {0.0}
 
 
-def syncs(client: Nonsense, count: int) -> list[tuple[int, int]]:
+def read_syncs(client: InvalidClient, count: int) -> list[tuple[int, int]]:
     """Return cycle (by the stamp) and counter of the next SYNCs."""
     found: list[tuple[int, int]] = []
     while len(found) < count:
@@ -197,13 +199,13 @@ def syncs(client: Nonsense, count: int) -> list[tuple[int, int]]:
     return found
 
 
-def test_samples_that_found_no_room_are_a_hole_of_their_size(shop: HalShop, nonsense: Nonsense) -> None:
-    (bridge,) = shop.nc.pids_of(hal_bus.__file__)
-    before = syncs(nonsense, 100)
+def test_dropped_samples_are_gap_of_their_size(hal_rig: HalRig, invalid_client: InvalidClient) -> None:
+    (bridge,) = hal_rig.nc.find_pids(hal_bus.__file__)
+    before = read_syncs(invalid_client, 100)
     os.kill(bridge, signal.SIGSTOP)
     time.sleep(1.3 * hal_bus.DEPTH / 1000)  # longer than the sampler has room for
     os.kill(bridge, signal.SIGCONT)
-    seen = np.array(before + syncs(nonsense, hal_bus.DEPTH + 1000))
+    seen = np.array(before + read_syncs(invalid_client, hal_bus.DEPTH + 1000))
     cycles, counters = np.diff(seen[:, 0]), np.diff(seen[:, 1]) % hal_bus.SYNC_RANGE
     assert np.count_nonzero(cycles > 1) == 1
     assert (cycles % hal_bus.SYNC_RANGE == counters).all()

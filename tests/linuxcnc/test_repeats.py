@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fdhil.records import Float
-from tests.linuxcnc.machine import LinuxCnc
+from tests.linuxcnc.linuxcnc_process import LinuxCnc
 from tests.sim.simulator_process import SimulatorProcess, write_config
 
 pytestmark = pytest.mark.debian
@@ -28,14 +28,14 @@ M2
 """
 
 
-def motions(reference_mm: Float) -> list[Float]:
+def split_motions(reference_mm: Float) -> list[Float]:
     """The demand (n, axes) of each stretch between two rests."""
     moves = np.abs(np.diff(reference_mm, axis=0)).max(axis=1) > 0
     edges = np.flatnonzero(np.diff(np.concatenate([[0], moves.astype(int), [0]])))
     return [reference_mm[a : b + 1] for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def test_between_two_rests_runs_are_the_same_to_the_last_digit(tmp_path: Path) -> None:
+def test_repeated_runs_are_identical_between_rests(tmp_path: Path) -> None:
     """A rest may differ by a cycle: LinuxCNC's dwell ends when its task checks the clock.
 
     A host without time for LinuxCNC's task starves its planner, which then slows down between two blocks: such a run is
@@ -43,12 +43,12 @@ def test_between_two_rests_runs_are_the_same_to_the_last_digit(tmp_path: Path) -
     """
     config = write_config(tmp_path, 'pace = "lockstep"\nmodbus = false')
     with SimulatorProcess(config, "--demand", "-", "--trace", tmp_path / "trace.csv") as twin:
-        with LinuxCnc() as nc, nc.driving(twin):
+        with LinuxCnc() as nc, nc.drive_simulator(twin):
             for _ in range(RUNS):
                 nc.run(PART)
         assert twin.wait_for_event("finished")["starved"] == 0
     table = np.genfromtxt(tmp_path / "trace.csv", delimiter=",", names=True)
-    runs = motions(np.column_stack([table["X_reference_mm"], table["Y_reference_mm"]]))
+    runs = split_motions(np.column_stack([table["X_reference_mm"], table["Y_reference_mm"]]))
     ordered = Counter(run.tobytes() for run in runs)
     same = [times for _, times in ordered.most_common(2)]
     assert min(same) >= LEAST_SAME, ordered.values()

@@ -18,15 +18,24 @@ from fdhil.cli.demo.toml_writer import format_toml
 from fdhil.daemon.daemon_socket import SOCKET_NAME
 from fdhil.program import load_trajectory
 from tests.free_ports import find_free_port
-from tests.linuxcnc.beside import PART, SHUTTLE, TRIES, contour_of_each_cut, fdhil, record, repeated, until
-from tests.linuxcnc.machine import LinuxCnc
+from tests.linuxcnc.cli_session import (
+    PART,
+    SHUTTLE,
+    TRIES,
+    compute_contour_errors,
+    is_pass_repeated,
+    record_demand,
+    run_fdhil,
+    wait_for_state,
+)
+from tests.linuxcnc.linuxcnc_process import LinuxCnc
 from tests.sim.simulator_process import SimulatorProcess
 
 pytestmark = pytest.mark.debian
 
 
 @dataclass
-class Shop:
+class ChainRig:
     """The simulated machine with its trace, and fdhil commissioned and recording."""
 
     file: Path
@@ -37,12 +46,12 @@ class Shop:
     def trace(self) -> Path:
         return self.file.with_name("trace.csv")
 
-    def status(self) -> dict[str, Any]:
-        return fdhil("status", self.file)
+    def read_status(self) -> dict[str, Any]:
+        return run_fdhil("status", self.file)
 
 
 @pytest.fixture
-def shop(tmp_path: Path) -> Iterator[Shop]:
+def chain_rig(tmp_path: Path) -> Iterator[ChainRig]:
     document = load_machine_document()
     document["sim"]["pace"] = "lockstep"
     document["nc"] = {"profile": "linuxcnc"}
@@ -58,30 +67,32 @@ def shop(tmp_path: Path) -> Iterator[Shop]:
         )
         document["bus"] = twin.ready["buses"]
         file.write_text(format_toml(document))
-        fdhil("commission", file, "--yes")
+        run_fdhil("commission", file, "--yes")
         for name, command in (("guard", ["fdhil.cli.guard"]), ("daemon", ["fdhil", "run"])):
             stack.enter_context(ChildProcess(name, [*command, str(file)], tmp_path / f"{name}.log"))
         run_directory = machine_config.load_config(file).store.run_directory
         assert run_directory is not None
-        until((run_directory / SOCKET_NAME).exists)
-        yield Shop(file, twin, document["nc_source"]["linuxcnc"]["port"])
+        wait_for_state((run_directory / SOCKET_NAME).exists)
+        yield ChainRig(file, twin, document["nc_source"]["linuxcnc"]["port"])
 
 
-def test_the_second_cut_of_a_program_is_corrected(shop: Shop) -> None:
-    part = shop.file.with_name("part.csv")
-    loads = f"loadusr -Wn {bridge.NAME} /usr/bin/python3 {bridge.__file__} --port {shop.bridge_port} --channel 1\n"
-    with LinuxCnc(hal=loads, axes="XY") as nc, nc.driving(shop.twin):
+def test_second_cut_of_program_is_corrected(chain_rig: ChainRig) -> None:
+    part = chain_rig.file.with_name("part.csv")
+    loads = f"loadusr -Wn {bridge.NAME} /usr/bin/python3 {bridge.__file__} --port {chain_rig.bridge_port} --channel 1\n"
+    with LinuxCnc(hal=loads, axes="XY") as nc, nc.drive_simulator(chain_rig.twin):
         nc.run(SHUTTLE)
-        until(lambda: all(axis["accepted"] >= 4 for axis in shop.status()["axes"].values()))
+        wait_for_state(lambda: all(axis["accepted"] >= 4 for axis in chain_rig.read_status()["axes"].values()))
         for tried in range(1, TRIES + 1):
-            record(shop.file, part, lambda: nc.run(PART))
-            promised = fdhil("correct", part, "--config", shop.file, "--from-history")
-            fdhil("arm", shop.file, part)
+            record_demand(chain_rig.file, part, lambda: nc.run(PART))
+            promised = run_fdhil("correct", part, "--config", chain_rig.file, "--from-history")
+            run_fdhil("arm", chain_rig.file, part)
             nc.run(PART)
-            until(lambda: len(shop.status()["passes"]) == tried)  # noqa: B023 - called at once
-            if repeated(shop.status()):
+            wait_for_state(lambda: len(chain_rig.read_status()["passes"]) == tried)  # noqa: B023 - called at once
+            if is_pass_repeated(chain_rig.read_status()):
                 break
-    shop.twin.wait_for_event("finished")
-    before, *_, after = contour_of_each_cut(shop.trace, load_trajectory(part, machine_config.load_config(shop.file)))
+    chain_rig.twin.wait_for_event("finished")
+    before, *_, after = compute_contour_errors(
+        chain_rig.trace, load_trajectory(part, machine_config.load_config(chain_rig.file))
+    )
     assert promised["contour"]["rms_um"] == pytest.approx(before, rel=0.05)
     assert after < before / 50

@@ -21,8 +21,8 @@ from fdhil import config as machine_config
 from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.guard_configuration import find_corrected_bus, make_guard_settings
 from fdhil.arming.operator_token import get_operator_token, make_run_directory
-from fdhil.commissioning.record import CommissioningRecord, axis_digest, load_record, save_record
-from fdhil.commissioning.void import confirm_record, void_mark
+from fdhil.commissioning.commissioning_record import CommissioningRecord, compute_axis_digest, load_record, save_record
+from fdhil.commissioning.void_mark import clear_void_mark, read_void_mark
 from fdhil.config import MachineConfig
 from fdhil.daemon.daemon_service import DaemonService
 from fdhil.daemon.daemon_socket import SOCKET_NAME
@@ -168,14 +168,14 @@ class CompleteMachine:
     def attest_facts(self) -> None:
         """Attest every drive's record, to the guard and on disk, as ``fdhil check`` does without differences."""
         directory = self.config.store.directory
-        marks = {axis: void_mark(directory, axis) for axis in self.config.axis}
+        marks = {axis: read_void_mark(directory, axis) for axis in self.config.axis}
         records = {axis: load_record(directory, axis) for axis in self.config.axis}
         with GuardClient(self.config.guard_directory, clock=self.clock) as client:
             touched = client.read_touch_counts(self.read_token)
             seen = {axis: record.fingerprint for axis, record in records.items() if record is not None}
             answer = client.report_comparison(self.read_token, seen, touched)
         for axis in set(seen) - {each["axis"] for each in answer.get("refused", [])}:
-            confirm_record(directory, axis, marks[axis])
+            clear_void_mark(directory, axis, marks[axis])
 
     @property
     def read_token(self) -> str:
@@ -480,7 +480,7 @@ class CompleteMachine:
                 product_code=product,
                 revision=revision,
                 serial=serial,
-                config_digest=axis_digest(self.config, name),
+                config_digest=compute_axis_digest(self.config, name),
                 mapping_fingerprint="as delivered",
                 options=options,
                 following_error_window_um=1e3 * self.config.axis[name].drive.following_error_window_mm,

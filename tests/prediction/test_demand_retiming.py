@@ -42,7 +42,7 @@ def test_slower_demand_equals_nc_output(share: float, decimals: int, within_um: 
 
     Stretched time would predict half of them.
     """
-    program = make_program_source(list(interpret(PROGRAM, Budget.of(CONFIG.nc))), CONFIG)
+    program = make_program_source(list(interpret(PROGRAM, Budget.create_from_config(CONFIG.nc))), CONFIG)
     truth = find_largest_error(program.at(dict.fromkeys(range(1, 6), share)))
     sure, hopeful = make_demand_sources(round_demand(program.at({}), decimals), MODELS, CONFIG, 1e6)
     assert (hopeful is None) == (decimals == 9)

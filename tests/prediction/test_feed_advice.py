@@ -61,7 +61,7 @@ def test_infeasible_feed_is_reported_with_feasible_feeds() -> None:
 
     Together they keep the tolerance, 5 % more do not.
     """
-    motions = list(interpret(FAST, Budget.of(SHARP.nc)))
+    motions = list(interpret(FAST, Budget.create_from_config(SHARP.nc)))
     source = make_program_source(motions, SHARP)
     advice = advise_feeds(source, MODELS, SHARP, 50.0, lambda r: predict_corrected_contour_um(r, MODELS, SHARP))
     assert [a.line for a in advice] == [1, 2, 3, 4, 5, 6]
@@ -89,7 +89,9 @@ def test_advised_feeds_keep_tolerance_and_higher_do_not(seed: int) -> None:
         axis: replace(model, Jt=model.Jt * random.uniform(0.9, 1.2), Cd=model.Cd * random.uniform(0.2, 1.0))
         for axis, model in build_nominal_models(config).items()
     }
-    source = make_program_source(list(interpret(draw_program(random, config), Budget.of(config.nc))), config)
+    source = make_program_source(
+        list(interpret(draw_program(random, config), Budget.create_from_config(config.nc))), config
+    )
     tolerance = float(predict_path(source.at({}), models, config).contour_um.max() * random.uniform(0.25, 0.8))
     advice = advise_feeds(source, models, config, tolerance)
     shares = collect_shares(advice, lambda a: a.plain)
@@ -102,7 +104,7 @@ def test_advised_feeds_keep_tolerance_and_higher_do_not(seed: int) -> None:
 
 def test_no_single_line_could_run_much_faster() -> None:
     lines = ["G21 G90 G64 F12000", "G1 X40", "Y12", "X70 Y45", "G3 X90 Y25 I20", "G1 X90 Y-20", "M2"]
-    source = make_program_source(list(interpret(lines, Budget.of(CONFIG.nc))), CONFIG)
+    source = make_program_source(list(interpret(lines, Budget.create_from_config(CONFIG.nc))), CONFIG)
     shares = collect_shares(advise_feeds(source, MODELS, CONFIG, 35.0), lambda a: a.plain)
     assert find_largest_error(source, shares, MODELS, CONFIG) <= 35.0
     slowed = [line for line, share in shares.items() if share < 0.95]
@@ -147,7 +149,7 @@ def draw_program(random: np.random.Generator, config: MachineConfig) -> list[str
 
 
 def test_corner_error_belongs_to_line_before() -> None:
-    source = make_program_source(list(interpret(PROGRAM, Budget.of(CONFIG.nc))), CONFIG)
+    source = make_program_source(list(interpret(PROGRAM, Budget.create_from_config(CONFIG.nc))), CONFIG)
     advice = advise_feeds(source, MODELS, CONFIG, 60.0)
     assert [a.line for a in advice] == [2, 3]
     assert all(a.corrected is None and a.load[2] < 1.0 for a in advice)
@@ -155,14 +157,14 @@ def test_corner_error_belongs_to_line_before() -> None:
 
 
 def test_path_within_tolerance_gets_no_advice() -> None:
-    source = make_program_source(list(interpret(PROGRAM, Budget.of(CONFIG.nc))), CONFIG)
+    source = make_program_source(list(interpret(PROGRAM, Budget.create_from_config(CONFIG.nc))), CONFIG)
     assert advise_feeds(source, MODELS, CONFIG, 250.0) == ()
 
 
 @pytest.mark.usefixtures("real_time")
 def test_tight_tolerance_is_kept_at_one_percent_feed() -> None:
     """Dry friction leaves 10 um of a corner down to a few hundredths of 15 m/min; no feed keeps a twentieth of them."""
-    source = make_program_source(list(interpret(PROGRAM[:3], Budget.of(CONFIG.nc))), CONFIG)
+    source = make_program_source(list(interpret(PROGRAM[:3], Budget.create_from_config(CONFIG.nc))), CONFIG)
     shares = collect_shares(advise_feeds(source, MODELS, CONFIG, 10.0), lambda a: a.plain)
     assert 0.005 < shares[3] < 0.05
     assert find_largest_error(source, shares, MODELS, CONFIG) <= 10.0
@@ -174,12 +176,12 @@ def test_tight_tolerance_is_kept_at_one_percent_feed() -> None:
 
 def test_rapids_are_excluded_and_rests_included() -> None:
     program = "G0 X20\nG1 Y30 F15000\nM2".splitlines()
-    source = make_program_source(list(interpret(program, Budget.of(CONFIG.nc))), CONFIG)
+    source = make_program_source(list(interpret(program, Budget.create_from_config(CONFIG.nc))), CONFIG)
     assert set(label_segments(source.at({})).tolist()) == {RAPID, REST, 2}
 
 
 def test_only_feed_moves_are_scaled() -> None:
-    motions = list(interpret(PROGRAM, Budget.of(CONFIG.nc)))
+    motions = list(interpret(PROGRAM, Budget.create_from_config(CONFIG.nc)))
     halved = scale_feeds(motions, lambda _: 0.5)
     assert [m.feed for m in halved if isinstance(m, Feed)] == [7500.0, 7500.0]
     assert [m for m in halved if isinstance(m, Dwell)] == [m for m in motions if isinstance(m, Dwell)]

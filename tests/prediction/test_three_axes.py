@@ -32,7 +32,7 @@ M2
 
 @pytest.fixture(scope="module", name="reference")
 def three_axis_reference() -> Trajectory:
-    return plan_program(interpret(PROGRAM, Budget.of(CONFIG.nc)), CONFIG)
+    return plan_program(interpret(PROGRAM, Budget.create_from_config(CONFIG.nc)), CONFIG)
 
 
 @pytest.fixture(scope="module", name="correction")

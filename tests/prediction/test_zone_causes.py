@@ -24,7 +24,7 @@ NC = {"fir": CONFIG, "linuxcnc": LINUXCNC}
 
 
 def plan_test_program(text: str, config: MachineConfig) -> Trajectory:
-    return plan_program(list(interpret(text.splitlines(), Budget.of(config.nc))), config)
+    return plan_program(list(interpret(text.splitlines(), Budget.create_from_config(config.nc))), config)
 
 
 def find_program_zones(reference: Trajectory, config: MachineConfig = CONFIG) -> tuple[Zone, ...]:

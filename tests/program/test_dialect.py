@@ -10,12 +10,12 @@ from fdhil.config import Nc
 from fdhil.program import Arc, Budget, Dwell, Motion, interpret
 
 
-def run(text: str, **nc: Any) -> list[Motion]:
-    return list(interpret(text.split("|"), Budget.of(Nc(**nc))))
+def run_program(text: str, **nc: Any) -> list[Motion]:
+    return list(interpret(text.split("|"), Budget.create_from_config(Nc(**nc))))
 
 
-def end_of(text: str, **nc: Any) -> tuple[float, float, float]:
-    last = run(text, **nc)[-1]
+def find_end(text: str, **nc: Any) -> tuple[float, float, float]:
+    last = run_program(text, **nc)[-1]
     assert not isinstance(last, Dwell)
     return last.end
 
@@ -35,8 +35,8 @@ def end_of(text: str, **nc: Any) -> tuple[float, float, float]:
         ("ms_without_point", "F100 G89 X1 Z-1 R1 P250", 0.25),
     ],
 )
-def test_a_dwell_is_in_the_unit_of_the_nc(unit: str, text: str, seconds: float) -> None:
-    assert [m.seconds for m in run(text, dwell_unit=unit) if isinstance(m, Dwell)] == [pytest.approx(seconds)]
+def test_dwell_is_in_configured_unit(unit: str, text: str, seconds: float) -> None:
+    assert [m.seconds for m in run_program(text, dwell_unit=unit) if isinstance(m, Dwell)] == [pytest.approx(seconds)]
 
 
 @pytest.mark.parametrize(
@@ -56,16 +56,16 @@ def test_a_dwell_is_in_the_unit_of_the_nc(unit: str, text: str, seconds: float) 
         ("N10 G0 X10000 (X20000)", (10.0, 0, 0)),
     ],
 )
-def test_a_length_without_a_point_is_in_thousandths(text: str, end: tuple[float, float, float]) -> None:
+def test_length_without_point_is_in_thousandths(text: str, end: tuple[float, float, float]) -> None:
     for integers in ("thousandths", "thousandths_and_feed"):
-        assert end_of(text, integers=integers) == pytest.approx(end)
+        assert find_end(text, integers=integers) == pytest.approx(end)
 
 
-def test_codes_counts_and_parameters_are_no_lengths() -> None:
-    arc = run("F100. G2 X20000 I10000 P2|M2", integers="thousandths")[0]
+def test_codes_counts_and_parameters_are_not_scaled() -> None:
+    arc = run_program("F100. G2 X20000 I10000 P2|M2", integers="thousandths")[0]
     assert isinstance(arc, Arc)
     assert (arc.end[0], arc.centre[0], arc.turns) == (20.0, 10.0, -2)
-    assert end_of("#1=1000|o1 repeat [2]|G91 G0 X1000|o1 endrepeat", integers="thousandths") == (2.0, 0, 0)
+    assert find_end("#1=1000|o1 repeat [2]|G91 G0 X1000|o1 endrepeat", integers="thousandths") == (2.0, 0, 0)
 
 
 @pytest.mark.parametrize(
@@ -78,5 +78,5 @@ def test_codes_counts_and_parameters_are_no_lengths() -> None:
         ("thousandths_and_feed", "G20|G1 X1 F10000", 25.4),
     ],
 )
-def test_a_feed_without_a_point_is_whole_unless_it_is_said_otherwise(integers: str, text: str, feed: float) -> None:
-    assert run(text, integers=integers)[-1].feed == pytest.approx(feed)  # type: ignore[union-attr]
+def test_feed_without_point_is_whole_unless_configured(integers: str, text: str, feed: float) -> None:
+    assert run_program(text, integers=integers)[-1].feed == pytest.approx(feed)  # type: ignore[union-attr]

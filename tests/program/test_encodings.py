@@ -20,7 +20,7 @@ LOOP = "%\r\no1 repeat [2] (Fr\u00e4sen)\r\nG91 G0 X1\r\no1 endrepeat\r\n%\r\n"
         LOOP.replace("\r", "").encode("cp1252"), LOOP[:-2].encode("utf-8"),
     ],
 )  # fmt: skip
-def test_text_of_usual_editors_is_read(stored: bytes, tmp_path: Path) -> None:
+def test_text_of_common_editors_is_read(stored: bytes, tmp_path: Path) -> None:
     path = tmp_path / "program.ngc"
     path.write_bytes(stored)
     expected = [Rapid(3, (1.0, 0.0, 0.0)), Rapid(3, (2.0, 0.0, 0.0))]
@@ -48,7 +48,7 @@ def test_utf_16_is_refused_by_name(stored: str, tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1", None])
-def test_a_character_of_a_text_processor_is_named(
+def test_character_of_text_processor_is_named(
     line: str, word: str, name: str, encoding: str | None, tmp_path: Path
 ) -> None:
     path = tmp_path / "program.ngc"
@@ -59,14 +59,14 @@ def test_a_character_of_a_text_processor_is_named(
     assert (caught.value.line, caught.value.word) == (2, word)
 
 
-def test_names_of_any_alphabet_are_shown_as_they_were_written() -> None:
+def test_names_of_any_alphabet_are_shown_as_written() -> None:
     assert list(interpret(["#<gr\u00f6\u00dfe>=2", "G0 X#<gr\u00f6\u00dfe>"])) == [Rapid(2, (2.0, 0.0, 0.0))]
     with pytest.raises(ProgramError) as caught:
         list(interpret(["G0 X#<gr\u00f6\u00dfe>"]))
     assert caught.value.word == "#<gr\u00f6\u00dfe>"
 
 
-def test_a_file_of_a_byte_order_mark_alone_is_empty(tmp_path: Path) -> None:
+def test_file_with_only_byte_order_mark_is_empty(tmp_path: Path) -> None:
     path = tmp_path / "program.ngc"
     path.write_bytes(codecs.BOM_UTF8)
     with pytest.raises(ProgramError, match="empty"):

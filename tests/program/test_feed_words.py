@@ -8,13 +8,13 @@ import pytest
 
 from fdhil.errors import ProgramError
 from fdhil.program.budget import Budget
-from fdhil.program.feed_words import cut, with_feeds
+from fdhil.program.feed_words import cut_to_digits, replace_feeds
 
 
-def written(folder: Path, program: bytes, shares: dict[int, float]) -> bytes:
+def write_program(folder: Path, program: bytes, shares: dict[int, float]) -> bytes:
     path = folder / "part.ngc"
     path.write_bytes(program)
-    return with_feeds(path, shares, Budget())
+    return replace_feeds(path, shares, Budget())
 
 
 @pytest.mark.parametrize(
@@ -52,21 +52,21 @@ def written(folder: Path, program: bytes, shares: dict[int, float]) -> bytes:
         "nothing to do",
     ],
 )
-def test_only_the_feeds_are_others(tmp_path: Path, program: bytes, shares: dict[int, float], new: bytes) -> None:
-    assert written(tmp_path, program, shares) == new
+def test_only_feeds_change(tmp_path: Path, program: bytes, shares: dict[int, float], new: bytes) -> None:
+    assert write_program(tmp_path, program, shares) == new
 
 
-def test_a_line_run_at_two_feeds_from_elsewhere_is_refused(tmp_path: Path) -> None:
+def test_line_with_two_inherited_feeds_is_refused(tmp_path: Path) -> None:
     program = b"o1 sub\nG91 G1 X1\no1 endsub\nF100\no1 call\nF200\no1 call\nM2\n"
     with pytest.raises(ProgramError, match=r"line 2.*by hand"):
-        written(tmp_path, program, {2: 0.5})
+        write_program(tmp_path, program, {2: 0.5})
 
 
-def test_a_program_of_several_files_is_refused(tmp_path: Path) -> None:
+def test_program_in_several_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "part2.ngc").write_text("o<part2> sub\nG1 X1 F100\no<part2> endsub\n")
     with pytest.raises(ProgramError, match="subroutines in other files"):
-        written(tmp_path, b"o<part2> call\nM2\n", {2: 0.5})
+        write_program(tmp_path, b"o<part2> call\nM2\n", {2: 0.5})
 
 
-def test_a_feed_is_cut_never_rounded_up() -> None:
-    assert [cut(value) for value in (5999.9, 0.12345, 100.0, 0.0)] == [5990, pytest.approx(0.123), 100, 0]
+def test_feed_is_truncated_never_rounded_up() -> None:
+    assert [cut_to_digits(value) for value in (5999.9, 0.12345, 100.0, 0.0)] == [5990, pytest.approx(0.123), 100, 0]

@@ -10,7 +10,7 @@ import pytest
 from fdhil.config import parse_config
 from fdhil.program import interpret, plan
 from tests.bench import bench_document, rotary_axis
-from tests.program.test_linuxcnc_demand import ACCELERATION_MM_S2, Theirs, recorder
+from tests.program.test_linuxcnc_demand import ACCELERATION_MM_S2, Theirs, open_recorder
 
 pytestmark = pytest.mark.debian
 
@@ -25,15 +25,15 @@ TURNING = {
 
 
 @pytest.fixture(scope="module")
-def theirs() -> Iterator[Theirs]:
-    with recorder("XYA") as recorded:
+def record_reference() -> Iterator[Theirs]:
+    with open_recorder("XYA") as recorded:
         yield recorded
 
 
 @pytest.mark.parametrize(("mode", "feed", "most"), [("G61", 6e3, 0.05), ("G64", 6e3, 0.6), ("G64 P0.05", 2e4, 1.5)])
 @pytest.mark.parametrize("path", TURNING)
-def test_linuxcnc_profile_plans_the_demand_of_a_rotary_axis(
-    path: str, mode: str, feed: float, most: float, theirs: Theirs
+def test_linuxcnc_profile_matches_rotary_demand(
+    path: str, mode: str, feed: float, most: float, record_reference: Theirs
 ) -> None:
     """X, Y in mm and A in degrees at the same millisecond: under G61 exactly, under G64 within a few cycles."""
     text = f"G21 G90 G17 {mode}\nF{feed:g}\n{TURNING[path]}M2\n"
@@ -46,7 +46,7 @@ def test_linuxcnc_profile_plans_the_demand_of_a_rotary_axis(
     config = parse_config(document)
     planned = plan(interpret(text.splitlines()), config).position_mm
     a = np.column_stack([planned[axis] / config.axis[axis].mm_per_unit for axis in "XYA"])
-    b = theirs(text, len(a))
+    b = record_reference(text, len(a))
     rows = min(len(a), len(b))
     assert float(np.abs(a[:rows] - b[:rows]).max()) <= most
     assert a[-1] == pytest.approx(b[-1], abs=1e-6)

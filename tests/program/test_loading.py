@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from fdhil.errors import ConfigError, ProgramError, RecordingError
-from fdhil.program import load_trajectory, program_digest, write_demand_csv
+from fdhil.program import compute_program_digest, load_trajectory, write_demand_csv
 from tests.bench import bench_config
 
 PROGRAMS = Path(__file__).parents[2] / "configs" / "programs"
 
 
-def test_a_written_demand_reads_back(tmp_path: Path) -> None:
+def test_written_demand_is_read_unchanged(tmp_path: Path) -> None:
     config = bench_config()
     planned = load_trajectory(PROGRAMS / "bench_10m.ngc", config)
     write_demand_csv(planned, tmp_path / "demand.csv")
@@ -26,7 +26,7 @@ def test_a_written_demand_reads_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["bench_10m.ngc", "bench_20m.ngc", "bench_rounded_10m.ngc", "shuttle.ngc"])
-def test_the_programs_that_come_along_can_be_planned(name: str) -> None:
+def test_example_programs_can_be_planned(name: str) -> None:
     reference = load_trajectory(PROGRAMS / name, bench_config())
     assert reference.position_mm["X"].max() >= 250.0 - 1e-9
     assert reference.rapid.any() == (name == "shuttle.ngc")
@@ -51,13 +51,13 @@ ROWS = [f"{k / 1000:.3f},{k * 0.1:.4f},0.0" for k in range(20)]
         ["time_s,X_mm,Y_mm", ROWS[0]],
     ],
 )
-def test_a_broken_demand_is_a_recording_error(lines: list[str], tmp_path: Path) -> None:
+def test_broken_demand_raises_recording_error(lines: list[str], tmp_path: Path) -> None:
     (tmp_path / "d.csv").write_text("".join(f"{line}\n" for line in lines))
     with pytest.raises(RecordingError):
         load_trajectory(tmp_path / "d.csv", bench_config())
 
 
-def test_a_missing_column_is_told_with_the_line_that_is_wanted(tmp_path: Path) -> None:
+def test_missing_column_is_reported_with_expected_header(tmp_path: Path) -> None:
     (tmp_path / "d.csv").write_text("time_s,X_mm\n" + "\n".join(row.rpartition(",")[0] for row in ROWS))
     with pytest.raises(
         RecordingError, match="no column Y_mm, Z_mm; a demand begins with the line time_s,X_mm,Y_mm,Z_mm"
@@ -84,45 +84,45 @@ DATA = "".join(f"{row}\n" for row in ROWS)
         (NAMES + "".join(f"{k / 1000},{k % 2}e300,0\n" for k in range(9)), "axis X moves at 1e+303 mm/s, 2e+300 times"),
     ],
 )
-def test_what_is_wrong_with_a_demand_is_told_with_its_line(text: str, told: str, tmp_path: Path) -> None:
+def test_demand_error_names_line(text: str, told: str, tmp_path: Path) -> None:
     (tmp_path / "d.csv").write_text(text)
     with pytest.raises(RecordingError) as caught:
         load_trajectory(tmp_path / "d.csv", bench_config())
     assert told in str(caught.value)
 
 
-def test_another_step_than_the_sync_period_is_a_config_error(tmp_path: Path) -> None:
+def test_step_other_than_sync_period_is_config_error(tmp_path: Path) -> None:
     (tmp_path / "d.csv").write_text("time_s,X_mm,Y_mm\n" + "".join(f"{k * 0.002:.3f},0,0\n" for k in range(9)))
     with pytest.raises(ConfigError, match="sync_period_s"):
         load_trajectory(tmp_path / "d.csv", bench_config())
 
 
-def test_a_digest_tells_programs_apart(tmp_path: Path) -> None:
-    assert program_digest(PROGRAMS / "bench_10m.ngc") != program_digest(PROGRAMS / "bench_20m.ngc")
+def test_digest_distinguishes_programs(tmp_path: Path) -> None:
+    assert compute_program_digest(PROGRAMS / "bench_10m.ngc") != compute_program_digest(PROGRAMS / "bench_20m.ngc")
     with pytest.raises(ProgramError):
-        program_digest(tmp_path / "none.ngc")
+        compute_program_digest(tmp_path / "none.ngc")
     with pytest.raises(ProgramError):
         load_trajectory(tmp_path / "none.ngc", bench_config())
 
 
-def straight(factor: float) -> str:
+def write_straight_demand(factor: float) -> str:
     """A move of 100 mm at 10 m/min as a demand, in millimetres times ``factor``."""
     rows = "".join(f"{k * 1e-3:.6f},{min(k, 600) / 6 * factor:.9f},{0.0:.1f}\n" for k in range(700))
     return "time_s,X_mm,Y_mm\n" + rows
 
 
-def test_a_demand_in_micrometres_is_refused_and_one_in_metres_is_told(
+def test_demand_in_micrometres_is_refused_and_in_metres_warned(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "demand.csv"
-    path.write_text(straight(1.0))
+    path.write_text(write_straight_demand(1.0))
     assert load_trajectory(path, bench_config()).time_s.size == 700
     assert caplog.records == []
-    path.write_text(straight(1e3))
+    path.write_text(write_straight_demand(1e3))
     with pytest.raises(
         RecordingError, match=r"axis X moves at 1.67e\+05 mm/s, 333 times its rapid speed; is X_mm in um"
     ):
         load_trajectory(path, bench_config())
-    path.write_text(straight(1e-3))
+    path.write_text(write_straight_demand(1e-3))
     load_trajectory(path, bench_config())
     assert "is it in m? convert it to mm" in caplog.records[0].getMessage()

@@ -11,7 +11,7 @@ import pytest
 from fdhil.config import MachineConfig, parse_config
 from fdhil.errors import ProgramError
 from fdhil.program import Arc, Dwell, Feed, Motion, Rapid, interpret, plan
-from fdhil.program.planner import stream
+from fdhil.program.planner import stream_trajectory
 from tests.bench import bench_config, bench_document
 
 MOVES: list[Motion] = [
@@ -26,13 +26,13 @@ MOVES: list[Motion] = [
 PROFILES = ("fir", "trapezoidal", "jerk_limited", "linuxcnc")
 
 
-def profiled(profile: str) -> MachineConfig:
+def plan_with_profile(profile: str) -> MachineConfig:
     document = bench_document()
     document["nc"] = {"profile": profile}
     return parse_config(document)
 
 
-def test_a_feed_is_the_programmed_speed_through_two_moving_averages() -> None:
+def test_feed_is_programmed_speed_after_two_moving_averages() -> None:
     reference = plan([Feed(1, (100.0, 0.0, 0.0), 6000.0)], bench_config())
     raw = np.minimum(np.arange(1000 + 88 + 2 + 500) * 0.1, 100.0)
     expected = raw
@@ -46,7 +46,7 @@ def test_a_feed_is_the_programmed_speed_through_two_moving_averages() -> None:
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_an_arc_is_slowed_only_by_the_axes_that_it_moves(profile: str) -> None:
+def test_arc_is_limited_only_by_its_axes(profile: str) -> None:
     document = bench_document("XYZ")
     document["nc"] = {"profile": profile}
     document["axis"]["Z"]["rapid_speed_mm_s"] = 50.0
@@ -56,7 +56,7 @@ def test_an_arc_is_slowed_only_by_the_axes_that_it_moves(profile: str) -> None:
     assert speed.max() == pytest.approx(100.0, rel=0.01)
 
 
-def test_the_path_is_run_at_the_programmed_feed_without_a_stop_between_feeds() -> None:
+def test_path_keeps_programmed_feed_between_feeds() -> None:
     document = bench_document()
     document["nc"] = {"smoothing_s": [], "end_rest_s": 0.0}
     reference = plan(MOVES[:4], parse_config(document))
@@ -70,7 +70,7 @@ def test_the_path_is_run_at_the_programmed_feed_without_a_stop_between_feeds() -
     assert y[np.abs(x - 150) < 0.1] == pytest.approx(5.0, abs=0.01)  # the lower half of the circle
 
 
-def test_rapids_keep_each_axis_within_its_limits_and_run_straight() -> None:
+def test_rapids_keep_axis_limits_and_are_straight() -> None:
     document = bench_document()
     document["nc"] = {"smoothing_s": []}
     document["axis"]["Y"]["max_acceleration_mm_s2"] = 1000.0
@@ -84,7 +84,7 @@ def test_rapids_keep_each_axis_within_its_limits_and_run_straight() -> None:
     assert reference.rapid[1:].all()
 
 
-def test_rapid_and_feed_are_parted_by_an_exact_stop() -> None:
+def test_rapid_and_feed_are_separated_by_exact_stop() -> None:
     reference = plan(MOVES, bench_config())
     x, y = reference.position_mm["X"], reference.position_mm["Y"]
     first_rapid = int(np.argmax(reference.rapid))
@@ -93,7 +93,7 @@ def test_rapid_and_feed_are_parted_by_an_exact_stop() -> None:
     assert (x[-1], y[-1]) == pytest.approx((0.0, 0.0), abs=1e-9)
 
 
-def test_exact_stop_between_feeds_is_an_option() -> None:
+def test_exact_stop_between_feeds_is_configurable() -> None:
     document = bench_document()
     document["nc"] = {"corner": "exact_stop", "settle_s": 0.01}
     reference = plan(MOVES[:2], parse_config(document))
@@ -109,9 +109,9 @@ def test_a_dwell_holds_all_axes() -> None:
     assert reference.time_s[-1] == pytest.approx(0.1 + 0.088 + 0.5 + 0.088 + 0.1 + 0.088 + 0.5, abs=0.003)
 
 
-def check_blocks(moves: Sequence[Motion], config: MachineConfig, atol: float = 1e-9) -> None:
+def require_equal_blocks(moves: Sequence[Motion], config: MachineConfig, atol: float = 1e-9) -> None:
     whole = plan(moves, config)
-    blocks = list(stream(moves, config, 333))
+    blocks = list(stream_trajectory(moves, config, 333))
     assert {block.time_s.size for block in blocks[:-1]} == {333}
     for axis in whole.axes:
         joined = np.concatenate([block.position_mm[axis] for block in blocks])
@@ -121,38 +121,38 @@ def check_blocks(moves: Sequence[Motion], config: MachineConfig, atol: float = 1
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_blocks_of_a_stream_make_the_same_reference(profile: str) -> None:
-    check_blocks([*MOVES, Dwell(6, 0.25), *MOVES], profiled(profile))
+def test_streamed_blocks_match_reference(profile: str) -> None:
+    require_equal_blocks([*MOVES, Dwell(6, 0.25), *MOVES], plan_with_profile(profile))
 
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_an_axis_that_the_machine_lacks_is_refused(profile: str) -> None:
     with pytest.raises(ProgramError, match="axis Z") as caught:
-        plan([Rapid(7, (0.0, 0.0, 1.0))], profiled(profile))
+        plan([Rapid(7, (0.0, 0.0, 1.0))], plan_with_profile(profile))
     assert caught.value.line == 7
 
 
-def test_axes_that_the_program_does_not_move_stay() -> None:
+def test_unmoved_axes_stay_at_rest_position() -> None:
     reference = plan([Feed(1, (10.0, 0.0, 0.0), 6000.0)], bench_config("XYZ"))
     assert reference.axes == ("X", "Y", "Z")
     assert not reference.position_mm["Z"].any()
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_no_motion_is_a_rest(profile: str) -> None:
-    assert not plan([], profiled(profile)).position_mm["X"].any()
+def test_empty_program_is_at_rest(profile: str) -> None:
+    assert not plan([], plan_with_profile(profile)).position_mm["X"].any()
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_an_endless_duration_is_refused(profile: str) -> None:
+def test_endless_duration_is_refused(profile: str) -> None:
     for move in (Dwell(1, 1e300), Feed(1, (1.0, 0.0, 0.0), 0.0)):
         with pytest.raises(ProgramError):
-            plan([move], profiled(profile))
+            plan([move], plan_with_profile(profile))
     with pytest.raises(ProgramError, match="h; split"):
-        plan([Feed(1, (1000.0, 0.0, 0.0), 1e-6)], profiled(profile))
+        plan([Feed(1, (1000.0, 0.0, 0.0), 1e-6)], plan_with_profile(profile))
 
 
-def test_helices_and_spirals_end_where_they_are_told() -> None:
+def test_helices_and_spirals_reach_programmed_end() -> None:
     config = bench_config("XYZ")
     start = Feed(1, (10.0, 0.0, 0.0), 6000.0)
     reference = plan([start, Arc(2, (10.001, 0.0, 5.0), (0.0, 0.0, None), -3, "XY", 6000.0)], config)
@@ -171,7 +171,7 @@ def test_helices_and_spirals_end_where_they_are_told() -> None:
         ("G64 P0.1|G1 F12000|G2 X40 I20|G3 X80 I20|G1 X120", 60.0, 2.841),
     ],
 )
-def test_the_path_is_run_no_faster_than_the_nc_allows(profile: str, text: str, most: float, linuxcnc_s: float) -> None:
+def test_path_speed_keeps_nc_limit(profile: str, text: str, most: float, linuxcnc_s: float) -> None:
     document = bench_document("XYZ")
     document["nc"] = {"profile": profile, "max_path_speed_mm_s": most, "end_rest_s": 0.0}
     for axis in document["axis"].values():
@@ -186,7 +186,7 @@ def test_the_path_is_run_no_faster_than_the_nc_allows(profile: str, text: str, m
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_a_motion_of_an_axis_that_is_not_planned_is_refused_with_its_line(profile: str) -> None:
+def test_motion_of_unplanned_axis_is_refused_with_line(profile: str) -> None:
     """Missing, or configured in mm; a word that keeps the axis in place orders nothing."""
     document = bench_document("XYA")
     document["nc"] = {"profile": profile}

@@ -15,7 +15,7 @@ from fdhil.store import reading_process
 from fdhil.store.reading_process import read_in_process
 from fdhil.store.recording_file import read_recording, read_table
 from fdhil.store.window_export import convert_window, export_table
-from tests.fuzz.tasting import FOUND
+from tests.fuzz.input_assessment import FOUND
 from tests.store import failing_reader
 from tests.store.sample_records import make_window
 

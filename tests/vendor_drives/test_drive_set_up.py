@@ -10,10 +10,10 @@ from pathlib import Path
 import canopen
 import pytest
 
+from fdhil.commissioning.commissioning_steps import commission_axis
 from fdhil.commissioning.config_check import check_machine
 from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.scan import read_descriptions, scan_bus
-from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, DriveFault
 from tests.drivers.peer import DrivePeer
@@ -65,12 +65,12 @@ def test_vendor_drive_is_found_checked_and_commissioned(outfit: VendorDrive, tmp
         assert node.answers.identity.vendor_id == peer.drive.dictionary.get_number(0x1018, 1)
         assert {k: v for k, v in list_differences(config).items() if k not in outfit.lacks} == {}
         if outfit.on_line:
-            record = commission(config, "X")
+            record = commission_axis(config, "X")
             assert record.watchdog == "proven"
             assert record.sign_test_um == pytest.approx(10.0, abs=3.0)
             return
         with pytest.raises(DriveFault, match="corrected demand"):
-            commission(config, "X")
+            commission_axis(config, "X")
 
 
 def test_factory_default_drive_lists_the_needed_set_up(tmp_path: Path) -> None:

@@ -15,9 +15,9 @@ from fdhil import correction
 from fdhil.arming.guard_configuration import make_guard_settings
 from fdhil.cia402 import pack_pdo
 from fdhil.cli.demo.toml_writer import format_toml
+from fdhil.commissioning.commissioning_record import save_record
+from fdhil.commissioning.commissioning_steps import commission_axis
 from fdhil.commissioning.config_check import check_machine
-from fdhil.commissioning.record import save_record
-from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
 from fdhil.errors import DriveFault
 from fdhil.guard import guard_step
@@ -161,7 +161,7 @@ def compute_path_error_um(twin: SteppedSimulator, demand: Trajectory) -> float:
 
 def run_online_correction(machine: MachineConfig, config: MachineConfig, folder: Path) -> None:
     """Commission over the bus, then arm the guard on the machine and run the move."""
-    save_record(commission(config, "X"), config.store.directory)
+    save_record(commission_axis(config, "X"), config.store.directory)
     demand = build_shuttle_demand()
     offset_um = plan_correction(config, demand)
     per_mm = config.axis["X"].scaling.increments_per_mm
@@ -182,7 +182,7 @@ def run_online_correction(machine: MachineConfig, config: MachineConfig, folder:
 def run_corrected_demand(config: MachineConfig) -> None:
     """A drive without an offset object is refused for on-line correction; the NC gets the corrected demand."""
     with pytest.raises(DriveFault, match="corrected demand"):
-        commission(config, "X")
+        commission_axis(config, "X")
     assert np.abs(plan_correction(config, build_shuttle_demand())).max() > 10
 
 

@@ -21,13 +21,13 @@ from fdhil import config as machine_config
 from fdhil.arming.operator_token import read_token
 from fdhil.cli.demo.processes import ChildProcess, SimulatorProcess
 from fdhil.cli.demo.toml_writer import format_toml
-from fdhil.commissioning.record import save_record
-from fdhil.commissioning.steps import commission
+from fdhil.commissioning.commissioning_record import save_record
+from fdhil.commissioning.commissioning_steps import commission_axis
 from fdhil.config import MachineConfig
 from fdhil.daemon.daemon_socket import ask_daemon
 from fdhil.errors import ConnectError
 from fdhil.guard.guard_step import SETTLED_CYCLES
-from fdhil.program import load_trajectory, program_digest
+from fdhil.program import compute_program_digest, load_trajectory
 from fdhil.store.history_database import History
 from tests.bench import bench_document
 from tests.daemon.machine_rig import patient
@@ -195,12 +195,12 @@ def _join_settings(asked: dict[str, Any], twin: SimulatorProcess, acting: bool) 
 def _prepare_machine(stage: WebRig, rapids: int) -> None:
     with patient():
         for axis in stage.config.axis:
-            save_record(commission(stage.config, axis), stage.config.store.directory)
+            save_record(commission_axis(stage.config, axis), stage.config.store.directory)
     stage.program.parent.mkdir()
     stage.program.write_text(CORNER, "ascii")
     stored_weeks.fill_store(stage.config, rapids)
     rows = load_trajectory(stage.program, stage.config).time_s.size
-    stored_weeks.write_learned_offsets(stage.config, program_digest(stage.program), rows)
+    stored_weeks.write_learned_offsets(stage.config, compute_program_digest(stage.program), rows)
     for name, role in ROLES.items():
         command = [sys.executable, "-m", "fdhil", "web-user", str(stage.config_path), name, "--role", role]
         subprocess.run(command, input=f"{PASSWORDS[name]}\n", text=True, check=True, capture_output=True)

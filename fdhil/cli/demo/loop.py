@@ -15,8 +15,8 @@ from fdhil.cli.demo.demo_page import CutPass, DemoResult, Published, compute_rms
 from fdhil.cli.demo.machines import load_machine_document
 from fdhil.cli.demo.processes import PATIENCE_S, ChildProcess, SimulatorProcess
 from fdhil.cli.demo.toml_writer import format_toml
-from fdhil.commissioning.record import save_record
-from fdhil.commissioning.steps import commission
+from fdhil.commissioning.commissioning_record import save_record
+from fdhil.commissioning.commissioning_steps import commission_axis
 from fdhil.config import MachineConfig
 from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
 from fdhil.errors import DeviceTimeout, FdhilError, RecordingError
@@ -132,7 +132,7 @@ def _wait_until(done: Callable[[], bool], failure: str, stage: DemoRig) -> None:
 def _commission_axes(stage: DemoRig) -> None:
     for axis in stage.config.axis:
         stage.show_progress(f"commissioning {axis}: identity, read-back, +10 um, feed-forward, watchdog")
-        record = commission(stage.config, axis)
+        record = commission_axis(stage.config, axis)
         save_record(record, stage.config.store.directory, stage.config.store.commissioning_key)
         where = "includes" if record.offset_in_feedforward else "does not include"
         stage.show_progress(

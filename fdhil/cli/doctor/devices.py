@@ -4,8 +4,8 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 
 from fdhil.arming.guard_client import GuardClient
 from fdhil.cli.doctor.trouble import Trouble
-from fdhil.commissioning.compare import RECORD_POINT
 from fdhil.commissioning.config_check import Place, check_machine
+from fdhil.commissioning.record_comparison import RECORD_POINT
 from fdhil.config import MachineConfig
 from fdhil.daemon.daemon_socket import SOCKET_NAME as DAEMON_SOCKET
 from fdhil.daemon.daemon_socket import ask_daemon

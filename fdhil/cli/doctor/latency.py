@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.cli.doctor.trouble import Trouble
-from fdhil.commissioning.cycle import Lateness
-from fdhil.commissioning.realtime import CYCLE_PRIORITY, prioritise
+from fdhil.commissioning.realtime_scheduling import CYCLE_PRIORITY, set_realtime_priority
+from fdhil.commissioning.sync_cycle import Lateness
 from fdhil.config import MachineConfig
 from fdhil.guard.turn_lateness import BINS_US, MOST_LATE
 from fdhil.store.atomic_file import make_folder, write_file
@@ -30,7 +30,7 @@ def measure_latency(
     """Sleep until each SYNC period for ``seconds``, with the guard's priority if permitted; return the latencies."""
     period_s, measured, over = config.machine.sync_period_s, Lateness(), 0
     before = os.sched_getscheduler(0), os.sched_getparam(0)
-    scheduling = prioritise(CYCLE_PRIORITY)
+    scheduling = set_realtime_priority(CYCLE_PRIORITY)
     gc.disable()
     try:
         due_s = now_s() + period_s
@@ -38,7 +38,7 @@ def measure_latency(
         while due_s < end_s:
             sleep(max(0.0, due_s - now_s()))
             late_s = now_s() - due_s
-            measured.add(late_s)
+            measured.count_sync(late_s)
             over += late_s > period_s
             due_s += period_s * (1 + int(max(0.0, late_s) / period_s))  # missed periods are skipped
     finally:
@@ -56,9 +56,9 @@ def measure_latency(
         "kernel": f"{os.uname().release} {os.uname().version}",
         "turns": measured.cycles,
         "late": over,
-        "p50_us": measured.quantile_us(0.5),
-        "p99_us": measured.quantile_us(0.99),
-        "p999_us": measured.quantile_us(0.999),
+        "p50_us": measured.compute_quantile_us(0.5),
+        "p99_us": measured.compute_quantile_us(0.99),
+        "p999_us": measured.compute_quantile_us(0.999),
         "worst_us": round(measured.most_us),
         "histogram_us": [[top, count] for top, count in zip((*BINS_US, None), counts, strict=True)],
     }

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from fdhil.arming.operator_token import TOKEN_NAME, check_run_directory, read_token
 from fdhil.cli.doctor.trouble import Trouble
-from fdhil.commissioning.record import load_record
-from fdhil.commissioning.void import is_void
+from fdhil.commissioning.commissioning_record import load_record
+from fdhil.commissioning.void_mark import is_record_void
 from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError, StoreError
 from fdhil.guard.guard_protocol import SOCKET_NAME
@@ -95,6 +95,6 @@ def _examine_record(config: MachineConfig, axis: str) -> Iterator[Trouble]:
     if record is None:
         mend = f"{COMMISSION} with the NC off and the axis free to move"
         yield Trouble("NotCommissioned", place, "it has [correction], but is not commissioned", means, mend, False)
-    elif is_void(directory, axis):
+    elif is_record_void(directory, axis):
         what = "its commissioning record became doubtful"
         yield Trouble("RecordVoid", place, what, means, "run `fdhil check` with the NC off, which compares the drive")

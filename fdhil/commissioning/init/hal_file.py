@@ -15,7 +15,7 @@ from pathlib import Path
 from textwrap import wrap
 
 from fdhil.bridges import hal_bus, linuxcnc
-from fdhil.commissioning.init.linuxcnc_text import Hal
+from fdhil.commissioning.init.linuxcnc_text import HalNetlist
 from fdhil.config import MachineConfig, OffsetBounds
 from fdhil.errors import ConfigError, ConfigFault
 
@@ -26,7 +26,7 @@ OWN = ("streamer", "limit3", "offset", "oneshot", "lut5")
 
 
 @dataclass(frozen=True, slots=True)
-class Splice:
+class OffsetInsertion:
     """Where an axis' offset is inserted: the signals of command and feedback, and the pins that the command drives."""
 
     axis: str
@@ -36,13 +36,13 @@ class Splice:
     driven: tuple[str, ...]
 
 
-def splices_of(hal: Hal, joints: Mapping[str, int], axes: Sequence[str]) -> list[Splice]:
+def find_insertions(hal: HalNetlist, joints: Mapping[str, int], axes: Sequence[str]) -> list[OffsetInsertion]:
     """Return where the offsets of ``axes`` are inserted; ConfigError naming the pin if HAL has no such place."""
     found, faults = [], []
     for axis in axes:
         pins = tuple(f"joint.{joints[axis]}.motor-pos-{end}" for end in ("cmd", "fb"))
         command, feedback = (next((s for s, on in hal.nets.items() if pin in on), "") for pin in pins)
-        driven = tuple(pin for pin in hal.joined(pins[0]) if pin != pins[1])
+        driven = tuple(pin for pin in hal.find_linked_pins(pins[0]) if pin != pins[1])
         where = f"axis.{axis}.correction"
         if not command or not feedback:
             missing = pins[0] if not command else pins[1]
@@ -52,31 +52,35 @@ def splices_of(hal: Hal, joints: Mapping[str, int], axes: Sequence[str]) -> list
         elif command == feedback or not driven:
             faults.append(ConfigFault(where, f"{pins[0]} commands no drive or pid component", "remove this section"))
         else:
-            found.append(Splice(axis, joints[axis], command, feedback, driven))
+            found.append(OffsetInsertion(axis, joints[axis], command, feedback, driven))
     if faults:
         raise ConfigError("HAL", faults)
     return found
 
 
-def correction_hal(config: MachineConfig, file: str, joints: int, splices: Sequence[Splice], hal: Hal) -> str:
+def format_correction_hal(
+    config: MachineConfig, file: str, joints: int, splices: Sequence[OffsetInsertion], hal: HalNetlist
+) -> str:
     """Return the HAL file of a machine with so many joints whose configuration is in ``file``.
 
     Without ``splices`` it only loads the bridges.
     """
-    return "\n".join([*_lines(config, file, joints, splices, hal), ""])
+    return "\n".join([*_format_lines(config, file, joints, splices, hal), ""])
 
 
-def _lines(config: MachineConfig, file: str, joints: int, splices: Sequence[Splice], hal: Hal) -> Iterator[str]:
-    yield from _comment(
+def _format_lines(
+    config: MachineConfig, file: str, joints: int, splices: Sequence[OffsetInsertion], hal: HalNetlist
+) -> Iterator[str]:
+    yield from _wrap_comment(
         "Written by fdhil init. Load it last: HALFILE = this file, after the others in [HAL] of the INI. Without it "
         "LinuxCNC runs as before."
     )
     if splices:
-        yield from _components(config, splices, hal)
+        yield from _format_components(config, splices, hal)
         bus = config.bus[config.axis[splices[0].axis].drive.bus]
-        yield from _wiring(splices, WATCHDOG_S + bus.offset_lead_cycles * config.machine.sync_period_s)
-        yield from _order(splices, hal)
-    yield from _comment(
+        yield from _format_wiring(splices, WATCHDOG_S + bus.offset_lead_cycles * config.machine.sync_period_s)
+        yield from _format_function_order(splices, hal)
+    yield from _wrap_comment(
         "The bridges of the drives (pins of [axis.X.drive.hal]) and of the NC: one sampler each, last in the thread."
     )
     linked = {pin for pins in hal.nets.values() for pin in pins}
@@ -89,10 +93,10 @@ def _lines(config: MachineConfig, file: str, joints: int, splices: Sequence[Spli
         yield f"loadusr -Wn {name} /usr/bin/python3 {Path(str(module.__file__)).resolve()} {options}"
 
 
-def _components(config: MachineConfig, splices: Sequence[Splice], hal: Hal) -> Iterator[str]:
-    yield from _comment("These limits bound every offset that fdhil sends; fdhil cannot change them.")
+def _format_components(config: MachineConfig, splices: Sequence[OffsetInsertion], hal: HalNetlist) -> Iterator[str]:
+    yield from _wrap_comment("These limits bound every offset that fdhil sends; fdhil cannot change them.")
     for name in (name for name in OWN if name in hal.loaded):
-        yield from _comment(
+        yield from _wrap_comment(
             f"Your HAL files already load {name}, and HAL loads a component only once: add the names below to "
             "that line with names=, and delete the line here."
         )
@@ -108,7 +112,7 @@ def _components(config: MachineConfig, splices: Sequence[Splice], hal: Hal) -> I
         assert pins is not None  # offsets are inserted on HAL axes only
         unit, per_mm = pins.position_mm_per_unit, axis.scaling.increments_per_mm
         offset, rate, acceleration, *_ = OffsetBounds.derive(axis, period_s).whole_increments
-        yield from _comment(
+        yield from _wrap_comment(
             f"{splice.axis}: the limits of [axis.{splice.axis}.correction] and {MARGIN:g} times its rates"
         )
         limit = offset / per_mm / unit
@@ -118,8 +122,8 @@ def _components(config: MachineConfig, splices: Sequence[Splice], hal: Hal) -> I
             yield f"setp {name}.{key} {value:.9g}"
 
 
-def _wiring(splices: Sequence[Splice], watchdog_s: float) -> Iterator[str]:
-    yield from _comment(
+def _format_wiring(splices: Sequence[OffsetInsertion], watchdog_s: float) -> Iterator[str]:
+    yield from _wrap_comment(
         "Offsets pass while the bridge's heartbeat arrives, the machine is on, and the streamer has data."
     )
     for key, value in (("width", watchdog_s), ("retriggerable", 1), ("rising", 1), ("falling", 1)):
@@ -133,7 +137,7 @@ def _wiring(splices: Sequence[Splice], watchdog_s: float) -> Iterator[str]:
     yield f"net fdhil-on fdhil-gate.out => {enabled}"
     for place, splice in enumerate(splices, 1):
         x = splice.axis.lower()
-        yield from _comment(
+        yield from _wrap_comment(
             f"{splice.axis}: the drive gets the command plus the offset; the joint's feedback excludes it."
         )
         yield f"net fdhil-table-{x} streamer.0.pin.{place} => fdhil-limit-{x}.in"
@@ -147,7 +151,7 @@ def _wiring(splices: Sequence[Splice], watchdog_s: float) -> Iterator[str]:
         yield f"net fdhil-feedback-{x} fdhil-offset-{x}.fb-out => joint.{splice.joint}.motor-pos-fb"
 
 
-def _order(splices: Sequence[Splice], hal: Hal) -> Iterator[str]:
+def _format_function_order(splices: Sequence[OffsetInsertion], hal: HalNetlist) -> Iterator[str]:
     """Put the feedback before the motion controller, and the offset right after it."""
     thread, functions = next(((t, f) for t, f in hal.threads.items() if "motion-controller" in f), ("servo-thread", []))
     before = [f"fdhil-offset-{s.axis.lower()}.update-feedback" for s in splices]
@@ -155,17 +159,21 @@ def _order(splices: Sequence[Splice], hal: Hal) -> Iterator[str]:
     after += [f"fdhil-limit-{s.axis.lower()}" for s in splices]
     after += [f"fdhil-offset-{s.axis.lower()}.update-output" for s in splices]
     if not functions:
-        yield from _comment("The order of your thread is unknown: put these right after motion-controller by hand.")
+        yield from _wrap_comment(
+            "The order of your thread is unknown: put these right after motion-controller by hand."
+        )
         yield from (f"addf {function} {thread}" for function in (*before, *after))
         return
     controller = functions.index("motion-controller")
     first = min(controller, functions.index("motion-command-handler") if "motion-command-handler" in functions else 99)
-    yield from _comment(f"In {thread}: feedback before function {first + 1}, offsets right after motion-controller.")
+    yield from _wrap_comment(
+        f"In {thread}: feedback before function {first + 1}, offsets right after motion-controller."
+    )
     for place, function in enumerate(before):
         yield f"addf {function} {thread} {first + 1 + place}"
     for place, function in enumerate(after):
         yield f"addf {function} {thread} {controller + 2 + len(before) + place}"
 
 
-def _comment(words: str) -> list[str]:
+def _wrap_comment(words: str) -> list[str]:
     return wrap(words, 110, initial_indent="# ", subsequent_indent="# ")

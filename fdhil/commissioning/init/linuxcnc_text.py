@@ -30,20 +30,20 @@ class Ini:
     sections: Mapping[str, Mapping[str, tuple[str, ...]]]
     repeated: tuple[str, ...] = ()
 
-    def all(self, section: str, key: str) -> tuple[str, ...]:
+    def find_all(self, section: str, key: str) -> tuple[str, ...]:
         """Return every value of a key; empty without one."""
         return self.sections.get(section, {}).get(key, ())
 
-    def text(self, section: str, key: str) -> str:
+    def get_text(self, section: str, key: str) -> str:
         """Return a key's first value, as LinuxCNC does; empty without one."""
-        return next(iter(self.all(section, key)), "")
+        return next(iter(self.find_all(section, key)), "")
 
-    def number(self, section: str, key: str) -> float | None:
+    def get_number(self, section: str, key: str) -> float | None:
         """Return a key's first word as a finite number; None if it is not one."""
-        return finite(self.text(section, key))
+        return parse_finite(self.get_text(section, key))
 
 
-def finite(text: str) -> float | None:
+def parse_finite(text: str) -> float | None:
     """Return the first word of a text as a finite number; None if it is not one.
 
     >>> finite("20.0  # mm"), finite("fast"), finite("nan")
@@ -61,7 +61,7 @@ def parse_ini(text: str, read: Read) -> Ini:
     sections: dict[str, dict[str, tuple[str, ...]]] = {}
     current: dict[str, tuple[str, ...]] = {}
     repeated: dict[str, None] = {}
-    for line in _included(text, read):
+    for line in _expand_includes(text, read):
         line = line.strip()
         if line.startswith("[") and "]" in line:
             name, current = line[1 : line.index("]")].strip(), {}
@@ -75,23 +75,23 @@ def parse_ini(text: str, read: Read) -> Ini:
     return Ini(sections, tuple(repeated))
 
 
-def _included(text: str, read: Read, depth: int = 0) -> Iterator[str]:
-    for line in _joined(text):
+def _expand_includes(text: str, read: Read, depth: int = 0) -> Iterator[str]:
+    for line in _join_continued_lines(text):
         words = line.split()
         if len(words) > 1 and words[0] == "#INCLUDE":
             if depth > 8:
                 raise ValueError("files include each other endlessly")
-            yield from _included(read(words[1]), read, depth + 1)
+            yield from _expand_includes(read(words[1]), read, depth + 1)
         else:
             yield line
 
 
-def _joined(text: str) -> Iterator[str]:
+def _join_continued_lines(text: str) -> Iterator[str]:
     yield from re.sub(r"\\[ \t]*\r?\n", " ", text).splitlines()  # a backslash continues the line
 
 
 @dataclass(slots=True)
-class Hal:
+class HalNetlist:
     """Parameters that are set, the pins on each signal, the components that are PID loops, and all loaded components.
 
     ``threads`` holds the functions of each thread in order.
@@ -103,39 +103,39 @@ class Hal:
     loaded: set[str] = field(default_factory=set)
     threads: dict[str, list[str]] = field(default_factory=dict)
 
-    def joined(self, pin: str) -> list[str]:
+    def find_linked_pins(self, pin: str) -> list[str]:
         """Return the other pins on a pin's signal, in alphabetical order."""
         return sorted(other for pins in self.nets.values() if pin in pins for other in pins - {pin})
 
-    def around(self, pin: str) -> list[str]:
+    def find_linked_components(self, pin: str) -> list[str]:
         """Return the components (with instance) whose pins are on a pin's signal."""
-        return list(dict.fromkeys(other.rpartition(".")[0] for other in self.joined(pin)))
+        return list(dict.fromkeys(other.rpartition(".")[0] for other in self.find_linked_pins(pin)))
 
-    def loops_behind(self, pin: str) -> list[str]:
+    def find_pid_loops(self, pin: str) -> list[str]:
         """Return the PID loops that a pin commands, directly or through a chain of components (adders, limits, ...)."""
         found: dict[str, None] = {}
         waiting, seen = [pin], {pin}
         while waiting:
-            for other in self.joined(waiting.pop()):
+            for other in self.find_linked_pins(waiting.pop()):
                 component, _, name = other.rpartition(".")
                 if component in self.loops or component.startswith("pid."):
                     if name == "command":
                         found[component] = None
                 elif component.partition(".")[0] not in _ENDS:
-                    waiting += [out for out in self._outputs(component) if out not in seen]
+                    waiting += [out for out in self._find_output_pins(component) if out not in seen]
                     seen.update(waiting)
         return sorted(found)
 
-    def _outputs(self, component: str) -> list[str]:
+    def _find_output_pins(self, component: str) -> list[str]:
         pins = [pin.rpartition(".") for pins in self.nets.values() for pin in pins]
         return sorted(f"{owner}.{name}" for owner, _, name in pins if owner == component and _OUTPUT.match(name))
 
 
-def parse_hal(text: str, ini: Ini, read: Read, hal: Hal, depth: int = 0) -> None:
+def parse_hal(text: str, ini: Ini, read: Read, hal: HalNetlist, depth: int = 0) -> None:
     """Add the commands of a HAL file, and of those that it sources, to ``hal``; unknown commands are ignored."""
-    for line in _joined(text):
+    for line in _join_continued_lines(text):
         # keys missing in the INI are kept verbatim
-        words = _SUBSTITUTE.sub(lambda found: ini.text(found[1], found[2]) or found[0], line).split()
+        words = _SUBSTITUTE.sub(lambda found: ini.get_text(found[1], found[2]) or found[0], line).split()
         words = words[: next((k for k, word in enumerate(words) if word.startswith("#")), len(words))]
         match words:
             case ["setp", pin, value, *_]:
@@ -148,7 +148,7 @@ def parse_hal(text: str, ini: Ini, read: Read, hal: Hal, depth: int = 0) -> None
                 hal.nets.setdefault(signals[0], set()).add(pin)
             case ["loadrt" | "newinst", name, *arguments]:
                 hal.loaded.add(name)
-                hal.loops.update(_instances(name, arguments) if name in _PIDS else ())
+                hal.loops.update(_list_instances(name, arguments) if name in _PIDS else ())
             case ["addf", function, thread, *position]:
                 functions = hal.threads.setdefault(thread, [])
                 place = int(position[0]) if position and position[0].lstrip("-").isdecimal() else -1
@@ -157,7 +157,7 @@ def parse_hal(text: str, ini: Ini, read: Read, hal: Hal, depth: int = 0) -> None
                 parse_hal(read(name), ini, read, hal, depth + 1)
 
 
-def _instances(name: str, arguments: Sequence[str]) -> Iterator[str]:
+def _list_instances(name: str, arguments: Sequence[str]) -> Iterator[str]:
     for argument in arguments:
         key, equals, value = argument.replace('"', "").partition("=")
         if key == "names" or not equals:

@@ -16,15 +16,15 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError
-from fdhil.program.dialect import Dialect
 from fdhil.program.motions import ALL_AXES, Dwell, Motion, Probe
+from fdhil.program.nc_dialect import Dialect
 from fdhil.program.planner import linuxcnc
-from fdhil.program.planner.limits import checked
+from fdhil.program.planner.axis_limits import check_motions
 from fdhil.program.planner.look_ahead import LookAhead
 from fdhil.program.planner.smoothing import Smoother
 from fdhil.program.planner.timeline import Timeline
+from fdhil.program.position_range_check import find_first_out_of_range
 from fdhil.program.program_notes import ProgramNotes
-from fdhil.program.reach import first_beyond
 from fdhil.records import Float, Int, Trajectory, freeze_array, freeze_integers
 
 MAX_ROWS = 10_000_000
@@ -36,12 +36,12 @@ def plan(motions: Iterable[Motion], config: MachineConfig, max_rows: int = MAX_R
 
     ProgramError for an axis that the machine lacks, a feed of zero, and more than ``max_rows`` SYNC periods.
     """
-    notes = ProgramNotes(Dialect.of(config.nc))
-    rows = np.concatenate(list(_parts(notes.watch(motions), config, _BLOCK_ROWS, max_rows)))
-    return replace(_trajectory(rows, 0, config), notes=notes.found)
+    notes = ProgramNotes(Dialect.create_from_config(config.nc))
+    rows = np.concatenate(list(_plan_parts(notes.watch_motions(motions), config, _BLOCK_ROWS, max_rows)))
+    return replace(_build_trajectory(rows, 0, config), notes=notes.notes)
 
 
-def stream(
+def stream_trajectory(
     motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float = math.inf
 ) -> Iterator[Trajectory]:
     """Yield the same reference in blocks of ``count_block_rows`` (the last one shorter), in constant memory.
@@ -50,26 +50,26 @@ def stream(
     """
     row = 0
     waiting = np.empty((0, len(ALL_AXES) + 2))
-    for part in _parts(motions, config, block_rows, max_rows):
+    for part in _plan_parts(motions, config, block_rows, max_rows):
         waiting = np.concatenate([waiting, part])
         while len(waiting) >= block_rows:
-            yield _trajectory(waiting[:block_rows], row, config)
+            yield _build_trajectory(waiting[:block_rows], row, config)
             waiting = waiting[block_rows:]
             row += block_rows
     if len(waiting):
-        yield _trajectory(waiting, row, config)
+        yield _build_trajectory(waiting, row, config)
 
 
-def _parts(motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float) -> Iterator[Float]:
+def _plan_parts(motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float) -> Iterator[Float]:
     """Yield the positions of ``ALL_AXES``, source line and rapid (0 or 1) of the next rows, (n, 11)."""
-    motions = _stopped_at_probes(checked(motions, config))
+    motions = _insert_probe_stops(check_motions(motions, config))
     if config.nc.profile == "linuxcnc":
-        return linuxcnc.Planner(config, max_rows).parts(motions, block_rows)
-    made = _smoothed if config.nc.profile == "fir" else _looked_ahead
+        return linuxcnc.LinuxcncPlanner(config, max_rows).plan_parts(motions, block_rows)
+    made = _plan_smoothed if config.nc.profile == "fir" else _plan_with_look_ahead
     return made(motions, config, block_rows, max_rows)
 
 
-def _stopped_at_probes(motions: Iterable[Motion]) -> Iterator[Motion]:
+def _insert_probe_stops(motions: Iterable[Motion]) -> Iterator[Motion]:
     for motion in motions:
         if isinstance(motion, Probe):
             yield Dwell(motion.line, 0.0)
@@ -79,37 +79,39 @@ def _stopped_at_probes(motions: Iterable[Motion]) -> Iterator[Motion]:
             yield motion
 
 
-def _smoothed(motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float) -> Iterator[Float]:
+def _plan_smoothed(
+    motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float
+) -> Iterator[Float]:
     dt_s = config.machine.sync_period_s
     smoother = Smoother(config.nc.smoothing_s, dt_s)
     timeline = Timeline(config, smoother.settle_rows, max_rows)
-    for segments in timeline.batches(motions):
-        for rows in _spans(segments.first_row, segments.end_row, block_rows):
-            part = segments.sample(rows, dt_s)
+    for segments in timeline.plan_batches(motions):
+        for rows in _split_into_spans(segments.first_row, segments.end_row, block_rows):
+            part = segments.sample_rows(rows, dt_s)
             part[:, :-2] = smoother(part[:, :-2])
             yield part
 
 
-def _looked_ahead(
+def _plan_with_look_ahead(
     motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float
 ) -> Iterator[Float]:
     dt_s = config.machine.sync_period_s
     ahead = LookAhead(config, max_rows)
     smoother = Smoother((ahead.filter_rows * dt_s,), dt_s)
-    for stretch in ahead.stretches(motions):
-        for rows in _spans(stretch.first_row, stretch.end_row, block_rows):
-            sampled = stretch.sample(rows, dt_s)
+    for stretch in ahead.plan_stretches(motions):
+        for rows in _split_into_spans(stretch.first_row, stretch.end_row, block_rows):
+            sampled = stretch.sample_rows(rows, dt_s)
             path_mm = smoother(sampled[:, :1])[:, 0]
-            yield np.column_stack([ahead.curve.at(path_mm), sampled[:, 1:]])
-            ahead.curve.forget(float(path_mm[-1]))
+            yield np.column_stack([ahead.curve.compute_points(path_mm), sampled[:, 1:]])
+            ahead.curve.drop_before(float(path_mm[-1]))
 
 
-def _spans(first_row: int, end_row: int, block_rows: int) -> Iterator[Int]:
+def _split_into_spans(first_row: int, end_row: int, block_rows: int) -> Iterator[Int]:
     for first in range(first_row, end_row, block_rows):
         yield np.arange(first, min(first + block_rows, end_row))
 
 
-def _trajectory(rows: Float, first_row: int, config: MachineConfig) -> Trajectory:
+def _build_trajectory(rows: Float, first_row: int, config: MachineConfig) -> Trajectory:
     n, dt_s = len(rows), config.machine.sync_period_s
     rapid = rows[:, -1].astype(np.bool_)
     rapid.setflags(write=False)
@@ -117,7 +119,7 @@ def _trajectory(rows: Float, first_row: int, config: MachineConfig) -> Trajector
         name: freeze_array(rows[:, ALL_AXES.index(name[0])] * axis.mm_per_unit if name[0] in ALL_AXES else np.zeros(n))
         for name, axis in config.axis.items()
     }
-    if (beyond := first_beyond(position_mm, config)) is not None:  # an arc may, between ends in range
+    if (beyond := find_first_out_of_range(position_mm, config)) is not None:  # an arc may, between ends in range
         raise ProgramError(int(rows[beyond.row, -2]), beyond.axis, beyond.text)
     return Trajectory(
         dt_s=dt_s,

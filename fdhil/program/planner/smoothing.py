@@ -32,11 +32,11 @@ class Smoother:
                 continue
             whole = np.concatenate([self._past[stage], rows])
             self._past[stage] = whole[whole.shape[0] - length + 1 :]
-            rows = np.column_stack([_mean(column, length) for column in whole.T])
+            rows = np.column_stack([_smooth_column(column, length) for column in whole.T])
         return rows
 
 
-def _mean(column: Float, length: int) -> Float:
+def _smooth_column(column: Float, length: int) -> Float:
     """Return the mean of each ``length`` consecutive values; a constant column is returned bit for bit."""
     origin = column[0]
     if column[-1] == origin and bool(np.all(column == origin)):

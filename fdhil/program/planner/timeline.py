@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.program.motions import ORIGIN, Dwell, Motion, Rapid, reached
-from fdhil.program.planner.limits import TICK_TOLERANCE, AxisLimits, check_duration
-from fdhil.program.planner.pieces import (
+from fdhil.program.motions import ORIGIN, Dwell, Motion, Rapid, compute_end
+from fdhil.program.planner.axis_limits import TICK_TOLERANCE, AxisLimits, check_duration
+from fdhil.program.planner.path_pieces import (
     KIND,
     LENGTH,
     LINE,
@@ -22,10 +22,10 @@ from fdhil.program.planner.pieces import (
     STOP,
     WIDTH,
     Row,
-    length_of,
-    path_limit,
-    piece,
-    points_at,
+    build_piece,
+    compute_points_at_share,
+    limit_path_speed,
+    measure_length,
 )
 from fdhil.records import Float, Int
 
@@ -37,14 +37,14 @@ _EVEN = (0.0, 0.0)  # no ramps
 
 
 @dataclass(frozen=True)
-class Segments:
+class TimedSegments:
     """Consecutive segments, (m, WIDTH + 4), for the rows from ``first_row`` to before ``end_row``."""
 
     table: Float
     first_row: int
     end_row: int
 
-    def sample(self, rows: Int, dt_s: float) -> Float:
+    def sample_rows(self, rows: Int, dt_s: float) -> Float:
         """Return the positions of ``ALL_AXES``, source line and rapid (0 or 1) at SYNC ``rows`` (n,): (n, 11)."""
         t = rows * dt_s
         index = np.searchsorted(self.table[:, _END_S], t - TICK_TOLERANCE * dt_s, side="left")
@@ -54,11 +54,11 @@ class Segments:
         share = np.divide(into, span, out=np.ones_like(span), where=span > 0.0)
         ramped = chosen[:, _RAMP_S] > 0.0
         if ramped.any():
-            share[ramped] = _ramped_share(into[ramped], chosen[ramped])
-        return np.column_stack([points_at(chosen, share), chosen[:, LINE], chosen[:, RAPID]])
+            share[ramped] = _compute_ramped_share(into[ramped], chosen[ramped])
+        return np.column_stack([compute_points_at_share(chosen, share), chosen[:, LINE], chosen[:, RAPID]])
 
 
-def _ramped_share(into: Float, chosen: Float) -> Float:
+def _compute_ramped_share(into: Float, chosen: Float) -> Float:
     acceleration, ramp_s = chosen[:, _RATE], chosen[:, _RAMP_S]
     left = chosen[:, _SPAN_S] - into
     share = acceleration * ramp_s * (into - ramp_s / 2.0)
@@ -73,11 +73,11 @@ class Timeline:
     """
 
     def __init__(self, config: MachineConfig, settle_rows: int, max_rows: float = math.inf) -> None:
-        self._limits = limits = AxisLimits.of(config)
+        self._limits = limits = AxisLimits.create_from_config(config)
         self._dt_s = limits.dt_s
         self._max_s = max_rows * self._dt_s
-        self._settle_rows = settle_rows + limits.rows(config.nc.settle_s)
-        self._end_rows = settle_rows + 1 + limits.rows(config.nc.end_rest_s)
+        self._settle_rows = settle_rows + limits.count_rows(config.nc.settle_s)
+        self._end_rows = settle_rows + 1 + limits.count_rows(config.nc.end_rest_s)
         self._stop_always = config.nc.corner == "exact_stop"
         self._at = ORIGIN
         self._now_s = 0.0
@@ -85,61 +85,61 @@ class Timeline:
         self._before: type[Motion] | None = None
         self._table: list[Row] = []
 
-    def batches(self, motions: Iterable[Motion]) -> Iterator[Segments]:
+    def plan_batches(self, motions: Iterable[Motion]) -> Iterator[TimedSegments]:
         """Yield the segments of all motions, the rest before them and the settling after them."""
         first_row = 0
-        self._hold(0.0)
+        self._hold_position(0.0)
         for motion in motions:
-            self._add(motion)
+            self._add_motion(motion)
             due = math.floor(self._now_s / self._dt_s)
             if len(self._table) >= _BATCH or due - first_row > _BATCH_ROWS:
                 end_row = max(first_row, due)
-                yield Segments(np.array(self._table), first_row, end_row)
+                yield TimedSegments(np.array(self._table), first_row, end_row)
                 first_row = end_row
                 self._table = self._table[-1:]
-        self._stop(self._end_rows)
-        yield Segments(np.array(self._table), first_row, round(self._now_s / self._dt_s) + 1)
+        self._hold_until_settled(self._end_rows)
+        yield TimedSegments(np.array(self._table), first_row, round(self._now_s / self._dt_s) + 1)
 
-    def _add(self, motion: Motion) -> None:
+    def _add_motion(self, motion: Motion) -> None:
         kind = type(motion)
         goes_on = kind not in (Rapid, Dwell) and self._before not in (Rapid, Dwell) and not self._stop_always
         if self._before is not None and not goes_on:
-            self._stop(self._settle_rows)
+            self._hold_until_settled(self._settle_rows)
         self._line = motion.line
         self._before = kind
         if isinstance(motion, Dwell):
-            self._hold(motion.seconds)
+            self._hold_position(motion.seconds)
             return
-        row = piece(motion, self._at, self._limits)
+        row = build_piece(motion, self._at, self._limits)
         if row is not None:
-            span_s, ramps = self._rapid(motion) if isinstance(motion, Rapid) else (row[LENGTH] / row[SPEED], _EVEN)
-            self._append(row, span_s, ramps)
-        self._at = reached(motion, self._at)
+            span_s, ramps = self._time_rapid(motion) if isinstance(motion, Rapid) else (row[LENGTH] / row[SPEED], _EVEN)
+            self._append_row(row, span_s, ramps)
+        self._at = compute_end(motion, self._at)
 
-    def _append(self, row: Row, span_s: float, ramps: Row) -> None:
+    def _append_row(self, row: Row, span_s: float, ramps: Row) -> None:
         self._now_s += span_s
         check_duration(self._line, self._now_s, self._max_s)
         self._table.append((*row, self._now_s, span_s, *ramps))
 
-    def _hold(self, span_s: float) -> None:
+    def _hold_position(self, span_s: float) -> None:
         still = [0.0] * WIDTH
         still[KIND], still[LINE], still[RAPID] = LINE_KIND, self._line, float(self._before is Rapid)
         still[START] = still[STOP] = self._at
-        self._append(tuple(still), span_s, _EVEN)
+        self._append_row(tuple(still), span_s, _EVEN)
 
-    def _stop(self, settle_rows: int) -> None:
-        row = self._limits.rows(self._now_s) + settle_rows
-        self._hold(max(0.0, row * self._dt_s - self._now_s))
+    def _hold_until_settled(self, settle_rows: int) -> None:
+        row = self._limits.count_rows(self._now_s) + settle_rows
+        self._hold_position(max(0.0, row * self._dt_s - self._now_s))
         self._now_s = row * self._dt_s
 
-    def _rapid(self, motion: Rapid) -> tuple[float, Row]:
+    def _time_rapid(self, motion: Rapid) -> tuple[float, Row]:
         """Return the duration and ramps of a rapid: one trapezoid for all axes, so that none exceeds its limits."""
-        end = reached(motion, self._at)
+        end = compute_end(motion, self._at)
         way = [abs(b - a) for a, b in zip(self._at, end, strict=True)]
         speed = min(
             v / w for v, w in zip(self._limits.speed, way, strict=True) if w
         )  # share of the distance per second
-        speed = min(speed, path_limit(self._at, end, self._limits) / length_of(self._at, end))
+        speed = min(speed, limit_path_speed(self._at, end, self._limits) / measure_length(self._at, end))
         acceleration = min(a / w for a, w in zip(self._limits.acceleration, way, strict=True) if w)
         ramp_s = min(speed / acceleration, 1.0 / math.sqrt(acceleration))
         span_s = 2.0 * ramp_s + max(0.0, (1.0 - acceleration * ramp_s**2) / (acceleration * ramp_s))

@@ -17,7 +17,7 @@ class DriveFaults:
 
     ``signals`` maps position, speed, current or voltage to a :class:`SignalFault`. ``drop_tpdo`` maps a TPDO number to
     the number of frames still to be dropped (-1: all). ``ignore_offset``: writes to 0x60B0 are lost. ``offset_scale``:
-    factor on the offset. ``not_csp``: 0x6061 shows profile position and set-points are not followed.
+    factor on the offset. ``refuse_csp``: 0x6061 shows profile position and set-points are not followed.
     ``no_heartbeat_consumer``: 0x1016 has no effect. ``load_torque_nm``: Tl, in the drive's direction.
     """
 

@@ -80,7 +80,11 @@ def advise_feeds(
     """Return the lines that exceed a tolerance with the feeds that keep it, as in ``fdhil advise --json``."""
     reference = load_reference(program, name, config)
     models, _, config = load_newest_models(reference, config)
-    motions = None if program.suffix == ".csv" else list(interpret(_read_lines(program), Budget.of(config.nc)))
+    motions = (
+        None
+        if program.suffix == ".csv"
+        else list(interpret(_read_lines(program), Budget.create_from_config(config.nc)))
+    )
     trials = itertools.count(1)
 
     def report_trials(source: FeedScaledPath) -> FeedScaledPath:
@@ -109,7 +113,7 @@ def load_reference(program: Path, name: str, config: MachineConfig) -> Trajector
             text = f"{name} lasts longer than the {minutes:.0f} minutes allowed in the browser"
             raise ProgramError(0, "", f"{text}; use fdhil correct")
         return reference
-    return planner.plan(interpret(_read_lines(program), Budget.of(config.nc)), config, MOST_ROWS)
+    return planner.plan(interpret(_read_lines(program), Budget.create_from_config(config.nc)), config, MOST_ROWS)
 
 
 def _read_lines(program: Path) -> Iterator[str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fdhil.commissioning.record import axis_digest
+from fdhil.commissioning.commissioning_record import compute_axis_digest
 from fdhil.config import Drive
 from fdhil.drivers.cia402.drive_profile_file import load_profile, read_profile, require_offset
 from fdhil.errors import ConfigError, EdsError
@@ -77,7 +77,7 @@ def test_profile_content_is_part_of_the_configuration_digest(tmp_path: Path) -> 
         read_profile.cache_clear()
         config = build_machine_config(folder=tmp_path, drive={"profile": "own.toml"})
         digests.append(config.digest)
-        records.append(axis_digest(config, "X"))
+        records.append(compute_axis_digest(config, "X"))
     assert digests[0] == digests[2] != digests[1]
     assert records[0] == records[2] != records[1]
     assert build_machine_config().axis["X"].drive.files_digest == ""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import cache
 from importlib import import_module
 
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 
 
 @cache
-def target_of(name: str) -> Target:
+def load_target(name: str) -> Target:
     """Return a target by its name; nothing else of fdhil is imported before."""
     made = import_module(f"tests.fuzz.targets.{name}").target()
     assert isinstance(made, Target)

@@ -19,7 +19,7 @@ from fdhil.daemon.daemon_service import DaemonService
 from fdhil.daemon.daemon_socket import ControlServer
 from fdhil.guard.guard_access import Role
 from tests.daemon.simulated_machine import SimulatedMachine, config_of
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 
 _FOLDER = tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None)
 _LOOP = asyncio.new_event_loop()
@@ -38,7 +38,7 @@ SAID: list[dict[str, Any]] = [
 ]
 
 
-async def _server() -> ControlServer:
+async def _build_server() -> ControlServer:
     config = config_of(Path(_FOLDER.name))
     config.store.directory.mkdir(parents=True)
     service = DaemonService(config, SimulatedMachine().open)
@@ -51,7 +51,7 @@ async def _server() -> ControlServer:
     return ControlServer(handle, lambda: None, lambda: None, Access())
 
 
-_SERVER = _LOOP.run_until_complete(_server())
+_SERVER = _LOOP.run_until_complete(_build_server())
 
 
 class _Client:
@@ -70,7 +70,7 @@ class _Client:
         return False
 
 
-async def _answered(data: bytes) -> None:
+async def _answer_line(data: bytes) -> None:
     peer, client = PEERS[data[0] % len(PEERS)], _Client()
     answer = await _SERVER._answer_line(data[1:], peer, client)  # type: ignore[arg-type] # stands for it
     line = json.dumps(answer)
@@ -83,7 +83,7 @@ def taste(data: bytes) -> None:
     """Send the bytes as a line, from the user selected by the first byte."""
     if data:
         with patch.object(service_log, "write_line"):
-            _LOOP.run_until_complete(_answered(data))
+            _LOOP.run_until_complete(_answer_line(data))
 
 
 def target() -> Target:

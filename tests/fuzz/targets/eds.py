@@ -9,7 +9,7 @@ from fdhil.drivers.cia402.capabilities import assess_capabilities, suggest_profi
 from fdhil.drivers.cia402.device_description import read_device
 from fdhil.drivers.cia402.drive_profile_file import read_profile
 from fdhil.errors import EdsError
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 
 FILES = Path(__file__).resolve().parents[2] / "eds"
 _FOLDER = tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None)

@@ -8,7 +8,7 @@ from pathlib import Path
 from fdhil.errors import ConfigError
 from fdhil.sim import fault_script
 from fdhil.sim.fault_kinds import FAULTS
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 
 _FOLDER = tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None)
 

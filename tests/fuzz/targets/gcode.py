@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fdhil.errors import ProgramError
 from fdhil.program import Budget, Dwell, interpret
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 
 ROOT = Path(__file__).resolve().parents[3]
 BUDGET = Budget(max_blocks=2000, max_repeated_blocks=2000, max_call_depth=10, max_motions_per_block=2000)

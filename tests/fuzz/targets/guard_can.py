@@ -16,7 +16,7 @@ from fdhil.guard.can_socket import ERROR, BusDown, SocketcandText, decode_contro
 from fdhil.guard.frame_monitor import FrameMonitor
 from fdhil.guard.guard_protocol import ON_PATH
 from fdhil.guard.guard_state import StepOutput
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 from tests.guard.frame_checks import CEILING
 from tests.guard.simulated_bus import Bench, bench
 
@@ -40,7 +40,7 @@ class _Hub:
         return self._pieces.pop(0) if self._pieces else b""
 
 
-def _in_the_cut() -> Bench:
+def _build_running_guard() -> Bench:
     made = bench(axes=("X",))
     made.settle()
     assert made.arm() == ()
@@ -51,11 +51,11 @@ def _in_the_cut() -> Bench:
     return made
 
 
-_SENDING = _in_the_cut()
+_SENDING = _build_running_guard()
 _IDS = (*_SENDING.listener.list_received_ids(), COB_SYNC, 0x7E5, 0x000)
 
 
-def _again() -> Bench:
+def _copy_guard() -> Bench:
     """Return a copy of the bench in the middle of a cut; constant parts are shared."""
     made = copy.copy(_SENDING)
     made.listener, heard = FrameMonitor(made.settings), made.listener
@@ -70,14 +70,14 @@ def _again() -> Bench:
 
 def taste(data: bytes) -> None:
     """Deliver the frames with SYNCs between them; an even first byte selects a hub's text."""
-    machine, frames = _again(), _records(data[1:])
+    machine, frames = _copy_guard(), _build_records(data[1:])
     if data and data[0] % 2 == 0:
-        frames = [(0, cob_id, payload) for cob_id, payload in _text(data[1:], machine)]
+        frames = [(0, cob_id, payload) for cob_id, payload in _build_hub_text(data[1:], machine)]
     cycles = 0
     for before, cob_id, payload in frames[:200]:
         for _ in range(min(before % 4, MOST_CYCLES - cycles)):
             cycles += 1
-            _judge(machine.run_sync())
+            _assess_state(machine.run_sync())
         if cob_id == ERROR:
             machine.listener.set_controller_state(payload.decode())
         elif cob_id == COB_SYNC:
@@ -85,16 +85,16 @@ def taste(data: bytes) -> None:
         else:
             machine.inject_frame(cob_id, payload)
     for _ in range(2):
-        _judge(machine.run_sync())
+        _assess_state(machine.run_sync())
 
 
-def _judge(output: StepOutput) -> None:
+def _assess_state(output: StepOutput) -> None:
     for offset in output.offsets or ():
         assert type(offset) is int
         assert abs(offset) <= CEILING
 
 
-def _records(data: bytes) -> list[tuple[int, int, bytes]]:
+def _build_records(data: bytes) -> list[tuple[int, int, bytes]]:
     found = []
     for which, length, before, payload in _RECORD.iter_unpack(data[: len(data) // _RECORD.size * _RECORD.size]):
         if which == 255:
@@ -104,7 +104,7 @@ def _records(data: bytes) -> list[tuple[int, int, bytes]]:
     return found
 
 
-def _text(data: bytes, machine: Bench) -> list[tuple[int, bytes]]:
+def _build_hub_text(data: bytes, machine: Bench) -> list[tuple[int, bytes]]:
     line = SocketcandText(cast(socket.socket, _Hub(data)), (), machine.listener.list_received_ids())
     frames: list[tuple[int, bytes]] = []
     try:

@@ -7,7 +7,7 @@ import json
 from fdhil.guard import correction_table
 from fdhil.guard.guard_state import GuardRequest
 from fdhil.guard.request_parsing import parse_line, parse_request
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 from tests.guard.simulated_bus import LIMITS, settings
 
 SETTINGS = settings(token_sha256="0" * 64)

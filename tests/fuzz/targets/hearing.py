@@ -15,7 +15,7 @@ from fdhil.drivers.cia402.bus_decoder import BusDecoder
 from fdhil.drivers.moves import load_event_source
 from fdhil.records import AxisSamples, TickTimes
 from tests.drivers.frame_builder import FrameBuilder, Row, build_machine_config
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 
 CONFIG = build_machine_config(axes="X")
 FLAGS = (0, 0, 0, 0, 0, 0x20000000, 0x40000000, EXTENDED_FLAG)
@@ -31,13 +31,13 @@ def taste(data: bytes) -> None:
     hearing.note_source_opened(0.0)
     ring = FrameRing(1 << 10)
     if data and data[0] % 2 == 0:
-        _text(data[1:], ring)
+        _build_hub_text(data[1:], ring)
     else:
-        for row in _rows(data[1:])[: 1 << 10]:
+        for row in _decode_rows(data[1:])[: 1 << 10]:
             ring.append_frame(*row)
     frames = ring.drain_frames()
     now_ns = 2_000_000_000
-    for block in _blocks(frames, len(data) % 2):
+    for block in _split_at_silence(frames, len(data) % 2):
         now_ns = max(now_ns + 400_000_000, int(block["t_ns"].max(initial=0)))
         for record in decoder.decode_frames(block, now_ns):
             if isinstance(record, AxisSamples | TickTimes):
@@ -50,20 +50,20 @@ def taste(data: bytes) -> None:
     decoder.read_counters()
 
 
-def _blocks(frames: Frames, halved: int) -> list[Frames]:
+def _split_at_silence(frames: Frames, halved: int) -> list[Frames]:
     """Split at long silences of the bus, which the daemon detects by a block without a frame, or in halves."""
     silent = np.flatnonzero(np.diff(frames["t_ns"]) > 1_000_000_000)[:SILENCES] + 1
     return np.split(frames, np.repeat(silent, 2) if silent.size else [frames.size // 2] * halved)
 
 
-def _text(data: bytes, ring: FrameRing) -> None:
+def _build_hub_text(data: bytes, ring: FrameRing) -> None:
     port = object.__new__(SocketcandPort)  # it would connect
     port._rest, port._clock, port.malformed = b"", HubClock(), 0
     for piece in (data[: len(data) // 2], data[len(data) // 2 :]):
         port._parse_chunk(piece, ring, time.monotonic_ns())
 
 
-def _rows(data: bytes) -> list[Row]:
+def _decode_rows(data: bytes) -> list[Row]:
     at_ns, found = 1_000_000_000, []
     for later, can_id, length, flags, payload in _ROW.iter_unpack(data[: len(data) // _ROW.size * _ROW.size]):
         at_ns += UNITS_NS[flags >> 3 & 3] * later

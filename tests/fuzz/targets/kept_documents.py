@@ -13,7 +13,7 @@ import numpy as np
 
 from fdhil.arming.checked_program import CheckedProgram
 from fdhil.arming.program_check import HEADER
-from fdhil.commissioning.record import load_record, record_path, save_record
+from fdhil.commissioning.commissioning_record import build_record_path, load_record, save_record
 from fdhil.config.user_file import hash_password, read_users, write_users
 from fdhil.correction.learned_offsets import LearnedOffset
 from fdhil.drivers.cia402.drive_profile_file import read_profile
@@ -27,7 +27,7 @@ from fdhil.store.column_map import read_column_map
 from fdhil.store.learned_offset_files import read_learned, write_learned
 from fdhil.store.window_file import read_window
 from tests.bench import bench_config
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 from tests.guard.simulated_bus import settings
 
 _FOLDER = tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None)
@@ -35,15 +35,15 @@ FOLDER = Path(_FOLDER.name)
 CONFIG = bench_config("X")
 
 
-def _profile(path: Path) -> None:
+def _read_profile(path: Path) -> None:
     read_profile.__wrapped__(str(path))
 
 
-def _record(path: Path) -> None:
+def _read_record(path: Path) -> None:
     load_record(path.parent, "X", may_lack_key=True)
 
 
-def _audit(path: Path) -> None:
+def _read_audit(path: Path) -> None:
     for body, wrong in audit_file.read_entries(path.parent):
         json.dumps(body)
         assert wrong is None or "audit" in wrong
@@ -55,14 +55,14 @@ READERS: Mapping[str, Callable[[Path], object]] = {
     "lesson.npz": read_learned,
     "guard.json": load_settings,
     "model.json": load_model_file,
-    record_path(Path(), "X").name: _record,
+    build_record_path(Path(), "X").name: _read_record,
     "users.json": read_users,
     "demand.csv": lambda path: read_demand_csv(path, CONFIG),
     "columns.toml": read_column_map,
-    "drive.toml": _profile,
+    "drive.toml": _read_profile,
     "nc.toml": lambda path: read_nc_profile(str(path), "mtconnect"),
     f"key{HEADER}": lambda path: CheckedProgram.find_checked(path.parent, "key", path.parent),
-    audit_file.AUDIT_FILE_NAME: _audit,
+    audit_file.AUDIT_FILE_NAME: _read_audit,
     "window.parquet": read_window,
 }
 
@@ -77,7 +77,7 @@ def taste(data: bytes) -> None:
         READERS[name](path)
 
 
-def _written() -> Mapping[str, bytes]:
+def _write_examples() -> Mapping[str, bytes]:
     from tests.commissioning.test_record import RECORD
 
     write_learned(FOLDER / "lesson.npz", LearnedOffset({"X": np.arange(4.0)}, 3.0, 0.5, (3.0, 1.0)))
@@ -101,7 +101,7 @@ def _written() -> Mapping[str, bytes]:
 
 
 def target() -> Target:
-    written, names = _written(), [*READERS]
+    written, names = _write_examples(), [*READERS]
     seeds = [bytes([names.index(name)]) + content for name, content in written.items() if name in names]
     words = [b"NaN", b"1e999", b"null", b"true", b"[]", b"{}", b'"digest"', b'"schema"', b"PK\x01\x02", b"\x93NUMPY"]
     return Target("kept_documents", seeds, taste, words, 3500)

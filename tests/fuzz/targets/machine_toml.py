@@ -7,7 +7,7 @@ import json
 from fdhil import config
 from fdhil.errors import ConfigError
 from tests.bench import bench_toml
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 
 MORE = """[bus.can0]
 interface = "socketcand"

@@ -11,7 +11,7 @@ from fdhil.drivers.modbus.rtu_frames import READ_COILS, READ_HOLDING, READ_INPUT
 from fdhil.drivers.modbus.rtu_line import RtuLine
 from fdhil.drivers.serial.byte_stream import Chunk
 from fdhil.errors import DeviceError
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 
 FUNCTIONS = (READ_INPUT, READ_HOLDING, READ_COILS, WRITE_REGISTER)
 PLACE = ModbusDevice(device="/dev/none")
@@ -38,7 +38,7 @@ class _Port:
         return Chunk(self._pieces.pop(0), time.monotonic_ns()) if self._pieces else None
 
 
-def _at_once(asking: Coroutine[None, None, ModbusAnswer]) -> ModbusAnswer:
+def _run_without_loop(asking: Coroutine[None, None, ModbusAnswer]) -> ModbusAnswer:
     """Run a coroutine that never waits, without a loop."""
     try:
         asking.send(None)
@@ -56,15 +56,15 @@ def taste(data: bytes) -> None:
     line = RtuLine(PLACE)
     line._port, line.silence_s = _Port([came[k : k + size] for k in range(0, len(came), size)]), 0.0  # type: ignore[assignment] # stands for it
     try:
-        answer = _at_once(line.send_request(request))
+        answer = _run_without_loop(line.send_request(request))
     except DeviceError as error:
         assert len(str(error)) < 500
         return
     assert len(answer.registers) == request.count
-    assert any(_is_frame_of(came[k:], request.unit) for k in range(len(came)))
+    assert any(_contains_frame(came[k:], request.unit) for k in range(len(came)))
 
 
-def _is_frame_of(data: bytes, unit: int) -> bool:
+def _contains_frame(data: bytes, unit: int) -> bool:
     """Return whether some of the first 64 bytes are a frame, by the checksum of Modbus over serial line V1.02 6.2.2."""
     crc = 0xFFFF
     for size, byte in enumerate(data[:64] if data[0] == unit else b"", 1):

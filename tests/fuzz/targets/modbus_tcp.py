@@ -11,7 +11,7 @@ from fdhil.drivers.modbus.modbus_line import ModbusRequest
 from fdhil.drivers.modbus.rtu_frames import READ_COILS, READ_HOLDING, READ_INPUT, WRITE_REGISTER
 from fdhil.drivers.modbus.tcp_line import LIBRARYS_OWN_S, TcpLine, _end_wait_at_unreadable_bytes
 from fdhil.errors import DeviceError
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 
 FUNCTIONS = (READ_INPUT, READ_HOLDING, READ_COILS, WRITE_REGISTER)
 _LOOP = asyncio.new_event_loop()
@@ -43,7 +43,7 @@ class _Wire:
         return False
 
 
-async def _asked(data: bytes) -> None:
+async def _send_request(data: bytes) -> None:
     kind, count = (*data[:2], 0, 0)[:2]
     request = ModbusRequest("sensor", 1, FUNCTIONS[kind % 4], 100, 1 + count % 9, 0.0)
     line = TcpLine("127.0.0.1", 502)
@@ -64,7 +64,7 @@ async def _asked(data: bytes) -> None:
 def taste(data: bytes) -> None:
     """Send the request in the first two bytes and receive the rest; exceptions of callbacks are in the log."""
     _RAISED.clear()
-    _LOOP.run_until_complete(_asked(data))
+    _LOOP.run_until_complete(_send_request(data))
     if _RAISED:
         raise _RAISED[0]
 

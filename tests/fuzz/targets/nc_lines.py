@@ -21,14 +21,14 @@ from fdhil.shopfloor.mtconnect_adapter import ShdrAdapter
 from fdhil.shopfloor.published_items import list_published_values
 from fdhil.shopfloor.sparkplug import is_rebirth_command, parse_host_state
 from tests.drivers.frame_builder import build_machine_config
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 
 CONFIG = build_machine_config(axes="X", g0={"source": "linuxcnc"})
 AGENT = build_machine_config(axes="X", g0={"source": "mtconnect"})
 _LOOP = asyncio.new_event_loop()
 
 
-def _block(first: int) -> tuple[TickTimes, AxisSamples]:
+def _build_block(first: int) -> tuple[TickTimes, AxisSamples]:
     """Forty SYNCs in which the axis moves and stops again."""
     tick = first + np.arange(40)
     way_mm, zeros = np.clip(0.1 * (tick - 20.0), 0.0, 4.0), np.zeros(40)
@@ -46,21 +46,21 @@ def _block(first: int) -> tuple[TickTimes, AxisSamples]:
     return TickTimes(freeze_integers(tick), freeze_integers(tick * 1_000_000)), samples
 
 
-HEARD, LATER = (*_block(0), *_block(40)), (*_block(80), *_block(2000))
+HEARD, LATER = (*_build_block(0), *_build_block(40)), (*_build_block(80), *_build_block(2000))
 
 
-def _reader(data: bytes) -> asyncio.StreamReader:
+def _build_reader(data: bytes) -> asyncio.StreamReader:
     reader = asyncio.StreamReader(loop=_LOOP)
     reader.feed_data(data)
     reader.feed_eof()
     return reader
 
 
-async def _linuxcnc(data: bytes) -> None:
+async def _parse_linuxcnc(data: bytes) -> None:
     bridge, moves, watch = LinuxCncSource(CONFIG), NcReportedMoves("X", CONFIG), NcWatch()
     for record in HEARD:
         moves.detect_moves(record)
-    bridge._reader = _reader(data)
+    bridge._reader = _build_reader(data)
     bridge._check_greeting(await bridge._next_message())
     try:
         while True:
@@ -74,8 +74,8 @@ async def _linuxcnc(data: bytes) -> None:
             moves.detect_moves(record)
 
 
-async def _http(data: bytes) -> None:
-    response = Response("agent", _reader(data))
+async def _parse_http(data: bytes) -> None:
+    response = Response("agent", _build_reader(data))
     await response.read_head()
     if response.headers.get("content-type", "").startswith("multipart"):
         parts = MultipartSplitter("agent", response.headers["content-type"])
@@ -83,10 +83,10 @@ async def _http(data: bytes) -> None:
             for part in parts.split_parts(came):
                 read_streams(part, "agent")
     else:
-        await _xml(await response.read_document())
+        await _parse_xml(await response.read_document())
 
 
-async def _xml(data: bytes) -> None:
+async def _parse_xml(data: bytes) -> None:
     streams, agent = read_streams(data, "agent"), MtConnectSource(AGENT)
     agent._select_signals(streams)
     for state in agent._build_states(streams):
@@ -110,16 +110,22 @@ class _Agent:
         pass
 
 
-async def _shdr(data: bytes) -> None:
-    await ShdrAdapter().serve_agent(_reader(data), _Agent())  # type: ignore[arg-type] # stands for it
+async def _parse_shdr(data: bytes) -> None:
+    await ShdrAdapter().serve_agent(_build_reader(data), _Agent())  # type: ignore[arg-type] # stands for it
 
 
-async def _sparkplug(data: bytes) -> None:
+async def _parse_sparkplug(data: bytes) -> None:
     assert type(is_rebirth_command(data)) is bool
     parse_host_state(data)
 
 
-WAYS: tuple[Callable[[bytes], Awaitable[None]], ...] = (_linuxcnc, _http, _xml, _shdr, _sparkplug)
+WAYS: tuple[Callable[[bytes], Awaitable[None]], ...] = (
+    _parse_linuxcnc,
+    _parse_http,
+    _parse_xml,
+    _parse_shdr,
+    _parse_sparkplug,
+)
 
 
 def taste(data: bytes) -> None:

@@ -13,7 +13,7 @@ from fdhil.fleet.offer_delivery import split_documents
 from fdhil.fleet.signed_offer import Offer, _parse_offer, create_key, encode_canonical, read_offer, sign_offer
 from fdhil.store.change_offers import ANSWERS_FILE, OfferDecision, add_decision, read_decisions
 from tests.bench import bench_toml
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 
 _FOLDER = tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None)
 FOLDER = Path(_FOLDER.name)
@@ -25,23 +25,23 @@ TOLD = {
 }  # fmt: skip
 
 
-def _of_message(data: bytes) -> None:
+def _read_message(data: bytes) -> None:
     for document in split_documents(data):
         with suppress(FdhilError):
             read_offer(document, {TRUSTED})
 
 
-def _of_text(data: bytes) -> None:
+def _read_text(data: bytes) -> None:
     with suppress(NotEditable, ValueError):
         edit_toml(data.decode(), {"axis.X.nominal.ft": 0.061, "maintenance.ft": 0.5}, "friction version 3")
 
 
-def _of_answers(data: bytes) -> None:
+def _read_answers(data: bytes) -> None:
     (FOLDER / ANSWERS_FILE).write_bytes(data)
     read_decisions(FOLDER)
 
 
-READERS = (_parse_offer, _of_message, _of_text, _of_answers)
+READERS = (_parse_offer, _read_message, _read_text, _read_answers)
 
 
 def taste(data: bytes) -> None:

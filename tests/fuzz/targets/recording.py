@@ -21,7 +21,7 @@ from fdhil.errors import FdhilError, RecordingError
 from fdhil.store import reading_process
 from fdhil.store.recording_table import RecordingTable, make_recording
 from fdhil.store.window_export import convert_window
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 from tests.store.sample_records import make_window
 
 WORDS = [b"fdhil-recording-1", b"sample_rate_hz", b"time_s", b"nan", b"inf", b"1e999", b"voltage_samples_V", b"\0" * 8]
@@ -29,7 +29,7 @@ RAISED = 1
 _FORKS = multiprocessing.get_context("fork")
 
 
-class _Reader:
+class _FormatReader:
     """The fork that reads with the module of a format."""
 
     def __init__(self, module: ModuleType) -> None:
@@ -41,15 +41,15 @@ class _Reader:
     def pid(self) -> int | None:
         return self._fork.pid if self._fork is not None and self._fork.is_alive() else None
 
-    def begin(self) -> None:
+    def start_fork(self) -> None:
         if self.pid is None:
             self._asked, there = _FORKS.Pipe()
             self._fork = _FORKS.Process(target=_read_all, args=(self._module, there, self._asked), daemon=True)
             self._fork.start()
             there.close()
 
-    def read(self, data: bytes) -> RecordingTable | FdhilError:
-        self.begin()
+    def read_file(self, data: bytes) -> RecordingTable | FdhilError:
+        self.start_fork()
         try:
             self._asked.send_bytes(data)
             return reading_process.receive_table(self._asked)
@@ -85,13 +85,13 @@ def target_of(name: str, longest: int, words: list[bytes]) -> Target:
     form = tables.load_entry(tables.RECORDING_FORMATS, name)
     whole = convert_window(make_window(n=120))
     few = RecordingTable(whole.headers, {key: values[:20] for key, values in whole.columns.items()})
-    reader = _Reader(form) if hasattr(form, "library") else None
+    reader = _FormatReader(form) if hasattr(form, "library") else None
 
     def taste(data: bytes) -> None:
         if not data:
             return  # every reader checks that first
         try:
-            table = form.decode(data, "r") if reader is None else reader.read(data)
+            table = form.decode(data, "r") if reader is None else reader.read_file(data)
             if isinstance(table, FdhilError):
                 raise table
             make_recording(table, "r")
@@ -99,4 +99,4 @@ def target_of(name: str, longest: int, words: list[bytes]) -> Target:
             assert len(str(error)) < 2000
 
     given = (f"recording_{name}", [form.encode(few)], taste, [*WORDS, *words], longest)
-    return Target(*given) if reader is None else Target(*given, worker=lambda: reader.pid, ready=reader.begin)
+    return Target(*given) if reader is None else Target(*given, worker=lambda: reader.pid, ready=reader.start_fork)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from tests.fuzz.input_assessment import Target
 from tests.fuzz.targets import recording
-from tests.fuzz.tasting import Target
 
 
 def target() -> Target:

@@ -11,7 +11,7 @@ from fdhil.shopfloor.mqtt_publisher import MqttSession
 from fdhil.shopfloor.shdr import build_adapter_state, format_notice, list_changed_lines
 from fdhil.shopfloor.status_poller import StatusPoller
 from tests.daemon.simulated_machine import config_of
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 from tests.shopfloor.status_documents import NOW_MS, status, trouble
 from tests.shopfloor.status_documents import notice as noticed
 
@@ -24,7 +24,7 @@ BORN.node.build_births(*BORN._make_metrics(BEFORE), NOW_MS)
 
 def taste(data: bytes) -> None:
     """Use the bytes, a JSON list or texts separated by zero bytes, for all values that come from outside."""
-    told = _told(data)
+    told = _publish_values(data)
     text, number = [str(item) for item in told[:4]], [x for x in told if type(x) in (int, float)]
     said = status(
         "X",
@@ -43,10 +43,10 @@ def taste(data: bytes) -> None:
         assert line.count("|") >= 2
         assert line.isprintable(), line
         line.encode()
-    _again()._build_changes(news)
+    _copy_session()._build_changes(news)
 
 
-def _again() -> MqttSession:
+def _copy_session() -> MqttSession:
     """Return a copy of the session with its published values; constant parts are shared."""
     session, node = copy.copy(BORN), copy.copy(BORN.node)
     session.node, session._notices = node, {}
@@ -54,7 +54,7 @@ def _again() -> MqttSession:
     return session
 
 
-def _told(data: bytes) -> list[Any]:
+def _publish_values(data: bytes) -> list[Any]:
     try:
         found = json.loads(data)
     except (ValueError, RecursionError):

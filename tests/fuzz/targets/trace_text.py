@@ -6,7 +6,7 @@ from fdhil.errors import RecordingError
 from fdhil.store.column_map import ColumnMap, apply_column_map
 from fdhil.store.recording_table import make_recording
 from fdhil.store.trace_text import parse_trace
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 from tests.store.trace_dialects import Dialect, make_column_map, make_signals, write_trace
 
 WORDS = [

@@ -16,18 +16,18 @@ from urllib.parse import unquote_to_bytes
 import anyio.to_thread
 
 from fdhil.web import login
-from tests.fuzz.tasting import Target
+from tests.fuzz.input_assessment import Target
 from tests.web.http_clients import log_in_for_token, make_test_app
 
 _FOLDER = tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None)
 _LOOP = asyncio.new_event_loop()
 
 
-def _no_match(_user: object, _password: str) -> bool:
+def _build_no_match(_user: object, _password: str) -> bool:
     return False
 
 
-async def _at_once(function: Any, *given: Any, **_how: Any) -> Any:
+async def _run_without_loop(function: Any, *given: Any, **_how: Any) -> Any:
     return function(*given)
 
 
@@ -37,7 +37,7 @@ DECLARED = {200, 204, 206, 304, 400, 401, 403, 404, 405, 408, 409, 413, 416, 421
 ROUTES = sorted({path for route in APP.routes if "json" not in (path := getattr(route, "path", ""))} - {""})
 
 
-def _scope(data: bytes) -> tuple[dict[str, Any], bytes]:
+def _build_scope(data: bytes) -> tuple[dict[str, Any], bytes]:
     head, _, body = data.partition(b"\n\n")
     first, *lines = head.split(b"\n")
     method, _, where = first.partition(b" ")
@@ -59,8 +59,8 @@ def _scope(data: bytes) -> tuple[dict[str, Any], bytes]:
     }, body
 
 
-async def _asked(data: bytes) -> None:
-    scope, body = _scope(data[1:])
+async def _send_request(data: bytes) -> None:
+    scope, body = _build_scope(data[1:])
     if scope["method"] == "POST" and scope["path"] == "/api/program":
         return
     scope["headers"] += [(b"host", b"localhost")] if data[0] & 4 else []
@@ -89,8 +89,11 @@ def taste(data: bytes) -> None:
     """Send the request in the bytes, as the user selected by the first of them."""
     if data:
         # by design a password takes a tenth of a second; a thread per request takes most of the rest
-        with patch.object(login, "verify_password", _no_match), patch.object(anyio.to_thread, "run_sync", _at_once):
-            _LOOP.run_until_complete(_asked(data))
+        with (
+            patch.object(login, "verify_password", _build_no_match),
+            patch.object(anyio.to_thread, "run_sync", _run_without_loop),
+        ):
+            _LOOP.run_until_complete(_send_request(data))
 
 
 def target() -> Target:

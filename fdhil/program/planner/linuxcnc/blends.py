@@ -11,9 +11,26 @@ import math
 from dataclasses import dataclass
 
 from fdhil.program.motions import Place, Point
-from fdhil.program.planner.limits import AxisLimits
-from fdhil.program.planner.linuxcnc.segments import ALONG_SHARE, EXACT, NORMAL_SHARE, PARABOLA, STOP, TANGENT, Segment
-from fdhil.program.planner.linuxcnc.shapes import Led, Line, Turn, cross, dot, minus, plus, unit
+from fdhil.program.planner.axis_limits import AxisLimits
+from fdhil.program.planner.linuxcnc.path_segments import (
+    ALONG_SHARE,
+    EXACT,
+    NORMAL_SHARE,
+    PARABOLA,
+    STOP,
+    TANGENT,
+    PathSegment,
+)
+from fdhil.program.planner.linuxcnc.path_shapes import (
+    ArcShape,
+    LedArcShape,
+    LineShape,
+    add_scaled,
+    compute_cross,
+    compute_dot,
+    normalise_vector,
+    subtract_points,
+)
 
 _KINK_SHARE = 0.1
 _KINK_SHARE_OF_ARC = 0.5
@@ -28,24 +45,24 @@ _ARC_SHARE, _ARC_SHARE_AT_END = 1.0 / 3.0, 2.0 / 3.0  # of an arc's angle that o
 _LEAST_HALF_OF_ARCS_RAD = math.pi / 12.0  # sharper corners of two arcs get no arc
 
 
-def join(before: Segment, after: Segment, limits: AxisLimits) -> tuple[Segment, ...]:
+def join_segments(before: PathSegment, after: PathSegment, limits: AxisLimits) -> tuple[PathSegment, ...]:
     """Decide the transition from ``before`` to ``after``; return what replaces ``before``.
 
     That is ``before`` itself, followed by an arc if one is inserted, or the arc alone if it absorbs ``before``.
     """
     if before.rapid != after.rapid:
         before.ending = STOP
-    if before.turns or after.turns:  # measured: no arc is inserted, and no kink is passed
+    if before.has_other_axes or after.has_other_axes:  # measured: no arc is inserted, and no kink is passed
         after.after_parabola = before.ending == PARABOLA
         return (before,)
-    if before.ending == STOP or _passed(before, after, limits) or before.ending == EXACT:
+    if before.ending == STOP or _is_kink_passable(before, after, limits) or before.ending == EXACT:
         return (before,)
-    arc = _arc(before, after, limits)
-    parabola = blend_speeds(before, after, probing=True)[2] / 2.0
+    arc = _fit_blend_arc(before, after, limits)
+    parabola = compute_blend_speeds(before, after, probing=True)[2] / 2.0
     if arc is not None and arc.segment.top >= max(parabola, before.kink_speed):
         _forget_kink(before, after)
         before.ending = TANGENT
-        return arc.put_between(before, after, limits.dt_s)
+        return arc.insert_between(before, after, limits.dt_s)
     if before.kink_speed > parabola:
         before.ending = TANGENT
     else:
@@ -54,19 +71,19 @@ def join(before: Segment, after: Segment, limits: AxisLimits) -> tuple[Segment, 
     return (before,)
 
 
-def _forget_kink(before: Segment, after: Segment) -> None:
+def _forget_kink(before: PathSegment, after: PathSegment) -> None:
     before.kink_speed, before.kept_back, after.kept_back_before = math.inf, 0.0, 0.0
 
 
-def _passed(before: Segment, after: Segment, limits: AxisLimits) -> bool:
-    t1, t2 = before.shape.tangent(before.shape.length), after.shape.tangent(0.0)
-    if dot(t1, t2) < _REVERSAL:
+def _is_kink_passable(before: PathSegment, after: PathSegment, limits: AxisLimits) -> bool:
+    t1, t2 = before.shape.compute_tangent(before.shape.length), after.shape.compute_tangent(0.0)
+    if compute_dot(t1, t2) < _REVERSAL:
         before.ending = EXACT  # measured: a stop, without a reserve for it
         return False
-    speed = min(before.free, after.free)
+    speed = min(before.free_speed, after.free_speed)
     step = speed / limits.dt_s + after.acceleration
     share = max(abs(b - a) * step / limit for a, b, limit in zip(t1, t2, limits.acceleration[:3], strict=True))
-    if isinstance(before.shape, Turn) or isinstance(after.shape, Turn):
+    if isinstance(before.shape, ArcShape) or isinstance(after.shape, ArcShape):
         share /= _KINK_SHARE_OF_ARC
     kept = min(share, _KINK_SHARE)
     before.kink_speed = speed if share < _KINK_SHARE else speed * _KINK_SHARE / share
@@ -76,20 +93,20 @@ def _passed(before: Segment, after: Segment, limits: AxisLimits) -> bool:
     return share < _KINK_SHARE
 
 
-def blend_speeds(before: Segment, after: Segment, probing: bool = False) -> tuple[float, float, float]:
+def compute_blend_speeds(before: PathSegment, after: PathSegment, probing: bool = False) -> tuple[float, float, float]:
     """Return the speeds at which a parabola begins in ``before`` and ends in ``after``, and that across the corner.
 
     ``probing`` assumes a parabola that is not decided yet.
     """
-    t1, t2 = before.shape.tangent(before.shape.length), after.shape.tangent(0.0)
+    t1, t2 = before.shape.compute_tangent(before.shape.length), after.shape.compute_tangent(0.0)
     kept = after.after_parabola
     after.after_parabola = kept or probing
-    a1, a2, v1, v2 = before.along, after.along, before.reachable, after.reachable
+    a1, a2, v1, v2 = before.path_acceleration, after.path_acceleration, before.reachable_speed, after.reachable_speed
     after.after_parabola = kept
     l1, l2 = before.shape.length, after.shape.length
     span = min(l1 / v1, l2 / v2, max(v1 / a1, v2 / a2))
     v1, v2 = min(v1, span * a1), min(v2, span * a2)
-    half = math.acos(max(-1.0, min(1.0, -dot(t1, t2)))) / 2.0  # pi / 2 where the path goes straight on
+    half = math.acos(max(-1.0, min(1.0, -compute_dot(t1, t2)))) / 2.0  # pi / 2 where the path goes straight on
     if before.tolerance > 0.0 and math.cos(half) > 1e-4:
         within = 2.0 * math.sqrt(a1 * before.tolerance / math.cos(half))
         v1, v2 = min(v1, within), min(v2, within)
@@ -98,67 +115,67 @@ def blend_speeds(before: Segment, after: Segment, probing: bool = False) -> tupl
 
 
 @dataclass(slots=True)
-class _Arc:
-    segment: Segment
+class _BlendArc:
+    segment: PathSegment
     taken: tuple[float, float]  # mm off the end of the one before and off the start of the one after
 
-    def put_between(self, before: Segment, after: Segment, dt_s: float) -> tuple[Segment, ...]:
+    def insert_between(self, before: PathSegment, after: PathSegment, dt_s: float) -> tuple[PathSegment, ...]:
         """Shorten both neighbours; a line shorter than four cycles is merged with the arc."""
         one, two, arc = before.shape, after.shape, self.segment
-        assert not isinstance(one, Led)
-        assert not isinstance(two, Led)
-        assert isinstance(arc.shape, Turn)
-        one.cut(0.0, self.taken[0])
-        two.cut(self.taken[1], 0.0)
-        if not isinstance(one, Line) or one.length >= _GAP_CYCLES * dt_s * arc.top:
+        assert not isinstance(one, LedArcShape)
+        assert not isinstance(two, LedArcShape)
+        assert isinstance(arc.shape, ArcShape)
+        one.trim_ends(0.0, self.taken[0])
+        two.trim_ends(self.taken[1], 0.0)
+        if not isinstance(one, LineShape) or one.length >= _GAP_CYCLES * dt_s * arc.top:
             return before, arc
         if one.length > 0.0:
-            arc.shape = Led(one, arc.shape)
+            arc.shape = LedArcShape(one, arc.shape)
         arc.nominal = arc.shape.length
         arc.after_parabola, arc.kept_back_before = before.after_parabola, before.kept_back_before
         return (arc,)
 
 
-def _arc(before: Segment, after: Segment, limits: AxisLimits) -> _Arc | None:
+def _fit_blend_arc(before: PathSegment, after: PathSegment, limits: AxisLimits) -> _BlendArc | None:
     one, two = before.shape, after.shape
-    if isinstance(one, Led) or isinstance(two, Led):
+    if isinstance(one, LedArcShape) or isinstance(two, LedArcShape):
         return None
-    t1, t2 = one.tangent(one.length), two.tangent(0.0)
-    normal = unit(cross(t1, t2))
-    half = math.acos(max(-1.0, min(1.0, -dot(t1, t2)))) / 2.0
-    if dot(normal, normal) == 0.0 or half < _LEAST_ANGLE_RAD or half > math.pi / 2.0 - _LEAST_ANGLE_RAD:
+    t1, t2 = one.compute_tangent(one.length), two.compute_tangent(0.0)
+    normal = normalise_vector(compute_cross(t1, t2))
+    half = math.acos(max(-1.0, min(1.0, -compute_dot(t1, t2)))) / 2.0
+    if compute_dot(normal, normal) == 0.0 or half < _LEAST_ANGLE_RAD or half > math.pi / 2.0 - _LEAST_ANGLE_RAD:
         return None
-    if not (_in_plane(one, normal) and _in_plane(two, normal)):
+    if not (_is_in_plane(one, normal) and _is_in_plane(two, normal)):
         return None
-    limit = _within_plane(limits.acceleration, normal)
-    tolerance = min(_tolerance(before), _tolerance(after))
-    room1, room2 = _room(before, t2, half, True), _room(after, t1, half, False)
+    limit = _limit_within_plane(limits.acceleration, normal)
+    tolerance = min(_determine_tolerance(before), _determine_tolerance(after))
+    room1, room2 = _measure_room(before, t2, half, True), _measure_room(after, t1, half, False)
     half_taken = half - max(room1.steeper, room2.steeper)
-    if isinstance(one, Turn) and isinstance(two, Turn) and half_taken < _LEAST_HALF_OF_ARCS_RAD:
+    if isinstance(one, ArcShape) and isinstance(two, ArcShape) and half_taken < _LEAST_HALF_OF_ARCS_RAD:
         return None
     reach = min(room1.reach, room2.reach, math.cos(half_taken) * tolerance / (1.0 - math.sin(half_taken)))
-    goal = min(max(before.free, after.free), _fastest(before, after, half, limits, normal))
+    goal = min(max(before.free_speed, after.free_speed), _compute_fastest_speed(before, after, half, limits, normal))
     widest = math.tan(half_taken) * reach
     speed = min(math.sqrt(NORMAL_SHARE * limit * widest), goal)
     # measured: if there is room, the arc lasts as long as half of the acceleration needs for its speed
     longest = speed * speed / (ALONG_SHARE * limit) / (math.pi - 2.0 * half_taken)
     radius = min(widest, max(speed * speed / (NORMAL_SHARE * limit), longest))
-    found = _touching(one, two, radius, normal, math.tan(half))
+    found = _fit_tangent_arc(one, two, radius, normal, math.tan(half))
     if found is None or found[1] > room1.most + _ROUNDING_MM or found[2] > room2.most + _ROUNDING_MM:
         return None
-    off = minus(found[0].centre, two.at(0.0))
-    if math.sqrt(dot(off, off)) - radius > tolerance + _ROUNDING_MM:
+    off = subtract_points(found[0].centre, two.compute_point(0.0))
+    if math.sqrt(compute_dot(off, off)) - radius > tolerance + _ROUNDING_MM:
         return None
     speed = min(speed, math.sqrt(NORMAL_SHARE * limit * radius))
     turn, taken = found[0], (min(found[1], one.length), min(found[2], two.length))
     wanted = max(before.wanted, after.wanted)
-    segment = Segment(before.line, before.rapid, turn, wanted, speed, limit, turn.radius,
+    segment = PathSegment(before.line, before.rapid, turn, wanted, speed, limit, turn.radius,
                       before.tolerance, TANGENT, turn.length, between=True)  # fmt: skip
-    return _Arc(segment, taken)
+    return _BlendArc(segment, taken)
 
 
 @dataclass(frozen=True, slots=True)
-class _Room:
+class _BlendRoom:
     """The length that a blend may use of a segment.
 
     ``reach`` mm as if it were straight, ``most`` mm along it, ``steeper``: angle (rad) by which half the corner counts
@@ -170,39 +187,41 @@ class _Room:
     steeper: float = 0.0
 
 
-def _room(segment: Segment, other: Point, half: float, at_end: bool) -> _Room:
+def _measure_room(segment: PathSegment, other: Point, half: float, at_end: bool) -> _BlendRoom:
     """Return the room of a corner with a segment of direction ``other``: on an arc less if it lies inside."""
     shape = segment.shape
-    if not isinstance(shape, Turn):
+    if not isinstance(shape, ArcShape):
         reach = min(shape.length, segment.nominal * _LENGTH_SHARE) if at_end else shape.length * _LENGTH_SHARE
-        return _Room(reach, reach)
-    out = minus(shape.at(shape.length if at_end else 0.0), shape.centre)
-    inside = (dot(out, other) < 0.0) == at_end
+        return _BlendRoom(reach, reach)
+    out = subtract_points(shape.compute_point(shape.length if at_end else 0.0), shape.centre)
+    inside = (compute_dot(out, other) < 0.0) == at_end
     angle = min(shape.angle * (_ARC_SHARE_AT_END if at_end else _ARC_SHARE), half if inside else math.pi / 2.0)
     if inside:
-        return _Room(math.sin(angle / 4.0) * shape.radius, angle * shape.radius, angle / 4.0)
-    return _Room(angle * shape.radius, angle * shape.radius)
+        return _BlendRoom(math.sin(angle / 4.0) * shape.radius, angle * shape.radius, angle / 4.0)
+    return _BlendRoom(angle * shape.radius, angle * shape.radius)
 
 
-def _tolerance(segment: Segment) -> float:
+def _determine_tolerance(segment: PathSegment) -> float:
     return segment.tolerance or segment.nominal * _TOLERANCE_SHARE
 
 
-def _in_plane(shape: Line | Turn, normal: Point) -> bool:
-    if isinstance(shape, Line):
+def _is_in_plane(shape: LineShape | ArcShape, normal: Point) -> bool:
+    if isinstance(shape, LineShape):
         return True
-    return shape.flat and abs(abs(dot(cross(shape.u, shape.v), normal)) - 1.0) < 1e-6
+    return shape.is_flat and abs(abs(compute_dot(compute_cross(shape.u, shape.v), normal)) - 1.0) < 1e-6
 
 
-def _within_plane(limits: Place, normal: Point) -> float:
+def _limit_within_plane(limits: Place, normal: Point) -> float:
     scales = [math.sqrt(max(0.0, 1.0 - n * n)) for n in normal]
     return min(limit / scale for limit, scale in zip(limits[:3], scales, strict=True) if scale > 1e-9)
 
 
-def _fastest(before: Segment, after: Segment, half: float, limits: AxisLimits, normal: Point) -> float:
+def _compute_fastest_speed(
+    before: PathSegment, after: PathSegment, half: float, limits: AxisLimits, normal: Point
+) -> float:
     """Return the speed that keeps the axes' limits along the whole of an arc between both directions."""
-    plane = _within_plane(limits.speed, normal)
-    if isinstance(before.shape, Turn) or isinstance(after.shape, Turn):
+    plane = _limit_within_plane(limits.speed, normal)
+    if isinstance(before.shape, ArcShape) or isinstance(after.shape, ArcShape):
         return plane
     turned = min(math.pi - 2.0 * half, 0.49 * math.pi)
     most = plane / math.cos(turned)
@@ -212,54 +231,54 @@ def _fastest(before: Segment, after: Segment, half: float, limits: AxisLimits, n
     return altitude if altitude > 0.0 else min(v1, v2)
 
 
-def _touching(
-    one: Line | Turn, two: Line | Turn, radius: float, normal: Point, steep: float
-) -> tuple[Turn, float, float] | None:
-    corner = two.at(0.0)
-    t1 = one.tangent(one.length)
+def _fit_tangent_arc(
+    one: LineShape | ArcShape, two: LineShape | ArcShape, radius: float, normal: Point, steep: float
+) -> tuple[ArcShape, float, float] | None:
+    corner = two.compute_point(0.0)
+    t1 = one.compute_tangent(one.length)
     reach = radius / steep
-    centre = plus(plus(corner, t1, -reach), cross(normal, t1), radius)
+    centre = add_scaled(add_scaled(corner, t1, -reach), compute_cross(normal, t1), radius)
     for _ in range(30):  # Newton steps from the centre between the tangents until its distance from both is the radius
-        (way1, d1, p1), (way2, d2, p2) = _nearest(one, centre), _nearest(two, centre)
+        (way1, d1, p1), (way2, d2, p2) = _find_nearest_point(one, centre), _find_nearest_point(two, centre)
         off1, off2 = radius - d1, radius - d2
         if abs(off1) + abs(off2) < 1e-10:
             break
-        across = dot(cross(way1, way2), normal)
+        across = compute_dot(compute_cross(way1, way2), normal)
         if abs(across) < 1e-9:
             return None
-        shift1, shift2 = cross(way2, normal), cross(normal, way1)
-        centre = plus(plus(centre, shift1, off1 / across), shift2, off2 / across)
+        shift1, shift2 = compute_cross(way2, normal), compute_cross(normal, way1)
+        centre = add_scaled(add_scaled(centre, shift1, off1 / across), shift2, off2 / across)
     else:
         return None
-    u = unit(minus(p1, centre))
-    v = cross(normal, u)
-    last = unit(minus(p2, centre))
-    angle = math.atan2(dot(last, v), dot(last, u)) % (2.0 * math.pi)
+    u = normalise_vector(subtract_points(p1, centre))
+    v = compute_cross(normal, u)
+    last = normalise_vector(subtract_points(p2, centre))
+    angle = math.atan2(compute_dot(last, v), compute_dot(last, u)) % (2.0 * math.pi)
     if not 0.0 < angle < math.pi:
         return None
-    taken1, taken2 = _length_to(one, p1, True), _length_to(two, p2, False)
+    taken1, taken2 = _measure_length_to(one, p1, True), _measure_length_to(two, p2, False)
     if taken1 < 0.0 or taken2 < 0.0:
         return None
-    return Turn(centre, u, v, radius, 0.0, angle, (0.0, 0.0, 0.0), radius * angle), taken1, taken2
+    return ArcShape(centre, u, v, radius, 0.0, angle, (0.0, 0.0, 0.0), radius * angle), taken1, taken2
 
 
-def _nearest(shape: Line | Turn, place: Point) -> tuple[Point, float, Point]:
+def _find_nearest_point(shape: LineShape | ArcShape, place: Point) -> tuple[Point, float, Point]:
     """Return direction and distance from the nearest point of a shape to a point, and that nearest point."""
-    if isinstance(shape, Line):
-        foot = plus(shape.start, shape.way, dot(minus(place, shape.start), shape.way))
+    if isinstance(shape, LineShape):
+        foot = add_scaled(shape.start, shape.way, compute_dot(subtract_points(place, shape.start), shape.way))
     else:
-        foot = plus(shape.centre, unit(minus(place, shape.centre)), shape.radius)
-    way = minus(place, foot)
-    return unit(way), math.sqrt(dot(way, way)), foot
+        foot = add_scaled(shape.centre, normalise_vector(subtract_points(place, shape.centre)), shape.radius)
+    way = subtract_points(place, foot)
+    return normalise_vector(way), math.sqrt(compute_dot(way, way)), foot
 
 
-def _length_to(shape: Line | Turn, point: Point, at_end: bool) -> float:
+def _measure_length_to(shape: LineShape | ArcShape, point: Point, at_end: bool) -> float:
     """Return the length from a point on a shape to its end, or from its start to the point; negative beyond."""
-    if isinstance(shape, Line):
-        along = dot(minus(point, shape.start), shape.way)
+    if isinstance(shape, LineShape):
+        along = compute_dot(subtract_points(point, shape.start), shape.way)
     else:
-        out = minus(point, shape.centre)
-        turned = math.atan2(dot(out, shape.v), dot(out, shape.u))
+        out = subtract_points(point, shape.centre)
+        turned = math.atan2(compute_dot(out, shape.v), compute_dot(out, shape.u))
         if turned < -math.pi / 2.0 or (at_end and turned < 0.0):
             turned += 2.0 * math.pi
         if at_end:
