@@ -37,20 +37,20 @@ def test_library_block_download_writes_object(content: bytes, crc: bool) -> None
     rig = DriveRig()
     node, _ = connect_directly(rig.drive)
     size = len(content)
-    with node.request_sdo.open(0x2122, 0, "wb", size=size, block_transfer=True, request_crc_support=crc) as stream:
+    with node.sdo.open(0x2122, 0, "wb", size=size, block_transfer=True, request_crc_support=crc) as stream:
         stream.write(content)
     assert rig.drive.dictionary.texts[0x212200] == content
-    assert node.request_sdo.upload(0x2122, 0) == content
+    assert node.sdo.upload(0x2122, 0) == content
 
 
 def test_number_in_block_download_is_checked() -> None:
     node, _ = connect_directly(DriveRig().drive)
-    with node.request_sdo.open(0x6083, 0, "wb", size=4, block_transfer=True) as stream:
+    with node.sdo.open(0x6083, 0, "wb", size=4, block_transfer=True) as stream:
         stream.write((4711).to_bytes(4, "little"))
-    assert node.request_sdo[0x6083].raw == 4711
+    assert node.sdo[0x6083].raw == 4711
     with (
         pytest.raises(canopen.SdoAbortedError) as abort,
-        node.request_sdo.open(0x6041, 0, "wb", size=2, block_transfer=True),
+        node.sdo.open(0x6041, 0, "wb", size=2, block_transfer=True),
     ):
         pass
     assert abort.value.code == 0x06010002
@@ -282,9 +282,9 @@ def test_guarding_toggles_and_timeout_is_lost_connection() -> None:
 def test_library_guards_node_over_bus() -> None:
     rig = DriveRig()
     with connect_over_virtual_bus(rig.drive) as node:
-        node.send_nmt.start_node_guarding(0.01)
-        assert node.send_nmt.wait_for_heartbeat(60) == "PRE-OPERATIONAL"
-        node.send_nmt.stop_node_guarding()
+        node.nmt.start_node_guarding(0.01)
+        assert node.nmt.wait_for_heartbeat(60) == "PRE-OPERATIONAL"
+        node.nmt.stop_node_guarding()
 
 
 # -- remote frames, NMT stopped, storage, boot

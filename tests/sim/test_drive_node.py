@@ -269,12 +269,12 @@ def test_library_reads_every_readable_object() -> None:
 def test_master_enables_drive_over_virtual_bus() -> None:
     rig = DriveRig()
     with connect_over_virtual_bus(rig.drive) as node:
-        node.send_nmt.state = "OPERATIONAL"
-        node.request_sdo["Modes of operation"].raw = 8
+        node.nmt.state = "OPERATIONAL"
+        node.sdo["Modes of operation"].raw = 8
         for word in (0x06, 0x07, 0x0F):
-            node.request_sdo["Controlword"].raw = word
-        assert node.request_sdo["Statusword"].raw & 0x6F == 0x27
-        assert node.request_sdo["Modes of operation display"].raw == 8
+            node.sdo["Controlword"].raw = word
+        assert node.sdo["Statusword"].raw & 0x6F == 0x27
+        assert node.sdo["Modes of operation display"].raw == 8
         assert node.emcy.log == []
 
 

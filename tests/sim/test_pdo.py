@@ -211,13 +211,13 @@ def test_tpdos_can_be_dropped_and_remapped_by_fault() -> None:
 def test_codec_matches_library(position: int, torque: int, word: int) -> None:
     RIG.send_nmt(0x80)
     node, bus = connect_directly(RIG.drive)
-    node.rpdo.read_object()
-    node.tpdo.read_object()
+    node.rpdo.read()
+    node.tpdo.read()
     assert [entry.name for entry in node.tpdo[1].map] == ["Position actual value", "Velocity actual value"]
     rpdo = node.rpdo[3]
     rpdo[0x60B1].raw, rpdo[0x60B2].raw = position, torque
     node.rpdo[1][0x6040].raw, node.rpdo[1][0x607A].raw = word & 0xFF00, position
-    node.send_nmt.send_command(0x01)
+    node.nmt.send_command(0x01)
     for pdo in (rpdo, node.rpdo[1]):
         bus.send(can.Message(arbitration_id=pdo.cob_id, data=pdo.data, is_extended_id=False))
     for _ in range(10):
@@ -236,7 +236,7 @@ RIG.write_object(0x1402, 1, 0x401, 4)
 def test_library_remaps_and_reads_back() -> None:
     rig = DriveRig()
     node, _ = connect_directly(rig.drive)
-    node.tpdo.read_object()
+    node.tpdo.read()
     pdo = node.tpdo[4]
     pdo.clear()
     pdo.add_variable(0x60F4)

@@ -68,10 +68,10 @@ def test_segmented_upload_returns_object(content: bytes) -> None:
 
 def test_strings_and_numbers_read_as_the_library_expects() -> None:
     node, _ = connect_directly(DriveRig().drive)
-    assert node.request_sdo[0x1008].raw == "fdhil twin drive"
-    assert node.request_sdo[0x1018][1].raw == 0x46444849
-    assert node.request_sdo[0x60C2][2].raw == -3
-    assert node.request_sdo[0x607D][1].raw == -(2**31)
+    assert node.sdo[0x1008].raw == "fdhil twin drive"
+    assert node.sdo[0x1018][1].raw == 0x46444849
+    assert node.sdo[0x60C2][2].raw == -3
+    assert node.sdo[0x607D][1].raw == -(2**31)
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -80,9 +80,9 @@ def test_strings_and_numbers_read_as_the_library_expects() -> None:
 def test_downloaded_value_is_uploaded(value: int, segmented: bool) -> None:
     node, _ = connect_directly(RIG.drive)
     data = value.to_bytes(4, "little", signed=True)
-    node.request_sdo.download(0x607A, 0, data, force_segment=segmented)
-    assert node.request_sdo.upload(0x607A, 0) == data
-    assert node.request_sdo[0x607A].raw == value
+    node.sdo.download(0x607A, 0, data, force_segment=segmented)
+    assert node.sdo.upload(0x607A, 0) == data
+    assert node.sdo[0x607A].raw == value
 
 
 RIG = DriveRig()
@@ -98,7 +98,7 @@ def test_library_block_upload_returns_object(cycles: int, block_size: int, crc: 
         trace.append_row(n, -n, n, 3 * n, n % 100, -n % 100)
     node, _ = connect_directly(rig.drive)
     canopen.sdo.client.BlockUploadStream.blksize = block_size
-    with node.request_sdo.open(0x2120, 0, "rb", block_transfer=True, request_crc_support=crc) as stream:
+    with node.sdo.open(0x2120, 0, "rb", block_transfer=True, request_crc_support=crc) as stream:
         data = stream.read()
     assert data == trace.read_rows()
     assert len(data) == 20 * min(cycles, 1024)
@@ -132,13 +132,13 @@ def test_block_upload_works_over_virtual_bus() -> None:
     for _ in range(300):
         rig.send_sync()
     with connect_over_virtual_bus(rig.drive) as node:
-        assert node.request_sdo[0x1000].raw == 0x00020192
-        node.request_sdo[0x6081].raw = 12345
-        assert node.request_sdo[0x6081].raw == 12345
-        with node.request_sdo.open(0x2120, 0, "rb", block_transfer=True) as stream:
+        assert node.sdo[0x1000].raw == 0x00020192
+        node.sdo[0x6081].raw = 12345
+        assert node.sdo[0x6081].raw == 12345
+        with node.sdo.open(0x2120, 0, "rb", block_transfer=True) as stream:
             assert len(stream.read()) == 300 * 20
         with pytest.raises(canopen.SdoAbortedError) as abort:
-            node.request_sdo.upload(0x5000, 0)
+            node.sdo.upload(0x5000, 0)
         assert abort.value.code == 0x06020000
 
 

@@ -308,7 +308,7 @@ def test_written_eds_matches_emulated_drive(emulate: Callable[[str], DriveRig], 
     assert {index << 8 for index in node.object_dictionary if index >= 0x1000} == {key & 0xFFFF00 for key in worn}
     for key, entry in worn.items():
         if entry.size and entry.access != "wo" and entry.index not in (0x1003, 0x1010, 0x1011):
-            assert int.from_bytes(node.request_sdo.upload(entry.index, entry.sub), "little") >= 0, f"{key:06X}"
+            assert int.from_bytes(node.sdo.upload(entry.index, entry.sub), "little") >= 0, f"{key:06X}"
     assert isinstance(node.object_dictionary[0x6041], canopen.objectdictionary.ODVariable)
     assert f"VendorNumber=0x{rig.drive.emulation.vendor:08X}" in own_eds_text(rig.drive)
 
