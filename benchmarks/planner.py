@@ -94,7 +94,7 @@ def make_jerky_demands(nc: DemandRecorder | None) -> Iterator[tuple[str, Float]]
                 yield f"LinuxCNC, {name}", np.concatenate([rows, np.repeat(rows[-1:], 500, axis=0)])
 
 
-def measure_gains(nc: DemandRecorder | None) -> None:
+def print_gains(nc: DemandRecorder | None) -> None:
     """Gains of the inverse correction on jerky demands as the drives get them, rounded to increments."""
     print("least gain over uncorrected (wanted: 14) and over mirror (2) on 40 scattered plants; RMS on the nominal one")
     per_mm = next(iter(bench_config().axis.values())).scaling.increments_per_mm
@@ -113,11 +113,11 @@ def main() -> None:
     measure_speeds()
     if shutil.which("linuxcnc") is None:
         print("LinuxCNC is not installed: apt-get install linuxcnc-uspace")
-        measure_gains(None)
+        print_gains(None)
         return
     with DemandRecorder(acceleration_mm_s2=ACCELERATION_MM_S2) as nc:
         compare_with_linuxcnc(nc)
-        measure_gains(nc)
+        print_gains(nc)
 
 
 if __name__ == "__main__":

@@ -13,34 +13,33 @@ import os
 
 TYPE_CHECKING = False  # type checkers know it; importing typing takes longer than all of this
 if TYPE_CHECKING:
-    from fdhil.api.drive_model import Model as Model
-    from fdhil.api.drive_model import Simulation as Simulation
-    from fdhil.api.drive_model import simulate as simulate
-    from fdhil.api.identification_result import Parameter as Parameter
-    from fdhil.api.identification_result import Result as Result
-    from fdhil.api.identification_result import identify as identify
-    from fdhil.api.machine_interface import Machine as Machine
-    from fdhil.api.machine_interface import correct as correct
-    from fdhil.api.machine_interface import plan as plan
-    from fdhil.api.machine_interface import predict as predict
-    from fdhil.api.recording_interface import Recording as Recording
-    from fdhil.api.recording_interface import read as read
+    from fdhil.api import Machine as Machine
+    from fdhil.api import Model as Model
+    from fdhil.api import Parameter as Parameter
+    from fdhil.api import Recording as Recording
+    from fdhil.api import Result as Result
+    from fdhil.api import Simulation as Simulation
+    from fdhil.api import correct as correct
+    from fdhil.api import identify as identify
+    from fdhil.api import plan as plan
+    from fdhil.api import predict as predict
+    from fdhil.api import read as read
+    from fdhil.api import simulate as simulate
 
-_MODULES = {
-    "Machine": "machine",
-    "Model": "model",
-    "Parameter": "result",
-    "Recording": "recordings",
-    "Result": "result",
-    "Simulation": "model",
-    "correct": "machine",
-    "identify": "result",
-    "plan": "machine",
-    "predict": "machine",
-    "read": "recordings",
-    "simulate": "model",
-}
-__all__ = [*_MODULES]
+__all__ = [
+    "Machine",
+    "Model",
+    "Parameter",
+    "Recording",
+    "Result",
+    "Simulation",
+    "correct",
+    "identify",
+    "plan",
+    "predict",
+    "read",
+    "simulate",
+]
 
 # The matrices of a window are small: threads of the numeric libraries only spin, and this PC has an NC next to it.
 # The libraries read these when NumPy is imported first.
@@ -50,11 +49,11 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 def __getattr__(name: str) -> object:
     """Return a name of the Python interface, importing it on first use."""
-    if name not in _MODULES:
+    if name not in __all__:
         raise AttributeError(f"module 'fdhil' has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(f"fdhil.api.{_MODULES[name]}"), name)
+    return getattr(import_module("fdhil.api"), name)
 
 
 def __dir__() -> list[str]:

@@ -27,8 +27,7 @@ import pytest
 if TYPE_CHECKING:
     import can
 
-    from fdhil.sim.frame_faults import FrameFault
-    from fdhil.sim.simulator_service import SimulatorService
+    from fdhil.sim import FrameFault, SimulatorService
 
 BUSES = ("virtual", "hub")  # any other name is that of a CAN interface, as vcan0
 DEFAULT_PATIENCE_S = 60.0
@@ -88,7 +87,7 @@ class FeedDriveBench:
     def __enter__(self) -> FeedDriveBench:
         from fdhil import config
         from fdhil.program import load_trajectory
-        from fdhil.sim.simulator_service import SimulatorService
+        from fdhil.sim import SimulatorService
 
         service = SimulatorService(
             config.parse_config(self._document, folder=self.folder), self._events.put, load_trajectory
@@ -125,7 +124,7 @@ class FeedDriveBench:
         """
         import can
 
-        from fdhil.sim.wire.fault_bus import FaultBus
+        from fdhil.sim import FaultBus
 
         bus = can.Bus(**self.bus_arguments)
         self._joined.append(FaultBus(bus, plan, seed) if plan else bus)

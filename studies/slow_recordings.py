@@ -89,13 +89,15 @@ def resample_rows(fine: Signals, dt_s: float) -> Signals:
     return Signals(dt_s, means, fine.voltage_instant[: n * every : every], **first)
 
 
-def draw_scene(rng: Rng) -> Scene:
+def draw_slow_scene(rng: Rng) -> Scene:
     """Draw a drive, a rapid and a recorder whose rows are closer than the sensor's samples."""
     scene = draw_scene(rng)
     return replace(scene, dt_s=min(scene.dt_s, 1e-3))
 
 
-def make_recording(scene: Scene, sensed: Sensed, severity: float = 0.0, *, says_rapid: bool = True) -> FaultyRecording:
+def make_slow_recording(
+    scene: Scene, sensed: Sensed, severity: float = 0.0, *, says_rapid: bool = True
+) -> FaultyRecording:
     """Return the recording with the severity of its fault."""
     slow = SlowVoltage(sensed.begin_s, sensed.period_s, 2e-4, freeze_array(sensed.voltage))
     return FaultyRecording(
@@ -105,8 +107,8 @@ def make_recording(scene: Scene, sensed: Sensed, severity: float = 0.0, *, says_
 
 def _wrap_voltage_fault(spoil: Callable[[Rng, Sensed], tuple[Sensed, float]]) -> Maker:
     def make(rng: Rng) -> FaultyRecording:
-        scene = draw_scene(rng)
-        return make_recording(scene, *spoil(rng, record_slowly(rng, scene, simulate_rapid(scene))))
+        scene = draw_slow_scene(rng)
+        return make_slow_recording(scene, *spoil(rng, record_slowly(rng, scene, simulate_rapid(scene))))
 
     return make
 
@@ -115,7 +117,7 @@ def _wrap_row_fault(fault: signal_faults.SignalFault) -> Maker:
     """Corrupt the rows as the other study does; the slow sensor continues by its own clock, whatever rows are lost."""
 
     def make(rng: Rng) -> FaultyRecording:
-        scene = draw_scene(rng)
+        scene = draw_slow_scene(rng)
         sensed = record_slowly(rng, scene, simulate_rapid(scene))
         whole = sensed.rows.signals
         numbered = sensed.rows.replace_signals(row=np.arange(whole["speed"].size, dtype=np.float64))
@@ -126,25 +128,25 @@ def _wrap_row_fault(fault: signal_faults.SignalFault) -> Maker:
             if now["voltage"] is whole["voltage"] or not kept:  # what the rows tell of the voltage is not recorded
                 break
         begin = sensed.begin_s - float(now["row"][0]) * rows.dt_s
-        return make_recording(scene, replace(sensed, rows=rows, begin_s=begin), severity)
+        return make_slow_recording(scene, replace(sensed, rows=rows, begin_s=begin), severity)
 
     return make
 
 
 def _wrap_machine_fault(change: Callable[[Rng, Scene], tuple[Scene, Array | None, float]]) -> Maker:
     def make(rng: Rng) -> FaultyRecording:
-        scene, load, severity = change(rng, draw_scene(rng))
-        return make_recording(scene, record_slowly(rng, scene, simulate_rapid(scene, load)), severity)
+        scene, load, severity = change(rng, draw_slow_scene(rng))
+        return make_slow_recording(scene, record_slowly(rng, scene, simulate_rapid(scene, load)), severity)
 
     return make
 
 
 def _wrap_demand_fault(shape: Callable[[Rng, Scene], tuple[Array, float]]) -> Maker:
     def make(rng: Rng) -> FaultyRecording:
-        scene = draw_scene(rng)
+        scene = draw_slow_scene(rng)
         rates, severity = shape(rng, scene)
         demand = demand_of(scene, scene.move.direction * rates)
-        return make_recording(
+        return make_slow_recording(
             scene, record_slowly(rng, scene, drives.simulate_loop(scene.drive, demand, drives.STEP_S)), severity
         )
 
@@ -154,40 +156,40 @@ def _wrap_demand_fault(shape: Callable[[Rng, Scene], tuple[Array, float]]) -> Ma
 def _stuck(rng: Rng) -> FaultyRecording:
     """Seconds for which current or speed repeats one value while it moves; the voltage must have seen it thrice."""
     while True:
-        scene = draw_scene(rng)
+        scene = draw_slow_scene(rng)
         sensed = record_slowly(rng, scene, simulate_rapid(scene))
         rows, severity = signal_faults.stuck(rng, sensed.rows)
         if rows.signals["voltage"] is sensed.rows.signals["voltage"] and severity > STUCK_SAMPLES * sensed.period_s:
-            return make_recording(scene, replace(sensed, rows=rows), severity)
+            return make_slow_recording(scene, replace(sensed, rows=rows), severity)
 
 
 def _left_behind(rng: Rng) -> FaultyRecording:
-    scene = draw_scene(rng)
+    scene = draw_slow_scene(rng)
     signals, share = machine_faults.stopped_short(rng, scene, drives.STEP_S)
-    return make_recording(scene, record_slowly(rng, scene, signals), share)
+    return make_slow_recording(scene, record_slowly(rng, scene, signals), share)
 
 
 def _moved(rng: Rng) -> FaultyRecording:
-    scene = draw_scene(rng)
+    scene = draw_slow_scene(rng)
     # a pair of windows that each tell R to the 10 % of what is published differ by chance up to 70 %
     other, amount = machine_faults.changed(rng, scene.drive, ("Jt", "K"))
     signals, _ = _simulate_both_ways(scene, other)
-    return make_recording(scene, record_slowly(rng, scene, signals), amount)
+    return make_slow_recording(scene, record_slowly(rng, scene, signals), amount)
 
 
 def _gain_between(rng: Rng) -> FaultyRecording:
     """Share by which the gain of voltage or current differs between two rapids of one recording."""
-    scene, of_voltage = draw_scene(rng), bool(rng.random() < 0.5)
+    scene, of_voltage = draw_slow_scene(rng), bool(rng.random() < 0.5)
     factor = 1 + signal_faults.sign(rng) * (amount := log_uniform(rng, 0.04, 0.2))
     signals, seam_s = _simulate_both_ways(scene, scene.drive)
     sensed = record_slowly(rng, scene, signals)
     if of_voltage:
         later = sensed.begin_s + np.arange(sensed.voltage.size) * sensed.period_s > seam_s
-        return make_recording(scene, sensed.replace_samples(np.where(later, factor, 1.0) * sensed.voltage), amount)
+        return make_slow_recording(scene, sensed.replace_samples(np.where(later, factor, 1.0) * sensed.voltage), amount)
     current = sensed.rows.signals["current"]
     later = np.arange(current.size) * scene.dt_s > seam_s
     rows = sensed.rows.replace_signals(current=np.where(later, factor, 1.0) * current)
-    return make_recording(scene, replace(sensed, rows=rows), amount)
+    return make_slow_recording(scene, replace(sensed, rows=rows), amount)
 
 
 def _simulate_both_ways(scene: Scene, other: Drive) -> tuple[Signals, float]:
@@ -261,21 +263,21 @@ def _voltage_turned(_rng: Rng, sensed: Sensed) -> tuple[Sensed, float]:
 
 
 def _voltage_late(rng: Rng) -> FaultyRecording:
-    scene = draw_scene(rng)
+    scene = draw_slow_scene(rng)
     late = signal_faults.sign(rng) * rng.uniform(1.3, 4.0)
-    return make_recording(scene, record_slowly(rng, scene, simulate_rapid(scene), late=late), abs(late))
+    return make_slow_recording(scene, record_slowly(rng, scene, simulate_rapid(scene), late=late), abs(late))
 
 
 def _good(rng: Rng) -> FaultyRecording:
-    scene = draw_scene(rng)
-    return make_recording(scene, record_slowly(rng, scene, simulate_rapid(scene)))
+    scene = draw_slow_scene(rng)
+    return make_slow_recording(scene, record_slowly(rng, scene, simulate_rapid(scene)))
 
 
 def _make_two_rapids(rng: Rng) -> FaultyRecording:
     """Return two rapids of a recording without the rapid speed in its header."""
-    scene = draw_scene(rng)
+    scene = draw_slow_scene(rng)
     signals, _ = _simulate_both_ways(scene, scene.drive)
-    return make_recording(scene, record_slowly(rng, scene, signals), says_rapid=False)
+    return make_slow_recording(scene, record_slowly(rng, scene, signals), says_rapid=False)
 
 
 def _make_kind(make: Maker, named: str, unit: str, matrix: str) -> Kind:

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fdhil.errors import ConfigError, ConfigFault, FdhilError
-from fdhil.model.feed_drive import simulate_plant
+from fdhil.model import simulate_plant
 from fdhil.records import PARAMETERS, Float, Parameters, VoltageSampling
 
 

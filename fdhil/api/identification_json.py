@@ -8,9 +8,7 @@ from typing import Any
 from fdhil.api.loop_comparison import compare_loops
 from fdhil.api.recording_analysis import FileResult
 from fdhil.config import Axis
-from fdhil.identification.physical_bounds import bound_estimate
-from fdhil.identification.rapid_windows import find_moving_range
-from fdhil.identification.torque_fit import NO_VOLTAGE
+from fdhil.identification import NO_VOLTAGE, bound_estimate, find_moving_range
 from fdhil.records import PARAMETERS, UNITS, Estimate, Verdict, WindowOutcome, get_unit
 
 SCHEMA = "fdhil-identify-1"

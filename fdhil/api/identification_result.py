@@ -138,7 +138,7 @@ class Result:
         from fdhil.report import require_libraries
 
         require_libraries()
-        from fdhil.report.identification_page import draw_identification
+        from fdhil.report import draw_identification
 
         return draw_identification(self.found, window)
 
@@ -146,8 +146,7 @@ class Result:
         """Write an HTML page of the result. FdhilError without the extra ``report``, OutputError for an unwritable
         path.
         """
-        from fdhil.report import write_page
-        from fdhil.report.identification_page import build_identification_page
+        from fdhil.report import build_identification_page, write_page
 
         write_page(build_identification_page(self.found), Path(path))
 

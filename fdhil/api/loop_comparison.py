@@ -7,8 +7,8 @@ from typing import Any
 
 from fdhil.api.recording_analysis import FileResult
 from fdhil.config import Axis, Identification, MachineConfig, Regulators
-from fdhil.daemon.outcome_json import build_loops_document
-from fdhil.pipeline.identified_loops import identify_from_outcomes
+from fdhil.daemon import build_loops_document
+from fdhil.pipeline import identify_from_outcomes
 from fdhil.records import LoopEstimate
 
 ALL_FED = 0.01  # tolerance of a feed-forward share of 1

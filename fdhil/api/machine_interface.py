@@ -12,12 +12,20 @@ from fdhil import config, correction, prediction
 from fdhil.api.compilation_notice import announce_compilation
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault, StoreError
-from fdhil.prediction import axis_models as model_files
-from fdhil.prediction.correction_gain import combine_held_out_um, find_largest_error_um, find_moving_axes
+from fdhil.prediction import (
+    apply_loops,
+    build_nominal_models,
+    combine_held_out_um,
+    describe_loop_differences,
+    find_largest_error_um,
+    find_moving_axes,
+    load_model_file,
+    load_validated_models,
+    select_models,
+)
 from fdhil.program import load_trajectory
 from fdhil.records import Correction, Parameters, Prediction, Trajectory
-from fdhil.store.history_gain import read_recent_skills
-from fdhil.store.newest_parameters import read_newest_parameters
+from fdhil.store import read_newest_parameters, read_recent_skills
 
 HISTORY = "history"
 Models = Mapping[str, Parameters] | str | Path | None
@@ -55,7 +63,7 @@ class Machine:
     @property
     def models(self) -> Mapping[str, Parameters]:
         """The nominal model of each axis."""
-        return model_files.build_nominal_models(self.config)
+        return build_nominal_models(self.config)
 
 
 def plan(program: str | Path | Trajectory, machine: Machine | str | Path) -> Trajectory:
@@ -103,7 +111,7 @@ def find_held_out_max_um(reference: Trajectory, settings: MachineConfig, models:
     if models == HISTORY:
         found = find_largest_error_um(read_recent_skills(settings))
     elif isinstance(models, str | Path):
-        found = model_files.load_model_file(Path(models)).held_out_max_um
+        found = load_model_file(Path(models)).held_out_max_um
     return combine_held_out_um(found, find_moving_axes(reference))
 
 
@@ -121,17 +129,17 @@ def read_inputs(
         source = str(settings.store.directory)
         newest = read_newest_parameters(settings.store.directory, settings.axis, warn)
         sets = {axis: found.set for axis, found in newest.items()}
-        given, settings = model_files.load_validated_models(sets, settings, source)
+        given, settings = load_validated_models(sets, settings, source)
     elif isinstance(models, str | Path):
         source = str(models)
-        file = model_files.load_model_file(Path(models))
+        file = load_model_file(Path(models))
         given = file.parameters
         _refuse_refuted_loops(settings, given.keys() - file.loops.keys(), source)
-        settings = model_files.apply_loops(settings, file.loops, source)
+        settings = apply_loops(settings, file.loops, source)
     elif models is not None:
         given = {**given, **models}
     reference = program if isinstance(program, Trajectory) else load_trajectory(Path(program), settings)
-    return reference, model_files.select_models(reference, given, settings, source), settings
+    return reference, select_models(reference, given, settings, source), settings
 
 
 def _refuse_refuted_loops(config: MachineConfig, axes: Iterable[str], source: str) -> None:
@@ -140,7 +148,7 @@ def _refuse_refuted_loops(config: MachineConfig, axes: Iterable[str], source: st
     with contextlib.suppress(StoreError):
         for axis, newest in read_newest_parameters(config.store.directory, config.axis.keys() & axes).items():
             loops, same = newest.set.loops or {}, newest.set.config_digest == config.digest
-            if same and (apart := model_files.describe_loop_differences(loops, config.axis[axis].regulators)):
+            if same and (apart := describe_loop_differences(loops, config.axis[axis].regulators)):
                 text = f"LoopsDiffer: is missing, and the machine's rapids showed other loops than configured ({apart})"
                 advice = "write the model again with fdhil identify --write-model, or use --from-history"
                 faults.append(ConfigFault(f"{axis}.loops", text, advice))

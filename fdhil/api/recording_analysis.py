@@ -6,8 +6,7 @@ from functools import partial
 from typing import Any
 
 from fdhil.config import Axis, Identification, MachineConfig
-from fdhil.identification.locked_rotor import estimate_locked_rotor, is_rotor_locked
-from fdhil.identification.rapid_windows import find_windows, make_whole_window
+from fdhil.identification import estimate_locked_rotor, find_windows, is_rotor_locked, make_whole_window
 from fdhil.pipeline import analyse_windows, pool_with_held_out
 from fdhil.records import (
     Estimate,
@@ -21,9 +20,8 @@ from fdhil.records import (
     WindowOutcome,
     make_read_only_view,
 )
-from fdhil.store.recording_table import COLUMN_SOURCES, IMPORT_NOTES, PITCH_KEY, RECORD_HZ, SLOW_HZ
-from fdhil.validation.data_sheet import detect_gain_error
-from fdhil.validation.signal_consistency import explain_missing_move
+from fdhil.store import COLUMN_SOURCES, IMPORT_NOTES, PITCH_KEY, RECORD_HZ, SLOW_HZ
+from fdhil.validation import detect_gain_error, explain_missing_move
 
 Work = Callable[[Window], WindowOutcome]
 Spread = Callable[[Work, Sequence[Window]], Iterable[WindowOutcome]]

@@ -13,12 +13,24 @@ import numpy.typing as npt
 from fdhil.errors import RecordingError
 from fdhil.records import Float, Window
 from fdhil.records import Recording as RecordedSignals
-from fdhil.store.column_map import apply_column_map, check_map, read_column_map
-from fdhil.store.column_proposal import propose_for_table
-from fdhil.store.derived_columns import check_sizes, derive_columns
-from fdhil.store.recording_file import read_raw, read_recording, read_stored_window
-from fdhil.store.recording_table import IMPORT_NOTES, RECORDING_FORMAT, VOLTAGE_COLUMN, RecordingTable, make_recording
-from fdhil.store.sample_times import compute_usual_step, find_even_times
+from fdhil.store import (
+    IMPORT_NOTES,
+    RECORDING_FORMAT,
+    VOLTAGE_COLUMN,
+    RecordingTable,
+    apply_column_map,
+    check_map,
+    check_sizes,
+    compute_usual_step,
+    derive_columns,
+    find_even_times,
+    make_recording,
+    propose_for_table,
+    read_column_map,
+    read_raw,
+    read_recording,
+    read_stored_window,
+)
 
 PROPOSE = "?"
 SIGNALS: Mapping[str, str] = {  # short names of columns=

@@ -14,21 +14,26 @@ from fdhil.arming.first_block import FirstBlock
 from fdhil.arming.model_tracker import SKILL_MOVES, AxisModelState
 from fdhil.arming.program_check import plan_reference_blocks
 from fdhil.arming.standstill_monitor import StandstillState
-from fdhil.commissioning.commissioning_record import CommissioningRecord, is_record_valid, load_record
-from fdhil.commissioning.feedforward_setup import format_rpdo_key
-from fdhil.commissioning.offset_writers import INVALID_COB_ID, extract_cob_id
+from fdhil.commissioning import (
+    INVALID_COB_ID,
+    CommissioningRecord,
+    extract_cob_id,
+    format_rpdo_key,
+    is_record_valid,
+    load_record,
+)
 from fdhil.config import MachineConfig
-from fdhil.correction import correction_gate, flatness_feedforward
-from fdhil.drivers.cia402.drive_profile_file import load_profile
-from fdhil.identification.drive_loops.loop_identification import get_regulator_values
-from fdhil.model.model_terms import add_resonance
-from fdhil.prediction.axis_models import load_validated_models
-from fdhil.prediction.correction_gain import (
+from fdhil.correction import check_held_out_error, check_writing_enabled, derive_feedforward_law
+from fdhil.drivers import load_profile
+from fdhil.identification import get_regulator_values
+from fdhil.model import add_resonance
+from fdhil.prediction import (
     CorrectionGain,
     add_held_out_um,
     combine_held_out_um,
     find_largest_error_um,
     find_worst_rms_um,
+    load_validated_models,
 )
 from fdhil.program import compute_program_digest
 from fdhil.records import Parameters, Reason, Skill
@@ -134,8 +139,8 @@ def prepare_request(
     digest = compute_program_digest(program)
     ahead = method in (None, "inverse") and _is_longer_than_ring(program, config, digest)
     if ahead and (
-        off := correction_gate.check_writing_enabled(list(config.axis), config)
-        or correction_gate.check_held_out_error(compute_largest_um(known, models))
+        off := check_writing_enabled(list(config.axis), config)
+        or check_held_out_error(compute_largest_um(known, models))
     ):
         return Refusal(off)
     return ArmRequest(program, digest, models, found[1], method, ahead)
@@ -250,10 +255,7 @@ def prepare_feedforward(config: MachineConfig, known: Mapping[str, AxisModelStat
     if isinstance(found, Refusal):
         return found
     models, own = found
-    laws = {
-        name: flatness_feedforward.derive_feedforward_law(models[name], own.axis[name], own.machine.sync_period_s)
-        for name in axes
-    }
+    laws = {name: derive_feedforward_law(models[name], own.axis[name], own.machine.sync_period_s) for name in axes}
     records = _read_records(axes, config)
     facts = collect_feedforward_facts(axes, config, known) | {
         "commissioned": all(is_record_valid(record, config, axis) for axis, record in records.items()),

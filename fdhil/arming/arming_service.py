@@ -42,9 +42,9 @@ from fdhil.arming.stream_feeder import StreamFeeder
 from fdhil.arming.whole_plan import plan_whole_program
 from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError
-from fdhil.guard.guard_protocol import RAMPING_MODES
+from fdhil.guard import RAMPING_MODES
 from fdhil.records import AxisSamples, NcState, Notice, Skill
-from fdhil.store.history_rows import Revision
+from fdhil.store import Revision
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 STREAM_S = 0.05

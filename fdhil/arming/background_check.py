@@ -13,9 +13,9 @@ from fdhil.arming.code_digest import MAKER
 from fdhil.arming.program_check import SCHEMA, make_part_path
 from fdhil.bounded_process import BoundedProcess
 from fdhil.config import MachineConfig
-from fdhil.prediction.model_variants import list_values
+from fdhil.prediction import list_values
 from fdhil.records import Parameters, Reason
-from fdhil.store.atomic_file import make_store_error
+from fdhil.store import make_store_error
 
 FOLDER = "checked"
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from fdhil.arming.code_digest import compute_code_digest
 from fdhil.arming.program_check import HEADER, ROWS, SCHEMA, compute_header_digest
-from fdhil.correction import correction_gate
+from fdhil.correction import check_gain
 from fdhil.errors import ProgramError, StoreError
 from fdhil.program import compute_program_digest
 from fdhil.records import Reason
@@ -117,7 +117,7 @@ class CheckedProgram:
     def gain_um(self) -> float:
         """The predicted reduction of the contour error's RMS in these rows; 0 if the gate refuses it."""
         then, now = self.errors["before"]["rms_um"], self.errors["after"]["rms_um"]
-        return 0.0 if correction_gate.check_gain(then, now) else then - now
+        return 0.0 if check_gain(then, now) else then - now
 
     @property
     def largest_um(self) -> float:

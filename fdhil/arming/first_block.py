@@ -16,13 +16,9 @@ from fdhil.arming.checked_program import TablePiece
 from fdhil.arming.program_check import plan_reference_blocks
 from fdhil.arming.standstill_monitor import StandstillState
 from fdhil.config import Axis, MachineConfig
-from fdhil.correction.inverse import AxisInversePlanner, compute_common_delay_s, count_block_rows
-from fdhil.correction.plan_limits import check_offsets
-from fdhil.model import closed_loop
-from fdhil.model.closed_loop import State
-from fdhil.model.closed_loop_kernels import CURRENT
-from fdhil.prediction.contour_error import compute_contour_error_um
-from fdhil.prediction.model_variants import FrictionBand, compute_friction_band
+from fdhil.correction import AxisInversePlanner, check_offsets, compute_common_delay_s, count_block_rows
+from fdhil.model import CURRENT, State, create_standstill_state, run_per_axis
+from fdhil.prediction import FrictionBand, compute_contour_error_um, compute_friction_band
 from fdhil.records import Float, Parameters, compute_rms, compute_table_path
 
 ALONE_S, JOINED_S = 0.9, 1.4  # begin and end of the blend into the checked rows
@@ -84,7 +80,7 @@ class FirstBlock:
         if not any(self._has_changed(axis, rest[axis]) for axis in axes):
             return None
         self._used_a = {axis: rest[axis].current_a for axis in axes}
-        found = closed_loop.run_per_axis(lambda axis: self._solve_axis(axis, rest[axis]), axes)
+        found = run_per_axis(lambda axis: self._solve_axis(axis, rest[axis]), axes)
         if not all(one.allowed for one in found.values()) or not self._is_improvement(found):
             return None
         signs = {axis: self._config.axis[axis].scaling.sign for axis in axes}
@@ -196,7 +192,7 @@ def make_initial_state(rest: StandstillState, start_mm: float, parameters: Param
     off_mm = rest.position_mm - rest.demand_mm
     if abs(off_mm) * axis.scaling.increments_per_mm < 1.0:  # the drive itself sees none
         off_mm = 0.0
-    return closed_loop.create_standstill_state(parameters, axis, start_mm + off_mm, rest.current_a, start_mm)
+    return create_standstill_state(parameters, axis, start_mm + off_mm, rest.current_a, start_mm)
 
 
 def _compute_blend(rows: int, period_s: float) -> Float:

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
-from fdhil.guard import correction_table
-from fdhil.guard.guard_protocol import SOCKET_NAME
+from fdhil.guard import SOCKET_NAME, Column, encode_table, seal_table
 from fdhil.json_lines import decode_line, encode_line
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
@@ -53,8 +52,8 @@ class GuardClient:
     def load_table(
         self,
         axes: Sequence[str],
-        demand: Mapping[str, correction_table.Column],
-        offset: Mapping[str, correction_table.Column],
+        demand: Mapping[str, Column],
+        offset: Mapping[str, Column],
         program_digest: str,
         first: int = 0,
         final: bool = True,
@@ -66,8 +65,8 @@ class GuardClient:
         drive increments (sequences of int or numpy integer arrays). Raises StoreError if the table is too long or
         memory is short, ValueError if a value does not fit into 32 bits.
         """
-        body = correction_table.encode_table(axes, demand, offset, program_digest, first, final)
-        descriptor = correction_table.seal_table(body)
+        body = encode_table(axes, demand, offset, program_digest, first, final)
+        descriptor = seal_table(body)
         try:
             return self.send_request(
                 {"request": "table", "renew": renew}, self._timeout_s + len(body) / 2e5, descriptor

@@ -9,17 +9,22 @@ from typing import Any
 
 from fdhil.arming.operator_token import find_credential
 from fdhil.cia402 import COB_RPDO, get_first_axis_index
-from fdhil.commissioning.cob_id_conflicts import list_guard_rpdos, require_unique_guard_ids
-from fdhil.commissioning.commissioning_record import KEY_NAME, CommissioningRecord, is_record_of_config, load_record
-from fdhil.commissioning.offset_writers import INVALID_COB_ID, extract_cob_id
-from fdhil.commissioning.void_mark import is_record_void, read_void_reason
+from fdhil.commissioning import (
+    INVALID_COB_ID,
+    KEY_NAME,
+    CommissioningRecord,
+    extract_cob_id,
+    is_record_of_config,
+    is_record_void,
+    list_guard_rpdos,
+    load_record,
+    read_void_reason,
+    require_unique_guard_ids,
+)
 from fdhil.config import Axis, MachineConfig, OffsetBounds, find_share_fault
-from fdhil.drivers.cia402.drive_profile import DriveProfile, PdoSpec
-from fdhil.drivers.cia402.drive_profile_file import load_profile, require_offset
+from fdhil.drivers import DriveProfile, PdoSpec, load_profile, require_offset
 from fdhil.errors import ConfigError, ConfigFault, StoreError
-from fdhil.guard.feedforward_law import FeedforwardLimits
-from fdhil.guard.guard_settings import AxisSettings, FeedforwardPdo, GuardSettings, Pdo
-from fdhil.guard.offset_limits import OffsetLimits
+from fdhil.guard import AxisSettings, FeedforwardLimits, FeedforwardPdo, GuardSettings, OffsetLimits, Pdo
 
 SPEED_STEPS = 2.0  # times the motor's power: margin for the load's own inertia and for sensor noise
 HEARTBEATS_AWAITED = 2.0  # periods of the drive's heartbeat until it counts as lost

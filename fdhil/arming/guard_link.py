@@ -21,7 +21,7 @@ from fdhil.arming.residual_offset import (
 )
 from fdhil.arming.residual_offset_file import ResidualOffsetFile
 from fdhil.errors import ConnectError, DeviceError
-from fdhil.guard.guard_protocol import AT_REST, CHARGED_STATES
+from fdhil.guard import AT_REST, CHARGED_STATES
 from fdhil.records import Notice
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 

@@ -6,7 +6,7 @@ import socket
 import time
 from pathlib import Path
 
-from fdhil.guard.guard_protocol import SOCKET_NAME
+from fdhil.guard import SOCKET_NAME
 
 ASK_AGAIN_S = 1.0
 RENEWED_S = 3.0  # a guard recreates its socket if the run directory was cleaned

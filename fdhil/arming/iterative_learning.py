@@ -15,13 +15,10 @@ from fdhil.arming.checked_program import CheckedProgram
 from fdhil.arming.program_check import encode_rows
 from fdhil.arming.whole_plan import store_in_memory
 from fdhil.config import MachineConfig
-from fdhil.correction.inverse import compute_common_delay_s, delay_path
-from fdhil.correction.learned_offsets import LearnedOffset, learn_from_pass
-from fdhil.correction.plan_limits import fit_all_axes
-from fdhil.prediction import compute_contour_error_um
-from fdhil.prediction.path_prediction import compute_table_deflection_mm
+from fdhil.correction import LearnedOffset, compute_common_delay_s, delay_path, fit_all_axes, learn_from_pass
+from fdhil.prediction import compute_contour_error_um, compute_table_deflection_mm
 from fdhil.records import Float, Parameters, Reason, compute_rms, compute_table_path
-from fdhil.store.learned_offset_files import make_learned_path, read_learned, write_learned
+from fdhil.store import make_learned_path, read_learned, write_learned
 
 MOST_ROWS = 1_000_000
 TOLERANCE_INCREMENTS = 2.5

@@ -4,9 +4,9 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from fdhil.identification.drive_loops.loop_identification import is_better_than_configured
+from fdhil.identification import is_better_than_configured
 from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, Temperature
-from fdhil.store.history_rows import Revision
+from fdhil.store import Revision
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 SKILL_MOVES = 3  # FAULTS E19: the last three recorded moves

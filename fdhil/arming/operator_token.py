@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from fdhil.errors import ConnectError, DeviceError
-from fdhil.store.atomic_file import sync_folder, write_all
+from fdhil.store import sync_folder, write_all
 
 TOKEN_NAME = "token"
 MAX_BYTES = 256

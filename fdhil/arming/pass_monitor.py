@@ -17,12 +17,9 @@ import numpy as np
 
 from fdhil.arming.iterative_learning import IterativeLearner
 from fdhil.config import MachineConfig
-from fdhil.correction import correction_gate
-from fdhil.correction.learned_offsets import LearnedOffset
+from fdhil.correction import LEAST_GAIN, LearnedOffset
 from fdhil.errors import StoreError
-from fdhil.prediction import compute_contour_error_um
-from fdhil.prediction.contour_error import WINDOW_S
-from fdhil.prediction.correction_gain import format_upper_limit
+from fdhil.prediction import WINDOW_S, compute_contour_error_um, format_upper_limit
 from fdhil.records import AxisSamples, Float, Int, MoveKind, NcState, Notice, Parameters, Reason, compute_table_path
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
@@ -153,7 +150,7 @@ class PassMonitor:
         if (
             ended.cause == FINISHED
             and ended.running.disturbed is None
-            and report["measured"]["rms_um"] * correction_gate.LEAST_GAIN > report["predicted_without"]["rms_um"]
+            and report["measured"]["rms_um"] * LEAST_GAIN > report["predicted_without"]["rms_um"]
         ):
             advice = "run a few rapids to identify the machine again, then arm"
             reason = Reason("PromiseBroken", f"{text}: the correction was withdrawn", advice)

@@ -23,14 +23,18 @@ import numpy as np
 from fdhil.arming.code_digest import compute_code_digest
 from fdhil.bounded_process import limit_process, receive_request, report_to_parent
 from fdhil.config import MachineConfig
-from fdhil.correction import correction_gate
-from fdhil.correction.block_streaming import StreamBlock, stream_blocks
+from fdhil.correction import StreamBlock, check_gain, stream_blocks
 from fdhil.errors import FdhilError, ProgramError, StoreError
-from fdhil.program import compute_program_digest, planner
-from fdhil.program.demand_csv import read_demand_csv, require_digest
-from fdhil.program.program_loading import is_demand, open_program
+from fdhil.program import (
+    compute_program_digest,
+    is_demand,
+    open_program,
+    read_demand_csv,
+    require_digest,
+    stream_trajectory,
+)
 from fdhil.records import Float, Parameters, Reason, Trajectory
-from fdhil.store.atomic_file import keep_newest, make_folder, make_store_error, sync_folder, write_file
+from fdhil.store import keep_newest, make_folder, make_store_error, sync_folder, write_file
 
 SCHEMA = "fdhil-check-4"
 ROWS = ".rows"
@@ -60,7 +64,7 @@ def _open_reference(program: Path, config: MachineConfig, sha256: str | None) ->
     if is_demand(program):
         return iter([read_demand_csv(program, config, sha256)]), list
     interpreter = open_program(program, config, sha256)
-    return planner.stream_trajectory(interpreter.run(), config, PIECE_ROWS), lambda: interpreter.files
+    return stream_trajectory(interpreter.run(), config, PIECE_ROWS), lambda: interpreter.files
 
 
 class _FileDigests:
@@ -149,9 +153,7 @@ class _CheckSummary:
 
     def make_header(self) -> dict[str, Any]:
         errors = self.compute_errors()
-        refused = self.refused or list(
-            correction_gate.check_gain(errors["before"]["rms_um"], errors["after"]["rms_um"])
-        )
+        refused = self.refused or list(check_gain(errors["before"]["rms_um"], errors["after"]["rms_um"]))
         reasons = [asdict(reason) for reason in refused[:MOST_REFUSED]]
         return {"rows": self.rows, **errors, "largest_um": self.largest_um, "refused": reasons}
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass
 from typing import Any
 
-from fdhil.guard.guard_protocol import AT_REST
+from fdhil.guard import AT_REST
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 GONE = frozenset({"absent", "lost"})

@@ -9,7 +9,7 @@ from typing import Any
 
 from fdhil.arming.residual_offset import START_AND_ADOPT, ResidualOffset, read_residual_offset
 from fdhil.errors import StoreError
-from fdhil.store.atomic_file import write_file
+from fdhil.store import write_file
 
 FILE_NAME = "may_stand.json"
 MOST_BYTES = 64 * 1024

@@ -8,7 +8,7 @@ from fdhil.arming.guard_link import GuardLink
 from fdhil.arming.residual_offset import REST
 from fdhil.arming.standstill_monitor import StandstillMonitor
 from fdhil.errors import DeviceError, StoreError
-from fdhil.guard.guard_protocol import RESERVE_S
+from fdhil.guard import RESERVE_S
 from fdhil.records import Notice
 
 SCARCE_S = 5.0  # half the ring: a late check is reported before the guard ends the correction

@@ -13,7 +13,7 @@ from fdhil.arming.model_tracker import AxisModelState
 from fdhil.arming.program_check import encode_rows
 from fdhil.config import MachineConfig
 from fdhil.errors import StoreError
-from fdhil.prediction.correction_gain import find_moving_axes, find_worst_rms_um, predict_gain
+from fdhil.prediction import find_moving_axes, find_worst_rms_um, predict_gain
 from fdhil.program import load_trajectory
 from fdhil.records import Correction, Float, Reason, compute_rms
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from fdhil.api.compilation_notice import announce_compilation
+from fdhil.api import announce_compilation
 from fdhil.cli.cli_errors import require_delivered_answer
 from fdhil.cli.options import AS_JSON, CONFIG, FILE, OutputFile, PositiveFloat, WritingCommand
 

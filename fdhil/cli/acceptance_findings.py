@@ -18,16 +18,13 @@ import numpy as np
 from fdhil import correction
 from fdhil.cli.doctor.latency import read_latency
 from fdhil.cli.prediction_commands import load_inputs
-from fdhil.commissioning.commissioning_record import CommissioningRecord, is_record_valid, load_record
-from fdhil.commissioning.step_progress import StepProgress
-from fdhil.commissioning.void_mark import is_record_void
+from fdhil.commissioning import CommissioningRecord, StepProgress, is_record_valid, is_record_void, load_record
 from fdhil.config import MachineConfig
 from fdhil.errors import RecordingError, StoreError
-from fdhil.prediction.circle_evaluation import CircleDeviations, evaluate_circle, write_circle_program
+from fdhil.prediction import CircleDeviations, evaluate_circle, write_circle_program
 from fdhil.program import compute_program_digest
 from fdhil.records import PARAMETERS, UNITS, Correction, Float, Prediction
-from fdhil.report.history_charts import AxisHistory
-from fdhil.report.history_reader import PASS_CODE, group_by_axis, read_history, read_notices, read_passes
+from fdhil.report import PASS_CODE, AxisHistory, group_by_axis, read_history, read_notices, read_passes
 
 SCHEMA = "fdhil-acceptance-1"
 NO_LIMIT = "no limit was set: give the required accuracy with --circle-um and --contour-um"

@@ -5,11 +5,17 @@ from typing import Any
 
 from fdhil.cli.acceptance_findings import NO_LIMIT, AxisProof, Findings
 from fdhil.cli.doctor.latency import format_latency
-from fdhil.report import Page, Section, Table
-from fdhil.report.circular_plot import draw_polar
-from fdhil.report.condition_summary import LATEST_HEAD, build_latest_rows
-from fdhil.report.parameter_format import INTERVAL_MEANING, format_minute
-from fdhil.report.path_report import build_correction_page
+from fdhil.report import (
+    INTERVAL_MEANING,
+    LATEST_HEAD,
+    Page,
+    Section,
+    Table,
+    build_correction_page,
+    build_latest_rows,
+    draw_polar,
+    format_minute,
+)
 
 CIRCLE_ROWS = (
     "G, counter-clockwise (um)", "G, clockwise (um)", "G(b), both runs (um)", "H, between the runs (um)",

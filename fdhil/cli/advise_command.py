@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fdhil.api.compilation_notice import announce_compilation
+from fdhil.api import announce_compilation
 from fdhil.cli.cli_errors import require_delivered_answer
 from fdhil.cli.options import (
     AS_JSON,
@@ -28,8 +28,7 @@ from fdhil.cli.prediction_commands import load_inputs
 
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig
-    from fdhil.prediction.feed_advice import FeedAdvice
-    from fdhil.prediction.feed_search import FeedScaledPath
+    from fdhil.prediction import FeedAdvice, FeedScaledPath
     from fdhil.records import Parameters, Trajectory
 
 UNHELD = "{} lines leave the tolerance at every feed tried, without the correction"
@@ -65,7 +64,7 @@ def advise(
     if out is not None and program.suffix.lower() == ".csv":
         raise click.UsageError("--out writes F words, which a demand does not have; give the NC program")
     reference, models, config = load_inputs(program, config_path, model_path, from_history)
-    from fdhil.correction.result_documents import advise_with_correction, build_advice_document
+    from fdhil.correction import advise_with_correction, build_advice_document
 
     corrects = all(config.axis[axis].correction is not None for axis in reference.axes)
     announce_compilation("predict", *(["correct"] if corrects else []))
@@ -97,9 +96,8 @@ def _can_keep_tolerance(advice: FeedAdvice, corrected: bool) -> bool:
 
 
 def _write_program(program: Path, advice: Sequence[FeedAdvice], config: MachineConfig, out: Path) -> None:
-    from fdhil.program import Budget
-    from fdhil.program.feed_words import replace_feeds
-    from fdhil.store.output_file import open_output
+    from fdhil.program import Budget, replace_feeds
+    from fdhil.store import open_output
 
     content = replace_feeds(program, {a.line: a.plain.run for a in advice}, Budget.create_from_config(config.nc))
     with open_output(out) as file:
@@ -113,7 +111,7 @@ def _create_feed_sources(
     config: MachineConfig,
     tolerance_um: float,
 ) -> tuple[FeedScaledPath, FeedScaledPath | None]:
-    from fdhil.correction.result_documents import make_feed_sources
+    from fdhil.correction import make_feed_sources
     from fdhil.program import Budget, interpret
 
     motions = (

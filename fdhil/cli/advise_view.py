@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fdhil.program.feed_words import cut_to_digits
+from fdhil.program import cut_to_digits
 
 if TYPE_CHECKING:
-    from fdhil.prediction.feed_advice import FeedAdvice, FeedResult
+    from fdhil.prediction import FeedAdvice, FeedResult
 
 BRACKETED = (
     "this demand does not match the averages of [nc] smoothing_s: the lower feed applies if the NC keeps its smoothing,"

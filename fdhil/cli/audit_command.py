@@ -25,8 +25,8 @@ def audit(config: Path, last: int, as_json: bool) -> int:
     The log lists each request to the machine with its time, client and result.
     """
     machine = machine_config.load_config(config)
-    from fdhil.daemon.service_log import escape_unprintable
-    from fdhil.store.audit_file import AUDIT_FILE_NAME, read_entries
+    from fdhil.daemon import escape_unprintable
+    from fdhil.store import AUDIT_FILE_NAME, read_entries
 
     found = list(read_entries(machine.store.directory))
     broken = [number for number, (_, wrong) in enumerate(found, start=1) if wrong]

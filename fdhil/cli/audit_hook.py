@@ -67,8 +67,7 @@ def _append_or_warn(machine: MachineConfig, entry: dict[str, str], what: str) ->
 
 
 def _append_entry(machine: MachineConfig, entry: dict[str, str]) -> None:
-    from fdhil.store import audit_file
-    from fdhil.store.atomic_file import make_store_error
+    from fdhil.store import append_entry, make_store_error
 
     folder, uid = machine.store.directory, os.getuid()
     entry = {key: value[:MOST_CHARACTERS] for key, value in entry.items()}
@@ -77,9 +76,7 @@ def _append_entry(machine: MachineConfig, entry: dict[str, str]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise make_store_error(folder, error) from None
-    audit_file.append_entry(
-        folder, {"who": {"user": _look_up_user(uid), "uid": uid, "pid": os.getpid()}, **by, **entry}
-    )
+    append_entry(folder, {"who": {"user": _look_up_user(uid), "uid": uid, "pid": os.getpid()}, **by, **entry})
 
 
 def _look_up_user(uid: int) -> str:

@@ -8,18 +8,14 @@ from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
 
-from fdhil.api.compilation_notice import announce_compilation
-from fdhil.api.recording_analysis import FileResult, Progress, analyse_recordings, ignore_progress
+from fdhil.api import FileResult, Progress, analyse_recordings, announce_compilation, ignore_progress
 from fdhil.child_process import request_parent_death_signal
 from fdhil.cli.cli_errors import describe_error
 from fdhil.config import Identification, MachineConfig
 from fdhil.errors import FdhilError, RecordingError
-from fdhil.fleet.task_pool import TaskPool
+from fdhil.fleet import TaskPool
 from fdhil.records import Reason, Recording, Verdict, Window, WindowOutcome
-from fdhil.store import file_suffixes
-from fdhil.store.accelerometer_csv import add_accelerometer
-from fdhil.store.column_map import ColumnMap
-from fdhil.store.recording_file import read_recording, read_stored_window
+from fdhil.store import RECORDING_SUFFIXES, ColumnMap, add_accelerometer, read_recording, read_stored_window
 
 MANY_FILES = 16  # above this, further processes pay for their start
 MANY_WINDOWS = 48
@@ -93,7 +89,7 @@ def analyse_file(
 
 def read_recording_or_window(path: Path, accelerometer: Path | None, columns: ColumnMap | None) -> Recording | Window:
     if next(os.walk(path), None) is not None:  # a folder without recordings; others are expanded before
-        known = ", ".join(file_suffixes.RECORDING_SUFFIXES)
+        known = ", ".join(RECORDING_SUFFIXES)
         raise RecordingError(f"{path} has no recordings ({known}); give the folder that has them")
     if accelerometer is None and columns is None and (stored := read_stored_window(path)) is not None:
         return stored

@@ -16,12 +16,10 @@ from fdhil.cli.cli_errors import require_delivered_answer
 from fdhil.cli.options import AS_JSON, CONFIG, FILE
 from fdhil.cli.terminal_text import print_progress
 from fdhil.errors import DeviceError
-from fdhil.guard.guard_protocol import SOCKET_NAME
+from fdhil.guard import SOCKET_NAME
 
 if TYPE_CHECKING:
-    from fdhil.commissioning.config_check import Place
-    from fdhil.commissioning.scan import BusScan, DeviceDescription, ScannedNode
-    from fdhil.commissioning.void_mark import Mark
+    from fdhil.commissioning import BusScan, DeviceDescription, Mark, Place, ScannedNode
     from fdhil.config import MachineConfig
 
 ReportToGuard = Callable[[Mapping[str, str]], Sequence[Mapping[str, str]] | None]
@@ -45,7 +43,7 @@ def scan(config: Path, places: tuple[Path, ...], as_json: bool) -> None:
     are received), nothing is sent, and the list contains only what was received.
     """
     machine = machine_config.load_config(config)
-    from fdhil.commissioning.scan import scan_bus  # late: --help imports nothing heavy
+    from fdhil.commissioning import scan_bus  # late: --help imports nothing heavy
 
     descriptions = _read_eds_files(places, config.parent)
     scans = []
@@ -60,7 +58,7 @@ def scan(config: Path, places: tuple[Path, ...], as_json: bool) -> None:
 
 def _read_eds_files(places: Sequence[Path], folder: Path) -> list[DeviceDescription]:
     # a named file must be readable; an unreadable one in the default folder is only reported
-    from fdhil.commissioning.scan import read_descriptions
+    from fdhil.commissioning import read_descriptions
 
     found, faults = read_descriptions(places or [folder])
     if faults and places:
@@ -117,8 +115,7 @@ def check(config: Path, as_json: bool) -> int:
     reads. If an NC runs the bus, it only listens, and points that need an SDO request are not compared.
     """
     machine = machine_config.load_config(config)
-    from fdhil.commissioning.config_check import check_machine
-    from fdhil.commissioning.void_mark import read_void_mark
+    from fdhil.commissioning import check_machine, read_void_mark
 
     marks = {axis: read_void_mark(machine.store.directory, axis) for axis in machine.axis}
     with _connect_guard(machine) as tell:
@@ -139,8 +136,7 @@ def _record_comparison(
 
     A doubt that arose after the comparison remains: in the guard, and in a mark that differs from ``marks``.
     """
-    from fdhil.commissioning.record_comparison import RECORD_POINT
-    from fdhil.commissioning.void_mark import clear_void_mark, is_record_void, mark_record_void
+    from fdhil.commissioning import RECORD_POINT, clear_void_mark, is_record_void, mark_record_void
 
     directory, seen = machine.store.directory, {}
     for place, finding in found:
@@ -172,8 +168,7 @@ def _connect_guard(machine: MachineConfig) -> Iterator[ReportToGuard]:
     That function returns the refusals of the guard, or None if the guard ended before it could answer. The connection
     stays open meanwhile, because a restarted guard would not know the earlier counts.
     """
-    from fdhil.arming.guard_client import GuardClient
-    from fdhil.arming.operator_token import get_operator_token
+    from fdhil.arming import GuardClient, get_operator_token
 
     def report_to_guard(seen: Mapping[str, str]) -> Sequence[Mapping[str, str]] | None:
         try:

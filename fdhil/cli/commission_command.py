@@ -38,7 +38,7 @@ from fdhil.errors import ConfigError, ConfigFault, DriveFault
 if TYPE_CHECKING:
     from types import FrameType
 
-    from fdhil.commissioning.step_progress import StepProgress
+    from fdhil.commissioning import StepProgress
     from fdhil.config import MachineConfig
 
 SCHEMA = "fdhil-commission-1"
@@ -125,7 +125,7 @@ def _interrupt_on_signals() -> Iterator[None]:
 
     Only the first signal counts: a second one must not interrupt the braking.
     """
-    from fdhil.commissioning.axis_motion import handle_signals
+    from fdhil.commissioning import handle_signals
 
     stopping = False
 
@@ -140,13 +140,13 @@ def _interrupt_on_signals() -> Iterator[None]:
 
 
 def _open_progress(machine: MachineConfig, axis: str) -> StepProgress:
-    from fdhil.commissioning.step_progress import StepProgress
+    from fdhil.commissioning import StepProgress
 
     return StepProgress(machine.store.directory, axis, machine.store.commissioning_key)
 
 
 def _print_plan(machine: MachineConfig, axes: list[str], options: CommissionOptions) -> int:
-    from fdhil.report.parameter_format import format_minute
+    from fdhil.report import format_minute
 
     plans: dict[str, list[dict[str, Any]]] = {}
     refused = None
@@ -178,9 +178,7 @@ def _print_plan(machine: MachineConfig, axes: list[str], options: CommissionOpti
 
 def _commission_axis(machine: MachineConfig, axis: str, options: CommissionOptions) -> dict[str, Any]:
     from fdhil.cli.bus_lock import lock_bus
-    from fdhil.commissioning import commissioning_steps
-    from fdhil.commissioning.commissioning_record import save_record
-    from fdhil.commissioning.hal_commissioning import commission_hal
+    from fdhil.commissioning import commission_axis, commission_hal, save_record
 
     hal = machine.axis[axis].drive.source == "hal"
     progress = _open_progress(machine, axis)
@@ -204,7 +202,7 @@ def _commission_axis(machine: MachineConfig, axis: str, options: CommissionOptio
         if hal:
             record = commission_hal(machine, axis, report)
         else:
-            record = commissioning_steps.commission_axis(machine, axis, report, progress, guide.report_result)
+            record = commission_axis(machine, axis, report, progress, guide.report_result)
         path = save_record(record, machine.store.directory, machine.store.commissioning_key)
         ended["text"] = f"record {record.digest[:16]}"
         options.show_text(
@@ -231,9 +229,8 @@ def _make_step_callback(
 
 def _set_pdos(machine: MachineConfig, axis: str, options: CommissionOptions) -> dict[str, Any]:
     from fdhil.cli.bus_lock import lock_bus
-    from fdhil.commissioning.master import Master
-    from fdhil.commissioning.pdo_setup import set_up_pdos
-    from fdhil.drivers.cia402.drive_profile_file import load_profile
+    from fdhil.commissioning import Master, set_up_pdos
+    from fdhil.drivers import load_profile
 
     profile = load_profile(machine.axis[axis].drive)
     if not options.yes:
@@ -250,7 +247,7 @@ def _set_pdos(machine: MachineConfig, axis: str, options: CommissionOptions) -> 
 
 
 def _confirm_first_motion(machine: MachineConfig, axis: str) -> None:
-    from fdhil.commissioning.commissioning_steps import compute_largest_move_um
+    from fdhil.commissioning import compute_largest_move_um
 
     hal = machine.axis[axis].drive.source == "hal"
     question = f"Axis {axis} will move by 10 um, or by 50 um if friction holds it. Is it free to move? Start?"

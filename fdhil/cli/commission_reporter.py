@@ -15,8 +15,7 @@ from fdhil.cli.operator_prompt import ask_yes_no
 from fdhil.errors import DriveFault
 
 if TYPE_CHECKING:
-    from fdhil.commissioning.step_progress import CompletedStep, Found, StepProgress
-    from fdhil.commissioning.stroke_planning import TravelRoom
+    from fdhil.commissioning import CompletedStep, Found, StepProgress, TravelRoom
 
 POSITION_S = 0.2  # period of the position display while an axis moves
 
@@ -64,7 +63,7 @@ class StepReporter:
 
     def report_kept_step(self, name: str, step: CompletedStep) -> None:
         """Report that a completed step is skipped, with its result."""
-        from fdhil.report.parameter_format import format_minute
+        from fdhil.report import format_minute
 
         self._show_line(
             f"{self._format_heading(name)}: skipped, done {format_minute(step.done_utc)}; {format_result(name, step.found)}"
@@ -99,7 +98,7 @@ def describe_step(does: str, moves: str) -> str:
 
 def parse_room(given: tuple[float, float] | None) -> TravelRoom | None:
     """Return the allowed travel, back and forward, mm or degrees. Raises click.BadParameter if it is invalid."""
-    from fdhil.commissioning.stroke_planning import TravelRoom
+    from fdhil.commissioning import TravelRoom
 
     if given is None:
         return None

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fdhil.commissioning.step_progress import StepProgress
-    from fdhil.commissioning.stroke_planning import TravelRoom
+    from fdhil.commissioning import StepProgress, TravelRoom
     from fdhil.config import MachineConfig
 
 STEPS: Mapping[str, str] = {
@@ -70,7 +69,7 @@ def format_result(step: str, found: Mapping[str, Any]) -> str:
 
 def _format_parameter(name: str, value: Mapping[str, Any]) -> str:
     from fdhil.records import INTERVAL_95
-    from fdhil.report.parameter_format import DISPLAY_UNITS, format_cell
+    from fdhil.report import DISPLAY_UNITS, format_cell
 
     if value["std"] is None:
         return f"{value['value']:.4g} {value['unit']} (given, not identified)"
@@ -87,7 +86,7 @@ def describe_motions(machine: MachineConfig, axis: str) -> dict[str, str]:
     if machine.axis[axis].drive.source == "hal":
         moved = "10 um toward plus, or 50 um if friction holds it"
         return {"listen": NOTHING, "move": moved, "watchdog test": "back to where it was"}
-    from fdhil.commissioning.commissioning_steps import SIGN_TEST_UM, TRIAL_RAMPS, compute_largest_move_um
+    from fdhil.commissioning import SIGN_TEST_UM, TRIAL_RAMPS, compute_largest_move_um
 
     largest = compute_largest_move_um(machine, axis)
     return dict.fromkeys(STEPS, NOTHING) | {
@@ -100,8 +99,7 @@ def describe_motions(machine: MachineConfig, axis: str) -> dict[str, str]:
 
 def describe_trial_motions(machine: MachineConfig, axis: str, room: TravelRoom | None) -> dict[str, str]:
     """Return the motion of each step of the ``TRIAL``. Raises DriveFault if the room is too small."""
-    from fdhil.commissioning.axis_trial import TRIAL_RAPIDS
-    from fdhil.commissioning.stroke_planning import plan_jog, plan_rapid, require_single_drive
+    from fdhil.commissioning import TRIAL_RAPIDS, plan_jog, plan_rapid, require_single_drive
 
     require_single_drive(machine, axis)
     settings = machine.axis[axis]

@@ -14,9 +14,7 @@ from fdhil.cli.operator_prompt import ask_text, ask_yes_no
 from fdhil.errors import DriveFault
 
 if TYPE_CHECKING:
-    from fdhil.commissioning.commissioning_record import CommissioningRecord
-    from fdhil.commissioning.step_progress import Found, StepProgress
-    from fdhil.commissioning.stroke_planning import TravelRoom
+    from fdhil.commissioning import CommissioningRecord, Found, StepProgress, TravelRoom
     from fdhil.config import MachineConfig
     from fdhil.pipeline import PipelineState
     from fdhil.records import Notice, Outcome
@@ -30,8 +28,8 @@ def run_trial(
     guide: StepReporter,
 ) -> dict[str, Any] | None:
     """Run the trial of a commissioned axis; None without a room. Raises DriveFault if it is refused."""
-    from fdhil.api.compilation_notice import announce_compilation
-    from fdhil.commissioning.axis_trial import OperatorCallbacks, try_axis
+    from fdhil.api import announce_compilation
+    from fdhil.commissioning import OperatorCallbacks, try_axis
 
     axis, room = record.axis, options.room
     if room is None:
@@ -99,8 +97,7 @@ def _open_history(
 
     While a daemon runs nothing is stored: it records the rapids itself.
     """
-    from fdhil.daemon.machine_lock import BusLocked, lock_machine
-    from fdhil.daemon.outcome_store import OutcomeStore
+    from fdhil.daemon import BusLocked, OutcomeStore, lock_machine
     from fdhil.pipeline import PipelineState
 
     with ExitStack() as open_:

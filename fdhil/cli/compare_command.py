@@ -126,7 +126,7 @@ def _compute_change_percent(before: Mapping[str, Any], after: Mapping[str, Any])
 
 
 def _read_model_values(path: Path) -> Values:
-    from fdhil.prediction.axis_models import load_model_file
+    from fdhil.prediction import load_model_file
     from fdhil.records import PARAMETERS
 
     return {
@@ -161,7 +161,7 @@ def _show_comparison(document: Mapping[str, Any]) -> None:
     from rich.markup import escape
 
     from fdhil.cli.status_view import make_narrow_table, open_console
-    from fdhil.report.parameter_format import compute_half_width, format_cell, format_heading
+    from fdhil.report import compute_half_width, format_cell, format_heading
 
     out, files = open_console(), [Path(document[when]["file"]).name for when in ("before", "after")]
     if document["kind"] == "pass":

@@ -22,7 +22,7 @@ from fdhil.cli.terminal_text import replace_controls
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, DriveFault
 
 if TYPE_CHECKING:
-    from fdhil.arming.guard_client import GuardClient
+    from fdhil.arming import GuardClient
 
 DISARM_S = 15.0  # covers the guard's answer and the ramp
 WATCH_S = 1.0
@@ -45,13 +45,13 @@ def run(config: Path, method: str | None, as_json: bool) -> int:
     zero and stops.
     """
     machine = machine_config.load_config(config)
-    from fdhil.api.compilation_notice import announce_compilation
-    from fdhil.daemon import daemon_service, service_log  # late: --help imports nothing heavy
+    from fdhil.api import announce_compilation
+    from fdhil.daemon import run_daemon_service, write_lines_as_json  # late: --help imports nothing heavy
     from fdhil.drivers import open_machine
 
     announce_compilation("identify", "predict", "correct")
-    with service_log.write_lines_as_json(as_json):
-        residual = daemon_service.run_daemon_service(machine, open_machine, method)
+    with write_lines_as_json(as_json):
+        residual = run_daemon_service(machine, open_machine, method)
     return 0 if residual.is_zero else 3
 
 
@@ -62,7 +62,7 @@ def _ask_daemon(
     progress: Callable[[Mapping[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     load = machine_config.load_directories if request["request"] == "disarm" else machine_config.load_config
-    from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
+    from fdhil.daemon import SOCKET_NAME, ask_daemon
 
     return ask_daemon(load(config).run_directory / SOCKET_NAME, request, timeout_s, progress)
 
@@ -92,7 +92,7 @@ def status(config: Path, watch: bool, as_json: bool) -> None:
 
 def _show_status(config: Path, as_json: bool) -> None:
     from fdhil.cli.status_view import show_status
-    from fdhil.daemon.daemon_status import describe_config_difference
+    from fdhil.daemon import describe_config_difference
 
     answer = _ask_daemon(config, {"request": "status"})
     answer["config_difference"] = describe_config_difference(answer, machine_config.load_config(config).digest)
@@ -128,7 +128,7 @@ def arm(config: Path, program: Path | None, method: str | None, whole: bool, as_
         os.close(
             os.open(program, os.O_RDONLY | os.O_NONBLOCK)
         )  # a missing file is exit code 3, not a refusal by the daemon
-    from fdhil.arming.operator_token import read_token
+    from fdhil.arming import read_token
 
     request = {
         "request": "arm",
@@ -210,8 +210,7 @@ def acknowledge(config: Path, numbers: tuple[int, ...], everything: bool, note: 
 def _disarm_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]:
     """Disarm at the guard after the daemon failed with ``silent``. Raises ConnectError if the guard fails as well."""
     machine = machine_config.load_directories(config)
-    from fdhil.arming.guard_client import GuardClient
-    from fdhil.arming.residual_offset import answer_disarm, wait_until_idle
+    from fdhil.arming import GuardClient, answer_disarm, wait_until_idle
 
     try:
         with GuardClient(machine.guard_directory) as guard:
@@ -236,8 +235,7 @@ def adopt(config: Path, yes: bool, as_json: bool) -> None:
     if as_json and not yes:
         raise click.UsageError("--json cannot prompt; give --yes as well")
     machine = machine_config.load_directories(config)
-    from fdhil.arming.guard_client import GuardClient
-    from fdhil.arming.operator_token import read_token
+    from fdhil.arming import GuardClient, read_token
 
     def record_and_read_token() -> str:
         found = read_token(machine.run_directory)
@@ -260,8 +258,8 @@ def _record_answer_after(config: Path, what: str, answer: Mapping[str, Any]) -> 
 
 
 def _adopt_offsets(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: bool) -> Mapping[str, Any]:
-    from fdhil.arming.residual_offset import answer_disarm, read_residual_offset, wait_until_idle
-    from fdhil.guard.guard_protocol import AT_REST
+    from fdhil.arming import answer_disarm, read_residual_offset, wait_until_idle
+    from fdhil.guard import AT_REST
 
     status = guard.read_status()
     residual, state = read_residual_offset(status), status["state"]

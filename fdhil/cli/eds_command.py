@@ -17,9 +17,7 @@ from fdhil.cli.options import AS_JSON, FILE
 from fdhil.errors import ConfigError, ConfigFault
 
 if TYPE_CHECKING:
-    from fdhil.drivers.cia402.capabilities import Capability
-    from fdhil.drivers.cia402.device_description import DeviceDescription, DeviceObject
-    from fdhil.drivers.cia402.drive_profile import DriveProfile, PdoSpec
+    from fdhil.drivers import Capability, DeviceDescription, DeviceObject, DriveProfile, PdoSpec
 
 SCHEMA = "fdhil-eds-1"
 COLOURS = {"yes": "green", "perhaps": "yellow", "no": "red"}
@@ -40,13 +38,7 @@ def eds(file: Path, name: str | None, as_json: bool) -> int:
     Suggests a profile for the vendor and the PDOs to set up. Lists the objects that may be a motor voltage, a DC link
     or a current. Nothing is sent. The drive itself may differ from its EDS.
     """
-    from fdhil.drivers.cia402.capabilities import (  # late: --help imports nothing
-        assess_capabilities,
-        find_similar_names,
-        suggest_profile,
-    )
-    from fdhil.drivers.cia402.device_description import read_device
-    from fdhil.drivers.cia402.drive_profile_file import read_profile
+    from fdhil.drivers import assess_capabilities, find_similar_names, read_device, read_profile, suggest_profile
 
     if name is not None and name not in tables.DRIVE_PROFILES and not name.endswith(".toml"):
         near = difflib.get_close_matches(name, tables.DRIVE_PROFILES, n=1)

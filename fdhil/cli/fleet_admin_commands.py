@@ -10,7 +10,7 @@ from fdhil.cli import fleet_view
 from fdhil.cli.fleet_commands import query_and_print, query_database, require_fleet_extra
 from fdhil.cli.options import AS_JSON, FILE, FLEET
 from fdhil.cli.terminal_text import print_progress
-from fdhil.config.fleet_config import load_fleet_config
+from fdhil.config import load_fleet_config
 
 
 @click.command()
@@ -35,12 +35,12 @@ def service(
     when = datetime.now(UTC).replace(microsecond=0) if at is None else at.replace(tzinfo=UTC)
     settings = load_fleet_config(fleet)
     with require_fleet_extra():
-        from fdhil.fleet import axis_services, parameter_sets
+        from fdhil.fleet import enter_service, parameter_sets, remove_service
     with parameter_sets.open_database(settings) as db:
         if remove:
-            answer = axis_services.remove_service(db, machine, axis or "", when)
+            answer = remove_service(db, machine, axis or "", when)
         else:
-            answer = axis_services.enter_service(db, machine, axis or "", when, note)
+            answer = enter_service(db, machine, axis or "", when, note)
     fleet_view.print_answer(answer, "service", as_json)
 
 
@@ -67,9 +67,9 @@ def retain(fleet: Path, as_json: bool) -> None:
     """
     settings = load_fleet_config(fleet)
     with require_fleet_extra():
-        from fdhil.fleet import parameter_sets, retention
+        from fdhil.fleet import apply_retention, parameter_sets
     with parameter_sets.open_database(settings) as db:
-        answer = retention.apply_retention(db, settings, datetime.now(UTC), print_progress)
+        answer = apply_retention(db, settings, datetime.now(UTC), print_progress)
     fleet_view.print_answer(answer, "retain", as_json)
 
 
@@ -87,11 +87,10 @@ def export(fleet: Path, folder: Path, labels: tuple[str, ...], key: Path | None,
     """
     settings = load_fleet_config(fleet)
     with require_fleet_extra():
-        from fdhil.fleet import anonymous_export as given_away
-        from fdhil.fleet import parameter_sets
+        from fdhil.fleet import export_tables, load_or_create_key, parameter_sets
     with parameter_sets.open_read_only(settings) as db:
-        answer = given_away.export_tables(
-            db, folder, given_away.load_or_create_key(key or fleet.parent / "anonymous.key"), labels, print_progress
+        answer = export_tables(
+            db, folder, load_or_create_key(key or fleet.parent / "anonymous.key"), labels, print_progress
         )
     fleet_view.print_answer(answer, "export", as_json)
 
@@ -111,17 +110,15 @@ def web(fleet: Path, host: str | None, port: int | None, as_json: bool) -> None:
 
     settings = load_fleet_config(fleet)
     with require_fleet_extra():
-        from fdhil.fleet import fleet_queries as _  # noqa: F401 - a missing library is reported before the start
-    from fdhil.web import serving
+        from fdhil.fleet import run_query as _  # noqa: F401 - a missing library is reported before the start
+    from fdhil.web import require_extra, serve_application
 
-    serving.require_extra()
-    from fdhil.web.fleet_app import make_fleet_app
+    require_extra()
+    from fdhil.web import make_fleet_app
 
     own = override_address(settings.web, host, port)
     ask = partial(query_database, settings)
-    serving.serve_application(
-        own, lambda: make_fleet_app(own, ask), lambda url: print_address("all machines", url, as_json)
-    )
+    serve_application(own, lambda: make_fleet_app(own, ask), lambda url: print_address("all machines", url, as_json))
 
 
 @click.command("web-user")

@@ -13,7 +13,7 @@ from fdhil.cli.options import AS_JSON, CONFIG, FLEET, LINES
 from fdhil.errors import FdhilError
 
 if TYPE_CHECKING:
-    from fdhil.config.fleet_config import Fleet
+    from fdhil.config import Fleet
 
 BY = click.option("--by", default="type", show_default=True, help="Label of [uplink] that groups comparable machines.")
 ELSEWHERE: Mapping[str, str] = {
@@ -48,11 +48,11 @@ def uplink(config: Path, as_json: bool) -> None:
 
     machine = machine_config.load_config(config)
     with require_fleet_extra():
-        from fdhil.fleet.record_uplink import send_records
-    from fdhil.daemon import service_log
-    from fdhil.shopfloor.publisher_process import report_ready, run_publisher
+        from fdhil.fleet import send_records
+    from fdhil.daemon import write_lines_as_json
+    from fdhil.shopfloor import report_ready, run_publisher
 
-    with service_log.write_lines_as_json(as_json):
+    with write_lines_as_json(as_json):
         run_publisher(lambda machine: send_records(machine, report_ready), machine)
 
 
@@ -89,30 +89,30 @@ def collect(fleet: Path, as_json: bool) -> None:
     Reads them from JetStream. Several collectors may run, on one or more computers. Creates stream and tables if they
     are missing. Stops on SIGTERM or Ctrl-C.
     """
-    from fdhil.config.fleet_config import load_fleet_config
+    from fdhil.config import load_fleet_config
 
     settings = load_fleet_config(fleet)
     with require_fleet_extra():
-        from fdhil.fleet.collector import collect_records as gather
-    from fdhil.daemon import service_log
-    from fdhil.shopfloor.publisher_process import report_ready, run_publisher
+        from fdhil.fleet import collect_records as gather
+    from fdhil.daemon import write_lines_as_json
+    from fdhil.shopfloor import report_ready, run_publisher
 
-    with service_log.write_lines_as_json(as_json):
+    with write_lines_as_json(as_json):
         run_publisher(lambda settings: gather(settings, report_ready), settings)
 
 
 def query_database(settings: "Fleet", question: str, **given: str | None) -> dict[str, Any]:
     """Return the answer of the database to a question, which is the name of a command."""
     with require_fleet_extra():
-        from fdhil.fleet import fleet_queries, parameter_sets
-    with parameter_sets.open_read_only(settings) as db:
-        return fleet_queries.QUERIES[question](db, **given)
+        from fdhil.fleet import QUERIES, open_read_only
+    with open_read_only(settings) as db:
+        return QUERIES[question](db, **given)
 
 
 def query_and_print(fleet: Path, question: str, as_json: bool, **given: str | None) -> dict[str, Any]:
     """Answer a question from the database of ``fleet``, and print the answer."""
     from fdhil.cli import fleet_view
-    from fdhil.config.fleet_config import load_fleet_config
+    from fdhil.config import load_fleet_config
 
     answer = query_database(load_fleet_config(fleet), question, **given)
     fleet_view.print_answer(answer, question, as_json)

@@ -61,8 +61,7 @@ def reanalyse(
     given are assessed with their regulators, the others with what the recordings contain. The results do not depend
     on the number of workers.
     """
-    from fdhil.config import Identification
-    from fdhil.config.fleet_config import load_fleet_config
+    from fdhil.config import Identification, load_fleet_config
 
     if scheduler is not None and workers is not None:
         raise click.UsageError(
@@ -70,23 +69,28 @@ def reanalyse(
         )
     settings, machines = load_fleet_config(fleet), _load_machine_configs(configs)
     with require_fleet_extra():
-        from fdhil.fleet import parameter_sets, reanalysis
-        from fdhil.fleet.reanalysis_changes import summarise_changes
-        from fdhil.fleet.window_reanalysis import AnalysisMethod, compute_code_digest
-        from fdhil.fleet.worker_pools import open_worker_pool as entered
-    from fdhil.api.compilation_notice import announce_compilation
+        from fdhil.fleet import (
+            AnalysisMethod,
+            WindowScope,
+            compute_code_digest,
+            open_read_only,
+            reanalyse_windows,
+            summarise_changes,
+        )
+        from fdhil.fleet import open_worker_pool as entered
+    from fdhil.api import announce_compilation
     from fdhil.cli import fleet_reanalysis_view as view
     from fdhil.cli import fleet_view
 
     chosen = AnalysisMethod(
         Identification(method=method), machines, settings.objects.directory.resolve(), compute_code_digest()
     )
-    scope = reanalysis.WindowScope(_convert_to_utc(since), _convert_to_utc(until), machine, axis)
+    scope = WindowScope(_convert_to_utc(since), _convert_to_utc(until), machine, axis)
     announce_compilation("identify")
     count = (os.cpu_count() or 1) if workers is None else workers
     with require_fleet_extra(), entered(scheduler, count) as pool, _show_progress_bar() as progress:
-        revision = reanalysis.reanalyse_windows(settings, chosen, scope, pool, progress)
-    with parameter_sets.open_read_only(settings) as db:
+        revision = reanalyse_windows(settings, chosen, scope, pool, progress)
+    with open_read_only(settings) as db:
         answer = summarise_changes(db, revision, by)
     fleet_view.print_answer(answer, "reanalyse", as_json, view.describe_changes)
     return UNREADABLE if answer["unreadable"] else 0
@@ -112,7 +116,7 @@ def _convert_to_utc(at: datetime | None) -> datetime | None:
 @contextmanager
 def _show_progress_bar() -> Iterator[Callable[[int, int], None]]:
     if not sys.stderr.isatty():
-        from fdhil.fleet.reanalysis import ignore_progress
+        from fdhil.fleet import ignore_progress
 
         yield ignore_progress
         return

@@ -15,8 +15,7 @@ from fdhil.cli.fleet_commands import require_fleet_extra
 from fdhil.cli.options import AS_JSON, FILE, FLEET, OutputFile, WritingCommand
 
 if TYPE_CHECKING:
-    from fdhil.fleet.rollout import MachineResponse, RolloutStatus
-    from fdhil.fleet.signed_offer import Offer, ProposedChange
+    from fdhil.fleet import MachineResponse, Offer, ProposedChange, RolloutStatus
 
 CHANGE = click.argument("change", type=FILE)
 MACHINES = click.option("--machine", "machines", multiple=True, help="Fleet name of a machine; repeatable.")
@@ -32,7 +31,7 @@ def key(file: Path, as_json: bool) -> None:
     [offers] trust. Anybody with access to FILE can sign in your name.
     """
     with require_fleet_extra():
-        from fdhil.fleet.signed_offer import create_key, read_public_key
+        from fdhil.fleet import create_key, read_public_key
     made = not file.exists()
     public = create_key(file) if made else read_public_key(file)
     if as_json:
@@ -56,9 +55,9 @@ def sign(change: Path, key_file: Path, by: str, machines: tuple[str, ...], out: 
     the labels of CHANGE.
     """
     with require_fleet_extra():
-        from fdhil.fleet.rollout import create_offer, read_change
-        from fdhil.fleet.signed_offer import sign_offer as signed
-    from fdhil.store.output_file import open_output
+        from fdhil.fleet import create_offer, read_change
+        from fdhil.fleet import sign_offer as signed
+    from fdhil.store import open_output
 
     proposal, days = read_change(change)
     offer = create_offer(proposal, days, by, 1, machines)
@@ -99,7 +98,7 @@ def stage(
     Lists the answers of the machines. With --key CHANGE is proposed to the next machines, once all earlier ones have
     accepted it, have identified with it, and have reported no notice since.
     """
-    from fdhil.config.fleet_config import load_fleet_config
+    from fdhil.config import load_fleet_config
 
     settings = load_fleet_config(fleet)
     with require_fleet_extra():
@@ -128,7 +127,7 @@ def stage(
 def _print_stage(
     change: ProposedChange, found: RolloutStatus, opened: Offer | None, withdrawn: Sequence[str], as_json: bool
 ) -> None:
-    from fdhil.daemon.service_log import escape_unprintable
+    from fdhil.daemon import escape_unprintable
 
     if as_json:
         click.echo(json.dumps({**_build_stage_document(change, found, opened), "withdrawn": list(withdrawn)}))

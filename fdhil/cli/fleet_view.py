@@ -12,7 +12,7 @@ Lines = Callable[[Mapping[str, Any]], Iterator[str]]
 
 def print_answer(answer: Mapping[str, Any], question: str, as_json: bool, lines: Lines | None = None) -> None:
     """Print an answer as text, by default with the ``LINES`` of its question, or as one JSON document."""
-    from fdhil.daemon.service_log import escape_unprintable
+    from fdhil.daemon import escape_unprintable
 
     if as_json:
         click.echo(json.dumps({"schema": f"fdhil-fleet-{question}-1", **answer}))

@@ -14,9 +14,7 @@ from fdhil.cli.cli_errors import prepare_streams, run_safely
 from fdhil.cli.epilogs import read_epilog
 from fdhil.cli.options import CONFIG
 from fdhil.errors import DeviceError
-from fdhil.guard.guard_protocol import SETTINGS_NAME
-from fdhil.guard.guard_settings import decode_settings, encode_settings
-from fdhil.guard.transmit_socket import greet_hub, open_transmit_socket
+from fdhil.guard import SETTINGS_NAME, decode_settings, encode_settings, greet_hub, open_transmit_socket
 
 
 @click.command(epilog=read_epilog("guard"), context_settings={"help_option_names": ["-h", "--help"]})
@@ -28,16 +26,21 @@ def guard(config: Path, check: bool) -> None:
     The guard sends no frame until the daemon arms a correction. It checks every interlock at each SYNC, and ramps the
     offsets to zero on any violation, when the daemon fails, and before it stops. Events are JSON lines on stdout.
     """
-    from fdhil.arming import guard_configuration  # late: heavy imports, not needed for --help
-    from fdhil.arming.operator_token import get_operator_token, make_run_directory
-    from fdhil.commissioning.record_comparison import verify_commissioned_drives
+    from fdhil.arming import (
+        find_corrected_bus,
+        get_operator_token,
+        make_guard_settings,
+        make_run_directory,
+        use_systemd_key,
+    )
+    from fdhil.commissioning import verify_commissioned_drives
 
-    machine = guard_configuration.use_systemd_key(machine_config.load_config(config))
-    name = guard_configuration.find_corrected_bus(machine, str(config))
+    machine = use_systemd_key(machine_config.load_config(config))
+    name = find_corrected_bus(machine, str(config))
     token_sha256 = hashlib.sha256(get_operator_token(machine.run_directory).encode()).hexdigest()
     run_directory = machine.guard_directory
     make_run_directory(run_directory)
-    text = encode_settings(guard_configuration.make_guard_settings(machine, name, run_directory, token_sha256))
+    text = encode_settings(make_guard_settings(machine, name, run_directory, token_sha256))
     decode_settings(text, str(config))  # settings that the guard would refuse are refused before it starts
     file, bus = run_directory / SETTINGS_NAME, machine.bus[name]
     if check:
@@ -49,9 +52,7 @@ def guard(config: Path, check: bool) -> None:
         verify_commissioned_drives(
             machine, name, lambda text: click.echo(json.dumps({"event": "record_void", "text": text}))
         )
-        _write_settings(
-            file, encode_settings(guard_configuration.make_guard_settings(machine, name, run_directory, token_sha256))
-        )
+        _write_settings(file, encode_settings(make_guard_settings(machine, name, run_directory, token_sha256)))
         greet_hub(name, bus, transmit)
         os.set_inheritable(lock.fileno(), True)
         transmit.set_inheritable(True)

@@ -11,11 +11,11 @@ import click
 
 from fdhil import config as machine_config
 from fdhil import tables
-from fdhil.api.compilation_notice import announce_compilation
+from fdhil.api import announce_compilation
 from fdhil.cli.cli_errors import require_delivered_answer
 from fdhil.cli.options import AS_JSON, COLUMNS, CONFIG, FILE, OutputFile, WritingCommand
 from fdhil.errors import RecordingError
-from fdhil.store import file_suffixes
+from fdhil.store import BUS_LOGS
 
 if TYPE_CHECKING:
     from fdhil.records import Outcome, Window
@@ -39,8 +39,7 @@ def replay(recordings: tuple[Path, ...], config: Path | None, method: str | None
     Windows of one axis are analysed in the given order, so that their pooling is repeated as well.
     """
     machine = machine_config.load_config(config) if config else None
-    from fdhil.daemon.outcome_json import build_outcome_document
-    from fdhil.daemon.service_log import format_outcome
+    from fdhil.daemon import build_outcome_document, format_outcome
 
     files = []
     validated = True
@@ -85,13 +84,12 @@ def _replay_windows(
 def read_windows(path: Path) -> list[Window]:
     """Return the windows of a window file (.parquet) or of a recording. Raises RecordingError for other files."""
     if path.suffix == ".parquet":
-        from fdhil.store.recording_parquet import is_recording
-        from fdhil.store.window_file import read_window
+        from fdhil.store import is_recording, read_window
 
         if not is_recording(path):
             return [read_window(path)]
-    from fdhil.identification.rapid_windows import find_windows
-    from fdhil.store.recording_file import read_recording
+    from fdhil.identification import find_windows
+    from fdhil.store import read_recording
 
     return find_windows(read_recording(path))
 
@@ -127,8 +125,7 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
     Lists revisions, slopes, changes, maintenance dates and notices.
     """
     machine = machine_config.load_config(config)
-    from fdhil.report import require_libraries
-    from fdhil.report.history_reader import group_by_axis, read_history, read_notices
+    from fdhil.report import group_by_axis, read_history, read_notices, require_libraries
 
     if plot is not None:
         require_libraries()
@@ -164,7 +161,7 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
 @click.option(
     "--format",
     "format_name",
-    type=click.Choice([*tables.RECORDING_FORMATS, *file_suffixes.BUS_LOGS.values()]),
+    type=click.Choice([*tables.RECORDING_FORMATS, *BUS_LOGS.values()]),
     help="File format (default: by the suffix of --out, else csv).",
 )
 @COLUMNS
@@ -198,7 +195,7 @@ def report(config: Path, out: Path, pdf: Path | None, as_json: bool) -> None:
     require_libraries()
     machine = machine_config.load_config(config)
     from fdhil.cli.history_report import write_report
-    from fdhil.report.history_reader import group_by_axis, read_history, read_notices, read_refusals
+    from fdhil.report import group_by_axis, read_history, read_notices, read_refusals
 
     rows, health = read_history(machine, tell=partial(click.echo, err=True))
     refused = read_refusals(machine)

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from fdhil.config import MachineConfig
-    from fdhil.prediction.error_forecast import ParameterStep, ZoneChange
+    from fdhil.prediction import ParameterStep, ZoneChange
     from fdhil.records import Float, Parameters, Prediction
-    from fdhil.store.history_rows import Comparison, Revision, TimeStamp
+    from fdhil.store import Comparison, Revision, TimeStamp
 
 DAY_S = 86400.0
 FAR_DAYS = 36500.0
@@ -40,7 +40,7 @@ class ProgramHistory:
     @staticmethod
     def read(config: MachineConfig, program_digest: str) -> ProgramHistory:
         """Read the machine's history. Raises StoreError if there is none."""
-        from fdhil.store.history_database import History
+        from fdhil.store import History
 
         with History.open_read_only(config.store.directory, partial(click.echo, err=True)) as history:
             revisions = {axis: history.read_revisions(axis, RECENT) for axis in config.axis}
@@ -57,7 +57,7 @@ def build_comparison(
     zones: Sequence[Mapping[str, Any]],
 ) -> Comparison:
     """Return this prediction as a row of the store; ``zones`` are the JSON entries."""
-    from fdhil.store.history_rows import Comparison, UsedParameters
+    from fdhil.store import Comparison, UsedParameters
 
     newest = {axis: found[-1].set.revision for axis, found in past.revisions.items() if found}
     return Comparison(
@@ -75,8 +75,7 @@ def store_comparison(past: ProgramHistory, now: Comparison, config: MachineConfi
     if past.comparisons and _is_same_basis(past.comparisons[0][1], now):
         return
     from fdhil.errors import StoreError
-    from fdhil.store.history_database import History
-    from fdhil.store.history_rows import TimeStamp
+    from fdhil.store import History, TimeStamp
 
     try:
         with History.open(config.store.directory) as history:
@@ -120,7 +119,7 @@ def compare_zones(
 def _describe_change(
     change: ZoneChange, earlier: Mapping[str, Parameters], models: Mapping[str, Parameters]
 ) -> dict[str, Any]:
-    from fdhil.prediction.model_variants import list_values
+    from fdhil.prediction import list_values
 
     both = {"before": earlier, "now": models}
     values = {when: {axis: list_values(p) for axis, p in of.items()} for when, of in both.items()}
@@ -149,7 +148,7 @@ def show_zone_changes(found: Mapping[str, Any] | None) -> None:
     """Print the zones with significant changes, largest change first, and their causes."""
     if found is None:
         return
-    from fdhil.prediction.correction_gain import format_half_interval
+    from fdhil.prediction import format_half_interval
 
     revisions = ", ".join(f"{axis} {revision}" for axis, revision in found["revisions"].items())
     since = f"since this program was predicted on {found['at'][:10]} (revisions {revisions})"
@@ -252,7 +251,7 @@ def predict_crossings(
 
     ``state`` is over, foreseen, not_foreseen (within ``within_days``) or not_enough_history (of ``compute_observed_days``).
     """
-    from fdhil.identification.trends import limit_forecast_days
+    from fdhil.identification import limit_forecast_days
     from fdhil.prediction import error_forecast
 
     newest = max((found[-1].stamp.wall_s for found in past.revisions.values() if found), default=0.0)

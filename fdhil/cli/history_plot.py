@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fdhil.errors import FdhilError
-from fdhil.report.history_charts import AxisHistory, build_time_chart
-from fdhil.report.typography import typeset_text
-from fdhil.store.output_file import open_output
+from fdhil.report import AxisHistory, build_time_chart, typeset_text
+from fdhil.store import open_output
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -5,23 +5,29 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.config import MachineConfig
-from fdhil.report import Page, Section, Table, write_page_or_pdf
-from fdhil.report.chart import render_svg
-from fdhil.report.condition_summary import IN_ORDER, LATEST_HEAD, Refusals, build_latest_rows, describe_condition
-from fdhil.report.drive_health import build_slope_rows, describe_change
-from fdhil.report.history_charts import (
+from fdhil.report import (
     DAY_PERCENTILES,
+    DISPLAY_UNITS,
+    IN_ORDER,
+    INTERVAL_MEANING,
+    LATEST_HEAD,
     MOST_SINGLE_ESTIMATES,
+    PARAMETER_MEANINGS,
     AxisHistory,
+    Page,
+    Refusals,
+    Section,
+    Table,
+    build_latest_rows,
+    build_slope_rows,
     build_temperature_chart,
     build_time_chart,
-)
-from fdhil.report.parameter_format import (
-    DISPLAY_UNITS,
-    INTERVAL_MEANING,
-    PARAMETER_MEANINGS,
     compute_half_width,
+    describe_change,
+    describe_condition,
     format_cell,
+    render_svg,
+    write_page_or_pdf,
 )
 
 MOST_REVISIONS = 50

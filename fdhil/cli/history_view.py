@@ -7,8 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from fdhil.cli.status_view import make_narrow_table, open_console
-from fdhil.report.drive_health import build_slope_rows, describe_change
-from fdhil.report.parameter_format import format_minute
+from fdhil.report import build_slope_rows, describe_change, format_minute
 
 SHOWN_OPEN, SHOWN_DONE = 10, 5
 

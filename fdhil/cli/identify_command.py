@@ -17,15 +17,14 @@ from fdhil import tables
 from fdhil.cli.cli_errors import require_delivered_answer
 from fdhil.cli.options import AS_JSON, FILE, OutputFile, PictureFile, WritingCommand
 from fdhil.records import INTERVAL_95, get_unit
-from fdhil.report.parameter_format import INTERVAL_MEANING, format_cell, format_heading
-from fdhil.store import file_suffixes
-from fdhil.store.output_file import open_output
+from fdhil.report import INTERVAL_MEANING, format_cell, format_heading
+from fdhil.store import RECORDING_SUFFIXES, open_output
 
 if TYPE_CHECKING:
-    from fdhil.api.recording_analysis import FileResult
+    from fdhil.api import FileResult
     from fdhil.config import Axis, Identification, MachineConfig
     from fdhil.records import Estimate, Verdict
-    from fdhil.store.column_map import ColumnMap
+    from fdhil.store import ColumnMap
 
 PROPOSE = "?"  # of --columns
 BESIDE = "-"  # of --plot without a name
@@ -108,13 +107,12 @@ def identify(
     if columns is not None and column_map is None:
         return 1
     results = _analyse_with_progress(recordings, settings, machine, accelerometer, column_map, any_move=any_move)
-    from fdhil.api.identification_json import build_identification_document
-    from fdhil.api.recording_analysis import compare_with_data_sheet
+    from fdhil.api import build_identification_document, compare_with_data_sheet
 
     if machine is not None:
         results = [compare_with_data_sheet(result, axes) for result in results]
     if with_loops:
-        from fdhil.api.loop_comparison import identify_all_loops
+        from fdhil.api import identify_all_loops
 
         results = identify_all_loops(results, settings, machine)
     if model is not None:
@@ -133,13 +131,13 @@ def identify(
 
 def _read_or_propose_columns(columns: Path | None, recordings: Sequence[Path], *, as_json: bool) -> ColumnMap | None:
     # None: the proposal is to be checked by the user first
-    from fdhil.store.column_map import read_column_map
+    from fdhil.store import read_column_map
 
     if columns is None:
         return None
     if str(columns) != PROPOSE:
         return read_column_map(columns)
-    from fdhil.store.column_proposal import propose_columns
+    from fdhil.store import propose_columns
 
     proposal = propose_columns(recordings[0])
     path = recordings[0].with_suffix(".columns.toml")
@@ -161,7 +159,7 @@ def _read_or_propose_columns(columns: Path | None, recordings: Sequence[Path], *
 def _write_figures(result: FileResult, report: Path | None, plot: Path | None) -> None:
     if result.error is not None or (report is None and plot is None):
         return
-    from fdhil.report.identification_page import build_identification_page, save_picture
+    from fdhil.report import build_identification_page, save_picture
 
     if report is not None:
         reports.write_page(build_identification_page(result), report)
@@ -182,7 +180,7 @@ def _find_recordings(place: Path) -> Iterator[Path]:
     closed: list[Path] = []  # includes a path that is not a folder
     for folder, _, names in os.walk(place, onerror=lambda error: closed.append(Path(error.filename))):
         for file in (Path(folder, name) for name in names if not name.startswith(".")):
-            if file.suffix.lower() in file_suffixes.RECORDING_SUFFIXES and _is_regular_file(file):
+            if file.suffix.lower() in RECORDING_SUFFIXES and _is_regular_file(file):
                 yield file
     yield from closed
 
@@ -232,10 +230,10 @@ def _show_results(results: Sequence[FileResult], axes: Mapping[str, Axis], with_
     from rich import box
     from rich.table import Table
 
-    from fdhil.api.identification_json import count_windows_used, select_usable_estimate
+    from fdhil.api import count_windows_used, select_usable_estimate
     from fdhil.cli.loops_view import show_loops
     from fdhil.cli.printable_console import PrintableConsole
-    from fdhil.identification.rapid_windows import find_moving_range
+    from fdhil.identification import find_moving_range
     from fdhil.records import PARAMETERS
 
     console = PrintableConsole(highlight=False, markup=False)
@@ -301,7 +299,7 @@ def _format_cell(estimate: Estimate, name: str) -> str:
 
 
 def _show_terms(console: Any, result: FileResult) -> None:
-    from fdhil.api.identification_json import select_usable_estimate
+    from fdhil.api import select_usable_estimate
 
     each = ((f"{o.window.start_s:.2f} s", select_usable_estimate(o)) for o in result.outcomes)
     for who, estimate in each if result.pooled is None else (("all", result.pooled),):
@@ -324,8 +322,8 @@ def _show_table_errors(console: Any, result: FileResult) -> None:
 
 
 def _show_reasons(console: Any, result: FileResult) -> None:
-    from fdhil.api.identification_json import describe_voltage_delay
-    from fdhil.validation.signal_plausibility import collect_signal_warnings
+    from fdhil.api import describe_voltage_delay
+    from fdhil.validation import collect_signal_warnings
 
     verdicts = [*(outcome.verdict for outcome in result.outcomes), result.verdict]
     reasons = [r for verdict in verdicts for r in (*verdict.reasons, *verdict.warnings)]

@@ -16,11 +16,7 @@ from fdhil.cli.options import AS_JSON, DEFAULT_CONFIG, FILE, OutputFile, Writing
 from fdhil.errors import ConfigError, ConfigFault, OutputError
 
 if TYPE_CHECKING:
-    from fdhil.commissioning.init.config_assembly import Look
-    from fdhil.commissioning.init.config_draft import ConfigDraft, OperatorQuestion
-    from fdhil.commissioning.init.drive_discovery import FoundBus
-    from fdhil.commissioning.init.linuxcnc_import import LinuxcncMachine
-    from fdhil.commissioning.init.sourced_value import SourcedValue
+    from fdhil.commissioning import ConfigDraft, FoundBus, LinuxcncMachine, Look, OperatorQuestion, SourcedValue
 
 SCHEMA = "fdhil-init-1"
 INTERFACES = Path("/sys/class/net")
@@ -74,8 +70,7 @@ def init(
             text = "exists, and fdhil init never overwrites a file; name another file, or move it away"
             raise OutputError(f"{each} {text}")
     given = machine_config.read_toml(answers, "a file of answers") if answers is not None else {}
-    from fdhil.commissioning.init.config_assembly import finish_draft, make_draft
-    from fdhil.commissioning.init.linuxcnc_import import read_linuxcnc  # late: --help imports nothing heavy
+    from fdhil.commissioning import finish_draft, make_draft, read_linuxcnc
 
     nc = read_linuxcnc(ini) if ini is not None else None
     ask = _ask_operator if answers is None and not as_json else None
@@ -109,7 +104,7 @@ def read_running_pins() -> list[str]:
 
 
 def _build_hal_file(text: str, file: Path, nc: LinuxcncMachine, draft: ConfigDraft) -> str:
-    from fdhil.commissioning.init.hal_file import find_insertions, format_correction_hal
+    from fdhil.commissioning import find_insertions, format_correction_hal
 
     machine = machine_config.parse_config(machine_config.parse_toml(text.encode(), str(file)), str(file), file.parent)
     corrected = [axis for axis, settings in machine.axis.items() if settings.correction is not None]
@@ -122,8 +117,7 @@ def _build_hal_file(text: str, file: Path, nc: LinuxcncMachine, draft: ConfigDra
 
 
 def _make_bus_scanner(places: Sequence[Path], folder: Path) -> Look:
-    from fdhil.commissioning.init.drive_discovery import find_drives
-    from fdhil.commissioning.scan import read_descriptions
+    from fdhil.commissioning import find_drives, read_descriptions
 
     descriptions, faults = read_descriptions(places or [folder])
     if faults and places:
@@ -140,7 +134,7 @@ def _make_bus_scanner(places: Sequence[Path], folder: Path) -> Look:
 
 
 def _find_can_interface() -> SourcedValue | None:
-    from fdhil.commissioning.init.sourced_value import SourcedValue
+    from fdhil.commissioning import SourcedValue
 
     found = [place.parent.name for place in sorted(INTERFACES.glob("*/type")) if place.read_text().strip() == CAN_TYPE]
     source = "this PC's CAN interface" if len(found) == 1 else f"guessed: the first of {', '.join(found)}"

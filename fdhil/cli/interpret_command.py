@@ -30,11 +30,7 @@ def interpret(program: Path, config_path: Path | None, as_document: bool, max_bl
     be interpreted.
     """
     from fdhil.config import Nc, load_config
-    from fdhil.program.budget import Budget
-    from fdhil.program.interpreter import Interpreter
-    from fdhil.program.motions import serialise_motion
-    from fdhil.program.planner.axis_limits import check_motions
-    from fdhil.program.program_notes import ProgramNotes
+    from fdhil.program import Budget, Interpreter, ProgramNotes, check_motions, serialise_motion
 
     config = None if config_path is None else load_config(config_path)
     budget = replace(

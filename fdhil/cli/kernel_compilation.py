@@ -12,10 +12,10 @@ from fdhil import config as machine_config
 from fdhil import tables
 from fdhil.cli.demo.machines import REAL, load_machine_document
 from fdhil.config import MachineConfig
-from fdhil.daemon.kernel_warmup import compile_kernels, simulate_nominal_rapid
+from fdhil.daemon import compile_kernels, simulate_nominal_rapid
 from fdhil.pipeline import analyse_window
 from fdhil.records import SlowVoltage, Window, freeze_array
-from fdhil.sim.simulated_machine import SimulatedMachine
+from fdhil.sim import SimulatedMachine
 
 SLOW_ROWS = 5
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from fdhil.records import INTERVAL_95
 
 if TYPE_CHECKING:
-    from fdhil.api.recording_analysis import FileResult
+    from fdhil.api import FileResult
     from fdhil.config import Axis
 
 
@@ -26,7 +26,7 @@ def show_loops(result: FileResult, axis: Axis | None, console: Any) -> None:
     from rich import box
     from rich.table import Table
 
-    from fdhil.api.loop_comparison import LOOP_UNITS, get_configured_value, list_equivalent_loops
+    from fdhil.api import LOOP_UNITS, get_configured_value, list_equivalent_loops
 
     found = result.loops
     if found is None:

@@ -9,17 +9,12 @@ from typing import Any
 
 import click
 
-from fdhil.api.recording_analysis import FileResult
+from fdhil.api import FileResult
 from fdhil.config import Axis
-from fdhil.identification.drive_loops.loop_identification import (
-    apply_loops,
-    find_changed_regulators,
-    get_regulator_values,
-    is_better_than_configured,
-)
+from fdhil.identification import apply_loops, find_changed_regulators, get_regulator_values, is_better_than_configured
 from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Reason
-from fdhil.store.output_file import open_output
-from fdhil.validation.table_error_budget import LOOPS_DIFFER
+from fdhil.store import open_output
+from fdhil.validation import LOOPS_DIFFER
 
 
 def write_model(results: Sequence[FileResult], axes: Mapping[str, Axis], path: Path) -> None:

@@ -45,9 +45,9 @@ def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
     """
     machine_config.load_config(config)
     with require_fleet_extra():
-        from fdhil.fleet.offer_review import load_current_machine, review_offer
+        from fdhil.fleet import load_current_machine, review_offer
     from fdhil.cli import offers_view
-    from fdhil.store.change_offers import list_offers
+    from fdhil.store import list_offers
 
     machine = load_current_machine(config)
     found = [review_offer(place, machine) for place in (*list_offers(machine.config.offers_directory), *files)]
@@ -72,7 +72,7 @@ def accept(config: Path, offer: Path, by: str, may_loosen: bool, as_json: bool) 
     machine = machine_config.load_config(config)
     by, place = _validate_text("--by", by, MOST_BY), _find_offer_file(machine, offer)
     with require_fleet_extra():
-        from fdhil.fleet.offer_review import accept_offer as write
+        from fdhil.fleet import accept_offer as write
     from fdhil.cli import offers_view
 
     with audit_action(machine, "accept an offer", offer=str(offer), by=by) as ended:
@@ -99,7 +99,7 @@ def reject(config: Path, offer: Path, by: str, reason: str, as_json: bool) -> No
         _validate_text("--reason", reason, MOST_REASON),
     )
     with require_fleet_extra():
-        from fdhil.fleet.offer_review import reject_offer as note
+        from fdhil.fleet import reject_offer as note
     with audit_action(machine, "reject an offer", offer=str(offer), by=by) as ended:
         done = note(place, config, by, reason)
         ended["text"] = reason
@@ -110,7 +110,7 @@ def reject(config: Path, offer: Path, by: str, reason: str, as_json: bool) -> No
 
 
 def _validate_text(option: str, text: str, most: int) -> str:
-    from fdhil.daemon.service_log import escape_unprintable
+    from fdhil.daemon import escape_unprintable
 
     if not text.strip() or len(text) > most:
         raise ConfigError(option, [ConfigFault(option, "is empty or too long", f"at most {most} characters")])
@@ -118,7 +118,7 @@ def _validate_text(option: str, text: str, most: int) -> str:
 
 
 def _find_offer_file(machine: MachineConfig, offer: Path) -> Path:
-    from fdhil.store.change_offers import list_offers
+    from fdhil.store import list_offers
 
     if offer.suffix == ".offer" or offer.name != str(offer):
         return offer

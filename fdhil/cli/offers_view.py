@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil.config import MachineConfig
-from fdhil.daemon.service_log import escape_unprintable
+from fdhil.daemon import escape_unprintable
 
 if TYPE_CHECKING:
-    from fdhil.fleet.offer_review import ReviewedOffer, ValueChange
+    from fdhil.fleet import ReviewedOffer, ValueChange
 
 NOTHING_ARMED = "nothing is armed"
 RESTART = "restart the daemon, which still uses the old configuration: systemctl restart fdhil"
@@ -38,7 +38,7 @@ def print_offers(found: Sequence[ReviewedOffer], machine: MachineConfig, as_json
 
 def print_acceptance(done: ReviewedOffer, before: MachineConfig, file: Path, as_json: bool) -> None:
     """Print the accepted changes and the next action."""
-    from fdhil.fleet.offer_review import build_backup_path
+    from fdhil.fleet import build_backup_path
 
     assert done.offer is not None
     kept = str(build_backup_path(file, done.offer)) if done.changes else None
@@ -63,7 +63,7 @@ def summarise_changes(done: ReviewedOffer) -> str:
 
 def describe_voided_items(old: MachineConfig, new: MachineConfig) -> Iterator[str]:
     """Yield what a change of the configuration invalidates, as text."""
-    from fdhil.commissioning.commissioning_record import build_record_path, compute_axis_digest
+    from fdhil.commissioning import build_record_path, compute_axis_digest
 
     for axis in new.axis:
         if build_record_path(new.store.directory, axis).exists() and compute_axis_digest(

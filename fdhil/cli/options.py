@@ -11,7 +11,7 @@ import click
 
 from fdhil.cli.cli_errors import is_json_requested
 from fdhil.errors import ConfigError, ConfigFault
-from fdhil.store.output_file import check_output
+from fdhil.store import check_output
 
 DEFAULT_CONFIG = Path("machine.toml")
 

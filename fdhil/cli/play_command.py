@@ -21,12 +21,10 @@ from fdhil.cli.operator_prompt import ask_yes_no, wait_for_bus_watch
 from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FILE
 from fdhil.cli.terminal_text import print_progress
 from fdhil.errors import DeviceError, DriveFault
-from fdhil.guard.guard_protocol import SOCKET_NAME
+from fdhil.guard import SOCKET_NAME
 
 if TYPE_CHECKING:
-    from fdhil.commissioning.commissioning_record import CommissioningRecord
-    from fdhil.commissioning.demand_playback import Bench, PlaybackPlan, PlaybackResult
-    from fdhil.commissioning.set_points import SetPointGenerator
+    from fdhil.commissioning import Bench, CommissioningRecord, PlaybackPlan, PlaybackResult, SetPointGenerator
     from fdhil.config import MachineConfig
 
 NOBODY = "standard input has ended, so Enter cannot be pressed; nothing was played; run it without --hold"
@@ -63,7 +61,7 @@ def play(
     meanwhile.
     """
     machine = machine_config.load_config(config_path)
-    from fdhil.commissioning.demand_playback import plan_playback
+    from fdhil.commissioning import plan_playback
     from fdhil.program import load_trajectory
 
     try:
@@ -85,10 +83,9 @@ def play(
 def _run_play(
     machine: MachineConfig, plan: PlaybackPlan, program: Path, go_to_start: bool, hold: bool, yes: bool
 ) -> PlaybackResult:
-    from fdhil.arming.guard_presence import GuardPresence
+    from fdhil.arming import GuardPresence
     from fdhil.cli.bus_lock import lock_bus_part
-    from fdhil.commissioning.demand_playback import load_valid_records, open_bench
-    from fdhil.commissioning.realtime_scheduling import lock_realtime_resources
+    from fdhil.commissioning import load_valid_records, lock_realtime_resources, open_bench
 
     records = load_valid_records(machine)
     with ExitStack() as held, _raise_on_signals():
@@ -135,7 +132,7 @@ def _confirm_records(
 
     The doubts of the guard and of the store are read before each comparison, so later doubts remain.
     """
-    from fdhil.commissioning.void_mark import clear_void_mark, read_void_mark
+    from fdhil.commissioning import clear_void_mark, read_void_mark
 
     try:
         refused = _report_to_guard(machine, records, as_compared)
@@ -158,8 +155,7 @@ def _report_to_guard(
     machine: MachineConfig, records: Mapping[str, CommissioningRecord], as_compared: Callable[[], set[str]]
 ) -> Sequence[Mapping[str, str]]:
     """Report the compared drives to a running guard; return its refusals. Raises DeviceError."""
-    from fdhil.arming.guard_client import GuardClient
-    from fdhil.arming.operator_token import get_operator_token
+    from fdhil.arming import GuardClient, get_operator_token
 
     directory = machine.guard_directory
     if not (directory / SOCKET_NAME).exists():
@@ -175,7 +171,7 @@ def _report_to_guard(
 @contextmanager
 def _raise_on_signals() -> Iterator[None]:
     # while the axes stand, SIGTERM and a closed terminal act like Ctrl-C
-    from fdhil.commissioning.axis_motion import handle_signals
+    from fdhil.commissioning import handle_signals
 
     with handle_signals(signal.default_int_handler):
         yield
@@ -184,7 +180,7 @@ def _raise_on_signals() -> Iterator[None]:
 @contextmanager
 def _brake_on_signals(path: SetPointGenerator) -> Iterator[None]:
     # while the axes move, every signal brakes them
-    from fdhil.commissioning.axis_motion import handle_signals
+    from fdhil.commissioning import handle_signals
 
     with handle_signals(lambda number, _frame: path.brake_to_rest(SIGNALS[number])):
         yield

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import tables
-from fdhil.api.compilation_notice import announce_compilation
+from fdhil.api import announce_compilation
 from fdhil.cli.cli_errors import require_delivered_answer
 from fdhil.cli.options import (
     AS_JSON,
@@ -25,13 +25,12 @@ from fdhil.cli.options import (
     WritingCommand,
 )
 from fdhil.records import INTERVAL_95
-from fdhil.report.parameter_format import INTERVAL_MEANING
+from fdhil.report import INTERVAL_MEANING
 
 if TYPE_CHECKING:
     from fdhil.cli.history_forecast import ProgramHistory
     from fdhil.config import MachineConfig
-    from fdhil.prediction.correction_gain import CorrectionGain
-    from fdhil.prediction.error_forecast import ParameterStep
+    from fdhil.prediction import CorrectionGain, ParameterStep
     from fdhil.records import Correction, Float, Parameters, Prediction, Trajectory
 
 MANY_ZONES = 12
@@ -107,7 +106,7 @@ def predict(options: PredictionOptions, sensitivity: bool, tolerance_um: float |
         options.program, options.config_path, options.model_path, options.from_history
     )
     from fdhil import prediction
-    from fdhil.correction.result_documents import build_prediction_document
+    from fdhil.correction import build_prediction_document
 
     announce_compilation("predict")
     predicted = prediction.predict_path(reference, models, config)
@@ -195,10 +194,10 @@ def correct(options: PredictionOptions, method: str | None) -> int:
         options.program, options.config_path, options.model_path, options.from_history
     )
     from fdhil import correction
-    from fdhil.api.machine_interface import find_held_out_max_um
-    from fdhil.correction.result_documents import build_correction_document
-    from fdhil.prediction.axis_models import load_model_file
-    from fdhil.store.history_gain import predict_gain_from_history
+    from fdhil.api import find_held_out_max_um
+    from fdhil.correction import build_correction_document
+    from fdhil.prediction import load_model_file
+    from fdhil.store import predict_gain_from_history
 
     announce_compilation("predict", "correct")
     held_out_um = {} if options.model_path is None else load_model_file(options.model_path).held_out_um
@@ -226,8 +225,7 @@ def _write_report(
     if options.report is None and options.pdf is None:
         return
     from fdhil.records import Prediction
-    from fdhil.report import write_page_or_pdf
-    from fdhil.report.path_report import build_correction_page, build_prediction_page
+    from fdhil.report import build_correction_page, build_prediction_page, write_page_or_pdf
 
     name, machine = options.program.name, config.machine.name
     parameters = "the nominal parameters of the configuration"
@@ -248,7 +246,7 @@ def load_inputs(
     """Read configuration, model and reference, in this order; loops of the model replace those of the configuration."""
     if model_path is not None and from_history:
         raise click.UsageError("--model and --from-history exclude each other; give only one of them")
-    from fdhil.api.machine_interface import Machine, read_inputs
+    from fdhil.api import Machine, read_inputs
 
     print_note = functools.partial(click.echo, err=True)
 
@@ -291,7 +289,7 @@ def _build_correction_columns(planned: Correction) -> dict[str, tuple[Float, int
 def _write_columns(path: Path, columns: Mapping[str, tuple[Float, int]]) -> None:
     import numpy as np
 
-    from fdhil.store.output_file import open_output
+    from fdhil.store import open_output
 
     # adding 0 after rounding turns -0.0000 into 0.0000
     values = np.column_stack([np.round(values, decimals) + 0.0 for values, decimals in columns.values()])
@@ -304,15 +302,15 @@ def _show_prediction(
     predicted: Prediction, zones: Sequence[Mapping[str, Any]] | None = None, tolerance_um: float | None = None
 ) -> None:
     from fdhil.cli.history_forecast import format_crossing
-    from fdhil.correction import result_documents
-    from fdhil.prediction.correction_gain import format_half_interval
+    from fdhil.correction import build_contour_document, build_zone_documents
+    from fdhil.prediction import format_half_interval
 
-    contour, time_s = result_documents.build_contour_document(predicted), predicted.reference.time_s
+    contour, time_s = build_contour_document(predicted), predicted.reference.time_s
     click.echo(
         f"{time_s[-1] - time_s[0]:.2f} s of path: contour error {contour['rms_um']:.1f} um RMS,"
         f" {contour['max_um']:.1f} um at most" + (f"; {INTERVAL_MEANING}" if zones and "std_um" in zones[0] else "")
     )
-    entries = result_documents.build_zone_documents(predicted) if zones is None else zones
+    entries = build_zone_documents(predicted) if zones is None else zones
     shown = sorted(sorted(entries, key=lambda zone: -zone["max_um"])[:MANY_ZONES], key=lambda zone: zone["start_s"])
     for note in predicted.reference.notes:
         click.echo(f"note, {note}; {note.advice}", err=True)
@@ -340,7 +338,7 @@ def _describe_sensitivity(per_axis: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def _show_correction(planned: Correction, predicted: CorrectionGain, models: Mapping[str, Parameters]) -> None:
-    from fdhil.correction import result_documents
+    from fdhil.correction import build_contour_document, list_prediction_points
 
     _show_prediction(planned.before)
     for reason in planned.warnings:
@@ -349,9 +347,9 @@ def _show_correction(planned: Correction, predicted: CorrectionGain, models: Map
         click.echo(f"refused, {reason}; {reason.advice}")
     if not planned.refused:
         sure = "" if predicted.at_least is None else f", at least {predicted.at_least:.1f} times better"
-        most = f"{result_documents.build_contour_document(planned.after)['max_um']:.1f} um at most"
+        most = f"{build_contour_document(planned.after)['max_um']:.1f} um at most"
         click.echo(f"predicted with the {planned.method} correction: {predicted}; {most}{sure}")
-        blind = [axis for axis, where in result_documents.list_prediction_points(models).items() if where == "encoder"]
+        blind = [axis for axis, where in list_prediction_points(models).items() if where == "encoder"]
         if blind:
             text = f"this applies at the encoders of {', '.join(blind)}, which do not measure oscillation of the table"
             click.echo(f"{text}; if the table oscillates behind its motor, set resonance_hz of the axis")

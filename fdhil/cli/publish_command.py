@@ -36,8 +36,8 @@ def publish(protocol: str, config: Path, devices: Path | None, as_json: bool) ->
     if devices is not None:
         _write_devices(machine, devices)
         return
-    from fdhil.daemon import service_log
-    from fdhil.shopfloor.publisher_process import run_publisher
+    from fdhil.daemon import write_lines_as_json
+    from fdhil.shopfloor import run_publisher
 
     try:
         publisher = tables.load_entry(tables.PUBLISHERS, protocol)
@@ -45,13 +45,13 @@ def publish(protocol: str, config: Path, devices: Path | None, as_json: bool) ->
         extra = EXTRAS.get(protocol, protocol)
         what = f"fdhil publish {protocol} needs the library {error.name}, which is not installed"
         raise FdhilError(f"{what}: pip install 'fdhil[{extra}]'") from None
-    with service_log.write_lines_as_json(as_json):
+    with write_lines_as_json(as_json):
         run_publisher(publisher, machine)
 
 
 def _write_devices(machine: MachineConfig, file: Path) -> None:
-    from fdhil.shopfloor.mtconnect_adapter import build_agent_devices
-    from fdhil.store.output_file import open_output
+    from fdhil.shopfloor import build_agent_devices
+    from fdhil.store import open_output
 
     with open_output(file) as written:
         written.write(build_agent_devices(machine).encode())

@@ -13,8 +13,7 @@ from fdhil.cli.cli_errors import require_delivered_answer
 from fdhil.cli.options import AS_JSON, CONFIG, OutputFile, PositiveFloat, WritingCommand
 
 if TYPE_CHECKING:
-    from fdhil.drivers import Record
-    from fdhil.drivers.demand_recorder import DemandRecorder, RecordedDemand
+    from fdhil.drivers import DemandRecorder, Record, RecordedDemand
 
 _SHOWN_GAPS = 5
 NOTHING_MOVED = "nothing moved; start the program on the NC while the recording waits"
@@ -44,7 +43,7 @@ def record(config: Path, out: Path, seconds: float | None, rest: float, with_gap
     machine = machine_config.load_config(config)
     import asyncio
 
-    from fdhil.drivers.demand_recorder import DemandRecorder
+    from fdhil.drivers import DemandRecorder
 
     recorder = DemandRecorder(machine, rest)
     asyncio.run(_record_demand(machine, recorder, seconds))
@@ -52,7 +51,7 @@ def record(config: Path, out: Path, seconds: float | None, rest: float, with_gap
     written = recorded is not None and (with_gaps or recorded.is_complete)
     if recorded is not None and written:
         from fdhil.program import write_demand_csv
-        from fdhil.store.output_file import open_output
+        from fdhil.store import open_output
 
         with open_output(out) as file:
             write_demand_csv(recorded.reference, file)

@@ -16,7 +16,7 @@ from fdhil.cli.options import CONFIG, FILE, OutputFile, WritingCommand
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from fdhil.sim.simulator_service import SimulatorService
+    from fdhil.sim import SimulatorService
 
 LINGER_S = 10.0
 LOOK_S = 0.1
@@ -64,11 +64,10 @@ def _run_simulator(path: Path, as_json: bool, script: Path | None, play: Path | 
 
     from fdhil import config
     from fdhil.program import load_trajectory
-    from fdhil.sim import fault_script
-    from fdhil.sim.simulator_service import SimulatorService
+    from fdhil.sim import SimulatorService, load_script
 
     machine = config.load_config(path)
-    entries = [] if script is None else fault_script.load_script(script, tuple(machine.axis))
+    entries = [] if script is None else load_script(script, tuple(machine.axis))
 
     service = SimulatorService(
         machine,

@@ -12,7 +12,7 @@ from rich.table import Table
 from fdhil.cli.loops_view import format_loop_status
 from fdhil.cli.printable_console import PrintableConsole
 from fdhil.records import PARAMETERS
-from fdhil.report.parameter_format import INTERVAL_MEANING, compute_half_width, format_cell, format_heading
+from fdhil.report import INTERVAL_MEANING, compute_half_width, format_cell, format_heading
 
 BARS = "▁▂▃▄▅▆▇█"
 COURSE = 7  # revisions in a sparkline, limited by the column width

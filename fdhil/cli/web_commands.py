@@ -9,8 +9,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.options import AS_JSON, CONFIG, ConfigFirstCommand
-from fdhil.config.user_file import Role
-from fdhil.config.web_section import Web
+from fdhil.config import Role, Web
 from fdhil.errors import ConfigError, ConfigFault
 
 
@@ -28,9 +27,9 @@ def web(config: Path, host: str | None, port: int | None, as_json: bool) -> None
     """
     machine = machine_config.load_config(config)
     machine = machine.model_copy(update={"web": override_address(machine.web, host, port)})
-    from fdhil.web import serving  # late: --help imports nothing heavy
+    from fdhil.web import serve_machine  # late: --help imports nothing heavy
 
-    serving.serve_machine(machine, lambda url: print_address(machine.machine.name, url, as_json))
+    serve_machine(machine, lambda url: print_address(machine.machine.name, url, as_json))
 
 
 def print_address(name: str, url: str, as_json: bool) -> None:
@@ -68,19 +67,24 @@ def set_web_user(web: Web, config: Path, name: str, role: Role, remove: bool, as
     if path is None:
         fault = ConfigFault("web.users_file", "is missing", 'add users_file = "web-users.json" to [web]')
         raise ConfigError(str(config), [fault])
-    from fdhil.config import user_file
+    from fdhil.config import (
+        LONGEST_PASSWORD,
+        SHORTEST_PASSWORD,
+        USER_NAME_PATTERN,
+        hash_password,
+        read_users,
+        write_users,
+    )
 
-    if re.fullmatch(user_file.USER_NAME_PATTERN, name) is None:
+    if re.fullmatch(USER_NAME_PATTERN, name) is None:
         raise click.BadParameter("a name may contain letters, digits, . _ @ and -, at most 64 characters")
-    users_by_name = dict(user_file.read_users(path)) if path.exists() else {}
+    users_by_name = dict(read_users(path)) if path.exists() else {}
     if remove:
         if users_by_name.pop(name, None) is None:
             raise click.BadParameter(f"there is no user {name}")
     else:
-        users_by_name[name] = user_file.hash_password(
-            _ask_password(user_file.SHORTEST_PASSWORD, user_file.LONGEST_PASSWORD), role
-        )
-    user_file.write_users(path, users_by_name)
+        users_by_name[name] = hash_password(_ask_password(SHORTEST_PASSWORD, LONGEST_PASSWORD), role)
+    write_users(path, users_by_name)
     if as_json:
         document = {"schema": "fdhil-web-user-1", "user": name, "role": None if remove else role, "file": str(path)}
         click.echo(json.dumps(document))

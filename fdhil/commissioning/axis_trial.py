@@ -38,7 +38,7 @@ from fdhil.commissioning.stroke_planning import Stroke, TravelRoom, plan_jog, pl
 from fdhil.commissioning.sync_timing import assess_answer_delay, assess_sync_jitter, measure_timing
 from fdhil.commissioning.watchdog import watch_heartbeat
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.bus_listener import ListeningBus
+from fdhil.drivers import ListeningBus
 from fdhil.errors import DeviceError, DriveFault, StoreError
 from fdhil.pipeline import PipelineState
 from fdhil.records import Outcome, Recording

@@ -11,9 +11,7 @@ from collections.abc import Callable, Iterator
 from fdhil import cia402
 from fdhil.commissioning.traffic_listener import classify_master_frame
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.frame_ring import FrameRing
-from fdhil.drivers.cia402.drive_profile import DriveProfile
-from fdhil.drivers.cia402.drive_profile_file import load_profile
+from fdhil.drivers import DriveProfile, FrameRing, load_profile
 from fdhil.errors import ConfigError, EdsError, ForeignMaster
 
 _DOWNLOAD = 1  # command specifier of an SDO request that writes (CiA 301, 7.2.4.3.3)

@@ -20,8 +20,7 @@ from fdhil.cia402 import (
 )
 from fdhil.commissioning.finding import Finding
 from fdhil.config import MachineConfig
-from fdhil.drivers.cia402.drive_profile import DriveProfile, PdoSpec
-from fdhil.drivers.cia402.drive_profile_file import load_profile
+from fdhil.drivers import DriveProfile, PdoSpec, load_profile
 from fdhil.errors import ConfigError, ConfigFault
 
 POINT = "identifiers"

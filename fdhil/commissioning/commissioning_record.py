@@ -19,9 +19,9 @@ from typing import Any
 from fdhil import tables
 from fdhil.commissioning.void_mark import clear_void_mark, is_record_void, read_void_mark
 from fdhil.config import Drive, MachineConfig
-from fdhil.drivers.cia402.drive_profile_file import load_profile
+from fdhil.drivers import load_profile
 from fdhil.errors import StoreError
-from fdhil.store.atomic_file import make_folder, make_store_error, sync_folder, write_file
+from fdhil.store import make_folder, make_store_error, sync_folder, write_file
 
 SCHEMA = "fdhil-commissioning-2"
 UNSEALED = "fdhil-commissioning-1"

@@ -33,7 +33,7 @@ from fdhil.commissioning.set_points import plan_straight_move
 from fdhil.commissioning.step_progress import Found, StepProgress
 from fdhil.commissioning.watchdog import run_watchdog_test
 from fdhil.config import CorrectionLimits, MachineConfig
-from fdhil.drivers.cia402.drive_profile_file import NO_OFFSET_ADVICE, explain_missing_offset, load_profile
+from fdhil.drivers import NO_OFFSET_ADVICE, explain_missing_offset, load_profile
 from fdhil.errors import DeviceError, DriveFault, ForeignMaster, ProtocolError
 
 SIGN_TEST_UM = 10.0

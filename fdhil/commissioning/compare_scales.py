@@ -6,7 +6,7 @@ from functools import partial
 from fdhil.cia402 import Object
 from fdhil.commissioning.finding import Finding, read_optional, report_missing_object
 from fdhil.commissioning.master import Master
-from fdhil.drivers.cia402.drive_profile import decode_speed_unit
+from fdhil.drivers import decode_speed_unit
 
 DC_LINK_TOLERANCE = 0.05
 Read = Callable[[int, int], int | None]

@@ -18,14 +18,10 @@ from fdhil.commissioning.record_comparison import RECORD_POINT, compare_record
 from fdhil.commissioning.sync_timing import assess_sync_jitter
 from fdhil.commissioning.traffic_listener import LISTEN_S, BusListener, BusTraffic
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.bus_listener import ListeningBus
-from fdhil.drivers.cia402.drive_profile import DriveProfile, PdoSpec
-from fdhil.drivers.cia402.drive_profile_file import load_profile
-from fdhil.drivers.moves import load_event_source
-from fdhil.drivers.sensor_source import Sensor, create_sensors
+from fdhil.drivers import DriveProfile, ListeningBus, PdoSpec, Sensor, create_sensors, load_event_source, load_profile
 from fdhil.errors import DeviceError, ForeignMaster, StoreError
-from fdhil.identification.drive_loops.loop_identification import compare_with_configuration, is_better_than_configured
-from fdhil.store.history_database import History
+from fdhil.identification import compare_with_configuration, is_better_than_configured
+from fdhil.store import History
 
 RATE_TOLERANCE = 0.1
 PERIOD_TOLERANCE = 0.02

@@ -25,7 +25,7 @@ from fdhil.commissioning.offset_writers import (
 )
 from fdhil.commissioning.traffic_listener import UNREADABLE
 from fdhil.config import CorrectionLimits
-from fdhil.drivers.cia402.drive_profile import DriveProfile, PdoSpec
+from fdhil.drivers import DriveProfile, PdoSpec
 from fdhil.errors import ConnectError, DeviceTimeout, DriveFault, ForeignMaster, ProtocolError, SdoAbort
 
 LISTEN_S = 2.0

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from fdhil.cia402 import Object
 from fdhil.commissioning.drive_survey import read_pdos
 from fdhil.commissioning.master import Master
-from fdhil.drivers.cia402.drive_profile import PdoSpec
+from fdhil.drivers import PdoSpec
 from fdhil.errors import DeviceError, DriveFault, ProtocolError, SdoAbort
 
 INVALID_COB_ID = 0x80000000

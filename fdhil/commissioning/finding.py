@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from fdhil.commissioning.master import Master
-from fdhil.drivers.can.sdo_channel import NO_OBJECT, NO_SUB_INDEX
+from fdhil.drivers import NO_OBJECT, NO_SUB_INDEX
 from fdhil.errors import SdoAbort
 
 

@@ -17,8 +17,7 @@ from fdhil.cia402 import COB_SYNC, pack_pdo, unpack_pdo
 from fdhil.commissioning.commissioning_record import CommissioningRecord, compute_axis_digest
 from fdhil.commissioning.transmit import SocketcandSender
 from fdhil.config import MachineConfig, OffsetBounds
-from fdhil.drivers.can.frame_ring import FrameRing
-from fdhil.drivers.cia402.drive_profile_file import load_profile
+from fdhil.drivers import FrameRing, load_profile
 from fdhil.errors import DriveFault
 
 STEPS_UM = (10.0, 50.0)  # the second if friction holds the axis against the first

@@ -8,8 +8,7 @@ from typing import Self
 from fdhil.config import MachineConfig
 from fdhil.drivers import open_machine
 from fdhil.errors import DeviceError
-from fdhil.pipeline import Record
-from fdhil.pipeline.sample_buffer import SampleBuffer
+from fdhil.pipeline import Record, SampleBuffer
 from fdhil.records import AxisSamples, NcState, Notice, Recording, TableSamples, TickTimes, VoltageSamples
 
 LONGEST_S = 600.0

@@ -15,10 +15,7 @@ from fdhil import cia402
 from fdhil.commissioning.bus_watch import find_offset_cob_ids
 from fdhil.commissioning.sync_cycle import SyncCycle
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.frame_ring import ERROR_FLAG
-from fdhil.drivers.can.sdo_channel import SdoChannel
-from fdhil.drivers.cia402.drive_profile import DriveProfile
-from fdhil.drivers.cia402.drive_profile_file import load_profile
+from fdhil.drivers import ERROR_FLAG, DriveProfile, SdoChannel, load_profile
 from fdhil.errors import DeviceTimeout, ForeignMaster
 
 

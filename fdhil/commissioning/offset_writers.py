@@ -13,10 +13,7 @@ from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.traffic_listener import BusTraffic
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.sdo_channel import NO_OBJECT, NO_SUB_INDEX
-from fdhil.drivers.cia402.device_description import read_device
-from fdhil.drivers.cia402.drive_profile import LOGICAL_AXIS_PDOS, DriveProfile
-from fdhil.drivers.cia402.drive_profile_file import load_profile
+from fdhil.drivers import LOGICAL_AXIS_PDOS, NO_OBJECT, NO_SUB_INDEX, DriveProfile, load_profile, read_device
 from fdhil.errors import SdoAbort
 
 POINT = "offset writers"

@@ -17,7 +17,7 @@ from fdhil.commissioning.drive_survey import (
 )
 from fdhil.commissioning.finding import read_optional
 from fdhil.commissioning.master import Master
-from fdhil.drivers.cia402.drive_profile import PdoSpec
+from fdhil.drivers import PdoSpec
 from fdhil.errors import DeviceError, DriveFault, ProtocolError, SdoAbort
 
 NO_REMOTE_REQUEST = 1 << 30

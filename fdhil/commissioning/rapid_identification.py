@@ -7,8 +7,7 @@ from typing import Any
 
 from fdhil.config import Identification, MachineConfig
 from fdhil.errors import DriveFault
-from fdhil.identification.estimators.maximum_likelihood import fit_windows
-from fdhil.identification.voltage_delay import score_delay
+from fdhil.identification import fit_windows, score_delay
 from fdhil.pipeline import AxisPipeline, PipelineState, Record
 from fdhil.records import PARAMETERS, Outcome, ParameterSet, Skill, WindowOutcome, get_unit
 

@@ -19,7 +19,7 @@ from fdhil.commissioning.offset_writers import compare_traffic_writers
 from fdhil.commissioning.traffic_listener import BusListener, BusTraffic
 from fdhil.commissioning.void_mark import clear_void_mark, mark_record_void, read_void_mark
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.bus_listener import ListeningBus
+from fdhil.drivers import ListeningBus
 from fdhil.errors import DeviceError, ForeignMaster, StoreError
 
 RECORD_POINT = "commissioning record"

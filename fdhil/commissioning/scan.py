@@ -15,8 +15,7 @@ from fdhil.commissioning.drive_survey import DeviceIdentity
 from fdhil.commissioning.traffic_listener import LISTEN_S, BusListener, BusTraffic
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import CanBus, MachineConfig
-from fdhil.drivers.can.frame_ring import Frames
-from fdhil.drivers.can.sdo_channel import SdoChannel
+from fdhil.drivers import Frames, SdoChannel
 from fdhil.eds import read_eds
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, EdsError, ForeignMaster, ProtocolError
 

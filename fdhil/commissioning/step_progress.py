@@ -15,7 +15,7 @@ from typing import Any
 
 from fdhil.commissioning.commissioning_record import KEY_NAME, load_sealing_key
 from fdhil.errors import StoreError
-from fdhil.store.atomic_file import make_folder, write_file
+from fdhil.store import make_folder, write_file
 
 SCHEMA = "fdhil-commissioning-steps-1"
 MAX_BYTES = 256 * 1024

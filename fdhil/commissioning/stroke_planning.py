@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from fdhil.config import Axis, MachineConfig
 from fdhil.errors import DriveFault
-from fdhil.identification.rapid_windows import PLATEAU_S, RAPID_SHARE
+from fdhil.identification import PLATEAU_S, RAPID_SHARE
 
 JOG_MM = 5.0
 LEAST_JOG_MM = 0.5

@@ -7,7 +7,7 @@ import numpy as np
 
 from fdhil.cia402 import COB_SYNC
 from fdhil.commissioning.finding import Finding
-from fdhil.drivers.can.frame_ring import Frames
+from fdhil.drivers import Frames
 from fdhil.records import Float, freeze_array
 
 LONGEST = 3.0  # periods between two SYNCs: after a longer gap the guard ends a correction

@@ -10,8 +10,7 @@ from typing import Self
 import numpy as np
 
 from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SDO_RESPONSE, COB_SYNC, Nmt
-from fdhil.drivers.can.bus_listener import ListeningBus
-from fdhil.drivers.can.frame_ring import ERROR_FLAG, REMOTE_FLAG, Frames
+from fdhil.drivers import ERROR_FLAG, REMOTE_FLAG, Frames, ListeningBus
 from fdhil.errors import ConnectError
 
 LISTEN_S = 2.5  # a heartbeat of one second comes twice

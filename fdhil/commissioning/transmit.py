@@ -14,12 +14,17 @@ import can
 
 from fdhil import config
 from fdhil.commissioning.bus_watch import BusWatch, WatchedRing
-from fdhil.drivers.can.bus_listener import ListeningBus
-from fdhil.drivers.can.frame_ring import FrameRing
-from fdhil.drivers.can.python_can_port import VirtualPort
-from fdhil.drivers.can.receive_port import Filter, ReceivePort
-from fdhil.drivers.can.socketcan_port import CAN_FRAME, SocketCanPort
-from fdhil.drivers.can.socketcand_port import CONNECT_TIMEOUT_S, SocketcandPort
+from fdhil.drivers import (
+    CAN_FRAME,
+    CONNECT_TIMEOUT_S,
+    Filter,
+    FrameRing,
+    ListeningBus,
+    ReceivePort,
+    SocketcandPort,
+    SocketCanPort,
+    VirtualPort,
+)
 from fdhil.errors import ConnectError, DeviceError
 
 LOOK_S = 0.25  # listening time before the first frame is sent: any NC's SYNC arrives meanwhile

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from fdhil.errors import StoreError
-from fdhil.store.atomic_file import make_folder, sync_folder
+from fdhil.store import make_folder, sync_folder
 
 MOST_BYTES, MOST_REASON = 64 * 1024, 300
 

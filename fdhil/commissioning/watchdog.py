@@ -7,7 +7,7 @@ from fdhil.cia402 import NmtCommand, Object, PowerState, describe_emergency
 from fdhil.commissioning.axis_motion import EMCY_HEARTBEAT
 from fdhil.commissioning.drive_survey import require_enabled
 from fdhil.commissioning.master import Master
-from fdhil.drivers.can.sdo_channel import NO_OBJECT, NO_SUB_INDEX
+from fdhil.drivers import NO_OBJECT, NO_SUB_INDEX
 from fdhil.errors import DeviceError, DriveFault, SdoAbort
 
 FEEDING_TRIES = 4

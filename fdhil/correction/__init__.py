@@ -1,8 +1,8 @@
 """Plans offsets that compensate the predicted path error: methods, limits, the gate."""
 
-from __future__ import annotations
+import lazy_loader
 
-from fdhil.correction.correction_planner import plan_correction
-from fdhil.correction.plan_limits import PlanLimits, check_offsets
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-__all__ = ["PlanLimits", "check_offsets", "plan_correction"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -16,8 +16,7 @@ from fdhil.config import Axis
 from fdhil.correction.linear_loop import LoopInverse
 from fdhil.correction.plan_limits import PlanLimits, check_offsets, fit_within_limits
 from fdhil.correction.stiction_hold import StictionHold, run_with_offset
-from fdhil.model.closed_loop import PreparedDrive, Response, State
-from fdhil.model.closed_loop_kernels import SPEED, TABLE_SPEED
+from fdhil.model import SPEED, TABLE_SPEED, PreparedDrive, Response, State
 from fdhil.records import Bool, Float, Parameters
 
 ITERATIONS = 8

@@ -20,8 +20,8 @@ from fdhil.correction.block_solver import AxisLoop, BlockSolution
 from fdhil.correction.inverse import AxisInversePlanner, compute_common_delay_s, count_block_rows, delay_path
 from fdhil.correction.mirror import build_lag_reason
 from fdhil.correction.plan_limits import check_offsets
-from fdhil.model.closed_loop import Commands, Response, State, create_standstill_state
-from fdhil.prediction.contour_error import WINDOW_S, compute_contour_error_um
+from fdhil.model import Commands, Response, State, create_standstill_state
+from fdhil.prediction import WINDOW_S, compute_contour_error_um
 from fdhil.records import Float, Parameters, Reason, compute_table_path
 
 LIMITED_S = 0.02  # longer limiting within a block is not settling

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, maximum_filter1d
 
 from fdhil.config import MachineConfig, find_share_fault
-from fdhil.prediction.inverse_dynamics import compute_required_shares, find_feasible_feed_share
+from fdhil.prediction import compute_required_shares, find_feasible_feed_share
 from fdhil.records import Bool, Float, Parameters, Prediction, Reason, Trajectory
 
 STEADY_S = 0.02  # a limit that acts for less in total has no lasting effect

@@ -11,7 +11,7 @@ from fdhil.config import MachineConfig
 from fdhil.correction import correction_gate
 from fdhil.correction.correction_method import CorrectionMethod, MethodPlan
 from fdhil.correction.plan_limits import fit_all_axes
-from fdhil.prediction.path_prediction import predict_corrected_path, predict_path
+from fdhil.prediction import predict_corrected_path, predict_path
 from fdhil.records import Correction, Float, Parameters, Prediction, Reason, Trajectory, freeze_array
 
 MASK_PASSES = 3

@@ -20,7 +20,7 @@ import numpy as np
 
 from fdhil.config import Axis, MachineConfig
 from fdhil.correction.correction_method import MethodPlan
-from fdhil.prediction.model_variants import average_friction, split_resisting_torque
+from fdhil.prediction import average_friction, split_resisting_torque
 from fdhil.records import Float, Parameters, Prediction, Trajectory
 
 STILL_RAD_S = 1e-6

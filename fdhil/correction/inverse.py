@@ -19,8 +19,8 @@ from fdhil.correction.correction_method import MethodPlan
 from fdhil.correction.mirror import check_lag_limits, get_allowed_um
 from fdhil.correction.plan_limits import PlanLimits
 from fdhil.correction.stiction_hold import StictionHold
-from fdhil.model import closed_loop
-from fdhil.prediction.correction_gain import find_moving_axes
+from fdhil.model import create_standstill_state, prepare_drive, run_per_axis
+from fdhil.prediction import find_moving_axes
 from fdhil.records import Float, Parameters, Prediction, Reason, Trajectory
 
 BLOCK_S = 2.0
@@ -73,7 +73,7 @@ def plan_inverse_offsets(
         walk = AxisInversePlanner.prepare(models[axis], config, axis, float(path[0]))
         return walk.solve_path(path, delay_path(path, tau / reference.dt_s))
 
-    found = closed_loop.run_per_axis(plan_axis, reference.axes)
+    found = run_per_axis(plan_axis, reference.axes)
     refused = check_lag_limits({axis: needed for axis, (_, needed) in found.items()}, models, config)
     return MethodPlan(nothing if refused else {axis: offset for axis, (offset, _) in found.items()}, tau, refused)
 
@@ -95,12 +95,12 @@ class AxisInversePlanner:
             drive,
             period,
             limits,
-            closed_loop.prepare_drive(parameters, drive, period),
+            prepare_drive(parameters, drive, period),
             linear_loop.invert_loop(parameters, drive, period, sum(count_block_rows(period))),
             StictionHold(parameters, drive, period, limits.um_per_increment * 1e-3),
         )
         return AxisInversePlanner(
-            loop, BlockState(closed_loop.create_standstill_state(parameters, drive, start_mm), np.zeros(2), np.empty(0))
+            loop, BlockState(create_standstill_state(parameters, drive, start_mm), np.zeros(2), np.empty(0))
         )
 
     def solve_next_block(self, reference_mm: Float, target_mm: Float, rows: int, ends: bool) -> BlockSolution:

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fdhil.config import Axis
-from fdhil.model import closed_loop
-from fdhil.prediction import model_variants
+from fdhil.model import simulate_axis
+from fdhil.prediction import linearise_model
 from fdhil.records import Float, Parameters
 
 BANDWIDTH_HZ = 120.0
@@ -47,14 +47,14 @@ class LoopInverse:
 def remove_limits(parameters: Parameters, axis: Axis, dry_nm: float = 0.0) -> tuple[Parameters, Axis]:
     """Return the linear part of the loop, without limits, and with another dry friction: without any it is linear."""
     free = axis.regulators.model_copy(update={"current_limit_a": 1e9, "voltage_limit_v": 1e9})
-    return model_variants.linearise_model(parameters, dry_nm), axis.model_copy(update={"regulators": free})
+    return linearise_model(parameters, dry_nm), axis.model_copy(update={"regulators": free})
 
 
 def measure_delay_s(parameters: Parameters, axis: Axis, sync_period_s: float) -> float:
     """Return by how much the loop lags at constant speed: 0 with full feed-forward, (1 - Kff) / Kv with less."""
     linear, free = remove_limits(parameters, axis)
     ramp = np.arange(round(RAMP_S / sync_period_s), dtype=np.float64) * (sync_period_s * RAMP_MM_S)
-    response = closed_loop.simulate_axis(linear, free, sync_period_s, ramp)
+    response = simulate_axis(linear, free, sync_period_s, ramp)
     # the last rows depend on the reference beyond its end, where it is held
     return float((ramp[-8] - response.position_mm[-8]) / RAMP_MM_S)
 
@@ -65,7 +65,7 @@ def invert_loop(parameters: Parameters, axis: Axis, sync_period_s: float, rows: 
     ahead = round(AHEAD_S / sync_period_s)
     impulse = np.zeros(ahead + round(IMPULSE_S / sync_period_s))
     impulse[ahead] = 1.0
-    answer = closed_loop.simulate_axis(linear, free, sync_period_s, impulse).table_mm
+    answer = simulate_axis(linear, free, sync_period_s, impulse).table_mm
     pad = round(PAD_S / sync_period_s)
     size = int(2 ** np.ceil(np.log2(rows + 2 * pad)))
     around = np.zeros(size)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fdhil.model.numba_decorators import compile_kernel
+from fdhil.model import compile_kernel
 from fdhil.records import Float
 
 ITERATIONS = 60

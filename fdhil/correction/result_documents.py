@@ -11,11 +11,16 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.correction.correction_planner import plan_correction
-from fdhil.prediction.correction_gain import CorrectionGain
-from fdhil.prediction.demand_retiming import make_demand_sources
-from fdhil.prediction.feed_advice import FeedAdvice, FeedResult, advise_feeds
-from fdhil.prediction.feed_search import FeedScaledPath, make_program_source
-from fdhil.prediction.inverse_dynamics import compute_required_shares
+from fdhil.prediction import (
+    CorrectionGain,
+    FeedAdvice,
+    FeedResult,
+    FeedScaledPath,
+    advise_feeds,
+    compute_required_shares,
+    make_demand_sources,
+    make_program_source,
+)
 from fdhil.program import Motion
 from fdhil.records import Correction, Float, Parameters, Prediction, Reason, Trajectory, compute_rms
 

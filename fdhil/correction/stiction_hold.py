@@ -17,10 +17,20 @@ from scipy.linalg.lapack import dposv
 from fdhil.config import Axis
 from fdhil.correction import offset_kernels
 from fdhil.correction.linear_loop import remove_limits
-from fdhil.model import closed_loop, model_terms
-from fdhil.model.closed_loop import Commands, PreparedDrive, Response, State
-from fdhil.model.closed_loop_kernels import CURRENT_DEMAND, POSITION, TABLE
-from fdhil.prediction.model_variants import FrictionBand, compute_friction_band
+from fdhil.model import (
+    CURRENT_DEMAND,
+    POSITION,
+    TABLE,
+    Commands,
+    PreparedDrive,
+    Response,
+    State,
+    create_zero_state,
+    has_spring,
+    prepare_drive,
+    rad_per_mm,
+)
+from fdhil.prediction import FrictionBand, compute_friction_band
 from fdhil.records import Float, Parameters
 
 FREE_S = 0.3  # in which the current is brought to its target
@@ -40,14 +50,14 @@ class StictionHold:
     """Holds one axis at rest; quantities that depend on its drive alone are computed once."""
 
     def __init__(self, parameters: Parameters, axis: Axis, sync_period_s: float, increment_mm: float) -> None:
-        self._held = closed_loop.prepare_drive(*remove_limits(parameters, axis, HELD_NM), sync_period_s)
-        self._parameters, self._rad_per_mm = parameters, model_terms.rad_per_mm(axis)
-        self._place = TABLE if model_terms.has_spring(parameters) else POSITION
+        self._held = prepare_drive(*remove_limits(parameters, axis, HELD_NM), sync_period_s)
+        self._parameters, self._rad_per_mm = parameters, rad_per_mm(axis)
+        self._place = TABLE if has_spring(parameters) else POSITION
         self._period_s, self._increment_mm = sync_period_s, increment_mm
         self._free, self._again = round(FREE_S / sync_period_s), round(AGAIN_S / sync_period_s)
         impulse = np.zeros(round((FREE_S + WATCHED_S) / sync_period_s))
         impulse[2] = increment_mm
-        self._answer_a = _get_current_demand(self._held.run(Commands(impulse), closed_loop.create_zero_state(0.0)))
+        self._answer_a = _get_current_demand(self._held.run(Commands(impulse), create_zero_state(0.0)))
         self._lead = _CurrentLead(self._answer_a, self._free)
 
     def compute_band_at(self, position_mm: float) -> FrictionBand:

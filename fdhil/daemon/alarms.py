@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from fdhil.records import Notice
-from fdhil.store.history_rows import Acknowledgement, StoredNotice, TimeStamp
-from fdhil.store.notice_document import format_date, make_acknowledgement_document
+from fdhil.store import Acknowledgement, StoredNotice, TimeStamp, format_date, make_acknowledgement_document
 
 _LASTING = """
     BusDown BusErrors BusOff BusSilent DiskFull DriveEmergency ErrorPassive FeedHold GantrySkew GuardLost

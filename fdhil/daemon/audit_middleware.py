@@ -10,13 +10,12 @@ from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fdhil.arming.dedicated_thread import run_in_dedicated_thread
-from fdhil.arming.refusals import Answer, make_refusal
+from fdhil.arming import Answer, make_refusal, run_in_dedicated_thread
 from fdhil.daemon import service_log
 from fdhil.daemon.daemon_access import NEEDS, ClientProcess
 from fdhil.errors import StoreError
-from fdhil.guard.guard_access import Role
-from fdhil.store import audit_file
+from fdhil.guard import Role
+from fdhil.store import append_entry
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 LOOKING = ("status", "live")
@@ -126,7 +125,7 @@ class AuditMiddleware:
             service_log.write_line(f"{_describe_requester(entry)} requested {what}: {entry['result']}")
         try:
             async with self._disk:  # keeps the order of the requests
-                await run_in_dedicated_thread(audit_file.append_entry, self._folder, entry, self._clock)
+                await run_in_dedicated_thread(append_entry, self._folder, entry, self._clock)
         except StoreError as error:
             text = f"{what} of {entry['who']['user']} could not be recorded in the audit log: {error}"
             service_log.write_line(text, "MAJOR")

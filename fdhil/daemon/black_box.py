@@ -13,7 +13,7 @@ from pathlib import Path
 
 from fdhil.errors import StoreError
 from fdhil.records import Notice
-from fdhil.store.atomic_file import make_folder, make_store_error, write_file
+from fdhil.store import make_folder, make_store_error, write_file
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 BLACK_BOX_FOLDER = "blackbox"

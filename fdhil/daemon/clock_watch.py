@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fdhil.errors import StoreError
 from fdhil.records import Notice
-from fdhil.store.history_database import History
+from fdhil.store import History
 
 JUMP_S = 2.0  # between two checks; slewing a clock changes less
 BEHIND_S = 60.0

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fdhil.config import Access
-from fdhil.guard.guard_access import Role, read_peer_credentials
+from fdhil.guard import Role, read_peer_credentials
 
 # rights that each request needs; any other needs the highest
 NEEDS: Mapping[str, Role] = {

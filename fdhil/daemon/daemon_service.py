@@ -11,12 +11,18 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from fdhil.arming.arming_service import ArmingService
-from fdhil.arming.guard_link import GUARD_TRIPPED, RECORD_VOIDING_CODES
-from fdhil.arming.refusals import Answer, make_refusal
-from fdhil.arming.residual_offset import ADOPT_ADVICE, START_AND_ADOPT, ResidualOffset
+from fdhil.arming import (
+    ADOPT_ADVICE,
+    GUARD_TRIPPED,
+    RECORD_VOIDING_CODES,
+    START_AND_ADOPT,
+    Answer,
+    ArmingService,
+    ResidualOffset,
+    make_refusal,
+)
 from fdhil.cancellation import find_first_error
-from fdhil.commissioning.void_mark import mark_record_void
+from fdhil.commissioning import mark_record_void
 from fdhil.config import MachineConfig, find_unlikely_values
 from fdhil.daemon import alarms, black_box, malloc_tuning, service_log
 from fdhil.daemon.acquisition import Acquisition, OpenSource

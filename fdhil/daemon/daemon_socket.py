@@ -17,13 +17,12 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from fdhil.arming.operator_token import make_run_directory
-from fdhil.arming.refusals import CHECK_ABANDONED, Answer, make_refusal
+from fdhil.arming import CHECK_ABANDONED, Answer, make_refusal, make_run_directory
 from fdhil.cancellation import END_S, end_tasks
 from fdhil.config import Access
 from fdhil.daemon.daemon_access import ClientProcess, identify_peer, open_listener
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, FdhilError
-from fdhil.guard.guard_access import Role
+from fdhil.guard import Role
 from fdhil.json_lines import decode_line, encode_line
 
 SOCKET_NAME = "daemon.sock"

@@ -10,7 +10,7 @@ from fdhil.daemon.bus_health import BusHealth, Trouble
 from fdhil.daemon.nc_watch import NcWatch
 from fdhil.daemon.outcome_json import build_loops_document
 from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, WindowOutcome
-from fdhil.store.parameter_document import report_parameters, report_terms
+from fdhil.store import report_parameters, report_terms
 
 SCHEMA = "fdhil-status-1"
 NOTICES = 20

@@ -6,10 +6,9 @@ import numpy as np
 
 from fdhil import correction
 from fdhil.config import Axis, MachineConfig
-from fdhil.correction.offset_kernels import project_onto_limits
-from fdhil.identification.kalman import compute_departure
-from fdhil.identification.robust_covariance import compute_robust_covariance
-from fdhil.model import closed_loop
+from fdhil.correction import project_onto_limits
+from fdhil.identification import compute_departure, compute_robust_covariance
+from fdhil.model import simulate_axis
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import Float, Parameters, Stages, Trajectory, Window, freeze_array, freeze_integers
 
@@ -33,7 +32,7 @@ def compile_kernels(config: MachineConfig, method: str | None = None) -> None:
     correction.plan_correction(reference, models, config)
     for name, model in models.items():
         for more in ({"load": 0.0}, {"resonance": 100.0}):
-            closed_loop.simulate_axis(model.replace_values(**more), config.axis[name], dt_s, demand[name][:8])
+            simulate_axis(model.replace_values(**more), config.axis[name], dt_s, demand[name][:8])
     _warm_rare_kernels()
 
 
@@ -58,7 +57,7 @@ def simulate_nominal_rapid(name: str, axis: Axis, dt_s: float, direction: int = 
     wanted = direction * top * _make_speed_profile(margin, ramp, cruise)
     turned = np.cumsum(wanted) - 0.5 * (wanted + wanted[0])  # trapezoids
     demand = turned * dt_s * axis.screw_pitch_mm / (2 * math.pi)
-    moved = closed_loop.simulate_axis(nominal, axis, dt_s, freeze_array(demand))
+    moved = simulate_axis(nominal, axis, dt_s, freeze_array(demand))
     position, speed, current = moved.position_mm, moved.speed_rad_s, moved.current_a
     angle = position * (2 * math.pi / axis.screw_pitch_mm)
     voltage = nominal.R * current + nominal.L * np.gradient(current, dt_s) + nominal.K * speed

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.arming.refusals import Answer, make_refusal
+from fdhil.arming import Answer, make_refusal
 from fdhil.config import MachineConfig
 from fdhil.json_lines import encode_line
 from fdhil.records import AxisSamples, Temperature, TickTimes, VoltageSamples

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.drivers.moves import load_event_source
-from fdhil.identification.rapid_windows import PLATEAU_BAND, PLATEAU_S, RAPID_SHARE, RUN_SHARE
+from fdhil.drivers import load_event_source
+from fdhil.identification import PLATEAU_BAND, PLATEAU_S, RAPID_SHARE, RUN_SHARE
 from fdhil.records import AxisSamples, Float, Int
 
 REST_S = 0.1  # standstill of the demand that completes a move

@@ -5,14 +5,19 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fdhil.arming.refusals import make_refusal
+from fdhil.arming import make_refusal
 from fdhil.daemon.alarms import AlarmTable, build_alarms_status
 from fdhil.daemon.service_log import escape_unprintable
 from fdhil.errors import FdhilError
 from fdhil.records import Notice
-from fdhil.store.history_database import RECENT_NOTICES
-from fdhil.store.history_rows import Acknowledgement, StoredNotice, TimeStamp
-from fdhil.store.notice_document import make_acknowledgement_document, make_notice_document
+from fdhil.store import (
+    RECENT_NOTICES,
+    Acknowledgement,
+    StoredNotice,
+    TimeStamp,
+    make_acknowledgement_document,
+    make_notice_document,
+)
 
 NEWEST = RECENT_NOTICES
 TOLD_OPEN = 20  # open notices in the status

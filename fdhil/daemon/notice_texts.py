@@ -6,7 +6,7 @@ Classes of the guard have their texts in ``fdhil/guard/interlocks.py``; all othe
 import re
 from collections.abc import Mapping
 
-from fdhil.guard.interlocks import INTERLOCK_CATALOGUE, LATE_PC, REACTION_EFFECTS
+from fdhil.guard import INTERLOCK_CATALOGUE, LATE_PC, REACTION_EFFECTS
 from fdhil.records import Notice
 
 _CLASS = re.compile(r"\b([A-Z][A-Za-z]+): ")

@@ -3,7 +3,7 @@
 from fdhil.config import MachineConfig
 from fdhil.errors import StoreError
 from fdhil.records import Notice
-from fdhil.store.change_offers import list_undecided
+from fdhil.store import list_undecided
 
 MOST = 20  # that are examined: the folder is another user's
 

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, WindowOutcome, get_unit
-from fdhil.store.history_database import format_friction, format_parameters
-from fdhil.store.parameter_document import make_set_document
+from fdhil.store import format_friction, format_parameters, make_set_document
 
 
 def build_outcome_document(outcome: Outcome) -> dict[str, Any]:

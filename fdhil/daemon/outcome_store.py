@@ -7,14 +7,13 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-from fdhil.arming.refusals import Answer
+from fdhil.arming import Answer
 from fdhil.config import MachineConfig
 from fdhil.daemon import service_log
 from fdhil.daemon.notice_log import NEWEST, NotAcknowledged, NoticeLog, describe_numbers, parse_acknowledgement
-from fdhil.drivers.cia402.drive_profile_file import load_profile
+from fdhil.drivers import load_profile
 from fdhil.errors import StoreError
-from fdhil.identification.between_window_variance import HISTORY_WINDOWS, PoolMember
-from fdhil.identification.parameter_drift import DriftPoint
+from fdhil.identification import HISTORY_WINDOWS, DriftPoint, PoolMember
 from fdhil.pipeline import POOL_WINDOWS, PipelineState
 from fdhil.records import (
     PARAMETERS,
@@ -28,13 +27,21 @@ from fdhil.records import (
     WindowOutcome,
     freeze_array,
 )
+from fdhil.store import (
+    HISTORY_FILE_NAME,
+    History,
+    Outbox,
+    RawScale,
+    Revision,
+    Scales,
+    StoredWindow,
+    TimeStamp,
+    WindowStore,
+    find_newest_loops,
+    find_newest_parameters,
+    sync_folder,
+)
 from fdhil.store import WINDOWS_FOLDER as WINDOWS_FOLDER
-from fdhil.store.atomic_file import sync_folder
-from fdhil.store.history_database import HISTORY_FILE_NAME, History
-from fdhil.store.history_rows import Revision, StoredWindow, TimeStamp
-from fdhil.store.newest_parameters import find_newest_loops, find_newest_parameters
-from fdhil.store.outbox import Outbox
-from fdhil.store.window_file import RawScale, Scales, WindowStore
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 SKILLS = 3

@@ -2,7 +2,7 @@
 
 import asyncio
 
-from fdhil.arming.arming_service import ArmingService
+from fdhil.arming import ArmingService
 from fdhil.errors import DeviceError
 from fdhil.records import Notice
 

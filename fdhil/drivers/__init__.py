@@ -1,5 +1,8 @@
 """Receives from the machine's buses and sensors and turns it into records."""
 
-from fdhil.drivers.machine_source import MachineSource, Record, open_machine
+import lazy_loader
 
-__all__ = ["MachineSource", "Record", "open_machine"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,20 +1,8 @@
 """Reads EDS and DCF files (CiA 306): the one reader of drivers, commissioning and simulator."""
 
-from fdhil.eds.eds_file import INTEGER_TYPES, EdsEntry, EdsFile, EdsObject
-from fdhil.eds.eds_numbers import read_expression, read_number, read_octal
-from fdhil.eds.eds_reader import MAX_BYTES, MAX_OBJECTS, MAX_SECTIONS, parse_eds, read_eds
+import lazy_loader
 
-__all__ = [
-    "INTEGER_TYPES",
-    "MAX_BYTES",
-    "MAX_OBJECTS",
-    "MAX_SECTIONS",
-    "EdsEntry",
-    "EdsFile",
-    "EdsObject",
-    "parse_eds",
-    "read_eds",
-    "read_expression",
-    "read_number",
-    "read_octal",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -16,8 +16,7 @@ from typing import Any, LiteralString
 
 from fdhil.errors import StoreError
 from fdhil.fleet.parameter_sets import Db
-from fdhil.store.atomic_file import make_folder, make_store_error
-from fdhil.store.parquet_library import pa, pq
+from fdhil.store import make_folder, make_store_error, pa, pq
 
 KEY_BYTES = 32
 NAME_CHARS = 16  # of the digest, 64 bits

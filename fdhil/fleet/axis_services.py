@@ -10,7 +10,7 @@ import numpy as np
 
 from fdhil.errors import StoreError
 from fdhil.fleet.parameter_sets import Db, Row, format_time, read_std
-from fdhil.identification.trends import compute_student_95
+from fdhil.identification import compute_student_95
 from fdhil.records import PARAMETERS, Float, get_unit
 
 MOST_SETS = 20  # on either side of a service, within NEAR

@@ -22,8 +22,8 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.js import JetStreamContext
 
-from fdhil.config.fleet_config import Fleet
-from fdhil.daemon import service_log
+from fdhil.config import Fleet
+from fdhil.daemon import write_line
 from fdhil.errors import StoreError
 from fdhil.fleet import schema_migrations, window_files
 from fdhil.fleet.nats_transport import (
@@ -140,7 +140,7 @@ class Collector:
         await schema_migrations.upgrade_schema(db)
         await db.execute(_INCOMING)
         reader = await prepare_record_stream(client.jetstream(), self._fleet.stream)
-        service_log.write_line("connected to the server and the database")
+        write_line("connected to the server and the database")
         coming = asyncio.ensure_future(_receive_batch(reader))
         try:
             while True:
@@ -201,9 +201,7 @@ class Collector:
                 await cursor.execute(NOTE_INCOMING)
                 await _insert_refused(cursor, aside)
         for subject, unread in aside:
-            service_log.write_line(
-                f"part of a message of {subject} was refused and stored apart: {unread.reason}", "minor"
-            )
+            write_line(f"part of a message of {subject} was refused and stored apart: {unread.reason}", "minor")
 
 
 def _limit_recorded_at(record: Record, stored_at: datetime) -> Record:

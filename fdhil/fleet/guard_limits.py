@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
-from fdhil.arming.guard_configuration import make_guard_settings
+from fdhil.arming import make_guard_settings
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError
 

@@ -23,8 +23,8 @@ from fdhil.fleet.parameter_sets import (
     read_std,
 )
 from fdhil.records import PARAMETERS, get_unit
-from fdhil.report.drive_health import assess_axis_health
-from fdhil.store.history_rows import StoredWindow, TimeStamp
+from fdhil.report import assess_axis_health
+from fdhil.store import StoredWindow, TimeStamp
 
 NEWEST_SETS, APART = 180, "1 day"  # half a year
 TOGETHER = 500  # axes per query

@@ -19,10 +19,8 @@ from nats.js import JetStreamContext
 from nats.js.api import AckPolicy, ConsumerConfig, DiscardPolicy, RetentionPolicy, StorageType, StreamConfig
 
 from fdhil.cancellation import GivenUp, run_attempt
-from fdhil.config.credentials import create_tls_context, read_password, read_secret
-from fdhil.config.fleet_config import Stream
-from fdhil.config.uplink_section import NatsServer
-from fdhil.daemon import service_log
+from fdhil.config import NatsServer, Stream, create_tls_context, read_password, read_secret
+from fdhil.daemon import write_line
 from fdhil.errors import ConnectError
 from fdhil.fleet.record_message import SUBJECTS
 
@@ -52,7 +50,7 @@ async def retry_forever(
         if done() > before:
             delay_s, logged = FIRST_RETRY_S, ""
         if cause != logged:
-            service_log.write_line(complaint.format(cause=cause), "minor")
+            write_line(complaint.format(cause=cause), "minor")
         logged = cause
         await asyncio.sleep(delay_s)
         delay_s = min(LAST_RETRY_S, 2 * delay_s)

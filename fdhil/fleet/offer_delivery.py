@@ -15,13 +15,20 @@ from nats.js import JetStreamContext
 from nats.js.api import DiscardPolicy, Header, StorageType, StreamConfig
 
 from fdhil.config import MachineConfig
-from fdhil.daemon import service_log
+from fdhil.daemon import write_line
 from fdhil.errors import StoreError
 from fdhil.fleet.nats_transport import ERRORS, describe_cause
 from fdhil.fleet.record_message import Message, encode_answer
 from fdhil.fleet.signed_offer import LARGEST, Offer, OfferRefused, read_offer
-from fdhil.store.atomic_file import make_folder, make_store_error, write_file
-from fdhil.store.change_offers import OfferDecision, list_offers, make_file_name, read_decisions
+from fdhil.store import (
+    OfferDecision,
+    list_offers,
+    make_file_name,
+    make_folder,
+    make_store_error,
+    read_decisions,
+    write_file,
+)
 
 STREAM = "fdhil-offers"
 PREFIX = "fdhil.offers.v1"
@@ -140,7 +147,7 @@ class OfferFetcher:
         except StoreError as error:
             complaint = str(error)
         if complaint and complaint != self._last_complaint:
-            service_log.write_line(complaint, "minor")
+            write_line(complaint, "minor")
         self._last_complaint = complaint
         return [encode_answer(asdict(each), self._machine, store) for each in self._read_new_answers()]
 
@@ -153,7 +160,7 @@ class OfferFetcher:
             self._reported = min(self._reported, len(answers))  # the file was started again
             return answers[self._reported :]
         except StoreError as error:
-            service_log.write_line(str(error), "minor")
+            write_line(str(error), "minor")
             return []
 
     def _update_folder(self, documents: list[bytes]) -> None:
@@ -164,7 +171,7 @@ class OfferFetcher:
             try:
                 offer = read_offer(document, self._config.offers.trust)
             except OfferRefused as error:
-                service_log.write_line(f"an offer was ignored: {error}", "minor")
+                write_line(f"an offer was ignored: {error}", "minor")
                 continue
             wanted[folder / make_file_name(offer.name, offer.version)] = document
         try:
@@ -176,7 +183,7 @@ class OfferFetcher:
         for path, document in wanted.items():
             if not _has_content(path, document):
                 write_file(path, document)
-                service_log.write_line(f"new offer of the fleet server in {path}; review it with fdhil offers list")
+                write_line(f"new offer of the fleet server in {path}; review it with fdhil offers list")
 
 
 def _has_content(path: Path, document: bytes) -> bool:

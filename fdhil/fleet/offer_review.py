@@ -18,14 +18,19 @@ from pathlib import Path
 from typing import Any, Literal
 
 from fdhil import config as machine_config
-from fdhil.config import MachineConfig, find_unlikely_values, parse_config, parse_toml
-from fdhil.config.remote_change_policy import is_loosening
-from fdhil.config.toml_editing import NotEditable, edit_toml
+from fdhil.config import (
+    MachineConfig,
+    NotEditable,
+    edit_toml,
+    find_unlikely_values,
+    is_loosening,
+    parse_config,
+    parse_toml,
+)
 from fdhil.errors import ConfigError, OutputError, StoreError
 from fdhil.fleet.guard_limits import derive_guard_limits
 from fdhil.fleet.signed_offer import LARGEST, Offer, OfferRefused, read_offer
-from fdhil.store.atomic_file import write_file
-from fdhil.store.change_offers import OfferDecision, add_decision, find_newest_accepted, list_offers, read_decisions
+from fdhil.store import OfferDecision, add_decision, find_newest_accepted, list_offers, read_decisions, write_file
 
 CAUSES = {
     "DiskFull": "the disk is full; free some space",

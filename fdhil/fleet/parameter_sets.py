@@ -10,7 +10,7 @@ from typing import Any, LiteralString
 import psycopg
 from psycopg.rows import DictRow, dict_row
 
-from fdhil.config.fleet_config import Fleet
+from fdhil.config import Fleet
 from fdhil.errors import ConnectError, StoreError
 from fdhil.fleet.schema_migrations import KNOWN_AXES
 from fdhil.records import PARAMETERS

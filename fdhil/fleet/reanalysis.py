@@ -15,7 +15,7 @@ from typing import Any, LiteralString
 import psycopg
 from psycopg.types.json import Jsonb
 
-from fdhil.config.fleet_config import Fleet
+from fdhil.config import Fleet
 from fdhil.errors import StoreError
 from fdhil.fleet import schema_migrations
 from fdhil.fleet.parameter_sets import Db, open_database

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from pydantic_core import from_json
 
 from fdhil.fleet import record_shapes
-from fdhil.store.outbox import OutboxEntry
+from fdhil.store import OutboxEntry
 
 SCHEMA = "fdhil-record-1"
 PREFIX = "fdhil.v1"

@@ -14,16 +14,21 @@ from typing import Any, NoReturn
 from nats.aio.client import Client
 from nats.js import JetStreamContext
 
-from fdhil.config import MachineConfig
-from fdhil.config.uplink_section import Uplink
-from fdhil.daemon import service_log
+from fdhil.config import MachineConfig, Uplink
+from fdhil.daemon import write_line
 from fdhil.errors import ConfigError, ConfigFault, StoreError
 from fdhil.fleet.nats_transport import ERRORS, check_credentials, connect_to_server, describe_cause, retry_forever
 from fdhil.fleet.offer_delivery import OfferFetcher
 from fdhil.fleet.record_message import Message, compute_digest, encode_entry, encode_machine, join_messages
-from fdhil.store import WINDOWS_FOLDER
-from fdhil.store.atomic_file import make_folder
-from fdhil.store.outbox import OutboxEntry, OutboxPosition, OutboxReader, read_position, write_position
+from fdhil.store import (
+    WINDOWS_FOLDER,
+    OutboxEntry,
+    OutboxPosition,
+    OutboxReader,
+    make_folder,
+    read_position,
+    write_position,
+)
 
 BATCH = 500  # entries per read and per stored position
 MESSAGE_BYTES = 60 << 10  # of a joined message; a single larger record still fits the smallest stream
@@ -90,7 +95,7 @@ class OutboxSender:
                 await self._send_entries(stream, position, entries, client.max_payload)
                 continue
             if not caught_up:
-                service_log.write_line(f"all records are sent ({self.sent} since the start)")
+                write_line(f"all records are sent ({self.sent} since the start)")
                 caught_up = True
             if client.is_closed:
                 raise ConnectionResetError("the connection has ended")

@@ -14,7 +14,7 @@ from typing import Any, LiteralString
 
 from psycopg import sql
 
-from fdhil.config.fleet_config import Fleet
+from fdhil.config import Fleet
 from fdhil.errors import ConfigError, ConfigFault, StoreError
 from fdhil.fleet.parameter_sets import Db
 from fdhil.fleet.schema_migrations import LOCK

@@ -15,10 +15,7 @@ import psycopg
 from psycopg.rows import DictRow, dict_row
 from pydantic import Field
 
-from fdhil.config.config_loader import check_section, check_section_file, load_section_file
-from fdhil.config.fleet_config import Fleet
-from fdhil.config.section import Section
-from fdhil.config.uplink_section import Label, Labels
+from fdhil.config import Fleet, Label, Labels, Section, check_section, check_section_file, load_section_file
 from fdhil.errors import ConfigError, ConfigFault, ConnectError
 from fdhil.fleet import offer_delivery, schema_migrations
 from fdhil.fleet.nats_transport import ERRORS, connect_to_server, describe_cause

@@ -19,14 +19,10 @@ from nacl.exceptions import CryptoError
 from nacl.signing import VerifyKey
 from pydantic import Field, FiniteFloat, StringConstraints, ValidationError, model_validator
 
-from fdhil.config.config_loader import check_value
-from fdhil.config.fleet_config import MACHINE_NAME_PATTERN as MACHINE
-from fdhil.config.offers_section import decode_plant_key
-from fdhil.config.remote_change_policy import explain_refusal
-from fdhil.config.section import Section
-from fdhil.config.uplink_section import Label, Labels
+from fdhil.config import MACHINE_NAME_PATTERN as MACHINE
+from fdhil.config import Label, Labels, Section, check_value, decode_plant_key, explain_refusal
 from fdhil.errors import ConfigError, ConfigFault, FdhilError
-from fdhil.store.change_offers import OFFER_NAME_PATTERN
+from fdhil.store import OFFER_NAME_PATTERN
 
 SCHEMA = "fdhil-offer-1"
 LARGEST = 512 * 1024  # bytes of an offer

@@ -5,7 +5,7 @@ import secrets
 from pathlib import Path
 
 from fdhil.errors import StoreError
-from fdhil.store.atomic_file import make_folder, make_store_error, write_file
+from fdhil.store import make_folder, make_store_error, write_file
 
 
 def build_window_path(folder: Path, name: str) -> Path:

@@ -17,8 +17,7 @@ from fdhil.errors import FdhilError, RecordingError
 from fdhil.fleet.window_files import build_window_path
 from fdhil.pipeline import analyse_windows
 from fdhil.records import WindowOutcome
-from fdhil.store.history_database import format_parameters
-from fdhil.store.window_file import MAX_FILE_BYTES, decode_window
+from fdhil.store import MAX_FILE_BYTES, decode_window, format_parameters
 
 ROOMS = ("records", "model", "identification", "validation", "pipeline")  # the code that the results depend on
 LIBRARIES = ("numpy", "scipy", "numba", "pyarrow")

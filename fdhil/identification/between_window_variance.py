@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.model.numba_decorators import compile_kernel
+from fdhil.model import compile_kernel
 from fdhil.records import PARAMETERS, Float
 
 HISTORY_WINDOWS = 24  # windows: older ones say little about the present warming

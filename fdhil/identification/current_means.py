@@ -16,7 +16,7 @@ from fdhil.identification.filtering import compute_moving_mean
 from fdhil.identification.low_rate_voltage.within_sample import STEPPED_ROW_S
 from fdhil.identification.rapid_windows import fill_forward, interpolate_gaps
 from fdhil.identification.speed_alignment import align_speed_to_samples
-from fdhil.model.closed_loop import simulate_axis
+from fdhil.model import simulate_axis
 from fdhil.records import Float, Parameters, Window, compute_rms, make_read_only_view
 
 SURELY = 0.6  # of the other replay's residual: largest of the right one

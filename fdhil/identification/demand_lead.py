@@ -10,7 +10,7 @@ import numpy as np
 
 from fdhil.config import Axis
 from fdhil.identification.rapid_windows import interpolate_gaps
-from fdhil.model.closed_loop import simulate_axis
+from fdhil.model import simulate_axis
 from fdhil.records import Float, Parameters, Window, compute_rms, make_read_only_view
 
 LEAST_FEEDFORWARD = 0.5  # with less, the lag at constant speed is the position loop's

@@ -18,8 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fdhil.identification.prepared_motion import BROKEN_MODE, DIFFUSE, UNKNOWN_MODE, Modes, Motion
-from fdhil.model.feed_drive import compute_transition
-from fdhil.model.numba_decorators import compile_kernel
+from fdhil.model import compile_kernel, compute_transition
 from fdhil.records import Bool, Float, make_read_only_view
 
 Rows = npt.NDArray[np.int64]

@@ -13,7 +13,7 @@ from fdhil.identification.identifiability import RELATIVE_STD_LIMIT
 from fdhil.identification.normal_equations import invert_gram
 from fdhil.identification.prepared_motion import estimate_noise_levels
 from fdhil.identification.rapid_windows import fill_forward
-from fdhil.model.feed_drive import compute_voltage_ramps
+from fdhil.model import compute_voltage_ramps
 from fdhil.records import PARAMETERS, Estimate, Float, Reason, Result, Window
 
 NAME = "locked_rotor"

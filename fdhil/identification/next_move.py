@@ -12,7 +12,7 @@ import numpy as np
 from fdhil.identification.normal_equations import invert_symmetric
 from fdhil.identification.prepared_motion import NoiseLevels, estimate_noise_levels
 from fdhil.identification.rapid_windows import fill_forward
-from fdhil.model.feed_drive import simulate_plant
+from fdhil.model import simulate_plant
 from fdhil.records import PARAMETERS, Estimate, Float, Parameters, Window
 
 MOVES: Mapping[str, Callable[[Float], Float]] = {  # share (n,) of the voltage over that of the time

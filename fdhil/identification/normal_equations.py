@@ -7,7 +7,7 @@ here.
 
 import numpy as np
 
-from fdhil.model.numba_decorators import compile_kernel
+from fdhil.model import compile_kernel
 from fdhil.records import Float
 
 NIL = 1e-15  # of the largest power: below it a direction is rounding

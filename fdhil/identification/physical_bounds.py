@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdhil.model.physical_limits import ParameterBound, list_bounds
+from fdhil.model import ParameterBound, list_bounds
 from fdhil.records import Estimate, Float, freeze_array
 
 SIGNIFICANT = 3.0  # standard deviations beyond a bound

@@ -17,7 +17,7 @@ from fdhil.identification.rapid_windows import (
     interpolate_gaps,
     sort_runs_by_length,
 )
-from fdhil.model.feed_drive import compute_voltage_ramps
+from fdhil.model import compute_voltage_ramps
 from fdhil.records import Bool, Float, SlowVoltage, VoltageSampling, Window
 
 UNKNOWN_MODE = 0  # stuck, reversing or about to move: the friction torque is unknown

@@ -26,7 +26,7 @@ from fdhil.identification.noise_fit import fit_noise
 from fdhil.identification.normal_equations import invert_symmetric
 from fdhil.identification.robust_covariance import SUMMED_LAGS
 from fdhil.identification.voltage_delay import LEAST_DELAY, MOST_DELAY, add_delay_doubt, differentiate_by_delay
-from fdhil.model.physical_limits import list_bounds
+from fdhil.model import list_bounds
 from fdhil.records import Estimate, Float
 
 Rows = npt.NDArray[np.intp]

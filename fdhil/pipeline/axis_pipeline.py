@@ -12,10 +12,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from fdhil.config import MachineConfig
-from fdhil.identification.between_window_variance import HISTORY_WINDOWS, PoolMember
-from fdhil.identification.parameter_drift import LEAST_JUMP, DriftPoint, DriftTracker
-from fdhil.identification.rapid_windows import find_windows
-from fdhil.identification.window_pool import build_pool_member, compute_change_covariance
+from fdhil.identification import (
+    HISTORY_WINDOWS,
+    LEAST_JUMP,
+    DriftPoint,
+    DriftTracker,
+    PoolMember,
+    build_pool_member,
+    compute_change_covariance,
+    find_windows,
+)
 from fdhil.pipeline.identified_loops import LoopTracker
 from fdhil.pipeline.sample_buffer import SampleBuffer
 from fdhil.pipeline.validated_pool import check_both_directions, estimate_together, is_model_refused
@@ -40,7 +46,7 @@ from fdhil.records import (
     Window,
     WindowOutcome,
 )
-from fdhil.validation.data_sheet import detect_gain_error
+from fdhil.validation import detect_gain_error
 
 RECENT_S = 30.0  # longer rapids are truncated, and then refused for a missing stage
 LEAD_S = 0.25  # standstill before a rapid

@@ -14,18 +14,17 @@ from functools import partial
 import numpy as np
 
 from fdhil.config import Axis, Identification
-from fdhil.identification.current_means import correct_current_to_means
-from fdhil.identification.drive_loops.loop_identification import (
+from fdhil.identification import (
     apply_loops,
+    bound_estimate,
+    correct_current_to_means,
     find_changed_regulators,
     identify_loops,
     is_better_than_configured,
 )
-from fdhil.identification.physical_bounds import bound_estimate
 from fdhil.pipeline.window_analysis import analyse_window, select_matching_axis
 from fdhil.records import LoopEstimate, Parameters, Window, WindowOutcome
-from fdhil.validation.move_replay import replay_with_load_search
-from fdhil.validation.table_error_budget import LOOPS_DIFFER
+from fdhil.validation import LOOPS_DIFFER, replay_with_load_search
 
 GRID = np.geomspace(40.0, 250.0, 14)  # Hz
 HALVINGS = 2  # of the grid's steps around the best

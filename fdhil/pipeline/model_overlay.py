@@ -7,14 +7,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.identification.speed_alignment import align_speed_to_samples
+from fdhil.identification import align_speed_to_samples
 from fdhil.pipeline.identified_loops import LoopTracker
 from fdhil.pipeline.window_analysis import GAVE_UP, analyse_window, estimate_window, select_matching_axis
 from fdhil.records import LoopEstimate, Result, Window, WindowOutcome
-from fdhil.validation.move_replay import Replay, replay_with_load_search
-from fdhil.validation.open_loop_simulation import SimulatedMotion, simulate_from_voltage
-from fdhil.validation.table_assessment import TableAssessment
-from fdhil.validation.window_signals import WindowSignals
+from fdhil.validation import (
+    Replay,
+    SimulatedMotion,
+    TableAssessment,
+    WindowSignals,
+    replay_with_load_search,
+    simulate_from_voltage,
+)
 
 NO_MODEL = {Result.NOT_FINITE, Result.DIVERGED}
 

@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 
 from fdhil.config import Axis
-from fdhil.identification.rapid_windows import find_runs
+from fdhil.identification import find_runs
 from fdhil.pipeline.table_sample_buffer import MotorMotion, TableSampleBuffer
 from fdhil.records import (
     AxisSamples,

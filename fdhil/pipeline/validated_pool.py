@@ -10,18 +10,20 @@ from typing import NamedTuple
 import numpy as np
 
 from fdhil.config import Axis, Identification
-from fdhil.identification.between_window_variance import (
+from fdhil.identification import (
     NO_BETWEEN_VARIANCE,
     BetweenWindowVariance,
     PoolMember,
+    align_demand_to_drive,
+    bound_estimate,
+    build_pool_member,
     estimate_between_window_variance,
+    find_unphysical_values,
+    identify_loops,
+    list_missing_reasons,
+    pool_estimates,
+    select_estimator,
 )
-from fdhil.identification.demand_lead import align_demand_to_drive
-from fdhil.identification.drive_loops.loop_identification import identify_loops
-from fdhil.identification.estimators import select_estimator
-from fdhil.identification.identifiability import find_unphysical_values, list_missing_reasons
-from fdhil.identification.physical_bounds import bound_estimate
-from fdhil.identification.window_pool import build_pool_member, pool_estimates
 from fdhil.pipeline.identified_loops import adopt_loops
 from fdhil.pipeline.window_analysis import GAVE_UP, build_solver_reason, select_matching_axis
 from fdhil.records import (
@@ -35,17 +37,19 @@ from fdhil.records import (
     WindowOutcome,
     freeze_array,
 )
-from fdhil.validation.estimate_agreement import WINDING_PARAMETERS, find_parameter_jumps, is_winding_jump
-from fdhil.validation.held_out_moves import (
+from fdhil.validation import (
+    LOOPS_DIFFER,
+    WINDING_PARAMETERS,
     Move,
+    Replay,
     check_held_out_limit,
+    find_parameter_jumps,
     fit_presliding,
     is_predicted,
+    is_winding_jump,
     predict_held_out,
     summarise_worst,
 )
-from fdhil.validation.move_replay import Replay
-from fdhil.validation.table_error_budget import LOOPS_DIFFER
 
 # causes of refusal that do not concern the model: the samples, or the course of the move
 OF_THE_MOVE = (

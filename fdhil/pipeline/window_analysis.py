@@ -9,31 +9,41 @@ from functools import lru_cache
 import numpy as np
 
 from fdhil.config import Axis, Identification
-from fdhil.identification.demand_lead import align_demand_to_drive
-from fdhil.identification.estimators import maximum_likelihood, select_estimator
-from fdhil.identification.identifiability import create_empty_estimate
-from fdhil.identification.likelihood_fit import LikelihoodFit
-from fdhil.identification.speed_alignment import align_speed_to_samples
-from fdhil.identification.spring_fit import fit_with_compliance
-from fdhil.identification.table_compliance import check_configured_resonance, estimate_compliance, merge_compliance
-from fdhil.identification.torque_fit import build_torque_estimate
-from fdhil.identification.torque_fit import fit_torque as fit_torque
+from fdhil.identification import (
+    MAXIMUM_LIKELIHOOD,
+    LikelihoodFit,
+    align_demand_to_drive,
+    align_speed_to_samples,
+    build_estimate,
+    build_torque_estimate,
+    check_configured_resonance,
+    create_empty_estimate,
+    estimate_compliance,
+    fit_windows,
+    fit_with_compliance,
+    merge_compliance,
+    refit_with_loops,
+    select_estimator,
+)
+from fdhil.identification import fit_torque as fit_torque
 from fdhil.records import Estimate, Parameters, Reason, Result, Verdict, Window, WindowOutcome
-from fdhil.validation.data_sheet import detect_gain_error, detect_scale_convention
-from fdhil.validation.signal_consistency import find_table_sensor_faults
-from fdhil.validation.table_assessment import TableAssessment
-from fdhil.validation.table_encoder_check import measure_table_error
-from fdhil.validation.window_checks import (
+from fdhil.validation import (
     FIT_CHECKS,
+    LEAST_SAMPLES,
     PLATEAU,
     SIGNAL_CHECKS,
     STUCK_SENSOR,
     WEIGHED,
     Findings,
+    TableAssessment,
+    WindowFit,
+    WindowSignals,
+    detect_gain_error,
+    detect_scale_convention,
+    find_table_sensor_faults,
+    measure_table_error,
     run_checks,
 )
-from fdhil.validation.window_fit import WindowFit
-from fdhil.validation.window_signals import LEAST_SAMPLES, WindowSignals
 
 # errors of solvers; scipy's raise ValueError for values that are not finite
 GAVE_UP = (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError, ValueError)
@@ -144,16 +154,16 @@ def estimate_window(signals: WindowSignals) -> WindowFit:
     name, estimator = select_estimator(settings)
     fit = _fit_window(window, settings)
     if fit is not None and axis is not None:
-        fit = maximum_likelihood.refit_with_loops(fit, window, settings, axis, signals.sync_period_s)
-    if name == maximum_likelihood.MAXIMUM_LIKELIHOOD and fit is not None:
-        return _fit_compliance(WindowFit(signals, maximum_likelihood.build_estimate(fit), fit))
+        fit = refit_with_loops(fit, window, settings, axis, signals.sync_period_s)
+    if name == MAXIMUM_LIKELIHOOD and fit is not None:
+        return _fit_compliance(WindowFit(signals, build_estimate(fit), fit))
     return WindowFit(signals, estimator([window], settings), fit)
 
 
 @lru_cache(maxsize=KEPT_FITS)
 def _fit_window(window: Window, settings: Identification) -> LikelihoodFit | None:
     """Return the fit of a window, the same for each section of the axis with which it is analysed."""
-    return maximum_likelihood.fit_windows([window], settings)
+    return fit_windows([window], settings)
 
 
 def _fit_compliance(stiff: WindowFit) -> WindowFit:
@@ -171,7 +181,7 @@ def _fit_compliance(stiff: WindowFit) -> WindowFit:
     found = fit_with_compliance(stiff.fit, axis)
     if found is None:
         return stiff
-    soft = WindowFit(stiff.signals, maximum_likelihood.build_estimate(found), found)
+    soft = WindowFit(stiff.signals, build_estimate(found), found)
     budget = TableAssessment(soft).budget
     left = math.inf if budget is None else budget.unexplained_um
     return soft if left < max(weight.limit_um, weight.unexplained_um) else stiff

@@ -1,17 +1,8 @@
 """Predicts the path error of the closed loops: axis errors, contour error, zones, and the model's own skill."""
 
-from __future__ import annotations
+import lazy_loader
 
-from fdhil.prediction.contour_error import compute_contour_error_um
-from fdhil.prediction.contour_uncertainty import compute_contour_std_um, compute_sensitivity_um
-from fdhil.prediction.model_skill import assess_model_skill
-from fdhil.prediction.path_prediction import predict_corrected_path, predict_path
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-__all__ = [
-    "assess_model_skill",
-    "compute_contour_error_um",
-    "compute_contour_std_um",
-    "compute_sensitivity_um",
-    "predict_corrected_path",
-    "predict_path",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -19,9 +19,8 @@ import numpy as np
 from fdhil import config as configuration
 from fdhil.config import MachineConfig, Regulators
 from fdhil.errors import ConfigError, ConfigFault
-from fdhil.identification.physical_bounds import find_significant_violations, project_to_bounds
-from fdhil.model import physical_limits
-from fdhil.model.model_terms import add_resonance
+from fdhil.identification import find_significant_violations, project_to_bounds
+from fdhil.model import ABOVE_ZERO, LEAST_SHARE, NOT_NEGATIVE, add_resonance, list_bounds
 from fdhil.prediction.model_variants import group_term_parts, list_values
 from fdhil.records import PARAMETERS, UNITS, Parameters, ParameterSet, Trajectory, get_unit
 
@@ -160,7 +159,7 @@ def _check_physical_model(axis: str, published: ParameterSet, faults: list[Confi
     """Return the parameters of a set, moved into the physical bounds that an earlier fdhil exceeded by chance."""
     by_name, covariance = list_values(published.parameters), published.covariance
     names, values = tuple(by_name), np.array([*by_name.values()])
-    if all(bound.compute_violation(by_name) <= 0.0 for bound in physical_limits.list_bounds(names)):
+    if all(bound.compute_violation(by_name) <= 0.0 for bound in list_bounds(names)):
         return published.parameters
     if covariance.shape != (len(names), len(names)) or find_significant_violations(names, values, covariance):
         text = "Unphysical: friction in the newest set would drive the axis, or a value must not be negative"
@@ -236,9 +235,7 @@ def _check_terms(axis: str, terms: Mapping[str, Any], dry_nm: Any) -> list[Confi
     if not faults and "stribeck" in terms and _check_value("Cd", dry_nm) is None:
         friction = {"Cd": dry_nm, **terms}
         if any(
-            bound.compute_violation(friction) > 0.0
-            for bound in physical_limits.list_bounds(tuple(friction))
-            if len(bound.weights) > 1
+            bound.compute_violation(friction) > 0.0 for bound in list_bounds(tuple(friction)) if len(bound.weights) > 1
         ):
             text = "exceeds the dry friction: at standstill friction would be below 0"
             faults.append(ConfigFault(f"{place}.stribeck", text, "in N.m"))
@@ -250,12 +247,12 @@ def _check_value(name: str, value: Any) -> str | None:
         return f"must be a number, not {_truncate_value(value)}"
     if abs(value) > LARGEST or not math.isfinite(value) or 0 < abs(value) < SMALLEST:
         return f"must be a finite number of this physical quantity, not {_truncate_value(value)}"
-    if name in physical_limits.ABOVE_ZERO and value <= 0:
+    if name in ABOVE_ZERO and value <= 0:
         return f"must be above 0, not {_truncate_value(value)}"
-    if name in physical_limits.NOT_NEGATIVE and value < 0:
+    if name in NOT_NEGATIVE and value < 0:
         return f"must be at least 0, not {_truncate_value(value)}"
-    if name == "resonance_share" and not physical_limits.LEAST_SHARE <= value <= 1 - physical_limits.LEAST_SHARE:
-        return f"must be from {physical_limits.LEAST_SHARE} to {1 - physical_limits.LEAST_SHARE}, not {_truncate_value(value)}"
+    if name == "resonance_share" and not LEAST_SHARE <= value <= 1 - LEAST_SHARE:
+        return f"must be from {LEAST_SHARE} to {1 - LEAST_SHARE}, not {_truncate_value(value)}"
     return None
 
 

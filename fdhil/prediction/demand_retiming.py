@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 from fdhil.config import MachineConfig
 from fdhil.prediction.feed_search import FeedScaledPath
 from fdhil.prediction.path_prediction import predict_path
-from fdhil.program.planner.smoothing import Smoother
+from fdhil.program import Smoother
 from fdhil.records import Bool, Float, Int, Parameters, Trajectory, freeze_array, freeze_integers
 
 APART_S = 0.1  # an error that oscillates through 0 has several peaks at one corner

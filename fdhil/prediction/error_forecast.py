@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.identification import trends
-from fdhil.identification.trends import LEAST_STEP, Slope, fit_slope, limit_forecast_days
+from fdhil.identification import LEAST_STEP, Slope, find_crossing, fit_slope, limit_forecast_days
 from fdhil.prediction.model_variants import collect_term_names, group_term_parts, restore_earlier_values
 from fdhil.prediction.path_prediction import predict_contour_um, predict_path
 from fdhil.records import PARAMETERS, Float, Parameters, ParameterSet, Prediction, Zone, compute_rms
@@ -243,7 +242,7 @@ def predict_tolerance_crossing(
         return None
     freedom = min(line.freedom for known in courses.values() for line in known.slopes.values())
     line = Slope(rate, float(np.sqrt(variance)), at=0.0, level=zone.max_um, freedom=freedom)
-    found = trends.find_crossing(line, tolerance_um)
+    found = find_crossing(line, tolerance_um)
     if found is None or found.at > limit_forecast_days(compute_observed_days(courses)):
         return None
     axis, name = max(rates, key=rates.__getitem__)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from fdhil.config import Axis, MachineConfig
-from fdhil.model import closed_loop
+from fdhil.model import simulate_axis
 from fdhil.prediction.model_variants import split_resisting_torque
 from fdhil.records import Float, Parameters, Trajectory
 
@@ -54,7 +54,7 @@ def find_feasible_feed_share(reference: Trajectory, models: Mapping[str, Paramet
                 > 1.0
             ):
                 return False
-            if closed_loop.simulate_axis(models[axis], config.axis[axis], reference.dt_s, scaled).limited_s > 0.0:
+            if simulate_axis(models[axis], config.axis[axis], reference.dt_s, scaled).limited_s > 0.0:
                 return False
         return True
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from fdhil.config import Axis
 from fdhil.records import Float, Int, Parameters, Skill, Window, compute_rms
-from fdhil.validation.move_replay import replay_setpoints
+from fdhil.validation import replay_setpoints
 
 LONGEST_DELAY = 8.0  # in SYNC cycles
 

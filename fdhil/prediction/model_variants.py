@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdhil.model import model_terms
+from fdhil.model import compute_friction_torque
 from fdhil.records import PARAMETERS, Bool, Float, Parameters
 
 DRY = ("coulomb_positive", "coulomb_negative", "stribeck", "stribeck_speed", "presliding_um")
@@ -64,7 +64,7 @@ class FrictionBand(NamedTuple):
 def compute_friction_band(parameters: Parameters, angle_rad: float) -> FrictionBand:
     """Return the band of a shaft that rests at an angle."""
     p = parameters
-    pull = float(model_terms.compute_friction_torque(p, np.zeros(1), np.array([angle_rad]))[0])
+    pull = float(compute_friction_torque(p, np.zeros(1), np.array([angle_rad]))[0])
     low, high = (p.get_term(f"coulomb_{side}", p.Cd) + p.get_term("stribeck") for side in ("negative", "positive"))
     return FrictionBand(pull - low, pull + high)
 
@@ -73,7 +73,7 @@ def split_resisting_torque(parameters: Parameters, speed_rad_s: Float, angle_rad
     """Return the torque (n,) against the positive direction of a turning shaft: its smooth and its dry part."""
     dry = replace(parameters, ft=0.0, terms=tuple(pair for pair in parameters.terms if pair[0] in DRY))
     models = remove_dry_friction(parameters), dry
-    smooth_nm, dry_nm = (model_terms.compute_friction_torque(model, speed_rad_s, angle_rad) for model in models)
+    smooth_nm, dry_nm = (compute_friction_torque(model, speed_rad_s, angle_rad) for model in models)
     return smooth_nm, dry_nm
 
 

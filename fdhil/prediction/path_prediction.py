@@ -8,7 +8,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
-from fdhil.model.closed_loop import Response, simulate_axes, simulate_axis
+from fdhil.model import Response, simulate_axes, simulate_axis
 from fdhil.prediction.contour_error import compute_contour_error_um
 from fdhil.prediction.error_zones import find_zones
 from fdhil.prediction.model_variants import remove_dry_friction

@@ -3,17 +3,9 @@
 Needs the extra ``report`` (matplotlib, jinja2); importing this package does not import them.
 """
 
-from fdhil.report.pdf import find_browser, write_page_or_pdf, write_pdf
-from fdhil.report.report_page import Page, Section, Table, render_html, require_libraries, write_page
+import lazy_loader
 
-__all__ = [
-    "Page",
-    "Section",
-    "Table",
-    "find_browser",
-    "render_html",
-    "require_libraries",
-    "write_page",
-    "write_page_or_pdf",
-    "write_pdf",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

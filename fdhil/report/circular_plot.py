@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fdhil.prediction.circle_evaluation import CIRCLE_POINTS, CircleDeviations
+from fdhil.prediction import CIRCLE_POINTS, CircleDeviations
 from fdhil.records import Float
 from fdhil.report.svg_drawing import COLOURS, INK, REFERENCE, open_drawing, place_legend_above
 

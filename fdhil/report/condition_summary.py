@@ -14,7 +14,7 @@ from fdhil.report.history_charts import AxisHistory
 from fdhil.report.parameter_format import DISPLAY_UNITS, compute_half_width, format_cell
 
 if TYPE_CHECKING:
-    from fdhil.store.history_rows import StoredWindow
+    from fdhil.store import StoredWindow
 
 RECENT_DAYS = 7.0  # before the newest rapid: changes within are reported
 NEWEST_RAPIDS = 100

@@ -11,10 +11,9 @@ from fdhil.report.parameter_format import DISPLAY_UNITS, compute_half_width, for
 
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig
-    from fdhil.identification.trends import Crossing, Step
+    from fdhil.identification import Crossing, Step
     from fdhil.records import Float
-    from fdhil.store.history_database import History
-    from fdhil.store.history_rows import StoredWindow
+    from fdhil.store import History, StoredWindow
 
 NEWEST_WINDOWS = 2000
 DAY_S = 86_400.0
@@ -69,13 +68,7 @@ def assess_axis_health(
     """Return an axis' health; ``limits`` maps a symbol to its first published value and its allowed relative change."""
     import numpy as np
 
-    from fdhil.identification.trends import (
-        BY_DIRECTION,
-        FRICTION_AT_RAPID,
-        find_steps,
-        fit_slope,
-        remove_direction_bias,
-    )
+    from fdhil.identification import BY_DIRECTION, FRICTION_AT_RAPID, find_steps, fit_slope, remove_direction_bias
 
     symbols = (*symbols, FRICTION_AT_RAPID) if symbols == PARAMETERS else symbols
     values, stds = (_collect_columns(windows, key, symbols) for key in ("value", "std"))
@@ -123,7 +116,7 @@ def assess_axis_health(
 def _collect_columns(windows: Sequence[StoredWindow], key: str, symbols: Sequence[str]) -> Float:
     import numpy as np
 
-    from fdhil.identification.trends import FRICTION_AT_RAPID
+    from fdhil.identification import FRICTION_AT_RAPID
 
     known: list[dict[str, Any]] = [
         {**(window.parameters or {}), FRICTION_AT_RAPID: window.friction or {}} for window in windows
@@ -143,7 +136,7 @@ def _format_date(seconds: float) -> str:
 def _predict_limit_date(
     symbol: str, line: Any, limit: tuple[float, float], newest_s: float, span_days: float
 ) -> dict[str, dict[str, Any]]:
-    from fdhil.identification.trends import find_crossing, limit_forecast_days
+    from fdhil.identification import find_crossing, limit_forecast_days
 
     first, share = limit
     value = first + abs(first) * (share if line.value > 0 else -share)
@@ -165,7 +158,7 @@ def _describe_crossing(reached: Crossing, newest_s: float) -> dict[str, str | No
 
 
 def _group_steps(found: Sequence[Step], windows: Sequence[StoredWindow]) -> list[dict[str, Any]]:
-    from fdhil.identification.trends import FRICTION_AT_RAPID
+    from fdhil.identification import FRICTION_AT_RAPID
 
     changes: list[list[Step]] = []
     for step in found:

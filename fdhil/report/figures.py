@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from fdhil.model.feed_drive import simulate_plant
+from fdhil.model import simulate_plant
 from fdhil.records import Float, Parameters, Window, compute_rms
 from fdhil.report.chart import MOST_POINTS, Chart, Panel, Trace, render_svg
 from fdhil.report.path_maps import (

@@ -12,7 +12,7 @@ from fdhil.report.drive_health import NEWEST_WINDOWS, assess_health
 from fdhil.report.history_charts import AxisHistory
 
 if TYPE_CHECKING:
-    from fdhil.store.history_rows import Revision, StoredWindow
+    from fdhil.store import Revision, StoredWindow
 
 NEWEST_NOTICES = 500
 PASS_CODE = "PassMeasured"
@@ -25,7 +25,7 @@ def read_history(
 
     ``tell`` receives a message about damaged rows that were left out.
     """
-    from fdhil.store.history_database import History
+    from fdhil.store import History
 
     with History.open_read_only(machine.store.directory, tell) as stored:
         windows = stored.read_windows(axis, limit=NEWEST_WINDOWS)
@@ -41,7 +41,7 @@ def read_axes(
 
     Of the published sets of one axis the first and the ``newest`` are read.
     """
-    from fdhil.store.history_database import History
+    from fdhil.store import History
 
     with History.open_read_only(machine.store.directory) as stored:
         windows = stored.read_windows(axis, limit=NEWEST_WINDOWS)
@@ -57,7 +57,7 @@ def read_axes(
 
 def read_refusals(machine: MachineConfig) -> dict[str, Refusals]:
     """Return the refusals among the newest windows, by axis. StoreError."""
-    from fdhil.store.history_database import History
+    from fdhil.store import History
 
     with History.open_read_only(machine.store.directory) as stored:
         return _count_refusals(stored.read_windows(limit=NEWEST_WINDOWS))
@@ -70,8 +70,7 @@ def _count_refusals(windows: Sequence[StoredWindow]) -> dict[str, Refusals]:
 
 def read_notices(machine: MachineConfig, axis: str | None = None) -> list[dict[str, Any]]:
     """Return the newest notices that require acknowledgement, and who acknowledged them, oldest first. StoreError."""
-    from fdhil.store.history_database import RECENT_NOTICES, History
-    from fdhil.store.notice_document import make_notice_document
+    from fdhil.store import RECENT_NOTICES, History, make_notice_document
 
     with History.open_read_only(machine.store.directory) as stored:
         known = stored.read_notices(limit=RECENT_NOTICES)
@@ -81,8 +80,7 @@ def read_notices(machine: MachineConfig, axis: str | None = None) -> list[dict[s
 
 def read_passes(machine: MachineConfig) -> list[dict[str, Any]]:
     """Return the notices of passes that were cut with correction, oldest first. StoreError."""
-    from fdhil.store.history_database import RECENT_NOTICES, History
-    from fdhil.store.notice_document import make_notice_document
+    from fdhil.store import RECENT_NOTICES, History, make_notice_document
 
     with History.open_read_only(machine.store.directory) as stored:
         known = stored.read_notices(limit=RECENT_NOTICES)
@@ -90,7 +88,7 @@ def read_passes(machine: MachineConfig) -> list[dict[str, Any]]:
 
 
 def _describe_revision(revision: Revision) -> dict[str, Any]:
-    from fdhil.store.parameter_document import make_set_document
+    from fdhil.store import make_set_document
 
     return {
         **make_set_document(revision.set),

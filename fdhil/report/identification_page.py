@@ -7,13 +7,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from fdhil.identification.next_move import predict_next_moves
+from fdhil.identification import predict_next_moves
 from fdhil.records import INTERVAL_95, PARAMETERS, Estimate, Float, Verdict, WindowOutcome, get_unit
 from fdhil.report.chart import Chart, Panel, Trace, decimate_curve, render_svg
 from fdhil.report.parameter_format import INTERVAL_MEANING, PARAMETER_MEANINGS, format_cell, format_heading
 from fdhil.report.report_page import Page, Section, Table
 from fdhil.report.svg_drawing import COLOURS, INK, REFERENCE
-from fdhil.validation.open_loop_simulation import simulate_from_voltage
+from fdhil.validation import simulate_from_voltage
 
 MOST_WINDOWS = 6
 LAGS = 40
@@ -49,7 +49,7 @@ def build_identification_page(found: IdentificationResult) -> Page:
 
 def save_picture(found: IdentificationResult, path: Path) -> None:
     """Save a picture of the first window in the format of the file's suffix."""
-    from fdhil.store.output_file import open_output
+    from fdhil.store import open_output
 
     figure = draw_identification(found)
     with open_output(path) as file:

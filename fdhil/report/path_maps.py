@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fdhil.identification.rapid_windows import find_longest_run
+from fdhil.identification import find_longest_run
 from fdhil.records import Float
 from fdhil.report.svg_drawing import (
     COLOURS,

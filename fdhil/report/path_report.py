@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fdhil.prediction.contour_error import find_nearest_points_mm
-from fdhil.prediction.correction_gain import CorrectionGain
+from fdhil.prediction import CorrectionGain, find_nearest_points_mm
 from fdhil.records import Correction, Float, Prediction, Trajectory, Zone
 from fdhil.report import figures
 from fdhil.report.figures import Curve, MapPosition

@@ -10,7 +10,7 @@ from typing import IO
 from fdhil.child_process import wrap_to_end_with_parent
 from fdhil.errors import FdhilError
 from fdhil.report.report_page import Page, render_html, write_page
-from fdhil.store.output_file import open_output
+from fdhil.store import open_output
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "microsoft-edge", "brave-browser")
 LONGEST_S = 120.0  # a start from a cold disk takes several seconds

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from fdhil.errors import FdhilError
 from fdhil.report.typography import typeset_markup, typeset_text
-from fdhil.store.output_file import open_output
+from fdhil.store import open_output
 
 
 @dataclass(frozen=True, slots=True)

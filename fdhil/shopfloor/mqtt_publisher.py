@@ -20,10 +20,8 @@ import aiomqtt
 from aiomqtt.exceptions import MqttConnectError
 
 from fdhil.cancellation import GivenUp, end_tasks, find_first_error, run_attempt
-from fdhil.config import MachineConfig
-from fdhil.config.credentials import create_tls_context, read_password
-from fdhil.config.publish_sections import MqttBroker
-from fdhil.daemon import service_log
+from fdhil.config import MachineConfig, MqttBroker, create_tls_context, read_password
+from fdhil.daemon import write_line
 from fdhil.shopfloor.published_items import PublishedEvent, PublishedValue
 from fdhil.shopfloor.publisher_process import report_ready
 from fdhil.shopfloor.sparkplug import (
@@ -96,10 +94,10 @@ async def _stay_connected(session: MqttSession, settings: MqttBroker) -> NoRetur
         except* (aiomqtt.MqttError, GivenUp) as errors:
             cause = _explain_failure(find_first_error(errors))
             if cause != logged:
-                service_log.write_line(f"nothing is published to the broker {where}: {cause}; retrying", "minor")
+                write_line(f"nothing is published to the broker {where}: {cause}; retrying", "minor")
             logged = cause
         except* HostGone:
-            service_log.write_line(f"the primary host {settings.primary_host} is offline; waiting for it", "minor")
+            write_line(f"the primary host {settings.primary_host} is offline; waiting for it", "minor")
         if time.monotonic() - began_s > LAST_RETRY_S:  # the connection lasted
             delay_s, logged = FIRST_RETRY_S, ""
         await asyncio.sleep(delay_s)
@@ -108,7 +106,7 @@ async def _stay_connected(session: MqttSession, settings: MqttBroker) -> NoRetur
 
 async def _serve_connection(session: MqttSession, settings: MqttBroker, where: str) -> None:
     async with _make_client(settings, session) as broker:
-        service_log.write_line(f"connected to the broker {where}")
+        write_line(f"connected to the broker {where}")
         await session.run(broker)
 
 
@@ -181,14 +179,12 @@ class MqttSession:
             self._note_event(self._events.popleft())
             if not self._dropped:
                 text = f"the broker is too slow: the oldest of {MOST_EVENTS} queued notices are dropped"
-                service_log.write_line(f"{text} for newer ones", "minor")
+                write_line(f"{text} for newer ones", "minor")
             self._dropped += 1
 
     def _log_skipped_notices(self) -> None:
         if self._dropped:
-            service_log.write_line(
-                f"{self._dropped} notices were not sent one by one: the broker was too slow", "minor"
-            )
+            write_line(f"{self._dropped} notices were not sent one by one: the broker was too slow", "minor")
         self._dropped = 0
 
     async def run(self, broker: aiomqtt.Client) -> None:

@@ -11,9 +11,8 @@ import contextlib
 import time
 from collections import Counter
 
-from fdhil.config import MachineConfig
-from fdhil.config.publish_sections import MtConnectAdapter
-from fdhil.daemon import service_log
+from fdhil.config import MachineConfig, MtConnectAdapter
+from fdhil.daemon import write_line
 from fdhil.errors import ConnectError
 from fdhil.shopfloor.published_items import list_published_values
 from fdhil.shopfloor.publisher_process import report_ready
@@ -97,7 +96,7 @@ class ShdrAdapter:
     async def serve_agent(self, reader: asyncio.StreamReader, agent: asyncio.StreamWriter) -> None:
         """Serve one agent until it disconnects."""
         if not self._make_room(agent):
-            service_log.write_line(f"{MAX_AGENTS} agents are connected, another one is refused", "minor")
+            write_line(f"{MAX_AGENTS} agents are connected, another one is refused", "minor")
             agent.close()
             return
         self._agents[agent] = asyncio.current_task()

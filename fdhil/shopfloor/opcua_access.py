@@ -20,9 +20,8 @@ from asyncua.server.internal_server import InternalServer
 from asyncua.server.internal_session import InternalSession
 from asyncua.server.user_managers import UserManager
 
-from fdhil.config.publish_sections import OpcUaServer
-from fdhil.config.user_file import User as KnownUser
-from fdhil.config.user_file import UsersFile, verify_password
+from fdhil.config import OpcUaServer, UsersFile, verify_password
+from fdhil.config import User as KnownUser
 from fdhil.errors import ConnectError
 from fdhil.shopfloor.opcua_subscriptions import ReportedValues
 

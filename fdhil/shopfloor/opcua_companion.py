@@ -8,7 +8,7 @@ from typing import Any
 
 from asyncua import Node, Server, ua
 
-from fdhil.config.publish_sections import OpcUaServer
+from fdhil.config import OpcUaServer
 from fdhil.shopfloor.opcua_values import make_data_value, make_node_id, make_unknown_value
 from fdhil.shopfloor.published_items import PublishedValue
 

@@ -11,8 +11,7 @@ import uvicorn
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 
-from fdhil.config import MachineConfig
-from fdhil.config.publish_sections import PrometheusMetrics
+from fdhil.config import MachineConfig, PrometheusMetrics
 from fdhil.connections import BoundedHttpProtocol
 from fdhil.errors import ConnectError
 from fdhil.shopfloor.prometheus_metrics import MetricsCollector

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from fdhil.guard.guard_protocol import FEEDFORWARD_STATE, Mode
+from fdhil.guard import FEEDFORWARD_STATE, Mode
 from fdhil.records import PARAMETERS, UNITS, MoveKind
 
 Kind = Literal["measure", "count", "flag", "state", "text"]

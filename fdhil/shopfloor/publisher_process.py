@@ -7,9 +7,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
 from fdhil.cancellation import end_tasks
-from fdhil.daemon import malloc_tuning, service_log
-from fdhil.daemon.shutdown import Shutdown
-from fdhil.daemon.systemd_notify import notify_systemd
+from fdhil.daemon import Shutdown, limit_heap_growth, notify_systemd, write_line
 
 C = TypeVar("C")
 PUBLISHER_S = 12.0  # to close connections to peers that do not answer
@@ -18,7 +16,7 @@ STOP_S = 18.0  # below the TimeoutStopSec of the units
 
 def run_publisher(publisher: Callable[[C], Coroutine[Any, Any, None]], config: C) -> None:
     """Publish until stopped. FdhilError when it cannot start."""
-    malloc_tuning.limit_heap_growth()
+    limit_heap_growth()
     shutdown = Shutdown(STOP_S, os._exit)
     try:
         asyncio.run(_publish_until_stopped(publisher(config), shutdown))
@@ -37,12 +35,10 @@ async def _publish_until_stopped(publisher: Coroutine[Any, Any, None], shutdown:
         stopping.cancel()
         publishing.result()
     elif await end_tasks([publishing], PUBLISHER_S):
-        service_log.write_line(
-            f"stopping: the connection is not closed after {PUBLISHER_S:g} s and is abandoned", "minor"
-        )
+        write_line(f"stopping: the connection is not closed after {PUBLISHER_S:g} s and is abandoned", "minor")
 
 
 def report_ready(text: str) -> None:
     """Report to the log and systemd that it serves; ``text`` names what and where, the address last."""
-    service_log.write_line(text)
+    write_line(text)
     notify_systemd(f"READY=1\nSTATUS={text}")

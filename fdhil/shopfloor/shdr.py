@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from functools import cache
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from fdhil.daemon.service_log import escape_unprintable
+from fdhil.daemon import escape_unprintable
 from fdhil.shopfloor.published_items import Plain, PublishedAlarm, PublishedEvent, PublishedItem, PublishedValue
 from fdhil.shopfloor.status_poller import StatusUpdate
 

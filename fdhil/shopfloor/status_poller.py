@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fdhil.config import MachineConfig
-from fdhil.daemon import service_log
-from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
+from fdhil.daemon import SOCKET_NAME, ask_daemon, write_line
 from fdhil.errors import DeviceError
 from fdhil.shopfloor.published_items import (
     PublishedAlarm,
@@ -84,7 +83,7 @@ async def poll_status(config: MachineConfig, period_s: float) -> AsyncIterator[S
         except DeviceError as error:
             silent = str(error)
         if silent != logged:
-            service_log.write_line(f"{silent}; no values are published meanwhile" if silent else "the daemon answers")
+            write_line(f"{silent}; no values are published meanwhile" if silent else "the daemon answers")
             logged = silent
         yield listener.build_update(status, time.time_ns() // 1_000_000, silent)
         await asyncio.sleep(max(0.0, period_s - (time.monotonic() - began_s)))

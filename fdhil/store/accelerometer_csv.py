@@ -12,8 +12,7 @@ import numpy as np
 
 from fdhil.csv_text import read_csv_text
 from fdhil.errors import RecordingError
-from fdhil.identification.filtering import filter_zero_phase, find_fft_size
-from fdhil.identification.rapid_windows import interpolate_gaps
+from fdhil.identification import filter_zero_phase, find_fft_size, interpolate_gaps
 from fdhil.records import Float, Recording, freeze_array
 
 LEAST_ROWS = 100

@@ -13,8 +13,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
 
-from fdhil.config.config_loader import read_toml
-from fdhil.config.section import Finite, Section
+from fdhil.config import Finite, Section, read_toml
 from fdhil.csv_text import quote_cell
 from fdhil.errors import ConfigError, ConfigFault, RecordingError
 from fdhil.records import Float

@@ -18,7 +18,7 @@ from types import MappingProxyType
 from typing import Any
 
 from fdhil.errors import StoreError
-from fdhil.identification.window_pool import build_pool_member, estimate_friction_at
+from fdhil.identification import build_pool_member, estimate_friction_at
 from fdhil.records import LoopEstimate, Notice, ParameterSet, Reason, Skill, WindowOutcome
 from fdhil.store import HISTORY_FILE, history_schema
 from fdhil.store.atomic_file import make_folder

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from fdhil.config import MachineConfig
-from fdhil.prediction.correction_gain import CorrectionGain, find_worst_rms_um, predict_gain
+from fdhil.prediction import CorrectionGain, find_worst_rms_um, predict_gain
 from fdhil.records import Correction, Parameters, Skill
 from fdhil.store.history_database import History
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdhil.correction.learned_offsets import LearnedOffset
+from fdhil.correction import LearnedOffset
 from fdhil.store.atomic_file import keep_newest, make_folder, make_store_error, write_file
 from fdhil.store.recording_table import UNREADABLE
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from fdhil.identification.drive_loops.loop_identification import get_regulator_values, is_better_than_configured
+from fdhil.identification import get_regulator_values, is_better_than_configured
 from fdhil.records import LoopEstimate
 from fdhil.store.history_database import HISTORY_FILE_NAME, History
 from fdhil.store.history_rows import Revision

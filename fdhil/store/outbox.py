@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from fdhil.config.uplink_section import Uplink
+from fdhil.config import Uplink
 from fdhil.errors import StoreError
 from fdhil.store import HISTORY_FILE, history_schema
 from fdhil.store.atomic_file import write_file

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from pydantic import Field
 
-from fdhil.config.section import Section
+from fdhil.config import Section
 from fdhil.csv_text import check_lengths, decode_text, quote_cell
 from fdhil.errors import RecordingError
 from fdhil.records import Float

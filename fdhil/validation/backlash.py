@@ -14,9 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.identification.filtering import compute_moving_mean
-from fdhil.identification.prepared_motion import estimate_noise_levels, find_resolution
-from fdhil.identification.rapid_windows import fill_forward, find_moving_range
+from fdhil.identification import (
+    compute_moving_mean,
+    estimate_noise_levels,
+    fill_forward,
+    find_moving_range,
+    find_resolution,
+)
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.false_alarm_budget import BUDGET
 

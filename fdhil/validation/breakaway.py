@@ -6,10 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.identification.filtering import compute_moving_mean
-from fdhil.identification.likelihood_fit import LikelihoodFit
-from fdhil.identification.prepared_motion import UNKNOWN_MODE
-from fdhil.identification.term_regressors import compute_term_torque_nm
+from fdhil.identification import UNKNOWN_MODE, LikelihoodFit, compute_moving_mean, compute_term_torque_nm
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.false_alarm_budget import BUDGET
 

@@ -7,8 +7,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from fdhil.identification.parameter_drift import FRICTION_PARAMETERS, LEAST_JUMP
-from fdhil.identification.window_pool import compute_difference_covariance
+from fdhil.identification import FRICTION_PARAMETERS, LEAST_JUMP, compute_difference_covariance
 from fdhil.records import PARAMETERS, Estimate, Float, Reason, Window
 from fdhil.validation.false_alarm_budget import BUDGET
 

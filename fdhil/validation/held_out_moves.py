@@ -15,9 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.config import Axis, Identification
-from fdhil.identification.between_window_variance import estimate_between_window_variance
-from fdhil.identification.physical_bounds import bound_estimate
-from fdhil.identification.window_pool import build_pool_member, pool_estimates
+from fdhil.identification import bound_estimate, build_pool_member, estimate_between_window_variance, pool_estimates
 from fdhil.records import Estimate, Float, HeldOut, Parameters, Reason, Window, freeze_array
 from fdhil.validation.move_replay import Replay, replay_setpoints
 

@@ -12,8 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fdhil.identification.filtering import compute_moving_mean
-from fdhil.identification.rapid_windows import find_longest_run, interpolate_gaps
+from fdhil.identification import compute_moving_mean, find_longest_run, interpolate_gaps
 from fdhil.records import Float, NcMove, Reason, Window
 from fdhil.validation.window_signals import WindowSignals
 

@@ -15,12 +15,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from fdhil.identification.candidate_terms import PHASE_SUFFIX
-from fdhil.identification.kalman import DELAY
-from fdhil.identification.likelihood_fit import LikelihoodFit
-from fdhil.identification.normal_equations import invert_symmetric, solve_least_squares
-from fdhil.identification.term_regressors import FIRST_TERM
-from fdhil.identification.voltage_delay import differentiate_by_delay
+from fdhil.identification import (
+    DELAY,
+    FIRST_TERM,
+    PHASE_SUFFIX,
+    LikelihoodFit,
+    differentiate_by_delay,
+    invert_symmetric,
+    solve_least_squares,
+)
 from fdhil.records import PARAMETERS, Estimate, Float, freeze_array
 from fdhil.validation.score_tests import Finding, ScoreTest
 

@@ -8,10 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdhil.config import Axis
-from fdhil.identification.prepared_motion import find_resolution
-from fdhil.identification.rapid_windows import find_moving_range
-from fdhil.model import closed_loop
-from fdhil.model.model_terms import add_resonance
+from fdhil.identification import find_moving_range, find_resolution
+from fdhil.model import Response, add_resonance, create_standstill_state, simulate_axis
 from fdhil.records import PARAMETERS, Float, Int, Parameters, Window, compute_rms
 
 LEAST_ROWS = 20
@@ -32,7 +30,7 @@ class Replay:
     ``step_um`` is the measured position's resolution.
     """
 
-    response: closed_loop.Response
+    response: Response
     rows: Int
     difference_um: Float
     following_um: Float
@@ -80,8 +78,8 @@ def replay_move(
     demand = _fill_gaps(demand_mm, "demand")
     offset = None if offset_mm is None else np.nan_to_num(offset_mm)
     position = float(_fill_gaps(position_mm, "position")[0])
-    start = closed_loop.create_standstill_state(parameters, axis, position, standstill_a, float(demand[0]))
-    response = closed_loop.simulate_axis(parameters, axis, sync_period_s, demand, offset, state=start)
+    start = create_standstill_state(parameters, axis, position, standstill_a, float(demand[0]))
+    response = simulate_axis(parameters, axis, sync_period_s, demand, offset, state=start)
     rows = np.flatnonzero(np.isfinite(demand_mm) & np.isfinite(position_mm))
     rows = rows[(rows >= _EDGE) & (rows < demand.size - _EDGE)]
     if rows.size < LEAST_ROWS:

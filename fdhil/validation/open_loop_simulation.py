@@ -6,11 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fdhil.identification import compute_term_voltage_v, fill_forward, list_missing_reasons
 from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
-from fdhil.identification.identifiability import list_missing_reasons
-from fdhil.identification.rapid_windows import fill_forward
-from fdhil.identification.term_regressors import compute_term_voltage_v
-from fdhil.model.feed_drive import discretise_plant, simulate_plant
+from fdhil.model import discretise_plant, simulate_plant
 from fdhil.records import Estimate, Float, Parameters, Window
 
 LEAST_FIT_PERCENT = 80.0

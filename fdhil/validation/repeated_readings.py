@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from fdhil.identification.prepared_motion import find_resolution
-from fdhil.identification.rapid_windows import estimate_noise_std
+from fdhil.identification import estimate_noise_std, find_resolution
 from fdhil.records import Bool, Float
 from fdhil.validation.false_alarm_budget import BUDGET
 

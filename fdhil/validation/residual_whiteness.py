@@ -6,10 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from fdhil.identification import estimate_aliasing_doubt, estimate_open_voltage_v, invert_symmetric
 from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
-from fdhil.identification.low_rate_voltage.low_rate_innovations import estimate_open_voltage_v
-from fdhil.identification.normal_equations import invert_symmetric
-from fdhil.identification.robust_covariance import estimate_aliasing_doubt
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.false_alarm_budget import BUDGET
 from fdhil.validation.score_tests import LAGS, compute_expected_autocorrelation

@@ -11,13 +11,20 @@ from functools import lru_cache
 
 import numpy as np
 
+from fdhil.identification import (
+    CURRENT,
+    LOAD,
+    SPEED,
+    VOLTAGE,
+    Motion,
+    compute_innovations,
+    compute_low_rate_innovations,
+    compute_moving_mean,
+    compute_signal_response,
+    estimate_aliasing_doubt,
+    invert_symmetric,
+)
 from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
-from fdhil.identification.filtering import compute_moving_mean
-from fdhil.identification.innovations import CURRENT, LOAD, SPEED, VOLTAGE, compute_innovations, compute_signal_response
-from fdhil.identification.low_rate_voltage.low_rate_innovations import compute_low_rate_innovations
-from fdhil.identification.normal_equations import invert_symmetric
-from fdhil.identification.prepared_motion import Motion
-from fdhil.identification.robust_covariance import estimate_aliasing_doubt
 from fdhil.records import Float, Reason
 from fdhil.validation.false_alarm_budget import BUDGET
 

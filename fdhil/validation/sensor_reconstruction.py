@@ -12,11 +12,16 @@ from functools import cached_property
 
 import numpy as np
 
+from fdhil.identification import (
+    BROKEN_MODE,
+    DELAY,
+    Modes,
+    compute_departure,
+    compute_load_nm,
+    compute_motor_voltage_v,
+    compute_moving_mean,
+)
 from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
-from fdhil.identification.filtering import compute_moving_mean
-from fdhil.identification.kalman import DELAY, compute_departure
-from fdhil.identification.prepared_motion import BROKEN_MODE, Modes
-from fdhil.identification.term_regressors import compute_load_nm, compute_motor_voltage_v
 from fdhil.records import Float
 
 NEIGHBOUR_S = 0.040  # around the doubted rows that are included: some time constants of a winding

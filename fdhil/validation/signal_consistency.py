@@ -13,9 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
-from fdhil.identification.normal_equations import solve_least_squares
-from fdhil.identification.prepared_motion import find_resolution
-from fdhil.identification.rapid_windows import fill_forward, interpolate_gaps, smooth_samples
+from fdhil.identification import fill_forward, find_resolution, interpolate_gaps, smooth_samples, solve_least_squares
 from fdhil.records import Float, Reason, Recording, Window
 from fdhil.validation.window_signals import SensorSignal, WindowSignals
 

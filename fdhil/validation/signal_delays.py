@@ -6,11 +6,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fdhil.identification.filtering import compute_moving_mean
-from fdhil.identification.innovations import CURRENT, VOLTAGE, compute_signal_response
-from fdhil.identification.likelihood_fit import LikelihoodFit
-from fdhil.identification.normal_equations import invert_symmetric
-from fdhil.identification.term_regressors import compute_motor_voltage_v
+from fdhil.identification import (
+    CURRENT,
+    VOLTAGE,
+    LikelihoodFit,
+    compute_motor_voltage_v,
+    compute_moving_mean,
+    compute_signal_response,
+    invert_symmetric,
+)
 from fdhil.records import Float, Reason
 from fdhil.validation.false_alarm_budget import BUDGET
 from fdhil.validation.score_tests import Finding, compute_expected_autocorrelation, compute_voltage_uncertainty

@@ -7,8 +7,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from fdhil.identification.prepared_motion import find_resolution
-from fdhil.identification.rapid_windows import fill_forward, find_longest_run, interpolate_gaps
+from fdhil.identification import fill_forward, find_longest_run, find_resolution, interpolate_gaps
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.false_alarm_budget import BUDGET
 from fdhil.validation.repeated_readings import is_beyond_chance

@@ -16,15 +16,21 @@ from dataclasses import replace
 
 import numpy as np
 
+from fdhil.identification import (
+    Motion,
+    build_sample_regressors,
+    compute_innovations,
+    compute_low_rate_innovations,
+    compute_moving_mean,
+    estimate_noise_std,
+    fill_forward,
+    find_resolution,
+    invert_symmetric,
+    smooth_samples,
+    sort_runs_by_length,
+)
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
-from fdhil.identification.filtering import compute_moving_mean
-from fdhil.identification.innovations import compute_innovations
-from fdhil.identification.low_rate_voltage.low_rate_innovations import compute_low_rate_innovations
-from fdhil.identification.low_rate_voltage.starting_values import build_sample_regressors
-from fdhil.identification.normal_equations import invert_symmetric
-from fdhil.identification.prepared_motion import Motion, find_resolution
-from fdhil.identification.rapid_windows import estimate_noise_std, fill_forward, smooth_samples, sort_runs_by_length
 from fdhil.records import Float, Reason, SlowVoltage, Window
 from fdhil.validation.false_alarm_budget import BUDGET
 from fdhil.validation.repeated_readings import compute_repeat_probability

@@ -6,12 +6,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fdhil.identification.estimators import maximum_likelihood
+from fdhil.identification import (
+    NoiseLevels,
+    build_estimate,
+    compute_term_voltage_v,
+    fill_forward,
+    invert_symmetric,
+    smooth_samples,
+)
 from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
-from fdhil.identification.normal_equations import invert_symmetric
-from fdhil.identification.prepared_motion import NoiseLevels
-from fdhil.identification.rapid_windows import fill_forward, smooth_samples
-from fdhil.identification.term_regressors import compute_term_voltage_v
 from fdhil.records import Reason, Window
 from fdhil.validation.false_alarm_budget import BUDGET
 from fdhil.validation.table_assessment import TableAssessment
@@ -89,7 +92,7 @@ def _compare_current_with_voltage(
 
 
 def _compute_resistance_std_share(fit: LikelihoodFit) -> float:
-    return maximum_likelihood.build_estimate(fit).get_std("R") / float(fit.theta[0])
+    return build_estimate(fit).get_std("R") / float(fit.theta[0])
 
 
 def _check_holding_torque(window: Window, fit: LikelihoodFit, rows: Rows) -> Iterator[Reason]:

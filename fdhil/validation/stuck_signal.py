@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from fdhil.identification.rapid_windows import sort_runs_by_length
+from fdhil.identification import sort_runs_by_length
 from fdhil.records import Bool, Float, Reason
 from fdhil.validation.false_alarm_budget import BUDGET
 from fdhil.validation.repeated_readings import (

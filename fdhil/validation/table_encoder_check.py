@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from fdhil.config import Axis
-from fdhil.identification.rapid_windows import find_moving_range
-from fdhil.model import closed_loop
+from fdhil.identification import find_moving_range
+from fdhil.model import simulate_axis
 from fdhil.records import AtTable, Float, Parameters, Window, compute_rms
 
 LEAST_ROWS = 20
@@ -58,4 +58,4 @@ def _predict_table_position(
     if parameters is None or axis is None or not complete or not same_grid or not np.isfinite(window.demand_mm).all():
         return None
     offset = None if window.offset_mm is None else np.nan_to_num(window.offset_mm)
-    return closed_loop.simulate_axis(parameters, axis, sync_period_s, window.demand_mm, offset).table_mm
+    return simulate_axis(parameters, axis, sync_period_s, window.demand_mm, offset).table_mm

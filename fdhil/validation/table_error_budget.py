@@ -21,11 +21,9 @@ from typing import Literal
 
 import numpy as np
 
-from fdhil.config import Axis, Identification
-from fdhil.config.nc_section import TOLERANCE_SHARE
-from fdhil.identification.filtering import compute_moving_mean, find_fft_size
-from fdhil.identification.rapid_windows import fill_forward
-from fdhil.model.model_terms import compute_friction_torque
+from fdhil.config import TOLERANCE_SHARE, Axis, Identification
+from fdhil.identification import compute_moving_mean, fill_forward, find_fft_size
+from fdhil.model import compute_friction_torque
 from fdhil.records import Bool, Float, Parameters, Reason, Window, compute_rms
 from fdhil.validation.move_replay import Replay, replay_with_load_search
 

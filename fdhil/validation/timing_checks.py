@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from fdhil.identification.likelihood_fit import LikelihoodFit, exclude_delay, run_gauss_newton, set_delay
-from fdhil.identification.likelihood_fit import fit_parameters_and_noise as refit
+from fdhil.identification import LikelihoodFit, exclude_delay, run_gauss_newton, set_delay
+from fdhil.identification import fit_parameters_and_noise as refit
 from fdhil.records import Reason
 from fdhil.validation.false_alarm_budget import BUDGET
 from fdhil.validation.signal_delays import LARGEST, SignalDelay, build_delay_reason, estimate_delays

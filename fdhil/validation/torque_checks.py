@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.identification.normal_equations import invert_gram
-from fdhil.identification.torque_fit import (
+from fdhil.identification import (
     TorqueFit,
     count_effective_samples,
     estimate_current_lag_s,
+    invert_gram,
     list_candidate_terms,
 )
 from fdhil.records import Reason, compute_rms

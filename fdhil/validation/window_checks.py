@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from fdhil.identification.identifiability import find_unphysical_values, list_missing_reasons
+from fdhil.identification import find_unphysical_values, list_missing_reasons
 from fdhil.records import Reason, Result
 from fdhil.validation.estimate_agreement import find_deviating_values
 from fdhil.validation.interrupted_moves import find_interruptions

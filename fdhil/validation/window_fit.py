@@ -7,10 +7,15 @@ from functools import cached_property
 
 import numpy as np
 
-from fdhil.identification.estimators import least_squares
-from fdhil.identification.likelihood_fit import LikelihoodFit, exclude_delay, fit_parameters_and_noise, set_delay
-from fdhil.identification.torque_fit import TorqueFit
-from fdhil.identification.voltage_delay import estimate_coarse_delay
+from fdhil.identification import (
+    LikelihoodFit,
+    TorqueFit,
+    align_signals,
+    estimate_coarse_delay,
+    exclude_delay,
+    fit_parameters_and_noise,
+    set_delay,
+)
 from fdhil.records import PARAMETERS, Estimate, Parameters, Reason, Window
 from fdhil.validation.breakaway import Breakaway, measure_breakaway
 from fdhil.validation.model_deficiencies import Deficiency, inflate_covariance, select_deficiencies
@@ -79,7 +84,7 @@ class WindowFit:
         window = self.window
         if not self.voltage_delay_s or window.voltage_v is None:
             return bool(self.voltage_delay_s)
-        return estimate_coarse_delay(least_squares.align_signals(window, self.signals.settings), window.dt_s) != 0.0
+        return estimate_coarse_delay(align_signals(window, self.signals.settings), window.dt_s) != 0.0
 
     @cached_property
     def aligned_fit(self) -> LikelihoodFit:

@@ -9,8 +9,14 @@ from functools import cached_property
 import numpy as np
 
 from fdhil.config import Axis, Identification
-from fdhil.identification.prepared_motion import NoiseLevels, estimate_noise_levels, find_resolution
-from fdhil.identification.rapid_windows import fill_forward, find_moving_range, smooth_samples
+from fdhil.identification import (
+    NoiseLevels,
+    estimate_noise_levels,
+    fill_forward,
+    find_moving_range,
+    find_resolution,
+    smooth_samples,
+)
 from fdhil.records import Bool, Float, Window
 from fdhil.validation.backlash import DeadBand, detect_backlash
 

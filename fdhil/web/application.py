@@ -16,10 +16,9 @@ from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 from starlette.middleware.gzip import GZipMiddleware
 
-from fdhil.arming.refusals import make_refusal
-from fdhil.config import MachineConfig
-from fdhil.config.web_section import Web
-from fdhil.daemon.daemon_socket import SOCKET_NAME
+from fdhil.arming import make_refusal
+from fdhil.config import MachineConfig, Web
+from fdhil.daemon import SOCKET_NAME
 from fdhil.errors import FdhilError
 from fdhil.web import pages
 from fdhil.web.daemon_client import DaemonClient

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel
 
-from fdhil.arming.refusals import make_refusal
+from fdhil.arming import make_refusal
 from fdhil.errors import ConfigError, ConnectError, DeviceTimeout, FdhilError, ProgramError, RecordingError, StoreError
 
 STATUS: Mapping[type[FdhilError], int] = {

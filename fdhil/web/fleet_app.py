@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends, FastAPI, Query, Request
 
-from fdhil.config.web_section import Web
+from fdhil.config import Web
 from fdhil.records import PARAMETERS
 from fdhil.web.application import make_application
 from fdhil.web.fault_responses import RequestRefused

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from fdhil.cancellation import run_attempt
-from fdhil.daemon.live_stream import LIVE_SIGNALS, decode_base64
+from fdhil.daemon import LIVE_SIGNALS, decode_base64
 from fdhil.errors import ConnectError, DeviceError
 from fdhil.json_lines import decode_line
 from fdhil.web.live_ring import SampleRing

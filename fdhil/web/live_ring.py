@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdhil.daemon.live_stream import LIVE_SIGNALS
+from fdhil.daemon import LIVE_SIGNALS
 
 Rows = NDArray[np.float32]
 UNITS = {

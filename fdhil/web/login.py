@@ -16,7 +16,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fdhil.config.user_file import LONGEST_PASSWORD, Role, User, UsersFile, verify_password
+from fdhil.config import LONGEST_PASSWORD, Role, User, UsersFile, verify_password
 from fdhil.web.fault_responses import RequestRefused
 
 LIFE_S = 12 * 3600.0

@@ -9,7 +9,7 @@ from pathlib import Path
 from pydantic import BaseModel, Field
 
 from fdhil.errors import StoreError
-from fdhil.store.named_file import open_named
+from fdhil.store import open_named
 from fdhil.web.fault_responses import RequestRefused
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"

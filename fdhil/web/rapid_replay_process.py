@@ -13,13 +13,10 @@ from typing import Any
 
 from fdhil.bounded_process import limit_process, receive_requests
 from fdhil.config import MachineConfig
-from fdhil.daemon.outcome_store import WINDOWS_FOLDER
+from fdhil.daemon import WINDOWS_FOLDER
 from fdhil.errors import FdhilError
-from fdhil.pipeline.model_overlay import overlay_model
-from fdhil.store.history_database import History
-from fdhil.store.named_file import open_named
-from fdhil.store.newest_parameters import find_newest_loops
-from fdhil.store.window_file import MAX_FILE_BYTES, decode_window
+from fdhil.pipeline import overlay_model
+from fdhil.store import MAX_FILE_BYTES, History, decode_window, find_newest_loops, open_named
 from fdhil.web.fault_responses import RequestRefused, find_http_status, make_fault_document
 from fdhil.web.pages.rapid_list import read_window
 from fdhil.web.pages.rapid_signals import RapidSignals, make_rapid_signals

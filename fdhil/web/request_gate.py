@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from fdhil.config.web_section import Web
+from fdhil.config import Web
 from fdhil.web.fault_responses import RequestRefused
 from fdhil.web.login import LoginManager, Principal
 

@@ -12,9 +12,8 @@ from typing import Annotated
 from fastapi import Depends
 from starlette.requests import HTTPConnection
 
-from fdhil.config import MachineConfig
-from fdhil.config.web_section import Web
-from fdhil.store.history_database import History
+from fdhil.config import MachineConfig, Web
+from fdhil.store import History
 from fdhil.web.daemon_client import DaemonClient
 from fdhil.web.login import LoginManager, Principal
 

@@ -12,10 +12,8 @@ from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
-from fdhil.config import MachineConfig
-from fdhil.config.web_section import Web, is_loopback
-from fdhil.daemon import malloc_tuning
-from fdhil.daemon.shutdown import Shutdown
+from fdhil.config import MachineConfig, Web, is_loopback
+from fdhil.daemon import Shutdown, limit_heap_growth, trim_heap
 from fdhil.errors import ConfigError, ConfigFault, ConnectError, FdhilError
 
 if TYPE_CHECKING:
@@ -72,7 +70,7 @@ def serve_application(web: Web, make: Callable[[], FastAPI], ready: Callable[[st
     require_extra()
     check_reach(web)
     certificate = _load_certificate(web)
-    malloc_tuning.limit_heap_growth()
+    limit_heap_growth()
     with _open_listener(web) as listener:
         shutdown = Shutdown(END_S, os._exit)
         try:
@@ -142,7 +140,7 @@ async def _give_back() -> None:
     """Return free memory regularly: a page of a long history takes 100 MB while it is made."""
     while True:
         await asyncio.sleep(GIVE_BACK_S)
-        await asyncio.to_thread(malloc_tuning.trim_heap)
+        await asyncio.to_thread(trim_heap)
 
 
 def make_server(app: FastAPI, certificate: ssl.SSLContext | None, ready: Callable[[], None]) -> uvicorn.Server:

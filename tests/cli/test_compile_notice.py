@@ -28,9 +28,8 @@ def test_cold_cache_is_announced_once_with_duration(
 def test_cached_kernels_of_numba_are_detected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The cache of a kernel of this process is the one that is examined."""
     source = Path(offset_kernels.__file__)
-    assert Path(offset_kernels._compute_differences.stats.cache_path) in list(
-        compilation_notice._list_cache_folders(source)
-    )  # type: ignore[attr-defined]
+    cache = offset_kernels._compute_differences.stats.cache_path  # type: ignore[attr-defined]
+    assert Path(cache) in list(compilation_notice._list_cache_folders(source))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     folder = tmp_path / f"{source.parent.name}_0"
     folder.mkdir()

@@ -57,8 +57,10 @@ CASES: dict[str, Callable[[], Any]] = {
     "what belongs to each axis": lambda: combine_axis_views(MADE, INPUTS, FEWER),
     "what was observed": lambda: read_back_checks.observe_drives(FEWER, INPUTS._replace(alarms=()), MADE),
     "speed and torque shown": lambda: read_back_checks._compare_feedforward_read_back(
-        STATE.axes[0], (0,), [(0, 0)] * 2
-    ),  # type: ignore[arg-type]
+        STATE.axes[0],
+        (0,),  # type: ignore[arg-type]
+        [(0, 0)] * 2,
+    ),
     "offsets while held": next_offsets(Mode.HOLD),
     "offsets toward zero": next_offsets(Mode.RAMP_DOWN),
     "offsets of the table": next_offsets(Mode.ACTIVE),

@@ -95,7 +95,7 @@ def create_config(outfit: VendorDrive, machine: MachineConfig, folder: Path, cap
 
 
 @pytest.fixture(autouse=True)
-def short_delays(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_sdo_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorten the SDO time-outs: a drive in this process answers at once."""
     monkeypatch.setattr("fdhil.commissioning.scan.PACE_S", 1e-4)
 

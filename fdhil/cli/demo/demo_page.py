@@ -20,9 +20,25 @@ from fdhil.records import (
     Window,
     get_unit,
 )
-from fdhil.report import Page, Section, Table, figures
-from fdhil.report.figures import Curve
-from fdhil.report.parameter_format import DISPLAY_UNITS, format_cell
+from fdhil.report import (
+    DISPLAY_UNITS,
+    Curve,
+    MapPosition,
+    Page,
+    Section,
+    Table,
+    draw_contour_errors,
+    draw_drift,
+    draw_error_map,
+    draw_model_comparison,
+    draw_path,
+    draw_path_detail,
+    draw_signals,
+    draw_torque,
+    find_common_scale,
+    format_cell,
+    magnify_deviation,
+)
 
 # named locations of the path, mm
 POINTS: Mapping[str, tuple[float, float]] = {
@@ -160,9 +176,9 @@ def _build_identification_section(loop: DemoResult) -> Section:
     for axis, (window, fit_percent) in loop.cold.items():
         found = loop.published[axis][0].parameters
         caption = f"Axis {axis}: voltage, current and speed of one rapid move, as measured (Figure 4 of the paper)"
-        pictures.append((caption, figures.draw_signals(window)))
+        pictures.append((caption, draw_signals(window)))
         caption = f"Axis {axis}: speed of model and drive for the measured voltage, and their difference (Figure 8)"
-        pictures.append((caption, figures.draw_model_comparison(window, found, fit_percent)))
+        pictures.append((caption, draw_model_comparison(window, found, fit_percent)))
     received, lost = loop.frames
     return Section(
         "Identified during rapid moves",
@@ -180,12 +196,12 @@ def _build_drift_section(loop: DemoResult) -> Section:
         cases = [(f"{found.temperature_c:.1f} degC", window, found.parameters)
                  for window, found in ((cold, first), (warm, last))]  # fmt: skip
         caption = f"Axis {axis}: torque of a rapid move with cold and with warm slide-ways, from the model (Figure 5)"
-        pictures.append((caption, figures.draw_torque(cases)))
+        pictures.append((caption, draw_torque(cases)))
     for symbol, meaning, number in (("ft", "Viscous friction", 6), ("Cd", "Coulomb friction", 7)):
         series = {axis: _collect_series(sets, symbol) for axis, sets in loop.published.items()}
         what = f"{meaning} {symbol} over the temperature of the slide-ways"
         caption = f"{what}, with its 95 % intervals (Figure {number})"
-        pictures.append((caption, figures.draw_drift(symbol, UNITS[symbol], series)))
+        pictures.append((caption, draw_drift(symbol, UNITS[symbol], series)))
     return Section(
         "Drift with the slide-ways' temperature",
         "The slide-ways were warmed while the axes kept shuttling. Only rapids were used.",
@@ -215,8 +231,8 @@ def _build_path_section(loop: DemoResult) -> Section:
     return Section(
         "The programmed path",
         figures=[
-            ("The path and its named places (Figure 10)", figures.draw_path(slow, POINTS)),
-            ("The rounded variant for a 40 mm cutter (Figure 19)", figures.draw_path(rounded, {})),
+            ("The path and its named places (Figure 10)", draw_path(slow, POINTS)),
+            ("The rounded variant for a 40 mm cutter (Figure 19)", draw_path(rounded, {})),
         ],
     )
 
@@ -230,10 +246,10 @@ def _build_prediction_section(loop: DemoResult) -> Section:
         curves = [Curve("desired, 10 m/min", _join_xy(slow.position_mm))]
         for feed, answer in feeds.items():
             desired = _join_xy(answer.reference.position_mm)
-            curves.append(Curve(feed, figures.magnify_deviation(desired, _join_xy(answer.predicted_mm), MAGNIFIED)))
+            curves.append(Curve(feed, magnify_deviation(desired, _join_xy(answer.predicted_mm), MAGNIFIED)))
         curves.append(Curve("desired, 20 m/min", _join_xy(loop.programs["20 m/min"].position_mm), dashed=True))
         caption = f"Predicted path at {place} for two feeds, errors {MAGNIFIED} times as large (Figure {number})"
-        pictures.append((caption, figures.draw_path_detail(curves, POINTS[place], 8.0)))
+        pictures.append((caption, draw_path_detail(curves, POINTS[place], 8.0)))
     for (label, change), number in zip(DRIFTS, (14, 15), strict=True):
         drifted = predict_path(slow, models | {"X": _apply_drift(models["X"], change)}, loop.config)
         curves = [
@@ -241,9 +257,7 @@ def _build_prediction_section(loop: DemoResult) -> Section:
             Curve("as identified", _join_xy(feeds["10 m/min"].predicted_mm)),
             Curve(label, _join_xy(drifted.predicted_mm), dashed=True),
         ]
-        pictures.append(
-            (f"Effect at E of {label} (Figure {number})", figures.draw_path_detail(curves, POINTS["E"], 0.2))
-        )
+        pictures.append((f"Effect at E of {label} (Figure {number})", draw_path_detail(curves, POINTS["E"], 0.2)))
     worst = [[f"{z.start_s:.2f} to {z.end_s:.2f}", z.where, f"{z.max_um:.1f}", z.cause] for z in loop.predicted.zones]
     return Section(
         "Predicted before the cut",
@@ -263,10 +277,7 @@ def _build_correction_section(loop: DemoResult) -> Section:
     before = loop.cuts[0]
     measured = [
         Curve("desired", before.reference_mm),
-        *(
-            Curve(cut.label, figures.magnify_deviation(cut.reference_mm, cut.table_mm, ENLARGED))
-            for cut in loop.cuts[:3]
-        ),
+        *(Curve(cut.label, magnify_deviation(cut.reference_mm, cut.table_mm, ENLARGED)) for cut in loop.cuts[:3]),
     ]
     errors = {cut.label: cut.contour_um for cut in loop.cuts}
     rounded, inverse = (
@@ -281,27 +292,27 @@ def _build_correction_section(loop: DemoResult) -> Section:
         figures=[
             (
                 "Contour error along the path, measured per pass (the loop of Figure 16, closed)",
-                figures.draw_contour_errors(loop.config.machine.sync_period_s, errors),
+                draw_contour_errors(loop.config.machine.sync_period_s, errors),
             ),
             *_draw_error_maps((before, loop.cuts[2])),
-            (f"Area A, measured, {larger} (Figure 17)", figures.draw_path_detail(measured, POINTS["A"], 6.0)),
+            (f"Area A, measured, {larger} (Figure 17)", draw_path_detail(measured, POINTS["A"], 6.0)),
             (
                 f"The straight after A, measured, {larger} (Figure 18)",
-                figures.draw_path_detail(measured, (20.0, 55.0), 12.0),
+                draw_path_detail(measured, (20.0, 55.0), 12.0),
             ),
-            (f"Area E, measured, {larger}", figures.draw_path_detail(measured, POINTS["E"], 6.0)),
+            (f"Area E, measured, {larger}", draw_path_detail(measured, POINTS["E"], 6.0)),
             (f"Rounded path at the end of A, simulated, {larger} (Figure 20)", _draw_rounded_path(rounded, inverse)),
         ],
     )
 
 
 def _draw_error_maps(cuts: Sequence[CutPass]) -> list[tuple[str, str]]:
-    largest, least = figures.find_common_scale([cut.contour_um for cut in cuts])
-    places = [figures.MapPosition(name, *at) for name, at in POINTS.items()]
+    largest, least = find_common_scale([cut.contour_um for cut in cuts])
+    places = [MapPosition(name, *at) for name, at in POINTS.items()]
     return [
         (
             f"Where the error is, {cut.label}: {cut.max_um:.1f} um at most; both maps have the same colour scale",
-            figures.draw_error_map(cut.reference_mm, cut.contour_um, largest, places=places, least_um=least),
+            draw_error_map(cut.reference_mm, cut.contour_um, largest, places=places, least_um=least),
         )
         for cut in cuts
     ]
@@ -312,7 +323,7 @@ def _draw_rounded_path(mirror: Correction, inverse: Correction) -> str:
     cases = {"uncorrected": mirror.before, "mirror": mirror.after, "inverse": inverse.after}
     curves = [Curve("desired", desired)]
     curves += [
-        Curve(label, figures.magnify_deviation(desired, _join_xy(answer.predicted_mm), ENLARGED))
+        Curve(label, magnify_deviation(desired, _join_xy(answer.predicted_mm), ENLARGED))
         for label, answer in cases.items()
     ]
-    return figures.draw_path_detail(curves, (20.0, 75.0), 12.0)
+    return draw_path_detail(curves, (20.0, 75.0), 12.0)

@@ -15,17 +15,15 @@ from fdhil.cli.demo.demo_page import CutPass, DemoResult, Published, compute_rms
 from fdhil.cli.demo.machines import load_machine_document
 from fdhil.cli.demo.processes import PATIENCE_S, ChildProcess, SimulatorProcess
 from fdhil.cli.demo.toml_writer import format_toml
-from fdhil.commissioning.commissioning_record import save_record
-from fdhil.commissioning.commissioning_steps import commission_axis
+from fdhil.commissioning import commission_axis, save_record
 from fdhil.config import MachineConfig
-from fdhil.daemon.daemon_socket import SOCKET_NAME, ask_daemon
+from fdhil.daemon import SOCKET_NAME, ask_daemon
 from fdhil.errors import DeviceTimeout, FdhilError, RecordingError
 from fdhil.prediction import compute_contour_error_um, predict_path
 from fdhil.program import load_trajectory
 from fdhil.records import PARAMETERS, Parameters, ParameterSet, Window
-from fdhil.sim.drive.plant_physics import build_plant_parameters
-from fdhil.store.history_database import History
-from fdhil.store.window_file import read_window
+from fdhil.sim import build_plant_parameters
+from fdhil.store import History, read_window
 
 Say = Callable[[str], None]
 

@@ -24,12 +24,10 @@ from fdhil.cli.demo.loop import (
 from fdhil.cli.demo.machines import REAL, load_machine_document
 from fdhil.config import MachineConfig
 from fdhil.errors import ConnectError, FdhilError
-from fdhil.prediction import predict_path
-from fdhil.prediction.axis_models import load_validated_models, select_models
+from fdhil.prediction import load_validated_models, predict_path, select_models
 from fdhil.program import load_trajectory
 from fdhil.records import Parameters, Prediction
-from fdhil.store.history_database import History
-from fdhil.store.newest_parameters import read_newest_parameters
+from fdhil.store import History, read_newest_parameters
 
 AMBIENT_C = 20.0
 

@@ -3,7 +3,7 @@
 from fdhil.cli.demo.demo_page import CUT_HEAD, PARAMETER_HEAD, compute_rms, format_cut_rows, list_identified_rows
 from fdhil.cli.demo.realistic_machine import AxisOutcome, RealisticResult
 from fdhil.config import Reality
-from fdhil.report import Section, Table, figures
+from fdhil.report import Section, Table, draw_contour_errors
 
 SHAPES = ("_phase", "_speed")  # suffixes of values that belong to another term
 VERDICT_HEAD = ("axis", "accepted rapids", "model", "reasons of refusals")
@@ -30,7 +30,7 @@ def build_section(realistic: RealisticResult) -> Section:
             Table(PARAMETER_HEAD, list_parameter_rows(realistic), "Identified"),
             Table(CUT_HEAD, list_cut_rows(realistic), "Contour error, 10 m/min, at the true table"),
         ],
-        figures=[("Contour error along the path, realistic machine", figures.draw_contour_errors(period_s, errors))],
+        figures=[("Contour error along the path, realistic machine", draw_contour_errors(period_s, errors))],
     )
 
 

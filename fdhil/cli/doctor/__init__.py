@@ -15,7 +15,7 @@ from fdhil.cli.cli_errors import require_delivered_answer
 from fdhil.cli.doctor.trouble import Trouble
 from fdhil.cli.options import AS_JSON, CONFIG, PositiveFloat
 from fdhil.cli.terminal_text import print_progress
-from fdhil.daemon.clock_watch import find_newest_record_s
+from fdhil.daemon import find_newest_record_s
 
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig

@@ -2,16 +2,14 @@
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 
-from fdhil.arming.guard_client import GuardClient
+from fdhil.arming import GuardClient
 from fdhil.cli.doctor.trouble import Trouble
-from fdhil.commissioning.config_check import Place, check_machine
-from fdhil.commissioning.record_comparison import RECORD_POINT
+from fdhil.commissioning import RECORD_POINT, Place, check_machine
 from fdhil.config import MachineConfig
-from fdhil.daemon.daemon_socket import SOCKET_NAME as DAEMON_SOCKET
-from fdhil.daemon.daemon_socket import ask_daemon
-from fdhil.daemon.daemon_status import describe_config_difference
+from fdhil.daemon import SOCKET_NAME as DAEMON_SOCKET
+from fdhil.daemon import ask_daemon, describe_config_difference
 from fdhil.errors import DeviceError
-from fdhil.guard.guard_protocol import SOCKET_NAME
+from fdhil.guard import SOCKET_NAME
 
 ORDER = ("NC", "SYNC", "drive")  # prerequisites of all other points of a drive
 MEANS = {

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.cli.doctor.trouble import Trouble
-from fdhil.commissioning.realtime_scheduling import CYCLE_PRIORITY, set_realtime_priority
-from fdhil.commissioning.sync_cycle import Lateness
+from fdhil.commissioning import CYCLE_PRIORITY, Lateness, set_realtime_priority
 from fdhil.config import MachineConfig
-from fdhil.guard.turn_lateness import BINS_US, MOST_LATE
-from fdhil.store.atomic_file import make_folder, write_file
+from fdhil.guard import BINS_US, MOST_LATE
+from fdhil.store import make_folder, write_file
 
 FILE_NAME = "latency.json"
 MEND = "reduce the load of this PC, use a real-time kernel (PREEMPT_RT), and start the guard with its systemd unit"

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from fdhil.cli.doctor.trouble import Trouble
 from fdhil.config import MachineConfig
 from fdhil.errors import StoreError
-from fdhil.store.change_offers import list_offers, list_undecided
+from fdhil.store import list_offers, list_undecided
 
 PLACE = "offers"
 MEANS = "proposed changes cannot be shown or accepted; the machine keeps its configuration"

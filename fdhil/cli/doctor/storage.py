@@ -5,14 +5,13 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from fdhil.arming.operator_token import TOKEN_NAME, check_run_directory, read_token
+from fdhil.arming import TOKEN_NAME, check_run_directory, read_token
 from fdhil.cli.doctor.trouble import Trouble
-from fdhil.commissioning.commissioning_record import load_record
-from fdhil.commissioning.void_mark import is_record_void
+from fdhil.commissioning import is_record_void, load_record
 from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError, StoreError
-from fdhil.guard.guard_protocol import SOCKET_NAME
-from fdhil.store.history_database import History
+from fdhil.guard import SOCKET_NAME
+from fdhil.store import History
 
 LEAST_FREE_BYTES = 256 << 20
 WINDOW_BYTES = 100_000  # approximate size of one recorded rapid

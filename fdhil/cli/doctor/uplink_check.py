@@ -10,11 +10,9 @@ from urllib.parse import urlsplit
 
 from fdhil.cli.doctor.storage import can_write
 from fdhil.cli.doctor.trouble import Trouble
-from fdhil.config import MachineConfig
-from fdhil.config.credentials import create_tls_context, read_password, read_secret
-from fdhil.config.uplink_section import Uplink
+from fdhil.config import MachineConfig, Uplink, create_tls_context, read_password, read_secret
 from fdhil.errors import ConnectError, StoreError
-from fdhil.store.outbox import POSITION_FILE, OutboxPosition, OutboxReader, read_position
+from fdhil.store import POSITION_FILE, OutboxPosition, OutboxReader, read_position
 
 PLACE = "uplink"
 LONGEST_WAIT_S = 3600.0  # usual at most

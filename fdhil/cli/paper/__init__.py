@@ -38,7 +38,7 @@ def paper(out: Path, runs: int, pdf: bool, as_json: bool) -> None:
 
     from fdhil.cli.paper.claims_page import build_claims_document, build_claims_page, write_pictures
     from fdhil.report import find_browser, require_libraries, write_page_or_pdf
-    from fdhil.store.output_file import open_output
+    from fdhil.store import open_output
 
     require_libraries()
     if pdf:

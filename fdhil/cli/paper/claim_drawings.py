@@ -7,8 +7,18 @@ import numpy as np
 
 from fdhil.cli.paper.derivative_operators import OPERATORS
 from fdhil.records import INTERVAL_95, PARAMETERS, Bool, Float
-from fdhil.report.chart import Chart, Panel, Trace, render_svg
-from fdhil.report.svg_drawing import COLOURS, INK, REFERENCE, compute_legend_layout, open_drawing, place_legend_above
+from fdhil.report import (
+    COLOURS,
+    INK,
+    REFERENCE,
+    Chart,
+    Panel,
+    Trace,
+    compute_legend_layout,
+    open_drawing,
+    place_legend_above,
+    render_svg,
+)
 
 WIDTH = 6.4  # inches
 TALL = 4.8

@@ -10,7 +10,7 @@ from typing import Any
 from fdhil.cli.paper.claims import Claim, Trial, Verdict
 from fdhil.cli.paper.scenarios import SCENARIOS
 from fdhil.report import Page, Section, Table
-from fdhil.store.output_file import open_output
+from fdhil.store import open_output
 
 SCHEMA = "fdhil-paper-1"
 CITATION = (

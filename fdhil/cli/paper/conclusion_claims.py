@@ -9,9 +9,8 @@ import numpy as np
 from fdhil.cli.paper import path_predictions
 from fdhil.cli.paper.claims import Claim, Trial, make_claim
 from fdhil.cli.paper.scenarios import DEMANDED, load_machine
-from fdhil.correction import flatness_feedforward
-from fdhil.prediction import predict_path
-from fdhil.prediction.axis_models import build_nominal_models
+from fdhil.correction import compute_feedforward_offsets
+from fdhil.prediction import build_nominal_models, predict_path
 from fdhil.records import Prediction
 from fdhil.report import Table
 
@@ -60,10 +59,7 @@ def _evaluate_online() -> Claim:
         model, axis = build_nominal_models(config)["X"], config.axis["X"]
         known = np.asarray(reference.position_mm["X"])
         middle = known.size // 2
-        whole, part = (
-            flatness_feedforward.compute_feedforward_offsets(p, model, axis, reference.dt_s)
-            for p in (known, known[:middle])
-        )
+        whole, part = (compute_feedforward_offsets(p, model, axis, reference.dt_s) for p in (known, known[:middle]))
         same = [np.flatnonzero(a[:middle] != b) for a, b in zip(whole, part, strict=True)]
         first = min((int(rows[0]) for rows in same if rows.size), default=middle)
         seconds = (middle - first) * reference.dt_s

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 
-from fdhil.identification.derivatives import ZERO_FORCING_1, DerivativeStencil
+from fdhil.identification import ZERO_FORCING_1, DerivativeStencil
 
 OPERATORS: Mapping[str, DerivativeStencil] = {
     operator.name: operator

@@ -9,9 +9,15 @@ from fdhil.cli.paper import claim_drawings, method_comparison, simulated_drive
 from fdhil.cli.paper.claims import Claim, Picture, Trial, make_claim
 from fdhil.cli.paper.scenarios import load_machine
 from fdhil.config import Identification
-from fdhil.identification.derivatives import ZERO_FORCING_1, differentiate_signal
-from fdhil.identification.estimators import least_squares
-from fdhil.prediction.axis_models import build_nominal_models
+from fdhil.identification import (
+    ZERO_FORCING_1,
+    align_signals,
+    build_regressors,
+    compute_residuals,
+    differentiate_signal,
+    solve_two_steps,
+)
+from fdhil.prediction import build_nominal_models
 from fdhil.records import PARAMETERS, Bool, Float, Recording, Window
 from fdhil.report import Table
 
@@ -116,10 +122,10 @@ def _evaluate_submodels(study: EstimationStudy) -> Claim:
     trials = []
     for name, noise in (("no-noise", QUIET), ("noise-0.1", 0.001), ("noise-0.5", 0.005)):
         (window,) = simulated_drive.add_noise(study.recording, noise, 0)
-        signals = least_squares.align_signals(window, Identification())
-        rows = least_squares.build_regressors(signals, window.dt_s)
-        theta, _ = least_squares.solve_two_steps(*rows)
-        left = least_squares.compute_residuals(theta, *rows)
+        signals = align_signals(window, Identification())
+        rows = build_regressors(signals, window.dt_s)
+        theta, _ = solve_two_steps(*rows)
+        left = compute_residuals(theta, *rows)
         whole = rows[0][:, 0], theta[2] * rows[1][:, 0]
         trials += [
             Trial(name, f"left of {what}", 100.0 * float(np.std(r) / np.sqrt(np.mean(y**2))), "%", most=5.0)

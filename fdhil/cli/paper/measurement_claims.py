@@ -12,14 +12,20 @@ from fdhil.cli.paper.method_comparison import convert_to_vector
 from fdhil.cli.paper.scenarios import load_machine
 from fdhil.cli.paper.simulated_drive import COLD_C, WARM_C, Disturbance, Move
 from fdhil.config import Identification
-from fdhil.identification.estimators import least_squares, maximum_likelihood
-from fdhil.identification.likelihood_fit import fit_parameters_and_noise
-from fdhil.identification.prepared_motion import prepare_window
-from fdhil.pipeline.window_analysis import analyse_window
+from fdhil.identification import (
+    PARAMETER_ORDER,
+    align_signals,
+    build_regressors,
+    compute_residuals,
+    fit_parameters_and_noise,
+    prepare_window,
+    solve_two_steps,
+)
+from fdhil.identification.estimators import maximum_likelihood
+from fdhil.pipeline import analyse_window
 from fdhil.records import UNITS, Estimate, Float, Window, WindowOutcome, compute_rms
-from fdhil.report import Table, figures
-from fdhil.report.parameter_format import DISPLAY_UNITS
-from fdhil.validation.backlash import measure_dead_band
+from fdhil.report import DISPLAY_UNITS, Table, draw_signals, draw_torque, simulate_speed
+from fdhil.validation import measure_dead_band
 
 TEMPERATURES_C = (20.0, 20.5, 21.0, 21.5, 22.0)
 SURE = 1.96  # standard deviations
@@ -125,14 +131,14 @@ def compute_correlations(residual: Float) -> Float:
 
 def _compute_residuals(window: Window) -> dict[str, Float]:
     # torque residuals of [6] by least squares, and innovations of the speed by maximum likelihood
-    signals = least_squares.align_signals(window, Identification())
-    rows = least_squares.build_regressors(signals, window.dt_s)
-    theta, _ = least_squares.solve_two_steps(*rows)
+    signals = align_signals(window, Identification())
+    rows = build_regressors(signals, window.dt_s)
+    theta, _ = solve_two_steps(*rows)
     motion = prepare_window(window)
-    found = fit_parameters_and_noise([motion], np.append(theta[least_squares.PARAMETER_ORDER], 0.0), range(6))
+    found = fit_parameters_and_noise([motion], np.append(theta[PARAMETER_ORDER], 0.0), range(6))
     surely = (np.abs(motion.mode) == 1) & motion.observed
     innovations = found.residuals[: 2 * motion.n].reshape(-1, 2)[surely, 1]
-    return {"residuals": least_squares.compute_residuals(theta, *rows)[1], "innovations": innovations}
+    return {"residuals": compute_residuals(theta, *rows)[1], "innovations": innovations}
 
 
 def _evaluate_whiteness() -> Claim:
@@ -179,7 +185,7 @@ def _evaluate_signals() -> Claim:
         pictures=[
             Picture(
                 "Voltage, current and speed of one rapid of the measured machine, noise of 0.1 % of 70 V, A and rad/s.",
-                figures.draw_signals(
+                draw_signals(
                     simulated_drive.add_noise(
                         simulated_drive.record_rapids(simulated_drive.compute_parameters()), 0.001, 0
                     )[0]
@@ -200,7 +206,7 @@ def _evaluate_torques() -> Claim:
         found = maximum_likelihood.estimate([window], Identification()).build_parameters()
         cases.append((f"{celsius:g} °C", window, found))
         cruise.append(found.Cd + found.ft * RAPID_RAD_S)
-        speed = figures.simulate_speed(window, found)
+        speed = simulate_speed(window, found)
         peak = float(np.max(found.Jt * np.gradient(speed, window.dt_s) + found.ft * speed + found.Cd))
         trials.append(Trial("noise-0.1", f"largest torque at {celsius:g} degC", peak, "N.m", 10.0, 14.0))
     trials.append(Trial("noise-0.1", "torque of the cruise, cold less warm", cruise[0] - cruise[1], "N.m", 0.3, 0.8))
@@ -210,7 +216,7 @@ def _evaluate_torques() -> Claim:
         pictures=[
             Picture(
                 "Torque Jt dw/dt + ft w + Cd sign(w) of one rapid by the parameters identified cold and warm.",
-                figures.draw_torque(cases),
+                draw_torque(cases),
             )
         ],
     )
@@ -258,7 +264,7 @@ def _evaluate_behaviour() -> Claim:
         outcome = _analyse_rapid(noise)
         assert outcome.estimate is not None
         window, model = outcome.window, outcome.estimate.build_parameters()
-        simulated = figures.simulate_speed(window, model)
+        simulated = simulate_speed(window, model)
         missed = compute_rms(window.speed_rad_s - simulated)
         trials.append(
             Trial(name, "RMS between model and drive", 100.0 * missed / RAPID_RAD_S, "% of 60 rad/s", most=1.0)

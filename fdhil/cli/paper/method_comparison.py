@@ -8,11 +8,24 @@ import numpy as np
 from fdhil.cli.paper.derivative_operators import OPERATORS
 from fdhil.cli.paper.simulated_drive import FULL_SCALE, add_noise
 from fdhil.config import Identification
-from fdhil.identification.derivatives import ZERO_FORCING_1, DerivativeStencil
-from fdhil.identification.estimators import least_squares, maximum_likelihood, partial_moments
-from fdhil.identification.filtering import filter_zero_phase
-from fdhil.identification.prepared_motion import NoiseLevels, prepare_window
-from fdhil.identification.rapid_windows import find_windows
+from fdhil.identification import (
+    PARAMETER_ORDER,
+    ZERO_FORCING_1,
+    DerivativeStencil,
+    NoiseLevels,
+    align_signals,
+    build_problem,
+    build_regressors,
+    compute_jacobian,
+    compute_moments,
+    count_horizon_steps,
+    estimate,
+    estimate_typical_sizes,
+    filter_zero_phase,
+    find_windows,
+    prepare_window,
+    solve_two_steps,
+)
 from fdhil.records import PARAMETERS, Bool, Float, Parameters, Recording, Window, freeze_array
 
 NOISES = (0.001, 0.005, 0.01)
@@ -47,7 +60,7 @@ def compare_methods(parameters: Parameters, recording: Recording, runs: int) -> 
         of, raw = [], []
         for seed in range(runs):
             windows = add_noise(recording, noise, seed)
-            likely = maximum_likelihood.estimate(windows, Identification()).values
+            likely = estimate(windows, Identification()).values
             of.append([[*_estimate_in_two_steps(windows, hz), likely] for hz in LOWPASSES_HZ])
             raw.append(estimate_least_squares(_filter_all_but_voltage(windows), NO_LOWPASS_HZ))
         relative = np.array(of) / true - 1.0, np.array(raw) / true - 1.0
@@ -62,8 +75,8 @@ def convert_to_vector(parameters: Parameters) -> Float:
 
 def _estimate_in_two_steps(windows: Sequence[Window], lowpass_hz: float) -> list[Float]:
     found = [estimate_least_squares(windows, lowpass_hz, operator) for operator in OPERATORS.values()]
-    steps = partial_moments.count_horizon_steps(Identification(lowpass_hz=lowpass_hz), windows[0].dt_s)
-    return [*found, _solve_two_steps([partial_moments.compute_moments(window, steps) for window in windows])]
+    steps = count_horizon_steps(Identification(lowpass_hz=lowpass_hz), windows[0].dt_s)
+    return [*found, _solve_two_steps([compute_moments(window, steps) for window in windows])]
 
 
 def estimate_least_squares(
@@ -75,16 +88,16 @@ def estimate_least_squares(
     """Return [R, L, K, Jt, ft, Cd] (6,) by least squares, from all or selected ``rows`` (n,) of each window."""
     parts = []
     for k, window in enumerate(windows):
-        signals = least_squares.align_signals(window, Identification(lowpass_hz=lowpass_hz))
+        signals = align_signals(window, Identification(lowpass_hz=lowpass_hz))
         if rows is not None:
             signals = replace(signals, usable=signals.usable & rows[k])
-        parts.append(least_squares.build_regressors(signals, window.dt_s, operator))
+        parts.append(build_regressors(signals, window.dt_s, operator))
     return _solve_two_steps(parts)
 
 
 def _solve_two_steps(parts: Sequence[tuple[Float, Float]]) -> Float:
     electrical, mechanical = (np.vstack([part[k] for part in parts]) for k in (0, 1))
-    values: Float = least_squares.solve_two_steps(electrical, mechanical)[0][least_squares.PARAMETER_ORDER]
+    values: Float = solve_two_steps(electrical, mechanical)[0][PARAMETER_ORDER]
     return values
 
 
@@ -113,7 +126,7 @@ def compute_cramer_rao_bound(parameters: Parameters, recording: Recording, noise
     """Return the Cramer-Rao standard deviations (6,) for the samples in which the drive is certainly moving."""
     theta = np.append(convert_to_vector(parameters), 0.0)
     motion = prepare_window(find_windows(recording)[0])
-    problem = maximum_likelihood.build_problem([motion], theta, [NoiseLevels(*np.full(3, noise * FULL_SCALE).tolist())])
-    scales = maximum_likelihood.estimate_typical_sizes(theta, [motion])
-    slope = maximum_likelihood.compute_jacobian(problem, theta, problem.compute_residuals(theta), range(6), scales)
+    problem = build_problem([motion], theta, [NoiseLevels(*np.full(3, noise * FULL_SCALE).tolist())])
+    scales = estimate_typical_sizes(theta, [motion])
+    slope = compute_jacobian(problem, theta, problem.compute_residuals(theta), range(6), scales)
     return np.asarray(np.sqrt(np.diag(np.linalg.inv(slope.T @ slope))))

@@ -14,10 +14,8 @@ from fdhil.cli.paper import simulated_drive
 from fdhil.cli.paper.claim_drawings import TracedPath
 from fdhil.cli.paper.scenarios import PATHS, load_machine
 from fdhil.config import MachineConfig
-from fdhil.correction import flatness_feedforward, linear_loop
-from fdhil.prediction import compute_contour_error_um
-from fdhil.prediction.axis_models import build_nominal_models
-from fdhil.prediction.path_prediction import predict_corrected_path
+from fdhil.correction import compute_feedforward_offsets, invert_loop
+from fdhil.prediction import build_nominal_models, compute_contour_error_um, predict_corrected_path
 from fdhil.program import load_trajectory
 from fdhil.records import Bool, Float, Parameters, Prediction, Trajectory, compute_rms
 
@@ -77,9 +75,7 @@ def predict_paper_correction(scenario: str, method: str, program: str = SLOW) ->
     models = build_nominal_models(config)
     if method == "flatness":
         offsets = {
-            axis: flatness_feedforward.compute_feedforward_offsets(
-                np.asarray(path), models[axis], config.axis[axis], before.reference.dt_s
-            )
+            axis: compute_feedforward_offsets(np.asarray(path), models[axis], config.axis[axis], before.reference.dt_s)
             for axis, path in before.reference.position_mm.items()
         }
         speed, torque = ({axis: pair[k] for axis, pair in offsets.items()} for k in (0, 1))
@@ -94,9 +90,7 @@ def compute_offset_um(scenario: str, method: str, program: str = SLOW) -> dict[s
         return {axis: -error for axis, error in before.error_um.items()}
     models = build_nominal_models(config)
     return {
-        axis: -linear_loop.invert_loop(
-            models[axis], config.axis[axis], before.reference.dt_s, error.size
-        ).compute_offset(error)
+        axis: -invert_loop(models[axis], config.axis[axis], before.reference.dt_s, error.size).compute_offset(error)
         for axis, error in before.error_um.items()
     }
 

@@ -11,12 +11,11 @@ from fdhil.cli.paper.path_predictions import CORNERS, FAST, PLACES, SLOW, SMOOTH
 from fdhil.cli.paper.scenarios import CASCADES, DEMANDED, PATHS, load_machine
 from fdhil.cli.paper.simulated_drive import Move
 from fdhil.config import Identification
-from fdhil.identification.estimators import maximum_likelihood
-from fdhil.model import closed_loop
-from fdhil.prediction import compute_contour_error_um, predict_path
-from fdhil.prediction.axis_models import build_nominal_models
+from fdhil.identification import estimate
+from fdhil.model import simulate_axes
+from fdhil.prediction import build_nominal_models, compute_contour_error_um, predict_path
 from fdhil.records import Float, Parameters, Prediction, compute_rms
-from fdhil.report import Table, figures
+from fdhil.report import Table, draw_path
 
 DRAWN = ("full", "half", "sharp-lag")  # scenarios with drawings
 LITTLE = 1.25  # ratio of the errors at both feeds that counts as a small influence
@@ -92,7 +91,7 @@ def identify_simulator() -> Parameters:
         simulated_drive.record_rapids(true, strokes=2, move=Move.create_measured(share)) for share in (1.0, SLOW_SHARE)
     ]
     windows = [window for k, one in enumerate(recordings) for window in simulated_drive.add_noise(one, 0.001, k)]
-    return maximum_likelihood.estimate(windows, Identification()).build_parameters()
+    return estimate(windows, Identification()).build_parameters()
 
 
 def _evaluate_prediction() -> Claim:
@@ -142,7 +141,7 @@ def _evaluate_path() -> Claim:
     return make_claim(
         "figure-10",
         trials,
-        pictures=[Picture("The programmed path and its named places.", figures.draw_path(desired, PLACES))],
+        pictures=[Picture("The programmed path and its named places.", draw_path(desired, PLACES))],
     )
 
 
@@ -245,7 +244,7 @@ def _compare_drift_with_feed() -> Claim:
 def simulate_offset_response(scenario: str, answer: Prediction, offset_um: dict[str, Float]) -> dict[str, Float]:
     """Return the displacement (n,) of each axis, um, due to ``offset_um`` on the reference."""
     config = load_machine(scenario)
-    moved = closed_loop.simulate_axes(
+    moved = simulate_axes(
         build_nominal_models(config), config.axis, answer.reference.dt_s, answer.reference.position_mm,
         {axis: 1e-3 * values for axis, values in offset_um.items()},
     )  # fmt: skip

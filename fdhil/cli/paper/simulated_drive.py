@@ -10,9 +10,9 @@ import numpy as np
 
 from fdhil.cli.paper.scenarios import load_machine
 from fdhil.config import Axis
-from fdhil.identification.rapid_windows import find_windows
+from fdhil.identification import find_windows
 from fdhil.records import Float, Parameters, Recording, Window, freeze_array
-from fdhil.sim.drive.plant_physics import PlantPhysics, build_plant_parameters
+from fdhil.sim import PlantPhysics, build_plant_parameters
 
 FULL_SCALE = 70.0  # V, A and rad/s: all three signals of figure 4 share its axis
 COLD_C, WARM_C = 20.0, 22.0

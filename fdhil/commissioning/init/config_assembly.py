@@ -16,11 +16,18 @@ from fdhil.commissioning.init.interview import (
 )
 from fdhil.commissioning.init.linuxcnc_import import ROTARY, LinuxcncMachine
 from fdhil.commissioning.init.sourced_value import SourcedValue
-from fdhil.config import CanBus, CorrectionLimits, find_unlikely_values, is_second_drive, parse_config, parse_toml
-from fdhil.config.axis_section import Axis
-from fdhil.config.config_loader import check_section
-from fdhil.config.config_template import write_filled_template
-from fdhil.config.offset_bounds import find_limit_faults
+from fdhil.config import (
+    Axis,
+    CanBus,
+    CorrectionLimits,
+    check_section,
+    find_limit_faults,
+    find_unlikely_values,
+    is_second_drive,
+    parse_config,
+    parse_toml,
+    write_filled_template,
+)
 from fdhil.errors import ConfigError, ConfigFault
 from fdhil.records import PARAMETERS
 

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from fdhil.commissioning.init.sourced_value import SourcedValue
-from fdhil.config.config_loader import check_value, find_field
+from fdhil.config import check_value, find_field
 from fdhil.errors import ConfigError, ConfigFault
 
 OPERATOR = "entered by the operator"

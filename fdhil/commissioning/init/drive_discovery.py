@@ -14,10 +14,7 @@ from fdhil.commissioning.compare_scales import Read, read_increments_per_rev
 from fdhil.commissioning.init.sourced_value import SourcedValue, round_to_six_digits
 from fdhil.commissioning.scan import BusScanner, DeviceDescription, NodeAnswers, find_best_description, scan_nodes
 from fdhil.config import CanBus
-from fdhil.drivers.cia402.capabilities import GENERIC_PROFILE, suggest_profile
-from fdhil.drivers.cia402.device_description import read_device
-from fdhil.drivers.cia402.drive_profile import DriveProfile, decode_speed_unit
-from fdhil.drivers.cia402.drive_profile_file import read_profile
+from fdhil.drivers import GENERIC_PROFILE, DriveProfile, decode_speed_unit, read_device, read_profile, suggest_profile
 
 TWIN, TWIN_VENDOR = "fdhil_twin", 0x46444849
 MOST_AXES = 8

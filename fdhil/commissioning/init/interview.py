@@ -12,13 +12,8 @@ from fdhil.commissioning.init.drive_discovery import FoundBus, FoundDrive, is_dc
 from fdhil.commissioning.init.hal_pins import convert_to_current_gains, propose_axis
 from fdhil.commissioning.init.linuxcnc_import import AxisScale, LinuxcncMachine
 from fdhil.commissioning.init.sourced_value import SourcedValue, round_to_six_digits
-from fdhil.config import Drive, is_second_drive
-from fdhil.config.axis_section import HalPins
-from fdhil.config.axis_tables import convert_key_to_degrees, convert_key_to_mm
-from fdhil.config.config_loader import check_section
-from fdhil.drivers.cia402.capabilities import GENERIC_PROFILE
-from fdhil.drivers.cia402.drive_profile import DriveProfile
-from fdhil.drivers.cia402.drive_profile_file import NO_OFFSET_ADVICE, explain_missing_offset, load_profile
+from fdhil.config import Drive, HalPins, check_section, convert_key_to_degrees, convert_key_to_mm, is_second_drive
+from fdhil.drivers import GENERIC_PROFILE, NO_OFFSET_ADVICE, DriveProfile, explain_missing_offset, load_profile
 from fdhil.errors import ConfigError, ConfigFault, EdsError
 
 UNITS_OF_CURRENT = {

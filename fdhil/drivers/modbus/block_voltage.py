@@ -2,8 +2,7 @@
 
 import math
 
-from fdhil.config import MachineConfig
-from fdhil.config.sensor_sections import compute_block_registers
+from fdhil.config import MachineConfig, compute_block_registers
 from fdhil.drivers.modbus.register_values import count_registers, decode_numbers, describe_other_orders
 from fdhil.drivers.modbus.sampled_voltage import ModbusVoltage, SensorBlock
 from fdhil.errors import ProtocolError

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Hashable
 from weakref import WeakValueDictionary
 
-from fdhil.config.sensor_sections import ModbusDevice
+from fdhil.config import ModbusDevice
 from fdhil.drivers.modbus.modbus_line import ModbusLine
 from fdhil.drivers.modbus.rtu_line import RtuLine
 from fdhil.drivers.modbus.tcp_line import TcpLine

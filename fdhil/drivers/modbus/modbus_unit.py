@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from fdhil.config.sensor_sections import ModbusDevice
+from fdhil.config import ModbusDevice
 from fdhil.drivers.modbus.line_registry import get_line
 from fdhil.drivers.modbus.modbus_line import BUSY, DamagedAnswer, ModbusAnswer, ModbusLine, ModbusRefused, ModbusRequest
 from fdhil.drivers.modbus.rtu_frames import READ_INPUT, WRITE_REGISTER

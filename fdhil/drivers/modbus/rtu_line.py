@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import MutableSet
 from weakref import WeakSet
 
-from fdhil.config.sensor_sections import ModbusDevice
+from fdhil.config import ModbusDevice
 from fdhil.drivers.modbus.modbus_line import DamagedAnswer, ModbusAnswer, ModbusRefused, ModbusRequest, make_timeout
 from fdhil.drivers.modbus.outstanding_answers import OutstandingAnswers
 from fdhil.drivers.modbus.rtu_frames import (

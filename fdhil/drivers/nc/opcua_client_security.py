@@ -9,7 +9,7 @@ from asyncua import Client
 from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 from asyncua.crypto.uacrypto import CertProperties, load_certificate, x509
 
-from fdhil.config.nc_client_sections import OpcUaNc
+from fdhil.config import OpcUaNc
 from fdhil.errors import ConnectError
 
 SECTION = "nc_source.opcua"

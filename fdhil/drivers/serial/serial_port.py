@@ -8,7 +8,7 @@ from pathlib import Path
 
 import serial
 
-from fdhil.config.sensor_sections import SerialDevice
+from fdhil.config import SerialDevice
 from fdhil.drivers.serial.byte_stream import ByteStream
 from fdhil.errors import ConnectError
 

@@ -3,8 +3,7 @@
 import re
 import time
 
-from fdhil.config import MachineConfig, Thermometer, Voltage
-from fdhil.config.sensor_sections import SerialDevice
+from fdhil.config import MachineConfig, SerialDevice, Thermometer, Voltage
 from fdhil.drivers.meter_voltage import MeterVoltage
 from fdhil.drivers.serial.serial_port import SerialPort
 from fdhil.drivers.serial.text_lines import LineReader

@@ -3,8 +3,7 @@
 import numpy as np
 
 from fdhil.cia402 import PdoEntry
-from fdhil.config import TableEncoder
-from fdhil.config.table_sensor_sections import IN_A_FRAME
+from fdhil.config import IN_A_FRAME, TableEncoder
 from fdhil.drivers.can.sync_grid import TickedFrames
 from fdhil.drivers.cia402.pdo_queue import decode_entry
 from fdhil.records import Notice, TableSamples, freeze_array

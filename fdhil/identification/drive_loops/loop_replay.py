@@ -9,7 +9,20 @@ from fdhil.config import Axis, Regulators
 from fdhil.identification.filtering import compute_moving_mean, erode_flags
 from fdhil.identification.prepared_motion import detect_motion
 from fdhil.identification.rapid_windows import interpolate_gaps
-from fdhil.model import closed_loop, closed_loop_kernels
+from fdhil.model import (
+    CURRENT,
+    CURRENT_DEMAND,
+    CURRENT_INTEGRAL,
+    POSITION_BEFORE,
+    POSITION_INTEGRAL,
+    SPEED,
+    SPEED_FILTERED,
+    SPEED_INTEGRAL,
+    WAITING,
+    State,
+    create_zero_state,
+    simulate_axis,
+)
 from fdhil.records import Bool, Float, Parameters, Window, make_read_only_view
 
 LEAST_ROWS = 50
@@ -193,30 +206,28 @@ def _simulate_loops(rapid: Rapid, axis: Axis, delay_cycles: int) -> Float:
     # a load is a torque offset of the opposite sign, except in the current, which includes it
     offset = -rapid.load_nm * (axis.nominal.K / rapid.plant.K)
     start = compute_standstill_state(rapid, drive)
-    answer = closed_loop.simulate_axis(
-        rapid.plant, drive, rapid.dt_s, rapid.demand_mm, torque_offset_nm=offset, state=start
-    )
+    answer = simulate_axis(rapid.plant, drive, rapid.dt_s, rapid.demand_mm, torque_offset_nm=offset, state=start)
     return np.stack((answer.position_mm, answer.current_a + rapid.load_nm / rapid.plant.K))
 
 
-def compute_standstill_state(rapid: Rapid, axis: Axis) -> closed_loop.State:
+def compute_standstill_state(rapid: Rapid, axis: Axis) -> State:
     """Return the state of an axis at standstill, whose integrators supply the holding current."""
     g, rad_per_mm = axis.regulators, 2 * math.pi / axis.screw_pitch_mm
     speed = rapid.creep_mm_s * rad_per_mm
     lag = (rapid.demand_mm[0] - rapid.standstill_mm) * rad_per_mm
     current = rapid.standstill_a - rapid.load_nm[0] / rapid.plant.K
     held = rapid.standstill_a - g.speed_kp * (g.position_gain_per_s * lag - speed)
-    state = closed_loop.create_zero_state(rapid.standstill_mm)
-    state[[closed_loop_kernels.CURRENT, closed_loop_kernels.CURRENT_DEMAND]] = current
-    state[[closed_loop_kernels.SPEED, closed_loop_kernels.SPEED_FILTERED]] = speed
+    state = create_zero_state(rapid.standstill_mm)
+    state[[CURRENT, CURRENT_DEMAND]] = current
+    state[[SPEED, SPEED_FILTERED]] = speed
     if g.structure == "pid":
-        state[closed_loop_kernels.POSITION_INTEGRAL] = held / g.speed_kp
-        state[closed_loop_kernels.POSITION_BEFORE] -= rapid.creep_mm_s * g.speed_period_s
+        state[POSITION_INTEGRAL] = held / g.speed_kp
+        state[POSITION_BEFORE] -= rapid.creep_mm_s * g.speed_period_s
     else:
-        state[closed_loop_kernels.SPEED_INTEGRAL] = held
+        state[SPEED_INTEGRAL] = held
     voltage = rapid.plant.R * current + rapid.plant.K * speed
-    state[closed_loop_kernels.CURRENT_INTEGRAL] = voltage
-    state[closed_loop_kernels.WAITING : closed_loop_kernels.WAITING + g.current_delay_cycles] = voltage
+    state[CURRENT_INTEGRAL] = voltage
+    state[WAITING : WAITING + g.current_delay_cycles] = voltage
     return state
 
 

@@ -18,7 +18,7 @@ from fdhil.config import Axis
 from fdhil.identification.kalman import CD, FT, JT, LOAD, VOLTAGE, K, L, R
 from fdhil.identification.prepared_motion import Motion, TermRegressor, WithinSampleDoubt
 from fdhil.identification.rapid_windows import RUN_SHARE
-from fdhil.model.closed_loop import simulate_axis
+from fdhil.model import simulate_axis
 from fdhil.records import PARAMETERS, Float, Parameters, Window, compute_rms
 
 LEAST_ROW_S = 0.003  # in shorter samples the first two are less than the regulator's own effect

@@ -8,8 +8,7 @@ import struct
 from collections.abc import Callable
 from typing import Protocol
 
-from fdhil.config import TableEncoder, Thermometer, Voltage
-from fdhil.config.sensor_sections import VoltageBlock
+from fdhil.config import TableEncoder, Thermometer, Voltage, VoltageBlock
 
 _FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f", "float64": ">d"}
 

@@ -18,22 +18,13 @@ import numpy as np
 from fdhil import correction
 from fdhil.bounded_process import limit_process, receive_request, report_to_parent
 from fdhil.config import MachineConfig
-from fdhil.correction.result_documents import (
-    advise_with_correction,
-    build_advice_document,
-    build_correction_document,
-    make_feed_sources,
-)
+from fdhil.correction import advise_with_correction, build_advice_document, build_correction_document, make_feed_sources
 from fdhil.errors import FdhilError, ProgramError
-from fdhil.prediction.axis_models import build_nominal_models, load_validated_models, select_models
-from fdhil.prediction.feed_search import FeedScaledPath
-from fdhil.program import Budget, interpret, planner
-from fdhil.program.demand_csv import read_demand_csv
+from fdhil.prediction import FeedScaledPath, build_nominal_models, load_validated_models, select_models
+from fdhil.program import Budget, interpret, plan, read_demand_csv
 from fdhil.records import Correction, Parameters, Trajectory
-from fdhil.report.figures import LEAST_UM, find_common_scale
-from fdhil.report.path_report import find_worst_positions, list_planes
-from fdhil.store.history_gain import predict_gain_from_history
-from fdhil.store.newest_parameters import read_newest_parameters
+from fdhil.report import LEAST_UM, find_common_scale, find_worst_positions, list_planes
+from fdhil.store import predict_gain_from_history, read_newest_parameters
 from fdhil.web.forecast import forecast_files
 
 MOST_ROWS = 600_000
@@ -113,7 +104,7 @@ def load_reference(program: Path, name: str, config: MachineConfig) -> Trajector
             text = f"{name} lasts longer than the {minutes:.0f} minutes allowed in the browser"
             raise ProgramError(0, "", f"{text}; use fdhil correct")
         return reference
-    return planner.plan(interpret(_read_lines(program), Budget.create_from_config(config.nc)), config, MOST_ROWS)
+    return plan(interpret(_read_lines(program), Budget.create_from_config(config.nc)), config, MOST_ROWS)
 
 
 def _read_lines(program: Path) -> Iterator[str]:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fdhil.prediction.contour_error import WINDOW_S, find_nearest_points_mm
+from fdhil.prediction import WINDOW_S, find_nearest_points_mm
 from fdhil.records import Bool, Float, Int
 from fdhil.web.forecast.forecast_files import AFTER, BEFORE, StoredForecast
 

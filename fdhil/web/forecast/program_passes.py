@@ -5,9 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from fdhil.config import MachineConfig
-from fdhil.store.history_rows import StoredNotice
-from fdhil.store.learned_offset_files import list_learned
-from fdhil.store.notice_document import format_date
+from fdhil.store import StoredNotice, format_date, list_learned
 
 SHOWN = 30
 _NUMBER = r"([\d.]+)"

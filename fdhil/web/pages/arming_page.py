@@ -10,9 +10,9 @@ from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, Field
 
 from fdhil import tables
-from fdhil.arming.operator_token import TOKEN_NAME, find_credential, read_token
+from fdhil.arming import TOKEN_NAME, find_credential, read_token
 from fdhil.config import MachineConfig
-from fdhil.daemon.daemon_status import describe_config_difference
+from fdhil.daemon import describe_config_difference
 from fdhil.web.fault_responses import RequestRefused, require_granted
 from fdhil.web.program_folder import NAME, Program, list_programs, read_program
 from fdhil.web.request_gate import find_token

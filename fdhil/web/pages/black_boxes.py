@@ -8,10 +8,10 @@ import numpy as np
 from pydantic import BaseModel
 
 from fdhil.config import MachineConfig
-from fdhil.daemon.black_box import BLACK_BOX_FOLDER, find_black_boxes
-from fdhil.drivers.cia402.candump_samples import LARGEST_LOG, decode_candump
+from fdhil.daemon import BLACK_BOX_FOLDER, find_black_boxes
+from fdhil.drivers import LARGEST_LOG, decode_candump
 from fdhil.records import AxisSamples, Float
-from fdhil.store.named_file import open_named
+from fdhil.store import open_named
 from fdhil.web.pages.rapid_signals import round_digits
 
 COLUMNS = 400

@@ -5,10 +5,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel
 
-from fdhil.daemon.alarms import MOST_TOGETHER, Alarm, AlarmTable
-from fdhil.daemon.notice_texts import get_effect_and_action
-from fdhil.store.history_rows import StoredNotice, TimeStamp
-from fdhil.store.notice_document import format_date, make_notice_document
+from fdhil.daemon import MOST_TOGETHER, Alarm, AlarmTable, get_effect_and_action
+from fdhil.store import StoredNotice, TimeStamp, format_date, make_notice_document
 
 MOST_PAGE = 200
 MOST_EARLIER = 50

@@ -6,8 +6,8 @@ from fastapi import APIRouter, Query
 from fastapi.responses import Response
 from pydantic import BaseModel, Field
 
-from fdhil.daemon.notice_log import MOST_NOTE
-from fdhil.store.history_database import RECENT_NOTICES
+from fdhil.daemon import MOST_NOTE
+from fdhil.store import RECENT_NOTICES
 from fdhil.web.fault_responses import require_granted
 from fdhil.web.file_response import FileStreamResponse
 from fdhil.web.pages.black_boxes import BlackBox, Envelope, make_envelope, open_black_box, summarise_black_boxes

@@ -5,8 +5,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Request
 
-from fdhil.report.condition_summary import Refusals
-from fdhil.report.history_reader import read_axes, read_notices
+from fdhil.report import Refusals, read_axes, read_notices
 from fdhil.web.fault_responses import RequestRefused
 from fdhil.web.pages.parameter_trends import make_axis_document, sort_notices, summarise_axis
 from fdhil.web.route_context import MachineContext, MachineDependency

@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocketDisconnect
 
-from fdhil.daemon.daemon_socket import SOCKET_NAME
+from fdhil.daemon import SOCKET_NAME
 from fdhil.web.fault_responses import RequestRefused
 from fdhil.web.live_feed import KEPT_S, MAX_BROWSERS, LiveFeed, LiveViewer
 from fdhil.web.live_ring import DRAWN, UNITS

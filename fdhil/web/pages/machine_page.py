@@ -9,9 +9,7 @@ from pydantic import BaseModel
 from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError, StoreError
 from fdhil.records import ParameterSet
-from fdhil.store.history_database import History
-from fdhil.store.history_rows import Revision
-from fdhil.store.parameter_document import report_parameters
+from fdhil.store import History, Revision, report_parameters
 from fdhil.web.fault_responses import Fault, make_fault_document
 from fdhil.web.pages.machine_state import AxisLight, Light, Step, classify_axis, classify_change, suggest_steps
 from fdhil.web.route_context import MachineDependency, PrincipalDependency

@@ -6,8 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel
 
-from fdhil.arming.guard_link import ORDERED_ENDS
-from fdhil.arming.residual_offset import ADOPT_ADVICE, START_AND_ADOPT
+from fdhil.arming import ADOPT_ADVICE, ORDERED_ENDS, START_AND_ADOPT
 
 Light = Literal["good", "warn", "bad", "none"]
 LIVE_S = 2.0

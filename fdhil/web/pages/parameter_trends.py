@@ -5,18 +5,25 @@ from typing import Any, Literal
 
 from fdhil.config import MachineConfig
 from fdhil.records import INTERVAL_95
-from fdhil.report.chart import Chart, export_chart
-from fdhil.report.condition_summary import IN_ORDER, NOT_IDENTIFIED, Refusals, build_latest_rows, describe_condition
-from fdhil.report.drive_health import describe_change
-from fdhil.report.history_charts import AxisHistory, build_temperature_chart, build_time_chart
-from fdhil.report.parameter_format import (
+from fdhil.report import (
+    COLOURS,
     DISPLAY_UNITS,
+    IN_ORDER,
+    NOT_IDENTIFIED,
     PARAMETER_MEANINGS,
+    AxisHistory,
+    Chart,
+    Refusals,
+    build_latest_rows,
+    build_temperature_chart,
+    build_time_chart,
     compute_half_width,
+    describe_change,
+    describe_condition,
     describe_name,
+    export_chart,
     format_cell,
 )
-from fdhil.report.svg_drawing import COLOURS
 
 MOST_REVISIONS = 50
 MOST_ESTIMATES = 50

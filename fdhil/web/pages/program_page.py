@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from starlette.requests import HTTPConnection
 
 from fdhil.errors import ConnectError, DeviceTimeout, StoreError
-from fdhil.store.history_database import RECENT_NOTICES
+from fdhil.store import RECENT_NOTICES
 from fdhil.web.fault_responses import RequestRefused
 from fdhil.web.forecast.forecast_queue import STATES, ForecastJob, ForecastQueue, ForecastTask
 from fdhil.web.forecast.path_view import ViewBox, find_plane, locate_line, make_error_curve, make_view

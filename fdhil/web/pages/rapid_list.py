@@ -7,10 +7,8 @@ from typing import Any, Literal
 from pydantic import BaseModel
 
 from fdhil.records import INTERVAL_95, get_unit
-from fdhil.report.parameter_format import DISPLAY_UNITS, format_cell
-from fdhil.report.typography import typeset_text
-from fdhil.store.history_database import History
-from fdhil.store.history_rows import StoredWindow
+from fdhil.report import DISPLAY_UNITS, format_cell, typeset_text
+from fdhil.store import History, StoredWindow
 from fdhil.web.fault_responses import RequestRefused
 
 SEARCHED = 5_000

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel
 
-from fdhil.identification.rapid_windows import find_moving_range, interpolate_gaps
-from fdhil.pipeline.model_overlay import ModelOverlay
+from fdhil.identification import find_moving_range, interpolate_gaps
+from fdhil.pipeline import ModelOverlay
 from fdhil.records import Float, Reason, Window, compute_rms
-from fdhil.report.typography import typeset_text
+from fdhil.report import typeset_text
 from fdhil.web.pages.rapid_list import Said
 
 MOST_POINTS = 6000

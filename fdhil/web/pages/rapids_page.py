@@ -10,9 +10,9 @@ from fastapi import APIRouter, Depends, FastAPI, Path, Query
 from fastapi.responses import Response
 from starlette.requests import HTTPConnection
 
-from fdhil.daemon.outcome_store import WINDOWS_FOLDER
+from fdhil.daemon import WINDOWS_FOLDER
 from fdhil.errors import StoreError
-from fdhil.store.named_file import open_named
+from fdhil.store import open_named
 from fdhil.web.file_response import FileStreamResponse
 from fdhil.web.pages.rapid_list import (
     LARGEST_ID,

@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 
-from fdhil.config.user_file import LONGEST_PASSWORD, Role
+from fdhil.config import LONGEST_PASSWORD, Role
 from fdhil.web.login import LIFE_S
 from fdhil.web.request_gate import find_token
 from fdhil.web.route_context import LoginDependency

@@ -1,0 +1,12 @@
+from .axis_pipeline import POOL_WINDOWS as POOL_WINDOWS
+from .axis_pipeline import AxisPipeline as AxisPipeline
+from .axis_pipeline import PipelineState as PipelineState
+from .axis_pipeline import Record as Record
+from .identified_loops import analyse_windows as analyse_windows
+from .identified_loops import identify_from_outcomes as identify_from_outcomes
+from .model_overlay import ModelOverlay as ModelOverlay
+from .model_overlay import overlay_model as overlay_model
+from .sample_buffer import SampleBuffer as SampleBuffer
+from .validated_pool import pool_windows as pool_windows
+from .validated_pool import pool_with_held_out as pool_with_held_out
+from .window_analysis import analyse_window as analyse_window
